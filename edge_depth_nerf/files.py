@@ -133,8 +133,10 @@ def write_distance_png(path: Path, distance_m: NDArray) -> None:
     write_png(path, np.where(steps > 65535, 0, steps).astype(np.uint16))
 
 
-def read_distance_png(path: Path) -> NDArray[np.float32]:
+def read_distance_png(path: Path, metres_per_step: float = 1 / DISTANCE_STEPS_PER_METRE) -> NDArray[np.float32]:
     """Read a 16-bit distance PNG as H×W float32 metres, 0 = no value.
+
+    `metres_per_step` is 1/256 m in this project's own files; other people's scenes declare theirs.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -144,7 +146,7 @@ def read_distance_png(path: Path) -> NDArray[np.float32]:
     image = _decode(path, cv2.IMREAD_UNCHANGED)
     if image.dtype != np.uint16 or image.ndim != 2:
         raise InputError(
-            f"{path}: expected a 16-bit single-channel PNG in units of 1/256 m, found {image.dtype} {image.shape}. "
-            "8-bit or colour maps have lost the distance; export the map again."
+            f"{path}: expected a 16-bit single-channel PNG in units of 1/256 m, found "
+            f"{image.dtype} {image.shape}. 8-bit or colour maps have lost the distance; export the map again."
         )
-    return image.astype(np.float32) / DISTANCE_STEPS_PER_METRE
+    return image.astype(np.float32) * np.float32(metres_per_step)

@@ -1,0 +1,21 @@
+"""Shared fixtures: where real data may lie, and no surprises from the machine."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+# more threads than cores only slow each other down when tests run side by side
+os.environ.setdefault("OMP_NUM_THREADS", "2")
+
+REAL_DATA = Path(__file__).resolve().parents[2] / "shared" / "real"
+
+
+@pytest.fixture
+def real_data() -> Path:
+    """Folder of real KITTI-360 excerpts, beside the checkout; not part of the project."""
+    if not REAL_DATA.is_dir():
+        pytest.skip("no real data beside the checkout (they are not part of the project)")
+    return REAL_DATA
