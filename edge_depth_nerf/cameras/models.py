@@ -1,0 +1,383 @@
+"""Camera models: MEI, Kannala-Brandt, pinhole. Project and unproject, exact beyond 90°, in torch.
+
+Frames and units. Camera frame: x right, y down, z forward (OpenCV). Pixels are (x, y) with centres at +0.5:
+the picture covers 0 <= x < width, 0 <= y < height. (OpenCV and KITTI-360's calibration count integer centres:
+their u0 is `cx` - 0.5.) Angles in radians; θ is the angle between a ray and the z axis. Leading dimensions
+are free. Results have the dtype and device of the input; parameters are plain floats.
+
+Validity. Every model ends at its own `theta_max_rad`, beyond which its formulas fold back into the picture.
+What is beyond is marked as not valid and is NaN; gradients of what is valid stay finite, and what is not
+valid gets a gradient of zero. Validity says nothing about the picture's borders: that is `inside`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar, TypeVar
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from edge_depth_nerf.cameras.distortion import Distortion
+from edge_depth_nerf.errors import InputError
+
+AnyCamera = TypeVar("AnyCamera", bound="Camera")
+
+
+@dataclass(frozen=True)
+class Camera(ABC):
+    """What the models share: a map from rays to a plane, the plane's distortion, and the pixel grid."""
+
+    model: ClassVar[str]
+    """The model's name in files."""
+
+    width: int
+    """Width of the picture in pixels."""
+    height: int
+    """Height of the picture in pixels."""
+    fx: float
+    """Focal length along x in pixels."""
+    fy: float
+    """Focal length along y in pixels."""
+    cx: float
+    """x of the principal point in pixels, pixel centres at +0.5."""
+    cy: float
+    """y of the principal point in pixels, pixel centres at +0.5."""
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if not math.isfinite(value):
+                raise InputError(f"{self.model} camera: {field.name} is {value}, expected a finite number.")
+            if value <= 0 and field.name in ("width", "height", "fx", "fy"):
+                raise InputError(f"{self.model} camera: {field.name} is {value}, expected more than 0.")
+
+    @property
+    @abstractmethod
+    def theta_max_rad(self) -> float:
+        """The largest angle from the z axis up to which the model is one-to-one."""
+
+    @cached_property
+    @abstractmethod
+    def _distortion(self) -> Distortion: ...
+
+    @cached_property
+    @abstractmethod
+    def _radius_max(self) -> float:
+        """Radius in the undistorted plane that belongs to `theta_max_rad`."""
+
+    @abstractmethod
+    def _to_plane(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Rays, of any positive length near 1, to the undistorted plane; second, whether that can be."""
+
+    @abstractmethod
+    def _from_plane(self, plane: Tensor) -> Tensor:
+        """Points within `_radius_max` of the undistorted plane to unit rays."""
+
+    def project(self, points: Float[Tensor, "*batch 3"]) -> tuple[Float[Tensor, "*batch 2"], Bool[Tensor, "*batch"]]:
+        """Project points or directions.
+
+        Args:
+            points: in the camera frame; any length but zero.
+
+        Returns:
+            Pixels (NaN where not valid), and whether θ <= `theta_max_rad`. A point at the origin, or with a
+            coordinate that is not finite, is not valid.
+
+        """
+        with torch.no_grad():
+            largest = points.abs().amax(-1, keepdim=True)
+            usable = (largest > 0) & torch.isfinite(largest)
+        # Points that cannot be used are replaced before the arithmetic, not after it: a NaN that is merely
+        # discarded by `where` would still come back as the gradient. Division by the largest coordinate keeps
+        # squares from overflow; the result does not depend on it, so it may be left out of the gradient.
+        forward = points.new_tensor([0.0, 0.0, 1.0])
+        rays = torch.where(usable, points, forward) / torch.where(usable, largest, 1.0)
+        with torch.no_grad():
+            theta = torch.atan2(rays[..., :2].norm(dim=-1), rays[..., 2])
+            # a ray of the rim itself may come out a rounding beyond it
+            limit = self.theta_max_rad * (1.0 + 8.0 * torch.finfo(points.dtype).eps)
+            usable = usable & (theta <= limit)[..., None]
+        plane, defined = self._to_plane(torch.where(usable, rays, forward))
+        pixels = self._distortion.distort(plane) * plane.new_tensor([self.fx, self.fy])
+        pixels = pixels + plane.new_tensor([self.cx, self.cy])
+        valid = usable.squeeze(-1) & defined & torch.isfinite(pixels).all(-1)
+        return torch.where(valid[..., None], pixels, math.nan), valid
+
+    def unproject(self, pixels: Float[Tensor, "*batch 2"]) -> tuple[Float[Tensor, "*batch 3"], Bool[Tensor, "*batch"]]:
+        """Find the rays of pixels, also of pixels outside the picture.
+
+        Returns:
+            Unit directions (NaN where not valid), and whether the pixel is the image of a ray with
+            θ <= `theta_max_rad`.
+
+        """
+        focal, principal = pixels.new_tensor([self.fx, self.fy]), pixels.new_tensor([self.cx, self.cy])
+        with torch.no_grad():
+            usable = torch.isfinite(((pixels - principal) / focal).square().sum(-1))
+        pixels = torch.where(usable[..., None], pixels, principal)
+        distorted = (pixels - principal) / focal
+        with torch.no_grad():
+            rounding = torch.finfo(pixels.dtype).eps * ((pixels.abs() + principal.abs()) / focal).amax(-1)
+        plane, solved = self._distortion.undistort(distorted, self._radius_max, rounding)
+        valid = usable & solved
+        directions = self._from_plane(torch.where(valid[..., None], plane, 0.0))
+        return torch.where(valid[..., None], directions, math.nan), valid
+
+    def inside(self, pixels: Float[Tensor, "*batch 2"]) -> Bool[Tensor, "*batch"]:
+        """Whether pixels lie in the picture; NaN does not."""
+        x, y = pixels.unbind(-1)
+        return (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+
+    def pixel_centres(self, dtype: torch.dtype = torch.float64) -> Float[Tensor, "height width 2"]:
+        """The centres (x, y) of all pixels, row by row."""
+        y, x = torch.meshgrid(
+            torch.arange(self.height, dtype=dtype) + 0.5,
+            torch.arange(self.width, dtype=dtype) + 0.5,
+            indexing="ij",
+        )
+        return torch.stack((x, y), -1)
+
+    def downscaled(self: AnyCamera, factor: int) -> AnyCamera:
+        """The camera of the picture whose pixels are `factor`×`factor` blocks; incomplete blocks are dropped.
+
+        Raises:
+            InputError: the factor is below 1 or leaves no pixel.
+
+        """
+        if not 1 <= factor <= min(self.width, self.height):
+            raise InputError(
+                f"downscale factor {factor}: expected 1 to {min(self.width, self.height)} "
+                f"for a picture of {self.width}x{self.height} pixels."
+            )
+        return dataclasses.replace(
+            self,
+            width=self.width // factor,
+            height=self.height // factor,
+            fx=self.fx / factor,
+            fy=self.fy / factor,
+            cx=self.cx / factor,
+            cy=self.cy / factor,
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """All parameters under their names, and "model"; `camera_from_dict` reads it back."""
+        return {"model": self.model, **dataclasses.asdict(self)}
+
+
+@dataclass(frozen=True)
+class MEI(Camera):
+    """The unified model of Mei & Rives (ICRA 2007, eq. 2-7), as in KITTI-360 and cv2.omnidir.
+
+    A unit ray (X, Y, Z) goes to the plane (X, Y)/(Z + ξ), is distorted, and scaled by fx = γ1, fy = γ2.
+    """
+
+    model: ClassVar[str] = "MEI"
+
+    xi: float
+    """Shift of the projection centre along the axis, in radii of the unit sphere; more than -1."""
+    k1: float
+    """Radial distortion, r²."""
+    k2: float
+    """Radial distortion, r⁴."""
+    p1: float
+    """Tangential distortion."""
+    p2: float
+    """Tangential distortion."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.xi <= -1:
+            raise InputError(f"MEI camera: xi is {self.xi}, expected more than -1.")
+
+    @cached_property
+    def theta_max_rad(self) -> float:
+        """For ξ > 1 the angle arccos(-1/ξ), beyond which the plane's radius shrinks again; else where Z = -ξ.
+
+        Less, where the distortion folds before.
+        """
+        fold = self._distortion.radius_max
+        if fold >= self._radius_of_sphere:
+            return math.acos(-1.0 / self.xi) if self.xi > 1 else math.acos(-self.xi)
+        root = math.sqrt(1.0 - (self.xi - 1.0) * (self.xi + 1.0) * fold**2)
+        return math.atan2((self.xi + root) * fold, root - self.xi * fold**2)
+
+    @property
+    def _radius_of_sphere(self) -> float:
+        """The largest radius in the plane that the sphere reaches."""
+        return 1.0 / math.sqrt((self.xi - 1.0) * (self.xi + 1.0)) if self.xi > 1 else math.inf
+
+    @cached_property
+    def _distortion(self) -> Distortion:
+        return Distortion((self.k1, self.k2), self.p1, self.p2)
+
+    @cached_property
+    def _radius_max(self) -> float:
+        return min(self._distortion.radius_max, self._radius_of_sphere)
+
+    def _to_plane(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        z, length = points[..., 2:], points.norm(dim=-1, keepdim=True)
+        # z + ξ·length; behind, z + length is taken from x² + y² = (length + z)(length - z), lest digits cancel
+        square = (points[..., :2] * points[..., :2]).sum(-1, keepdim=True)
+        behind = z < 0
+        from_the_back = torch.where(behind, square / torch.where(behind, length - z, 1.0), z + length)
+        denominator = (self.xi - 1.0) * length + from_the_back
+        defined = denominator > torch.finfo(points.dtype).eps
+        return points[..., :2] / torch.where(defined, denominator, 1.0), defined.squeeze(-1)
+
+    def _from_plane(self, plane: Tensor) -> Tensor:
+        square = (plane * plane).sum(-1, keepdim=True)
+        argument = 1.0 - (self.xi - 1.0) * (self.xi + 1.0) * square
+        # zero at the rim, where rounding makes it negative and the root has no derivative
+        positive = argument > 0
+        root = torch.where(positive, torch.where(positive, argument, 1.0).sqrt(), 0.0)
+        return torch.cat(((self.xi + root) * plane, root - self.xi * square), -1) / (1.0 + square)
+
+
+@dataclass(frozen=True)
+class KannalaBrandt(Camera):
+    """The fisheye model θ_d = θ(1 + k1θ² + k2θ⁴ + k3θ⁶ + k4θ⁸) (Kannala & Brandt, PAMI 2006, eq. 6).
+
+    With p1 = p2 = 0 it is OpenCV's fisheye model and COLMAP's OPENCV_FISHEYE. The tangential terms act in the
+    plane of θ, as in nerfstudio's OPENCV_FISHEYE cameras, whose six parameters mean the same here.
+    """
+
+    model: ClassVar[str] = "KANNALA_BRANDT"
+
+    k1: float
+    """Coefficient of θ³."""
+    k2: float
+    """Coefficient of θ⁵."""
+    k3: float
+    """Coefficient of θ⁷."""
+    k4: float
+    """Coefficient of θ⁹."""
+    p1: float = 0.0
+    """Tangential distortion."""
+    p2: float = 0.0
+    """Tangential distortion."""
+    theta_limit_rad: float = math.pi
+    """The angle up to which the parameters were fitted; the model is not valid beyond."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 < self.theta_limit_rad <= math.pi:
+            raise InputError(
+                f"KANNALA_BRANDT camera: theta_limit_rad is {self.theta_limit_rad}, "
+                "expected more than 0 and at most pi."
+            )
+
+    @cached_property
+    def theta_max_rad(self) -> float:
+        """Where the polynomial stops to rise, at most `theta_limit_rad`."""
+        return min(self._distortion.radius_max, self.theta_limit_rad)
+
+    @cached_property
+    def _distortion(self) -> Distortion:
+        return Distortion((self.k1, self.k2, self.k3, self.k4), self.p1, self.p2)
+
+    @property
+    def _radius_max(self) -> float:
+        return self.theta_max_rad
+
+    def _to_plane(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        z = points[..., 2:]
+        square = (points[..., :2] * points[..., :2]).sum(-1, keepdim=True)
+        on_axis = square == 0
+        rho = torch.where(on_axis, 1.0, square).sqrt()
+        # θ/ρ tends to 1/z on the axis ahead; on the axis behind it has no limit
+        ahead = torch.where(on_axis & (z > 0), z, 1.0)
+        factor = torch.where(on_axis, 1.0 / ahead, torch.atan2(rho, z) / rho)
+        return factor * points[..., :2], ~(on_axis & (z <= 0)).squeeze(-1)
+
+    def _from_plane(self, plane: Tensor) -> Tensor:
+        square = (plane * plane).sum(-1, keepdim=True)
+        on_axis = square == 0
+        theta = torch.where(on_axis, 1.0, square).sqrt()
+        factor = torch.where(on_axis, 1.0, theta.sin() / theta)
+        return torch.cat((factor * plane, torch.where(on_axis, 1.0, theta.cos())), -1)
+
+
+@dataclass(frozen=True)
+class Pinhole(Camera):
+    """The pinhole with OpenCV's first four distortion parameters: nerfstudio's and COLMAP's OPENCV camera."""
+
+    model: ClassVar[str] = "PINHOLE"
+
+    k1: float = 0.0
+    """Radial distortion, r²."""
+    k2: float = 0.0
+    """Radial distortion, r⁴."""
+    p1: float = 0.0
+    """Tangential distortion."""
+    p2: float = 0.0
+    """Tangential distortion."""
+
+    @cached_property
+    def theta_max_rad(self) -> float:
+        """90°, which no ray reaches; less, where the distortion folds before."""
+        return math.atan(self._radius_max)
+
+    @cached_property
+    def _distortion(self) -> Distortion:
+        return Distortion((self.k1, self.k2), self.p1, self.p2)
+
+    @property
+    def _radius_max(self) -> float:
+        return self._distortion.radius_max
+
+    def _to_plane(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        z = points[..., 2:]
+        defined = z > torch.finfo(points.dtype).eps
+        return points[..., :2] / torch.where(defined, z, 1.0), defined.squeeze(-1)
+
+    def _from_plane(self, plane: Tensor) -> Tensor:
+        rays = torch.cat((plane, torch.ones_like(plane[..., :1])), -1)
+        return rays / rays.norm(dim=-1, keepdim=True)
+
+
+_MODELS: dict[str, type[Camera]] = {camera.model: camera for camera in (MEI, KannalaBrandt, Pinhole)}
+
+
+def camera_from_dict(parameters: dict[str, Any], where: str) -> Camera:
+    """Build the camera that `Camera.to_dict` described.
+
+    Args:
+        parameters: "model" and the model's fields.
+        where: the file, and the place in it, for error messages.
+
+    Raises:
+        InputError: the model is unknown, a field is missing, unknown, or not a usable number.
+
+    """
+    name = parameters.get("model")
+    if not isinstance(name, str) or name not in _MODELS:
+        raise InputError(f"{where}: unknown camera model {name!r}, expected one of {', '.join(_MODELS)}.")
+    model = _MODELS[name]
+    fields = dataclasses.fields(model)
+    given = parameters.keys() - {"model"}
+    missing = [f.name for f in fields if f.name not in given and f.default is dataclasses.MISSING]
+    unknown = sorted(given - {f.name for f in fields})
+    if missing or unknown:
+        faults = [f"lacks {', '.join(missing)}"] if missing else []
+        faults += [f"has unknown {', '.join(unknown)}"] if unknown else []
+        expected = ", ".join(f.name for f in fields)
+        raise InputError(f"{where}: the {name} camera {' and '.join(faults)}; expected {expected}.")
+    numbers = {}
+    for key in given:
+        value, whole = parameters[key], key in ("width", "height")
+        # a file may hold 700 for 700.0; True is a number to Python only
+        usable = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if not usable or (whole and value % 1 != 0):
+            kind = "a whole number" if whole else "a number"
+            raise InputError(f"{where}: {key} of the {name} camera is {value!r}, expected {kind}.")
+        numbers[key] = int(value) if whole else float(value)
+    try:
+        return model(**numbers)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None

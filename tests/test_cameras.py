@@ -1,0 +1,575 @@
+"""Laws of the camera models, golden values, and agreement with OpenCV and nerfstudio."""
+
+from __future__ import annotations
+
+import json
+import math
+import pickle
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from lenses import FISHEYE, IMAGE_02, IMAGE_03, KITTI, angle, nerfstudio_directions, rays
+from torch import Tensor
+
+from edge_depth_nerf.cameras import MEI, Camera, KannalaBrandt, Pinhole, camera_from_dict
+from edge_depth_nerf.cameras.distortion import Distortion
+from edge_depth_nerf.errors import InputError
+
+CAMERAS = [
+    *KITTI,
+    pytest.param(replace(IMAGE_02, k2=-2.0), id="mei-folding-distortion"),
+    pytest.param(MEI(640, 480, 300.0, 310.0, 321.3, 239.1, 1.0, -0.02, 0.001, 0.001, -0.002), id="mei-parabolic"),
+    pytest.param(MEI(640, 480, 300.0, 310.0, 321.3, 239.1, 0.7, 0.0, 0.0, 0.0, 0.0), id="mei-xi-0.7"),
+    pytest.param(FISHEYE, id="fisheye"),
+    pytest.param(replace(FISHEYE, theta_limit_rad=math.radians(95)), id="fisheye-fitted-to-95"),
+    pytest.param(KannalaBrandt(800, 600, 200.0, 201.0, 400.2, 299.8, 0.0, 0.0, 0.0, 0.0), id="fisheye-equidistant"),
+    pytest.param(
+        KannalaBrandt(800, 600, 250.0, 250.0, 400.0, 300.0, -0.08, 0.0, 0.0, 0.0, 0.003, 0.01), id="fisheye-folding"
+    ),
+    pytest.param(KannalaBrandt(800, 600, 99.0, 99.0, 400.0, 300.0, 0.3, -0.09, 0.0, 1e-4, 1e-3), id="fisheye-s-shaped"),
+    pytest.param(Pinhole(640, 480, 500.0, 505.0, 320.5, 239.0), id="pinhole"),
+    pytest.param(Pinhole(640, 480, 500.0, 505.0, 320.5, 239.0, -0.3, 0.1, 1e-3, -2e-3), id="pinhole-barrel"),
+    pytest.param(Pinhole(640, 480, 500.0, 505.0, 320.5, 239.0, -0.2), id="pinhole-folding"),
+]
+each_camera = pytest.mark.parametrize("camera", CAMERAS)
+
+
+def open_rim(camera: Camera) -> bool:
+    """Whether the rim lies at infinity in the picture."""
+    return math.isinf(camera._radius_max)
+
+
+# -- round trips --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("camera", KITTI)
+@pytest.mark.parametrize(("dtype", "bound_rad"), [(torch.float64, 1e-13), (torch.float32, 1e-5)])
+def test_mei_round_trip_to_100_degrees(camera: MEI, dtype: torch.dtype, bound_rad: float) -> None:
+    there = rays(torch.linspace(0, math.radians(100), 2001, dtype=torch.float64)).to(dtype)
+    pixels, seen = camera.project(there)
+    back, found = camera.unproject(pixels)
+    assert pixels.dtype == back.dtype == dtype
+    assert seen.all() and found.all()
+    assert angle(there.double(), back.double()).max() < bound_rad
+
+
+@each_camera
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_round_trip_dense_to_the_rim(camera: Camera, dtype: torch.dtype) -> None:
+    # ever closer to the rim, and on it unless it lies at infinity; behind, the axis is the image of a circle
+    near = camera.theta_max_rad * (1 - torch.logspace(-7, -1, 61, dtype=torch.float64))
+    rim = [] if open_rim(camera) or camera.theta_max_rad == math.pi else [camera.theta_max_rad]
+    inner = torch.linspace(0, 0.95 * camera.theta_max_rad, 400, dtype=torch.float64)
+    theta = torch.cat((inner, near, torch.tensor(rim, dtype=torch.float64)))
+    if open_rim(camera):
+        theta = theta[theta < camera.theta_max_rad - 0.1]
+    there = rays(theta).to(dtype)
+    pixels, seen = camera.project(there)
+    assert seen.all()
+    back, found = camera.unproject(pixels)
+    assert found.all()
+    # a pixel's rounding decides how well the angle can be known; near a fold that is its square root
+    again, seen = camera.project(back)
+    assert seen.all()
+    eps = torch.finfo(dtype).eps
+    scale = pixels.abs().amax(-1) + max(camera.cx, camera.cy)
+    assert ((again - pixels).norm(dim=-1) / scale).max() < (2000 if open_rim(camera) else 40) * eps
+    error = angle(there.double(), back.double()).amax(-1)
+    assert error.max() < 20 * math.sqrt(eps)
+    assert (back.norm(dim=-1) - 1).abs().max() < 8 * eps
+
+
+@each_camera
+def test_every_valid_pixel_of_the_picture_returns_to_itself(camera: Camera) -> None:
+    pixels = camera.pixel_centres()[::7, ::7]
+    directions, found = camera.unproject(pixels)
+    again, seen = camera.project(directions)
+    assert torch.equal(found, seen)
+    assert found.float().mean() > 0.2
+    assert (again - pixels)[found].abs().max() < 1e-9
+    assert directions[~found].isnan().all() and not directions[found].isnan().any()
+
+
+@pytest.mark.parametrize("camera", [p for p in CAMERAS if p.id in ("pinhole-barrel", "mei-parabolic")])
+def test_far_pixels_are_inverted_beside_near_ones(camera: Camera) -> None:
+    # up to where r⁵ has brought them: what lies far out must not spoil the start for the others
+    reach = torch.cat((torch.logspace(0, 15, 400, dtype=torch.float64), torch.tensor([1e30])))
+    pixels = torch.tensor([camera.cx, camera.cy]) + reach[:, None] * rays(math.pi / 2, 1)[0, :, :2]
+    directions, found = camera.unproject(pixels)
+    assert found.all()
+    assert (torch.atan2(directions[:, :2].norm(dim=-1), directions[:, 2]).diff() >= 0).all()
+    again, seen = camera.project(directions[reach < 1e6])
+    assert seen.all()
+    torch.testing.assert_close(again, pixels[reach < 1e6], rtol=1e-9, atol=1e-9)
+
+
+def test_mei_keeps_its_digits_close_behind() -> None:
+    # ξ = 1 images the whole sphere: r = tan(θ/2); at 179.9° that is 1145.9, from z + 1 = 1.5e-6
+    camera = MEI(640, 480, 100.0, 100.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
+    for degrees in (100.0, 150.0, 179.0, 179.9):
+        theta = math.radians(degrees)
+        pixel = camera.project(torch.tensor([math.sin(theta), 0.0, math.cos(theta)]))[0]
+        assert pixel[0].item() == pytest.approx(100 * math.tan(theta / 2), rel=3e-6)
+
+
+def test_random_lenses_are_inverted_up_to_their_folds() -> None:
+    generator = torch.Generator().manual_seed(5)
+
+    def draw(low: float, high: float) -> float:
+        return low + (high - low) * float(torch.rand((), generator=generator))
+
+    folding = 0
+    for _ in range(40):
+        size = (1000, 1000, 300.0, 300.0, 500.0, 500.0)
+        camera = KannalaBrandt(
+            *size,
+            draw(-0.3, 0.3),
+            draw(-0.1, 0.1),
+            draw(-0.02, 0.02),
+            draw(-0.002, 0.002),
+            draw(-0.03, 0.03),
+            draw(-0.03, 0.03),
+        )
+        folding += camera.theta_max_rad < math.pi
+        there = rays(torch.linspace(0, camera.theta_max_rad * 0.9999, 150, dtype=torch.float64), 24)
+        pixels, seen = camera.project(there)
+        back, found = camera.unproject(pixels)
+        assert seen.all() and found.all(), camera
+        assert angle(there, back).max() < 1e-9, camera
+    assert 10 < folding < 40
+
+
+# -- validity -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("camera", "degrees"), [(IMAGE_02, 116.8588), (IMAGE_03, 113.0552)])
+def test_mei_ends_at_arccos_of_minus_one_over_xi(camera: MEI, degrees: float) -> None:
+    # cos(116.8588°) = -0.451794 = -1/2.213405;  cos(113.0552°) = -0.391617 = -1/2.553514
+    assert math.degrees(camera.theta_max_rad) == pytest.approx(degrees, abs=1e-4)
+    # the radius in the picture grows up to there and shrinks from there on
+    without = replace(camera, k1=0.0, k2=0.0, p1=0.0, p2=0.0)
+    theta = torch.linspace(0, camera.theta_max_rad, 500, dtype=torch.float64)
+    radius = (without.project(rays(theta, 1))[0] - torch.tensor([camera.cx, camera.cy])).norm(dim=-1).squeeze(-1)
+    assert (radius.diff() > 0).all()
+    assert radius[-1] - radius[-2] < 1e-2 * (radius[1] - radius[0])
+
+
+@pytest.mark.parametrize("camera", [*KITTI, *(p for p in CAMERAS if p.id in ("fisheye", "fisheye-folding"))])
+@pytest.mark.parametrize("degrees", [120.0, 150.0, 179.9, 180.0])
+def test_nothing_folds_back_into_the_picture(camera: Camera, degrees: float) -> None:
+    points = rays(math.radians(degrees)) * torch.tensor([0.1, 1.0, 80.0, 200.0]).repeat(6)[:, None]
+    pixels, valid = camera.project(points)
+    assert not valid.any()
+    assert pixels.isnan().all()
+    assert not camera.inside(pixels).any()
+
+
+@each_camera
+def test_validity_ends_at_theta_max(camera: Camera) -> None:
+    limit = camera.theta_max_rad
+    assert camera.project(rays(limit - 1e-7))[1].all()
+    if limit < math.pi:
+        beyond = torch.linspace(limit + 1e-9, math.pi, 100, dtype=torch.float64)
+        assert not camera.project(rays(beyond))[1].any()
+
+
+@each_camera
+def test_no_two_rays_share_a_pixel(camera: Camera) -> None:
+    # rays all over the sphere: what projects is found again by the pixel alone
+    generator = torch.Generator().manual_seed(1)
+    points = torch.randn(20000, 3, generator=generator, dtype=torch.float64)
+    points = points[points[:, 2] / points.norm(dim=-1) > -0.999]
+    pixels, valid = camera.project(points)
+    theta = torch.atan2(points[:, :2].norm(dim=-1), points[:, 2])
+    assert torch.equal(valid, theta <= camera.theta_max_rad)
+    back, found = camera.unproject(pixels[valid])
+    assert found.all()
+    assert angle(back, torch.nn.functional.normalize(points[valid], dim=-1)).max() < 1e-6
+
+
+@each_camera
+def test_pixels_beyond_the_rim_are_not_valid(camera: Camera) -> None:
+    centre = torch.tensor([camera.cx, camera.cy], dtype=torch.float64)
+    if open_rim(camera):
+        assert camera.unproject(centre + rays(math.pi / 2)[..., :2] * 1e6)[1].all()
+        return
+    rim = camera.project(rays(camera.theta_max_rad * (1 - 1e-12)))[0]
+    outward = (rim - centre) / (rim - centre).norm(dim=-1, keepdim=True)
+    assert camera.unproject(rim - 1e-3 * outward)[1].all()
+    for beyond_px in (1e-3, 1.0, 100.0, 1e4, 1e12):
+        directions, valid = camera.unproject(rim + beyond_px * outward)
+        assert not valid.any()
+        assert directions.isnan().all()
+
+
+def test_the_corners_of_kitti_360_see_nothing() -> None:
+    for camera in (IMAGE_02, IMAGE_03):
+        corners = torch.tensor([[0.5, 0.5], [1399.5, 0.5], [0.5, 1399.5], [1399.5, 1399.5]])
+        assert not camera.unproject(corners)[1].any()
+
+
+def test_kannala_brandt_ends_where_its_polynomial_does() -> None:
+    # d/dθ (θ + k1 θ³) = 1 + 3 k1 θ² = 0 at θ = 1/√(-3 k1) = 1/√0.24 = 2.041241
+    camera = KannalaBrandt(800, 800, 200.0, 200.0, 400.0, 400.0, -0.08, 0.0, 0.0, 0.0)
+    assert camera.theta_max_rad == pytest.approx(2.0412414523193152, abs=1e-12)
+    # 1 + 9 k4 θ⁸ = 0 at θ = (1/0.009)^(1/8) = 1.801833
+    only_k4 = replace(camera, k1=0.0, k4=-0.001)
+    assert only_k4.theta_max_rad == pytest.approx(0.009**-0.125, abs=1e-12)
+    assert replace(camera, k1=0.08, k4=0.001).theta_max_rad == math.pi
+    assert replace(camera, theta_limit_rad=1.5).theta_max_rad == 1.5
+    assert replace(camera, theta_limit_rad=2.5).theta_max_rad == camera.theta_max_rad
+
+
+def test_mei_ends_where_its_distortion_does() -> None:
+    # 1 + 3 k1 r² = 0 at r = 1/√3 for k1 = -1; with ξ = 1, r = tan(θ/2), so θ = 60°
+    camera = MEI(800, 800, 200.0, 200.0, 400.0, 400.0, 1.0, -1.0, 0.0, 0.0, 0.0)
+    assert math.degrees(camera.theta_max_rad) == pytest.approx(60.0, abs=1e-9)
+    assert replace(camera, k1=0.0).theta_max_rad == pytest.approx(math.pi)
+    # for ξ < 1 the plane ends where Z = -ξ: 120° for ξ = 1/2
+    assert math.degrees(replace(camera, k1=0.0, xi=0.5).theta_max_rad) == pytest.approx(120.0)
+
+
+def test_pinhole_ends_below_90_degrees() -> None:
+    camera = Pinhole(640, 480, 500.0, 500.0, 320.0, 240.0)
+    assert camera.theta_max_rad == math.pi / 2
+    assert not camera.project(torch.tensor([[1.0, 0, 0], [1, 0, -1], [0, 0, -1]]))[1].any()
+    # 1 + 3 k1 r² = 0 at r = 1 for k1 = -1/3: 45°
+    assert math.degrees(replace(camera, k1=-1 / 3).theta_max_rad) == pytest.approx(45.0)
+
+
+@pytest.mark.parametrize(
+    "distortion",
+    [
+        Distortion((-0.08, 0.0, 0.0, 0.0), 0.003, 0.01),
+        Distortion((0.3, -0.09, 0.0, 1e-4), 0.02, -0.05),
+        Distortion((-0.5, 0.1), -0.01, 0.02),
+        Distortion((), 0.05, 0.05),
+    ],
+)
+def test_radius_max_is_where_the_jacobian_stops_being_positive(distortion: Distortion) -> None:
+    radius_max = distortion.radius_max
+    assert math.isfinite(radius_max)
+    directions = rays(math.pi / 2, 720)[0, :, :2]
+
+    def smallest_eigenvalue(radius: float) -> float:
+        jacobian = torch.func.vmap(torch.func.jacrev(distortion.distort))(radius * directions)
+        assert torch.allclose(jacobian, jacobian.mT)
+        return float(torch.linalg.eigvalsh(jacobian).min())
+
+    for share in (0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.99, 0.999):
+        assert smallest_eigenvalue(share * radius_max) > 0
+    assert smallest_eigenvalue(radius_max) == pytest.approx(0.0, abs=1e-4)
+    assert smallest_eigenvalue(1.01 * radius_max) < 0
+
+
+# -- golden values ------------------------------------------------------------------------------------------
+
+
+def test_mei_by_hand() -> None:
+    plain = MEI(800, 800, 200.0, 210.0, 400.5, 300.5, 1.0, 0.0, 0.0, 0.0, 0.0)
+    points = torch.tensor([[1.0, 0, 0], [0, 3.0, 0], [0.6, 0, -0.8], [0, 0, 7.0]], dtype=torch.float64)
+    # ξ = 1: (1, 0)/(0 + 1) -> 400.5 + 200;  likewise 300.5 + 210;  0.6/(-0.8 + 1) = 3 -> 400.5 + 600
+    expected = [[600.5, 300.5], [400.5, 510.5], [1000.5, 300.5], [400.5, 300.5]]
+    torch.testing.assert_close(plain.project(points)[0], torch.tensor(expected, dtype=torch.float64), rtol=0, atol=1e-9)
+
+    bent = replace(plain, k1=0.1, k2=0.01, p1=0.001, p2=0.002)
+    # at 90° to the right x = 1, r = 1: x' = 1·1.11 + 0.002·(1 + 2) = 1.116,  y' = 0.001·1
+    torch.testing.assert_close(
+        bent.project(points[:1])[0],
+        torch.tensor([[400.5 + 200 * 1.116, 300.5 + 210 * 0.001]], dtype=torch.float64),
+        rtol=0,
+        atol=1e-9,
+    )
+
+
+def test_kannala_brandt_by_hand() -> None:
+    camera = KannalaBrandt(800, 800, 200.0, 210.0, 400.5, 300.5, 0.1, 0.01, 0.001, 0.0001, 0.001, 0.002)
+    # to the right at θ = 1: θ_d = 1.1111;  x' = 1.1111 + 0.002·3 = 1.1171,  y' = 0.001
+    # straight behind the limit π/2 + 0.4 = 1.970796 it still goes on: θ = 2 below (0, sin 2, cos 2):
+    # θ² = 4, 1 + 0.4 + 0.16 + 0.064 + 0.0256 = 1.6496, θ_d = 3.2992;  y' = 3.2992 + 0.001·12,  x' = 0.002·4
+    points = [[math.sin(1.0), 0.0, math.cos(1.0)], [0.0, math.sin(2.0), math.cos(2.0)]]
+    expected = [[400.5 + 200 * 1.1171, 300.5 + 210 * 0.001], [400.5 + 200 * 0.008, 300.5 + 210 * 3.3112]]
+    torch.testing.assert_close(
+        camera.project(torch.tensor(points, dtype=torch.float64))[0],
+        torch.tensor(expected, dtype=torch.float64),
+        rtol=0,
+        atol=1e-9,
+    )
+
+
+def test_kitti_360_at_90_degrees_by_hand() -> None:
+    # x = 1/ξ = 0.451793, r² = 0.204117, d = 1 + 0.016798·0.204117 + 1.654877·0.041664 = 1.072377
+    # x' = 0.451793·1.072377 + 3·4.2462e-4·0.204117 = 0.484753;  1336.322·0.484753 + 717.443 = 1365.229
+    # y' = 4.2224e-4·0.204117 = 8.6186e-5;  1335.788·8.6186e-5 + 706.265 = 706.380
+    pixel = IMAGE_02.project(torch.tensor([5.0, 0.0, 0.0], dtype=torch.float64))[0]
+    assert pixel.tolist() == pytest.approx([1365.229, 706.380], abs=2e-3)
+
+
+@pytest.mark.parametrize("camera", KITTI)
+def test_mei_agrees_with_cv2_omnidir(camera: MEI) -> None:
+    if not hasattr(cv2, "omnidir"):
+        pytest.skip("this OpenCV is built without its contrib modules, which hold cv2.omnidir")
+    theta = torch.linspace(1e-3, camera.theta_max_rad, 300, dtype=torch.float64)
+    points = (rays(theta) * torch.linspace(0.5, 80, 24, dtype=torch.float64)[:, None]).reshape(-1, 3)
+    # OpenCV's pixel centres are whole numbers
+    matrix = np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]])
+    theirs, _ = cv2.omnidir.projectPoints(
+        points.numpy()[:, None],
+        np.zeros(3),
+        np.zeros(3),
+        matrix,
+        camera.xi,
+        np.array([camera.k1, camera.k2, camera.p1, camera.p2]),
+    )
+    ours, valid = camera.project(points)
+    assert valid.all()
+    assert np.abs(ours.numpy() - 0.5 - theirs.reshape(-1, 2)).max() < 1e-9
+
+
+def test_kannala_brandt_agrees_with_cv2_fisheye() -> None:
+    # cv2.fisheye knows neither tangential terms nor rays from 90° on
+    camera = replace(FISHEYE, p1=0.0, p2=0.0)
+    points = rays(torch.linspace(1e-3, math.radians(89), 200, dtype=torch.float64)).reshape(-1, 1, 3)
+    matrix = np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]])
+    k = np.array([camera.k1, camera.k2, camera.k3, camera.k4])
+    theirs, _ = cv2.fisheye.projectPoints(points.numpy(), np.zeros(3), np.zeros(3), matrix, k)
+    assert np.abs(camera.project(points)[0].numpy() - 0.5 - theirs).max() < 1e-9
+
+
+def test_pinhole_agrees_with_cv2() -> None:
+    camera = Pinhole(640, 480, 500.0, 505.0, 320.5, 239.0, -0.3, 0.1, 1e-3, -2e-3)
+    points = rays(torch.linspace(0, 0.6, 100, dtype=torch.float64)).reshape(-1, 3)
+    matrix = np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]])
+    k = np.array([camera.k1, camera.k2, camera.p1, camera.p2])
+    theirs, _ = cv2.projectPoints(points.numpy(), np.zeros(3), np.zeros(3), matrix, k)
+    assert np.abs(camera.project(points)[0].numpy() - 0.5 - theirs.reshape(-1, 2)).max() < 1e-9
+
+
+# -- the axis, 90°, and what is no point at all -------------------------------------------------------------
+
+
+@each_camera
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_the_axis_goes_exactly_to_the_principal_point(camera: Camera, dtype: torch.dtype) -> None:
+    pixels, seen = camera.project(torch.tensor([[0, 0, 1], [0, 0, 1e-3], [0, 0, 250]], dtype=dtype))
+    assert seen.all()
+    assert torch.equal(pixels, torch.tensor([[camera.cx, camera.cy]] * 3, dtype=dtype))
+    direction, found = camera.unproject(torch.tensor([camera.cx, camera.cy], dtype=dtype))
+    assert found
+    assert direction.tolist() == [0.0, 0.0, 1.0]
+
+
+@each_camera
+def test_only_the_direction_of_a_point_counts(camera: Camera) -> None:
+    points = rays(torch.linspace(0, 0.9 * camera.theta_max_rad, 30, dtype=torch.float64)).float()
+    expected, _ = camera.project(points)
+    for factor in (1e-20, 1e-3, 80.0, 1e20):
+        pixels, valid = camera.project(points * factor)
+        assert valid.all()
+        torch.testing.assert_close(pixels, expected, rtol=1e-4, atol=1e-3)
+
+
+@each_camera
+def test_what_is_no_point_is_not_valid_and_gets_no_gradient(camera: Camera) -> None:
+    nan, inf = math.nan, math.inf
+    bad = [[0, 0, 0], [nan, 0, 1], [0, nan, nan], [inf, 0, 1], [0, 0, inf], [0, 0, -1], [1e-30, 0, -1]]
+    points = torch.tensor([*bad, [0.0, 0.0, 1.0], [0.1, 0.1, 1.0]], requires_grad=True)
+    pixels, valid = camera.project(points)
+    assert valid.tolist() == [False] * len(bad) + [True, True]
+    assert pixels[: len(bad)].isnan().all()
+    pixels[valid].sum().backward()
+    assert points.grad is not None
+    assert points.grad.isfinite().all()
+    assert (points.grad[: len(bad)] == 0).all()
+    assert (points.grad[len(bad) :] != 0).any(-1).all()
+
+
+@each_camera
+def test_what_is_no_pixel_is_not_valid_and_gets_no_gradient(camera: Camera) -> None:
+    bad = [[math.nan, 3.0], [5.0, math.inf], [math.nan, math.nan], [3e38, 3e38], [-1e25, 0.0]]
+    pixels = torch.tensor([*bad, [camera.cx, camera.cy], [camera.cx + 9, camera.cy]], requires_grad=True)
+    directions, valid = camera.unproject(pixels)
+    assert valid.tolist() == [False] * len(bad) + [True, True]
+    directions[valid].sum().backward()
+    assert pixels.grad is not None
+    assert pixels.grad.isfinite().all()
+    assert (pixels.grad[: len(bad)] == 0).all()
+
+
+@each_camera
+def test_gradients_are_finite_all_over(camera: Camera) -> None:
+    theta = torch.linspace(0, math.pi, 181, dtype=torch.float64)
+    points = torch.cat((rays(theta), rays(camera.theta_max_rad))).float().requires_grad_()
+    pixels, valid = camera.project(points)
+    pixels[valid].sum().backward()
+    assert points.grad is not None and points.grad.isfinite().all()
+
+    rim = torch.cat((camera.pixel_centres(torch.float32)[::20, ::20].reshape(-1, 2), pixels[-1].detach()))
+    rim.requires_grad_()
+    directions, valid = camera.unproject(rim)
+    directions[valid].sum().backward()
+    assert rim.grad is not None and rim.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_gradients_are_finite_on_the_rim_itself(dtype: torch.dtype) -> None:
+    # where the root of MEI's lift, or the determinant of the distortion, comes out as zero or just below
+    for step in range(40):
+        sphere = MEI(9, 9, 1.0, 1.0, 0.0, 0.0, 1.1 + 0.05 * step, 0.0, 0.0, 0.0, 0.0)
+        bent = Pinhole(9, 9, 1.0, 1.0, 0.0, 0.0, -0.1 - 0.01 * step, 0.0, 0.001 * (step % 2))
+        for camera, radius in ((sphere, sphere._radius_max), (bent, 2 / 3 * bent._radius_max)):
+            pixels = radius * torch.tensor([[1.0, 0.0], [0.0, -1.0], [0.6, 0.8]], dtype=dtype)
+            pixels.requires_grad_()
+            directions, valid = camera.unproject(pixels)
+            directions[valid].sum().backward()
+            assert pixels.grad is not None and pixels.grad.isfinite().all()
+
+
+@each_camera
+def test_derivatives_forward_reverse_and_numerical_agree(camera: Camera) -> None:
+    theta = torch.tensor([0.0, 1e-4, 0.3, 0.7, 0.9], dtype=torch.float64) * camera.theta_max_rad
+    right = torch.tensor([math.pi / 2]) if camera.theta_max_rad > 1.6 else torch.tensor([])
+    points = rays(torch.cat((theta, right)), 5).reshape(-1, 3) * 3.0
+    points = torch.cat((points, torch.tensor([[0.0, 0.0, 0.5]], dtype=torch.float64))).requires_grad_()
+    torch.autograd.gradcheck(lambda p: camera.project(p)[0], points, eps=1e-7, rtol=1e-4, check_forward_ad=True)
+
+    pixels = camera.project(points)[0].detach().requires_grad_()
+    torch.autograd.gradcheck(lambda p: camera.unproject(p)[0], pixels, eps=1e-4, rtol=1e-4, check_forward_ad=True)
+    # one is the inverse of the other: their derivatives, too (beside the length, which the picture loses)
+    jacobian = torch.autograd.functional.jacobian
+    unit = camera.unproject(pixels)[0].detach()
+    there = jacobian(lambda p: camera.project(p)[0].sum(0), unit)
+    back = jacobian(lambda p: camera.unproject(p)[0].sum(0), pixels.detach())
+    assert isinstance(there, Tensor) and isinstance(back, Tensor)
+    product = torch.einsum("inj,jnk->nik", there, back)
+    torch.testing.assert_close(product, torch.eye(2, dtype=torch.float64).expand_as(product))
+
+
+# -- the picture, files, errors -----------------------------------------------------------------------------
+
+
+def test_shapes_and_empty_input() -> None:
+    assert IMAGE_02.project(torch.rand(3))[0].shape == (2,)
+    assert IMAGE_02.project(torch.rand(2, 5, 3))[1].shape == (2, 5)
+    for camera in (IMAGE_02, FISHEYE, Pinhole(6, 4, 5.0, 5.0, 3.0, 2.0)):
+        assert camera.project(torch.zeros(0, 3))[0].shape == (0, 2)
+        assert camera.unproject(torch.zeros(0, 2))[0].shape == (0, 3)
+
+
+def test_pixel_centres_and_inside() -> None:
+    camera = Pinhole(3, 2, 5.0, 5.0, 1.5, 1.0)
+    assert camera.pixel_centres().tolist() == [
+        [[0.5, 0.5], [1.5, 0.5], [2.5, 0.5]],
+        [[0.5, 1.5], [1.5, 1.5], [2.5, 1.5]],
+    ]
+    assert camera.pixel_centres(torch.float32).dtype == torch.float32
+    assert camera.inside(camera.pixel_centres()).all()
+    probes = torch.tensor([[0.0, 0.0], [3.0, 1.0], [2.99, 1.99], [1.0, 2.0], [-0.01, 1.0], [math.nan, 1.0]])
+    assert camera.inside(probes).tolist() == [True, False, True, False, False, False]
+
+
+@each_camera
+@pytest.mark.parametrize("factor", [1, 2, 3, 8])
+def test_downscaled_projects_to_pixels_over_factor(camera: Camera, factor: int) -> None:
+    small = camera.downscaled(factor)
+    assert type(small) is type(camera)
+    assert (small.width, small.height) == (camera.width // factor, camera.height // factor)
+    assert small.theta_max_rad == camera.theta_max_rad
+    points = rays(torch.linspace(0, 0.99 * camera.theta_max_rad, 50, dtype=torch.float64))
+    torch.testing.assert_close(small.project(points)[0], camera.project(points)[0] / factor, rtol=1e-12, atol=1e-9)
+
+
+@pytest.mark.parametrize("factor", [0, -2, 1401])
+def test_downscaled_refuses_what_leaves_no_picture(factor: int) -> None:
+    with pytest.raises(InputError, match=rf"{factor}.*1 to 1400"):
+        IMAGE_02.downscaled(factor)
+
+
+@each_camera
+def test_cameras_survive_files_and_processes(camera: Camera) -> None:
+    assert camera_from_dict(json.loads(json.dumps(camera.to_dict())), "here") == camera
+    camera.project(torch.rand(4, 3))  # fills what is computed once
+    copy = pickle.loads(pickle.dumps(camera))
+    assert copy == camera and hash(copy) == hash(camera)
+
+
+def test_to_dict_holds_every_parameter() -> None:
+    assert list(IMAGE_02.to_dict()) == [
+        *("model", "width", "height", "fx", "fy", "cx", "cy", "xi", "k1", "k2", "p1", "p2")
+    ]
+    assert list(FISHEYE.to_dict()) == [
+        *("model", "width", "height", "fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "theta_limit_rad")
+    ]
+
+
+def test_defaults_may_be_left_out_and_whole_numbers_may_be_given() -> None:
+    given = {"model": "PINHOLE", "width": 6, "height": 4, "fx": 5, "fy": 5, "cx": 3, "cy": 2}
+    camera = camera_from_dict(given, "here")
+    assert camera == Pinhole(6, 4, 5.0, 5.0, 3.0, 2.0)
+    assert isinstance(camera.fx, float)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"model": "FOV"}, "unknown camera model 'FOV', expected one of MEI, KANNALA_BRANDT, PINHOLE"),
+        ({"model": None}, "unknown camera model None"),
+        ({"model": ["MEI"]}, "unknown camera model"),
+        ({"xi": None}, "xi of the MEI camera is None, expected a number"),
+        ({"xi": True}, "xi of the MEI camera is True, expected a number"),
+        ({"fx": "wide"}, "fx of the MEI camera is 'wide', expected a number"),
+        ({"k2": math.nan}, "k2 is nan, expected a finite number"),
+        ({"fy": 0.0}, "fy is 0.0, expected more than 0"),
+        ({"width": 0}, "width is 0, expected more than 0"),
+        ({"height": 3.5}, "height of the MEI camera is 3.5, expected a whole number"),
+        ({"xi": -1.0}, "xi is -1.0, expected more than -1"),
+        ({"k5": 0.0}, "has unknown k5; expected width, height"),
+    ],
+)
+def test_bad_parameters_are_named_with_their_place(change: dict, message: str) -> None:
+    with pytest.raises(InputError) as caught:
+        camera_from_dict({**IMAGE_02.to_dict(), **change}, "transforms.json, original_cameras image_02")
+    assert str(caught.value).startswith("transforms.json, original_cameras image_02: ")
+    assert message in str(caught.value)
+
+
+def test_missing_parameters_are_named() -> None:
+    parameters = IMAGE_02.to_dict()
+    del parameters["xi"], parameters["p2"]
+    with pytest.raises(InputError, match=r"here: the MEI camera lacks xi, p2; expected width, .*, p2\."):
+        camera_from_dict(parameters, "here")
+
+
+@pytest.mark.parametrize("limit", [0.0, -1.0, 3.2])
+def test_a_limit_that_is_no_angle_is_refused(limit: float) -> None:
+    with pytest.raises(InputError, match="theta_limit_rad"):
+        replace(FISHEYE, theta_limit_rad=limit)
+
+
+# -- nerfstudio ---------------------------------------------------------------------------------------------
+
+
+def test_kannala_brandt_is_nerfstudios_fisheye_camera() -> None:
+    # half pixels and centres; none on the principal point, where nerfstudio's camera divides zero by zero
+    x = torch.arange(0.25, 1400, 12.5, dtype=torch.float64)
+    pixels = torch.stack(torch.meshgrid(x, x, indexing="xy"), -1).reshape(-1, 2)
+    ours, valid = FISHEYE.unproject(pixels)
+    kept = valid & (torch.atan2(ours[:, :2].norm(dim=-1), ours[:, 2]) <= math.radians(95))
+    assert kept.float().mean() > 0.7
+    parameters = {name: getattr(FISHEYE, name) for name in ("k1", "k2", "k3", "k4", "p1", "p2")}
+    theirs = nerfstudio_directions(FISHEYE, "FISHEYE", parameters, pixels[kept])
+    # their rays are float32: 1e-6 rad is 4e-4 px here
+    assert angle(ours[kept], theirs).max() < 2e-6
+
+
+def test_pinhole_is_nerfstudios_perspective_camera() -> None:
+    camera = Pinhole(640, 480, 500.0, 505.0, 320.5, 239.0, -0.3, 0.1, 1e-3, -2e-3)
+    pixels = camera.pixel_centres()[::5, ::5].reshape(-1, 2)
+    ours, valid = camera.unproject(pixels)
+    assert valid.all()
+    parameters = {name: getattr(camera, name) for name in ("k1", "k2", "p1", "p2")}
+    theirs = nerfstudio_directions(camera, "PERSPECTIVE", parameters, pixels)
+    assert angle(ours, theirs).max() < 2e-6
