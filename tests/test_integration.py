@@ -1,0 +1,412 @@
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+import reference
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from edge_depth_nerf import integration
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.integration import (
+    IntegratedDepth,
+    IntegrationOptions,
+    integrate_depth,
+    select_prior,
+    sigma_m,
+)
+
+
+def random_maps(
+    seed: int, height: int = 11, width: int = 13, dtype: torch.dtype = torch.float32, ragged: bool = True
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """LiDAR, mono, valid: smooth surfaces near 20 and 100 m with an edge between; ragged: holes and broken values.
+
+    No two values lie 37 to 39 σ_d (1 m) apart, where float64 underflows and twin and fast form part.
+    """
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:height, :width]
+    mono = np.where(x + 0.5 * y < 0.8 * width, 20, 100) + 2 * np.sin(x / 4 + seed) + rng.normal(0, 0.4, x.shape)
+    lidar = np.where(rng.random(x.shape) < 0.25, mono * rng.uniform(0.97, 1.05) + rng.normal(0, 0.3, x.shape), 0)
+    valid = np.ones(x.shape, bool)
+    if ragged:
+        broken = [0, -3.0, np.nan, np.inf, -np.inf]
+        mono = np.where(rng.random(x.shape) < 0.15, rng.choice(broken, x.shape), mono)
+        lidar = np.where(rng.random(x.shape) < 0.1, rng.choice(broken, x.shape), lidar)
+        valid = rng.random(x.shape) > 0.15
+    return torch.tensor(lidar, dtype=dtype), torch.tensor(mono, dtype=dtype), torch.tensor(valid)
+
+
+def everywhere(image: torch.Tensor) -> torch.Tensor:
+    return torch.ones(image.shape, dtype=torch.bool)
+
+
+def assert_same(a: IntegratedDepth, b: IntegratedDepth, atol: float = 1e-5) -> None:
+    for field in dataclasses.fields(IntegratedDepth):
+        torch.testing.assert_close(getattr(a, field.name), getattr(b, field.name), rtol=0, atol=atol, msg=field.name)
+
+
+CHOICES = list(
+    itertools.product(
+        ["edge-aware", "spatial-gaussian"], ["pooled", "per-source"], [False, True], ["mono", "lidar"], [0.7, 0.0, 1.0]
+    )
+)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize(("kind", "normalise", "keep_returns", "guide", "alpha"), CHOICES)
+def test_equals_twin(kind, normalise, keep_returns, guide, alpha, dtype):
+    options = IntegrationOptions(
+        alpha=alpha, integration=kind, normalise=normalise, keep_returns=keep_returns, range_guide=guide
+    )
+    lidar, mono, valid = random_maps(CHOICES.index((kind, normalise, keep_returns, guide, alpha)), dtype=dtype)
+    result = integrate_depth(lidar, mono, valid, options)
+    distance, spread, share = reference.integrate_depth(
+        lidar.numpy(), mono.numpy(), valid.numpy(), **dataclasses.asdict(options)
+    )
+    assert result.distance_m.dtype == dtype
+    atol = 1e-4 if dtype == torch.float32 else 1e-9
+    np.testing.assert_allclose(result.distance_m, distance, rtol=0, atol=atol)
+    # a root near 0 has half the digits; the sums' x is at most some 80 m
+    np.testing.assert_allclose(result.spread_m**2, spread**2, rtol=1e-5, atol=atol)
+    np.testing.assert_allclose(result.mono_share, share, rtol=0, atol=atol / 10)
+    assert 0 < (distance > 0).mean() < 1
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"kernel_size": 1},
+        {"kernel_size": 3, "sigma_space_px": 0.5},
+        {"kernel_size": 21},
+        {"sigma_depth_m": 0.05},
+        {"sigma_depth_m": 30.0, "normalise": "per-source"},
+    ],
+    ids=str,
+)
+def test_equals_twin_with_other_kernels(fields):
+    lidar, mono, valid = random_maps(5)
+    result = integrate_depth(lidar, mono, valid, IntegrationOptions(**fields))
+    twin = reference.integrate_depth(lidar.numpy(), mono.numpy(), valid.numpy(), **fields)
+    np.testing.assert_allclose(result.distance_m, twin[0], rtol=0, atol=1e-4)
+    np.testing.assert_allclose(result.spread_m**2, twin[1] ** 2, rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(result.mono_share, twin[2], rtol=0, atol=1e-5)
+
+
+def test_one_return_by_hand():
+    # 3×3 window, σ_s = 3: sides weigh a = exp(-1/18) = 0.945959, corners b = exp(-2/18) = 0.894839.
+    # mono is 10 everywhere (distance factor 1); the right neighbour has a return of 12.
+    #   LiDAR's weight  0.7 · a              = 0.662171
+    #   mono's weight   0.3 · (1 + 3a + 4b)  = 2.225171
+    #   η               = 2.887342
+    #   d̃ = 10 + 2 · 0.662171 / 2.887342     = 10.458672
+    #   share of mono   2.225171 / 2.887342  = 0.770664
+    #   spread: a value of 12 with p = 0.229336, 10 with 1 - p:  2 · sqrt(p (1 - p)) = 0.840812
+    mono = torch.full((3, 3), 10.0)
+    lidar = torch.zeros(3, 3)
+    lidar[1, 2] = 12.0
+    result = integrate_depth(lidar, mono, everywhere(mono), IntegrationOptions(kernel_size=3))
+    assert float(result.distance_m[1, 1]) == pytest.approx(10.458672, abs=2e-6)
+    assert float(result.mono_share[1, 1]) == pytest.approx(0.770664, abs=2e-6)
+    assert float(result.spread_m[1, 1]) == pytest.approx(0.840812, abs=2e-6)
+    # per source: counts do not matter, 0.7 · 12 + 0.3 · 10 = 11.4, spread 2 · sqrt(0.7 · 0.3) = 0.916515
+    result = integrate_depth(lidar, mono, everywhere(mono), IntegrationOptions(kernel_size=3, normalise="per-source"))
+    assert float(result.distance_m[1, 1]) == pytest.approx(11.4, abs=2e-6)
+    assert float(result.mono_share[1, 1]) == pytest.approx(0.3, abs=2e-6)
+    assert float(result.spread_m[1, 1]) == pytest.approx(0.916515, abs=2e-6)
+    # (1, 0) does not see the return in its 3×3 window
+    assert float(result.distance_m[1, 0]) == pytest.approx(10.0, abs=1e-6)
+
+
+def test_range_guide_by_hand():
+    # 1 pixel high, kernel 3, σ_s = 3, σ_d = 1. mono 10, 12, 12; a return of 10 at the middle.
+    # Its guide is 10, so g is a = exp(-1/18) for the left (difference 0), and exp(-2) for itself (10 to its d̂ 12)
+    # and a · exp(-2) for the right.  exp(-2) = 0.135335, a = 0.945959
+    #   η = 0.7 · 0.135335 + 0.3 · 0.945959 · (1 + 0.135335) = 0.094735 + 0.322195 = 0.416929
+    #   d̃ = 10 + 2 · 0.3 · 0.945959 · 0.135335 / 0.416929 = 10.184235
+    mono, lidar = torch.tensor([[10.0, 12.0, 12.0]]), torch.tensor([[0.0, 10.0, 0.0]])
+    options = IntegrationOptions(kernel_size=3, range_guide="lidar")
+    assert float(integrate_depth(lidar, mono, everywhere(mono), options).distance_m[0, 1]) == pytest.approx(
+        10.184235, abs=2e-6
+    )
+
+
+@pytest.mark.parametrize("kind", ["edge-aware", "spatial-gaussian"])
+@pytest.mark.parametrize("normalise", ["pooled", "per-source"])
+def test_constant_map_stays(kind, normalise):
+    mono = torch.full((12, 15), 73.3)
+    lidar = torch.where(torch.rand(12, 15, generator=torch.Generator().manual_seed(0)) < 0.2, 73.3, 0.0)
+    valid = random_maps(1, 12, 15)[2]
+    result = integrate_depth(lidar, mono, valid, IntegrationOptions(integration=kind, normalise=normalise))
+    assert torch.equal(result.distance_m > 0, valid)
+    torch.testing.assert_close(result.distance_m[valid], mono[valid], rtol=0, atol=1e-5)
+    assert float(result.spread_m.max()) < 1e-5
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=st.integers(0, 1000), scale=st.floats(0.05, 20))
+@pytest.mark.parametrize("normalise", ["pooled", "per-source"])
+def test_scaling_distances_scales_the_prior(normalise, seed, scale):
+    lidar, mono, valid = random_maps(seed, dtype=torch.float64)
+    options = IntegrationOptions(sigma_depth_m=1.3, normalise=normalise)
+    before = integrate_depth(lidar, mono, valid, options)
+    after = integrate_depth(lidar * scale, mono * scale, valid, dataclasses.replace(options, sigma_depth_m=1.3 * scale))
+    assert_same(
+        after, IntegratedDepth(before.distance_m * scale, before.spread_m * scale, before.mono_share), atol=1e-6
+    )
+
+
+def test_adding_a_distance_adds_it_to_the_prior():
+    lidar, mono, valid = random_maps(3, dtype=torch.float64)
+    before = integrate_depth(lidar, mono, valid)
+    usable = torch.isfinite(mono) & (mono > 0)
+    returns = torch.isfinite(lidar) & (lidar > 0)
+    after = integrate_depth(torch.where(returns, lidar + 7, 0), torch.where(usable, mono + 7, 0), valid)
+    exists = (before.distance_m > 0).double()
+    assert_same(after, IntegratedDepth(before.distance_m + 7 * exists, before.spread_m, before.mono_share))
+
+
+def test_moves_and_flips_with_the_picture():
+    lidar, mono, valid = random_maps(4)
+    expected = integrate_depth(lidar, mono, valid)
+
+    def changed(change) -> IntegratedDepth:
+        return IntegratedDepth(*(change(getattr(expected, f.name)) for f in dataclasses.fields(expected)))
+
+    for change in (
+        lambda t: torch.nn.functional.pad(t, (3, 6, 5, 2)),
+        lambda t: t.flip(0).contiguous(),
+        lambda t: t.T,
+    ):
+        assert_same(integrate_depth(change(lidar), change(mono), change(valid)), changed(change))
+
+
+def test_limits_of_alpha():
+    lidar, mono, valid = random_maps(6, 30, 30, ragged=False)
+    lidar[:, :15] = 0
+    only_lidar = integrate_depth(lidar, mono, valid, IntegrationOptions(alpha=1.0))
+    # α = 1: a prior only within 4 px of a return, made of LiDAR alone
+    assert (only_lidar.distance_m[:, :11] == 0).all()
+    assert (only_lidar.mono_share == 0).all()
+    # α = 0: LiDAR does not count, whatever it says
+    only_mono = IntegrationOptions(alpha=0.0)
+    assert_same(integrate_depth(lidar, mono, valid, only_mono), integrate_depth(lidar * 3, mono, valid, only_mono))
+    no_lidar = torch.zeros_like(mono)
+    for options in (only_mono, IntegrationOptions(), IntegrationOptions(normalise="per-source")):
+        alone = integrate_depth(no_lidar, mono, valid, options)
+        assert_same(alone, integrate_depth(no_lidar, mono, valid))
+        assert (alone.mono_share == 1).all()
+    # LiDAR everywhere: no monocular value counts
+    dense = integrate_depth(mono + 1, mono, valid, IntegrationOptions(normalise="per-source"))
+    assert (dense.mono_share == 0).all()
+
+
+def test_a_masked_pixel_gives_nothing_and_gets_nothing():
+    lidar, mono, valid = random_maps(7)
+    expected = integrate_depth(lidar, mono, valid)
+    for field in dataclasses.fields(expected):
+        assert (getattr(expected, field.name)[~valid] == 0).all()
+    for rubbish in (21.0, 1e4, float("nan")):
+        assert_same(
+            integrate_depth(torch.where(valid, lidar, rubbish), torch.where(valid, mono, rubbish), valid), expected
+        )
+
+
+def test_a_return_without_estimate_gives_nothing():
+    mono = torch.full((9, 9), 10.0)
+    mono[4, 4] = 0
+    lidar = torch.zeros(9, 9)
+    lidar[4, 4] = 12.0
+    for options in (IntegrationOptions(), IntegrationOptions(keep_returns=True)):
+        result = integrate_depth(lidar, mono, everywhere(mono), options)
+        assert result.distance_m[4, 4] == 0
+        assert (result.mono_share[mono > 0] == 1).all()
+
+
+def test_an_edge_keeps_the_sides_apart():
+    mono = torch.full((9, 20), 10.0)
+    mono[:, 10:] = 30.0
+    lidar = torch.zeros(9, 20)
+    lidar[4, 12] = 31.0
+    for normalise in ("pooled", "per-source"):
+        near = integrate_depth(lidar, mono, everywhere(mono), IntegrationOptions(normalise=normalise)).distance_m
+        torch.testing.assert_close(near[:, :10], mono[:, :10], rtol=0, atol=1e-5)
+        assert float(near[4, 12]) > 30.01
+    mixed = integrate_depth(lidar, mono, everywhere(mono), IntegrationOptions(integration="spatial-gaussian"))
+    assert float(mixed.distance_m[4, 9]) > 15
+
+
+def test_no_pixel_that_agrees_is_no_prior():
+    # α = 1 and the only return lies 40 σ_d behind the centre: its weight is 0 in float64, and so is η
+    mono, lidar = torch.tensor([[10.0, 50.0]]), torch.tensor([[0.0, 50.0]])
+    result = integrate_depth(lidar, mono, everywhere(mono), IntegrationOptions(alpha=1.0))
+    assert result.distance_m.tolist() == [[0.0, 50.0]]
+    # 30 σ_d behind it is the only one there is, and η is small but not 0
+    result = integrate_depth(
+        lidar - 10, mono - torch.tensor([[0.0, 10.0]]), everywhere(mono), IntegrationOptions(alpha=1.0)
+    )
+    assert result.distance_m.tolist() == [[40.0, 40.0]]
+
+
+@pytest.mark.parametrize("fields", [{"alpha": 0.0}, {"range_guide": "lidar"}], ids=str)
+def test_far_from_every_estimate_the_nearest_counts(fields):
+    # A return of 40 at the middle. α = 0: d̂ there is 40, left 25, right 24; LiDAR's guide: d̂ there 24 too.
+    # 15 σ_d against 16: exp(-112.5) against exp(-128), both below float32's least number.
+    middle = 40.0 if "alpha" in fields else 24.0
+    mono, lidar = torch.tensor([[25.0, middle, 24.0]]), torch.tensor([[0.0, 40.0, 0.0]])
+    result = integrate_depth(lidar, mono, everywhere(mono), IntegrationOptions(**fields))
+    assert float(result.distance_m[0, 1]) == pytest.approx(25.0, abs=1e-4)
+    # beyond 37 σ_d there is none
+    shift = torch.tensor([[0.0, 30.0, 0.0]])
+    mono = mono + shift if "alpha" in fields else mono
+    result = integrate_depth(lidar + shift, mono, everywhere(mono), IntegrationOptions(**fields))
+    assert result.distance_m[0, 1] == 0
+
+
+def test_keep_returns():
+    lidar, mono, valid = random_maps(8, ragged=False)
+    kept = integrate_depth(lidar, mono, valid, IntegrationOptions(keep_returns=True))
+    averaged = integrate_depth(lidar, mono, valid)
+    returns = lidar > 0
+    assert torch.equal(kept.distance_m[returns], lidar[returns])
+    assert (kept.spread_m[returns] == 0).all() and (kept.mono_share[returns] == 0).all()
+    assert torch.equal(kept.distance_m[~returns], averaged.distance_m[~returns])
+
+
+def test_batch_and_strips_change_nothing(monkeypatch):
+    maps = [random_maps(seed) for seed in range(6)]
+    lidar, mono, valid = (torch.stack(tensors).reshape(2, 3, 11, 13) for tensors in zip(*maps, strict=True))
+    batched = integrate_depth(lidar, mono, valid)
+    monkeypatch.setattr(integration, "CPU_STRIP_PIXELS", 5)
+    for i, (lidar_map, mono_map, valid_map) in enumerate(maps):
+        alone = integrate_depth(lidar_map, mono_map, valid_map)
+        of_batch = (getattr(batched, field.name)[i // 3, i % 3] for field in dataclasses.fields(batched))
+        assert_same(alone, IntegratedDepth(*of_batch), atol=1e-6)
+
+
+def test_leaves_the_number_of_threads_alone():
+    before = torch.get_num_threads()
+    integrate_depth(*random_maps(0))
+    assert torch.get_num_threads() == before
+
+
+@pytest.mark.parametrize("shape", [(0, 4, 5), (4, 0), (2, 4, 5)])
+def test_nothing_valid_is_no_prior(shape):
+    result = integrate_depth(torch.ones(shape), torch.ones(shape), torch.zeros(shape, dtype=torch.bool))
+    assert result.distance_m.shape == shape
+    assert not result.distance_m.any() and not result.spread_m.any() and not result.mono_share.any()
+
+
+def test_half_precision_and_gradients_do_not_matter():
+    lidar, mono, valid = random_maps(9, ragged=False)
+    half = integrate_depth(lidar.half(), mono.half().requires_grad_(), valid)
+    assert half.distance_m.dtype == torch.float32 and not half.distance_m.requires_grad
+    assert_same(half, integrate_depth(lidar.half().float(), mono.half().float(), valid))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.parametrize("normalise", ["pooled", "per-source"])
+def test_cuda_equals_cpu(normalise):
+    lidar, mono, valid = random_maps(10)
+    options = IntegrationOptions(normalise=normalise)
+    there = integrate_depth(lidar.cuda(), mono.cuda(), valid.cuda(), options)
+    here = IntegratedDepth(there.distance_m.cpu(), there.spread_m.cpu(), there.mono_share.cpu())
+    assert_same(here, integrate_depth(lidar, mono, valid, options), atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"alpha": 1.5}, "alpha is 1.5; expected a finite number from 0 to 1"),
+        ({"alpha": float("nan")}, "alpha is nan"),
+        ({"kernel_size": 8}, "kernel_size is 8; expected an odd whole number"),
+        ({"kernel_size": -1}, "kernel_size is -1"),
+        ({"sigma_space_px": 0.0}, "sigma_space_px is 0.0; expected a finite number from 0.001"),
+        ({"sigma_depth_m": float("inf")}, "sigma_depth_m is inf"),
+        ({"integration": "bilateral"}, "integration is 'bilateral'; expected one of 'edge-aware', 'spatial-gaussian'"),
+        ({"normalise": "none"}, "normalise is 'none'"),
+        ({"range_guide": "radar"}, "range_guide is 'radar'"),
+    ],
+)
+def test_bad_options(fields, words, unchecked_types):
+    with pytest.raises(InputError, match=words):
+        IntegrationOptions(**fields)
+
+
+def test_wrong_shapes(unchecked_types):
+    image = torch.ones(4, 5)
+    with pytest.raises(InputError, match=r"integrate_depth.*lidar_m \(5, 4\).*mono_m \(4, 5\).*one shape"):
+        integrate_depth(image.T, image, everywhere(image))
+    with pytest.raises(InputError, match="integrate_depth"):
+        integrate_depth(image[0], image[0], everywhere(image[0]))
+    with pytest.raises(InputError, match="select_prior"):
+        select_prior("mono", None, image, everywhere(image.T))
+
+
+def test_sources_alone():
+    lidar, mono, valid = random_maps(11)
+    only_lidar = select_prior("lidar", lidar, None, valid)
+    returns = valid & torch.isfinite(lidar) & (lidar > 0)
+    assert torch.equal(only_lidar.distance_m, torch.where(returns, lidar, 0))
+    assert not only_lidar.spread_m.any() and not only_lidar.mono_share.any()
+    only_mono = select_prior("mono", None, mono, valid)
+    usable = valid & torch.isfinite(mono) & (mono > 0)
+    assert torch.equal(only_mono.distance_m, torch.where(usable, mono, 0))
+    assert torch.equal(only_mono.mono_share > 0, usable)
+    assert_same(select_prior("integrated", lidar, mono, valid), integrate_depth(lidar, mono, valid))
+
+
+@pytest.mark.parametrize(
+    ("source", "missing"), [("lidar", "lidar"), ("mono", "mono"), ("integrated", "lidar and mono")]
+)
+def test_a_missing_source_is_named(source, missing):
+    with pytest.raises(InputError, match=f"'{source}' needs {missing} distance maps"):
+        select_prior(source, None, None, torch.ones(3, 3, dtype=torch.bool))
+
+
+def test_sigma_by_hand():
+    prior = IntegratedDepth(
+        torch.tensor([[0.0, 10.0, 14.0]]), torch.tensor([[0.0, 0.3, 0.01]]), torch.tensor([[0.0, 0.5, 1.0]])
+    )
+    mono = torch.tensor([[float("nan"), 12.0, 14.0]])
+    # σ̂² = spread² + (0.1 · d̂ · share)² + 0.05²
+    #   0.09 + (0.1 · 12 · 0.5)² + 0.0025   = 0.4525    root 0.672681
+    #   0.0001 + (0.1 · 14 · 1)² + 0.0025   = 1.9626    root 1.400928
+    torch.testing.assert_close(
+        sigma_m(prior, "combined", mono_m=mono), torch.tensor([[0.0, 0.672681, 1.400928]]), rtol=0, atol=1e-6
+    )
+    assert sigma_m(prior, "spread").tolist() == [[0.0, pytest.approx(0.3), pytest.approx(0.05)]]
+    assert sigma_m(prior, "constant", constant_m=0.5).tolist() == [[0.0, 0.5, 0.5]]
+    # the standard deviation of 10 and 14 is 2
+    torch.testing.assert_close(sigma_m(prior, "image"), torch.tensor([[0.0, 2.0, 2.0]]))
+
+
+def test_sigma_of_an_image_is_its_own():
+    distance = torch.tensor([[[10.0, 14.0]], [[5.0, 5.0]], [[0.0, 0.0]]])
+    prior = IntegratedDepth(distance, torch.zeros_like(distance), torch.ones_like(distance))
+    # 5, 5 has no deviation: the floor; no prior, no σ̂
+    torch.testing.assert_close(sigma_m(prior, "image"), torch.tensor([[[2.0, 2.0]], [[0.05, 0.05]], [[0.0, 0.0]]]))
+
+
+@pytest.mark.parametrize("mode", ["constant", "image", "spread", "combined"])
+def test_sigma_is_positive_exactly_where_there_is_a_prior(mode):
+    lidar, mono, valid = random_maps(12)
+    prior = integrate_depth(lidar, mono, valid, IntegrationOptions(keep_returns=True))
+    sigma = sigma_m(prior, mode, mono_m=mono)
+    assert torch.isfinite(sigma).all()
+    assert torch.equal(sigma > 0, prior.distance_m > 0)
+
+
+def test_combined_sigma_wants_mono_only_where_it_counts(unchecked_types):
+    lidar, mono, valid = random_maps(13)
+    assert float(sigma_m(select_prior("lidar", lidar, None, valid), "combined").max()) == pytest.approx(0.05)
+    with pytest.raises(InputError, match="needs mono_m"):
+        sigma_m(integrate_depth(lidar, mono, valid), "combined")
+    with pytest.raises(InputError, match="sigma mode is 'magic'; expected one of 'constant'"):
+        sigma_m(integrate_depth(lidar, mono, valid), "magic")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InputError, match="constant_m is 0"):
+        sigma_m(integrate_depth(lidar, mono, valid), "constant", constant_m=0.0)
