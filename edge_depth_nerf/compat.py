@@ -1,0 +1,45 @@
+"""Workarounds for faults of the host, each with what it works around and what would end it.
+
+Everything here is about nerfstudio 1.1.5 and what it is installed with; no other module patches the host.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import torch
+import torchmetrics.image.lpip
+
+
+def allow_numpy_scalars_in_checkpoints() -> None:
+    """Let `torch.load` read the checkpoints that nerfstudio writes.
+
+    They hold NumPy scalars (learning rates of schedulers), which torch >= 2.6 refuses by default
+    (nerfstudio issue 3561). Naming the three types keeps safe loading on. NumPy 2 calls the module
+    `numpy._core`; files written under either name are to be read under both.
+    Ends with: a nerfstudio that saves Python floats.
+    """
+    if not hasattr(torch.serialization, "add_safe_globals"):
+        return  # torch < 2.4 loads everything
+    scalar = np.float64(0).__reduce__()[0]
+    allowed = [(scalar, "numpy.core.multiarray.scalar"), (scalar, "numpy._core.multiarray.scalar"), np.dtype]
+    allowed += [type(np.dtype(kind)) for kind in (np.float64, np.float32, np.int64)]
+    torch.serialization.add_safe_globals(allowed)
+
+
+@contextmanager
+def lpips_not_built() -> Iterator[None]:
+    """Keep nerfacto from building LPIPS, which downloads AlexNet's weights at start and enters the state dict.
+
+    nerfacto's `populate_modules` imports the class at that moment, so the name in torchmetrics is swapped for
+    the duration. Ends with: a nerfstudio that builds its metrics at first use.
+    """
+    module = torchmetrics.image.lpip
+    original = module.LearnedPerceptualImagePatchSimilarity
+    module.LearnedPerceptualImagePatchSimilarity = lambda **_: None
+    try:
+        yield
+    finally:
+        module.LearnedPerceptualImagePatchSimilarity = original

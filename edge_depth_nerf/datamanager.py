@@ -1,0 +1,209 @@
+"""Serves training rays with colour and depth prior.
+
+Host-facing. The prior of each training frame is integrated once, in `setup_train` (ns-render and the viewer's
+thumbnails never wait for it), from that frame's own maps: a sweep of a held-out moment is in no training frame.
+Batches are drawn from all valid pixels of all training pictures (see `pixel_table`), so that scenes of one picture,
+of mixed sizes, with masks or without all work; nerfstudio's own pixel sampler fails on some of these.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
+from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
+from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIndicesEvalDataloader
+from nerfstudio.model_components.ray_generators import RayGenerator
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.progress import track
+
+from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
+from edge_depth_nerf.dataset import FisheyeDepthDataset
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.integration import IntegrationOptions
+from edge_depth_nerf.pixel_table import PixelBatch, PixelTable
+from edge_depth_nerf.prior import Prior, PriorCache, PriorOptions
+
+
+@dataclass
+class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig):
+    """Rays of fisheye pictures with an edge-aware integrated depth prior."""
+
+    _target: type = field(default_factory=lambda: FisheyeDepthDataManager)
+    """Target class to instantiate."""
+    dataparser: AnnotatedDataParserUnion = field(default_factory=FisheyeDepthDataParserConfig)
+    """Specifies the dataparser used to unpack the data."""
+    depth_source: Literal["auto", "integrated", "lidar", "mono"] = "auto"
+    """Where the prior comes from: LiDAR and monocular maps integrated (Eq. 5), or one of them alone (Table 3).
+    auto: what the scene has."""
+    integration: Literal["edge-aware", "spatial-gaussian"] = "edge-aware"
+    """Kernel of the integration: Eq. 7, or Eq. 7 without its depth factor (Table 4)."""
+    alpha: float = 0.7
+    """Weight of LiDAR against monocular distance, 0..1 (Eq. 5, 6)."""
+    kernel_size: int = 9
+    """Side of the integration's window, px, odd (Eq. 7)."""
+    sigma_space: float = 3.0
+    """Standard deviation of the kernel over pixels, px (Eq. 7)."""
+    sigma_depth: float = 1.0
+    """Standard deviation of the kernel over distance, metres (Eq. 7)."""
+    normalise: Literal["pooled", "per-source"] = "pooled"
+    """Whether alpha weighs single pixels (Eq. 5, 6) or the averages of the two sources."""
+    keep_returns: bool = False
+    """Keep the LiDAR distance unchanged at pixels with a return."""
+    range_guide: Literal["mono", "lidar"] = "mono"
+    """What the kernel's depth factor compares with the neighbours: monocular distance (Eq. 7 as written), or LiDAR
+    where there is a return (the paper's prose)."""
+    sigma_mode: Literal["constant", "image", "spread", "combined"] = "combined"
+    """Standard deviation of the prior: one number, one number a frame (the paper's words), the spread of what was
+    integrated, or that spread with a floor and a share of the monocular distance."""
+    sigma_constant: float = 1.0
+    """The standard deviation under sigma_mode constant, metres."""
+    cache_dir: Path | None = None
+    """Where integrated priors are kept. Not set: .cache/ in the scene folder."""
+
+    def prior_options(self, has_lidar: bool, has_mono: bool) -> PriorOptions:
+        """The options of the prior, with depth_source settled by what the scene has.
+
+        Raises:
+            InputError: the depth source asked for is not in the scene, or an option is out of its range.
+
+        """
+        source = self.depth_source
+        if source == "auto":
+            source = "integrated" if has_lidar and has_mono else "lidar" if has_lidar else "mono"
+        missing = [
+            name
+            for name, has, needed in (
+                ("LiDAR", has_lidar, source in ("integrated", "lidar")),
+                ("monocular", has_mono, source in ("integrated", "mono")),
+            )
+            if needed and not has
+        ]
+        if missing:
+            raise InputError(
+                f"{self.dataparser.data}: the scene has no {' and no '.join(missing)} distance maps, but depth_source "
+                f"{self.depth_source} needs them. Process the drive again (monocular maps: `edge-depth-nerf process "
+                "… --mono DIR`), or choose another --pipeline.datamanager.depth-source (integrated, lidar, mono), or "
+                "train without a prior by --pipeline.model.depth-loss none."
+            )
+        return PriorOptions(
+            depth_source=source,
+            sigma_mode=self.sigma_mode,
+            sigma_constant_m=self.sigma_constant,
+            integration=IntegrationOptions(
+                alpha=self.alpha,
+                kernel_size=self.kernel_size,
+                sigma_space_px=self.sigma_space,
+                sigma_depth_m=self.sigma_depth,
+                integration=self.integration,
+                normalise=self.normalise,
+                keep_returns=self.keep_returns,
+                range_guide=self.range_guide,
+            ),
+        )
+
+
+class TablePixelSampler:
+    """What nerfstudio calls a pixel sampler; its exporter sets `num_rays_per_batch`."""
+
+    def __init__(self, table: PixelTable, num_rays_per_batch: int):
+        self.table = table
+        self.num_rays_per_batch = num_rays_per_batch
+
+    def set_num_rays_per_batch(self, num_rays_per_batch: int) -> None:
+        """Set the rays of a batch (nerfstudio's interface)."""
+        self.num_rays_per_batch = num_rays_per_batch
+
+    def sample(self) -> PixelBatch:
+        """Draw a batch."""
+        return self.table.sample(self.num_rays_per_batch)
+
+
+class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
+    """DataManager of fisheye scenes.
+
+    A batch holds image (n×3), indices (n×3: picture, row, column), prior_distance_m and prior_sigma_m (n×1, metres,
+    0 = no prior).
+    """
+
+    config: FisheyeDepthDataManagerConfig
+    train_dataset: FisheyeDepthDataset
+    eval_dataset: FisheyeDepthDataset
+    train_pixel_sampler: TablePixelSampler | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    eval_pixel_sampler: TablePixelSampler | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def setup_train(self) -> None:
+        """Integrate the prior of every training frame and fill the table of training pixels."""
+        table = self._fill(self.train_dataset, "Integrating depth", with_prior=True)
+        self.train_pixel_sampler = TablePixelSampler(table, self.config.train_num_rays_per_batch)
+        self.train_ray_generator = RayGenerator(self.train_dataset.cameras.to(self.device))
+        CONSOLE.log(
+            f"{len(self.train_dataset)} training pictures, {len(table):,} valid pixels, "
+            f"{table.share_with_prior:.1%} of them with a depth prior"
+        )
+
+    def setup_eval(self) -> None:
+        """Fill the table of held-out pixels (no prior) and prepare the loaders of whole views."""
+        table = self._fill(self.eval_dataset, "Reading held-out pictures", with_prior=False)
+        self.eval_pixel_sampler = TablePixelSampler(table, self.config.eval_num_rays_per_batch)
+        self.eval_ray_generator = RayGenerator(self.eval_dataset.cameras.to(self.device))
+        self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(
+            input_dataset=self.eval_dataset, device=self.device
+        )
+        self.eval_dataloader = RandIndicesEvalDataloader(input_dataset=self.eval_dataset, device=self.device)
+
+    def next_train(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
+        """Rays of the next training batch and what supervises them."""
+        self.train_count += 1
+        assert self.train_pixel_sampler is not None
+        return self._serve(self.train_pixel_sampler, self.train_ray_generator)
+
+    def next_eval(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
+        """Rays of a batch of held-out pixels and their colours."""
+        self.eval_count += 1
+        assert self.eval_pixel_sampler is not None
+        return self._serve(self.eval_pixel_sampler, self.eval_ray_generator)
+
+    def _serve(self, sampler: TablePixelSampler, generator: RayGenerator) -> tuple[RayBundle, dict[str, Any]]:
+        batch = sampler.sample()
+        rays = generator(batch.indices.to(self.device))
+        return rays, {
+            "image": batch.rgb.to(self.device),
+            "indices": batch.indices,
+            "prior_distance_m": batch.prior_distance_m.to(self.device),
+            "prior_sigma_m": batch.prior_sigma_m.to(self.device),
+        }
+
+    def _fill(self, dataset: FisheyeDepthDataset, description: str, with_prior: bool) -> PixelTable:
+        table = PixelTable()
+        cache: PriorCache | None = None
+        has_lidar = bool(dataset.metadata["lidar_filenames"])
+        has_mono = bool(dataset.metadata["mono_filenames"])
+        if with_prior and (has_lidar or has_mono or self.config.depth_source != "auto"):
+            options = self.config.prior_options(has_lidar, has_mono)
+            data = Path(self.config.dataparser.data)
+            scene = data.parent if data.suffix == ".json" else data
+            cache = PriorCache(self.config.cache_dir or scene / ".cache" / "prior", options)
+
+        def load(image_idx: int) -> tuple[Any, Any, Prior | None]:
+            rgb = dataset.rgb(image_idx)
+            mask = dataset.mask(image_idx)
+            if cache is None:
+                return rgb, mask, None
+            lidar, mono = dataset.lidar_distance_m(image_idx), dataset.mono_distance_m(image_idx)
+            return rgb, mask, cache.prior(lidar, mono, mask)
+
+        # OpenCV and torch release the interpreter's lock, so two threads read and integrate side by side
+        with ThreadPoolExecutor(max_workers=2) as pool:
+            loaded = pool.map(load, range(len(dataset)))
+            progress = track(loaded, f"{description}…", len(dataset), console=CONSOLE, transient=True)
+            for image_idx, (rgb, mask, prior) in enumerate(progress):
+                distance = prior.distance_m if prior else None
+                sigma = prior.sigma_m if prior else None
+                table.add(rgb, mask, dataset.mask_key(image_idx), distance, sigma)
+        table.finish()
+        return table

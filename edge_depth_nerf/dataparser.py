@@ -1,0 +1,175 @@
+"""Reads a scene folder: nerfstudio's own format, with metric scale and the maps of this project beside it.
+
+Host-facing. Poses and cameras are read by nerfstudio's parser; here come the scale in metres, the files of LiDAR,
+monocular and true maps, and errors that name what is wrong. The scene's axes are kept (z up), so that a distance
+in scene units times `metres_per_unit` is metres.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
+
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.files import DISTANCE_STEPS_PER_METRE, read_json
+from edge_depth_nerf.scale import default_metres_per_unit
+
+SUPPORTED_CAMERA_TYPES = (CameraType.PERSPECTIVE, CameraType.FISHEYE)
+
+MAP_KEYS = {
+    "lidar_filenames": "lidar_file_path",
+    "mono_filenames": "mono_file_path",
+    "truth_distance_filenames": "truth_distance_file_path",
+    "truth_rgb_filenames": "truth_rgb_file_path",
+}
+"""Metadata of the dataset: key of the frame in transforms.json. All frames have a map or none has."""
+
+
+@dataclass
+class FisheyeDepthDataParserConfig(NerfstudioDataParserConfig):
+    """Scene with fisheye (or pinhole) cameras, metric poses and distance maps."""
+
+    _target: type = field(default_factory=lambda: FisheyeDepth)
+    """Target class to instantiate."""
+    metres_per_unit: float | None = None
+    """Metres that one scene unit stands for. Not set: half of the drive's extent, at least 10 m, at most what keeps
+    the finest hash cell at 0.25 m."""
+    hash_resolution: int = 2048
+    """Cells of the finest hash-grid level along one axis, for the choice above (the model's max_res)."""
+    depth_unit_scale_factor: float | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    """Metres per count of the files under depth_file_path. Not set: what transforms.json says, else nerfstudio's
+    0.001."""
+    depth_kind: Literal["auto", "distance", "z_depth"] = "auto"
+    """What the files under depth_file_path hold. auto: distance along the ray in scenes of this project and in
+    fisheye scenes, z_depth (nerfstudio's convention) in other people's pinhole scenes."""
+    downscale_factor: int | None = 1
+    """How much to downscale images; other than 1 needs nerfstudio's images_K folders (not in our scenes)."""
+    orientation_method: Literal["pca", "up", "vertical", "none"] = "none"
+    """The method to use for orientation; the drive's own axes by default."""
+    auto_scale_poses: bool = False
+    """nerfstudio's scaling of all poses into +-1. Kept off: the scale is metres_per_unit."""
+    eval_mode: Literal["fraction", "filename", "interval", "all"] = "interval"
+    """How a scene without split files is divided. Interval holds out every eval_interval-th picture."""
+
+
+def check_meta(meta: Any, path: Path) -> list[dict[str, Any]]:
+    """Check what nerfstudio's parser takes for granted; give the list of frames.
+
+    Raises:
+        InputError: no frames, an unknown camera model, a frame without picture or pose, a map that only some
+            frames have.
+
+    """
+    if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list) or not meta["frames"]:
+        raise InputError(
+            f"{path}: has no list of frames. Expected a transforms.json of nerfstudio's format; "
+            "`edge-depth-nerf process` writes one."
+        )
+    model = meta.get("camera_model", "PINHOLE")
+    supported = [name for name, kind in CAMERA_MODEL_TO_TYPE.items() if kind in SUPPORTED_CAMERA_TYPES]
+    if model not in supported:
+        raise InputError(
+            f"{path}: camera_model is {model!r}; expected one of {', '.join(supported)}. "
+            "Convert the cameras, for example with `edge-depth-nerf process`."
+        )
+    frames = meta["frames"]
+    for number, frame in enumerate(frames):
+        for key in ("file_path", "transform_matrix"):
+            if key not in frame:
+                raise InputError(f"{path}: frame {number} has no {key}. Every frame needs a picture and a pose.")
+        pose = np.asarray(frame["transform_matrix"], dtype=np.float64)
+        if pose.shape != (4, 4) or not np.isfinite(pose).all():
+            raise InputError(
+                f"{path}: frame {number} ({frame['file_path']}): transform_matrix must be 4×4 finite numbers, "
+                f"found shape {pose.shape}."
+            )
+    for key in (*MAP_KEYS.values(), "depth_file_path", "mask_path"):
+        missing = [frame["file_path"] for frame in frames if key not in frame]
+        if missing and len(missing) < len(frames):
+            raise InputError(
+                f"{path}: {key} is given for {len(frames) - len(missing)} of {len(frames)} frames; it is missing "
+                f"for {', '.join(missing[:3])}{' …' if len(missing) > 3 else ''}. Give it for every frame or none."
+            )
+    return frames
+
+
+class FisheyeDepth(Nerfstudio):
+    """Parser of scene folders."""
+
+    config: FisheyeDepthDataParserConfig
+
+    def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
+        """Cameras, pictures, masks and the files of distance maps of one split.
+
+        Raises:
+            FileNotFoundError: no scene there, or a file it names is missing.
+            InputError: the scene cannot be used as it is.
+
+        """
+        data = Path(self.config.data)
+        path = data if data.suffix == ".json" else data / "transforms.json"
+        if not path.is_file():
+            raise FileNotFoundError(
+                f"{path}: no such file. --data takes a scene folder with a transforms.json; "
+                "`edge-depth-nerf process` makes one from a raw drive."
+            )
+        meta = read_json(path)
+        frames = check_meta(meta, path)
+        own_scene = any(key in frames[0] for key in MAP_KEYS.values())
+        if own_scene and self.config.downscale_factor not in (None, 1):
+            raise InputError(
+                f"{path}: downscale_factor is {self.config.downscale_factor}, but the distance maps of this scene "
+                "have one size only. Run `edge-depth-nerf process … --downscale K` instead."
+            )
+        is_fisheye = CAMERA_MODEL_TO_TYPE[meta.get("camera_model", "PINHOLE")] == CameraType.FISHEYE
+
+        positions_m = np.array([frame["transform_matrix"] for frame in frames], dtype=np.float64)[:, :3, 3]
+        metres_per_unit = self.config.metres_per_unit
+        if metres_per_unit is None:
+            metres_per_unit = default_metres_per_unit(positions_m, self.config.hash_resolution)
+        if not (np.isfinite(metres_per_unit) and metres_per_unit > 0):
+            raise InputError(f"metres_per_unit is {metres_per_unit}; expected a positive number of metres.")
+
+        unit = self.config.depth_unit_scale_factor
+        if unit is None:
+            unit = float(meta.get("depth_unit_scale_factor", 1e-3))
+        # nerfstudio's parser takes the scale from its config
+        self.config.scale_factor = 1.0 / metres_per_unit
+        outputs = super()._generate_dataparser_outputs(split)
+
+        data_dir = path.parent
+        by_image = {self._get_fname(Path(frame["file_path"]), data_dir): frame for frame in frames}
+        chosen = [by_image[image] for image in outputs.image_filenames]
+        metadata: dict[str, Any] = {
+            name: [data_dir / frame[key] for frame in chosen] if key in frames[0] else None
+            for name, key in MAP_KEYS.items()
+        }
+        metadata["lidar_metres_per_count"] = 1 / DISTANCE_STEPS_PER_METRE
+        metadata["lidar_is_z_depth"] = False
+        depth_filenames = outputs.metadata["depth_filenames"]
+        if metadata["lidar_filenames"] is None and depth_filenames is not None:
+            metadata["lidar_filenames"] = depth_filenames
+            metadata["lidar_metres_per_count"] = unit
+            own = own_scene or is_fisheye
+            kind = self.config.depth_kind if self.config.depth_kind != "auto" else ("distance" if own else "z_depth")
+            metadata["lidar_is_z_depth"] = kind == "z_depth"
+        metadata["metres_per_unit"] = metres_per_unit
+        metadata["theta_max_rad"] = np.radians(meta["theta_max_deg"]).item() if "theta_max_deg" in meta else None
+        metadata["depth_unit_scale_factor"] = unit
+        outputs.metadata.update(metadata)
+
+        for files in (
+            outputs.image_filenames,
+            outputs.mask_filenames,
+            *(metadata[name] for name in MAP_KEYS),
+        ):
+            for file in files or []:
+                if not file.is_file():
+                    raise FileNotFoundError(f"{file}: no such file, but {path} names it. Process the drive again.")
+        return outputs

@@ -1,0 +1,198 @@
+"""nerfacto with the edge loss, in metres, judged inside the mask.
+
+Host-facing: formulas stand in `losses` and `metrics`. Lengths in scene units are turned into metres with the
+`metres_per_unit` of the dataset's metadata, so that near, far, sigma and the loss weight mean the same in every
+scene.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.rays import RaySamples
+from nerfstudio.model_components.losses import ds_nerf_depth_loss, urban_radiance_field_depth_loss
+from nerfstudio.model_components.scene_colliders import NearFarCollider
+from nerfstudio.models.nerfacto import NerfactoModel, NerfactoModelConfig
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from edge_depth_nerf.compat import lpips_not_built
+from edge_depth_nerf.losses import edge_loss
+from edge_depth_nerf.metrics import DepthErrors, load_lpips, masked_lpips, masked_psnr, masked_ssim
+from edge_depth_nerf.pictures import colour_distance
+
+LARGEST_NEAR_PLANE_M = 0.5
+"""A near plane beyond this cuts off road and car beside the camera."""
+
+
+@dataclass
+class EdgeDepthNerfModelConfig(NerfactoModelConfig):
+    """nerfacto supervised by a distance prior."""
+
+    _target: type = field(default_factory=lambda: EdgeDepthNerfModel)
+    """Target class to instantiate."""
+    near_m: float = 0.2
+    """How far along the ray to start sampling, metres (in place of near_plane)."""
+    far_m: float = 1000.0
+    """How far along the ray to stop sampling, metres (in place of far_plane)."""
+    depth_loss: Literal["edge", "ds-nerf", "urban-nerf", "none"] = "edge"
+    """The loss on the distance prior: Eq. 4, nerfstudio's DS-NeRF or UrbanNeRF loss, or none (plain nerfacto)."""
+    depth_loss_mult: float = 1e-3
+    """Weight λ of the loss on the distance prior."""
+    depth_sigma: float = 0.5
+    """Standard deviation that the DS-NeRF and UrbanNeRF losses assume, metres. (Eq. 4 takes the prior's own.)"""
+    depth_loss_levels: Literal["all", "final"] = "all"
+    """Whether the loss acts on the samples of the proposal networks too, or on the final ones alone."""
+    edge_gaussian: Literal["point", "interval"] = "interval"
+    """How Eq. 4 weighs a sample: by the Gaussian's value at its middle times its length, or by the Gaussian's mass
+    over its interval."""
+    edge_divide_by_norm: bool = True
+    """Divide Eq. 4's Gaussian by σ̂·√(2π), so that a wide one does not pull harder than a narrow one."""
+
+
+class LpipsAtFirstUse:
+    """LPIPS as nerfacto calls it, kept outside the module tree and so outside checkpoints.
+
+    Without AlexNet's weights on disk it says so once and gives NaN, which the model leaves out of its figures.
+    """
+
+    def __init__(self) -> None:
+        self._loaded = False
+        self.network: torch.nn.Module | None = None
+
+    def load(self, device: torch.device) -> torch.nn.Module | None:
+        """The network on `device`, or None where its weights are missing."""
+        if not self._loaded:
+            self._loaded = True
+            self.network = load_lpips()
+        return None if self.network is None else self.network.to(device)
+
+    def __call__(self, image: Tensor, other: Tensor) -> Tensor:
+        """LPIPS of two pictures (1×3×H×W in 0..1), NaN without weights."""
+        network = self.load(image.device)
+        return image.new_tensor(float("nan")) if network is None else network(image, other.clamp(0, 1))
+
+
+class EdgeDepthNerfModel(NerfactoModel):
+    """nerfacto supervised by a distance prior."""
+
+    config: EdgeDepthNerfModelConfig
+
+    def populate_modules(self) -> None:
+        """Build nerfacto with near and far planes in metres."""
+        metadata = self.kwargs.get("metadata") or {}
+        self.metres_per_unit: float = metadata.get("metres_per_unit", 1.0)
+        if self.config.near_m > LARGEST_NEAR_PLANE_M:
+            CONSOLE.print(
+                f"[bold yellow]The near plane is at {self.config.near_m:g} m: what is nearer to a camera is not "
+                "rendered. Set --pipeline.model.near-m 0.2 unless that is meant."
+            )
+        with lpips_not_built():
+            super().populate_modules()
+        self.lpips = LpipsAtFirstUse()
+        # the near plane is not reset at evaluation: nothing was trained in front of it
+        self.collider = NearFarCollider(
+            near_plane=self.config.near_m / self.metres_per_unit,
+            far_plane=self.config.far_m / self.metres_per_unit,
+            reset_near_plane=False,
+        )
+        self.reset_depth_errors()
+
+    def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
+        """Nerfacto's metrics and, in training, the share of rays with a prior."""
+        metrics = super().get_metrics_dict(outputs, batch)
+        if self.training and self.config.depth_loss != "none":
+            metrics["share_with_prior"] = (batch["prior_distance_m"] > 0).float().mean()
+        return metrics
+
+    def get_loss_dict(
+        self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Any] | None = None
+    ) -> dict[str, Tensor]:
+        """Nerfacto's losses and the one on the distance prior: L_color + λ·L_edge."""
+        losses = super().get_loss_dict(outputs, batch, metrics_dict)
+        if self.training and self.config.depth_loss != "none":
+            levels = list(zip(outputs["weights_list"], outputs["ray_samples_list"], strict=True))
+            if self.config.depth_loss_levels == "final":
+                levels = levels[-1:]
+            per_level = [self._depth_loss(weights, samples, outputs, batch) for weights, samples in levels]
+            name = "edge_loss" if self.config.depth_loss == "edge" else "depth_loss"
+            losses[name] = self.config.depth_loss_mult * torch.stack(per_level).mean()
+        return losses
+
+    def _depth_loss(
+        self,
+        weights: Float[Tensor, "rays samples 1"],
+        samples: RaySamples,
+        outputs: dict[str, Any],
+        batch: dict[str, Any],
+    ) -> Float[Tensor, ""]:
+        starts_m = samples.frustums.starts * self.metres_per_unit
+        ends_m = samples.frustums.ends * self.metres_per_unit
+        prior_m = batch["prior_distance_m"].to(weights)
+        if self.config.depth_loss == "edge":
+            return edge_loss(
+                weights[..., 0],
+                starts_m[..., 0],
+                ends_m[..., 0],
+                prior_m[..., 0],
+                batch["prior_sigma_m"].to(weights)[..., 0],
+                gaussian=self.config.edge_gaussian,
+                divide_by_norm=self.config.edge_divide_by_norm,
+            )
+        middles_m = (starts_m + ends_m) / 2
+        sigma_m = weights.new_tensor([self.config.depth_sigma])
+        if self.config.depth_loss == "ds-nerf":
+            return ds_nerf_depth_loss(weights, prior_m, middles_m, ends_m - starts_m, sigma_m)
+        expected_m = outputs["expected_depth"] * self.metres_per_unit
+        return urban_radiance_field_depth_loss(weights, prior_m, expected_m, middles_m, sigma_m)
+
+    def reset_depth_errors(self) -> None:
+        """Start pooling depth errors anew."""
+        self._depth_errors = {"lidar": DepthErrors(), "truth": DepthErrors()}
+
+    def pooled_depth_errors(self) -> dict[str, float]:
+        """Depth errors over all pixels judged since the last reset."""
+        return {
+            key: value
+            for name, errors in self._depth_errors.items()
+            for key, value in errors.compute(f"{name}_").items()
+        }
+
+    @torch.no_grad()
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Tensor], batch: dict[str, Any]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Nerfacto's metrics over the full frame, ours inside the mask, and depth errors.
+
+        Returns:
+            psnr, ssim and, given weights, lpips over the full frame; masked_* inside the mask; truth_masked_*
+            against the picture without noise where it is known. The pictures hold `distance`, the median distance
+            in metric colours, besides nerfacto's. The errors of the median distance (1-60 m) against LiDAR and
+            truth, where there are any, are in `pooled_depth_errors`: a view without them has no figure of its own.
+
+        """
+        metrics, images = super().get_image_metrics_and_images(outputs, batch)
+        has_lpips = self.lpips.network is not None
+        if not has_lpips:
+            del metrics["lpips"]
+        predicted = outputs["rgb"].clamp(0, 1)
+        mask = batch["mask"][..., 0].to(predicted.device)
+        for prefix, key in (("", "image"), ("truth_", "truth_rgb")):
+            if key in batch:
+                target = batch[key][..., :3].to(predicted)
+                metrics[f"{prefix}masked_psnr"] = float(masked_psnr(predicted, target, mask))
+                metrics[f"{prefix}masked_ssim"] = float(masked_ssim(predicted, target, mask))
+                if has_lpips:
+                    network = self.lpips.load(predicted.device)
+                    metrics[f"{prefix}masked_lpips"] = float(masked_lpips(predicted, target, mask, network))
+        distance_m = outputs["depth"][..., 0] * self.metres_per_unit
+        for name, errors in self._depth_errors.items():
+            if f"{name}_distance_m" in batch:
+                true_m = batch[f"{name}_distance_m"][..., 0].to(distance_m)
+                errors.update(distance_m, true_m, mask)
+        coloured = colour_distance(distance_m.cpu().numpy(), mask.cpu().numpy())
+        images["distance"] = torch.from_numpy(coloured).float() / 255
+        return metrics, images

@@ -1,0 +1,51 @@
+"""Pools depth errors over the pixels of all held-out views, where nerfstudio would average over pictures."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+
+from edge_depth_nerf.model import EdgeDepthNerfModel
+
+
+@dataclass
+class EdgeDepthPipelineConfig(VanillaPipelineConfig):
+    """nerfstudio's pipeline with pooled depth errors."""
+
+    _target: type = field(default_factory=lambda: EdgeDepthPipeline)
+    """Target class to instantiate."""
+
+
+class EdgeDepthPipeline(VanillaPipeline):
+    """nerfstudio's pipeline with pooled depth errors."""
+
+    def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Figures and pictures of one held-out view."""
+        model = self.model
+        assert isinstance(model, EdgeDepthNerfModel)
+        model.reset_depth_errors()
+        metrics, images = super().get_eval_image_metrics_and_images(step)
+        return {**metrics, **model.pooled_depth_errors()}, images
+
+    def get_average_image_metrics(
+        self,
+        data_loader: Any,
+        image_prefix: str,
+        step: int | None = None,
+        output_path: Path | None = None,
+        get_std: bool = False,
+    ) -> dict[str, Any]:
+        """Nerfstudio's averages over pictures; AbsRel, RMSE and δ are over all their pixels together."""
+        model = self.model
+        assert isinstance(model, EdgeDepthNerfModel)
+        model.reset_depth_errors()
+        metrics = super().get_average_image_metrics(data_loader, image_prefix, step, output_path, get_std)
+        pooled = model.pooled_depth_errors()
+        # a spread over pictures says nothing of a pooled figure, and of a single picture it is NaN
+        spreads = {f"{name}_std" for name in pooled}
+        kept = {name: value for name, value in metrics.items() if name not in spreads and math.isfinite(value)}
+        return {**kept, **pooled}

@@ -1,0 +1,204 @@
+"""nerfstudio's own commands on our method and our scene, as a user gives them: offline, on the CPU."""
+
+from __future__ import annotations
+
+import gzip
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from nerfstudio.utils.eval_utils import eval_setup
+from scenes import fisheye, write_scene
+
+from edge_depth_nerf.files import read_json
+
+METHOD = "edge-depth-nerf-lite"
+TIMEOUT_S = 240
+SMALL = (
+    *("--pipeline.datamanager.train-num-rays-per-batch", "128", "--pipeline.model.num-levels", "4"),
+    *("--pipeline.model.log2-hashmap-size", "12", "--logging.local-writer.max-log-size", "0", "--vis", "tensorboard"),
+)
+
+try:
+    import open3d
+except (ImportError, OSError):
+    open3d = None
+
+
+def command(*arguments) -> list[str]:
+    words = [str(word) for word in arguments]
+    return [str(Path(sys.executable).with_name(words[0])), *words[1:]]
+
+
+def call(*arguments, **environment) -> str:
+    done = subprocess.run(
+        command(*arguments),
+        env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=TIMEOUT_S,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout[-4000:]
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("scene"), [fisheye(24, 20)], frames=13)
+
+
+@pytest.fixture(scope="module")
+def killed_run(scene, tmp_path_factory) -> Path:
+    """A training killed in the middle, by SIGKILL, after some checkpoints."""
+    output = tmp_path_factory.mktemp("runs")
+    train = command(
+        *("ns-train", METHOD, "--data", scene, "--output-dir", output, "--experiment-name", "killed"),
+        *("--timestamp", "run", "--max-num-iterations", 100000, "--steps-per-save", 5, *SMALL),
+    )
+    run = output / "killed" / METHOD / "run"
+    with subprocess.Popen(train, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        deadline = time.monotonic() + TIMEOUT_S
+        while not (run / "nerfstudio_models" / "step-000000020.ckpt").exists():
+            assert process.poll() is None and time.monotonic() < deadline
+            time.sleep(0.01)
+        process.send_signal(signal.SIGKILL)
+    return run
+
+
+def last_step(run: Path) -> int:
+    return max(int(path.stem[5:]) for path in (run / "nerfstudio_models").glob("step-*.ckpt"))
+
+
+def test_a_killed_run_gives_figures(killed_run, tmp_path):
+    call("ns-eval", "--load-config", killed_run / "config.yml", "--output-path", tmp_path / "figures.json")
+    figures = read_json(tmp_path / "figures.json")["results"]
+    for name in ("psnr", "ssim", "masked_psnr", "masked_ssim", "truth_masked_psnr", "lidar_abs_rel", "truth_abs_rel"):
+        assert np.isfinite(figures[name]), name
+    assert figures["lidar_pixels"] > 20
+
+
+def test_what_is_loaded_is_what_was_saved(killed_run):
+    """nerfstudio falls back to a lenient load without a word; so every tensor is compared."""
+    _, pipeline, checkpoint, _ = eval_setup(killed_run / "config.yml", test_mode="inference")
+    saved = torch.load(checkpoint, map_location="cpu", weights_only=True)["pipeline"]
+    loaded = pipeline.state_dict()
+    assert set(saved) == set(loaded)
+    assert all(torch.equal(saved[name], loaded[name]) for name in saved)
+
+
+def test_a_killed_run_is_taken_up_again(killed_run, scene, tmp_path):
+    step = last_step(killed_run)
+    assert step >= 20
+    said = call(
+        *("ns-train", METHOD, "--data", scene, "--output-dir", tmp_path, "--experiment-name", "resumed"),
+        *("--timestamp", "run", "--max-num-iterations", 7, "--load-dir", killed_run / "nerfstudio_models", *SMALL),
+    )
+    assert f"step-{step:09d}.ckpt" in said.replace("\n", "")
+    resumed = tmp_path / "resumed" / METHOD / "run"
+    assert last_step(resumed) == step + 7
+    assert not list(resumed.glob(".unfinished*"))
+    before, after = (
+        torch.load(run / "nerfstudio_models" / f"step-{last_step(run):09d}.ckpt", weights_only=True)
+        for run in (killed_run, resumed)
+    )
+    ages = [next(iter(saved["optimizers"]["fields"]["state"].values()))["step"] for saved in (before, after)]
+    assert ages[1] == ages[0] + 7  # the optimiser's moments went on, too
+
+
+def test_render_dataset(killed_run, tmp_path):
+    call(
+        *("ns-render", "dataset", "--load-config", killed_run / "config.yml", "--output-path", tmp_path),
+        *("--split", "test", "--rendered-output-names", "rgb", "depth", "raw-depth", "--image-format", "png"),
+    )
+    rendered = cv2.imread(str(tmp_path / "test" / "rgb" / "0004.png"))
+    assert rendered.shape == (20, 24, 3)
+    with gzip.open(tmp_path / "test" / "raw-depth" / "0012.npy.gz") as file:
+        distance_m = np.load(file)
+    assert distance_m.shape == (20, 24, 1)
+    _, pipeline, _, _ = eval_setup(killed_run / "config.yml", test_mode="test")
+    outputs = pipeline.model.get_outputs_for_camera(pipeline.datamanager.eval_dataset.cameras[1:2])
+    expected_m = outputs["depth"].numpy() * pipeline.model.metres_per_unit
+    assert np.nanmax(np.abs(distance_m / expected_m - 1)) < 1e-3
+
+
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ns-render interpolate writes videos with ffmpeg")
+def test_render_interpolate(killed_run, tmp_path):
+    call(
+        *("ns-render", "interpolate", "--load-config", killed_run / "config.yml", "--interpolation-steps", 2),
+        *("--output-path", tmp_path / "film.mp4", "--pose-source", "train"),
+    )
+    film = cv2.VideoCapture(str(tmp_path / "film.mp4"))
+    assert film.get(cv2.CAP_PROP_FRAME_COUNT) > 2
+
+
+@pytest.mark.skipif(open3d is None, reason="open3d cannot be imported (Debian: apt-get install libusb-1.0-0)")
+def test_export_pointcloud(killed_run, tmp_path):
+    call(
+        *("ns-export", "pointcloud", "--load-config", killed_run / "config.yml", "--output-dir", tmp_path),
+        *("--num-points", 500, "--num-rays-per-batch", 256, "--normal-method", "open3d", "--save-world-frame", "True"),
+        *("--remove-outliers", "False", "--reorient-normals", "False"),
+    )
+    header = (tmp_path / "point_cloud.ply").read_bytes()[:300].decode("latin1")
+    assert int(header.split("element vertex ")[1].split()[0]) >= 500
+
+
+def test_viewer(killed_run):
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    viewer = command(
+        *("ns-viewer", "--load-config", killed_run / "config.yml", "--viewer.websocket-host", "127.0.0.1"),
+        *("--viewer.websocket-port", port),
+    )
+    with subprocess.Popen(viewer, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+        try:
+            deadline = time.monotonic() + TIMEOUT_S
+            page = b""
+            while not page:
+                assert process.poll() is None, process.stdout.read()[-3000:]
+                assert time.monotonic() < deadline
+                try:
+                    with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=5) as answer:
+                        page = answer.read()
+                except OSError:
+                    time.sleep(0.5)
+            assert b"<html" in page.lower()
+        finally:
+            process.kill()
+
+
+@pytest.fixture(scope="module")
+def torch_home(tmp_path_factory) -> Path:
+    """nerfstudio's own methods demand AlexNet's weights; random ones do to see whether they read our scene."""
+    from torchvision.models import alexnet
+
+    home = tmp_path_factory.mktemp("torch_home")
+    checkpoints = home / "hub" / "checkpoints"
+    checkpoints.mkdir(parents=True)
+    torch.save(alexnet(weights=None).state_dict(), checkpoints / "alexnet-owt-7be5be79.pth")
+    return home
+
+
+@pytest.mark.parametrize("method", ["nerfacto", "depth-nerfacto"])
+def test_the_host_methods_read_our_scene(scene, torch_home, tmp_path, method):
+    euclidean = ["--pipeline.model.is-euclidean-depth", "True"] if method == "depth-nerfacto" else []
+    call(
+        *("ns-train", method, "--output-dir", tmp_path, "--machine.device-type", "cpu"),
+        *("--timestamp", "run", "--experiment-name", "host", "--max-num-iterations", 3),
+        *("--pipeline.model.implementation", "torch", *SMALL, *euclidean),
+        *("fisheye-depth-data", "--data", scene),
+        TORCH_HOME=str(torch_home),
+    )
+    assert last_step(tmp_path / "host" / method / "run") == 2

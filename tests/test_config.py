@@ -1,0 +1,115 @@
+import subprocess
+import sys
+from copy import deepcopy
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import pytest
+from nerfstudio.configs.dataparser_configs import all_dataparsers
+from nerfstudio.configs.method_configs import all_methods
+from nerfstudio.plugins.types import MethodSpecification
+
+from edge_depth_nerf import config
+from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
+from edge_depth_nerf.errors import InputError
+
+ROOT = Path(__file__).parents[1]
+DECLARED = config.read_method_file()
+
+
+def lookup(node, dotted):
+    for part in dotted.split("."):
+        node = node[part] if isinstance(node, dict) else getattr(node, part)
+    return node
+
+
+def test_entry_points_and_declarations_name_the_same_methods():
+    points = {p.name: p for p in entry_points(group="nerfstudio.method_configs") if "edge_depth_nerf" in p.value}
+    assert set(points) == set(DECLARED["methods"])
+    for name, point in points.items():
+        specification = point.load()
+        assert isinstance(specification, MethodSpecification)
+        assert specification.config.method_name == name
+        assert specification.description == DECLARED["methods"][name]["description"]
+        assert all_methods[name] is specification.config
+
+
+@pytest.mark.parametrize("name", DECLARED["methods"])
+def test_configurations_hold_what_the_file_says(name):
+    method = all_methods[name]
+    overrides = DECLARED["presets"][DECLARED["methods"][name]["preset"]]
+    constants = {key: entry["value"] for key, entry in DECLARED["constants"].items()}
+    for dotted, value in {**constants, **overrides}.items():
+        found = lookup(method, dotted)
+        assert (list(found) if isinstance(found, tuple) else found) == value, dotted
+        assert type(found) is type(lookup(config.base_config(name), dotted)), dotted
+
+
+def test_constants_carry_their_source():
+    assert DECLARED["constants"]["pipeline.datamanager.alpha"]["value"] == 0.7
+    for entry in DECLARED["constants"].values():
+        assert "Eq." in entry["source"] or "Table" in entry["source"]
+
+
+def test_the_paper_preset_is_the_literal_form():
+    model, data = (getattr(all_methods["edge-depth-nerf-paper"].pipeline, part) for part in ("model", "datamanager"))
+    assert (model.edge_gaussian, model.edge_divide_by_norm, model.depth_loss_levels) == ("point", False, "final")
+    assert (data.sigma_mode, data.normalise, data.keep_returns, data.range_guide) == ("image", "pooled", False, "mono")
+    assert (data.alpha, data.kernel_size, data.sigma_space, data.sigma_depth) == (0.7, 9, 3.0, 1.0)
+
+
+def test_the_viewer_of_a_training_listens_on_this_machine_only():
+    assert all(all_methods[name].viewer.websocket_host == "127.0.0.1" for name in DECLARED["methods"])
+
+
+def test_the_dataparser_is_registered():
+    assert isinstance(all_dataparsers["fisheye-depth-data"], FisheyeDepthDataParserConfig)
+
+
+def test_all_that_is_wrong_is_said_in_one_error():
+    base = config.base_config("x")
+    with pytest.raises(InputError) as error:
+        config.apply_overrides(
+            base,
+            {
+                "pipeline.model.num_level": 3,
+                "pipeline.datamanager.alpha": "much",
+                "optimizers.field.optimizer.lr": 0.1,
+                "steps_per_save": 10,
+            },
+            "here",
+        )
+    message = str(error.value)
+    assert message.startswith("here: ")
+    assert "did you mean 'num_levels'" in message
+    assert "alpha: expected float, found 'much'" in message
+    assert "did you mean 'fields'" in message
+    assert "steps_per_save" not in message
+
+
+def test_an_unknown_preset_is_named():
+    declared = deepcopy(DECLARED)
+    declared["methods"]["edge-depth-nerf"]["preset"] = "huge"
+    with pytest.raises(InputError, match="'huge'; there are full, lite, paper"):
+        config.make_specifications(declared)
+
+
+def test_methods_share_no_state():
+    specifications = config.make_specifications(DECLARED)
+    specifications["edge-depth-nerf"].config.pipeline.model.proposal_net_args_list[0]["max_res"] = -1
+    assert specifications["edge-depth-nerf-lite"].config.pipeline.model.proposal_net_args_list[0]["max_res"] == 128
+
+
+def test_the_file_at_the_top_is_the_shipped_one():
+    shipped = ROOT / "edge_depth_nerf" / config.METHOD_FILE
+    assert (ROOT / "nerfstudio_method.toml").read_text() == shipped.read_text()
+
+
+def test_the_command_line_imports_nothing_heavy():
+    code = (
+        "import sys, edge_depth_nerf.cli; "
+        "heavy = {'torch', 'cv2', 'trimesh', 'nerfstudio', 'scipy'} & set(sys.modules); "
+        "sys.exit(', '.join(sorted(heavy)) or 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

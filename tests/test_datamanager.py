@@ -1,0 +1,142 @@
+import numpy as np
+import pytest
+import torch
+from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager
+from scenes import fisheye, pinhole, write_scene
+
+from edge_depth_nerf import datamanager as datamanager_module
+from edge_depth_nerf.datamanager import FisheyeDepthDataManagerConfig
+from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.prior import make_prior
+
+
+def manager(folder, test_mode="val", parser=None, **options):
+    parser = FisheyeDepthDataParserConfig(data=folder, **(parser or {}))
+    return FisheyeDepthDataManagerConfig(dataparser=parser, **options).setup(test_mode=test_mode)
+
+
+def test_a_batch_carries_colour_prior_and_rays_of_its_pixels(tmp_path):
+    data = manager(write_scene(tmp_path), train_num_rays_per_batch=500)
+    rays, batch = data.next_train(0)
+    dataset = data.train_dataset
+    options = data.config.prior_options(True, True)
+    assert options.depth_source == "integrated"
+    priors = [
+        make_prior(dataset.lidar_distance_m(i), dataset.mono_distance_m(i), dataset.mask(i), options)
+        for i in range(len(dataset))
+    ]
+    picture, row, column = batch["indices"].T
+    assert len(set(picture.tolist())) == len(dataset)
+    for n in range(len(picture)):
+        i, r, c = int(picture[n]), int(row[n]), int(column[n])
+        assert dataset.mask(i)[r, c]
+        assert abs(batch["prior_distance_m"][n].item() - priors[i].distance_m[r, c]) <= 1 / 512 + 1e-6
+        assert abs(batch["prior_sigma_m"][n].item() - priors[i].sigma_m[r, c]) <= 1 / 512 + 1e-6
+        assert torch.equal((batch["image"][n] * 255).round().to(torch.uint8), torch.from_numpy(dataset.rgb(i)[r, c]))
+    # the rays of nerfstudio's camera are those of our lens, turned by the pose
+    directions, _ = fisheye().unproject(torch.stack([column + 0.5, row + 0.5], dim=-1).double())
+    poses = dataset.cameras.camera_to_worlds[picture].double()
+    in_world = (poses[:, :, :3] @ (directions * torch.tensor([1.0, -1.0, -1.0]))[..., None])[..., 0]
+    assert torch.allclose(rays.directions.double(), in_world, atol=1e-5)
+    assert torch.isfinite(rays.directions).all()
+
+
+def test_held_out_maps_are_in_no_training_prior(tmp_path):
+    """The prior of every training frame is made from its own files alone; held-out sweeps are not even opened."""
+    scene = write_scene(tmp_path)
+    (scene / "lidar" / "0004.png").write_bytes(b"not a picture")
+    data = manager(scene, eval_num_rays_per_batch=7)
+    assert "0004.png" not in [path.name for path in data.train_dataset.image_filenames]
+    rays, batch = data.next_eval(0)
+    assert len(rays) == 7
+    assert (batch["prior_distance_m"] == 0).all()
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        dict(frames=1),
+        dict(frames=1, mask=False),
+        dict(frames=5, mask=False),
+        dict(cameras=[fisheye(), fisheye(24, 36)]),
+        dict(cameras=[pinhole(), pinhole(20, 24)], mask=False),
+    ],
+    ids=["one picture", "one without mask", "no masks", "mixed sizes", "pinhole of mixed sizes"],
+)
+def test_scenes_that_break_the_host_sampler(tmp_path, scene):
+    data = manager(write_scene(tmp_path, **scene), train_num_rays_per_batch=256)
+    for step in range(3):
+        rays, batch = data.next_train(step)
+        assert torch.isfinite(rays.directions).all() and torch.isfinite(rays.origins).all()
+        for i, r, c in batch["indices"].tolist():
+            assert data.train_dataset.mask(i)[r, c]
+
+
+def test_the_host_sets_the_size_of_batches(tmp_path):
+    data = manager(write_scene(tmp_path))
+    assert isinstance(data, VanillaDataManager)
+    assert data.get_train_rays_per_batch() == 1024
+    data.train_pixel_sampler.num_rays_per_batch = 33  # as nerfstudio's exporter does
+    rays, batch = data.next_train(0)
+    assert len(rays) == 33 and len(batch["image"]) == 33
+    assert data.get_train_rays_per_batch() == 33
+
+
+def test_integration_happens_once(tmp_path, monkeypatch):
+    scene = write_scene(tmp_path)
+    manager(scene)
+    assert len(list((scene / ".cache" / "prior").glob("*.npz"))) == 8
+    monkeypatch.setattr("edge_depth_nerf.prior.make_prior", lambda *_: pytest.fail("integrated again"))
+    manager(scene)
+    with pytest.raises(pytest.fail.Exception):
+        manager(scene, alpha=0.5)
+
+
+def test_nothing_is_integrated_for_rendering(tmp_path, monkeypatch):
+    monkeypatch.setattr(datamanager_module, "PriorCache", lambda *_: pytest.fail("integrated"))
+    scene = write_scene(tmp_path)
+    data = manager(scene, test_mode="inference")
+    assert data.train_dataset[0]["image"].shape == (28, 32, 3)
+
+
+@pytest.mark.parametrize(
+    ("has", "source", "message"),
+    [
+        (dict(mono=False), "integrated", "no monocular distance maps.*--mono.*depth-source"),
+        (dict(mono=False), "mono", "no monocular"),
+        (dict(lidar=False), "lidar", "no LiDAR"),
+        (dict(lidar=False, mono=False), "integrated", "no LiDAR and no monocular"),
+    ],
+)
+def test_a_source_that_is_not_there(tmp_path, has, source, message):
+    with pytest.raises(InputError, match=message):
+        manager(write_scene(tmp_path, **has), depth_source=source)
+
+
+@pytest.mark.parametrize(
+    ("has", "source"), [(dict(mono=False), "lidar"), (dict(lidar=False), "mono"), (dict(), "integrated")]
+)
+def test_auto_takes_what_is_there(tmp_path, has, source):
+    data = manager(write_scene(tmp_path, **has))
+    assert data.config.prior_options("lidar" not in has, "mono" not in has).depth_source == source
+    assert (data.next_train(0)[1]["prior_distance_m"] > 0).any()
+
+
+def test_a_scene_without_depth_has_no_prior(tmp_path):
+    _, batch = manager(write_scene(tmp_path, lidar=False, mono=False)).next_train(0)
+    assert (batch["prior_distance_m"] == 0).all()
+
+
+def test_options_out_of_range(tmp_path):
+    with pytest.raises(InputError, match="alpha"):
+        manager(write_scene(tmp_path), alpha=1.4)
+
+
+def test_the_same_seed_gives_the_same_rays(tmp_path):
+    scene = write_scene(tmp_path)
+    drawn = []
+    for _ in range(2):
+        torch.manual_seed(7)
+        drawn.append(manager(scene).next_train(0)[1]["indices"])
+    assert np.array_equal(drawn[0], drawn[1])

@@ -1,0 +1,187 @@
+import json
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.cameras.cameras import CameraType
+from scenes import fisheye, pinhole, write_scene
+
+from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
+from edge_depth_nerf.dataset import FisheyeDepthDataset
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.files import read_json, write_distance_png, write_json, write_mask, write_png
+from edge_depth_nerf.scale import default_metres_per_unit
+
+
+def parse(folder, split="train", **options):
+    return FisheyeDepthDataParserConfig(data=folder, **options).setup().get_dataparser_outputs(split)
+
+
+def edit(folder, change):
+    meta = read_json(folder / "transforms.json")
+    change(meta)
+    write_json(folder / "transforms.json", meta)
+
+
+def test_positions_are_metres_over_metres_per_unit(tmp_path):
+    scene = write_scene(tmp_path)
+    meta = read_json(scene / "transforms.json")
+    outputs = parse(scene, metres_per_unit=20.0, center_method="none")
+    expected = [f["transform_matrix"] for f in meta["frames"] if f["file_path"] in meta["train_filenames"]]
+    expected = np.array(expected)[:, :3]
+    expected[:, :, 3] /= 20
+    assert np.allclose(outputs.cameras.camera_to_worlds, expected, atol=1e-6)
+    assert outputs.metadata["metres_per_unit"] == 20
+    assert outputs.dataparser_scale == pytest.approx(1 / 20)
+    assert len(parse(scene, "test").image_filenames) == 1
+
+
+def test_the_default_scale_says_metres():
+    line = np.array([[0.0, 0, 0], [60, 3, 0]])
+    assert default_metres_per_unit(line, 2048) == 30  # half of 60 m
+    assert default_metres_per_unit(line / 10, 2048) == 10  # never under 10 m
+    assert default_metres_per_unit(line * 10, 2048) == 128  # 4 · 128 / 2048 = 0.25 m, the coarsest cell allowed
+    assert default_metres_per_unit(line * 10, 512) == 32
+    assert default_metres_per_unit(line * 10, 64) == 10
+
+
+def test_maps_follow_the_pictures(tmp_path):
+    outputs = parse(write_scene(tmp_path), "train")
+    names = [path.name for path in outputs.image_filenames]
+    assert names == [f"{i:04d}.png" for i in (0, 1, 2, 3, 5, 6, 7, 8)]
+    for key in ("lidar_filenames", "mono_filenames", "truth_distance_filenames", "truth_rgb_filenames"):
+        assert [path.name for path in outputs.metadata[key]] == names
+
+
+@pytest.mark.parametrize("camera", [fisheye(), pinhole()])
+def test_lenses_keep_their_kind(tmp_path, camera):
+    scene = write_scene(tmp_path, [camera])
+    outputs = parse(scene)
+    kind = CameraType.FISHEYE if camera.model == "KANNALA_BRANDT" else CameraType.PERSPECTIVE
+    assert (outputs.cameras.camera_type == kind.value).all()
+    dataset = FisheyeDepthDataset(outputs)
+    ours, _ = dataset.camera(0).unproject(camera.pixel_centres())
+    original, valid = camera.unproject(camera.pixel_centres())
+    assert torch.allclose(ours[valid], original[valid], atol=1e-6)
+
+
+def test_a_plain_nerfstudio_scene_counts_as_lidar_and_z_becomes_distance(tmp_path):
+    """nerfstudio's own scenes: millimetres of z-depth under depth_file_path."""
+    camera = pinhole()
+    scene = write_scene(tmp_path, [camera], lidar=False, mono=False, truth=False)
+    z_depth_m = 2.0
+
+    def add_depth(meta):
+        del meta["depth_unit_scale_factor"]
+        for frame in meta["frames"]:
+            name = frame["file_path"].replace("images", "depth")
+            write_png(scene / name, np.full((camera.height, camera.width), 1000 * z_depth_m, np.uint16))
+            frame["depth_file_path"] = name
+
+    edit(scene, add_depth)
+    dataset = FisheyeDepthDataset(parse(scene))
+    distance = dataset.lidar_distance_m(0)
+    directions, _ = camera.unproject(camera.pixel_centres())
+    assert distance is not None
+    assert np.allclose(distance, z_depth_m / directions[..., 2].numpy(), rtol=1e-5)
+    assert distance.max() > 1.2 * z_depth_m  # the corner's ray is longer
+    taken_as_distance = FisheyeDepthDataset(parse(scene, depth_kind="distance")).lidar_distance_m(0)
+    assert np.allclose(taken_as_distance, z_depth_m)
+
+
+def test_the_mask_ends_where_the_lens_does(tmp_path):
+    """Without any mask file, rays beyond theta_max are not valid."""
+    scene = write_scene(tmp_path, mask=False, theta_max_deg=60.0)
+    outputs = parse(scene)
+    assert outputs.mask_filenames is None
+    dataset = FisheyeDepthDataset(outputs)
+    directions, known = fisheye().unproject(fisheye().pixel_centres())
+    theta_deg = np.degrees(np.arccos(np.clip(torch.nan_to_num(directions[..., 2]).numpy(), -1, 1)))
+    mask = dataset[0]["mask"][..., 0].numpy()
+    assert np.array_equal(mask, known.numpy() & (theta_deg <= 60))
+    assert 0 < mask.sum() < mask.size
+
+
+def test_the_scene_mask_is_within_the_lens(tmp_path):
+    dataset = FisheyeDepthDataset(parse(write_scene(tmp_path, theta_max_deg=60.0)))
+    mask = dataset.mask(0)
+    assert not mask[-5:].any()
+    assert np.array_equal(mask[:-5], dataset.valid_rays(0)[:-5])
+
+
+def test_an_item_judges(tmp_path):
+    item = FisheyeDepthDataset(parse(write_scene(tmp_path), "test"))[0]
+    height, width = fisheye().height, fisheye().width
+    assert {key: tuple(value.shape) for key, value in item.items() if key != "image_idx"} == {
+        "image": (height, width, 3),
+        "mask": (height, width, 1),
+        "lidar_distance_m": (height, width, 1),
+        "truth_distance_m": (height, width, 1),
+        "truth_rgb": (height, width, 3),
+    }
+    returns = item["lidar_distance_m"] > 0
+    assert torch.allclose(item["lidar_distance_m"][returns], item["truth_distance_m"][returns])
+
+
+@pytest.mark.parametrize("what", ["images", "lidar", "masks", "mono", "truth/distance"])
+def test_another_size_is_named(tmp_path, what):
+    scene = write_scene(tmp_path)
+    target = next((scene / what).iterdir())
+    if what == "masks":
+        write_mask(target, np.ones((9, 9), bool))
+    elif what == "images":
+        write_png(target.with_name("0000.png"), np.zeros((9, 9, 3), np.uint8))
+    else:
+        write_distance_png(target.with_name("0000.png"), np.ones((9, 9)))
+    dataset = FisheyeDepthDataset(parse(scene))
+    with pytest.raises(InputError, match=r"9×9.*32×28"):
+        dataset[0]
+        dataset.mono_distance_m(0)
+
+
+def test_no_scene(tmp_path):
+    with pytest.raises(FileNotFoundError, match="edge-depth-nerf process"):
+        parse(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda meta: meta.update(camera_model="MEI"), "camera_model is 'MEI'.*OPENCV_FISHEYE"),
+        (lambda meta: meta.update(frames=[]), "no list of frames"),
+        (lambda meta: meta["frames"][2].pop("transform_matrix"), "frame 2 has no transform_matrix"),
+        (lambda meta: meta["frames"][3].update(transform_matrix=[[1, 2], [3, 4]]), r"frame 3 .*4×4.*\(2, 2\)"),
+        (lambda meta: meta["frames"][1].pop("mono_file_path"), "mono_file_path is given for 8 of 9.*0001.png"),
+    ],
+)
+def test_bad_scenes(tmp_path, change, message):
+    scene = write_scene(tmp_path)
+    edit(scene, change)
+    with pytest.raises(InputError, match=message):
+        parse(scene)
+
+
+def test_a_missing_map_is_named_before_training(tmp_path):
+    scene = write_scene(tmp_path)
+    (scene / "lidar" / "0003.png").unlink()
+    with pytest.raises(FileNotFoundError, match=r"lidar.0003\.png"):
+        parse(scene)
+
+
+def test_broken_json_is_named(tmp_path):
+    scene = write_scene(tmp_path)
+    (scene / "transforms.json").write_text(json.dumps(read_json(scene / "transforms.json"))[:-40])
+    with pytest.raises(InputError, match=r"transforms\.json"):
+        parse(scene)
+
+
+@pytest.mark.parametrize("value", [0.0, -3.0, float("nan")])
+def test_the_scale_must_be_positive(tmp_path, value):
+    with pytest.raises(InputError, match="metres_per_unit"):
+        parse(write_scene(tmp_path), metres_per_unit=value)
+
+
+def test_k4_is_read(tmp_path):
+    scene = write_scene(tmp_path)
+    edit(scene, lambda meta: [frame.update(k4=0.0123) for frame in meta["frames"]])
+    assert FisheyeDepthDataset(parse(scene)).camera(0).to_dict()["k4"] == pytest.approx(0.0123)
