@@ -252,16 +252,16 @@ def test_pinhole_ends_below_90_degrees() -> None:
 def test_radius_max_is_where_the_jacobian_stops_being_positive(distortion: Distortion) -> None:
     radius_max = distortion.radius_max
     assert math.isfinite(radius_max)
-    directions = rays(math.pi / 2, 720)[0, :, :2]
+    directions = rays(math.pi / 2, 180)[0, :, :2]
 
     def smallest_eigenvalue(radius: float) -> float:
         jacobian = torch.func.vmap(torch.func.jacrev(distortion.distort))(radius * directions)
         assert torch.allclose(jacobian, jacobian.mT)
         return float(torch.linalg.eigvalsh(jacobian).min())
 
-    for share in (0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.99, 0.999):
+    for share in (0.0, 0.5, 0.8, 0.99, 0.999):
         assert smallest_eigenvalue(share * radius_max) > 0
-    assert smallest_eigenvalue(radius_max) == pytest.approx(0.0, abs=1e-4)
+    assert smallest_eigenvalue(radius_max) == pytest.approx(0.0, abs=1e-3)
     assert smallest_eigenvalue(1.01 * radius_max) < 0
 
 
@@ -430,9 +430,9 @@ def test_gradients_are_finite_on_the_rim_itself(dtype: torch.dtype) -> None:
 
 @each_camera
 def test_derivatives_forward_reverse_and_numerical_agree(camera: Camera) -> None:
-    theta = torch.tensor([0.0, 1e-4, 0.3, 0.7, 0.9], dtype=torch.float64) * camera.theta_max_rad
+    theta = torch.tensor([0.0, 1e-4, 0.4, 0.9], dtype=torch.float64) * camera.theta_max_rad
     right = torch.tensor([math.pi / 2]) if camera.theta_max_rad > 1.6 else torch.tensor([])
-    points = rays(torch.cat((theta, right)), 5).reshape(-1, 3) * 3.0
+    points = rays(torch.cat((theta, right)), 3).reshape(-1, 3) * 3.0
     points = torch.cat((points, torch.tensor([[0.0, 0.0, 0.5]], dtype=torch.float64))).requires_grad_()
     torch.autograd.gradcheck(lambda p: camera.project(p)[0], points, eps=1e-7, rtol=1e-4, check_forward_ad=True)
 

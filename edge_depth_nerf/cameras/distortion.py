@@ -102,7 +102,7 @@ class Distortion:
         plane = self._radial_guess(target, length, radius_max)
         residual = self.distort(plane) - target
         share = torch.ones_like(length)
-        active = self._error(residual) > eps * self._magnitude(plane)
+        active = residual.norm(dim=-1) > eps * self._magnitude(plane)
         if math.isfinite(radius_max):
             # what lies beyond the image of the rim has no solution; the bound is exact for p = 0
             reach = radius_max * float(self._scale(torch.tensor(radius_max**2, dtype=torch.float64)))
@@ -117,13 +117,13 @@ class Distortion:
             new = here - share[index] * step
             new = new * (radius_max / new.norm(dim=-1, keepdim=True).clamp_min(eps)).clamp_max(1.0)
             new_residual = self.distort(new) - there
-            better = (self._error(new_residual) < self._error(old))[:, None]
+            better = (new_residual.norm(dim=-1) < old.norm(dim=-1))[:, None]
             plane[index] = torch.where(better, new, here)
             residual[index] = torch.where(better, new_residual, old)
             share[index] = torch.where(better, (2.0 * share[index]).clamp_max(1.0), 0.25 * share[index])
-            unsolved = self._error(residual[index]) > eps * self._magnitude(plane[index])
+            unsolved = residual[index].norm(dim=-1) > eps * self._magnitude(plane[index])
             index = index[unsolved & (share[index].squeeze(-1) >= _SHORTEST_STEP)]
-        valid = self._error(residual) <= _ROUNDING * eps * self._magnitude(plane) + tolerance
+        valid = residual.norm(dim=-1) <= _ROUNDING * eps * self._magnitude(plane) + tolerance
         return plane, valid
 
     def _radial_guess(self, target: Tensor, length: Tensor, radius_max: float) -> Tensor:
@@ -162,10 +162,6 @@ class Distortion:
         square = (plane * plane).sum(-1)
         scale = Distortion(tuple(abs(k) for k in self.radial))._scale(square)
         return square.sqrt() * scale + 3.0 * math.hypot(self.p1, self.p2) * square
-
-    @staticmethod
-    def _error(residual: Tensor) -> Tensor:
-        return residual.norm(dim=-1)
 
     def _inverse_jacobian(self, plane: Tensor) -> Tensor:
         x, y = plane.unbind(-1)

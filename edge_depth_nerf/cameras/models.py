@@ -31,7 +31,12 @@ AnyCamera = TypeVar("AnyCamera", bound="Camera")
 
 @dataclass(frozen=True)
 class Camera(ABC):
-    """What the models share: a map from rays to a plane, the plane's distortion, and the pixel grid."""
+    """What the models share: a map from rays to a plane, the plane's distortion, and the pixel grid.
+
+    Raises:
+        InputError: a parameter is not finite or out of its range.
+
+    """
 
     model: ClassVar[str]
     """The model's name in files."""
