@@ -1,0 +1,243 @@
+"""KITTI-360's calibration, poses and timestamps, as its files write them.
+
+Frames: cameras (x right, y down, z forward), velodyne (x forward, y left, z up), pose = the vehicle (x forward,
+y right, z down), world (z up). Transforms are 4×4, metres, named a_to_b. All of it is of the unrectified cameras.
+Each error names the file and the line.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from edge_depth_nerf.cameras import MEI
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.process.transforms import Transform, check_rigid
+
+_MEI_FIELDS = {
+    "mirror_parameters": ("xi",),
+    "distortion_parameters": ("k1", "k2", "p1", "p2"),
+    "projection_parameters": ("gamma1", "gamma2", "u0", "v0"),
+}
+_DOWNLOAD = "Copy the file again from the data set."
+
+
+@dataclass(frozen=True)
+class Kitti360Rig:
+    """Where the cameras and the scanner sit on the vehicle."""
+
+    cameras: dict[str, MEI]
+    """The fisheye cameras at their full size."""
+    camera_to_pose: dict[str, Transform]
+    """From each camera's frame to the vehicle's."""
+    velo_to_pose: Transform
+    """From the scanner's frame to the vehicle's."""
+
+
+def read_rig(calibration: Path, cameras: tuple[str, ...]) -> Kitti360Rig:
+    """Read what the folder `calibration` says of the scanner and some fisheye cameras.
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        InputError: a file is truncated or holds something else.
+
+    """
+    pose_file = calibration / "calib_cam_to_pose.txt"
+    camera_to_pose = read_cam_to_pose(pose_file)
+    for name in ("image_00", *cameras):
+        if name not in camera_to_pose:
+            raise InputError(
+                f"{pose_file}: has no line for {name}, only for {', '.join(camera_to_pose) or 'nothing'}. {_DOWNLOAD}"
+            )
+    cam0_to_velo = read_cam_to_velo(calibration / "calib_cam_to_velo.txt")
+    return Kitti360Rig(
+        cameras={name: read_mei_camera(calibration / f"{name}.yaml") for name in cameras},
+        camera_to_pose={name: camera_to_pose[name] for name in cameras},
+        velo_to_pose=camera_to_pose["image_00"] @ np.linalg.inv(cam0_to_velo),
+    )
+
+
+def read_mei_camera(path: Path) -> MEI:
+    """Read image_02.yaml or image_03.yaml: OpenCV's dialect of YAML, a MEI camera with integer pixel centres.
+
+    Returns:
+        The camera with pixel centres at +0.5: cx = u0 + 0.5.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: broken, truncated, or another camera model.
+
+    """
+    lines = len(_read_text(path).splitlines())
+    try:
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    except (cv2.error, SystemError) as error:
+        # the binding wraps OpenCV's error, which ends in "file.yaml(17): what is wrong'"
+        found = re.search(r"\((\d+)\): ([^'\n]*'?[^'\n]*'?)'\s*$", str(error.__cause__ or error))
+        where = f"{path}, line {found[1]}: {found[2]}" if found else f"{path}: nothing in it"
+        raise InputError(f"{where}; expected OpenCV's YAML with a MEI camera. {_DOWNLOAD}") from error
+
+    def node(*keys: str) -> cv2.FileNode:
+        found = storage.root()
+        for key in keys:
+            found = found.getNode(key) if found.isMap() else cv2.FileNode()
+        if found.isNone() or found.empty():
+            raise InputError(
+                f"{path}: ends after line {lines} without {'.'.join(keys)}; expected a MEI camera's parameters. "
+                f"The file is truncated or of another camera. {_DOWNLOAD}"
+            )
+        return found
+
+    def number(*keys: str) -> float:
+        found = node(*keys)
+        if not (found.isReal() or found.isInt()):
+            raise InputError(f"{path}, line {_line_of(path, keys[-1])}: {'.'.join(keys)} is not a number. {_DOWNLOAD}")
+        return found.real()
+
+    model = node("model_type")
+    if not model.isString() or model.string() != "MEI":
+        raise InputError(
+            f"{path}, line {_line_of(path, 'model_type')}: model_type is not MEI. Only KITTI-360's fisheye cameras "
+            "image_02 and image_03 can be read."
+        )
+    xi, k1, k2, p1, p2, gamma1, gamma2, u0, v0 = (
+        number(group, key) for group, keys in _MEI_FIELDS.items() for key in keys
+    )
+    width, height = number("image_width"), number("image_height")
+    for key, centre, size in (("u0", u0, width), ("v0", v0, height)):
+        # a number that lost its last digits, or its exponent, is still a number
+        if not 0.25 * size <= centre <= 0.75 * size:
+            raise InputError(
+                f"{path}, line {_line_of(path, key)}: {key} is {centre:g}, which is not in the middle half of a "
+                f"picture of {size:g} pixels. The file is truncated or of another camera. {_DOWNLOAD}"
+            )
+    try:
+        # KITTI-360 counts integer pixel centres
+        return MEI(int(width), int(height), gamma1, gamma2, u0 + 0.5, v0 + 0.5, xi, k1, k2, p1, p2)
+    except InputError as error:
+        raise InputError(f"{path}: {error} {_DOWNLOAD}") from None
+
+
+def read_cam_to_pose(path: Path) -> dict[str, Transform]:
+    """Read calib_cam_to_pose.txt: a line "image_00: r11 r12 r13 t1 …" for each camera.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: a line is not a name and 12 numbers that are a rotation and a translation.
+
+    """
+    transforms = {}
+    for number, line in _lines(path):
+        name, colon, rest = line.partition(":")
+        if not colon:
+            raise InputError(f"{path}, line {number}: expected 'image_00: ' and 12 numbers. {_DOWNLOAD}")
+        transforms[name.strip()] = _transform(rest, path, number)
+    return transforms
+
+
+def read_cam_to_velo(path: Path) -> Transform:
+    """Read calib_cam_to_velo.txt: one line of 12 numbers, unrectified camera 0 to the scanner.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: not one line of 12 numbers that are a rotation and a translation.
+
+    """
+    lines = list(_lines(path))
+    if len(lines) != 1:
+        raise InputError(f"{path}: {len(lines)} lines with text, expected one with 12 numbers. {_DOWNLOAD}")
+    return _transform(lines[0][1], path, lines[0][0])
+
+
+def read_poses(path: Path) -> dict[int, Transform]:
+    """Read poses.txt: lines "frame r11 r12 r13 t1 …", the vehicle's pose in the world; not every frame has one.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: a line is not a frame and 12 numbers, or a frame has two poses.
+
+    """
+    poses: dict[int, Transform] = {}
+    for number, line in _lines(path):
+        first, _, rest = line.strip().partition(" ")
+        frame = _number(first, path, number)
+        if frame != int(frame) or frame < 0:
+            raise InputError(f"{path}, line {number}: {first!r} is not the number of a frame. {_DOWNLOAD}")
+        if int(frame) in poses:
+            raise InputError(f"{path}, line {number}: frame {int(frame)} has a pose already. {_DOWNLOAD}")
+        poses[int(frame)] = _transform(rest, path, number)
+    if not poses:
+        raise InputError(f"{path}: no poses in it. {_DOWNLOAD}")
+    return poses
+
+
+def read_timestamps(path: Path) -> list[float]:
+    """Read timestamps.txt: line i holds "2013-05-28 08:46:02.123456789" for frame i.
+
+    Returns:
+        Seconds since 1970, the times read as UTC; to some 0.2 µs.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: a line is not a time.
+
+    """
+    times = []
+    for number, line in _lines(path):
+        # datetime stops at microseconds
+        whole, _, fraction = line.strip().partition(".")
+        try:
+            moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc)
+            times.append(moment.timestamp() + float(f"0.{fraction or 0}"))
+        except ValueError:
+            raise InputError(
+                f"{path}, line {number}: {line.strip()!r} is not a time like 2013-05-28 08:46:02.123456789. {_DOWNLOAD}"
+            ) from None
+    return times
+
+
+def _read_text(path: Path) -> str:
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file. It is part of the data set's calibration, poses or timestamps.")
+    try:
+        return path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not a text file ({error}). {_DOWNLOAD}") from error
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Lines with something in them, counted from 1."""
+    return ((number, line) for number, line in enumerate(_read_text(path).splitlines(), 1) if line.strip())
+
+
+def _line_of(path: Path, key: str) -> int:
+    return next((number for number, line in _lines(path) if line.strip().startswith(key)), 0)
+
+
+def _number(text: str, path: Path, line: int) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise InputError(f"{path}, line {line}: {text!r} is not a finite number. {_DOWNLOAD}")
+    return value
+
+
+def _transform(text: str, path: Path, line: int) -> Transform:
+    numbers = [_number(word, path, line) for word in text.split()]
+    if len(numbers) != 12:
+        raise InputError(
+            f"{path}, line {line}: {len(numbers)} numbers, expected 12 (the 3×4 matrix of rotation and translation, "
+            f"row by row). {_DOWNLOAD}"
+        )
+    transform = np.eye(4)
+    transform[:3] = np.reshape(numbers, (3, 4))
+    check_rigid(transform, f"{path}, line {line}")
+    return transform

@@ -1,0 +1,852 @@
+"""From a raw drive to a scene: geometry against closed forms, KITTI-360's files, and everything that can be wrong."""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from drives import (
+    CAM0_TO_VELO,
+    CAM_TO_POSE,
+    ROOM,
+    SEQUENCE,
+    RoomDrive,
+    aimed_points,
+    matrix,
+    pose,
+    wall_distance,
+    write_masks,
+    write_points,
+    write_room_drive,
+)
+from rich.console import Console
+from test_scene import read_ply, tree
+
+from edge_depth_nerf.cameras import MEI, KannalaBrandt, camera_from_dict, fit_kannala_brandt
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.files import (
+    read_distance_png,
+    read_image,
+    read_json,
+    read_mask,
+    write_distance_png,
+    write_json,
+    write_mask,
+    write_png,
+)
+from edge_depth_nerf.process import scene as scene_module
+from edge_depth_nerf.process.kitti360 import process_kitti360
+from edge_depth_nerf.process.kitti360_calibration import (
+    read_cam_to_pose,
+    read_cam_to_velo,
+    read_mei_camera,
+    read_poses,
+    read_rig,
+    read_timestamps,
+)
+from edge_depth_nerf.process.options import Kitti360Options
+from edge_depth_nerf.process.scene import ProcessReport, Skipped
+from edge_depth_nerf.process.transforms import opencv_to_opengl
+
+CAMERAS = ("image_02", "image_03")
+STEP_M = 1 / 256
+_FIT_ONCE = functools.cache(fit_kannala_brandt)
+
+
+@pytest.fixture(autouse=True)
+def fit_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scene_module, "fit_kannala_brandt", _FIT_ONCE)
+
+
+def process(drive: RoomDrive | Path, output: Path, **options: Any) -> ProcessReport:
+    root = drive if isinstance(drive, Path) else drive.root
+    console = options.pop("console", Console(quiet=True))
+    return process_kitti360(
+        Kitti360Options(**{"root": root, "sequence": SEQUENCE, "output": output} | options), console
+    )
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> RoomDrive:
+    """A drive with all there is; not to be changed."""
+    return write_room_drive(tmp_path_factory.mktemp("room") / "drive", truth=True)
+
+
+@pytest.fixture(scope="module")
+def scene(room: RoomDrive) -> Path:
+    """The scene of it; not to be changed."""
+    output = room.root.parent / "scene"
+    process(room, output, ego_mask=write_masks(room.root.parent / "masks", room))
+    return output
+
+
+@pytest.fixture
+def drive(tmp_path: Path) -> RoomDrive:
+    """A small drive that a test may break."""
+    return write_room_drive(tmp_path / "drive", frames=3, beams=300, size=32)
+
+
+def maps(scene: Path, key: str) -> dict[tuple[str, int], np.ndarray]:
+    frames = read_json(scene / "transforms.json")["frames"]
+    return {(f["camera"], f["frame"]): read_distance_png(scene / f[key]) for f in frames}
+
+
+def scene_camera(frame: dict[str, Any]) -> KannalaBrandt:
+    keys = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")
+    return KannalaBrandt(frame["w"], frame["h"], *(frame[key] for key in keys))
+
+
+# ---- geometry --------------------------------------------------------------------------------------------------
+
+
+def test_lidar_is_at_the_walls_of_the_room(room: RoomDrive, scene: Path) -> None:
+    found = maps(scene, "lidar_file_path")
+    assert set(found) == {(name, frame) for name in CAMERAS for frame in room.frames}
+    samples = np.stack(np.meshgrid(*[np.linspace(-0.5, 0.5, 5)] * 2), -1).reshape(-1, 2)
+    for (name, frame), lidar in found.items():
+        rows, columns = np.nonzero(lidar)
+        assert len(rows) > 300
+        # integer pixel centres: the pixel in column c covers u from c - 0.5 to c + 0.5
+        pixels = np.stack((columns, rows), -1)[:, None] + samples
+        distance, _, _ = room.see(name, frame, pixels)
+        slack = 0.02 * distance.max(1)
+        hits = lidar[rows, columns]
+        assert (hits >= distance.min(1) - slack - STEP_M).all()
+        assert (hits <= distance.max(1) + slack + STEP_M).all()
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_returns_aimed_at_pixels_land_in_them(tmp_path: Path, camera: str) -> None:
+    """Half a pixel of error, in either direction, would move half of them to a neighbour."""
+    drive = write_room_drive(tmp_path / "drive", frames=2, aim=camera)
+    process(drive, tmp_path / "scene")
+    mask = read_mask(tmp_path / f"scene/masks/{camera}.png")
+    rng = np.random.default_rng(0)
+    for frame in drive.frames:
+        _, pixels, distance = aimed_points(drive, camera, frame, rng)
+        expected = np.zeros((drive.size, drive.size))
+        expected[pixels[:, 1], pixels[:, 0]] = distance
+        found = maps(tmp_path / "scene", "lidar_file_path")[camera, frame]
+        assert np.count_nonzero(expected) > 400
+        # float32 of the sweep and steps of the PNG
+        np.testing.assert_allclose(found, np.where(mask, expected, 0), atol=STEP_M / 2 + 1e-4)
+
+
+def test_fitted_camera_and_opengl_pose_put_points_where_the_raw_chain_does(room: RoomDrive, scene: Path) -> None:
+    meta = read_json(scene / "transforms.json")
+    rng = np.random.default_rng(1)
+    walls = rng.uniform(ROOM[0], ROOM[1], (2000, 3))
+    side = rng.integers(0, 2, 2000)
+    axis = rng.integers(0, 3, 2000)
+    walls[np.arange(2000), axis] = ROOM[side, axis]
+    for frame in meta["frames"]:
+        world_to_camera = np.linalg.inv(room.camera_to_world(frame["camera"], frame["frame"]))
+        raw = walls @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
+        seen = raw[:, 2] > np.cos(np.radians(94)) * np.linalg.norm(raw, axis=-1)
+        raw_pixels = room.camera(frame["camera"]).project(raw[seen]) + 0.5
+
+        world_to_opengl = np.linalg.inv(np.array(frame["transform_matrix"]))
+        opengl = (walls[seen] - meta["world_offset_m"]) @ world_to_opengl[:3, :3].T + world_to_opengl[:3, 3]
+        pixels, valid = scene_camera(frame).project(torch.from_numpy(opengl * (1.0, -1.0, -1.0)))
+        assert valid.all() and len(pixels) > 500
+        assert np.linalg.norm(pixels.numpy() - raw_pixels, axis=-1).max() < 0.02
+
+
+def test_nerfstudio_sees_the_walls_too(room: RoomDrive, scene: Path) -> None:
+    """nerfstudio's own rays through the scene's cameras, as long as the LiDAR says, end at the walls."""
+    from nerfstudio.cameras.cameras import Cameras, CameraType
+
+    meta = read_json(scene / "transforms.json")
+    for frame in (meta["frames"][2], meta["frames"][-1]):
+        keys = ("k1", "k2", "k3", "k4", "p1", "p2")
+        cameras = Cameras(
+            camera_to_worlds=torch.tensor(frame["transform_matrix"])[None, :3],
+            fx=torch.tensor([[frame["fl_x"]]]),
+            fy=torch.tensor([[frame["fl_y"]]]),
+            cx=torch.tensor([[frame["cx"]]]),
+            cy=torch.tensor([[frame["cy"]]]),
+            distortion_params=torch.tensor([[frame[key] for key in keys]]),
+            width=frame["w"],
+            height=frame["h"],
+            camera_type=CameraType.FISHEYE,
+        )
+        rays = cameras.generate_rays(camera_indices=0)
+        distance = read_distance_png(scene / frame["truth_distance_file_path"])
+        used = (distance > 0) & read_mask(scene / frame["mask_path"])
+        assert used.sum() > 2000
+        ends = (rays.origins + rays.directions * torch.from_numpy(distance)[..., None]).numpy()[used]
+        world = ends + np.array(meta["world_offset_m"])
+        to_wall = np.abs(world[:, None] - ROOM).min((1, 2))
+        assert to_wall.max() < 0.03
+
+
+def test_world_is_moved_near_the_cameras(room: RoomDrive, scene: Path) -> None:
+    meta = read_json(scene / "transforms.json")
+    centres = np.array([frame["transform_matrix"] for frame in meta["frames"]])[:, :3, 3]
+    assert np.abs(centres.mean(0)).max() <= 0.5
+    assert meta["world_offset_m"] == [round(value) for value in meta["world_offset_m"]]
+    for frame in meta["frames"]:
+        expected = room.camera_to_world(frame["camera"], frame["frame"])
+        expected[:3, 3] -= meta["world_offset_m"]
+        np.testing.assert_allclose(frame["transform_matrix"], opencv_to_opengl(expected), atol=1e-9)
+    # up stays up: the floor is below the cameras
+    assert (centres[:, 2] + meta["world_offset_m"][2] > ROOM[0, 2]).all()
+
+
+def test_cloud_lies_on_the_walls_in_their_colours(room: RoomDrive, scene: Path) -> None:
+    vertices, colours = read_ply(scene / "points.ply")
+    world = vertices + np.array(read_json(scene / "transforms.json")["world_offset_m"])
+    assert len(world) > 3000
+    assert np.abs(world[:, None] - ROOM).min((1, 2)).max() < 1e-3
+    middle = ROOM.mean(0)
+    rays = (world - middle) / np.linalg.norm(world - middle, axis=-1, keepdims=True)
+    expected = wall_distance(middle, rays)[1]
+    # pixels on an edge may have the neighbour's colour
+    assert (colours == expected).all(-1).mean() > 0.9
+
+
+def test_cloud_has_nothing_of_held_out_moments(tmp_path: Path, drive: RoomDrive) -> None:
+    # only the sweep of moment 1, held out of every 2, reaches beyond the room
+    far = drive.returns[1] * 3
+    write_points(drive.sweep(1), far)
+    process(drive, tmp_path / "scene", holdout_every=2)
+    meta = read_json(tmp_path / "scene/transforms.json")
+    assert {name[-14:-4] for name in meta["val_filenames"]} == {"0000000001"}
+    world = read_ply(tmp_path / "scene/points.ply")[0] + np.array(meta["world_offset_m"])
+    assert (world > ROOM[0] - 0.01).all() and (world < ROOM[1] + 0.01).all()
+    assert maps(tmp_path / "scene", "lidar_file_path")["image_02", 1].max() > 25
+
+
+# ---- what the scene holds --------------------------------------------------------------------------------------
+
+
+def test_frames_split_masks_and_truth(room: RoomDrive, scene: Path) -> None:
+    meta = read_json(scene / "transforms.json")
+    assert meta["camera_model"] == "OPENCV_FISHEYE"
+    assert meta["val_filenames"] == [f"images/{name}/0000000004.png" for name in CAMERAS]
+    assert len(meta["train_filenames"]) == 16
+    assert meta["source"]["sequence"] == SEQUENCE and meta["source"]["root"] == "drive"
+    for frame in meta["frames"]:
+        name, number = frame["camera"], frame["frame"]
+        assert frame["depth_file_path"] == frame["lidar_file_path"]
+        assert (scene / frame["file_path"]).read_bytes() == room.image(name, number).read_bytes()
+        assert frame["mask_path"] == f"masks/{name}.png"
+        truth = room.root / f"truth/{SEQUENCE}/{name}"
+        for key, kind in (("truth_distance_file_path", "distance"), ("truth_rgb_file_path", "rgb")):
+            assert (scene / frame[key]).read_bytes() == (truth / kind / f"{number:010d}.png").read_bytes()
+    # 0.123456789 s and one tenth a frame; 2013-05-28 08:46:00 UTC
+    times = [frame["timestamp_s"] for frame in meta["frames"][:3]]
+    np.testing.assert_allclose(times, [1369730760.023456789, 1369730760.123456789, 1369730760.223456789], atol=1e-6)
+    for name in CAMERAS:
+        mask = read_mask(scene / f"masks/{name}.png")
+        _, theta = room.camera(name).rays(room.grid())
+        lens = np.nan_to_num(theta, nan=np.inf) <= np.radians(95)
+        assert np.array_equal(mask[:56], lens[:56])
+        assert not mask[56:].any(), "the vehicle"
+        original = camera_from_dict(meta["original_cameras"][name], "here")
+        assert isinstance(original, MEI)
+        assert original.cx == pytest.approx(room.camera(name).u0 + 0.5, abs=1e-12)
+
+
+def test_shifted_views(room: RoomDrive, scene: Path) -> None:
+    meta = read_json(scene / "transforms.json")
+    assert set(meta["shifted_views"]) == {"1", "2"}
+    for metres, views in meta["shifted_views"].items():
+        assert [(view["camera"], view["frame"]) for view in views] == [(name, 4) for name in CAMERAS]
+        for view in views:
+            centre = np.array(view["transform_matrix"])[:3, 3] + meta["world_offset_m"]
+            path = room.camera_to_world(view["camera"], 4)[:3, 3]
+            assert np.linalg.norm(centre - path) == pytest.approx(float(metres))
+            distance = read_distance_png(scene / view["truth_distance_file_path"])
+            assert distance.shape == (70, 70) and distance.any()
+            assert read_image(scene / view["truth_rgb_file_path"]).shape == (70, 70, 3)
+
+
+def test_downscaled_scene_agrees_with_the_camera(room: RoomDrive, tmp_path: Path) -> None:
+    mono = room.root / "truth" / SEQUENCE
+    mono_folder = tmp_path / "mono"
+    for name in CAMERAS:
+        shutil.copytree(mono / name / "distance", mono_folder / name)
+    ego = write_masks(tmp_path / "masks", room)
+    process(room, tmp_path / "scene", downscale=4, mono=mono_folder, ego_mask=ego, frames=6)
+    meta = read_json(tmp_path / "scene/transforms.json")
+    samples = np.stack(np.meshgrid(*[np.linspace(-2, 2, 9)] * 2), -1).reshape(-1, 2)
+    for frame in meta["frames"]:
+        name, number = frame["camera"], frame["frame"]
+        # 70 = 17 · 4 + 2
+        assert (frame["w"], frame["h"]) == (17, 17)
+        image = read_image(tmp_path / "scene" / frame["file_path"])
+        raw = read_image(room.image(name, number)).astype(float)
+        np.testing.assert_allclose(image[3, 5], raw[12:16, 20:24].mean((0, 1)), atol=0.51)
+        mask = read_mask(tmp_path / "scene" / frame["mask_path"])
+        assert not mask[14:].any() and mask[5, 8]
+        # the block in row 3 covers raw rows 12 to 15, whose centres' mean is 13.5
+        rows, columns = np.nonzero(mask)
+        centres = np.stack((columns, rows), -1)[:, None] * 4 + 1.5
+        distance, _, _ = room.see(name, number, centres + samples)
+        at_centre, _, _ = room.see(name, number, centres[:, 0])
+        for key in ("mono_file_path", "truth_distance_file_path"):
+            small = read_distance_png(tmp_path / "scene" / frame[key])[mask]
+            # where the block lies on one wall, away from the lens's rim, the value is that of its centre
+            smooth = (distance.max(1) < 1.25 * distance.min(1)) & (small > 0)
+            assert smooth.sum() > 60
+            assert np.median(np.abs(small - at_centre)[smooth] / at_centre[smooth]) < 0.01
+            assert (small[smooth] >= distance.min(1)[smooth] - STEP_M).all()
+            assert (small[smooth] <= distance.max(1)[smooth] + STEP_M).all()
+        lidar = read_distance_png(tmp_path / "scene" / frame["lidar_file_path"])[mask]
+        hit = lidar > 0
+        assert hit.sum() > 60
+        assert (lidar[hit] >= 0.98 * distance.min(1)[hit] - STEP_M).all()
+        assert (lidar[hit] <= 1.02 * distance.max(1)[hit] + STEP_M).all()
+
+
+def test_frame_masks_and_mono(drive: RoomDrive, tmp_path: Path) -> None:
+    for name in CAMERAS:
+        for frame in drive.frames:
+            keep = np.ones((32, 32), bool)
+            keep[:, : 10 + frame] = False
+            write_mask(tmp_path / f"moving/{name}/{frame:010d}.png", keep)
+            write_distance_png(tmp_path / f"mono/{name}/{frame:010d}.png", np.full((32, 32), 3.0 + frame))
+    process(drive, tmp_path / "scene", frame_masks=tmp_path / "moving", mono=tmp_path / "mono")
+    for frame in read_json(tmp_path / "scene/transforms.json")["frames"]:
+        mask = read_mask(tmp_path / "scene" / frame["mask_path"])
+        assert not mask[:, : 10 + frame["frame"]].any() and mask[16, 14 + frame["frame"]]
+        assert not read_distance_png(tmp_path / "scene" / frame["lidar_file_path"])[~mask].any()
+        assert (read_distance_png(tmp_path / "scene" / frame["mono_file_path"]) == 3 + frame["frame"]).all()
+    world = read_ply(tmp_path / "scene/points.ply")[0]
+    assert 0 < len(world) < 3 * 600
+
+
+def test_one_ego_mask_for_both_cameras(drive: RoomDrive, tmp_path: Path) -> None:
+    keep = np.ones((32, 32), bool)
+    keep[20:] = False
+    write_mask(tmp_path / "ego.png", keep)
+    process(drive, tmp_path / "scene", ego_mask=tmp_path / "ego.png")
+    for name in CAMERAS:
+        assert not read_mask(tmp_path / f"scene/masks/{name}.png")[20:].any()
+
+
+def test_one_camera_alone(drive: RoomDrive, tmp_path: Path) -> None:
+    shutil.rmtree(drive.image("image_02", 0).parents[1])
+    report = process(drive, tmp_path / "scene", cameras=("image_03",))
+    assert (report.training, set(report.fits)) == (3, {"image_03"})
+    assert not (tmp_path / "scene/images/image_02").exists()
+
+
+def test_points_that_are_none_are_counted(drive: RoomDrive, tmp_path: Path) -> None:
+    points = drive.returns[1].copy()
+    points[:5], points[5:12] = np.nan, 0
+    write_points(drive.sweep(1), points)
+    report = process(drive, tmp_path / "scene")
+    # once a sweep, though both cameras read it
+    assert any(notice.startswith("5 LiDAR points left out of 3 sweeps: NaN") for notice in report.notices)
+    assert any(notice.startswith("7 LiDAR points left out of 3 sweeps: zero") for notice in report.notices)
+
+
+# ---- choosing frames -------------------------------------------------------------------------------------------
+
+
+def test_frames_without_pose_sweep_or_picture_are_listed_and_skipped(tmp_path: Path) -> None:
+    drive = write_room_drive(tmp_path / "drive", frames=12, beams=300, size=32)
+    lines = drive.poses_file().read_text().splitlines(keepends=True)
+    drive.poses_file().write_text("".join(lines[1:3] + lines[5:]))
+    drive.sweep(7).unlink()
+    drive.image("image_03", 9).unlink()
+    console = Console(record=True, width=300, file=open(os.devnull, "w"))
+    report = process(drive, tmp_path / "scene", console=console)
+    assert report.skipped == (
+        *(Skipped(frame, None, "no pose") for frame in (0, 3, 4)),
+        Skipped(7, None, "no sweep"),
+        Skipped(9, "image_03", "no picture"),
+    )
+    assert "Skipped no pose: 0, 3-4; no sweep: 7; no picture of image_03: 9" in console.export_text()
+    meta = read_json(tmp_path / "scene/transforms.json")
+    by_camera = {n: [f["frame"] for f in meta["frames"] if f["camera"] == n] for n in CAMERAS}
+    # moments in order: 1 2 5 6 8 9 10 11, of which the fifth, 8, is held out
+    assert by_camera == {"image_02": [1, 2, 5, 6, 8, 9, 10, 11], "image_03": [1, 2, 5, 6, 8, 10, 11]}
+    assert meta["val_filenames"] == [f"images/{name}/0000000008.png" for name in CAMERAS]
+    for frame in meta["frames"]:
+        expected = opencv_to_opengl(drive.camera_to_world(frame["camera"], frame["frame"]))
+        expected[:3, 3] -= meta["world_offset_m"]
+        np.testing.assert_allclose(frame["transform_matrix"], expected, atol=1e-9)
+
+
+def test_first_frames_and_stride(tmp_path: Path) -> None:
+    drive = write_room_drive(tmp_path / "drive", frames=12, beams=300, size=32, truth=True)
+    process(drive, tmp_path / "scene", first=2, frames=3, stride=4)
+    meta = read_json(tmp_path / "scene/transforms.json")
+    assert [frame["frame"] for frame in meta["frames"]] == [2, 6, 10, 2, 6, 10]
+    assert "shifted_views" not in meta, "those are of frame 4"
+    process(drive, tmp_path / "rest", first=3)
+    frames = read_json(tmp_path / "rest/transforms.json")["frames"]
+    assert [frame["frame"] for frame in frames[:9]] == list(range(3, 12))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"first": 3}, "--first 3: reaches frame 3, but the pictures .* are of frames 0 to 2"),
+        ({"frames": 4}, "--first 0 --frames 4 --stride 1: reaches frame 3.*leave out --frames"),
+        ({"frames": 2, "stride": 3}, "reaches frame 3"),
+        ({"first": -1}, "--first -1: expected"),
+        ({"frames": 0}, "--frames 0: expected 1 or more"),
+        ({"stride": 0}, "--stride 0: expected 1 or more"),
+        ({"downscale": 0}, "--downscale 0: expected 1 or more"),
+        ({"downscale": 33}, "downscale factor 33: expected 1 to 32"),
+        ({"holdout_every": 1}, "--holdout-every 1: expected 2 or more, or 0"),
+        ({"theta_max_deg": -5.0}, "--theta-max-deg -5.0: expected degrees"),
+        ({"theta_max_deg": math.nan}, "--theta-max-deg nan: expected degrees"),
+        ({"cameras": ()}, "--cameras : expected image_02, image_03 or both"),
+        ({"cameras": ("image_00",)}, "--cameras image_00: expected image_02"),
+        ({"cameras": ("image_02", "image_02")}, "--cameras image_02 image_02: expected"),
+    ],
+)
+def test_options_out_of_range(drive: RoomDrive, tmp_path: Path, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        process(drive, tmp_path / "scene", **options)
+    assert not (tmp_path / "scene").exists()
+
+
+# ---- bad drives ------------------------------------------------------------------------------------------------
+
+
+def drop_line(path: Path, line: int) -> None:
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(lines[: line - 1] + lines[line:]))
+
+
+def change(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+def halve(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def sweeps(drive: RoomDrive) -> Path:
+    return drive.sweep(0).parent
+
+
+def yaml(drive: RoomDrive) -> Path:
+    return drive.root / "calibration/image_03.yaml"
+
+
+def to_pose(drive: RoomDrive) -> Path:
+    return drive.root / "calibration/calib_cam_to_pose.txt"
+
+
+def to_velo(drive: RoomDrive) -> Path:
+    return drive.root / "calibration/calib_cam_to_velo.txt"
+
+
+def times(drive: RoomDrive) -> Path:
+    return drive.root / f"data_2d_raw/{SEQUENCE}/image_03/timestamps.txt"
+
+
+BROKEN: dict[str, tuple[Callable[[RoomDrive], Any], str]] = {
+    "no calibration": (
+        lambda d: shutil.rmtree(d.root / "calibration"),
+        "drive/calibration: no such folder; .*drive holds data_2d_raw, data_3d_raw, data_poses",
+    ),
+    "no poses folder": (lambda d: shutil.rmtree(d.root / "data_poses"), "drive/data_poses: no such folder"),
+    "no poses of the sequence": (
+        lambda d: shutil.move(d.poses_file().parent, d.root / "data_poses/2013_05_28_drive_0002_sync"),
+        rf"data_poses/{SEQUENCE}: no such folder; .*data_poses holds 2013_05_28_drive_0002_sync",
+    ),
+    "no camera": (
+        lambda d: shutil.rmtree(d.image("image_03", 0).parents[1]),
+        "image_03/data_rgb: no such folder; .*holds image_02. .*leave out that camera",
+    ),
+    "rectified pictures": (
+        lambda d: d.image("image_02", 0).parent.rename(d.image("image_02", 0).parents[1] / "data_rect"),
+        "image_02/data_rgb: no such folder; .*image_02 holds data_rect",
+    ),
+    "no sweeps folder": (lambda d: shutil.rmtree(sweeps(d)), "velodyne_points/data: no such folder"),
+    "no sweeps": (lambda d: [path.unlink() for path in sweeps(d).iterdir()], "none of frames 0 to 2.*no sweep: 0-2"),
+    "no pictures": (
+        lambda d: [d.image(name, frame).unlink() for name in CAMERAS for frame in d.frames],
+        r"no pictures with names like 0000000123\.png",
+    ),
+    "no pose fits": (
+        lambda d: d.poses_file().write_text(_pose_line(70)),
+        "none of frames 0 to 2 can be used: no pose: 0-2. .*has poses of frames 70 to 70, .*sweeps of frames 0 to 2",
+    ),
+    "yaml missing": (lambda d: yaml(d).unlink(), r"image_03\.yaml: no such file"),
+    "yaml empty": (lambda d: yaml(d).write_text(""), r"image_03\.yaml: nothing in it"),
+    "yaml binary": (lambda d: yaml(d).write_bytes(b"\x93\xff\x00"), r"image_03\.yaml: not a text file"),
+    "yaml cut after p1": (
+        lambda d: yaml(d).write_text("".join(yaml(d).read_text().splitlines(keepends=True)[:11])),
+        r"image_03\.yaml: ends after line 11 without distortion_parameters\.p1",
+    ),
+    "yaml cut in the last number": (
+        lambda d: change(yaml(d), "v0: 15.", "v0: 1."),
+        r"image_03\.yaml, line 18: v0 is 1\..*not in the middle half",
+    ),
+    "yaml no number": (
+        lambda d: change(yaml(d), "u0: ", "u0: about "),
+        r"image_03\.yaml, line 17: .*u0 is not a number",
+    ),
+    "yaml no colon": (lambda d: change(yaml(d), "k2:", "k2"), r"image_03\.yaml, line 11: Missing ':'"),
+    "yaml other model": (
+        lambda d: change(yaml(d), "MEI", "PINHOLE"),
+        r"image_03\.yaml, line 3: model_type is not MEI",
+    ),
+    "yaml bad focal length": (lambda d: change(yaml(d), "gamma1: ", "gamma1: -"), r"image_03\.yaml: MEI camera: fx"),
+    "cam_to_pose missing": (lambda d: to_pose(d).unlink(), r"calib_cam_to_pose\.txt: no such file"),
+    "cam_to_pose short": (
+        lambda d: to_pose(d).write_text(to_pose(d).read_text().rsplit(" ", 1)[0]),
+        r"calib_cam_to_pose\.txt, line 3: 11 numbers, expected 12",
+    ),
+    "cam_to_pose without a camera": (
+        lambda d: drop_line(to_pose(d), 2),
+        r"calib_cam_to_pose\.txt: has no line for image_02, only for image_00, image_03",
+    ),
+    "cam_to_pose without a name": (lambda d: change(to_pose(d), "image_02:", ""), "line 2: expected 'image_00: ' and"),
+    "cam_to_pose no number": (
+        lambda d: change(to_pose(d), "-0.0307524527", "O.0307"),
+        r"calib_cam_to_pose\.txt, line 2: 'O\.0307' is not a finite number",
+    ),
+    "cam_to_pose no rotation": (
+        lambda d: change(to_pose(d), "0.9995185086", "0.9895185086"),
+        r"calib_cam_to_pose\.txt, line 2: not a rotation",
+    ),
+    "cam_to_velo missing": (lambda d: to_velo(d).unlink(), r"calib_cam_to_velo\.txt: no such file"),
+    "cam_to_velo empty": (
+        lambda d: to_velo(d).write_text(""),
+        r"calib_cam_to_velo\.txt: 0 lines with text, expected one",
+    ),
+    "cam_to_velo long": (
+        lambda d: to_velo(d).write_text(CAM0_TO_VELO + " 0 0 0 1\n"),
+        r"calib_cam_to_velo\.txt, line 1: 16 numbers, expected 12",
+    ),
+    "poses missing": (lambda d: d.poses_file().unlink(), r"poses\.txt: no such file"),
+    "poses empty": (lambda d: d.poses_file().write_text("\n"), r"poses\.txt: no poses in it"),
+    "poses cut": (
+        lambda d: d.poses_file().write_text(d.poses_file().read_text().rsplit(" ", 3)[0]),
+        r"poses\.txt, line 3: 9 numbers, expected 12",
+    ),
+    "poses NaN": (
+        lambda d: d.poses_file().write_text(d.poses_file().read_text().rsplit(" ", 1)[0] + " nan\n"),
+        r"poses\.txt, line 3: 'nan' is not a finite number",
+    ),
+    "poses twice": (
+        lambda d: d.poses_file().write_text(d.poses_file().read_text() + _pose_line(1)),
+        r"poses\.txt, line 4: frame 1 has a pose already",
+    ),
+    "poses odd frame": (
+        lambda d: d.poses_file().write_text(_pose_line(1).replace("1 ", "1.5 ", 1)),
+        r"poses\.txt, line 1: '1\.5' is not the number of a frame",
+    ),
+    "timestamps cut": (lambda d: drop_line(times(d), 3), r"image_03/timestamps\.txt: ends after line 2, but frame 2"),
+    "timestamps odd": (
+        lambda d: change(times(d), "2013-05-28 08:46:00.1", "yesterday "),
+        r"image_03/timestamps\.txt, line 2: 'yesterday .*is not a time",
+    ),
+    "sweep cut": (
+        lambda d: d.sweep(1).write_bytes(d.sweep(1).read_bytes()[:-3]),
+        r"0000000001\.bin: 4797 bytes, expected a multiple of 16",
+    ),
+    "sweep empty": (lambda d: d.sweep(2).write_bytes(b""), r"0000000002\.bin: 0 bytes"),
+    "picture cut": (lambda d: halve(d.image("image_03", 1)), r"image_03/data_rgb/0000000001\.png: truncated"),
+    "picture empty": (lambda d: d.image("image_03", 1).write_bytes(b""), r"0000000001\.png: not a PNG \(0 bytes\)"),
+    "picture small": (
+        lambda d: write_png(d.image("image_03", 1), np.zeros((32, 31, 3), np.uint8)),
+        r"0000000001\.png: 31×32 pixels, but its camera's calibration says 32×32",
+    ),
+}
+
+
+def _pose_line(frame: int) -> str:
+    return f"{frame} " + " ".join(str(value) for value in pose(0)[:3].ravel().tolist()) + "\n"
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_broken_drive_is_an_error_before_the_work(drive: RoomDrive, tmp_path: Path, case: str) -> None:
+    breaking, message = BROKEN[case]
+    breaking(drive)
+    with pytest.raises((InputError, FileNotFoundError), match=message):
+        process(drive, tmp_path / "scene")
+    assert not (tmp_path / "scene").exists()
+
+
+def test_wrong_root_or_sequence_says_what_is_there(drive: RoomDrive, tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"drives: no such folder; .* holds drive\. --root takes"):
+        process(tmp_path / "drives", tmp_path / "scene")
+    with pytest.raises(
+        FileNotFoundError, match=r"calibration: no such folder; .* holds drive. --root .* is not the data"
+    ):
+        process(tmp_path, tmp_path / "scene")
+    with pytest.raises(FileNotFoundError, match=f"no such folder; .*data_2d_raw holds {SEQUENCE}. --sequence takes"):
+        process(drive, tmp_path / "scene", sequence="2013_05_28_drive_0007_sync")
+
+
+@pytest.mark.parametrize("option", ["mono", "frame_masks"])
+def test_maps_beside_the_drive_are_checked(drive: RoomDrive, tmp_path: Path, option: str) -> None:
+    given = {option: tmp_path / "maps"}
+    name = "--" + option.replace("_", "-")
+
+    def refuse(message: str) -> None:
+        with pytest.raises((InputError, FileNotFoundError), match=message):
+            process(drive, tmp_path / "scene", **given)
+        assert not (tmp_path / "scene").exists()
+
+    refuse(f"maps/image_02: no such folder; .*{name} takes a folder with one folder a camera")
+    for camera in CAMERAS:
+        for frame in drive.frames:
+            write_distance_png(tmp_path / f"maps/{camera}/{frame:010d}.png", np.full((32, 32), 4.0))
+    path = tmp_path / "maps/image_03/0000000002.png"
+    path.unlink()
+    refuse(rf"maps/image_03/0000000002\.png: no such file; {name} needs one for every frame taken \(0-2 of image_03\)")
+    write_distance_png(path, np.full((16, 32), 4.0))
+    refuse(r"0000000002\.png: 32×16 pixels")
+    write_distance_png(path, np.full((32, 32), 4.0))
+    halve(path)
+    refuse(r"0000000002\.png: truncated")
+    if option == "mono":
+        write_mask(path, np.ones((32, 32), bool))
+        refuse(r"0000000002\.png: 8-bit grey, expected a 16-bit grey PNG in units of 1/256 m")
+
+
+def test_ego_masks_are_checked(drive: RoomDrive, tmp_path: Path) -> None:
+    masks = write_masks(tmp_path / "masks", drive)
+
+    def refuse(message: str) -> None:
+        with pytest.raises((InputError, FileNotFoundError), match=message):
+            process(drive, tmp_path / "scene", ego_mask=masks)
+        assert not (tmp_path / "scene").exists()
+
+    write_mask(masks / "image_03.png", np.ones((32, 33), bool))
+    refuse(r"masks/image_03\.png: 33×32 pixels, but its camera's calibration says 32×32")
+    halve(masks / "image_03.png")
+    refuse(r"masks/image_03\.png: cannot be decoded")
+    write_mask(masks / "image_03.png", np.zeros((32, 32), bool))
+    refuse("mask of camera image_03 leaves no pixel.*inverted")
+    (masks / "image_03.png").unlink()
+    refuse(r"masks/image_03\.png: no such file; --ego-mask takes")
+
+
+def test_truth_is_checked(tmp_path: Path) -> None:
+    drive = write_room_drive(tmp_path / "drive", frames=5, beams=300, size=32, truth=True)
+    truth = drive.root / f"truth/{SEQUENCE}"
+
+    def refuse(message: str) -> None:
+        with pytest.raises((InputError, FileNotFoundError), match=message):
+            process(drive, tmp_path / "scene")
+        assert not (tmp_path / "scene").exists()
+
+    poses = read_json(truth / "shifted.json")
+    poses["2"]["image_02"]["4"][0][0] += 0.1
+    write_json(truth / "shifted.json", poses)
+    refuse(r"shifted\.json: 2 m, image_02, frame 4: not a rotation")
+    poses["2"]["image_02"]["4"].pop()
+    write_json(truth / "shifted.json", poses)
+    refuse(r"shifted\.json: 2 m, image_02, frame 4: expected a 4×4 matrix")
+    (truth / "image_03/rgb/0000000003.png").unlink()
+    refuse(r"image_03/rgb/0000000003\.png: no such file; the drive's truth is incomplete")
+
+
+def test_sweep_without_returns_is_an_error(drive: RoomDrive, tmp_path: Path) -> None:
+    write_points(drive.sweep(1), np.full((50, 3), np.nan))
+    with pytest.raises(InputError, match=r"0000000001\.bin: none of its 50 points can be used \(50 are NaN"):
+        process(drive, tmp_path / "scene")
+    # mended, the same command goes on
+    write_points(drive.sweep(1), drive.returns[1][:50])
+    process(drive, tmp_path / "again")
+    shutil.rmtree(tmp_path / "scene")
+    process(drive, tmp_path / "scene")
+    assert tree(tmp_path / "scene") == tree(tmp_path / "again")
+
+
+def test_scanner_that_sees_nothing_is_an_error(drive: RoomDrive, tmp_path: Path) -> None:
+    write_mask(tmp_path / "ego.png", np.eye(32) > 0)
+    for frame in drive.frames:
+        write_points(drive.sweep(frame), np.array([[0.0, 0.0, 50.0]]))
+    with pytest.raises(InputError, match="no LiDAR return lies in any training picture"):
+        process(drive, tmp_path / "scene", ego_mask=tmp_path / "ego.png")
+
+
+def test_missing_timestamps_are_no_obstacle(drive: RoomDrive, tmp_path: Path) -> None:
+    times(drive).unlink()
+    report = process(drive, tmp_path / "scene")
+    assert any("image_03 have no timestamp_s" in notice for notice in report.notices)
+    meta = read_json(tmp_path / "scene/transforms.json")
+    assert [f["camera"] for f in meta["frames"] if "timestamp_s" not in f] == ["image_03"] * 3
+
+
+# ---- run again -------------------------------------------------------------------------------------------------
+
+
+def test_same_input_same_bytes_and_nothing_done_twice(drive: RoomDrive, tmp_path: Path) -> None:
+    assert process(drive, tmp_path / "one").written == 6
+    assert process(drive, tmp_path / "two").written == 6
+    before = tree(tmp_path / "one")
+    assert before == tree(tmp_path / "two")
+    assert process(drive, tmp_path / "one").written == 0
+    assert tree(tmp_path / "one") == before
+
+
+def test_other_options_or_other_input_are_another_scene(drive: RoomDrive, tmp_path: Path) -> None:
+    process(drive, tmp_path / "scene")
+    before = tree(tmp_path / "scene")
+    with pytest.raises(InputError, match="holds another scene: frames is None there, 2 now"):
+        process(drive, tmp_path / "scene", frames=2)
+    other = write_room_drive(tmp_path / "other/drive", frames=3, beams=400, size=32)
+    with pytest.raises(InputError, match="holds another scene: inputs_sha256"):
+        process(other, tmp_path / "scene")
+    with pytest.raises(InputError, match=r"and no process\.json"):
+        process(drive, drive.root)
+    assert tree(tmp_path / "scene") == before
+
+
+def test_killed_run_is_continued(drive: RoomDrive, tmp_path: Path) -> None:
+    """SIGKILL in the middle: what is whole stays, the rest is made, and the result is the same."""
+    program = (
+        "import os, sys, threading\n"
+        "from pathlib import Path\n"
+        "from edge_depth_nerf.process import kitti360\n"
+        "from edge_depth_nerf.process.options import Kitti360Options\n"
+        "os.cpu_count = lambda: 1\n"
+        "load, calls = kitti360._load, []\n"
+        "def dying(*args, **options):\n"
+        "    calls.append(1)\n"
+        "    if len(calls) == 4:\n"
+        "        os.kill(os.getpid(), 9)\n"
+        "    return load(*args, **options)\n"
+        "kitti360._load = dying\n"
+        "kitti360.process_kitti360(Kitti360Options(*map(Path, sys.argv[1:2]), sys.argv[2], Path(sys.argv[3])))\n"
+    )
+    command = [sys.executable, "-c", program, str(drive.root), SEQUENCE, str(tmp_path / "scene")]
+    assert subprocess.run(command, capture_output=True, check=False).returncode == -9
+    assert not (tmp_path / "scene/transforms.json").exists()
+    assert len(list((tmp_path / "scene/images").rglob("*.png"))) == 3
+    assert process(drive, tmp_path / "scene").written == 3
+    process(drive, tmp_path / "whole")
+    assert tree(tmp_path / "scene") == tree(tmp_path / "whole")
+
+
+# ---- KITTI-360's files -----------------------------------------------------------------------------------------
+
+
+def test_yaml_without_spaces_after_the_colon(tmp_path: Path) -> None:
+    drive = write_room_drive(tmp_path / "drive", frames=1, beams=300, size=32, space="")
+    twin = drive.camera("image_02")
+    assert "xi:2.2134" in (drive.root / "calibration/image_02.yaml").read_text()
+    camera = read_mei_camera(drive.root / "calibration/image_02.yaml")
+    assert camera.to_dict() == {
+        **{"model": "MEI", "width": 32, "height": 32, "fx": twin.gamma1, "fy": twin.gamma2},
+        **{"cx": twin.u0 + 0.5, "cy": twin.v0 + 0.5, "xi": twin.xi},
+        **{"k1": twin.k1, "k2": twin.k2, "p1": twin.p1, "p2": twin.p2},
+    }
+    process(drive, tmp_path / "scene")
+
+
+def test_chain_of_frames(drive: RoomDrive) -> None:
+    rig = read_rig(drive.root / "calibration", CAMERAS)
+    cam0_to_pose, cam0_to_velo = matrix(CAM_TO_POSE["image_00"]), matrix(CAM0_TO_VELO)
+    for name in CAMERAS:
+        # velo → camera 0 → vehicle → camera k
+        chain = np.linalg.inv(matrix(CAM_TO_POSE[name])) @ cam0_to_pose @ np.linalg.inv(cam0_to_velo)
+        found = np.linalg.inv(rig.camera_to_pose[name]) @ rig.velo_to_pose
+        np.testing.assert_allclose(found, chain, atol=1e-12)
+    # the scanner's axes in the vehicle: x forward stays, y left and z up become right and down
+    np.testing.assert_allclose(rig.velo_to_pose[:3, :3], np.diag([1, -1, -1]), atol=0.02)
+
+
+def test_timestamps_keep_fractions_of_a_microsecond(tmp_path: Path) -> None:
+    path = tmp_path / "timestamps.txt"
+    path.write_text("1970-01-02 00:00:01.123456789\n1970-01-02 00:00:02\n\n")
+    first, second = read_timestamps(path)
+    assert first == pytest.approx(86401.123456789, abs=1e-9)
+    assert second == 86402.0
+
+
+def test_real_calibration(real_data: Path) -> None:
+    folder = real_data / "kitti360_calibration"
+    camera = read_mei_camera(folder / "image_02.yaml")
+    assert (camera.width, camera.height) == (1400, 1400)
+    assert (camera.fx, camera.fy) == (1.3363220825849971e03, 1.3357883350012958e03)
+    assert (camera.cx, camera.cy) == (7.1694323510126321e02 + 0.5, 7.0576498308221585e02 + 0.5)
+    assert (camera.xi, camera.k1, camera.k2) == (2.2134047507854890, 1.6798235660113681e-02, 1.6548773243373522)
+    assert (camera.p1, camera.p2) == (4.2223943394772046e-04, 4.2462134260997584e-04)
+    right = read_mei_camera(folder / "image_03.yaml")
+    assert (right.xi, right.p2) == (2.5535139132482758, -7.0340482615055284e-04)
+    poses = read_cam_to_pose(folder / "calib_cam_to_pose.txt")
+    assert set(poses) == {"image_00", "image_01", "image_02", "image_03"}
+    assert poses["image_01"][1].tolist() == [0.9997374956, -0.0100836652, -0.0205732716, 0.5981494900]
+    for name, numbers in CAM_TO_POSE.items():
+        assert np.array_equal(poses[name], matrix(numbers))
+    assert np.array_equal(read_cam_to_velo(folder / "calib_cam_to_velo.txt"), matrix(CAM0_TO_VELO))
+    rig = read_rig(folder, CAMERAS)
+    assert rig.cameras == {"image_02": camera, "image_03": right}
+
+
+def test_poses_skip_frames(tmp_path: Path) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_text(_pose_line(3) + "\n" + _pose_line(11).replace("11 ", "1.1e1   ", 1))
+    assert {frame: found.tolist() for frame, found in read_poses(path).items()} == {
+        frame: pose(0).tolist() for frame in (3, 11)
+    }
+
+
+# ---- the command line's side -----------------------------------------------------------------------------------
+
+
+def test_options_are_light_to_import() -> None:
+    program = (
+        "import sys, edge_depth_nerf.process.options; "
+        "assert not {'torch', 'cv2', 'numpy', 'nerfstudio'} & set(sys.modules), sorted(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_report_says_how_well_the_cameras_fit(drive: RoomDrive, tmp_path: Path) -> None:
+    console = Console(record=True, width=200, file=open(os.devnull, "w"))
+    report = process(drive, tmp_path / "scene", console=console)
+    text = console.export_text()
+    for name in CAMERAS:
+        assert f"{name}: fisheye camera fitted within {report.fits[name].rms_px:.4f} px rms" in text
+    assert "6 pictures for training, 0 held out" in text
+    assert "No frame is held out" in text
+    assert json.loads((tmp_path / "scene/process.json").read_text())["kind"] == "kitti360"
+    assert replace(report, notices=()).scene == tmp_path / "scene"
+
+
+def test_synthesised_drive(tmp_path: Path) -> None:
+    """What the generator writes is read as it is, and its LiDAR agrees with its true distances."""
+    from edge_depth_nerf.synthetic.drive import synthesize_drive
+    from edge_depth_nerf.synthetic.options import SynthesizeOptions
+
+    synthesize_drive(SynthesizeOptions(tmp_path / "drive", frames=5, size=64))
+    truth = tmp_path / f"drive/truth/{SEQUENCE}"
+    report = process(
+        *(tmp_path / "drive", tmp_path / "scene"),
+        ego_mask=tmp_path / "drive/truth/masks",
+        mono=tmp_path / f"drive/simulated_mono/{SEQUENCE}",
+    )
+    assert (report.training, report.held_out) == (8, 2)
+    meta = read_json(tmp_path / "scene/transforms.json")
+    assert set(meta["shifted_views"]) == {"1", "2"}
+    errors = []
+    for frame in meta["frames"]:
+        lidar = read_distance_png(tmp_path / "scene" / frame["lidar_file_path"])
+        true = read_distance_png(tmp_path / "scene" / frame["truth_distance_file_path"])
+        both = (lidar > 0) & (true > 0)
+        assert both.sum() > 100
+        errors.append(np.abs(lidar - true)[both] / true[both])
+        assert read_distance_png(truth / frame["camera"] / f"distance/{frame['frame']:010d}.png").shape == true.shape
+    # the sweep is skewed, and pixels are coarse
+    assert np.median(np.concatenate(errors)) < 0.025
