@@ -1,0 +1,127 @@
+"""Scene folders made of the real KITTI-360 excerpts (not part of the project; see the fixture `real_data`)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from edge_depth_nerf.cameras import MEI, Pinhole
+from edge_depth_nerf.files import read_distance_png, read_image, read_json
+from edge_depth_nerf.process.downscale import downscale_image, downscale_mask
+from edge_depth_nerf.process.scene import FrameContent, SceneCamera, SceneFrame, write_scene
+
+BLOCK_PX = 64
+HELD_OUT_SHARE = 0.1
+HELD_OUT_STEREO_FRAME = 702
+
+
+def nearest_of_blocks(distance_m: np.ndarray, factor: int) -> np.ndarray:
+    """The nearest return of each factor × factor block, 0 where there is none."""
+    height, width = distance_m.shape[0] // factor, distance_m.shape[1] // factor
+    blocks = distance_m[: height * factor, : width * factor].reshape(height, factor, width, factor)
+    nearest = np.where(blocks > 0, blocks, np.inf).min(axis=(1, 3))
+    return np.where(np.isfinite(nearest), nearest, 0)
+
+
+def held_out_blocks(shape: tuple[int, int], block_px: int, share: float, seed: int = 0) -> np.ndarray:
+    """True in whole blocks of block_px, drawn at random, `share` of all."""
+    rows, columns = -(-shape[0] // block_px), -(-shape[1] // block_px)
+    chosen = np.random.default_rng(seed).permutation(rows * columns) < round(share * rows * columns)
+    blocks = chosen.reshape(rows, columns)
+    return np.kron(blocks, np.ones((block_px, block_px), bool))[: shape[0], : shape[1]]
+
+
+def fisheye_frame_scene(real_data: Path, output: Path, downscale: int = 4) -> Path:
+    """The one real fisheye frame as a scene: trained with nine tenths of its LiDAR, judged on the rest.
+
+    LiDAR is held out in whole blocks of 64 px. The frame stands twice in the scene: once for training, once, with the
+    other returns, for judging.
+    """
+    folder = real_data / "kitti360_fisheye_frame"
+    sample = read_json(folder / "kitti360_sample.json")["cam_params"]
+    # KITTI-360 counts integer pixel centres
+    camera = MEI(
+        width=1400,
+        height=1400,
+        fx=sample["fx"],
+        fy=sample["fy"],
+        cx=sample["cx"] + 0.5,
+        cy=sample["cy"] + 0.5,
+        **{name: sample[name] for name in ("xi", "k1", "k2", "p1", "p2")},
+    )
+    hidden = np.load(folder / "mask_left_fisheye.npy")
+    lidar = read_distance_png(folder / "kitti360_depth.png")
+    judged = held_out_blocks(lidar.shape, BLOCK_PX, HELD_OUT_SHARE)
+    image = downscale_image(read_image(folder / "kitti360_rgb.png"), downscale)
+    frames = [
+        SceneFrame(
+            camera="image_02",
+            frame=number,
+            camera_to_world=np.eye(4),
+            content=FrameContent(image=image, lidar=nearest_of_blocks(lidar * kept, downscale)),
+            held_out=number == 1,
+        )
+        for number, kept in enumerate((~judged, judged))
+    ]
+    cameras = [SceneCamera("image_02", camera.downscaled(downscale), downscale_mask(~hidden, downscale))]
+    source = {"recording": "KITTI-360, one fisheye frame", "downscale": downscale}
+    write_scene(output, cameras, frames, layers=("lidar",), source=source)
+    return output
+
+
+def stereo_distance(left: np.ndarray, right: np.ndarray, camera: Pinhole, baseline_m: float) -> np.ndarray:
+    """Distance along the rays of the left of two rectified pictures, by semi-global matching; 0 = no match."""
+    grey = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in (left, right)]
+    matcher = cv2.StereoSGBM.create(
+        minDisparity=0, numDisparities=128, blockSize=5, P1=200, P2=800, uniquenessRatio=10, speckleWindowSize=100,
+        speckleRange=2, disp12MaxDiff=1, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+    )  # fmt: skip
+    disparity = matcher.compute(*grey).astype(np.float64) / 16
+    z_depth = np.where(disparity > 1, camera.fx * baseline_m / np.maximum(disparity, 1), 0)
+    directions, _ = camera.unproject(camera.pixel_centres())
+    return z_depth / directions[..., 2].numpy()
+
+
+def stereo_scene(real_data: Path, output: Path, downscale: int = 4) -> Path:
+    """Ten real rectified pictures with poses; distance of the left ones by stereo matching, as a monocular source.
+
+    Both pictures of frame 702 are held out. The right pictures get theirs by matching mirrored pictures.
+    """
+    folder = real_data / "kitti360_stereo"
+    meta = read_json(folder / "transforms.json")
+    camera = Pinhole(meta["w"], meta["h"], meta["fl_x"], meta["fl_y"], meta["cx"], meta["cy"])
+    poses = {Path(frame["file_path"]).stem: np.array(frame["transform_matrix"]) for frame in meta["frames"]}
+    opengl_to_opencv = np.diag([1.0, -1.0, -1.0, 1.0])
+    frames = []
+    for moment in sorted({name.split("_")[0] for name in poses}):
+        pictures = [read_image(folder / f"{moment}_{side}.png") for side in ("00", "01")]
+        baseline_m = float(np.linalg.norm(poses[f"{moment}_00"][:3, 3] - poses[f"{moment}_01"][:3, 3]))
+        mirrored = [np.ascontiguousarray(picture[:, ::-1]) for picture in pictures]
+        mirrored_camera = Pinhole(
+            camera.width, camera.height, camera.fx, camera.fy, camera.width - camera.cx, camera.cy
+        )
+        distances = [
+            stereo_distance(pictures[0], pictures[1], camera, baseline_m),
+            stereo_distance(mirrored[1], mirrored[0], mirrored_camera, baseline_m)[:, ::-1],
+        ]
+        for side, (picture, distance) in enumerate(zip(pictures, distances, strict=True)):
+            offset = downscale // 2
+            content = FrameContent(
+                image=downscale_image(picture, downscale),
+                mono=distance[offset::downscale, offset::downscale].copy(),
+            )
+            frames.append(
+                SceneFrame(
+                    camera=f"image_0{side}",
+                    frame=int(moment),
+                    camera_to_world=poses[f"{moment}_0{side}"] @ opengl_to_opencv,
+                    content=content,
+                    held_out=int(moment) == HELD_OUT_STEREO_FRAME,
+                )
+            )
+    cameras = [SceneCamera(f"image_0{side}", camera.downscaled(downscale)) for side in (0, 1)]
+    source = {"recording": "KITTI-360, five rectified stereo pairs", "downscale": downscale}
+    write_scene(output, cameras, frames, layers=("mono",), source=source)
+    return output

@@ -1,0 +1,75 @@
+"""Real KITTI-360 excerpts go the whole way: scene, prior, training, judging. How good it gets is a benchmark's
+matter (benchmarks/real_input.py); here the geometry must hold and the training must learn."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.configs.method_configs import all_methods
+from nerfstudio.engine.optimizers import Optimizers
+from real_scenes import fisheye_frame_scene, stereo_scene
+
+from edge_depth_nerf.files import read_distance_png, read_json, read_mask
+
+
+def train(scene, steps, **model):
+    torch.manual_seed(0)
+    config = deepcopy(all_methods["edge-depth-nerf-lite"])
+    config.pipeline.datamanager.data = scene
+    config.pipeline.datamanager.train_num_rays_per_batch = 256
+    for name, value in {"num_levels": 4, "log2_hashmap_size": 14, **model}.items():
+        setattr(config.pipeline.model, name, value)
+    pipeline = config.pipeline.setup(device="cpu", test_mode="test")
+    optimisers = Optimizers(deepcopy(config.optimizers), pipeline.get_param_groups())
+    colour_losses = []
+    for step in range(steps):
+        optimisers.zero_grad_all()
+        _, losses, _ = pipeline.get_train_loss_dict(step)
+        sum(losses.values()).backward()
+        optimisers.optimizer_step_all()
+        colour_losses.append(float(losses["rgb_loss"]))
+        assert np.isfinite(colour_losses[-1])
+    return pipeline, colour_losses
+
+
+def test_the_real_fisheye_frame(real_data, tmp_path):
+    scene = fisheye_frame_scene(real_data, tmp_path, downscale=10)
+    frames = read_json(scene / "transforms.json")["frames"]
+    mask = read_mask(scene / frames[0]["mask_path"])
+    trained, judged = (read_distance_png(scene / frame["lidar_file_path"]) for frame in frames)
+    assert not (trained > 0)[~mask].any() and not (judged > 0)[~mask].any()
+    share = (judged > 0).sum() / ((judged > 0).sum() + (trained > 0).sum())
+    assert 0.03 < share < 0.25  # a tenth of the blocks; blocks differ in returns
+    hidden = np.load(real_data / "kitti360_fisheye_frame" / "mask_left_fisheye.npy")
+    assert mask.mean() < 1 - hidden.mean()  # the real mask keeps more than the lens circle
+
+    pipeline, losses = train(scene, 60)
+    assert np.mean(losses[-10:]) < 0.5 * np.mean(losses[:5])
+    metrics = pipeline.get_average_eval_image_metrics()
+    assert np.isfinite(metrics["masked_psnr"]) and metrics["lidar_pixels"] > 20
+
+
+def test_the_real_stereo_drive(real_data, tmp_path):
+    scene = stereo_scene(real_data, tmp_path, downscale=16)
+    transforms = read_json(scene / "transforms.json")
+    assert len(transforms["frames"]) == 10 and len(transforms["test_filenames"]) == 2
+    distance = read_distance_png(scene / transforms["frames"][0]["mono_file_path"])
+    known = distance > 0
+    assert known.mean() > 0.4
+    # a street seen from a car: the road some metres ahead, nothing nearer than its bonnet
+    assert 2 < np.percentile(distance[known], 5) < np.percentile(distance[known], 95) < 120
+    pipeline, losses = train(scene, 60)
+    assert np.mean(losses[-10:]) < 0.5 * np.mean(losses[:5])
+    metrics = pipeline.get_average_eval_image_metrics()
+    assert np.isfinite(metrics["masked_psnr"])
+    assert "lidar_abs_rel" not in metrics
+
+
+@pytest.mark.parametrize("name", ["image_02", "image_03"])
+def test_the_real_masks_are_the_frames_size(real_data, name):
+    side = {"image_02": "left", "image_03": "right"}[name]
+    hidden = np.load(real_data / "kitti360_fisheye_frame" / f"mask_{side}_fisheye.npy")
+    assert hidden.shape == (1400, 1400) and 0.2 < hidden.mean() < 0.3
