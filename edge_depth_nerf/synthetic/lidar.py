@@ -1,0 +1,82 @@
+"""A Velodyne HDL-64E on the moving car: one sweep a frame, each firing from the pose of its own moment.
+
+Frames: velodyne (x forward, y left, z up), world (z up); metres, seconds. 64 beams from +2° to -24.8°; 0.2° of
+azimuth between firings, clockwise seen from above. A sweep begins and ends facing backwards; at the frame's moment
+the laser faces forwards. A firing at azimuth a (counter-clockwise from x) happens at -a/360° of a turn after it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from edge_depth_nerf.synthetic.motion import FRAME_INTERVAL_S, Drive
+from edge_depth_nerf.synthetic.render import World
+from edge_depth_nerf.synthetic.rig import VELO_TO_POSE
+
+BEAM_ELEVATION_RAD = np.deg2rad(np.linspace(2.0, -24.8, 64))
+"""Elevations of the beams, from top to bottom."""
+
+FIRINGS = 1800
+"""Firings a turn, 0.2° apart."""
+
+# half a step off the rear, so that no firing lies on the seam of ±180°
+AZIMUTH_RAD = np.deg2rad(180.0 - (np.arange(FIRINGS) + 0.5) * 360.0 / FIRINGS)
+"""Azimuths in the order of firing, counter-clockwise from x."""
+
+RANGE_M = (0.9, 80.0)
+"""Nearest and farthest return."""
+
+RANGE_NOISE_M = 0.02
+"""Standard deviation of the range."""
+
+DROPOUT = 0.05
+"""Share of returns that are lost."""
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """N returns in the order of firing, beam by beam."""
+
+    raw: NDArray[np.float32]
+    """N×4: x, y, z in the velodyne frame of the firing's own moment, with range noise; reflectance in 0-1."""
+    deskewed: NDArray[np.float32]
+    """N×4: the same returns without noise, in the velodyne frame of the sweep's moment; reflectance.
+
+    Only the recording car's own motion is taken out: a car that drives stays where each firing met it.
+    """
+
+
+def sweep(world: World, drive: Drive, time_s: float, rng: Generator) -> Sweep:
+    """Take the sweep that faces forwards at `time_s`."""
+    offset_s = -AZIMUTH_RAD / (2 * np.pi) * FRAME_INTERVAL_S
+    velo_to_world = drive.pose_to_world(time_s + offset_s) @ VELO_TO_POSE
+    cos, sin = np.cos(BEAM_ELEVATION_RAD), np.sin(BEAM_ELEVATION_RAD)
+    directions = np.empty((FIRINGS, len(cos), 3))
+    directions[..., 0] = np.cos(AZIMUTH_RAD)[:, None] * cos
+    directions[..., 1] = np.sin(AZIMUTH_RAD)[:, None] * cos
+    directions[..., 2] = sin
+    world_directions = np.einsum("fij,fbj->fbi", velo_to_world[:, :3, :3], directions).reshape(-1, 3)
+    world_origins = np.repeat(velo_to_world[:, :3, 3], len(cos), axis=0)
+    times = np.repeat(time_s + offset_s, len(cos))
+    origins, rays = world_origins.astype(np.float32), world_directions.astype(np.float32)
+    hits = world.trace(origins, rays, times)
+    echo = world.laser_echo(origins, rays, hits, times)
+    range_m = hits.distance_m.astype(np.float64)
+    # drawn for every ray, so that one ray's fate does not depend on the others'
+    noise, fate = rng.normal(0, RANGE_NOISE_M, len(range_m)), rng.random(len(range_m))
+    seen = (range_m >= RANGE_M[0]) & (range_m <= RANGE_M[1]) & (fate >= DROPOUT)
+    range_m, noise = range_m[seen], noise[seen]
+    raw = directions.reshape(-1, 3)[seen] * (range_m + noise)[:, None]
+    points = world_origins[seen] + world_directions[seen] * range_m[:, None]
+    world_to_velo = np.linalg.inv(drive.pose_to_world(np.array([time_s]))[0] @ VELO_TO_POSE)
+    deskewed = points @ world_to_velo[:3, :3].T + world_to_velo[:3, 3]
+    # the sensor counts reflectance in steps of 1/100
+    reflectance = np.round(np.clip(echo[seen], 0, 0.99), 2)
+    return Sweep(
+        np.column_stack((raw, reflectance)).astype(np.float32),
+        np.column_stack((deskewed, reflectance)).astype(np.float32),
+    )

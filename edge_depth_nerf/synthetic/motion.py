@@ -1,0 +1,113 @@
+"""Where cars are at any moment: routes on the ground, and the recording car's motion along one.
+
+Frames: world (x, y horizontal, z up, metres), pose = vehicle (x forward, y right, z down). Times in seconds;
+headings in radians, counter-clockwise from world x.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from edge_depth_nerf.synthetic.rig import POSE_HEIGHT_M
+
+FRAME_INTERVAL_S = 0.1
+"""Time between frames, and of one turn of the LiDAR."""
+
+_STEP_M = 0.01
+
+
+class Route:
+    """A path on the ground: straight, or straight with one turn whose curvature rises and falls evenly."""
+
+    def __init__(
+        self,
+        start: tuple[float | int, float | int],
+        heading_rad: float = 0.0,
+        turn_rad: float = 0.0,
+        turn_at_m: float = 0.0,
+        radius_m: float = 8.0,
+        easing_m: float = 3.0,
+    ) -> None:
+        """Lay out the route.
+
+        Args:
+            start: x, y where the arc length is 0.
+            heading_rad: heading there.
+            turn_rad: signed angle of the turn, 0 = none.
+            turn_at_m: arc length where the turn begins.
+            radius_m: smallest radius of the turn.
+            easing_m: length over which the curvature goes from 0 to 1/radius, and back.
+
+        """
+        self._start, self._heading = np.asarray(start, np.float64), heading_rad
+        self._turn, self._turn_at = turn_rad, turn_at_m
+        self.turn_length_m = abs(turn_rad) * radius_m + easing_m if turn_rad else 0.0
+        """Arc length of the turn with its easing."""
+        s = np.arange(0, self.turn_length_m + _STEP_M, _STEP_M)
+        curvature = np.minimum(1, np.minimum(s, self.turn_length_m - s).clip(0) / easing_m) / radius_m
+        # middle of each step, so that the sums are second-order accurate
+        turned = np.concatenate(([0.0], np.cumsum((curvature[1:] + curvature[:-1]) / 2 * _STEP_M)))
+        turned = np.sign(turn_rad) * turned * (abs(turn_rad) / turned[-1] if turn_rad else 0.0)
+        middle = heading_rad + (turned[1:] + turned[:-1]) / 2
+        steps = np.stack((np.cos(middle), np.sin(middle)), -1) * _STEP_M
+        self._turn_s, self._turned = s, turned
+        self._turn_path = np.concatenate((np.zeros((1, 2)), np.cumsum(steps, axis=0)))
+
+    def at(self, s_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Positions (N×2) and headings (N) at N arc lengths, which may lie before the start."""
+        s = np.asarray(s_m, np.float64)
+        before = np.minimum(s, self._turn_at) if self._turn else s
+        inside = np.clip(s - self._turn_at, 0, self._turn_s[-1]) if self._turn else np.zeros_like(s)
+        after = np.maximum(s - self._turn_at - self._turn_s[-1], 0) if self._turn else np.zeros_like(s)
+        turned = np.interp(inside, self._turn_s, self._turned)
+        bend = np.stack([np.interp(inside, self._turn_s, self._turn_path[:, axis]) for axis in (0, 1)], -1)
+        first = np.array((np.cos(self._heading), np.sin(self._heading)))
+        last = np.array((np.cos(self._heading + self._turn), np.sin(self._heading + self._turn)))
+        return self._start + before[..., None] * first + bend + after[..., None] * last, self._heading + turned
+
+
+@dataclass(frozen=True)
+class Drive:
+    """The recording car's motion: along a route at an uneven speed, swaying, pitching and rolling a little."""
+
+    route: Route
+    start_m: float
+    """Arc length at time 0."""
+    speed_m_s: float
+    """Mean speed."""
+    phases: NDArray[np.float64]
+    """Five phases in radians: speed, sway, pitch, roll, bounce."""
+
+    @staticmethod
+    def random(route: Route, start_m: float, speed_m_s: float, rng: Generator) -> Drive:
+        """A drive whose disturbances have random phases."""
+        return Drive(route, start_m, speed_m_s, rng.uniform(0, 2 * np.pi, 5))
+
+    def pose_to_world(self, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The vehicle's poses at N times, N×4×4."""
+        t = np.asarray(time_s, np.float64)
+        phase = self.phases
+        rate = 2 * np.pi / 3.1
+        uneven = 0.06 * (np.cos(phase[0]) - np.cos(rate * t + phase[0])) / rate
+        s = self.start_m + self.speed_m_s * (t + uneven)
+        position, heading = self.route.at(s)
+        sway, sway_rate = 0.10, 2 * np.pi / 23
+        left = np.stack((-np.sin(heading), np.cos(heading)), -1)
+        position = position + (sway * np.sin(sway_rate * s + phase[1]))[..., None] * left
+        heading = heading + np.arctan(sway * sway_rate * np.cos(sway_rate * s + phase[1]))
+        pitch = np.deg2rad(0.35) * np.sin(2 * np.pi * t / 1.3 + phase[2])
+        roll = np.deg2rad(0.5) * np.sin(2 * np.pi * t / 1.7 + phase[3])
+        height = POSE_HEIGHT_M + 0.01 * np.sin(2 * np.pi * t / 1.1 + phase[4])
+        ch, sh, cp, sp, cr, sr = (f(a) for a in (heading, pitch, roll) for f in (np.cos, np.sin))
+        # turning by heading, then pitch, then roll; the pose's y and z axes point right and down
+        forward = np.stack((ch * cp, sh * cp, sp), -1)
+        left = np.stack((-sh * cr - ch * sp * sr, ch * cr - sh * sp * sr, cp * sr), -1)
+        poses = np.zeros((*t.shape, 4, 4))
+        poses[..., :3, 0], poses[..., :3, 1] = forward, -left
+        poses[..., :3, 2] = np.cross(forward, -left)
+        poses[..., :2, 3], poses[..., 2, 3], poses[..., 3, 3] = position, height, 1
+        return poses

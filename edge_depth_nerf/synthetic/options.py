@@ -1,0 +1,76 @@
+"""The options of `edge-depth-nerf synthesize`; light to import, so that the command line starts at once."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from edge_depth_nerf.errors import InputError
+
+SceneName = Literal["street", "parking", "turn"]
+
+SCENES: tuple[SceneName, ...] = ("street", "parking", "turn")
+"""The scenes that can be synthesised."""
+
+DEFAULT_SPEED_M_S: dict[SceneName, float] = {"street": 8.0, "parking": 4.0, "turn": 6.0}
+"""How fast the car drives in each scene unless told otherwise; a frame is 0.1 s."""
+
+_SIZE_RANGE_PX = (32, 4096)
+_MOVING_MAX = 8
+_SPEED_MAX_M_S = 40.0
+
+
+@dataclass(frozen=True)
+class SynthesizeOptions:
+    """A drive with fisheye pictures, LiDAR sweeps, poses and their truth, in KITTI-360's raw layout."""
+
+    output: Path
+    """Folder to write the drive to; new, empty, or an unfinished drive of the same options, which is continued."""
+    scene: SceneName = "street"
+    """street: houses, trees, parked cars; parking: an underground car park; turn: 90 degrees at a junction."""
+    frames: int = 40
+    """Number of frames, 0.1 s apart, each with two pictures and one LiDAR sweep."""
+    size: int = 350
+    """Width and height of the pictures in pixels; KITTI-360's own are 1400."""
+    seed: int = 0
+    """Seed of everything random: the scene, the motion, noise and drop-outs. Same options, same bytes."""
+    moving: int = 0
+    """Number of other cars that drive through the scene; their masks are written as truth/<sequence>/moving_masks."""
+    speed_m_s: float | None = None
+    """Mean speed of the car in m/s; none = the scene's own (street 8, parking 4, turn 6)."""
+    sequence: str = "2013_05_28_drive_0000_sync"
+    """Name of the sequence in the folders."""
+
+    @property
+    def mean_speed_m_s(self) -> float:
+        """The mean speed that applies, in m/s."""
+        return DEFAULT_SPEED_M_S[self.scene] if self.speed_m_s is None else self.speed_m_s
+
+    def check(self) -> None:
+        """Check every field's range.
+
+        Raises:
+            InputError: a value cannot be used; names the option, the value and the range.
+
+        """
+        if self.scene not in SCENES:
+            raise InputError(f"--scene {self.scene}: no such scene, expected one of {', '.join(SCENES)}.")
+        if self.frames < 1:
+            raise InputError(f"--frames {self.frames}: expected at least 1.")
+        if not _SIZE_RANGE_PX[0] <= self.size <= _SIZE_RANGE_PX[1]:
+            raise InputError(f"--size {self.size}: expected {_SIZE_RANGE_PX[0]} to {_SIZE_RANGE_PX[1]} pixels.")
+        if self.seed < 0:
+            raise InputError(f"--seed {self.seed}: expected 0 or more.")
+        if not 0 <= self.moving <= _MOVING_MAX:
+            raise InputError(f"--moving {self.moving}: expected 0 to {_MOVING_MAX} driving cars.")
+        speed = self.mean_speed_m_s
+        if not (math.isfinite(speed) and 0 < speed <= _SPEED_MAX_M_S):
+            raise InputError(f"--speed-m-s {speed}: expected more than 0 and at most {_SPEED_MAX_M_S} m/s.")
+        if not re.fullmatch(r"[A-Za-z0-9_-]+", self.sequence):
+            raise InputError(
+                f"--sequence {self.sequence!r}: expected a folder name of letters, digits, '_' and '-', "
+                "like 2013_05_28_drive_0000_sync."
+            )

@@ -1,0 +1,521 @@
+"""The three scenes: a street, an underground car park, a turn at a junction.
+
+World frame: x along the first stretch of road, y left of it, z up, the road at z = 0, metres. Everything stands
+still and looks the same in every frame, but for the cars that drive.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from edge_depth_nerf.synthetic import objects
+from edge_depth_nerf.synthetic.geometry import Colour, Geometry, MeshBuilder, Pair, Real, Triple, placement
+from edge_depth_nerf.synthetic.materials import Material
+from edge_depth_nerf.synthetic.motion import FRAME_INTERVAL_S, Drive, Route
+from edge_depth_nerf.synthetic.options import SceneName, SynthesizeOptions
+
+LANE_M = 3.5
+KERB_Y_M = 5.7
+"""From the middle of the road to the kerb: a lane and a row of parked cars."""
+HOUSE_Y_M = 8.7
+KERB_HEIGHT_M = 0.12
+
+_ASPHALT: Colour = (0.115, 0.113, 0.11)
+_PAVING: Colour = (0.27, 0.255, 0.235)
+_KERB: Colour = (0.36, 0.35, 0.33)
+_GRASS: Colour = (0.085, 0.125, 0.04)
+_LINE: Colour = (0.62, 0.62, 0.6)
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """What lights a scene; linear RGB."""
+
+    exposure: Real
+    """Factor from radiance to the picture's 0-1."""
+    ambient_up: Colour
+    """Light on what faces up."""
+    ambient_down: Colour
+    """Light on what faces down."""
+    sun_direction: Triple | None = None
+    """Unit vector to the sun; none = indoors, without a sky."""
+    sun: Colour = (0.0, 0.0, 0.0)
+    """The sun's light on what faces it."""
+    lamps: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+    """Positions of lamps, N×3."""
+    lamp: Colour = (0.0, 0.0, 0.0)
+    """A lamp's light at 1 m on what faces it."""
+    lamp_reach_m: Real = 8.0
+    """Distance at which a lamp's light has faded to nothing."""
+
+
+@dataclass(frozen=True)
+class Mover:
+    """A car that drives along a route at one speed."""
+
+    geometry: Geometry
+    route: Route
+    start_m: Real
+    """Arc length at time 0."""
+    speed_m_s: Real
+
+    def at(self, time_s: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Positions on the ground (N×2) and headings (N) at N times."""
+        return self.route.at(self.start_m + self.speed_m_s * np.asarray(time_s, np.float64))
+
+
+@dataclass(frozen=True)
+class SceneModel:
+    """All that sensors can see, and how the recording car drives through it."""
+
+    static: Geometry
+    movers: list[Mover]
+    lighting: Lighting
+    contacts: list[NDArray[np.float64]]
+    """Convex outlines (N×2) of what stands on the ground and keeps light from it."""
+    drive: Drive
+
+
+class _Site:
+    """A mesh and the outlines of what stands in it."""
+
+    def __init__(self) -> None:
+        self.mesh = MeshBuilder()
+        self.contacts: list[NDArray[np.float64]] = []
+
+    def put(self, geometry: Geometry, transform: NDArray, outline: Sequence[Pair] = ()) -> None:
+        """Add an object; its outline is given in its own frame."""
+        self.mesh.add(geometry, transform)
+        if outline:
+            flat = np.asarray(outline, np.float64)
+            self.contacts.append(flat @ transform[:2, :2].T + transform[:2, 3])
+
+    def put_site(self, other: _Site, transform: NDArray) -> None:
+        self.mesh.add(other.mesh.build(), transform)
+        self.contacts += [outline @ transform[:2, :2].T + transform[:2, 3] for outline in other.contacts]
+
+
+def _rectangle(x: Pair, y: Pair) -> list[Pair]:
+    return [(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]
+
+
+def _car_outline(shape: objects.CarShape) -> list[Pair]:
+    length, width = shape.length / 2 - 0.1, shape.width / 2 - 0.05
+    return _rectangle((-length, length), (-width, width))
+
+
+def _parked_row(site: _Site, x: Pair, facing_rad: Real, rng: Generator) -> None:
+    """Cars parked one behind the other along the kerb, with gaps."""
+    at = x[0] + rng.uniform(0, 2)
+    while True:
+        geometry, shape = objects.random_car(rng)
+        if at + shape.length > x[1]:
+            return
+        if rng.random() < 0.78:
+            yaw = facing_rad + rng.normal(0, 0.015) + (np.pi if rng.random() < 0.06 else 0.0)
+            where = placement(at + shape.length / 2, 4.62 + rng.normal(0, 0.06), 0, yaw)
+            site.put(geometry, where, _car_outline(shape))
+        else:
+            at += rng.uniform(0, 2.5)
+        at += shape.length + rng.uniform(0.6, 1.3)
+
+
+def _houses(site: _Site, x: Pair, rng: Generator, corner_first: bool) -> None:
+    """A row of houses at the back of the pavement, with gaps, front gardens, hedges and walls."""
+    at = x[0]
+    first = True
+    while at < x[1]:
+        width = rng.uniform(8, 13.5)
+        at_corner = first and corner_first
+        set_back = 0.0 if at_corner or rng.random() < 0.6 else rng.uniform(2.0, 3.5)
+        depth = rng.uniform(9, 11) if not at_corner else 10.0
+        shop = set_back == 0 and rng.random() < 0.35
+        front = HOUSE_Y_M + set_back
+        site.put(
+            objects.house(width, depth, rng, shop),
+            placement(at, front, KERB_HEIGHT_M),
+            _rectangle((0, width), (0, depth)),
+        )
+        if set_back:
+            site.mesh.add_rectangle(
+                (at - 0.3, at + width + 0.3), (HOUSE_Y_M, front), KERB_HEIGHT_M + 0.015, Material.GRASS, _GRASS
+            )
+            if rng.random() < 0.6:
+                plant = objects.hedge(width - 3.0, rng.uniform(0.8, 1.3), rng)
+                site.put(plant, placement(at, HOUSE_Y_M + 0.35, KERB_HEIGHT_M), _rectangle((0, width - 3), (-0.3, 0.3)))
+            else:
+                size = (width - 3.0, 0.25, rng.uniform(0.7, 1.1))
+                centre = (at + size[0] / 2, HOUSE_Y_M + 0.15, KERB_HEIGHT_M + size[2] / 2)
+                site.mesh.add_box(centre, size, Material.BRICK, (0.36, 0.17, 0.11))
+        for _ in range(int(rng.integers(0, 3))):
+            colour = ((0.05, 0.06, 0.06), (0.08, 0.18, 0.07), (0.45, 0.35, 0.02))[int(rng.integers(3))]
+            where = placement(
+                at + rng.uniform(0.5, width - 0.5), HOUSE_Y_M - 0.45, KERB_HEIGHT_M, rng.normal(1.57, 0.1)
+            )
+            site.put(objects.bin_on_wheels(colour), where, _rectangle((-0.28, 0.28), (-0.28, 0.28)))
+        at += width
+        first = False
+        if rng.random() < 0.3 and not at_corner:
+            gap = rng.uniform(3, 7)
+            site.mesh.add_rectangle(
+                (at, at + gap), (HOUSE_Y_M, HOUSE_Y_M + 25), KERB_HEIGHT_M + 0.01, Material.GRASS, _GRASS
+            )
+            hedge = objects.hedge(gap, rng.uniform(1.0, 1.8), rng)
+            site.put(hedge, placement(at, HOUSE_Y_M + 0.5, KERB_HEIGHT_M), _rectangle((0, gap), (-0.3, 0.3)))
+            small = objects.tree(rng.uniform(5, 8), rng, leaves=5000)
+            site.put(small, placement(at + gap / 2, HOUSE_Y_M + rng.uniform(3.5, 8), KERB_HEIGHT_M))
+            at += gap
+
+
+def _street_side(x: Pair, clear_m: Real, facing_rad: Real, rng: Generator, corner_first: bool = False) -> _Site:
+    """One side of a street, y > 0, along x: parked cars, trees, lamps, signs, houses.
+
+    Args:
+        x: where the houses begin and end.
+        clear_m: length at the beginning without cars and trees (a junction).
+        facing_rad: heading of the parked cars.
+        rng: random choices.
+        corner_first: whether the first house stands at a corner.
+
+    """
+    site = _Site()
+    begin = x[0] + clear_m
+    _parked_row(site, (begin, x[1]), facing_rad, rng)
+    _houses(site, x, rng, corner_first)
+    edge = KERB_Y_M + 0.75
+    ground = KERB_HEIGHT_M
+    small = _rectangle((-0.14, 0.14), (-0.14, 0.14))
+    at = begin + rng.uniform(1, 6)
+    while at < x[1]:
+        trunk = placement(at, edge + rng.normal(0, 0.05), ground, rng.uniform(0, 6.28))
+        site.put(objects.tree(rng.uniform(6.5, 10.5), rng), trunk, small)
+        bed = (at - 0.65, at + 0.65), (edge - 0.6, edge + 0.6)
+        site.mesh.add_rectangle(*bed, ground + 0.004, Material.GRASS, (0.10, 0.09, 0.055))
+        at += rng.uniform(8, 17)
+    at = begin + rng.uniform(0, 8)
+    while at < x[1]:
+        site.put(objects.street_lamp(), placement(at, KERB_Y_M + 0.45, ground), small)
+        at += rng.uniform(22, 28)
+    at = begin - 0.5 * clear_m + rng.uniform(0, 4)
+    while at < x[1]:
+        kind = int(rng.integers(4))
+        # signs face the traffic on their own side
+        yaw = facing_rad + rng.normal(0, 0.08)
+        site.put(objects.road_sign(kind), placement(at, KERB_Y_M + 0.4, ground, yaw), small)
+        at += rng.uniform(9, 20)
+    at = begin + rng.uniform(0, 10)
+    while at < x[1]:
+        choice = rng.random()
+        if choice < 0.4:
+            for step in range(int(rng.integers(3, 6))):
+                site.put(objects.bollard(), placement(at + 1.5 * step, KERB_Y_M + 0.35, ground), small)
+        elif choice < 0.7:
+            where = placement(at, HOUSE_Y_M - 0.3, ground)
+            site.put(objects.cabinet(), where, _rectangle((-0.45, 0.45), (-0.17, 0.17)))
+        else:
+            colour = ((0.06, 0.25, 0.1), (0.08, 0.15, 0.4), (0.45, 0.12, 0.05))[int(rng.integers(3))]
+            site.put(objects.billboard(colour), placement(at, HOUSE_Y_M - 0.5, ground))
+        at += rng.uniform(14, 28)
+    mesh = site.mesh
+    for bay in np.arange(begin, x[1], 5.6):
+        mesh.add_rectangle((bay - 0.05, bay + 0.05), (LANE_M, KERB_Y_M), 0.003, Material.MARKING, _LINE)
+    mesh.add_rectangle((begin, x[1]), (LANE_M - 0.05, LANE_M + 0.05), 0.0025, Material.MARKING, _LINE)
+    # gutter of small stones along the kerb
+    mesh.add_rectangle((begin, x[1]), (KERB_Y_M - 0.3, KERB_Y_M), 0.002, Material.PAVING, (0.17, 0.165, 0.155))
+    return site
+
+
+def _road_details(mesh: MeshBuilder, x: Pair, rng: Generator) -> None:
+    """Middle line, repaired patches, manholes along a road on the x axis."""
+    for dash in np.arange(x[0], x[1] - 3, 6.0):
+        mesh.add_rectangle((dash, dash + 3.0), (-0.06, 0.06), 0.003, Material.MARKING, _LINE)
+    for at in np.arange(x[0], x[1], 7.0):
+        if rng.random() < 0.6:
+            start, width = at + rng.uniform(0, 4), rng.uniform(0.6, 1.6)
+            y, length = rng.uniform(-3.2, 2.2), rng.uniform(1, 4)
+            tone = rng.uniform(0.05, 0.085)
+            mesh.add_rectangle((start, start + length), (y, y + width), 0.0015, Material.ASPHALT, (tone, tone, tone))
+        if rng.random() < 0.5:
+            where = (at + rng.uniform(0, 7), rng.uniform(-3, 3), 0.004)
+            mesh.add_disc(where, (0, 0, 1), 0.36, Material.STONE, (0.2, 0.195, 0.19), 24)
+            mesh.add_disc((*where[:2], 0.005), (0, 0, 1), 0.29, Material.METAL, (0.07, 0.065, 0.06), 24)
+
+
+def _block(mesh: MeshBuilder, outline: NDArray[np.float64]) -> None:
+    """A raised block of pavement with a kerb, from a convex counter-clockwise outline (N×2)."""
+    following = np.roll(outline, -1, axis=0)
+    low, high = np.zeros(len(outline)), np.full(len(outline), KERB_HEIGHT_M)
+    for a, b in zip(np.column_stack((outline, low)), np.column_stack((following, low)), strict=True):
+        up = (0, 0, KERB_HEIGHT_M)
+        mesh.add_polygon([a, b, b + up, a + up], Material.STONE, _KERB)
+    mesh.add_polygon(np.column_stack((outline, high)), Material.PAVING, _PAVING)
+    # the kerb stones' tops: a strip along each edge, moved inwards along the mean of the edges' normals
+    edge = following - outline
+    inward = np.stack((-edge[:, 1], edge[:, 0]), -1) / np.linalg.norm(edge, axis=1, keepdims=True)
+    joint = inward + np.roll(inward, 1, axis=0)
+    joint = joint / np.sum(joint * inward, axis=1, keepdims=True) * 0.16
+    inner = outline + joint
+    for i in range(len(outline)):
+        j = (i + 1) % len(outline)
+        strip = [outline[i], outline[j], inner[j], inner[i]]
+        mesh.add_ground_polygon(strip, KERB_HEIGHT_M + 0.002, Material.STONE, _KERB)
+
+
+_DAYLIGHT = Lighting(
+    exposure=0.56,
+    ambient_up=(0.68, 0.76, 0.92),
+    ambient_down=(0.30, 0.27, 0.23),
+    # ahead and left, so that one camera looks into the light and the other with it
+    sun_direction=(0.479, 0.628, 0.613),
+    sun=(2.5, 2.35, 2.05),
+)
+
+
+def _movers(
+    options: SynthesizeOptions, own: Drive, oncoming: Route, oncoming_zero_m: Real, rng: Generator
+) -> list[Mover]:
+    """Cars that drive: by turns towards the recording car, meeting it during the drive, and ahead of it.
+
+    `oncoming_zero_m` is the arc length of the oncoming route where the recording car starts beside it.
+    """
+    movers = []
+    speed = options.mean_speed_m_s
+    duration = options.frames * FRAME_INTERVAL_S
+    towards = (options.moving + 1) // 2
+    for number in range(options.moving):
+        kind = str(rng.choice(["hatchback", "saloon", "estate"]))
+        colour = objects.CAR_COLOURS[int(rng.integers(len(objects.CAR_COLOURS)))]
+        geometry = objects.car(kind, colour)
+        if number % 2 == 0:
+            meets_s = duration * (number // 2 + 0.5) / towards
+            its_speed = speed * rng.uniform(0.9, 1.1)
+            # both have the same place beside the road at the moment of meeting
+            start = oncoming_zero_m - speed * meets_s - its_speed * meets_s
+            movers.append(Mover(geometry, oncoming, start, its_speed))
+        else:
+            ahead = 9.0 + 9.0 * (number // 2)
+            movers.append(Mover(geometry, own.route, own.start_m + ahead, speed))
+    return movers
+
+
+def _street(options: SynthesizeOptions) -> SceneModel:
+    rng = np.random.default_rng([options.seed, 1])
+    length = options.mean_speed_m_s * options.frames * FRAME_INTERVAL_S
+    x = (-60.0, length + 75.0)
+    site = _Site()
+    mesh = site.mesh
+    mesh.add_rectangle((x[0] - 150, x[1] + 150), (-200, 200), -0.01, Material.GRASS, _GRASS)
+    mesh.add_rectangle((x[0] - 60, x[1] + 60), (-KERB_Y_M, KERB_Y_M), 0.0, Material.ASPHALT, _ASPHALT)
+    _road_details(mesh, x, rng)
+    for side in (1, -1):
+        outline = np.array(_rectangle((x[0] - 60, x[1] + 60), (KERB_Y_M, 45.0)))
+        _block(mesh, outline if side > 0 else -outline)
+        row = _street_side(x, 0.0, np.pi if side > 0 else 0.0, rng)
+        site.put_site(row, placement(0, 0, mirror_y=side < 0))
+        back = objects.thicket(x[1] - x[0] + 80, 12.0, rng)
+        site.put(back, placement(x[0] - 40, side * 42.0))
+    for end, yaw in ((x[0] - 40, np.pi / 2), (x[1] + 40, -np.pi / 2)):
+        row = _Site()
+        _houses(row, (-30.0, 26.0), rng, corner_first=False)
+        site.put_site(row, placement(end, 0, 0, yaw))
+    drive = Drive.random(Route((0.0, -1.75)), 0.0, options.mean_speed_m_s, np.random.default_rng([options.seed, 2]))
+    movers = _movers(options, drive, Route((0.0, 1.75), np.pi), 0.0, np.random.default_rng([options.seed, 3]))
+    return SceneModel(mesh.build(), movers, _DAYLIGHT, site.contacts, drive)
+
+
+_CORNER_M = 4.0
+"""Radius of the kerb at a junction's corners."""
+
+
+def _traffic_light(site: _Site, x: Real, y: Real, yaw_rad: Real) -> None:
+    mesh = MeshBuilder()
+    mesh.add_rod((0, 0, 0), (0, 0, 3.3), 0.055, Material.METAL, (0.2, 0.21, 0.21))
+    mesh.add_box((-0.12, 0, 2.85), (0.2, 0.3, 0.9), Material.PAINTED, (0.02, 0.02, 0.02))
+    for z, colour in ((3.13, (0.6, 0.02, 0.01)), (2.85, (0.2, 0.12, 0.01)), (2.57, (0.01, 0.12, 0.05))):
+        mesh.add_disc((-0.225, 0, z), (1, 0, 0), 0.1, Material.PAINTED, colour)
+    site.put(mesh.build(), placement(x, y, KERB_HEIGHT_M, yaw_rad), _rectangle((-0.1, 0.1), (-0.1, 0.1)))
+
+
+def _crossing(mesh: MeshBuilder) -> None:
+    """Zebra stripes and a stop line across the arm that leaves the origin along x."""
+    near = KERB_Y_M + _CORNER_M + 0.3
+    for y in np.arange(-KERB_Y_M + 0.35, KERB_Y_M - 0.5, 1.0):
+        mesh.add_rectangle((near, near + 3.0), (y, y + 0.5), 0.003, Material.MARKING, _LINE)
+    mesh.add_rectangle((near + 3.7, near + 4.15), (0.1, LANE_M), 0.003, Material.MARKING, _LINE)
+
+
+def _turn(options: SynthesizeOptions) -> SceneModel:
+    rng = np.random.default_rng([options.seed, 1])
+    length = options.mean_speed_m_s * options.frames * FRAME_INTERVAL_S
+    straight = 15.0
+    route = Route((0.0, -1.75), turn_rad=-np.pi / 2, turn_at_m=straight)
+    # a drive too short for all of it has the turn in its middle
+    start = max(0.0, straight + route.turn_length_m / 2 - length / 2)
+    after, _ = route.at(np.array([straight + route.turn_length_m]))
+    centre_x = float(after[0, 0]) + 1.75
+    site = _Site()
+    mesh = site.mesh
+    mesh.add_rectangle((-260, 320), (-320, 260), -0.01, Material.GRASS, _GRASS)
+    reach = max(65.0, length + 45.0)
+    for half_x, half_y in ((reach + 60, KERB_Y_M), (KERB_Y_M, reach + 60)):
+        z = 0.0 if half_y == KERB_Y_M else -0.001
+        mesh.add_rectangle((centre_x - half_x, centre_x + half_x), (-half_y, half_y), z, Material.ASPHALT, _ASPHALT)
+    # the road's full width at the corners, where the kerb is round
+    inner = KERB_Y_M + _CORNER_M
+    mesh.add_rectangle((centre_x - inner, centre_x + inner), (-inner, inner), 0.0007, Material.ASPHALT, _ASPHALT)
+    house_gap = HOUSE_Y_M + 10.0 + 2.5
+    for arm in range(4):
+        local = _Site()
+        # two opposite arms own the corner houses, the others begin behind them
+        corner = arm % 2 == 0
+        begin = HOUSE_Y_M if corner else house_gap
+        clear = 16.5 - HOUSE_Y_M if corner else 1.0
+        for side in (1, -1):
+            row = _street_side((begin, reach), clear, np.pi if side > 0 else 0.0, rng, corner)
+            local.put_site(row, placement(0, 0, mirror_y=side < 0))
+            angles = np.linspace(np.pi, 1.5 * np.pi, 9)
+            arc = inner + _CORNER_M * np.column_stack((np.cos(angles), np.sin(angles)))
+            if side > 0:
+                _block(
+                    local.mesh,
+                    np.concatenate((arc, [(reach + 60, KERB_Y_M), (reach + 60, reach + 60), (KERB_Y_M, reach + 60)])),
+                )
+            _traffic_light(local, inner + 3.4, side * (KERB_Y_M + 0.35), np.pi if side > 0 else 0.0)
+        _crossing(local.mesh)
+        _road_details(local.mesh, (inner + 4.5, reach), rng)
+        far = _Site()
+        _houses(far, (-30.0, 26.0), rng, corner_first=False)
+        local.put_site(far, placement(reach + 15, 0, 0, -np.pi / 2))
+        back = objects.thicket(2 * reach, 12.0, rng)
+        local.put(back, placement(reach + 25, -reach, 0, np.pi / 2))
+        site.put_site(local, placement(centre_x, 0, 0, arm * np.pi / 2))
+    drive = Drive.random(route, start, options.mean_speed_m_s, np.random.default_rng([options.seed, 2]))
+    oncoming = Route((0.0, 1.75), np.pi)
+    movers = _movers(options, drive, oncoming, -start, np.random.default_rng([options.seed, 3]))
+    return SceneModel(mesh.build(), movers, _DAYLIGHT, site.contacts, drive)
+
+
+_CEILING_M = 2.6
+_BAY_M = 2.5
+_AISLE_HALF_M = 3.0
+_BAY_DEPTH_M = 5.0
+_LINE_COLOUR: Colour = (0.62, 0.52, 0.10)
+
+
+def _bays(site: _Site, x: Pair, front_y: Real, side: int, share: Real, rng: Generator) -> None:
+    """Parking bays across the aisle from `front_y` on, with lines, numbers and some cars."""
+    back_y = front_y + side * _BAY_DEPTH_M
+    y = (min(front_y, back_y), max(front_y, back_y))
+    for start in np.arange(x[0], x[1] - _BAY_M + 0.01, _BAY_M):
+        site.mesh.add_rectangle((start - 0.05, start + 0.05), y, 0.003, Material.MARKING, _LINE_COLOUR)
+        number = (start + 0.8, start + 1.7), tuple(sorted((front_y + side * 0.3, front_y + side * 0.7)))
+        site.mesh.add_rectangle(number[0], (number[1][0], number[1][1]), 0.003, Material.PRINT, (0.25, 0.24, 0.22))
+        if rng.random() < share:
+            geometry, shape = objects.random_car(rng)
+            yaw = side * np.pi / 2 * (1 if rng.random() < 0.7 else -1) + rng.normal(0, 0.025)
+            depth = front_y + side * (shape.length / 2 + rng.uniform(0.1, 0.3 + _BAY_DEPTH_M - shape.length))
+            where = placement(start + _BAY_M / 2 + rng.normal(0, 0.08), depth, 0, yaw)
+            site.put(geometry, where, _car_outline(shape))
+
+
+def _pillar(site: _Site, x: Real, y: Real, number: int) -> None:
+    mesh, half = site.mesh, 0.26
+    mesh.add_box((x, y, _CEILING_M / 2), (2 * half, 2 * half, _CEILING_M), Material.CONCRETE, (0.40, 0.39, 0.37))
+    for band in range(5):
+        colour: Colour = (0.55, 0.40, 0.02) if band % 2 == 0 else (0.03, 0.03, 0.03)
+        size = 2 * half + 0.012
+        mesh.add_box((x, y, 0.1 + 0.2 * band), (size, size, 0.2), Material.PAINTED, colour)
+    colour = ((0.05, 0.2, 0.45), (0.4, 0.05, 0.05), (0.06, 0.3, 0.1))[number % 3]
+    mesh.add_box((x, y, 1.75), (2 * half + 0.012, 2 * half + 0.012, 0.45), Material.PRINT, colour)
+    site.contacts.append(np.array(_rectangle((x - half, x + half), (y - half, y + half))))
+
+
+def _parking(options: SynthesizeOptions) -> SceneModel:
+    rng = np.random.default_rng([options.seed, 1])
+    length = options.mean_speed_m_s * options.frames * FRAME_INTERVAL_S
+    bays = 7.5
+    x0, x1 = -15.0, bays * np.ceil((length + 18.0) / bays)
+    wall_left = _AISLE_HALF_M + _BAY_DEPTH_M + 0.2
+    second = -(_AISLE_HALF_M + 2 * _BAY_DEPTH_M + _AISLE_HALF_M)
+    wall_right = second - _AISLE_HALF_M - _BAY_DEPTH_M - 0.2
+    site = _Site()
+    mesh = site.mesh
+    whole = (x0, x1), (wall_right, wall_left)
+    mesh.add_rectangle(*whole, 0.0, Material.CONCRETE, (0.23, 0.23, 0.225))
+    mesh.add_rectangle(*whole, _CEILING_M, Material.CONCRETE, (0.42, 0.41, 0.39))
+    corners = [np.array(corner) for corner in _rectangle(*whole)]
+    for a, b in zip(corners, [*corners[1:], corners[0]], strict=True):
+
+        def upright(low: Real, high: Real, inset: Real, kind: Material, tint: Colour, a=a, b=b) -> None:
+            inward = np.array([-(b - a)[1], (b - a)[0]]) / np.linalg.norm(b - a) * inset
+            points = [(*(a + inward), low), (*(b + inward), low), (*(b + inward), high), (*(a + inward), high)]
+            mesh.add_polygon(points, kind, tint)
+
+        upright(0.0, _CEILING_M, 0.0, Material.CONCRETE, (0.46, 0.45, 0.43))
+        upright(0.0, 1.1, 0.004, Material.PLASTER, (0.16, 0.27, 0.24))
+        upright(1.1, 1.2, 0.006, Material.PAINTED, (0.50, 0.38, 0.03))
+    for front, side, share in (
+        (_AISLE_HALF_M, 1, 0.62),
+        (-_AISLE_HALF_M, -1, 0.62),
+        (second + _AISLE_HALF_M, 1, 0.5),
+        (second - _AISLE_HALF_M, -1, 0.5),
+    ):
+        _bays(site, (x0, x1), front, side, share, rng)
+    number = 0
+    for x in np.arange(x0 + bays, x1 - 0.1, bays):
+        for y in (3.9, -3.9, -_AISLE_HALF_M - _BAY_DEPTH_M, second + 3.9, second - 3.9):
+            _pillar(site, x, y, number)
+            number += 1
+        mesh.add_box(
+            (x, (wall_left + wall_right) / 2, _CEILING_M - 0.14),
+            (0.45, wall_left - wall_right, 0.28),
+            Material.CONCRETE,
+            (0.40, 0.39, 0.37),
+        )
+    lamps = []
+    for y in (0.0, second):
+        for x in np.arange(x0 + bays / 4, x1, bays / 2):
+            mesh.add_box((x, y, _CEILING_M - 0.10), (1.3, 0.16, 0.07), Material.PAINTED, (0.5, 0.5, 0.5))
+            mesh.add_box((x, y, _CEILING_M - 0.145), (1.2, 0.07, 0.03), Material.LAMP, (0.95, 1.0, 0.92))
+            lamps.append((x, y, _CEILING_M - 0.20))
+    middle, span = (x0 + x1) / 2, x1 - x0
+    mesh.add_rod((x0, 2.1, 2.26), (x1, 2.1, 2.26), 0.05, Material.PAINTED, (0.38, 0.03, 0.025), 12)
+    mesh.add_rod((x0, 2.45, 2.27), (x1, 2.45, 2.27), 0.035, Material.METAL, (0.32, 0.33, 0.33), 12)
+    mesh.add_box((middle, -2.2, 2.25), (span, 0.32, 0.05), Material.METAL, (0.34, 0.35, 0.35))
+    mesh.add_box((middle, 6.2, 2.33), (span, 0.7, 0.34), Material.METAL, (0.40, 0.41, 0.42))
+    for x in np.arange(x0 + 4, x1, 3.0):
+        mesh.add_rod((x, 2.1, 2.26), (x, 2.1, 2.10), 0.02, Material.METAL, (0.4, 0.4, 0.4), 8)
+    for x in np.arange(x0 + 6, x1, 22.5):
+        mesh.add_box((x, wall_left - 0.03, 1.05), (1.0, 0.06, 2.1), Material.PAINTED, (0.33, 0.35, 0.36))
+        mesh.add_box((x, wall_left - 0.08, 2.28), (0.6, 0.06, 0.22), Material.LAMP, (0.05, 0.42, 0.12))
+        mesh.add_box((x + 1.4, wall_left - 0.1, 1.3), (0.3, 0.2, 0.7), Material.PAINTED, (0.45, 0.03, 0.02))
+    for x in np.arange(x0 + 7, x1 - 4, 11.0):
+        for y, facing in ((-1.4, 1), (1.4, -1)):
+            mesh.add_rectangle((x - 0.8, x + 0.8), (y - 0.08, y + 0.08), 0.003, Material.MARKING, _LINE)
+            head = [(x + facing * 1.5, y), (x + facing * 0.8, y + 0.35), (x + facing * 0.8, y - 0.35)]
+            mesh.add_ground_polygon(head, 0.003, Material.MARKING, _LINE)
+    lighting = Lighting(
+        exposure=1.05,
+        ambient_up=(0.30, 0.305, 0.28),
+        ambient_down=(0.20, 0.20, 0.185),
+        lamps=np.array(lamps),
+        lamp=(1.9, 2.0, 1.8),
+        lamp_reach_m=8.0,
+    )
+    drive = Drive.random(Route((0.0, -1.1)), 0.0, options.mean_speed_m_s, np.random.default_rng([options.seed, 2]))
+    movers = _movers(options, drive, Route((0.0, 1.6), np.pi), 0.0, np.random.default_rng([options.seed, 3]))
+    return SceneModel(mesh.build(), movers, lighting, site.contacts, drive)
+
+
+_BUILDERS = {"street": _street, "turn": _turn, "parking": _parking}
+
+
+def build_scene(options: SynthesizeOptions) -> SceneModel:
+    """Build the scene that the options name, as large as the drive needs; the same for the same options."""
+    name: SceneName = options.scene
+    return _BUILDERS[name](options)
