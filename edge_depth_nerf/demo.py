@@ -1,0 +1,241 @@
+"""`edge-depth-nerf demo`: the whole way once, from a raw drive to compared figures and pictures.
+
+Each stage is the command a user would give (`edge-depth-nerf …`, `ns-train`, `ns-eval`), and what it leaves under
+the output folder is not done again. The two models differ in the depth loss alone.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import re
+import shlex
+import subprocess
+import sys
+import time
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+from edge_depth_nerf.demo_options import DemoOptions
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.files import read_distance_png, read_image, read_json, read_mask, write_json, write_png
+from edge_depth_nerf.pictures import colour_distance, side_by_side
+from edge_depth_nerf.process.kitti360 import process_kitti360
+from edge_depth_nerf.process.options import Kitti360Options
+from edge_depth_nerf.synthetic.drive import synthesize_drive
+from edge_depth_nerf.synthetic.options import SynthesizeOptions
+
+METHOD = "edge-depth-nerf-lite"
+RUNS = {"nerfacto": "none", "ours": "edge"}
+"""Name of the run: its depth loss. nerfacto is our model without one, so near plane, scale, sampler, mask and
+initial density are the same."""
+TABLE_COLUMNS = {
+    "masked_psnr": ("masked PSNR, dB ↑", ".2f"),
+    "masked_ssim": ("masked SSIM ↑", ".3f"),
+    "truth_masked_psnr": ("… against noise-free, dB ↑", ".2f"),
+    "lidar_abs_rel": ("AbsRel, LiDAR ↓", ".3f"),
+    "truth_abs_rel": ("AbsRel, truth ↓", ".3f"),
+    "truth_delta_1_25": ("δ<1.25, truth ↑", ".3f"),
+}
+VIEWS = 3
+
+
+def run_demo(options: DemoOptions, console: Console | None = None) -> dict[str, Any]:
+    """Run or finish the demo.
+
+    Returns:
+        What results.json holds: options, versions, figures of each run, seconds of each stage, commands.
+
+    Raises:
+        InputError: the output folder holds a demo of other options, or a stage failed (its log is named).
+
+    """
+    console = console or Console()
+    output = options.output
+    recorded = {key: value for key, value in asdict(options).items() if key != "output"}
+    record = output / "demo.json"
+    if record.is_file() and read_json(record) != recorded:
+        raise InputError(
+            f"{record}: this folder holds a demo of other options ({read_json(record)}). "
+            "Choose another --output, or remove the folder."
+        )
+    write_json(record, recorded)
+    seconds: dict[str, float] = {}
+
+    started = time.monotonic()
+    drive = output / "drive"
+    synthesis = SynthesizeOptions(
+        output=drive, scene=options.scene, frames=options.frames, size=options.size, seed=options.seed
+    )
+    synthesize_drive(synthesis)
+    seconds["synthesize"] = time.monotonic() - started
+
+    started = time.monotonic()
+    scene = output / "scene"
+    process_kitti360(
+        Kitti360Options(
+            root=drive,
+            sequence=synthesis.sequence,
+            output=scene,
+            ego_mask=drive / "truth" / "masks",
+            mono=drive / "simulated_mono" / synthesis.sequence,
+        )
+    )
+    seconds["process"] = time.monotonic() - started
+
+    figures, commands = {}, []
+    for name in RUNS:
+        run = _Run(name, scene, output / "runs", options)
+        started = time.monotonic()
+        run.train(console)
+        seconds[f"train {name}"] = time.monotonic() - started
+        started = time.monotonic()
+        figures[name] = run.evaluate(console)
+        seconds[f"evaluate {name}"] = time.monotonic() - started
+        commands.append(run.viewer_command)
+
+    picture = output / "comparison.png"
+    write_png(picture, _comparison(scene, output / "runs"))
+    results = {
+        "options": recorded,
+        "versions": {name: version(name) for name in ("edge-depth-nerf", "nerfstudio", "torch", "numpy")}
+        | {"python": platform.python_version()},
+        "cores": os.cpu_count(),
+        "figures": figures,
+        "seconds": {name: round(value, 1) for name, value in seconds.items()},
+        "viewer_commands": commands,
+    }
+    write_json(output / "results.json", results)
+
+    table = Table(title=f"{options.scene}, {options.frames} moments, {options.size} px, {options.steps} steps each")
+    table.add_column("held-out views")
+    for title, _ in TABLE_COLUMNS.values():
+        table.add_column(title, justify="right")
+    for name, figure in figures.items():
+        cells = [format(figure[key], form) if key in figure else "–" for key, (_, form) in TABLE_COLUMNS.items()]
+        table.add_row(name, *cells)
+    console.print(table)
+    if "masked_lpips" not in figures["ours"]:
+        console.print("LPIPS is left out: its weights are not on this machine (nothing is downloaded).")
+    console.print(f"Picture: {picture}\nFigures: {output / 'results.json'}\nTo look around in the trained scene:")
+    for command in commands:
+        console.print(f"  {command}", soft_wrap=True)
+    return results
+
+
+class _Run:
+    """One training with its evaluation: nerfstudio's own commands, their output in log files."""
+
+    def __init__(self, name: str, scene: Path, runs: Path, options: DemoOptions) -> None:
+        self.name, self.options, self.runs = name, options, runs
+        self.scene = scene
+        self.folder = runs / name / METHOD / "run"
+        self.checkpoints = self.folder / "nerfstudio_models"
+        self.config = self.folder / "config.yml"
+        self.metrics = runs / name / "metrics.json"
+        self.viewer_command = f"ns-viewer --load-config {self.config} --viewer.websocket-host 127.0.0.1"
+
+    def _last_step(self) -> int:
+        steps = [int(path.stem.removeprefix("step-")) for path in self.checkpoints.glob("step-*.ckpt")]
+        return max(steps, default=-1)
+
+    def train(self, console: Console) -> None:
+        done = self._last_step() + 1
+        remaining = self.options.steps - done
+        if remaining <= 0:
+            return
+        arguments = [
+            *("ns-train", METHOD, "--data", self.scene, "--output-dir", self.runs),
+            *("--experiment-name", self.name, "--timestamp", "run", "--vis", "tensorboard"),
+            *("--max-num-iterations", remaining, "--machine.seed", self.options.seed),
+            *("--logging.local-writer.max-log-size", 0, "--pipeline.model.depth-loss", RUNS[self.name]),
+            *(["--load-dir", self.checkpoints] if done else []),
+        ]
+        self._call("train", arguments, console, f"Training {self.name}", total=self.options.steps)
+
+    def evaluate(self, console: Console) -> dict[str, float]:
+        if not self.metrics.is_file():
+            unfinished = self.metrics.with_name("unfinished.json")
+            arguments = [
+                *("ns-eval", "--load-config", self.config, "--output-path", unfinished),
+                *("--render-output-path", self.runs / self.name / "views"),
+            ]
+            self._call("evaluate", arguments, console, f"Evaluating {self.name}", total=None)
+            unfinished.rename(self.metrics)
+        return read_json(self.metrics)["results"]
+
+    def _call(self, stage: str, arguments: list[Any], console: Console, title: str, total: int | None) -> None:
+        log = self.runs / self.name / f"{stage}.log"
+        log.parent.mkdir(parents=True, exist_ok=True)
+        command = [str(argument) for argument in arguments]
+        program = Path(sys.executable).with_name(command[0])
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+        times = (TimeElapsedColumn(), TimeRemainingColumn())
+        with (
+            log.open("a", encoding="utf-8") as sink,
+            Progress(*(columns if total else columns[:2]), *times, console=console) as progress,
+        ):
+            task = progress.add_task(title, total=total)
+            sink.write(f"$ {shlex.join(command)}\n")
+            sink.flush()
+            process = subprocess.Popen(
+                [str(program), *command[1:]], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+            )
+            try:
+                assert process.stdout is not None
+                for line in process.stdout:
+                    sink.write(line)
+                    step = re.match(r"\s*(\d+) \(\d", line)
+                    if step and total:
+                        progress.update(task, completed=int(step.group(1)))
+                status = process.wait()
+            finally:
+                process.kill()
+            if total:
+                progress.update(task, completed=total)
+        if status:
+            raise InputError(
+                f"{program.name} ended with status {status}. What it said is in {log}; the command was\n"
+                f"{shlex.join(command)}"
+            )
+
+
+def _comparison(scene: Path, runs: Path) -> np.ndarray:
+    """Truth, nerfacto and ours, colours and distance, for some held-out views."""
+    transforms = json.loads((scene / "transforms.json").read_text())
+    held_out = set(transforms["test_filenames"])
+    frames = sorted((f for f in transforms["frames"] if f["file_path"] in held_out), key=lambda f: f["file_path"])
+    chosen = np.linspace(0, len(frames) - 1, min(VIEWS, len(frames))).round().astype(int)
+    rows = []
+    for index in chosen:
+        frame = frames[index]
+        mask = read_mask(scene / frame["mask_path"])
+        true_rgb = read_image(scene / frame["file_path"])
+        true_distance = read_distance_png(scene / frame["truth_distance_file_path"])
+        colours, distances = [true_rgb], [colour_distance(true_distance, mask)]
+        for name in RUNS:
+            views = runs / name / "views"
+            # nerfstudio saves truth and rendering side by side
+            colours.append(read_image(views / f"eval_img_{index:04d}.png")[:, true_rgb.shape[1] :])
+            distances.append(read_image(views / f"eval_distance_{index:04d}.png"))
+        hidden = ~mask
+        for picture in colours[1:]:
+            picture[hidden] = 0
+        rows.append([*colours, *distances])
+    names = ["truth", *RUNS]
+    return side_by_side(rows, [*names, *(f"{name}: distance" for name in names)])

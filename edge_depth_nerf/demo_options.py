@@ -1,0 +1,28 @@
+"""Options of `edge-depth-nerf demo`; a module of its own so that the command line starts fast."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+
+@dataclass
+class DemoOptions:
+    """Synthesise a drive, train nerfacto and edge-depth-nerf-lite on it, compare them on held-out views.
+
+    Stopped at any moment, the same command takes up where it was.
+    """
+
+    output: Path = Path("outputs/demo")
+    """Folder for the drive, the scene, the trained models, results.json and the pictures."""
+    scene: Literal["street", "parking", "turn"] = "street"
+    """What the drive passes."""
+    frames: int = 40
+    """Moments of the drive; two pictures each."""
+    size: int = 256
+    """Width and height of the pictures, px."""
+    steps: int = 800
+    """Training steps of each model."""
+    seed: int = 0
+    """Seed of the drive and of the training."""

@@ -1,0 +1,106 @@
+"""The demo, small: every stage for real."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from edge_depth_nerf import demo
+from edge_depth_nerf.demo_options import DemoOptions
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.files import read_image, read_json
+from edge_depth_nerf.pictures import NO_VALUE_RGB, colour_distance, side_by_side
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    options = DemoOptions(output=tmp_path_factory.mktemp("demo") / "out", frames=13, size=64, steps=8)
+    return options, demo.run_demo(options, Console(quiet=True))
+
+
+def test_it_leaves_figures_and_a_picture(finished):
+    options, results = finished
+    assert read_json(options.output / "results.json") == results
+    for name in ("nerfacto", "ours"):
+        assert {*demo.TABLE_COLUMNS} <= set(results["figures"][name])
+        assert np.isfinite(list(results["figures"][name].values())).all()
+    picture = read_image(options.output / "comparison.png")
+    # two moments of two cameras are held out (4 and 12), of which three views are shown: three rows of six pictures
+    assert picture.shape == (34 + 3 * 70 - 6, 6 * 70 - 6, 3)
+    assert len(results["viewer_commands"]) == 2
+    assert all("--viewer.websocket-host 127.0.0.1" in command for command in results["viewer_commands"])
+
+
+def test_the_two_models_differ_in_the_depth_loss_alone(finished):
+    options, _ = finished
+    texts = []
+    for name in demo.RUNS:
+        text = next((options.output / "runs" / name).rglob("config.yml")).read_text()
+        texts.append(text.replace(f"experiment_name: {name}", "experiment_name: X").splitlines())
+    different = [(a, b) for a, b in zip(*texts, strict=True) if a != b]
+    assert [(a.strip(), b.strip()) for a, b in different] == [("depth_loss: none", "depth_loss: edge")]
+
+
+def test_what_is_there_is_not_done_again(finished, monkeypatch):
+    options, results = finished
+    monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: pytest.fail("started a command"))
+    again = demo.run_demo(options, Console(quiet=True))
+    assert again["figures"] == results["figures"]
+
+
+def test_other_options_need_another_folder(finished):
+    options, _ = finished
+    with pytest.raises(InputError, match="other options"):
+        demo.run_demo(replace(options, steps=9), Console(quiet=True))
+
+
+def test_a_stage_that_fails_names_its_log(finished, tmp_path, monkeypatch):
+    options, _ = finished
+    run = demo._Run("nerfacto", tmp_path / "no scene", tmp_path / "runs", options)
+    with pytest.raises(InputError, match=r"train\.log.*\n.*ns-train edge-depth-nerf-lite"):
+        run.train(Console(quiet=True))
+    assert "no such file" in (tmp_path / "runs" / "nerfacto" / "train.log").read_text()
+
+
+def test_the_command_says_what_is_wrong_without_a_traceback(tmp_path):
+    done = subprocess.run(
+        [
+            *(sys.executable, "-m", "edge_depth_nerf.cli", "process", "kitti360", "--root", str(tmp_path)),
+            *("--sequence", "drive", "--output", str(tmp_path / "scene")),
+        ],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith("edge-depth-nerf: ")
+    assert str(tmp_path) in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "scene").exists()
+
+
+def test_colours_of_distance():
+    distance = np.array([[1.0, 60.0, 0.0, np.nan, np.inf, 200.0, 7.7]])
+    colours = colour_distance(distance)
+    assert colours.dtype == np.uint8
+    red, blue = colours[0, 0].astype(int), colours[0, 1].astype(int)
+    assert red[0] > 100 > red[2]  # near is red
+    assert blue[2] > blue[0] - 30 and red[0] > blue[0]
+    for none in (2, 3, 4):
+        assert tuple(colours[0, none]) == NO_VALUE_RGB
+    assert (colours[0, 5] == colours[0, 1]).all()  # beyond the range: its last colour
+    hidden = colour_distance(distance, np.zeros(distance.shape, bool))
+    assert (hidden == np.array(NO_VALUE_RGB)).all()
+
+
+def test_a_sheet_holds_its_pictures():
+    red, green = (np.full((20, 30, 3), colour, np.uint8) for colour in ((255, 0, 0), (0, 255, 0)))
+    sheet = side_by_side([[red, green], [green, red]], ["a", "b"])
+    assert sheet.shape == (34 + 46, 66, 3)
+    assert (sheet[34:54, :30] == red).all() and (sheet[60:80, 36:] == red).all()
+    assert (sheet[34:54, 36:] == green).all()
