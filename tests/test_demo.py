@@ -63,7 +63,7 @@ def test_a_stage_that_fails_names_its_log(finished, tmp_path, monkeypatch):
     options, _ = finished
     run = demo._Run("nerfacto", tmp_path / "no scene", tmp_path / "runs", options)
     with pytest.raises(InputError, match=r"train\.log.*\n.*ns-train edge-depth-nerf-lite"):
-        run.train(Console(quiet=True))
+        run.train(demo._progress(Console(quiet=True)))
     assert "no such file" in (tmp_path / "runs" / "nerfacto" / "train.log").read_text()
 
 
