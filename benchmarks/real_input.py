@@ -19,7 +19,7 @@ from rich.table import Table
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 
-from real_scenes import fisheye_frame_scene, stereo_scene  # noqa: E402
+from real_scenes import fisheye_frame_scene, stereo_scene  # noqa: E402  # pyright: ignore[reportMissingImports]
 
 from edge_depth_nerf.files import read_json  # noqa: E402
 

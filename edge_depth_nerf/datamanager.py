@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
@@ -25,6 +26,7 @@ from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
 from edge_depth_nerf.dataset import FisheyeDepthDataset
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.integration import IntegrationOptions
+from edge_depth_nerf.metrics import has_whole_window
 from edge_depth_nerf.pixel_table import PixelBatch, PixelTable
 from edge_depth_nerf.prior import Prior, PriorCache, PriorOptions
 
@@ -37,9 +39,9 @@ class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig):
     """Target class to instantiate."""
     dataparser: AnnotatedDataParserUnion = field(default_factory=FisheyeDepthDataParserConfig)
     """Specifies the dataparser used to unpack the data."""
-    depth_source: Literal["auto", "integrated", "lidar", "mono"] = "auto"
+    depth_source: Literal["auto", "integrated", "lidar", "mono", "none"] = "auto"
     """Where the prior comes from: LiDAR and monocular maps integrated (Eq. 5), or one of them alone (Table 3).
-    auto: what the scene has."""
+    auto: what the scene has. none: no prior."""
     integration: Literal["edge-aware", "spatial-gaussian"] = "edge-aware"
     """Kernel of the integration: Eq. 7, or Eq. 7 without its depth factor (Table 4)."""
     alpha: float = 0.7
@@ -73,6 +75,7 @@ class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig):
 
         """
         source = self.depth_source
+        assert source != "none"
         if source == "auto":
             source = "integrated" if has_lidar and has_mono else "lidar" if has_lidar else "mono"
         missing = [
@@ -183,7 +186,8 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         cache: PriorCache | None = None
         has_lidar = bool(dataset.metadata["lidar_filenames"])
         has_mono = bool(dataset.metadata["mono_filenames"])
-        if with_prior and (has_lidar or has_mono or self.config.depth_source != "auto"):
+        wanted = self.config.depth_source != "none" and (has_lidar or has_mono or self.config.depth_source != "auto")
+        if with_prior and wanted:
             options = self.config.prior_options(has_lidar, has_mono)
             data = Path(self.config.dataparser.data)
             scene = data.parent if data.suffix == ".json" else data
@@ -192,6 +196,12 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         def load(image_idx: int) -> tuple[Any, Any, Prior | None]:
             rgb = dataset.rgb(image_idx)
             mask = dataset.mask(image_idx)
+            if not with_prior and not has_whole_window(torch.from_numpy(mask)):
+                raise InputError(
+                    f"{dataset.mask_key(image_idx)[0] or dataset.image_filenames[image_idx]}: the mask of the held-out "
+                    f"picture {dataset.image_filenames[image_idx].name} keeps too little to judge by (not one window "
+                    "of SSIM, 11×11 px). Mend the mask (255 = use the pixel), or do not hold that picture out."
+                )
             if cache is None:
                 return rgb, mask, None
             lidar, mono = dataset.lidar_distance_m(image_idx), dataset.mono_distance_m(image_idx)

@@ -83,6 +83,12 @@ def check_meta(meta: Any, path: Path) -> list[dict[str, Any]]:
         for key in ("file_path", "transform_matrix"):
             if key not in frame:
                 raise InputError(f"{path}: frame {number} has no {key}. Every frame needs a picture and a pose.")
+        for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
+            if key not in meta and key not in frame:
+                raise InputError(
+                    f"{path}: frame {number} ({frame['file_path']}) has no {key}, nor has the whole scene. "
+                    "Every camera needs fl_x, fl_y, cx, cy, w and h in pixels."
+                )
         pose = np.asarray(frame["transform_matrix"], dtype=np.float64)
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
             raise InputError(
@@ -97,6 +103,36 @@ def check_meta(meta: Any, path: Path) -> list[dict[str, Any]]:
                 f"for {', '.join(missing[:3])}{' …' if len(missing) > 3 else ''}. Give it for every frame or none."
             )
     return frames
+
+
+def check_split(meta: dict[str, Any], path: Path) -> None:
+    """Check the lists of training and held-out pictures.
+
+    A moment is either trained on or held out, with all its cameras: they share one LiDAR sweep. (A scene with nothing
+    held out has the same pictures in both lists.)
+
+    Raises:
+        InputError: a name that is no frame's, or a moment that is in both.
+    """
+    by_name = {frame["file_path"]: frame for frame in meta["frames"]}
+    lists = {split: meta[f"{split}_filenames"] for split in ("train", "val", "test") if f"{split}_filenames" in meta}
+    for split, names in lists.items():
+        unknown = [name for name in names if name not in by_name]
+        if unknown:
+            raise InputError(f"{path}: {split}_filenames names {unknown[0]}, which is the file_path of no frame.")
+    if "train" not in lists:
+        return
+    for split in ("val", "test"):
+        held_out = lists.get(split, [])
+        if set(held_out) == set(lists["train"]):
+            continue
+        moments = [{by_name[name].get("frame", name) for name in names} for names in (lists["train"], held_out)]
+        shared = sorted(moments[0] & moments[1], key=str)
+        if shared:
+            raise InputError(
+                f"{path}: frame {shared[0]} is in train_filenames and in {split}_filenames. All cameras of a moment "
+                "share one LiDAR sweep, so a moment is either trained on or held out. Process the drive again."
+            )
 
 
 class FisheyeDepth(Nerfstudio):
@@ -121,6 +157,7 @@ class FisheyeDepth(Nerfstudio):
             )
         meta = read_json(path)
         frames = check_meta(meta, path)
+        check_split(meta, path)
         own_scene = any(key in frames[0] for key in MAP_KEYS.values())
         if own_scene and self.config.downscale_factor not in (None, 1):
             raise InputError(
@@ -133,15 +170,25 @@ class FisheyeDepth(Nerfstudio):
         metres_per_unit = self.config.metres_per_unit
         if metres_per_unit is None:
             metres_per_unit = default_metres_per_unit(positions_m, self.config.hash_resolution)
+        if self.config.auto_scale_poses:
+            raise InputError(
+                "auto_scale_poses would lose the metres that near plane, prior and loss are in. "
+                "Set the scale with --pipeline.datamanager.dataparser.metres-per-unit instead."
+            )
         if not (np.isfinite(metres_per_unit) and metres_per_unit > 0):
             raise InputError(f"metres_per_unit is {metres_per_unit}; expected a positive number of metres.")
 
         unit = self.config.depth_unit_scale_factor
         if unit is None:
             unit = float(meta.get("depth_unit_scale_factor", 1e-3))
+        if len(frames) == 1 and "train_filenames" not in meta:
+            self.config.eval_mode = "all"  # the one picture is for training and for judging
         # nerfstudio's parser takes the scale from its config
         self.config.scale_factor = 1.0 / metres_per_unit
         outputs = super()._generate_dataparser_outputs(split)
+
+        if not outputs.image_filenames:
+            raise InputError(f"{path}: no picture is left for the split {split!r}; it needs one at least.")
 
         data_dir = path.parent
         by_image = {self._get_fname(Path(frame["file_path"]), data_dir): frame for frame in frames}

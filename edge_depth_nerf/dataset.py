@@ -8,6 +8,7 @@ valid, whether the scene brings a mask or not.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,11 @@ class FisheyeDepthDataset(InputDataset):
                 f"camera_res_scale_factor is {scale_factor}; distance maps are not resized. "
                 "Run `edge-depth-nerf process … --downscale K` instead."
             )
+        if "metres_per_unit" not in self.metadata:
+            raise InputError(
+                "this method reads scenes with the parser fisheye-depth-data; leave the other parser away (ours reads "
+                "nerfstudio's own scenes, too)."
+            )
         self._valid_rays: dict[Camera, NDArray[np.bool_]] = {}
 
     def camera(self, image_idx: int) -> Camera:
@@ -45,7 +51,7 @@ class FisheyeDepthDataset(InputDataset):
         k1, k2, k3, k4, p1, p2 = distortion
         if int(cameras.camera_type) == CameraType.FISHEYE.value:
             return KannalaBrandt(width, height, fx, fy, cx, cy, k1, k2, k3, k4, p1, p2)
-        return Pinhole(width, height, fx, fy, cx, cy, k1, k2, p1, p2)
+        return Pinhole(width, height, fx, fy, cx, cy, k1, k2, p1, p2, k3, k4)
 
     def valid_rays(self, image_idx: int) -> NDArray[np.bool_]:
         """H×W, True where the lens model gives a ray within the scene's theta_max."""
@@ -75,7 +81,7 @@ class FisheyeDepthDataset(InputDataset):
 
     def rgb(self, image_idx: int) -> NDArray[np.uint8]:
         """H×W×3 colours; an alpha channel is left away."""
-        pixels = self.get_numpy_image(image_idx)[..., :3]
+        pixels = self._decoded(image_idx, self.get_numpy_image)[..., :3]
         self._check_size(self.image_filenames[image_idx], pixels, image_idx)
         return pixels
 
@@ -86,7 +92,12 @@ class FisheyeDepthDataset(InputDataset):
             return None
         metres_per_count = self.metadata["lidar_metres_per_count"]
         if path.suffix == ".npy":
-            distance = np.load(path, allow_pickle=False).astype(np.float32) * np.float32(metres_per_count)
+            try:
+                distance = np.load(path, allow_pickle=False).astype(np.float32) * np.float32(metres_per_count)
+            except (ValueError, EOFError) as error:
+                raise InputError(f"{path}: cannot be read as an array ({error}). Make the file again.") from error
+            if distance.ndim == 3 and distance.shape[2] == 1:
+                distance = distance[..., 0]
         else:
             distance = read_distance_png(path, metres_per_count)
         self._check_size(path, distance, image_idx)
@@ -113,7 +124,7 @@ class FisheyeDepthDataset(InputDataset):
             truth_distance_m (H×W×1 float32), truth_rgb (H×W×3 float32).
 
         """
-        image = self.get_image_uint8(image_idx) if image_type == "uint8" else self.get_image_float32(image_idx)
+        image = self._decoded(image_idx, self.get_image_uint8 if image_type == "uint8" else self.get_image_float32)
         self._check_size(self.image_filenames[image_idx], image, image_idx)
         mask = torch.from_numpy(self.mask(image_idx))[..., None]
         data: dict[str, Any] = {"image_idx": image_idx, "image": image, "mask": mask}
@@ -137,6 +148,13 @@ class FisheyeDepthDataset(InputDataset):
             found["truth_rgb"] = torch.from_numpy(pixels.astype(np.float32) / 255)
         return found
 
+    def _decoded(self, image_idx: int, decode: Callable[[int], Any]) -> Any:
+        try:
+            return decode(image_idx)
+        except (OSError, SyntaxError) as error:  # Pillow raises either on a broken file
+            path = self.image_filenames[image_idx]
+            raise InputError(f"{path}: cannot be decoded as a picture ({error}). Copy or make it again.") from error
+
     def _map_path(self, name: str, image_idx: int) -> Path | None:
         filenames = self.metadata[name]
         return filenames[image_idx] if filenames else None
@@ -151,7 +169,7 @@ class FisheyeDepthDataset(InputDataset):
 
     def _check_size(self, path: Path, pixels: NDArray | Tensor, image_idx: int) -> None:
         expected = int(self.cameras.height[image_idx]), int(self.cameras.width[image_idx])
-        if pixels.shape[:2] != expected:
+        if pixels.shape[:2] != expected or pixels.ndim > 3:
             raise InputError(
                 f"{path}: is {pixels.shape[1]}×{pixels.shape[0]} pixels (width × height), but the camera of "
                 f"{self.image_filenames[image_idx].name} has {expected[1]}×{expected[0]}. Pictures, masks and "

@@ -14,7 +14,11 @@ import shlex
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import asdict
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -23,7 +27,6 @@ import numpy as np
 from rich.console import Console
 from rich.progress import (
     BarColumn,
-    MofNCompleteColumn,
     Progress,
     TextColumn,
     TimeElapsedColumn,
@@ -53,6 +56,7 @@ TABLE_COLUMNS = {
     "truth_delta_1_25": ("δ<1.25, truth ↑", ".3f"),
 }
 VIEWS = 3
+PICTURE = "comparison.png"
 
 
 def run_demo(options: DemoOptions, console: Console | None = None) -> dict[str, Any]:
@@ -74,68 +78,94 @@ def run_demo(options: DemoOptions, console: Console | None = None) -> dict[str, 
             f"{record}: this folder holds a demo of other options ({read_json(record)}). "
             "Choose another --output, or remove the folder."
         )
+    finished = output / "results.json"
+    if record.is_file() and finished.is_file():
+        results = read_json(finished)
+        _show(results, output, console)
+        return results
     write_json(record, recorded)
-    seconds: dict[str, float] = {}
+    clock = _Clock(output / "seconds.json")
 
-    started = time.monotonic()
     drive = output / "drive"
     synthesis = SynthesizeOptions(
         output=drive, scene=options.scene, frames=options.frames, size=options.size, seed=options.seed
     )
-    synthesize_drive(synthesis)
-    seconds["synthesize"] = time.monotonic() - started
-
-    started = time.monotonic()
     scene = output / "scene"
-    process_kitti360(
-        Kitti360Options(
-            root=drive,
-            sequence=synthesis.sequence,
-            output=scene,
-            ego_mask=drive / "truth" / "masks",
-            mono=drive / "simulated_mono" / synthesis.sequence,
-        )
+    processing = Kitti360Options(
+        root=drive,
+        sequence=synthesis.sequence,
+        output=scene,
+        ego_mask=drive / "truth" / "masks",
+        mono=drive / "simulated_mono" / synthesis.sequence,
     )
-    seconds["process"] = time.monotonic() - started
+    with clock.stage("synthesize"):
+        synthesize_drive(synthesis)
+    with clock.stage("process"):
+        process_kitti360(processing)
 
-    figures, commands = {}, []
-    for name in RUNS:
-        run = _Run(name, scene, output / "runs", options)
-        started = time.monotonic()
-        run.train(console)
-        seconds[f"train {name}"] = time.monotonic() - started
-        started = time.monotonic()
-        figures[name] = run.evaluate(console)
-        seconds[f"evaluate {name}"] = time.monotonic() - started
-        commands.append(run.viewer_command)
+    runs = [_Run(name, scene, output / "runs", options) for name in RUNS]
+    # side by side, each on its share of the cores: two threads do not make one training twice as fast
+    with _progress(console) as progress, ThreadPoolExecutor(len(runs)) as pool:
+        for stage in (_Run.train, _Run.evaluate):
+            with clock.stage(stage.__name__):
+                try:
+                    list(pool.map(partial(stage, progress=progress), runs))
+                except BaseException:
+                    for run in runs:
+                        run.stop()
+                    raise
+    figures = {run.name: run.figures() for run in runs}
+    commands = [run.viewer_command for run in runs]
 
-    picture = output / "comparison.png"
-    write_png(picture, _comparison(scene, output / "runs"))
+    write_png(output / PICTURE, _comparison(scene, output / "runs"))
     results = {
         "options": recorded,
         "versions": {name: version(name) for name in ("edge-depth-nerf", "nerfstudio", "torch", "numpy")}
         | {"python": platform.python_version()},
         "cores": os.cpu_count(),
         "figures": figures,
-        "seconds": {name: round(value, 1) for name, value in seconds.items()},
+        "seconds": clock.seconds,
         "viewer_commands": commands,
     }
-    write_json(output / "results.json", results)
+    write_json(finished, results)
+    _show(results, output, console)
+    return results
 
-    table = Table(title=f"{options.scene}, {options.frames} moments, {options.size} px, {options.steps} steps each")
-    table.add_column("held-out views")
-    for title, _ in TABLE_COLUMNS.values():
-        table.add_column(title, justify="right")
+
+def _show(results: dict[str, Any], output: Path, console: Console) -> None:
+    options, figures = results["options"], results["figures"]
+    title = "{scene}, {frames} moments, {size} px, {steps} steps each".format(**options)
+    table = Table("held-out views", title=title)
+    for heading, _ in TABLE_COLUMNS.values():
+        table.add_column(heading, justify="right")
     for name, figure in figures.items():
         cells = [format(figure[key], form) if key in figure else "–" for key, (_, form) in TABLE_COLUMNS.items()]
         table.add_row(name, *cells)
     console.print(table)
     if "masked_lpips" not in figures["ours"]:
         console.print("LPIPS is left out: its weights are not on this machine (nothing is downloaded).")
-    console.print(f"Picture: {picture}\nFigures: {output / 'results.json'}\nTo look around in the trained scene:")
-    for command in commands:
+    console.print(
+        f"Picture: {output / PICTURE}\nFigures: {output / 'results.json'}\nTo look around in what was trained:"
+    )
+    for command in results["viewer_commands"]:
         console.print(f"  {command}", soft_wrap=True)
-    return results
+
+
+class _Clock:
+    """Seconds of each stage, kept in a file, so that those of an interrupted call count, too."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.seconds: dict[str, float] = read_json(path) if path.is_file() else {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        started = time.monotonic()
+        try:
+            yield
+        finally:
+            self.seconds[name] = round(self.seconds.get(name, 0.0) + time.monotonic() - started, 1)
+            write_json(self.path, self.seconds)
 
 
 class _Run:
@@ -148,13 +178,14 @@ class _Run:
         self.checkpoints = self.folder / "nerfstudio_models"
         self.config = self.folder / "config.yml"
         self.metrics = runs / name / "metrics.json"
+        self._process: subprocess.Popen[str] | None = None
         self.viewer_command = f"ns-viewer --load-config {self.config} --viewer.websocket-host 127.0.0.1"
 
     def _last_step(self) -> int:
         steps = [int(path.stem.removeprefix("step-")) for path in self.checkpoints.glob("step-*.ckpt")]
         return max(steps, default=-1)
 
-    def train(self, console: Console) -> None:
+    def train(self, progress: Progress) -> None:
         done = self._last_step() + 1
         remaining = self.options.steps - done
         if remaining <= 0:
@@ -166,53 +197,61 @@ class _Run:
             *("--logging.local-writer.max-log-size", 0, "--pipeline.model.depth-loss", RUNS[self.name]),
             *(["--load-dir", self.checkpoints] if done else []),
         ]
-        self._call("train", arguments, console, f"Training {self.name}", total=self.options.steps)
+        self._call("train", arguments, progress, f"Training {self.name}", total=self.options.steps)
 
-    def evaluate(self, console: Console) -> dict[str, float]:
-        if not self.metrics.is_file():
-            unfinished = self.metrics.with_name("unfinished.json")
-            arguments = [
-                *("ns-eval", "--load-config", self.config, "--output-path", unfinished),
-                *("--render-output-path", self.runs / self.name / "views"),
-            ]
-            self._call("evaluate", arguments, console, f"Evaluating {self.name}", total=None)
-            unfinished.rename(self.metrics)
+    def evaluate(self, progress: Progress) -> None:
+        if self.metrics.is_file():
+            return
+        unfinished = self.metrics.with_name("unfinished.json")
+        arguments = [
+            *("ns-eval", "--load-config", self.config, "--output-path", unfinished),
+            *("--render-output-path", self.runs / self.name / "views"),
+        ]
+        self._call("evaluate", arguments, progress, f"Judging {self.name}", total=None)
+        unfinished.rename(self.metrics)
+
+    def figures(self) -> dict[str, float]:
         return read_json(self.metrics)["results"]
 
-    def _call(self, stage: str, arguments: list[Any], console: Console, title: str, total: int | None) -> None:
+    def stop(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+
+    def _call(self, stage: str, arguments: list[Any], progress: Progress, title: str, total: int | None) -> None:
         log = self.runs / self.name / f"{stage}.log"
         log.parent.mkdir(parents=True, exist_ok=True)
         command = [str(argument) for argument in arguments]
         program = Path(sys.executable).with_name(command[0])
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-        times = (TimeElapsedColumn(), TimeRemainingColumn())
-        with (
-            log.open("a", encoding="utf-8") as sink,
-            Progress(*(columns if total else columns[:2]), *times, console=console) as progress,
-        ):
-            task = progress.add_task(title, total=total)
+        threads = str(max(1, (os.cpu_count() or 1) // len(RUNS)))
+        task = progress.add_task(title, total=total)
+        with log.open("a", encoding="utf-8") as sink:
             sink.write(f"$ {shlex.join(command)}\n")
             sink.flush()
-            process = subprocess.Popen(
-                [str(program), *command[1:]], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+            self._process = subprocess.Popen(
+                [str(program), *command[1:]],
+                env={"OMP_NUM_THREADS": threads, **os.environ},
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
             )
-            try:
-                assert process.stdout is not None
-                for line in process.stdout:
-                    sink.write(line)
-                    step = re.match(r"\s*(\d+) \(\d", line)
-                    if step and total:
-                        progress.update(task, completed=int(step.group(1)))
-                status = process.wait()
-            finally:
-                process.kill()
-            if total:
-                progress.update(task, completed=total)
+            assert self._process.stdout is not None
+            for line in self._process.stdout:
+                sink.write(line)
+                step = re.match(r"\s*(\d+) \(\d", line)
+                if step and total:
+                    progress.update(task, completed=int(step.group(1)))
+            status = self._process.wait()
         if status:
             raise InputError(
                 f"{program.name} ended with status {status}. What it said is in {log}; the command was\n"
                 f"{shlex.join(command)}"
             )
+        progress.update(task, total=total or 1, completed=total or 1)
+
+
+def _progress(console: Console) -> Progress:
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    return Progress(*columns, console=console)
 
 
 def _comparison(scene: Path, runs: Path) -> np.ndarray:

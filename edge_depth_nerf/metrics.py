@@ -29,6 +29,8 @@ LOG = logging.getLogger(__name__)
 
 SSIM_RADIUS_PX = 5
 """Radius of SSIM's Gaussian window (11 px, standard deviation 1.5 px, as in nerfstudio)."""
+SSIM_SIZE_PX = 2 * SSIM_RADIUS_PX + 1
+"""Side of that window."""
 
 LEAST_SQUARED_ERROR = 1e-10
 """Below this mean squared error PSNR stays at 100 dB, so that equal pictures have a finite figure."""
@@ -65,6 +67,19 @@ def masked_psnr(
     return -10 * torch.log10((pred[mask] - target[mask]).square().mean().clamp(min=LEAST_SQUARED_ERROR))
 
 
+def _whole_windows(mask: Tensor) -> Tensor:
+    """[h, w] to [h - 10, w - 10]: True where a whole window of SSIM lies in the mask."""
+    if min(mask.shape) < SSIM_SIZE_PX:
+        return mask.new_zeros(0)
+    # a window fits where the largest of "outside" over it is still 0; without padding, so inside the picture
+    return torch.nn.functional.max_pool2d((~mask).float()[None, None], SSIM_SIZE_PX, stride=1)[0, 0] == 0
+
+
+def has_whole_window(mask: Bool[Tensor, "h w"]) -> bool:
+    """Say whether SSIM can be taken inside a mask: whether one whole window, 11×11 px, lies in it."""
+    return bool(_whole_windows(mask).any())
+
+
 def masked_ssim(
     pred: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"]
 ) -> Float[Tensor, ""]:
@@ -78,15 +93,10 @@ def masked_ssim(
 
     """
     _check_pictures("masked_ssim", pred, target, mask)
-    size = 2 * SSIM_RADIUS_PX + 1
-    # a window fits where the largest of "outside" over it is still 0; without padding, so inside the picture
-    outside = (~mask).to(pred.dtype)[None, None]
-    fits = mask.new_zeros(0)
-    if min(mask.shape) >= size:
-        fits = torch.nn.functional.max_pool2d(outside, size, stride=1)[0, 0] == 0
+    fits = _whole_windows(mask)
     if not fits.any():
         raise InputError(
-            f"masked_ssim: the mask {tuple(mask.shape)} has no {size}×{size} window inside; "
+            f"masked_ssim: the mask {tuple(mask.shape)} has no {SSIM_SIZE_PX}×{SSIM_SIZE_PX} window inside; "
             "it is too thin, or the picture too small, for SSIM."
         )
     _, full = structural_similarity_index_measure(

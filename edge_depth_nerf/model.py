@@ -40,8 +40,8 @@ class EdgeDepthNerfModelConfig(NerfactoModelConfig):
     """How far along the ray to stop sampling, metres (in place of far_plane)."""
     depth_loss: Literal["edge", "ds-nerf", "urban-nerf", "none"] = "edge"
     """The loss on the distance prior: Eq. 4, nerfstudio's DS-NeRF or UrbanNeRF loss, or none (plain nerfacto)."""
-    depth_loss_mult: float = 1e-3
-    """Weight λ of the loss on the distance prior."""
+    depth_loss_mult: float = 0.03
+    """Weight λ of the loss on the distance prior (not published; how it was chosen: docs/loss_weight.md)."""
     depth_sigma: float = 0.5
     """Standard deviation that the DS-NeRF and UrbanNeRF losses assume, metres. (Eq. 4 takes the prior's own.)"""
     depth_loss_levels: Literal["all", "final"] = "all"
@@ -145,7 +145,8 @@ class EdgeDepthNerfModel(NerfactoModel):
         middles_m = (starts_m + ends_m) / 2
         sigma_m = weights.new_tensor([self.config.depth_sigma])
         if self.config.depth_loss == "ds-nerf":
-            return ds_nerf_depth_loss(weights, prior_m, middles_m, ends_m - starts_m, sigma_m)
+            # nerfstudio divides by 2σ where a Gaussian has 2σ², so what it calls sigma is a variance
+            return ds_nerf_depth_loss(weights, prior_m, middles_m, ends_m - starts_m, sigma_m.square())
         expected_m = outputs["expected_depth"] * self.metres_per_unit
         return urban_radiance_field_depth_loss(weights, prior_m, expected_m, middles_m, sigma_m)
 
@@ -175,8 +176,8 @@ class EdgeDepthNerfModel(NerfactoModel):
 
         """
         metrics, images = super().get_image_metrics_and_images(outputs, batch)
-        has_lpips = self.lpips.network is not None
-        if not has_lpips:
+        lpips = self.lpips.load(self.device)
+        if lpips is None:
             del metrics["lpips"]
         predicted = outputs["rgb"].clamp(0, 1)
         mask = batch["mask"][..., 0].to(predicted.device)
@@ -185,9 +186,8 @@ class EdgeDepthNerfModel(NerfactoModel):
                 target = batch[key][..., :3].to(predicted)
                 metrics[f"{prefix}masked_psnr"] = float(masked_psnr(predicted, target, mask))
                 metrics[f"{prefix}masked_ssim"] = float(masked_ssim(predicted, target, mask))
-                if has_lpips:
-                    network = self.lpips.load(predicted.device)
-                    metrics[f"{prefix}masked_lpips"] = float(masked_lpips(predicted, target, mask, network))
+                if lpips is not None:
+                    metrics[f"{prefix}masked_lpips"] = float(masked_lpips(predicted, target, mask, lpips))
         distance_m = outputs["depth"][..., 0] * self.metres_per_unit
         for name, errors in self._depth_errors.items():
             if f"{name}_distance_m" in batch:

@@ -1,15 +1,20 @@
-"""Pools depth errors over the pixels of all held-out views, where nerfstudio would average over pictures."""
+"""Holds model and DataManager together, and pools depth errors over the pixels of all held-out views.
+
+nerfstudio would average depth errors over pictures.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 
-from edge_depth_nerf.model import EdgeDepthNerfModel
+from edge_depth_nerf.datamanager import FisheyeDepthDataManager, FisheyeDepthDataManagerConfig
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.model import EdgeDepthNerfModel, EdgeDepthNerfModelConfig
 
 
 @dataclass
@@ -22,6 +27,27 @@ class EdgeDepthPipelineConfig(VanillaPipelineConfig):
 
 class EdgeDepthPipeline(VanillaPipeline):
     """nerfstudio's pipeline with pooled depth errors."""
+
+    def __init__(self, config: EdgeDepthPipelineConfig, device: str, *args: Any, **kwargs: Any) -> None:
+        """Build both parts; a model without depth loss has no prior made for it.
+
+        Raises:
+            InputError: the model has a depth loss, but no training pixel has a prior.
+        """
+        model, data = config.model, config.datamanager
+        assert isinstance(model, EdgeDepthNerfModelConfig) and isinstance(data, FisheyeDepthDataManagerConfig)
+        if model.depth_loss == "none":
+            config = replace(config, datamanager=replace(data, depth_source="none"))
+        super().__init__(config, device, *args, **kwargs)
+        manager = self.datamanager
+        assert isinstance(manager, FisheyeDepthDataManager)
+        sampler = manager.train_pixel_sampler
+        if model.depth_loss != "none" and sampler is not None and sampler.table.share_with_prior == 0:
+            raise InputError(
+                f"{manager.get_datapath()}: no training pixel has a depth prior, so nothing for the depth loss "
+                f"{model.depth_loss!r}. Process the drive with LiDAR or with --mono DIR, or train without a prior by "
+                "--pipeline.model.depth-loss none."
+            )
 
     def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict[str, Any], dict[str, Any]]:
         """Figures and pictures of one held-out view."""

@@ -26,6 +26,13 @@ def to_steps(distance_m: NDArray) -> NDArray[np.uint16]:
     return np.where((steps > 0) & (steps <= 65535), steps, 0).astype(np.uint16)
 
 
+def _sigma_steps(sigma_m: NDArray) -> NDArray[np.uint16]:
+    """As `to_steps`, but what is too small or too large for 16 bits stays a standard deviation."""
+    usable = np.isfinite(sigma_m) & (sigma_m > 0)
+    steps = np.clip(np.rint(np.where(usable, sigma_m, 0) * DISTANCE_STEPS_PER_METRE), 1, 65535)
+    return np.where(usable, steps, 0).astype(np.uint16)
+
+
 @dataclass
 class PixelBatch:
     """A batch of n training pixels."""
@@ -87,7 +94,7 @@ class PixelTable:
         none = np.zeros(len(pixels), np.uint16)
         self._rgb.append(rgb.reshape(-1, 3)[pixels])
         self._distance.append(none if prior_distance_m is None else to_steps(prior_distance_m.reshape(-1)[pixels]))
-        self._sigma.append(none if prior_sigma_m is None else to_steps(prior_sigma_m.reshape(-1)[pixels]))
+        self._sigma.append(none if prior_sigma_m is None else _sigma_steps(prior_sigma_m.reshape(-1)[pixels]))
         self._widths.append(mask.shape[1])
         self._mask_of_picture.append(mask_key)
 
@@ -100,7 +107,7 @@ class PixelTable:
         """
         if not sum(map(len, self._rgb)):
             raise InputError(
-                f"None of the {len(self._rgb)} training pictures has a valid pixel: the masks leave nothing. "
+                f"None of the {len(self._rgb)} pictures has a valid pixel: the masks leave nothing. "
                 "Masks are 255 where a pixel may be used; check that they are not inverted."
             )
         keys = list(self._masks)

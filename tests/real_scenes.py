@@ -53,7 +53,7 @@ def fisheye_frame_scene(real_data: Path, output: Path, downscale: int = 4) -> Pa
     )
     hidden = np.load(folder / "mask_left_fisheye.npy")
     lidar = read_distance_png(folder / "kitti360_depth.png")
-    judged = held_out_blocks(lidar.shape, BLOCK_PX, HELD_OUT_SHARE)
+    judged = held_out_blocks((1400, 1400), BLOCK_PX, HELD_OUT_SHARE)
     image = downscale_image(read_image(folder / "kitti360_rgb.png"), downscale)
     frames = [
         SceneFrame(

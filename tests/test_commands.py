@@ -69,11 +69,13 @@ def killed_run(scene, tmp_path_factory) -> Path:
     )
     run = output / "killed" / METHOD / "run"
     with subprocess.Popen(train, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        deadline = time.monotonic() + TIMEOUT_S
-        while not (run / "nerfstudio_models" / "step-000000020.ckpt").exists():
-            assert process.poll() is None and time.monotonic() < deadline
-            time.sleep(0.01)
-        process.send_signal(signal.SIGKILL)
+        try:
+            deadline = time.monotonic() + TIMEOUT_S
+            while not (run / "nerfstudio_models" / "step-000000020.ckpt").exists():
+                assert process.poll() is None and time.monotonic() < deadline
+                time.sleep(0.01)
+        finally:
+            process.send_signal(signal.SIGKILL)
     return run
 
 
@@ -128,7 +130,9 @@ def test_render_dataset(killed_run, tmp_path):
         distance_m = np.load(file)
     assert distance_m.shape == (20, 24, 1)
     _, pipeline, _, _ = eval_setup(killed_run / "config.yml", test_mode="test")
-    outputs = pipeline.model.get_outputs_for_camera(pipeline.datamanager.eval_dataset.cameras[1:2])
+    dataset = pipeline.datamanager.eval_dataset
+    assert dataset is not None
+    outputs = pipeline.model.get_outputs_for_camera(dataset.cameras[1:2])
     expected_m = outputs["depth"].numpy() * pipeline.model.metres_per_unit
     assert np.nanmax(np.abs(distance_m / expected_m - 1)) < 1e-3
 
@@ -167,7 +171,7 @@ def test_viewer(killed_run):
             deadline = time.monotonic() + TIMEOUT_S
             page = b""
             while not page:
-                assert process.poll() is None, process.stdout.read()[-3000:]
+                assert process.poll() is None, process.stdout and process.stdout.read()[-3000:]
                 assert time.monotonic() < deadline
                 try:
                     with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=5) as answer:

@@ -45,6 +45,12 @@ def test_configurations_hold_what_the_file_says(name):
         assert type(found) is type(lookup(config.base_config(name), dotted)), dotted
 
 
+@pytest.mark.parametrize("name", DECLARED["methods"])
+def test_the_scale_is_chosen_for_the_grid_of_the_model(name):
+    pipeline = all_methods[name].pipeline
+    assert pipeline.datamanager.dataparser.hash_resolution == pipeline.model.max_res
+
+
 def test_constants_carry_their_source():
     assert DECLARED["constants"]["pipeline.datamanager.alpha"]["value"] == 0.7
     for entry in DECLARED["constants"].values():
@@ -96,8 +102,10 @@ def test_an_unknown_preset_is_named():
 
 def test_methods_share_no_state():
     specifications = config.make_specifications(DECLARED)
-    specifications["edge-depth-nerf"].config.pipeline.model.proposal_net_args_list[0]["max_res"] = -1
-    assert specifications["edge-depth-nerf-lite"].config.pipeline.model.proposal_net_args_list[0]["max_res"] == 128
+    models = [specifications[name].config.pipeline.model for name in ("edge-depth-nerf", "edge-depth-nerf-lite")]
+    arguments = [lookup(model, "proposal_net_args_list")[0] for model in models]
+    arguments[0]["max_res"] = -1
+    assert arguments[1]["max_res"] == 128
 
 
 def test_the_file_at_the_top_is_the_shipped_one():

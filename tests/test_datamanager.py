@@ -1,3 +1,5 @@
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 import torch
@@ -8,6 +10,7 @@ from edge_depth_nerf import datamanager as datamanager_module
 from edge_depth_nerf.datamanager import FisheyeDepthDataManagerConfig
 from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
 from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.files import read_json, write_json, write_mask
 from edge_depth_nerf.prior import make_prior
 
 
@@ -77,6 +80,7 @@ def test_the_host_sets_the_size_of_batches(tmp_path):
     data = manager(write_scene(tmp_path))
     assert isinstance(data, VanillaDataManager)
     assert data.get_train_rays_per_batch() == 1024
+    assert data.train_pixel_sampler is not None
     data.train_pixel_sampler.num_rays_per_batch = 33  # as nerfstudio's exporter does
     rays, batch = data.next_train(0)
     assert len(rays) == 33 and len(batch["image"]) == 33
@@ -140,3 +144,22 @@ def test_the_same_seed_gives_the_same_rays(tmp_path):
         torch.manual_seed(7)
         drawn.append(manager(scene).next_train(0)[1]["indices"])
     assert np.array_equal(drawn[0], drawn[1])
+
+
+def test_a_held_out_mask_that_leaves_nothing_is_found_before_training(tmp_path):
+    scene = write_scene(tmp_path)
+    meta = read_json(scene / "transforms.json")
+    write_mask(scene / "masks" / "thin.png", np.arange(28)[:, None] * np.ones((1, 32)) == 3)
+    meta["frames"][4]["mask_path"] = "masks/thin.png"
+    write_json(scene / "transforms.json", meta)
+    with pytest.raises(InputError, match=r"thin\.png.*held-out picture 0004\.png"):
+        manager(scene)
+
+
+def test_two_processes_may_fill_one_cache(tmp_path):
+    """Files appear whole: a second reader in the middle finds them or makes them itself."""
+    scene = write_scene(tmp_path)
+    with ThreadPoolExecutor(3) as pool:
+        tables = list(pool.map(lambda _: manager(scene).train_pixel_sampler.table, range(3)))
+    assert len({table.share_with_prior for table in tables}) == 1
+    assert len(list((scene / ".cache" / "prior").iterdir())) == 8

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.cameras import CameraType
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from scenes import fisheye, pinhole, write_scene
 
+from edge_depth_nerf.cameras import Pinhole
 from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
 from edge_depth_nerf.dataset import FisheyeDepthDataset
 from edge_depth_nerf.errors import InputError
@@ -86,7 +88,7 @@ def test_a_plain_nerfstudio_scene_counts_as_lidar_and_z_becomes_distance(tmp_pat
     assert np.allclose(distance, z_depth_m / directions[..., 2].numpy(), rtol=1e-5)
     assert distance.max() > 1.2 * z_depth_m  # the corner's ray is longer
     taken_as_distance = FisheyeDepthDataset(parse(scene, depth_kind="distance")).lidar_distance_m(0)
-    assert np.allclose(taken_as_distance, z_depth_m)
+    assert taken_as_distance is not None and np.allclose(taken_as_distance, z_depth_m)
 
 
 def test_the_mask_ends_where_the_lens_does(tmp_path):
@@ -151,6 +153,10 @@ def test_no_scene(tmp_path):
         (lambda meta: meta.update(frames=[]), "no list of frames"),
         (lambda meta: meta["frames"][2].pop("transform_matrix"), "frame 2 has no transform_matrix"),
         (lambda meta: meta["frames"][3].update(transform_matrix=[[1, 2], [3, 4]]), r"frame 3 .*4×4.*\(2, 2\)"),
+        (lambda meta: meta["frames"][5].pop("fl_x"), "frame 5 .*0005.png.* has no fl_x"),
+        (lambda meta: meta["test_filenames"].append("images/x.png"), "test_filenames names images/x.png"),
+        (lambda meta: [frame.update(frame=3) for frame in meta["frames"]], "frame 3 is in train_.* and in val_"),
+        (lambda meta: meta.update(train_filenames=[]), "no picture is left for the split 'train'"),
         (lambda meta: meta["frames"][1].pop("mono_file_path"), "mono_file_path is given for 8 of 9.*0001.png"),
     ],
 )
@@ -185,3 +191,84 @@ def test_k4_is_read(tmp_path):
     scene = write_scene(tmp_path)
     edit(scene, lambda meta: [frame.update(k4=0.0123) for frame in meta["frames"]])
     assert FisheyeDepthDataset(parse(scene)).camera(0).to_dict()["k4"] == pytest.approx(0.0123)
+
+
+def test_a_plain_scene_of_one_picture(tmp_path):
+    scene = write_scene(tmp_path, frames=1, split=False)
+    for split in ("train", "test"):
+        assert len(parse(scene, split).image_filenames) == 1
+
+
+def test_a_moment_is_trained_on_or_held_out_with_all_its_cameras(tmp_path):
+    """Two cameras a moment: what `process` writes is taken, a split through a moment is not."""
+    scene = write_scene(tmp_path, frames=10)
+
+    def pair(meta):
+        for number, frame in enumerate(meta["frames"]):
+            frame["frame"] = number // 2
+        names = [frame["file_path"] for frame in meta["frames"]]
+        meta["train_filenames"] = names[:4] + names[6:]
+        meta["val_filenames"] = meta["test_filenames"] = names[4:6]
+
+    edit(scene, pair)
+    assert len(parse(scene).image_filenames) == 8
+    edit(scene, lambda meta: meta["train_filenames"].append(meta["test_filenames"][0]))
+    with pytest.raises(InputError, match="frame 2 is in train_filenames and in val_filenames"):
+        parse(scene)
+    edit(scene, lambda meta: meta.update({f"{split}_filenames": meta["train_filenames"] for split in ("val", "test")}))
+    assert len(parse(scene, "test").image_filenames) == 9  # nothing held out
+
+
+def test_scaling_that_loses_metres_is_refused(tmp_path):
+    with pytest.raises(InputError, match="metres-per-unit"):
+        parse(write_scene(tmp_path), auto_scale_poses=True)
+
+
+def test_a_truncated_picture_is_named(tmp_path):
+    scene = write_scene(tmp_path)
+    picture = scene / "images" / "0000.png"
+    picture.write_bytes(picture.read_bytes()[:300])
+    dataset = FisheyeDepthDataset(parse(scene))
+    with pytest.raises(InputError, match=r"0000\.png.*decoded"):
+        dataset[0]
+    with pytest.raises(InputError, match=r"0000\.png.*decoded"):
+        dataset.rgb(0)
+
+
+def test_a_truncated_array_is_named(tmp_path):
+    scene = write_scene(tmp_path, lidar=False, mono=False, truth=False)
+    good = np.ones((28, 32, 1), np.float32)
+
+    def arrays(meta):
+        for frame in meta["frames"]:
+            frame["depth_file_path"] = frame["file_path"].replace("images", "depth").replace("png", "npy")
+            (scene / "depth").mkdir(exist_ok=True)
+            np.save(scene / frame["depth_file_path"], good)
+
+    edit(scene, arrays)
+    dataset = FisheyeDepthDataset(parse(scene, depth_unit_scale_factor=2.0))
+    distance = dataset.lidar_distance_m(0)
+    assert distance is not None and distance.shape == (28, 32) and (distance == 2).all()
+    path = scene / "depth" / "0000.npy"
+    path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(InputError, match=r"0000\.npy"):
+        dataset.lidar_distance_m(0)
+
+
+def test_another_parser_is_refused(tmp_path):
+    scene = write_scene(tmp_path)
+    outputs = NerfstudioDataParserConfig(data=scene).setup().get_dataparser_outputs("train")
+    with pytest.raises(InputError, match="fisheye-depth-data"):
+        FisheyeDepthDataset(outputs)
+
+
+def test_all_radial_terms_of_a_pinhole_are_read(tmp_path):
+    camera = Pinhole(32, 28, 20.0, 20.5, 16.0, 14.0, 0.01, 0.02, 1e-3, 2e-3, 0.03, 0.01)
+    outputs = parse(write_scene(tmp_path, [camera]), center_method="none")
+    dataset = FisheyeDepthDataset(outputs)
+    pixels = camera.pixel_centres()
+    rays = outputs.cameras[0].generate_rays(camera_indices=0, coords=pixels.flip(-1).float())
+    ours, _ = dataset.camera(0).unproject(pixels)
+    pose = outputs.cameras.camera_to_worlds[0].double()
+    in_world = (ours * torch.tensor([1.0, -1.0, -1.0])) @ pose[:, :3].T
+    assert torch.allclose(rays.directions.double(), in_world, atol=1e-5)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from rich.console import Console
 
 from edge_depth_nerf import demo
@@ -51,6 +53,24 @@ def test_what_is_there_is_not_done_again(finished, monkeypatch):
     monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: pytest.fail("started a command"))
     again = demo.run_demo(options, Console(quiet=True))
     assert again["figures"] == results["figures"]
+
+
+def test_an_interrupted_demo_is_finished(finished, tmp_path):
+    """As if it had been stopped after four of ours' eight steps: only the rest is done, from the checkpoint."""
+    options, results = finished
+    output = tmp_path / "out"
+    shutil.copytree(options.output, output)
+    (output / "results.json").unlink()
+    (output / "runs" / "ours" / "metrics.json").unlink()
+    folder = output / "runs" / "ours" / demo.METHOD / "run" / "nerfstudio_models"
+    saved = torch.load(folder / "step-000000007.ckpt", weights_only=True)
+    (folder / "step-000000007.ckpt").unlink()
+    torch.save({**saved, "step": 3}, folder / "step-000000003.ckpt")
+    again = demo.run_demo(replace(options, output=output), Console(quiet=True))
+    assert again["figures"]["nerfacto"] == results["figures"]["nerfacto"]
+    assert [path.name for path in folder.iterdir()] == ["step-000000007.ckpt"]
+    assert "--max-num-iterations 4" in (output / "runs" / "ours" / "train.log").read_text()
+    assert again["seconds"]["train"] > results["seconds"]["train"]
 
 
 def test_other_options_need_another_folder(finished):

@@ -3,12 +3,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.cameras.rays import Frustums, RayBundle, RaySamples
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.model_components.losses import ds_nerf_depth_loss, urban_radiance_field_depth_loss
 from nerfstudio.models.nerfacto import NerfactoModel
 
+from edge_depth_nerf.compat import lpips_not_built
 from edge_depth_nerf.losses import edge_loss
 from edge_depth_nerf.model import EdgeDepthNerfModel
 
@@ -99,18 +100,32 @@ def test_all_levels_reach_the_proposal_networks():
 def test_baselines_are_the_host_own_losses_in_metres(kind):
     model = build(depth_loss=kind, depth_loss_mult=0.5, depth_sigma=0.3)
     outputs, losses = trained_step(model)
-    total = 0.0
+    total = torch.zeros(())
     prior, sigma = batch()["prior_distance_m"], torch.tensor([0.3])
     for weights, samples in zip(outputs["weights_list"], outputs["ray_samples_list"], strict=True):
         starts, ends = samples.frustums.starts * METRES_PER_UNIT, samples.frustums.ends * METRES_PER_UNIT
         middles = (starts + ends) / 2
         if kind == "ds-nerf":
-            total += ds_nerf_depth_loss(weights, prior, middles, ends - starts, sigma)
+            total += ds_nerf_depth_loss(weights, prior, middles, ends - starts, sigma**2)
         else:
             rendered = outputs["expected_depth"] * METRES_PER_UNIT
             total += urban_radiance_field_depth_loss(weights, prior, rendered, middles, sigma)
     assert torch.allclose(losses["depth_loss"], 0.5 * total / 3)
     assert "edge_loss" not in losses
+
+
+def test_sigma_of_ds_nerf_is_a_standard_deviation_in_metres():
+    """One sample a ray, one sigma from the prior: it is pulled exp(-1/2) as hard as one at the prior."""
+    model = build(depth_loss="ds-nerf", depth_sigma=0.3, depth_loss_mult=1.0)
+    pulls = []
+    for middle_m in (5.0, 5.3):
+        starts, ends = (torch.full((1, 1, 1), (middle_m + half) / METRES_PER_UNIT) for half in (-0.05, 0.05))
+        zero = torch.zeros(1, 1, 3)
+        frustums = Frustums(origins=zero, directions=zero, starts=starts, ends=ends, pixel_area=starts)
+        supervision = {"prior_distance_m": torch.full((1, 1), 5.0)}
+        weights = torch.full((1, 1, 1), 0.5)
+        pulls.append(float(model._depth_loss(weights, RaySamples(frustums=frustums), {}, supervision)))
+    assert pulls[1] / pulls[0] == pytest.approx(math.exp(-0.5), rel=1e-4)
 
 
 def test_without_a_depth_loss_it_is_nerfacto():
@@ -207,6 +222,9 @@ class _MeanDifference(torch.nn.Module):
 
 def test_same_parameters_as_nerfacto():
     """Checkpoints go back and forth between nerfacto and this model (but for LPIPS, which nerfacto stores)."""
-    ours = {name: value.shape for name, value in build().state_dict().items()}
-    assert issubclass(EdgeDepthNerfModel, NerfactoModel)
-    assert {name.split(".")[0] for name in ours} == {"device_indicator_param", "field", "proposal_networks"}
+    ours = build()
+    with lpips_not_built():
+        host = NerfactoModel(config=ours.config, scene_box=ours.scene_box, num_train_data=3)
+    shapes = [{name: value.shape for name, value in model.state_dict().items()} for model in (ours, host)]
+    assert shapes[0] == shapes[1]
+    host.load_state_dict(ours.state_dict())

@@ -76,3 +76,14 @@ def test_the_same_seed_draws_the_same():
     table.finish()
     first, second = (table.sample(64, torch.Generator().manual_seed(3)) for _ in range(2))
     assert torch.equal(first.indices, second.indices)
+
+
+def test_a_sigma_beyond_16_bits_stays_a_sigma():
+    table = PixelTable()
+    distance = np.full((1, 4), 5, np.float32)
+    sigma = np.array([[1e-4, 1000.0, 0.5, 0.0]], np.float32)
+    table.add(picture(1, 4), np.ones((1, 4), bool), 0, distance, sigma)
+    table.finish()
+    batch = table.sample(200, torch.Generator().manual_seed(0))
+    stored = {int(column): float(s) for (_, _, column), s in zip(batch.indices, batch.prior_sigma_m, strict=True)}
+    assert stored == {0: 1 / 256, 1: 65535 / 256, 2: 0.5, 3: 0.0}

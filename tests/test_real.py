@@ -6,7 +6,6 @@ from __future__ import annotations
 from copy import deepcopy
 
 import numpy as np
-import pytest
 import torch
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.optimizers import Optimizers
@@ -28,7 +27,7 @@ def train(scene, steps, **model):
     for step in range(steps):
         optimisers.zero_grad_all()
         _, losses, _ = pipeline.get_train_loss_dict(step)
-        sum(losses.values()).backward()
+        torch.stack(list(losses.values())).sum().backward()
         optimisers.optimizer_step_all()
         colour_losses.append(float(losses["rgb_loss"]))
         assert np.isfinite(colour_losses[-1])
@@ -66,10 +65,3 @@ def test_the_real_stereo_drive(real_data, tmp_path):
     metrics = pipeline.get_average_eval_image_metrics()
     assert np.isfinite(metrics["masked_psnr"])
     assert "lidar_abs_rel" not in metrics
-
-
-@pytest.mark.parametrize("name", ["image_02", "image_03"])
-def test_the_real_masks_are_the_frames_size(real_data, name):
-    side = {"image_02": "left", "image_03": "right"}[name]
-    hidden = np.load(real_data / "kitti360_fisheye_frame" / f"mask_{side}_fisheye.npy")
-    assert hidden.shape == (1400, 1400) and 0.2 < hidden.mean() < 0.3

@@ -310,7 +310,7 @@ class KannalaBrandt(Camera):
 
 @dataclass(frozen=True)
 class Pinhole(Camera):
-    """The pinhole with OpenCV's first four distortion parameters: nerfstudio's and COLMAP's OPENCV camera."""
+    """The pinhole with polynomial distortion: nerfstudio's OPENCV camera, and with k4 = 0 OpenCV's."""
 
     model: ClassVar[str] = "PINHOLE"
 
@@ -322,6 +322,10 @@ class Pinhole(Camera):
     """Tangential distortion."""
     p2: float = 0.0
     """Tangential distortion."""
+    k3: float = 0.0
+    """Radial distortion, r⁶."""
+    k4: float = 0.0
+    """Radial distortion, r⁸ (nerfstudio's; OpenCV has a denominator there)."""
 
     @cached_property
     def theta_max_rad(self) -> float:
@@ -330,7 +334,7 @@ class Pinhole(Camera):
 
     @cached_property
     def _distortion(self) -> Distortion:
-        return Distortion((self.k1, self.k2), self.p1, self.p2)
+        return Distortion((self.k1, self.k2, self.k3, self.k4), self.p1, self.p2)
 
     @property
     def _radius_max(self) -> float:

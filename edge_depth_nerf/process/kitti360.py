@@ -93,7 +93,7 @@ def process_kitti360(options: Kitti360Options, console: Console | None = None) -
             inputs=files[name, frame].paths,
         )
 
-    shifted = _shifted_views(drive, rig, set(kept))
+    shifted = _shifted_views(drive, rig, {(name, frame) for name, frame in kept if held_out[frame]})
     report = write_scene(
         options.output,
         cameras,
@@ -221,8 +221,8 @@ def _layers(drive: Kitti360Drive) -> list[str]:
     return [layer for layer, present in given.items() if present]
 
 
-def _shifted_views(drive: Kitti360Drive, rig: Kitti360Rig, kept: set[tuple[str, int]]) -> list[ShiftedView]:
-    """Find the true views beside the path, of the frames taken."""
+def _shifted_views(drive: Kitti360Drive, rig: Kitti360Rig, held_out: set[tuple[str, int]]) -> list[ShiftedView]:
+    """Find the true views beside the path, of the frames held out: next to a training frame, judging is too easy."""
     path = drive.truth / "shifted.json"
     if not path.is_file():
         return []
@@ -234,7 +234,7 @@ def _shifted_views(drive: Kitti360Drive, rig: Kitti360Rig, kept: set[tuple[str, 
     }
     views = []
     for (metres, name, frame), matrix in poses.items():
-        if (name, frame) not in kept:
+        if (name, frame) not in held_out:
             continue
         where = f"{path}: {metres} m, {name}, frame {frame}"
         camera_to_world = np.array(matrix, np.float64)

@@ -1,0 +1,42 @@
+from copy import deepcopy
+
+import numpy as np
+import pytest
+from nerfstudio.configs.method_configs import all_methods
+from scenes import write_scene
+
+from edge_depth_nerf.errors import InputError
+
+
+def build(scene, **model):
+    config = deepcopy(all_methods["edge-depth-nerf-lite"].pipeline)
+    config.datamanager.data = scene
+    for name, value in {"num_levels": 2, "log2_hashmap_size": 8, **model}.items():
+        setattr(config.model, name, value)
+    return config.setup(device="cpu", test_mode="val"), config
+
+
+def test_a_depth_loss_without_any_prior_is_an_error(tmp_path):
+    scene = write_scene(tmp_path, lidar=False, mono=False)
+    with pytest.raises(InputError, match=r"no training pixel has a depth prior.*--mono.*depth-loss none"):
+        build(scene)
+    pipeline, _ = build(scene, depth_loss="none")
+    assert np.isfinite(float(pipeline.get_train_loss_dict(0)[1]["rgb_loss"].detach()))
+
+
+def test_nothing_is_integrated_for_a_model_without_depth_loss(tmp_path, monkeypatch):
+    monkeypatch.setattr("edge_depth_nerf.datamanager.PriorCache", lambda *_: pytest.fail("integrated"))
+    pipeline, config = build(write_scene(tmp_path), depth_loss="none")
+    assert pipeline.datamanager.config.depth_source == "none"
+    assert config.datamanager.depth_source == "auto"  # what the user gave is left as it was
+
+
+def test_depth_errors_are_pooled_and_every_figure_is_finite(tmp_path):
+    pipeline, _ = build(write_scene(tmp_path))
+    for metrics in (
+        pipeline.get_average_eval_image_metrics(get_std=True),
+        pipeline.get_eval_image_metrics_and_images(0)[0],
+    ):
+        assert {"masked_psnr", "truth_masked_ssim", "lidar_abs_rel", "truth_delta_1_25"} <= set(metrics)
+        assert "lidar_abs_rel_std" not in metrics
+        assert np.isfinite([float(value) for value in metrics.values()]).all()
