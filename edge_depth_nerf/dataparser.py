@@ -173,7 +173,7 @@ class FisheyeDepth(Nerfstudio):
         if self.config.auto_scale_poses:
             raise InputError(
                 "auto_scale_poses would lose the metres that near plane, prior and loss are in. "
-                "Set the scale with --pipeline.datamanager.dataparser.metres-per-unit instead."
+                "Set the scale with fisheye-depth-data --metres-per-unit M instead."
             )
         if not (np.isfinite(metres_per_unit) and metres_per_unit > 0):
             raise InputError(f"metres_per_unit is {metres_per_unit}; expected a positive number of metres.")

@@ -229,7 +229,7 @@ class _Run:
             sink.flush()
             self._process = subprocess.Popen(
                 [str(program), *command[1:]],
-                env={"OMP_NUM_THREADS": threads, **os.environ},
+                env={"OMP_NUM_THREADS": threads, "PYTHONUNBUFFERED": "1", **os.environ},
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
                 text=True,

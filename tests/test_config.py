@@ -3,6 +3,7 @@ import sys
 from copy import deepcopy
 from importlib.metadata import entry_points
 from pathlib import Path
+from typing import Any
 
 import pytest
 from nerfstudio.configs.dataparser_configs import all_dataparsers
@@ -17,7 +18,7 @@ ROOT = Path(__file__).parents[1]
 DECLARED = config.read_method_file()
 
 
-def lookup(node, dotted):
+def lookup(node: Any, dotted: str) -> Any:
     for part in dotted.split("."):
         node = node[part] if isinstance(node, dict) else getattr(node, part)
     return node

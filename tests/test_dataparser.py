@@ -220,7 +220,7 @@ def test_a_moment_is_trained_on_or_held_out_with_all_its_cameras(tmp_path):
 
 
 def test_scaling_that_loses_metres_is_refused(tmp_path):
-    with pytest.raises(InputError, match="metres-per-unit"):
+    with pytest.raises(InputError, match="--metres-per-unit"):
         parse(write_scene(tmp_path), auto_scale_poses=True)
 
 

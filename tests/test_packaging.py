@@ -1,3 +1,4 @@
+import re
 import shutil
 import subprocess
 import sys
@@ -54,3 +55,13 @@ def test_the_wheel_works_without_the_sources(wheel, tmp_path):
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=False)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("page", ["README.md", "data/README.md", "docs/loss_weight.md"])
+def test_pages_link_to_what_exists(page):
+    text = (ROOT / page).read_text(encoding="utf-8")
+    assert "@@" not in text
+    links = re.findall(r"\]\((?!http)([^)#]+)\)", text)
+    assert page != "README.md" or len(links) > 3
+    for link in links:
+        assert ((ROOT / page).parent / link).exists(), link
