@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import torch
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 
 from edge_depth_nerf.datamanager import FisheyeDepthDataManager, FisheyeDepthDataManagerConfig
@@ -28,7 +29,7 @@ class EdgeDepthPipelineConfig(VanillaPipelineConfig):
 class EdgeDepthPipeline(VanillaPipeline):
     """nerfstudio's pipeline with pooled depth errors."""
 
-    def __init__(self, config: EdgeDepthPipelineConfig, device: str, *args: Any, **kwargs: Any) -> None:
+    def __init__(self, config: EdgeDepthPipelineConfig, device: str | torch.device, *args: Any, **kwargs: Any) -> None:
         """Build both parts; a model without depth loss has no prior made for it.
 
         Raises:
@@ -38,7 +39,7 @@ class EdgeDepthPipeline(VanillaPipeline):
         assert isinstance(model, EdgeDepthNerfModelConfig) and isinstance(data, FisheyeDepthDataManagerConfig)
         if model.depth_loss == "none":
             config = replace(config, datamanager=replace(data, depth_source="none"))
-        super().__init__(config, device, *args, **kwargs)
+        super().__init__(config, str(device), *args, **kwargs)
         manager = self.datamanager
         assert isinstance(manager, FisheyeDepthDataManager)
         sampler = manager.train_pixel_sampler
