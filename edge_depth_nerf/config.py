@@ -29,7 +29,7 @@ from edge_depth_nerf.trainer import EdgeDepthTrainerConfig
 if sys.version_info >= (3, 11):
     import tomllib
 else:
-    import tomli as tomllib
+    import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 METHOD_FILE = "nerfstudio_method.toml"
 
