@@ -62,7 +62,7 @@ def main() -> None:
                 command("ns-eval", "--load-config", config, "--output-path", figures, "--render-output-path", views)
             results = read_json(figures)["results"]
             table.add_row(title, name, *(f"{results[key]:.3f}" if key in results else "–" for key in COLUMNS))
-    Console().print(table)
+    Console(width=120).print(table)
 
 
 if __name__ == "__main__":
