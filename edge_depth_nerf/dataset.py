@@ -40,7 +40,7 @@ class FisheyeDepthDataset(InputDataset):
                 "this method reads scenes with the parser fisheye-depth-data; leave the other parser away (ours reads "
                 "nerfstudio's own scenes, too)."
             )
-        self._valid_rays: dict[Camera, NDArray[np.bool_]] = {}
+        self._rays: dict[Camera, tuple[NDArray[np.bool_], NDArray[np.float64]]] = {}
 
     def camera(self, image_idx: int) -> Camera:
         """The lens of a picture, as one of the project's own camera models."""
@@ -55,14 +55,19 @@ class FisheyeDepthDataset(InputDataset):
 
     def valid_rays(self, image_idx: int) -> NDArray[np.bool_]:
         """H×W, True where the lens model gives a ray within the scene's theta_max."""
+        return self._rays_of(image_idx)[0]
+
+    def _rays_of(self, image_idx: int) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+        """Validity and cosine of the angle from the axis, H×W each; made once a camera, it takes seconds."""
         camera = self.camera(image_idx)
-        if camera not in self._valid_rays:
+        if camera not in self._rays:
             directions, valid = camera.unproject(camera.pixel_centres())
+            cos_theta = directions[..., 2]
             theta_max_rad = self.metadata["theta_max_rad"]
             if theta_max_rad is not None:
-                valid = valid & (directions[..., 2] >= math.cos(theta_max_rad))
-            self._valid_rays[camera] = valid.numpy()
-        return self._valid_rays[camera]
+                valid = valid & (cos_theta >= math.cos(theta_max_rad))
+            self._rays[camera] = valid.numpy(), cos_theta.numpy()
+        return self._rays[camera]
 
     def mask_key(self, image_idx: int) -> tuple[Path | None, Camera]:
         """Pictures with the same key have the same mask."""
@@ -102,9 +107,8 @@ class FisheyeDepthDataset(InputDataset):
             distance = read_distance_png(path, metres_per_count)
         self._check_size(path, distance, image_idx)
         if self.metadata["lidar_is_z_depth"]:
-            camera = self.camera(image_idx)
-            cos_theta = camera.unproject(camera.pixel_centres())[0][..., 2].numpy()
-            valid = self.valid_rays(image_idx) & (cos_theta > 0)
+            valid, cos_theta = self._rays_of(image_idx)
+            valid = valid & (cos_theta > 0)
             distance = np.where(valid, distance / np.where(valid, cos_theta, 1), 0).astype(np.float32)
         return distance
 

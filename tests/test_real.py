@@ -45,8 +45,8 @@ def test_the_real_fisheye_frame(real_data, tmp_path):
     hidden = np.load(real_data / "kitti360_fisheye_frame" / "mask_left_fisheye.npy")
     assert mask.mean() < 1 - hidden.mean()  # the real mask keeps more than the lens circle
 
-    pipeline, losses = train(scene, 60)
-    assert np.mean(losses[-10:]) < 0.5 * np.mean(losses[:5])
+    pipeline, losses = train(scene, 200)
+    assert np.mean(losses[-10:]) < 0.3 * np.mean(losses[:5])
     metrics = pipeline.get_average_eval_image_metrics()
     assert np.isfinite(metrics["masked_psnr"]) and metrics["lidar_pixels"] > 20
 
@@ -60,8 +60,8 @@ def test_the_real_stereo_drive(real_data, tmp_path):
     assert known.mean() > 0.4
     # a street seen from a car: the road some metres ahead, nothing nearer than its bonnet
     assert 2 < np.percentile(distance[known], 5) < np.percentile(distance[known], 95) < 120
-    pipeline, losses = train(scene, 60)
-    assert np.mean(losses[-10:]) < 0.5 * np.mean(losses[:5])
+    pipeline, losses = train(scene, 200)
+    assert np.mean(losses[-10:]) < 0.3 * np.mean(losses[:5])
     metrics = pipeline.get_average_eval_image_metrics()
     assert np.isfinite(metrics["masked_psnr"])
     assert "lidar_abs_rel" not in metrics
