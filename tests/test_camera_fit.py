@@ -11,7 +11,7 @@ import pytest
 import torch
 from lenses import FISHEYE, IMAGE_02, IMAGE_03, KITTI, nerfstudio_directions, rays
 
-from edge_depth_nerf.cameras import MEI, Camera, KannalaBrandt, Pinhole, fit_kannala_brandt
+from edge_depth_nerf.cameras import MEI, Camera, KannalaBrandt, Pinhole, fit_kannala_brandt, host_residual
 from edge_depth_nerf.errors import InputError
 
 
@@ -107,6 +107,87 @@ def test_the_limit_is_what_the_picture_sees() -> None:
 def test_what_cannot_be_fitted_is_said(camera: Camera, degrees: float, message: str) -> None:
     with pytest.raises(InputError, match=message):
         fit_kannala_brandt(camera, math.radians(degrees))
+
+
+# ---- nerfstudio's rays up to 110° ------------------------------------------------------------------------------
+
+
+def filling(camera: Camera, degrees: float) -> Camera:
+    """The camera with focal lengths that put this angle at 0.48 of the picture's width from its middle."""
+    theta = min(math.radians(degrees), 0.999 * camera.theta_max_rad)
+    pixels, _ = camera.project(torch.tensor([[math.sin(theta), 0.0, math.cos(theta)]], dtype=torch.float64))
+    scale = 0.48 * camera.width / (float(pixels[0, 0]) - camera.cx)
+    return replace(camera, fx=camera.fx * scale, fy=camera.fy * scale)
+
+
+def mei(xi: float, degrees: float) -> Camera:
+    return filling(MEI(1000, 1000, 1.0, 1.0, 500.3, 499.8, xi, 0.0, 0.0, 0.0, 0.0), degrees)
+
+
+def kannala_brandt(degrees: float, *coefficients: float) -> Camera:
+    return filling(KannalaBrandt(1000, 1000, 1.0, 1.0, 500.3, 499.8, *coefficients), degrees)
+
+
+def host_error_px(camera: Camera, replacement: KannalaBrandt | Pinhole, limit_rad: float) -> torch.Tensor:
+    """How far from its pixel the camera sees the ray that nerfstudio itself generates; infinite if it does not."""
+    pixels = camera.pixel_centres()[::6, ::6].reshape(-1, 2)
+    true, valid = camera.unproject(pixels)
+    kept = valid & (torch.atan2(true[:, :2].norm(dim=-1), true[:, 2]) <= limit_rad)
+    assert kept.float().mean() > 0.1
+    parameters = {name: getattr(replacement, name) for name in ("k1", "k2", "k3", "k4", "p1", "p2")}
+    kind = "FISHEYE" if isinstance(replacement, KannalaBrandt) else "PERSPECTIVE"
+    seen, visible = camera.project(nerfstudio_directions(replacement, kind, parameters, pixels[kept]))
+    return torch.where(visible, (seen - pixels[kept]).norm(dim=-1), math.inf)
+
+
+@pytest.mark.parametrize(
+    ("camera", "degrees"),
+    [
+        # a MEI with ξ = 0 is a pinhole; with ξ < 1 its picture grows faster than a polynomial of θ can follow
+        pytest.param(mei(0.0, 60), 60, id="xi=0"),
+        pytest.param(mei(0.5, 95), 95, id="xi=0.5"),
+        pytest.param(mei(1.0, 110), 110, id="xi=1"),
+        pytest.param(mei(1.5, 110), 110, id="xi=1.5"),
+        pytest.param(mei(2.5, 110), 110, id="xi=2.5"),
+        pytest.param(Pinhole(1000, 700, 700.0, 705.0, 503.3, 349.8, -0.12, 0.02, 1e-3, -5e-4), 95, id="pinhole"),
+    ],
+)
+def test_a_fitted_camera_gives_nerfstudio_the_right_rays(camera: Camera, degrees: float) -> None:
+    limit = min(math.radians(degrees), 0.999 * camera.theta_max_rad)
+    replacement = fit_kannala_brandt(camera, limit).camera
+    reported, wrong = host_residual(camera, replacement, limit)
+    error = host_error_px(camera, replacement, limit)
+    assert error.square().mean().sqrt() == pytest.approx(reported.rms_px, rel=0.05, abs=5e-4)
+    assert reported.rms_px < 0.5 and (wrong == math.inf) == (reported.max_px < 0.5)
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        pytest.param(kannala_brandt(110, 0.0, 0.0, 0.0, 0.0), id="equidistant"),
+        pytest.param(kannala_brandt(110, 1 / 12, 1 / 120, 17 / 20160, 31 / 362880), id="stereographic"),
+        pytest.param(kannala_brandt(110, -1 / 24, 1 / 1920, -1 / 322560, 0.0), id="equisolid"),
+        pytest.param(kannala_brandt(110, -0.08, 0.0, 0.0, 0.0, 1e-3, -5e-4), id="folds at 117°"),
+    ],
+)
+def test_a_kannala_brandt_camera_gives_nerfstudio_the_right_rays(camera: KannalaBrandt) -> None:
+    limit = math.radians(110)
+    assert host_error_px(camera, camera, limit).max() < 2e-3  # their rays are float32
+    fit, wrong = host_residual(camera, camera, limit)
+    assert fit.max_px < 1e-6 and wrong == math.inf
+    assert math.degrees(fit.theta_max_rad) == pytest.approx(110)
+
+
+def test_where_nerfstudio_goes_astray_is_told() -> None:
+    """A polynomial that first rises faster, then slower: Newton's steps from the distorted point overshoot its fold."""
+    camera = kannala_brandt(106, 0.0652, 0.0189, -0.0042, -0.0013)
+    assert isinstance(camera, KannalaBrandt)
+    fit, wrong = host_residual(camera, camera, math.radians(105))
+    assert fit.rms_px == math.inf and 85 < math.degrees(wrong) < 95
+    assert host_error_px(camera, camera, math.radians(105)).max() > 10
+    # up to there all is well, for us and for nerfstudio
+    assert host_residual(camera, camera, wrong - 0.01)[0].max_px < 1e-6
+    assert host_error_px(camera, camera, wrong - 0.01).max() < 2e-3
 
 
 def test_the_constants_are_kitti_360s_own(real_data: Path) -> None:

@@ -497,12 +497,24 @@ def test_cameras_survive_files_and_processes(camera: Camera) -> None:
 
 
 def test_to_dict_holds_every_parameter() -> None:
-    assert list(IMAGE_02.to_dict()) == [
-        *("model", "width", "height", "fx", "fy", "cx", "cy", "xi", "k1", "k2", "p1", "p2")
-    ]
-    assert list(FISHEYE.to_dict()) == [
-        *("model", "width", "height", "fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "theta_limit_rad")
-    ]
+    common = ("model", "width", "height", "fx", "fy", "cx", "cy", "theta_limit_rad")
+    assert list(IMAGE_02.to_dict()) == [*common, "xi", "k1", "k2", "p1", "p2"]
+    assert list(FISHEYE.to_dict()) == [*common, "k1", "k2", "k3", "k4", "p1", "p2"]
+
+
+@pytest.mark.parametrize(
+    "camera", [IMAGE_02, FISHEYE, Pinhole(640, 480, 300.0, 300.0, 320.0, 240.0, -0.1, 0.01)], ids=lambda c: c.model
+)
+def test_no_camera_goes_beyond_what_it_was_calibrated_for(camera: Camera) -> None:
+    limited = replace(camera, theta_limit_rad=0.6)
+    assert limited.theta_max_rad == pytest.approx(0.6, abs=1e-12)
+    assert replace(camera, theta_limit_rad=3.0).theta_max_rad == camera.theta_max_rad
+    directions = rays(torch.tensor([0.3, 0.599999, 0.600001, 0.9], dtype=torch.float64))
+    pixels, valid = limited.project(directions)
+    assert valid.all(-1).tolist() == [True, True, False, False] and not valid[2:].any()
+    unlimited, _ = camera.project(directions)
+    assert torch.equal(pixels[:2], unlimited[:2])
+    assert limited.unproject(unlimited)[1].all(-1).tolist() == [True, True, False, False]
 
 
 def test_defaults_may_be_left_out_and_whole_numbers_may_be_given() -> None:

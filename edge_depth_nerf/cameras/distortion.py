@@ -163,7 +163,30 @@ class Distortion:
         scale = Distortion(tuple(abs(k) for k in self.radial))._scale(square)
         return square.sqrt() * scale + 3.0 * math.hypot(self.p1, self.p2) * square
 
-    def _inverse_jacobian(self, plane: Tensor) -> Tensor:
+    def newton(self, distorted: Float[Tensor, "*batch 2"], steps: int, smallest_determinant: float) -> Tensor:
+        """Make undamped Newton steps from the distorted point, as simple solvers do; they may end anywhere.
+
+        Args:
+            distorted: coordinates in the distorted plane.
+            steps: how many.
+            smallest_determinant: a point where the Jacobian's is smaller stays where it is.
+
+        Returns:
+            What is reached; where all is well, the undistorted plane.
+
+        """
+        plane = distorted
+        for _ in range(steps):
+            xx, yy, xy = self._jacobian(plane)
+            determinant = xx * yy - xy * xy
+            u, v = (self.distort(plane) - distorted).unbind(-1)
+            moves = determinant.abs() > smallest_determinant
+            step = torch.stack((yy * u - xy * v, xx * v - xy * u), -1) / torch.where(moves, determinant, 1.0)[..., None]
+            plane = plane - torch.where(moves[..., None], step, 0.0)
+        return plane
+
+    def _jacobian(self, plane: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The symmetric Jacobian's xx, yy and xy."""
         x, y = plane.unbind(-1)
         square = x * x + y * y
         slope = torch.zeros_like(square)
@@ -172,7 +195,10 @@ class Distortion:
         diagonal = self._scale(square) + 2.0 * (self.p2 * x + self.p1 * y)
         xx = diagonal + 2.0 * slope * x * x + 4.0 * self.p2 * x
         yy = diagonal + 2.0 * slope * y * y + 4.0 * self.p1 * y
-        xy = 2.0 * slope * x * y + 2.0 * (self.p1 * x + self.p2 * y)
+        return xx, yy, 2.0 * slope * x * y + 2.0 * (self.p1 * x + self.p2 * y)
+
+    def _inverse_jacobian(self, plane: Tensor) -> Tensor:
+        xx, yy, xy = self._jacobian(plane)
         # at the rim the determinant may be zero; a finite inverse there keeps steps and gradients finite
         determinant = (xx * yy - xy * xy).clamp_min(torch.finfo(plane.dtype).eps)
         rows = torch.stack((torch.stack((yy, -xy), -1), torch.stack((-xy, xx), -1)), -2)

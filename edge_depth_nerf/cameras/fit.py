@@ -1,9 +1,13 @@
-"""The Kannala-Brandt camera that comes nearest to another camera.
+"""The Kannala-Brandt camera that comes nearest to another camera, and how near nerfstudio's rays come in the end.
 
 nerfstudio knows no MEI; its OPENCV_FISHEYE camera, which is `KannalaBrandt`, takes its place. Ten parameters
 are free: fx, fy, cx, cy, k1-k4, p1, p2. The distances minimised, and reported, are those in the picture, in
 pixels: for a ray of the source, from its pixel to the one where the fitted camera puts it. The rays are those
 of a regular grid of pixels, so every part of the picture within the angle asked for counts by its area.
+
+nerfstudio inverts a camera's distortion by ten undamped Newton steps from the distorted point. That ends at the
+right ray for nearly every lens, but goes astray at the rim of some whose polynomial bends sharply there:
+`host_residual` makes the same steps and tells.
 """
 
 from __future__ import annotations
@@ -15,21 +19,25 @@ import numpy as np
 import torch
 from scipy.optimize import least_squares
 
-from edge_depth_nerf.cameras.models import Camera, KannalaBrandt
+from edge_depth_nerf.cameras.models import Camera, KannalaBrandt, Pinhole
 from edge_depth_nerf.errors import InputError
 
 _FIT_GRID = 150
 """Rays along each side of the grid that is fitted; more change nothing within 1e-3 px."""
 _JUDGE_GRID = 401
 """Rays along each side of the grid over which the residual is reported; odd against the other."""
+_HOST_STEPS = 10
+"""Newton steps of nerfstudio's radial_and_tangential_undistort."""
+_HOST_SMALLEST_DETERMINANT = 1e-3
+"""Below it that function makes no step."""
 
 
 @dataclass(frozen=True)
 class CameraFit:
-    """A fitted camera, and how far its picture lies from the source's."""
+    """A camera in another one's place, and how far its picture lies from the source's."""
 
-    camera: KannalaBrandt
-    """The fitted camera; it is not valid beyond `theta_max_rad`."""
+    camera: KannalaBrandt | Pinhole
+    """The camera; a fitted one is not valid beyond `theta_max_rad`."""
     rms_px: float
     """Root mean square, over the picture's area, of the distance between the two pixels of a ray."""
     max_px: float
@@ -55,9 +63,7 @@ def fit_kannala_brandt(source: Camera, theta_max_rad: float = math.radians(95)) 
     if not limit > 0:
         raise InputError(f"camera fit: theta_max_rad is {theta_max_rad}, expected more than 0.")
     directions, pixels = _rays(source, limit, _FIT_GRID)
-    if len(pixels) == _FIT_GRID**2:
-        # the picture ends before the angle does, and with it what the fit can be trusted for
-        limit = float(np.arctan2(np.linalg.norm(directions[:, :2], axis=1), directions[:, 2]).max())
+    limit = _seen_limit(directions, limit, _FIT_GRID)
     if len(pixels) < 100:
         raise InputError(
             f"camera fit: only {len(pixels)} of {_FIT_GRID**2} pixels sampled in the picture of "
@@ -112,6 +118,48 @@ def fit_kannala_brandt(source: Camera, theta_max_rad: float = math.radians(95)) 
         )
     distance = np.linalg.norm(fitted.numpy() - pixels, axis=1)
     return CameraFit(camera, float(np.sqrt(np.mean(distance**2))), float(distance.max()), limit)
+
+
+def host_residual(
+    source: Camera, replacement: KannalaBrandt | Pinhole, theta_max_rad: float
+) -> tuple[CameraFit, float]:
+    """Measure how far off nerfstudio's rays are, made from the parameters of a camera that takes another's place.
+
+    Args:
+        source: the camera that took the pictures.
+        replacement: what nerfstudio is given: a fit, or the source itself.
+        theta_max_rad: the angle from the axis up to which the rays are used. The last thousandth of the source's own
+            range, where its picture folds, is left out.
+
+    Returns:
+        The distances between each pixel and the one where the source sees nerfstudio's ray of it; infinite where that
+        ray goes astray. Second, the smallest angle from the axis of a ray that is off by half a pixel or more;
+        infinite if none is.
+
+    """
+    limit = min(theta_max_rad, 0.999 * source.theta_max_rad)
+    directions, pixels = _rays(source, limit, _JUDGE_GRID)
+    limit = _seen_limit(directions, limit, _JUDGE_GRID)
+    wanted = torch.from_numpy(pixels)
+    focal = wanted.new_tensor([replacement.fx, replacement.fy])
+    principal = wanted.new_tensor([replacement.cx, replacement.cy])
+    plane = replacement._distortion.newton((wanted - principal) / focal, _HOST_STEPS, _HOST_SMALLEST_DETERMINANT)
+    # nerfstudio clips a fisheye's angle at 180°
+    reached = plane.norm(dim=-1) < (math.pi if isinstance(replacement, KannalaBrandt) else math.inf)
+    seen, valid = source.project(replacement._from_plane(torch.where(reached[:, None], plane, 0.0)))
+    distance = torch.where(reached & valid, (seen - wanted).norm(dim=-1), math.inf).numpy()
+    wrong = _theta(directions)[distance >= 0.5]
+    fit = CameraFit(replacement, float(np.sqrt(np.mean(distance**2))), float(distance.max()), limit)
+    return fit, float(wrong.min()) if len(wrong) else math.inf
+
+
+def _theta(directions: np.ndarray) -> np.ndarray:
+    return np.arctan2(np.linalg.norm(directions[:, :2], axis=1), directions[:, 2])
+
+
+def _seen_limit(directions: np.ndarray, limit: float, count: int) -> float:
+    """The angle asked for, or less where the picture ends before, and with it what can be said of the camera."""
+    return float(_theta(directions).max()) if len(directions) == count**2 else limit
 
 
 def _rays(camera: Camera, limit: float, count: int) -> tuple[np.ndarray, np.ndarray]:

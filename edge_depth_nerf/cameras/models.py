@@ -53,6 +53,8 @@ class Camera(ABC):
     """x of the principal point in pixels, pixel centres at +0.5."""
     cy: float
     """y of the principal point in pixels, pixel centres at +0.5."""
+    theta_limit_rad: float = dataclasses.field(default=math.pi, kw_only=True)
+    """The angle up to which the parameters were fitted; the model is not valid beyond."""
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -61,11 +63,15 @@ class Camera(ABC):
                 raise InputError(f"{self.model} camera: {field.name} is {value}, expected a finite number.")
             if value <= 0 and field.name in ("width", "height", "fx", "fy"):
                 raise InputError(f"{self.model} camera: {field.name} is {value}, expected more than 0.")
+        if not 0 < self.theta_limit_rad <= math.pi:
+            raise InputError(
+                f"{self.model} camera: theta_limit_rad is {self.theta_limit_rad}, expected more than 0 and at most pi."
+            )
 
     @property
     @abstractmethod
     def theta_max_rad(self) -> float:
-        """The largest angle from the z axis up to which the model is one-to-one."""
+        """The largest angle from the z axis up to which the model is one-to-one, at most `theta_limit_rad`."""
 
     @cached_property
     @abstractmethod
@@ -204,8 +210,12 @@ class MEI(Camera):
     def theta_max_rad(self) -> float:
         """For ξ > 1 the angle arccos(-1/ξ), beyond which the plane's radius shrinks again; else where Z = -ξ.
 
-        Less, where the distortion folds before.
+        Less, where the distortion folds before, or `theta_limit_rad` says so.
         """
+        return min(self._theta_of_model, self.theta_limit_rad)
+
+    @cached_property
+    def _theta_of_model(self) -> float:
         fold = self._distortion.radius_max
         if fold >= self._radius_of_sphere:
             return math.acos(-1.0 / self.xi) if self.xi > 1 else math.acos(-self.xi)
@@ -223,6 +233,8 @@ class MEI(Camera):
 
     @cached_property
     def _radius_max(self) -> float:
+        if self.theta_limit_rad < self._theta_of_model:
+            return math.sin(self.theta_limit_rad) / (math.cos(self.theta_limit_rad) + self.xi)
         return min(self._distortion.radius_max, self._radius_of_sphere)
 
     def _to_plane(self, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -266,16 +278,6 @@ class KannalaBrandt(Camera):
     """Tangential distortion."""
     p2: float = 0.0
     """Tangential distortion."""
-    theta_limit_rad: float = math.pi
-    """The angle up to which the parameters were fitted; the model is not valid beyond."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0 < self.theta_limit_rad <= math.pi:
-            raise InputError(
-                f"KANNALA_BRANDT camera: theta_limit_rad is {self.theta_limit_rad}, "
-                "expected more than 0 and at most pi."
-            )
 
     @cached_property
     def theta_max_rad(self) -> float:
@@ -329,7 +331,7 @@ class Pinhole(Camera):
 
     @cached_property
     def theta_max_rad(self) -> float:
-        """90°, which no ray reaches; less, where the distortion folds before."""
+        """90°, which no ray reaches; less, where the distortion folds before, or `theta_limit_rad` says so."""
         return math.atan(self._radius_max)
 
     @cached_property
@@ -338,7 +340,8 @@ class Pinhole(Camera):
 
     @property
     def _radius_max(self) -> float:
-        return self._distortion.radius_max
+        limit = self.theta_limit_rad
+        return min(self._distortion.radius_max, math.tan(limit) if limit < math.pi / 2 else math.inf)
 
     def _to_plane(self, points: Tensor) -> tuple[Tensor, Tensor]:
         z = points[..., 2:]
