@@ -1,0 +1,1 @@
+"""Masks: the lens circle, the recording vehicle, moving things, the sky. Pure: arrays in, arrays out."""
