@@ -137,7 +137,7 @@ class RoomDrive:
     frames: tuple[int, ...]
     poses: dict[int, NDArray]
     returns: dict[int, NDArray] = field(default_factory=dict)
-    """Points of each sweep in the scanner's frame."""
+    """Points of each sweep in the scanner's frame at the frame's moment; the files hold them `as_measured`."""
 
     def camera(self, name: str) -> MeiTwin:
         return MeiTwin.kitti360(name, self.size)
@@ -145,8 +145,25 @@ class RoomDrive:
     def camera_to_world(self, name: str, frame: int) -> NDArray:
         return self.poses[frame] @ matrix(CAM_TO_POSE[name])
 
-    def velo_to_world(self, frame: int) -> NDArray:
-        return self.poses[frame] @ matrix(CAM_TO_POSE["image_00"]) @ np.linalg.inv(matrix(CAM0_TO_VELO))
+    def velo_to_world(self, frame: float) -> NDArray:
+        """Where the scanner is, also between frames."""
+        return pose(frame) @ matrix(CAM_TO_POSE["image_00"]) @ np.linalg.inv(matrix(CAM0_TO_VELO))
+
+    def as_measured(self, points: NDArray, frame: int) -> NDArray:
+        """Points of the scanner's frame at the frame's moment, as the turning scanner measures them on the way.
+
+        It turns clockwise, once a frame, and faces forward at the frame's moment.
+        """
+        to_world = self.velo_to_world(frame)
+        world = points @ to_world[:3, :3].T + to_world[:3, 3]
+        measured = points
+        for _ in range(30):
+            turns = -np.arctan2(measured[:, 1], measured[:, 0]) / (2 * np.pi)
+            # the drive is straight: the scanner only shifts, by so much a frame
+            per_frame = self.velo_to_world(1)[:3, 3] - self.velo_to_world(0)[:3, 3]
+            moved = world - (to_world[:3, 3] + turns[:, None] * per_frame)
+            measured = moved @ to_world[:3, :3]
+        return measured
 
     def see(self, name: str, frame: int, pixels: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         """True distance, colour and θ at (u, v), integer pixel centres."""
@@ -168,8 +185,8 @@ class RoomDrive:
         return self.root / f"data_poses/{SEQUENCE}/poses.txt"
 
 
-def pose(frame: int, yaw_rad: float = 0.4) -> NDArray:
-    """Vehicle to world: 1 m a frame, x forward, y right, z down."""
+def pose(frame: float, yaw_rad: float = 0.4) -> NDArray:
+    """Vehicle to world: 0.5 m a frame, x forward, y right, z down."""
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     found = np.eye(4)
@@ -246,7 +263,7 @@ def write_room_drive(
         else:
             points = aimed_points(drive, aim, frame, rng)[0]
         drive.returns[frame] = points
-        write_points(drive.sweep(frame), points)
+        write_points(drive.sweep(frame), drive.as_measured(points, frame))
     if truth:
         _write_shifted(drive, cameras)
     return drive

@@ -21,7 +21,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from edge_depth_nerf.cameras import MEI, Camera, KannalaBrandt, Pinhole, camera_from_dict, fit_kannala_brandt
+from edge_depth_nerf.cameras import (
+    MEI,
+    Camera,
+    KannalaBrandt,
+    Pinhole,
+    camera_from_dict,
+    fit_kannala_brandt,
+    host_residual,
+)
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import (
     read_distance_png,
@@ -58,9 +66,11 @@ QUIET = Console(quiet=True)
 @pytest.fixture(autouse=True)
 def fit_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scene, "fit_kannala_brandt", _FIT_ONCE)
+    monkeypatch.setattr(scene, "host_residual", _JUDGED_ONCE)
 
 
 _FIT_ONCE = functools.cache(fit_kannala_brandt)
+_JUDGED_ONCE = functools.cache(host_residual)
 
 
 def pose(index: int) -> np.ndarray:
@@ -219,7 +229,7 @@ def test_mask_is_lens_circle_and_own_mask(tmp_path: Path) -> None:
 def test_lens_circle_is_where_rays_are_within_the_limit(camera: Camera, theta_max_deg: float) -> None:
     directions, valid = camera.unproject(camera.pixel_centres())
     theta = np.degrees(np.arctan2(directions[..., :2].norm(dim=-1).numpy(), directions[..., 2].numpy()))
-    circle = scene._lens_circle(camera, theta_max_deg)
+    circle = scene.lens_circle(camera, theta_max_deg)
     assert circle.shape == (camera.height, camera.width)
     assert np.array_equal(circle, valid.numpy() & (theta <= theta_max_deg))
 
@@ -259,7 +269,9 @@ def test_layers_that_are_not_given_leave_no_trace(tmp_path: Path) -> None:
 def test_cameras_that_nerfstudio_knows_are_not_fitted(tmp_path: Path, camera: KannalaBrandt | Pinhole) -> None:
     report = write(tmp_path / "scene", camera)
     meta = read_json(tmp_path / "scene/transforms.json")
-    assert report.fits == meta["camera_fits"] == {}
+    assert report.fits["image_02"].camera == camera
+    assert report.fits["image_02"].max_px < 1e-6
+    assert meta["camera_fits"]["image_02"]["rms_px"] == 0.0
     assert meta["camera_model"] == ("OPENCV" if camera is PINHOLE else "OPENCV_FISHEYE")
     names = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "k1": "k1", "k2": "k2", "p1": "p1", "p2": "p2"}
     for key, name in names.items():
@@ -514,10 +526,6 @@ SKEWED[0, 0] = 1.01
         ({"theta_max_deg": 200.0}, "theta_max_deg is 200.0"),
         ({"cameras": [SceneCamera("a/b", FISHEYE)]}, "camera 'a/b'"),
         ({"cameras": [SceneCamera("image_02", FISHEYE)] * 2}, "two cameras have one name"),
-        (
-            {"cameras": [SceneCamera("image_02", FISHEYE), SceneCamera("image_00", PINHOLE)]},
-            "mixed: image_02 is MEI, image_00 is PINHOLE.*one scene of the fisheye",
-        ),
     ],
 )
 def test_bad_scene_is_an_error(tmp_path: Path, options: dict[str, Any], message: str) -> None:
@@ -526,14 +534,68 @@ def test_bad_scene_is_an_error(tmp_path: Path, options: dict[str, Any], message:
     assert not (tmp_path / "scene/transforms.json").exists()
 
 
-def test_camera_that_nerfstudio_cannot_match_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def poor_fit(source: Camera, theta_max_rad: float) -> Any:
-        return replace(_FIT_ONCE(source, theta_max_rad), rms_px=0.51)
+WIDE = Pinhole(SIZE, SIZE, 4.0, 4.0, 16.4, 16.1)
+"""Its corners lie at 80°: no polynomial of the angle follows the tangent so far."""
+BENT = KannalaBrandt(SIZE, SIZE, 7.0, 7.0, 16.4, 16.1, 0.0652, 0.0189, -0.0042, -0.0013)
+"""nerfstudio's iteration goes astray beyond some 90°."""
 
-    monkeypatch.setattr(scene, "fit_kannala_brandt", poor_fit)
-    with pytest.raises(InputError, match=r"camera image_02: .* differs .* by 0\.51 px rms up to 95°"):
-        write(tmp_path / "scene")
+
+@pytest.mark.parametrize(
+    ("cameras", "theta_max_deg", "message"),
+    [
+        (
+            [SceneCamera("wide", WIDE), SceneCamera("round", POLYNOMIAL)],
+            95.0,
+            r"wide: .* PINHOLE.*pinhole cameras alone",
+        ),
+        (
+            [SceneCamera("bent", BENT)],
+            105.0,
+            r"bent: .*astray; at most 0\.5 px rms can be used\. Give --theta-max-deg 90,",
+        ),
+    ],
+)
+def test_camera_that_nerfstudio_cannot_match_is_an_error(
+    tmp_path: Path, cameras: list[SceneCamera], theta_max_deg: float, message: str
+) -> None:
+    given = [replace(frame, camera=cameras[0].name) for frame in frames()]
+    with pytest.raises(InputError, match=message) as error:
+        write(tmp_path / "scene", given=given, cameras=cameras, theta_max_deg=theta_max_deg)
     assert not (tmp_path / "scene").exists(), "an error before the work leaves no folder behind"
+    # what it says to do helps
+    usable_deg = float(str(error.value).split("--theta-max-deg ")[1].split(",")[0])
+    write(tmp_path / "scene", given=given, cameras=cameras, theta_max_deg=usable_deg)
+
+
+def test_cameras_of_all_models_make_one_scene(tmp_path: Path) -> None:
+    """Each frame with its own camera; nerfstudio's rays of all of them are those of the originals."""
+    originals: dict[str, Camera] = {"mei": FISHEYE, "polynomial": POLYNOMIAL, "pinhole": PINHOLE}
+    given = [replace(frame, camera=name) for name in originals for frame in frames(3)]
+    cameras = [SceneCamera(name, camera) for name, camera in originals.items()]
+    report = write(tmp_path / "scene", given=given, cameras=cameras)
+    meta = read_json(tmp_path / "scene/transforms.json")
+    assert meta["camera_model"] == "OPENCV_FISHEYE"
+    assert meta["camera_fits"].keys() == report.fits.keys() == originals.keys()
+    assert all(0 <= fit["rms_px"] < 0.1 for fit in meta["camera_fits"].values())
+    assert camera_from_dict(meta["original_cameras"]["pinhole"], "here") == PINHOLE
+
+    from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+
+    parser = NerfstudioDataParserConfig(data=tmp_path / "scene", orientation_method="none", center_method="none")
+    outputs = parser.setup().get_dataparser_outputs("train")
+    for index, picture in enumerate(outputs.image_filenames):
+        name = picture.parent.name
+        mask = read_mask(tmp_path / f"scene/masks/{name}.png")
+        bundle = outputs.cameras.generate_rays(camera_indices=index)
+        turned = (
+            outputs.cameras.camera_to_worlds[index, :, :3].double()
+            @ torch.diag(torch.tensor([1.0, -1.0, -1.0])).double()
+        )
+        directions = bundle.directions.double() @ turned
+        pixels, valid = originals[name].project(directions)
+        distance = (pixels - originals[name].pixel_centres()).norm(dim=-1)
+        assert valid.numpy()[mask].all()
+        assert distance.numpy()[mask].max() < 0.25
 
 
 def test_check_rigid() -> None:

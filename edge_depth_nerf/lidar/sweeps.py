@@ -6,6 +6,7 @@ turn, and nothing is corrected for that here.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,6 +25,24 @@ _BYTES_PER_POINT = 16
 
 
 @dataclass(frozen=True)
+class SweepTiming:
+    """When a turning scanner measures which direction: at its reference azimuth at the sweep's own moment."""
+
+    turn_s: float
+    """Duration of a turn."""
+    clockwise: bool = True
+    """Seen from above, from the +z axis."""
+    reference_azimuth_rad: float = 0.0
+    """Counter-clockwise from x. Half a turn from it the sweep begins and ends."""
+
+    def offsets_s(self, points_m: Float[Tensor, "returns 3"]) -> Float[Tensor, "returns"]:
+        """When each return was measured, from the sweep's own moment: -turn_s/2 to turn_s/2."""
+        azimuth = torch.atan2(points_m[:, 1], points_m[:, 0]) - self.reference_azimuth_rad
+        turns = torch.remainder(azimuth / (2 * math.pi) + 0.5, 1.0) - 0.5
+        return turns * (-self.turn_s if self.clockwise else self.turn_s)
+
+
+@dataclass(frozen=True)
 class Sweep:
     """The usable returns of one turn of the scanner."""
 
@@ -35,6 +54,8 @@ class Sweep:
     """How many returns were left out because a coordinate is NaN or infinite."""
     out_of_range: int
     """How many returns were left out because they lie nearer than 0.5 m (zeros among them) or beyond 255 m."""
+    offset_s: Float[Tensor, "returns"] | None = None
+    """When each return was measured, from the sweep's own moment, where the file says so; float64."""
 
 
 def check_sweep_size(path: Path) -> None:
@@ -65,19 +86,37 @@ def read_sweep(path: Path) -> Sweep:
     """
     check_sweep_size(path)
     values = torch.from_numpy(np.fromfile(path, "<f4").reshape(-1, 4).astype(np.float64))
-    finite = torch.isfinite(values[:, :3]).all(-1)
-    range_m = values[:, :3].norm(dim=-1)
+    return usable_returns(path, values[:, :3], values[:, 3])
+
+
+def usable_returns(
+    path: Path,
+    points_m: Float[Tensor, "points 3"],
+    reflectance: Float[Tensor, "points"],
+    offset_s: Float[Tensor, "points"] | None = None,
+) -> Sweep:
+    """Leave out and count what is no return: NaN and infinity, zeros, what is too near or too far.
+
+    Raises:
+        InputError: nothing is left; names `path`.
+
+    """
+    finite = torch.isfinite(points_m).all(-1)
+    if offset_s is not None:
+        finite &= torch.isfinite(offset_s)
+    range_m = points_m.norm(dim=-1)
     # NaN compares as false
     usable = finite & (range_m >= MIN_RANGE_M) & (range_m <= MAX_RANGE_M)
     if not usable.any():
         raise InputError(
-            f"{path}: none of its {len(values)} points can be used ({int((~finite).sum())} are NaN or infinite, the "
+            f"{path}: none of its {len(points_m)} points can be used ({int((~finite).sum())} are NaN or infinite, the "
             f"others lie nearer than {MIN_RANGE_M} m or beyond {MAX_RANGE_M:.0f} m). Copy the file again, or delete "
             "it so that its frame is skipped."
         )
     return Sweep(
-        points_m=values[usable, :3],
-        reflectance=values[usable, 3],
+        points_m=points_m[usable],
+        reflectance=reflectance[usable],
         not_finite=int((~finite).sum()),
         out_of_range=int((finite & ~usable).sum()),
+        offset_s=None if offset_s is None else offset_s[usable],
     )

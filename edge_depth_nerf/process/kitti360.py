@@ -1,54 +1,44 @@
-"""From a KITTI-360 drive, real or synthesised, to a scene folder.
+"""A KITTI-360 drive, real or synthesised, as a recording.
 
 Read from the data set's folder, for each frame number f:
 
     calibration/{image_02.yaml,image_03.yaml,calib_cam_to_pose.txt,calib_cam_to_velo.txt}
     data_2d_raw/SEQUENCE/image_02/data_rgb/f.png     and image_02/timestamps.txt, if it is there
+    data_2d_semantics/train/SEQUENCE/image_02/semantic/f.png    label ids, where there are any
     data_3d_raw/SEQUENCE/velodyne_points/data/f.bin
     data_poses/SEQUENCE/poses.txt
     truth/SEQUENCE/…                                 what only synthesised drives have
 
-A LiDAR sweep goes to a camera by velo → vehicle → camera, at the frame's own moment: inv(camera→pose) ·
-(cam_0→pose) · inv(cam_0→velo). cam0_to_world.txt is of the rectified camera 0 and not used. Everything is checked
-by sizes and headers before the first map is made.
+Frames: scanner → vehicle by inv(cam_0→velo) and cam_0→pose; camera → vehicle by cam→pose. cam0_to_world.txt is of
+the rectified camera 0 and not used. The cameras fire when the laser faces forward, so frame f's picture and sweep
+share their moment; the scanner turns clockwise, once a frame. Everything is checked by sizes and headers.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import hashlib
-from collections.abc import Iterable
+import math
+import statistics
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
-from jaxtyping import Float, Int, UInt8
 from rich.console import Console
-from torch import Tensor
 
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_distance_png, read_image, read_json, read_mask
-from edge_depth_nerf.lidar import Sweep, project_points, read_sweep, transform_points
-from edge_depth_nerf.process.downscale import downscale_distance, downscale_image, downscale_mask
+from edge_depth_nerf.files import read_json
+from edge_depth_nerf.lidar import SweepTiming, check_sweep_size, read_sweep
+from edge_depth_nerf.lidar.trajectory import Trajectory
+from edge_depth_nerf.process.build import load_distance, load_picture, process_recording
+from edge_depth_nerf.process.checks import check_distance, check_size
 from edge_depth_nerf.process.kitti360_calibration import Kitti360Rig, read_poses, read_rig
-from edge_depth_nerf.process.kitti360_drive import FrameFiles, Kitti360Drive, check_distance, check_size, summarise
+from edge_depth_nerf.process.kitti360_drive import Kitti360Drive
 from edge_depth_nerf.process.options import Kitti360Options
-from edge_depth_nerf.process.points import PointCloud
-from edge_depth_nerf.process.scene import (
-    CLOUD,
-    DistanceMap,
-    FrameContent,
-    Picture,
-    ProcessReport,
-    SceneCamera,
-    SceneFrame,
-    ShiftedView,
-    held_out_frames,
-    write_scene,
-)
-from edge_depth_nerf.process.transforms import Transform, check_rigid
+from edge_depth_nerf.process.recording import RecordedCamera, RecordedPicture, RecordedSweep, Recording
+from edge_depth_nerf.process.scene import DistanceMap, Picture, ProcessReport, ShiftedView
+from edge_depth_nerf.process.transforms import check_rigid
+
+FRAME_INTERVAL_S = 0.1
+"""Between frames, and of one turn of the scanner, where the drive brings no timestamps."""
 
 
 def process_kitti360(options: Kitti360Options, console: Console | None = None) -> ProcessReport:
@@ -59,170 +49,123 @@ def process_kitti360(options: Kitti360Options, console: Console | None = None) -
         InputError: an option, a file of the drive, or the output folder cannot be used.
 
     """
-    console = console or Console()
+    return process_recording(read_kitti360(options), options, console)
+
+
+def read_kitti360(options: Kitti360Options) -> Recording:
+    """Find and check what a drive's scene is made of.
+
+    Raises:
+        FileNotFoundError: a folder or file of the drive is missing.
+        InputError: an option or a file of the drive cannot be used.
+
+    """
     drive = Kitti360Drive(options)
     rig = read_rig(drive.calibration, options.cameras)
-    poses = read_poses(drive.poses)
+    poses = read_poses(drive.poses) if options.poses == "recorded" else None
     kept, skipped = drive.select(poses)
-    if skipped:
-        _say(console, f"Skipped {summarise(skipped)}", "yellow")
     files = drive.check_files(rig, kept)
-    cameras = [_scene_camera(drive, rig, name) for name in options.cameras]
     moments = sorted({frame for _, frame in kept})
-    times = {name: drive.read_timestamps(name, moments) for name in options.cameras}
-    held_out = dict(zip(moments, held_out_frames(len(moments), options.holdout_every), strict=True))
-    dropped = _Dropped()
+    stamps = {name: drive.read_timestamps(name, moments) for name in options.cameras}
+    clock = _Clock(next((times for times in stamps.values() if times), []))
 
-    def scene_frame(name: str, frame: int) -> SceneFrame:
-        return SceneFrame(
+    pictures = tuple(
+        RecordedPicture(
             camera=name,
             frame=frame,
-            camera_to_world=poses[frame] @ rig.camera_to_pose[name],
-            content=partial(
-                _load,
-                files[name, frame],
-                rig,
-                name,
-                poses[frame],
-                factor=options.downscale,
-                training=not held_out[frame],
-                dropped=dropped,
-            ),
-            timestamp_s=times[name].get(frame),
-            held_out=held_out[frame],
-            inputs=files[name, frame].paths,
+            path=found.image,
+            time_s=clock.time_s(frame),
+            camera_to_world=None if poses is None else poses[frame] @ rig.camera_to_pose[name],
+            timestamp_s=stamps[name][frame] if stamps[name] else None,
+            mask=found.mask,
+            semantics=found.semantics,
+            mono=found.mono,
+            truth_distance=found.truth_distance,
+            truth_rgb=found.truth_rgb,
         )
-
-    shifted = _shifted_views(drive, rig, {(name, frame) for name, frame in kept if held_out[frame]})
-    report = write_scene(
-        options.output,
-        cameras,
-        [scene_frame(name, frame) for name, frame in kept],
-        layers=_layers(drive),
-        source=_source(drive, files.values(), shifted),
-        theta_max_deg=options.theta_max_deg,
-        shifted=shifted,
-        console=console,
+        for (name, frame), found in files.items()
     )
-    timeless = [
-        f"{drive.timestamps_file(name)}: no such file; the frames of {name} have no timestamp_s."
-        for name, found in times.items()
-        if not found
-    ]
-    report = dataclasses.replace(
-        report, skipped=tuple(skipped), notices=(*timeless, *dropped.notices(), *report.notices)
-    )
-    _show(report, console)
-    return report
-
-
-# ---- making the maps -------------------------------------------------------------------------------------------
-
-
-class _Dropped:
-    """Counts the points left out, once a sweep: each is read by several threads, for each camera again."""
-
-    def __init__(self) -> None:
-        self._by_file: dict[Path, tuple[int, int]] = {}
-
-    def add(self, path: Path, sweep: Sweep) -> None:
-        self._by_file[path] = (sweep.not_finite, sweep.out_of_range)
-
-    def notices(self) -> list[str]:
-        not_finite, out_of_range = np.sum([*self._by_file.values(), (0, 0)], axis=0)
-        found = {"NaN or infinite": not_finite, "zero, nearer than 0.5 m or beyond 255 m": out_of_range}
-        return [
-            f"{count} LiDAR points left out of {len(self._by_file)} sweeps: {why}."
-            for why, count in found.items()
-            if count
-        ]
-
-
-def _points_in_pose(sweep: Sweep, rig: Kitti360Rig) -> Float[Tensor, "returns 3"]:
-    """Express a sweep in the vehicle's frame at the frame's moment; metres.
-
-    The sweep is taken as if it had been measured at one moment. The vehicle's motion during the scanner's turn
-    belongs here.
-    """
-    return transform_points(torch.from_numpy(rig.velo_to_pose), sweep.points_m)
-
-
-def _load(
-    files: FrameFiles,
-    rig: Kitti360Rig,
-    name: str,
-    pose_to_world: Transform,
-    *,
-    factor: int,
-    training: bool,
-    dropped: _Dropped,
-) -> FrameContent:
-    """Make the maps of one picture, at the scene's size."""
-    camera = rig.cameras[name].downscaled(factor)
-    sweep = read_sweep(files.sweep)
-    dropped.add(files.sweep, sweep)
-    in_pose = _points_in_pose(sweep, rig)
-    pose_to_camera = torch.from_numpy(np.linalg.inv(rig.camera_to_pose[name]))
-    seen = project_points(transform_points(pose_to_camera, in_pose), camera)
-    image = downscale_image(read_image(files.image), factor)
-    mask = None if files.mask is None else downscale_mask(read_mask(files.mask), factor)
-    return FrameContent(
-        image=files.image if factor == 1 else image,
-        mask=mask,
-        lidar=seen.distance_m.numpy(),
-        mono=None if files.mono is None else _distance(files.mono, factor),
-        truth_distance=None if files.truth_distance is None else _distance(files.truth_distance, factor),
-        truth_rgb=None if files.truth_rgb is None else _picture(files.truth_rgb, factor),
-        cloud=_cloud(seen.point_index, in_pose, pose_to_world, image) if training else None,
+    # a picture's sweeps are checked against those around them, as far again
+    reach = 2 * options.sweeps
+    numbers = [n for n in sorted(drive.sweep_numbers()) if n in moments or _near(n, moments, reach)]
+    timing = SweepTiming(clock.interval_s)
+    sweeps = []
+    for number in numbers:
+        path = drive.sweep_file(number)
+        check_sweep_size(path)
+        sweeps.append(
+            RecordedSweep(
+                path=path,
+                time_s=clock.time_s(number),
+                frame=number,
+                scanner="velodyne",
+                to_vehicle=rig.velo_to_pose,
+                read=partial(read_sweep, path),
+                timing=timing,
+            )
+        )
+    return Recording(
+        cameras=tuple(RecordedCamera(name, rig.cameras[name], rig.camera_to_pose[name]) for name in options.cameras),
+        pictures=pictures,
+        sweeps=tuple(sweeps),
+        trajectory=None if poses is None else _trajectory(poses, clock, drive.poses),
+        source={
+            "kind": "kitti360",
+            "root": options.root.resolve().name,
+            "sequence": options.sequence,
+            "cameras": list(options.cameras),
+        },
+        whole_inputs=(
+            drive.calibration / "calib_cam_to_pose.txt",
+            drive.calibration / "calib_cam_to_velo.txt",
+            *([] if poses is None else [drive.poses]),
+            *(drive.calibration / f"{name}.yaml" for name in options.cameras),
+        ),
+        skipped=tuple(skipped),
+        notices=tuple(
+            f"{drive.timestamps_file(name)}: no such file; the frames of {name} have no timestamp_s."
+            for name, times in stamps.items()
+            if not times
+        ),
+        shifted=tuple(_shifted_views(drive, rig, set(files))),
     )
 
 
-def _cloud(
-    point_index: Int[Tensor, "height width"],
-    in_pose: Float[Tensor, "returns 3"],
-    pose_to_world: Transform,
-    image: UInt8[np.ndarray, "height width 3"],
-) -> PointCloud:
-    """Gather the points that a picture sees, in the world, with its colours."""
-    hit = point_index >= 0
-    points = in_pose[point_index[hit]]
-    return PointCloud(
-        points_m=transform_points(torch.from_numpy(pose_to_world), points).numpy(),
-        colours=image[hit.numpy()],
-        pixels=torch.nonzero(hit).numpy(),
-    )
+class _Clock:
+    """When frames were taken, from the first one of the drive on."""
+
+    def __init__(self, times_s: list[float]) -> None:
+        self._times_s = times_s
+        steps = np.diff(times_s).tolist()
+        self.interval_s = statistics.median(steps) if steps else FRAME_INTERVAL_S
+        if not (math.isfinite(self.interval_s) and self.interval_s > 0):
+            raise InputError("the timestamps of the pictures do not increase. Copy timestamps.txt from the data set.")
+
+    def time_s(self, frame: int) -> float:
+        """The time of a frame; beyond the timestamps, at their usual interval."""
+        if not self._times_s:
+            return frame * self.interval_s
+        last = len(self._times_s) - 1
+        return self._times_s[min(frame, last)] - self._times_s[0] + max(frame - last, 0) * self.interval_s
 
 
-def _picture(path: Path, factor: int) -> Picture:
-    return path if factor == 1 else downscale_image(read_image(path), factor)
+def _trajectory(poses: dict[int, np.ndarray], clock: _Clock, path: Path) -> Trajectory:
+    frames = sorted(poses)
+    times_s = np.array([clock.time_s(frame) for frame in frames])
+    try:
+        return Trajectory(times_s, np.stack([poses[frame] for frame in frames]))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
 
 
-def _distance(path: Path, factor: int) -> DistanceMap:
-    return path if factor == 1 else downscale_distance(read_distance_png(path), factor)
+def _near(number: int, moments: list[int], reach: int) -> bool:
+    index = int(np.searchsorted(moments, number))
+    around = moments[max(index - 1, 0) : index + 1]
+    return any(abs(number - moment) <= reach for moment in around)
 
 
-def _scene_camera(drive: Kitti360Drive, rig: Kitti360Rig, name: str) -> SceneCamera:
-    factor = drive.options.downscale
-    mask = drive.read_ego_mask(name, rig.cameras[name])
-    return SceneCamera(
-        name, rig.cameras[name].downscaled(factor), None if mask is None else downscale_mask(mask, factor)
-    )
-
-
-def _layers(drive: Kitti360Drive) -> list[str]:
-    given = {
-        "mask": drive.options.frame_masks is not None,
-        "lidar": True,
-        "mono": drive.options.mono is not None,
-        "truth_distance": drive.has_truth,
-        "truth_rgb": drive.has_truth,
-        CLOUD: True,
-    }
-    return [layer for layer, present in given.items() if present]
-
-
-def _shifted_views(drive: Kitti360Drive, rig: Kitti360Rig, held_out: set[tuple[str, int]]) -> list[ShiftedView]:
-    """Find the true views beside the path, of the frames held out: next to a training frame, judging is too easy."""
+def _shifted_views(drive: Kitti360Drive, rig: Kitti360Rig, taken: set[tuple[str, int]]) -> list[ShiftedView]:
+    """Find the true views beside the path, of the frames taken."""
     path = drive.truth / "shifted.json"
     if not path.is_file():
         return []
@@ -234,7 +177,7 @@ def _shifted_views(drive: Kitti360Drive, rig: Kitti360Rig, held_out: set[tuple[s
     }
     views = []
     for (metres, name, frame), matrix in poses.items():
-        if (name, frame) not in held_out:
+        if (name, frame) not in taken:
             continue
         where = f"{path}: {metres} m, {name}, frame {frame}"
         camera_to_world = np.array(matrix, np.float64)
@@ -259,55 +202,4 @@ def _shifted_views(drive: Kitti360Drive, rig: Kitti360Rig, held_out: set[tuple[s
 
 
 def _load_shifted(picture: Path, distance: Path, factor: int) -> tuple[Picture, DistanceMap]:
-    return _picture(picture, factor), _distance(distance, factor)
-
-
-# ---- what the scene says of itself -----------------------------------------------------------------------------
-
-
-def _source(drive: Kitti360Drive, files: Iterable[FrameFiles], shifted: list[ShiftedView]) -> dict[str, Any]:
-    """Describe what the scene is made of, without the machine's paths."""
-    options = drive.options
-    digest = hashlib.sha256()
-    whole = [drive.calibration / "calib_cam_to_pose.txt", drive.calibration / "calib_cam_to_velo.txt", drive.poses]
-    whole += [drive.calibration / f"{name}.yaml" for name in options.cameras]
-    whole += [path for name in options.cameras if (path := drive.ego_mask_file(name))]
-    for path in whole:
-        digest.update(path.read_bytes())
-    # the maps' sizes tell one drive from another; reading them all would take as long as the work
-    sized = [path for found in files for path in found.paths] + [path for view in shifted for path in view.inputs]
-    for path in sized:
-        digest.update(f"{path.parent.name}/{path.name} {path.stat().st_size}\n".encode())
-    return {
-        "kind": "kitti360",
-        "root": options.root.resolve().name,
-        "sequence": options.sequence,
-        "first": options.first,
-        "frames": options.frames,
-        "stride": options.stride,
-        "cameras": list(options.cameras),
-        "downscale": options.downscale,
-        "ego_mask": options.ego_mask is not None,
-        "frame_masks": options.frame_masks is not None,
-        "mono": options.mono is not None,
-        "theta_max_deg": options.theta_max_deg,
-        "holdout_every": options.holdout_every,
-        "inputs_sha256": digest.hexdigest(),
-    }
-
-
-def _say(console: Console, text: str, style: str | None = None) -> None:
-    console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
-
-
-def _show(report: ProcessReport, console: Console) -> None:
-    for name, fit in report.fits.items():
-        _say(
-            console,
-            f"{name}: fisheye camera fitted within {fit.rms_px:.4f} px rms, {fit.max_px:.3f} px at most; the mask "
-            f"keeps {report.mask_share[name]:.0%} of the picture",
-        )
-    for notice in report.notices:
-        _say(console, notice, "yellow")
-    done = "" if report.written else "; nothing was left to do"
-    _say(console, f"{report.scene}: {report.training} pictures for training, {report.held_out} held out{done}")
+    return load_picture(picture, factor), load_distance(distance, factor)

@@ -4,41 +4,121 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
+
+from edge_depth_nerf.errors import InputError
 
 
-@dataclass(frozen=True)
-class Kitti360Options:
+@dataclass(frozen=True, kw_only=True)
+class ProcessOptions:
+    """What every converter can be told."""
+
+    output: Path
+    """The scene folder to write. A run that was interrupted is continued by the same command."""
+    first: int = 0
+    """Number of the first frame."""
+    frames: int | None = None
+    """How many frames to look at: first, first + stride, and so on. Not set: to the end of the drive. Those without
+    pose, picture or sweep are listed and skipped."""
+    stride: int = 1
+    """Take every stride-th frame."""
+    downscale: int = 1
+    """Average blocks of this many pixels by this many into one. What does not fill a block, at the right and at the
+    bottom, is cut off."""
+    holdout_every: int = 8
+    """One frame of so many is held out of training, for all cameras at once: frames 4, 12, 20 of every 8. 0 holds out
+    none."""
+    theta_max_deg: float = 95.0
+    """Rays further than this from the optical axis are masked out, in degrees."""
+    poses: Literal["recorded", "colmap"] = "recorded"
+    """recorded: the poses that come with the drive; colmap: found from the pictures, their scale from LiDAR (needs
+    `pip install edge-depth-nerf[colmap]`)."""
+    sweeps: int = 3
+    """Accumulate this many LiDAR sweeps before and after each picture's own. Training never sees a sweep of a moment
+    that is held out; a picture that is held out gets its own alone."""
+    deskew: bool = True
+    """Move each point by the vehicle's pose at the time it was measured; off to compare."""
+    occlusion: bool = True
+    """Remove points that a nearer surface hides from the camera; off to compare."""
+    ego_mask: Path | None = None
+    """What of the picture is never used, such as the vehicle itself (255 = use the pixel, 0 = ignore it): a PNG for
+    all cameras, or a folder with a PNG named after each camera. In the size of the raw pictures."""
+    find_ego: bool = True
+    """Where no mask is given, find the vehicle as what never changes while it moves; the masks found are written to
+    ego_masks/ in the scene, to be corrected and given as --ego-mask."""
+    frame_masks: Path | None = None
+    """Masks of single frames, such as moving things: a folder with CAMERA/0000000123.png (255 = use the pixel). In
+    the size of the raw pictures; one for every frame taken."""
+    moving_classes: tuple[str, ...] = (
+        *("person", "rider", "car", "truck", "bus", "caravan", "trailer", "train", "motorcycle", "bicycle"),
+        "unknown vehicle",
+    )
+    """Classes that are masked out where the drive brings KITTI-360's semantics; none to keep all."""
+    mono: Path | None = None
+    """Monocular distance maps: a folder with CAMERA/0000000123.png, 16 bit, 1/256 m along the ray, 0 = none. In the
+    size of the raw pictures; one for every frame taken."""
+    sky: bool = True
+    """Leave the sky without monocular distance, instead of a wrong one."""
+
+    def ego_mask_of(self, camera: str) -> Path | None:
+        """The mask of the vehicle that is given for a camera, if one is."""
+        given = self.ego_mask
+        return given / f"{camera}.png" if given is not None and given.is_dir() else given
+
+    def check(self) -> None:
+        """Check the ranges.
+
+        Raises:
+            InputError: an option is out of its range.
+
+        """
+
+        def require(fine: bool, option: str, found: object, expected: str) -> None:
+            if not fine:
+                raise InputError(f"--{option} {found}: expected {expected}.")
+
+        require(self.first >= 0, "first", self.first, "the number of a frame, 0 or more")
+        require(self.frames is None or self.frames > 0, "frames", self.frames, "1 or more")
+        require(self.stride > 0, "stride", self.stride, "1 or more")
+        require(self.downscale > 0, "downscale", self.downscale, "1 or more")
+        holdout = self.holdout_every
+        require(holdout == 0 or holdout >= 2, "holdout-every", holdout, "2 or more, or 0 to hold out none")
+        require(0 < self.theta_max_deg <= 180, "theta-max-deg", self.theta_max_deg, "degrees above 0, up to 180")
+        require(0 <= self.sweeps <= 100, "sweeps", self.sweeps, "0 to 100")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kitti360Options(ProcessOptions):
     """Turn a stretch of a KITTI-360 drive, or of one written by `synthesize`, into a scene folder."""
 
     root: Path
     """The data set's folder: the one that holds calibration, data_2d_raw, data_3d_raw and data_poses."""
     sequence: str
     """The drive, such as 2013_05_28_drive_0000_sync."""
-    output: Path
-    """The scene folder to write. A run that was interrupted is continued by the same command."""
-    first: int = 0
-    """Number of the first frame, as in the file names."""
-    frames: int | None = None
-    """How many frames to look at: first, first + stride, and so on. Not set: to the end of the drive. Those without
-    pose, picture or sweep are listed and skipped."""
-    stride: int = 1
-    """Take every stride-th frame."""
     cameras: tuple[str, ...] = ("image_02", "image_03")
     """Which of the two fisheye cameras: image_02 (left), image_03 (right)."""
-    downscale: int = 1
-    """Average blocks of this many pixels by this many into one. What does not fill a block, at the right and at the
-    bottom, is cut off."""
-    ego_mask: Path | None = None
-    """What of the picture is never used, such as the vehicle itself (255 = use the pixel, 0 = ignore it): a PNG for
-    all cameras, or a folder with image_02.png and image_03.png. In the size of the raw pictures."""
-    frame_masks: Path | None = None
-    """Masks of single frames, such as moving things: a folder with image_02/0000000123.png. In the size of the raw
-    pictures; one for every frame taken."""
-    mono: Path | None = None
-    """Monocular distance maps: a folder with image_02/0000000123.png, 16 bit, 1/256 m along the ray, 0 = none. In
-    the size of the raw pictures; one for every frame taken."""
-    theta_max_deg: float = 95.0
-    """Rays further than this from the optical axis are masked out, in degrees."""
-    holdout_every: int = 8
-    """One frame of so many is held out of training, for all cameras at once: frames 4, 12, 20 of every 8. 0 holds out
-    none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigOptions(ProcessOptions):
+    """Turn a recording of your own into a scene folder. docs/rig.md says how it is described."""
+
+    root: Path
+    """The recording's folder; paths in the rig file count from it."""
+    rig: Path | None = None
+    """The file that describes cameras, scanners and poses. Not set: rig.toml or rig.json in the recording's folder."""
+    cameras: tuple[str, ...] = ()
+    """Which of its cameras; none named: all."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class JbnuDepth360Options(ProcessOptions):
+    """Turn a sequence of JBNU-Depth360 into a scene folder. docs/jbnu_depth360.md says what is to be handed in."""
+
+    root: Path
+    """The sequence's folder: the one that holds image and bin."""
+    calibration: Path
+    """TOML or JSON with cameras, scanner and poses, which the data set does not publish; paths in it count from its own
+    folder, those of pictures and scans from the sequence's."""
+    cameras: tuple[str, ...] = ()
+    """Which of its cameras; none named: all."""

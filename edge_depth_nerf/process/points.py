@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from edge_depth_nerf.files import write_atomically, write_bytes
+from edge_depth_nerf.lidar.voxels import first_in_voxel
 
 MAX_POINTS = 200_000
 """points.ply holds at most so many points."""
@@ -22,8 +23,6 @@ VOXEL_M = 0.15
 """points.ply holds one point of each cube of this size; larger cubes where they would be too many."""
 _MERGE_AT = 1_000_000
 """So many points are collected before they are thinned; bounds the memory for long drives."""
-_CELL_BITS = 21
-"""Bits of a cube's number along one axis: 314 km of 0.15 m."""
 
 
 @dataclass(frozen=True)
@@ -49,9 +48,7 @@ def _thinned(parts: Sequence[_Part], voxel_m: float) -> _Part:
     """Keep the first point of each cube, in the order given."""
     points_m = np.concatenate([part.points_m for part in parts])
     colours = np.concatenate([part.colours for part in parts])
-    cells = np.floor(points_m / voxel_m).astype(np.int64) + (1 << (_CELL_BITS - 1))
-    keys = (cells[:, 0] << (2 * _CELL_BITS)) | (cells[:, 1] << _CELL_BITS) | cells[:, 2]
-    first = np.sort(np.unique(keys, return_index=True)[1])
+    first = first_in_voxel(points_m, voxel_m)
     return _Part(points_m[first], colours[first])
 
 

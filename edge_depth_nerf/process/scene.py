@@ -20,12 +20,13 @@ A run that was interrupted continues: whole files are kept, unless what they are
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 import re
 import shutil
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from functools import partial
@@ -34,13 +35,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from edge_depth_nerf import __version__
-from edge_depth_nerf.cameras import Camera, CameraFit, KannalaBrandt, Pinhole, fit_kannala_brandt
+from edge_depth_nerf.cameras import Camera, CameraFit, KannalaBrandt, Pinhole, fit_kannala_brandt, host_residual
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import (
     DISTANCE_STEPS_PER_METRE,
@@ -53,6 +54,7 @@ from edge_depth_nerf.files import (
     write_mask,
     write_png,
 )
+from edge_depth_nerf.masks.lens import lens_circle
 from edge_depth_nerf.process.png import read_png_bytes, read_png_header
 from edge_depth_nerf.process.points import PointCloud, merge_parts, write_part
 from edge_depth_nerf.process.transforms import Transform, check_rigid, opencv_to_opengl
@@ -174,13 +176,33 @@ class ProcessReport:
     written: int
     """Pictures whose files were written now; the others were there already."""
     fits: dict[str, CameraFit]
-    """How well each camera's replacement fits; none for cameras that nerfstudio knows itself."""
+    """How far nerfstudio's rays of each camera are off, in pixels."""
     mask_share: dict[str, float]
     """Which part of each camera's pictures is used, 0 to 1."""
     skipped: tuple[Skipped, ...] = ()
     """Frames that were asked for and left out."""
     notices: tuple[str, ...] = ()
     """What the user should know."""
+
+
+def summarise(skipped: Iterable[Skipped]) -> str:
+    """Group frames left out by the reason: "no pose: 0, 7-9"."""
+    groups: dict[str, list[int]] = {}
+    for item in skipped:
+        reason = item.reason if item.camera is None else f"{item.reason} of {item.camera}"
+        groups.setdefault(reason, []).append(item.frame)
+    return "; ".join(f"{reason}: {ranges(frames)}" for reason, frames in groups.items())
+
+
+def ranges(frames: Sequence[int]) -> str:
+    """Shorten numbers in order: "0, 7-9"."""
+    runs: list[list[int]] = []
+    for frame in frames:
+        if runs and frame == runs[-1][1] + 1:
+            runs[-1][1] = frame
+        else:
+            runs.append([frame, frame])
+    return ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in runs)
 
 
 def held_out_frames(count: int, holdout_every: int) -> list[bool]:
@@ -203,7 +225,8 @@ def write_scene(
 
     Args:
         output: the folder; new, empty, or begun from the same `source`.
-        cameras: the cameras; all fisheye (MEI, Kannala-Brandt) or all pinhole.
+        cameras: the cameras, of any models. A scene has one of nerfstudio's: OPENCV if all are pinholes, else
+            OPENCV_FISHEYE, with a fitted camera in the place of each MEI and pinhole.
         frames: the pictures, in any order.
         layers: which of `LAYERS` every frame's content holds; "cloud" for points.ply.
         source: what the scene is made of, as JSON; decides whether a folder that exists is the same scene.
@@ -224,12 +247,16 @@ def write_scene(
     # adding zero turns -0.0 into 0.0
     offset = np.round(np.mean([frame.camera_to_world[:3, 3] for frame in frames], axis=0)) + 0.0
 
-    _open_output(output, {"made_by": f"edge-depth-nerf {__version__}", **source})
+    open_scene(output, source)
     for name, mask in masks.items():
         write_mask(output / f"masks/{name}.png", mask)
     work = _pending(output, frames, shifted, layers)
     jobs = [
-        *(partial(_write_frame, output, frame, masks[frame.camera], layers, offset) for frame in work.frames),
+        # the cameras of a moment one after another: they share its sweeps
+        *(
+            partial(_write_frame, output, frame, masks[frame.camera], layers, offset)
+            for frame in sorted(work.frames, key=lambda frame: (frame.frame, frame.camera))
+        ),
         *(partial(_write_shifted, output, view, by_name[view.camera].original) for view in work.shifted),
     ]
     if jobs:
@@ -285,13 +312,6 @@ def _check(
     for name in by_name:
         if not re.fullmatch(r"\w[\w.-]*", name):
             raise InputError(f"camera {name!r}: expected a name of letters, digits, _ and -; it becomes a folder.")
-    kinds = {isinstance(camera.original, Pinhole) for camera in cameras}
-    if len(kinds) > 1:
-        raise InputError(
-            "a scene has one camera model, but these are mixed: "
-            + ", ".join(f"{camera.name} is {camera.original.model}" for camera in cameras)
-            + ". Make one scene of the fisheye cameras and one of the pinhole cameras."
-        )
     for camera in cameras:
         size = (camera.original.height, camera.original.width)
         if camera.mask is not None and camera.mask.shape != size:
@@ -313,8 +333,14 @@ def _size_error(what: str, found: tuple[int, ...], expected: tuple[int, int]) ->
     )
 
 
-def _open_output(output: Path, record: dict[str, Any]) -> None:
-    """Begin the folder, or make sure that it was begun from the same things."""
+def open_scene(output: Path, source: Mapping[str, Any]) -> None:
+    """Begin the folder, or make sure that it was begun from the same things.
+
+    Raises:
+        InputError: it holds something else, or cannot be written.
+
+    """
+    record = {"made_by": f"edge-depth-nerf {__version__}", **source}
     path = output / RECORD
     if output.exists() and not output.is_dir():
         raise InputError(f"{output}: is a file; --output takes a folder.")
@@ -349,34 +375,84 @@ def _open_output(output: Path, record: dict[str, Any]) -> None:
 # ---- cameras ---------------------------------------------------------------------------------------------------
 
 
+def check_cameras(cameras: Sequence[SceneCamera], theta_max_deg: float) -> None:
+    """Check that a scene can have these cameras and masks, before anything is written.
+
+    Raises:
+        InputError: nerfstudio has no camera that is near enough to one, or its mask hides everything.
+
+    """
+    _scene_cameras(cameras, theta_max_deg)
+    for camera in cameras:
+        _camera_mask(camera, theta_max_deg)
+
+
 def _scene_cameras(
     cameras: Sequence[SceneCamera], theta_max_deg: float
 ) -> tuple[dict[str, KannalaBrandt | Pinhole], dict[str, CameraFit]]:
     """Find the cameras that nerfstudio knows, and how far they are from the originals."""
-    found: dict[str, KannalaBrandt | Pinhole] = {}
-    fits = {}
-    for camera in cameras:
-        original = camera.original
-        if isinstance(original, Pinhole):
-            found[camera.name] = original
-            continue
-        if isinstance(original, KannalaBrandt):
-            found[camera.name] = _off_pixel_centre(original)
-            continue
-        fit = fit_kannala_brandt(original, min(math.radians(theta_max_deg), original.theta_max_rad))
-        if not fit.rms_px <= MAX_FIT_RMS_PX:
-            raise InputError(
-                f"camera {camera.name}: nerfstudio's fisheye camera differs from this {original.model} camera by "
-                f"{fit.rms_px:.2f} px rms up to {math.degrees(fit.theta_max_rad):.0f}°; at most {MAX_FIT_RMS_PX} px "
-                "can be used. Check its calibration, or give a smaller --theta-max-deg."
+    fisheye = any(not isinstance(camera.original, Pinhole) for camera in cameras)
+    fits = {camera.name: _scene_camera(camera, math.radians(theta_max_deg), fisheye) for camera in cameras}
+    return {name: fit.camera for name, fit in fits.items()}, fits
+
+
+def _scene_camera(camera: SceneCamera, theta_max_rad: float, fisheye: bool) -> CameraFit:
+    """Find the camera that takes the place of one, as an OPENCV_FISHEYE camera or an OPENCV camera."""
+    original = camera.original
+    try:
+        fit, wrong_rad = _replaced(original, theta_max_rad, fisheye)
+    except InputError as error:
+        fault = str(error)
+    else:
+        if fit.rms_px <= MAX_FIT_RMS_PX:
+            return fit
+        off = f"by {fit.rms_px:.2f} px rms up to {math.degrees(fit.theta_max_rad):.0f}°"
+        if math.isinf(fit.rms_px):
+            off = f"without bound from {math.degrees(wrong_rad):.1f}° on, where nerfstudio's iteration goes astray"
+        fault = (
+            f"nerfstudio's {'fisheye' if fisheye else 'pinhole'} camera differs from this {original.model} camera {off}"
+        )
+    remedy = "Check its calibration."
+    if (usable_deg := _usable_deg(original, theta_max_rad, fisheye)) is not None:
+        remedy = f"Give --theta-max-deg {usable_deg}, up to which it can."
+        if isinstance(original, Pinhole) and fisheye:
+            remedy += (
+                " Or limit this camera alone, by theta_max_deg in a rig file. Or make a scene of the pinhole cameras "
+                "alone, where they stay as they are."
             )
-        fits[camera.name] = replace(fit, camera=_off_pixel_centre(_rounded(fit.camera)))
-        found[camera.name] = fits[camera.name].camera
-    return found, fits
+    raise InputError(
+        f"camera {camera.name}: {fault.rstrip('.')}; at most {MAX_FIT_RMS_PX} px rms can be used. {remedy}"
+    )
 
 
-def _rounded(camera: KannalaBrandt) -> KannalaBrandt:
+@functools.lru_cache(maxsize=64)
+def _replaced(original: Camera, theta_max_rad: float, fisheye: bool) -> tuple[CameraFit, float]:
+    """Find the camera for nerfstudio, the residual of its rays, and the angle where one is wrong."""
+    limit_rad = min(theta_max_rad, original.theta_max_rad)
+    if isinstance(original, KannalaBrandt):
+        replacement = _off_pixel_centre(original)
+    elif isinstance(original, Pinhole) and not fisheye:
+        replacement = original
+    else:
+        replacement = _off_pixel_centre(_rounded(fit_kannala_brandt(original, limit_rad).camera))
+    return host_residual(original, replacement, limit_rad)
+
+
+def _usable_deg(original: Camera, theta_max_rad: float, fisheye: bool) -> int | None:
+    """The largest multiple of 5° up to which the camera can be used; None = not even to 20°."""
+    limit_deg = math.degrees(min(theta_max_rad, original.theta_max_rad))
+    for angle_deg in range(math.ceil(limit_deg / 5) * 5 - 5, 15, -5):
+        try:
+            if _replaced(original, math.radians(angle_deg), fisheye)[0].rms_px <= MAX_FIT_RMS_PX:
+                return angle_deg
+        except InputError:
+            continue
+    return None
+
+
+def _rounded(camera: KannalaBrandt | Pinhole) -> KannalaBrandt:
     """Keep nine digits: the last ones of a fit depend on how its sums were shared among threads."""
+    assert isinstance(camera, KannalaBrandt)
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")
     return replace(camera, **{name: float(f"{getattr(camera, name):.9g}") for name in names})
 
@@ -394,7 +470,7 @@ def _off_pixel_centre(camera: KannalaBrandt) -> KannalaBrandt:
 
 def _camera_mask(camera: SceneCamera, theta_max_deg: float) -> NDArray[np.bool_]:
     """Lens circle and the camera's own mask."""
-    mask = _lens_circle(camera.original, theta_max_deg)
+    mask = lens_circle(camera.original, theta_max_deg)
     if camera.mask is not None:
         mask &= camera.mask
     if not mask.any():
@@ -403,22 +479,6 @@ def _camera_mask(camera: SceneCamera, theta_max_deg: float) -> NDArray[np.bool_]
             "255 = use the pixel, 0 = ignore it: is it inverted?"
         )
     return mask
-
-
-def _lens_circle(camera: Camera, theta_max_deg: float) -> Bool[np.ndarray, "h w"]:
-    """Pixels whose ray is at most so far from the axis, and within the camera's own range.
-
-    Up to there a camera is one-to-one: they are the pixels inside the curve that the rays at the limit draw around
-    the principal point. Unprojecting every pixel gives the same and takes a hundred times as long.
-    """
-    limit_rad = min(math.radians(theta_max_deg), camera.theta_max_rad) * (1 - 1e-9)
-    azimuth_rad = torch.linspace(0, 2 * math.pi, 8192, dtype=torch.float64)
-    across, along = math.sin(limit_rad), torch.full_like(azimuth_rad, math.cos(limit_rad))
-    rim = torch.stack((across * azimuth_rad.cos(), across * azimuth_rad.sin(), along), -1)
-    x, y = (camera.project(rim)[0].numpy() - (camera.cx, camera.cy)).T
-    column, row = np.arange(camera.width) + 0.5 - camera.cx, np.arange(camera.height)[:, None] + 0.5 - camera.cy
-    rim_radius_px = np.interp(np.arctan2(row, column), np.arctan2(y, x), np.hypot(x, y), period=2 * math.pi)
-    return np.hypot(row, column) <= rim_radius_px
 
 
 # ---- the files of a frame --------------------------------------------------------------------------------------
@@ -491,7 +551,10 @@ def _run(jobs: Sequence[Callable[[], None]], console: Console) -> None:
     progress = Progress(
         TextColumn("Writing the scene"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=console
     )
-    # decoding and encoding leave Python's lock; a few threads keep memory small
+    # decoding, encoding and torch leave Python's lock; a few threads keep memory small, and are not to share their
+    # cores with threads of torch's own
+    inner_threads = torch.get_num_threads()
+    torch.set_num_threads(1)
     with progress, ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
         task = progress.add_task("", total=len(jobs))
         futures = [pool.submit(job) for job in jobs]
@@ -502,6 +565,8 @@ def _run(jobs: Sequence[Callable[[], None]], console: Console) -> None:
         except BaseException:
             pool.shutdown(wait=True, cancel_futures=True)
             raise
+        finally:
+            torch.set_num_threads(inner_threads)
 
 
 def _write_frame(
@@ -637,10 +702,11 @@ def _write_transforms(
             "truth_distance_file_path": distance,
         }
 
+    any_fisheye = any(isinstance(camera, KannalaBrandt) for camera in scene_cameras.values())
     images = {held_out: [_frame_files(f, ())["image"] for f in frames if f.held_out == held_out] for held_out in (0, 1)}
     evaluation = images[True] or images[False]
     content: dict[str, Any] = {
-        "camera_model": "OPENCV" if isinstance(next(iter(scene_cameras.values())), Pinhole) else "OPENCV_FISHEYE",
+        "camera_model": "OPENCV_FISHEYE" if any_fisheye else "OPENCV",
         "depth_unit_scale_factor": 1 / DISTANCE_STEPS_PER_METRE,
         "theta_max_deg": theta_max_deg,
         "world_offset_m": offset.tolist(),

@@ -1,0 +1,386 @@
+"""Reading LiDAR scans of any recorder: .bin, .npy, .ply and .pcd files.
+
+    .bin    values one after another, little-endian; their columns and type are declared
+    .npy    a structured array, or points × columns, whose columns are declared
+    .ply    the element `vertex`; ascii, binary_little_endian, binary_big_endian
+    .pcd    ascii, binary, binary_compressed
+
+Coordinates are metres in the scanner's frame, as recorded. Headers are not trusted: what they promise is compared
+with the file's size before anything is allocated. A time for each point, where the file holds one, makes `offset_s`.
+"""
+
+from __future__ import annotations
+
+import struct
+import tokenize
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Shaped
+
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.lidar.sweeps import Sweep, usable_returns
+
+Encoding = Literal["records", "text", "lzf", "matrix"]
+
+SCAN_SUFFIXES = (".bin", ".npy", ".ply", ".pcd")
+"""The formats that can be read."""
+MAX_POINTS = 20_000_000
+"""A file of more points is no single scan."""
+_MAX_HEADER_BYTES = 1 << 16
+_AGAIN = "Copy or export the file again, or delete it so that its moment is skipped."
+
+_PLY_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
+    **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
+}
+_PLY_ENCODINGS: dict[str, tuple[Encoding, str]] = {
+    "ascii": ("text", "<"),
+    "binary_little_endian": ("records", "<"),
+    "binary_big_endian": ("records", ">"),
+}
+
+
+@dataclass(frozen=True)
+class PointTimes:
+    """How a file tells when each of its points was measured."""
+
+    column: str
+    """Name of the column."""
+    seconds_per_count: float = 1.0
+    """What one count of it stands for."""
+    absolute: bool = False
+    """Whether it counts on the recording's clock, instead of from the scan's timestamp."""
+
+
+@dataclass(frozen=True)
+class ScanFormat:
+    """What is to be known of a scanner's files beside what they say themselves."""
+
+    columns: tuple[str, ...] = ("x", "y", "z", "intensity")
+    """Names of the columns of .bin files and of .npy files without names. x, y, z are needed."""
+    dtype: Literal["float32", "float64"] = "float32"
+    """Type of the values in .bin files."""
+    names: Mapping[str, str] = field(default_factory=dict)
+    """What x, y, z, intensity are called in the files, where they are called something else."""
+    times: PointTimes | None = None
+    """Where each point's time is, if anywhere."""
+
+    def name(self, quantity: str) -> str:
+        """What x, y, z or intensity is called in the files."""
+        return self.names.get(quantity, quantity)
+
+    @property
+    def needed(self) -> tuple[str, ...]:
+        """Columns without which a file cannot be used."""
+        return (*(self.name(axis) for axis in "xyz"), *([] if self.times is None else [self.times.column]))
+
+
+@dataclass(frozen=True)
+class _Header:
+    """What a file says of its points."""
+
+    record: np.dtype
+    """One point, field by field."""
+    count: int
+    """Number of points."""
+    encoding: Encoding
+    """Records one after another, lines of text, PCD's compressed columns, or an array of NumPy's."""
+    offset: int = 0
+    """Where the points begin, in bytes."""
+
+
+def check_scan(path: Path, scan: ScanFormat) -> None:
+    """Check by its header and size that a file is whole and has the columns needed.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: of an unknown format, truncated, without points or without a column.
+
+    """
+    _read_header(path, scan)
+
+
+def read_scan(path: Path, scan: ScanFormat, moment_s: float = 0.0) -> Sweep:
+    """Read a scan and leave out what is no return.
+
+    Args:
+        path: the file.
+        scan: what its columns mean.
+        moment_s: the scan's own moment on the clock that its points' times count on; `offset_s` is counted from it.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: of an unknown format, broken, without a column needed, or without a single usable return.
+
+    """
+    header = _read_header(path, scan)
+    columns = _read_columns(path, header, scan)
+    points_m = np.stack([columns[scan.name(axis)] for axis in "xyz"], -1)
+    intensity = columns.get(scan.name("intensity"), np.zeros(len(points_m)))
+    offset_s = None
+    if scan.times is not None:
+        offset_s = torch.from_numpy(columns[scan.times.column] * scan.times.seconds_per_count - moment_s)
+    return usable_returns(path, torch.from_numpy(points_m), torch.from_numpy(intensity), offset_s)
+
+
+# ---- headers ---------------------------------------------------------------------------------------------------
+
+
+def _read_header(path: Path, scan: ScanFormat) -> _Header:
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    readers = {".bin": _bin_header, ".npy": _npy_header, ".ply": _ply_header, ".pcd": _pcd_header}
+    suffix = path.suffix.lower()
+    if suffix not in readers:
+        raise InputError(
+            f"{path}: a scan of unknown format {suffix or '(no suffix)'}; expected one of {', '.join(SCAN_SUFFIXES)}."
+        )
+    size = path.stat().st_size
+    if size == 0:
+        raise InputError(f"{path}: an empty file, expected a scan. {_AGAIN}")
+    header = readers[suffix](path, size, scan)
+    names = header.record.names or ()
+    if missing := [name for name in scan.needed if name not in names]:
+        raise InputError(
+            f"{path}: has no column {', '.join(missing)}, only {', '.join(names)}. Say in the rig file what x, y, z, "
+            "intensity and time are called."
+        )
+    if header.count == 0:
+        raise InputError(f"{path}: a scan without points. {_AGAIN}")
+    if header.count > MAX_POINTS:
+        raise InputError(
+            f"{path}: {header.count} points, expected at most {MAX_POINTS}: one scan a file, not a whole map."
+        )
+    if header.encoding == "records" and header.offset + header.count * header.record.itemsize > size:
+        raise InputError(
+            f"{path}: {size} bytes, but {header.count} points of {header.record.itemsize} bytes from byte "
+            f"{header.offset} on are promised: the file is truncated. {_AGAIN}"
+        )
+    # a value and a line end, or space, take two bytes at least
+    if header.encoding == "text" and header.offset + header.count * 2 * len(names) - 1 > size:
+        raise InputError(f"{path}: {size} bytes cannot hold the {header.count} lines promised. {_AGAIN}")
+    return header
+
+
+def _bin_header(path: Path, size: int, scan: ScanFormat) -> _Header:
+    record = np.dtype([(name, np.dtype(scan.dtype).newbyteorder("<")) for name in scan.columns])
+    if size % record.itemsize:
+        raise InputError(
+            f"{path}: {size} bytes, expected a multiple of {record.itemsize} ({', '.join(scan.columns)} as "
+            f"{scan.dtype}). The file is truncated, or has other columns than the rig file says."
+        )
+    return _Header(record, size // record.itemsize, "records")
+
+
+def _npy_array(path: Path) -> np.ndarray:
+    try:
+        # mapped, so that a header's promise is compared with the file's size and nothing is allocated
+        return np.load(path, mmap_mode="r", allow_pickle=False)
+    except (ValueError, EOFError, OSError, SyntaxError, tokenize.TokenError) as error:
+        raise InputError(f"{path}: cannot be read as an array ({error}). {_AGAIN}") from error
+
+
+def _npy_header(path: Path, size: int, scan: ScanFormat) -> _Header:
+    array = _npy_array(path)
+    if array.dtype.names:
+        if array.ndim == 1:
+            return _Header(array.dtype, len(array), "matrix")
+    elif array.ndim == 2 and array.shape[1] == len(scan.columns) and array.dtype.kind in "fiu":
+        record = np.dtype([(name, array.dtype) for name in scan.columns])
+        return _Header(record, len(array), "matrix")
+    raise InputError(
+        f"{path}: an array of {array.dtype} and shape {array.shape}; expected a structured array, or points × "
+        f"{len(scan.columns)} numbers ({', '.join(scan.columns)}). Say in the rig file which columns it has."
+    )
+
+
+def _header_lines(path: Path, file: BinaryIO, last: str) -> list[list[str]]:
+    """The words of the header's lines, up to the one that begins with `last`."""
+    lines: list[list[str]] = []
+    while file.tell() < _MAX_HEADER_BYTES and (line := file.readline(_MAX_HEADER_BYTES)):
+        lines.append(line.decode("latin-1").split())
+        if lines[-1][:1] == [last]:
+            return lines
+    raise InputError(f"{path}: the header has no end (a line {last!r} is expected). {_AGAIN}")
+
+
+def _broken(path: Path, line: list[str]) -> InputError:
+    return InputError(f"{path}: the header's line {' '.join(line)!r} cannot be read. {_AGAIN}")
+
+
+def _ply_header(path: Path, size: int, scan: ScanFormat) -> _Header:
+    with path.open("rb") as file:
+        if file.readline(8).strip() != b"ply":
+            raise InputError(f"{path}: does not begin with 'ply'. {_AGAIN}")
+        lines = _header_lines(path, file, "end_header")
+        offset = file.tell()
+    encoding, order = "text", "<"
+    # name, count, fields, whether it has lists
+    elements: list[tuple[str, int, list[tuple[str, str]], bool]] = []
+    for line in lines:
+        try:
+            if line[:1] == ["format"]:
+                encoding, order = _PLY_ENCODINGS[line[1]]
+            elif line[:1] == ["element"]:
+                elements.append((line[1], int(line[2]), [], False))
+            elif line[:2] == ["property", "list"]:
+                elements[-1] = (*elements[-1][:3], True)
+            elif line[:1] == ["property"]:
+                elements[-1][2].append((line[2], order + _PLY_TYPES[line[1]]))
+        except (IndexError, KeyError, ValueError):
+            raise _broken(path, line) from None
+    if not elements or elements[0][0] != "vertex" or elements[0][3] or elements[0][1] < 0:
+        found = ", ".join(element[0] for element in elements) or "none"
+        raise InputError(f"{path}: the first element must be vertex, without lists; found {found}. {_AGAIN}")
+    _, count, fields, _ = elements[0]
+    return _Header(_record(path, fields), count, encoding, offset)
+
+
+def _pcd_header(path: Path, size: int, scan: ScanFormat) -> _Header:
+    with path.open("rb") as file:
+        lines = _header_lines(path, file, "DATA")
+        offset = file.tell()
+    words = {line[0]: line[1:] for line in lines if line and not line[0].startswith("#")}
+    fields: list[tuple[str, str, tuple[int]] | tuple[str, str]] = []
+    try:
+        counts = [int(word) for word in words.get("COUNT", ["1"] * len(words["FIELDS"]))]
+        described = zip(words["FIELDS"], words["TYPE"], words["SIZE"], counts, strict=True)
+        for number, (name, kind, width, count) in enumerate(described):
+            # PCL calls padding "_", several times over
+            unique = f"{name}{number}" if name == "_" else name
+            code = "<" + {"F": "f", "I": "i", "U": "u"}[kind] + width
+            fields.append((unique, code) if count == 1 else (unique, code, (count,)))
+        points = int(words["POINTS"][0]) if "POINTS" in words else int(words["WIDTH"][0]) * int(words["HEIGHT"][0])
+        encodings: dict[str, Encoding] = {"ascii": "text", "binary": "records", "binary_compressed": "lzf"}
+        encoding = encodings[words["DATA"][0]]
+    except (KeyError, ValueError, IndexError) as error:
+        raise InputError(f"{path}: the header cannot be read ({error!r}). {_AGAIN}") from None
+    if points < 0 or any(count < 1 for count in counts):
+        raise InputError(f"{path}: the header has a negative count. {_AGAIN}")
+    return _Header(_record(path, fields), points, encoding, offset)
+
+
+def _record(path: Path, fields: list) -> np.dtype:
+    try:
+        return np.dtype(fields)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path}: the header's fields cannot be read ({error}). {_AGAIN}") from None
+
+
+# ---- points ----------------------------------------------------------------------------------------------------
+
+
+def _read_columns(path: Path, header: _Header, scan: ScanFormat) -> dict[str, Shaped[np.ndarray, "points"]]:
+    """The columns that are used, as float64."""
+    wanted = [*scan.needed, scan.name("intensity")]
+    names = [name for name in header.record.names or () if name in wanted]
+    if header.encoding == "matrix":
+        array = _npy_array(path)
+        index = {name: number for number, name in enumerate(scan.columns)}
+        picked = {name: array[name] if array.dtype.names else array[:, index[name]] for name in names}
+    elif header.encoding == "text":
+        picked = _text_columns(path, header, names)
+    elif header.encoding == "lzf":
+        picked = _compressed_columns(path, header, names)
+    else:
+        records = np.memmap(path, header.record, "r", header.offset, (header.count,))
+        picked = {name: records[name] for name in names}
+    for name, column in picked.items():
+        if column.ndim != 1 or column.dtype.kind not in "fiu":
+            raise InputError(
+                f"{path}: column {name} holds no single numbers ({column.dtype}, {column.shape}). {_AGAIN}"
+            )
+    return {name: np.array(column, np.float64) for name, column in picked.items()}
+
+
+def _text_columns(path: Path, header: _Header, names: list[str]) -> dict[str, np.ndarray]:
+    position, places = 0, {}
+    for name in header.record.names or ():
+        places[name] = position
+        position += int(np.prod(header.record[name].shape, dtype=int))
+    with path.open("rb") as file:
+        file.seek(header.offset)
+        try:
+            values = np.loadtxt(
+                file, np.float64, usecols=[places[name] for name in names], max_rows=header.count, ndmin=2
+            )
+        except ValueError as error:
+            raise InputError(f"{path}: a line of its points cannot be read ({error}). {_AGAIN}") from None
+    if len(values) != header.count:
+        raise InputError(f"{path}: {len(values)} lines of points, {header.count} are promised: truncated. {_AGAIN}")
+    return {name: values[:, number] for number, name in enumerate(names)}
+
+
+def _compressed_columns(path: Path, header: _Header, names: list[str]) -> dict[str, np.ndarray]:
+    """PCD's binary_compressed: two sizes, then all of the first field, all of the second, and so on, in LZF."""
+    expected = header.count * header.record.itemsize
+    with path.open("rb") as file:
+        file.seek(header.offset)
+        sizes = file.read(8)
+        compressed = file.read()
+    if len(sizes) < 8:
+        raise InputError(f"{path}: truncated. {_AGAIN}")
+    packed, unpacked = struct.unpack("<II", sizes)
+    if packed > len(compressed) or unpacked != expected:
+        raise InputError(
+            f"{path}: {len(compressed)} compressed bytes for {unpacked} bytes of points, expected {packed} for "
+            f"{expected}. {_AGAIN}"
+        )
+    try:
+        content = _unpack_lzf(compressed[:packed], unpacked)
+    except (IndexError, ValueError):
+        raise InputError(f"{path}: its compressed points are damaged. {_AGAIN}") from None
+    found, start = {}, 0
+    for name in header.record.names or ():
+        field_type = header.record[name]
+        if name in names:
+            found[name] = np.frombuffer(
+                content, field_type.base, header.count * (field_type.itemsize // field_type.base.itemsize), start
+            )
+        start += header.count * field_type.itemsize
+    return found
+
+
+def _unpack_lzf(packed: bytes, size: int) -> bytes:
+    """Undo LZF (liblzf): runs of literal bytes, and references to bytes already written.
+
+    Raises:
+        IndexError, ValueError: damaged.
+
+    """
+    written, place = bytearray(), 0
+    while place < len(packed):
+        control = packed[place]
+        place += 1
+        if control < 32:
+            run = packed[place : place + control + 1]
+            if len(run) != control + 1:
+                raise ValueError
+            written += run
+            place += control + 1
+        else:
+            length = control >> 5
+            if length == 7:
+                length += packed[place]
+                place += 1
+            start = len(written) - ((control & 31) << 8) - packed[place] - 1
+            place += 1
+            if start < 0:
+                raise ValueError
+            length += 2
+            chunk = written[start : start + length]
+            # a reference may reach into what it writes
+            while len(chunk) < length:
+                chunk += chunk[: length - len(chunk)]
+            written += chunk
+        if len(written) > size:
+            raise ValueError
+    if len(written) != size:
+        raise ValueError
+    return bytes(written)

@@ -1,0 +1,470 @@
+"""From a recording to a scene folder: poses, masks, and the maps of each picture.
+
+What every converter shares. LiDAR points go to the world by the vehicle's pose at their own time, from there to the
+camera, and through its lens to a sparse map of distances; what is hidden from the camera is left out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import threading
+from collections import defaultdict
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from numpy.typing import NDArray
+from rich.console import Console
+from torch import Tensor
+
+from edge_depth_nerf.cameras import Camera
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.files import read_distance_png, read_image, read_mask, write_mask
+from edge_depth_nerf.lidar import project_points, transform_points
+from edge_depth_nerf.masks.ego import EgoMask, find_ego
+from edge_depth_nerf.masks.lens import dark_rim, lens_circle
+from edge_depth_nerf.masks.semantics import check_classes, keep_static, read_labels
+from edge_depth_nerf.masks.semantics import sky as sky_of_labels
+from edge_depth_nerf.masks.sky import find_sky
+from edge_depth_nerf.process.checks import size_error
+from edge_depth_nerf.process.downscale import downscale_distance, downscale_image, downscale_mask
+from edge_depth_nerf.process.options import ProcessOptions
+from edge_depth_nerf.process.points import PointCloud
+from edge_depth_nerf.process.recording import DepthFile, RecordedPicture, Recording
+from edge_depth_nerf.process.scene import (
+    CLOUD,
+    DistanceMap,
+    FrameContent,
+    Picture,
+    ProcessReport,
+    SceneCamera,
+    SceneFrame,
+    check_cameras,
+    held_out_frames,
+    open_scene,
+    summarise,
+    write_scene,
+)
+from edge_depth_nerf.process.sweep_store import SweepStore
+from edge_depth_nerf.process.transforms import Transform
+
+EGO_MASKS = "ego_masks"
+"""Folder of the scene with the vehicle's masks that were found, in the size of the raw pictures."""
+_EGO_PICTURES = 60
+"""The vehicle is looked for in so many pictures of a camera, spread over the drive."""
+_RIM_PICTURES = 4
+"""The lens's dark rim in so many: what stays dark in different places."""
+
+
+def process_recording(recording: Recording, options: ProcessOptions, console: Console | None = None) -> ProcessReport:
+    """Write the scene folder of a recording, or continue it.
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        InputError: an option, a file of the drive, or the output folder cannot be used.
+
+    """
+    console = console or Console()
+    options.check()
+    check_classes(options.moving_classes)
+    if options.poses == "colmap":
+        from edge_depth_nerf.process.colmap_models import import_pycolmap
+
+        import_pycolmap()
+    source = _source(recording, options)
+    masks = _given_masks(recording, options)
+    check_cameras(_scene_cameras(recording, masks, options), options.theta_max_deg)
+    open_scene(options.output, source)
+    notices: list[str] = []
+    if options.find_ego:
+        recording, notices = _find_vehicle(recording, masks, options, console)
+    if options.poses == "colmap":
+        from edge_depth_nerf.process.colmap_poses import colmap_poses
+
+        recording = colmap_poses(recording, options, console)
+    if recording.trajectory is None:
+        raise InputError("the recording has no poses. Give them, or find them with --poses colmap.")
+    if recording.skipped:
+        _say(console, f"Skipped {summarise(recording.skipped)}", "yellow")
+    moments = sorted({picture.frame for picture in recording.pictures})
+    held_out = {
+        frame for frame, out in zip(moments, held_out_frames(len(moments), options.holdout_every), strict=True) if out
+    }
+    builder = _Builder(recording, options, held_out, masks)
+    frames = [
+        SceneFrame(
+            camera=picture.camera,
+            frame=picture.frame,
+            camera_to_world=builder.pose(picture),
+            content=partial(builder.content, picture),
+            timestamp_s=picture.timestamp_s,
+            held_out=picture.frame in held_out,
+            inputs=builder.inputs(picture),
+        )
+        for picture in recording.pictures
+    ]
+    report = write_scene(
+        options.output,
+        _scene_cameras(recording, masks, options),
+        frames,
+        layers=builder.layers,
+        source=source,
+        theta_max_deg=options.theta_max_deg,
+        shifted=[view for view in recording.shifted if view.frame in held_out],
+        console=console,
+    )
+    report = dataclasses.replace(
+        report,
+        skipped=recording.skipped,
+        notices=(*recording.notices, *notices, *builder.notices(), *report.notices),
+    )
+    _show(report, console)
+    return report
+
+
+# ---- the vehicle's own mask ------------------------------------------------------------------------------------
+
+
+def _given_masks(recording: Recording, options: ProcessOptions) -> dict[str, NDArray[np.bool_]]:
+    """Read the masks that are given, by camera."""
+    given = {}
+    for recorded in recording.cameras:
+        path = options.ego_mask_of(recorded.name) or recorded.ego_mask
+        if path is not None:
+            given[recorded.name] = _read_mask(path, recorded.camera)
+    return given
+
+
+def _find_vehicle(
+    recording: Recording, masks: dict[str, NDArray[np.bool_]], options: ProcessOptions, console: Console
+) -> tuple[Recording, list[str]]:
+    """Find the masks that are not given, add them to `masks`, and write them into the scene."""
+    cameras, notices = [], []
+    for recorded in recording.cameras:
+        if recorded.name not in masks:
+            path = options.output / EGO_MASKS / f"{recorded.name}.png"
+            if not path.is_file():
+                mask, said = _find_mask(recorded.camera, recording.pictures_of(recorded.name), options, console)
+                write_mask(path, mask)
+                notices.append(f"{recorded.name}: {said} Look at {path}; correct it there, or give --ego-mask.")
+            masks[recorded.name] = _read_mask(path, recorded.camera)
+            recorded = dataclasses.replace(recorded, ego_mask=path)
+        cameras.append(recorded)
+    return dataclasses.replace(recording, cameras=tuple(cameras)), notices
+
+
+def _find_mask(
+    camera: Camera, files: Sequence[Path], options: ProcessOptions, console: Console
+) -> tuple[NDArray[np.bool_], str]:
+    """Find the vehicle and the lens's dark rim in a camera's pictures, at their own size."""
+    spread = [files[index] for index in np.unique(np.linspace(0, len(files) - 1, _EGO_PICTURES).astype(int))]
+    with console.status("Looking for the vehicle in the pictures"):
+        rim = dark_rim(read_image(file) for file in spread[:: max(len(spread) // _RIM_PICTURES, 1)])
+        mask = np.ones((camera.height, camera.width), bool) if rim is None else rim
+        found = find_ego(
+            [partial(read_image, file) for file in spread], lens_circle(camera, options.theta_max_deg) & mask
+        )
+    if isinstance(found, EgoMask):
+        return mask & found.keep, f"the vehicle was found by itself and hides {found.share:.1%} of the lens."
+    return mask, f"the vehicle's own mask was not found: {found.reason.rstrip('.')}."
+
+
+def _scene_cameras(
+    recording: Recording, masks: dict[str, NDArray[np.bool_]], options: ProcessOptions
+) -> list[SceneCamera]:
+    """The cameras at the scene's size."""
+    factor = options.downscale
+    return [
+        SceneCamera(
+            recorded.name,
+            recorded.camera.downscaled(factor),
+            downscale_mask(masks[recorded.name], factor) if recorded.name in masks else None,
+        )
+        for recorded in recording.cameras
+    ]
+
+
+def _read_mask(path: Path, camera: Camera) -> NDArray[np.bool_]:
+    mask = read_mask(path)
+    if mask.shape != (camera.height, camera.width):
+        raise InputError(size_error(path, mask.shape[1], mask.shape[0], camera))
+    return mask
+
+
+# ---- making the maps -------------------------------------------------------------------------------------------
+
+
+class _Builder:
+    """Makes the maps of pictures; called from several threads."""
+
+    def __init__(
+        self,
+        recording: Recording,
+        options: ProcessOptions,
+        held_out: set[int],
+        masks: dict[str, NDArray[np.bool_]],
+    ) -> None:
+        assert recording.trajectory is not None
+        self._options, self._held_out, self._trajectory = options, held_out, recording.trajectory
+        self._cameras = {recorded.name: recorded for recorded in recording.cameras}
+        self._ego = {name: options.ego_mask_of(name) or recorded.ego_mask for name, recorded in self._cameras.items()}
+        self._store = SweepStore(
+            recording.sweeps,
+            recording.trajectory,
+            reach=options.sweeps,
+            deskew=options.deskew,
+            held_out=held_out,
+        )
+        self._usable: dict[str, NDArray[np.bool_]] = {}
+        for scene_camera in _scene_cameras(recording, masks, options):
+            usable = lens_circle(scene_camera.original, options.theta_max_deg)
+            self._usable[scene_camera.name] = usable if scene_camera.mask is None else usable & scene_camera.mask
+        self._lock = threading.Lock()
+        self._coverage: dict[str, list[float]] = defaultdict(list)
+        self._without: list[str] = []
+        pictures = recording.pictures
+        present = {
+            "mask": any(picture.mask or picture.semantics for picture in pictures),
+            "lidar": bool(recording.sweeps) or any(picture.depth for picture in pictures),
+            "mono": any(picture.mono for picture in pictures),
+            "truth_distance": any(picture.truth_distance for picture in pictures),
+            "truth_rgb": any(picture.truth_rgb for picture in pictures),
+        }
+        present[CLOUD] = present["lidar"]
+        self.layers = [layer for layer, there in present.items() if there]
+
+    def pose(self, picture: RecordedPicture) -> Transform:
+        """Where a picture was taken: its own pose, or the vehicle's at its time."""
+        if picture.camera_to_world is not None:
+            return picture.camera_to_world
+        vehicle_to_world = self._trajectory.at(np.array([picture.time_s]))[0]
+        return vehicle_to_world @ self._cameras[picture.camera].to_vehicle
+
+    def inputs(self, picture: RecordedPicture) -> tuple[Path, ...]:
+        """Files that a picture's maps are made from."""
+        sweeps = [sweep.path for sweep in self._store.used(picture.frame, picture.time_s)]
+        ego = self._ego[picture.camera]
+        return (*picture.inputs, *sweeps, *([] if ego is None else [ego]))
+
+    def content(self, picture: RecordedPicture) -> FrameContent:
+        """Make the maps of one picture, at the scene's size."""
+        factor = self._options.downscale
+        camera = self._cameras[picture.camera].camera
+        raw = read_image(picture.path)
+        image = downscale_image(raw, factor)
+        labels = None if picture.semantics is None else read_labels(picture.semantics)
+        mask = self._mask(picture, labels, camera)
+        lidar, cloud = self._lidar(picture, camera, image)
+        mono = None if picture.mono is None else self._mono(picture, camera, raw, labels, lidar)
+        return FrameContent(
+            image=picture.path if factor == 1 else image,
+            mask=None if mask is None else downscale_mask(mask, factor),
+            lidar=lidar,
+            mono=mono,
+            truth_distance=None if picture.truth_distance is None else load_distance(picture.truth_distance, factor),
+            truth_rgb=None if picture.truth_rgb is None else load_picture(picture.truth_rgb, factor),
+            cloud=None if picture.frame in self._held_out else cloud,
+        )
+
+    def _mask(
+        self, picture: RecordedPicture, labels: UInt8[np.ndarray, "h w"] | None, camera: Camera
+    ) -> NDArray[np.bool_] | None:
+        """What of the picture holds still, as far as that is given."""
+        if "mask" not in self.layers:
+            return None
+        mask = np.ones((camera.height, camera.width), bool)
+        if picture.mask is not None:
+            mask &= _read_mask(picture.mask, camera)
+        if labels is not None:
+            mask &= keep_static(labels, self._options.moving_classes)
+        return mask
+
+    def _lidar(
+        self, picture: RecordedPicture, full: Camera, image: UInt8[np.ndarray, "h w 3"]
+    ) -> tuple[Float[np.ndarray, "h w"] | None, PointCloud | None]:
+        """LiDAR's map, and the points that it holds."""
+        camera = full.downscaled(self._options.downscale)
+        camera_to_world = self.pose(picture)
+        if picture.depth is not None:
+            distance_m = downscale_distance(read_depth(picture.depth, full), self._options.downscale)
+            points = _rays_of(camera)[0] * torch.from_numpy(distance_m)[..., None]
+            index = torch.where(
+                torch.from_numpy(distance_m) > 0, torch.arange(distance_m.size).view(distance_m.shape), -1
+            )
+            in_camera = points.reshape(-1, 3).double()
+        elif "lidar" in self.layers:
+            around = self._store.around(picture.frame, picture.time_s, camera_to_world)
+            in_camera = transform_points(torch.from_numpy(np.linalg.inv(camera_to_world)), around.points_m)
+            hides = self._options.occlusion
+            seen = project_points(
+                in_camera.float(),
+                camera,
+                spacing_m=around.spacing_m if hides else None,
+                age_s=around.age_s,
+                only_hides=around.only_hides,
+            )
+            distance_m, index = seen.distance_m.numpy(), seen.point_index
+        else:
+            return None, None
+        has_return = distance_m[self._usable[picture.camera]] > 0
+        with self._lock:
+            self._coverage[picture.camera].append(float(has_return.mean()))
+            if not has_return.any():
+                self._without.append(f"{picture.frame} of {picture.camera}")
+        return distance_m, _cloud(index, in_camera, camera_to_world, image)
+
+    def _mono(
+        self,
+        picture: RecordedPicture,
+        full: Camera,
+        raw: UInt8[np.ndarray, "h w 3"],
+        labels: UInt8[np.ndarray, "h w"] | None,
+        lidar: Float[np.ndarray, "h2 w2"] | None,
+    ) -> DistanceMap:
+        """The monocular map, without the sky."""
+        assert picture.mono is not None
+        factor = self._options.downscale
+        if not self._options.sky:
+            return load_distance(picture.mono, factor)
+        mono = downscale_distance(read_distance_png(picture.mono), factor)
+        if labels is not None:
+            sky = ~downscale_mask(~sky_of_labels(labels), factor)
+        else:
+            camera = full.downscaled(factor)
+            up = np.linalg.inv(self.pose(picture))[:3, 2]
+            lidar = np.zeros(mono.shape, np.float32) if lidar is None else lidar
+            sky = find_sky(downscale_image(raw, factor), self._usable[picture.camera], up, camera, lidar, mono)
+        return np.where(sky, 0, mono).astype(np.float32)
+
+    def notices(self) -> list[str]:
+        """What the user should know of the maps that were made now."""
+        found = self._store.notices()
+        if self._coverage:
+            shares = ", ".join(f"{np.mean(shares):.1%} of {name}" for name, shares in sorted(self._coverage.items()))
+            found.append(f"LiDAR covers, of what the masks keep, {shares}.")
+        if self._without:
+            found.append(
+                f"No LiDAR return in {len(self._without)} pictures: frames {', '.join(sorted(self._without)[:10])}"
+                f"{' …' if len(self._without) > 10 else ''}."
+            )
+        return found
+
+
+def read_depth(depth: DepthFile, camera: Camera) -> Float[np.ndarray, "h w"]:
+    """Read a depth map and turn it into distance along the ray, metres, 0 = none.
+
+    Raises:
+        InputError: broken, or not of the camera's size.
+
+    """
+    distance_m = read_distance_png(depth.path, depth.metres_per_count)
+    if distance_m.shape != (camera.height, camera.width):
+        raise InputError(size_error(depth.path, distance_m.shape[1], distance_m.shape[0], camera))
+    if depth.kind == "distance":
+        return distance_m
+    rays, valid = _rays_of(camera)
+    cosine = rays[..., 2].numpy()
+    # a depth along the axis says nothing where the ray is at right angles to it, or points backwards
+    usable = valid.numpy() & (cosine > 0.01)
+    return np.where(usable, distance_m / np.where(usable, cosine, 1), 0).astype(np.float32)
+
+
+@functools.lru_cache(maxsize=8)
+def _rays_of(camera: Camera) -> tuple[Float[Tensor, "h w 3"], Bool[Tensor, "h w"]]:
+    """Unit rays of all pixels, 0 where there is none; takes seconds."""
+    rays, valid = camera.unproject(camera.pixel_centres())
+    return torch.where(valid[..., None], rays, 0.0).float(), valid
+
+
+def _cloud(
+    point_index: Int[Tensor, "height width"],
+    in_camera: Float[Tensor, "points 3"],
+    camera_to_world: Transform,
+    image: UInt8[np.ndarray, "height width 3"],
+) -> PointCloud:
+    """Gather the points that a picture sees, in the world, with its colours."""
+    hit = point_index >= 0
+    points = in_camera[point_index[hit]]
+    return PointCloud(
+        points_m=transform_points(torch.from_numpy(camera_to_world), points).numpy(),
+        colours=image[hit.numpy()],
+        pixels=torch.nonzero(hit).numpy(),
+    )
+
+
+def load_picture(path: Path, factor: int) -> Picture:
+    """A picture at the scene's size; the file itself where that is its own."""
+    return path if factor == 1 else downscale_image(read_image(path), factor)
+
+
+def load_distance(path: Path, factor: int) -> DistanceMap:
+    """A distance map at the scene's size; the file itself where that is its own."""
+    return path if factor == 1 else downscale_distance(read_distance_png(path), factor)
+
+
+# ---- what the scene says of itself -----------------------------------------------------------------------------
+
+
+def _source(recording: Recording, options: ProcessOptions) -> dict[str, Any]:
+    """Describe what the scene is made of, without the machine's paths."""
+    digest = hashlib.sha256()
+    ego_masks = [
+        path for recorded in recording.cameras if (path := options.ego_mask_of(recorded.name) or recorded.ego_mask)
+    ]
+    for path in (*recording.whole_inputs, *ego_masks):
+        if not path.is_file():
+            raise FileNotFoundError(
+                f"{path}: no such file; --ego-mask takes a PNG, or a folder with a PNG for each camera "
+                f"({', '.join(recorded.name for recorded in recording.cameras)})."
+            )
+        digest.update(path.read_bytes())
+    # the maps' sizes tell one drive from another; reading them all would take as long as the work
+    sized = [path for picture in recording.pictures for path in picture.inputs]
+    sized += [sweep.path for sweep in recording.sweeps]
+    sized += [path for view in recording.shifted for path in view.inputs]
+    for path in sized:
+        digest.update(f"{path.parent.name}/{path.name} {path.stat().st_size}\n".encode())
+    return {
+        **recording.source,
+        "first": options.first,
+        "frames": options.frames,
+        "stride": options.stride,
+        "downscale": options.downscale,
+        "poses": options.poses,
+        "sweeps": options.sweeps,
+        "deskew": options.deskew,
+        "occlusion": options.occlusion,
+        "ego_mask": options.ego_mask is not None,
+        "find_ego": options.find_ego,
+        "frame_masks": options.frame_masks is not None,
+        "moving_classes": list(options.moving_classes),
+        "mono": options.mono is not None,
+        "sky": options.sky,
+        "theta_max_deg": options.theta_max_deg,
+        "holdout_every": options.holdout_every,
+        "inputs_sha256": digest.hexdigest(),
+    }
+
+
+def _say(console: Console, text: str, style: str | None = None) -> None:
+    console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
+
+
+def _show(report: ProcessReport, console: Console) -> None:
+    for name, share in report.mask_share.items():
+        fit = report.fits[name]
+        _say(
+            console,
+            f"{name}: nerfstudio's camera fits within {fit.rms_px:.4f} px rms, {fit.max_px:.3f} px at most; the mask "
+            f"keeps {share:.0%} of the picture",
+        )
+    for notice in report.notices:
+        _say(console, notice, "yellow")
+    done = "" if report.written else "; nothing was left to do"
+    _say(console, f"{report.scene}: {report.training} pictures for training, {report.held_out} held out{done}")

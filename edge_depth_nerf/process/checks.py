@@ -1,0 +1,65 @@
+"""Checks of files by their headers and sizes, before the work begins."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from edge_depth_nerf.cameras import Camera
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.process.png import PngHeader, read_png_header
+
+
+def check_size(path: Path, camera: Camera) -> PngHeader:
+    """Check that a PNG is whole, as far as its ends tell, and has its camera's size.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: it is not.
+
+    """
+    header = read_png_header(path)
+    if (header.width, header.height) != (camera.width, camera.height):
+        raise InputError(size_error(path, header.width, header.height, camera))
+    return header
+
+
+def check_distance(path: Path, camera: Camera) -> None:
+    """Check the same of a distance map.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: it is not, or not a distance map.
+
+    """
+    header = check_size(path, camera)
+    if not header.is_distance:
+        raise InputError(
+            f"{path}: {header.bit_depth}-bit {header.colour}, expected a 16-bit grey PNG in units of 1/256 m. "
+            "Other kinds have lost the distance; export the map again."
+        )
+
+
+def size_error(path: Path, width: int, height: int, camera: Camera) -> str:
+    """Say that a file is not of its camera's size."""
+    return (
+        f"{path}: {width}×{height} pixels, but its camera's calibration says {camera.width}×{camera.height}. Pictures, "
+        "masks and maps are to have the size of the raw pictures; --downscale then reduces them together."
+    )
+
+
+def require_folder(folder: Path, remedy: str) -> None:
+    """Check that a folder is there.
+
+    Raises:
+        FileNotFoundError: it is not; with what is there instead, and the remedy.
+
+    """
+    if folder.is_dir():
+        return
+    parent = folder.parent
+    while not parent.is_dir():
+        parent = parent.parent
+    there = sorted(entry.name for entry in parent.iterdir())
+    listed = f"{', '.join(there[:12])}{' …' if len(there) > 12 else ''}" if there else "nothing"
+    what = "is not a folder" if folder.exists() else "no such folder"
+    raise FileNotFoundError(f"{folder}: {what}; {parent.resolve()} holds {listed}. {remedy[0].upper()}{remedy[1:]}.")

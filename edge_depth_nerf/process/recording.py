@@ -1,0 +1,130 @@
+"""A recorded drive as every converter hands it on: sensors, pictures, sweeps, the vehicle's path.
+
+Each converter (kitti360, jbnu_depth360, rig) reads its own layout into a `Recording`, checking every file by size
+and header; `build.process_recording` makes the scene folder of it. Frames: camera (x right, y down, z forward),
+scanner and vehicle as the recording has them, world with z up. Transforms are 4×4, metres, named a_to_b. Times are
+seconds of one clock for pictures, sweeps and poses. A moment is what all cameras see at once; its number is `frame`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from edge_depth_nerf.cameras import Camera
+from edge_depth_nerf.lidar import Sweep, SweepTiming
+from edge_depth_nerf.lidar.trajectory import Trajectory
+from edge_depth_nerf.process.scene import ShiftedView, Skipped
+from edge_depth_nerf.process.transforms import Transform
+
+
+@dataclass(frozen=True)
+class DepthFile:
+    """A dense or sparse map from another sensor, in place of LiDAR."""
+
+    path: Path
+    """16-bit PNG, 0 = none."""
+    metres_per_count: float
+    """What one count of the file stands for."""
+    kind: Literal["distance", "z_depth"]
+    """Along the ray, or along the optical axis."""
+
+
+@dataclass(frozen=True)
+class RecordedCamera:
+    """A camera on the vehicle."""
+
+    name: str
+    """Letters, digits, _ and -: it becomes a folder."""
+    camera: Camera
+    """At the size of its pictures."""
+    to_vehicle: Transform
+    """From the camera's frame to the vehicle's."""
+    ego_mask: Path | None = None
+    """What of its pictures is never used, 255 = use; None = not given."""
+
+
+@dataclass(frozen=True)
+class RecordedPicture:
+    """A picture and the maps that come with it, all at the camera's size."""
+
+    camera: str
+    """Name of its camera."""
+    frame: int
+    """Number of its moment; the pictures of one moment are held out together."""
+    path: Path
+    """8-bit picture."""
+    time_s: float
+    """When it was taken."""
+    camera_to_world: Transform | None = None
+    """Where it was taken; None = from the vehicle's path at its time."""
+    timestamp_s: float | None = None
+    """Seconds since 1970 for transforms.json; None = not known."""
+    depth: DepthFile | None = None
+    """A depth map in place of sweeps."""
+    mask: Path | None = None
+    """This picture's own mask, 255 = use."""
+    semantics: Path | None = None
+    """KITTI-360's label ids, 8-bit PNG."""
+    mono: Path | None = None
+    """Monocular distance, 16-bit PNG of 1/256 m along the ray."""
+    truth_distance: Path | None = None
+    """True distance, likewise."""
+    truth_rgb: Path | None = None
+    """The picture without noise."""
+
+    @property
+    def inputs(self) -> tuple[Path, ...]:
+        """All files there are."""
+        found = [self.path, self.mask, self.semantics, self.mono, self.truth_distance, self.truth_rgb]
+        found.append(None if self.depth is None else self.depth.path)
+        return tuple(path for path in found if path is not None)
+
+
+@dataclass(frozen=True)
+class RecordedSweep:
+    """One scan of a LiDAR."""
+
+    path: Path
+    """Its file."""
+    time_s: float
+    """The moment that its points' times are counted from."""
+    frame: int | None
+    """Number of the moment it belongs to (held out with it); None = between the moments taken."""
+    scanner: str
+    """Name of the scanner: the sweeps before and after are of the same one."""
+    to_vehicle: Transform
+    """From the scanner's frame to the vehicle's."""
+    read: Callable[[], Sweep]
+    """Reads it; called from several threads at once."""
+    timing: SweepTiming | None = None
+    """When each azimuth was measured; not used where the file says each point's time; None = all at once."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A drive, checked, not yet read."""
+
+    cameras: tuple[RecordedCamera, ...]
+    pictures: tuple[RecordedPicture, ...]
+    """Those that are to be in the scene, in order of frames."""
+    sweeps: tuple[RecordedSweep, ...]
+    """All that may be used, those around the pictures' moments included; empty with depth maps in their place."""
+    trajectory: Trajectory | None
+    """None if poses are still to be found."""
+    source: dict[str, Any]
+    """What the scene is made of, as JSON, without paths of the machine: kind and the options of the converter."""
+    whole_inputs: tuple[Path, ...] = ()
+    """Small files that belong to the whole drive (calibration, poses): their bytes are part of its fingerprint."""
+    skipped: tuple[Skipped, ...] = ()
+    """What was asked for and cannot be taken."""
+    notices: tuple[str, ...] = ()
+    """What the user should know."""
+    shifted: tuple[ShiftedView, ...] = field(default=())
+    """True views from beside the path, of synthetic drives."""
+
+    def pictures_of(self, camera: str) -> list[Path]:
+        """The files of one camera's pictures, in order of frames."""
+        return [picture.path for picture in sorted(self.pictures, key=lambda p: p.frame) if picture.camera == camera]

@@ -1,0 +1,280 @@
+"""The sweeps around each picture, in the world: read once, kept while they are needed.
+
+A picture of moment f gets the sweep of its own moment and, of the same scanner, those of up to K sweeps before and
+after. A picture for training never gets anything from a sweep of a moment that is held out, not even the evidence
+that a point has moved; a picture that is held out gets the sweep of its own moment alone.
+
+Of the sweeps of other moments are left out: points that another sweep saw through, so that a passing car leaves no
+trail, and points above the field of the picture's own sweep, where nothing nearer could have been measured that
+hides them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import statistics
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Generic, TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from edge_depth_nerf.lidar import transform_points
+from edge_depth_nerf.lidar.free_space import FreeSpace
+from edge_depth_nerf.lidar.trajectory import MAX_POSE_GAP_S, Trajectory
+from edge_depth_nerf.lidar.voxels import first_in_voxel
+from edge_depth_nerf.lidar.world import WorldSweep, above_field, sweep_in_world
+from edge_depth_nerf.process.recording import RecordedSweep
+from edge_depth_nerf.process.transforms import Transform
+
+VOXEL_M = 0.05
+"""Beyond `MAX_POINTS` the points around a picture are thinned to one of each cube of this size, nearest in time
+first; cubes grow where they would still be too many."""
+MAX_POINTS = 2_000_000
+"""So many points at most are kept around a picture."""
+
+Value = TypeVar("Value")
+
+
+class _Shared(Generic[Value]):
+    """Remembers what was made last; several threads that want the same thing wait for one to make it."""
+
+    def __init__(self, make: Callable[[int], Value], size: int) -> None:
+        self._make, self._size = make, size
+        self._lock = threading.Lock()
+        self._made: OrderedDict[int, Future[Value]] = OrderedDict()
+
+    def get(self, key: int) -> Value:
+        with self._lock:
+            future = self._made.get(key)
+            mine = future is None
+            if future is None:
+                future = self._made[key] = Future()
+                while len(self._made) > self._size:
+                    self._made.popitem(last=False)
+            self._made.move_to_end(key)
+        if mine:
+            try:
+                future.set_result(self._make(key))
+            except BaseException as error:
+                future.set_exception(error)
+        return future.result()
+
+
+@dataclass(frozen=True)
+class _Loaded:
+    world: WorldSweep
+    free_space: FreeSpace | None
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What the scanners know around a picture."""
+
+    points_m: Float[Tensor, "points 3"]
+    """World, float64."""
+    spacing_m: Float[Tensor, "points"]
+    """How wide a patch of surface each point stands for."""
+    age_s: Float[Tensor, "points"]
+    """How far in time from the picture its sweep is."""
+    only_hides: Bool[Tensor, "points"]
+    """Points that were not measured: they hide others and are not to be chosen."""
+
+
+class _Scanner:
+    """The sweeps of one scanner, in order of time."""
+
+    def __init__(
+        self,
+        sweeps: Sequence[RecordedSweep],
+        trajectory: Trajectory,
+        count: Callable[[Path, int, int], None],
+        *,
+        reach: int,
+        deskew: bool,
+        held_out: Collection[int],
+    ) -> None:
+        self.sweeps = sorted(sweeps, key=lambda sweep: sweep.time_s)
+        self.times_s = np.array([sweep.time_s for sweep in self.sweeps])
+        intervals = np.diff(self.times_s)
+        turn = self.sweeps[0].timing.turn_s if self.sweeps[0].timing else 0.1
+        self.half_turn_s = 0.5 * (statistics.median(intervals.tolist()) if len(intervals) else turn)
+        self.trains = [sweep.frame not in held_out for sweep in self.sweeps]
+        self._bridged = [
+            trajectory.gap_s(time) <= MAX_POSE_GAP_S or 0 < trajectory.outside_s(time) <= self.half_turn_s
+            for time in self.times_s.tolist()
+        ]
+        self._reach, self._trajectory, self._deskew, self._count = reach, trajectory, deskew, count
+        # of two pictures in work at once, each with its window and what its window's sweeps are checked against
+        window = 4 * reach + 4
+        self._loaded: _Shared[_Loaded] = _Shared(self._load, window)
+        self._still: _Shared[WorldSweep] = _Shared(self._without_moving, window)
+
+    def _load(self, index: int) -> _Loaded:
+        recorded = self.sweeps[index]
+        sweep = recorded.read()
+        self._count(recorded.path, sweep.not_finite, sweep.out_of_range)
+        world = sweep_in_world(
+            sweep, recorded.time_s, recorded.to_vehicle, self._trajectory, recorded.timing, deskew=self._deskew
+        )
+        return _Loaded(world, FreeSpace.of(world) if self._reach else None)
+
+    def around(self, index: int) -> list[int]:
+        """The sweeps near another that training may see, without it."""
+        first, last = max(index - self._reach, 0), min(index + self._reach, len(self.sweeps) - 1)
+        return [i for i in range(first, last + 1) if i != index and self.trains[i] and self._bridged[i]]
+
+    def _without_moving(self, index: int) -> WorldSweep:
+        """A sweep without what another one saw through."""
+        world = self._loaded.get(index).world
+        passed = torch.zeros(len(world.points_m), dtype=torch.bool)
+        for other in self.around(index):
+            free_space = self._loaded.get(other).free_space
+            assert free_space is not None
+            passed |= free_space.seen_through(world.points_m)
+        return dataclasses.replace(world, points_m=world.points_m[~passed], spacing_m=world.spacing_m[~passed])
+
+    def own(self, frame: int, time_s: float) -> int | None:
+        """The sweep of a picture's moment: the one that belongs to it, else the nearest in time, within a turn."""
+        of_frame = [index for index, sweep in enumerate(self.sweeps) if sweep.frame == frame]
+        if of_frame:
+            return min(of_frame, key=lambda index: abs(self.times_s[index] - time_s))
+        nearest = int(np.abs(self.times_s - time_s).argmin())
+        return nearest if abs(self.times_s[nearest] - time_s) <= 2 * self.half_turn_s else None
+
+    def whole(self, index: int) -> WorldSweep:
+        """A sweep with all its points."""
+        return self._loaded.get(index).world
+
+    def still(self, index: int) -> WorldSweep:
+        """A sweep's points that no other sweep saw through."""
+        return self._still.get(index)
+
+
+class SweepStore:
+    """All sweeps of a drive.
+
+    Args:
+        sweeps: of any number of scanners.
+        trajectory: the vehicle's path.
+        reach: how many sweeps before and after a picture are taken.
+        deskew: whether each point is moved by the pose of its own time.
+        held_out: numbers of the moments that training must not see.
+
+    """
+
+    def __init__(
+        self,
+        sweeps: Sequence[RecordedSweep],
+        trajectory: Trajectory,
+        *,
+        reach: int,
+        deskew: bool,
+        held_out: Collection[int],
+    ) -> None:
+        self._left_out: dict[Path, tuple[int, int]] = {}
+        by_scanner: dict[str, list[RecordedSweep]] = {}
+        for sweep in sweeps:
+            by_scanner.setdefault(sweep.scanner, []).append(sweep)
+
+        def count(path: Path, not_finite: int, out_of_range: int) -> None:
+            self._left_out[path] = (not_finite, out_of_range)
+
+        self._held_out = frozenset(held_out)
+        self._scanners = [
+            _Scanner(found, trajectory, count, reach=reach, deskew=deskew, held_out=self._held_out)
+            for found in by_scanner.values()
+        ]
+
+    def notices(self) -> list[str]:
+        """What was left out of the sweeps that were read."""
+        not_finite, out_of_range = np.sum([*self._left_out.values(), (0, 0)], axis=0)
+        found = {"NaN or infinite": not_finite, "zero, nearer than 0.5 m or beyond 255 m": out_of_range}
+        return [
+            f"{count} LiDAR points left out of {len(self._left_out)} sweeps: {why}."
+            for why, count in found.items()
+            if count
+        ]
+
+    def used(self, frame: int, time_s: float) -> list[RecordedSweep]:
+        """The sweeps whose points a picture may get."""
+        return [scanner.sweeps[index] for scanner in self._scanners for index in self._window(scanner, frame, time_s)]
+
+    def _window(self, scanner: _Scanner, frame: int, time_s: float) -> list[int]:
+        """A picture's sweeps of one scanner, nearest in time first."""
+        own = scanner.own(frame, time_s)
+        if own is None:
+            return []
+        if frame in self._held_out:
+            return [own] if scanner.sweeps[own].frame == frame else []
+        window = [own] if scanner.trains[own] else []
+        return window + sorted(scanner.around(own), key=lambda index: abs(scanner.times_s[index] - time_s))
+
+    def around(self, frame: int, time_s: float, viewpoint_in_world: Transform) -> Surroundings:
+        """Gather the points around a picture.
+
+        Args:
+            frame: number of its moment.
+            time_s: when it was taken.
+            viewpoint_in_world: the camera's pose, camera to world.
+
+        """
+        found = _Gathered(viewpoint_in_world[:3, 3])
+        for scanner in self._scanners:
+            window = self._window(scanner, frame, time_s)
+            for rank, index in enumerate(window):
+                age_s = abs(float(scanner.times_s[index]) - time_s)
+                if rank == 0 and age_s <= scanner.half_turn_s:
+                    sweep = scanner.whole(index)
+                    found.add(sweep.points_m, sweep.spacing_m, age_s)
+                    found.hide(*above_field(sweep, viewpoint_in_world[:3, 3]))
+                else:
+                    sweep, first = scanner.still(index), scanner.whole(window[0])
+                    low = _elevation(sweep.points_m, first) <= first.elevation_rad[1]
+                    found.add(sweep.points_m[low], sweep.spacing_m[low], age_s)
+        return found.together()
+
+
+def _elevation(points_m: Float[Tensor, "points 3"], sweep: WorldSweep) -> Float[Tensor, "points"]:
+    """Elevation of points as a sweep's scanner sees them."""
+    x, y, z = transform_points(torch.from_numpy(sweep.world_to_scanner), points_m).unbind(-1)
+    return torch.atan2(z, torch.hypot(x, y))
+
+
+class _Gathered:
+    """Collects points, nearest in time first, and thins them when they become too many."""
+
+    def __init__(self, centre_m: np.ndarray) -> None:
+        self._centre = torch.from_numpy(centre_m)
+        self._parts: list[tuple[Tensor, Tensor, Tensor]] = []
+        self._hiding: list[tuple[Tensor, Tensor]] = []
+        self._voxel_m = VOXEL_M
+
+    def add(self, points_m: Tensor, spacing_m: Tensor, age_s: float) -> None:
+        self._parts.append((points_m, spacing_m, torch.full_like(spacing_m, age_s)))
+        while sum(len(part[0]) for part in self._parts) > MAX_POINTS:
+            points, spacing, age = (torch.cat(values) for values in zip(*self._parts, strict=True))
+            kept = torch.from_numpy(first_in_voxel((points - self._centre).numpy(), self._voxel_m))
+            self._parts = [(points[kept], spacing[kept], age[kept])]
+            self._voxel_m *= 1.2
+
+    def hide(self, points_m: Tensor, spacing_m: Tensor) -> None:
+        self._hiding.append((points_m, spacing_m))
+
+    def together(self) -> Surroundings:
+        none = (torch.empty(0, 3, dtype=torch.float64), torch.empty(0), torch.empty(0))
+        points, spacing, age = (torch.cat(values) for values in zip(none, *self._parts, strict=True))
+        hiding, hiding_spacing = (torch.cat(values) for values in zip(none[:2], *self._hiding, strict=True))
+        return Surroundings(
+            points_m=torch.cat((points, hiding)),
+            spacing_m=torch.cat((spacing, hiding_spacing)),
+            age_s=torch.cat((age, torch.zeros(len(hiding)))),
+            only_hides=torch.arange(len(points) + len(hiding)) >= len(points),
+        )

@@ -1,0 +1,266 @@
+"""Scans of any recorder: every format gives the same points, and broken files are named."""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.lidar.scans import MAX_POINTS, PointTimes, ScanFormat, _unpack_lzf, check_scan, read_scan
+
+POINTS = np.array([[1.5, -2.25, 0.5], [-8.0, 3.0, -1.75], [40.0, 0.125, 2.0]])
+INTENSITY = np.array([0.25, 0.5, 1.0])
+COUNTS = np.array([0, 40_000_000, 99_000_000])
+"""Nanoseconds from the scan's timestamp."""
+TIMED = ScanFormat(times=PointTimes("t", 1e-9))
+RECORD = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("t", "<u4")]
+
+
+def records(record: list[tuple[str, str]] = RECORD) -> np.ndarray:
+    table = np.zeros(len(POINTS), record)
+    for axis, name in enumerate("xyz"):
+        table[name] = POINTS[:, axis]
+    table["intensity"], table["t"] = INTENSITY, COUNTS
+    return table
+
+
+def pcd(path: Path, data: str, content: bytes, fields: str = "x y z intensity t", points: int = 3) -> Path:
+    count = len(fields.split())
+    path.write_bytes(
+        f"# .PCD v0.7\nVERSION 0.7\nFIELDS {fields}\nSIZE {' '.join('4' * count)}\nTYPE F F F F U\n"
+        f"COUNT {' '.join('1' * count)}\nWIDTH {points}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {points}\n"
+        f"DATA {data}\n".encode()
+        + content
+    )
+    return path
+
+
+def ply(path: Path, encoding: str, content: bytes, count: int = 3) -> Path:
+    path.write_bytes(
+        f"ply\nformat {encoding} 1.0\ncomment made here\nelement vertex {count}\nproperty float x\nproperty float y\n"
+        "property float z\nproperty float intensity\nproperty uint t\nelement face 0\n"
+        "property list uchar int vertex_indices\nend_header\n".encode()
+        + content
+    )
+    return path
+
+
+def lines() -> bytes:
+    return "".join(f"{x} {y} {z} {i} {t}\n" for (x, y, z), i, t in zip(POINTS, INTENSITY, COUNTS, strict=True)).encode()
+
+
+def lzf_literals(content: bytes) -> bytes:
+    """LZF that only says what follows, 32 bytes at most at a time."""
+    parts = [content[start : start + 32] for start in range(0, len(content), 32)]
+    return b"".join(bytes([len(part) - 1]) + part for part in parts)
+
+
+def write_bin(folder: Path) -> tuple[Path, ScanFormat]:
+    path = folder / "a.bin"
+    path.write_bytes(np.column_stack((POINTS, INTENSITY, COUNTS / 1e9)).astype("<f8").tobytes())
+    columns = ("x", "y", "z", "intensity", "seconds")
+    return path, ScanFormat(columns=columns, dtype="float64", times=PointTimes("seconds"))
+
+
+def write_npy(folder: Path) -> tuple[Path, ScanFormat]:
+    np.save(folder / "a.npy", np.asfortranarray(np.column_stack((COUNTS, POINTS, INTENSITY))))
+    return folder / "a.npy", replace(TIMED, columns=("t", "x", "y", "z", "intensity"))
+
+
+def write_structured_npy(folder: Path) -> tuple[Path, ScanFormat]:
+    table = records()
+    table.dtype.names = ("X", "Y", "Z", "i", "t")
+    np.save(folder / "a.npy", table)
+    return folder / "a.npy", replace(TIMED, names={"x": "X", "y": "Y", "z": "Z", "intensity": "i"})
+
+
+def write_compressed_pcd(folder: Path) -> tuple[Path, ScanFormat]:
+    content = b"".join(records()[name].tobytes() for name in ("x", "y", "z", "intensity", "t"))
+    packed = lzf_literals(content)
+    return pcd(folder / "a.pcd", "binary_compressed", struct.pack("<II", len(packed), len(content)) + packed), TIMED
+
+
+def write_padded_pcd(folder: Path) -> tuple[Path, ScanFormat]:
+    """What PCL writes of PointXYZI: padding under the name _, which takes several values."""
+    record = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("pad", "V4"), ("intensity", "<f4"), ("t", "<u4")]
+    header = (
+        "VERSION .7\nFIELDS x y z _ intensity t\nSIZE 4 4 4 1 4 4\nTYPE F F F U F U\nCOUNT 1 1 1 4 1 1\nWIDTH 3\n"
+        "HEIGHT 1\nPOINTS 3\nDATA binary\n"
+    )
+    (folder / "a.pcd").write_bytes(header.encode() + records(record).tobytes())
+    return folder / "a.pcd", TIMED
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        write_bin,
+        write_npy,
+        write_structured_npy,
+        pytest.param(lambda folder: (ply(folder / "a.ply", "ascii", lines()), TIMED), id="ply ascii"),
+        pytest.param(
+            lambda folder: (ply(folder / "a.ply", "binary_little_endian", records().tobytes()), TIMED), id="ply little"
+        ),
+        pytest.param(
+            lambda folder: (
+                ply(
+                    folder / "a.PLY",
+                    "binary_big_endian",
+                    records([(name, ">" + kind[1:]) for name, kind in RECORD]).tobytes(),
+                ),
+                TIMED,
+            ),
+            id="ply big",
+        ),
+        pytest.param(lambda folder: (pcd(folder / "a.pcd", "ascii", lines()), TIMED), id="pcd ascii"),
+        pytest.param(lambda folder: (pcd(folder / "a.pcd", "binary", records().tobytes()), TIMED), id="pcd binary"),
+        write_compressed_pcd,
+        write_padded_pcd,
+    ],
+)
+def test_every_format_gives_the_same_points(tmp_path: Path, write) -> None:
+    path, scan = write(tmp_path)
+    check_scan(path, scan)
+    found = read_scan(path, scan)
+    assert found.points_m.tolist() == POINTS.tolist()
+    assert found.reflectance.tolist() == INTENSITY.tolist()
+    assert found.offset_s is not None
+    assert found.offset_s.tolist() == pytest.approx([0.0, 0.04, 0.099], abs=1e-12)
+    # without times, and counted from another moment
+    assert read_scan(path, replace(scan, times=None)).offset_s is None
+    later = read_scan(path, scan, 0.05).offset_s
+    assert later is not None and later.tolist() == pytest.approx([-0.05, -0.01, 0.049], abs=1e-12)
+
+
+def test_times_on_the_clock_keep_their_digits(tmp_path: Path) -> None:
+    start_ns = 1_369_730_762_123_456_789
+    table = np.zeros(2, [("x", "f8"), ("y", "f8"), ("z", "f8"), ("stamp", "u8")])
+    table["x"], table["stamp"] = 5.0, [start_ns, start_ns + 50_000_000]
+    np.save(tmp_path / "a.npy", table)
+    scan = ScanFormat(times=PointTimes("stamp", 1e-9, absolute=True))
+    found = read_scan(tmp_path / "a.npy", scan, start_ns / 1e9)
+    assert found.offset_s is not None
+    assert found.offset_s.tolist() == pytest.approx([0, 0.05], abs=1e-6)
+    assert found.reflectance.tolist() == [0, 0]  # there is no intensity
+
+
+def test_what_is_no_return_is_left_out_and_counted(tmp_path: Path) -> None:
+    nan = math.nan
+    rows = np.array(
+        [[nan, 0, 0, 1], [0, 0, 0, 1], [0.1, 0.2, 0, 1], [3, 4, 0, 0.5], [0, 999, 0, 1], [1, math.inf, 0, 1]]
+    )
+    np.save(tmp_path / "a.npy", rows)
+    found = read_scan(tmp_path / "a.npy", ScanFormat())
+    assert found.points_m.tolist() == [[3, 4, 0]] and found.reflectance.tolist() == [0.5]
+    assert (found.not_finite, found.out_of_range) == (2, 3)
+
+
+# ---- broken files ----------------------------------------------------------------------------------------------
+
+
+def named(folder: Path, name: str, content: bytes) -> Path:
+    (folder / name).write_bytes(content)
+    return folder / name
+
+
+def saved(path: Path, array: np.ndarray) -> Path:
+    np.save(path, array, allow_pickle=array.dtype == object)
+    return path
+
+
+BROKEN = {
+    "unknown format": (lambda f: named(f, "a.las", b"LASF"), r"a\.las: a scan of unknown format \.las.*\.bin, \.npy"),
+    "empty file": (lambda f: named(f, "a.bin", b""), r"a\.bin: an empty file"),
+    "cut .bin": (lambda f: named(f, "a.bin", bytes(18)), r"a\.bin: 18 bytes, expected a multiple of 16"),
+    "all NaN": (lambda f: saved(f / "a.npy", np.full((4, 4), np.nan)), r"a\.npy: none of its 4 points.*4 are NaN"),
+    "no points": (lambda f: saved(f / "a.npy", np.zeros((0, 4))), r"a\.npy: a scan without points"),
+    "other columns": (lambda f: saved(f / "a.npy", np.zeros((9, 5))), r"shape \(9, 5\).*points × 4"),
+    "pickled": (lambda f: saved(f / "a.npy", np.array([{}, None])), r"a\.npy: cannot be read as an array"),
+    "no column": (lambda f: saved(f / "a.npy", records()[["x", "y", "t"]]), r"has no column z, only x, y, t"),
+    "cut .npy": (
+        lambda f: named(f, "b.npy", saved(f / "a.npy", np.ones((9, 4))).read_bytes()[:-8]),
+        r"b\.npy: cannot be read as an array",
+    ),
+    "no ply": (lambda f: named(f, "a.ply", b"solid\n"), r"a\.ply: does not begin with 'ply'"),
+    "ply of faces": (
+        lambda f: named(f, "a.ply", b"ply\nformat ascii 1.0\nelement face 1\nproperty list uchar int i\nend_header\n"),
+        "the first element must be vertex, without lists; found face",
+    ),
+    "ply without end": (lambda f: named(f, "a.ply", b"ply\nformat ascii 1.0\n" * 3), "the header has no end"),
+    "ply of an unknown type": (
+        lambda f: named(f, "a.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty half x\nend_header\n1\n"),
+        "the header's line 'property half x' cannot be read",
+    ),
+    "cut ply": (lambda f: ply(f / "a.ply", "binary_little_endian", records().tobytes()[:-1]), "the file is truncated"),
+    "cut ascii ply": (lambda f: ply(f / "a.ply", "ascii", lines()[:-60]), "lines of points|cannot"),
+    "ply of words": (lambda f: ply(f / "a.ply", "ascii", b"one two three four five\n" * 3), "a line of its points"),
+    "huge promise": (
+        lambda f: ply(f / "a.ply", "binary_little_endian", b"", MAX_POINTS + 1),
+        "20000001 points, expected at most 20000000",
+    ),
+    "big promise": (lambda f: ply(f / "a.ply", "ascii", lines(), MAX_POINTS), "cannot hold the 20000000 lines"),
+    "negative": (lambda f: pcd(f / "a.pcd", "binary", b"", points=-3), "negative count"),
+    "pcd without z": (lambda f: pcd(f / "a.pcd", "ascii", lines(), "x y h intensity t"), "has no column z"),
+    "pcd of another kind": (
+        lambda f: pcd(f / "a.pcd", "binary_zstd", lines()),
+        "the header cannot be read.*binary_zstd",
+    ),
+    "cut pcd": (lambda f: pcd(f / "a.pcd", "binary", records().tobytes()[:-20]), "the file is truncated"),
+    "compressed to another size": (
+        lambda f: pcd(f / "a.pcd", "binary_compressed", struct.pack("<II", 3, 99) + b"\0a"),
+        "2 compressed bytes for 99",
+    ),
+    "damaged": (
+        lambda f: pcd(f / "a.pcd", "binary_compressed", struct.pack("<II", 3, 60) + b"\xe0\x00\x00"),
+        "its compressed points are damaged",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_broken_scan_is_named(tmp_path: Path, name: str) -> None:
+    make, message = BROKEN[name]
+    path = make(tmp_path)
+    with pytest.raises(InputError, match=message) as error:
+        read_scan(path, ScanFormat())
+    assert str(error.value).startswith(str(path))
+
+
+def test_what_a_header_tells_is_found_without_reading_the_points(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="truncated"):
+        check_scan(pcd(tmp_path / "a.pcd", "binary", records().tobytes()[:-20]), ScanFormat())
+    with pytest.raises(InputError, match="has no column t, only x, y, z, intensity"):
+        check_scan(named(tmp_path, "a.bin", bytes(32)), TIMED)
+    with pytest.raises(FileNotFoundError, match=r"b\.ply"):
+        check_scan(tmp_path / "b.ply", TIMED)
+    check_scan(saved(tmp_path / "a.npy", np.full((4, 4), np.nan)), ScanFormat())
+
+
+# ---- LZF -------------------------------------------------------------------------------------------------------
+
+
+def test_lzf_references() -> None:
+    # 3 literals; then 2 + 2 = 4 bytes from 3 back: "abc" again and its first; then 7 + 1 + 2 = 10 bytes from 1 back
+    packed = b"\x02abc" + bytes([2 << 5, 2]) + bytes([7 << 5, 1, 0])
+    assert _unpack_lzf(packed, 17) == b"abcabca" + b"a" * 10
+
+
+@given(st.binary(min_size=1, max_size=300), st.integers(0, 255), st.data())
+def test_lzf_undoes_itself_and_damage_is_noticed(content: bytes, distance: int, data: st.DataObject) -> None:
+    packed, whole = lzf_literals(content), content
+    if distance < len(content):
+        # five bytes from `distance` + 1 back, which may reach into themselves
+        packed += bytes([3 << 5, distance])
+        for _ in range(5):
+            whole += whole[-distance - 1 :][:1]
+    assert _unpack_lzf(packed, len(whole)) == whole
+    cut = data.draw(st.integers(0, len(packed) - 1))
+    with pytest.raises((ValueError, IndexError)):
+        _unpack_lzf(packed[:cut], len(whole))
