@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -46,7 +47,7 @@ from edge_depth_nerf.synthetic import rig
 from edge_depth_nerf.synthetic.lidar import sweep
 from edge_depth_nerf.synthetic.motion import FRAME_INTERVAL_S
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
-from edge_depth_nerf.synthetic.render import FisheyeCamera, World, own_car_world
+from edge_depth_nerf.synthetic.render import FisheyeCamera, View, World, own_car_world
 from edge_depth_nerf.synthetic.scenes import build_scene
 from edge_depth_nerf.synthetic.simulated_mono import simulated_estimate
 
@@ -67,6 +68,9 @@ _BLACK_LEVEL = 2.0 / 255
 _MANIFEST = "drive.json"
 _FIRST_MOMENT = datetime(2013, 5, 28, 8, 46, 2)
 _FIRST_NANOSECONDS = 123_456_789
+
+Job = tuple[int, str | None]
+"""A frame, and a camera; None = its sweep."""
 
 _log = logging.getLogger(__name__)
 
@@ -129,6 +133,9 @@ class _Paths:
 def _manifest(options: SynthesizeOptions) -> dict[str, Any]:
     fields = dataclasses.asdict(options)
     del fields["output"]
+    if options.layout == "kitti-360":
+        # as when there was no other
+        del fields["layout"]
     fields["speed_m_s"] = options.mean_speed_m_s
     return {
         "kind": "synthetic drive",
@@ -153,11 +160,13 @@ def _open_folder(options: SynthesizeOptions) -> None:
     if path.is_file():
         there = read_json(path)
         if there != manifest:
-            old = there.get("options", {}) if isinstance(there, dict) else {}
+            given = there.get("options", {}) if isinstance(there, dict) else {}
+            # this layout is not written down
+            old, new = ({"layout": "kitti-360", **options} for options in (given, manifest["options"]))
             changed = [
-                f"{name} is {old.get(name)!r} there and {value!r} here"
-                for name, value in manifest["options"].items()
-                if old.get(name) != value
+                f"{name} is {old.get(name)!r} there and {new.get(name)!r} here"
+                for name in dict.fromkeys((*new, *old))
+                if old.get(name) != new.get(name)
             ]
             raise InputError(
                 f"{folder}: holds a drive of other options ({'; '.join(changed) or 'made by another version'}). "
@@ -165,7 +174,7 @@ def _open_folder(options: SynthesizeOptions) -> None:
             )
         # what an interrupted run was about to write
         for left_over in folder.rglob(".*"):
-            if left_over.suffix in (".png", ".bin", ".txt", ".json", ".yaml"):
+            if left_over.suffix in (".png", ".bin", ".pcd", ".txt", ".json", ".yaml", ".toml"):
                 left_over.unlink()
     elif folder.is_dir() and any(folder.iterdir()):
         names = sorted(entry.name for entry in folder.iterdir())
@@ -253,38 +262,46 @@ class _Synthesis:
         write_bytes(self.paths.sweep(frame), taken.raw.astype("<f4").tobytes())
         write_bytes(self.paths.points(frame), taken.deskewed.astype("<f4").tobytes())
 
-    def _gain(self, camera: int, frame: int) -> float:
-        """The exposure's smooth drift: two slow waves, within ±10 %."""
-        rng = np.random.default_rng([self.options.seed, 30, camera])
-        phases, periods = rng.uniform(0, 2 * np.pi, 2), rng.uniform((4.0, 1.7), (7.0, 2.9))
-        time_s = frame * FRAME_INTERVAL_S
-        waves = np.sin(2 * np.pi * time_s / periods + phases) * (0.7, 0.3)
-        return float(1 + _EXPOSURE_DRIFT * waves.sum())
-
     def write_pictures(self, name: str, frame: int) -> None:
         number, camera, time_s = rig.CAMERAS.index(name), self.cameras[name], frame * FRAME_INTERVAL_S
         for shift in SHIFTS_M if held_out(frame) else ():
             pose = self._camera_pose(name, frame, shift)
             view = camera.view(self._world, pose, time_s, with_own_car=False)
             clean = self._world.to_picture(view.radiance)
-            write_png(self.paths.truth(name, f"shifted_{shift}m/rgb", frame), _to_bytes(clean))
+            write_png(self.paths.truth(name, f"shifted_{shift}m/rgb", frame), to_bytes(clean))
             write_distance_png(self.paths.truth(name, f"shifted_{shift}m/distance", frame), view.distance_m)
         view = camera.view(self._world, self._camera_pose(name, frame), time_s)
         write_distance_png(self.paths.truth(name, "distance", frame), view.distance_m)
-        write_png(self.paths.truth(name, "rgb", frame), _to_bytes(self._world.to_picture(view.radiance)))
+        write_png(self.paths.truth(name, "rgb", frame), to_bytes(self._world.to_picture(view.radiance)))
         if self.options.moving:
             write_mask(self.paths.moving_mask(name, frame), ~view.moving)
         estimate = simulated_estimate(
             view.distance_m, camera.own_distance_m, camera.lens, frame, self.options.seed, number
         )
         write_distance_png(self.paths.mono(name, frame), estimate)
-        rng = np.random.default_rng([self.options.seed, 31, number, frame])
-        picture = self._world.to_picture(view.radiance, self._gain(number, frame))
-        noise = rng.standard_normal(picture.shape, np.float32) * np.float32(PICTURE_NOISE)
-        write_png(self.paths.picture(name, frame), _to_bytes(np.maximum(picture, _BLACK_LEVEL) + noise))
+        picture = take_picture(self._world, view, self.options.seed, number, frame)
+        write_png(self.paths.picture(name, frame), picture)
 
 
-def _to_bytes(picture: NDArray[np.float32]) -> NDArray[np.uint8]:
+def take_picture(world: World, view: View, seed: int, camera: int, frame: int) -> NDArray[np.uint8]:
+    """A view as the camera's sensor gives it: H×W×3, with exposure drift and noise."""
+    rng = np.random.default_rng([seed, 31, camera, frame])
+    picture = world.to_picture(view.radiance, _gain(seed, camera, frame))
+    noise = rng.standard_normal(picture.shape, np.float32) * np.float32(PICTURE_NOISE)
+    return to_bytes(np.maximum(picture, _BLACK_LEVEL) + noise)
+
+
+def _gain(seed: int, camera: int, frame: int) -> float:
+    """The exposure's smooth drift: two slow waves, within ±10 %."""
+    rng = np.random.default_rng([seed, 30, camera])
+    phases, periods = rng.uniform(0, 2 * np.pi, 2), rng.uniform((4.0, 1.7), (7.0, 2.9))
+    time_s = frame * FRAME_INTERVAL_S
+    waves = np.sin(2 * np.pi * time_s / periods + phases) * (0.7, 0.3)
+    return float(1 + _EXPOSURE_DRIFT * waves.sum())
+
+
+def to_bytes(picture: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Picture values of 0-1 as bytes."""
     return np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)
 
 
@@ -294,7 +311,7 @@ def synthesize_drive(options: SynthesizeOptions) -> Path:
     The same options give the same bytes, whether at once or continued.
 
     Returns:
-        The output folder: the root for `process kitti360`.
+        The output folder: the root for `process kitti360`, or for the converter of the layout.
 
     Raises:
         InputError: an option is out of range, or the output folder holds something else.
@@ -302,13 +319,17 @@ def synthesize_drive(options: SynthesizeOptions) -> Path:
     """
     options.check()
     _open_folder(options)
+    if options.layout != "kitti-360":
+        from edge_depth_nerf.synthetic.rig_drive import synthesize_rig_drive
+
+        synthesize_rig_drive(options)
+        return options.output
     paths = _Paths(options.output, options.sequence)
 
     def lacks(files: list[Path]) -> bool:
         return not all(path.is_file() for path in files)
 
-    # (frame, camera), camera None = the sweep
-    missing: list[tuple[int, str | None]] = []
+    missing: list[Job] = []
     for frame in range(options.frames):
         if lacks(paths.of_sweep(frame)):
             missing.append((frame, None))
@@ -320,13 +341,19 @@ def synthesize_drive(options: SynthesizeOptions) -> Path:
         return options.output
     synthesis = _Synthesis(options)
     synthesis.write_once()
+    for frame, camera in shown(missing, options):
+        if camera is None:
+            synthesis.write_sweep(frame)
+        else:
+            synthesis.write_pictures(camera, frame)
+    return options.output
+
+
+def shown(missing: list[Job], options: SynthesizeOptions) -> Iterator[Job]:
+    """Go through what is to be made, and show how far it is."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns) as progress:
         task = progress.add_task(f"{options.scene}: pictures and sweeps", total=len(missing))
-        for frame, camera in missing:
-            if camera is None:
-                synthesis.write_sweep(frame)
-            else:
-                synthesis.write_pictures(camera, frame)
+        for job in missing:
+            yield job
             progress.advance(task)
-    return options.output

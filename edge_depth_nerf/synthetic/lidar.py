@@ -27,6 +27,27 @@ FIRINGS = 1800
 AZIMUTH_RAD = np.deg2rad(180.0 - (np.arange(FIRINGS) + 0.5) * 360.0 / FIRINGS)
 """Azimuths in the order of firing, counter-clockwise from x."""
 
+
+@dataclass(frozen=True)
+class Scanner:
+    """A turning scanner: clockwise, a turn a frame, beginning and ending backwards."""
+
+    elevation_rad: NDArray[np.float64]
+    """Elevations of its beams."""
+    azimuth_rad: NDArray[np.float64]
+    """Azimuths in the order of firing, counter-clockwise from its x axis."""
+    to_pose: NDArray[np.float64]
+    """4×4, from its frame (x forward, y left, z up) to the vehicle's."""
+
+    @property
+    def offset_s(self) -> NDArray[np.float64]:
+        """When each firing happens, from the moment that the laser faces forwards."""
+        return -self.azimuth_rad / (2 * np.pi) * FRAME_INTERVAL_S
+
+
+HDL_64E = Scanner(BEAM_ELEVATION_RAD, AZIMUTH_RAD, VELO_TO_POSE)
+"""KITTI-360's scanner."""
+
 RANGE_M = (0.9, 80.0)
 """Nearest and farthest return."""
 
@@ -42,22 +63,24 @@ class Sweep:
     """N returns in the order of firing, beam by beam."""
 
     raw: NDArray[np.float32]
-    """N×4: x, y, z in the velodyne frame of the firing's own moment, with range noise; reflectance in 0-1."""
+    """N×4: x, y, z in the scanner's frame of the firing's own moment, with range noise; reflectance in 0-1."""
+    offset_s: NDArray[np.float64]
+    """N: when each was measured, from the sweep's moment."""
     deskewed: NDArray[np.float32]
-    """N×4: the same returns without noise, in the velodyne frame of the sweep's moment; reflectance.
+    """N×4: the same returns without noise, in the scanner's frame of the sweep's moment; reflectance.
 
     Only the recording car's own motion is taken out: a car that drives stays where each firing met it.
     """
 
 
-def sweep(world: World, drive: Drive, time_s: float, rng: Generator) -> Sweep:
+def sweep(world: World, drive: Drive, time_s: float, rng: Generator, scanner: Scanner = HDL_64E) -> Sweep:
     """Take the sweep that faces forwards at `time_s`."""
-    offset_s = -AZIMUTH_RAD / (2 * np.pi) * FRAME_INTERVAL_S
-    velo_to_world = drive.pose_to_world(time_s + offset_s) @ VELO_TO_POSE
-    cos, sin = np.cos(BEAM_ELEVATION_RAD), np.sin(BEAM_ELEVATION_RAD)
-    directions = np.empty((FIRINGS, len(cos), 3))
-    directions[..., 0] = np.cos(AZIMUTH_RAD)[:, None] * cos
-    directions[..., 1] = np.sin(AZIMUTH_RAD)[:, None] * cos
+    offset_s, azimuth = scanner.offset_s, scanner.azimuth_rad
+    velo_to_world = drive.pose_to_world(time_s + offset_s) @ scanner.to_pose
+    cos, sin = np.cos(scanner.elevation_rad), np.sin(scanner.elevation_rad)
+    directions = np.empty((len(azimuth), len(cos), 3))
+    directions[..., 0] = np.cos(azimuth)[:, None] * cos
+    directions[..., 1] = np.sin(azimuth)[:, None] * cos
     directions[..., 2] = sin
     world_directions = np.einsum("fij,fbj->fbi", velo_to_world[:, :3, :3], directions).reshape(-1, 3)
     world_origins = np.repeat(velo_to_world[:, :3, 3], len(cos), axis=0)
@@ -72,11 +95,12 @@ def sweep(world: World, drive: Drive, time_s: float, rng: Generator) -> Sweep:
     range_m, noise = range_m[seen], noise[seen]
     raw = directions.reshape(-1, 3)[seen] * (range_m + noise)[:, None]
     points = world_origins[seen] + world_directions[seen] * range_m[:, None]
-    world_to_velo = np.linalg.inv(drive.pose_to_world(np.array([time_s]))[0] @ VELO_TO_POSE)
+    world_to_velo = np.linalg.inv(drive.pose_to_world(np.array([time_s]))[0] @ scanner.to_pose)
     deskewed = points @ world_to_velo[:3, :3].T + world_to_velo[:3, 3]
     # the sensor counts reflectance in steps of 1/100
     reflectance = np.round(np.clip(echo[seen], 0, 0.99), 2)
     return Sweep(
         np.column_stack((raw, reflectance)).astype(np.float32),
+        np.repeat(offset_s, len(cos))[seen],
         np.column_stack((deskewed, reflectance)).astype(np.float32),
     )

@@ -18,6 +18,11 @@ SCENES: tuple[SceneName, ...] = ("street", "parking", "turn")
 DEFAULT_SPEED_M_S: dict[SceneName, float] = {"street": 8.0, "parking": 4.0, "turn": 6.0}
 """How fast the car drives in each scene unless told otherwise; a frame is 0.1 s."""
 
+LayoutName = Literal["kitti-360", "jbnu-depth360", "rig"]
+
+LAYOUTS: tuple[LayoutName, ...] = ("kitti-360", "jbnu-depth360", "rig")
+"""The layouts that a drive can be written in."""
+
 _SIZE_RANGE_PX = (32, 4096)
 _MOVING_MAX = 8
 _SPEED_MAX_M_S = 40.0
@@ -25,7 +30,7 @@ _SPEED_MAX_M_S = 40.0
 
 @dataclass(frozen=True)
 class SynthesizeOptions:
-    """A drive with fisheye pictures, LiDAR sweeps, poses and their truth, in KITTI-360's raw layout."""
+    """A drive with fisheye pictures, LiDAR sweeps, poses and their truth, in KITTI-360's raw layout or another one."""
 
     output: Path
     """Folder to write the drive to; new, empty, or an unfinished drive of the same options, which is continued."""
@@ -42,7 +47,10 @@ class SynthesizeOptions:
     speed_m_s: float | None = None
     """Mean speed of the car in m/s; none = the scene's own (street 8, parking 4, turn 6)."""
     sequence: str = "2013_05_28_drive_0000_sync"
-    """Name of the sequence in the folders."""
+    """Name of the sequence in the folders (KITTI-360's layout alone)."""
+    layout: LayoutName = "kitti-360"
+    """kitti-360: two fisheyes, Velodyne; jbnu-depth360: four 183 degree fisheyes, Ouster; rig: two fisheyes to 110
+    degrees, a pinhole and a scanner, described by a rig.toml. --size is the width; other pictures are not square."""
 
     @property
     def mean_speed_m_s(self) -> float:
@@ -58,6 +66,8 @@ class SynthesizeOptions:
         """
         if self.scene not in SCENES:
             raise InputError(f"--scene {self.scene}: no such scene, expected one of {', '.join(SCENES)}.")
+        if self.layout not in LAYOUTS:
+            raise InputError(f"--layout {self.layout}: no such layout, expected one of {', '.join(LAYOUTS)}.")
         if self.frames < 1:
             raise InputError(f"--frames {self.frames}: expected at least 1.")
         if not _SIZE_RANGE_PX[0] <= self.size <= _SIZE_RANGE_PX[1]:

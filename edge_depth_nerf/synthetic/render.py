@@ -18,7 +18,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
-from edge_depth_nerf.cameras import MEI
+from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.synthetic.geometry import Geometry, flat_normals
 from edge_depth_nerf.synthetic.materials import (
     LASER_REFLECTANCE,
@@ -33,11 +33,11 @@ from edge_depth_nerf.synthetic.scenes import Mover, SceneModel
 
 Array = NDArray[np.float32]
 
-LENS_THETA_RAD = float(np.deg2rad(97.0))
-"""The lens circle: rays up to here are seen in full."""
+LENS_THETA_DEG = 97.0
+"""KITTI-360's lens circle: rays up to here are seen in full."""
 
-_RIM_THETA_RAD = np.deg2rad((99.2, 99.7, 100.4))
-"""Where red, green and blue have faded to nothing outside the lens circle."""
+_RIM_WIDTH_DEG = np.array((2.2, 2.7, 3.4))
+"""How far outside the lens circle red, green and blue have faded to nothing."""
 
 _SUBSAMPLES = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
 """Offsets from the pixel's centre, in pixels."""
@@ -361,31 +361,40 @@ class View:
 
 
 class FisheyeCamera:
-    """A fisheye camera on the recording car: its rays, its lens, and the own car in its picture.
+    """A camera on the recording car, of any model: its rays, its lens, and the own car in its picture.
 
     Colours are the mean of 2×2 rays a pixel; distances belong to the pixel's centre.
     """
 
-    def __init__(self, camera: MEI, own_car: World, camera_to_ground: NDArray[np.float64]) -> None:
+    def __init__(
+        self,
+        camera: Camera,
+        own_car: World,
+        camera_to_ground: NDArray[np.float64],
+        lens_theta_deg: float = LENS_THETA_DEG,
+    ) -> None:
         """Prepare rays and the own car's picture.
 
         Args:
             camera: the camera.
             own_car: a world that holds the own car alone, origin on the road below the pose's origin.
             camera_to_ground: 4×4, from the camera to that world.
+            lens_theta_deg: half of the lens's field of view.
 
         """
+        lens_theta_rad = float(np.deg2rad(lens_theta_deg))
+        rim_theta_rad = np.deg2rad(lens_theta_deg + _RIM_WIDTH_DEG)
         self.height, self.width = camera.height, camera.width
-        self.pixel_rad = 2 * LENS_THETA_RAD / self.width
+        self.pixel_rad = 2 * lens_theta_rad / self.width
         centres = camera.pixel_centres().reshape(-1, 2)
         rays, valid = camera.unproject(centres)
         theta = torch.atan2(rays[:, :2].norm(dim=-1), rays[:, 2])
-        seen = valid & (theta <= _RIM_THETA_RAD.max())
-        self.lens = (seen & (theta <= LENS_THETA_RAD)).reshape(self.height, self.width).numpy()
+        seen = valid & (theta <= rim_theta_rad.max())
+        self.lens = (seen & (theta <= lens_theta_rad)).reshape(self.height, self.width).numpy()
         """H×W, True inside the lens circle."""
         self._pixels = np.flatnonzero(seen.numpy())
         self._centre_rays = rays[seen].numpy().astype(np.float32)
-        past = (theta[seen].numpy()[:, None] - LENS_THETA_RAD) / (_RIM_THETA_RAD - LENS_THETA_RAD)
+        past = (theta[seen].numpy()[:, None] - lens_theta_rad) / (rim_theta_rad - lens_theta_rad)
         past = np.clip(past, 0, 1)
         self._transmission = (1 - past**2 * (3 - 2 * past)).astype(np.float32)
         # a quarter of a pixel off the centre the ray is linear in the pixel, to some thousandths of a pixel

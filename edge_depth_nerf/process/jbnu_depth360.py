@@ -1,0 +1,91 @@
+"""JBNU-Depth360 (Jeonbuk National University): 183° fisheyes of 1920×1080 and an Ouster OS0-32 in a car park.
+
+A sequence, 230329/test_1 and so on, as published:
+
+    image/000000.png                 pictures of the front camera
+    bin/000000.bin                   scans; a scan's number is that of its picture
+
+Calibration and poses are not published: they are handed in as a rig file, docs/jbnu_depth360.md says how. What the
+data set is known, or taken, to have stands in `_fill_in` and may be left out there. All else is as for any rig.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.console import Console
+
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.process.build import process_recording
+from edge_depth_nerf.process.checks import require_folder
+from edge_depth_nerf.process.options import JbnuDepth360Options
+from edge_depth_nerf.process.recording import Recording
+from edge_depth_nerf.process.rig import recording_of_rig
+from edge_depth_nerf.process.rig_file import read_rig
+from edge_depth_nerf.process.scene import ProcessReport
+
+RATE_HZ = 10.0
+"""Pictures and scans a second; the data set has numbers in place of times."""
+SCANNER = "ouster"
+"""The scanner's name, if the rig file has none."""
+
+
+def process_jbnu_depth360(options: JbnuDepth360Options, console: Console | None = None) -> ProcessReport:
+    """Write the scene folder that `options` describe, or continue it.
+
+    Raises:
+        FileNotFoundError: a folder or file of the data set is missing.
+        InputError: an option, a file of the data set, or the output folder cannot be used.
+
+    """
+    return process_recording(read_jbnu_depth360(options), options, console)
+
+
+def read_jbnu_depth360(options: JbnuDepth360Options) -> Recording:
+    """Find and check what the scene of a sequence is made of.
+
+    Raises:
+        FileNotFoundError: a folder or file of the data set is missing.
+        InputError: an option or a file of the data set cannot be used.
+
+    """
+    options.check()
+    for folder in ("image", "bin"):
+        require_folder(options.root / folder, "--root takes a sequence's folder, such as 230329/test_1")
+    rig = read_rig(options.calibration, options.calibration.parent, _fill_in)
+    if len(rig.lidars) != 1:
+        raise InputError(f"{rig.path}: {len(rig.lidars)} scanners in [lidars]; the data set has one.")
+    source = {"kind": "jbnu-depth360", "root": options.root.resolve().name, "cameras": list(options.cameras)}
+    return recording_of_rig(rig, options.root, options, source)
+
+
+def _fill_in(content: dict[str, Any]) -> None:
+    """Add what a file does not say. Tables that are no tables are left for the check that follows."""
+    cameras = content.get("cameras")
+    cameras = cameras if isinstance(cameras, dict) else {}
+    for name, camera in cameras.items():
+        if isinstance(camera, dict):
+            camera.setdefault("model", "kannala-brandt")
+            camera.setdefault("width", 1920)
+            camera.setdefault("height", 1080)
+            camera.setdefault("images", "image" if len(cameras) == 1 else f"image/{name}")
+            _fill_in_clock(camera)
+    # without a scanner in the file, the vehicle's frame is the scanner's
+    identity = [[float(row == column) for column in range(4)] for row in range(4)]
+    lidars = content.setdefault("lidars", {SCANNER: {"to_vehicle": identity}})
+    for lidar in lidars.values() if isinstance(lidars, dict) else ():
+        if isinstance(lidar, dict):
+            lidar.setdefault("scans", "bin")
+            _fill_in_clock(lidar)
+            if "turn_s" not in lidar and "point_times" not in lidar:
+                lidar |= {"turn_s": 1 / RATE_HZ, "direction": "clockwise", "timestamp": "middle"}
+    poses = content.get("poses")
+    if isinstance(poses, dict):
+        poses.setdefault("format", "tum")
+        if poses["format"] == "kitti":
+            _fill_in_clock(poses)
+
+
+def _fill_in_clock(sensor: dict[str, Any]) -> None:
+    if not {"times_file", "times_from_names", "rate_hz"} & sensor.keys():
+        sensor["rate_hz"] = RATE_HZ

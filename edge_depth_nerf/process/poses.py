@@ -1,0 +1,188 @@
+"""Poses and times in the formats that people have: TUM, KITTI, nerfstudio; and the text files behind them.
+
+Transforms are 4×4, metres, sensor to world; nerfstudio's are turned from OpenGL's camera axes to OpenCV's. Each error
+names the file and the line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.spatial.transform import Rotation
+
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.files import read_json
+from edge_depth_nerf.process.transforms import Transform, check_rigid
+
+QUATERNION_TOLERANCE = 1e-3
+"""How far a quaternion's length may be from 1; four written digits still pass."""
+
+
+def read_tum(path: Path) -> tuple[Float64[np.ndarray, "poses"], Float64[np.ndarray, "poses 4 4"]]:
+    """Read TUM's format: lines "time x y z qx qy qz qw"; seconds, metres, a unit quaternion.
+
+    Returns:
+        Times, increasing, and poses.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: a line is not such a pose, or the times do not increase.
+
+    """
+    times, poses = [], []
+    for line, values in _number_lines(path):
+        if len(values) != 8:
+            raise InputError(
+                f"{path}, line {line}: {len(values)} numbers, expected 8 (time x y z qx qy qz qw, TUM's format). "
+                "Check the format that the rig file gives for the poses."
+            )
+        if times and not values[0] > times[-1]:
+            raise InputError(
+                f"{path}, line {line}: its time {values[0]:.6f} is not after {times[-1]:.6f} of the line before. Sort "
+                "the poses by time, one pose a time."
+            )
+        times.append(values[0])
+        poses.append(pose_of_quaternion(values[1:4], values[4:], f"{path}, line {line}"))
+    return np.array(times, np.float64), np.array(poses, np.float64).reshape(-1, 4, 4)
+
+
+def read_kitti(path: Path) -> Float64[np.ndarray, "poses 4 4"]:
+    """Read KITTI's format: lines of 12 numbers, the upper 3×4 of each pose, row by row. Times are elsewhere.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: a line is not such a pose.
+
+    """
+    poses = []
+    for line, values in _number_lines(path):
+        if len(values) != 12:
+            raise InputError(
+                f"{path}, line {line}: {len(values)} numbers, expected 12 (a 3×4 matrix row by row, KITTI's format). "
+                "Check the format that the rig file gives for the poses."
+            )
+        pose = np.eye(4)
+        pose[:3] = np.reshape(values, (3, 4))
+        check_rigid(pose, f"{path}, line {line}")
+        poses.append(pose)
+    return np.array(poses, np.float64).reshape(-1, 4, 4)
+
+
+def read_nerfstudio(path: Path) -> dict[str, Transform]:
+    """Read the frames of a nerfstudio transforms.json.
+
+    Returns:
+        Camera-to-world poses with OpenCV's camera axes, by file_path without its suffix, as it is written there.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: no frames, or a frame without name or pose.
+
+    """
+    content = read_json(path)
+    frames = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(frames, list) or not frames:
+        raise InputError(f"{path}: has no list of frames; expected nerfstudio's transforms.json.")
+    poses = {}
+    for number, frame in enumerate(frames):
+        where = f"{path}: frames[{number}]"
+        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+            raise InputError(f"{where} has no file_path; expected nerfstudio's transforms.json.")
+        pose = transform_of_rows(frame.get("transform_matrix"), f"{where}.transform_matrix")
+        name = str(Path(frame["file_path"]).with_suffix(""))
+        if name in poses:
+            raise InputError(f"{where}: {frame['file_path']} has a pose already; expected one for each picture.")
+        # OpenGL's camera has y up and z backwards
+        poses[name] = pose @ np.diag([1.0, -1.0, -1.0, 1.0])
+    return poses
+
+
+def read_times(path: Path) -> list[tuple[str | None, float]]:
+    """Read a time a line: "TIME", or "NAME TIME".
+
+    Returns:
+        Names, None where there are none, and times in the file's unit.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: a line is neither, or some have names and some have none.
+
+    """
+    found: list[tuple[str | None, float]] = []
+    for line, words in _lines(path):
+        if len(words) > 2:
+            raise InputError(f"{path}, line {line}: {len(words)} words, expected a time, or a file's name and a time.")
+        found.append((words[0] if len(words) == 2 else None, _number(words[-1], path, line)))
+        if (found[0][0] is None) != (found[-1][0] is None):
+            raise InputError(
+                f"{path}, line {line}: some lines have a file's name and some have none; one or the other."
+            )
+    return found
+
+
+def pose_of_quaternion(translation: list[float], quaternion: list[float], where: str) -> Transform:
+    """Make a transform of x, y, z and qx, qy, qz, qw.
+
+    Raises:
+        InputError: the quaternion's length is not 1; names `where`.
+
+    """
+    length = float(np.linalg.norm(quaternion))
+    if not abs(length - 1) <= QUATERNION_TOLERANCE:
+        raise InputError(
+            f"{where}: the quaternion {' '.join(f'{value:g}' for value in quaternion)} has the length {length:.4g}, so "
+            "it is not a rotation; expected qx qy qz qw (w last) of length 1."
+        )
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
+    pose[:3, 3] = translation
+    return pose
+
+
+def transform_of_rows(rows: object, where: str) -> Transform:
+    """Make a transform of four rows of four numbers (or three: the last is 0 0 0 1).
+
+    Raises:
+        InputError: they are something else, or no rotation and translation; names `where`.
+
+    """
+    try:
+        values = np.array(rows, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        values = np.empty(0)
+    if values.shape not in ((4, 4), (3, 4)) or not np.isfinite(values).all():
+        raise InputError(
+            f"{where}: expected 4 rows of 4 numbers, a rotation and a translation in metres; found {rows!r}."
+        )
+    pose = np.eye(4)
+    pose[: len(values)] = values
+    check_rigid(pose, where)
+    return pose
+
+
+def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Lines with something in them, counted from 1, as words; what follows # is left out."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    with path.open(encoding="utf-8", errors="replace") as file:
+        for number, line in enumerate(file, 1):
+            if words := line.partition("#")[0].replace(",", " ").split():
+                yield number, words
+
+
+def _number(word: str, path: Path, line: int) -> float:
+    try:
+        value = float(word)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise InputError(f"{path}, line {line}: {word!r} is not a finite number.")
+    return value
+
+
+def _number_lines(path: Path) -> Iterator[tuple[int, list[float]]]:
+    for number, words in _lines(path):
+        yield number, [_number(word, path, number) for word in words]

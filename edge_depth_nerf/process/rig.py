@@ -1,0 +1,561 @@
+"""Anyone's recording, described by a rig file, as a recording to make a scene of. docs/rig.md is its manual.
+
+Files of a sensor are taken in the order of their names, numbers in them counting as numbers, and get their times
+as the rig file says. Pictures of different cameras less than half a frame apart form a moment; moments are numbered
+from 0 in order of time. A scan belongs to the nearest moment, if that is at most half a turn away.
+"""
+
+from __future__ import annotations
+
+import re
+import statistics
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+from PIL import Image, UnidentifiedImageError
+from rich.console import Console
+
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.files import DISTANCE_STEPS_PER_METRE
+from edge_depth_nerf.lidar.scans import SCAN_SUFFIXES, check_scan, read_scan
+from edge_depth_nerf.lidar.trajectory import MAX_POSE_GAP_S, Trajectory
+from edge_depth_nerf.process.build import process_recording
+from edge_depth_nerf.process.checks import check_size, size_error
+from edge_depth_nerf.process.options import JbnuDepth360Options, RigOptions
+from edge_depth_nerf.process.poses import read_kitti, read_nerfstudio, read_times, read_tum
+from edge_depth_nerf.process.recording import (
+    DepthFile,
+    RecordedCamera,
+    RecordedPicture,
+    RecordedSweep,
+    Recording,
+)
+from edge_depth_nerf.process.rig_file import Clock, Rig, RigCamera, RigLidar, RigPoses, read_rig
+from edge_depth_nerf.process.scene import ProcessReport, Skipped, summarise
+from edge_depth_nerf.process.transforms import Transform
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+"""Pictures that are found in a folder."""
+_RIG_FILES = ("rig.toml", "rig.json")
+
+
+@dataclass(frozen=True)
+class _Timed:
+    """A file of a sensor."""
+
+    path: Path
+    time_s: float
+
+
+@dataclass(frozen=True)
+class _Scans:
+    """The scans of a scanner, in order of time."""
+
+    lidar: RigLidar
+    files: list[_Timed]
+
+    @cached_property
+    def middles_s(self) -> np.ndarray:
+        """The middle of each one's turn."""
+        return np.array([item.time_s for item in self.files]) + self.lidar.to_middle_s
+
+    @cached_property
+    def turn_s(self) -> float:
+        """How long a turn takes."""
+        return self.lidar.turn_s or min(_interval([item.time_s for item in self.files]), 1.0)
+
+    def nearest(self, time_s: float) -> tuple[int, float]:
+        """The scan whose middle is nearest to a time, and how far it is."""
+        apart = np.abs(self.middles_s - time_s)
+        return int(apart.argmin()), float(apart.min())
+
+
+def process_rig(options: RigOptions, console: Console | None = None) -> ProcessReport:
+    """Write the scene folder that `options` describe, or continue it.
+
+    Raises:
+        FileNotFoundError: a folder or file of the recording is missing.
+        InputError: an option, a file of the recording, or the output folder cannot be used.
+
+    """
+    return process_recording(read_rig_recording(options), options, console)
+
+
+def read_rig_recording(options: RigOptions) -> Recording:
+    """Find and check what the scene of a recording is made of.
+
+    Raises:
+        FileNotFoundError: a folder or file of the recording is missing.
+        InputError: an option or a file of the recording cannot be used.
+
+    """
+    options.check()
+    if not options.root.is_dir():
+        raise FileNotFoundError(f"{options.root}: no such folder; --root takes the recording's folder.")
+    there = [options.root / name for name in _RIG_FILES if (options.root / name).is_file()]
+    if options.rig is None and len(there) != 1:
+        found = " and ".join(path.name for path in there) or "neither"
+        raise InputError(
+            f"{options.root}: expected {' or '.join(_RIG_FILES)} in it, found {found}. Write one (docs/rig.md shows "
+            "how), or name it with --rig."
+        )
+    rig = read_rig(options.rig or there[0], options.root)
+    source = {"kind": "rig", "root": options.root.resolve().name, "cameras": list(options.cameras)}
+    return recording_of_rig(rig, options.root, options, source)
+
+
+def recording_of_rig(rig: Rig, root: Path, options: RigOptions | JbnuDepth360Options, source: dict) -> Recording:
+    """Find and check the files that a rig file describes.
+
+    Args:
+        rig: what the file says.
+        root: the recording's folder.
+        options: which cameras and moments.
+        source: what the scene says that it is made of.
+
+    Raises:
+        FileNotFoundError: a folder or file of the recording is missing.
+        InputError: an option or a file of the recording cannot be used.
+
+    """
+    cameras = _chosen(rig, options.cameras)
+    files = {camera.name: _timed(_files(root, camera.images, IMAGE_SUFFIXES), camera.clock) for camera in cameras}
+    moments = _moments(files)
+    path, camera_poses, notices = None, {}, []
+    if options.poses == "recorded":
+        if rig.poses is None:
+            raise InputError(
+                f"{rig.path}: has no table [poses]. Give poses (docs/rig.md), or have them found with --poses colmap."
+            )
+        path, camera_poses = _path(rig, rig.poses, cameras, files)
+    scans = [_Scans(lidar, _timed(_files(root, lidar.scans, SCAN_SUFFIXES), lidar.clock)) for lidar in rig.lidars]
+    _check_clocks(rig, files, scans, path)
+
+    taken = _select(moments, options)
+    skipped: list[Skipped] = []
+    kept: dict[int, dict[str, _Timed]] = {}
+    for frame in taken:
+        reason = _unusable(moments[frame], path, scans)
+        if reason:
+            skipped.append(Skipped(frame, None, reason))
+            continue
+        pictures = moments[frame]
+        lacking = [name for name, picture in pictures.items() if camera_poses and picture.path not in camera_poses]
+        skipped += [Skipped(frame, name, "no pose") for name in lacking]
+        kept[frame] = {name: picture for name, picture in pictures.items() if name not in lacking}
+    kept = {frame: pictures for frame, pictures in kept.items() if pictures}
+    if not kept:
+        raise InputError(f"{root}: none of the moments asked for can be used: {summarise(skipped)}.")
+
+    by_name = {camera.name: camera for camera in cameras}
+    companions = _Companions(root, cameras, options)
+    recorded = tuple(
+        companions.picture(by_name[name], frame, picture, camera_poses.get(picture.path))
+        for frame, pictures in sorted(kept.items())
+        for name, picture in sorted(pictures.items())
+    )
+    sweeps = _sweeps(scans, {frame: _time(pictures) for frame, pictures in kept.items()}, path, options.sweeps)
+    for lidar in rig.lidars:
+        if lidar.timing is None and lidar.format.times is None:
+            notices.append(
+                f"{lidar.name}: neither turn_s nor point_times is given; its scans are taken as of one moment."
+            )
+    for camera in cameras:
+        if camera.ego_mask:
+            check_size(camera.ego_mask, camera.camera)
+    clocks = [sensor.clock for sensor in (*cameras, *rig.lidars)]
+    if rig.poses and path:
+        clocks += [rig.poses.clock] if rig.poses.clock else []
+    return Recording(
+        cameras=tuple(RecordedCamera(c.name, c.camera, c.to_vehicle, c.ego_mask) for c in cameras),
+        pictures=recorded,
+        sweeps=tuple(sweeps),
+        trajectory=path,
+        source=source,
+        whole_inputs=(
+            rig.path,
+            *([rig.poses.file] if rig.poses and path else []),
+            *(clock.file for clock in clocks if clock.file),
+        ),
+        skipped=tuple(skipped),
+        notices=tuple(notices),
+    )
+
+
+def _chosen(rig: Rig, names: Sequence[str]) -> list[RigCamera]:
+    known = {camera.name: camera for camera in rig.cameras}
+    if unknown := [name for name in names if name not in known]:
+        raise InputError(f"--cameras {unknown[0]}: {rig.path} has no such camera, only {', '.join(known)}.")
+    return [known[name] for name in dict.fromkeys(names)] if names else list(rig.cameras)
+
+
+# ---- files and their times -------------------------------------------------------------------------------------
+
+
+def _files(root: Path, given: str, suffixes: tuple[str, ...]) -> list[Path]:
+    """Files of a folder, or those that a pattern names, in the order of their names."""
+    path, parts = root / given, Path(given).parts
+    wild = [number for number, part in enumerate(parts) if any(sign in part for sign in "*?[")]
+    if wild:
+        folder = root.joinpath(*parts[: wild[0]])
+        found = [file for file in folder.glob(str(Path(*parts[wild[0] :]))) if file.is_file()]
+        what = "no file has such a name"
+    elif path.is_dir():
+        present = [file for file in path.iterdir() if file.is_file() and not file.name.startswith(".")]
+        found = [file for file in present if file.suffix.lower() in suffixes]
+        if not found and present:
+            raise InputError(
+                f"{path}: files of unknown format, such as {sorted(present)[0].name}; expected {', '.join(suffixes)}."
+            )
+        what = "nothing in it"
+    else:
+        raise FileNotFoundError(f"{path}: no such folder; the rig file names it.")
+    if not found:
+        raise FileNotFoundError(f"{path}: {what}; expected {', '.join(suffixes)} files.")
+    return sorted(found, key=_natural)
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """Numbers in names count as numbers."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
+
+
+def _number_in(path: Path) -> float:
+    numbers = re.findall(r"\d+(?:\.\d+)?", path.stem)
+    if not numbers:
+        raise InputError(f"{path}: no number in its name, which the rig file takes its time from. Give a times_file.")
+    return float(numbers[-1])
+
+
+def _timed(files: list[Path], clock: Clock) -> list[_Timed]:
+    """Files with their times, in the order of time."""
+    if clock.file is not None:
+        counts = _times_of_file(clock.file, files)
+    else:
+        counts = [_number_in(path) for path in files]
+    scale = 1 / clock.rate_hz if clock.rate_hz else clock.seconds_per_count
+    timed = sorted(
+        (_Timed(path, count * scale + clock.offset_s) for path, count in zip(files, counts, strict=True)),
+        key=lambda item: item.time_s,
+    )
+    for before, after in pairwise(timed):
+        if before.time_s == after.time_s:
+            raise InputError(
+                f"{after.path} and {before.path.name} have the same time, {after.time_s:.6f} s; mend the times."
+            )
+    return timed
+
+
+def _times_of_file(path: Path, files: list[Path]) -> list[float]:
+    lines = read_times(path)
+    if lines and lines[0][0] is not None:
+        by_name = {name: time for name, time in lines}
+        found = [by_name.get(file.name, by_name.get(file.stem)) for file in files]
+        for file, time in zip(files, found, strict=True):
+            if time is None:
+                raise InputError(f"{path}: has no time for {file.name}. Add a line, or take the file away.")
+        return [time for time in found if time is not None]
+    if len(lines) != len(files):
+        raise InputError(
+            f"{path}: {len(lines)} times, but {files[0].parent} has {len(files)} files. Expected one line for each, in "
+            "the order of their names; or write lines 'NAME TIME'."
+        )
+    return [time for _, time in lines]
+
+
+# ---- moments ---------------------------------------------------------------------------------------------------
+
+
+def _time(pictures: dict[str, _Timed]) -> float:
+    """When a moment was: the middle of its pictures."""
+    times = [picture.time_s for picture in pictures.values()]
+    return (min(times) + max(times)) / 2
+
+
+def _interval(times: list[float]) -> float:
+    """The usual time from one to the next; infinite for a single one."""
+    return statistics.median(np.diff(times).tolist()) if len(times) > 1 else float("inf")
+
+
+def _moments(files: dict[str, list[_Timed]]) -> list[dict[str, _Timed]]:
+    """Pictures that belong together, by camera, in order of time."""
+    interval = min(_interval([item.time_s for item in timed]) for timed in files.values())
+    every = sorted(((item, name) for name, timed in files.items() for item in timed), key=lambda pair: pair[0].time_s)
+    moments: list[dict[str, _Timed]] = []
+    begun = -float("inf")
+    for item, name in every:
+        if not moments or name in moments[-1] or item.time_s - begun >= interval / 2:
+            moments.append({})
+            begun = item.time_s
+        moments[-1][name] = item
+    return moments
+
+
+def _select(moments: list[dict[str, _Timed]], options: RigOptions | JbnuDepth360Options) -> range:
+    last = len(moments) - 1
+    end = max(last, options.first) if options.frames is None else options.first + (options.frames - 1) * options.stride
+    if end > last:
+        asked = "" if options.frames is None else f" --frames {options.frames} --stride {options.stride}"
+        raise InputError(
+            f"--first {options.first}{asked}: reaches moment {end}, but the recording has moments 0 to {last}. Ask for "
+            "fewer, or leave out --frames to take all."
+        )
+    return range(options.first, end + 1, options.stride)
+
+
+def _unusable(pictures: dict[str, _Timed], path: Trajectory | None, scans: Sequence[_Scans]) -> str | None:
+    """Why a moment cannot be used, if it cannot."""
+    time_s = _time(pictures)
+    if path is not None:
+        slack_s = min(0.1, 0.5 * _interval(path.times_s.tolist()))
+        if path.outside_s(time_s) > slack_s:
+            return "before the first or after the last pose"
+        if path.outside_s(time_s) == 0 and path.gap_s(time_s) > MAX_POSE_GAP_S:
+            return f"no pose within {MAX_POSE_GAP_S:g} s"
+    if scans and all(scanner.nearest(time_s)[1] > scanner.turn_s for scanner in scans):
+        return "no scan"
+    return None
+
+
+# ---- poses -----------------------------------------------------------------------------------------------------
+
+
+def _path(
+    rig: Rig, poses: RigPoses, cameras: Sequence[RigCamera], files: dict[str, list[_Timed]]
+) -> tuple[Trajectory, dict[Path, Transform]]:
+    """The vehicle's path; and each picture's own pose, where the file has these."""
+    of_pictures: dict[Path, Transform] = {}
+    if poses.format == "nerfstudio":
+        times, sensor_to_world, to_vehicle, of_pictures = _picture_poses(poses, cameras, files)
+    else:
+        sensors = {sensor.name: sensor.to_vehicle for sensor in (*rig.cameras, *rig.lidars)}
+        to_vehicle = sensors.get(poses.of, np.eye(4))
+        times, sensor_to_world = _pose_list(poses)
+    if len(times) < 2:
+        raise InputError(
+            f"{poses.file}: {len(times)} pose{'' if len(times) == 1 else 's'}, expected two at least: the vehicle's "
+            "motion comes from them."
+        )
+    upright = _upright(poses.up)
+
+    def in_metres(pose: Float64[np.ndarray, "*poses 4 4"]) -> Float64[np.ndarray, "*poses 4 4"]:
+        moved = pose.copy()
+        moved[..., :3, 3] *= poses.metres_per_unit
+        return upright @ moved
+
+    vehicle_to_world = in_metres(sensor_to_world) @ np.linalg.inv(to_vehicle)
+    try:
+        path = Trajectory(times, vehicle_to_world)
+    except InputError as error:
+        raise InputError(f"{poses.file}: {error}") from None
+    return path, {file: in_metres(pose) for file, pose in of_pictures.items()}
+
+
+def _pose_list(poses: RigPoses) -> tuple[np.ndarray, np.ndarray]:
+    if poses.format == "tum":
+        return read_tum(poses.file)
+    matrices, clock = read_kitti(poses.file), poses.clock
+    assert clock is not None
+    if clock.from_names:
+        raise InputError(f"{poses.file}: KITTI's poses have no names; give poses.times_file or poses.rate_hz.")
+    counts = list(range(len(matrices))) if clock.file is None else [time for _, time in read_times(clock.file)]
+    if len(counts) != len(matrices):
+        raise InputError(f"{clock.file}: {len(counts)} times for the {len(matrices)} poses of {poses.file.name}.")
+    scale = 1 / clock.rate_hz if clock.rate_hz else clock.seconds_per_count
+    return np.array(counts, np.float64) * scale + clock.offset_s, matrices
+
+
+def _picture_poses(
+    poses: RigPoses, cameras: Sequence[RigCamera], files: dict[str, list[_Timed]]
+) -> tuple[np.ndarray, np.ndarray, Transform, dict[Path, Transform]]:
+    """Poses of pictures by their names; the camera that has most of them gives the vehicle's path."""
+    given = read_nerfstudio(poses.file)
+    by_ending: dict[tuple[str, ...], list[Path]] = defaultdict(list)
+    for picture in (item.path for timed in files.values() for item in timed):
+        parts = picture.with_suffix("").absolute().parts
+        for count in range(1, len(parts) + 1):
+            by_ending[parts[-count:]].append(picture)
+    found: dict[Path, Transform] = {}
+    for name, pose in given.items():
+        parts = Path(name).parts
+        # the picture that has most of its path in common
+        endings = (by_ending.get(parts[-count:], []) for count in range(len(parts), 0, -1))
+        pictures = next((pictures for pictures in endings if pictures), [])
+        if len(pictures) > 1:
+            raise InputError(
+                f"{poses.file}: {name} fits {pictures[0]} and {pictures[1]}. Write more of the folders into its "
+                "file_path, as in front/000001.png."
+            )
+        if pictures and pictures[0] in found:
+            raise InputError(
+                f"{poses.file}: {name} is a second pose of {pictures[0]}. Write more of the folders into it."
+            )
+        if pictures:
+            found[pictures[0]] = pose
+    if not found:
+        raise InputError(
+            f"{poses.file}: none of its {len(given)} frames, such as {next(iter(given))}, is a picture of this rig, "
+            f"such as {next(iter(files.values()))[0].path}. Their names must agree."
+        )
+    best = max(cameras, key=lambda camera: sum(item.path in found for item in files[camera.name]))
+    posed = [item for item in files[best.name] if item.path in found]
+    times = np.array([item.time_s for item in posed])
+    return times, np.stack([found[item.path] for item in posed]), best.to_vehicle, found
+
+
+def _upright(up: str) -> Transform:
+    """The turn of the world that makes its upward axis z; axes are exchanged, nothing more."""
+    axes = np.eye(3)
+    upward = axes["xyz".index(up[-1])] * (-1.0 if up.startswith("-") else 1.0)
+    forward = axes[(int(np.abs(upward).argmax()) + 1) % 3]
+    turn = np.eye(4)
+    turn[:3, :3] = axes if up == "z" else np.stack((forward, np.cross(upward, forward), upward))
+    return turn
+
+
+def _check_clocks(rig: Rig, files: dict[str, list[_Timed]], scans: Sequence[_Scans], path: Trajectory | None) -> None:
+    """Whether the sensors' times are of one clock, as far as that shows."""
+    sensors = files | {scanner.lidar.name: scanner.files for scanner in scans}
+    ranges = {name: (timed[0].time_s, timed[-1].time_s) for name, timed in sensors.items()}
+    reference = next(iter(files))
+    if path is not None:
+        ranges["the poses"] = (float(path.times_s[0]), float(path.times_s[-1]))
+    first, last = ranges[reference]
+    for name, (start, end) in ranges.items():
+        slack_s = 0.5
+        if start > last + slack_s or end < first - slack_s:
+            raise InputError(
+                f"{rig.path}: the times of {reference} and {name} do not overlap: {reference} has {first:.3f} to "
+                f"{last:.3f} s, {name} {start:.3f} to {end:.3f} s. Are they of one clock and one unit? time_unit and "
+                "time_offset_s bring them together."
+            )
+
+
+def _sweeps(
+    scans: Sequence[_Scans], moments_s: dict[int, float], path: Trajectory | None, reach: int
+) -> list[RecordedSweep]:
+    """The scans that the moments taken can use, checked by their headers, each with the moment it belongs to."""
+    frames, times_s = np.array(list(moments_s)), np.array(list(moments_s.values()))
+    found = []
+    for scanner in scans:
+        lidar = scanner.lidar
+        absolute = lidar.format.times is not None and lidar.format.times.absolute
+        # around each moment's scan, those that are accumulated, and those that tell what moved in them
+        margin = 2 * reach + 1
+        first = max(0, scanner.nearest(float(times_s.min()))[0] - margin)
+        last = scanner.nearest(float(times_s.max()))[0] + margin
+        for item, middle_s in list(zip(scanner.files, scanner.middles_s.tolist(), strict=True))[first : last + 1]:
+            if path is not None and path.outside_s(middle_s) > scanner.turn_s:
+                continue
+            check_scan(item.path, lidar.format)
+            apart = np.abs(times_s - middle_s)
+            belongs = apart.min() <= scanner.turn_s / 2 * (1 + 1e-6)
+            found.append(
+                RecordedSweep(
+                    path=item.path,
+                    time_s=middle_s,
+                    frame=int(frames[apart.argmin()]) if belongs else None,
+                    scanner=lidar.name,
+                    to_vehicle=lidar.to_vehicle,
+                    read=partial(read_scan, item.path, lidar.format, middle_s if absolute else lidar.to_middle_s),
+                    timing=lidar.timing,
+                )
+            )
+    return found
+
+
+# ---- what comes with the pictures ------------------------------------------------------------------------------
+
+
+class _Companions:
+    """Finds the maps that come with pictures, and checks them by their headers.
+
+    They have the name of the picture's file where the rig file names a folder, and the moment's number where an option
+    does.
+    """
+
+    def __init__(self, root: Path, cameras: Sequence[RigCamera], options: RigOptions | JbnuDepth360Options) -> None:
+        self._options = options
+        self._found = {
+            (camera.name, what): {path.stem: path for path in _files(root, given, (".png",))}
+            for camera in cameras
+            for what, given in (
+                ("masks", camera.masks),
+                ("mono", camera.mono),
+                ("depth.files", camera.depth and camera.depth.files),
+            )
+            if given is not None
+        }
+
+    def picture(
+        self, camera: RigCamera, frame: int, picture: _Timed, camera_to_world: Transform | None
+    ) -> RecordedPicture:
+        """A picture with all that comes with it."""
+        _check_picture(picture.path, camera)
+        mask = self._by_name(camera, "masks", picture.path) or self._by_number("frame_masks", camera, frame)
+        mono = self._by_number("mono", camera, frame) or self._by_name(camera, "mono", picture.path)
+        depth = self._by_name(camera, "depth.files", picture.path)
+        steps = 1 / DISTANCE_STEPS_PER_METRE
+        for path, metres in ((mono, steps), (depth, camera.depth.metres_per_count if camera.depth else steps)):
+            if path is not None and not check_size(path, camera.camera).is_distance:
+                raise InputError(
+                    f"{path}: expected a 16-bit grey PNG, {metres:g} m a count. Other kinds have lost the distance; "
+                    "export the map again."
+                )
+        if mask is not None:
+            check_size(mask, camera.camera)
+        return RecordedPicture(
+            camera=camera.name,
+            frame=frame,
+            path=picture.path,
+            time_s=picture.time_s,
+            camera_to_world=camera_to_world,
+            depth=None
+            if depth is None or camera.depth is None
+            else DepthFile(depth, camera.depth.metres_per_count, camera.depth.kind),
+            mask=mask,
+            mono=mono,
+        )
+
+    def _by_name(self, camera: RigCamera, what: str, picture: Path) -> Path | None:
+        files = self._found.get((camera.name, what))
+        if files is None:
+            return None
+        if picture.stem not in files:
+            folder = next(iter(files.values())).parent
+            raise FileNotFoundError(
+                f"{folder / picture.stem}.png: no such file; cameras.{camera.name}.{what} needs one for every picture "
+                "taken, of the picture's name."
+            )
+        return files[picture.stem]
+
+    def _by_number(self, option: str, camera: RigCamera, frame: int) -> Path | None:
+        folder: Path | None = getattr(self._options, option)
+        if folder is None:
+            return None
+        path = folder / camera.name / f"{frame:010d}.png"
+        if not path.is_file():
+            raise FileNotFoundError(
+                f"{path}: no such file; --{option.replace('_', '-')} needs one for every picture taken, named after "
+                "the moment's number."
+            )
+        return path
+
+
+def _check_picture(path: Path, camera: RigCamera) -> None:
+    if path.suffix.lower() == ".png":
+        check_size(path, camera.camera)
+        return
+    try:
+        with Image.open(path) as image:
+            width, height = image.size
+    except (OSError, SyntaxError, UnidentifiedImageError) as error:
+        raise InputError(f"{path}: not a picture ({error}). Copy or export it again.") from error
+    if (width, height) != (camera.camera.width, camera.camera.height):
+        raise InputError(size_error(path, width, height, camera.camera))

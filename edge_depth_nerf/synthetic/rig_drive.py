@@ -1,0 +1,339 @@
+"""Writing a synthetic drive as somebody's own rig, or as JBNU-Depth360, with what `process` wants beside it.
+
+The layout `rig`: fisheyes to the left (Kannala-Brandt) and right (MEI) that see to 110° from their axes, a pinhole
+with distortion ahead, a scanner whose points have times. Every camera has a clock of its own.
+
+    rig.toml                                what docs/rig.md describes
+    poses.txt                               TUM: the vehicle (x forward, y left, z up) to the world, every 0.04 s
+    images/{left,right,front}/000000.png    pictures; times_left.txt and so on hold when they were taken
+    lidar/1369730762073456789.pcd           scans; the name is the start of the turn in ns, `t` counts ns from it
+
+The layout `jbnu-depth360`: four 183° fisheyes (Kannala-Brandt), a scanner of 32 beams.
+
+    calibration.toml, poses.txt             what docs/jbnu_depth360.md describes; the data set has neither
+    image/{front,left,rear,right}/000000.png, bin/000000.bin    (the data set publishes the front camera, in image/)
+
+Both, with c the camera:
+
+    masks/c.png                             255 = keep: inside the lens, not the own car
+    mono/c/*.png                            made from the truth with a network's faults; no network's estimate
+    truth/c/distance/*.png, truth/c/rgb/*.png    metres along the ray in 1/256 m; pictures without drift and noise
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from edge_depth_nerf.cameras import MEI, Camera, KannalaBrandt, Pinhole
+from edge_depth_nerf.files import write_bytes, write_distance_png, write_mask, write_png, write_text
+from edge_depth_nerf.synthetic import rig
+from edge_depth_nerf.synthetic.drive import WORLD_ORIGIN_M, Job, shown, take_picture, to_bytes
+from edge_depth_nerf.synthetic.lidar import Scanner, Sweep, sweep
+from edge_depth_nerf.synthetic.motion import FRAME_INTERVAL_S
+from edge_depth_nerf.synthetic.options import SynthesizeOptions
+from edge_depth_nerf.synthetic.render import FisheyeCamera, World, own_car_world
+from edge_depth_nerf.synthetic.scenes import build_scene
+from edge_depth_nerf.synthetic.simulated_mono import simulated_estimate
+
+POSE_INTERVAL_S = 0.04
+"""Time between the written poses; it does not fit the pictures'."""
+
+_VEHICLE_TO_POSE = np.diag([1.0, -1.0, -1.0, 1.0])
+_FIRST_NS = 1_369_730_762_123_456_789
+_MODELS = {MEI: "mei", KannalaBrandt: "kannala-brandt", Pinhole: "pinhole"}
+
+
+@dataclass(frozen=True)
+class MountedCamera:
+    """A camera on the vehicle."""
+
+    camera: Camera
+    """At the size of its pictures."""
+    to_vehicle: NDArray[np.float64]
+    """4×4, from its frame to the vehicle's (x forward, y left, z up)."""
+    lens_theta_deg: float
+    """Half of the lens's field of view."""
+    delay_s: float = 0.0
+    """How long after the frame's moment it fires."""
+
+
+def looking(yaw_deg: float, pitch_deg: float, position_m: tuple[float, float, float]) -> NDArray[np.float64]:
+    """Camera to vehicle, 4×4, of a camera that is turned to the left by `yaw_deg` and down by `pitch_deg`."""
+    yaw, pitch = math.radians(yaw_deg), math.radians(pitch_deg)
+    forward = np.array([math.cos(yaw) * math.cos(pitch), math.sin(yaw) * math.cos(pitch), -math.sin(pitch)])
+    right = np.array([math.sin(yaw), -math.cos(yaw), 0.0])
+    transform = np.eye(4)
+    transform[:3, :3] = np.stack((right, np.cross(forward, right), forward), -1)
+    transform[:3, 3] = position_m
+    return transform
+
+
+def rig_cameras(size: int) -> dict[str, MountedCamera]:
+    """The cameras of the layout `rig`; the fisheyes are square, the pinhole is 4:3."""
+    centre = (0.507 * size, 0.496 * size)
+    left = KannalaBrandt(size, size, 1.0, 1.0, *centre, -0.012, 0.006, -0.0018, 0.00008)
+    right = MEI(size, size, 1.0, 1.0, *centre, 1.2, 0.03, 0.02, 3e-4, -2e-4)
+    height = round(0.75 * size)
+    front = Pinhole(size, height, 0.7 * size, 0.702 * size, 0.503 * size, 0.49 * height, -0.11, 0.03, 4e-4, -3e-4)
+    return {
+        "left": MountedCamera(_filled(left, 110.0), looking(88.0, 8.0, (0.73, 0.15, 1.07)), 110.0),
+        "right": MountedCamera(_filled(right, 110.0), looking(-91.0, 6.0, (0.70, -0.75, 1.07)), 110.0, 0.004),
+        "front": MountedCamera(front, looking(1.0, 5.0, (1.58, 0.05, 0.65)), 60.0, 0.012),
+    }
+
+
+def jbnu_cameras(size: int) -> dict[str, MountedCamera]:
+    """The cameras of the layout `jbnu-depth360`: 16:9, the lens circle as wide as the picture."""
+    height = round(size * 1080 / 1920)
+    lens = KannalaBrandt(size, height, 1.0, 1.0, 0.502 * size, 0.497 * height, -0.02, 0.004, -0.0015, 0.0)
+    camera = _filled(lens, 91.5)
+    places: dict[str, tuple[float, tuple[float, float, float]]] = {
+        "front": (0.0, (1.5, 0.0, 0.7)),
+        "left": (90.0, (0.5, 0.5, 1.05)),
+        "rear": (180.0, (-0.7, 0.0, 1.05)),
+        "right": (-90.0, (0.5, -0.5, 1.05)),
+    }
+    return {name: MountedCamera(camera, looking(yaw, 4.0, place), 91.5) for name, (yaw, place) in places.items()}
+
+
+def _filled(camera: Camera, theta_deg: float) -> Camera:
+    """The camera with focal lengths that put this angle at 0.49 of the picture's width from the principal point."""
+    theta = math.radians(theta_deg)
+    ray = torch.tensor([[math.sin(theta), 0.0, math.cos(theta)]], dtype=torch.float64)
+    focal = 0.49 * camera.width / (float(camera.project(ray)[0][0, 0]) - camera.cx)
+    return replace(camera, fx=focal, fy=1.001 * focal)
+
+
+def _scanner(top_deg: float, bottom_deg: float, beams: int, firings: int, to_vehicle: NDArray[np.float64]) -> Scanner:
+    azimuth = np.deg2rad(180.0 - (np.arange(firings) + 0.5) * 360.0 / firings)
+    return Scanner(np.deg2rad(np.linspace(top_deg, bottom_deg, beams)), azimuth, _VEHICLE_TO_POSE @ to_vehicle)
+
+
+def _mounted(yaw_deg: float, position_m: tuple[float, float, float]) -> NDArray[np.float64]:
+    """Scanner to vehicle, 4×4."""
+    transform = np.eye(4)
+    transform[:3, :3] = Rotation.from_euler("z", yaw_deg, degrees=True).as_matrix()
+    transform[:3, 3] = position_m
+    return transform
+
+
+class _RigDrive:
+    """A scene seen by a rig; what the two layouts share."""
+
+    cameras: dict[str, MountedCamera]
+    scanner_to_vehicle: NDArray[np.float64]
+    scanner: Scanner
+    first_s = 0.0
+    """Time of frame 0."""
+
+    def __init__(self, options: SynthesizeOptions) -> None:
+        self.options, self.root = options, options.output
+        model = build_scene(options)
+        self._drive, self._world = model.drive, World(model, options.seed)
+        own_car = own_car_world(model, options.seed)
+        pose_to_ground = np.diag([1.0, -1.0, -1.0, 1.0])
+        pose_to_ground[2, 3] = rig.POSE_HEIGHT_M
+        self._views = {
+            name: FisheyeCamera(
+                mounted.camera,
+                own_car,
+                pose_to_ground @ _VEHICLE_TO_POSE @ mounted.to_vehicle,
+                mounted.lens_theta_deg,
+            )
+            for name, mounted in self.cameras.items()
+        }
+
+    def picture(self, name: str, frame: int) -> Path:
+        raise NotImplementedError
+
+    def scan(self, frame: int) -> Path:
+        raise NotImplementedError
+
+    def description(self) -> tuple[Path, str]:
+        """The rig file, and what it says."""
+        raise NotImplementedError
+
+    def scan_bytes(self, taken: Sweep) -> bytes:
+        raise NotImplementedError
+
+    def map(self, kind: str, name: str, frame: int) -> Path:
+        """Where a map of a picture lies."""
+        folder = {"mono": f"mono/{name}", "distance": f"truth/{name}/distance", "rgb": f"truth/{name}/rgb"}[kind]
+        return self.root / folder / f"{frame:06d}.png"
+
+    def files(self, frame: int, name: str | None) -> list[Path]:
+        if name is None:
+            return [self.scan(frame)]
+        return [self.picture(name, frame), *(self.map(kind, name, frame) for kind in ("mono", "distance", "rgb"))]
+
+    def write(self, frame: int, name: str | None) -> None:
+        time_s, seed = frame * FRAME_INTERVAL_S, self.options.seed
+        if name is None:
+            rng = np.random.default_rng([seed, 20, frame])
+            taken = sweep(self._world, self._drive, time_s, rng, self.scanner)
+            write_bytes(self.scan(frame), self.scan_bytes(taken))
+            return
+        number, camera, mounted = list(self.cameras).index(name), self._views[name], self.cameras[name]
+        time_s += mounted.delay_s
+        pose = self._drive.pose_to_world(np.array([time_s]))[0] @ _VEHICLE_TO_POSE @ mounted.to_vehicle
+        view = camera.view(self._world, pose, time_s)
+        write_distance_png(self.map("distance", name, frame), view.distance_m)
+        write_png(self.map("rgb", name, frame), to_bytes(self._world.to_picture(view.radiance)))
+        estimate = simulated_estimate(view.distance_m, camera.own_distance_m, camera.lens, frame, seed, number)
+        write_distance_png(self.map("mono", name, frame), estimate)
+        write_png(self.picture(name, frame), take_picture(self._world, view, seed, number, frame))
+
+    def write_once(self) -> None:
+        """Masks, poses, times, and last of all the rig file."""
+        for name, camera in self._views.items():
+            write_mask(self.root / "masks" / f"{name}.png", camera.lens & ~camera.own_car)
+        end_s = (self.options.frames - 1) * FRAME_INTERVAL_S + 0.2
+        times_s = np.arange(-0.2, end_s, POSE_INTERVAL_S)
+        lines = []
+        for time_s, pose in zip(times_s, self._drive.pose_to_world(times_s) @ _VEHICLE_TO_POSE, strict=True):
+            position, quaternion = pose[:3, 3] + WORLD_ORIGIN_M, Rotation.from_matrix(pose[:3, :3]).as_quat()
+            numbers = " ".join(f"{value:.9f}" for value in (*position, *quaternion))
+            lines.append(f"{self.first_s + time_s:.6f} {numbers}\n")
+        write_text(self.root / "poses.txt", "# time x y z qx qy qz qw\n" + "".join(lines))
+        for name, mounted in self.cameras.items():
+            moments = [frame * FRAME_INTERVAL_S + mounted.delay_s for frame in range(self.options.frames)]
+            self.write_times(name, moments)
+        write_text(*self.description())
+
+    def write_times(self, name: str, moments_s: list[float]) -> None:
+        """Write when a camera's pictures were taken, where the layout says so."""
+
+
+class _Rig(_RigDrive):
+    """The layout `rig`."""
+
+    first_s = _FIRST_NS / 1e9
+
+    def __init__(self, options: SynthesizeOptions) -> None:
+        self.cameras = rig_cameras(options.size)
+        self.scanner_to_vehicle = _mounted(3.0, (0.8, 0.02, 0.84))
+        self.scanner = _scanner(12.0, -26.0, 48, 1200, self.scanner_to_vehicle)
+        super().__init__(options)
+
+    def picture(self, name: str, frame: int) -> Path:
+        return self.root / "images" / name / f"{frame:06d}.png"
+
+    def scan(self, frame: int) -> Path:
+        start_ns = _FIRST_NS + round((frame - 0.5) * FRAME_INTERVAL_S * 1e9)
+        return self.root / "lidar" / f"{start_ns}.pcd"
+
+    def scan_bytes(self, taken: Sweep) -> bytes:
+        record = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("t", "<u4")]
+        points = np.empty(len(taken.raw), record)
+        for column, name in enumerate(("x", "y", "z", "intensity")):
+            points[name] = taken.raw[:, column]
+        points["t"] = np.rint((taken.offset_s + FRAME_INTERVAL_S / 2) * 1e9)
+        header = (
+            "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z intensity t\nSIZE 4 4 4 4 4\n"
+            f"TYPE F F F F U\nCOUNT 1 1 1 1 1\nWIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\n"
+            f"POINTS {len(points)}\nDATA binary\n"
+        )
+        return header.encode() + points.tobytes()
+
+    def write_times(self, name: str, moments_s: list[float]) -> None:
+        lines = "".join(f"{self.first_s + moment:.6f}\n" for moment in moments_s)
+        write_text(self.root / f"times_{name}.txt", lines)
+
+    def description(self) -> tuple[Path, str]:
+        text = '[poses]\nfile = "poses.txt"\nformat = "tum"\n'
+        for name, mounted in self.cameras.items():
+            text += f"\n[cameras.{name}]\n" + _table(
+                images=f"images/{name}",
+                times_file=f"times_{name}.txt",
+                ego_mask=f"masks/{name}.png",
+                mono=f"mono/{name}",
+                **_model(mounted.camera),
+                to_vehicle=mounted.to_vehicle,
+            )
+        text += "\n[lidars.roof]\n" + _table(
+            scans="lidar",
+            times_from_names=True,
+            time_unit="ns",
+            point_times={"column": "t", "unit": "ns", "counted_from": "timestamp"},
+            turn_s=FRAME_INTERVAL_S,
+            timestamp="start",
+            to_vehicle={
+                "translation": self.scanner_to_vehicle[:3, 3],
+                "quaternion": Rotation.from_matrix(self.scanner_to_vehicle[:3, :3]).as_quat(),
+            },
+        )
+        return self.root / "rig.toml", text
+
+
+class _JbnuDepth360(_RigDrive):
+    """The layout `jbnu-depth360`."""
+
+    def __init__(self, options: SynthesizeOptions) -> None:
+        self.cameras = jbnu_cameras(options.size)
+        self.scanner_to_vehicle = _mounted(0.0, (0.4, 0.0, 1.2))
+        self.scanner = _scanner(45.0, -45.0, 32, 1024, self.scanner_to_vehicle)
+        super().__init__(options)
+
+    def picture(self, name: str, frame: int) -> Path:
+        return self.root / "image" / name / f"{frame:06d}.png"
+
+    def scan(self, frame: int) -> Path:
+        return self.root / "bin" / f"{frame:06d}.bin"
+
+    def scan_bytes(self, taken: Sweep) -> bytes:
+        return taken.raw.astype("<f4").tobytes()
+
+    def description(self) -> tuple[Path, str]:
+        text = '[poses]\nfile = "poses.txt"\n'
+        for name, mounted in self.cameras.items():
+            model = _model(mounted.camera)
+            del model["model"]
+            text += f"\n[cameras.{name}]\n" + _table(
+                **model, ego_mask=f"masks/{name}.png", mono=f"mono/{name}", to_vehicle=mounted.to_vehicle
+            )
+        text += "\n[lidars.ouster]\n" + _table(to_vehicle=self.scanner_to_vehicle)
+        return self.root / "calibration.toml", text
+
+
+def _model(camera: Camera) -> dict[str, Any]:
+    """A camera as a rig file describes it, with OpenCV's pixel centres, in which it was calibrated."""
+    found = camera.to_dict()
+    del found["theta_limit_rad"]
+    found |= {"model": _MODELS[type(camera)], "cx": camera.cx - 0.5, "cy": camera.cy - 0.5}
+    return {key: value for key, value in found.items() if value != 0.0}
+
+
+def _table(**values: Any) -> str:
+    return "".join(f"{key} = {_toml(value)}\n" for key, value in values.items())
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key} = {_toml(inner)}" for key, inner in value.items()) + "}"
+    if isinstance(value, np.ndarray) and value.ndim == 2:
+        return "[\n" + "".join(f"    {_toml(row)},\n" for row in value) + "]"
+    if isinstance(value, np.ndarray):
+        # adding zero turns -0.0 into 0.0
+        return "[" + ", ".join(str(number) for number in (np.round(value, 10) + 0.0).tolist()) + "]"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f'"{value}"' if isinstance(value, str) else f"{value:.12g}"
+
+
+def synthesize_rig_drive(options: SynthesizeOptions) -> None:
+    """Write what is missing of a drive in the layout `rig` or `jbnu-depth360`; its folder is open."""
+    drive = {"rig": _Rig, "jbnu-depth360": _JbnuDepth360}[options.layout](options)
+    jobs: list[Job] = [(frame, name) for frame in range(options.frames) for name in (None, *drive.cameras)]
+    missing = [job for job in jobs if not all(path.is_file() for path in drive.files(*job))]
+    if missing or not drive.description()[0].is_file():
+        drive.write_once()
+    for job in shown(missing, options):
+        drive.write(*job)

@@ -1,0 +1,573 @@
+"""A rig of one's own: the example of docs/rig.md goes the whole way, and whatever is wrong with a recording is said."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import shutil
+import struct
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+from scipy.spatial.transform import Rotation
+from test_real import train
+
+from edge_depth_nerf.cameras import MEI, KannalaBrandt, Pinhole
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.files import read_distance_png, read_image, read_json, read_mask, write_json, write_png
+from edge_depth_nerf.process.options import RigOptions
+from edge_depth_nerf.process.rig import process_rig, read_rig_recording
+from edge_depth_nerf.process.rig_file import read_rig, tomllib
+from edge_depth_nerf.synthetic.drive import synthesize_drive
+from edge_depth_nerf.synthetic.options import SynthesizeOptions
+
+PAGE = Path(__file__).parents[1] / "docs" / "rig.md"
+FRAMES = 5
+FIRST_S = 1369730762.123456789
+
+
+def example() -> str:
+    """The complete rig.toml of the page."""
+    return next(block for block in re.findall(r"```toml\n(.*?)```", PAGE.read_text(), re.S) if "[lidars.roof]" in block)
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The drive of the page, with the page's own rig.toml."""
+    root = tmp_path_factory.mktemp("rig") / "drive"
+    synthesize_drive(SynthesizeOptions(root, "parking", frames=FRAMES, size=128, layout="rig"))
+    written, page = root / "rig.toml", root.parent / "page.toml"
+    page.write_text(example())
+    for ours, theirs in zip(read_rig(page, root).cameras, read_rig(written, root).cameras, strict=True):
+        assert ours.camera == theirs.camera and ours.images == theirs.images
+        assert ours.to_vehicle == pytest.approx(theirs.to_vehicle, abs=1e-9)
+    shutil.copy(page, written)
+    return root
+
+
+@pytest.fixture
+def mine(drive: Path, tmp_path: Path) -> Path:
+    """A copy of the drive that a test may spoil."""
+    return Path(shutil.copytree(drive, tmp_path / "drive", ignore=shutil.ignore_patterns("truth")))
+
+
+def options(root: Path, **changes) -> RigOptions:
+    return RigOptions(**{"root": root, "output": root.parent / "scene", "theta_max_deg": 110.0, **changes})
+
+
+def edit(root: Path, *changes: tuple[str, str], file: str = "rig.toml") -> Path:
+    path = root / file
+    content = path.read_text()
+    for old, new in changes:
+        assert old in content, old
+        content = content.replace(old, new, 1)
+    path.write_text(content)
+    return root
+
+
+# ---- the whole way ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def scene(drive: Path) -> Path:
+    report = process_rig(options(drive), Console(quiet=True))
+    assert (report.training, report.held_out) == (12, 3)
+    assert report.skipped == ()
+    assert {name: fit.rms_px < 0.01 for name, fit in report.fits.items()} == dict.fromkeys(
+        ("left", "right", "front"), True
+    )
+    return report.scene
+
+
+def test_the_pages_example_is_a_scene(scene: Path) -> None:
+    meta = read_json(scene / "transforms.json")
+    assert meta["camera_model"] == "OPENCV_FISHEYE"
+    assert meta["source"]["kind"] == "rig" and "/" not in json.dumps(meta["source"])
+    sizes = {frame["camera"]: (frame["w"], frame["h"]) for frame in meta["frames"]}
+    assert sizes == {"left": (128, 128), "right": (128, 128), "front": (128, 96)}
+    # the lenses see past 95 degrees, and the masks keep it
+    assert read_mask(scene / "masks/left.png").mean() > 0.5
+
+
+def test_lidar_lies_on_what_the_cameras_see(scene: Path, drive: Path) -> None:
+    """Models, transforms, clocks and point times together: the distances are the true ones of the pixels."""
+    for name in ("left", "right", "front"):
+        errors, returns = [], 0
+        for frame in range(FRAMES):
+            lidar = read_distance_png(scene / f"lidar/{name}/{frame:010d}.png")
+            truth = read_distance_png(drive / f"truth/{name}/distance/{frame:06d}.png")
+            both = (lidar > 0) & (truth > 0)
+            returns += both.sum()
+            errors.append(np.abs(lidar[both] / truth[both] - 1))
+        assert returns > 5000
+        # a pixel is 1.5° wide; a return lies anywhere in it
+        assert np.median(np.concatenate(errors)) < 0.015
+        assert np.mean(np.concatenate(errors) < 0.05) > 0.8
+
+
+def test_the_pages_example_trains(scene: Path) -> None:
+    pipeline, losses = train(scene, 25)
+    assert np.mean(losses[-5:]) < 0.6 * np.mean(losses[:3])
+    metrics = pipeline.get_average_eval_image_metrics()
+    assert np.isfinite(metrics["masked_psnr"]) and metrics["lidar_pixels"] > 100
+
+
+# ---- reading ---------------------------------------------------------------------------------------------------
+
+
+def test_cameras_are_read_as_the_page_says(drive: Path) -> None:
+    rig = read_rig(drive / "rig.toml", drive)
+    left, right, front = (camera.camera for camera in rig.cameras)
+    assert left == KannalaBrandt(128, 128, 33.9625035468, 33.9964660503, 64.896, 63.488, -0.012, 0.006, -0.0018, 8e-05)
+    assert right == MEI(128, 128, 53.8160469987, 53.8698630457, 64.896, 63.488, 1.2, 0.03, 0.02, 0.0003, -0.0002)
+    assert front == Pinhole(128, 96, 89.6, 89.856, 64.384, 47.04, -0.11, 0.03, 0.0004, -0.0003)
+    # quaternion of 3 degrees about z
+    angle = math.radians(3)
+    rows = [[math.cos(angle), -math.sin(angle), 0, 0.8], [math.sin(angle), math.cos(angle), 0, 0.02], [0, 0, 1, 0.84]]
+    assert rig.lidars[0].to_vehicle == pytest.approx(np.array([*rows, [0, 0, 0, 1]]), abs=1e-9)
+
+
+def test_json_says_the_same(mine: Path) -> None:
+    content = tomllib.loads((mine / "rig.toml").read_text())
+    of_toml = read_rig_recording(options(mine))
+    (mine / "rig.toml").unlink()
+    write_json(mine / "rig.json", content)
+    of_json = read_rig_recording(options(mine))
+    assert of_json.pictures == of_toml.pictures
+    assert [sweep.time_s for sweep in of_json.sweeps] == [sweep.time_s for sweep in of_toml.sweeps]
+
+
+@pytest.mark.parametrize(("centre", "cx"), [("0", 64.896), ("0.5", 64.396), ("1", 63.896)])
+def test_pixel_centres(mine: Path, centre: str, cx: float) -> None:
+    edit(mine, ("cx = 64.396", f"pixel_centre = {centre}\ncx = 64.396"))
+    assert read_rig(mine / "rig.toml", mine).cameras[0].camera.cx == pytest.approx(cx)
+
+
+def test_a_camera_ends_where_its_calibration_does(mine: Path) -> None:
+    edit(mine, ('model = "mei"', 'model = "mei"\ntheta_max_deg = 80'))
+    cameras = read_rig_recording(options(mine)).cameras
+    assert [math.degrees(camera.camera.theta_max_rad) for camera in cameras][1] == pytest.approx(80)
+
+
+def test_moments_and_scans(mine: Path) -> None:
+    recording = read_rig_recording(options(mine))
+    assert [picture.frame for picture in recording.pictures] == sorted(3 * list(range(FRAMES)))
+    delays = {"left": 0.0, "right": 0.004, "front": 0.012}
+    for picture in recording.pictures:
+        moment = FIRST_S + 0.1 * int(picture.path.stem) + delays[picture.camera]
+        assert picture.time_s == pytest.approx(moment, abs=2e-6)
+        assert picture.mono is not None and picture.mono.stem == picture.path.stem
+    # the name is the start of the turn; the middle of it is the pictures' moment
+    assert [(sweep.frame, sweep.path.name) for sweep in recording.sweeps][:2] == [
+        (0, "1369730762073456789.pcd"),
+        (1, "1369730762173456789.pcd"),
+    ]
+    for sweep in recording.sweeps:
+        assert sweep.frame is not None
+        assert sweep.time_s == pytest.approx(FIRST_S + 0.1 * sweep.frame, abs=2e-6)
+        offset_s = sweep.read().offset_s
+        assert offset_s is not None and -0.05 < offset_s.min() < -0.04 and 0.04 < offset_s.max() < 0.05
+
+
+def test_a_turn_says_the_same_as_the_points_own_times(mine: Path) -> None:
+    timed = read_rig_recording(options(mine)).sweeps[2]
+    by_point = timed.read()
+    line = 'point_times = {column = "t", unit = "ns", counted_from = "timestamp"}'
+    edit(mine, (line, 'direction = "clockwise"'))
+    turning = read_rig_recording(options(mine)).sweeps[2]
+    assert (turning.time_s, turning.frame) == (timed.time_s, timed.frame)
+    by_turn = turning.read()
+    assert by_turn.offset_s is None and turning.timing is not None and by_point.offset_s is not None
+    # 1200 firings a turn of 0.1 s: within a tenth of one
+    assert (turning.timing.offsets_s(by_turn.points_m) - by_point.offset_s).abs().max() < 1e-5
+    # the same counted on the clock, but for the digits that seconds since 1970 have
+    record = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("t", "<u4")]
+    for path in sorted((mine / "lidar").iterdir()):
+        points = np.frombuffer(path.read_bytes().partition(b"DATA binary\n")[2], record)
+        on_clock = np.empty(len(points), [("x", "f4"), ("y", "f4"), ("z", "f4"), ("stamp", "u8")])
+        for name in "xyz":
+            on_clock[name] = points[name]
+        on_clock["stamp"] = points["t"] + np.uint64(path.stem)
+        np.save(path.with_suffix(".npy"), on_clock)
+        path.unlink()
+    edit(mine, ('direction = "clockwise"', 'point_times = {column = "stamp", unit = "ns", counted_from = "clock"}'))
+    on_clock = read_rig_recording(options(mine)).sweeps[2].read()
+    assert on_clock.offset_s is not None
+    assert (on_clock.offset_s - by_point.offset_s).abs().max() < 1e-6
+
+
+def test_the_path_is_the_vehicles(mine: Path) -> None:
+    """The poses given of the scanner, with its transform, make the same path as those of the vehicle."""
+    trajectory = read_rig_recording(options(mine)).trajectory
+    assert trajectory is not None
+    lines = (mine / "poses.txt").read_text().splitlines()[1:]
+    angle = math.radians(3)
+    roof = np.eye(4)
+    roof[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
+    roof[:3, 3] = 0.8, 0.02, 0.84
+    moved = []
+    for line in lines:
+        time, *numbers = map(float, line.split())
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = Rotation.from_quat(numbers[3:]).as_matrix(), numbers[:3]
+        pose = pose @ roof
+        row = (*(pose[:3, 3] / 2), *Rotation.from_matrix(pose[:3, :3]).as_quat())
+        moved.append(f"{time - 3:.6f} {' '.join(f'{value:.10f}' for value in row)}")
+    (mine / "poses.txt").write_text("\n".join(moved))
+    # another sensor, another unit; the other clocks are set back by the same three seconds
+    edit(mine, ('format = "tum"', 'format = "tum"\nof = "roof"\nmetres_per_unit = 2'))
+    content = (mine / "rig.toml").read_text()
+    content = content.replace("times_file", "time_offset_s = -3\ntimes_file").replace(
+        "times_from_names", "time_offset_s = -3\ntimes_from_names"
+    )
+    (mine / "rig.toml").write_text(content)
+    again = read_rig_recording(options(mine)).trajectory
+    assert again is not None
+    assert again.times_s + 3 == pytest.approx(trajectory.times_s, abs=1e-5)
+    assert again.vehicle_to_world == pytest.approx(trajectory.vehicle_to_world, abs=1e-6)
+
+
+def test_poses_of_kitti_in_a_world_with_y_down(mine: Path) -> None:
+    reference = read_rig_recording(options(mine)).trajectory
+    assert reference is not None
+    # x right, y down, z forward of x forward, y left, z up
+    turned = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1.0]])
+    poses = turned @ reference.vehicle_to_world
+    (mine / "kitti.txt").write_text(
+        "".join(" ".join(f"{value:.12g}" for value in pose[:3].ravel()) + "\n" for pose in poses)
+    )
+    (mine / "kitti_times.txt").write_text("".join(f"{time:.6f}\n" for time in reference.times_s))
+    poses_table = 'file = "kitti.txt"\nformat = "kitti"\nup = "-y"\ntimes_file = "kitti_times.txt"'
+    edit(mine, ('file = "poses.txt"\nformat = "tum" ', poses_table))
+    found = read_rig_recording(options(mine)).trajectory
+    assert found is not None
+    # the same path but for a turn about the vertical axis: heights and tilts agree
+    assert found.vehicle_to_world[:, 2] == pytest.approx(reference.vehicle_to_world[:, 2], abs=1e-5)
+    between = np.linalg.norm(np.diff(found.vehicle_to_world[:, :3, 3], axis=0), axis=1)
+    assert between == pytest.approx(np.linalg.norm(np.diff(reference.vehicle_to_world[:, :3, 3], axis=0), axis=1))
+
+
+def test_poses_of_nerfstudio(mine: Path) -> None:
+    """Each picture's own pose, and the vehicle's path made of them."""
+    reference = read_rig_recording(options(mine))
+    assert reference.trajectory is not None
+    to_vehicle = {camera.name: camera.to_vehicle for camera in reference.cameras}
+    expected, frames = {}, []
+    for picture in reference.pictures:
+        pose = reference.trajectory.at(np.array([picture.time_s]))[0] @ to_vehicle[picture.camera]
+        expected[picture.camera, picture.frame] = pose
+        # the right camera's last picture has no pose; names of another tool, with another suffix
+        if (picture.camera, picture.frame) != ("right", 4):
+            name = f"colmap/{picture.camera}/{picture.path.stem}.jpg"
+            matrix = pose @ np.diag([1.0, -1.0, -1.0, 1.0])
+            frames.append({"file_path": name, "transform_matrix": matrix.tolist()})
+    write_json(mine / "transforms.json", {"frames": frames})
+    edit(mine, ('file = "poses.txt"\nformat = "tum" ', 'file = "transforms.json"\nformat = "nerfstudio" '))
+    found = read_rig_recording(options(mine))
+    assert [(item.frame, item.camera, item.reason) for item in found.skipped] == [(4, "right", "no pose")]
+    assert len(found.pictures) == len(reference.pictures) - 1
+    for picture in found.pictures:
+        assert picture.camera_to_world is not None
+        assert picture.camera_to_world == pytest.approx(expected[picture.camera, picture.frame], abs=1e-9)
+    times = np.array([picture.time_s for picture in found.pictures if picture.camera == "left"])
+    assert found.trajectory is not None
+    assert found.trajectory.at(times) == pytest.approx(reference.trajectory.at(times), abs=1e-6)
+
+    frames[0]["file_path"] = frames[0]["file_path"].removeprefix("colmap/left/")
+    write_json(mine / "transforms.json", {"frames": frames[:2]})
+    with pytest.raises(InputError, match=r"000000\.?\w* fits .*Write more of the folders"):
+        write_json(mine / "transforms.json", {"frames": [{**frame, "file_path": "000000.png"} for frame in frames[:1]]})
+        read_rig_recording(options(mine))
+
+
+def test_a_moment_without_pose_or_scan_is_skipped(mine: Path) -> None:
+    lines = (mine / "poses.txt").read_text().splitlines(keepends=True)
+    early = [line for line in lines[1:] if float(line.split()[0]) < FIRST_S + 0.33]
+    (mine / "poses.txt").write_text("".join(early))
+    sorted((mine / "lidar").iterdir())[0].unlink()
+    sorted((mine / "lidar").iterdir())[0].unlink()
+    recording = read_rig_recording(options(mine))
+    assert [(item.frame, item.camera, item.reason) for item in recording.skipped] == [
+        (0, None, "no scan"),
+        (4, None, "before the first or after the last pose"),
+    ]
+    assert sorted({picture.frame for picture in recording.pictures}) == [1, 2, 3]
+
+
+def test_some_cameras_and_some_moments(mine: Path) -> None:
+    recording = read_rig_recording(options(mine, cameras=("front",), first=1, frames=2, stride=2))
+    assert [(picture.camera, picture.frame) for picture in recording.pictures] == [("front", 1), ("front", 3)]
+    assert [camera.name for camera in recording.cameras] == ["front"]
+    assert [sweep.frame for sweep in recording.sweeps] == [None, 1, None, 3, None]
+
+
+def test_cameras_of_different_rates(mine: Path) -> None:
+    """A camera of half the rate is in every other moment."""
+    for number in (1, 3):
+        (mine / f"images/front/{number:06d}.png").unlink()
+    lines = (mine / "times_front.txt").read_text().splitlines()
+    (mine / "times_front.txt").write_text("\n".join(lines[::2]))
+    frames = {name: [] for name in ("left", "right", "front")}
+    for picture in read_rig_recording(options(mine)).pictures:
+        frames[picture.camera].append(picture.frame)
+    assert frames == {"left": [0, 1, 2, 3, 4], "right": [0, 1, 2, 3, 4], "front": [0, 2, 4]}
+
+
+def test_times_by_name_and_by_rate(mine: Path) -> None:
+    lines = (mine / "times_left.txt").read_text().split()
+    named = [f"{number:06d}.png {time}" for number, time in enumerate(lines)]
+    (mine / "times_left.txt").write_text("\n".join(reversed(named)))
+    edit(mine, ('times_file = "times_right.txt"', f"rate_hz = 10\ntime_offset_s = {FIRST_S}"))
+    for picture in read_rig_recording(options(mine)).pictures:
+        moment = FIRST_S + 0.1 * picture.frame
+        assert abs(picture.time_s - moment) < 0.0121
+
+
+def test_options_bring_masks_and_monocular_maps(mine: Path) -> None:
+    for kind in ("moving", "depth"):
+        for name, size in (("left", (128, 128)), ("right", (128, 128)), ("front", (96, 128))):
+            for frame in range(FRAMES):
+                values = np.full(size, 255, np.uint8 if kind == "moving" else np.uint16)
+                (mine / kind / name).mkdir(parents=True, exist_ok=True)
+                write_png(mine / kind / name / f"{frame:010d}.png", values)
+    recording = read_rig_recording(options(mine, frame_masks=mine / "moving", mono=mine / "depth"))
+    for picture in recording.pictures:
+        assert picture.mask == mine / f"moving/{picture.camera}/{picture.frame:010d}.png"
+        assert picture.mono == mine / f"depth/{picture.camera}/{picture.frame:010d}.png"
+    (mine / "moving/front/0000000003.png").unlink()
+    with pytest.raises(FileNotFoundError, match=r"front/0000000003\.png: no such file; --frame-masks needs one"):
+        read_rig_recording(options(mine, frame_masks=mine / "moving"))
+
+
+def test_z_depth_maps_in_place_of_lidar(mine: Path, drive: Path) -> None:
+    """Millimetres along the axis become distance along the ray, here against the true distances."""
+    recording = read_rig_recording(options(mine))
+    for camera in recording.cameras:
+        directions, valid = camera.camera.unproject(camera.camera.pixel_centres())
+        cosine = np.where(valid.numpy(), directions[..., 2].numpy(), 0)
+        for frame in range(FRAMES):
+            truth = read_distance_png(drive / f"truth/{camera.name}/distance/{frame:06d}.png")
+            counts = np.rint(truth * np.clip(cosine, 0, None) * 1000)
+            (mine / "depth" / camera.name).mkdir(parents=True, exist_ok=True)
+            write_png(
+                mine / f"depth/{camera.name}/{frame:06d}.png", np.where(counts > 65535, 0, counts).astype(np.uint16)
+            )
+    content = (mine / "rig.toml").read_text()
+    content = content[: content.index("[lidars.roof]")]
+    for name in ("left", "right", "front"):
+        line = f'depth = {{files = "depth/{name}", kind = "z_depth", metres_per_count = 0.001}}\n'
+        content = content.replace(f"[cameras.{name}]\n", f"[cameras.{name}]\n{line}")
+    (mine / "rig.toml").write_text(content)
+    report = process_rig(options(mine, frames=2, holdout_every=2), Console(quiet=True))
+    for name in ("left", "front"):
+        distance = read_distance_png(report.scene / f"lidar/{name}/0000000000.png")
+        truth = read_distance_png(drive / f"truth/{name}/distance/000000.png")
+        both = (distance > 0) & (truth > 0)
+        assert both.mean() > 0.3
+        # half a millimetre along the axis is some centimetres along a ray that is nearly at right angles to it
+        assert np.quantile(np.abs(distance[both] - truth[both]), 0.99) < 0.06
+        assert np.median(np.abs(distance[both] - truth[both])) < 0.004
+
+
+# ---- what is wrong is said -------------------------------------------------------------------------------------
+
+
+LEFT = '[cameras.left]\nimages = "images/left"'
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("fx = 33.9625035468\n", "", r"rig\.toml: cameras\.left\.fx is missing; expected a number above 0"),
+        ("fx = 33.9625035468", "fx = '33.9'", r"cameras\.left\.fx is '33\.9', expected a number above 0"),
+        ("fx = 33.9625035468", "fx = 0", r"cameras\.left\.fx is 0, expected a number above 0"),
+        ("fx = 33.9625035468", "fx = true", r"cameras\.left\.fx is True, expected a number"),
+        ("fx = 33.9625035468", "fx = nan", r"cameras\.left\.fx is nan, expected a number"),
+        ("fx = 33.9625035468", "fxx = 33.9", r"cameras\.left\.fx is missing.*Is fxx meant"),
+        ("cx = 64.396", "cx = 643.96", r"cameras\.left\.cx is 643\.96, expected a pixel within the picture, 0 to 128"),
+        ("width = 128", "width = 128.5", r"cameras\.left\.width is 128\.5, expected a whole number from 1"),
+        ("width = 128", "width = 96", r"000000\.png: 128×128 pixels, but its camera's calibration says 96×128"),
+        ("k4 = 8e-05", "k5 = 8e-05", r"cameras\.left\.k5: unknown key; known are model, .*k4"),
+        ('model = "pinhole"', 'model = "fisheye"', r"cameras\.front\.model is 'fisheye', expected one of 'mei'"),
+        ("xi = 1.2\n", "", r"cameras\.right\.xi is missing"),
+        ("xi = 1.2", "xi = -1.2", r"cameras\.right\.model: MEI camera: xi is -1\.2, expected more than -1"),
+        ('times_file = "times_left.txt"', "", r"cameras\.left\.times_file: expected one of .*found none"),
+        ('times_file = "times_left.txt"', 'times_file = "t"\nrate_hz = 10', "found times_file and rate_hz"),
+        ('time_unit = "ns"', 'time_unit = "minutes"', r"lidars\.roof\.time_unit is 'minutes'"),
+        ("timestamp =", "time_stamp =", r"lidars\.roof\.timestamp is missing"),
+        ("turn_s = 0.1", "", r"lidars\.roof\.turn_s is missing; timestamp says nothing without it"),
+        (
+            "turn_s = 0.1",
+            'turn_s = 0.1\ndirection = "clockwise"',
+            r"lidars\.roof\.direction: points with times of their",
+        ),
+        ('column = "t", unit', 'column = "t", units', r"lidars\.roof\.point_times\.units: unknown key; Is unit meant"),
+        ("-0.9902680687", "0.9902680687", r"cameras\.left\.to_vehicle: not a rotation and a translation"),
+        ("0.0348994967", "0.5", r"cameras\.left\.to_vehicle: not a rotation"),
+        (
+            "[0.0, -0.9902680687, -0.139173101, 1.07],",
+            "",
+            r"cameras\.left\.to_vehicle: not a rotation and a translation",
+        ),
+        (
+            "quaternion = [0.0, 0.0,",
+            "quaternion = [0.0, 1.0,",
+            r"lidars\.roof\.to_vehicle: the quaternion .* length 1\.41",
+        ),
+        (
+            "translation = [0.8, 0.02, 0.84]",
+            "translation = [0.8]",
+            r"to_vehicle\.translation is \[0\.8\], expected 3 num",
+        ),
+        ('format = "tum"', 'format = "tum2"', r"poses\.format is 'tum2', expected one of 'tum', 'kitti'"),
+        ('format = "tum"', 'format = "tum"\nof = "roo"', r"poses\.of is 'roo', expected one of 'vehicle', 'left'"),
+        ('format = "tum"', 'format = "kitti"\nrate_hz = 10', r"poses\.txt, line 2: 8 numbers, expected 12"),
+        ("[poses]", "[pose]", r"rig\.toml: pose: unknown key; Is poses meant\?"),
+        ("[lidars.roof]", "[lidars.left]", "left is the name of a camera and of a scanner"),
+        ("[cameras.left]", "[cameras.'a/b']", r"cameras\.a/b: a sensor's name is letters"),
+        ("[poses]", "[poses", r"rig\.toml: not valid TOML \(.*line 1"),
+        ('"images/left"', '"images/lift"', r"images/lift: no such folder; the rig file names it"),
+        ('"images/left"', '"images/left/*.jpeg"', r"\*\.jpeg: no file has such a name"),
+        (
+            'scans = "lidar"',
+            'scans = "images/front"',
+            r"images/front: files of unknown format, such as 000000\.png.*\.pcd",
+        ),
+        ('column = "t"', 'column = "time"', r"\.pcd: has no column time, only x, y, z, intensity, t"),
+        (
+            LEFT,
+            LEFT + '\ndepth = {files = "mono/left", kind = "z_depth", metres_per_count = 0.001}',
+            r"depth maps take the place of LiDAR",
+        ),
+    ],
+)
+def test_a_wrong_rig_file_is_named(mine: Path, old: str, new: str, message: str) -> None:
+    # without the page's comments, so that whole lines can be exchanged
+    (mine / "rig.toml").write_text(re.sub(r" +# [^\n]*", "", (mine / "rig.toml").read_text()))
+    with pytest.raises((InputError, FileNotFoundError), match=message):
+        read_rig_recording(options(edit(mine, (old, new))))
+
+
+def move_times(root: Path, by_s: float) -> None:
+    for name in ("left", "right", "front"):
+        path = root / f"times_{name}.txt"
+        path.write_text("".join(f"{float(line) + by_s:.6f}\n" for line in path.read_text().split()))
+
+
+def spoil_scan(content: Callable[[bytes], bytes]) -> Callable[[Path], None]:
+    def spoil(root: Path) -> None:
+        path = sorted((root / "lidar").iterdir())[1]
+        path.write_bytes(content(path.read_bytes()))
+
+    return spoil
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (
+            lambda root: move_times(root, -1e9),
+            r"times of left and roof do not overlap: left has 369730762\.123 to 369730762\.523 s, roof 1369730762\.073",
+        ),
+        (
+            lambda root: (root / "poses.txt").write_text("5 0 0 0 0 0 0 1\n6 0 0 0 0 0 0 1\n"),
+            "left and the poses do not",
+        ),
+        (
+            lambda root: (root / "poses.txt").write_text("5 0 0 0 0 0 0 1\n"),
+            r"poses\.txt: 1 pose, expected two at least",
+        ),
+        (lambda root: (root / "poses.txt").write_text("# nothing\n"), r"poses\.txt: 0 poses, expected two at least"),
+        (lambda root: (root / "poses.txt").unlink(), r"poses\.txt: no such file"),
+        (
+            lambda root: (root / "times_left.txt").write_text("1\n2\n"),
+            "times_left.txt: 2 times, but .*left has 5 files",
+        ),
+        (
+            lambda root: (root / "times_left.txt").write_text("1\n1\n1\n1\n1\n"),
+            r"000001\.png and 000000\.png have the same time, 1\.0",
+        ),
+        (lambda root: (root / "images/left/000002.png").write_bytes(b"no"), r"left/000002\.png: not a PNG"),
+        (
+            lambda root: (root / "mono/left/000002.png").unlink(),
+            r"mono/left/000002\.png: no such file; cameras\.left\.mono",
+        ),
+        (
+            lambda root: shutil.copy(root / "masks/left.png", root / "mono/left/000002.png"),
+            "expected a 16-bit grey PNG",
+        ),
+        (spoil_scan(lambda content: b""), r"\.pcd: an empty file, expected a scan"),
+        (spoil_scan(lambda content: content[:-3]), r"\.pcd: .* the file is truncated"),
+        (
+            spoil_scan(lambda content: re.sub(rb"(WIDTH|POINTS) \d+", rb"\1 0", content)),
+            r"\.pcd: a scan without points",
+        ),
+        (lambda root: (root / "masks/left.png").unlink(), r"masks/left\.png: no such file"),
+        (
+            lambda root: shutil.copy(root / "masks/left.png", root / "masks/front.png"),
+            r"front\.png: 128×128 pixels, but",
+        ),
+        (lambda root: shutil.copy(root / "rig.toml", root / "rig.json"), "found rig.toml and rig.json"),
+        (lambda root: (root / "rig.toml").unlink(), "expected rig.toml or rig.json in it, found neither"),
+    ],
+)
+def test_a_wrong_recording_is_named(mine: Path, spoil: Callable[[Path], object], message: str) -> None:
+    spoil(mine)
+    with pytest.raises((InputError, FileNotFoundError), match=message):
+        read_rig_recording(options(mine))
+
+
+def test_a_scan_of_nan_is_an_error_when_it_is_read(mine: Path) -> None:
+    path = sorted((mine / "lidar").iterdir())[1]
+    head, _, points = path.read_bytes().partition(b"DATA binary\n")
+    nothing = struct.pack("<ffffI", math.nan, math.nan, math.nan, 0, 0)
+    path.write_bytes(head + b"DATA binary\n" + nothing * (len(points) // len(nothing)))
+    with pytest.raises(InputError, match=rf"{path.name}: none of its \d+ points can be used"):
+        process_rig(options(mine, sweeps=0), Console(quiet=True))
+    # some NaN among the points are left out and counted
+    path.write_bytes(head + b"DATA binary\n" + nothing * 7 + points[7 * len(nothing) :])
+    report = process_rig(options(mine, sweeps=0), Console(quiet=True))
+    assert any(notice.startswith("7 LiDAR points left out") for notice in report.notices)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"cameras": ("middle",)}, r"--cameras middle: .* no such camera, only left, right, front"),
+        ({"first": 9}, "--first 9: reaches moment 9, but the recording has moments 0 to 4"),
+        ({"frames": 9}, "--first 0 --frames 9 --stride 1: reaches moment 8"),
+        ({"stride": 0}, "--stride 0"),
+        ({"root": Path("nowhere")}, "nowhere: no such folder"),
+        ({"rig": Path("nowhere.toml")}, r"nowhere\.toml: no such file"),
+    ],
+)
+def test_wrong_options_are_named(mine: Path, changes: dict, message: str) -> None:
+    with pytest.raises((InputError, FileNotFoundError), match=message):
+        read_rig_recording(replace(options(mine), **changes))
+
+
+def test_without_poses_it_says_what_to_do(mine: Path) -> None:
+    content = (mine / "rig.toml").read_text()
+    (mine / "rig.toml").write_text(content[content.index("[cameras.left]") :])
+    with pytest.raises(InputError, match=r"has no table \[poses\].*--poses colmap"):
+        read_rig_recording(options(mine))
+    recording = read_rig_recording(options(mine, poses="colmap"))
+    assert recording.trajectory is None and len(recording.pictures) == 15
+
+
+def test_jpegs_and_patterns(mine: Path) -> None:
+    import cv2
+
+    for path in sorted((mine / "images/front").iterdir()):
+        cv2.imwrite(str(mine / f"front_{int(path.stem)}.jpg"), read_image(path)[..., ::-1])
+    edit(mine, ('images = "images/front"', 'images = "front_*.jpg"'), ('mono = "mono/front"\n', ""))
+    recording = read_rig_recording(options(mine, cameras=("front",)))
+    assert [picture.path.name for picture in recording.pictures] == [f"front_{number}.jpg" for number in range(FRAMES)]
+    (mine / "front_3.jpg").write_bytes(b"\xff\xd8\xff")
+    with pytest.raises(InputError, match=r"front_3\.jpg: not a picture"):
+        read_rig_recording(options(mine, cameras=("front",)))
