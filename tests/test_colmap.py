@@ -1,0 +1,516 @@
+import contextlib
+import dataclasses
+import functools
+import math
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from alignment import umeyama
+from drives import MeiTwin
+from rich.console import Console
+from scipy.spatial.transform import Rotation
+
+from edge_depth_nerf.cameras import MEI, KannalaBrandt, Pinhole
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.files import read_mask, write_distance_png, write_mask, write_png
+from edge_depth_nerf.lidar import Sweep, SweepTiming
+from edge_depth_nerf.process.colmap_models import ColmapModel, SparseView, colmap_lens
+from edge_depth_nerf.process.colmap_poses import NOT_REGISTERED, colmap_poses
+from edge_depth_nerf.process.colmap_scale import join_models, metric_path
+from edge_depth_nerf.process.kitti360 import read_kitti360
+from edge_depth_nerf.process.options import Kitti360Options, ProcessOptions
+from edge_depth_nerf.process.recording import DepthFile, RecordedCamera, RecordedPicture, RecordedSweep, Recording
+from edge_depth_nerf.synthetic.drive import synthesize_drive
+from edge_depth_nerf.synthetic.options import SynthesizeOptions
+
+QUIET = Console(quiet=True)
+
+# ---- lenses ----------------------------------------------------------------------------------------------------
+
+
+def rays_within(degrees: float, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    theta, phi = np.radians(rng.uniform(0, degrees, 500)), rng.uniform(0, 2 * np.pi, 500)
+    return np.stack((np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)), -1)
+
+
+def kannala_brandt_twin(c: KannalaBrandt, rays: np.ndarray) -> np.ndarray:
+    theta = np.arccos(rays[:, 2])
+    x, y = rays[:, :2].T / np.hypot(*rays[:, :2].T) * theta
+    r2 = x * x + y * y
+    radial = 1 + c.k1 * r2 + c.k2 * r2**2 + c.k3 * r2**3 + c.k4 * r2**4
+    u = x * radial + 2 * c.p1 * x * y + c.p2 * (r2 + 2 * x * x)
+    v = y * radial + c.p1 * (r2 + 2 * y * y) + 2 * c.p2 * x * y
+    return np.stack((c.fx * u + c.cx, c.fy * v + c.cy), -1)
+
+
+def pinhole_twin(c: Pinhole, rays: np.ndarray) -> np.ndarray:
+    x, y = rays[:, :2].T / rays[:, 2]
+    r2 = x * x + y * y
+    radial = 1 + c.k1 * r2 + c.k2 * r2**2 + c.k3 * r2**3
+    u = x * radial + 2 * c.p1 * x * y + c.p2 * (r2 + 2 * x * x)
+    v = y * radial + c.p1 * (r2 + 2 * y * y) + 2 * c.p2 * x * y
+    return np.stack((c.fx * u + c.cx, c.fy * v + c.cy), -1)
+
+
+@pytest.mark.parametrize("name", ["image_02", "image_03", "kannala_brandt", "pinhole"])
+def test_colmap_projects_as_the_camera_does(name):
+    pycolmap = pytest.importorskip("pycolmap")
+    if name == "kannala_brandt":
+        camera = KannalaBrandt(640, 480, 200.0, 201.0, 322.5, 238.0, -0.01, 0.008, -0.002, 1e-4, 3e-3, -2e-3)
+        rays, tolerance_px = rays_within(84), 1e-9
+        expected = kannala_brandt_twin(camera, rays)
+    elif name == "pinhole":
+        camera = Pinhole(640, 480, 500.0, 510.0, 322.5, 238.0, -0.2, 0.05, 1e-3, -2e-3, 0.01)
+        rays, tolerance_px = rays_within(35), 1e-9
+        expected = pinhole_twin(camera, rays)
+    else:
+        twin = MeiTwin.kitti360(name, 350)
+        numbers = (twin.gamma1, twin.gamma2, twin.u0 + 0.5, twin.v0 + 0.5, twin.xi, twin.k1, twin.k2, twin.p1, twin.p2)
+        camera = MEI(350, 350, *map(float, numbers))
+        # no COLMAP model is MEI: the nearest one is fitted
+        rays, tolerance_px = rays_within(84), 0.02
+        expected = twin.project(rays) + 0.5
+    lens = colmap_lens(camera)
+    assert lens.rms_px < tolerance_px
+    theirs = pycolmap.Camera(model=lens.model, width=camera.width, height=camera.height, params=list(lens.parameters))
+    np.testing.assert_allclose(np.array(theirs.img_from_cam(rays)), expected, rtol=0, atol=tolerance_px)
+
+
+# ---- the path in metres ----------------------------------------------------------------------------------------
+
+SPEED_M_S = 10.0
+LEVER = {"left": (0.7, -0.3, -1.0), "right": (0.5, 0.9, -1.1)}
+
+
+def looking(name: str) -> np.ndarray:
+    """Camera to vehicle (x forward, y right, z down), looking left or right."""
+    to_vehicle = np.eye(4)
+    z = np.array([0.1, -1.0, 0.05]) if name == "left" else np.array([-0.1, 1.0, 0.0])
+    z /= np.linalg.norm(z)
+    x = np.cross([0, 0, 1.0], z)
+    x /= np.linalg.norm(x)
+    to_vehicle[:3, :3] = np.stack((x, np.cross(z, x), z), -1)
+    to_vehicle[:3, 3] = LEVER[name]
+    return to_vehicle
+
+
+def true_pose(time_s: np.ndarray | float) -> np.ndarray:
+    """Vehicle to world: a bend, z down, some pitch."""
+    time_s = np.asarray(time_s, float)
+    yaw = 0.25 * time_s
+    rotation = Rotation.from_euler("xyz", np.stack((np.pi + 0 * yaw, 0.01 * np.sin(3 * time_s), yaw), -1)).as_matrix()
+    pose = np.zeros((*time_s.shape, 4, 4))
+    pose[..., :3, :3], pose[..., 3, 3] = rotation, 1
+    pose[..., 0, 3] = SPEED_M_S / 0.25 * np.sin(yaw)
+    pose[..., 1, 3] = -SPEED_M_S / 0.25 * np.cos(yaw)
+    pose[..., 2, 3] = 0.93
+    return pose
+
+
+def recording(moments: int, cameras=("left", "right"), sweeps=()) -> Recording:
+    lens = KannalaBrandt(300, 300, 90.0, 90.0, 150.0, 150.0, 0.0, 0.0, 0.0, 0.0)
+    return Recording(
+        cameras=tuple(RecordedCamera(name, lens, looking(name)) for name in cameras),
+        # the right camera fires 4 ms after the left
+        pictures=tuple(
+            RecordedPicture(name, frame, Path(f"{name}/{frame}.png"), 0.1 * frame + 0.004 * number)
+            for frame in range(moments)
+            for number, name in enumerate(cameras)
+        ),
+        sweeps=tuple(sweeps),
+        trajectory=None,
+        source={},
+    )
+
+
+def model_of(recording: Recording, indices, metres_per_unit: float, seed: int, points=None, noise=0.0) -> ColmapModel:
+    """What COLMAP would find: true poses and points in a world and a unit of their own."""
+    rng = np.random.default_rng(seed)
+    world_to_model = np.eye(4)
+    world_to_model[:3, :3] = Rotation.from_rotvec(rng.normal(size=3)).as_matrix()
+    world_to_model[:3, 3] = rng.normal(size=3) * 50
+    to_vehicle = {camera.name: camera.to_vehicle for camera in recording.cameras}
+    poses, views = {}, {}
+    for index in indices:
+        picture = recording.pictures[index]
+        pose = true_pose(picture.time_s) @ to_vehicle[picture.camera]
+        if points is not None:
+            seen = (points - pose[:3, 3]) @ pose[:3, :3]
+            distance = np.linalg.norm(seen, axis=-1)
+            wanted = seen[:, 2] > 0.1 * distance
+            error = 1 + noise * rng.standard_normal(wanted.sum())
+            views[index] = SparseView(seen[wanted] / distance[wanted, None], distance[wanted] / metres_per_unit * error)
+        pose = world_to_model @ pose
+        pose[:3, 3] /= metres_per_unit
+        poses[index] = pose
+    return ColmapModel(poses, views, 0 if points is None else len(points), 0.3)
+
+
+def worst_deviation_m(path, recording) -> float:
+    """How far the path lies from the true one, after a rigid motion."""
+    found = path.trajectory.vehicle_to_world
+    true = true_pose(path.trajectory.times_s)
+    to_true = true[0] @ np.linalg.inv(found[0])
+    return float(np.abs(to_true @ found - true).max())
+
+
+def test_models_without_a_common_view_are_joined_by_the_rig():
+    drive = recording(20)
+    left = [i for i, picture in enumerate(drive.pictures) if picture.camera == "left"]
+    right = [i for i, picture in enumerate(drive.pictures) if picture.camera == "right"]
+    # the right camera is lost halfway, and what is seen then has two moments in common: too few
+    models = [
+        model_of(drive, left[:16], 2.5, seed=1),
+        model_of(drive, right[:12], 0.4, seed=2),
+        model_of(drive, right[14:], 7.0, seed=3),
+    ]
+    # the second one's scale is off by 1 %: the first one's counts
+    path = join_models(drive, models, [2.5, 0.404, 7.0])
+    assert sorted(path.moments) == list(range(16))
+    assert path.scales == pytest.approx((2.5, 0.4), rel=2e-4)
+    # 10 m/s for 4 ms are 4 cm
+    assert worst_deviation_m(path, drive) < 1e-2
+    assert path.disagreement_m < 5e-3
+
+    # joined, where the third has more in common
+    models[2] = model_of(drive, right[12:], 7.0, seed=3)
+    path = join_models(drive, models, [2.5, 0.4, 7.0])
+    assert sorted(path.moments) == list(range(20))
+    assert worst_deviation_m(path, drive) < 1e-2
+
+
+def test_cameras_of_one_model_are_averaged():
+    drive = recording(12)
+    model = model_of(drive, range(24), 3.0, seed=4)
+    wrong = 11  # the right camera at moment 5, moved by 10 cm
+    model.camera_to_model[wrong] = model.camera_to_model[wrong].copy()
+    model.camera_to_model[wrong][:3, 3] += np.array([0.1, 0, 0]) / 3.0
+    path = join_models(drive, [model], [3.0])
+    true = true_pose(path.trajectory.times_s)
+    found = (true[0] @ np.linalg.inv(path.trajectory.vehicle_to_world[0])) @ path.trajectory.vehicle_to_world
+    apart = np.linalg.norm((found - true)[:, :3, 3], axis=-1)
+    assert apart[5] == pytest.approx(0.05, abs=3e-3)
+    assert np.delete(apart, 5).max() < 3e-3
+
+
+def wall_points(count: int, seed: int) -> np.ndarray:
+    """Points on four walls around the bend."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform((-25, -50, 0), (30, 0, 4), (count, 3))
+    side = rng.integers(0, 3, count)
+    points[:, 1] = np.where(side == 0, -50.0, np.where(side == 1, 0.0, points[:, 1]))
+    points[:, 0] = np.where(side == 2, 30.0, points[:, 0])
+    return points
+
+
+def turning_scanner(frame: int, points: np.ndarray, behind: float = 0.0) -> RecordedSweep:
+    """A sweep of the points, each measured from where the vehicle is when the laser faces it; some from behind."""
+    to_vehicle = np.diag([1.0, -1.0, -1.0, 1.0])
+    to_vehicle[:3, 3] = (0.0, 0.1, -0.8)
+    timing = SweepTiming(0.1)
+    offset = np.zeros(len(points))
+    local = points
+    for _ in range(8):
+        # when it is measured depends on where it is seen, and the other way round
+        world_to_scanner = np.linalg.inv(true_pose(0.1 * frame + offset) @ to_vehicle)
+        local = np.einsum("nij,nj->ni", world_to_scanner[:, :3, :3], points) + world_to_scanner[:, :3, 3]
+        azimuth = np.arctan2(local[:, 1], local[:, 0])
+        offset = -azimuth / (2 * np.pi) * 0.1
+    rng = np.random.default_rng(frame)
+    local = local * np.where(rng.random(len(local)) < behind, rng.uniform(1.2, 2, len(local)), 1.0)[:, None]
+    sweep = Sweep(torch.from_numpy(local), torch.ones(len(local), dtype=torch.float64), 0, 0)
+    return RecordedSweep(
+        Path(f"{frame}.bin"), 0.1 * frame, frame, "scanner", to_vehicle, functools.partial(lambda s: s, sweep), timing
+    )
+
+
+def cloud_around(features: np.ndarray, seed: int) -> np.ndarray:
+    """Four returns beside each feature, on its wall."""
+    rng = np.random.default_rng(seed)
+    near = np.repeat(features, 4, axis=0) + rng.uniform(-0.03, 0.03, (4 * len(features), 3))
+    for axis, at in ((1, -50.0), (1, 0.0), (0, 30.0)):
+        near[np.repeat(features[:, axis] == at, 4), axis] = at
+    return near
+
+
+def test_the_scale_is_that_of_lidar_moved_by_the_path():
+    features = wall_points(150, seed=5)
+    cloud = cloud_around(features, seed=6)
+    drive = recording(12, sweeps=[turning_scanner(frame, cloud) for frame in range(12)])
+    left = [i for i, picture in enumerate(drive.pictures) if picture.camera == "left"]
+    right = [i for i, picture in enumerate(drive.pictures) if picture.camera == "right"]
+    models = [
+        model_of(drive, left, 2.5, seed=1, points=features, noise=0.02),
+        model_of(drive, right, 0.4, seed=2, points=features, noise=0.02),
+    ]
+    path, scale = metric_path(drive, models)
+    assert scale.ratio == pytest.approx(2.5, rel=3e-3)
+    # the quartiles of a normal distribution lie 0.674 deviations from its middle
+    assert scale.spread == pytest.approx(0.674 * 0.02, rel=0.25)
+    assert scale.pairs > 500
+    assert worst_deviation_m(path, drive) < 0.005 * SPEED_M_S * 1.1
+
+    # the sweeps' timing is what makes it so: what lies ahead seems too far, what lies behind too near
+    exact = [
+        model_of(drive, left, 2.5, seed=1, points=features),
+        model_of(drive, right, 0.4, seed=2, points=features),
+    ]
+    still = dataclasses.replace(drive, sweeps=tuple(dataclasses.replace(s, timing=None) for s in drive.sweeps))
+    assert metric_path(still, exact)[1].spread > 5 * metric_path(drive, exact)[1].spread
+
+
+def test_returns_that_see_past_an_edge_do_not_count():
+    features = wall_points(150, seed=5)
+    # a fifth of the returns lie behind what the feature is on
+    sweeps = [turning_scanner(frame, cloud_around(features, seed=6), behind=0.2) for frame in range(12)]
+    drive = recording(12, cameras=("left",), sweeps=sweeps)
+    model = model_of(drive, range(12), 2.5, seed=1, points=features)
+    _, scale = metric_path(drive, [model])
+    assert scale.ratio == pytest.approx(2.5, rel=2e-3)
+    assert scale.spread < 0.005
+
+
+def test_the_scale_can_come_from_depth_maps(tmp_path):
+    features = wall_points(400, seed=7)
+    drive = recording(6, cameras=("left",))
+    kept = []
+    for picture in drive.pictures:
+        camera = drive.cameras[0]
+        pose = true_pose(picture.time_s) @ camera.to_vehicle
+        rays, valid = camera.camera.unproject(camera.camera.pixel_centres())
+        world = rays.numpy() @ pose[:3, :3].T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            reach = np.stack(
+                [(at - pose[axis, 3]) / world[..., axis] for axis, at in ((1, -50.0), (1, 0.0), (0, 30.0))]
+            )
+        distance = np.where(valid.numpy(), np.min(np.where(reach > 0, reach, np.inf), axis=0), 0)
+        # along the axis, in centimetres, as other sensors write it
+        z_depth = np.where(rays.numpy()[..., 2] > 0.05, distance * rays.numpy()[..., 2], 0)
+        path = tmp_path / f"{picture.frame}.png"
+        write_distance_png(path, z_depth * 100 / 256)
+        kept.append(dataclasses.replace(picture, depth=DepthFile(path, 0.01, "z_depth")))
+    drive = dataclasses.replace(drive, pictures=tuple(kept))
+    _, scale = metric_path(drive, [model_of(drive, range(6), 1.7, seed=1, points=features)])
+    assert scale.ratio == pytest.approx(1.7, rel=3e-3)
+
+
+def test_too_few_returns_beside_points_are_an_error():
+    features = wall_points(4, seed=5)
+    drive = recording(6, cameras=("left",), sweeps=[turning_scanner(f, cloud_around(features, 6)) for f in range(6)])
+    with pytest.raises(InputError, match=r"only \d+ of COLMAP's points have a LiDAR return beside them, expected 30"):
+        metric_path(drive, [model_of(drive, range(6), 2.5, seed=1, points=features)])
+
+
+# ---- errors before the work ------------------------------------------------------------------------------------
+
+
+def pictured(folder: Path, moments: int, size: int = 64) -> Recording:
+    """Black pictures with a sweep each."""
+    drive = recording(moments, sweeps=[turning_scanner(f, wall_points(50, f)) for f in range(moments)])
+    lens = KannalaBrandt(size, size, 20.0, 20.0, size / 2, size / 2, 0.0, 0.0, 0.0, 0.0)
+    pictures = []
+    for picture in drive.pictures:
+        path = folder / picture.path
+        write_png(path, np.zeros((size, size, 3), np.uint8))
+        pictures.append(dataclasses.replace(picture, path=path))
+    cameras = tuple(dataclasses.replace(camera, camera=lens) for camera in drive.cameras)
+    return dataclasses.replace(drive, cameras=cameras, pictures=tuple(pictures))
+
+
+def test_a_missing_package_is_named_with_the_command(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with pytest.raises(InputError, match=r"pip install edge-depth-nerf\[colmap\]"):
+        colmap_poses(recording(12), ProcessOptions(output=tmp_path / "scene"), QUIET)
+
+
+def test_two_pictures_are_too_few(tmp_path):
+    pytest.importorskip("pycolmap")
+    with pytest.raises(InputError, match="2 pictures, expected 3 or more"):
+        colmap_poses(recording(1), ProcessOptions(output=tmp_path / "scene"), QUIET)
+
+
+def test_without_lidar_there_is_no_scale(tmp_path):
+    pytest.importorskip("pycolmap")
+    with pytest.raises(InputError, match="none of the pictures has a LiDAR sweep or a depth map"):
+        colmap_poses(recording(12), ProcessOptions(output=tmp_path / "scene"), QUIET)
+    assert not list(tmp_path.iterdir())
+
+
+def test_foreign_files_are_left_alone(tmp_path):
+    pytest.importorskip("pycolmap")
+    foreign = tmp_path / ".scene.colmap" / "thesis.txt"
+    foreign.parent.mkdir()
+    foreign.write_text("dear")
+    with pytest.raises(InputError, match="holds other files"):
+        colmap_poses(pictured(tmp_path / "raw", 3), ProcessOptions(output=tmp_path / "scene"), QUIET)
+    assert foreign.read_text() == "dear"
+
+
+def test_a_mask_of_another_size_is_named(tmp_path):
+    pytest.importorskip("pycolmap")
+    write_mask(tmp_path / "ego.png", np.ones((32, 64), bool))
+    options = ProcessOptions(output=tmp_path / "scene", ego_mask=tmp_path / "ego.png")
+    with pytest.raises(InputError, match=r"ego\.png: 64x32 pixels, expected 64x64"):
+        colmap_poses(pictured(tmp_path / "raw", 3), options, QUIET)
+
+
+def test_pictures_without_features_are_an_error(tmp_path):
+    pytest.importorskip("pycolmap")
+    with pytest.raises(InputError, match="COLMAP found no poses for the 8 pictures of left, right"):
+        colmap_poses(pictured(tmp_path / "raw", 4), ProcessOptions(output=tmp_path / "scene"), QUIET)
+
+
+# ---- a drive ---------------------------------------------------------------------------------------------------
+
+FRAMES = 10
+SIZE = 256
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory) -> Path:
+    """A street; at moment 4 the right camera sees nothing, at the last one neither does."""
+    folder = tmp_path_factory.mktemp("colmap") / "street"
+    synthesize_drive(SynthesizeOptions(folder, "street", frames=FRAMES, size=SIZE))
+    pictures = folder / "data_2d_raw" / SynthesizeOptions(folder).sequence
+    for camera, frame in (("image_03", 4), ("image_02", FRAMES - 1), ("image_03", FRAMES - 1)):
+        write_png(pictures / camera / "data_rgb" / f"{frame:010d}.png", np.zeros((SIZE, SIZE, 3), np.uint8))
+    return folder
+
+
+def true_poses(drive: Path) -> dict[int, np.ndarray]:
+    rows = np.loadtxt(next(drive.glob("data_poses/*/poses.txt")))
+    return {int(row[0]): np.vstack((row[1:].reshape(3, 4), [0, 0, 0, 1])) for row in rows}
+
+
+@pytest.fixture(scope="module")
+def found(drive, tmp_path_factory) -> tuple[Kitti360Options, Recording]:
+    """The drive's poses found, without a look at those that come with it."""
+    pytest.importorskip("pycolmap")
+    blind = tmp_path_factory.mktemp("colmap") / "blind"
+    shutil.copytree(drive, blind, ignore=shutil.ignore_patterns("poses.txt", "cam0_to_world.txt", "shifted.json"))
+    options = Kitti360Options(
+        root=blind, sequence=SynthesizeOptions(drive).sequence, output=blind.parent / "scene", poses="colmap"
+    )
+    return options, colmap_poses(read_kitti360(options), options, QUIET)
+
+
+@pytest.mark.slow
+def test_poses_of_a_drive_are_metric_and_right(drive, found):
+    _, recording = found
+    truth = true_poses(drive)
+    to_vehicle = {camera.name: camera.to_vehicle for camera in recording.cameras}
+    true = np.stack([truth[p.frame] @ to_vehicle[p.camera] for p in recording.pictures])
+    poses = np.stack([p.camera_to_world for p in recording.pictures])
+    path_m = sum(np.linalg.norm(truth[f + 1][:3, 3] - truth[f][:3, 3]) for f in range(FRAMES - 2))
+    factor, error_m = umeyama(poses[:, :3, 3], true[:, :3, 3])
+    assert error_m.max() < 0.005 * path_m
+    assert abs(1 / factor - 1) < 0.01
+    # turns from one picture to the next, whatever the world
+    for a in range(0, len(poses) - 2, 2):
+        turned = poses[a][:3, :3].T @ poses[a + 2][:3, :3]
+        expected = true[a][:3, :3].T @ true[a + 2][:3, :3]
+        assert Rotation.from_matrix(turned.T @ expected).magnitude() < math.radians(0.3)
+    # z is up, the first pose the origin
+    assert recording.trajectory is not None
+    vehicle = recording.trajectory.vehicle_to_world
+    np.testing.assert_allclose(vehicle[0, :3, 3], 0, atol=1e-9)
+    up = np.stack([truth[f][2, :3] for f in range(FRAMES - 1)])
+    assert np.degrees(np.arccos((vehicle[:, 2, :3] * up).sum(-1))).max() < 1.5
+    assert vehicle[-1, 0, 3] == pytest.approx(path_m, rel=0.02)
+
+
+@pytest.mark.slow
+def test_pictures_that_cannot_be_registered_are_listed(found):
+    _, recording = found
+    assert [(s.frame, s.camera, s.reason) for s in recording.skipped] == [
+        (FRAMES - 1, "image_02", NOT_REGISTERED),
+        (FRAMES - 1, "image_03", NOT_REGISTERED),
+    ]
+    # the other camera of the moment was registered, and the rig is known
+    assert ("image_03", 4) in {(picture.camera, picture.frame) for picture in recording.pictures}
+    notices = " ".join(recording.notices)
+    assert (
+        f"COLMAP registered {2 * FRAMES - 3} of {2 * FRAMES} pictures, 1 more have their pose through the rig"
+        in notices
+    )
+    assert "m per unit, spread" in notices and "mean reprojection error 0." in notices
+
+
+@pytest.mark.slow
+def test_the_same_command_finds_the_work_done(found):
+    options, recording = found
+    folder = options.output.with_name(f".{options.output.name}.colmap")
+    assert not (folder / "database.db").exists()
+    made = (folder / "models").stat().st_mtime_ns
+    again = colmap_poses(read_kitti360(options), options, QUIET)
+    assert (folder / "models").stat().st_mtime_ns == made
+    assert again.trajectory is not None and recording.trajectory is not None
+    np.testing.assert_array_equal(again.trajectory.vehicle_to_world, recording.trajectory.vehicle_to_world)
+
+
+@pytest.mark.slow
+def test_an_interrupted_run_goes_on(found, tmp_path, monkeypatch):
+    import pycolmap
+
+    options, _ = found
+    options = dataclasses.replace(options, output=tmp_path / "scene", frames=4)
+    database = tmp_path / ".scene.colmap" / "database.db"
+
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    def features() -> list[int]:
+        with contextlib.closing(pycolmap.Database.open(database)) as opened:
+            return [opened.num_keypoints_for_image(image.image_id) for image in opened.read_all_images()]
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(pycolmap, "match_image_pairs", interrupted)
+        colmap_poses(read_kitti360(options), options, QUIET)
+    there = features()
+    assert min(there) > 20
+
+    extract, seen = pycolmap.extract_features, []
+
+    def watched(*arguments, **options):
+        seen.append(features())
+        extract(*arguments, **options)
+        seen.append(features())
+
+    monkeypatch.setattr(pycolmap, "extract_features", watched)
+    assert len(colmap_poses(read_kitti360(options), options, QUIET).pictures) == 8
+    assert seen == [there, there]
+
+    # other inputs, other work
+    write_mask(tmp_path / "ego.png", np.ones((SIZE, SIZE), bool))
+    masked = dataclasses.replace(options, ego_mask=tmp_path / "ego.png")
+    colmap_poses(read_kitti360(masked), masked, QUIET)
+    assert sum(seen[2]) == 0 < sum(seen[3])
+
+
+@pytest.mark.slow
+def test_masked_pixels_have_no_features(drive, found, tmp_path):
+    import pycolmap
+
+    options, _ = found
+    keep = np.zeros((SIZE, SIZE), bool)
+    keep[:, : SIZE // 2] = True
+    for name in ("image_02", "image_03"):
+        write_mask(tmp_path / "ego" / f"{name}.png", keep & read_mask(drive / "truth" / "masks" / f"{name}.png"))
+    options = dataclasses.replace(options, output=tmp_path / "scene", ego_mask=tmp_path / "ego", frames=5)
+    colmap_poses(read_kitti360(options), options, QUIET)
+    models = sorted((tmp_path / ".scene.colmap" / "models").iterdir())
+    pixels = np.concatenate(
+        [
+            [point.xy for point in image.points2D]
+            for model in models
+            for image in pycolmap.Reconstruction(model).images.values()
+            if image.num_points2D()
+        ]
+    )
+    assert len(pixels) > 200
+    assert pixels[:, 0].max() < SIZE // 2
