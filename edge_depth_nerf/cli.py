@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
 from edge_depth_nerf.demo_options import DemoOptions
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.process.options import Kitti360Options
+from edge_depth_nerf.inspect_options import InspectOptions
+from edge_depth_nerf.process.options import JbnuDepth360Options, Kitti360Options, RigOptions
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 
 
@@ -18,14 +19,18 @@ from edge_depth_nerf.synthetic.options import SynthesizeOptions
 class Process:
     """Turn a raw drive into a scene folder that nerfstudio trains on."""
 
-    dataset: tyro.conf.Positional[Literal["kitti360"]]
-    """Layout of the raw drive."""
-    options: Annotated[Kitti360Options, tyro.conf.arg(name="")]
+    options: Annotated[
+        Annotated[Kitti360Options, tyro.conf.subcommand("kitti360")]
+        | Annotated[JbnuDepth360Options, tyro.conf.subcommand("jbnu-depth360")]
+        | Annotated[RigOptions, tyro.conf.subcommand("rig")],
+        tyro.conf.arg(name=""),
+    ]
 
 
 Command = (
     Annotated[SynthesizeOptions, tyro.conf.subcommand("synthesize")]
     | Annotated[Process, tyro.conf.subcommand("process")]
+    | Annotated[InspectOptions, tyro.conf.subcommand("inspect")]
     | Annotated[DemoOptions, tyro.conf.subcommand("demo")]
 )
 
@@ -42,13 +47,30 @@ def run(command: Command) -> None:
 
         synthesize_drive(command)
     elif isinstance(command, Process):
-        from edge_depth_nerf.process.kitti360 import process_kitti360
+        _process(command.options)
+    elif isinstance(command, InspectOptions):
+        from edge_depth_nerf.inspecting import inspect_scene
 
-        process_kitti360(command.options)
+        inspect_scene(command)
     else:
         from edge_depth_nerf.demo import run_demo
 
         run_demo(command)
+
+
+def _process(options: Kitti360Options | JbnuDepth360Options | RigOptions) -> None:
+    if isinstance(options, Kitti360Options):
+        from edge_depth_nerf.process.kitti360 import process_kitti360
+
+        process_kitti360(options)
+    elif isinstance(options, JbnuDepth360Options):
+        from edge_depth_nerf.process.jbnu_depth360 import process_jbnu_depth360
+
+        process_jbnu_depth360(options)
+    else:
+        from edge_depth_nerf.process.rig import process_rig
+
+        process_rig(options)
 
 
 def main() -> None:

@@ -1,0 +1,233 @@
+"""`edge-depth-nerf inspect`: writes the pictures and summary.json, prints the figures and what to mend."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from edge_depth_nerf import __version__
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.files import read_json, write_json, write_png
+from edge_depth_nerf.inspect_options import InspectOptions
+from edge_depth_nerf.inspecting.figures import (
+    PictureFigures,
+    camera_figures,
+    map_figures,
+    measure,
+    measured_moments,
+    path_figures,
+)
+from edge_depth_nerf.inspecting.findings import find, limited
+from edge_depth_nerf.inspecting.reader import InspectedPicture, InspectedScene, read_scene
+from edge_depth_nerf.inspecting.sheets import draw_sheet
+from edge_depth_nerf.inspecting.top_view import draw_top_view
+
+SUMMARY = "summary.json"
+TOP_VIEW = "top_view.png"
+CAMERAS_IN_A_TABLE = 4
+"""More would not fit a terminal."""
+CAPTION = "mean (least to most); coverage of the pixels used; distances: median (5 to 95 %)"
+
+
+def inspect_scene(options: InspectOptions, console: Console | None = None) -> dict[str, Any]:
+    """Look at a scene: sheets of some frames, a view from above, figures, warnings.
+
+    Args:
+        options: which scene, where to, how much.
+        console: where progress, figures and warnings are shown.
+
+    Returns:
+        The content of summary.json.
+
+    Raises:
+        FileNotFoundError: no scene there.
+        InputError: the scene, a file of it, an option or the output folder cannot be used.
+
+    """
+    options.check()
+    console = console or Console()
+    scene = read_scene(options.scene)
+    points_m = scene.points_m()
+    folder = scene.folder.resolve()
+    output = options.output or folder.with_name(f"{folder.name}_inspection")
+    _open_output(output)
+
+    measured, shown = measured_moments(scene, options.frames)
+    chosen = [picture for picture in scene.pictures if picture.moment in set(measured)]
+    sheets = {picture.name: _sheet_name(picture) for picture in chosen if picture.moment in shown}
+    jobs = [
+        partial(_look_at, scene, picture, output / sheets[picture.name] if picture.name in sheets else None, options)
+        for picture in chosen
+    ]
+    figures = _run(jobs, console)
+
+    findings = find(scene, figures)
+    write_png(output / TOP_VIEW, draw_top_view(scene, points_m, findings, shown))
+    held_out = sum(picture.held_out for picture in scene.pictures)
+    summary = {
+        "made_by": f"edge-depth-nerf {__version__}",
+        "scene": str(folder),
+        "camera_model": scene.camera_model,
+        "lengths_are_metres": scene.own,
+        "moments": len(scene.moments()),
+        "pictures": len(scene.pictures),
+        "training": len(scene.pictures) - held_out if scene.split_known else None,
+        "held_out": held_out if scene.split_known else None,
+        "points": None if points_m is None else len(points_m),
+        "path": path_figures(scene),
+        "measured": _sample(len(figures), len(scene.pictures)),
+        "maps": map_figures(figures),
+        "cameras": {name: camera_figures(scene, name, figures) for name in scene.cameras()},
+        "warnings": [finding.to_dict() for finding in findings],
+        "frames": [one.to_dict() for one in figures],
+        "sheets": list(sheets.values()),
+    }
+    write_json(output / SUMMARY, summary)
+    _show(summary, console)
+    for line in limited(findings):
+        _say(console, f"Warning: {line}", "yellow")
+    _say(console, f"{output}: {len(sheets)} sheets, {TOP_VIEW}, {SUMMARY}")
+    return summary
+
+
+def _sample(measured: int, pictures: int) -> str:
+    return "all pictures" if measured == pictures else f"{measured} pictures spread evenly over the drive"
+
+
+def _open_output(output: Path) -> None:
+    """Make the folder; sheets of an earlier look are removed, so that none of another scene stays among the new."""
+    if output.exists() and not output.is_dir():
+        raise InputError(f"{output}: is a file; --output takes a folder.")
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        if (output / SUMMARY).is_file():
+            earlier = read_json(output / SUMMARY)
+            for name in earlier.get("sheets", ()) if isinstance(earlier, dict) else ():
+                if re.fullmatch(r"[\w.-]+\.png", str(name)):
+                    (output / name).unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(f"{output}: cannot be written ({error.strerror}). Give another --output.") from error
+
+
+def _sheet_name(picture: InspectedPicture) -> str:
+    return f"{re.sub(r'[^A-Za-z0-9_-]+', '_', picture.camera)}_{picture.moment:010d}.png"
+
+
+def _look_at(
+    scene: InspectedScene, picture: InspectedPicture, sheet: Path | None, options: InspectOptions
+) -> PictureFigures:
+    """Measure one picture, and draw its sheet if it is to be shown."""
+    maps = scene.maps(picture)
+    figures = measure(picture, maps)
+    if sheet is not None:
+        write_png(sheet, draw_sheet(scene, figures, maps, options.size))
+    return figures
+
+
+def _run(jobs: Sequence[partial[PictureFigures]], console: Console) -> list[PictureFigures]:
+    """Do all jobs, several at once, and give their results in order; the first error ends it."""
+    progress = Progress(
+        TextColumn("Looking at the pictures"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=console
+    )
+    # decoding and integrating leave Python's lock; a few threads keep memory small
+    with progress, ThreadPoolExecutor(min(os.cpu_count() or 1, 4)) as pool:
+        task = progress.add_task("", total=len(jobs))
+        futures = [pool.submit(job) for job in jobs]
+        try:
+            for future in as_completed(futures):
+                future.result()
+                progress.advance(task)
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+    return [future.result() for future in futures]
+
+
+# ---- the terminal ----------------------------------------------------------------------------------------------
+
+
+def _say(console: Console, text: str, style: str | None = None) -> None:
+    console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
+
+
+def _number(value: float | int | None, form: str, unit: str = "") -> str:
+    return "–" if value is None else format(value, form) + unit
+
+
+def _spread(values: dict[str, float] | None, form: str) -> str:
+    """Mean, with the smallest and largest in brackets."""
+    return "–" if values is None else "{mean:{0}} ({min:{0}} to {max:{0}})".format(form, **values)
+
+
+def _quantiles(values: dict[str, float] | None) -> str:
+    return "–" if values is None else "{median:.1f} m ({p5:.1f} to {p95:.1f})".format(**values)
+
+
+def _show(summary: dict[str, Any], console: Console) -> None:
+    path, unit = summary["path"], "m" if summary["lengths_are_metres"] else "units"
+    drive = Table("drive", "", title=summary["scene"], show_header=False)
+    split = "no split given"
+    if summary["held_out"] is not None:
+        split = f"{summary['training']} for training, {summary['held_out']} held out"
+    drive.add_row("pictures", f"{summary['pictures']} at {summary['moments']} moments: {split}")
+    drive.add_row("path", f"{path['length_m']:.1f} {unit} ({path['camera']})")
+    drive.add_row("spacing", f"{path['spacing_median_m']:.2f} {unit} (median), {path['spacing_max_m']:.2f} at most")
+    if path["duration_s"] is not None:
+        speeds = (_number(path[key], ".1f", " m/s") for key in ("speed_mean_mps", "speed_max_mps"))
+        drive.add_row("time", "{:.1f} s; {} on average, {} at most".format(path["duration_s"], *speeds))
+    drive.add_row("points.ply", _number(summary["points"], ",", " points"))
+    console.print(drive)
+
+    cameras = summary["cameras"]
+    names = list(cameras)
+    for first in range(0, len(names), CAMERAS_IN_A_TABLE):
+        some = {name: cameras[name] for name in names[first : first + CAMERAS_IN_A_TABLE]}
+        table = Table("", *some, caption=f"{summary['measured']}; {CAPTION}")
+        for label, cells in _rows(list(some.values())):
+            if any(cell != "–" for cell in cells):
+                table.add_row(label, *cells)
+        console.print(table)
+
+
+def _rows(cameras: Sequence[dict[str, Any]]) -> list[tuple[str, list[str]]]:
+    def lens(camera: dict[str, Any]) -> str:
+        original = camera["original_model"]
+        return camera["model"] if original in (None, camera["model"]) else f"{camera['model']} for {original}"
+
+    def fit(camera: dict[str, Any]) -> str:
+        if camera["fit_rms_px"] is None:
+            return "–"
+        return f"{camera['fit_rms_px']:.3f} / {_number(camera['fit_max_px'], '.3f')}"
+
+    def mono(camera: dict[str, Any]) -> str:
+        if camera["mono_over_lidar_median"] is None:
+            return "–"
+        return f"{camera['mono_over_lidar_median']:.2f}, {camera['mono_against_lidar_abs_rel']:.2f}"
+
+    rows = {
+        "pictures (held out)": lambda c: f"{c['pictures']} ({c['held_out']})",
+        "lens": lens,
+        "size, px": lambda c: "{}×{}".format(*c["size_px"]) + ("" if c["one_lens"] else ", varies"),
+        "fit rms / max, px": fit,
+        "used up to": lambda c: _number(c["angle_limit_deg"], ".0f", "°"),
+        "used of the picture": lambda c: _spread(c["used_share"], ".0%"),
+        "LiDAR coverage": lambda c: _spread(c["lidar_coverage"], ".1%"),
+        "mono coverage": lambda c: _spread(c["mono_coverage"], ".0%"),
+        "rays with a prior": lambda c: _spread(c["prior_share"], ".0%"),
+        "without (sky, …)": lambda c: _number(c["no_prior_share"], ".0%"),
+        "LiDAR distance": lambda c: _quantiles(c["lidar_distance_m"]),
+        "prior distance": lambda c: _quantiles(c["prior_distance_m"]),
+        "sigma, median": lambda c: _number(c["sigma_median_m"], ".2f", " m"),
+        "mono / LiDAR, AbsRel": mono,
+        "prior against truth, AbsRel": lambda c: _number(c["prior_against_truth_abs_rel"], ".3f"),
+    }
+    return [(label, [cell(camera) for camera in cameras]) for label, cell in rows.items()]

@@ -1,0 +1,105 @@
+"""A sheet of one picture: the picture and its maps side by side, each with its legend."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_depth_nerf.inspecting.figures import PictureFigures
+from edge_depth_nerf.inspecting.reader import InspectedScene, PictureMaps
+from edge_depth_nerf.pictures import (
+    DISTANCE,
+    RELATIVE_ERROR,
+    SIGMA,
+    ColourScale,
+    colour_bar,
+    draw_points,
+    is_distance,
+    lay_out,
+    panel,
+    resize,
+    swatches,
+    tinted,
+)
+
+HIDDEN_RGB = (205, 50, 60)
+"""Tint of what the mask hides."""
+NO_PRIOR_RGB = (60, 110, 230)
+"""Tint, hatched, of usable pixels without a prior."""
+
+
+def draw_sheet(
+    scene: InspectedScene, figures: PictureFigures, maps: PictureMaps, longer_side_px: int
+) -> NDArray[np.uint8]:
+    """Draw the sheet of one picture; panels of maps that it does not have are left out.
+
+    Args:
+        scene: whose picture it is.
+        figures: of this picture, for the heading.
+        maps: its maps.
+        longer_side_px: of each panel's picture.
+
+    """
+    height, width = maps.usable.shape
+    scale = longer_side_px / max(height, width)
+    size = (max(round(width * scale), 1), max(round(height * scale), 1))
+
+    def coloured(title: str, values: NDArray, shown: NDArray[np.bool_], colours: ColourScale) -> NDArray[np.uint8]:
+        picture = colours.coloured(resize(values, size), resize(shown, size))
+        return panel(picture, title, colour_bar(colours, size[0]))
+
+    def distance(title: str, distance_m: NDArray) -> NDArray[np.uint8]:
+        return coloured(title, distance_m, is_distance(distance_m) & maps.usable, DISTANCE)
+
+    panels = [panel(resize(maps.rgb, size), "picture")]
+    if maps.lidar_m is not None:
+        over = draw_points(maps.rgb, maps.lidar_m, size)
+        panels.append(panel(over, "LiDAR over the picture", colour_bar(DISTANCE, size[0])))
+    if maps.mono_m is not None:
+        panels.append(distance("monocular distance", maps.mono_m))
+    if maps.prior is not None:
+        source = figures.picture.depth_source()
+        panels.append(distance(f"prior ({source})", maps.prior.distance_m))
+        has_prior = is_distance(maps.prior.distance_m)
+        panels.append(coloured("sigma of the prior", maps.prior.sigma_m, has_prior, SIGMA))
+    if "mask" in figures.picture.files or maps.prior is not None:
+        panels.append(_mask_panel(maps, size))
+    if maps.truth_m is not None:
+        panels.append(distance("true distance", maps.truth_m))
+        if maps.prior is not None:
+            both = is_distance(maps.prior.distance_m) & is_distance(maps.truth_m)
+            error = 100 * (maps.prior.distance_m / np.where(both, maps.truth_m, 1) - 1)
+            panels.append(coloured("prior against truth", error, both, RELATIVE_ERROR))
+    columns = 4 if len(panels) > 6 else min(len(panels), 3)
+    return lay_out(panels, columns, _heading(scene, figures))
+
+
+def _mask_panel(maps: PictureMaps, size: tuple[int, int]) -> NDArray[np.uint8]:
+    picture = tinted(resize(maps.rgb, size), resize(~maps.usable, size), HIDDEN_RGB)
+    names: list[tuple[str, tuple[int, int, int]]] = [("hidden", HIDDEN_RGB)]
+    if maps.prior is not None:
+        without = maps.usable & ~is_distance(maps.prior.distance_m)
+        picture = tinted(picture, resize(without, size), NO_PRIOR_RGB, hatched=True)
+        names.append(("used, without prior", NO_PRIOR_RGB))
+    return panel(picture, "mask", swatches(names, size[0]))
+
+
+def _heading(scene: InspectedScene, figures: PictureFigures) -> list[str]:
+    picture = figures.picture
+    split = ("held out" if picture.held_out else "training") if scene.split_known else "no split given"
+    facts = [f"uses {figures.used_share:.0%} of the picture"]
+    if figures.lidar_coverage is not None:
+        facts.append(f"LiDAR on {figures.lidar_coverage:.1%} of that")
+    if len(figures.mono_over_lidar):
+        error = np.abs(figures.mono_over_lidar - 1).mean()
+        facts.append(f"mono / LiDAR {np.median(figures.mono_over_lidar):.2f} (median), AbsRel {error:.2f}")
+    if figures.prior_share is not None:
+        facts.append(f"prior on {figures.prior_share:.0%}")
+    if len(figures.sigma_m):
+        facts.append(f"sigma {np.median(figures.sigma_m):.2g} m (median)")
+    if len(figures.prior_over_truth):
+        facts.append(f"prior against truth: AbsRel {np.abs(figures.prior_over_truth - 1).mean():.3f}")
+    return [
+        f"{picture.camera}, frame {picture.moment} ({split})",
+        f"{picture.lens.width} x {picture.lens.height} px; " + "; ".join(facts),
+    ]

@@ -1,0 +1,753 @@
+"""Looking at a scene: its figures against independent numbers, its warnings, its pictures pixel by pixel."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from rich.console import Console
+from scenes import pinhole, write_scene
+
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.files import (
+    read_distance_png,
+    read_image,
+    read_json,
+    write_distance_png,
+    write_json,
+    write_mask,
+    write_png,
+)
+from edge_depth_nerf.inspect_options import InspectOptions
+from edge_depth_nerf.inspecting import inspect_scene
+from edge_depth_nerf.inspecting.figures import measured_moments
+from edge_depth_nerf.inspecting.findings import Finding, find, limited
+from edge_depth_nerf.inspecting.reader import read_scene
+from edge_depth_nerf.inspecting.top_view import HELD_OUT_RGB, TRAINING_RGB, draw_top_view, nice_length
+from edge_depth_nerf.pictures import (
+    DISTANCE,
+    INK_RGB,
+    NO_VALUE_RGB,
+    RELATIVE_ERROR,
+    SIGMA,
+    colour_bar,
+    colour_distance,
+    draw_points,
+    resize,
+    tinted,
+    write_text,
+)
+
+ROOT = Path(__file__).parents[1]
+SAMPLE = ROOT / "data" / "sample_drive"
+
+
+def look(scene: Path, output: Path, **options: Any) -> dict[str, Any]:
+    return inspect_scene(InspectOptions(scene, output, **{"size": 64, **options}), Console(quiet=True))
+
+
+# ---- the sample drive ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def sample(tmp_path_factory):
+    """The summary of the sample drive, where it was written, and the scene's files before and after."""
+    output = tmp_path_factory.mktemp("inspection") / "out"
+
+    def files() -> list[Path]:
+        return sorted(path for path in SAMPLE.rglob("*") if ".cache" not in path.parts)
+
+    before = files()
+    summary = look(SAMPLE, output, frames=2)
+    assert files() == before  # a look changes nothing
+    return summary, output
+
+
+def frames_of(camera: str) -> list[dict[str, Any]]:
+    frames = read_json(SAMPLE / "transforms.json")["frames"]
+    return sorted((frame for frame in frames if frame["camera"] == camera), key=lambda frame: frame["frame"])
+
+
+def test_what_is_returned_is_what_is_written(sample):
+    summary, output = sample
+    assert read_json(output / "summary.json") == summary
+    assert len(summary["sheets"]) == 4
+    for name in (*summary["sheets"], "top_view.png"):
+        assert read_image(output / name).std() > 10
+    assert summary["warnings"] == []
+
+
+def test_its_counts(sample):
+    summary, _ = sample
+    assert (summary["pictures"], summary["moments"], summary["training"], summary["held_out"]) == (24, 12, 22, 2)
+    header = (SAMPLE / "points.ply").read_bytes()[:200].decode("latin1")
+    assert summary["points"] == int(header.split("element vertex ")[1].split()[0])
+    recorded = read_json(SAMPLE / "transforms.json")["camera_fits"]
+    for name, camera in summary["cameras"].items():
+        assert camera["fit_rms_px"] == recorded[name]["rms_px"]
+        assert camera["fit_max_px"] == recorded[name]["max_px"]
+        assert camera["angle_limit_deg"] == 95.0
+        assert camera["size_px"] == [128, 128]
+        assert (camera["model"], camera["original_model"]) == ("KANNALA_BRANDT", "MEI")
+
+
+def test_its_path(sample):
+    path = sample[0]["path"]
+    poses = [frame["transform_matrix"] for frame in frames_of(path["camera"])]
+    steps = [sum((after[row][3] - before[row][3]) ** 2 for row in range(3)) ** 0.5 for before, after in pairwise(poses)]
+    assert path["length_m"] == pytest.approx(sum(steps), rel=1e-5)
+    assert path["spacing_median_m"] == pytest.approx(sorted(steps)[5], rel=1e-5)
+    assert path["spacing_max_m"] == pytest.approx(max(steps), rel=1e-5)
+    times = [frame["timestamp_s"] for frame in frames_of(path["camera"])]
+    assert path["duration_s"] == pytest.approx(times[-1] - times[0], rel=1e-5)
+    assert path["speed_mean_mps"] == pytest.approx(sum(steps) / (times[-1] - times[0]), rel=1e-5)
+
+
+@pytest.mark.parametrize("camera", ["image_02", "image_03"])
+def test_its_maps(sample, camera):
+    """Everything counted again with OpenCV, from the files."""
+    coverages, monos, used, ratios, lidars, errors = [], [], [], [], [], []
+    for frame in frames_of(camera):
+        lidar, mono = (
+            cv2.imread(str(SAMPLE / frame[f"{layer}_file_path"]), cv2.IMREAD_UNCHANGED) / 256
+            for layer in ("lidar", "mono")
+        )
+        mask = cv2.imread(str(SAMPLE / frame["mask_path"]), cv2.IMREAD_GRAYSCALE) > 0
+        coverages.append(((lidar > 0) & mask).sum() / mask.sum())
+        monos.append(((mono > 0) & mask).sum() / mask.sum())
+        used.append(mask.mean())
+        both = (lidar > 0) & (mono > 0) & mask
+        ratios.append(mono[both] / lidar[both])
+        errors.append(np.abs(mono[both] - lidar[both]) / lidar[both])
+        lidars.append(lidar[mask & (lidar > 0)])
+    found = sample[0]["cameras"][camera]
+    # pixels on the very rim of the lens circle may fall on either side
+    assert found["lidar_coverage"]["mean"] == pytest.approx(np.mean(coverages), rel=2e-3)
+    assert found["lidar_coverage"]["min"] == pytest.approx(min(coverages), rel=2e-3)
+    assert found["lidar_coverage"]["max"] == pytest.approx(max(coverages), rel=2e-3)
+    assert found["used_share"]["mean"] == pytest.approx(np.mean(used), rel=2e-3)
+    assert found["mono_over_lidar_median"] == pytest.approx(np.median(np.concatenate(ratios)), rel=1e-3)
+    assert found["mono_against_lidar_abs_rel"] == pytest.approx(np.mean(np.concatenate(errors)), rel=5e-3)
+    low, median, high = np.quantile(np.concatenate(lidars), (0.05, 0.5, 0.95))
+    quantiles = found["lidar_distance_m"]
+    assert [quantiles["p5"], quantiles["median"], quantiles["p95"]] == pytest.approx([low, median, high], rel=1e-3)
+    # the sky has no monocular distance and no return, and so no prior
+    assert 0.4 < min(monos) and max(monos) < 0.9
+    assert found["mono_coverage"]["mean"] == pytest.approx(np.mean(monos), rel=2e-3)
+    assert found["prior_share"]["mean"] == pytest.approx(np.mean(monos), abs=0.02)
+    assert found["no_prior_share"] == pytest.approx(1 - found["prior_share"]["mean"], abs=1e-3)
+    assert 0.01 < found["prior_against_truth_abs_rel"] < 0.2
+    assert 0.05 < found["sigma_median_m"] < 5
+
+
+def test_a_sheet_shows_the_maps(sample):
+    """The picture is where it should be, and the truth beside it has the truth's colours."""
+    _, output = sample
+    sheet = read_image(output / "image_02_0000000003.png")
+    # two rows of four panels of 64 px, under two lines
+    assert sheet.shape == (14 + 2 * 28 + 6 + 2 * (64 + 70 + 14), 14 + 4 * (64 + 14), 3)
+    top, left = 14 + 2 * 28 + 6 + 30, 14
+    picture = cv2.resize(read_image(SAMPLE / "images/image_02/0000000003.png"), (64, 64), interpolation=cv2.INTER_AREA)
+    assert (sheet[top : top + 64, left : left + 64] == picture).all()
+    truth = read_distance_png(SAMPLE / "truth/image_02/distance/0000000003.png")
+    mask = cv2.imread(str(SAMPLE / "masks/image_02.png"), cv2.IMREAD_GRAYSCALE) > 0
+    below, third = top + 64 + 70 + 14, left + 2 * (64 + 14)
+    shown = sheet[below : below + 64, third : third + 64]
+    expected = colour_distance(truth, mask)
+    candidates = [expected[row::2, column::2] for row in (0, 1) for column in (0, 1)]
+    assert max((shown == candidate).all(-1).mean() for candidate in candidates) > 0.99
+
+
+def test_the_figures_in_the_terminal(tmp_path):
+    console = Console(record=True, width=100, file=(tmp_path / "log").open("w"))
+    inspect_scene(InspectOptions(SAMPLE, tmp_path / "out", frames=1, size=64), console)
+    said = console.export_text()
+    for words in (
+        "22 for training, 2 held out",
+        "8.9 m (image_02)",
+        "KANNALA_BRANDT for MEI",
+        "128×128",
+        "all pictures",
+    ):
+        assert words in said
+
+
+# ---- small drives with one fault each --------------------------------------------------------------------------
+
+SIZE = (16, 12)
+
+
+def write_drive(folder: Path, moments: int = 12, cameras: tuple[str, ...] = ("left",)) -> Path:
+    """A straight drive along x, a step of 0.5 m every 0.1 s, whose every figure is known.
+
+    The mask hides the lower two of twelve rows; every other usable pixel has a return at 8 m; mono says 8.4 m but for
+    the upper three rows, the sky.
+    """
+    mask = np.ones(SIZE[::-1], bool)
+    mask[-2:] = False
+    lidar = np.where(mask & (np.indices(mask.shape).sum(0) % 2 == 0), 8.0, 0.0)
+    mono = np.full(mask.shape, 8.4)
+    mono[:3] = 0
+    frames = []
+    for camera in cameras:
+        write_mask(folder / f"masks/{camera}.png", mask)
+        for moment in range(moments):
+            file = f"{camera}/{moment:010d}.png"
+            write_png(folder / "images" / file, np.full((*mask.shape, 3), 100, np.uint8))
+            write_distance_png(folder / "lidar" / file, lidar)
+            write_distance_png(folder / "mono" / file, mono)
+            pose = np.eye(4)
+            pose[:3, 3] = 0.5 * moment, 1.0 * cameras.index(camera), 0
+            frames.append(
+                {
+                    "file_path": f"images/{file}",
+                    "transform_matrix": pose.tolist(),
+                    "mask_path": f"masks/{camera}.png",
+                    "lidar_file_path": f"lidar/{file}",
+                    "mono_file_path": f"mono/{file}",
+                    "camera": camera,
+                    "frame": moment,
+                    "timestamp_s": 50.0 + 0.1 * moment,
+                }
+            )
+    names = {held: [f["file_path"] for f in frames if (f["frame"] % 8 == 4) == held] for held in (False, True)}
+    (folder / "points.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+        "1.0 3.0 0.0\n4.0 -2.0 1.0\n"
+    )
+    write_json(
+        folder / "transforms.json",
+        {
+            "camera_model": "PINHOLE",
+            **{"w": SIZE[0], "h": SIZE[1], "fl_x": 8.0, "fl_y": 8.0, "cx": 8.0, "cy": 6.0},
+            "camera_fits": {camera: {"rms_px": 0.01, "max_px": 0.03, "theta_max_deg": 90.0} for camera in cameras},
+            "frames": frames,
+            "train_filenames": names[False],
+            "val_filenames": names[True],
+            "test_filenames": names[True],
+            "ply_file_path": "points.ply",
+        },
+    )
+    return folder
+
+
+def change(folder: Path, mend: Callable[[dict[str, Any]], None]) -> None:
+    meta = read_json(folder / "transforms.json")
+    mend(meta)
+    write_json(folder / "transforms.json", meta)
+
+
+@pytest.fixture
+def drive(tmp_path) -> Path:
+    return write_drive(tmp_path / "drive")
+
+
+def test_a_drive_without_fault(drive, tmp_path):
+    summary = look(drive, tmp_path / "out", frames=1)
+    assert summary["warnings"] == []
+    camera = summary["cameras"]["left"]
+    assert summary["path"] == {
+        "camera": "left",
+        "length_m": 5.5,
+        "spacing_median_m": 0.5,
+        "spacing_max_m": 0.5,
+        "duration_s": 1.1,
+        "speed_mean_mps": 5.0,
+        "speed_max_mps": 5.0,
+    }
+    assert camera["lidar_coverage"] == {"mean": 0.5, "min": 0.5, "max": 0.5}
+    assert camera["mono_coverage"]["mean"] == camera["prior_share"]["mean"] == pytest.approx(0.7)
+    assert camera["no_prior_share"] == pytest.approx(0.3)
+    assert camera["used_share"]["mean"] == pytest.approx(10 / 12, rel=1e-5)
+    assert camera["hidden_share_of_lens"]["mean"] == pytest.approx(2 / 12, rel=1e-5)
+    assert camera["mono_over_lidar_median"] == pytest.approx(8.4 / 8, rel=1e-3)
+    assert camera["mono_against_lidar_abs_rel"] == pytest.approx(0.05, rel=1e-2)
+    assert camera["lidar_distance_m"] == {"p5": 8.0, "median": 8.0, "p95": 8.0}
+    assert summary["frames"][0]["brightness"] == 100
+
+
+def shift_from(moment: int, metres: float):
+    def mend(meta):
+        for frame in meta["frames"]:
+            if frame["frame"] >= moment:
+                frame["transform_matrix"][0][3] += metres
+
+    return mend
+
+
+def turn_from(moment: int, degrees: float):
+    def mend(meta):
+        cosine, sine = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+        for frame in meta["frames"]:
+            if frame["frame"] >= moment:
+                frame["transform_matrix"][0][:2] = [cosine, -sine]
+                frame["transform_matrix"][1][:2] = [sine, cosine]
+
+    return mend
+
+
+def late(meta):
+    meta["frames"][7]["timestamp_s"] = meta["frames"][6]["timestamp_s"]
+
+
+def badly_fitted(meta):
+    meta["camera_fits"]["left"]["rms_px"] = 0.2
+
+
+def nothing_held_out(meta):
+    meta["train_filenames"] = meta["test_filenames"] = meta["val_filenames"] = [f["file_path"] for f in meta["frames"]]
+
+
+def without(*keys: str):
+    def mend(meta):
+        for entry in (meta, *meta["frames"]):
+            for key in keys:
+                entry.pop(key, None)
+
+    return mend
+
+
+def one_without_mono(meta):
+    del meta["frames"][3]["mono_file_path"]
+
+
+POSES_AND_LISTS = [
+    (shift_from(5, 4.8), "gap", ("left",), (4, 5), "Frames 4 and 5 lie 5.3 m apart, 11 times the usual 0.5 m"),
+    (turn_from(9, 30), "turn", ("left",), (8, 9), "From frame 8 to 9 the camera turns by 30 degrees"),
+    (late, "timestamps", ("left",), (7,), "do not increase at frame 7"),
+    (badly_fitted, "fit", ("left",), (), "0.20 px rms"),
+    (nothing_held_out, "no_held_out", (), (), "--holdout-every"),
+    (without("train_filenames", "val_filenames", "test_filenames"), "no_split", (), (), "every eighth"),
+    (without("lidar_file_path"), "no_lidar", (), (), "no LiDAR"),
+    (without("mono_file_path"), "no_mono", (), (), "--mono"),
+    (without("mono_file_path", "lidar_file_path", "frame"), "no_prior", (), (), "plain nerfacto"),
+    (without("mask_path"), "no_mask", (), (), "--ego-mask"),
+    (without("ply_file_path"), "no_points", (), (), "ply_file_path"),
+    (one_without_mono, "incomplete", (), (), "mono_file_path is given for 11 of 12 frames"),
+]
+
+
+@pytest.mark.parametrize(("mend", "kind", "cameras", "frames", "words"), POSES_AND_LISTS, ids=lambda v: str(v)[:12])
+def test_each_fault_gives_its_warning_alone(drive, tmp_path, mend, kind, cameras, frames, words):
+    change(drive, mend)
+    summary = look(drive, tmp_path / "out", frames=1)
+    assert [warning["kind"] for warning in summary["warnings"]] == [kind]
+    (warning,) = summary["warnings"]
+    assert words in warning["text"]
+    assert (tuple(warning["cameras"]), tuple(warning["frames"])) == (cameras, frames)
+
+
+@pytest.mark.parametrize("mend", [shift_from(5, 4.4), turn_from(9, 15)], ids=["9.8 times", "a bend"])
+def test_what_is_usual_gives_none(drive, mend):
+    change(drive, mend)
+    assert find(read_scene(drive), []) == []
+
+
+def test_a_vehicle_that_stands_is_no_measure_of_gaps(drive):
+    """Most of the drive at a red light, a millimetre a frame: driving on is not a gap."""
+
+    def mend(meta):
+        for frame in meta["frames"]:
+            frame["transform_matrix"][0][3] = 0.001 * frame["frame"] + 0.5 * max(frame["frame"] - 8, 0)
+
+    change(drive, mend)
+    assert find(read_scene(drive), []) == []
+
+
+def test_two_cameras_share_a_gap(tmp_path):
+    scene = write_drive(tmp_path / "drive", cameras=("left", "right"))
+    change(scene, shift_from(5, 7))
+    (gap,) = find(read_scene(scene), [])
+    assert gap.cameras == ("left", "right")
+
+
+def rewrite(folder: Path, layer: str, moments: tuple[int, ...], alter: Callable[[np.ndarray], np.ndarray]) -> None:
+    for moment in moments:
+        path = folder / layer / "left" / f"{moment:010d}.png"
+        if layer == "images":
+            write_png(path, alter(read_image(path)))
+        else:
+            write_distance_png(path, alter(read_distance_png(path)))
+
+
+def sparse(lidar):
+    lidar[:, 2:] = 0
+    return lidar
+
+
+CONTENTS = [
+    ("lidar", (6,), sparse, "lidar", (6,), "frame 6 of left where 50.00% is usual"),
+    ("images", (2, 3), lambda picture: picture // 3, "dark", (2, 3), "frames 2, 3 of left is dark, mean grey 33"),
+    ("images", (8,), lambda picture: picture * 2 + 30, "bright", (8,), "frame 8 of left is bright"),
+    ("mono", tuple(range(12)), lambda mono: mono * 1.5, "mono_scale", (), "1.57 times LiDAR's in left"),
+    ("mono", (1,), lambda mono: mono / 2, "mono_scale", (1,), "0.52 times LiDAR's in frame 1 of left"),
+    ("lidar", tuple(range(12)), np.zeros_like, "lidar", (), "hold no return"),
+]
+
+
+@pytest.mark.parametrize(("layer", "moments", "alter", "kind", "frames", "words"), CONTENTS, ids=lambda v: str(v)[:12])
+def test_maps_out_of_the_ordinary(drive, tmp_path, layer, moments, alter, kind, frames, words):
+    rewrite(drive, layer, moments, alter)
+    summary = look(drive, tmp_path / "out", frames=1)
+    assert [(w["kind"], tuple(w["frames"])) for w in summary["warnings"]] == [(kind, frames)]
+    assert words in summary["warnings"][0]["text"]
+
+
+def test_an_inverted_mask(drive, tmp_path):
+    mask = np.zeros(SIZE[::-1], bool)
+    mask[-2:] = True
+    write_mask(drive / "masks/left.png", mask)
+    for moment in range(12):
+        write_distance_png(drive / f"lidar/left/{moment:010d}.png", np.where(mask, 8.0, 0))
+    (warning,) = look(drive, tmp_path / "out", frames=1)["warnings"]
+    assert warning["kind"] == "mask" and "hides 83% of the lens" in warning["text"]
+
+
+def test_of_many_warnings_of_a_kind_some_are_printed():
+    findings = [Finding("gap", f"gap {number}") for number in range(8)] + [Finding("fit", "a fit")]
+    lines = limited(findings)
+    assert lines[:6] == ["gap 0", "gap 1", "gap 2", "gap 3", "gap 4", "a fit"]
+    assert lines[6] == "3 more of the kind 'gap' are in summary.json."
+
+
+# ---- what is measured and shown --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("moments", "cameras", "measured"), [(200, 1, 64), (100, 2, 32), (12, 2, 12)])
+def test_long_drives_are_sampled_evenly(tmp_path, moments, cameras, measured):
+    scene = read_scene(write_drive(tmp_path / "drive", moments, ("left", "right")[:cameras]))
+    chosen, shown = measured_moments(scene, 4)
+    assert len(chosen) == measured
+    assert chosen[0] == 0 and chosen[-1] == moments - 1
+    steps = np.diff(chosen)
+    assert steps.max() - steps.min() <= 1
+    assert len(shown) == 4 and set(shown) <= set(chosen)
+    assert np.allclose(shown, moments * np.array([1, 3, 5, 7]) / 8, atol=0.03 * moments + 1)
+
+
+def test_the_summary_says_that_it_is_of_a_sample(tmp_path):
+    scene = write_drive(tmp_path / "drive", 70)
+    summary = look(scene, tmp_path / "out", frames=1)
+    assert summary["measured"] == "64 pictures spread evenly over the drive"
+    assert summary["maps"]["measured_pictures"] == len(summary["frames"]) == 64
+
+
+def test_more_frames_than_there_are(drive, tmp_path):
+    assert len(look(drive, tmp_path / "out", frames=50)["sheets"]) == 12
+
+
+def test_a_second_look_leaves_no_sheets_of_the_first(drive, tmp_path):
+    output = tmp_path / "out"
+    look(drive, output, frames=3)
+    (output / "notes.png").write_bytes(b"mine")
+    summary = look(drive, output, frames=1)
+    assert {path.name for path in output.iterdir()} == {*summary["sheets"], "top_view.png", "summary.json", "notes.png"}
+
+
+def test_the_output_lies_beside_the_scene(drive):
+    inspect_scene(InspectOptions(drive, frames=1, size=64), Console(quiet=True))
+    assert (drive.parent / "drive_inspection" / "summary.json").is_file()
+    assert not (drive / "summary.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("missing", "panels"),
+    [
+        ((), 6),
+        (("mono_file_path",), 5),
+        (("lidar_file_path",), 5),
+        (("lidar_file_path", "mono_file_path"), 2),
+        (("lidar_file_path", "mono_file_path", "mask_path"), 1),
+    ],
+)
+def test_panels_of_what_is_missing_are_left_out(drive, tmp_path, missing, panels):
+    change(drive, without(*missing))
+    (name,) = look(drive, tmp_path / "out", frames=1, size=200)["sheets"]
+    height, width = read_image(tmp_path / "out" / name).shape[:2]
+    columns = min(panels, 3)
+    rows = -(-panels // 3)
+    assert (height, width) == (14 + 2 * 28 + 6 + rows * (150 + 70 + 14), 14 + columns * (200 + 14))
+
+
+# ---- other people's scenes -------------------------------------------------------------------------------------
+
+
+def test_z_depth_of_a_pinhole_scene_becomes_distance(tmp_path):
+    scene = write_scene(tmp_path / "scene", [pinhole()], lidar=False, mono=False, mask=False, truth=False, split=False)
+    meta = read_json(scene / "transforms.json")
+    del meta["depth_unit_scale_factor"]
+    depth_mm = np.full((28, 32), 5000, np.uint16)
+    for number, frame in enumerate(meta["frames"]):
+        # once as nerfstudio's PNG in millimetres, once as an array
+        frame["depth_file_path"] = f"depth/{number}.{'png' if number else 'npy'}"
+        (scene / "depth").mkdir(exist_ok=True)
+        if number:
+            cv2.imwrite(str(scene / frame["depth_file_path"]), depth_mm)
+        else:
+            np.save(scene / frame["depth_file_path"], depth_mm[..., None])
+    for frame in meta["frames"]:
+        frame["k1"] = 0.0
+    write_json(scene / "transforms.json", meta)
+    inspected = read_scene(scene)
+    x = (np.arange(32) + 0.5 - 16) / 20.0
+    y = (np.arange(28)[:, None] + 0.5 - 14) / 20.5
+    expected = 5 * np.sqrt(x**2 + y**2 + 1)
+    for picture in inspected.pictures[:2]:
+        maps = inspected.maps(picture)
+        assert maps.lidar_m is not None and np.allclose(maps.lidar_m, expected, rtol=1e-4)
+        assert picture.depth_source() == "lidar"
+    summary = look(scene, tmp_path / "out", frames=1)
+    assert not summary["lengths_are_metres"]
+    assert summary["held_out"] is None
+    assert summary["maps"]["lidar_coverage"]["mean"] == 1.0
+    assert {warning["kind"] for warning in summary["warnings"]} == {"no_mono", "no_mask", "no_points", "no_split"}
+
+
+def test_cameras_and_moments_without_names(drive):
+    """Cameras are then told by the folders of their pictures, moments by the order of the names."""
+    change(drive, without("camera", "frame"))
+    pictures = read_scene(drive / "transforms.json").pictures
+    assert {picture.camera for picture in pictures} == {"images/left"}
+    assert [picture.moment for picture in pictures] == list(range(12))
+
+
+# ---- bad input -------------------------------------------------------------------------------------------------
+
+
+def cut(folder: Path) -> None:
+    path = folder / "transforms.json"
+    path.write_text(path.read_text()[:-200])
+
+
+def no_frames(folder: Path) -> None:
+    change(folder, lambda meta: meta.update(frames=[]))
+
+
+def no_picture(folder: Path) -> None:
+    (folder / "images/left/0000000003.png").unlink()
+
+
+def no_ply(folder: Path) -> None:
+    (folder / "points.ply").unlink()
+
+
+def broken_ply(folder: Path) -> None:
+    (folder / "points.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 5\n")
+
+
+def other_model(folder: Path) -> None:
+    change(folder, lambda meta: meta.update(camera_model="EQUIRECTANGULAR"))
+
+
+def no_focal_length(folder: Path) -> None:
+    change(folder, without("fl_x"))
+
+
+def flat_pose(folder: Path) -> None:
+    change(folder, lambda meta: meta["frames"][2].update(transform_matrix=[[1, 2, 3]]))
+
+
+def wrong_size(folder: Path) -> None:
+    write_png(folder / "images/left/0000000000.png", np.zeros((9, 9, 3), np.uint8))
+
+
+def huge_camera(folder: Path) -> None:
+    change(folder, lambda meta: meta.update(w=10**9, h=10**9))
+
+
+def broken_map(folder: Path) -> None:
+    (folder / "mono/left/0000000000.png").write_bytes(b"no picture")
+
+
+def bad_time(folder: Path) -> None:
+    change(folder, lambda meta: meta["frames"][1].update(timestamp_s="noon"))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (shutil.rmtree, "process"),
+        (cut, "not valid JSON"),
+        (no_frames, "no list of frames"),
+        (no_picture, "0000000003.png: no such file"),
+        (no_ply, "points.ply: no such file"),
+        (broken_ply, "cannot be read as a PLY"),
+        (other_model, "EQUIRECTANGULAR"),
+        (no_focal_length, "fl_x is None"),
+        (flat_pose, "transform_matrix"),
+        (wrong_size, "9×9"),
+        (huge_camera, "1000000000×1000000000"),
+        (broken_map, "cannot be decoded"),
+        (bad_time, "timestamp_s is 'noon'"),
+    ],
+)
+def test_a_scene_that_cannot_be_read(drive, tmp_path, spoil, words):
+    spoil(drive)
+    with pytest.raises((InputError, FileNotFoundError)) as raised:
+        look(drive, tmp_path / "out")
+    assert words in str(raised.value) and str(drive) in str(raised.value)
+
+
+@pytest.mark.parametrize(("options", "words"), [({"frames": 0}, "--frames 0"), ({"size": 9}, "--size 9")])
+def test_options_out_of_range(drive, tmp_path, options, words):
+    with pytest.raises(InputError, match=words):
+        look(drive, tmp_path / "out", **options)
+
+
+def test_an_output_that_is_a_file(drive):
+    with pytest.raises(InputError, match="is a file"):
+        look(drive, drive / "points.ply")
+
+
+def test_the_command_runs_without_nerfstudio(drive, tmp_path):
+    """Importing nerfstudio takes longer than the whole command."""
+    code = (
+        "import sys; sys.modules['nerfstudio'] = None; from edge_depth_nerf.cli import main; "
+        f"sys.argv = ['edge-depth-nerf', 'inspect', {str(drive)!r}, '--output', {str(tmp_path / 'out')!r}, "
+        "'--frames', '1', '--size', '64']; main()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "out" / "top_view.png").is_file()
+    spoiled = subprocess.run(
+        [sys.executable, "-c", code.replace("'1'", "'0'")], capture_output=True, text=True, check=False
+    )
+    assert spoiled.returncode == 2 and spoiled.stderr.startswith("edge-depth-nerf: --frames 0")
+
+
+# ---- drawing ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("map_size", "size"), [(128, 640), (128, 128), (1400, 700), (350, 640)])
+def test_points_are_drawn_where_they_are(map_size, size):
+    """Lone returns become discs around their own pixel's centre, in their own colour."""
+    pixels = [(map_size // 8, map_size // 3), (map_size // 2, map_size - 10), (map_size - 12, 11)]
+    distance = np.zeros((map_size, map_size), np.float32)
+    for number, (row, column) in enumerate(pixels):
+        distance[row, column] = (2.0, 11.0, 40.0)[number]
+    picture = np.full((map_size, map_size, 3), 200, np.uint8)
+    drawn = draw_points(picture, distance, (size, size))
+    blank = draw_points(picture, np.zeros_like(distance), (size, size))
+    assert drawn.shape == (size, size, 3)
+    for row, column in pixels:
+        colour = colour_distance(distance[row : row + 1, column : column + 1])[0, 0]
+        ys, xs = np.nonzero((drawn == colour).all(-1))
+        assert 5 <= len(ys) <= (0.02 * size) ** 2 + 30
+        scale = size / map_size
+        assert abs(ys.mean() + 0.5 - (row + 0.5) * scale) <= 0.5
+        assert abs(xs.mean() + 0.5 - (column + 0.5) * scale) <= 0.5
+        drawn[ys, xs] = blank[ys, xs]
+    assert (drawn == blank).all()  # and nothing else
+
+
+@pytest.mark.parametrize("map_size", [128, 350, 1400])
+def test_dense_points_leave_the_picture_to_be_seen(map_size):
+    picture = np.zeros((map_size, map_size, 3), np.uint8)
+    distance = np.full((map_size, map_size), 5.0, np.float32)
+    covered = (draw_points(picture, distance, (640, 640)) == colour_distance(distance)[0, 0]).all(-1).mean()
+    assert 0.15 < covered < 0.6
+
+
+def test_scales():
+    for scale in (DISTANCE, SIGMA, RELATIVE_ERROR):
+        values = np.array([[scale.low, scale.high, scale.low - 1e3, scale.high + 1e3]])
+        colours = scale.coloured(values, np.ones(values.shape, bool))
+        assert (colours[0, 2] == colours[0, 0]).all() and (colours[0, 3] == colours[0, 1]).all()
+        assert (colours[0, 0] != colours[0, 1]).any()
+        assert tuple(scale.coloured(values, np.zeros(values.shape, bool))[0, 0]) == NO_VALUE_RGB
+    # √(1·60) m is half way, as 0 % is
+    assert DISTANCE.position(np.array([60**0.5]))[0] == pytest.approx(0.5)
+    assert RELATIVE_ERROR.position(np.array([0.0]))[0] == pytest.approx(0.5)
+    assert np.ptp(RELATIVE_ERROR.coloured(np.zeros((1, 1)), np.ones((1, 1), bool)).astype(int)) < 5  # neutral
+
+
+def test_a_legend_has_its_ticks_where_their_colours_are():
+    bar = colour_bar(DISTANCE, 500)
+    ticks = np.nonzero((bar[19] == INK_RGB).all(-1))[0]
+    assert len(ticks) == len(DISTANCE.ticks)
+    expected = colour_distance(np.array([DISTANCE.ticks]))[0].astype(int)
+    assert np.abs(bar[10, ticks].astype(int) - expected).max() <= 4
+    assert (bar[10] == NO_VALUE_RGB).all(-1).sum() == 30
+
+
+def test_maps_keep_their_values_when_they_shrink():
+    distance = np.where(np.indices((40, 40))[1] < 20, 2.0, 50.0).astype(np.float32)
+    assert set(np.unique(resize(distance, (13, 13)))) == {2.0, 50.0}
+    assert resize(distance > 10, (13, 13)).dtype == np.bool_
+
+
+def test_tints():
+    picture = np.full((24, 24, 3), 100, np.uint8)
+    where = np.zeros((24, 24), bool)
+    where[:12] = True
+    plain = tinted(picture, where, (200, 0, 0))
+    assert (plain[12:] == 100).all() and (plain[:12] == (150, 50, 50)).all()
+    hatched = tinted(picture, where, (0, 0, 200), hatched=True)
+    assert (hatched[:12] == (0, 0, 200)).all(-1).mean() == pytest.approx(0.25, abs=0.05)
+
+
+def test_text_that_is_too_long_becomes_smaller():
+    sheet = np.full((40, 100, 3), 255, np.uint8)
+    assert write_text(sheet, "a long title for a small place", (2, 30), max_width=90) <= 92
+    columns = np.nonzero((sheet != 255).any((0, 2)))[0]
+    assert len(columns) and columns.max() < 96
+
+
+@pytest.mark.parametrize(("largest", "nice"), [(0.99, 0.5), (1.0, 1.0), (4.9, 2.0), (5.0, 5.0), (73.0, 50.0)])
+def test_lengths_of_scale_bars(largest, nice):
+    assert nice_length(largest) == pytest.approx(nice)
+
+
+def positions(picture: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray:
+    """Pixels (x, y) of one colour in the map, between title and legend."""
+    return np.argwhere((picture[40:-84] == colour).all(-1))[:, ::-1] + (0, 40)
+
+
+def test_the_top_view_is_to_scale(drive):
+    """A path of 5.5 m against the scale bar of 2 m; held-out frames at their places; points, y up."""
+    scene = read_scene(drive)
+    picture = draw_top_view(scene, scene.points_m(), [], shown=[])
+    training = positions(picture, TRAINING_RGB)
+    path_px = np.ptp(training[:, 0])
+    bar = picture[-84 + 50]
+    bar_px = np.ptp(np.nonzero((bar[100:] == INK_RGB).all(-1))[0])
+    assert bar_px / path_px == pytest.approx(2 / 5.5, rel=0.01)
+    held_out = positions(picture, HELD_OUT_RGB)
+    assert held_out[:, 0].mean() - training[:, 0].min() == pytest.approx(4 / 11 * path_px, abs=6)
+    grey = np.argwhere(np.ptp(picture[40:-84].astype(int), axis=-1) == 0)[:, ::-1] + (0, 40)
+    grey = grey[np.abs(grey[:, 1] - training[:, 1].mean()) > 40]  # away from the numbers beside the path
+    shades = picture[grey[:, 1], grey[:, 0], 0]
+    low, high = grey[shades == 225].mean(0), grey[shades == 110].mean(0)
+    px_per_m = path_px / 5.5
+    # points at (1, 3, 0) and (4, -2, 1), the higher one darker
+    assert high[0] - low[0] == pytest.approx(3 * px_per_m, rel=0.03)
+    assert high[1] - low[1] == pytest.approx(5 * px_per_m, rel=0.03)
+
+
+def test_the_top_view_marks_gaps(drive):
+    change(drive, shift_from(5, 7))
+    scene = read_scene(drive)
+    gap = (210, 20, 40)
+    findings = find(scene, [])
+    marked = positions(draw_top_view(scene, None, findings, []), gap)
+    assert len(marked) and not len(positions(draw_top_view(scene, None, [], []), gap))
+    # from 2 m to 9.5 m of a path from 0 to 12.5 m
+    training = positions(draw_top_view(scene, None, findings, []), TRAINING_RGB)
+    left, width = training[:, 0].min(), np.ptp(training[:, 0])
+    assert (marked[:, 0].min() - left) / width == pytest.approx(2 / 12.5, abs=0.02)
+    assert (marked[:, 0].max() - left) / width == pytest.approx(9.5 / 12.5, abs=0.02)
+
+
+def test_a_scene_of_one_picture(tmp_path):
+    summary = look(write_drive(tmp_path / "drive", 1), tmp_path / "out")
+    assert summary["path"]["length_m"] == 0 and len(summary["sheets"]) == 1
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["moments"] == 1
