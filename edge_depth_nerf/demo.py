@@ -99,7 +99,6 @@ def run_demo(options: DemoOptions, console: Console | None = None) -> dict[str, 
         root=drive,
         sequence=synthesis.sequence,
         output=scene,
-        ego_mask=drive / "truth" / "masks",
         mono=drive / "simulated_mono" / synthesis.sequence,
     )
     with clock.stage("synthesize"):

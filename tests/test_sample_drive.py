@@ -37,8 +37,9 @@ def test_its_maps_agree():
         returns = (lidar > 0) & (truth > 0)
         assert returns.sum() > 300
         assert not (lidar > 0)[~mask].any()
-        # a sweep taken from a moving car, seen from elsewhere: most returns are right, not all
-        assert np.median(np.abs(lidar[returns] / truth[returns] - 1)) < 0.02
+        # a return lies anywhere in its pixel, the truth in its middle: at edges they differ
+        off = np.abs(lidar[returns] / truth[returns] - 1)
+        assert np.median(off) < 0.02 and (off < 0.05).mean() > 0.85
         both = (mono > 0) & (truth > 0) & mask
         assert 0.01 < np.median(np.abs(mono[both] / truth[both] - 1)) < 0.2
 
