@@ -23,7 +23,9 @@ import sys
 import threading
 import time
 from collections import Counter
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -90,6 +92,10 @@ def deskewing(made: SynthesizeOptions) -> Table:
     return table
 
 
+def nothing_moved(scanner: Any, index: int) -> torch.Tensor:
+    return torch.zeros(len(scanner.whole(index).points_m), dtype=torch.bool)
+
+
 def right(distance_m: NDArray, truth_m: NDArray) -> NDArray[np.bool_]:
     """Which returns lie within the true distances around, give or take 5 %."""
     around = np.ones((3, 3), np.uint8)
@@ -138,7 +144,7 @@ def judge(made: SynthesizeOptions, reach: int, every: int, *, free_space: bool =
     }
     for kind, store in stores.items():
         for scanner in store._scanners if kind != "kept" or not free_space else ():
-            scanner.still = scanner.whole
+            scanner.moved = partial(nothing_moved, scanner)
     masks = {recorded.name: read_mask(made.output / f"truth/masks/{recorded.name}.png") for recorded in found.cameras}
     counts = {name: Counts() for name in masks}
     pictures = [p for p in found.pictures if p.frame not in held_out and p.frame % every == 0]
@@ -191,7 +197,7 @@ def picture(made: SynthesizeOptions, path: Path, reach: int = 5, camera: str = "
     for kind in KINDS:
         store = SweepStore(found.sweeps, found.trajectory, reach=reach, deskew=kind != "recorded", held_out=())
         for scanner in store._scanners if kind != "kept" else ():
-            scanner.still = scanner.whole
+            scanner.moved = partial(nothing_moved, scanner)
         distance_m = mask * project(taken, found, store, everything=kind != "kept")
         fine = right(distance_m, truth)
         wrong = cv2.dilate(((distance_m > 0) & ~fine).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0

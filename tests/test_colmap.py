@@ -355,7 +355,7 @@ def test_a_mask_of_another_size_is_named(tmp_path):
     pytest.importorskip("pycolmap")
     write_mask(tmp_path / "ego.png", np.ones((32, 64), bool))
     options = ProcessOptions(output=tmp_path / "scene", ego_mask=tmp_path / "ego.png")
-    with pytest.raises(InputError, match=r"ego\.png: 64x32 pixels, expected 64x64"):
+    with pytest.raises(InputError, match=r"ego\.png: 64×32 pixels, but its camera.s calibration says 64×64"):
         colmap_poses(pictured(tmp_path / "raw", 3), options, QUIET)
 
 

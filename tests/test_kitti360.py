@@ -45,6 +45,9 @@ from edge_depth_nerf.files import (
     write_mask,
     write_png,
 )
+from edge_depth_nerf.lidar.trajectory import Trajectory
+from edge_depth_nerf.masks.ego import NoEgo
+from edge_depth_nerf.process import build, colmap_poses
 from edge_depth_nerf.process.kitti360 import process_kitti360
 from edge_depth_nerf.process.kitti360_calibration import (
     read_cam_to_pose,
@@ -54,7 +57,8 @@ from edge_depth_nerf.process.kitti360_calibration import (
     read_rig,
     read_timestamps,
 )
-from edge_depth_nerf.process.options import Kitti360Options
+from edge_depth_nerf.process.options import Kitti360Options, ProcessOptions
+from edge_depth_nerf.process.recording import Recording
 from edge_depth_nerf.process.scene import ProcessReport, Skipped
 from edge_depth_nerf.process.transforms import opencv_to_opengl
 
@@ -325,6 +329,72 @@ def test_vehicle_mask_is_found_corrected_and_kept(tmp_path: Path) -> None:
     process(drive, tmp_path / "other", ego_mask=tmp_path / "scene/ego_masks")
     assert (tmp_path / "other/lidar/image_02/0000000000.png").read_bytes() != before
     assert (read_distance_png(tmp_path / "other/lidar/image_02/0000000000.png") == after).all()
+
+
+def test_labels_are_checked_before_the_work(drive: RoomDrive, tmp_path: Path) -> None:
+    path = drive.root / f"data_2d_semantics/train/{SEQUENCE}/image_02/semantic/0000000002.png"
+    write_png(path, np.zeros((32, 32, 3), np.uint8))
+    with pytest.raises(InputError, match=r"semantic/0000000002\.png: found 8-bit RGB, expected an 8-bit PNG"):
+        process(drive, tmp_path / "scene")
+    assert not (tmp_path / "scene").exists()
+
+
+def test_times_must_increase_and_the_line_is_named(drive: RoomDrive, tmp_path: Path) -> None:
+    path = drive.root / f"data_2d_raw/{SEQUENCE}/image_02/timestamps.txt"
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join([*lines[:2], lines[1]]))
+    with pytest.raises(InputError, match=r"timestamps\.txt, line 3: not after the line before"):
+        process(drive, tmp_path / "scene")
+
+
+def test_the_vehicle_is_looked_for_in_training_pictures_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drive = write_room_drive(tmp_path / "drive", frames=9, beams=300, size=32)
+    looked: set[str] = set()
+
+    def look(pictures: Any, lens: np.ndarray) -> NoEgo:
+        looked.update(picture.args[0].name for picture in pictures)
+        return NoEgo("not looked for here")
+
+    monkeypatch.setattr(build, "find_ego", look)
+    process(drive, tmp_path / "scene")
+    assert looked == {f"{frame:010d}.png" for frame in range(9) if frame != 4}
+
+
+def found_by(options: dict[int, float], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the search for poses keep some moments, each shifted along the world's x axis."""
+
+    def found(recording: Recording, _options: ProcessOptions, _console: Console) -> Recording:
+        kept = []
+        for picture in recording.pictures:
+            if picture.frame in options:
+                camera = next(c for c in recording.cameras if c.name == picture.camera)
+                vehicle = pose(picture.frame)
+                vehicle[0, 3] += options[picture.frame]
+                kept.append(replace(picture, camera_to_world=vehicle @ camera.to_vehicle))
+        poses = np.stack([pose(frame) for frame in options])
+        poses[:, 0, 3] += list(options.values())
+        path = Trajectory(np.array([0.1 * frame for frame in options]), poses)
+        return replace(recording, pictures=tuple(kept), trajectory=path)
+
+    monkeypatch.setattr(colmap_poses, "colmap_poses", found)
+
+
+def test_other_poses_found_make_other_maps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As if the search had been made anew: what was held out by the old poses is not by the new ones."""
+    drive = write_room_drive(tmp_path / "drive", frames=9, beams=300, size=32)
+    for scene, kept in (("scene", range(9)), ("scene", range(2, 9)), ("fresh", range(2, 9))):
+        found_by({frame: 0.02 * len(kept) for frame in kept}, monkeypatch)
+        process(drive, tmp_path / scene, poses="colmap", sweeps=1, ego_mask=write_masks(tmp_path / "ego", drive))
+    meta = read_json(tmp_path / "scene/transforms.json")
+    assert {name[-14:-4] for name in meta["val_filenames"]} == {"0000000006"}
+    for name in [f[key] for f in meta["frames"] for key in ("lidar_file_path", "file_path")] + ["points.ply"]:
+        assert (tmp_path / "scene" / name).read_bytes() == (tmp_path / "fresh" / name).read_bytes(), name
+
+
+def test_a_search_that_cannot_begin_leaves_nothing_behind(drive: RoomDrive, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="2 pictures, expected 3 or more"):
+        process(drive, tmp_path / "scene", poses="colmap", frames=1)
+    assert not (tmp_path / "scene").exists()
 
 
 # ---- what the scene holds --------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from edge_depth_nerf.lidar.voxels import first_in_voxel
 from edge_depth_nerf.lidar.world import WorldSweep, above_field, sweep_in_world
 from edge_depth_nerf.process import sweep_store
 from edge_depth_nerf.process.recording import RecordedSweep
-from edge_depth_nerf.process.sweep_store import SweepStore, _Gathered, _Shared
+from edge_depth_nerf.process.sweep_store import Surroundings, SweepStore, _Gathered, _Shared
 
 FISHEYE = MEI(700, 700, 668.0, 668.0, 350.5, 349.0, 2.2134, 0.0168, 1.6549, 4e-4, 4e-4)
 
@@ -271,12 +272,21 @@ def test_a_passing_car_leaves_no_trail_but_stays_where_it_is() -> None:
         bearing, at = (np.arctan2(p[:, 1], p[:, 0]) for p in (wall, car))
         hidden = (bearing > at.min()) & (bearing < at.max()) & (wall[:, 2] < 0.6)
         worlds[frame], cars[frame] = np.concatenate((wall[~hidden], car)), car
-    found = store(stored(worlds), 3, set()).around(3, 0.3, BELOW)
+    sweeps = store(stored(worlds), 3, set())
+    found = sweeps.around(3, 0.3, BELOW)
     near = found.points_m.norm(dim=-1) < 15
     own = found.age_s[near] < 0.05
     assert own.sum() == len(box), "its own moment's car is there"
     assert (~own).sum() <= 0.02 * 6 * len(box), "what is left of the six other moments' cars"
     assert len(found.points_m) > 6 * 0.9 * len(wall), "the wall stays"
+    # what lasts, over all pictures: next to nothing of seven cars
+    trails = sum(int((~f.moved & (f.points_m.norm(dim=-1) < 15)).sum()) for f in map(sweeps_of(sweeps), range(7)))
+    assert trails <= 0.05 * sum(min(frame + 3, 6) - max(frame - 3, 0) + 1 for frame in range(7)) * len(box)
+    assert not found.moved[~near].any()
+
+
+def sweeps_of(sweeps: SweepStore) -> Callable[[int], Surroundings]:
+    return lambda frame: sweeps.around(frame, frame * 0.1, BELOW)
 
 
 def test_points_above_the_own_sweeps_field_are_left_out() -> None:
@@ -311,12 +321,45 @@ def test_memory_is_bounded_and_the_newest_points_stay(monkeypatch: pytest.Monkey
     centre = torch.tensor([4e6, 5e5, 100.0], dtype=torch.float64)
     for age in range(8):
         points = torch.from_numpy(rng.uniform(-2, 2, (3000, 3))) + centre
-        gathered.add(points, torch.full((3000,), 0.1), age / 10)
+        gathered.add(points, torch.full((3000,), 0.1), torch.zeros(3000, dtype=torch.bool), age / 10)
         assert sum(len(part[0]) for part in gathered._parts) <= 5000
     found = gathered.together()
     cells = torch.floor((found.points_m - centre) / 0.05).long()
     assert len(torch.unique(cells, dim=0)) == len(cells)
     assert (found.age_s == 0).sum() > (found.age_s > 0.6).sum()
+
+
+def test_thinned_points_hide_as_much_as_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    near = grid_on_plane(300, 300, 0.01, np.array([0, 0, 2.0]), np.array([1.0, 0, 0]), np.array([0, 1.0, 0]))
+    far = grid_on_plane(150, 150, 0.1, np.array([0, 0, 20.0]), np.array([1.0, 0, 0]), np.array([0, 1.0, 0]))
+    monkeypatch.setattr(sweep_store, "MAX_POINTS", 60_000)
+    gathered = _Gathered(np.zeros(3))
+    for points, spacing in ((near, 0.014), (far, 0.14)):
+        moved = torch.zeros(len(points), dtype=torch.bool)
+        gathered.add(torch.from_numpy(points), torch.full((len(points),), spacing), moved, 0.0)
+    found = gathered.together()
+    assert len(found.points_m) < 60_000
+    seen = project_points(found.points_m, FISHEYE, spacing_m=found.spacing_m)
+    shown = found.points_m[seen.point_index[seen.point_index >= 0]]
+    assert (shown[:, 2] < 3).sum() > 500
+    covered = (shown[:, :2] * (2 / shown[:, 2:])).abs().amax(-1) < 1.3
+    assert not (covered & (shown[:, 2] > 3)).any()
+
+
+def test_a_stray_return_is_not_the_edge_of_the_field() -> None:
+    clean = sweep_in_world(as_sweep(circle(20.0)), 0.0, np.eye(4), straight(0.0), None)
+    stray = np.concatenate((circle(20.0), [[5.0, 0, 3.0], [5.0, 0, -4.0]]))
+    found = sweep_in_world(as_sweep(stray), 0.0, np.eye(4), straight(0.0), None)
+    np.testing.assert_allclose(found.elevation_rad, clean.elevation_rad, atol=1e-3)
+    assert found.spacing_rad == pytest.approx(clean.spacing_rad, rel=0.01)
+
+
+def test_nothing_only_hides_unless_asked() -> None:
+    above = np.eye(4)
+    above[2, 3] = 0.4
+    sweeps = store(stored({0: circle(20.0)}), 0, set())
+    assert sweeps.around(0, 0.0, above).only_hides.any()
+    assert not sweeps.around(0, 0.0, above, hide=False).only_hides.any()
 
 
 def test_first_of_each_cube_in_order() -> None:

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from edge_depth_nerf import __version__
+from edge_depth_nerf.console import run_jobs, say
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_json, write_json, write_png
 from edge_depth_nerf.inspect_options import InspectOptions
@@ -68,7 +66,7 @@ def inspect_scene(options: InspectOptions, console: Console | None = None) -> di
         partial(_look_at, scene, picture, output / sheets[picture.name] if picture.name in sheets else None, options)
         for picture in chosen
     ]
-    figures = _run(jobs, console)
+    figures = run_jobs(jobs, "Looking at the pictures", console)
 
     findings = find(scene, figures)
     write_png(output / TOP_VIEW, draw_top_view(scene, points_m, findings, shown))
@@ -94,8 +92,8 @@ def inspect_scene(options: InspectOptions, console: Console | None = None) -> di
     write_json(output / SUMMARY, summary)
     _show(summary, console)
     for line in limited(findings):
-        _say(console, f"Warning: {line}", "yellow")
-    _say(console, f"{output}: {len(sheets)} sheets, {TOP_VIEW}, {SUMMARY}")
+        say(console, f"Warning: {line}", "yellow")
+    say(console, f"{output}: {len(sheets)} sheets, {TOP_VIEW}, {SUMMARY}")
     return summary
 
 
@@ -133,30 +131,7 @@ def _look_at(
     return figures
 
 
-def _run(jobs: Sequence[partial[PictureFigures]], console: Console) -> list[PictureFigures]:
-    """Do all jobs, several at once, and give their results in order; the first error ends it."""
-    progress = Progress(
-        TextColumn("Looking at the pictures"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=console
-    )
-    # decoding and integrating leave Python's lock; a few threads keep memory small
-    with progress, ThreadPoolExecutor(min(os.cpu_count() or 1, 4)) as pool:
-        task = progress.add_task("", total=len(jobs))
-        futures = [pool.submit(job) for job in jobs]
-        try:
-            for future in as_completed(futures):
-                future.result()
-                progress.advance(task)
-        except BaseException:
-            pool.shutdown(wait=True, cancel_futures=True)
-            raise
-    return [future.result() for future in futures]
-
-
 # ---- the terminal ----------------------------------------------------------------------------------------------
-
-
-def _say(console: Console, text: str, style: str | None = None) -> None:
-    console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
 
 
 def _number(value: float | int | None, form: str, unit: str = "") -> str:

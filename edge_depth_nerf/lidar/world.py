@@ -27,6 +27,8 @@ _SPACING = 1.4
 """How much further apart than evenly spread the returns are where they are sparse: scanners have fewer beams than
 firings (0.43° by 0.2° for KITTI-360's)."""
 
+_STRAY = 1e-3
+"""Share of returns that may lie beyond the scanner's field; one beam of 64 has 16 times as many."""
 _TOP_RAD = math.radians(0.6)
 """Returns within this of the highest one are of the highest beam or two."""
 _STEPS_UP = 6
@@ -79,7 +81,8 @@ def sweep_in_world(
 
     range_m = sweep.points_m.norm(dim=-1)
     sine = sweep.points_m[:, 2] / range_m
-    low, high = sine.min().item(), sine.max().item()
+    # a stray return, off drops or dust, is not the edge of the scanner's field
+    low, high = (float(limit) for limit in np.quantile(sine.numpy(), (_STRAY, 1 - _STRAY)))
     # the directions between two elevations fill 2π·(sin high - sin low) steradians
     spacing_rad = _SPACING * math.sqrt(2 * math.pi * max(high - low, 1e-3) / len(range_m))
     return WorldSweep(

@@ -45,6 +45,22 @@ def label_path(root: Path, sequence: str, camera: str, frame: int) -> Path:
     return root / "data_2d_semantics" / "train" / sequence / camera / "semantic" / f"{frame:010d}.png"
 
 
+def check_label_header(path: Path) -> None:
+    """Check that a file can be a label map, without decoding it.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: not a whole 8-bit PNG of one channel.
+
+    """
+    header = read_png_header(path)
+    if header.bit_depth != 8 or header.colour != "grey":
+        raise InputError(
+            f"{path}: found {header.bit_depth}-bit {header.colour}, expected an 8-bit PNG of one channel with "
+            "KITTI-360's label ids. Take the files in semantic/, not those in semantic_rgb/ or instance/."
+        )
+
+
 def read_labels(path: Path) -> UInt8[np.ndarray, "h w"]:
     """Read a label map.
 
@@ -56,12 +72,7 @@ def read_labels(path: Path) -> UInt8[np.ndarray, "h w"]:
         InputError: not a whole 8-bit PNG of one channel, or with ids that no class has.
 
     """
-    header = read_png_header(path)
-    if header.bit_depth != 8 or header.colour != "grey":
-        raise InputError(
-            f"{path}: found {header.bit_depth}-bit {header.colour}, expected an 8-bit PNG of one channel with "
-            "KITTI-360's label ids. Take the files in semantic/, not those in semantic_rgb/ or instance/."
-        )
+    check_label_header(path)
     labels = cv2.imdecode(np.frombuffer(read_png_bytes(path), np.uint8), cv2.IMREAD_UNCHANGED)
     if labels is None:
         raise InputError(f"{path}: cannot be decoded as a picture. Copy or make the file again.")
@@ -84,7 +95,7 @@ def check_classes(classes: Iterable[str]) -> list[int]:
     ids = []
     for name in classes:
         if name not in CLASSES:
-            raise InputError(f"{name!r}: no class of KITTI-360's, expected some of {', '.join(CLASSES)}.")
+            raise InputError(f"{name!r} is no class of KITTI-360's; expected some of {', '.join(CLASSES)}.")
         ids.append(CLASSES.index(name))
     return ids
 

@@ -24,15 +24,16 @@ from rich.console import Console
 from torch import Tensor
 
 from edge_depth_nerf.cameras import Camera
+from edge_depth_nerf.console import say
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_distance_png, read_image, read_mask, write_mask
+from edge_depth_nerf.files import read_distance_png, read_image, read_json, write_json, write_mask
 from edge_depth_nerf.lidar import project_points, transform_points
 from edge_depth_nerf.masks.ego import EgoMask, find_ego
 from edge_depth_nerf.masks.lens import dark_rim, lens_circle
 from edge_depth_nerf.masks.semantics import check_classes, keep_static, read_labels
 from edge_depth_nerf.masks.semantics import sky as sky_of_labels
 from edge_depth_nerf.masks.sky import find_sky
-from edge_depth_nerf.process.checks import size_error
+from edge_depth_nerf.process.checks import read_camera_mask, size_error
 from edge_depth_nerf.process.downscale import downscale_distance, downscale_image, downscale_mask
 from edge_depth_nerf.process.options import ProcessOptions
 from edge_depth_nerf.process.points import PointCloud
@@ -56,6 +57,8 @@ from edge_depth_nerf.process.transforms import Transform
 
 EGO_MASKS = "ego_masks"
 """Folder of the scene with the vehicle's masks that were found, in the size of the raw pictures."""
+FOUND_POSES = "found_poses.json"
+"""File of the scene with the poses that were found from the pictures: camera, frame, held out, camera to world."""
 _EGO_PICTURES = 60
 """The vehicle is looked for in so many pictures of a camera, spread over the drive."""
 _RIM_PICTURES = 4
@@ -74,16 +77,17 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
     options.check()
     check_classes(options.moving_classes)
     if options.poses == "colmap":
-        from edge_depth_nerf.process.colmap_models import import_pycolmap
+        from edge_depth_nerf.process.colmap_poses import check_colmap
 
-        import_pycolmap()
+        check_colmap(recording, options)
     source = _source(recording, options)
     masks = _given_masks(recording, options)
     check_cameras(_scene_cameras(recording, masks, options), options.theta_max_deg)
     open_scene(options.output, source)
     notices: list[str] = []
     if options.find_ego:
-        recording, notices = _find_vehicle(recording, masks, options, console)
+        training = [picture for picture in recording.pictures if picture.frame not in _held_out(recording, options)]
+        recording, notices = _find_vehicle(recording, training, masks, options, console)
     if options.poses == "colmap":
         from edge_depth_nerf.process.colmap_poses import colmap_poses
 
@@ -91,11 +95,8 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
     if recording.trajectory is None:
         raise InputError("the recording has no poses. Give them, or find them with --poses colmap.")
     if recording.skipped:
-        _say(console, f"Skipped {summarise(recording.skipped)}", "yellow")
-    moments = sorted({picture.frame for picture in recording.pictures})
-    held_out = {
-        frame for frame, out in zip(moments, held_out_frames(len(moments), options.holdout_every), strict=True) if out
-    }
+        say(console, f"Skipped {summarise(recording.skipped)}", "yellow")
+    held_out = _held_out(recording, options)
     builder = _Builder(recording, options, held_out, masks)
     frames = [
         SceneFrame(
@@ -128,6 +129,13 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
     return report
 
 
+def _held_out(recording: Recording, options: ProcessOptions) -> set[int]:
+    """Numbers of the moments that are kept from training."""
+    moments = sorted({picture.frame for picture in recording.pictures})
+    held_out = held_out_frames(len(moments), options.holdout_every)
+    return {frame for frame, out in zip(moments, held_out, strict=True) if out}
+
+
 # ---- the vehicle's own mask ------------------------------------------------------------------------------------
 
 
@@ -137,12 +145,16 @@ def _given_masks(recording: Recording, options: ProcessOptions) -> dict[str, NDA
     for recorded in recording.cameras:
         path = options.ego_mask_of(recorded.name) or recorded.ego_mask
         if path is not None:
-            given[recorded.name] = _read_mask(path, recorded.camera)
+            given[recorded.name] = read_camera_mask(path, recorded.camera)
     return given
 
 
 def _find_vehicle(
-    recording: Recording, masks: dict[str, NDArray[np.bool_]], options: ProcessOptions, console: Console
+    recording: Recording,
+    training: Sequence[RecordedPicture],
+    masks: dict[str, NDArray[np.bool_]],
+    options: ProcessOptions,
+    console: Console,
 ) -> tuple[Recording, list[str]]:
     """Find the masks that are not given, add them to `masks`, and write them into the scene."""
     cameras, notices = [], []
@@ -150,10 +162,11 @@ def _find_vehicle(
         if recorded.name not in masks:
             path = options.output / EGO_MASKS / f"{recorded.name}.png"
             if not path.is_file():
-                mask, said = _find_mask(recorded.camera, recording.pictures_of(recorded.name), options, console)
+                files = [picture.path for picture in training if picture.camera == recorded.name]
+                mask, said = _find_mask(recorded.camera, files, options, console)
                 write_mask(path, mask)
                 notices.append(f"{recorded.name}: {said} Look at {path}; correct it there, or give --ego-mask.")
-            masks[recorded.name] = _read_mask(path, recorded.camera)
+            masks[recorded.name] = read_camera_mask(path, recorded.camera)
             recorded = dataclasses.replace(recorded, ego_mask=path)
         cameras.append(recorded)
     return dataclasses.replace(recording, cameras=tuple(cameras)), notices
@@ -190,13 +203,6 @@ def _scene_cameras(
     ]
 
 
-def _read_mask(path: Path, camera: Camera) -> NDArray[np.bool_]:
-    mask = read_mask(path)
-    if mask.shape != (camera.height, camera.width):
-        raise InputError(size_error(path, mask.shape[1], mask.shape[0], camera))
-    return mask
-
-
 # ---- making the maps -------------------------------------------------------------------------------------------
 
 
@@ -212,6 +218,7 @@ class _Builder:
     ) -> None:
         assert recording.trajectory is not None
         self._options, self._held_out, self._trajectory = options, held_out, recording.trajectory
+        self._pictures = recording.pictures
         self._cameras = {recorded.name: recorded for recorded in recording.cameras}
         self._ego = {name: options.ego_mask_of(name) or recorded.ego_mask for name, recorded in self._cameras.items()}
         self._store = SweepStore(
@@ -225,6 +232,7 @@ class _Builder:
         for scene_camera in _scene_cameras(recording, masks, options):
             usable = lens_circle(scene_camera.original, options.theta_max_deg)
             self._usable[scene_camera.name] = usable if scene_camera.mask is None else usable & scene_camera.mask
+        self._found = [] if options.poses == "recorded" else [self._keep_poses()]
         self._lock = threading.Lock()
         self._coverage: dict[str, list[float]] = defaultdict(list)
         self._without: list[str] = []
@@ -239,6 +247,14 @@ class _Builder:
         present[CLOUD] = present["lidar"]
         self.layers = [layer for layer, there in present.items() if there]
 
+    def _keep_poses(self) -> Path:
+        """Write down the poses that were found, and what is held out by them: other ones make other maps."""
+        path = self._options.output / FOUND_POSES
+        poses = [[p.camera, p.frame, p.frame in self._held_out, self.pose(p).tolist()] for p in self._pictures]
+        if not path.is_file() or read_json(path) != poses:
+            write_json(path, poses)
+        return path
+
     def pose(self, picture: RecordedPicture) -> Transform:
         """Where a picture was taken: its own pose, or the vehicle's at its time."""
         if picture.camera_to_world is not None:
@@ -250,18 +266,17 @@ class _Builder:
         """Files that a picture's maps are made from."""
         sweeps = [sweep.path for sweep in self._store.used(picture.frame, picture.time_s)]
         ego = self._ego[picture.camera]
-        return (*picture.inputs, *sweeps, *([] if ego is None else [ego]))
+        return (*picture.inputs, *sweeps, *self._found, *([] if ego is None else [ego]))
 
     def content(self, picture: RecordedPicture) -> FrameContent:
         """Make the maps of one picture, at the scene's size."""
         factor = self._options.downscale
         camera = self._cameras[picture.camera].camera
-        raw = read_image(picture.path)
-        image = downscale_image(raw, factor)
+        image = downscale_image(read_image(picture.path), factor)
         labels = None if picture.semantics is None else read_labels(picture.semantics)
         mask = self._mask(picture, labels, camera)
         lidar, cloud = self._lidar(picture, camera, image)
-        mono = None if picture.mono is None else self._mono(picture, camera, raw, labels, lidar)
+        mono = None if picture.mono is None else self._mono(picture, camera, image, labels, lidar)
         return FrameContent(
             image=picture.path if factor == 1 else image,
             mask=None if mask is None else downscale_mask(mask, factor),
@@ -280,7 +295,7 @@ class _Builder:
             return None
         mask = np.ones((camera.height, camera.width), bool)
         if picture.mask is not None:
-            mask &= _read_mask(picture.mask, camera)
+            mask &= read_camera_mask(picture.mask, camera)
         if labels is not None:
             mask &= keep_static(labels, self._options.moving_classes)
         return mask
@@ -293,15 +308,15 @@ class _Builder:
         camera_to_world = self.pose(picture)
         if picture.depth is not None:
             distance_m = downscale_distance(read_depth(picture.depth, full), self._options.downscale)
-            points = _rays_of(camera)[0] * torch.from_numpy(distance_m)[..., None]
+            points = rays_of(camera)[0] * torch.from_numpy(distance_m)[..., None]
             index = torch.where(
                 torch.from_numpy(distance_m) > 0, torch.arange(distance_m.size).view(distance_m.shape), -1
             )
             in_camera = points.reshape(-1, 3).double()
         elif "lidar" in self.layers:
-            around = self._store.around(picture.frame, picture.time_s, camera_to_world)
-            in_camera = transform_points(torch.from_numpy(np.linalg.inv(camera_to_world)), around.points_m)
             hides = self._options.occlusion
+            around = self._store.around(picture.frame, picture.time_s, camera_to_world, hide=hides)
+            in_camera = transform_points(torch.from_numpy(np.linalg.inv(camera_to_world)), around.points_m)
             seen = project_points(
                 in_camera.float(),
                 camera,
@@ -310,6 +325,8 @@ class _Builder:
                 only_hides=around.only_hides,
             )
             distance_m, index = seen.distance_m.numpy(), seen.point_index
+            # what moved is in the picture, but no part of the cloud
+            index = torch.where(around.moved[index.clamp(min=0)], -1, index)
         else:
             return None, None
         has_return = distance_m[self._usable[picture.camera]] > 0
@@ -323,7 +340,7 @@ class _Builder:
         self,
         picture: RecordedPicture,
         full: Camera,
-        raw: UInt8[np.ndarray, "h w 3"],
+        image: UInt8[np.ndarray, "h2 w2 3"],
         labels: UInt8[np.ndarray, "h w"] | None,
         lidar: Float[np.ndarray, "h2 w2"] | None,
     ) -> DistanceMap:
@@ -339,7 +356,7 @@ class _Builder:
             camera = full.downscaled(factor)
             up = np.linalg.inv(self.pose(picture))[:3, 2]
             lidar = np.zeros(mono.shape, np.float32) if lidar is None else lidar
-            sky = find_sky(downscale_image(raw, factor), self._usable[picture.camera], up, camera, lidar, mono)
+            sky = find_sky(image, self._usable[picture.camera], up, camera, lidar, mono)
         return np.where(sky, 0, mono).astype(np.float32)
 
     def notices(self) -> list[str]:
@@ -368,7 +385,7 @@ def read_depth(depth: DepthFile, camera: Camera) -> Float[np.ndarray, "h w"]:
         raise InputError(size_error(depth.path, distance_m.shape[1], distance_m.shape[0], camera))
     if depth.kind == "distance":
         return distance_m
-    rays, valid = _rays_of(camera)
+    rays, valid = rays_of(camera)
     cosine = rays[..., 2].numpy()
     # a depth along the axis says nothing where the ray is at right angles to it, or points backwards
     usable = valid.numpy() & (cosine > 0.01)
@@ -376,7 +393,7 @@ def read_depth(depth: DepthFile, camera: Camera) -> Float[np.ndarray, "h w"]:
 
 
 @functools.lru_cache(maxsize=8)
-def _rays_of(camera: Camera) -> tuple[Float[Tensor, "h w 3"], Bool[Tensor, "h w"]]:
+def rays_of(camera: Camera) -> tuple[Float[Tensor, "h w 3"], Bool[Tensor, "h w"]]:
     """Unit rays of all pixels, 0 where there is none; takes seconds."""
     rays, valid = camera.unproject(camera.pixel_centres())
     return torch.where(valid[..., None], rays, 0.0).float(), valid
@@ -452,19 +469,15 @@ def _source(recording: Recording, options: ProcessOptions) -> dict[str, Any]:
     }
 
 
-def _say(console: Console, text: str, style: str | None = None) -> None:
-    console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
-
-
 def _show(report: ProcessReport, console: Console) -> None:
     for name, share in report.mask_share.items():
         fit = report.fits[name]
-        _say(
+        say(
             console,
             f"{name}: nerfstudio's camera fits within {fit.rms_px:.4f} px rms, {fit.max_px:.3f} px at most; the mask "
             f"keeps {share:.0%} of the picture",
         )
     for notice in report.notices:
-        _say(console, notice, "yellow")
+        say(console, notice, "yellow")
     done = "" if report.written else "; nothing was left to do"
-    _say(console, f"{report.scene}: {report.training} pictures for training, {report.held_out} held out{done}")
+    say(console, f"{report.scene}: {report.training} pictures for training, {report.held_out} held out{done}")

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.files import read_mask
 from edge_depth_nerf.process.png import PngHeader, read_png_header
 
 
@@ -37,6 +41,20 @@ def check_distance(path: Path, camera: Camera) -> None:
             f"{path}: {header.bit_depth}-bit {header.colour}, expected a 16-bit grey PNG in units of 1/256 m. "
             "Other kinds have lost the distance; export the map again."
         )
+
+
+def read_camera_mask(path: Path, camera: Camera) -> NDArray[np.bool_]:
+    """Read a mask of a camera's pictures, True = use.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: broken, or not of the camera's size.
+
+    """
+    mask = read_mask(path)
+    if mask.shape != (camera.height, camera.width):
+        raise InputError(size_error(path, mask.shape[1], mask.shape[0], camera))
+    return mask
 
 
 def size_error(path: Path, width: int, height: int, camera: Camera) -> str:

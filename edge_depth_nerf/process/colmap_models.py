@@ -18,6 +18,7 @@ drives, COLMAP 4.2). Without it, the cameras that share no view become a model e
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 import math
@@ -39,14 +40,15 @@ from edge_depth_nerf.cameras import Camera, KannalaBrandt, Pinhole, fit_kannala_
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import (
     read_json,
-    read_mask,
     write_atomically,
     write_bytes,
     write_json,
     write_mask,
     write_text,
 )
+from edge_depth_nerf.masks.lens import lens_circle
 from edge_depth_nerf.masks.semantics import keep_static, read_labels
+from edge_depth_nerf.process.checks import read_camera_mask
 from edge_depth_nerf.process.options import ProcessOptions
 from edge_depth_nerf.process.recording import Recording
 from edge_depth_nerf.process.transforms import Transform
@@ -57,6 +59,7 @@ THETA_MAX_DEG = 85.0
 INSTALL = "pip install edge-depth-nerf[colmap]"
 
 _OLDEST = (4, 2)
+_RECORD = "inputs.json"
 _VERSION = 1
 """Of what is done with the inputs; raised when results change."""
 _NEIGHBOURS = (1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 20)
@@ -107,6 +110,7 @@ class _Lens:
     """How far it is from the camera it stands for."""
 
 
+@functools.lru_cache(maxsize=64)
 def colmap_lens(camera: Camera, theta_max_rad: float = math.radians(THETA_MAX_DEG)) -> _Lens:
     """Express a camera in one of COLMAP's models, whose pixel centres are at +0.5 as well.
 
@@ -151,6 +155,20 @@ def import_pycolmap() -> Any:
             f"`{INSTALL}`."
         )
     return pycolmap
+
+
+def check_folder(folder: Path) -> None:
+    """Check that a folder to work in is new, or ours.
+
+    Raises:
+        InputError: it holds something else.
+
+    """
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / _RECORD).is_file():
+        raise InputError(
+            f"{folder}: COLMAP's features and models are to go there, but it holds other files. Move them away, or "
+            "choose another --output."
+        )
 
 
 def find_models(recording: Recording, options: ProcessOptions, folder: Path, console: Console) -> list[ColmapModel]:
@@ -209,15 +227,11 @@ class _Run:
 
     def prepare(self) -> None:
         """Empty the folder unless it was made from the same inputs."""
-        record = self.folder / "inputs.json"
+        record = self.folder / _RECORD
         inputs = {"kind": "COLMAP's work for edge-depth-nerf", "digest": self._digest()}
         if record.is_file() and read_json(record) == inputs:
             return
-        if self.folder.is_dir() and any(self.folder.iterdir()) and not record.is_file():
-            raise InputError(
-                f"{self.folder}: COLMAP's features and models are to go there, but it holds other files. Move them "
-                "away, or choose another --output."
-            )
+        check_folder(self.folder)
         shutil.rmtree(self.folder, ignore_errors=True)
         self.folder.mkdir(parents=True)
         write_json(record, inputs)
@@ -310,13 +324,15 @@ class _Run:
                 continue
             if picture.camera not in shared:
                 camera = cameras[picture.camera]
-                shared[picture.camera] = _lens_mask(camera.camera, self.lenses[camera.name].theta_max_rad)
+                shared[picture.camera] = lens_circle(
+                    camera.camera, math.degrees(self.lenses[camera.name].theta_max_rad)
+                )
                 ego_mask = self.ego_masks[camera.name]
                 if ego_mask is not None:
-                    shared[picture.camera] &= _mask_of(ego_mask, camera.camera)
+                    shared[picture.camera] &= read_camera_mask(ego_mask, camera.camera)
             mask = shared[picture.camera]
             if picture.mask is not None:
-                mask = mask & _mask_of(picture.mask, cameras[picture.camera].camera)
+                mask = mask & read_camera_mask(picture.mask, cameras[picture.camera].camera)
             if picture.semantics is not None:
                 mask = mask & keep_static(read_labels(picture.semantics), self.options.moving_classes)
             # a feature at the edge of a mask looks at what is masked
@@ -340,10 +356,9 @@ class _Run:
         geometry = colmap.TwoViewGeometryOptions()
         geometry.ransac.max_error = self._error_px()
         geometry.ransac.random_seed = _SEED
-        if None in self.ego_masks.values():
-            # what stays where it is in the picture may be the vehicle
-            geometry.filter_stationary_matches = True
-            geometry.stationary_matches_max_error = 1.0
+        # what stays where it is in the picture is the vehicle, or dirt on the lens
+        geometry.filter_stationary_matches = True
+        geometry.stationary_matches_max_error = 1.0
         pairing = colmap.ImportedPairingOptions()
         pairing.match_list_path = self.folder / "pairs.txt"
         pairs = self._pairs()
@@ -461,24 +476,8 @@ def _chunks(items: Sequence, size: int) -> Iterator[Sequence]:
         yield items[start : start + size]
 
 
-def _lens_mask(camera: Camera, theta_max_rad: float) -> NDArray[np.bool_]:
-    """Pixels within an angle of the axis."""
-    rays, valid = camera.unproject(camera.pixel_centres())
-    return (valid & (rays[..., 2] >= math.cos(theta_max_rad))).numpy()
-
-
 def _reach_rad(camera: Camera, theta_max_rad: float) -> float:
     """The largest angle from the axis, up to a limit, that the middle row of the picture sees."""
     rays, valid = camera.unproject(camera.pixel_centres()[camera.height // 2])
     inside = valid & (rays[..., 2] >= math.cos(theta_max_rad))
     return math.acos(float(rays[..., 2][inside].min())) if inside.any() else 0.0
-
-
-def _mask_of(path: Path, camera: Camera) -> NDArray[np.bool_]:
-    mask = read_mask(path)
-    if mask.shape != (camera.height, camera.width):
-        raise InputError(
-            f"{path}: {mask.shape[1]}x{mask.shape[0]} pixels, expected {camera.width}x{camera.height}, the size of the "
-            "pictures. Make the mask again in that size."
-        )
-    return mask

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
@@ -16,7 +17,14 @@ from rich.console import Console
 
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.lidar.trajectory import Trajectory
-from edge_depth_nerf.process.colmap_models import ColmapModel, find_models, import_pycolmap
+from edge_depth_nerf.process.colmap_models import (
+    THETA_MAX_DEG,
+    ColmapModel,
+    check_folder,
+    colmap_lens,
+    find_models,
+    import_pycolmap,
+)
 from edge_depth_nerf.process.colmap_scale import MetricPath, Scale, metric_path
 from edge_depth_nerf.process.options import ProcessOptions
 from edge_depth_nerf.process.recording import Recording
@@ -48,10 +56,8 @@ def colmap_poses(recording: Recording, options: ProcessOptions, console: Console
             related, or LiDAR and the reconstruction share too little for a scale.
 
     """
-    import_pycolmap()
-    _check(recording)
-    output = options.output.absolute()
-    models = find_models(recording, options, output.with_name(f".{output.name}.colmap"), console)
+    check_colmap(recording, options)
+    models = find_models(recording, options, _folder(options), console)
     models = [model for model in models if _spans(recording, model)]
     if not models:
         cameras = ", ".join(camera.name for camera in recording.cameras)
@@ -82,8 +88,24 @@ def colmap_poses(recording: Recording, options: ProcessOptions, console: Console
     )
 
 
-def _check(recording: Recording) -> None:
-    """Check what can be checked before the long work."""
+def _folder(options: ProcessOptions) -> Path:
+    """Where COLMAP works: beside the scene."""
+    output = options.output.absolute()
+    return output.with_name(f".{output.name}.colmap")
+
+
+def check_colmap(recording: Recording, options: ProcessOptions) -> None:
+    """Check what can be checked before the long work.
+
+    Raises:
+        InputError: pycolmap is missing, there are too few pictures or none with LiDAR, a lens has no counterpart in
+            COLMAP, or the folder to work in holds something else.
+
+    """
+    import_pycolmap()
+    check_folder(_folder(options))
+    for camera in recording.cameras:
+        colmap_lens(camera.camera, math.radians(min(options.theta_max_deg, THETA_MAX_DEG)))
     found = len(recording.pictures)
     if found < _MIN_PICTURES:
         raise InputError(

@@ -22,8 +22,10 @@ from scipy.spatial.transform import Rotation
 
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.lidar import transform_points
 from edge_depth_nerf.lidar.trajectory import Trajectory
-from edge_depth_nerf.process.build import read_depth
+from edge_depth_nerf.lidar.world import sweep_in_world
+from edge_depth_nerf.process.build import rays_of, read_depth
 from edge_depth_nerf.process.colmap_models import ColmapModel
 from edge_depth_nerf.process.recording import RecordedPicture, RecordedSweep, Recording
 from edge_depth_nerf.process.transforms import Transform
@@ -264,15 +266,9 @@ def _ratios(
 def _scan(sweep: RecordedSweep, trajectory: Trajectory | None) -> Float64[np.ndarray, "returns 3"]:
     """A sweep's points in the world, each by the vehicle's pose at its time; without a path, in the vehicle's frame."""
     read = sweep.read()
-    to_vehicle = torch.from_numpy(sweep.to_vehicle)
-    points = read.points_m.double() @ to_vehicle[:3, :3].T + to_vehicle[:3, 3]
     if trajectory is None:
-        return points.numpy()
-    offset_s = read.offset_s
-    if offset_s is None and sweep.timing is not None:
-        offset_s = sweep.timing.offsets_s(read.points_m)
-    times_s = torch.full((len(points),), sweep.time_s, dtype=torch.float64)
-    return trajectory.to_world(points, times_s if offset_s is None else times_s + offset_s.double()).numpy()
+        return transform_points(torch.from_numpy(sweep.to_vehicle), read.points_m).numpy()
+    return sweep_in_world(read, sweep.time_s, sweep.to_vehicle, trajectory, sweep.timing).points_m.numpy()
 
 
 def _returns_in_camera(
@@ -295,7 +291,7 @@ def _depth_points(picture: RecordedPicture, camera: Camera) -> Float64[np.ndarra
     if picture.depth is None:
         return np.zeros((0, 3))
     distance = torch.from_numpy(read_depth(picture.depth, camera)).double()
-    rays, valid = camera.unproject(camera.pixel_centres())
+    rays, valid = rays_of(camera)
     return (rays * distance[..., None])[valid & (distance > 0)].numpy()
 
 

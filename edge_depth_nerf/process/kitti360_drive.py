@@ -8,10 +8,11 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.masks.semantics import label_path
+from edge_depth_nerf.masks.semantics import check_label_header, label_path
 from edge_depth_nerf.process.checks import check_distance, check_size, require_folder
 from edge_depth_nerf.process.kitti360_calibration import Kitti360Rig, read_timestamps
 from edge_depth_nerf.process.options import Kitti360Options
@@ -170,9 +171,12 @@ class Kitti360Drive:
                         f"{path}: no such file; the drive's truth is incomplete. Synthesise the drive again, or move "
                         f"{self.truth} away to go on without it."
                     )
-            for path in (files.mask, files.semantics, files.truth_rgb):
+            for path in (files.mask, files.truth_rgb):
                 if path is not None:
                     check_size(path, camera)
+            if files.semantics is not None:
+                check_size(files.semantics, camera)
+                check_label_header(files.semantics)
             for path in (files.mono, files.truth_distance):
                 if path is not None:
                     check_distance(path, camera)
@@ -194,6 +198,12 @@ class Kitti360Drive:
         if not path.is_file():
             return []
         times = read_timestamps(path)
+        for number, (before, time) in enumerate(pairwise(times), 2):
+            if not time > before:
+                raise InputError(
+                    f"{path}, line {number}: not after the line before. Copy the file again from the data set, or move "
+                    "it away: frames then count as 0.1 s apart."
+                )
         if missing := [frame for frame in frames if frame >= len(times)]:
             raise InputError(
                 f"{path}: ends after line {len(times)}, but frame {missing[0]} needs line {missing[0] + 1}. The file "

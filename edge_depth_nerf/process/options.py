@@ -84,7 +84,7 @@ class ProcessOptions:
         holdout = self.holdout_every
         require(holdout == 0 or holdout >= 2, "holdout-every", holdout, "2 or more, or 0 to hold out none")
         require(0 < self.theta_max_deg <= 180, "theta-max-deg", self.theta_max_deg, "degrees above 0, up to 180")
-        require(0 <= self.sweeps <= 100, "sweeps", self.sweeps, "0 to 100")
+        require(0 <= self.sweeps <= 30, "sweeps", self.sweeps, "0 to 30")
 
 
 @dataclass(frozen=True, kw_only=True)

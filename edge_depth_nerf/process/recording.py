@@ -124,7 +124,3 @@ class Recording:
     """What the user should know."""
     shifted: tuple[ShiftedView, ...] = field(default=())
     """True views from beside the path, of synthetic drives."""
-
-    def pictures_of(self, camera: str) -> list[Path]:
-        """The files of one camera's pictures, in order of frames."""
-        return [picture.path for picture in sorted(self.pictures, key=lambda p: p.frame) if picture.camera == camera]

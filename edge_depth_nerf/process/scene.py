@@ -22,26 +22,23 @@ from __future__ import annotations
 
 import functools
 import math
-import os
 import re
 import shutil
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float64
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from edge_depth_nerf import __version__
 from edge_depth_nerf.cameras import Camera, CameraFit, KannalaBrandt, Pinhole, fit_kannala_brandt, host_residual
+from edge_depth_nerf.console import run_jobs
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import (
     DISTANCE_STEPS_PER_METRE,
@@ -262,7 +259,7 @@ def write_scene(
     if jobs:
         # a reader is not to find a scene whose maps are being replaced
         (output / TRANSFORMS).unlink(missing_ok=True)
-        _run(jobs, console)
+        run_jobs(jobs, "Writing the scene", console)
     if work.cloud:
         parts = [output / _cloud_path(frame) for frame in frames if not frame.held_out]
         if not merge_parts(parts, output / POINTS):
@@ -348,7 +345,10 @@ def open_scene(output: Path, source: Mapping[str, Any]) -> None:
         there = read_json(path)
         there = there if isinstance(there, dict) else {}
         differing = [key for key in dict.fromkeys((*record, *there)) if there.get(key) != record.get(key)]
-        if differing:
+        if differing and not any(entry.name != RECORD for entry in output.iterdir()):
+            # a run that failed before it wrote anything does not bind the next one
+            write_json(path, record)
+        elif differing:
             key = differing[0]
             others = f" (also: {', '.join(differing[1:])})" if differing[1:] else ""
             raise InputError(
@@ -544,29 +544,6 @@ def _pending(
             )
         ]
     return _Work(stale, [view for view in shifted if not fresh(_shifted_files(view), view.inputs)], cloud)
-
-
-def _run(jobs: Sequence[Callable[[], None]], console: Console) -> None:
-    """Do all jobs, several at once; the first error ends it."""
-    progress = Progress(
-        TextColumn("Writing the scene"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=console
-    )
-    # decoding, encoding and torch leave Python's lock; a few threads keep memory small, and are not to share their
-    # cores with threads of torch's own
-    inner_threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    with progress, ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
-        task = progress.add_task("", total=len(jobs))
-        futures = [pool.submit(job) for job in jobs]
-        try:
-            for future in as_completed(futures):
-                future.result()
-                progress.advance(task)
-        except BaseException:
-            pool.shutdown(wait=True, cancel_futures=True)
-            raise
-        finally:
-            torch.set_num_threads(inner_threads)
 
 
 def _write_frame(

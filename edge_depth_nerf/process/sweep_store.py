@@ -11,7 +11,6 @@ hides them.
 
 from __future__ import annotations
 
-import dataclasses
 import statistics
 import threading
 from collections import OrderedDict
@@ -39,6 +38,10 @@ VOXEL_M = 0.05
 first; cubes grow where they would still be too many."""
 MAX_POINTS = 2_000_000
 """So many points at most are kept around a picture."""
+_DIAGONAL = 1.4
+"""Neighbours of thinned points are up to so many cubes apart, across."""
+_TURN_S = 0.1
+"""A turn of a scanner of which nothing is known."""
 
 Value = TypeVar("Value")
 
@@ -86,6 +89,8 @@ class Surroundings:
     """How far in time from the picture its sweep is."""
     only_hides: Bool[Tensor, "points"]
     """Points that were not measured: they hide others and are not to be chosen."""
+    moved: Bool[Tensor, "points"]
+    """Points of the picture's own sweep that others saw through: there at its moment, and no part of what lasts."""
 
 
 class _Scanner:
@@ -103,9 +108,12 @@ class _Scanner:
     ) -> None:
         self.sweeps = sorted(sweeps, key=lambda sweep: sweep.time_s)
         self.times_s = np.array([sweep.time_s for sweep in self.sweeps])
-        intervals = np.diff(self.times_s)
-        turn = self.sweeps[0].timing.turn_s if self.sweeps[0].timing else 0.1
-        self.half_turn_s = 0.5 * (statistics.median(intervals.tolist()) if len(intervals) else turn)
+        self._of_frame: dict[int | None, list[int]] = {}
+        for index, sweep in enumerate(self.sweeps):
+            self._of_frame.setdefault(sweep.frame, []).append(index)
+        timing, intervals = self.sweeps[0].timing, np.diff(self.times_s).tolist()
+        turn_s = timing.turn_s if timing else min(statistics.median(intervals), _TURN_S) if intervals else _TURN_S
+        self.half_turn_s = turn_s / 2
         self.trains = [sweep.frame not in held_out for sweep in self.sweeps]
         self._bridged = [
             trajectory.gap_s(time) <= MAX_POSE_GAP_S or 0 < trajectory.outside_s(time) <= self.half_turn_s
@@ -115,7 +123,7 @@ class _Scanner:
         # of two pictures in work at once, each with its window and what its window's sweeps are checked against
         window = 4 * reach + 4
         self._loaded: _Shared[_Loaded] = _Shared(self._load, window)
-        self._still: _Shared[WorldSweep] = _Shared(self._without_moving, window)
+        self._moved: _Shared[Tensor] = _Shared(self._seen_through, window)
 
     def _load(self, index: int) -> _Loaded:
         recorded = self.sweeps[index]
@@ -131,31 +139,32 @@ class _Scanner:
         first, last = max(index - self._reach, 0), min(index + self._reach, len(self.sweeps) - 1)
         return [i for i in range(first, last + 1) if i != index and self.trains[i] and self._bridged[i]]
 
-    def _without_moving(self, index: int) -> WorldSweep:
-        """A sweep without what another one saw through."""
+    def _seen_through(self, index: int) -> Bool[Tensor, "returns"]:
+        """Which points of a sweep another one saw through."""
         world = self._loaded.get(index).world
         passed = torch.zeros(len(world.points_m), dtype=torch.bool)
         for other in self.around(index):
             free_space = self._loaded.get(other).free_space
             assert free_space is not None
             passed |= free_space.seen_through(world.points_m)
-        return dataclasses.replace(world, points_m=world.points_m[~passed], spacing_m=world.spacing_m[~passed])
+        return passed
 
     def own(self, frame: int, time_s: float) -> int | None:
         """The sweep of a picture's moment: the one that belongs to it, else the nearest in time, within a turn."""
-        of_frame = [index for index, sweep in enumerate(self.sweeps) if sweep.frame == frame]
-        if of_frame:
+        if of_frame := self._of_frame.get(frame):
             return min(of_frame, key=lambda index: abs(self.times_s[index] - time_s))
-        nearest = int(np.abs(self.times_s - time_s).argmin())
+        after = int(np.searchsorted(self.times_s, time_s))
+        around = range(max(after - 1, 0), min(after + 1, len(self.sweeps)))
+        nearest = min(around, key=lambda index: abs(self.times_s[index] - time_s))
         return nearest if abs(self.times_s[nearest] - time_s) <= 2 * self.half_turn_s else None
 
     def whole(self, index: int) -> WorldSweep:
         """A sweep with all its points."""
         return self._loaded.get(index).world
 
-    def still(self, index: int) -> WorldSweep:
-        """A sweep's points that no other sweep saw through."""
-        return self._still.get(index)
+    def moved(self, index: int) -> Bool[Tensor, "returns"]:
+        """Which of them another sweep, that training may see, saw through."""
+        return self._moved.get(index)
 
 
 class SweepStore:
@@ -217,13 +226,14 @@ class SweepStore:
         window = [own] if scanner.trains[own] else []
         return window + sorted(scanner.around(own), key=lambda index: abs(scanner.times_s[index] - time_s))
 
-    def around(self, frame: int, time_s: float, viewpoint_in_world: Transform) -> Surroundings:
+    def around(self, frame: int, time_s: float, viewpoint_in_world: Transform, *, hide: bool = True) -> Surroundings:
         """Gather the points around a picture.
 
         Args:
             frame: number of its moment.
             time_s: when it was taken.
             viewpoint_in_world: the camera's pose, camera to world.
+            hide: also give the points that only hide others.
 
         """
         found = _Gathered(viewpoint_in_world[:3, 3])
@@ -233,12 +243,18 @@ class SweepStore:
                 age_s = abs(float(scanner.times_s[index]) - time_s)
                 if rank == 0 and age_s <= scanner.half_turn_s:
                     sweep = scanner.whole(index)
-                    found.add(sweep.points_m, sweep.spacing_m, age_s)
-                    found.hide(*above_field(sweep, viewpoint_in_world[:3, 3]))
+                    # a picture that is held out has no others around it, and nothing lasting is made of it
+                    moved = torch.zeros(len(sweep.points_m), dtype=torch.bool)
+                    if len(window) > 1:
+                        moved = scanner.moved(index)
+                    found.add(sweep.points_m, sweep.spacing_m, moved, age_s)
+                    if hide:
+                        found.hide(*above_field(sweep, viewpoint_in_world[:3, 3]))
                 else:
-                    sweep, first = scanner.still(index), scanner.whole(window[0])
-                    low = _elevation(sweep.points_m, first) <= first.elevation_rad[1]
-                    found.add(sweep.points_m[low], sweep.spacing_m[low], age_s)
+                    sweep, first, still = scanner.whole(index), scanner.whole(window[0]), ~scanner.moved(index)
+                    points_m, spacing_m = sweep.points_m[still], sweep.spacing_m[still]
+                    low = _elevation(points_m, first) <= first.elevation_rad[1]
+                    found.add(points_m[low], spacing_m[low], torch.zeros_like(low[low]), age_s)
         return found.together()
 
 
@@ -253,28 +269,36 @@ class _Gathered:
 
     def __init__(self, centre_m: np.ndarray) -> None:
         self._centre = torch.from_numpy(centre_m)
-        self._parts: list[tuple[Tensor, Tensor, Tensor]] = []
+        self._parts: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
         self._hiding: list[tuple[Tensor, Tensor]] = []
         self._voxel_m = VOXEL_M
 
-    def add(self, points_m: Tensor, spacing_m: Tensor, age_s: float) -> None:
-        self._parts.append((points_m, spacing_m, torch.full_like(spacing_m, age_s)))
+    def add(self, points_m: Tensor, spacing_m: Tensor, moved: Tensor, age_s: float) -> None:
+        self._parts.append((points_m, spacing_m, moved, torch.full_like(spacing_m, age_s)))
         while sum(len(part[0]) for part in self._parts) > MAX_POINTS:
-            points, spacing, age = (torch.cat(values) for values in zip(*self._parts, strict=True))
+            points, spacing, moved, age = (torch.cat(values) for values in zip(*self._parts, strict=True))
             kept = torch.from_numpy(first_in_voxel((points - self._centre).numpy(), self._voxel_m))
-            self._parts = [(points[kept], spacing[kept], age[kept])]
+            # points further apart stand for wider patches: they are to hide as much as before
+            wide = spacing[kept].clamp(min=_DIAGONAL * self._voxel_m)
+            self._parts = [(points[kept], wide, moved[kept], age[kept])]
             self._voxel_m *= 1.2
 
     def hide(self, points_m: Tensor, spacing_m: Tensor) -> None:
         self._hiding.append((points_m, spacing_m))
 
     def together(self) -> Surroundings:
-        none = (torch.empty(0, 3, dtype=torch.float64), torch.empty(0), torch.empty(0))
-        points, spacing, age = (torch.cat(values) for values in zip(none, *self._parts, strict=True))
+        none = (
+            torch.empty(0, 3, dtype=torch.float64),
+            torch.empty(0),
+            torch.empty(0, dtype=torch.bool),
+            torch.empty(0),
+        )
+        points, spacing, moved, age = (torch.cat(values) for values in zip(none, *self._parts, strict=True))
         hiding, hiding_spacing = (torch.cat(values) for values in zip(none[:2], *self._hiding, strict=True))
         return Surroundings(
             points_m=torch.cat((points, hiding)),
             spacing_m=torch.cat((spacing, hiding_spacing)),
             age_s=torch.cat((age, torch.zeros(len(hiding)))),
             only_hides=torch.arange(len(points) + len(hiding)) >= len(points),
+            moved=torch.cat((moved, torch.zeros(len(hiding), dtype=torch.bool))),
         )

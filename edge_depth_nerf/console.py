@@ -1,0 +1,46 @@
+"""What long commands share: lines on the terminal, and jobs in threads with progress."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from typing import TypeVar
+
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+_MAX_THREADS = 8
+"""More threads would hold more maps in memory at once."""
+
+Result = TypeVar("Result")
+
+
+def say(console: Console, text: str, style: str | None = None) -> None:
+    """Print a line as it is: paths and brackets are not markup, and the terminal wraps it."""
+    console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
+
+
+def run_jobs(jobs: Sequence[Callable[[], Result]], title: str, console: Console) -> list[Result]:
+    """Do all jobs, several at once, and give their results in order; the first error ends it.
+
+    Decoding, encoding and torch leave Python's lock. Torch gets one thread of its own in each job: the jobs share the
+    cores already.
+    """
+    progress = Progress(TextColumn(title), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=console)
+    inner_threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    with progress, ThreadPoolExecutor(min(os.cpu_count() or 1, _MAX_THREADS)) as pool:
+        task = progress.add_task("", total=len(jobs))
+        futures = [pool.submit(job) for job in jobs]
+        try:
+            for future in as_completed(futures):
+                future.result()
+                progress.advance(task)
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+        finally:
+            torch.set_num_threads(inner_threads)
+    return [future.result() for future in futures]
