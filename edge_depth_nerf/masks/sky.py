@@ -21,6 +21,7 @@ from edge_depth_nerf.masks.regions import (
     block_mean,
     dilated,
     enlarge,
+    from_nearest,
     larger,
     means_within,
     opened,
@@ -99,6 +100,9 @@ def find_sky(
         far &= (mono_m == 0) | (mono_m >= NEAR_M)
         possible &= block_mean(far.astype(np.float32), factor) > 0.5
     sky = _grow(block_mean(picture, factor).astype(np.float32), possible, usable, height_sine)
+    if usable.any():
+        # blocks that the mask cuts, along the lens's rim, are as those beside them
+        sky = from_nearest(sky, usable)
     return enlarge(sky, factor, (mask.shape[0], mask.shape[1])) & mask & far
 
 
