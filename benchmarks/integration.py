@@ -1,17 +1,22 @@
-"""Time the integration of one frame: the package against a plain NumPy form and torch's unfold.
+"""Time and memory of integrating one frame: the package against a plain NumPy form and torch's unfold.
 
-    python benchmarks/integration.py [--size 1400] [--repeat 3] [--threads 2]
+    python benchmarks/integration.py [--size 1400] [--repeat 7] [--threads 2]
 
 The frame is a picture circle over smooth surfaces with edges, 2.6 % of its pixels with a LiDAR return, as in a real
-KITTI-360 frame. The largest difference is to the NumPy form, which computes in float64.
+KITTI-360 frame. Largest differences are to the NumPy form, which computes in float64. Wall time is the best and the
+median of the runs, CPU time the best (it does not count what else the machine does). Memory is the peak beyond what
+was there before, with the result, as a number of H×W float32 maps; measured on Linux only.
 """
 
 from __future__ import annotations
 
 import argparse
-import math
+import ctypes
+import statistics
+import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -84,37 +89,74 @@ def package_form(device: str = "cpu", **fields) -> Callable[..., np.ndarray]:
     return integrate
 
 
+def peak_bytes(work: Callable[[], object]) -> int | None:
+    """Measure how far the process's memory rises above where it stood; None where the system does not say."""
+    if sys.platform != "linux":
+        return None
+
+    def kib(name: str) -> int:
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return next(int(line.split()[1]) for line in lines if line.startswith(f"{name}:"))
+
+    ctypes.CDLL(None).malloc_trim(0)  # freed memory that is still held would hide what is used anew
+    try:
+        Path("/proc/self/clear_refs").write_text("5")  # the peak starts again from here
+    except OSError:
+        return None
+    before = kib("VmRSS")
+    work()
+    return 1024 * (kib("VmHWM") - before)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--size", type=int, default=1400, help="height and width, pixels")
-    parser.add_argument("--repeat", type=int, default=3, help="the best of so many runs is printed")
-    parser.add_argument("--threads", type=int, default=2, help="torch's threads; NumPy and the package use one")
+    parser.add_argument("--repeat", type=int, default=7, help="how often each form runs")
+    parser.add_argument("--threads", type=int, default=2, help="the most threads that torch and the package may use")
     arguments = parser.parse_args()
-    torch.set_num_threads(arguments.threads)
 
+    start = time.perf_counter()
+    package_form()(*make_frame(64))
+    first_call = time.perf_counter() - start
     frame = make_frame(arguments.size)
     expected = numpy_form(*frame)
-    forms: dict[str, tuple[Callable[..., np.ndarray], bool]] = {
-        "NumPy, shifted slices, float64": (numpy_form, True),
-        "torch unfold, float32": (unfold_form, True),
-        "package": (package_form(), True),
-        "package, per-source": (package_form(normalise="per-source"), False),
-        "package, spatial-gaussian": (package_form(integration="spatial-gaussian"), False),
-        "package, range_guide lidar": (package_form(range_guide="lidar"), False),
-    }
+    several = sorted({1, arguments.threads})
+    # name, form, threads to try, whether its result is the NumPy form's
+    forms: list[tuple[str, Callable[..., np.ndarray], list[int], bool]] = [
+        ("NumPy, shifted slices, float64", numpy_form, [1], True),
+        ("torch unfold, float32", unfold_form, several, True),
+        ("package", package_form(), several, True),
+        ("package, per-source", package_form(normalise="per-source"), several, False),
+        ("package, spatial-gaussian", package_form(integration="spatial-gaussian"), several, False),
+        ("package, range_guide lidar", package_form(range_guide="lidar"), several, False),
+    ]
     if torch.cuda.is_available():
-        forms["package, CUDA"] = (package_form("cuda"), True)
-    print(f"one frame of {arguments.size}×{arguments.size}, {arguments.threads} threads, torch {torch.__version__}")
-    print("The package also gives spread and monocular share, the other two forms do not.\n")
-    print("| form | s | of CPU | largest difference, m |\n|---|---|---|---|")
-    for name, (form, comparable) in forms.items():
-        best = math.inf, math.inf
-        for _ in range(arguments.repeat):
-            start, start_cpu = time.perf_counter(), time.process_time()
-            result = form(*frame)
-            best = min(best, (time.perf_counter() - start, time.process_time() - start_cpu))
-        difference = f"{np.abs(result - expected).max():.1e}" if comparable else ""
-        print(f"| {name} | {best[0]:.2f} | {best[1]:.2f} | {difference} |", flush=True)
+        forms.append(("package, CUDA", package_form("cuda"), [1], True))
+    print(f"one frame of {arguments.size}×{arguments.size}, torch {torch.__version__}")
+    print("The package also gives spread and monocular share, NumPy's and unfold's forms do not.")
+    print(
+        f"The package's first call took {first_call:.1f} s: loading Numba, and compiling where that is not on disk.\n"
+    )
+    print("| form | threads | s, best | s, median | s of CPU | memory, maps | largest difference, m |")
+    print("|---|---|---|---|---|---|---|")
+    for name, form, thread_counts, comparable in forms:
+        for threads in thread_counts:
+            torch.set_num_threads(threads)
+            difference = f"{np.abs(form(*frame) - expected).max():.1e}" if comparable else ""
+            form(*frame)
+            wall, cpu = [], []
+            for _ in range(arguments.repeat):
+                start, start_cpu = time.perf_counter(), time.process_time()
+                form(*frame)
+                wall.append(time.perf_counter() - start)
+                cpu.append(time.process_time() - start_cpu)
+            used = None if "CUDA" in name else peak_bytes(lambda form=form: form(*frame))
+            maps = "" if used is None else f"{used / frame[1].nbytes:.1f}"
+            best, median = min(wall), statistics.median(wall)
+            print(
+                f"| {name} | {threads} | {best:.2f} | {median:.2f} | {min(cpu):.2f} | {maps} | {difference} |",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

@@ -9,18 +9,20 @@ Eq. 7   g  = exp(-(k² + l²) / 2σ_s²) · exp(-(d̂[i,j] - d̂[i+k,j+l])² / 2
 Eq. 5   d̃ = (1/η) Σ g · (α d 1(d > 0) + (1-α) d̂ 1(d = 0))                       d, d̂ read at [i+k, j+l]
 Eq. 6   η = Σ g · (α 1(d > 0) + (1-α) 1(d = 0))
 
-Nothing here is differentiated: the prior is data. CPU and CUDA tensors; work is done in float32, or in float64
-for float64 maps, for sums over returns and where the weights of a window may all be tiny.
+Nothing here is differentiated: the prior is data. CPU tensors are integrated by compiled loops
+(`integration_numba`), CUDA tensors by torch; both compute in float64, which keeps the ratios of weights up to
+37 sigma_depth_m.
 """
 
 from __future__ import annotations
 
-import contextlib
+import functools
 import math
-from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -34,7 +36,11 @@ DepthSource = Literal["integrated", "lidar", "mono"]
 SigmaMode = Literal["constant", "image", "spread", "combined"]
 
 CPU_STRIP_PIXELS = 1 << 16
-"""On the CPU a map is integrated in strips of about so many pixels, whose sums then stay in the cache."""
+"""On the CPU a map is integrated in strips of about so many pixels: the work that a thread takes at a time."""
+CUDA_STRIP_PIXELS = 1 << 18
+"""The same on a GPU, where strips bound the memory: some twenty float64 numbers a pixel."""
+LOWEST_EXPONENT = -700.0
+"""Distance factors (Eq. 7) of lower exponents are 0: float64 ends at -745, the last of it with few digits."""
 
 
 def _check_choice(where: str, value: str, choices: object) -> None:
@@ -147,169 +153,129 @@ def integrate_depth(
     """
     options = options or IntegrationOptions()
     _check_maps("integrate_depth", lidar_m=lidar_m, mono_m=mono_m, valid=valid)
-    flat = (math.prod(mono_m.shape[:-2]), *mono_m.shape[-2:])
     dtype = _work_dtype(lidar_m, mono_m)
-    result = torch.zeros(3, *flat, dtype=dtype, device=mono_m.device)
-    inputs = (tensor.detach().reshape(flat) for tensor in (lidar_m, mono_m, valid))
-    for i, (lidar, mono, usable) in enumerate(zip(*inputs, strict=True)):
-        usable = usable & _is_distance(mono)
-        if not usable.any():
-            continue
-        # nothing outside the bounding box of the usable pixels gives or gets a weight
-        rows, columns = usable.any(1).nonzero(), usable.any(0).nonzero()
-        box = (slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1))
-        with _one_thread():
-            maps = _integrate_map(lidar[box].to(dtype), mono[box].to(dtype), usable[box], options)
-        result[(slice(None), i, *box)] = maps
+    flat = (math.prod(mono_m.shape[:-2]), *mono_m.shape[-2:])
+    lidar, mono = (maps.detach().reshape(flat).to(dtype) for maps in (lidar_m, mono_m))
+    usable = valid.reshape(flat)
+    # empty, not zeros: torch's own threads, once they have filled so many, spin for a while beside ours
+    result = torch.empty(3, *flat, dtype=dtype, device=mono.device)
+    integrate = _integrate_on_cpu if mono.device.type == "cpu" else _integrate_with_torch
+    for i in range(flat[0]):
+        integrate(lidar[i], mono[i], usable[i], options, result[:, i])
     distance_m, spread_m, mono_share = result.reshape(3, *mono_m.shape)
     return IntegratedDepth(distance_m, spread_m, mono_share)
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Let torch use one thread on the CPU.
-
-    The work is ten thousand operations of some ten microseconds: split over threads they gain nothing, and where
-    other work wants the cores each waits for its slowest part (measured: ten times longer). A thread that finds
-    one thread set leaves it at that, so that concurrent calls cannot restore a wrong number.
-    """
-    threads = torch.get_num_threads()
-    if threads == 1:
-        yield
-        return
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _work_dtype(*maps: Tensor) -> torch.dtype:
     return torch.float64 if any(tensor.dtype == torch.float64 for tensor in maps) else torch.float32
 
 
-def _integrate_map(lidar: Tensor, mono: Tensor, usable: Tensor, options: IntegrationOptions) -> Tensor:
-    """Integrate one map: [h, w] each to [3, h, w], rows as the fields of IntegratedDepth."""
-    returns = usable & _is_distance(lidar)
-    mono = torch.where(usable, mono, 0)
-    lidar_guide = options.integration == "edge-aware" and options.range_guide == "lidar"
-    guide = torch.where(returns, lidar, mono) if lidar_guide else mono
-    if lidar_guide or options.alpha == 0:
-        # Elsewhere a window holds a return (whose sums are float64) or its own centre, whose distance factor is 1.
-        # Here all weights may be tiny: float64 keeps their ratios up to 37 sigma_depth_m, float32 only to 13.
-        mono, guide = mono.double(), guide.double()
+def _axis_weights(options: IntegrationOptions) -> list[float]:
+    """List the spatial weights along one axis; Eq. 7's first factor is the product of two of them."""
+    radius = int(options.kernel_size) // 2
+    return [math.exp(-0.5 * (k / options.sigma_space_px) ** 2) for k in range(-radius, radius + 1)]
+
+
+def _inverse_variance(options: IntegrationOptions) -> float:
+    """Give 1 / σ_d² in 1/m²; 0 makes Eq. 7's second factor 1."""
+    return options.sigma_depth_m**-2 if options.integration == "edge-aware" else 0.0
+
+
+def _integrate_on_cpu(lidar: Tensor, mono: Tensor, valid: Tensor, options: IntegrationOptions, out: Tensor) -> None:
+    """Integrate one map, [h, w] each, into [3, h, w], rows as the fields of IntegratedDepth.
+
+    Threads of our own share the rows out: they wait for each other without spinning, and unlike Numba's they
+    allow concurrent callers and forked processes. There are as many as torch may use.
+    """
+    # imported here, because Numba takes half a second to load
+    from edge_depth_nerf.integration_numba import TILE, integrate_rows
 
     height, width = mono.shape
-    radius = int(options.kernel_size) // 2
-    from_lidar = _lidar_sums(lidar, mono, guide, returns, options)
-    padded_mono, padded_weight = (
-        torch.nn.functional.pad(image, (radius,) * 4) for image in (mono, (usable & ~returns).to(mono.dtype))
+    integrate = functools.partial(
+        integrate_rows,
+        *(tensor.contiguous().numpy() for tensor in (lidar, mono, valid)),
+        *(tensor.numpy() for tensor in out),
+        np.array(_axis_weights(options)),
+        _inverse_variance(options),
+        LOWEST_EXPONENT,
+        float(options.alpha),
+        options.normalise == "per-source",
+        options.keep_returns,
+        options.range_guide == "lidar",
     )
-    result = torch.empty(3, height, width, dtype=lidar.dtype, device=mono.device)
-    strip = max(1, CPU_STRIP_PIXELS // width) if mono.device.type == "cpu" else height
+    strip = max(1, CPU_STRIP_PIXELS // max(TILE, width))
+    tops = range(0, height, strip)
+    bottoms = [min(top + strip, height) for top in tops]
+    threads = min(torch.get_num_threads(), len(tops))
+    if threads > 1:
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(integrate, tops, bottoms))
+    else:
+        list(map(integrate, tops, bottoms))
+
+
+def _integrate_with_torch(lidar: Tensor, mono: Tensor, valid: Tensor, options: IntegrationOptions, out: Tensor) -> None:
+    """As `_integrate_on_cpu`, on any device, strip by strip."""
+    height, width = mono.shape
+    radius = int(options.kernel_size) // 2
+    strip = max(1, CUDA_STRIP_PIXELS // max(1, width))
     for top in range(0, height, strip):
-        rows, padded_rows = slice(top, top + strip), slice(top, top + strip + 2 * radius)
-        from_mono = _mono_sums(padded_mono[padded_rows], padded_weight[padded_rows], guide[rows], options)
-        result[:, rows] = _combine(from_lidar[:, rows], from_mono, guide[rows], options).to(result.dtype)
-    result *= usable
-    if options.keep_returns:
-        result[0] = torch.where(returns, lidar, result[0])
-        result[1:] *= ~returns
-    return result
+        first, bottom = max(0, top - radius), min(top + strip, height)
+        rows = slice(first, bottom + radius)
+        integrated = _integrate_strip(lidar[rows], mono[rows], valid[rows], options)
+        out[:, top:bottom] = integrated[:, top - first : bottom - first]
 
 
-def _shifts(options: IntegrationOptions) -> list[tuple[int, int, float]]:
-    """List the window's k, l with their spatial weight (Eq. 7, first factor)."""
-    radius = int(options.kernel_size) // 2
-    steps = range(-radius, radius + 1)
-    return [(k, l, math.exp(-0.5 * (math.hypot(k, l) / options.sigma_space_px) ** 2)) for k in steps for l in steps]
+def _integrate_strip(lidar: Tensor, mono: Tensor, valid: Tensor, options: IntegrationOptions) -> Tensor:
+    """Integrate a map by operations on all of it, one for each shift of the window: [h, w] each to [3, h, w]."""
+    usable = valid & _is_distance(mono)
+    returns = usable & _is_distance(lidar)
+    mono = torch.where(usable, mono, 0).double()
+    value = torch.where(returns, lidar.double(), mono)
+    guide = value if options.range_guide == "lidar" else mono
+    height, width = mono.shape
+    weights = _axis_weights(options)
+    padded = torch.nn.functional.pad(
+        torch.stack([mono, value, (usable & ~returns).double(), returns.double()]), (len(weights) // 2,) * 4
+    )
+    shifted = [
+        (spatial_k * spatial_l, padded[:, k : k + height, l : l + width])
+        for k, spatial_k in enumerate(weights)
+        for l, spatial_l in enumerate(weights)
+    ]
 
-
-def _range_weight(difference: Tensor, options: IntegrationOptions, out: Tensor | None = None) -> Tensor:
-    """Eq. 7, second factor."""
-    exponent = torch.mul(difference, difference, out=out).mul_(-0.5 / options.sigma_depth_m / options.sigma_depth_m)
-    # exp is a hundred times slower where it underflows; the least weights become 1e-35, in float64 1e-304
-    return exponent.clamp_(min=-80 if exponent.dtype == torch.float32 else -700).exp_()
-
-
-# The sums of one source over the window of every pixel are kept as [4, h, w]:
-#   Σ g,  Σ g x,  Σ g x²  and  Σ (spatial part of g),  with x = value - guide at the centre.
-# The last is only wanted by normalise "per-source".
-
-
-def _lidar_sums(
-    lidar: Tensor, mono: Tensor, guide: Tensor, returns: Tensor, options: IntegrationOptions
-) -> Float[Tensor, "4 h w"]:
-    """Sum over the returns of each window, by spreading each return over its window: they are few."""
-    radius = int(options.kernel_size) // 2
-    padded_guide = torch.nn.functional.pad(guide.double(), (radius,) * 4)
-    height, width = padded_guide.shape
-    padded_guide = padded_guide.flatten()
-    sums = torch.zeros(4, height * width, dtype=torch.float64, device=mono.device)
-    row, column = returns.nonzero(as_tuple=True)
-    source = (row + radius) * width + column + radius
-    value, estimate = lidar[row, column].double(), mono[row, column].double()
-    for k, l, spatial in _shifts(options):
-        centre = source - (k * width + l)
-        centre_guide = padded_guide[centre]
-        if options.integration == "edge-aware":
-            weight = _range_weight(estimate - centre_guide, options).mul_(spatial)
-        else:
-            weight = torch.full_like(value, spatial)
-        x = value - centre_guide
-        weighted = weight * x
-        # within one shift no two returns have the same centre, so the order of addition cannot vary
-        sums[0].index_add_(0, centre, weight)
-        sums[1].index_add_(0, centre, weighted)
-        sums[2].index_add_(0, centre, weighted.mul_(x))
-        if options.normalise == "per-source":
-            sums[3].index_add_(0, centre, torch.full_like(value, spatial))
-    inside_rows, inside_columns = slice(radius, height - radius), slice(radius, width - radius)
-    return sums.view(4, height, width)[:, inside_rows, inside_columns]
-
-
-def _mono_sums(
-    padded_mono: Tensor, padded_weight: Tensor, guide: Tensor, options: IntegrationOptions
-) -> Float[Tensor, "4 h w"]:
-    """Sum over the pixels of each window that have an estimate and no return (padded_weight 1, else 0)."""
-    height, width = guide.shape
-    radius = int(options.kernel_size) // 2
-    sums = torch.zeros(4, height, width, dtype=guide.dtype, device=guide.device)
-    x, g = torch.empty_like(guide), torch.empty_like(guide)
-    for k, l, spatial in _shifts(options):
-        window = (slice(radius + k, radius + k + height), slice(radius + l, radius + l + width))
-        weight = padded_weight[window]
-        torch.sub(padded_mono[window], guide, out=x)
-        if options.integration == "edge-aware":
-            torch.mul(_range_weight(x, options, out=g), weight, out=g)
-        else:
-            g.copy_(weight)
-        sums[0].add_(g, alpha=spatial)
-        g.mul_(x)
-        sums[1].add_(g, alpha=spatial)
-        sums[2].addcmul_(g, x, value=spatial)
-        if options.normalise == "per-source":
-            sums[3].add_(weight, alpha=spatial)
-    return sums
-
-
-def _combine(from_lidar: Tensor, from_mono: Tensor, guide: Tensor, options: IntegrationOptions) -> Tensor:
-    """Weigh the sums of the two sources into [3, h, w]: distance, spread, monocular share (Eq. 5, Eq. 6)."""
-    from_mono, guide = from_mono.double(), guide.double()
-    lidar_factor, mono_factor = options.alpha, 1 - options.alpha
+    factors: list[float] | list[Tensor] = [1 - options.alpha, options.alpha]
     if options.normalise == "per-source":
-        lidar_factor, mono_factor = (
-            torch.where(sums[3] > 0, factor / sums[3].clamp(min=torch.finfo(sums.dtype).tiny), 0)
-            for factor, sums in ((lidar_factor, from_lidar), (mono_factor, from_mono))
-        )
-    eta, first, second = lidar_factor * from_lidar[:3] + mono_factor * from_mono[:3]
-    # below this are only weights that _range_weight had to lift
-    exists = eta > 1e-290
+        spatial_sums = torch.zeros(2, height, width, dtype=torch.float64, device=mono.device)
+        for spatial, window in shifted:
+            spatial_sums.add_(window[2:], alpha=spatial)
+        least = torch.finfo(torch.float64).tiny
+        factors = [
+            torch.where(sums > 0, factor / sums.clamp(min=least), 0)
+            for factor, sums in zip(factors, spatial_sums, strict=True)
+        ]
+
+    eta, first, second, eta_mono = torch.zeros(4, height, width, dtype=torch.float64, device=mono.device)
+    for spatial, (mono_there, value_there, is_mono, is_lidar) in shifted:
+        exponent = (mono_there - guide).square_().mul_(-0.5 * _inverse_variance(options))
+        g = torch.where(exponent > LOWEST_EXPONENT, exponent.exp().mul_(spatial), 0)
+        from_mono = (g * is_mono).mul_(factors[0])
+        weight = g.mul_(is_lidar).mul_(factors[1]).add_(from_mono)
+        x = value_there - guide
+        eta.add_(weight)
+        eta_mono.add_(from_mono)
+        first.add_(weight.mul_(x))
+        second.add_(weight.mul_(x))
+
+    exists = usable & (eta > 0)
     eta = torch.where(exists, eta, 1)
     mean = first / eta
-    spread = (second / eta - mean * mean).clamp_(min=0).sqrt_()
-    share = mono_factor * from_mono[0] / eta
-    return torch.stack([guide + mean, spread, share]) * exists
+    spread = (second / eta - mean.square()).clamp_(min=0).sqrt_()
+    result = torch.stack([guide + mean, spread, eta_mono / eta]) * exists
+    if options.keep_returns:
+        result[0] = torch.where(returns, lidar.double(), result[0])
+        result[1:] *= ~returns
+    return result
 
 
 def select_prior(

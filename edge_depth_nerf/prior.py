@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from edge_depth_nerf.files import write_atomically
 from edge_depth_nerf.integration import DepthSource, IntegrationOptions, SigmaMode, select_prior, sigma_m
 
-CACHE_VERSION = 1
+CACHE_VERSION = 2
 """Part of every key: raised whenever the same inputs give another prior."""
 
 

@@ -2,7 +2,11 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
 
+import numba
 import numpy as np
 import pytest
 import reference
@@ -10,7 +14,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge_depth_nerf import integration
+from edge_depth_nerf import integration, integration_numba
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.integration import (
     IntegratedDepth,
@@ -292,6 +296,81 @@ def test_leaves_the_number_of_threads_alone():
     before = torch.get_num_threads()
     integrate_depth(*random_maps(0))
     assert torch.get_num_threads() == before
+
+
+@pytest.fixture
+def two_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("normalise", ["pooled", "per-source"])
+def test_threads_and_concurrent_callers_change_no_bit(normalise, two_threads, monkeypatch):
+    options = IntegrationOptions(normalise=normalise)
+    maps = [random_maps(seed, 120, 150) for seed in range(3)]
+    monkeypatch.setattr(integration, "CPU_STRIP_PIXELS", 1 << 30)
+    in_one_piece = [integrate_depth(lidar, mono, valid, options) for lidar, mono, valid in maps]
+    monkeypatch.setattr(integration, "CPU_STRIP_PIXELS", 7 * 512)  # seven rows
+    with ThreadPoolExecutor(4) as pool:
+        results = list(pool.map(lambda m: integrate_depth(m[0], m[1], m[2], options), maps * 8))
+    for result, expected in zip(results, in_one_piece * 8, strict=True):
+        assert_same(result, expected, atol=0)
+
+
+@pytest.mark.parametrize("normalise", ["pooled", "per-source"])
+@pytest.mark.parametrize("width", [511, 512, 513, 1030])
+def test_wide_maps_equal_twin(width, normalise):
+    # on the CPU the columns are worked on 512 at a time
+    lidar, mono, valid = random_maps(14, 3, width, dtype=torch.float64)
+    valid[1, :520] = False
+    fields = {"kernel_size": 5, "normalise": normalise}
+    result = integrate_depth(lidar, mono, valid, IntegrationOptions(**fields))
+    twin = reference.integrate_depth(lidar.numpy(), mono.numpy(), valid.numpy(), **fields)
+    np.testing.assert_allclose(result.distance_m, twin[0], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(result.mono_share, twin[2], rtol=0, atol=1e-9)
+
+
+def test_distance_factor_is_exact_down_to_the_smallest():
+    # Two pixels, the right one x farther. Seen from the left one its part is p = a·w / (1 + a·w) with
+    # w = exp(-x²/2), a = exp(-1/18), and spread² = x²·p·(1 - p), which follows w over 300 powers of ten.
+    x = torch.linspace(0, 37.3, 2001, dtype=torch.float64)
+    mono = torch.stack([torch.full_like(x, 10), 10 + x], 1)[:, None]
+    spread = integrate_depth(torch.zeros_like(mono), mono, everywhere(mono), IntegrationOptions(kernel_size=3)).spread_m
+    moved = (mono[:, 0, 1] - mono[:, 0, 0]).numpy()
+    weight = np.exp(-(moved**2) / 2 - 1 / 18)
+    part = weight / (1 + weight)
+    np.testing.assert_allclose(spread[:, 0, 0] ** 2, moved**2 * part * (1 - part), rtol=1e-11, atol=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize(("kind", "normalise", "keep_returns", "guide", "alpha"), CHOICES)
+def test_operations_for_gpus_equal_compiled_loops(kind, normalise, keep_returns, guide, alpha, dtype, monkeypatch):
+    monkeypatch.setattr(integration, "CUDA_STRIP_PIXELS", 40)  # three rows
+    options = IntegrationOptions(
+        alpha=alpha, integration=kind, normalise=normalise, keep_returns=keep_returns, range_guide=guide
+    )
+    lidar, mono, valid = random_maps(15, dtype=dtype)
+    out = torch.full((3, *mono.shape), torch.nan, dtype=dtype)
+    integration._integrate_with_torch(lidar, mono, valid, options, out)
+    expected = integrate_depth(lidar, mono, valid, options)
+    assert_same(IntegratedDepth(out[0], out[1], out[2]), expected, atol=1e-5 if dtype == torch.float32 else 1e-7)
+    torch.testing.assert_close(out[0], expected.distance_m, rtol=0, atol=1e-5 if dtype == torch.float32 else 1e-10)
+
+
+def test_compiles_where_nothing_can_be_kept():
+    # a function without a file is one that Numba has no folder for
+    names: dict = {}
+    exec("def double(x): return 2 * x", names)
+    with pytest.raises(RuntimeError, match="cannot cache"):
+        numba.njit(cache=True)(names["double"])
+    assert integration_numba._compiled(names["double"])(21) == 42
+
+
+def test_numba_is_loaded_only_to_integrate():
+    check = "import sys, edge_depth_nerf.integration; sys.exit('numba' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", check], check=False).returncode == 0
 
 
 @pytest.mark.parametrize("shape", [(0, 4, 5), (4, 0), (2, 4, 5)])
