@@ -234,11 +234,13 @@ def processing(made: SynthesizeOptions, output: Path) -> Table:
         watcher.join()
     written = sorted(path.stat().st_mtime for path in output.glob("lidar/*/*.png"))
     between = np.diff(written)
-    table = Table("pictures", "median s", "slowest s", "memory MB at a quarter, half, end", title="process --sweeps 3")
+    title = "process --sweeps 3: seconds between one picture and the next"
+    table = Table("pictures", "mean s", "median s", "slowest s", "memory MB at a quarter, half, end", title=title)
     at = [written[int(share * (len(written) - 1))] for share in (0.25, 0.5, 1.0)]
     used = [max(mb for when, mb in memory if abs(when - moment) < 0.5) for moment in at]
     table.add_row(
         str(len(written)),
+        f"{between.mean():.2f}",
         f"{statistics.median(between):.2f}",
         f"{between.max():.2f}",
         ", ".join(f"{mb:.0f}" for mb in used),
