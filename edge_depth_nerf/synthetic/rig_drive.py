@@ -23,6 +23,7 @@ Both, with c the camera:
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -125,7 +126,7 @@ def _mounted(yaw_deg: float, position_m: tuple[float, float, float]) -> NDArray[
     return transform
 
 
-class _RigDrive:
+class _RigDrive(ABC):
     """A scene seen by a rig; what the two layouts share."""
 
     cameras: dict[str, MountedCamera]
@@ -151,18 +152,21 @@ class _RigDrive:
             for name, mounted in self.cameras.items()
         }
 
+    @abstractmethod
     def picture(self, name: str, frame: int) -> Path:
-        raise NotImplementedError
+        """Where a picture lies."""
 
+    @abstractmethod
     def scan(self, frame: int) -> Path:
-        raise NotImplementedError
+        """Where a scan lies."""
 
+    @abstractmethod
     def description(self) -> tuple[Path, str]:
         """The rig file, and what it says."""
-        raise NotImplementedError
 
+    @abstractmethod
     def scan_bytes(self, taken: Sweep) -> bytes:
-        raise NotImplementedError
+        """A scan in the layout's own format."""
 
     def map(self, kind: str, name: str, frame: int) -> Path:
         """Where a map of a picture lies."""
@@ -208,6 +212,7 @@ class _RigDrive:
             self.write_times(name, moments)
         write_text(*self.description())
 
+    @abstractmethod
     def write_times(self, name: str, moments_s: list[float]) -> None:
         """Write when a camera's pictures were taken, where the layout says so."""
 
@@ -275,6 +280,9 @@ class _Rig(_RigDrive):
 
 class _JbnuDepth360(_RigDrive):
     """The layout `jbnu-depth360`."""
+
+    def write_times(self, name: str, moments_s: list[float]) -> None:
+        """Nothing: the numbers of the pictures and their rate say it."""
 
     def __init__(self, options: SynthesizeOptions) -> None:
         self.cameras = jbnu_cameras(options.size)
