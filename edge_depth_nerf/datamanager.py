@@ -1,7 +1,8 @@
 """Serves training rays with colour and depth prior.
 
 Host-facing. The prior of each training frame is integrated once, in `setup_train` (ns-render and the viewer's
-thumbnails never wait for it), from that frame's own maps: a sweep of a held-out moment is in no training frame.
+thumbnails never wait for it), from that frame's own maps: a sweep of a held-out moment is in no training frame. How
+far it is trusted is measured on training frames alone (`mono.trust`), once, if the scene does not bring it.
 Batches are drawn from all valid pixels of all training pictures (see `pixel_table`), so that scenes of one picture,
 of mixed sizes, with masks or without all work; nerfstudio's own pixel sampler fails on some of these.
 """
@@ -13,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
@@ -27,8 +29,9 @@ from edge_depth_nerf.dataset import FisheyeDepthDataset
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.integration import IntegrationOptions
 from edge_depth_nerf.metrics import has_whole_window
+from edge_depth_nerf.mono.trust import find_trust
 from edge_depth_nerf.pixel_table import PixelBatch, PixelTable
-from edge_depth_nerf.prior import Prior, PriorCache, PriorOptions
+from edge_depth_nerf.prior import Prior, PriorCache, PriorOptions, View, view_of
 
 
 @dataclass
@@ -52,16 +55,20 @@ class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig):
     """Standard deviation of the kernel over pixels, px (Eq. 7)."""
     sigma_depth: float = 1.0
     """Standard deviation of the kernel over distance, metres (Eq. 7)."""
-    normalise: Literal["pooled", "per-source"] = "pooled"
+    normalise: Literal["pooled", "per-source"] = "per-source"
     """Whether alpha weighs single pixels (Eq. 5, 6) or the averages of the two sources."""
-    keep_returns: bool = False
+    keep_returns: bool = True
     """Keep the LiDAR distance unchanged at pixels with a return."""
     range_guide: Literal["mono", "lidar"] = "mono"
     """What the kernel's depth factor compares with the neighbours: monocular distance (Eq. 7 as written), or LiDAR
     where there is a return (the paper's prose)."""
-    sigma_mode: Literal["constant", "image", "spread", "combined"] = "combined"
-    """Standard deviation of the prior: one number, one number a frame (the paper's words), the spread of what was
-    integrated, or that spread with a floor and a share of the monocular distance."""
+    align: Literal["none", "global", "local"] = "local"
+    """How monocular distance is fitted to each frame's LiDAR before both are integrated: not at all, by a scale and an
+    exponent, or also by a smooth correction near returns."""
+    sigma_mode: Literal["calibrated", "constant", "image", "spread", "combined"] = "calibrated"
+    """Standard deviation of the prior: measured at LiDAR returns left out of it (and no prior where nothing could be
+    measured), one number, one number a frame (the paper's words), the spread of what was integrated, or that spread
+    with a floor and a share of the monocular distance."""
     sigma_constant: float = 1.0
     """The standard deviation under sigma_mode constant, metres."""
     cache_dir: Path | None = None
@@ -95,6 +102,7 @@ class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig):
             )
         return PriorOptions(
             depth_source=source,
+            align=self.align,
             sigma_mode=self.sigma_mode,
             sigma_constant_m=self.sigma_constant,
             integration=IntegrationOptions(
@@ -108,6 +116,15 @@ class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig):
                 range_guide=self.range_guide,
             ),
         )
+
+
+def _view(dataset: FisheyeDepthDataset, image_idx: int) -> View:
+    """Where the rays of a picture point; up is the scene's z before nerfstudio turned it."""
+    outputs = dataset._dataparser_outputs
+    up = outputs.dataparser_transform[:3, :3].double() @ torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    rotation = dataset.cameras.camera_to_worlds[image_idx, :3, :3].double()
+    up_in_camera = (rotation.T @ up).numpy() * np.array([1.0, -1.0, -1.0])  # OpenGL to OpenCV
+    return view_of(dataset.camera(image_idx), up_in_camera)
 
 
 class TablePixelSampler:
@@ -191,7 +208,12 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
             options = self.config.prior_options(has_lidar, has_mono)
             data = Path(self.config.dataparser.data)
             scene = data.parent if data.suffix == ".json" else data
-            cache = PriorCache(self.config.cache_dir or scene / ".cache" / "prior", options)
+            trust = None
+            if has_lidar and has_mono and options.wants_trust:
+                trust_cache = self.config.cache_dir or scene / ".cache"
+                trust = find_trust(data, options, trust_cache, dataset.image_filenames, CONSOLE)
+                CONSOLE.log(f"Depth prior: {trust.summary()}.")
+            cache = PriorCache(self.config.cache_dir or scene / ".cache" / "prior", options, trust)
 
         def load(image_idx: int) -> tuple[Any, Any, Prior | None]:
             rgb = dataset.rgb(image_idx)
@@ -205,7 +227,8 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
             if cache is None:
                 return rgb, mask, None
             lidar, mono = dataset.lidar_distance_m(image_idx), dataset.mono_distance_m(image_idx)
-            return rgb, mask, cache.prior(lidar, mono, mask)
+            view = None if cache.trust is None else _view(dataset, image_idx)
+            return rgb, mask, cache.prior(lidar, mono, mask, view)
 
         # OpenCV and torch release the interpreter's lock, so two threads read and integrate side by side
         with ThreadPoolExecutor(max_workers=2) as pool:

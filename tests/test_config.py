@@ -62,6 +62,7 @@ def test_the_paper_preset_is_the_literal_form():
     model, data = (getattr(all_methods["edge-depth-nerf-paper"].pipeline, part) for part in ("model", "datamanager"))
     assert (model.edge_gaussian, model.edge_divide_by_norm, model.depth_loss_levels) == ("point", False, "final")
     assert (data.sigma_mode, data.normalise, data.keep_returns, data.range_guide) == ("image", "pooled", False, "mono")
+    assert data.align == "none"
     assert (data.alpha, data.kernel_size, data.sigma_space, data.sigma_depth) == (0.7, 9, 3.0, 1.0)
 
 

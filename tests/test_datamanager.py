@@ -1,3 +1,4 @@
+import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -11,7 +12,10 @@ from edge_depth_nerf.datamanager import FisheyeDepthDataManagerConfig
 from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_json, write_json, write_mask
-from edge_depth_nerf.prior import make_prior
+from edge_depth_nerf.inspecting.reader import read_scene
+from edge_depth_nerf.mono.error_model import read_trust
+from edge_depth_nerf.mono.trust import calibrate_scene, find_trust
+from edge_depth_nerf.prior import make_prior, view_of
 
 
 def manager(folder, test_mode="val", parser=None, **options):
@@ -25,8 +29,19 @@ def test_a_batch_carries_colour_prior_and_rays_of_its_pixels(tmp_path):
     dataset = data.train_dataset
     options = data.config.prior_options(True, True)
     assert options.depth_source == "integrated"
+    scene = read_scene(tmp_path)
+    by_name = {picture.files["image"].name: picture for picture in scene.pictures}
+    pictures = [by_name[path.name] for path in dataset.image_filenames]
+    trust = find_trust(tmp_path, options)
     priors = [
-        make_prior(dataset.lidar_distance_m(i), dataset.mono_distance_m(i), dataset.mask(i), options)
+        make_prior(
+            dataset.lidar_distance_m(i),
+            dataset.mono_distance_m(i),
+            dataset.mask(i),
+            options,
+            trust,
+            view_of(pictures[i].lens, pictures[i].up_in_camera),
+        )
         for i in range(len(dataset))
     ]
     picture, row, column = batch["indices"].T
@@ -163,3 +178,36 @@ def test_two_processes_may_fill_one_cache(tmp_path):
         tables = list(pool.map(lambda _: manager(scene).train_pixel_sampler.table, range(3)))
     assert len({table.share_with_prior for table in tables}) == 1
     assert len(list((scene / ".cache" / "prior").iterdir())) == 8
+
+
+def test_the_calibration_of_training_pictures_is_found_or_made(tmp_path):
+    scene = write_scene(tmp_path)
+    made = calibrate_scene(scene)
+    assert made.error_model is not None
+    manager(scene)
+    # the scene's own was taken, nothing was measured again
+    assert not list((scene / ".cache").glob("mono_trust_*"))
+    manager(scene, align="global")
+    (other,) = (scene / ".cache").glob("mono_trust_*")
+    assert read_trust(other).made_of != made.made_of
+
+
+def test_the_literal_form_measures_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr("edge_depth_nerf.datamanager.find_trust", lambda *_: pytest.fail("measured"))
+    scene = write_scene(tmp_path)
+    data = manager(scene, align="none", sigma_mode="image", keep_returns=False)
+    _, batch = data.next_train(0)
+    assert (batch["prior_distance_m"] > 0).any()
+
+
+def test_a_turned_scene_has_the_same_prior(tmp_path):
+    """The world's up is the drive's, whatever axes nerfstudio is told to choose."""
+    scene = write_scene(tmp_path)
+    calibrated = calibrate_scene(scene)
+    dataclasses.replace(calibrated, field_rad=(-0.2, 0.3)).write(scene / "mono_trust.json")
+    shares = []
+    for method in ("none", "up"):
+        data = manager(scene, parser={"orientation_method": method})
+        shares.append(data.train_pixel_sampler.table.share_with_prior)
+    assert shares[0] == pytest.approx(shares[1], abs=2e-3)
+    assert 0.1 < shares[0] < 0.9

@@ -2,10 +2,15 @@ import dataclasses
 
 import numpy as np
 import pytest
+import torch
 
 from edge_depth_nerf import prior as prior_module
-from edge_depth_nerf.integration import IntegrationOptions
-from edge_depth_nerf.prior import PriorCache, PriorOptions, make_prior
+from edge_depth_nerf.cameras import KannalaBrandt
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.integration import IntegrationOptions, integrate_depth
+from edge_depth_nerf.mono.alignment import Fit
+from edge_depth_nerf.mono.error_model import KNOTS, ErrorModel, Trust
+from edge_depth_nerf.prior import PriorCache, PriorOptions, View, make_prior, view_of
 
 RNG = np.random.default_rng(2)
 
@@ -83,3 +88,97 @@ def test_a_folder_that_cannot_be_made_is_no_error(tmp_path):
     lidar, mono, mask = maps()
     prior = PriorCache(tmp_path / "file" / "cache", PriorOptions()).prior(lidar, mono, mask)
     assert (prior.distance_m > 0).any()
+
+
+def a_trust(**changes):
+    """Sigma is 1 % of the distance at a return, 10 % elsewhere."""
+    flat = {name: [0.0] * len(knots) for name, knots in KNOTS.items()}
+    models = {
+        name: ErrorModel(float(np.log(part)), flat) for name, part in (("error_model", 0.1), ("return_model", 0.01))
+    }
+    fields = {"made_of": "", "field_rad": (-1.0, 1.0), "everywhere": False, "drive_fit": None, **models, **changes}
+    return Trust(**fields)
+
+
+def level_view(shape):
+    return View(np.zeros(shape, np.float32), np.zeros(shape, np.float32))
+
+
+def test_a_calibrated_prior_is_aligned_and_trusted_by_the_models():
+    lidar, mono, mask = maps(60, 50)
+    lidar = np.where(lidar > 0, mono * 1.5, 0).astype(np.float32)
+    prior = make_prior(lidar, mono, mask, PriorOptions(), a_trust(), level_view(mask.shape))
+    returns = mask & (lidar > 0)
+    np.testing.assert_array_equal(prior.distance_m[returns], lidar[returns])
+    elsewhere = mask & ~returns
+    # mono was half too near; window averages of values that lie within 1 m
+    assert np.abs(prior.distance_m[elsewhere] - 1.5 * mono[elsewhere]).max() < 1.5
+    assert np.mean(prior.distance_m[elsewhere]) == pytest.approx(1.5 * np.mean(mono[elsewhere]), rel=0.02)
+    np.testing.assert_allclose(prior.sigma_m[returns], 0.01 * lidar[returns], rtol=1e-5)
+    np.testing.assert_allclose(prior.sigma_m[elsewhere], 0.1 * prior.distance_m[elsewhere], rtol=1e-5)
+
+
+@pytest.mark.parametrize("sigma_mode", ["calibrated", "combined"])
+def test_a_frame_with_few_returns_takes_the_drives_fit(sigma_mode):
+    _, mono, mask = maps(60, 50)
+    lidar = np.zeros_like(mono)
+    lidar[3, 3:20] = 1
+    trust = a_trust(drive_fit=Fit(float(np.log(3)), 1.0))
+    options = PriorOptions(sigma_mode=sigma_mode)
+    prior = make_prior(lidar, mono, mask, options, trust, level_view(mask.shape))
+    assert np.mean(prior.distance_m[20:][mask[20:]]) == pytest.approx(3 * np.mean(mono[20:][mask[20:]]), rel=0.01)
+
+
+def test_without_alignment_and_calibration_it_is_the_literal_form():
+    lidar, mono, mask = maps()
+    ramp = np.arange(mask.size, dtype=np.float32).reshape(mask.shape) / 4
+    mono, lidar = mono + ramp, np.where(lidar > 0, lidar + ramp, 0).astype(np.float32)
+    options = PriorOptions(align="none", sigma_mode="image", integration=IntegrationOptions())
+    assert not options.wants_trust
+    literal = make_prior(lidar, mono, mask, options)
+    expected = integrate_depth(torch.from_numpy(lidar), torch.from_numpy(mono), torch.from_numpy(mask))
+    np.testing.assert_array_equal(literal.distance_m, expected.distance_m.numpy())
+    np.testing.assert_allclose(literal.sigma_m[mask], np.std(literal.distance_m[mask]), rtol=1e-4)
+
+
+def test_mono_alone_never_sees_lidar():
+    lidar, mono, mask = maps(60, 50)
+    options = PriorOptions(depth_source="mono")
+    prior = make_prior(lidar * 2, mono, mask, options, a_trust(return_model=None), level_view(mask.shape))
+    np.testing.assert_array_equal(prior.distance_m, mono * mask)
+    np.testing.assert_allclose(prior.sigma_m[mask], 0.1 * mono[mask], rtol=1e-5)
+
+
+def test_another_calibration_makes_another_file(tmp_path):
+    lidar, mono, mask = maps()
+    view = level_view(mask.shape)
+    first = PriorCache(tmp_path, PriorOptions(), a_trust()).prior(lidar, mono, mask, view)
+    second = PriorCache(tmp_path, PriorOptions(), a_trust(error_model=None)).prior(lidar, mono, mask, view)
+    assert len(list(tmp_path.iterdir())) == 2
+    assert not np.array_equal(first.sigma_m, second.sigma_m)
+    turned = View(view.theta_rad, view.elevation_rad + 2)
+    assert not PriorCache(tmp_path, PriorOptions(), a_trust()).prior(lidar, mono, mask, turned).distance_m.any()
+
+
+def test_the_angles_of_a_picture():
+    camera = KannalaBrandt(41, 41, 12.0, 12.0, 20.5, 20.5, 0.0, 0.0, 0.0, 0.0)
+    # upright: up is -y of the camera
+    view = view_of(camera, np.array([0.0, -1.0, 0.0]))
+    assert view.theta_rad[20, 20] == pytest.approx(0, abs=1e-3)
+    assert view.theta_rad[20, 32] == pytest.approx(1.0, abs=1e-4)
+    assert view.elevation_rad[8, 20] == pytest.approx(1.0, abs=1e-4)
+    assert view.elevation_rad[32, 20] == pytest.approx(-1.0, abs=1e-4)
+    # rolled by 90 degrees: up is +x
+    assert view_of(camera, np.array([1.0, 0.0, 0.0])).elevation_rad[20, 32] == pytest.approx(1.0, abs=1e-4)
+
+
+@pytest.mark.parametrize("fields", [{"align": "much"}, {"sigma_mode": "magic"}])
+def test_an_unknown_choice(fields, unchecked_types):
+    with pytest.raises(InputError, match="expected one of"):
+        PriorOptions(**fields)
+
+
+def test_a_mono_map_of_another_size(unchecked_types):
+    lidar, mono, mask = maps()
+    with pytest.raises(InputError, match=r"mono_m \(11, 10\)"):
+        make_prior(lidar, mono[1:], mask, PriorOptions())

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,8 @@ from edge_depth_nerf.cameras import Camera, KannalaBrandt, Pinhole
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import DISTANCE_STEPS_PER_METRE, read_distance_png, read_image, read_json, read_mask
 from edge_depth_nerf.integration import DepthSource
-from edge_depth_nerf.prior import Prior, PriorOptions, make_prior
+from edge_depth_nerf.mono.error_model import TRUST_FILE, Trust, read_trust
+from edge_depth_nerf.prior import Prior, PriorOptions, make_prior, view_of
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 FISHEYE_MODEL = "OPENCV_FISHEYE"
@@ -67,6 +68,11 @@ class InspectedPicture:
     def looks_along(self) -> Float64[np.ndarray, "3"]:
         """Unit vector of the optical axis in the scene."""
         return -self.rotation[:, 2]
+
+    @property
+    def up_in_camera(self) -> Float64[np.ndarray, "3"]:
+        """The scene's upward direction, z, in the camera's axes (OpenCV)."""
+        return self.rotation[2] * np.array([1.0, -1.0, -1.0])
 
     def depth_source(self) -> DepthSource | None:
         """What training makes its prior of, left to itself."""
@@ -127,6 +133,17 @@ class InspectedScene:
         """Where its files are relative to."""
         return self.path.parent
 
+    @cached_property
+    def trust(self) -> Trust | None:
+        """The calibration of its prior beside the maps; without one sigma is as under sigma_mode combined.
+
+        Raises:
+            InputError: the file is broken.
+
+        """
+        path = self.folder / TRUST_FILE
+        return read_trust(path) if path.is_file() else None
+
     def cameras(self) -> dict[str, tuple[InspectedPicture, ...]]:
         """The pictures of each camera, in order of their moments."""
         names = dict.fromkeys(picture.camera for picture in self.pictures)
@@ -140,8 +157,12 @@ class InspectedScene:
         """Whether any picture has this layer."""
         return any(layer in picture.files for picture in self.pictures)
 
-    def maps(self, picture: InspectedPicture) -> PictureMaps:
+    def maps(self, picture: InspectedPicture, with_prior: bool = True) -> PictureMaps:
         """Read all that a picture has, and make its prior.
+
+        Args:
+            picture: one of the scene's.
+            with_prior: False leaves the prior away, which takes most of the time.
 
         Raises:
             InputError: a file cannot be decoded, or has another size than the camera.
@@ -163,8 +184,12 @@ class InspectedScene:
             ahead = lens & (cos_theta > 0)
             found["lidar"] = np.where(ahead, found["lidar"] / np.where(ahead, cos_theta, 1), 0).astype(np.float32)
         lidar_m, mono_m = found.get("lidar"), found.get("mono")
-        source = picture.depth_source()
-        prior = make_prior(lidar_m, mono_m, usable, PriorOptions(depth_source=source)) if source else None
+        source = picture.depth_source() if with_prior else None
+        prior = None
+        if source:
+            options = PriorOptions(depth_source=source)
+            view = view_of(picture.lens, picture.up_in_camera) if self.trust else None
+            prior = make_prior(lidar_m, mono_m, usable, options, self.trust, view)
         return PictureMaps(found["image"], lens, usable, lidar_m, mono_m, found.get("truth"), prior)
 
     def points_m(self) -> Float64[np.ndarray, "points 3"] | None:

@@ -1,0 +1,1 @@
+"""Monocular depth: networks, alignment to LiDAR, and how far it is trusted."""

@@ -1,0 +1,336 @@
+"""A drive's calibration of trust: how well its monocular maps fit LiDAR, and how wrong its priors are.
+
+Made from training frames alone. Of each frame some returns are left out, the prior is made of the rest, and compared
+with what was left out: whole blocks of 64 px (of 1400), single returns, and in every second frame LiDAR's lowest and
+highest rows, beyond which a prior is extrapolated. The result is kept beside the scene's maps.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Collection, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.inspecting.reader import InspectedPicture, InspectedScene, read_scene
+from edge_depth_nerf.mono.alignment import LEAST_RETURNS, align, both, fit_logs
+from edge_depth_nerf.mono.error_model import (
+    TRUST_FILE,
+    FrameAlignment,
+    Trust,
+    error_of_returns,
+    fit_error_model,
+    pixel_features,
+    read_trust,
+)
+from edge_depth_nerf.prior import CACHE_VERSION, PriorOptions, View, integrate_frame, view_of
+
+MOST_FRAMES = 100
+"""Of longer drives so many training pictures are used, evenly spread."""
+HELD_OUT_BLOCK_SHARE = 64 / 1400
+"""Side of the blocks that are left out, as a share of the picture's width."""
+HELD_OUT_PART = 0.1
+"""So much of the blocks, and of the single returns, is left out."""
+HELD_OUT_ROWS = (0.1, 0.95)
+"""In every second frame returns below and above these quantiles of their elevation are left out."""
+FIELD_QUANTILES = (0.001, 0.999)
+"""LiDAR's field of elevation, but for stray returns."""
+_JUDGED_A_FRAME = 5_000
+_FOR_THE_DRIVE_A_FRAME = 2_000
+"""So many returns of a frame enter; more tell nothing new."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MeasuredFrame:
+    """One training frame's part in the calibration."""
+
+    alignment: FrameAlignment
+    """How well its map was fitted."""
+    features: dict[str, NDArray[np.float32]]
+    """Of the pixels of left-out returns."""
+    relative_error: NDArray[np.float32]
+    """|d̃ - d| / d̃ there."""
+    return_features: dict[str, NDArray[np.float32]]
+    """Of pixels that keep their return."""
+    return_error: NDArray[np.float32]
+    """Relative error of these returns against their neighbours."""
+    elevation_rad: NDArray[np.float32]
+    """Of all returns, above the horizon."""
+    lidar_m: NDArray[np.float32]
+    """Of pixels with LiDAR and mono."""
+    mono_m: NDArray[np.float32]
+    """The map as it came, at the same pixels."""
+
+
+def held_out_returns(
+    returns: NDArray[np.bool_], elevation_rad: NDArray[np.float32], number: int
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which of a frame's returns to leave out, and which of these lie in whole blocks.
+
+    Args:
+        returns: H×W, True at a return.
+        elevation_rad: H×W, of each ray.
+        number: of the frame in the calibration; seeds the choice.
+
+    """
+    rng = np.random.default_rng([7, number])
+    height, width = returns.shape
+    side = max(4, round(HELD_OUT_BLOCK_SHARE * width))
+    chosen = rng.random((height // side + 1, width // side + 1)) < HELD_OUT_PART
+    in_blocks = np.kron(chosen, np.ones((side, side), bool))[:height, :width] & returns
+    left_out = in_blocks | ((rng.random(returns.shape) < HELD_OUT_PART) & returns)
+    if number % 2 and returns.any():
+        low, high = np.quantile(elevation_rad[returns], HELD_OUT_ROWS)
+        left_out |= returns & ((elevation_rad < low) | (elevation_rad > high))
+    return left_out, in_blocks
+
+
+def calibrate_scene(scene: Path, options: PriorOptions | None = None, console: Console | None = None) -> Trust:
+    """Measure a scene's alignment and errors from its training frames, and keep the result as SCENE/mono_trust.json.
+
+    Args:
+        scene: the folder, or its transforms.json.
+        options: of the prior to be trusted; the default ones by default.
+        console: where progress is shown; nowhere by default.
+
+    Raises:
+        FileNotFoundError: no scene there.
+        InputError: the scene has no LiDAR or no monocular maps, or one of its files is broken.
+
+    """
+    read = read_scene(scene)
+    trust = _calibrate(read, _chosen(read), options or PriorOptions(), console)
+    trust.write(read.folder / TRUST_FILE)
+    return trust
+
+
+def saved_trust(
+    scene: InspectedScene,
+    options: PriorOptions,
+    cache: Path | None = None,
+    training_images: Collection[Path] | None = None,
+) -> Trust | None:
+    """The scene's calibration, if one is there that was made of the files as they are and for these options."""
+    made_of = _made_of(scene, _chosen(scene, training_images), options)
+    for path in (scene.folder / TRUST_FILE, _cached(scene, cache, made_of)):
+        try:
+            trust = read_trust(path)
+        except (OSError, InputError):
+            continue
+        if trust.made_of == made_of:
+            return trust
+    return None
+
+
+def find_trust(
+    scene: Path,
+    options: PriorOptions,
+    cache: Path | None = None,
+    training_images: Collection[Path] | None = None,
+    console: Console | None = None,
+) -> Trust:
+    """The scene's calibration for these options; made now and kept in SCENE/.cache where there is none.
+
+    Args:
+        scene: the folder, or its transforms.json.
+        options: of the prior to be trusted.
+        cache: another folder than SCENE/.cache.
+        training_images: the pictures that are trained on, where the scene does not say so itself.
+        console: where progress is shown; nowhere by default.
+
+    Raises:
+        FileNotFoundError: no scene there.
+        InputError: as `calibrate_scene`.
+
+    """
+    read = read_scene(scene)
+    trust = saved_trust(read, options, cache, training_images)
+    if trust is None:
+        trust = _calibrate(read, _chosen(read, training_images), options, console)
+        try:
+            trust.write(_cached(read, cache, trust.made_of))
+        except OSError:  # a scene that cannot be written: made anew each time
+            pass
+    return trust
+
+
+def _cached(scene: InspectedScene, cache: Path | None, made_of: str) -> Path:
+    return (cache or scene.folder / ".cache") / f"mono_trust_{made_of}.json"
+
+
+def _chosen(scene: InspectedScene, training_images: Collection[Path] | None = None) -> list[InspectedPicture]:
+    if training_images is None:
+        training = [picture for picture in scene.pictures if not picture.held_out]
+    else:
+        images = {path.resolve() for path in training_images}
+        training = [picture for picture in scene.pictures if picture.files["image"].resolve() in images]
+    if len(training) <= MOST_FRAMES:
+        return training
+    return [training[i] for i in np.linspace(0, len(training) - 1, MOST_FRAMES).round().astype(int)]
+
+
+def _made_of(scene: InspectedScene, pictures: Sequence[InspectedPicture], options: PriorOptions) -> str:
+    """Key of the options and of the names and sizes of the files: to read a long drive's maps would take minutes."""
+    relevant = dataclasses.asdict(options)
+    del relevant["sigma_mode"], relevant["sigma_constant_m"]
+    digest = hashlib.sha256(json.dumps([CACHE_VERSION, relevant, _trained_on(scene)], sort_keys=True).encode())
+    for picture in pictures:
+        sizes = [
+            (layer, path.name, path.stat().st_size)
+            for layer, path in sorted(picture.files.items())
+            if layer in ("lidar", "mono", "mask")
+        ]
+        digest.update(repr((picture.name, sizes, picture.rotation.round(9).tolist())).encode())
+    return digest.hexdigest()[:16]
+
+
+def _trained_on(scene: InspectedScene) -> str:
+    """Where the maps' source was trained: elsewhere only if it says so."""
+    source = scene.meta.get("mono")
+    found = source.get("trained_on") if isinstance(source, dict) else None
+    return "elsewhere" if found == "elsewhere" else "scene"
+
+
+def _calibrate(
+    scene: InspectedScene, pictures: Sequence[InspectedPicture], options: PriorOptions, console: Console | None
+) -> Trust:
+    missing = [word for layer, word in (("lidar", "LiDAR"), ("mono", "monocular")) if not scene.has(layer)]
+    if missing:
+        raise InputError(
+            f"{scene.path}: has no {' and no '.join(missing)} distance maps, so there is nothing to measure the "
+            "monocular maps' error by. Process the drive with its sweeps, and make monocular maps with "
+            "`edge-depth-nerf estimate-depth`."
+        )
+    measurable = [p for p in pictures if "lidar" in p.files and "mono" in p.files]
+    if not measurable:
+        raise InputError(
+            f"{scene.path}: no picture for training has a LiDAR and a monocular map, so the prior's error cannot be "
+            "measured. Process the drive again."
+        )
+
+    def measure(numbered: tuple[int, InspectedPicture]) -> MeasuredFrame:
+        number, picture = numbered
+        maps = scene.maps(picture, with_prior=False)
+        assert maps.lidar_m is not None and maps.mono_m is not None
+        view = view_of(picture.lens, picture.up_in_camera)
+        return measure_frame(picture.name, number, maps.lidar_m, maps.mono_m, maps.usable, view, options)
+
+    with ThreadPoolExecutor(2) as pool:
+        measuring = pool.map(measure, enumerate(measurable))
+        description, quiet = "Measuring the prior's error…", console is None
+        progress = track(measuring, description, len(measurable), console=console, transient=True, disable=quiet)
+        frames = list(progress)
+    return combine(frames, options, _made_of(scene, pictures, options), everywhere=_trained_on(scene) == "elsewhere")
+
+
+def measure_frame(
+    name: str,
+    number: int,
+    lidar_m: NDArray[np.float32],
+    mono_m: NDArray[np.float32],
+    usable: NDArray[np.bool_],
+    view: View,
+    options: PriorOptions,
+) -> MeasuredFrame:
+    """Leave out some of a frame's returns, make its prior of the rest, and compare.
+
+    Args:
+        name: of the frame, for the report.
+        number: of the frame in the calibration: decides what is left out.
+        lidar_m: H×W LiDAR distance, 0 = no return.
+        mono_m: H×W monocular distance as it came, 0 = none.
+        usable: H×W, True where the picture may be used.
+        view: the angles of its rays.
+        options: of the prior.
+
+    Raises:
+        InputError: the maps differ in size.
+
+    """
+    returns = both(lidar_m, mono_m, usable)
+    rng = np.random.default_rng([8, number])
+    left_out, in_blocks = held_out_returns(returns, view.elevation_rad, number)
+    kept_m = np.where(left_out, np.float32(0), lidar_m)
+    # a source alone is not aligned, in the prior either
+    mode = "none" if options.depth_source == "mono" else options.align
+    aligned = align(kept_m, mono_m, usable, mode)
+    frame = integrate_frame(kept_m, mono_m, usable, options)
+    features = pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, frame.returns, view.theta_rad)
+    judged = _some(left_out & (frame.distance_m > 0), _JUDGED_A_FRAME, rng)
+    distance = frame.distance_m[judged]
+    # of a prior that keeps its returns; where none is kept (mono alone), or all are averaged, there is no such pixel
+    found, error_by_neighbours = error_of_returns(lidar_m, frame.returns)
+    kept = _some(found & options.integration.keep_returns, _JUDGED_A_FRAME, rng)
+    for_the_drive = _some(returns, _FOR_THE_DRIVE_A_FRAME, rng)
+
+    def error(estimate_m: NDArray[np.float32]) -> float | None:
+        if not in_blocks.any():
+            return None
+        return float(np.mean(np.abs(estimate_m[in_blocks] - lidar_m[in_blocks]) / lidar_m[in_blocks]))
+
+    return MeasuredFrame(
+        FrameAlignment(name, int(returns.sum()), aligned.fit_of, aligned.fit, error(mono_m), error(aligned.mono_m)),
+        {feature: values[judged] for feature, values in features.items()},
+        np.abs(distance - lidar_m[judged]) / distance,
+        {feature: values[kept] for feature, values in features.items()},
+        error_by_neighbours[kept],
+        view.elevation_rad[usable & (lidar_m > 0)],
+        lidar_m[for_the_drive],
+        mono_m[for_the_drive],
+    )
+
+
+def _some(pixels: NDArray[np.bool_], most: int, rng: np.random.Generator) -> tuple[NDArray[np.intp], ...]:
+    """Rows and columns of True pixels, at most so many, drawn evenly."""
+    where = np.flatnonzero(pixels)
+    if len(where) > most:
+        where = rng.choice(where, most, replace=False)
+    return np.unravel_index(where, pixels.shape)
+
+
+def combine(frames: Sequence[MeasuredFrame], options: PriorOptions, made_of: str, everywhere: bool) -> Trust:
+    """Put the measurements of a drive's frames together.
+
+    Args:
+        frames: at least one.
+        options: of the prior.
+        made_of: key of what they were made of.
+        everywhere: whether the monocular maps are to be trusted beyond LiDAR's field of elevation.
+
+    """
+
+    def pooled(values: Iterable[NDArray]) -> NDArray:
+        return np.concatenate(list(values))
+
+    elevations = pooled(frame.elevation_rad for frame in frames)
+    low, high = np.quantile(elevations, FIELD_QUANTILES) if len(elevations) else (0.0, 0.0)
+    lidar_m, mono_m = pooled(frame.lidar_m for frame in frames), pooled(frame.mono_m for frame in frames)
+    aligned = options.align != "none" and options.depth_source == "integrated"
+    drive_fit = fit_logs(lidar_m, mono_m) if aligned and len(lidar_m) >= LEAST_RETURNS else None
+    names = frames[0].features
+    features = {name: pooled(frame.features[name] for frame in frames) for name in names}
+    return_features = {name: pooled(frame.return_features[name] for frame in frames) for name in names}
+    alignments = (frame.alignment for frame in frames)
+    return Trust(
+        made_of=made_of,
+        error_model=fit_error_model(features, pooled(frame.relative_error for frame in frames)),
+        return_model=fit_error_model(return_features, pooled(frame.return_error for frame in frames)),
+        field_rad=(float(low), float(high)),
+        everywhere=everywhere,
+        drive_fit=drive_fit,
+        frames=tuple(
+            # what the prior of a frame with few returns will take
+            dataclasses.replace(found, fit_of="drive", fit=drive_fit)
+            if drive_fit is not None and found.returns < LEAST_RETURNS
+            else found
+            for found in alignments
+        ),
+    )

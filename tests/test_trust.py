@@ -1,0 +1,266 @@
+"""Calibration of trust: error models on errors of known distribution, and scenes of known maps."""
+
+import dataclasses
+import shutil
+
+import numpy as np
+import pytest
+from scenes import write_scene
+
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.files import read_distance_png, read_json, write_distance_png, write_json
+from edge_depth_nerf.mono import trust as trust_module
+from edge_depth_nerf.mono.error_model import (
+    FIELD_MARGIN_DEG,
+    KNOTS,
+    LEAST_JUDGED,
+    TRUST_FILE,
+    error_of_returns,
+    fit_error_model,
+    pixel_features,
+    read_trust,
+)
+from edge_depth_nerf.mono.trust import calibrate_scene, find_trust, held_out_returns
+from edge_depth_nerf.prior import PriorOptions, View, make_prior
+
+
+def random_features(count, seed=0, least_nearest=1.0):
+    rng = np.random.default_rng(seed)
+    return {
+        "distance_m": np.exp(rng.uniform(0, 4, count)).astype(np.float32),
+        "theta_deg": rng.uniform(0, 100, count).astype(np.float32),
+        "nearest_px": (least_nearest + rng.exponential(5, count)).astype(np.float32),
+        "spread": np.exp(rng.uniform(-7, -1, count)).astype(np.float32),
+        "step": np.exp(rng.uniform(-6, 0, count)).astype(np.float32),
+    }
+
+
+def known_sigma(features):
+    """Relative: 1 %, more far from returns and with spread."""
+    return 0.01 * (1 + features["nearest_px"] / 10) * (1 + 20 * features["spread"])
+
+
+def test_a_known_error_is_covered_in_every_part():
+    features, judged = random_features(60_000), random_features(60_000, seed=1)
+    rng = np.random.default_rng(2)
+    model = fit_error_model(features, np.abs(rng.normal(0, known_sigma(features))))
+    assert model is not None
+    error_m = np.abs(rng.normal(0, known_sigma(judged))) * judged["distance_m"]
+    scaled = error_m / model.sigma_m(judged)
+    parts = {
+        "all": np.ones(len(scaled), bool),
+        "near": judged["nearest_px"] < 2,
+        "far": judged["nearest_px"] > 12,
+        "disagreeing": judged["spread"] > 0.1,
+        "agreeing": judged["spread"] < 0.003,
+        "wide": judged["theta_deg"] > 80,
+    }
+    for name, part in parts.items():
+        # where the floor of 2 cm counts, sigma is too large on purpose
+        part &= judged["distance_m"] > 5
+        assert np.mean(scaled[part] < 1) == pytest.approx(0.683, abs=0.05), name
+        assert np.mean(scaled[part] < 2) == pytest.approx(0.954, abs=0.03), name
+
+
+def test_heavy_tails_still_have_95_percent_within_two():
+    features = random_features(30_000)
+    error = np.abs(np.random.default_rng(3).laplace(0, 0.02, 30_000))
+    model = fit_error_model(features, error)
+    assert model is not None
+    scaled = error / np.exp(model.log_sigma(features))
+    # a Laplace distribution scaled so: 1 - exp(-ln(1 / 0.0455) / 2) within one
+    assert np.mean(scaled < 2) == pytest.approx(0.954, abs=0.02)
+    assert np.mean(scaled < 1) == pytest.approx(0.787, abs=0.03)
+
+
+def test_too_few_errors_give_no_model():
+    features = random_features(LEAST_JUDGED - 1)
+    assert fit_error_model(features, known_sigma(features)) is None
+
+
+def test_at_a_return_half_of_the_variance_is_left():
+    features = random_features(5_000)
+    model = fit_error_model(features, np.abs(np.random.default_rng(0).normal(0, 0.02, 5_000)))
+    assert model is not None
+    factors = model.log_factors["nearest_px"]
+    assert np.exp(2 * (factors[1] - factors[0])) == pytest.approx(2)
+
+
+def test_returns_against_their_neighbours():
+    y, x = np.mgrid[:50, :60]
+    # a plane seen by a pinhole: inverse z is linear
+    plane = (1 / (0.1 + 0.001 * x + 0.002 * y)).astype(np.float32)
+    returns = np.ones(plane.shape, bool)
+    returns[10] = False
+    found, error = error_of_returns(np.where(returns, plane, 0), returns)
+    assert not found[10].any() and found[20, 20] and not found[0, 0]
+    assert error.max() < 1e-5
+    noisy = (plane * (1 + np.random.default_rng(0).normal(0, 0.01, plane.shape))).astype(np.float32)
+    _, error = error_of_returns(noisy, np.ones(plane.shape, bool))
+    inner = error[1:-1, 1:-1]
+    # the larger of two that share the middle value: a fifth to two fifths more than one alone
+    assert 1.1 < np.sqrt(np.mean(inner**2)) / 0.01 < 1.5
+
+
+def test_features_of_pixels():
+    mono = np.full((20, 30), 10, np.float32)
+    mono[:, 20:] = 30
+    mono[0] = 0
+    returns = np.zeros(mono.shape, bool)
+    returns[10, 5] = True
+    spread = np.full(mono.shape, 0.5, np.float32)
+    found = pixel_features(mono, spread, mono, returns, np.full(mono.shape, np.pi / 4, np.float32))
+    assert set(found) == set(KNOTS)
+    assert found["nearest_px"][10, 5] == 0
+    assert found["nearest_px"][10, 8] == pytest.approx(3, abs=0.1)
+    assert found["nearest_px"][13, 9] == pytest.approx(5, abs=0.3)
+    assert found["step"][10, 10] == 0
+    assert found["step"][10, 20] == pytest.approx(np.log(3), rel=1e-5)
+    assert found["step"][1, 10] == 0  # beside pixels without a map
+    assert found["spread"][10, 10] == pytest.approx(0.05)
+    assert found["theta_deg"][3, 3] == pytest.approx(45)
+
+
+def test_blocks_rows_and_single_returns_are_left_out():
+    returns = np.random.default_rng(0).random((350, 350)) < 0.5
+    elevation = np.broadcast_to(np.linspace(0.2, -0.5, 350)[:, None], returns.shape).astype(np.float32)
+    for number in (0, 1):
+        left_out, in_blocks = held_out_returns(returns, elevation, number)
+        assert not (left_out & ~returns).any() and not (in_blocks & ~left_out).any()
+        assert 0.06 < in_blocks.sum() / returns.sum() < 0.14
+        rows = left_out[:10].sum() / returns[:10].sum()
+        assert rows == 1 if number else rows < 0.5
+        again, _ = held_out_returns(returns, elevation, number)
+        np.testing.assert_array_equal(left_out, again)
+
+
+# ---- scenes ----------------------------------------------------------------------------------------------------------
+
+
+def change_map(scene, key, frame, change):
+    meta = read_json(scene / "transforms.json")
+    path = scene / meta["frames"][frame][key]
+    write_distance_png(path, change(read_distance_png(path)))
+
+
+def test_a_scene_is_calibrated_and_the_file_read_again(tmp_path):
+    scene = write_scene(tmp_path)
+    trust = calibrate_scene(scene)
+    assert read_trust(scene / TRUST_FILE) == trust
+    assert len(trust.frames) == 8
+    for frame in trust.frames:
+        # mono is a tenth too far, the same everywhere
+        assert frame.fit_of == "frame" and frame.fit.exponent == pytest.approx(1, abs=0.05)
+        assert frame.held_out_before == pytest.approx(0.1, abs=0.01)
+        assert frame.held_out_after is not None and frame.held_out_after < 0.01
+    assert trust.drive_fit is not None
+    assert trust.drive_fit.apply(np.array([[11.0]], np.float32))[0, 0] == pytest.approx(10, rel=0.02)
+    assert "0.100 before" in trust.summary()
+
+
+@pytest.mark.parametrize("key", ["lidar_file_path", "mono_file_path"])
+def test_held_out_frames_change_nothing(tmp_path, key):
+    scene = write_scene(tmp_path / "a")
+    changed = write_scene(tmp_path / "b")
+    change_map(changed, key, 4, lambda metres: metres * 3)  # the held-out frame
+    assert calibrate_scene(scene) == calibrate_scene(changed)
+    change_map(changed, key, 5, lambda metres: np.where(metres > 5, metres * 1.5, metres))
+    assert calibrate_scene(scene) != calibrate_scene(changed)
+
+
+def test_the_host_says_which_pictures_are_for_training(tmp_path):
+    scene = write_scene(tmp_path, split=False)
+    images = [scene / "images" / f"{i:04d}.png" for i in (0, 2, 3)]
+    trust = find_trust(scene, PriorOptions(), training_images=images)
+    assert [frame.frame for frame in trust.frames] == [f"images/{i:04d}.png" for i in (0, 2, 3)]
+
+
+def test_few_returns_are_named(tmp_path):
+    scene = write_scene(tmp_path)
+    change_map(scene, "lidar_file_path", 2, lambda metres: metres * (np.arange(metres.size) < 90).reshape(metres.shape))
+    trust = calibrate_scene(scene)
+    (poor,) = [frame for frame in trust.frames if frame.fit_of == "drive"]
+    assert poor.frame == "images/0002.png" and poor.returns < 50 and poor.fit == trust.drive_fit
+    assert "images/0002.png, take the drive's fit" in trust.summary()
+
+
+def test_a_calibration_is_found_until_its_files_change(tmp_path, monkeypatch):
+    scene = write_scene(tmp_path)
+    options = PriorOptions()
+    made = find_trust(scene, options)
+    (kept,) = (scene / ".cache").iterdir()
+    monkeypatch.setattr(trust_module, "_calibrate", lambda *_: pytest.fail("made again"))
+    assert find_trust(scene, options) == made
+    # sigma's own options have no part in it
+    assert find_trust(scene, dataclasses.replace(options, sigma_mode="combined")) == made
+    shutil.move(kept, scene / TRUST_FILE)
+    assert find_trust(scene, options) == made
+    monkeypatch.undo()
+    change_map(scene, "mono_file_path", 0, lambda metres: metres + np.arange(metres.size).reshape(metres.shape) % 7)
+    assert find_trust(scene, options) != made
+    assert find_trust(scene, PriorOptions(align="none")).made_of != made.made_of
+
+
+@pytest.mark.parametrize(
+    "content", ["{", '{"version": 0}', "[]", '{"version": 1, "error_model": {"log_base": 0, "log_factors": {}}}']
+)
+def test_a_broken_calibration_is_named_and_made_anew(tmp_path, content):
+    scene = write_scene(tmp_path)
+    made = calibrate_scene(scene)
+    (scene / TRUST_FILE).write_text(content)
+    with pytest.raises(InputError, match=TRUST_FILE):
+        read_trust(scene / TRUST_FILE)
+    assert find_trust(scene, PriorOptions()) == made
+
+
+def test_a_scene_without_maps_to_measure_by(tmp_path):
+    with pytest.raises(InputError, match="has no LiDAR distance maps"):
+        calibrate_scene(write_scene(tmp_path / "a", lidar=False))
+    with pytest.raises(InputError, match="no monocular"):
+        calibrate_scene(write_scene(tmp_path / "b", mono=False))
+
+
+def test_a_mono_map_of_another_size_is_named(tmp_path):
+    scene = write_scene(tmp_path)
+    change_map(scene, "mono_file_path", 1, lambda metres: metres[1:])
+    with pytest.raises(InputError, match=r"mono/0001\.png: is 32×27"):
+        calibrate_scene(scene)
+
+
+def test_maps_of_zeros_give_no_model_but_no_error(tmp_path):
+    scene = write_scene(tmp_path)
+    for frame in range(9):
+        change_map(scene, "mono_file_path", frame, lambda metres: metres * 0)
+    trust = calibrate_scene(scene)
+    assert trust.error_model is None and trust.drive_fit is None
+    assert "too few LiDAR returns" in trust.summary()
+
+
+def test_no_prior_beyond_lidars_field_but_from_a_source_trained_elsewhere(tmp_path):
+    scene = write_scene(tmp_path)
+    trust = calibrate_scene(scene)
+    assert not trust.everywhere
+    trust = dataclasses.replace(trust, field_rad=(-0.4, 0.1))
+    shape = (28, 32)
+    elevation = np.broadcast_to(np.linspace(-1, 1, 28, dtype=np.float32)[:, None], shape)
+    view = View(np.full(shape, 0.5, np.float32), elevation)
+    mono = np.full(shape, 9, np.float32)
+    mono[14, 5] = 230  # far beyond
+    lidar = np.where(np.random.default_rng(0).random(shape) < 0.3, np.float32(8), 0).astype(np.float32)
+    mask = np.ones(shape, bool)
+    prior = make_prior(lidar, mono, mask, PriorOptions(), trust, view)
+    margin = np.radians(FIELD_MARGIN_DEG)
+    expected = (elevation > -0.4 - margin) & (elevation < 0.1 + margin)
+    expected[14, 5] = False
+    np.testing.assert_array_equal(prior.distance_m > 0, expected)
+    np.testing.assert_array_equal(prior.sigma_m > 0, expected)
+    # other modes keep to what was asked for
+    literal = make_prior(lidar, mono, mask, PriorOptions(align="none", sigma_mode="image"), trust, view)
+    assert (literal.distance_m > 0).all()
+
+    meta = read_json(scene / "transforms.json")
+    write_json(scene / "transforms.json", {**meta, "mono": {"trained_on": "elsewhere"}})
+    elsewhere = calibrate_scene(scene)
+    assert elsewhere.everywhere
+    everywhere = make_prior(lidar, mono, mask, PriorOptions(), elsewhere, view)
+    assert (everywhere.distance_m > 0).sum() == mask.sum() - 1
