@@ -11,6 +11,7 @@ import tyro
 from edge_depth_nerf.demo_options import DemoOptions
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.inspect_options import InspectOptions
+from edge_depth_nerf.mono.options import EstimateDepthOptions
 from edge_depth_nerf.process.options import JbnuDepth360Options, Kitti360Options, RigOptions
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 
@@ -30,6 +31,7 @@ class Process:
 Command = (
     Annotated[SynthesizeOptions, tyro.conf.subcommand("synthesize")]
     | Annotated[Process, tyro.conf.subcommand("process")]
+    | Annotated[EstimateDepthOptions, tyro.conf.subcommand("estimate-depth")]
     | Annotated[InspectOptions, tyro.conf.subcommand("inspect")]
     | Annotated[DemoOptions, tyro.conf.subcommand("demo")]
 )
@@ -48,6 +50,10 @@ def run(command: Command) -> None:
         synthesize_drive(command)
     elif isinstance(command, Process):
         _process(command.options)
+    elif isinstance(command, EstimateDepthOptions):
+        from edge_depth_nerf.mono.estimate import estimate_depth
+
+        estimate_depth(command)
     elif isinstance(command, InspectOptions):
         from edge_depth_nerf.inspecting import inspect_scene
 

@@ -1,0 +1,342 @@
+"""`edge-depth-nerf estimate-depth`: trains the network on scenes' own LiDAR, and predicts all their pictures.
+
+Held-out pictures, which scenes keep for judging, are predicted and nothing else: they are neither trained on nor used
+to stop. For stopping, one moment of eight of those to be trained on is kept aside, with all its cameras.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float32
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from edge_depth_nerf import __version__
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.files import read_image
+from edge_depth_nerf.inspecting.reader import InspectedPicture, InspectedScene, read_scene
+from edge_depth_nerf.masks.sky import find_sky
+from edge_depth_nerf.mono.examples import (
+    LARGEST_SET_BYTES,
+    bytes_a_picture,
+    camera_height_m,
+    lens_rays,
+    load_examples,
+    read_lidar,
+    room_radius_m,
+    small_picture,
+    view_of,
+)
+from edge_depth_nerf.mono.network import (
+    ARCHITECTURE,
+    DepthNetwork,
+    NetworkSettings,
+    distance_m,
+    load_network,
+    log_room_distance,
+    ray_geometry,
+    save_network,
+)
+from edge_depth_nerf.mono.options import EstimateDepthOptions, Preset
+from edge_depth_nerf.mono.scene_maps import write_mono_maps
+from edge_depth_nerf.mono.training import Trained, TrainingOptions, as_json, train
+from edge_depth_nerf.mono.trust import calibrate_scene
+
+WEIGHTS = "mono_network.safetensors"
+"""The weights' file in a scene."""
+KEEP_EVERY = 8
+"""One training moment of so many is kept for stopping."""
+_HEIGHT_PICTURES = 20
+"""The camera's height is taken from so many pictures of each camera."""
+_EYE_LEVEL_M = 1.6
+"""Height of a camera that nothing is known of."""
+
+
+@dataclass(frozen=True)
+class PresetValues:
+    """What a preset stands for."""
+
+    channels: tuple[int, ...]
+    """See `NetworkSettings`."""
+    working_px: int
+    """See `NetworkSettings`."""
+    training: TrainingOptions
+    """Steps and rates."""
+
+
+PRESETS: dict[Preset, PresetValues] = {
+    "lite": PresetValues((16, 32, 64, 96, 128), 192, TrainingOptions(steps=1000)),
+    "full": PresetValues(
+        (32, 64, 128, 256, 384, 512),
+        512,
+        TrainingOptions(steps=20000, batch=8, learning_rate=1e-3, evaluate_every=250, patience=20),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class EstimateReport:
+    """What was done."""
+
+    weights: Path
+    """The file whose weights made the maps."""
+    trained: Trained | None
+    """How it was trained, if it was now."""
+    predicted: int
+    """Pictures that got a map."""
+
+
+def estimate_depth(options: EstimateDepthOptions, console: Console | None = None) -> EstimateReport:
+    """Train a network, or take one, write its maps into the scenes, and measure how far they can be trusted.
+
+    Raises:
+        FileNotFoundError: a scene or the weights are not there.
+        InputError: an option, a scene or the weights cannot be used.
+
+    """
+    console = console or Console()
+    options.check()
+    start, about = load_network(options.model) if options.model is not None else (None, {})
+    scenes = [read_scene(path) for path in options.scenes]
+    if len({scene.path.resolve() for scene in scenes}) < len(scenes):
+        raise InputError("a scene is given twice. Name each scene once.")
+    trained = None
+    if options.trains:
+        network, weights, about, trained = _train(scenes, options, start, console)
+    else:
+        assert start is not None and options.model is not None
+        network, weights = start, options.model
+    source = {
+        "kind": "network",
+        # it has seen LiDAR alone, in whatever scene: beyond a scanner's field it knows nothing
+        "trained_on": "scene",
+        "weights": weights.name,
+        "architecture": ARCHITECTURE,
+        **{key: about[key] for key in ("preset", "steps", "abs_rel", "scenes") if key in about},
+    }
+    with _progress(console) as progress, _one_thread():
+        for scene in scenes:
+            # on these the maps are better than elsewhere
+            seen = about.get("trained_frames", {}).get(_name(scene), [])
+            write_mono_maps(scene.folder, predicted_maps(network, scene), {**source, "trained_frames": seen}, progress)
+    count = sum(len(scene.pictures) for scene in scenes)
+    console.print(f"{count} pictures got a monocular map, from {weights}", soft_wrap=True)
+    for scene in scenes:
+        if scene.has("lidar"):
+            trust = calibrate_scene(scene.path, console=console)
+            console.print(f"{scene.folder}: {trust.summary()}", soft_wrap=True)
+    return EstimateReport(weights, trained, count)
+
+
+# ---- training --------------------------------------------------------------------------------------------------
+
+
+def _train(
+    scenes: Sequence[InspectedScene],
+    options: EstimateDepthOptions,
+    start: DepthNetwork | None,
+    console: Console,
+) -> tuple[DepthNetwork, Path, dict[str, Any], Trained | None]:
+    """Train, or find that it was done; give the network, its file, what is known about it, and the training."""
+    preset = PRESETS[options.preset]
+    training = replace(
+        preset.training, steps=options.train_steps or preset.training.steps, seconds=options.seconds, seed=options.seed
+    )
+    weights = options.output or scenes[0].folder / WEIGHTS
+    settings = start.settings if start else NetworkSettings(preset.channels, preset.working_px, _EYE_LEVEL_M, 1.0)
+    split = [training_split(scene) for scene in scenes]
+    split = _thinned(split, settings.working_px, console)
+    heights = [camera_heights_m(scene, settings) for scene in scenes]
+    count = sum(len(pictures) for both in split for pictures in both)
+    with _progress(console) as progress:
+        task = progress.add_task("Reading pictures", total=count)
+        examples, kept = (
+            load_examples(
+                scenes,
+                [both[which] for both in split],
+                heights,
+                settings.working_px,
+                settings.multiple_px,
+                lambda: progress.advance(task),
+            )
+            if any(both[which] for both in split)
+            else None
+            for which in (0, 1)
+        )
+        assert examples is not None
+        if not examples.lidar_m.any():
+            raise InputError(
+                f"{scenes[0].path}: no LiDAR return lies inside the masks of the training pictures, nothing to train "
+                "on. Check the LiDAR maps with `edge-depth-nerf inspect`."
+            )
+        if start is None:
+            mean_height_m = float(np.mean([height for by_camera in heights for height in by_camera.values()]))
+            settings = replace(settings, camera_height_m=mean_height_m, room_radius_m=room_radius_m(examples))
+        identity = {
+            "training": asdict(training),
+            "settings": asdict(settings),
+            "examples": examples.fingerprint(),
+            "start": None if options.model is None else hashlib.sha256(options.model.read_bytes()).hexdigest(),
+        }
+        identity = as_json(identity)
+        if weights.is_file() and weights != options.model:
+            network, about = load_network(weights)
+            if about.get("identity") == identity:
+                console.print(f"{weights} is trained already", soft_wrap=True)
+                return network, weights, about, None
+        task = progress.add_task("Training", total=1.0)
+
+        def report(share: float, error: float) -> None:
+            said = "" if np.isinf(error) else f", error {error:.1%} of the distance"
+            progress.update(task, completed=share, description=f"Training{said}")
+
+        checkpoint = weights.with_suffix(".checkpoint")
+        trained = train(examples, kept, settings, training, start=start, checkpoint=checkpoint, report=report)
+    about = {
+        "made_by": f"edge-depth-nerf {__version__}",
+        "preset": options.preset,
+        "steps": trained.best_step,
+        "abs_rel": None if kept is None else round(trained.abs_rel, 5),
+        "scenes": [_name(scene) for scene in scenes],
+        "trained_frames": {
+            _name(scene): [picture.name for picture in both[0]] for scene, both in zip(scenes, split, strict=True)
+        },
+        "identity": identity,
+    }
+    save_network(weights, trained.network, about)
+    checkpoint.unlink(missing_ok=True)
+    early = ", where it stopped by itself" if trained.stopped_early else ""
+    judged = "" if kept is None else f"; error on the {len(kept)} pictures kept for stopping: {trained.abs_rel:.1%}"
+    console.print(
+        f"Trained {trained.steps} steps{early} in {trained.seconds:.0f} s on {len(examples)} pictures{judged}",
+        soft_wrap=True,
+    )
+    return trained.network, weights, about, trained
+
+
+def _name(scene: InspectedScene) -> str:
+    return scene.folder.resolve().name
+
+
+def training_split(scene: InspectedScene) -> tuple[list[InspectedPicture], list[InspectedPicture]]:
+    """Divide a scene's training pictures, whole moments each: to train on, and to stop by.
+
+    Raises:
+        InputError: it has no LiDAR, or does not say what is held out.
+
+    """
+    if not all("lidar" in picture.files for picture in scene.pictures):
+        raise InputError(
+            f"{scene.path}: has no LiDAR maps, which the network is trained on. Give weights with --model, or train on "
+            "a scene with LiDAR."
+        )
+    if not scene.split_known:
+        raise InputError(
+            f"{scene.path}: does not say which pictures are held out for judging (train_filenames, val_filenames, "
+            "test_filenames). Add them, lest the network sees what the scene is judged by."
+        )
+    allowed = [picture for picture in scene.pictures if not picture.held_out]
+    moments = sorted({picture.moment for picture in allowed})
+    kept = {moment for number, moment in enumerate(moments) if number % KEEP_EVERY == KEEP_EVERY // 2}
+    return (
+        [picture for picture in allowed if picture.moment not in kept],
+        [picture for picture in allowed if picture.moment in kept],
+    )
+
+
+def _thinned(
+    split: list[tuple[list[InspectedPicture], list[InspectedPicture]]], working_px: int, console: Console
+) -> list[tuple[list[InspectedPicture], list[InspectedPicture]]]:
+    """Take every k-th picture where all would not fit in memory."""
+    pictures = [picture for both in split for pictures in both for picture in pictures]
+    most = LARGEST_SET_BYTES // bytes_a_picture(pictures, working_px)
+    step = -(-len(pictures) // most)
+    if step > 1:
+        console.print(f"{len(pictures)} pictures would not fit in memory: every {step}th is used", soft_wrap=True)
+    return [(used[::step], kept[::step]) for used, kept in split]
+
+
+def camera_heights_m(scene: InspectedScene, settings: NetworkSettings) -> Mapping[str, float]:
+    """Height of each camera above the ground: from LiDAR of training pictures, else as the network knows it."""
+    heights = {}
+    for camera, pictures in scene.cameras().items():
+        usable = [picture for picture in pictures if not picture.held_out and "lidar" in picture.files]
+        spread = usable[:: -(-len(usable) // _HEIGHT_PICTURES) or 1]
+        heights[camera] = camera_height_m(scene, spread, settings.working_px) or settings.camera_height_m
+    return heights
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Single small pictures gain nothing from torch's threads, which wait for each other by spinning."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _progress(console: Console) -> Progress:
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("left"))
+    return Progress(*columns, TimeRemainingColumn(), console=console)
+
+
+# ---- prediction ------------------------------------------------------------------------------------------------
+
+
+def predicted_maps(network: DepthNetwork, scene: InspectedScene) -> Iterator[tuple[str, Float32[np.ndarray, "h w"]]]:
+    """Predict all pictures of a scene, one after another: file_path and H×W metres along the ray, 0 in the sky.
+
+    The network never learns of the sky, where LiDAR has no returns; so it is looked for in the picture.
+    """
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    network = network.to(device)
+    heights = camera_heights_m(scene, network.settings)
+    for picture in scene.pictures:
+        metres = predict(network, scene, picture, heights[picture.camera], device)
+        usable = view_of(picture, scene.theta_max_rad, max(metres.shape)).usable
+        lidar_m = read_lidar(scene, picture) if "lidar" in picture.files else np.zeros_like(metres)
+        sky = find_sky(read_image(picture.files["image"]), usable, picture.up_in_camera, picture.lens, lidar_m)
+        yield picture.name, np.where(sky, 0, metres)
+
+
+@torch.no_grad()
+def predict(
+    network: DepthNetwork,
+    scene: InspectedScene,
+    picture: InspectedPicture,
+    height_m: float,
+    device: torch.device,
+) -> Float32[np.ndarray, "h w"]:
+    """Predict one picture at its own size, metres along the ray."""
+    settings = network.settings
+    view = view_of(picture, scene.theta_max_rad, settings.working_px)
+    rows, columns = view.usable.shape
+    rgb = small_picture(picture, (columns, rows))
+
+    def padded(values: np.ndarray) -> torch.Tensor:
+        margins = [(0, -side % settings.multiple_px) for side in (rows, columns)]
+        values = np.pad(values, [*margins, *[(0, 0)] * (values.ndim - 2)])
+        return torch.from_numpy(values)[None].to(device)
+
+    up, height = (torch.from_numpy(np.asarray(v, np.float32))[None].to(device) for v in (view.up_in_camera, height_m))
+    geometry, _ = ray_geometry(padded(view.rays), up, height, settings)
+    seen = padded(rgb).permute(0, 3, 1, 2).float() / 255.0
+    log_ratio = network(seen, geometry, padded(view.usable))[0, :rows, :columns].cpu().numpy()
+    # the ratio is smooth, the room is known exactly at any size
+    size = (picture.lens.width, picture.lens.height)
+    log_ratio = cv2.resize(log_ratio, size, interpolation=cv2.INTER_LINEAR)
+    rays, _ = lens_rays(picture.lens, scene.theta_max_rad, size)
+    height_sine = torch.from_numpy(rays @ view.up_in_camera).clamp(-1.0, 1.0)
+    log_room = log_room_distance(height_sine, height_m, settings.room_radius_m)
+    return distance_m(torch.from_numpy(log_ratio), log_room).numpy()

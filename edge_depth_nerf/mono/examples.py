@@ -1,0 +1,250 @@
+"""Pictures of scenes at the network's size, with their rays, masks and LiDAR, held in memory for training.
+
+All pictures stand in arrays of one size: smaller ones lie in the upper left corner, the rest is not usable. Distances
+are metres along the ray, 0 = none; masks True = use; rays unit vectors in the camera's frame (x right, y down, z
+forward), zeros where a pixel has none.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, UInt8
+from numpy.typing import NDArray
+
+from edge_depth_nerf.cameras import KannalaBrandt, Pinhole
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.files import read_distance_png, read_image, read_mask
+from edge_depth_nerf.inspecting.reader import InspectedPicture, InspectedScene
+
+LARGEST_SET_BYTES = 8 << 30
+"""More pictures than fit in this are thinned evenly."""
+_GROUND_SINE = -math.sin(math.radians(12.0))
+"""Returns below this elevation are mostly of the ground."""
+_GROUND_QUANTILE = 0.8
+"""Of how far returns lie below the camera: kerbs and parked cars lie less deep, nothing much deeper."""
+_MIN_GROUND_RETURNS = 100
+
+
+@dataclass(frozen=True)
+class View:
+    """One picture at the network's size, without its colours."""
+
+    rays: Float32[np.ndarray, "h w 3"]
+    usable: Bool[np.ndarray, "h w"]
+    up_in_camera: Float32[np.ndarray, "3"]
+    """Unit vector against gravity."""
+
+
+@dataclass(frozen=True)
+class Examples:
+    """Pictures to train on or to judge by."""
+
+    rgb: UInt8[np.ndarray, "n h w 3"]
+    lidar_m: Float32[np.ndarray, "n h w"]
+    usable: Bool[np.ndarray, "n h w"]
+    rays: Float32[np.ndarray, "lenses h w 3"]
+    """Of each lens; pictures of one lens share them."""
+    lens: NDArray[np.int64]
+    """Which of them, by picture."""
+    up_in_camera: Float32[np.ndarray, "n 3"]
+    camera_height_m: Float32[np.ndarray, "n"]
+
+    def __len__(self) -> int:
+        return len(self.rgb)
+
+    def fingerprint(self) -> str:
+        """What tells one set from another."""
+        digest = hashlib.sha256()
+        for field in dataclasses.fields(self):
+            values: np.ndarray = getattr(self, field.name)
+            digest.update(f"{field.name}{values.dtype}{values.shape}".encode())
+            digest.update(np.ascontiguousarray(values).data)
+        return digest.hexdigest()[:32]
+
+
+def working_size(width: int, height: int, working_px: int) -> tuple[int, int]:
+    """Width and height at which the network sees a picture: its longer side no longer than `working_px`."""
+    longer = max(width, height)
+    if longer <= working_px:
+        return width, height
+    return max(round(width * working_px / longer), 1), max(round(height * working_px / longer), 1)
+
+
+def view_of(picture: InspectedPicture, theta_max_rad: float, working_px: int) -> View:
+    """Rays and mask of a picture at the network's size."""
+    size = working_size(picture.lens.width, picture.lens.height, working_px)
+    rays, within = lens_rays(picture.lens, theta_max_rad, size)
+    if "mask" in picture.files:
+        mask = read_mask(picture.files["mask"])
+        check_size(mask, picture, "mask")
+        # a pixel that a masked one is mixed into is masked as well
+        within = within & (cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999)
+    return View(rays, within, picture.up_in_camera.astype(np.float32))
+
+
+@lru_cache(maxsize=16)
+def lens_rays(
+    lens: KannalaBrandt | Pinhole, theta_max_rad: float, size: tuple[int, int]
+) -> tuple[Float32[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
+    """Rays of the pixels of a picture scaled to (width, height), and which lie within `theta_max_rad` of the axis."""
+    x, y = size[0] / lens.width, size[1] / lens.height
+    scaled = dataclasses.replace(
+        lens, width=size[0], height=size[1], fx=lens.fx * x, fy=lens.fy * y, cx=lens.cx * x, cy=lens.cy * y
+    )
+    directions, valid = scaled.unproject(scaled.pixel_centres())
+    within = valid & (directions[..., 2] >= math.cos(theta_max_rad))
+    rays = torch.where(within[..., None], directions, 0.0).to(torch.float32)
+    return rays.numpy(), within.numpy()
+
+
+def load_examples(
+    scenes: Sequence[InspectedScene],
+    chosen: Sequence[Sequence[InspectedPicture]],
+    heights_m: Sequence[Mapping[str, float]],
+    working_px: int,
+    multiple_px: int,
+    advance: Callable[[], None] = lambda: None,
+) -> Examples:
+    """Read pictures into memory.
+
+    Args:
+        scenes: the scenes.
+        chosen: pictures of each.
+        heights_m: of each scene, the height of each of its cameras above the ground.
+        working_px: longer side at the network.
+        multiple_px: what both sides of the arrays are multiples of.
+        advance: called after each picture.
+
+    Raises:
+        InputError: a file cannot be decoded, or has another size than its camera.
+
+    """
+    sizes = [working_size(p.lens.width, p.lens.height, working_px) for pictures in chosen for p in pictures]
+    width, height = (-(-max(side) // multiple_px) * multiple_px for side in zip(*sizes, strict=True))
+    count = len(sizes)
+    rgb = np.zeros((count, height, width, 3), np.uint8)
+    lidar_m = np.zeros((count, height, width), np.float32)
+    usable = np.zeros((count, height, width), bool)
+    ups, heights, lenses = np.zeros((count, 3), np.float32), np.zeros(count, np.float32), np.zeros(count, np.int64)
+    rays: dict[object, tuple[int, np.ndarray]] = {}
+    index = 0
+    for scene, pictures, height_m in zip(scenes, chosen, heights_m, strict=True):
+        for picture in pictures:
+            view = view_of(picture, scene.theta_max_rad, working_px)
+            rows, columns = view.usable.shape
+            part = (index, slice(0, rows), slice(0, columns))
+            rgb[part] = small_picture(picture, (columns, rows))
+            lidar_m[part] = small_lidar(scene, picture, view)
+            usable[part] = view.usable
+            key = (picture.lens, scene.theta_max_rad)
+            if key not in rays:
+                padded = np.zeros((height, width, 3), np.float32)
+                padded[:rows, :columns] = view.rays
+                rays[key] = (len(rays), padded)
+            lenses[index] = rays[key][0]
+            ups[index], heights[index] = view.up_in_camera, height_m[picture.camera]
+            index += 1
+            advance()
+    return Examples(rgb, lidar_m, usable, np.stack([ray for _, ray in rays.values()]), lenses, ups, heights)
+
+
+def bytes_a_picture(pictures: Sequence[InspectedPicture], working_px: int) -> int:
+    """Memory that one picture takes at most."""
+    largest = max(np.prod(working_size(p.lens.width, p.lens.height, working_px)) for p in pictures)
+    return int(largest) * (3 + 4 + 1)
+
+
+def small_picture(picture: InspectedPicture, size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
+    """The picture averaged down to (width, height)."""
+    pixels = read_image(picture.files["image"])
+    check_size(pixels, picture, "image")
+    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def small_lidar(scene: InspectedScene, picture: InspectedPicture, view: View) -> Float32[np.ndarray, "h w"]:
+    """LiDAR at the network's size: of the returns in a pixel the one nearest to its centre."""
+    lidar_m = read_lidar(scene, picture)
+    full_rows, full_columns = lidar_m.shape
+    rows, columns = view.usable.shape
+    row, column = np.nonzero(lidar_m)
+    y, x = (row + 0.5) * rows / full_rows, (column + 0.5) * columns / full_columns
+    small_row, small_column = y.astype(np.int64), x.astype(np.int64)
+    off_centre = np.hypot(y - small_row - 0.5, x - small_column - 0.5)
+    farthest_first = np.argsort(-off_centre, kind="stable")
+    small = np.zeros((rows, columns), np.float32)
+    # of several values for one pixel the last one stays
+    small[small_row[farthest_first], small_column[farthest_first]] = lidar_m[row, column][farthest_first]
+    small[~view.usable] = 0
+    return small
+
+
+def read_lidar(scene: InspectedScene, picture: InspectedPicture) -> Float32[np.ndarray, "h w"]:
+    """A picture's own LiDAR map, as distances."""
+    lidar_m = read_distance_png(picture.files["lidar"], scene.lidar_metres_per_count)
+    check_size(lidar_m, picture, "lidar")
+    if scene.lidar_is_z_depth:
+        rays, within = lens_rays(picture.lens, scene.theta_max_rad, (picture.lens.width, picture.lens.height))
+        ahead = within & (rays[..., 2] > 0)
+        lidar_m = np.where(ahead, lidar_m / np.where(ahead, rays[..., 2], 1), 0).astype(np.float32)
+    return lidar_m
+
+
+def check_size(pixels: np.ndarray, picture: InspectedPicture, layer: str) -> None:
+    """Check that a file has its camera's size.
+
+    Raises:
+        InputError: it has another.
+
+    """
+    width, height = picture.lens.width, picture.lens.height
+    if pixels.shape[:2] != (height, width):
+        raise InputError(
+            f"{picture.files[layer]}: is {pixels.shape[1]}×{pixels.shape[0]} pixels (width × height), but the camera "
+            f"of {picture.name} is {width}×{height}. Pictures, masks and distance maps of a frame must have one size; "
+            "make the file again at that size."
+        )
+
+
+def camera_height_m(scene: InspectedScene, pictures: Sequence[InspectedPicture], working_px: int) -> float | None:
+    """Height of the cameras above the ground, from some pictures' returns below the horizon.
+
+    Returns:
+        Metres; None where too few returns lie there.
+
+    """
+    depths = []
+    for picture in pictures:
+        size = working_size(picture.lens.width, picture.lens.height, working_px)
+        view = View(*lens_rays(picture.lens, scene.theta_max_rad, size), picture.up_in_camera.astype(np.float32))
+        lidar_m = small_lidar(scene, picture, view)
+        height_sine = view.rays @ view.up_in_camera
+        below = (lidar_m > 0) & (height_sine < _GROUND_SINE)
+        depths.append((-lidar_m * height_sine)[below])
+    below_m = np.concatenate(depths) if depths else np.empty(0)
+    return float(np.quantile(below_m, _GROUND_QUANTILE)) if below_m.size >= _MIN_GROUND_RETURNS else None
+
+
+def room_radius_m(examples: Examples) -> float:
+    """Horizontal distance of the room's wall: the geometric mean over returns near and above the horizon.
+
+    Returns:
+        Metres; 20 where there are no such returns.
+
+    """
+    logs = []
+    for index in range(len(examples)):
+        height_sine = examples.rays[examples.lens[index]] @ examples.up_in_camera[index]
+        lidar_m = examples.lidar_m[index]
+        level = (lidar_m > 0) & (height_sine > -0.5 * examples.camera_height_m[index] / np.maximum(lidar_m, 1e-6))
+        logs.append(np.log((lidar_m * np.sqrt(1 - np.minimum(height_sine**2, 1)))[level]))
+    collected = np.concatenate(logs)
+    return float(np.exp(collected.mean())) if collected.size else 20.0

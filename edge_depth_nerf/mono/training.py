@@ -1,0 +1,400 @@
+"""Training of the monocular network on LiDAR: losses, augmentation, the loop with its checkpoints.
+
+Augmentation keeps the lens's geometry true: whatever moves a pixel moves its ray with it, and a mirrored picture gets
+mirrored rays. Distances along rays change in none of it. A step's randomness comes from the seed and the step's number
+alone, so that a training that was killed goes on as if nothing had been.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.mono.examples import Examples
+from edge_depth_nerf.mono.network import (
+    DepthNetwork,
+    NetworkSettings,
+    distance_m,
+    ray_geometry,
+    read_tensors,
+    write_tensors,
+)
+
+
+@dataclass(frozen=True)
+class TrainingOptions:
+    """How a network is trained."""
+
+    steps: int
+    """Steps at most."""
+    seconds: float | None = None
+    """Wall time at most, of all calls together; the learning rate follows whichever ends first."""
+    batch: int = 4
+    """Pictures a step."""
+    learning_rate: float = 2e-3
+    """At its highest, after the first twentieth; falls to nothing along a cosine."""
+    weight_decay: float = 1e-2
+    """AdamW's."""
+    balance: float = 0.5
+    """Share of a picture's mean error that the scale-invariant loss forgives."""
+    smoothness: float = 0.1
+    """Weight of the smoothness term."""
+    crop: float = 0.875
+    """Least side of a crop, as a share of the picture's."""
+    jitter: float = 0.15
+    """Standard deviation of the logarithm of brightness and contrast; colours get a third."""
+    evaluate_every: int = 50
+    """Steps between two looks at the pictures kept for stopping."""
+    patience: int = 10
+    """Stops after so many looks without improvement."""
+    seed: int = 0
+    """Of the first weights and of each step."""
+
+
+@dataclass
+class Trained:
+    """The outcome: the weights of the best look."""
+
+    network: DepthNetwork
+    steps: int
+    """Steps taken."""
+    best_step: int
+    """The step that the weights are of."""
+    abs_rel: float
+    """Mean relative error on the pictures kept for stopping; NaN without any."""
+    seconds: float
+    """Wall time of all calls together."""
+    stopped_early: bool
+    """Whether it was stopped because nothing improved any more."""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Pictures on their way into the network."""
+
+    rgb: Float[Tensor, "n 3 h w"]
+    """0 to 1."""
+    geometry: Float[Tensor, "n 5 h w"]
+    """See `network.ray_geometry`."""
+    log_room: Float[Tensor, "n h w"]
+    usable: Bool[Tensor, "n h w"]
+    lidar_m: Float[Tensor, "n h w"]
+    """0 = no return."""
+
+
+def scale_invariant_loss(
+    log_error: Float[Tensor, "n h w"], valid: Bool[Tensor, "n h w"], balance: float
+) -> Float[Tensor, ""]:
+    """Scale-invariant log loss (Eigen et al., NIPS 2014, Eq. 4): mean(e²) - balance·mean(e)², over pictures.
+
+    Its square root is taken, so that a few wrong returns do not rule it.
+
+    Args:
+        log_error: log(predicted / measured distance).
+        valid: where there is a measurement; pictures without any count for nothing.
+        balance: 0 = plain squared log error, 1 = a picture's scale does not matter.
+
+    """
+    counts = valid.sum((1, 2))
+    error = torch.where(valid, log_error, 0.0)
+    mean = error.sum((1, 2)) / counts.clamp(min=1)
+    square = error.square().sum((1, 2)) / counts.clamp(min=1)
+    # the root's slope at 0 is infinite
+    loss = (square - balance * mean.square() + 1e-6).sqrt()
+    measured = counts > 0
+    return torch.where(measured, loss, 0.0).sum() / measured.sum().clamp(min=1)
+
+
+def smoothness_loss(
+    log_ratio: Float[Tensor, "n h w"], rgb: Float[Tensor, "n 3 h w"], usable: Bool[Tensor, "n h w"]
+) -> Float[Tensor, ""]:
+    """Edge-aware smoothness: |difference of neighbours| · exp(-10·colour difference), mean over usable pairs.
+
+    Args:
+        log_ratio: log(predicted distance / the room's distance): floors and walls as such cost nothing.
+        rgb: 0 to 1; the colour difference is the mean of the channels' absolute differences.
+        usable: both of a pair must be.
+
+    """
+    total, count = log_ratio.new_zeros(()), log_ratio.new_zeros(())
+    for axis in (1, 2):
+        length = log_ratio.shape[axis] - 1
+        pair = usable.narrow(axis, 0, length) & usable.narrow(axis, 1, length)
+        step = log_ratio.diff(dim=axis).abs()
+        weight = torch.exp(-10.0 * rgb.diff(dim=axis + 1).abs().mean(1))
+        total = total + torch.where(pair, step * weight, 0.0).sum()
+        count = count + pair.sum()
+    return total / count.clamp(min=1)
+
+
+# ---- batches ---------------------------------------------------------------------------------------------------
+
+
+def make_batch(examples: Examples, indices: np.ndarray, settings: NetworkSettings, device: torch.device) -> Batch:
+    """Put some examples together, as they are."""
+
+    def on_device(values: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(values)).to(device)
+
+    rays = on_device(examples.rays[examples.lens[indices]])
+    geometry, log_room = ray_geometry(
+        rays, on_device(examples.up_in_camera[indices]), on_device(examples.camera_height_m[indices]), settings
+    )
+    return Batch(
+        rgb=on_device(examples.rgb[indices]).permute(0, 3, 1, 2).float() / 255.0,
+        geometry=geometry,
+        log_room=log_room,
+        usable=on_device(examples.usable[indices]),
+        lidar_m=on_device(examples.lidar_m[indices]),
+    )
+
+
+def augmented(batch: Batch, options: TrainingOptions, multiple_px: int, generator: np.random.Generator) -> Batch:
+    """Mirror some pictures, cut all to one part of them, change their light and colours."""
+    mirrored = torch.from_numpy(generator.random(len(batch.rgb)) < 0.5).to(batch.rgb.device)
+    batch = _mirror(batch, mirrored)
+    height, width = batch.usable.shape[1:]
+    rows, row = _cut(height, options.crop, multiple_px, generator)
+    columns, column = _cut(width, options.crop, multiple_px, generator)
+    part = (..., slice(row, row + rows), slice(column, column + columns))
+    return Batch(
+        rgb=_jittered(batch.rgb[part], options.jitter, generator),
+        geometry=batch.geometry[part],
+        log_room=batch.log_room[part],
+        usable=batch.usable[part],
+        lidar_m=batch.lidar_m[part],
+    )
+
+
+def _mirror(batch: Batch, which: Bool[Tensor, "n"]) -> Batch:
+    """Swap left and right of some pictures, and the sign of their rays' x."""
+
+    def chosen(values: Tensor) -> Tensor:
+        return torch.where(which.reshape(-1, *[1] * (values.ndim - 1)), values.flip(-1), values)
+
+    sign = torch.ones_like(batch.geometry[:, :, :1, :1])
+    sign[:, 0] = torch.where(which, -1.0, 1.0)[:, None, None]
+    return Batch(
+        chosen(batch.rgb),
+        chosen(batch.geometry) * sign,
+        chosen(batch.log_room),
+        chosen(batch.usable),
+        chosen(batch.lidar_m),
+    )
+
+
+def _cut(length: int, least: float, multiple: int, generator: np.random.Generator) -> tuple[int, int]:
+    """Length and start of a part, the length a multiple of `multiple`."""
+    blocks = length // multiple
+    taken = int(generator.integers(max(math.ceil(least * blocks), 1), blocks + 1)) * multiple
+    return taken, int(generator.integers(0, length - taken + 1))
+
+
+def _jittered(rgb: Tensor, strength: float, generator: np.random.Generator) -> Tensor:
+    count = len(rgb)
+    gain = generator.normal(0, strength, (count, 1, 1, 1)) + generator.normal(0, strength / 3, (count, 3, 1, 1))
+    contrast = generator.normal(0, strength, (count, 1, 1, 1))
+    gain, contrast = (torch.from_numpy(np.exp(values)).to(rgb) for values in (gain, contrast))
+    mean = rgb.mean((1, 2, 3), keepdim=True)
+    return (((rgb - mean) * contrast + mean) * gain).clamp(0.0, 1.0)
+
+
+# ---- the loop --------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class _State:
+    """What a checkpoint holds beside tensors."""
+
+    step: int = 0
+    seconds: float = 0.0
+    best: float = math.inf
+    best_step: int = 0
+    looks_since_best: int = 0
+    finished: bool = False
+    identity: dict[str, Any] = field(default_factory=dict)
+
+
+def train(
+    examples: Examples,
+    kept: Examples | None,
+    settings: NetworkSettings,
+    options: TrainingOptions,
+    *,
+    start: DepthNetwork | None = None,
+    checkpoint: Path | None = None,
+    checkpoint_seconds: float = 20.0,
+    device: torch.device | None = None,
+    report: Callable[[float, float], None] = lambda share, abs_rel: None,
+) -> Trained:
+    """Train a network, or go on with a training that was interrupted.
+
+    Args:
+        examples: what is trained on.
+        kept: pictures kept for stopping; None to take the last weights.
+        settings: the network's.
+        options: how.
+        start: weights to begin with, of the same settings.
+        checkpoint: file for what a killed training goes on from; one of another training is replaced.
+        checkpoint_seconds: how often it is written.
+        device: where; the GPU if there is one.
+        report: called after each step with the share done and the least error so far, infinite before the first look.
+
+    """
+    device = device or torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(options.seed)
+        network = DepthNetwork(settings)
+    if start is not None:
+        network.load_state_dict(start.state_dict())
+    network = network.to(device).to(memory_format=torch.channels_last)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=options.learning_rate, weight_decay=options.weight_decay)
+    best = {name: tensor.detach().clone() for name, tensor in network.state_dict().items()}
+    identity = {"options": asdict(options), "settings": asdict(settings), "examples": examples.fingerprint()}
+    state = _State(identity=as_json(identity))
+    if checkpoint is not None and checkpoint.is_file():
+        state = _resume(checkpoint, state, network, optimizer, best)
+
+    started = time.monotonic() - state.seconds
+    saved = time.monotonic()
+    while not state.finished:
+        share = _share(state, options)
+        for group in optimizer.param_groups:
+            group["lr"] = options.learning_rate * _rate(share)
+        _step(network, optimizer, examples, settings, options, state.step, device)
+        state.step += 1
+        state.seconds = time.monotonic() - started
+        share = _share(state, options)
+        state.finished = share >= 1.0
+        if kept is not None and (state.finished or state.step % options.evaluate_every == 0):
+            error = abs_rel(network, kept, settings, device)
+            if error < state.best:
+                state.best, state.best_step, state.looks_since_best = error, state.step, 0
+                best = {name: tensor.detach().clone() for name, tensor in network.state_dict().items()}
+            else:
+                state.looks_since_best += 1
+                state.finished |= state.looks_since_best >= options.patience
+        if checkpoint is not None and (state.finished or time.monotonic() - saved >= checkpoint_seconds):
+            _save(checkpoint, state, network, optimizer, best)
+            saved = time.monotonic()
+        report(1.0 if state.finished else share, state.best)
+
+    if kept is not None:
+        network.load_state_dict(best)
+    return Trained(
+        network=network.cpu().eval(),
+        steps=state.step,
+        best_step=state.best_step if kept is not None else state.step,
+        abs_rel=state.best if kept is not None else math.nan,
+        seconds=state.seconds,
+        stopped_early=_share(state, options) < 1.0,
+    )
+
+
+def _share(state: _State, options: TrainingOptions) -> float:
+    """How much of the training is done: of its steps, or of its time."""
+    by_time = state.seconds / options.seconds if options.seconds else 0.0
+    return min(max(state.step / options.steps, by_time), 1.0)
+
+
+def _rate(share: float) -> float:
+    """Learning rate as a share of the highest: a short rise, then a cosine."""
+    return min(share / 0.05 + 0.02, 1.0) * (0.5 + 0.5 * math.cos(math.pi * share))
+
+
+def _step(
+    network: DepthNetwork,
+    optimizer: torch.optim.Optimizer,
+    examples: Examples,
+    settings: NetworkSettings,
+    options: TrainingOptions,
+    step: int,
+    device: torch.device,
+) -> None:
+    generator = np.random.default_rng([options.seed, step])
+    indices = generator.choice(len(examples), min(options.batch, len(examples)), replace=False)
+    batch = augmented(make_batch(examples, indices, settings, device), options, settings.multiple_px, generator)
+    log_ratio = network(batch.rgb, batch.geometry, batch.usable)
+    valid = (batch.lidar_m > 0) & batch.usable
+    log_error = log_ratio + batch.log_room - batch.lidar_m.clamp(min=1e-3).log()
+    loss = scale_invariant_loss(log_error, valid, options.balance)
+    loss = loss + options.smoothness * smoothness_loss(log_ratio, batch.rgb, batch.usable)
+    optimizer.zero_grad(set_to_none=True)
+    loss.backward()
+    torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+    optimizer.step()
+
+
+@torch.no_grad()
+def abs_rel(network: DepthNetwork, examples: Examples, settings: NetworkSettings, device: torch.device) -> float:
+    """Mean of |predicted - measured| / measured over all returns of the examples."""
+    total, count = 0.0, 0
+    for first in range(0, len(examples), 4):
+        batch = make_batch(examples, np.arange(first, min(first + 4, len(examples))), settings, device)
+        predicted_m = distance_m(network(batch.rgb, batch.geometry, batch.usable), batch.log_room)
+        valid = (batch.lidar_m > 0) & batch.usable
+        total += float(((predicted_m - batch.lidar_m).abs() / batch.lidar_m.clamp(min=1e-3))[valid].double().sum())
+        count += int(valid.sum())
+    return total / count if count else math.nan
+
+
+# ---- checkpoints -----------------------------------------------------------------------------------------------
+
+
+def _save(
+    path: Path, state: _State, network: DepthNetwork, optimizer: torch.optim.Optimizer, best: dict[str, Tensor]
+) -> None:
+    tensors = {f"network/{name}": tensor for name, tensor in network.state_dict().items()}
+    tensors |= {f"best/{name}": tensor for name, tensor in best.items()}
+    for number, moments in optimizer.state_dict()["state"].items():
+        tensors |= {f"optimizer/{number}/{name}": tensor for name, tensor in moments.items()}
+    header = asdict(state)
+    header["best"] = None if math.isinf(state.best) else state.best
+    write_tensors(path, tensors, header)
+
+
+def _resume(
+    path: Path,
+    fresh: _State,
+    network: DepthNetwork,
+    optimizer: torch.optim.Optimizer,
+    best: dict[str, Tensor],
+) -> _State:
+    """Load a checkpoint into network, optimizer and `best`; one of another training changes nothing."""
+    try:
+        tensors, header = read_tensors(path)
+    except InputError:
+        return fresh
+    if header.get("identity") != fresh.identity:
+        return fresh
+    groups: dict[str, dict[str, Tensor]] = {"network": {}, "best": {}, "optimizer": {}}
+    for name, tensor in tensors.items():
+        kind, _, rest = name.partition("/")
+        groups[kind][rest] = tensor
+    network.load_state_dict(groups["network"])
+    best.update(groups["best"])
+    described = optimizer.state_dict()
+    moments: dict[int, dict[str, Tensor]] = {}
+    for name, tensor in groups["optimizer"].items():
+        number, _, kind = name.partition("/")
+        moments.setdefault(int(number), {})[kind] = tensor
+    optimizer.load_state_dict({**described, "state": moments})
+    header["best"] = math.inf if header["best"] is None else header["best"]
+    return _State(**header)
+
+
+def as_json(value: Any) -> Any:
+    """As it comes back from a file: tuples become lists."""
+    if isinstance(value, dict):
+        return {key: as_json(entry) for key, entry in value.items()}
+    return [as_json(entry) for entry in value] if isinstance(value, (list, tuple)) else value
