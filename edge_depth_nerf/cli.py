@@ -49,7 +49,9 @@ def run(command: Command) -> None:
 
         synthesize_drive(command)
     elif isinstance(command, Process):
-        _process(command.options)
+        from edge_depth_nerf.process.command import process
+
+        process(command.options)
     elif isinstance(command, EstimateDepthOptions):
         from edge_depth_nerf.mono.estimate import estimate_depth
 
@@ -62,21 +64,6 @@ def run(command: Command) -> None:
         from edge_depth_nerf.demo import run_demo
 
         run_demo(command)
-
-
-def _process(options: Kitti360Options | JbnuDepth360Options | RigOptions) -> None:
-    if isinstance(options, Kitti360Options):
-        from edge_depth_nerf.process.kitti360 import process_kitti360
-
-        process_kitti360(options)
-    elif isinstance(options, JbnuDepth360Options):
-        from edge_depth_nerf.process.jbnu_depth360 import process_jbnu_depth360
-
-        process_jbnu_depth360(options)
-    else:
-        from edge_depth_nerf.process.rig import process_rig
-
-        process_rig(options)
 
 
 def main() -> None:

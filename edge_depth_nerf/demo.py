@@ -38,7 +38,7 @@ from edge_depth_nerf.demo_options import DemoOptions
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_distance_png, read_image, read_json, read_mask, write_json, write_png
 from edge_depth_nerf.pictures import colour_distance, side_by_side
-from edge_depth_nerf.process.kitti360 import process_kitti360
+from edge_depth_nerf.process.command import process
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
@@ -99,12 +99,12 @@ def run_demo(options: DemoOptions, console: Console | None = None) -> dict[str, 
         root=drive,
         sequence=synthesis.sequence,
         output=scene,
-        mono=drive / "simulated_mono" / synthesis.sequence,
+        mono_seconds=options.mono_seconds,
     )
     with clock.stage("synthesize"):
         synthesize_drive(synthesis)
     with clock.stage("process"):
-        process_kitti360(processing)
+        process(processing)
 
     runs = [_Run(name, scene, output / "runs", options) for name in RUNS]
     # side by side, each on its share of the cores: two threads do not make one training twice as fast

@@ -9,7 +9,7 @@ from typing import Literal
 
 @dataclass
 class DemoOptions:
-    """Synthesise a drive, train nerfacto and edge-depth-nerf-lite on it, compare them on held-out views.
+    """Synthesise a drive, train its depth network, then nerfacto and edge-depth-nerf-lite, and compare these two.
 
     Stopped at any moment, the same command takes up where it was.
     """
@@ -22,6 +22,8 @@ class DemoOptions:
     """Moments of the drive; two pictures each."""
     size: int = 256
     """Width and height of the pictures, px."""
+    mono_seconds: float = 90.0
+    """Seconds that the monocular depth network is trained for."""
     steps: int = 800
     """Training steps of each model."""
     seed: int = 0

@@ -13,6 +13,7 @@ import torch
 from rich.console import Console
 
 from edge_depth_nerf import demo
+from edge_depth_nerf.compat import allow_numpy_scalars_in_checkpoints
 from edge_depth_nerf.demo_options import DemoOptions
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_image, read_json
@@ -63,6 +64,7 @@ def test_an_interrupted_demo_is_finished(finished, tmp_path):
     (output / "results.json").unlink()
     (output / "runs" / "ours" / "metrics.json").unlink()
     folder = output / "runs" / "ours" / demo.METHOD / "run" / "nerfstudio_models"
+    allow_numpy_scalars_in_checkpoints()
     saved = torch.load(folder / "step-000000007.ckpt", weights_only=True)
     (folder / "step-000000007.ckpt").unlink()
     torch.save({**saved, "step": 3}, folder / "step-000000003.ckpt")

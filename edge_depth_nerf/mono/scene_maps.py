@@ -20,10 +20,8 @@ from edge_depth_nerf.files import read_json, read_mask, write_distance_png, writ
 from edge_depth_nerf.inspecting.reader import InspectedPicture, InspectedScene, read_scene
 from edge_depth_nerf.mono.error_model import TRUST_FILE
 from edge_depth_nerf.mono.examples import lens_rays
-from edge_depth_nerf.process.scene import LAYERS
+from edge_depth_nerf.process.scene import LAYERS, MONO_ENTRY
 
-MONO_ENTRY = "mono"
-"""Key of transforms.json that says where the maps come from."""
 FARTHEST_M = 200.0
 """What a network puts beyond is the sky, or as good as that: no value."""
 _PARTIAL = ".mono.partial"

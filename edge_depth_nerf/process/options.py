@@ -56,7 +56,16 @@ class ProcessOptions:
     """Classes that are masked out where the drive brings KITTI-360's semantics; none to keep all."""
     mono: Path | None = None
     """Monocular distance maps: a folder with CAMERA/0000000123.png, 16 bit, 1/256 m along the ray, 0 = none. In the
-    size of the raw pictures; one for every frame taken."""
+    size of the raw pictures; one for every frame taken. Not set: a network of the drive's own makes them."""
+    estimate_depth: bool = True
+    """Where no monocular maps are given, train a network on the drive's LiDAR, as `edge-depth-nerf estimate-depth`
+    does; off to leave the scene without, or to bring maps of other networks by that command."""
+    mono_model: Path | None = None
+    """Weights that `estimate-depth` trained on other drives: they predict as they are, nothing is trained."""
+    mono_preset: Literal["lite", "full"] = "lite"
+    """Size of the drive's own network; lite: some minutes on a laptop's CPU; full: for a GPU."""
+    mono_seconds: float | None = None
+    """The drive's own network is trained for so many seconds at most. Not set: all steps of its preset."""
     sky: bool = True
     """Leave the sky without monocular distance, instead of a wrong one."""
 
@@ -85,6 +94,11 @@ class ProcessOptions:
         require(holdout == 0 or holdout >= 2, "holdout-every", holdout, "2 or more, or 0 to hold out none")
         require(0 < self.theta_max_deg <= 180, "theta-max-deg", self.theta_max_deg, "degrees above 0, up to 180")
         require(0 <= self.sweeps <= 30, "sweeps", self.sweeps, "0 to 30")
+        seconds = self.mono_seconds
+        require(seconds is None or seconds > 0, "mono-seconds", seconds, "more than 0")
+        if self.mono_model is not None and (self.mono is not None or not self.estimate_depth):
+            other = "--mono" if self.mono is not None else "--no-estimate-depth"
+            raise InputError(f"--mono-model and {other} exclude each other. Give one of them.")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -69,6 +69,8 @@ LAYERS = {
 """What every frame of a scene has beside its picture, or none: its folder, and its key in transforms.json."""
 CLOUD = "cloud"
 """The layer that becomes points.ply."""
+MONO_ENTRY = "mono"
+"""Key of transforms.json that says where monocular maps come from that were put into the scene later."""
 
 MAX_FIT_RMS_PX = 0.5
 """A camera whose replacement is off by more than this cannot be used."""
@@ -710,4 +712,22 @@ def _write_transforms(
         content["shifted_views"] = {
             str(metres): [view(item) for item in ordered if item.metres == metres] for metres in distances
         }
+    if "mono" not in layers:
+        _keep_mono(content, output / TRANSFORMS)
     write_json(output / TRANSFORMS, content)
+
+
+def _keep_mono(content: dict[str, Any], written: Path) -> None:
+    """Keep naming the monocular maps that were put into the scene since it was written.
+
+    Where any of the scene's files were written now, there is no transforms.json any more, and the maps are made anew.
+    """
+    if not written.is_file():
+        return
+    there = read_json(written)
+    key = LAYERS["mono"][1]
+    maps = {frame["file_path"]: frame[key] for frame in there["frames"] if key in frame}
+    if MONO_ENTRY in there and all(frame["file_path"] in maps for frame in content["frames"]):
+        content[MONO_ENTRY] = there[MONO_ENTRY]
+        for frame in content["frames"]:
+            frame[key] = maps[frame["file_path"]]

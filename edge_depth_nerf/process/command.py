@@ -1,0 +1,79 @@
+"""`edge-depth-nerf process`: from a raw drive to a scene that is ready to be trained on.
+
+First the converter writes the scene; then, if it has no monocular maps, a network is trained on its LiDAR and predicts
+them; then it is measured how far the maps can be trusted. Each step that is done is not done again.
+"""
+
+from __future__ import annotations
+
+from rich.console import Console
+
+from edge_depth_nerf.console import say
+from edge_depth_nerf.inspecting.reader import InspectedScene, read_scene
+from edge_depth_nerf.process.options import JbnuDepth360Options, Kitti360Options, ProcessOptions, RigOptions
+from edge_depth_nerf.process.scene import ProcessReport
+
+
+def process(
+    options: Kitti360Options | JbnuDepth360Options | RigOptions, console: Console | None = None
+) -> ProcessReport:
+    """Write the scene of a drive, its monocular maps and their calibration, or continue where a run stopped.
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        InputError: an option, a file of the drive, or the output folder cannot be used.
+
+    """
+    console = console or Console()
+    options.check()
+    _check_network(options)
+    if isinstance(options, Kitti360Options):
+        from edge_depth_nerf.process.kitti360 import process_kitti360
+
+        report = process_kitti360(options, console)
+    elif isinstance(options, JbnuDepth360Options):
+        from edge_depth_nerf.process.jbnu_depth360 import process_jbnu_depth360
+
+        report = process_jbnu_depth360(options, console)
+    else:
+        from edge_depth_nerf.process.rig import process_rig
+
+        report = process_rig(options, console)
+    _add_mono(read_scene(report.scene), options, console)
+    return report
+
+
+def _check_network(options: ProcessOptions) -> None:
+    """Find out before anything long begins whether the weights that are given can be used."""
+    if options.mono_model is not None:
+        from edge_depth_nerf.mono.network import load_network
+
+        load_network(options.mono_model)
+
+
+def _add_mono(scene: InspectedScene, options: ProcessOptions, console: Console) -> None:
+    """Give the scene monocular maps, if it has none, and the calibration of those it has."""
+    lidar = scene.has("lidar")
+    if not scene.has("mono") and options.estimate_depth:
+        if lidar or options.mono_model is not None:
+            from edge_depth_nerf.mono.estimate import estimate_depth
+            from edge_depth_nerf.mono.options import EstimateDepthOptions
+
+            estimating = EstimateDepthOptions(
+                (scene.folder,), model=options.mono_model, seconds=options.mono_seconds, preset=options.mono_preset
+            )
+            estimate_depth(estimating, console)
+            return
+        say(
+            console,
+            "No LiDAR, so no network of the drive's own can be trained. Bring monocular maps with --mono, or weights "
+            "with --mono-model.",
+            "yellow",
+        )
+    if scene.has("mono") and lidar:
+        from edge_depth_nerf.mono.trust import calibrate_scene, saved_trust
+        from edge_depth_nerf.prior import PriorOptions
+
+        if saved_trust(scene, PriorOptions()) is None:
+            trust = calibrate_scene(scene.path, console=console)
+            say(console, f"Monocular maps: {trust.summary()}")

@@ -1,0 +1,163 @@
+"""`process` as a whole: scene, monocular maps and their calibration by one command, each done once."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from drives import SEQUENCE, RoomDrive, write_room_drive
+from rich.console import Console
+
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.files import read_distance_png, read_json, write_distance_png, write_json
+from edge_depth_nerf.inspecting.reader import read_scene
+from edge_depth_nerf.mono import estimate
+from edge_depth_nerf.mono.error_model import TRUST_FILE, read_trust
+from edge_depth_nerf.mono.estimate import WEIGHTS, PresetValues
+from edge_depth_nerf.mono.scene_maps import write_mono_maps
+from edge_depth_nerf.mono.training import TrainingOptions
+from edge_depth_nerf.process.command import process
+from edge_depth_nerf.process.options import Kitti360Options
+
+
+@pytest.fixture(autouse=True)
+def small_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A network of seconds."""
+    small = PresetValues((8, 16, 24), 64, TrainingOptions(steps=12, batch=2, evaluate_every=6))
+    monkeypatch.setitem(estimate.PRESETS, "lite", small)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> RoomDrive:
+    return write_room_drive(tmp_path_factory.mktemp("room") / "drive", frames=6, size=64)
+
+
+def options_of(room: RoomDrive, output: Path, **changes: Any) -> Kitti360Options:
+    return Kitti360Options(root=room.root, sequence=SEQUENCE, output=output, sweeps=1, find_ego=False, **changes)
+
+
+def run(options: Kitti360Options) -> str:
+    console = Console(file=io.StringIO(), width=200)
+    process(options, console)
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue()
+
+
+def dates(scene: Path) -> dict[str, int]:
+    return {str(path.relative_to(scene)): path.stat().st_mtime_ns for path in scene.rglob("*") if path.is_file()}
+
+
+def test_one_command_gives_lidar_mono_and_its_calibration(room: RoomDrive, tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    said = run(options_of(room, scene))
+    meta = read_json(scene / "transforms.json")
+    assert meta["mono"]["kind"] == "network" and meta["mono"]["trained_on"] == "scene"
+    assert len(meta["frames"]) == 12
+    for frame in meta["frames"]:
+        mono = read_distance_png(scene / frame["mono_file_path"])
+        assert mono.shape == (64, 64) and (mono > 0).mean() > 0.2
+    # moment 4 is held out: no network saw it
+    trained = meta["mono"]["trained_frames"]
+    assert trained and not any("0000000004" in name for name in trained)
+    trust = read_trust(scene / TRUST_FILE)
+    assert trust.error_model is not None and len(trust.frames) == 10
+    assert (scene / WEIGHTS).is_file()
+    assert "12 pictures got a monocular map" in said
+
+    before = dates(scene)
+    transforms = (scene / "transforms.json").read_bytes()
+    again = run(options_of(room, scene))
+    assert "nothing was left to do" in again and "Train" not in again and "monocular map" not in again
+    assert (scene / "transforms.json").read_bytes() == transforms
+    changed = {name for name, date in dates(scene).items() if before[name] != date}
+    assert not {name for name in changed if name.startswith(("mono/", "lidar/")) or name in (WEIGHTS, TRUST_FILE)}
+
+
+@pytest.mark.parametrize("stage", ["estimate_depth", "calibrate_scene"])
+def test_a_run_stopped_between_its_stages_is_finished(
+    stage: str, room: RoomDrive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    scene = tmp_path / "scene"
+    with monkeypatch.context() as patch:
+        patch.setattr(estimate, stage, stop)
+        with pytest.raises(KeyboardInterrupt):
+            run(options_of(room, scene))
+    assert not (scene / TRUST_FILE).exists()
+    said = run(options_of(room, scene))
+    assert (scene / TRUST_FILE).is_file() and read_scene(scene).has("mono")
+    assert ("Trained" in said) == (stage == "estimate_depth")
+
+
+def test_maps_that_came_later_stay(room: RoomDrive, tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    run(options_of(room, scene, estimate_depth=False))
+    assert not read_scene(scene).has("mono")
+    names = [picture.name for picture in read_scene(scene).pictures]
+    write_mono_maps(scene, ((name, np.full((64, 64), 3.0, np.float32)) for name in names), {"trained_on": "elsewhere"})
+    said = run(options_of(room, scene))
+    assert "Train" not in said
+    meta = read_json(scene / "transforms.json")
+    assert meta["mono"] == {"trained_on": "elsewhere"}
+    assert set(np.unique(read_distance_png(scene / meta["frames"][0]["mono_file_path"]))) == {0.0, 3.0}
+    # these are calibrated, too
+    assert read_trust(scene / TRUST_FILE).everywhere
+
+
+def test_maps_of_pictures_that_have_changed_are_made_anew(room: RoomDrive, tmp_path: Path) -> None:
+    drive = write_room_drive(tmp_path / "drive", frames=6, size=64)
+    scene = tmp_path / "scene"
+    run(options_of(drive, scene))
+    for picture in drive.root.rglob("0000000002.png"):
+        picture.touch()
+    assert "12 pictures got a monocular map" in run(options_of(drive, scene))
+
+
+def test_maps_that_are_given_are_calibrated(room: RoomDrive, tmp_path: Path) -> None:
+    for camera in ("image_02", "image_03"):
+        for frame in room.frames:
+            write_distance_png(tmp_path / f"mono/{camera}/{frame:010d}.png", np.full((64, 64), 4.0))
+    said = run(options_of(room, tmp_path / "scene", mono=tmp_path / "mono"))
+    assert read_trust(tmp_path / "scene" / TRUST_FILE).error_model is not None
+    assert not (tmp_path / "scene" / WEIGHTS).exists() and "Monocular maps:" in said
+
+
+def test_weights_of_another_drive_predict_without_training(room: RoomDrive, tmp_path: Path) -> None:
+    run(options_of(room, tmp_path / "first"))
+    said = run(options_of(room, tmp_path / "second", mono_model=tmp_path / "first" / WEIGHTS))
+    assert "Trained" not in said
+    assert read_scene(tmp_path / "second").has("mono")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"mono_model": Path("nowhere.safetensors")}, "nowhere.safetensors"),
+        ({"mono_seconds": 0.0}, "--mono-seconds 0"),
+        ({"mono_model": Path("x.safetensors"), "mono": Path("mono")}, "exclude each other"),
+        ({"mono_model": Path("x.safetensors"), "estimate_depth": False}, "exclude each other"),
+    ],
+)
+def test_what_cannot_be_is_said_before_anything_is_written(
+    changes: dict[str, Any], message: str, room: RoomDrive, tmp_path: Path
+) -> None:
+    with pytest.raises((InputError, FileNotFoundError), match=message):
+        process(options_of(room, tmp_path / "scene", **changes), Console(quiet=True))
+    assert not (tmp_path / "scene").exists()
+
+
+def test_without_lidar_it_says_what_to_do(room: RoomDrive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = tmp_path / "scene"
+    report = process(options_of(room, scene, estimate_depth=False), Console(quiet=True))
+    meta = read_json(scene / "transforms.json")
+    for frame in meta["frames"]:
+        del frame["lidar_file_path"], frame["depth_file_path"]
+    write_json(scene / "transforms.json", meta)
+    monkeypatch.setattr("edge_depth_nerf.process.kitti360.process_kitti360", lambda *_: report)
+    assert "--mono-model" in run(options_of(room, scene))
+    assert not read_scene(scene).has("mono")
