@@ -3,12 +3,20 @@
 Host-facing. The prior of each training frame is integrated once, in `setup_train` (ns-render and the viewer's
 thumbnails never wait for it), from that frame's own maps: a sweep of a held-out moment is in no training frame. How
 far it is trusted is measured on training frames alone (`mono.trust`), once, if the scene does not bring it.
-Batches are drawn from all valid pixels of all training pictures (see `pixel_table`), so that scenes of one picture,
-of mixed sizes, with masks or without all work; nerfstudio's own pixel sampler fails on some of these.
+Batches are read from a table of all valid pixels of all training pictures (see `pixel_table`), so that scenes of one
+picture, of mixed sizes, with masks or without all work; nerfstudio's own pixel sampler fails on some of these. The
+table is kept on disk: the next training of the same scene with the same prior reads no picture at all.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
+import json
+import os
+import tempfile
+from collections import deque
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,6 +30,7 @@ from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, Va
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIndicesEvalDataloader
 from nerfstudio.model_components.ray_generators import RayGenerator
 from nerfstudio.utils.rich_utils import CONSOLE
+from numpy.typing import NDArray
 from rich.progress import track
 
 from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
@@ -29,9 +38,13 @@ from edge_depth_nerf.dataset import FisheyeDepthDataset
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.integration import IntegrationOptions
 from edge_depth_nerf.metrics import has_whole_window
+from edge_depth_nerf.mono.error_model import Trust
 from edge_depth_nerf.mono.trust import find_trust
-from edge_depth_nerf.pixel_table import PixelBatch, PixelTable
-from edge_depth_nerf.prior import Prior, PriorCache, PriorOptions, View, view_of
+from edge_depth_nerf.pixel_table import TABLE_VERSION, PixelBatch, PixelTable, PixelTableWriter
+from edge_depth_nerf.prior import CACHE_VERSION, Prior, PriorCache, PriorOptions, View, view_of
+
+KEPT_TABLES = 8
+"""So many tables of pixels are kept of a scene, those used last; one of 300 pictures of 1400×1400 px takes 6 GB."""
 
 
 @dataclass
@@ -71,8 +84,14 @@ class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig):
     with a floor and a share of the monocular distance."""
     sigma_constant: float = 1.0
     """The standard deviation under sigma_mode constant, metres."""
+    prior_weight: float = 1.0
+    """How often a pixel with a prior is drawn, against one without."""
     cache_dir: Path | None = None
-    """Where integrated priors are kept. Not set: .cache/ in the scene folder."""
+    """Where integrated priors and tables of training pixels are kept. Not set: .cache/ in the scene folder."""
+
+    def __post_init__(self) -> None:
+        if not 0.01 <= self.prior_weight <= 100:
+            raise InputError(f"prior_weight is {self.prior_weight:g}; expected 0.01 to 100.")
 
     def prior_options(self, has_lidar: bool, has_mono: bool) -> PriorOptions:
         """The options of the prior, with depth_source settled by what the scene has.
@@ -133,14 +152,21 @@ class TablePixelSampler:
     def __init__(self, table: PixelTable, num_rays_per_batch: int):
         self.table = table
         self.num_rays_per_batch = num_rays_per_batch
+        # another seed begins elsewhere
+        self._first = int(torch.randint(len(table), ()))
+        self._drawn = 0
 
     def set_num_rays_per_batch(self, num_rays_per_batch: int) -> None:
         """Set the rays of a batch (nerfstudio's interface)."""
         self.num_rays_per_batch = num_rays_per_batch
 
-    def sample(self) -> PixelBatch:
-        """Draw a batch."""
-        return self.table.sample(self.num_rays_per_batch)
+    def sample(self, step: int = 0) -> PixelBatch:
+        """Read the next batch; at a later step of training, the one that belongs there."""
+        # a training that is taken up again goes on where it was; the exporter always says 0
+        self._drawn = max(self._drawn, step * self.num_rays_per_batch)
+        batch = self.table.batch(self._first + self._drawn, self.num_rays_per_batch)
+        self._drawn += self.num_rays_per_batch
+        return batch
 
 
 class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
@@ -156,9 +182,13 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
     train_pixel_sampler: TablePixelSampler | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
     eval_pixel_sampler: TablePixelSampler | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
 
+    def __init__(self, config: FisheyeDepthDataManagerConfig, *args: Any, **kwargs: Any):
+        self._temporary: list[tempfile.TemporaryDirectory[str]] = []
+        super().__init__(config, *args, **kwargs)
+
     def setup_train(self) -> None:
-        """Integrate the prior of every training frame and fill the table of training pixels."""
-        table = self._fill(self.train_dataset, "Integrating depth", with_prior=True)
+        """Integrate the prior of every training frame and write the table of training pixels, or find it."""
+        table = self._table(self.train_dataset, "Integrating depth", with_prior=True)
         self.train_pixel_sampler = TablePixelSampler(table, self.config.train_num_rays_per_batch)
         self.train_ray_generator = RayGenerator(self.train_dataset.cameras.to(self.device))
         CONSOLE.log(
@@ -167,8 +197,8 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         )
 
     def setup_eval(self) -> None:
-        """Fill the table of held-out pixels (no prior) and prepare the loaders of whole views."""
-        table = self._fill(self.eval_dataset, "Reading held-out pictures", with_prior=False)
+        """Write or find the table of held-out pixels (no prior) and prepare the loaders of whole views."""
+        table = self._table(self.eval_dataset, "Reading held-out pictures", with_prior=False)
         self.eval_pixel_sampler = TablePixelSampler(table, self.config.eval_num_rays_per_batch)
         self.eval_ray_generator = RayGenerator(self.eval_dataset.cameras.to(self.device))
         self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(
@@ -180,16 +210,15 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         """Rays of the next training batch and what supervises them."""
         self.train_count += 1
         assert self.train_pixel_sampler is not None
-        return self._serve(self.train_pixel_sampler, self.train_ray_generator)
+        return self._serve(self.train_pixel_sampler.sample(step), self.train_ray_generator)
 
     def next_eval(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
         """Rays of a batch of held-out pixels and their colours."""
         self.eval_count += 1
         assert self.eval_pixel_sampler is not None
-        return self._serve(self.eval_pixel_sampler, self.eval_ray_generator)
+        return self._serve(self.eval_pixel_sampler.sample(), self.eval_ray_generator)
 
-    def _serve(self, sampler: TablePixelSampler, generator: RayGenerator) -> tuple[RayBundle, dict[str, Any]]:
-        batch = sampler.sample()
+    def _serve(self, batch: PixelBatch, generator: RayGenerator) -> tuple[RayBundle, dict[str, Any]]:
         rays = generator(batch.indices.to(self.device))
         return rays, {
             "image": batch.rgb.to(self.device),
@@ -198,45 +227,116 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
             "prior_sigma_m": batch.prior_sigma_m.to(self.device),
         }
 
-    def _fill(self, dataset: FisheyeDepthDataset, description: str, with_prior: bool) -> PixelTable:
-        table = PixelTable()
-        cache: PriorCache | None = None
+    def _table(self, dataset: FisheyeDepthDataset, description: str, with_prior: bool) -> PixelTable:
+        """The table of a split's pixels: the one on disk, if it was made of the same things, or a new one."""
+        data = Path(self.config.dataparser.data)
+        scene = data.parent if data.suffix == ".json" else data
+        cache_dir = self.config.cache_dir or scene / ".cache"
+        options: PriorOptions | None = None
+        trust: Trust | None = None
         has_lidar = bool(dataset.metadata["lidar_filenames"])
         has_mono = bool(dataset.metadata["mono_filenames"])
         wanted = self.config.depth_source != "none" and (has_lidar or has_mono or self.config.depth_source != "auto")
         if with_prior and wanted:
             options = self.config.prior_options(has_lidar, has_mono)
-            data = Path(self.config.dataparser.data)
-            scene = data.parent if data.suffix == ".json" else data
-            trust = None
             if has_lidar and has_mono and options.wants_trust:
-                trust_cache = self.config.cache_dir or scene / ".cache"
-                trust = find_trust(data, options, trust_cache, dataset.image_filenames, CONSOLE)
+                trust = find_trust(data, options, cache_dir, dataset.image_filenames, CONSOLE)
                 CONSOLE.log(f"Depth prior: {trust.summary()}.")
-            cache = PriorCache(self.config.cache_dir or scene / ".cache" / "prior", options, trust)
+        weight = self.config.prior_weight if options else 1.0
+        path = cache_dir / "pixels" / f"{_table_key(dataset, options, trust, weight)}.npy"
+        try:
+            table = PixelTable(path)
+            os.utime(path)
+            return table
+        except (OSError, ValueError, KeyError, InputError):
+            pass  # not there, or not whole: made now
+        if not _writable(path.parent):
+            # a scene that cannot be written: the table lives as long as this object
+            self._temporary.append(tempfile.TemporaryDirectory(prefix="edge-depth-nerf-"))
+            path = Path(self._temporary[-1].name) / path.name
+        cache = None if options is None else PriorCache(cache_dir / "prior", options, trust)
+        most = int((dataset.cameras.width * dataset.cameras.height).sum())
+        with PixelTableWriter(path, most, prior_weight=weight) as writer:
+            loaded = _load(dataset, cache, whole_windows=not with_prior)
+            for pixels in track(loaded, f"{description}…", len(dataset), console=CONSOLE, transient=True):
+                writer.add(*pixels)
+            writer.finish()
+        _remove_old(path.parent)
+        return PixelTable(path)
 
-        def load(image_idx: int) -> tuple[Any, Any, Prior | None]:
-            rgb = dataset.rgb(image_idx)
-            mask = dataset.mask(image_idx)
-            if not with_prior and not has_whole_window(torch.from_numpy(mask)):
-                raise InputError(
-                    f"{dataset.mask_key(image_idx)[0] or dataset.image_filenames[image_idx]}: the mask of the held-out "
-                    f"picture {dataset.image_filenames[image_idx].name} keeps too little to judge by (not one window "
-                    "of SSIM, 11×11 px). Mend the mask (255 = use the pixel), or do not hold that picture out."
-                )
-            if cache is None:
-                return rgb, mask, None
-            lidar, mono = dataset.lidar_distance_m(image_idx), dataset.mono_distance_m(image_idx)
-            view = None if cache.trust is None else _view(dataset, image_idx)
-            return rgb, mask, cache.prior(lidar, mono, mask, view)
 
-        # OpenCV and torch release the interpreter's lock, so two threads read and integrate side by side
-        with ThreadPoolExecutor(max_workers=2) as pool:
-            loaded = pool.map(load, range(len(dataset)))
-            progress = track(loaded, f"{description}…", len(dataset), console=CONSOLE, transient=True)
-            for image_idx, (rgb, mask, prior) in enumerate(progress):
-                distance = prior.distance_m if prior else None
-                sigma = prior.sigma_m if prior else None
-                table.add(rgb, mask, dataset.mask_key(image_idx), distance, sigma)
-        table.finish()
-        return table
+def _load(
+    dataset: FisheyeDepthDataset, cache: PriorCache | None, whole_windows: bool
+) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.float32] | None, NDArray[np.float32] | None]]:
+    """Colours, mask, prior and its sigma of each picture.
+
+    Raises:
+        InputError: a file cannot be used, or, with `whole_windows`, a mask leaves too little to be judged by.
+
+    """
+
+    def load(image_idx: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_], Prior | None]:
+        rgb = dataset.rgb(image_idx)
+        mask = dataset.mask(image_idx)
+        if whole_windows and not has_whole_window(torch.from_numpy(mask)):
+            raise InputError(
+                f"{dataset.mask_key(image_idx)[0] or dataset.image_filenames[image_idx]}: the mask of the held-out "
+                f"picture {dataset.image_filenames[image_idx].name} keeps too little to judge by (not one window "
+                "of SSIM, 11×11 px). Mend the mask (255 = use the pixel), or do not hold that picture out."
+            )
+        if cache is None:
+            return rgb, mask, None
+        lidar, mono = dataset.lidar_distance_m(image_idx), dataset.mono_distance_m(image_idx)
+        view = None if cache.trust is None else _view(dataset, image_idx)
+        return rgb, mask, cache.prior(lidar, mono, mask, view)
+
+    # OpenCV and torch release the interpreter's lock, so two threads read and integrate side by side; a few pictures
+    # ahead, not all that the disk can bring
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        waiting = deque(pool.submit(load, image_idx) for image_idx in range(min(3, len(dataset))))
+        for ahead in range(len(dataset)):
+            rgb, mask, prior = waiting.popleft().result()
+            if ahead + 3 < len(dataset):
+                waiting.append(pool.submit(load, ahead + 3))
+            yield rgb, mask, prior.distance_m if prior else None, prior.sigma_m if prior else None
+
+
+def _table_key(dataset: FisheyeDepthDataset, options: PriorOptions | None, trust: Trust | None, weight: float) -> str:
+    """What a table was made of: the files by name, size and date, the cameras, and what the prior is made by."""
+    metadata, cameras = dataset.metadata, dataset.cameras
+    masks = dataset._dataparser_outputs.mask_filenames
+    files = [*dataset.image_filenames, *(masks or [])]
+    if options is not None:
+        files += [*(metadata["lidar_filenames"] or []), *(metadata["mono_filenames"] or [])]
+    stats = [(str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in files]
+    described = {
+        "versions": [TABLE_VERSION, CACHE_VERSION],
+        "files": stats,
+        "weight": weight,
+        "metadata": [metadata[key] for key in ("theta_max_rad", "lidar_metres_per_count", "lidar_is_z_depth")],
+        "prior": None if options is None else dataclasses.asdict(options),
+        "trust": None if trust is None else trust.to_dict(),
+        "turn": dataset._dataparser_outputs.dataparser_transform[:3, :3].tolist(),
+    }
+    digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
+    lenses = (cameras.width, cameras.height, cameras.fx, cameras.fy, cameras.cx, cameras.cy, cameras.camera_type)
+    for values in (*lenses, cameras.distortion_params, cameras.camera_to_worlds[:, :3, :3]):
+        digest.update(b"" if values is None else values.cpu().numpy().tobytes())
+    return digest.hexdigest()[:32]
+
+
+def _writable(folder: Path) -> bool:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False
+
+
+def _remove_old(folder: Path) -> None:
+    """Keep the tables that were used last."""
+    tables = sorted(folder.glob("*.npy"), key=lambda path: path.stat().st_mtime_ns)
+    for path in tables[:-KEPT_TABLES]:
+        path.with_suffix(".json").unlink(missing_ok=True)
+        path.unlink(missing_ok=True)

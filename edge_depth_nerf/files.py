@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,8 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
     A reader sees the old file or the whole new one, never a part of it.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    # two threads may write one file
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{threading.get_native_id()}{path.suffix}")
     try:
         write(temporary)
         os.replace(temporary, path)

@@ -1,23 +1,49 @@
-"""The training pixels that count, as flat arrays.
+"""The training pixels that count, on disk in a random order.
 
-Pure. Only valid pixels of each picture are kept: colour as uint8, prior distance and sigma as uint16 in 1/256 m
-(0 = no prior). Pictures may differ in size; those with the same mask share one list of pixel positions.
-A batch is drawn uniformly, with replacement, over all valid pixels of all pictures.
+Pure. Only valid pixels of each picture are kept, as records of 15 bytes: colour as uint8, prior distance and sigma as
+uint16 in 1/256 m (0 = no prior), and where the pixel is. Their order is random, so that a batch is one contiguous
+read of a memory-mapped file: any number of pictures needs next to no memory of the process's own. A batch holds each
+pixel at most once, and all pixels are passed before one comes again.
+
+The order is made in two passes: each pixel goes to one of several files, drawn at random; then each file, small enough
+for memory, is shuffled and appended to the whole. That is a uniformly random permutation.
 """
 
 from __future__ import annotations
 
-from collections.abc import Hashable
-from dataclasses import dataclass, field
+import tempfile
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import IO
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import DISTANCE_STEPS_PER_METRE
+from edge_depth_nerf.files import DISTANCE_STEPS_PER_METRE, read_json, write_atomically, write_json
+
+TABLE_VERSION = 1
+"""Raised whenever the form of the file changes."""
+BUCKET_BYTES = 64 << 20
+"""So much is shuffled in memory at once."""
+RECORD = np.dtype(
+    [
+        ("rgb", "u1", 3),
+        ("distance", "<u2"),
+        ("sigma", "<u2"),
+        ("picture", "<u4"),
+        ("row", "<u2"),
+        ("column", "<u2"),
+    ]
+)
+"""One pixel, packed."""
+LARGEST_SIDE_PX = 1 << 16
+"""Rows and columns are kept in 16 bits."""
 
 
 def to_steps(distance_m: NDArray) -> NDArray[np.uint16]:
@@ -47,111 +73,150 @@ class PixelBatch:
     """Its standard deviation, metres."""
 
 
-@dataclass
-class _Frozen:
-    """n valid pixels of p pictures."""
-
-    rgb: NDArray[np.uint8]
-    distance: NDArray[np.uint16]
-    sigma: NDArray[np.uint16]
-    ends: NDArray[np.int64]
-    """p: one past the last pixel of each picture."""
-    pixels: NDArray[np.int32]
-    """Positions (row · width + column) of the valid pixels of all masks, one after the other."""
-    shifts: NDArray[np.int64]
-    """p: first pixel of each picture less the start of its mask's list in `pixels`."""
-    widths: NDArray[np.int64]
-
-
-@dataclass
 class PixelTable:
-    """Flat arrays of all valid pixels; filled picture by picture with `add`, then sampled."""
+    """All valid pixels of some pictures, in a random order, memory-mapped."""
 
-    _rgb: list[NDArray[np.uint8]] = field(default_factory=list)
-    _distance: list[NDArray[np.uint16]] = field(default_factory=list)
-    _sigma: list[NDArray[np.uint16]] = field(default_factory=list)
-    _widths: list[int] = field(default_factory=list)
-    _masks: dict[Hashable, NDArray[np.int32]] = field(default_factory=dict)
-    _mask_of_picture: list[Hashable] = field(default_factory=list)
-    _frozen: _Frozen | None = None
+    def __init__(self, path: Path):
+        """Open a table that `PixelTableWriter` wrote.
+
+        Raises:
+            InputError, OSError, ValueError: it is not there, of another version, or not whole.
+
+        """
+        about = read_json(_about(path))
+        self._records: NDArray = np.load(path, mmap_mode="r", allow_pickle=False)
+        if about.get("version") != TABLE_VERSION or self._records.dtype != RECORD:
+            raise ValueError(f"{path}: a table of version {about.get('version')}, expected {TABLE_VERSION}")
+        if len(self._records) != about["pixels"]:
+            raise ValueError(f"{path}: {len(self._records)} pixels, expected {about['pixels']}")
+        self._with_prior = int(about["with_prior"])
+
+    def __len__(self) -> int:
+        """Number of records: of valid pixels, where each counts once."""
+        return len(self._records)
+
+    @property
+    def share_with_prior(self) -> float:
+        """Share of the records that have a prior."""
+        return self._with_prior / len(self)
+
+    def batch(self, start: int, count: int) -> PixelBatch:
+        """Read `count` pixels from number `start` on; after the last one comes the first again."""
+        first = start % len(self)
+        records = self._records[first : first + count]
+        if len(records) < count:
+            records = self._records[np.arange(first, first + count) % len(self)]
+
+        def metres(steps: NDArray[np.uint16]) -> Tensor:
+            return torch.from_numpy(steps.astype(np.float32) / DISTANCE_STEPS_PER_METRE)[:, None]
+
+        where = np.stack([records[name].astype(np.int64) for name in ("picture", "row", "column")], axis=1)
+        return PixelBatch(
+            indices=torch.from_numpy(where),
+            rgb=torch.from_numpy(records["rgb"].astype(np.float32) / 255),
+            prior_distance_m=metres(records["distance"]),
+            prior_sigma_m=metres(records["sigma"]),
+        )
+
+
+class PixelTableWriter:
+    """Writes a table, picture by picture; a context in which temporary files live.
+
+    with PixelTableWriter(path, most_pixels) as writer:
+        writer.add(rgb, mask, distance_m, sigma_m)
+        writer.finish()
+    """
+
+    def __init__(self, path: Path, most_pixels: int, seed: int = 0, prior_weight: float = 1.0):
+        """Begin.
+
+        Args:
+            path: the file to be, .npy; its folder is made.
+            most_pixels: an upper bound of the pixels that will be added.
+            seed: of their order.
+            prior_weight: a pixel with a prior is drawn so many times as often as one without. (It is in the table
+                once or more often: so many times in the mean, or, below 1, one without is.)
+
+        """
+        self.path = path
+        self._rng = np.random.default_rng(seed)
+        self._copies = (max(1.0, 1 / prior_weight), max(1.0, prior_weight))
+        self._most_bytes = int(most_pixels * max(self._copies)) * RECORD.itemsize
+        self._stack = ExitStack()
+        self._buckets: list[IO[bytes]] = []
+        self._pictures = self._pixels = self._with_prior = 0
+
+    def __enter__(self) -> PixelTableWriter:
+        """Open the temporary files."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        for _ in range(max(1, -(-self._most_bytes // BUCKET_BYTES))):
+            file = tempfile.TemporaryFile(dir=self.path.parent, prefix=".pixels.")
+            self._buckets.append(self._stack.enter_context(file))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Remove the temporary files."""
+        self._stack.close()
 
     def add(
         self,
-        rgb: NDArray[np.uint8],
-        mask: NDArray[np.bool_],
-        mask_key: Hashable,
-        prior_distance_m: NDArray[np.float32] | None,
-        prior_sigma_m: NDArray[np.float32] | None,
+        rgb: UInt8[np.ndarray, "h w 3"],
+        mask: Bool[np.ndarray, "h w"],
+        prior_distance_m: Float[np.ndarray, "h w"] | None,
+        prior_sigma_m: Float[np.ndarray, "h w"] | None,
     ) -> None:
-        """Add a picture (H×W×3) with its mask (H×W); pictures with equal `mask_key` have equal masks.
-
-        Maps of the prior are H×W metres; None means no prior anywhere.
-        """
-        assert rgb.shape[:2] == mask.shape
-        if mask_key not in self._masks:
-            self._masks[mask_key] = np.flatnonzero(mask).astype(np.int32)
-        pixels = self._masks[mask_key]
-        none = np.zeros(len(pixels), np.uint16)
-        self._rgb.append(rgb.reshape(-1, 3)[pixels])
-        self._distance.append(none if prior_distance_m is None else to_steps(prior_distance_m.reshape(-1)[pixels]))
-        self._sigma.append(none if prior_sigma_m is None else _sigma_steps(prior_sigma_m.reshape(-1)[pixels]))
-        self._widths.append(mask.shape[1])
-        self._mask_of_picture.append(mask_key)
+        """Add the next picture; maps of the prior are metres, None means no prior anywhere."""
+        assert max(mask.shape) < LARGEST_SIDE_PX
+        rows, columns = np.nonzero(mask)
+        records = np.zeros(len(rows), RECORD)
+        records["rgb"] = rgb[rows, columns]
+        records["row"], records["column"], records["picture"] = rows, columns, self._pictures
+        if prior_distance_m is not None and prior_sigma_m is not None:
+            records["distance"] = to_steps(prior_distance_m[rows, columns])
+            records["sigma"] = _sigma_steps(prior_sigma_m[rows, columns])
+        self._pictures += 1
+        if max(self._copies) > 1:
+            copies = np.asarray(self._copies)[(records["distance"] > 0).astype(int)]
+            records = np.repeat(records, (copies + self._rng.random(len(records))).astype(np.int64))
+        self._pixels += len(records)
+        self._with_prior += int((records["distance"] > 0).sum())
+        bucket = self._rng.integers(len(self._buckets), size=len(records))
+        ordered = records[np.argsort(bucket, kind="stable")]
+        ends = np.cumsum(np.bincount(bucket, minlength=len(self._buckets)))
+        for file, part in zip(self._buckets, np.split(ordered, ends[:-1]), strict=True):
+            file.write(part.tobytes())
 
     def finish(self) -> None:
-        """Join what was added.
+        """Put the pixels into their order and the file in its place.
 
         Raises:
             InputError: no valid pixel in any picture.
 
         """
-        if not sum(map(len, self._rgb)):
+        if not self._pixels:
             raise InputError(
-                f"None of the {len(self._rgb)} pictures has a valid pixel: the masks leave nothing. "
+                f"None of the {self._pictures} pictures has a valid pixel: the masks leave nothing. "
                 "Masks are 255 where a pixel may be used; check that they are not inverted."
             )
-        keys = list(self._masks)
-        mask_starts = np.cumsum([0, *(len(self._masks[key]) for key in keys)])
-        first_of_mask = dict(zip(keys, mask_starts, strict=False))
-        ends = np.cumsum([len(rgb) for rgb in self._rgb])
-        starts = ends - [len(rgb) for rgb in self._rgb]
-        self._frozen = _Frozen(
-            rgb=np.concatenate(self._rgb),
-            distance=np.concatenate(self._distance),
-            sigma=np.concatenate(self._sigma),
-            ends=ends,
-            pixels=np.concatenate([self._masks[key] for key in keys]),
-            shifts=starts - np.array([first_of_mask[key] for key in self._mask_of_picture]),
-            widths=np.array(self._widths),
-        )
-        for joined in (self._rgb, self._distance, self._sigma, self._masks):
-            joined.clear()
 
-    def __len__(self) -> int:
-        """Number of valid pixels."""
-        return 0 if self._frozen is None else int(self._frozen.ends[-1])
+        def write(temporary: Path) -> None:
+            with temporary.open("wb") as out:
+                header = {"descr": np.lib.format.dtype_to_descr(RECORD), "fortran_order": False}
+                np.lib.format.write_array_header_1_0(out, {**header, "shape": (self._pixels,)})
+                for file in self._buckets:
+                    file.seek(0)
+                    records = np.frombuffer(file.read(), RECORD)
+                    out.write(records[self._rng.permutation(len(records))].tobytes())
+                    file.seek(0)
+                    file.truncate()
 
-    @property
-    def share_with_prior(self) -> float:
-        """Share of the valid pixels that have a prior."""
-        assert self._frozen is not None
-        return float((self._frozen.distance > 0).mean())
+        write_atomically(self.path, write)
+        about = {"version": TABLE_VERSION, "pixels": self._pixels, "with_prior": self._with_prior}
+        write_json(_about(self.path), {**about, "pictures": self._pictures})
 
-    def sample(self, count: int, generator: torch.Generator | None = None) -> PixelBatch:
-        """Draw `count` pixels uniformly, with replacement."""
-        assert self._frozen is not None, "finish() first"
-        table = self._frozen
-        drawn = torch.randint(len(self), (count,), generator=generator).numpy()
-        picture = np.searchsorted(table.ends, drawn, side="right")
-        pixel = table.pixels[drawn - table.shifts[picture]]
-        rows, columns = np.divmod(pixel, table.widths[picture])
 
-        def metres(steps: NDArray[np.uint16]) -> Tensor:
-            return torch.from_numpy(steps[drawn].astype(np.float32) / DISTANCE_STEPS_PER_METRE)[:, None]
-
-        return PixelBatch(
-            indices=torch.from_numpy(np.stack([picture, rows, columns], axis=1)),
-            rgb=torch.from_numpy(table.rgb[drawn].astype(np.float32) / 255),
-            prior_distance_m=metres(table.distance),
-            prior_sigma_m=metres(table.sigma),
-        )
+def _about(path: Path) -> Path:
+    """The file that tells that a table is whole."""
+    return path.with_suffix(".json")

@@ -10,6 +10,7 @@ from scenes import fisheye, pinhole, write_scene
 from edge_depth_nerf import datamanager as datamanager_module
 from edge_depth_nerf.datamanager import FisheyeDepthDataManagerConfig
 from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
+from edge_depth_nerf.dataset import FisheyeDepthDataset
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_json, write_json, write_mask
 from edge_depth_nerf.inspecting.reader import read_scene
@@ -211,3 +212,75 @@ def test_a_turned_scene_has_the_same_prior(tmp_path):
         shares.append(data.train_pixel_sampler.table.share_with_prior)
     assert shares[0] == pytest.approx(shares[1], abs=2e-3)
     assert 0.1 < shares[0] < 0.9
+
+
+# ---- the table of pixels ---------------------------------------------------------------------------------------
+
+
+def test_the_second_training_reads_no_picture(tmp_path, monkeypatch):
+    scene = write_scene(tmp_path)
+    first = manager(scene).train_pixel_sampler.table
+    with monkeypatch.context() as patch:
+        patch.setattr(FisheyeDepthDataset, "rgb", lambda *_: pytest.fail("read a picture"))
+        again = manager(scene).train_pixel_sampler.table
+        assert torch.equal(first.batch(0, 500).indices, again.batch(0, 500).indices)
+        assert len(list((scene / ".cache" / "pixels").glob("*.npy"))) == 2  # training, held out
+        with pytest.raises(pytest.fail.Exception):
+            manager(scene, prior_weight=2.0)
+        (scene / "images" / "0002.png").touch()
+        with pytest.raises(pytest.fail.Exception):
+            manager(scene)
+
+
+def test_a_broken_table_is_made_anew(tmp_path):
+    scene = write_scene(tmp_path)
+    whole = manager(scene).train_pixel_sampler.table.batch(0, 500).indices
+    for path in (scene / ".cache" / "pixels").glob("*.npy"):
+        path.write_bytes(path.read_bytes()[:-40])
+    assert torch.equal(manager(scene).train_pixel_sampler.table.batch(0, 500).indices, whole)
+
+
+def test_a_scene_that_cannot_be_written_trains(tmp_path):
+    scene = write_scene(tmp_path)
+    (scene / ".cache").write_text("in the way")
+    data = manager(scene)
+    assert (data.next_train(0)[1]["prior_distance_m"] > 0).any()
+    assert len(data.next_eval(0)[0]) > 0
+    assert (scene / ".cache").read_text() == "in the way"
+
+
+def test_only_the_tables_used_last_are_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr(datamanager_module, "KEPT_TABLES", 3)
+    scene = write_scene(tmp_path)
+    for alpha in (0.5, 0.6, 0.7):
+        manager(scene, alpha=alpha)
+    folder = scene / ".cache" / "pixels"
+    assert len(list(folder.glob("*.npy"))) == len(list(folder.glob("*.json"))) == 3
+    # held out, 0.6, 0.7
+    before = {path.name for path in folder.glob("*.npy")}
+    manager(scene, alpha=0.6)
+    assert {path.name for path in folder.glob("*.npy")} == before
+
+
+def test_a_resumed_training_goes_on_with_the_next_pixels(tmp_path):
+    scene = write_scene(tmp_path)
+    torch.manual_seed(3)
+    undisturbed = manager(scene)
+    drawn = [undisturbed.next_train(step)[1]["indices"] for step in range(6)]
+    torch.manual_seed(3)
+    resumed = manager(scene)
+    assert torch.equal(resumed.next_train(4)[1]["indices"], drawn[4])
+    assert torch.equal(resumed.next_train(5)[1]["indices"], drawn[5])
+    # nerfstudio's exporter always says step 0, and wants other rays each time
+    assert not torch.equal(resumed.next_train(0)[1]["indices"], drawn[5])
+    torch.manual_seed(4)
+    assert not torch.equal(manager(scene).next_train(0)[1]["indices"], drawn[0])
+
+
+def test_pixels_with_a_prior_can_be_drawn_more_often(tmp_path):
+    scene = write_scene(tmp_path, mono=False)
+    shares = [manager(scene, prior_weight=weight).train_pixel_sampler.table.share_with_prior for weight in (1.0, 4.0)]
+    assert 0 < shares[0] < 0.9
+    assert shares[1] == pytest.approx(4 * shares[0] / (1 + 3 * shares[0]), rel=0.03)
+    with pytest.raises(InputError, match="prior_weight"):
+        manager(scene, prior_weight=0.0)

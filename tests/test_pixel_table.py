@@ -1,9 +1,12 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
-import torch
 
+from edge_depth_nerf import pixel_table
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.pixel_table import PixelTable, to_steps
+from edge_depth_nerf.files import read_json, write_json
+from edge_depth_nerf.pixel_table import RECORD, PixelTable, PixelTableWriter, to_steps
 
 RNG = np.random.default_rng(5)
 
@@ -14,55 +17,98 @@ def picture(height, width):
     return np.stack([rows, columns, np.full_like(rows, 9)], axis=-1).astype(np.uint8)
 
 
-def test_draws_are_valid_pixels_of_the_right_picture_with_their_own_prior():
-    sizes = [(4, 7), (9, 3), (4, 7)]
-    masks = [RNG.random(size) < 0.5 for size in sizes[:2]]
-    masks.append(masks[0])
-    table = PixelTable()
+def table_of(path: Path, masks, priors=None, seed=0, prior_weight=1.0) -> PixelTable:
+    with PixelTableWriter(path, sum(mask.size for mask in masks), seed, prior_weight) as writer:
+        for number, mask in enumerate(masks):
+            distance, sigma = priors[number] if priors else (None, None)
+            writer.add(picture(*mask.shape), mask, distance, sigma)
+        writer.finish()
+    return PixelTable(path)
+
+
+@pytest.mark.parametrize("bucket_bytes", [1 << 20, 200])
+def test_every_valid_pixel_comes_once_with_its_own_prior(tmp_path, monkeypatch, bucket_bytes):
+    monkeypatch.setattr(pixel_table, "BUCKET_BYTES", bucket_bytes)
+    masks = [RNG.random(size) < 0.5 for size in [(4, 7), (9, 3), (4, 7)]]
     priors = []
-    for number, ((height, width), mask) in enumerate(zip(sizes, masks, strict=True)):
-        distance = (1 + number + np.arange(height * width).reshape(height, width) / 256).astype(np.float32)
-        priors.append(distance)
-        table.add(picture(height, width), mask, (height, width), distance, distance / 2)
-    table.finish()
+    for number, mask in enumerate(masks):
+        distance = (1 + number + np.arange(mask.size).reshape(mask.shape) / 256).astype(np.float32)
+        priors.append((distance, distance / 2))
+    table = table_of(tmp_path / "t.npy", masks, priors)
     assert len(table) == sum(mask.sum() for mask in masks)
     assert table.share_with_prior == 1
-    batch = table.sample(3000, torch.Generator().manual_seed(0))
+    batch = table.batch(0, len(table))
     seen = set()
     for (number, row, column), rgb, distance, sigma in zip(
         batch.indices.tolist(), batch.rgb, batch.prior_distance_m, batch.prior_sigma_m, strict=True
     ):
         assert masks[number][row, column]
         assert (rgb * 255).round().tolist() == [row, column, 9]
-        assert distance.item() == priors[number][row, column]  # a multiple of 1/256 m
+        assert distance.item() == priors[number][0][row, column]  # a multiple of 1/256 m
         assert abs(sigma.item() - distance.item() / 2) <= 1 / 512 + 1e-6
         seen.add((number, row, column))
-    assert len(seen) == len(table)  # 3000 draws of some 50 pixels: every one is reached
+    assert len(seen) == len(table)
+    # nothing else stays behind
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["t.json", "t.npy"]
 
 
-def test_uniform_over_pixels_not_over_pictures():
-    table = PixelTable()
-    table.add(picture(30, 30), np.ones((30, 30), bool), 0, None, None)
-    table.add(picture(10, 10), np.ones((10, 10), bool), 1, None, None)
-    table.finish()
+def test_after_the_last_pixel_comes_the_first(tmp_path):
+    table = table_of(tmp_path / "t.npy", [np.ones((5, 6), bool)])
+    whole = table.batch(0, 30).indices
+    np.testing.assert_array_equal(table.batch(25, 8).indices, whole[[25, 26, 27, 28, 29, 0, 1, 2]])
+    np.testing.assert_array_equal(table.batch(30 * 7 + 3, 4).indices, whole[3:7])
+    # a batch larger than the table
+    assert np.bincount(table.batch(4, 70).indices[:, 1] * 6 + table.batch(4, 70).indices[:, 2]).min() == 2
+
+
+@pytest.mark.parametrize("bucket_bytes", [1 << 20, 1000])
+def test_the_order_is_random(tmp_path, monkeypatch, bucket_bytes):
+    """Wherever one looks, the batch is a fair sample of pictures and places."""
+    monkeypatch.setattr(pixel_table, "BUCKET_BYTES", bucket_bytes)
+    table = table_of(tmp_path / "t.npy", [np.ones((60, 60), bool), np.ones((20, 20), bool)])
+    shares, rows = [], []
+    for start in range(0, 4000, 400):
+        indices = table.batch(start, 400).indices
+        shares.append((indices[:, 0] == 0).float().mean())
+        rows.append(indices[indices[:, 0] == 0][:, 1].float().mean())
+    # 3600 of 4000 pixels; standard deviations of a sample of 400: 0.015 and 0.91
+    assert np.abs(np.array(shares) - 0.9).max() < 0.06 and np.std(shares) > 0.003
+    assert np.abs(np.array(rows) - 29.5).max() < 4 and np.std(rows) > 0.2
+    together = table.batch(0, 4000).indices.numpy() @ [3600, 60, 1]
+    neighbours = np.corrcoef(together[:-1], together[1:])[0, 1]
+    assert abs(neighbours) < 0.06  # standard deviation 0.016
+
+
+def test_the_same_seed_gives_the_same_order(tmp_path):
+    masks = [np.ones((8, 8), bool)]
+    first, again, other = (
+        table_of(tmp_path / f"{number}.npy", masks, seed=seed).batch(0, 64).indices
+        for number, seed in enumerate((3, 3, 4))
+    )
+    assert np.array_equal(first, again) and not np.array_equal(first, other)
+
+
+@pytest.mark.parametrize("weight", [1.0, 2.5, 0.25])
+def test_pixels_with_a_prior_may_count_more(tmp_path, weight):
+    mask = np.ones((100, 100), bool)
+    distance = np.where(np.arange(100) < 50, 5.0, 0.0).astype(np.float32) * np.ones((100, 1), np.float32)
+    table = table_of(tmp_path / "t.npy", [mask], [(distance, distance / 10)], prior_weight=weight)
+    assert table.share_with_prior == pytest.approx(weight / (1 + weight), abs=0.01)
+    places = table.batch(0, len(table)).indices[:, 1:].numpy() @ [100, 1]
+    assert len(np.unique(places)) == 10_000
+
+
+def test_pictures_without_valid_pixels_are_never_drawn(tmp_path):
+    masks = [np.zeros((3, 3), bool), np.eye(3, dtype=bool), np.zeros((3, 3), bool)]
+    table = table_of(tmp_path / "t.npy", masks)
     assert table.share_with_prior == 0
-    share = (table.sample(20000, torch.Generator().manual_seed(1)).indices[:, 0] == 0).float().mean()
-    assert abs(share - 0.9) < 0.01  # 900 of 1000 pixels; standard deviation 0.002
+    assert set(table.batch(0, 100).indices[:, 0].tolist()) == {1}
 
 
-def test_a_picture_without_valid_pixels_is_never_drawn():
-    table = PixelTable()
-    for number, mask in enumerate([np.zeros((3, 3), bool), np.eye(3, dtype=bool), np.zeros((3, 3), bool)]):
-        table.add(picture(3, 3), mask, number, None, None)
-    table.finish()
-    assert set(table.sample(100).indices[:, 0].tolist()) == {1}
-
-
-def test_no_valid_pixel_at_all():
-    table = PixelTable()
-    table.add(picture(2, 2), np.zeros((2, 2), bool), 0, None, None)
+def test_no_valid_pixel_at_all(tmp_path):
     with pytest.raises(InputError, match="inverted"):
-        table.finish()
+        table_of(tmp_path / "t.npy", [np.zeros((2, 2), bool)])
+    assert not list(tmp_path.iterdir())
 
 
 def test_steps_of_a_quarter_of_a_centimetre():
@@ -70,20 +116,39 @@ def test_steps_of_a_quarter_of_a_centimetre():
     assert to_steps(metres).tolist() == [0, 256, 65535, 0, 0, 0, 0, 1]
 
 
-def test_the_same_seed_draws_the_same():
-    table = PixelTable()
-    table.add(picture(8, 8), np.ones((8, 8), bool), 0, None, None)
-    table.finish()
-    first, second = (table.sample(64, torch.Generator().manual_seed(3)) for _ in range(2))
-    assert torch.equal(first.indices, second.indices)
-
-
-def test_a_sigma_beyond_16_bits_stays_a_sigma():
-    table = PixelTable()
+def test_a_sigma_beyond_16_bits_stays_a_sigma(tmp_path):
     distance = np.full((1, 4), 5, np.float32)
     sigma = np.array([[1e-4, 1000.0, 0.5, 0.0]], np.float32)
-    table.add(picture(1, 4), np.ones((1, 4), bool), 0, distance, sigma)
-    table.finish()
-    batch = table.sample(200, torch.Generator().manual_seed(0))
+    batch = table_of(tmp_path / "t.npy", [np.ones((1, 4), bool)], [(distance, sigma)]).batch(0, 4)
     stored = {int(column): float(s) for (_, _, column), s in zip(batch.indices, batch.prior_sigma_m, strict=True)}
     assert stored == {0: 1 / 256, 1: 65535 / 256, 2: 0.5, 3: 0.0}
+
+
+def test_a_record_has_no_gaps():
+    assert RECORD.itemsize == 15
+
+
+def test_what_is_not_whole_does_not_open(tmp_path):
+    path = tmp_path / "t.npy"
+    table_of(path, [np.ones((8, 8), bool)])
+    about = read_json(path.with_suffix(".json"))
+    whole = path.read_bytes()
+
+    path.write_bytes(whole[:-15])
+    with pytest.raises(ValueError):
+        PixelTable(path)
+    path.write_bytes(whole)
+    write_json(path.with_suffix(".json"), {**about, "version": 0})
+    with pytest.raises(ValueError, match="version 0"):
+        PixelTable(path)
+    # killed between the two files
+    path.with_suffix(".json").unlink()
+    with pytest.raises(FileNotFoundError):
+        PixelTable(path)
+
+
+def test_an_interrupted_writer_leaves_nothing(tmp_path):
+    with pytest.raises(KeyboardInterrupt), PixelTableWriter(tmp_path / "t.npy", 64) as writer:
+        writer.add(picture(8, 8), np.ones((8, 8), bool), None, None)
+        raise KeyboardInterrupt
+    assert not list(tmp_path.iterdir())
