@@ -497,6 +497,17 @@ def test_frame_masks_and_mono(drive: RoomDrive, tmp_path: Path) -> None:
     assert 0 < len(world) < 3 * 600
 
 
+@pytest.mark.parametrize("sky", [True, False])
+def test_an_empty_monocular_map_is_named(sky: bool, drive: RoomDrive, tmp_path: Path) -> None:
+    for name in CAMERAS:
+        for frame in drive.frames:
+            empty = name == "image_03" and frame == 1
+            write_distance_png(tmp_path / f"mono/{name}/{frame:010d}.png", np.full((32, 32), 0.0 if empty else 3.0))
+    with pytest.raises(InputError, match=r"image_03/0000000001\.png: its monocular map has no distance anywhere"):
+        process(drive, tmp_path / "scene", mono=tmp_path / "mono", sky=sky)
+    assert not (tmp_path / "scene/transforms.json").exists()
+
+
 def test_one_ego_mask_for_both_cameras(drive: RoomDrive, tmp_path: Path) -> None:
     keep = np.ones((32, 32), bool)
     keep[20:] = False

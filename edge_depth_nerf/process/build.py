@@ -347,9 +347,15 @@ class _Builder:
         """The monocular map, without the sky."""
         assert picture.mono is not None
         factor = self._options.downscale
+        whole = read_distance_png(picture.mono)
+        if not whole.any():
+            raise InputError(
+                f"{picture.mono}: its monocular map has no distance anywhere. Expected 16-bit counts of 1/256 m along "
+                "the ray; a network gives every picture a depth, so its export has failed: make the map again."
+            )
         if not self._options.sky:
             return load_distance(picture.mono, factor)
-        mono = downscale_distance(read_distance_png(picture.mono), factor)
+        mono = downscale_distance(whole, factor)
         if labels is not None:
             sky = ~downscale_mask(~sky_of_labels(labels), factor)
         else:

@@ -56,7 +56,8 @@ class ProcessOptions:
     """Classes that are masked out where the drive brings KITTI-360's semantics; none to keep all."""
     mono: Path | None = None
     """Monocular distance maps: a folder with CAMERA/0000000123.png, 16 bit, 1/256 m along the ray, 0 = none. In the
-    size of the raw pictures; one for every frame taken. Not set: a network of the drive's own makes them."""
+    size of the raw pictures; one for every frame taken. They count as knowing no more than LiDAR's field;
+    `estimate-depth --maps` takes other forms and says otherwise. Not set: a network of the drive's own makes them."""
     estimate_depth: bool = True
     """Where no monocular maps are given, train a network on the drive's LiDAR, as `edge-depth-nerf estimate-depth`
     does; off to leave the scene without, or to bring maps of other networks by that command."""
