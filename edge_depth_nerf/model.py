@@ -7,19 +7,22 @@ scene.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.rays import RaySamples
+from nerfstudio.field_components.spatial_distortions import SceneContraction
 from nerfstudio.model_components.losses import ds_nerf_depth_loss, urban_radiance_field_depth_loss
 from nerfstudio.model_components.scene_colliders import NearFarCollider
 from nerfstudio.models.nerfacto import NerfactoModel, NerfactoModelConfig
+from nerfstudio.utils.external import TCNN_EXISTS
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from edge_depth_nerf.compat import lpips_not_built
+from edge_depth_nerf.encodings.fused import FusedHashEncoding, use_fused_encodings
 from edge_depth_nerf.losses import edge_loss
 from edge_depth_nerf.metrics import DepthErrors, load_lpips, masked_lpips, masked_psnr, masked_ssim
 from edge_depth_nerf.pictures import colour_distance
@@ -51,6 +54,22 @@ class EdgeDepthNerfModelConfig(NerfactoModelConfig):
     over its interval."""
     edge_divide_by_norm: bool = True
     """Divide Eq. 4's Gaussian by σ̂·√(2π), so that a wide one does not pull harder than a narrow one."""
+    implementation: Literal["auto", "fused", "tcnn", "torch"] = "auto"  # pyright: ignore[reportIncompatibleVariableOverride]
+    """What computes hash grids and networks. fused: hash grids in kernels of our own (Numba on the CPU, Triton on
+    CUDA), networks in torch. torch: nerfstudio's, same results and checkpoints as fused, many times slower. tcnn:
+    tiny-cuda-nn, with checkpoints of its own. auto: tcnn on a GPU where it is installed, else fused."""
+
+
+class CubeContraction(SceneContraction):
+    """nerfacto's contraction into a cube: the same numbers.
+
+    On the CPU torch's infinity norm of three numbers takes 30 times as long as their largest.
+    """
+
+    def forward(self, positions: Float[Tensor, "*bs 3"]) -> Float[Tensor, "*bs 3"]:
+        """Contract positions in scene units to -2..2."""
+        norm = positions.abs().amax(dim=-1, keepdim=True)
+        return torch.where(norm < 1, positions, (2 - 1 / norm) * (positions / norm))
 
 
 class LpipsAtFirstUse:
@@ -90,8 +109,24 @@ class EdgeDepthNerfModel(NerfactoModel):
                 f"[bold yellow]The near plane is at {self.config.near_m:g} m: what is nearer to a camera is not "
                 "rendered. Set --pipeline.model.near-m 0.2 unless that is meant."
             )
+        implementation = self.config.implementation
+        if implementation == "auto":
+            on_gpu = torch.device(self.kwargs.get("device", "cpu")).type == "cuda"
+            implementation = "tcnn" if TCNN_EXISTS and on_gpu else "fused"
+        # nerfstudio knows two of them; the model's own configuration says which was built
+        self.config = replace(self.config, implementation="tcnn" if implementation == "tcnn" else "torch")
         with lpips_not_built():
             super().populate_modules()
+        if implementation == "fused":
+            use_fused_encodings(self)
+            # nerfacto's field asks for a gradient to the positions at every step, for normals or poses
+            if not self.config.predict_normals and self.config.camera_optimizer.mode == "off":
+                for part in self.modules():
+                    if isinstance(part, FusedHashEncoding):
+                        part.follows_positions = False
+        if not self.config.disable_scene_contraction:
+            for network in (self.field, *self.proposal_networks):
+                network.spatial_distortion = CubeContraction(order=float("inf"))
         self.lpips = LpipsAtFirstUse()
         # the near plane is not reset at evaluation: nothing was trained in front of it
         self.collider = NearFarCollider(

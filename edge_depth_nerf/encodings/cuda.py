@@ -1,0 +1,205 @@
+"""The hash grid on a GPU: Triton kernels; meaning and shapes as in `hash_grid`, functions as in `cpu`.
+
+Triton comes with torch on Linux, and compiles at the first call for each number of features. Results differ from the
+CPU's by fused multiply-adds, and in the table's gradient by the order of additions, which are atomic.
+With TRITON_INTERPRET=1 set before the import the kernels run on CPU tensors.
+"""
+
+from __future__ import annotations
+
+from typing import no_type_check
+
+import torch
+import triton
+import triton.language as tl
+from jaxtyping import Float
+from torch import Tensor
+
+POINTS = 128
+"""Points that one program works on."""
+
+
+@triton.jit
+@no_type_check  # the tests' type checker would wrap what Triton has to read
+def _corner_pair(scaled, prime: tl.constexpr):
+    """Give the lower and the upper corner on one axis, times its prime, and the place between them."""
+    low, high = tl.floor(scaled).to(tl.int32), tl.ceil(scaled).to(tl.int32)
+    factor = tl.full(scaled.shape, prime, tl.uint32)
+    offset = scaled - low.to(tl.float32)
+    return low.to(tl.uint32, bitcast=True) * factor, high.to(tl.uint32, bitcast=True) * factor, offset
+
+
+@triton.jit
+@no_type_check
+def _find_corners(positions, point, inside, scaling, size, FEATURES: tl.constexpr):
+    """Give where the features of a point's eight corners begin in a level's grid, and the place between them."""
+    x0, x1, x = _corner_pair(tl.load(positions + 3 * point, inside, 0.0) * scaling, 1)
+    y0, y1, y = _corner_pair(tl.load(positions + 3 * point + 1, inside, 0.0) * scaling, 2654435761)
+    z0, z1, z = _corner_pair(tl.load(positions + 3 * point + 2, inside, 0.0) * scaling, 805459861)
+    mask = (size - 1).to(tl.uint32)
+    at0 = ((x0 ^ y0 ^ z0) & mask).to(tl.int64) * FEATURES
+    at1 = ((x1 ^ y0 ^ z0) & mask).to(tl.int64) * FEATURES
+    at2 = ((x0 ^ y1 ^ z0) & mask).to(tl.int64) * FEATURES
+    at3 = ((x1 ^ y1 ^ z0) & mask).to(tl.int64) * FEATURES
+    at4 = ((x0 ^ y0 ^ z1) & mask).to(tl.int64) * FEATURES
+    at5 = ((x1 ^ y0 ^ z1) & mask).to(tl.int64) * FEATURES
+    at6 = ((x0 ^ y1 ^ z1) & mask).to(tl.int64) * FEATURES
+    at7 = ((x1 ^ y1 ^ z1) & mask).to(tl.int64) * FEATURES
+    return at0, at1, at2, at3, at4, at5, at6, at7, x, y, z
+
+
+@triton.jit
+@no_type_check
+def _encode_kernel(
+    positions,
+    table,
+    scalings,
+    encoded,
+    points,
+    size,
+    LEVELS: tl.constexpr,
+    FEATURES: tl.constexpr,
+    POINTS: tl.constexpr,
+):
+    point = tl.program_id(0).to(tl.int64) * POINTS + tl.arange(0, POINTS)
+    level = tl.program_id(1).to(tl.int64)
+    inside = point < points
+    at0, at1, at2, at3, at4, at5, at6, at7, x, y, z = _find_corners(
+        positions, point, inside, tl.load(scalings + level), size, FEATURES
+    )
+    for c in tl.static_range(FEATURES):
+        grid = table + level * size * FEATURES + c
+        low_low = tl.load(grid + at1, inside, 0.0) * x + tl.load(grid + at0, inside, 0.0) * (1 - x)
+        high_low = tl.load(grid + at3, inside, 0.0) * x + tl.load(grid + at2, inside, 0.0) * (1 - x)
+        low_high = tl.load(grid + at5, inside, 0.0) * x + tl.load(grid + at4, inside, 0.0) * (1 - x)
+        high_high = tl.load(grid + at7, inside, 0.0) * x + tl.load(grid + at6, inside, 0.0) * (1 - x)
+        low = high_low * y + low_low * (1 - y)
+        high = high_high * y + low_high * (1 - y)
+        tl.store(encoded + (point * LEVELS + level) * FEATURES + c, high * z + low * (1 - z), inside)
+
+
+@triton.jit
+@no_type_check
+def _table_gradient_kernel(
+    positions,
+    gradient,
+    scalings,
+    to_table,
+    points,
+    size,
+    LEVELS: tl.constexpr,
+    FEATURES: tl.constexpr,
+    POINTS: tl.constexpr,
+):
+    point = tl.program_id(0).to(tl.int64) * POINTS + tl.arange(0, POINTS)
+    level = tl.program_id(1).to(tl.int64)
+    inside = point < points
+    at0, at1, at2, at3, at4, at5, at6, at7, x, y, z = _find_corners(
+        positions, point, inside, tl.load(scalings + level), size, FEATURES
+    )
+    low_low, high_low, low_high, high_high = (1 - y) * (1 - z), y * (1 - z), (1 - y) * z, y * z
+    for c in tl.static_range(FEATURES):
+        grid = to_table + level * size * FEATURES + c
+        g = tl.load(gradient + (point * LEVELS + level) * FEATURES + c, inside, 0.0)
+        tl.atomic_add(grid + at0, g * low_low * (1 - x), inside, sem="relaxed")
+        tl.atomic_add(grid + at1, g * low_low * x, inside, sem="relaxed")
+        tl.atomic_add(grid + at2, g * high_low * (1 - x), inside, sem="relaxed")
+        tl.atomic_add(grid + at3, g * high_low * x, inside, sem="relaxed")
+        tl.atomic_add(grid + at4, g * low_high * (1 - x), inside, sem="relaxed")
+        tl.atomic_add(grid + at5, g * low_high * x, inside, sem="relaxed")
+        tl.atomic_add(grid + at6, g * high_high * (1 - x), inside, sem="relaxed")
+        tl.atomic_add(grid + at7, g * high_high * x, inside, sem="relaxed")
+
+
+@triton.jit
+@no_type_check
+def _position_gradient_kernel(
+    positions,
+    table,
+    gradient,
+    scalings,
+    to_positions,
+    points,
+    size,
+    LEVELS: tl.constexpr,
+    FEATURES: tl.constexpr,
+    POINTS: tl.constexpr,
+):
+    point = tl.program_id(0).to(tl.int64) * POINTS + tl.arange(0, POINTS)
+    inside = point < points
+    to_x = tl.zeros((POINTS,), tl.float32)
+    to_y = tl.zeros((POINTS,), tl.float32)
+    to_z = tl.zeros((POINTS,), tl.float32)
+    for level in range(LEVELS):
+        scaling = tl.load(scalings + level)
+        at0, at1, at2, at3, at4, at5, at6, at7, x, y, z = _find_corners(
+            positions, point, inside, scaling, size, FEATURES
+        )
+        for c in tl.static_range(FEATURES):
+            grid = table + tl.cast(level, tl.int64) * size * FEATURES + c
+            v0, v1 = tl.load(grid + at0, inside, 0.0), tl.load(grid + at1, inside, 0.0)
+            v2, v3 = tl.load(grid + at2, inside, 0.0), tl.load(grid + at3, inside, 0.0)
+            v4, v5 = tl.load(grid + at4, inside, 0.0), tl.load(grid + at5, inside, 0.0)
+            v6, v7 = tl.load(grid + at6, inside, 0.0), tl.load(grid + at7, inside, 0.0)
+            g = tl.load(gradient + (point * LEVELS + level) * FEATURES + c, inside, 0.0) * scaling
+            along_x = ((v1 - v0) * (1 - y) + (v3 - v2) * y) * (1 - z) + ((v5 - v4) * (1 - y) + (v7 - v6) * y) * z
+            low_low, high_low = v1 * x + v0 * (1 - x), v3 * x + v2 * (1 - x)
+            low_high, high_high = v5 * x + v4 * (1 - x), v7 * x + v6 * (1 - x)
+            to_x += g * along_x
+            to_y += g * ((high_low - low_low) * (1 - z) + (high_high - low_high) * z)
+            to_z += g * ((low_high - low_low) * (1 - y) + (high_high - high_low) * y)
+    tl.store(to_positions + 3 * point, to_x, inside)
+    tl.store(to_positions + 3 * point + 1, to_y, inside)
+    tl.store(to_positions + 3 * point + 2, to_z, inside)
+
+
+def encode(
+    positions: Float[Tensor, "points 3"], table: Float[Tensor, "rows features"], scalings: Float[Tensor, "levels"]
+) -> Float[Tensor, "points encoded"]:
+    """Encode points, float32; see `hash_grid`."""
+    (points, _), (rows, features), levels = positions.shape, table.shape, len(scalings)
+    encoded = positions.new_empty(points, levels * features)
+    arrays = positions.detach().contiguous(), table.detach().contiguous(), scalings, encoded
+    if points > 0:
+        with torch.cuda.device_of(positions):
+            _encode_kernel[(triton.cdiv(points, POINTS), levels)](
+                *arrays, points, rows // levels, LEVELS=levels, FEATURES=features, POINTS=POINTS
+            )
+    return encoded
+
+
+def table_gradient(
+    positions: Float[Tensor, "points 3"],
+    gradient: Float[Tensor, "points encoded"],
+    scalings: Float[Tensor, "levels"],
+    rows: int,
+) -> Float[Tensor, "rows features"]:
+    """Give the gradient to a table of `rows` rows, from the gradient to the encoded values."""
+    points, levels = len(positions), len(scalings)
+    features = gradient.shape[1] // levels
+    result = positions.new_zeros(rows, features)
+    arrays = positions.detach().contiguous(), gradient.detach().contiguous(), scalings, result
+    if points > 0:
+        with torch.cuda.device_of(positions):
+            _table_gradient_kernel[(triton.cdiv(points, POINTS), levels)](
+                *arrays, points, rows // levels, LEVELS=levels, FEATURES=features, POINTS=POINTS
+            )
+    return result
+
+
+def position_gradient(
+    positions: Float[Tensor, "points 3"],
+    table: Float[Tensor, "rows features"],
+    gradient: Float[Tensor, "points encoded"],
+    scalings: Float[Tensor, "levels"],
+) -> Float[Tensor, "points 3"]:
+    """Give the gradient to the positions, from the gradient to the encoded values."""
+    (points, _), (rows, features), levels = positions.shape, table.shape, len(scalings)
+    result = positions.new_empty(points, 3)
+    given = positions.detach().contiguous(), table.detach().contiguous(), gradient.detach().contiguous()
+    if points > 0:
+        with torch.cuda.device_of(positions):
+            _position_gradient_kernel[(triton.cdiv(points, POINTS),)](
+                *given, scalings, result, points, rows // levels, LEVELS=levels, FEATURES=features, POINTS=POINTS
+            )
+    return result

@@ -1,0 +1,509 @@
+"""The fused hash grid against nerfstudio's class and against a NumPy form of its own."""
+
+from __future__ import annotations
+
+import copy
+import multiprocessing
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.configs.method_configs import all_methods
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.field_components.encodings import HashEncoding
+from nerfstudio.field_components.spatial_distortions import SceneContraction
+
+from edge_depth_nerf.encodings import cpu
+from edge_depth_nerf.encodings.fused import FusedHashEncoding, use_fused_encodings
+from edge_depth_nerf.encodings.hash_grid import back_end
+from edge_depth_nerf.model import CubeContraction, EdgeDepthNerfModel
+
+SIZES = {
+    "nerfacto": {"num_levels": 16, "log2_hashmap_size": 19, "max_res": 2048},
+    "proposal 1": {"num_levels": 5, "log2_hashmap_size": 17, "max_res": 128},
+    "proposal 2": {"num_levels": 5, "log2_hashmap_size": 17, "max_res": 256},
+    "lite": {"num_levels": 8, "log2_hashmap_size": 16, "max_res": 512},
+    "big": {"num_levels": 16, "log2_hashmap_size": 21, "max_res": 8192},
+    "one level": {"num_levels": 1, "log2_hashmap_size": 10},
+    "four features": {"num_levels": 3, "log2_hashmap_size": 12, "features_per_level": 4, "max_res": 100},
+    "one feature": {"num_levels": 3, "log2_hashmap_size": 12, "features_per_level": 1, "max_res": 100},
+}
+
+
+@pytest.fixture(autouse=True)
+def threads():
+    """Leave torch's number of threads as it was."""
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
+def small_shares(monkeypatch):
+    """Let even a few points be shared out to all threads."""
+    monkeypatch.setattr(cpu, "LEAST_SHARE", 1)
+
+
+def both(seed: int = 0, **size) -> tuple[HashEncoding, FusedHashEncoding]:
+    """nerfstudio's encoding and a fused one with the same table, its values between -1 and 1."""
+    torch.manual_seed(seed)
+    host = HashEncoding(**{"hash_init_scale": 1.0, **size}, implementation="torch")
+    fused = copy.deepcopy(host)
+    use_fused_encodings(fused)
+    assert isinstance(fused, FusedHashEncoding)
+    return host, fused
+
+
+def points(scalings: torch.Tensor, count: int = 3000) -> torch.Tensor:
+    """Anywhere, on borders of cells, at -1, 0 and 1 on one to three axes, just beside them, and outside."""
+    random = torch.rand(count, 3)
+    at = torch.tensor([-1.0, 0.0, 1.0, 1e-8, 1 - 6e-8, -1e-8, 0.5, -0.3, 1.7])
+    corners = torch.cartesian_prod(at, at, at)
+    cells = torch.floor(random[None] * scalings[:, None, None].float()) / scalings[:, None, None].float()
+    borders = cells[:, :200].reshape(-1, 3)
+    mixed = torch.where(torch.rand(len(borders), 3) < 0.5, borders, torch.rand(len(borders), 3))
+    return torch.cat([random, corners, borders, mixed])
+
+
+def numpy_form(x: np.ndarray, table: np.ndarray, scalings: np.ndarray, gradient: np.ndarray):
+    """Instant-NGP's multiresolution hash with nerfstudio's choices, in float64 but for the scaled position.
+
+    Returns the encoded points and the gradients to table and positions.
+    """
+    levels, features = len(scalings), table.shape[1]
+    rows = len(table) // levels
+    encoded = np.zeros((len(x), levels * features))
+    to_table, to_x = np.zeros(table.shape), np.zeros(x.shape)
+    for level, scaling in enumerate(scalings):
+        scaled = x * scaling  # in float32, as it decides in which cell a point lies
+        bounds = [np.floor(scaled).astype(np.int64), np.ceil(scaled).astype(np.int64)]
+        place = scaled.astype(np.float64) - bounds[0]
+        columns = slice(level * features, (level + 1) * features)
+        for upper in np.ndindex(2, 2, 2):
+            corner = [bounds[side][:, axis] for axis, side in enumerate(upper)]
+            row = (corner[0] ^ (corner[1] * 2654435761) ^ (corner[2] * 805459861)) % rows + level * rows
+            along = [place[:, axis] if side else 1 - place[:, axis] for axis, side in enumerate(upper)]
+            encoded[:, columns] += (along[0] * along[1] * along[2])[:, None] * table[row]
+            np.add.at(to_table, row, (along[0] * along[1] * along[2])[:, None] * gradient[:, columns])
+            value = (gradient[:, columns].astype(np.float64) * table[row]).sum(1) * float(scaling)
+            for axis in range(3):
+                others = np.prod([along[other] for other in range(3) if other != axis], axis=0)
+                to_x[:, axis] += (1 if upper[axis] else -1) * others * value
+    return encoded, to_table, to_x
+
+
+def assert_near(found: torch.Tensor | None, expected: torch.Tensor | np.ndarray | None, tolerance: float) -> None:
+    """Differences relative to the largest value."""
+    assert found is not None and expected is not None
+    expected = torch.as_tensor(expected)
+    largest = float(expected.abs().max())
+    assert largest > 0
+    assert float((found - expected).abs().max()) <= tolerance * largest
+
+
+@pytest.mark.parametrize("name", ["lite", "proposal 1", "one level", "four features"])
+def test_equals_the_formula(name):
+    _, fused = both(**SIZES[name])
+    x = points(fused.scalings).requires_grad_()
+    encoded = fused(x)
+    gradient = torch.randn(encoded.shape)
+    encoded.backward(gradient)
+    expected = numpy_form(
+        x.detach().numpy(), fused.hash_table.detach().numpy(), fused.scalings.float().numpy(), gradient.numpy()
+    )
+    assert_near(encoded.detach(), expected[0], 1e-6)
+    assert_near(fused.hash_table.grad, expected[1], 1e-5)
+    assert_near(x.grad, expected[2], 1e-5)
+
+
+@pytest.mark.parametrize("name", SIZES)
+def test_equals_nerfstudio(name):
+    host, fused = both(**SIZES[name])
+    x = points(host.scalings, 500)
+    xs = [x.clone().requires_grad_() for _ in range(2)]
+    encoded = [encoding(each) for encoding, each in zip((host, fused), xs, strict=True)]
+    assert torch.equal(*encoded)
+    gradient = torch.randn(encoded[0].shape)
+    for each in encoded:
+        each.backward(gradient)
+    assert_near(fused.hash_table.grad, host.hash_table.grad, 1e-5)
+    assert_near(xs[1].grad, xs[0].grad, 1e-5)
+
+
+def test_many_additions_to_one_row():
+    """Positions outside the scene box all become 0: a hundred thousand gradients in one row."""
+    host, fused = both(**SIZES["proposal 1"])
+    x = torch.zeros(100_000, 3)
+    gradient = torch.rand(len(x), host.get_out_dim())
+    fused(x).backward(gradient)
+    exact = gradient.double().sum(0).view(5, 2)
+    assert fused.hash_table.grad is not None
+    assert_near(fused.hash_table.grad.view(5, -1, 2)[:, 0], exact, 1e-5)
+    assert int((fused.hash_table.grad != 0).sum()) == 10
+
+
+def test_a_border_has_no_gradient_across_it():
+    _, fused = both(num_levels=1, log2_hashmap_size=10)
+    x = torch.tensor([[0.5, 0.26, 0.77], [0.26, 0.77, 0.5]], requires_grad=True)  # 16 cells: 0.5 is a border
+    fused(x).sum().backward()
+    assert x.grad is not None
+    assert torch.equal(x.grad == 0, torch.tensor([[True, False, False], [False, False, True]]))
+
+
+def test_gradient_to_positions_is_the_slope():
+    _, fused = both(num_levels=3, log2_hashmap_size=12, max_res=40)
+    step = 1e-3
+    # the middle of cells of the finest level, and not near borders of the others
+    x = (torch.randint(0, 40, (400, 3)) + 0.5) / 40
+    scaled = x[:, None] * fused.scalings[:, None]
+    x = x[((scaled - scaled.round()).abs() > 2 * step * 40).all(-1).all(-1)].requires_grad_()
+    assert len(x) > 20
+    weights = torch.randn(6)
+    (fused(x) @ weights).sum().backward()
+    assert x.grad is not None
+    with torch.no_grad():
+        for axis in range(3):
+            move = step * torch.eye(3)[axis]
+            slope = ((fused(x + move) - fused(x - move)) @ weights) / (2 * step)
+            assert_near(x.grad[:, axis], slope, 1e-3)
+
+
+@pytest.mark.parametrize("count", [1, 255, 256, 257, 5000])
+@pytest.mark.parametrize("levels", [1, 5, 8])
+def test_threads_do_not_change_the_result(small_shares, levels, count):
+    _, fused = both(num_levels=levels, log2_hashmap_size=8, max_res=64)
+    x, gradient = torch.rand(count, 3), torch.randn(count, 2 * levels)
+    table, scalings = fused.hash_table.detach(), fused.scalings.float()
+
+    def all_three():
+        return (
+            cpu.encode(x, table, scalings),
+            cpu.table_gradient(x, gradient, scalings, len(table)),
+            cpu.position_gradient(x, table, gradient, scalings),
+        )
+
+    torch.set_num_threads(1)
+    expected = all_three()
+    for number in (2, 3, 7):
+        torch.set_num_threads(number)
+        found = all_three()
+        assert torch.equal(found[0], expected[0]) and torch.equal(found[2], expected[2])
+        assert_near(found[1], expected[1], 1e-6)
+
+
+def test_callers_at_once_do_not_mix(small_shares):
+    torch.set_num_threads(2)
+    encodings = [both(seed, num_levels=4, log2_hashmap_size=8)[1] for seed in range(6)]
+    x = torch.rand(3000, 3)
+
+    def work(encoding: FusedHashEncoding):
+        torch.set_num_threads(2)
+        encoding.hash_table.grad = None
+        encoded = encoding(x)
+        encoded.square().sum().backward()
+        return encoded.detach(), encoding.hash_table.grad
+
+    expected = [work(encoding) for encoding in encodings]
+    with ThreadPoolExecutor(6) as pool:
+        for _ in range(5):
+            for found, alone in zip(pool.map(work, encodings), expected, strict=True):
+                assert torch.equal(found[0], alone[0])
+                assert found[1] is not None and alone[1] is not None
+                torch.testing.assert_close(found[1], alone[1])
+
+
+def _encode_in_child(queue, x, table, scalings):
+    queue.put(cpu.encode(x, table, scalings).numpy())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="forks")
+def test_a_forked_process_starts_its_own_threads(small_shares):
+    torch.set_num_threads(2)
+    _, fused = both(num_levels=2, log2_hashmap_size=6)
+    arguments = torch.rand(500, 3), fused.hash_table.detach(), fused.scalings
+    expected = cpu.encode(*arguments)
+    context = multiprocessing.get_context("fork")
+    queue = context.Queue()
+    child = context.Process(target=_encode_in_child, args=(queue, *arguments), daemon=True)
+    child.start()
+    assert np.array_equal(queue.get(timeout=30), expected.numpy())
+    child.join(30)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64], ids=str)
+def test_other_types_of_positions(dtype):
+    host, fused = both(**SIZES["four features"])
+    xs = [torch.rand(50, 3).to(dtype) for _ in range(1)] * 2
+    xs = [x.clone().requires_grad_() for x in xs]
+    encoded = [encoding(x) for encoding, x in zip((host, fused), xs, strict=True)]
+    assert encoded[0].dtype == encoded[1].dtype and torch.equal(*encoded)
+    for each in encoded:
+        each.square().sum().backward()
+    torch.testing.assert_close(xs[0].grad, xs[1].grad)
+    assert_near(fused.hash_table.grad, host.hash_table.grad, 1e-5)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float64], ids=str)
+def test_other_types_of_the_table(dtype):
+    host, fused = (encoding.to(dtype) for encoding in both(**SIZES["four features"]))
+    x = torch.rand(50, 3)
+    assert torch.equal(host(x), fused(x)) and host(x).dtype == fused(x).dtype
+
+
+def test_under_mixed_precision():
+    host, fused = both(**SIZES["lite"])
+    layer = torch.nn.Linear(16, 4)
+    gradients = []
+    for encoding in (host, fused):
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            encoded = encoding(torch.linspace(0, 1, 300).view(-1, 3))
+            assert encoded.dtype == torch.float32
+            layer(encoded).float().square().sum().backward()
+        gradients.append(encoding.hash_table.grad)
+    assert_near(gradients[1], gradients[0], 1e-5)
+
+
+@pytest.mark.parametrize("shape", [(3,), (0, 3), (7, 0, 3), (4, 3), (2, 5, 3), (2, 1, 3, 3)])
+def test_any_leading_shape(shape):
+    host, fused = both(**SIZES["four features"])
+    x = torch.rand(shape)
+    assert fused(x).shape == (*shape[:-1], 12)
+    assert torch.equal(host(x), fused(x))
+    x.requires_grad_()
+    fused(x).sum().backward()
+    assert x.grad is not None and x.grad.shape == x.shape
+    assert fused.hash_table.grad is not None and fused.hash_table.grad.any() == (x.numel() > 0)
+
+
+def test_strided_tensors():
+    host, fused = both(**SIZES["lite"])
+    wide = torch.rand(6, 500).t()[:, ::2]
+    assert not wide.is_contiguous()
+    encoded = [encoding(wide) for encoding in (host, fused)]
+    assert torch.equal(*encoded)
+    for each in encoded:  # a gradient of stride 0, then one of strange strides
+        each.sum().backward(retain_graph=True)
+        each.backward(torch.linspace(-1, 1, each.numel()).view(each.shape[::-1]).t())
+    assert_near(fused.hash_table.grad, host.hash_table.grad, 1e-5)
+
+
+@pytest.mark.parametrize(("of_positions", "of_table"), [(True, False), (False, True), (False, False)])
+def test_only_the_gradients_asked_for(of_positions, of_table, monkeypatch):
+    host, fused = both(**SIZES["four features"])
+    for name, wanted in (("position_gradient", of_positions), ("table_gradient", of_table)):
+        if not wanted:
+            monkeypatch.setattr(cpu, name, lambda *_: pytest.fail("not asked for"))
+    x = torch.rand(20, 3)
+    xs = [x.clone().requires_grad_(of_positions) for _ in range(2)]
+    for encoding, each in zip((host, fused), xs, strict=True):
+        encoding.hash_table.requires_grad_(of_table)
+        encoded = encoding(each)
+        assert encoded.requires_grad == (of_positions or of_table)
+        if encoded.requires_grad:
+            encoded.square().sum().backward()
+    if of_positions:
+        assert_near(xs[1].grad, xs[0].grad, 1e-5)
+    if of_table:
+        assert_near(fused.hash_table.grad, host.hash_table.grad, 1e-5)
+    with torch.no_grad():
+        assert not fused(xs[1]).requires_grad
+
+
+def test_gradients_add_up_and_do_not_share_memory():
+    _, fused = both(**SIZES["four features"])
+    x = torch.rand(20, 3)
+    fused(x).sum().backward()
+    once = fused.hash_table.grad
+    assert once is not None
+    once = once.clone()
+    fused(x).sum().backward()
+    torch.testing.assert_close(fused.hash_table.grad, 2 * once)
+
+
+def test_a_second_derivative_is_refused():
+    _, fused = both(**SIZES["four features"])
+    x = torch.rand(20, 3, requires_grad=True)
+    (slope,) = torch.autograd.grad(fused(x).sum(), x, create_graph=True)
+    with pytest.raises(NotImplementedError, match="implementation torch"):
+        slope.square().sum().backward()
+
+
+def test_nan_stays_nan_and_breaks_nothing():
+    host, fused = both(**SIZES["four features"])
+    x = torch.rand(10, 3)
+    x[3, 1] = float("nan")
+    x[5, 0] = float("inf")
+    x[7] = 1e30
+    encoded = fused(x)
+    assert encoded[[3, 5]].isnan().any(1).all()
+    kept = [0, 1, 2, 4, 6, 8, 9]
+    assert torch.equal(encoded[kept], host(x[kept]))
+    encoded.sum().backward()
+
+
+def test_state_goes_both_ways():
+    host, _ = both(1, **SIZES["lite"])
+    _, fused = both(2, **SIZES["lite"])
+    x = torch.rand(100, 3)
+    assert not torch.equal(host(x), fused(x))
+    fused.load_state_dict(host.state_dict())
+    assert torch.equal(host(x), fused(x))
+    other = both(3, **SIZES["lite"])[0]
+    other.load_state_dict(fused.state_dict())
+    assert torch.equal(other(x), fused(x))
+
+
+def build(**options) -> EdgeDepthNerfModel:
+    torch.manual_seed(0)
+    config = all_methods["edge-depth-nerf-lite"].pipeline.model
+    camera_optimizer = replace(config.camera_optimizer, mode=options.pop("poses", "off"))
+    config = replace(config, camera_optimizer=camera_optimizer, **options)
+    box = SceneBox(aabb=torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
+    return config.setup(scene_box=box, num_train_data=3, metadata={"metres_per_unit": 20.0}, device="cpu")
+
+
+def step(model: EdgeDepthNerfModel) -> dict[str, torch.Tensor]:
+    """Losses of a training step, their gradients in the parameters."""
+    model.train()
+    generator = torch.Generator().manual_seed(1)
+    bundle = RayBundle(
+        origins=torch.rand(32, 3, generator=generator) - 0.5,
+        directions=torch.nn.functional.normalize(torch.randn(32, 3, generator=generator), dim=-1),
+        pixel_area=torch.full((32, 1), 1e-4),
+        camera_indices=torch.arange(32)[:, None] % 3,
+    )
+    prior = 3 + 10 * torch.rand(32, 1, generator=generator)
+    batch = {
+        "image": torch.rand(32, 3, generator=generator),
+        "prior_distance_m": prior,
+        "prior_sigma_m": 0.1 * prior,
+    }
+    torch.manual_seed(3)
+    outputs = model(bundle)
+    losses = model.get_loss_dict(outputs, batch, model.get_metrics_dict(outputs, batch))
+    torch.stack(list(losses.values())).sum().backward()
+    return losses
+
+
+def encodings_of(model: torch.nn.Module) -> list[HashEncoding]:
+    return [part for part in model.modules() if isinstance(part, HashEncoding)]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"predict_normals": True}, {"poses": "SO3xR3"}, {"num_levels": 16, "log2_hashmap_size": 19}],
+    ids=str,
+)
+def test_a_training_step_is_the_torch_step(options):
+    models = [build(implementation=implementation, **options) for implementation in ("torch", "fused")]
+    losses = [step(model) for model in models]
+    for name, loss in losses[0].items():
+        assert float(losses[1][name].detach()) == pytest.approx(float(loss.detach()), rel=1e-5), name
+    found = dict(models[1].named_parameters())
+    compared = 0
+    for name, parameter in models[0].named_parameters():
+        if parameter.grad is not None and parameter.grad.any():
+            assert_near(found[name].grad, parameter.grad, 2e-5)
+            compared += 1
+    assert compared > 10
+    # the normals' own gradient, and that of poses, ask for positions; nothing else does
+    assert all(
+        part.follows_positions == bool({"predict_normals", "poses"} & set(options))
+        for part in encodings_of(models[1])
+        if isinstance(part, FusedHashEncoding)
+    )
+    models[0].load_state_dict(models[1].state_dict())
+    models[1].load_state_dict(models[0].state_dict())
+
+
+def test_the_contraction_is_nerfactos():
+    """Inside and outside the unit cube, on its border, and where two or three axes are equally far."""
+    at = torch.tensor([-30.0, -2.0, -1.0, -0.5, 0.0, 1e-30, 0.3, 1.0, 2.0, 1e6])
+    x = torch.cat(
+        [torch.cartesian_prod(at, at, at), 3 * torch.randn(500, 3, generator=torch.Generator().manual_seed(0))]
+    )
+    assert isinstance(build().field.spatial_distortion, CubeContraction)
+    found = []
+    for kind in (SceneContraction, CubeContraction):
+        each = x.clone().requires_grad_()
+        contracted = kind(order=float("inf"))(each)
+        (contracted * torch.linspace(-1, 1, x.numel()).view_as(x)).sum().backward()
+        found.append((contracted, each.grad))
+    assert torch.equal(found[0][0], found[1][0])
+    # at the very centre both give NaN, from 0 / 0 in the branch that is not selected
+    torch.testing.assert_close(found[1][1], found[0][1], equal_nan=True)
+
+
+def test_the_choice_of_implementation(monkeypatch):
+    assert all_methods["edge-depth-nerf"].pipeline.model.implementation == "auto"
+    assert all_methods["edge-depth-nerf-lite"].pipeline.model.implementation == "auto"
+    for choice, kind in (("auto", FusedHashEncoding), ("fused", FusedHashEncoding), ("torch", HashEncoding)):
+        assert [type(part) for part in encodings_of(build(implementation=choice))] == [kind] * 3
+    # tiny-cuda-nn serves no CPU
+    monkeypatch.setattr("edge_depth_nerf.model.TCNN_EXISTS", True)
+    assert [type(part) for part in encodings_of(build(implementation="auto"))] == [FusedHashEncoding] * 3
+
+
+def test_other_devices_are_left_to_torch():
+    assert back_end(torch.device("mps")) is None
+    if not torch.cuda.is_available():
+        back_end.cache_clear()
+        with pytest.warns(UserWarning, match="fused hash grid does not work on cuda"):
+            assert back_end(torch.device("cuda")) is None
+        back_end.cache_clear()
+
+
+INTERPRETED = """
+import torch
+from edge_depth_nerf.encodings import cpu, cuda
+torch.manual_seed(0)
+for levels, features, count in ((3, 2, 300), (2, 4, 5), (1, 1, 128)):
+    x = torch.rand(count, 3)
+    x[:4] = torch.tensor([0.0, 1.0, -1.0, 0.5])[:, None]
+    scalings, table = torch.tensor([16.0, 23.0, 64.0])[:levels], torch.randn(levels * 256, features)
+    gradient = torch.randn(count, levels * features)
+    for name, arguments, tolerance in (
+        ("encode", (x, table, scalings), 1e-6),
+        ("table_gradient", (x, gradient, scalings, len(table)), 1e-5),
+        ("position_gradient", (x, table, gradient, scalings), 1e-5),
+    ):
+        expected, found = (getattr(module, name)(*arguments) for module in (cpu, cuda))
+        assert (found - expected).abs().max() <= tolerance * expected.abs().max(), (name, levels)
+        assert found.shape == expected.shape
+assert cuda.encode(x[:0], table, scalings).shape == (0, 1)
+print("all equal")
+"""
+
+
+def test_triton_kernels_in_its_interpreter():
+    pytest.importorskip("triton")
+    done = subprocess.run(
+        [sys.executable, "-c", INTERPRETED],
+        env={**os.environ, "TRITON_INTERPRET": "1"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.stdout == "all equal\n", done.stderr
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("name", SIZES)
+def test_equals_nerfstudio_on_a_gpu(name):
+    host, fused = (encoding.cuda() for encoding in both(**SIZES[name]))
+    assert back_end(torch.device("cuda", 0)) is not None
+    x = points(host.scalings.cpu(), 500).cuda()
+    xs = [x.clone().requires_grad_() for _ in range(2)]
+    encoded = [encoding(each) for encoding, each in zip((host, fused), xs, strict=True)]
+    assert_near(encoded[1], encoded[0], 1e-6)
+    gradient = torch.randn(encoded[0].shape, device="cuda")
+    for each in encoded:
+        each.backward(gradient)
+    assert_near(fused.hash_table.grad, host.hash_table.grad, 1e-5)
+    assert_near(xs[1].grad, xs[0].grad, 1e-5)
