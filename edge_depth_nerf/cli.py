@@ -28,12 +28,18 @@ class Process:
     ]
 
 
+@dataclass
+class Doctor:
+    """Look at what is installed, and say what to do about it. Exit status 1 if something must be mended."""
+
+
 Command = (
     Annotated[SynthesizeOptions, tyro.conf.subcommand("synthesize")]
     | Annotated[Process, tyro.conf.subcommand("process")]
     | Annotated[EstimateDepthOptions, tyro.conf.subcommand("estimate-depth")]
     | Annotated[InspectOptions, tyro.conf.subcommand("inspect")]
     | Annotated[DemoOptions, tyro.conf.subcommand("demo")]
+    | Annotated[Doctor, tyro.conf.subcommand("doctor")]
 )
 
 
@@ -60,6 +66,10 @@ def run(command: Command) -> None:
         from edge_depth_nerf.inspecting import inspect_scene
 
         inspect_scene(command)
+    elif isinstance(command, Doctor):
+        from edge_depth_nerf.doctor import run_doctor
+
+        sys.exit(run_doctor())
     else:
         from edge_depth_nerf.demo import run_demo
 

@@ -135,14 +135,19 @@ def _say_once(message: str) -> None:
     LOG.warning(message)
 
 
+def lpips_weights() -> tuple[Path, str]:
+    """Where AlexNet's weights lie if they are on this machine, and the address they come from."""
+    url = AlexNet_Weights.IMAGENET1K_V1.url
+    return Path(torch.hub.get_dir()) / "checkpoints" / Path(urlparse(url).path).name, url
+
+
 def load_lpips() -> torch.nn.Module | None:
     """Build LPIPS (AlexNet, as nerfstudio has it) if AlexNet's weights lie in torch.hub's folder.
 
     Nothing is ever downloaded, and no figure comes from random weights: without the file the answer is None, and
     the log says so once; likewise for a file that cannot be read. The module takes pictures `[1, 3, h, w]` in 0 to 1.
     """
-    url = AlexNet_Weights.IMAGENET1K_V1.url
-    path = Path(torch.hub.get_dir()) / "checkpoints" / Path(urlparse(url).path).name
+    path, url = lpips_weights()
     if not path.is_file():
         _say_once(f"LPIPS is left out: no AlexNet weights at {path}. To have it, put the file of {url} there.")
         return None

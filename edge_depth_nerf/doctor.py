@@ -1,0 +1,283 @@
+"""`edge-depth-nerf doctor`: what is installed here, what that means, and what to do about it.
+
+Each check stands alone and never fails itself: a library that cannot be imported is a finding, not a traceback.
+"""
+
+from __future__ import annotations
+
+import ctypes.util
+import importlib
+import os
+import platform
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, distributions, entry_points, version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Literal
+
+from rich.console import Console
+from rich.table import Table
+
+from edge_depth_nerf import __version__
+
+State = Literal["ok", "note", "problem"]
+MARKS: dict[State, str] = {"ok": "[green]ok[/green]", "note": "[yellow]–[/yellow]", "problem": "[bold red]✗[/bold red]"}
+METHODS = ("edge-depth-nerf", "edge-depth-nerf-lite", "edge-depth-nerf-paper")
+SUPPORTED = ((3, 10), (3, 13))
+"""From this Python to before that one."""
+LEAST_FREE_MEMORY_GB = 4.0
+"""Less does not hold nerfstudio and a training of the lite preset."""
+LEAST_FREE_DISK_GB = 5.0
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What one check found."""
+
+    what: str
+    """What was looked at."""
+    state: State
+    """ok; note: works, but something could be better or is left out; problem: something does not work."""
+    found: str
+    """What is there."""
+    remedy: str = ""
+    """What to do, for notes and problems."""
+
+
+def check_python() -> Iterator[Finding]:
+    """The interpreter."""
+    first, end = SUPPORTED
+    wanted = f"{first[0]}.{first[1]} to {end[0]}.{end[1] - 1}"
+    fine = first <= sys.version_info[:2] < end
+    found = f"{platform.python_version()} on {platform.system()} {platform.machine()}"
+    yield Finding(
+        "Python",
+        "ok" if fine else "problem",
+        found,
+        ""
+        if fine
+        else f"Make an environment with Python {wanted}: nerfstudio's dependencies have no wheels for others.",
+    )
+
+
+def check_torch() -> Iterator[Finding]:
+    """PyTorch, and what it computes on."""
+    try:
+        import torch
+    except Exception as error:  # whatever keeps it from loading
+        yield _broken("PyTorch", "torch", error)
+        return
+    yield Finding("PyTorch", "ok", torch.__version__)
+    if torch.cuda.is_available():
+        name, total = torch.cuda.get_device_name(), torch.cuda.get_device_properties(0).total_memory / 2**30
+        yield Finding("Device", "ok", f"{name}, {total:.0f} GiB, CUDA {torch.version.cuda}")
+        return
+    built = torch.version.cuda
+    gpu = shutil.which("nvidia-smi") is not None
+    yield Finding(
+        "Device",
+        "problem" if gpu else "note",
+        f"CPU, {os.cpu_count()} cores"
+        + (f"; torch is built for CUDA {built}" if built else "; torch is built without CUDA"),
+        "There is an NVIDIA driver, but torch finds no GPU: install a torch whose CUDA the driver knows "
+        "(https://pytorch.org/get-started)."
+        if gpu
+        else "Train with edge-depth-nerf-lite; the full preset wants a GPU.",
+    )
+
+
+def check_kernels() -> Iterator[Finding]:
+    """What computes hash grids."""
+    if find_spec("tinycudann") is not None:
+        yield Finding("Hash grids", "ok", "tiny-cuda-nn on a GPU, Numba on the CPU")
+        return
+    numba, triton = find_spec("numba") is not None, find_spec("triton") is not None
+    found = " and ".join(name for name, there in (("Numba (CPU)", numba), ("Triton (CUDA)", triton)) if there)
+    yield Finding(
+        "Hash grids",
+        "ok" if numba else "problem",
+        f"fused kernels: {found or 'none'}; no tiny-cuda-nn, none is needed",
+        "" if numba else "Reinstall edge-depth-nerf: it brings Numba.",
+    )
+
+
+def check_nerfstudio() -> Iterator[Finding]:
+    """The host, and whether it finds our methods."""
+    try:
+        found = version("nerfstudio")
+    except PackageNotFoundError:
+        yield Finding("nerfstudio", "problem", "not installed", "pip install 'nerfstudio>=1.1.5,<1.2'")
+        return
+    fine = found.startswith("1.1.")
+    yield Finding(
+        "nerfstudio", "ok" if fine else "problem", found, "" if fine else "pip install 'nerfstudio>=1.1.5,<1.2'"
+    )
+    registered = {point.name for point in entry_points(group="nerfstudio.method_configs")}
+    missing = [name for name in METHODS if name not in registered]
+    yield Finding(
+        "Methods",
+        "problem" if missing else "ok",
+        f"not registered: {', '.join(missing)}" if missing else ", ".join(METHODS),
+        "Install the package into this environment (`pip install .` in a clone), not only onto the path."
+        if missing
+        else "",
+    )
+    on_path = shutil.which(
+        "ns-train", path=os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
+    )
+    yield Finding(
+        "ns-train",
+        "ok" if on_path else "problem",
+        on_path or "not on the path",
+        "" if on_path else "Activate the environment that nerfstudio is installed in.",
+    )
+
+
+def check_opencv() -> Iterator[Finding]:
+    """Which of OpenCV's wheels won."""
+    wheels = sorted(
+        f"{name} {found.version}"
+        for found in distributions()
+        if (name := (found.metadata["Name"] or "").lower().replace("_", "-")).startswith("opencv-")
+    )
+    try:
+        cv2 = importlib.import_module("cv2")
+    except Exception as error:
+        yield _broken("OpenCV", "opencv-contrib-python-headless", error)
+        return
+    contrib = hasattr(cv2, "ximgproc")
+    found = (
+        f"{cv2.__version__}, {'with' if contrib else 'without'} contrib; installed: {', '.join(wheels) or 'unknown'}"
+    )
+    yield Finding(
+        "OpenCV",
+        "ok" if contrib else "note",
+        found,
+        ""
+        if contrib
+        else "The wheels overwrite each other, the last one wins; all works but the comparison with a filter of "
+        "contrib. For it: pip install --force-reinstall --no-deps opencv-contrib-python-headless",
+    )
+
+
+def check_lpips() -> Iterator[Finding]:
+    """The weights of one metric."""
+    try:
+        from edge_depth_nerf.metrics import lpips_weights
+    except Exception as error:
+        yield _broken("LPIPS", "torchmetrics", error)
+        return
+    path, url = lpips_weights()
+    there = path.is_file()
+    yield Finding(
+        "LPIPS",
+        "ok" if there else "note",
+        str(path) if there else "no weights; the figure is left out",
+        "" if there else f"Put the file of {url} at {path}. Nothing is downloaded by itself.",
+    )
+
+
+def check_extras() -> Iterator[Finding]:
+    """Optional libraries and programs."""
+    for name, package, extra, what in (
+        ("COLMAP", "pycolmap", "colmap", "poses found from pictures (process --poses colmap)"),
+        ("transformers", "transformers", "hf", "ready-made depth networks (estimate-depth --hf)"),
+    ):
+        there = find_spec(package) is not None
+        yield Finding(
+            name,
+            "ok" if there else "note",
+            version(package) if there else f"not installed; only for {what}",
+            "" if there else f"pip install 'edge-depth-nerf[{extra}]'",
+        )
+    ffmpeg = shutil.which("ffmpeg")
+    yield Finding(
+        "ffmpeg",
+        "ok" if ffmpeg else "note",
+        ffmpeg or "not found; only for films (ns-render)",
+        "" if ffmpeg else "apt-get install ffmpeg",
+    )
+    usb = ctypes.util.find_library("usb-1.0")
+    yield Finding(
+        "libusb",
+        "ok" if usb or platform.system() != "Linux" else "note",
+        usb or "not found; only for meshes and normals (ns-export)",
+        "" if usb else "apt-get install libusb-1.0-0",
+    )
+
+
+def check_room() -> Iterator[Finding]:
+    """Free memory and disk."""
+    free_gb = _free_memory_gb()
+    if free_gb is not None:
+        little = free_gb < LEAST_FREE_MEMORY_GB
+        yield Finding(
+            "Free memory",
+            "problem" if little else "ok",
+            f"{free_gb:.1f} GiB",
+            f"A training takes {LEAST_FREE_MEMORY_GB:g} GiB at least: close other programs." if little else "",
+        )
+    disk_gb = shutil.disk_usage(Path.cwd()).free / 2**30
+    little = disk_gb < LEAST_FREE_DISK_GB
+    yield Finding(
+        "Free disk",
+        "note" if little else "ok",
+        f"{disk_gb:.0f} GiB in {Path.cwd()}",
+        "Scenes, tables of pixels and checkpoints lie beside each other: work in a folder with more room."
+        if little
+        else "",
+    )
+
+
+CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
+    check_python,
+    check_torch,
+    check_kernels,
+    check_nerfstudio,
+    check_opencv,
+    check_lpips,
+    check_extras,
+    check_room,
+)
+
+
+def run_doctor(console: Console | None = None) -> int:
+    """Run all checks and show them.
+
+    Returns:
+        0 without problems, 1 with: the command's exit status.
+
+    """
+    console = console or Console()
+    findings = [finding for check in CHECKS for finding in check()]
+    table = Table(title=f"edge-depth-nerf {__version__}", show_edge=False, title_justify="left")
+    for heading in ("", "", "found", "what to do"):
+        table.add_column(heading, overflow="fold")
+    for finding in findings:
+        table.add_row(MARKS[finding.state], finding.what, finding.found, finding.remedy)
+    console.print(table)
+    problems = [finding.what for finding in findings if finding.state == "problem"]
+    if problems:
+        console.print(f"\n[bold red]{len(problems)} to mend: {', '.join(problems)}[/bold red]")
+    else:
+        console.print("\nNothing to mend.")
+    return 1 if problems else 0
+
+
+def _broken(what: str, package: str, error: Exception) -> Finding:
+    said = str(error).strip().split("\n")[0]
+    return Finding(what, "problem", f"cannot be imported ({said})", f"pip install --force-reinstall {package}")
+
+
+def _free_memory_gb() -> float | None:
+    """Memory that programs can still take; None where the system does not tell."""
+    try:
+        for line in Path("/proc/meminfo").read_text().splitlines():
+            if line.startswith("MemAvailable"):
+                return int(line.split()[1]) / 2**20
+    except OSError:
+        pass
+    return None

@@ -1,0 +1,122 @@
+"""`doctor`: every check, with what it looks for there and missing."""
+
+from __future__ import annotations
+
+import io
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from edge_depth_nerf import doctor, metrics
+from edge_depth_nerf.doctor import Finding, run_doctor
+
+
+def found(check) -> dict[str, Finding]:
+    return {finding.what: finding for finding in check()}
+
+
+def test_the_command_is_content_with_this_environment():
+    """As a user gives it: this environment passes the tests, so there is nothing to mend."""
+    program = Path(sys.executable).with_name("edge-depth-nerf")
+    done = subprocess.run([program, "doctor"], capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "Nothing to mend" in done.stdout
+    for what in (
+        "Python",
+        "PyTorch",
+        "Device",
+        "Hash grids",
+        "nerfstudio",
+        "Methods",
+        "OpenCV",
+        "LPIPS",
+        "Free memory",
+    ):
+        assert what in done.stdout
+
+
+def test_one_problem_is_enough_for_the_exit_status(monkeypatch):
+    def broken():
+        yield Finding("Thing", "problem", "is not there", "Get it.")
+
+    console = Console(file=io.StringIO(), width=100)
+    monkeypatch.setattr(doctor, "CHECKS", (broken,))
+    assert run_doctor(console) == 1
+    assert isinstance(console.file, io.StringIO)
+    assert "1 to mend: Thing" in console.file.getvalue() and "Get it." in console.file.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("running", "state"), [((3, 9), "problem"), ((3, 10), "ok"), ((3, 12), "ok"), ((3, 13), "problem")]
+)
+def test_pythons(monkeypatch, running, state):
+    monkeypatch.setattr(sys, "version_info", (*running, 0))
+    assert found(doctor.check_python)["Python"].state == state
+
+
+def test_missing_libraries_are_findings(monkeypatch):
+    spec = doctor.find_spec
+    monkeypatch.setattr(doctor, "find_spec", lambda name: None if name in hidden else spec(name))
+    hidden = {"pycolmap", "transformers", "tinycudann", "numba"}
+    extras = found(doctor.check_extras)
+    assert extras["COLMAP"].state == "note" and "edge-depth-nerf[colmap]" in extras["COLMAP"].remedy
+    assert extras["transformers"].state == "note" and "edge-depth-nerf[hf]" in extras["transformers"].remedy
+    assert found(doctor.check_kernels)["Hash grids"].state == "problem"
+    hidden.remove("numba")
+    assert found(doctor.check_kernels)["Hash grids"].state == "ok"
+
+
+def test_methods_that_are_not_registered(monkeypatch):
+    monkeypatch.setattr(doctor, "entry_points", lambda **_: [])
+    finding = found(doctor.check_nerfstudio)["Methods"]
+    assert finding.state == "problem" and "edge-depth-nerf-lite" in finding.found and "pip install" in finding.remedy
+
+
+def test_another_nerfstudio(monkeypatch):
+    monkeypatch.setattr(doctor, "version", lambda _: "1.2.0")
+    assert found(doctor.check_nerfstudio)["nerfstudio"].state == "problem"
+
+
+def test_lpips_weights(monkeypatch, tmp_path):
+    monkeypatch.setattr(metrics.torch.hub, "get_dir", lambda: str(tmp_path))
+    missing = found(doctor.check_lpips)["LPIPS"]
+    assert missing.state == "note" and str(tmp_path) in missing.remedy and "https://" in missing.remedy
+    path, _ = metrics.lpips_weights()
+    path.parent.mkdir(parents=True)
+    path.write_bytes(b"")
+    assert found(doctor.check_lpips)["LPIPS"].state == "ok"
+
+
+def test_an_opencv_that_does_not_load_and_one_without_contrib(monkeypatch):
+    def fail(_):
+        raise ImportError("libGL.so.1: cannot open shared object file")
+
+    monkeypatch.setattr(doctor.importlib, "import_module", fail)
+    broken = found(doctor.check_opencv)["OpenCV"]
+    assert broken.state == "problem" and "libGL" in broken.found
+    plain = type("cv2", (), {"__version__": "4.10"})
+    monkeypatch.setattr(doctor.importlib, "import_module", lambda _: plain)
+    finding = found(doctor.check_opencv)["OpenCV"]
+    assert finding.state == "note" and "without contrib" in finding.found
+
+
+@pytest.mark.parametrize(("free_gb", "state"), [(1.0, "problem"), (16.0, "ok")])
+def test_memory(monkeypatch, free_gb, state):
+    monkeypatch.setattr(doctor, "_free_memory_gb", lambda: free_gb)
+    assert found(doctor.check_room)["Free memory"].state == state
+
+
+def test_a_driver_without_a_usable_gpu(monkeypatch):
+    import torch
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(
+        doctor.shutil, "which", lambda name, **_: "/usr/bin/nvidia-smi" if name == "nvidia-smi" else None
+    )
+    assert found(doctor.check_torch)["Device"].state == "problem"
+    monkeypatch.setattr(doctor.shutil, "which", lambda *_, **__: None)
+    device = found(doctor.check_torch)["Device"]
+    assert device.state == "note" and "edge-depth-nerf-lite" in device.remedy
