@@ -68,6 +68,8 @@ class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig):
     """Standard deviation of the kernel over pixels, px (Eq. 7)."""
     sigma_depth: float = 1.0
     """Standard deviation of the kernel over distance, metres (Eq. 7)."""
+    sigma_depth_growth: float = 0.005
+    """That standard deviation is at least so much (1/m) times the square of the distance; 0 for Eq. 7 as written."""
     normalise: Literal["pooled", "per-source"] = "per-source"
     """Whether alpha weighs single pixels (Eq. 5, 6) or the averages of the two sources."""
     keep_returns: bool = True
@@ -129,6 +131,7 @@ class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig):
                 kernel_size=self.kernel_size,
                 sigma_space_px=self.sigma_space,
                 sigma_depth_m=self.sigma_depth,
+                sigma_depth_growth_per_m=self.sigma_depth_growth,
                 integration=self.integration,
                 normalise=self.normalise,
                 keep_returns=self.keep_returns,

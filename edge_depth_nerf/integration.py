@@ -78,6 +78,9 @@ class IntegrationOptions:
     """Standard deviation of the kernel over the picture, pixels (Eq. 7)."""
     sigma_depth_m: float = 1.0
     """Standard deviation of the kernel over distance, metres (Eq. 7)."""
+    sigma_depth_growth_per_m: float = 0.0
+    """That standard deviation is at least so much times the square of the distance at the centre: neighbouring pixels
+    of the ground lie apart by the square of their distance over the camera's height. 0: Eq. 7."""
     integration: Integration = "edge-aware"
     """edge-aware: Eq. 7. spatial-gaussian: Eq. 7 without its distance factor (the rival of Table 4)."""
     normalise: Normalise = "pooled"
@@ -92,6 +95,7 @@ class IntegrationOptions:
         _check_number("alpha", self.alpha, 0.0, 1.0)
         _check_number("sigma_space_px", self.sigma_space_px, 1e-3)
         _check_number("sigma_depth_m", self.sigma_depth_m, 1e-3)
+        _check_number("sigma_depth_growth_per_m", self.sigma_depth_growth_per_m, 0.0)
         if not (self.kernel_size >= 1 and self.kernel_size % 2 == 1):
             raise InputError(f"kernel_size is {self.kernel_size}; expected an odd whole number of pixels from 1.")
         _check_choice("integration", self.integration, Integration)
@@ -197,6 +201,7 @@ def _integrate_on_cpu(lidar: Tensor, mono: Tensor, valid: Tensor, options: Integ
         *(tensor.numpy() for tensor in out),
         np.array(_axis_weights(options)),
         _inverse_variance(options),
+        float(options.sigma_depth_growth_per_m),
         LOWEST_EXPONENT,
         float(options.alpha),
         options.normalise == "per-source",
@@ -233,6 +238,11 @@ def _integrate_strip(lidar: Tensor, mono: Tensor, valid: Tensor, options: Integr
     mono = torch.where(usable, mono, 0).double()
     value = torch.where(returns, lidar.double(), mono)
     guide = value if options.range_guide == "lidar" else mono
+    inverse_variance = torch.full_like(guide, _inverse_variance(options))
+    if options.sigma_depth_growth_per_m > 0:
+        # where the guide is 0 there is no prior
+        widest = (options.sigma_depth_growth_per_m * guide.square()).clamp(min=1e-100)
+        inverse_variance = torch.minimum(inverse_variance, widest.pow(-2))
     height, width = mono.shape
     weights = _axis_weights(options)
     padded = torch.nn.functional.pad(
@@ -257,7 +267,7 @@ def _integrate_strip(lidar: Tensor, mono: Tensor, valid: Tensor, options: Integr
 
     eta, first, second, eta_mono = torch.zeros(4, height, width, dtype=torch.float64, device=mono.device)
     for spatial, (mono_there, value_there, is_mono, is_lidar) in shifted:
-        exponent = (mono_there - guide).square_().mul_(-0.5 * _inverse_variance(options))
+        exponent = (mono_there - guide).square_().mul_(inverse_variance).mul_(-0.5)
         g = torch.where(exponent > LOWEST_EXPONENT, exponent.exp().mul_(spatial), 0)
         from_mono = (g * is_mono).mul_(factors[0])
         weight = g.mul_(is_lidar).mul_(factors[1]).add_(from_mono)

@@ -22,7 +22,7 @@ TILE = 512
 
 # Of a tile's centres, each a stretch of TILE numbers in one array, at these places. It is one array with places known
 # to the compiler because it vectorises a loop only if it can tell that what is written is not what is read.
-GUIDE, MONO_FACTOR, LIDAR_FACTOR, ETA, FIRST, SECOND, ETA_MONO, STRETCHES = range(8)
+GUIDE, INVERSE_VARIANCE, MONO_FACTOR, LIDAR_FACTOR, ETA, FIRST, SECOND, ETA_MONO, STRETCHES = range(9)
 
 _LEAST = 2.3e-308
 """float64's least number with all its digits."""
@@ -46,11 +46,11 @@ def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @_compiled
 @no_type_check  # the tests' type checker would wrap what Numba has to read
-def _add_shift(mono, value, is_mono, is_lidar, centres, count, spatial, inverse_variance, lowest_exponent):
+def _add_shift(mono, value, is_mono, is_lidar, centres, count, spatial, lowest_exponent):
     """Add to the sums of `count` centres what they get from their neighbours at one shift of the window."""
     for j in range(count):
         difference = mono[j] - centres[GUIDE * TILE + j]
-        exponent = -0.5 * difference * difference * inverse_variance
+        exponent = -0.5 * difference * difference * centres[INVERSE_VARIANCE * TILE + j]
         # e^x = 2^n · e^r with |r| ≤ ln 2 / 2; ten terms of e^r's series leave 3e-13 of it, n goes into the exponent
         t = max(exponent, lowest_exponent)
         rounded = t * _LOG2_E + _ROUND
@@ -122,6 +122,7 @@ def integrate_rows(
     mono_share,
     space,
     inverse_variance,
+    growth_per_m,
     lowest_exponent,
     alpha,
     per_source,
@@ -141,6 +142,7 @@ def integrate_rows(
         mono_share: the same for the monocular share.
         space: [kernel] float64, spatial weights along one axis.
         inverse_variance: 1 / σ_d² in 1/m²; 0 leaves the distance factor away.
+        growth_per_m: σ_d is at least so much times the square of the centre's distance.
         lowest_exponent: distance factors of lower exponents are 0; at least -708, where float64 loses digits.
         alpha: LiDAR's share.
         per_source: divide each source's weights by the sum of its spatial weights.
@@ -171,7 +173,12 @@ def integrate_rows(
             if count == 0:
                 continue
             for j in range(count):
-                centres[GUIDE * TILE + j] = tile[1 if lidar_guides else 0, i + radius, first + j + radius]
+                guide = tile[1 if lidar_guides else 0, i + radius, first + j + radius]
+                widest = growth_per_m * guide * guide
+                centres[GUIDE * TILE + j] = guide
+                centres[INVERSE_VARIANCE * TILE + j] = (
+                    min(inverse_variance, 1 / (widest * widest)) if widest > 0 else inverse_variance
+                )
                 mono_factor, lidar_factor = 1 - alpha, alpha
                 if per_source:
                     mono_factor = _divided(mono_factor, along_rows[0], i, first + j, space)
@@ -189,7 +196,6 @@ def integrate_rows(
                         centres,
                         count,
                         space[k] * space[l],
-                        inverse_variance,
                         lowest_exponent,
                     )
             for j in range(count):

@@ -28,7 +28,7 @@ from edge_depth_nerf.integration import DepthSource, IntegrationOptions, SigmaMo
 from edge_depth_nerf.mono.alignment import Align, align
 from edge_depth_nerf.mono.error_model import Trust, pixel_features
 
-CACHE_VERSION = 2
+CACHE_VERSION = 4
 """Part of every key: raised whenever the same inputs give another prior."""
 
 FARTHEST_M = 200.0
@@ -57,7 +57,9 @@ class PriorOptions:
     sigma_constant_m: float = 1.0
     """The standard deviation under sigma_mode constant, metres."""
     integration: IntegrationOptions = field(
-        default_factory=lambda: IntegrationOptions(normalise="per-source", keep_returns=True)
+        default_factory=lambda: IntegrationOptions(
+            normalise="per-source", keep_returns=True, sigma_depth_growth_per_m=0.005
+        )
     )
     """Eq. 5-7 and their variants; the default is what measures best (docs/prior.md)."""
 

@@ -18,6 +18,7 @@ def integrate_depth(
     kernel_size=9,
     sigma_space_px=3.0,
     sigma_depth_m=1.0,
+    sigma_depth_growth_per_m=0.0,
     integration="edge-aware",
     normalise="pooled",
     keep_returns=False,
@@ -53,7 +54,8 @@ def integrate_depth(
                     spatial = math.exp(-(k**2 + l**2) / (2 * sigma_space_px**2))
                     g = spatial
                     if integration == "edge-aware":
-                        g *= math.exp(-((centre - mono[y, x]) ** 2) / (2 * sigma_depth_m**2))
+                        sigma_m = max(sigma_depth_m, sigma_depth_growth_per_m * centre**2)
+                        g *= math.exp(-((centre - mono[y, x]) ** 2) / (2 * sigma_m**2))
                     is_lidar = has_return(y, x)
                     entries.append((is_lidar, lidar[y, x] if is_lidar else mono[y, x], g, spatial))
             weights = []

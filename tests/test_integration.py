@@ -89,6 +89,8 @@ def test_equals_twin(kind, normalise, keep_returns, guide, alpha, dtype):
         {"kernel_size": 21},
         {"sigma_depth_m": 0.05},
         {"sigma_depth_m": 30.0, "normalise": "per-source"},
+        {"sigma_depth_m": 0.05, "sigma_depth_growth_per_m": 0.01},
+        {"sigma_depth_growth_per_m": 0.05, "normalise": "per-source", "range_guide": "lidar"},
     ],
     ids=str,
 )
