@@ -1,21 +1,25 @@
-"""The depth prior against truth: alignment, integration and its calibration, on drives of the own generator.
+"""The depth prior against truth: alignment, integration, rivals and calibration, on drives of the own generator.
 
     python benchmarks/prior.py --output outputs/prior [--mono network|simulated] [--drives street parking turn]
         [--seeds 0 1 2] [--frames 40] [--size 350] [--seconds 300] [--variants] [--scenes DIR …]
         [--real kitti360_fisheye_frame [--real-mono MAP.png]]
 
-Synthesises, processes and, with `--mono network`, trains a network on the training frames (the default; some eight
-minutes a drive), or takes finished scenes that have truth. Then prints, for training and for held-out pictures, per
-drive and over its seeds, against truth from 1 to 60 m inside the mask:
+Synthesises, processes and, with `--mono network`, trains a network on the training frames (the default; some four
+minutes a drive), or takes finished scenes that have truth. Drives, scenes, networks and figures stay under the output
+folder: a run that was stopped goes on there. Then prints, for training and for held-out pictures, per drive, mean and
+standard deviation over its seeds, against truth from 1 to 60 m inside the mask:
 
-  AbsRel, RMSE and δ<1.25 of LiDAR alone, mono as it came, fitted by one curve a frame, aligned locally, integrated with
-  a spatial Gaussian, integrated; each where it has a value, with its coverage;
+  coverage, AbsRel, RMSE and δ<1.25 of LiDAR alone, mono as it came, fitted by one curve a frame, aligned locally,
+  integrated with a spatial Gaussian (pooled as in the paper, and with the options of the integration), integrated, and
+  completed along the picture's colours (`mono/completion.py`, of mono as it came and of the aligned map);
   the same inside and outside LiDAR's field of elevation (± 3°), within 4 px of depth edges, by ring of angle from the
   axis, and by distance in pixels from the nearest return;
-  the part of the prior's pixels whose error is within 1 and 2 of its sigma.
+  the part of the prior's pixels whose error is within 1 and 2 of its sigma;
+  for each drive and seed, whether the prior reaches what it is meant to.
 
-`--variants` compares the ways to integrate. `--real` holds a fifth of one real frame's LiDAR out in blocks of 64 px and
-judges against it; its monocular map is a network's, trained on the other blocks, or the one given.
+All figures are kept in figures/ as JSON as well. `--variants` compares the ways to integrate. `--real` holds a fifth of
+one real frame's LiDAR out in blocks of 64 px and judges against it; its monocular map is a network's, trained on the
+other blocks, or the one given; a picture of it lies beside.
 """
 
 from __future__ import annotations
@@ -23,7 +27,7 @@ from __future__ import annotations
 import argparse
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -35,17 +39,18 @@ from rich.progress import track
 from rich.table import Table
 
 from edge_depth_nerf.cameras import MEI
-from edge_depth_nerf.files import read_distance_png, read_image, read_json, write_png
+from edge_depth_nerf.files import read_distance_png, read_image, read_json, write_json, write_png
 from edge_depth_nerf.inspecting.reader import read_scene
-from edge_depth_nerf.integration import IntegrationOptions, integrate_depth
+from edge_depth_nerf.integration import integrate_depth
 from edge_depth_nerf.metrics import JUDGED_RANGE_M
 from edge_depth_nerf.mono.alignment import Fit, align
+from edge_depth_nerf.mono.completion import complete
 from edge_depth_nerf.mono.error_model import Trust
 from edge_depth_nerf.mono.estimate import estimate_depth
 from edge_depth_nerf.mono.options import EstimateDepthOptions
 from edge_depth_nerf.mono.trust import find_trust
 from edge_depth_nerf.pictures import colour_distance
-from edge_depth_nerf.prior import PriorOptions, View, make_prior, view_of
+from edge_depth_nerf.prior import Prior, PriorOptions, View, make_prior, view_of
 from edge_depth_nerf.process.kitti360 import process_kitti360
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.process.scene import FrameContent, SceneCamera, SceneFrame, write_scene
@@ -59,6 +64,13 @@ RINGS_DEG = (0, 30, 60, 90, 180)
 NEAREST_PX = (0, 1, 3, 9, 33)
 """Least distances of the classes: at a return, 1-2, 3-8, 9-32 and more."""
 REAL_BLOCK_PX, REAL_PART = 64, 0.2
+MONO_SIGMA = 0.1
+"""Standard deviation of a monocular map that nothing is known of, as a part of its distance."""
+IN_FIELD, AT_EDGES = "in LiDAR's field", "in it, at edges"
+MONO_AT_MOST, ALIGNED_AT_MOST = 0.15, 0.7
+"""What the prior is meant to reach: AbsRel of mono, and that of aligned mono as a part of mono's."""
+PATTERNS = ("{:.0%}", "{:.4f}", "{:.2f}", "{:.3f}")
+WITHIN, WITHIN_MARGIN = (0.68, 0.95), 0.05
 
 Maps = dict[str, NDArray[np.float32]]
 
@@ -83,17 +95,12 @@ class Sums:
         self.squared += float(((found - true) ** 2).sum())
         self.close += int((np.maximum(found / true, true / found) < 1.25).sum())
 
-    def figures(self) -> list[str]:
-        """Coverage, AbsRel, RMSE, δ."""
+    def figures(self) -> list[float | None]:
+        """Coverage, AbsRel, RMSE, δ; None where there is nothing to judge."""
         if not self.known:
-            return ["-"] * 4
-        rmse = (self.squared / self.known) ** 0.5
-        return [
-            f"{self.known / self.pixels:.0%}",
-            f"{self.relative / self.known:.4f}",
-            f"{rmse:.2f}",
-            f"{self.close / self.known:.3f}",
-        ]
+            return [None] * 4
+        shares = [self.relative / self.known, (self.squared / self.known) ** 0.5, self.close / self.known]
+        return [self.known / self.pixels, *shares]
 
 
 @dataclass
@@ -110,15 +117,16 @@ class Within:
         self.one += int((scaled_error <= 1).sum())
         self.two += int((scaled_error <= 2).sum())
 
-    def figures(self) -> list[str]:
-        """Part within 1 and 2."""
-        return [f"{n / self.pixels:.1%}" if self.pixels else "-" for n in (self.one, self.two)]
+    def figures(self) -> list[float | None]:
+        """Part within 1 and 2; None without pixels."""
+        return [n / self.pixels if self.pixels else None for n in (self.one, self.two)]
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A picture's maps."""
+    """A picture and its maps."""
 
+    rgb: NDArray[np.uint8]
     lidar_m: NDArray[np.float32]
     mono_m: NDArray[np.float32]
     truth_m: NDArray[np.float32]
@@ -136,36 +144,47 @@ def frames_of(scene: Path, training_stride: int) -> Iterator[Frame]:
         if maps.lidar_m is None or maps.mono_m is None or maps.truth_m is None:
             raise SystemExit(f"{scene}: {picture.name} has not all of LiDAR, mono and truth; nothing to judge by")
         view = view_of(picture.lens, picture.up_in_camera)
-        yield Frame(maps.lidar_m, maps.mono_m, maps.truth_m, maps.usable, view, picture.held_out)
+        yield Frame(maps.rgb, maps.lidar_m, maps.mono_m, maps.truth_m, maps.usable, view, picture.held_out)
 
 
-def integrated(frame: Frame, mono_m: NDArray[np.float32], **options: object) -> NDArray[np.float32]:
-    chosen = IntegrationOptions(**options)  # pyright: ignore[reportArgumentType]
+def integrated(frame: Frame, mono_m: NDArray[np.float32], **changed: object) -> NDArray[np.float32]:
+    """The integration of the default prior, but for some options."""
+    options = replace(PriorOptions().integration, **changed)  # pyright: ignore[reportArgumentType]
     lidar, mono, usable = (torch.from_numpy(pixels) for pixels in (frame.lidar_m, mono_m, frame.usable))
-    return integrate_depth(lidar, mono, usable, chosen).distance_m.float().numpy()
+    return integrate_depth(lidar, mono, usable, options).distance_m.float().numpy()
 
 
-def rivals(frame: Frame, drive_fit: Fit | None, variants: bool) -> Maps:
-    """All maps to be compared."""
+def rivals(frame: Frame, drive_fit: Fit | None, prior: Prior | None, variants: bool) -> Maps:
+    """All maps to be compared; the completion of the aligned map has the prior's sigma where there is one."""
     aligned = align(frame.lidar_m, frame.mono_m, frame.usable, "local", drive_fit).mono_m
     one_curve = align(frame.lidar_m, frame.mono_m, frame.usable, "global", drive_fit).mono_m
-    chosen = {"normalise": "per-source", "keep_returns": True}
+    guess_m = (MONO_SIGMA * aligned).astype(np.float32)
+    sigma_m = guess_m if prior is None else np.where(prior.sigma_m > 0, prior.sigma_m, guess_m)
+    literal = {"normalise": "pooled", "keep_returns": False, "sigma_depth_growth_per_m": 0.0}
+
+    def completed(mono_m: NDArray[np.float32], mono_sigma_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        return complete(frame.rgb, frame.lidar_m, mono_m, mono_sigma_m, frame.usable)
+
     maps = {
         "LiDAR": frame.lidar_m,
         "mono": frame.mono_m,
         "mono, one curve a frame": one_curve,
         "mono aligned": aligned,
-        "spatial Gaussian, pooled": integrated(frame, aligned, integration="spatial-gaussian"),
-        "spatial Gaussian": integrated(frame, aligned, integration="spatial-gaussian", **chosen),
-        "integrated": integrated(frame, aligned, **chosen),
+        "spatial Gaussian, pooled": integrated(frame, aligned, integration="spatial-gaussian", **literal),
+        "spatial Gaussian": integrated(frame, aligned, integration="spatial-gaussian"),
+        "integrated": integrated(frame, aligned),
+        "completion of mono": completed(frame.mono_m, (MONO_SIGMA * frame.mono_m).astype(np.float32)),
+        "completion of aligned": completed(aligned, sigma_m),
     }
     if variants:
-        maps["paper: not aligned, pooled"] = integrated(frame, frame.mono_m)
-        maps["not aligned, as integrated"] = integrated(frame, frame.mono_m, **chosen)
+        maps["paper: not aligned, pooled"] = integrated(frame, frame.mono_m, **literal)
+        maps["not aligned, as integrated"] = integrated(frame, frame.mono_m)
+        maps["sigma of 1 m at any distance"] = integrated(frame, aligned, sigma_depth_growth_per_m=0.0)
         for normalise in ("pooled", "per-source"):
             for guide in ("mono", "lidar"):
-                maps[f"{normalise}, guide {guide}"] = integrated(frame, aligned, normalise=normalise, range_guide=guide)
-        maps["pooled, returns kept"] = integrated(frame, aligned, keep_returns=True)
+                changed = {**literal, "normalise": normalise, "range_guide": guide}
+                maps[f"returns averaged, {normalise}, guide {guide}"] = integrated(frame, aligned, **changed)
+        maps["pooled, returns kept"] = integrated(frame, aligned, normalise="pooled")
     return maps
 
 
@@ -186,8 +205,8 @@ def regions(frame: Frame, trust: Trust) -> dict[str, NDArray[np.bool_]]:
     theta_deg = np.degrees(frame.view.theta_rad)
     found = {
         "overall": judged,
-        "in LiDAR's field": judged & in_field,
-        "in it, at edges": judged & in_field & near_edge,
+        IN_FIELD: judged & in_field,
+        AT_EDGES: judged & in_field & near_edge,
         "in it, off edges": judged & in_field & ~near_edge,
         "outside it": judged & ~in_field,
         "at edges": judged & near_edge,
@@ -201,40 +220,87 @@ def regions(frame: Frame, trust: Trust) -> dict[str, NDArray[np.bool_]]:
     return found
 
 
+Figures = dict[str, dict[str, dict[str, list]]]
+"""errors: for each region and map coverage, AbsRel, RMSE in metres, δ. sigma: for each region the parts within."""
+
+
 class Result:
-    """Figures of several scenes together."""
+    """Sums over the pictures of a scene."""
 
     def __init__(self) -> None:
-        self.errors: dict[tuple[str, str], Sums] = {}
+        self.errors: dict[str, dict[str, Sums]] = {}
         self.calibration: dict[str, Within] = {}
 
-    def add(self, frame: Frame, maps: Maps, trust: Trust) -> None:
+    def add(self, frame: Frame, trust: Trust, variants: bool) -> None:
         """Add a picture."""
         where = regions(frame, trust)
-        for region, pixels in where.items():
-            for name, estimate in maps.items():
-                self.errors.setdefault((region, name), Sums()).add(estimate[pixels], frame.truth_m[pixels])
-        options = PriorOptions()
-        prior = make_prior(frame.lidar_m, frame.mono_m, frame.usable, options, trust, frame.view)
+        prior = make_prior(frame.lidar_m, frame.mono_m, frame.usable, PriorOptions(), trust, frame.view)
+        maps = rivals(frame, trust.drive_fit, prior, variants)
         has = prior.distance_m > 0
         for region, pixels in where.items():
+            for name, estimate in maps.items():
+                sums = self.errors.setdefault(region, {}).setdefault(name, Sums())
+                sums.add(estimate[pixels], frame.truth_m[pixels])
             chosen = pixels & has
             scaled = np.abs(prior.distance_m[chosen] - frame.truth_m[chosen]) / prior.sigma_m[chosen]
             self.calibration.setdefault(region, Within()).add(scaled)
 
-    def show(self, console: Console, title: str) -> None:
-        """Print both tables."""
-        table = Table("where", "map", "coverage", "AbsRel", "RMSE, m", "δ<1.25", title=title)
-        names = list(dict.fromkeys(name for _, name in self.errors))
-        for region in dict.fromkeys(region for region, _ in self.errors):
-            for name in names:
-                table.add_row(region if name == names[0] else "", name, *self.errors[region, name].figures())
-            table.add_section()
-        console.print(table)
-        table = Table("where", "pixels", "within 1 sigma", "within 2 sigma", title=f"{title}: calibration of sigma")
-        for region, within in self.calibration.items():
-            table.add_row(region, f"{within.pixels:,}", *within.figures())
-        console.print(table)
+    def figures(self) -> Figures:
+        """As they are kept."""
+        errors = {r: {name: sums.figures() for name, sums in maps.items()} for r, maps in self.errors.items()}
+        return {"errors": errors, "sigma": {r: {"sigma": within.figures()} for r, within in self.calibration.items()}}
+
+
+def mean_and_spread(values: list[float | None], pattern: str) -> str:
+    """Mean of the seeds and their standard deviation."""
+    known = [value for value in values if value is not None]
+    if not known:
+        return "-"
+    spread = f" ± {pattern.format(np.std(known))}" if len(values) > 1 else ""
+    return pattern.format(np.mean(known)) + spread
+
+
+def show(console: Console, title: str, seeds: list[Figures]) -> None:
+    """Print both tables of a drive."""
+    table = Table("where", "map", "coverage", "AbsRel", "RMSE, m", "δ<1.25", title=title)
+    for region, maps in seeds[0]["errors"].items():
+        for name in maps:
+            columns = zip(*(figures["errors"][region][name] for figures in seeds), strict=True)
+            cells = [mean_and_spread(list(c), pattern) for c, pattern in zip(columns, PATTERNS, strict=True)]
+            table.add_row(region if name == next(iter(maps)) else "", name, *cells)
+        table.add_section()
+    console.print(table)
+    table = Table("where", "within 1 sigma", "within 2 sigma", title=f"{title}: calibration of sigma")
+    for region in seeds[0]["sigma"]:
+        columns = zip(*(figures["sigma"][region]["sigma"] for figures in seeds), strict=True)
+        table.add_row(region, *(mean_and_spread(list(column), "{:.1%}") for column in columns))
+    console.print(table)
+
+
+def show_goals(console: Console, drives: dict[str, dict[str, Figures]]) -> None:
+    """Print for each scene whether the prior reaches what it is meant to; what misses is marked."""
+    title = "in LiDAR's field (at edges), pictures for training; ! misses"
+    table = Table("scene", "mono", "aligned", "of mono", "spatial G.", "integrated", "1 sigma", "2 sigma", title=title)
+    for scenes in drives.values():
+        for scene, figures in scenes.items():
+            field, edges = (
+                {name: values[1] for name, values in figures["errors"][region].items()}
+                for region in (IN_FIELD, AT_EDGES)
+            )
+            best = all(
+                errors["integrated"] < min(errors["mono aligned"], errors["spatial Gaussian"])
+                for errors in (field, edges)
+            )
+            share = field["mono aligned"] / field["mono"]
+            cells = [f"{field['mono']:.4f}{'' if field['mono'] <= MONO_AT_MOST else ' !'}"]
+            cells += [f"{field['mono aligned']:.4f} ({edges['mono aligned']:.4f})"]
+            cells += [f"{share:.2f}{'' if share <= ALIGNED_AT_MOST else ' !'}"]
+            cells += [f"{field['spatial Gaussian']:.4f} ({edges['spatial Gaussian']:.4f})"]
+            cells += [f"{field['integrated']:.4f} ({edges['integrated']:.4f}){'' if best else ' !'}"]
+            for found, wanted in zip(figures["sigma"][IN_FIELD]["sigma"], WITHIN, strict=True):
+                cells.append(f"{found:.1%}{'' if abs(found - wanted) <= WITHIN_MARGIN else ' !'}")
+            table.add_row(scene, *cells)
+    console.print(table)
 
 
 def make_scene(arguments: argparse.Namespace, drive: str, seed: int, console: Console) -> Path:
@@ -263,23 +329,35 @@ def make_scene(arguments: argparse.Namespace, drive: str, seed: int, console: Co
     return scene
 
 
+def judge(scene: Path, arguments: argparse.Namespace, console: Console) -> dict[str, Figures]:
+    """Figures of a scene's pictures for training and of the held-out ones, from before if nothing has changed."""
+    trust = find_trust(scene, PriorOptions(), console=console)
+    console.print(f"{scene}: {trust.summary()}", soft_wrap=True)
+    made_of = [trust.made_of, arguments.stride, arguments.variants]
+    kept = arguments.output / "figures" / f"{scene.name}.json"
+    if kept.is_file() and (found := read_json(kept))["made_of"] == made_of:
+        return found["figures"]
+    results = {"training": Result(), "held out": Result()}
+    for frame in track(list(frames_of(scene, arguments.stride)), f"{scene.name}…", console=console, transient=True):
+        results["held out" if frame.held_out else "training"].add(frame, trust, arguments.variants)
+    figures = {part: result.figures() for part, result in results.items()}
+    write_json(kept, {"made_of": made_of, "figures": figures})
+    return figures
+
+
 def run_drives(arguments: argparse.Namespace, console: Console) -> None:
     """Figures of all drives."""
     if arguments.scenes:
-        groups = {str(scene): [scene] for scene in arguments.scenes}
+        groups = {scene.name: [scene] for scene in arguments.scenes}
     else:
         groups = {d: [make_scene(arguments, d, seed, console) for seed in arguments.seeds] for d in arguments.drives}
+    training: dict[str, dict[str, Figures]] = {}
     for drive, scenes in groups.items():
-        training, held_out = Result(), Result()
-        for scene in scenes:
-            trust = find_trust(scene, PriorOptions(), console=console)
-            console.print(f"{scene}: {trust.summary()}", soft_wrap=True)
-            listed = list(frames_of(scene, arguments.stride))
-            for frame in track(listed, f"{scene.name}…", console=console, transient=True):
-                result = held_out if frame.held_out else training
-                result.add(frame, rivals(frame, trust.drive_fit, arguments.variants), trust)
-        training.show(console, f"{drive}, pictures for training")
-        held_out.show(console, f"{drive}, held-out pictures")
+        figures = {scene.name: judge(scene, arguments, console) for scene in scenes}
+        show(console, f"{drive}, pictures for training", [found["training"] for found in figures.values()])
+        show(console, f"{drive}, held-out pictures", [found["held out"] for found in figures.values()])
+        training[drive] = {scene: found["training"] for scene, found in figures.items()}
+    show_goals(console, training)
 
 
 # ---- one real frame -------------------------------------------------------------------------------------------------
@@ -339,10 +417,11 @@ def run_real(arguments: argparse.Namespace, console: Console) -> None:
         mono_m, label = filled(kept_m), "STAND-IN for mono: LiDAR of the other blocks spread smoothly, no network"
     read = read_scene(scene)
     picture = read.pictures[0]
-    usable = read.maps(picture, with_prior=False).usable
+    found = read.maps(picture, with_prior=False)
+    usable = found.usable
     view = view_of(picture.lens, picture.up_in_camera)
-    frame = Frame(kept_m, mono_m, np.where(held_out, lidar_m, np.float32(0)), usable, view, held_out=True)
-    maps = rivals(frame, None, arguments.variants)
+    frame = Frame(found.rgb, kept_m, mono_m, np.where(held_out, lidar_m, np.float32(0)), usable, view, held_out=True)
+    maps = rivals(frame, None, None, arguments.variants)
     low, high = JUDGED_RANGE_M
     judged = usable & held_out & (lidar_m >= low) & (lidar_m <= high)
     returns = usable & (kept_m > 0)
@@ -352,7 +431,8 @@ def run_real(arguments: argparse.Namespace, console: Console) -> None:
         for name, estimate in maps.items():
             sums = Sums()
             sums.add(estimate[pixels], lidar_m[pixels])
-            table.add_row(region if name == "LiDAR" else "", name, *sums.figures())
+            cells = [mean_and_spread([v], pattern) for pattern, v in zip(PATTERNS, sums.figures(), strict=True)]
+            table.add_row(region if name == "LiDAR" else "", name, *cells)
         table.add_section()
     console.print(table)
     panels = [read_image(folder / "kitti360_rgb.png")]

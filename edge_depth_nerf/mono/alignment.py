@@ -33,12 +33,14 @@ OUTLIER_SCALE = 8.0
 
 FINEST_CELL_SHARE = 1 / 175
 """Side of the finest cells as a share of the picture's longer side (8 px of 1400)."""
-FINEST_CELL_LOG = 0.2
-"""Depth of the finest cells in log m; that of all coarser ones is twice as much, a factor of 1.5 in distance."""
+FINEST_CELL_LOG = 0.07
+"""Depth of the finest cells in log m; that of all coarser ones is twice as much, a factor of 1.15 in distance."""
 LEVELS = 6
 """Grids of the pyramid; each has cells of twice the side of the one below, the coarsest of a fifth of the picture."""
 IMAGINED_RETURNS = 0.2
 """So many returns with the coarser cell's value are added to each cell."""
+JUDGING_RETURNS = 0.5
+"""The same where outliers are looked for: a return alone in its cell is judged by those around."""
 
 
 @dataclass(frozen=True)
@@ -168,9 +170,11 @@ def _correct(
     # an outlier is one against its neighbours, not against the picture: twice weighted anew
     weight = _weights(residual, least_spread=0.1)
     for _ in range(2):
-        left = residual - pyramid.read(pyramid.grid(places, residual, weight), places)
+        left = residual - pyramid.read(pyramid.grid(places, residual, weight, JUDGING_RETURNS), places)
         weight = _weights(left, least_spread=1e-3)
-    correction = pyramid.read(pyramid.grid(places, residual, weight), pyramid.places(wanted, log_m[wanted]))
+    correction = pyramid.read(
+        pyramid.grid(places, residual, weight, IMAGINED_RETURNS), pyramid.places(wanted, log_m[wanted])
+    )
     corrected = mono_m.copy()
     corrected[wanted] *= np.exp(correction)
     return corrected
@@ -196,7 +200,9 @@ class _Pyramid:
         place[2] = (column + 0.5) / self.cell_px
         return torch.from_numpy(place)
 
-    def grid(self, places: torch.Tensor, value: NDArray, weight: NDArray) -> Float[torch.Tensor, "1 1 z y x"]:
+    def grid(
+        self, places: torch.Tensor, value: NDArray, weight: NDArray, imagined: float
+    ) -> Float[torch.Tensor, "1 1 z y x"]:
         """Corrections of the finest grid's cells."""
         z, y, x = places.long().numpy()
         cell = (z * self.shape[1] + y) * self.shape[2] + x
@@ -208,7 +214,7 @@ class _Pyramid:
         correction = torch.zeros_like(levels[-1][:, :1])
         for level in reversed(levels):
             coarser = torch.nn.functional.interpolate(correction, size=level.shape[2:], mode="trilinear")
-            correction = (level[:, :1] + IMAGINED_RETURNS * coarser) / (level[:, 1:] + IMAGINED_RETURNS)
+            correction = (level[:, :1] + imagined * coarser) / (level[:, 1:] + imagined)
         return correction
 
     def read(self, grid: torch.Tensor, places: torch.Tensor) -> Float[np.ndarray, "n"]:

@@ -9,8 +9,8 @@ nearest_px    distance in the picture from the nearest return that the prior was
 spread        spread of what Eq. 5 averaged, as a part of d̃
 step          largest less least log of the aligned monocular map over 3×3 pixels: an edge is near
 
-σ̂ = d̃ · base · Π factor. The factors are fitted in turn so that in every bin around a knot 95.4 % of the errors are
-within 2 σ̂. (Errors have heavy tails: with 68.3 % within 1 σ̂ instead, fewer than 90 % are within 2.)
+σ̂ = d̃ · base · Π factor. The factors are fitted in turn so that in every bin around a knot 95 % of the errors are
+within 2 σ̂. (Errors have heavy tails: with 68 % within 1 σ̂ instead, fewer than 90 % are within 2.)
 
 One such model is of pixels without a return, from held-out returns. Another is of pixels that keep theirs: no return is
 held out there, but returns can be held against their neighbours.
@@ -114,8 +114,8 @@ class ErrorModel:
 
 
 def _log_scale(scaled_error: NDArray) -> float:
-    """Logarithm of half of what 95.4 % of the errors are within."""
-    return float(np.log(max(np.quantile(scaled_error, 0.9545) / 2, 1e-6)))
+    """Logarithm of half of what 95 % of the errors are within."""
+    return float(np.log(max(np.quantile(scaled_error, 0.95) / 2, 1e-6)))
 
 
 def fit_error_model(features: Features, relative_error: Float[np.ndarray, "n"]) -> ErrorModel | None:

@@ -1,4 +1,6 @@
-"""`edge-depth-nerf estimate-depth`: trains the network on scenes' own LiDAR, and predicts all their pictures.
+"""`edge-depth-nerf estimate-depth`: monocular maps for scenes, and how far they can be trusted.
+
+They come from a network trained on the scenes' own LiDAR, from a ready-made one, or from files of another tool.
 
 Held-out pictures, which scenes keep for judging, are predicted and nothing else: they are neither trained on nor used
 to stop. For stopping, one moment of eight of those to be trained on is kept aside, with all its cameras.
@@ -6,8 +8,9 @@ to stop. For stopping, one moment of eight of those to be trained on is kept asi
 
 from __future__ import annotations
 
+import functools
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -25,6 +28,8 @@ from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_image
 from edge_depth_nerf.inspecting.reader import InspectedPicture, InspectedScene, read_scene
 from edge_depth_nerf.masks.sky import find_sky
+from edge_depth_nerf.mono.alignment import LEAST_RETURNS
+from edge_depth_nerf.mono.elsewhere import FittedMaps
 from edge_depth_nerf.mono.examples import (
     LARGEST_SET_BYTES,
     bytes_a_picture,
@@ -36,6 +41,9 @@ from edge_depth_nerf.mono.examples import (
     small_picture,
     view_of,
 )
+from edge_depth_nerf.mono.far_seen import seen_above, static_cloud
+from edge_depth_nerf.mono.files import find_maps
+from edge_depth_nerf.mono.hf import ReadyNetwork, load_ready_network, view_layers
 from edge_depth_nerf.mono.network import (
     ARCHITECTURE,
     DepthNetwork,
@@ -47,6 +55,7 @@ from edge_depth_nerf.mono.network import (
     save_network,
 )
 from edge_depth_nerf.mono.options import EstimateDepthOptions, Preset
+from edge_depth_nerf.mono.relative import KIND_SAID, Layer
 from edge_depth_nerf.mono.scene_maps import write_mono_maps
 from edge_depth_nerf.mono.training import Trained, TrainingOptions, as_json, train
 from edge_depth_nerf.mono.trust import calibrate_scene
@@ -88,7 +97,7 @@ class EstimateReport:
     """What was done."""
 
     weights: Path
-    """The file whose weights made the maps."""
+    """The file whose weights made the maps; of other sources than our own network the folder or name given."""
     trained: Trained | None
     """How it was trained, if it was now."""
     predicted: int
@@ -96,25 +105,49 @@ class EstimateReport:
 
 
 def estimate_depth(options: EstimateDepthOptions, console: Console | None = None) -> EstimateReport:
-    """Train a network, or take one, write its maps into the scenes, and measure how far they can be trusted.
+    """Get maps for all pictures of scenes, write them there, and measure how far they can be trusted.
 
     Raises:
-        FileNotFoundError: a scene or the weights are not there.
-        InputError: an option, a scene or the weights cannot be used.
+        FileNotFoundError: a scene, the weights or a map are not there.
+        InputError: an option, a scene, the weights or a map cannot be used.
 
     """
     console = console or Console()
     options.check()
     start, about = load_network(options.model) if options.model is not None else (None, {})
+    ready = load_ready_network(options.hf, options.hf_output) if options.hf is not None else None
     scenes = [read_scene(path) for path in options.scenes]
     if len({scene.path.resolve() for scene in scenes}) < len(scenes):
         raise InputError("a scene is given twice. Name each scene once.")
     trained = None
-    if options.trains:
-        network, weights, about, trained = _train(scenes, options, start, console)
+    if ready is not None:
+        weights = Path(ready.name)
+        _write_predicted(ready, scenes, console)
+    elif options.maps is not None:
+        weights = options.maps
+        _write_from_files(options, scenes[0], console)
     else:
-        assert start is not None and options.model is not None
-        network, weights = start, options.model
+        if options.trains:
+            network, weights, about, trained = _train(scenes, options, start, console)
+        else:
+            assert start is not None and options.model is not None
+            network, weights = start, options.model
+        _write_own(network, weights, about, scenes, console)
+    count = sum(len(scene.pictures) for scene in scenes)
+    console.print(f"{count} pictures got a monocular map, from {weights}", soft_wrap=True)
+    for scene in scenes:
+        if scene.has("lidar"):
+            trust = calibrate_scene(scene.path, console=console)
+            console.print(f"{scene.folder}: {trust.summary()}", soft_wrap=True)
+    return EstimateReport(weights, trained, count)
+
+
+# ---- sources of maps ---------------------------------------------------------------------------------------------
+
+
+def _write_own(
+    network: DepthNetwork, weights: Path, about: dict[str, Any], scenes: Sequence[InspectedScene], console: Console
+) -> None:
     source = {
         "kind": "network",
         # it has seen LiDAR alone, in whatever scene: beyond a scanner's field it knows nothing
@@ -128,13 +161,52 @@ def estimate_depth(options: EstimateDepthOptions, console: Console | None = None
             # on these the maps are better than elsewhere
             seen = about.get("trained_frames", {}).get(_name(scene), [])
             write_mono_maps(scene.folder, predicted_maps(network, scene), {**source, "trained_frames": seen}, progress)
-    count = sum(len(scene.pictures) for scene in scenes)
-    console.print(f"{count} pictures got a monocular map, from {weights}", soft_wrap=True)
-    for scene in scenes:
-        if scene.has("lidar"):
-            trust = calibrate_scene(scene.path, console=console)
-            console.print(f"{scene.folder}: {trust.summary()}", soft_wrap=True)
-    return EstimateReport(weights, trained, count)
+
+
+def _write_predicted(network: ReadyNetwork, scenes: Sequence[InspectedScene], console: Console) -> None:
+    console.print(f"{network.name}: {network.model_type}, {KIND_SAID[network.kind]}", soft_wrap=True)
+    source = {
+        "kind": "ready-made network",
+        "trained_on": "elsewhere",
+        "network": Path(network.name).name,
+        "architecture": network.model_type,
+        "output": network.kind,
+    }
+    # all scenes' faults are told before the first one's work
+    fitted = [FittedMaps(scene, network.kind, _layers_by(network, scene)) for scene in scenes]
+    _write_fitted(fitted, source, console)
+
+
+def _layers_by(network: ReadyNetwork, scene: InspectedScene) -> Callable[[InspectedPicture], Sequence[Layer]]:
+    return lambda picture: view_layers(network, picture, read_image(picture.files["image"]), scene.theta_max_rad)
+
+
+def _write_from_files(options: EstimateDepthOptions, scene: InspectedScene, console: Console) -> None:
+    assert options.maps is not None and options.maps_kind is not None and options.maps_along is not None
+    files = find_maps(scene, options.maps, options.maps_kind, options.maps_along, options.metres_per_count)
+    source = {
+        "kind": "files",
+        "trained_on": options.maps_trained_on or "elsewhere",
+        "folder": options.maps.resolve().name,
+        "output": files.kind,
+        "along": files.along,
+    }
+    fitted = FittedMaps(scene, files.kind, lambda picture: [files.layer(scene, picture)])
+    _write_fitted([fitted], source, console)
+
+
+def _write_fitted(every: Sequence[FittedMaps], source: dict[str, Any], console: Console) -> None:
+    with _progress(console) as progress:
+        for fitted in every:
+            maps = ((picture.name, without_sky(fitted.scene, picture, metres, metres)) for picture, metres in fitted)
+            write_mono_maps(fitted.scene.folder, maps, source, progress)
+    for fitted in every:
+        if few := fitted.by_the_drive:
+            console.print(
+                f"{fitted.scene.folder}: {len(few)} of {len(fitted.scene.pictures)} pictures have fewer than "
+                f"{LEAST_RETURNS} LiDAR returns to fit to, such as {few[0]}; they took the drive's fit",
+                soft_wrap=True,
+            )
 
 
 # ---- training --------------------------------------------------------------------------------------------------
@@ -158,6 +230,12 @@ def _train(
     heights = [camera_heights_m(scene, settings) for scene in scenes]
     count = sum(len(pictures) for both in split for pictures in both)
     with _progress(console) as progress:
+        task = progress.add_task("Gathering LiDAR", total=3 * sum(len(both[0]) for both in split))
+        clouds = [
+            static_cloud(scene, both[0], lambda: progress.advance(task))
+            for scene, both in zip(scenes, split, strict=True)
+        ]
+        far_seen = [functools.partial(seen_above, cloud, scene) for cloud, scene in zip(clouds, scenes, strict=True)]
         task = progress.add_task("Reading pictures", total=count)
         examples, kept = (
             load_examples(
@@ -167,6 +245,8 @@ def _train(
                 settings.working_px,
                 settings.multiple_px,
                 lambda: progress.advance(task),
+                # what stops the training is what these pictures measured themselves
+                far_seen if which == 0 else None,
             )
             if any(both[which] for both in split)
             else None
@@ -304,10 +384,29 @@ def predicted_maps(network: DepthNetwork, scene: InspectedScene) -> Iterator[tup
     heights = camera_heights_m(scene, network.settings)
     for picture in scene.pictures:
         metres = predict(network, scene, picture, heights[picture.camera], device)
-        usable = view_of(picture, scene.theta_max_rad, max(metres.shape)).usable
-        lidar_m = read_lidar(scene, picture) if "lidar" in picture.files else np.zeros_like(metres)
-        sky = find_sky(read_image(picture.files["image"]), usable, picture.up_in_camera, picture.lens, lidar_m)
-        yield picture.name, np.where(sky, 0, metres)
+        yield picture.name, without_sky(scene, picture, metres)
+
+
+def without_sky(
+    scene: InspectedScene,
+    picture: InspectedPicture,
+    metres: Float32[np.ndarray, "h w"],
+    known_m: Float32[np.ndarray, "h w"] | None = None,
+) -> Float32[np.ndarray, "h w"]:
+    """Look for the sky in a picture, and leave it out of its map.
+
+    Args:
+        scene: of the picture.
+        picture: one of the scene's.
+        metres: its map.
+        known_m: a map that can tell a ceiling from the sky; None without.
+
+    """
+    usable = view_of(picture, scene.theta_max_rad, max(metres.shape)).usable
+    lidar_m = read_lidar(scene, picture) if "lidar" in picture.files else np.zeros_like(metres)
+    rgb = read_image(picture.files["image"])
+    sky = find_sky(rgb, usable, picture.up_in_camera, picture.lens, lidar_m, known_m)
+    return np.where(sky, 0, metres)
 
 
 @torch.no_grad()

@@ -25,6 +25,8 @@ from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_distance_png, read_image, read_mask
 from edge_depth_nerf.inspecting.reader import InspectedPicture, InspectedScene
 
+FarSeen = Callable[[InspectedPicture, tuple[int, int]], NDArray[np.float32]]
+"""Gives for a picture, at (width, height), distances along the ray, 0 = none."""
 LARGEST_SET_BYTES = 8 << 30
 """More pictures than fit in this are thinned evenly."""
 _GROUND_SINE = -math.sin(math.radians(12.0))
@@ -91,15 +93,20 @@ def view_of(picture: InspectedPicture, theta_max_rad: float, working_px: int) ->
     return View(rays, within, picture.up_in_camera.astype(np.float32))
 
 
+def scaled_lens(lens: KannalaBrandt | Pinhole, size: tuple[int, int]) -> KannalaBrandt | Pinhole:
+    """The lens of the same picture scaled to (width, height)."""
+    x, y = size[0] / lens.width, size[1] / lens.height
+    return dataclasses.replace(
+        lens, width=size[0], height=size[1], fx=lens.fx * x, fy=lens.fy * y, cx=lens.cx * x, cy=lens.cy * y
+    )
+
+
 @lru_cache(maxsize=16)
 def lens_rays(
     lens: KannalaBrandt | Pinhole, theta_max_rad: float, size: tuple[int, int]
 ) -> tuple[Float32[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
     """Rays of the pixels of a picture scaled to (width, height), and which lie within `theta_max_rad` of the axis."""
-    x, y = size[0] / lens.width, size[1] / lens.height
-    scaled = dataclasses.replace(
-        lens, width=size[0], height=size[1], fx=lens.fx * x, fy=lens.fy * y, cx=lens.cx * x, cy=lens.cy * y
-    )
+    scaled = scaled_lens(lens, size)
     directions, valid = scaled.unproject(scaled.pixel_centres())
     within = valid & (directions[..., 2] >= math.cos(theta_max_rad))
     rays = torch.where(within[..., None], directions, 0.0).to(torch.float32)
@@ -113,6 +120,7 @@ def load_examples(
     working_px: int,
     multiple_px: int,
     advance: Callable[[], None] = lambda: None,
+    far_seen: Sequence[FarSeen] | None = None,
 ) -> Examples:
     """Read pictures into memory.
 
@@ -123,6 +131,7 @@ def load_examples(
         working_px: longer side at the network.
         multiple_px: what both sides of the arrays are multiples of.
         advance: called after each picture.
+        far_seen: of each scene, what gives more distances of a picture where it has no return; see `mono.far_seen`.
 
     Raises:
         InputError: a file cannot be decoded, or has another size than its camera.
@@ -137,13 +146,18 @@ def load_examples(
     ups, heights, lenses = np.zeros((count, 3), np.float32), np.zeros(count, np.float32), np.zeros(count, np.int64)
     rays: dict[object, tuple[int, np.ndarray]] = {}
     index = 0
-    for scene, pictures, height_m in zip(scenes, chosen, heights_m, strict=True):
+    for number, (scene, pictures, height_m) in enumerate(zip(scenes, chosen, heights_m, strict=True)):
         for picture in pictures:
             view = view_of(picture, scene.theta_max_rad, working_px)
             rows, columns = view.usable.shape
             part = (index, slice(0, rows), slice(0, columns))
             rgb[part] = small_picture(picture, (columns, rows))
-            lidar_m[part] = small_lidar(scene, picture, view)
+            known_m = small_lidar(scene, picture, view)
+            if far_seen is not None:
+                # at twice the size it is told better what is hidden
+                twice = working_size(picture.lens.width, picture.lens.height, 2 * working_px)
+                known_m = np.where(known_m > 0, known_m, _reduced(far_seen[number](picture, twice), view))
+            lidar_m[part] = known_m
             usable[part] = view.usable
             key = (picture.lens, scene.theta_max_rad)
             if key not in rays:
@@ -172,7 +186,11 @@ def small_picture(picture: InspectedPicture, size: tuple[int, int]) -> UInt8[np.
 
 def small_lidar(scene: InspectedScene, picture: InspectedPicture, view: View) -> Float32[np.ndarray, "h w"]:
     """LiDAR at the network's size: of the returns in a pixel the one nearest to its centre."""
-    lidar_m = read_lidar(scene, picture)
+    return _reduced(read_lidar(scene, picture), view)
+
+
+def _reduced(lidar_m: Float32[np.ndarray, "rows columns"], view: View) -> Float32[np.ndarray, "h w"]:
+    """A sparse map at the size of a view: of the values in a pixel the one nearest to its centre."""
     full_rows, full_columns = lidar_m.shape
     rows, columns = view.usable.shape
     row, column = np.nonzero(lidar_m)

@@ -11,11 +11,15 @@ import tyro
 from edge_depth_nerf.errors import InputError
 
 Preset = Literal["lite", "full"]
+HfOutput = Literal["auto", "metric", "relative", "inverse"]
+MapsKind = Literal["metric", "relative", "inverse"]
+Along = Literal["ray", "z"]
+TrainedOn = Literal["scene", "elsewhere"]
 
 
 @dataclass(frozen=True)
 class EstimateDepthOptions:
-    """Train a monocular depth network on scenes' own LiDAR, and write its distance maps into them.
+    """Write monocular distance maps into scenes: of a network trained on their own LiDAR, of another, or from files.
 
     Held-out pictures are never trained on. Stopped at any moment, the same command takes up where it was.
     """
@@ -35,6 +39,26 @@ class EstimateDepthOptions:
     seed: int = 0
     """Of the first weights and of the order of pictures; on one thread the same seed gives the same weights, unless
     --seconds ends the training."""
+    hf: str | None = None
+    """A ready-made network instead: the folder of a depth network of the transformers library, or its name in Hugging
+    Face's cache, such as depth-anything/Depth-Anything-V2-Small-hf. Nothing is downloaded. Needs `pip install
+    edge-depth-nerf[hf]`."""
+    hf_output: HfOutput = "auto"
+    """What its maps are: metric (z in metres), relative (depth up to scale and shift), inverse (disparity up to scale
+    and shift); auto: as its config tells."""
+    maps: Path | None = None
+    """Maps of another tool instead: a folder with CAMERA/FRAME.npy (floating point) or .png (16 bit, 0 = none), in the
+    pictures' sizes; one for every picture of the one scene."""
+    maps_kind: MapsKind | None = None
+    """What they are: metric (metres), relative (depth up to scale and shift), inverse (one over depth, up to scale and
+    shift). The last two are fitted to LiDAR."""
+    maps_along: Along | None = None
+    """Whether they count along the ray (distance) or along the optical axis (z)."""
+    metres_per_count: float | None = None
+    """Of PNGs with metric maps, such as 0.00390625 (1/256)."""
+    maps_trained_on: TrainedOn | None = None
+    """What their maker has seen: scene, if it was trained on LiDAR alone and knows nothing beyond a scanner's field of
+    elevation, where no prior is made then. Not set: elsewhere."""
 
     def check(self) -> None:
         """Check the ranges.
@@ -53,6 +77,37 @@ class EstimateDepthOptions:
             raise InputError(f"--seed {self.seed}: expected 0 or more, below 2^63.")
         if self.output is not None and self.output.suffix != ".safetensors":
             raise InputError(f"--output {self.output}: expected a file that ends in .safetensors.")
+
+        self._check_sources()
+
+    def _check_sources(self) -> None:
+        """Check that one source of maps is chosen, and that all options belong to it."""
+        own = {"--model": self.model, "--train-steps": self.train_steps, "--seconds": self.seconds}
+        own |= {"--output": self.output, "--preset": None if self.preset == "lite" else self.preset}
+        own |= {"--seed": self.seed or None}
+        of_hf = {"--hf-output": None if self.hf_output == "auto" else self.hf_output}
+        of_files = {"--maps-kind": self.maps_kind, "--maps-along": self.maps_along}
+        of_files |= {"--metres-per-count": self.metres_per_count, "--maps-trained-on": self.maps_trained_on}
+        if self.hf is not None and self.maps is not None:
+            raise InputError("--hf and --maps: expected one source of maps. Leave one of them out.")
+        source = "--maps" if self.maps is not None else "--hf" if self.hf is not None else "a network of our own"
+        for owner, options in (("a network of our own", own), ("--hf", of_hf), ("--maps", of_files)):
+            given = [name for name, value in options.items() if value is not None]
+            if owner != source and given:
+                raise InputError(
+                    f"{', '.join(given)}: for {owner}, but the maps come from {source}. Leave out the one or the other."
+                )
+        if self.maps is None:
+            return
+        if len(self.scenes) > 1:
+            raise InputError(f"--maps {self.maps}: holds the maps of one scene, {len(self.scenes)} are given.")
+        if self.maps_kind is None or self.maps_along is None:
+            raise InputError(
+                f"--maps {self.maps}: say what its values are, with --maps-kind metric, relative or inverse, and "
+                "--maps-along ray or z."
+            )
+        if self.metres_per_count is not None and not 0 < self.metres_per_count < 1000:
+            raise InputError(f"--metres-per-count {self.metres_per_count:g}: expected more than 0, below 1000.")
 
     @property
     def trains(self) -> bool:

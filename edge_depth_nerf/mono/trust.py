@@ -2,7 +2,8 @@
 
 Made from training frames alone. Of each frame some returns are left out, the prior is made of the rest, and compared
 with what was left out: whole blocks of 64 px (of 1400), single returns, and in every second frame LiDAR's lowest and
-highest rows, beyond which a prior is extrapolated. The result is kept beside the scene's maps.
+highest rows, beyond which a prior is extrapolated. Above a frame's own returns the prior is compared with what the
+returns of the other frames show there. The result is kept beside the scene's maps.
 """
 
 from __future__ import annotations
@@ -17,12 +18,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import track
+from rich.progress import Progress
 
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.inspecting.reader import InspectedPicture, InspectedScene, read_scene
 from edge_depth_nerf.mono.alignment import LEAST_RETURNS, align, both, fit_logs
 from edge_depth_nerf.mono.error_model import (
+    FIELD_MARGIN_DEG,
     TRUST_FILE,
     FrameAlignment,
     Trust,
@@ -31,6 +33,7 @@ from edge_depth_nerf.mono.error_model import (
     pixel_features,
     read_trust,
 )
+from edge_depth_nerf.mono.far_seen import seen_above, static_cloud
 from edge_depth_nerf.prior import CACHE_VERSION, PriorOptions, View, integrate_frame, view_of
 
 MOST_FRAMES = 100
@@ -55,7 +58,7 @@ class MeasuredFrame:
     alignment: FrameAlignment
     """How well its map was fitted."""
     features: dict[str, NDArray[np.float32]]
-    """Of the pixels of left-out returns."""
+    """Of the pixels of left-out returns, and of those that other frames' returns show."""
     relative_error: NDArray[np.float32]
     """|d̃ - d| / d̃ there."""
     return_features: dict[str, NDArray[np.float32]]
@@ -221,13 +224,16 @@ def _calibrate(
         maps = scene.maps(picture, with_prior=False)
         assert maps.lidar_m is not None and maps.mono_m is not None
         view = view_of(picture.lens, picture.up_in_camera)
-        return measure_frame(picture.name, number, maps.lidar_m, maps.mono_m, maps.usable, view, options)
+        far_seen_m = seen_above(cloud, scene, picture, (picture.lens.width, picture.lens.height))
+        return measure_frame(picture.name, number, maps.lidar_m, maps.mono_m, maps.usable, view, options, far_seen_m)
 
-    with ThreadPoolExecutor(2) as pool:
-        measuring = pool.map(measure, enumerate(measurable))
-        description, quiet = "Measuring the prior's error…", console is None
-        progress = track(measuring, description, len(measurable), console=console, transient=True, disable=quiet)
-        frames = list(progress)
+    with Progress(console=console, transient=True, disable=console is None) as progress, ThreadPoolExecutor(2) as pool:
+        task = progress.add_task("Measuring the prior's error…", total=4 * len(measurable))
+        cloud = static_cloud(scene, measurable, lambda: progress.advance(task))
+        frames = []
+        for frame in pool.map(measure, enumerate(measurable)):
+            frames.append(frame)
+            progress.advance(task)
     return combine(frames, options, _made_of(scene, pictures, options), everywhere=_trained_on(scene) == "elsewhere")
 
 
@@ -239,6 +245,7 @@ def measure_frame(
     usable: NDArray[np.bool_],
     view: View,
     options: PriorOptions,
+    far_seen_m: NDArray[np.float32] | None = None,
 ) -> MeasuredFrame:
     """Leave out some of a frame's returns, make its prior of the rest, and compare.
 
@@ -250,6 +257,7 @@ def measure_frame(
         usable: H×W, True where the picture may be used.
         view: the angles of its rays.
         options: of the prior.
+        far_seen_m: H×W distance that the returns of other frames show above this one's, 0 = none.
 
     Raises:
         InputError: the maps differ in size.
@@ -264,7 +272,13 @@ def measure_frame(
     aligned = align(kept_m, mono_m, usable, mode)
     frame = integrate_frame(kept_m, mono_m, usable, options)
     features = pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, frame.returns, view.theta_rad)
-    judged = _some(left_out & (frame.distance_m > 0), _JUDGED_A_FRAME, rng)
+    has_prior = frame.distance_m > 0
+    measured_m, measured = lidar_m, left_out
+    if far_seen_m is not None and returns.any():
+        highest = np.quantile(view.elevation_rad[returns], FIELD_QUANTILES[1]) + np.radians(FIELD_MARGIN_DEG)
+        far_seen = usable & (far_seen_m > 0) & ~returns & (view.elevation_rad <= highest)
+        measured_m, measured = np.where(far_seen, far_seen_m, lidar_m), left_out | far_seen
+    judged = _some(measured & has_prior, _JUDGED_A_FRAME, rng)
     distance = frame.distance_m[judged]
     # of a prior that keeps its returns; where none is kept (mono alone), or all are averaged, there is no such pixel
     found, error_by_neighbours = error_of_returns(lidar_m, frame.returns)
@@ -279,7 +293,7 @@ def measure_frame(
     return MeasuredFrame(
         FrameAlignment(name, int(returns.sum()), aligned.fit_of, aligned.fit, error(mono_m), error(aligned.mono_m)),
         {feature: values[judged] for feature, values in features.items()},
-        np.abs(distance - lidar_m[judged]) / distance,
+        np.abs(distance - measured_m[judged]) / distance,
         {feature: values[kept] for feature, values in features.items()},
         error_by_neighbours[kept],
         view.elevation_rad[usable & (lidar_m > 0)],

@@ -1,0 +1,143 @@
+"""Monocular maps of a source that this project did not train, made metric: by ready-made networks, or by file.
+
+Metric maps stay as they are, but that views of one picture are brought to agree. Others are fitted to LiDAR: each
+picture to its own returns, for a map of unknown scale has another scale in every picture. One with too few returns
+takes scale and shift of the drive, from pictures for training. So nothing of a held-out picture enters another one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float32
+
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.inspecting.reader import InspectedPicture, InspectedScene
+from edge_depth_nerf.mono.alignment import LEAST_RETURNS
+from edge_depth_nerf.mono.examples import read_lidar, view_of
+from edge_depth_nerf.mono.relative import (
+    WRONG_WAY,
+    Kind,
+    Layer,
+    Line,
+    Samples,
+    blend,
+    fit_lines,
+    rank_correlation,
+    take_samples,
+)
+
+_SAMPLES = 3000
+_SAMPLES_FOR_THE_DRIVE = 300
+"""Returns of a picture, and so many other pixels."""
+
+
+@dataclass
+class FittedMaps:
+    """The maps of a scene, made metric one after another.
+
+    Raises:
+        InputError: maps of unknown scale, and a camera without LiDAR to fit them to.
+
+    """
+
+    scene: InspectedScene
+    kind: Kind
+    layers: Callable[[InspectedPicture], Sequence[Layer]]
+    """What a picture's views say."""
+    by_the_drive: list[str] = field(default_factory=list)
+    """Pictures that took the drive's fit so far."""
+
+    def __post_init__(self) -> None:
+        if self.kind == "metric":
+            return
+        for camera, pictures in self.scene.cameras().items():
+            # most often the first will do
+            if not any(not picture.held_out and self._returns(picture) >= LEAST_RETURNS for picture in pictures):
+                raise self._no_lidar(camera)
+
+    def __iter__(self) -> Iterator[tuple[InspectedPicture, Float32[np.ndarray, "h w"]]]:
+        """Give H×W metres along the ray of all pictures; those with few returns come last."""
+        waiting: list[InspectedPicture] = []
+        drive: dict[str, list[Samples]] = {}
+        for picture in self.scene.pictures:
+            if self.kind != "metric" and self._returns(picture) < LEAST_RETURNS:
+                waiting.append(picture)
+                continue
+            layers, samples = self._seen(picture)
+            if self.kind != "metric" and samples.returns < LEAST_RETURNS:
+                waiting.append(picture)
+                continue
+            if self.kind == "metric":
+                start = [Line()] * len(layers)
+                lines = fit_lines(samples, self.kind, start) if len(layers) > 1 else start
+            else:
+                self._check_direction(picture, samples)
+                lines = fit_lines(samples, self.kind)
+                if not picture.held_out:
+                    drive.setdefault(picture.camera, []).append(_thinned(samples))
+            yield picture, self._blended(picture, layers, lines)
+        of_drive: dict[str, list[Line]] = {}
+        for picture in waiting:
+            if picture.camera not in drive:
+                raise self._no_lidar(picture.camera)
+            if picture.camera not in of_drive:
+                of_drive[picture.camera] = fit_lines(Samples.joined(drive[picture.camera]), self.kind)
+            layers, samples = self._seen(picture)
+            lines = fit_lines(samples, self.kind, of_drive[picture.camera])
+            self.by_the_drive.append(picture.name)
+            yield picture, self._blended(picture, layers, lines)
+
+    def _no_lidar(self, camera: str) -> InputError:
+        return InputError(
+            f"{self.scene.path}: no picture for training of {camera} has {LEAST_RETURNS} LiDAR returns where its map "
+            f"has values, so {self.kind} maps, of unknown scale, cannot be made metric. Process the drive with its "
+            "sweeps, or take a source of metric maps."
+        )
+
+    def _seen(self, picture: InspectedPicture) -> tuple[Sequence[Layer], Samples]:
+        layers = self.layers(picture)
+        usable = self._usable(picture)
+        lidar_m = read_lidar(self.scene, picture) if "lidar" in picture.files else np.zeros(usable.shape, np.float32)
+        return layers, take_samples(layers, lidar_m, usable, _SAMPLES)
+
+    def _usable(self, picture: InspectedPicture) -> np.ndarray:
+        return view_of(picture, self.scene.theta_max_rad, max(picture.lens.width, picture.lens.height)).usable
+
+    def _returns(self, picture: InspectedPicture) -> int:
+        if "lidar" not in picture.files:
+            return 0
+        return int((self._usable(picture) & (read_lidar(self.scene, picture) > 0)).sum())
+
+    def _blended(
+        self, picture: InspectedPicture, layers: Sequence[Layer], lines: Sequence[Line]
+    ) -> Float32[np.ndarray, "h w"]:
+        return blend(layers, lines, self.kind, (picture.lens.height, picture.lens.width))
+
+    def _check_direction(self, picture: InspectedPicture, samples: Samples) -> None:
+        """Find depth that is declared disparity, or the other way round."""
+        returns = np.flatnonzero(samples.lidar_m > 0)
+        best = np.where(samples.seen, samples.weight, -1)[:, returns].argmax(0)
+        values, cosine = samples.values[best, returns], samples.cosine[best, returns]
+        known = np.isfinite(values)
+        z = (samples.lidar_m[returns] * cosine)[known]
+        found = rank_correlation(values[known], z) * (-1 if self.kind == "inverse" else 1)
+        if found < WRONG_WAY:
+            other = "relative (or metric)" if self.kind == "inverse" else "inverse"
+            raise InputError(
+                f"{picture.name}: its map {'rises' if self.kind == 'inverse' else 'falls'} where LiDAR's distance "
+                f"rises (rank correlation {abs(found):.2f}), so it is not {self.kind}. Declare it {other}."
+            )
+
+
+def _thinned(samples: Samples) -> Samples:
+    rng = np.random.default_rng(0)
+    has_return = samples.lidar_m > 0
+    chosen = np.concatenate(
+        [rng.permutation(np.flatnonzero(each))[:_SAMPLES_FOR_THE_DRIVE] for each in (has_return, ~has_return)]
+    )
+    return Samples(
+        samples.values[:, chosen], samples.cosine[:, chosen], samples.weight[:, chosen], samples.lidar_m[chosen]
+    )

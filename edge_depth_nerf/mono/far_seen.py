@@ -1,0 +1,196 @@
+"""What LiDAR saw from elsewhere: the returns of other moments, as a picture sees them above its own LiDAR's reach.
+
+A scanner's field ends some degrees above the horizon, a fisheye's does not. But what stands high up before a picture
+was in the scanner's field when the vehicle was farther away. So the returns of all training moments are put together
+as points in the world, what moved is taken out, and the rest is projected into each picture, above its own returns
+alone: within their field these are denser, and what they do not show is mostly hidden.
+
+Lengths are metres, distances along the ray, 0 = none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Float64, Int32
+from numpy.typing import NDArray
+
+from edge_depth_nerf.inspecting.reader import InspectedPicture, InspectedScene
+from edge_depth_nerf.lidar.projection import project_points
+from edge_depth_nerf.lidar.voxels import first_in_voxel
+from edge_depth_nerf.mono.examples import lens_rays, read_lidar, scaled_lens, view_of
+
+VOXEL_M = 0.05
+"""The cloud holds one point of each cube of this size."""
+SPACING_RAD = 0.0075
+"""How far apart returns lie, seen from where they were measured: 0.43°, that of a scanner of 64 beams."""
+FIELD_QUANTILE = 0.99
+"""Above this quantile of its own returns' elevation a picture has next to none of its own."""
+_BELOW_SINE = 0.02
+"""Points so little below hide what is above."""
+_AZIMUTHS = 360
+_MERGE_AT = 4_000_000
+"""So many points are collected before they are thinned."""
+_SAME, _SAME_M = 1.05, 0.3
+"""What differs in distance by less than this ratio or by less than this length may be one thing."""
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Points in the scene's world."""
+
+    points_m: Float64[np.ndarray, "points 3"]
+    spacing_m: Float32[np.ndarray, "points"]
+    """How wide a patch of surface each stands for."""
+
+
+@dataclass(frozen=True)
+class _Field:
+    """What a picture's own returns reach."""
+
+    top_sine: float
+    """Sine of their highest elevation, but for a few; 1 without returns."""
+    reach_m: Float32[np.ndarray, "azimuths"]
+    """How far off, horizontally, the picture can see above them, by azimuth. What a return at the upper edge belongs
+    to may go on above it, as a house does, and hide what is behind."""
+
+
+def static_cloud(
+    scene: InspectedScene, pictures: Sequence[InspectedPicture], advance: Callable[[], None] = lambda: None
+) -> Cloud:
+    """Put the returns of some pictures together, as far as they are above any of these pictures' own.
+
+    What more of the pictures see through than see has moved, and is left out.
+
+    Args:
+        scene: the scene.
+        pictures: those whose LiDAR maps are used.
+        advance: called three times a picture.
+
+    Raises:
+        InputError: a file cannot be decoded, or has another size than its camera.
+
+    """
+    tops = []
+    for picture in pictures:
+        tops.append(_field(scene, picture).top_sine)
+        advance()
+    points, spacings = [np.empty((0, 3))], [np.empty(0, np.float32)]
+    for number, picture in enumerate(pictures):
+        rays, lidar_m = _own(scene, picture)
+        seen = lidar_m > 0
+        points.append(_to_world(picture, rays[seen] * lidar_m[seen, None]))
+        spacings.append((SPACING_RAD * lidar_m[seen]).astype(np.float32))
+        if number == len(pictures) - 1 or sum(map(len, points)) > _MERGE_AT:
+            points_m, spacing_m = np.concatenate(points), np.concatenate(spacings)
+            kept = first_in_voxel(points_m, VOXEL_M)
+            kept = kept[_above_any(pictures, tops, points_m[kept])]
+            points, spacings = [points_m[kept]], [spacing_m[kept]]
+        advance()
+    votes = np.zeros(len(points[0]), np.int32)
+    for picture in pictures:
+        votes += _votes(picture, points[0], _own(scene, picture)[1])
+        advance()
+    return Cloud(points[0][votes >= 0], spacings[0][votes >= 0])
+
+
+def seen_above(
+    cloud: Cloud, scene: InspectedScene, picture: InspectedPicture, size: tuple[int, int]
+) -> Float32[np.ndarray, "h w"]:
+    """Project a cloud into a picture, above the picture's own returns, without what is or may be hidden.
+
+    Args:
+        cloud: from `static_cloud`.
+        scene: the scene.
+        picture: one of it, with LiDAR.
+        size: width and height of the map.
+
+    """
+    field = _field(scene, picture)
+    high = _is_above(picture, cloud.points_m, field.top_sine)
+    in_camera, spacing_m = torch.from_numpy(_to_camera(picture, cloud.points_m[high])), cloud.spacing_m[high]
+    projected = project_points(in_camera, scaled_lens(picture.lens, size), spacing_m=torch.from_numpy(spacing_m))
+    distance_m = projected.distance_m.float().numpy()
+    rays, within = lens_rays(picture.lens, scene.theta_max_rad, size)
+    sine = rays @ picture.up_in_camera.astype(np.float32)
+    visible = _level_m(distance_m, sine) <= field.reach_m[_azimuth(picture, rays)]
+    return np.where(within & (sine > field.top_sine) & visible, distance_m, np.float32(0))
+
+
+def _field(scene: InspectedScene, picture: InspectedPicture) -> _Field:
+    rays, lidar_m = _own(scene, picture)
+    rays, lidar_m = rays[lidar_m > 0], lidar_m[lidar_m > 0]
+    if not len(lidar_m):
+        return _Field(1.0, np.zeros(_AZIMUTHS, np.float32))
+    sine, azimuth = rays @ picture.up_in_camera.astype(np.float32), _azimuth(picture, rays)
+    highest_m = np.full(_AZIMUTHS, np.inf, np.float32)
+    # of several values for one azimuth the last one stays
+    upward = np.argsort(sine, kind="stable")
+    highest_m[azimuth[upward]] = _level_m(lidar_m, sine)[upward]
+    nearest_m = np.minimum(np.minimum(np.roll(highest_m, 1), np.roll(highest_m, -1)), highest_m)
+    return _Field(float(np.quantile(sine, FIELD_QUANTILE)), (_SAME * nearest_m + _SAME_M).astype(np.float32))
+
+
+def _level_m(distance_m: NDArray[np.float32], sine: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Horizontal distance."""
+    return distance_m * np.sqrt(np.maximum(1 - sine**2, 0))
+
+
+def _azimuth(picture: InspectedPicture, rays: Float32[np.ndarray, "*shape 3"]) -> NDArray[np.intp]:
+    """Which of the azimuths rays in the camera's frame have in the world."""
+    world = (rays * np.array([1.0, -1.0, -1.0])) @ picture.rotation.T
+    turn = np.arctan2(world[..., 1], world[..., 0]) / (2 * np.pi) + 0.5
+    return (turn * _AZIMUTHS).astype(np.intp) % _AZIMUTHS
+
+
+def _is_above(
+    picture: InspectedPicture, points_m: Float64[np.ndarray, "n 3"], top_sine: float
+) -> Bool[np.ndarray, "n"]:
+    """Whether points lie above a picture's returns, or so little below that they hide what does."""
+    from_camera = points_m - picture.position_m
+    return from_camera[:, 2] > (top_sine - _BELOW_SINE) * np.linalg.norm(from_camera, axis=1)
+
+
+def _above_any(
+    pictures: Sequence[InspectedPicture], tops: Sequence[float], points_m: Float64[np.ndarray, "n 3"]
+) -> Bool[np.ndarray, "n"]:
+    above = np.zeros(len(points_m), bool)
+    for picture, top_sine in zip(pictures, tops, strict=True):
+        above |= _is_above(picture, points_m, top_sine)
+    return above
+
+
+def _own(
+    scene: InspectedScene, picture: InspectedPicture
+) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
+    """A picture's rays, and its LiDAR map within the mask, at its own size."""
+    view = view_of(picture, scene.theta_max_rad, max(picture.lens.width, picture.lens.height))
+    return view.rays, np.where(view.usable, read_lidar(scene, picture), np.float32(0))
+
+
+def _to_world(picture: InspectedPicture, in_camera: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+    return (in_camera * np.array([1.0, -1.0, -1.0])) @ picture.rotation.T + picture.position_m
+
+
+def _to_camera(picture: InspectedPicture, points_m: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+    return (points_m - picture.position_m) @ picture.rotation * np.array([1.0, -1.0, -1.0])
+
+
+def _votes(
+    picture: InspectedPicture, points_m: Float64[np.ndarray, "n 3"], lidar_m: Float32[np.ndarray, "h w"]
+) -> Int32[np.ndarray, "n"]:
+    """1 for each point that the picture's own returns confirm, -1 for each that they saw through, else 0."""
+    in_camera = torch.from_numpy(_to_camera(picture, points_m))
+    pixels, valid = picture.lens.project(in_camera)
+    seen = (valid & picture.lens.inside(pixels)).numpy()
+    column, row = pixels[torch.from_numpy(seen)].long().unbind(-1)
+    measured_m = lidar_m[row.numpy(), column.numpy()]
+    distance_m = in_camera[torch.from_numpy(seen)].norm(dim=-1).numpy()
+    beyond = (measured_m > distance_m * _SAME) & (measured_m > distance_m + _SAME_M)
+    hides = (distance_m > measured_m * _SAME) & (distance_m > measured_m + _SAME_M)
+    votes = np.zeros(len(points_m), np.int32)
+    votes[seen] = np.where(measured_m == 0, 0, np.where(beyond, -1, np.where(hides, 0, 1)))
+    return votes

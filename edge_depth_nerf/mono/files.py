@@ -1,0 +1,168 @@
+"""Monocular maps from any other tool, by file: FOLDER/CAMERA/FRAME.npy or .png, one for each picture of a scene."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.files import DISTANCE_STEPS_PER_METRE, read_distance_png
+from edge_depth_nerf.inspecting.reader import InspectedPicture, InspectedScene
+from edge_depth_nerf.mono.examples import lens_rays
+from edge_depth_nerf.mono.options import Along
+from edge_depth_nerf.mono.relative import Kind, Layer
+from edge_depth_nerf.process.png import read_png_header
+
+LEAST_COSINE = 0.02
+"""Below (beyond 88.9°) z says nothing of the distance: a count of 4 mm is 0.2 m."""
+
+
+@dataclass(frozen=True)
+class MapFiles:
+    """The maps of one scene, checked by their headers."""
+
+    by_picture: Mapping[str, Path]
+    """File of each picture, by the picture's file_path."""
+    kind: Kind
+    along: Along
+    metres_per_count: float
+    """Of PNGs."""
+
+    def layer(self, scene: InspectedScene, picture: InspectedPicture) -> Layer:
+        """Read a picture's map.
+
+        Raises:
+            InputError: it cannot be read, or holds no positive number.
+
+        """
+        path = self.by_picture[picture.name]
+        values = read_npy(path) if path.suffix == ".npy" else read_distance_png(path, self.metres_per_count)
+        values = np.where(np.isfinite(values) & (values > 0), values, np.float32(np.nan))
+        if np.isnan(values).all():
+            raise InputError(
+                f"{path}: holds no positive number, only zeros, negative numbers, NaN or infinity: no map of anything. "
+                "Make it again, or leave the frame out of the scene."
+            )
+        size = (picture.lens.width, picture.lens.height)
+        if self.along == "ray":
+            cosine = np.ones(values.shape, np.float32)
+        else:
+            cosine = lens_rays(picture.lens, scene.theta_max_rad, size)[0][..., 2]
+        whole = slice(0, size[1]), slice(0, size[0])
+        return Layer(whole, values, cosine, (cosine >= LEAST_COSINE).astype(np.float32))
+
+
+def find_maps(
+    scene: InspectedScene, folder: Path, kind: Kind, along: Along, metres_per_count: float | None
+) -> MapFiles:
+    """Find a map for every picture of a scene, and check all by their headers.
+
+    Args:
+        scene: whose pictures they are of.
+        folder: holds CAMERA/FRAME.npy or .png, with the names of the scene's cameras and pictures.
+        kind: what the values are.
+        along: whether they count along the ray or along the optical axis.
+        metres_per_count: of PNGs; None where that is not declared.
+
+    Raises:
+        FileNotFoundError: the folder or a map is not there.
+        InputError: a map is of another size than its picture, or of a kind that is not read.
+
+    """
+    if not folder.is_dir():
+        raise FileNotFoundError(
+            f"{folder}: no such folder. --maps takes the folder that holds CAMERA/FRAME.npy or .png."
+        )
+    found = {picture.name: _find(folder, picture) for picture in scene.pictures}
+    for picture in scene.pictures:
+        path = found[picture.name]
+        height, width = npy_shape(path) if path.suffix == ".npy" else _png_shape(path)
+        if (width, height) != (picture.lens.width, picture.lens.height):
+            raise InputError(
+                f"{path}: is {width}×{height} (width × height), its picture {picture.name} "
+                f"{picture.lens.width}×{picture.lens.height}. A map needs a value for every pixel: make it in the "
+                "picture's own size."
+            )
+    has_png = any(path.suffix == ".png" for path in found.values())
+    if has_png and kind == "metric" and metres_per_count is None:
+        raise InputError(
+            f"{folder}: holds PNGs, whose counts may be anything. Say --metres-per-count, such as 0.00390625 (1/256 m, "
+            "as in this project and KITTI) or 0.001."
+        )
+    if not has_png and metres_per_count is not None:
+        raise InputError(
+            f"--metres-per-count {metres_per_count:g}: is for PNGs, {folder} holds .npy, which are in metres."
+        )
+    return MapFiles(found, kind, along, metres_per_count or 1 / DISTANCE_STEPS_PER_METRE)
+
+
+def _find(folder: Path, picture: InspectedPicture) -> Path:
+    camera = [part for part in Path(picture.camera).parts if part not in ("..", "/")]
+    stem = folder.joinpath(*camera, Path(picture.name).stem)
+    choices = [stem.with_name(f"{stem.name}{suffix}") for suffix in (".npy", ".png")]
+    there = [path for path in choices if path.is_file()]
+    if not there:
+        raise FileNotFoundError(
+            f"{choices[0]}: no such file, nor {choices[1].name}. --maps needs a map for every picture of the scene, "
+            "under its camera's and its own name."
+        )
+    if len(there) > 1:
+        raise InputError(f"{there[0]}: there is {there[1].name} as well. Leave one map for each picture.")
+    return there[0]
+
+
+def _png_shape(path: Path) -> tuple[int, int]:
+    header = read_png_header(path)
+    if not header.is_distance:
+        raise InputError(
+            f"{path}: {header.bit_depth}-bit {header.colour}, expected a 16-bit grey PNG. Other kinds have lost the "
+            "distance; export the map again, best as .npy."
+        )
+    return header.height, header.width
+
+
+def npy_shape(path: Path) -> tuple[int, int]:
+    """Height and width of the map in a .npy file, from its header, which is held against the file's size.
+
+    Raises:
+        InputError: not a .npy file, truncated, or not one map of floating-point numbers.
+
+    """
+    broken = "Save the map with numpy.save, as H×W floating-point numbers."
+    with path.open("rb") as file:
+        try:
+            version = np.lib.format.read_magic(file)
+            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            shape, _, kind = read(file)
+        except ValueError as error:
+            raise InputError(f"{path}: cannot be read as an array ({str(error).splitlines()[0]}). {broken}") from None
+        start, size = file.tell(), file.seek(0, 2)
+    if kind.kind != "f":
+        raise InputError(f"{path}: holds {kind}, expected float16, float32 or float64. {broken}")
+    sides = [side for side in shape if side != 1] if len(shape) > 2 else list(shape)
+    if len(sides) != 2 or min(sides) < 1:
+        raise InputError(f"{path}: its shape is {shape}, expected height × width. {broken}")
+    if size - start < math.prod(shape) * kind.itemsize:
+        raise InputError(
+            f"{path}: truncated: {size - start} bytes of numbers for a shape of {shape} of {kind}. Copy or make the "
+            "file again."
+        )
+    return sides[0], sides[1]
+
+
+def read_npy(path: Path) -> NDArray[np.float32]:
+    """Read a map, H×W.
+
+    Raises:
+        InputError: as `npy_shape`.
+
+    """
+    shape = npy_shape(path)
+    # beyond float32's range is infinity, which is no distance
+    with np.errstate(over="ignore"):
+        return np.load(path, allow_pickle=False).reshape(shape).astype(np.float32)
