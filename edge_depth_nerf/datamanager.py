@@ -39,7 +39,7 @@ from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.integration import IntegrationOptions
 from edge_depth_nerf.metrics import has_whole_window
 from edge_depth_nerf.mono.error_model import Trust
-from edge_depth_nerf.mono.trust import find_trust
+from edge_depth_nerf.mono.trust import field_of_source, find_trust
 from edge_depth_nerf.pixel_table import TABLE_VERSION, PixelBatch, PixelTable, PixelTableWriter
 from edge_depth_nerf.prior import CACHE_VERSION, Prior, PriorCache, PriorOptions, View, view_of
 
@@ -117,8 +117,8 @@ class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig):
         if missing:
             raise InputError(
                 f"{self.dataparser.data}: the scene has no {' and no '.join(missing)} distance maps, but depth_source "
-                f"{self.depth_source} needs them. Process the drive again (monocular maps: `edge-depth-nerf process "
-                "… --mono DIR`), or choose another --pipeline.datamanager.depth-source (integrated, lidar, mono), or "
+                f"{self.depth_source} needs them. Process the drive again (monocular maps alone: `edge-depth-nerf "
+                "estimate-depth`), or choose another --pipeline.datamanager.depth-source (integrated, lidar, mono), or "
                 "train without a prior by --pipeline.model.depth-loss none."
             )
         return PriorOptions(
@@ -243,8 +243,11 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         if with_prior and wanted:
             options = self.config.prior_options(has_lidar, has_mono)
             if has_lidar and has_mono and options.wants_trust:
-                trust = find_trust(data, options, cache_dir, dataset.image_filenames, CONSOLE)
+                unit = dataset.metadata["lidar_metres_per_count"], dataset.metadata["lidar_is_z_depth"]
+                trust = find_trust(data, options, cache_dir, dataset.image_filenames, CONSOLE, unit)
                 CONSOLE.log(f"Depth prior: {trust.summary()}.")
+            elif has_mono and options.sigma_mode == "calibrated" and options.depth_source == "mono":
+                trust = field_of_source(data)
         weight = self.config.prior_weight if options else 1.0
         path = cache_dir / "pixels" / f"{_table_key(dataset, options, trust, weight)}.npy"
         try:
@@ -339,7 +342,8 @@ def _writable(folder: Path) -> bool:
 
 def _remove_old(folder: Path) -> None:
     """Keep the tables that were used last."""
-    tables = sorted(folder.glob("*.npy"), key=lambda path: path.stat().st_mtime_ns)
+    # names that begin with a dot are files that another process is writing
+    tables = sorted(folder.glob("[!.]*.npy"), key=lambda path: path.stat().st_mtime_ns)
     for path in tables[:-KEPT_TABLES]:
         path.with_suffix(".json").unlink(missing_ok=True)
         path.unlink(missing_ok=True)

@@ -19,6 +19,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, Nerfst
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import DISTANCE_STEPS_PER_METRE, read_json
 from edge_depth_nerf.scale import default_metres_per_unit
+from edge_depth_nerf.scene_format import is_own_scene
 
 SUPPORTED_CAMERA_TYPES = (CameraType.PERSPECTIVE, CameraType.FISHEYE)
 
@@ -158,8 +159,8 @@ class FisheyeDepth(Nerfstudio):
         meta = read_json(path)
         frames = check_meta(meta, path)
         check_split(meta, path)
-        own_scene = any(key in frames[0] for key in MAP_KEYS.values())
-        if own_scene and self.config.downscale_factor not in (None, 1):
+        has_maps = any(key in frames[0] for key in MAP_KEYS.values())
+        if has_maps and self.config.downscale_factor not in (None, 1):
             raise InputError(
                 f"{path}: downscale_factor is {self.config.downscale_factor}, but the distance maps of this scene "
                 "have one size only. Run `edge-depth-nerf process … --downscale K` instead."
@@ -203,7 +204,7 @@ class FisheyeDepth(Nerfstudio):
         if metadata["lidar_filenames"] is None and depth_filenames is not None:
             metadata["lidar_filenames"] = depth_filenames
             metadata["lidar_metres_per_count"] = unit
-            own = own_scene or is_fisheye
+            own = is_own_scene(meta) or is_fisheye
             kind = self.config.depth_kind if self.config.depth_kind != "auto" else ("distance" if own else "z_depth")
             metadata["lidar_is_z_depth"] = kind == "z_depth"
         metadata["metres_per_unit"] = metres_per_unit

@@ -46,7 +46,8 @@ class EdgeDepthPipeline(VanillaPipeline):
         if model.depth_loss != "none" and sampler is not None and sampler.table.share_with_prior == 0:
             raise InputError(
                 f"{manager.get_datapath()}: no training pixel has a depth prior, so nothing for the depth loss "
-                f"{model.depth_loss!r}. Process the drive with LiDAR or with --mono DIR, or train without a prior by "
+                f"{model.depth_loss!r}. Process the drive with LiDAR, or make monocular maps by "
+                "`edge-depth-nerf estimate-depth`, or train without a prior by "
                 "--pipeline.model.depth-loss none."
             )
 

@@ -123,7 +123,7 @@ def test_nothing_is_integrated_for_rendering(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("has", "source", "message"),
     [
-        (dict(mono=False), "integrated", "no monocular distance maps.*--mono.*depth-source"),
+        (dict(mono=False), "integrated", "no monocular distance maps.*estimate-depth.*depth-source"),
         (dict(mono=False), "mono", "no monocular"),
         (dict(lidar=False), "lidar", "no LiDAR"),
         (dict(lidar=False, mono=False), "integrated", "no LiDAR and no monocular"),

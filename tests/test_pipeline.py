@@ -18,7 +18,7 @@ def build(scene, **model):
 
 def test_a_depth_loss_without_any_prior_is_an_error(tmp_path):
     scene = write_scene(tmp_path, lidar=False, mono=False)
-    with pytest.raises(InputError, match=r"no training pixel has a depth prior.*--mono.*depth-loss none"):
+    with pytest.raises(InputError, match=r"no training pixel has a depth prior.*estimate-depth.*depth-loss none"):
         build(scene)
     pipeline, _ = build(scene, depth_loss="none")
     assert np.isfinite(float(pipeline.get_train_loss_dict(0)[1]["rgb_loss"].detach()))

@@ -161,3 +161,68 @@ def test_without_lidar_it_says_what_to_do(room: RoomDrive, tmp_path: Path, monke
     monkeypatch.setattr("edge_depth_nerf.process.kitti360.process_kitti360", lambda *_: report)
     assert "--mono-model" in run(options_of(room, scene))
     assert not read_scene(scene).has("mono")
+
+
+def own_maps(drive: RoomDrive, folder: Path, distance_m: float) -> Path:
+    for camera in ("image_02", "image_03"):
+        for frame in drive.frames:
+            write_distance_png(folder / f"{camera}/{frame:010d}.png", np.full((64, 64), distance_m))
+    return folder
+
+
+def put_in(scene: Path, distance_m: float) -> None:
+    names = [picture.name for picture in read_scene(scene).pictures]
+    maps = ((name, np.full((64, 64), distance_m, np.float32)) for name in names)
+    write_mono_maps(scene, maps, {"trained_on": "elsewhere"})
+
+
+def distances(scene: Path) -> set[float]:
+    frames = read_json(scene / "transforms.json")["frames"]
+    return {float(value) for f in frames for value in np.unique(read_distance_png(scene / f["mono_file_path"]))} - {0.0}
+
+
+def test_maps_put_in_over_those_of_the_drive_stay_with_their_source(tmp_path: Path) -> None:
+    drive = write_room_drive(tmp_path / "drive", frames=6, size=64)
+    scene, mono = tmp_path / "scene", own_maps(drive, tmp_path / "mono", 9.0)
+    options = options_of(drive, scene, mono=mono, sky=False)
+    run(options)
+    assert distances(scene) == {9.0} and "mono" not in read_json(scene / "transforms.json")
+    put_in(scene, 3.0)
+    run(options)
+    assert distances(scene) == {3.0}
+    assert read_json(scene / "transforms.json")["mono"] == {"trained_on": "elsewhere"}
+    # one file renewed: all are the drive's again, none is mixed in
+    next(mono.rglob("0000000002.png")).touch()
+    assert "are left out" in run(options)
+    assert distances(scene) == {9.0} and "mono" not in read_json(scene / "transforms.json")
+
+
+def test_maps_that_were_being_put_in_are_not_taken_for_the_drives(tmp_path: Path) -> None:
+    drive = write_room_drive(tmp_path / "drive", frames=6, size=64)
+    scene = tmp_path / "scene"
+    options = options_of(drive, scene, mono=own_maps(drive, tmp_path / "mono", 9.0), sky=False)
+    run(options)
+    # killed while the new maps were moved in
+    meta = read_json(scene / "transforms.json")
+    write_distance_png(scene / meta["frames"][0]["mono_file_path"], np.full((64, 64), 5.0))
+    for frame in meta["frames"]:
+        del frame["mono_file_path"]
+    write_json(scene / "transforms.json", {**meta, "mono": {"unfinished": True}})
+    assert not read_scene(scene).has("mono")
+    run(options)
+    assert distances(scene) == {9.0}
+
+
+def test_a_map_that_is_lost_is_made_again(room: RoomDrive, tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    run(options_of(room, scene))
+    next((scene / "mono").rglob("*.png")).unlink()
+    said = run(options_of(room, scene))
+    assert "are left out" in said and "is trained already" in said
+    assert read_scene(scene).has("mono") and (scene / TRUST_FILE).is_file()
+
+
+def test_other_weights_for_a_scene_that_has_maps(room: RoomDrive, tmp_path: Path) -> None:
+    run(options_of(room, tmp_path / "scene"))
+    other = (tmp_path / "scene" / WEIGHTS).rename(tmp_path / "other.safetensors")
+    assert "they stay" in run(options_of(room, tmp_path / "scene", mono_model=other))

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 import trimesh
 from jaxtyping import Bool, Float32, Float64, UInt8
+from numpy.typing import NDArray
 
 from edge_depth_nerf.cameras import Camera, KannalaBrandt, Pinhole
 from edge_depth_nerf.errors import InputError
@@ -26,6 +27,7 @@ from edge_depth_nerf.files import DISTANCE_STEPS_PER_METRE, read_distance_png, r
 from edge_depth_nerf.integration import DepthSource
 from edge_depth_nerf.mono.error_model import TRUST_FILE, Trust, read_trust
 from edge_depth_nerf.prior import Prior, PriorOptions, make_prior, view_of
+from edge_depth_nerf.scene_format import is_own_scene
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 FISHEYE_MODEL = "OPENCV_FISHEYE"
@@ -135,14 +137,22 @@ class InspectedScene:
 
     @cached_property
     def trust(self) -> Trust | None:
-        """The calibration of its prior beside the maps; without one sigma is as under sigma_mode combined.
+        """The calibration of its prior beside the maps, if it was made of them as they are.
+
+        Without one sigma is as under sigma_mode combined.
 
         Raises:
             InputError: the file is broken.
 
         """
         path = self.folder / TRUST_FILE
-        return read_trust(path) if path.is_file() else None
+        if not path.is_file():
+            return None
+        read_trust(path)
+        # imported here: it reads scenes itself
+        from edge_depth_nerf.mono.trust import saved_trust
+
+        return saved_trust(self, PriorOptions())
 
     def cameras(self) -> dict[str, tuple[InspectedPicture, ...]]:
         """The pictures of each camera, in order of their moments."""
@@ -180,9 +190,8 @@ class InspectedScene:
         # after the check: the size in transforms.json may be anything, that of the decoded picture is in memory
         lens, cos_theta = _rays(picture.lens, self.theta_max_rad)
         usable = found["mask"] & lens if "mask" in found else lens
-        if "lidar" in found and self.lidar_is_z_depth:
-            ahead = lens & (cos_theta > 0)
-            found["lidar"] = np.where(ahead, found["lidar"] / np.where(ahead, cos_theta, 1), 0).astype(np.float32)
+        if "lidar" in found:
+            found["lidar"] = self._as_distance(found["lidar"], lens, cos_theta)
         lidar_m, mono_m = found.get("lidar"), found.get("mono")
         source = picture.depth_source() if with_prior else None
         prior = None
@@ -191,6 +200,32 @@ class InspectedScene:
             view = view_of(picture.lens, picture.up_in_camera) if self.trust else None
             prior = make_prior(lidar_m, mono_m, usable, options, self.trust, view)
         return PictureMaps(found["image"], lens, usable, lidar_m, mono_m, found.get("truth"), prior)
+
+    def lidar_m(self, picture: InspectedPicture) -> Float32[np.ndarray, "h w"]:
+        """Read a picture's LiDAR map alone: metres along the ray, 0 = none.
+
+        Raises:
+            InputError: it cannot be decoded, or has another size than the camera.
+
+        """
+        pixels = self._read("lidar", picture.files["lidar"])
+        width, height = picture.lens.width, picture.lens.height
+        if pixels.shape != (height, width):
+            raise InputError(
+                f"{picture.files['lidar']}: is {'×'.join(map(str, pixels.shape[1::-1]))} pixels (width × height), but "
+                f"the camera of {picture.name} is {width}×{height}. Pictures, masks and distance maps of a frame must "
+                "have one size; make the file again at that size."
+            )
+        return self._as_distance(pixels, *_rays(picture.lens, self.theta_max_rad)) if self.lidar_is_z_depth else pixels
+
+    def _as_distance(
+        self, pixels: NDArray[np.float32], lens: NDArray[np.bool_], cos_theta: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Turn what a LiDAR file holds into metres along the ray."""
+        if not self.lidar_is_z_depth:
+            return pixels
+        ahead = lens & (cos_theta > 0)
+        return np.where(ahead, pixels / np.where(ahead, cos_theta, 1), 0).astype(np.float32)
 
     def points_m(self) -> Float64[np.ndarray, "points 3"] | None:
         """Read the point cloud, if there is one.
@@ -274,7 +309,7 @@ def read_scene(scene: Path) -> InspectedScene:
     for number, frame in enumerate(frames):
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise InputError(f"{path}: frame {number} has no file_path. Every frame needs a picture and a pose.")
-    own = "world_offset_m" in meta or any(key in frames[0] for key in OWN_MAPS.values())
+    own = is_own_scene(meta)
     own_lidar = OWN_MAPS["lidar"] in frames[0]
     held_out, split_known = _held_out(meta)
     moments = _moments(frames)
@@ -316,11 +351,14 @@ def read_scene(scene: Path) -> InspectedScene:
 
 def _held_out(meta: dict[str, Any]) -> tuple[set[str], bool]:
     """Names that are kept from training, and whether the scene says so at all."""
-    lists = {}
+    lists: dict[str, set[str]] = {}
     for split in ("train", "val", "test"):
         names = meta.get(f"{split}_filenames")
         lists[split] = {name for name in names if isinstance(name, str)} if isinstance(names, list) else set()
-    return (lists["val"] | lists["test"]) - lists["train"], any(lists.values())
+    if lists["train"]:
+        # what no list names is not trained on either
+        return {frame["file_path"] for frame in meta["frames"]} - lists["train"], True
+    return lists["val"] | lists["test"], any(lists.values())
 
 
 def _camera_name(frame: dict[str, Any]) -> str:

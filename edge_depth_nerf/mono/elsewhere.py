@@ -79,6 +79,12 @@ class FittedMaps:
                 if not picture.held_out:
                     drive.setdefault(picture.camera, []).append(_thinned(samples))
             yield picture, self._blended(picture, layers, lines)
+        if waiting and not self.scene.split_known:
+            raise InputError(
+                f"{self.scene.path}: {waiting[0].name} has fewer than {LEAST_RETURNS} LiDAR returns, so its map needs "
+                "the fit of pictures for training; but the scene does not say which these are. Add train_filenames, "
+                "val_filenames and test_filenames, or take a source of metric maps."
+            )
         of_drive: dict[str, list[Line]] = {}
         for picture in waiting:
             if picture.camera not in drive:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from edge_depth_nerf.cameras import KannalaBrandt, Pinhole
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_distance_png, read_image, read_mask
+from edge_depth_nerf.files import read_image, read_mask
 from edge_depth_nerf.inspecting.reader import InspectedPicture, InspectedScene
 
 FarSeen = Callable[[InspectedPicture, tuple[int, int]], NDArray[np.float32]]
@@ -207,13 +207,7 @@ def _reduced(lidar_m: Float32[np.ndarray, "rows columns"], view: View) -> Float3
 
 def read_lidar(scene: InspectedScene, picture: InspectedPicture) -> Float32[np.ndarray, "h w"]:
     """A picture's own LiDAR map, as distances."""
-    lidar_m = read_distance_png(picture.files["lidar"], scene.lidar_metres_per_count)
-    check_size(lidar_m, picture, "lidar")
-    if scene.lidar_is_z_depth:
-        rays, within = lens_rays(picture.lens, scene.theta_max_rad, (picture.lens.width, picture.lens.height))
-        ahead = within & (rays[..., 2] > 0)
-        lidar_m = np.where(ahead, lidar_m / np.where(ahead, rays[..., 2], 1), 0).astype(np.float32)
-    return lidar_m
+    return scene.lidar_m(picture)
 
 
 def check_size(pixels: np.ndarray, picture: InspectedPicture, layer: str) -> None:

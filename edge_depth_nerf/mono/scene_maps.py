@@ -1,7 +1,8 @@
 """Monocular maps put into a scene that exists: whole, or not at all.
 
-The maps are first written beside the scene's own, then moved in, and transforms.json is rewritten last: a run that is
-killed, or fails on its last map, leaves the scene with the maps it had.
+The maps are first written beside the scene's own: a run that is killed, or fails on its last map, leaves the scene with
+the maps it had. When all are there transforms.json drops the old ones, they are moved in, and it names them: a run that
+is killed in that moment leaves a scene without monocular maps.
 """
 
 from __future__ import annotations
@@ -82,6 +83,11 @@ def write_mono_maps(
                 f"{found.path}: {len(missing)} of {len(pictures)} frames have no monocular map, such as {missing[0]}. "
                 "Give one for every frame."
             )
+        meta = read_json(found.path)
+        for frame in meta["frames"]:
+            frame.pop(LAYERS["mono"][1], None)
+        # `process` then knows that what lies there is not what it wrote
+        write_json(found.path, {**meta, MONO_ENTRY: {"unfinished": True}})
         # what was measured about the errors of other maps
         (found.folder / TRUST_FILE).unlink(missing_ok=True)
         for target in targets.values():
@@ -89,7 +95,6 @@ def write_mono_maps(
             (partial / target).replace(found.folder / target)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    meta = read_json(found.path)
     for frame in meta["frames"]:
         frame[LAYERS["mono"][1]] = targets[frame["file_path"]]
     meta[MONO_ENTRY] = dict(source)
@@ -112,10 +117,11 @@ def usable_distance(
             f"camera {size[0]}×{size[1]}. Make the map from the scene's own picture, in its size."
         )
     # comparisons with NaN are false
-    kept = lens_rays(picture.lens, scene.theta_max_rad, size)[1] & (metres > 0) & (metres <= FARTHEST_M)
+    usable = lens_rays(picture.lens, scene.theta_max_rad, size)[1]
     if "mask" in picture.files:
-        kept &= read_mask(picture.files["mask"])
-    if not kept.any():
+        usable = usable & read_mask(picture.files["mask"])
+    kept = usable & (metres > 0) & (metres <= FARTHEST_M)
+    if usable.any() and not kept.any():
         raise InputError(
             f"{picture.name}: its monocular map has no distance between 0 and {FARTHEST_M:g} m anywhere in the mask. "
             "Expected metres along the ray."

@@ -139,6 +139,7 @@ def find_trust(
     cache: Path | None = None,
     training_images: Collection[Path] | None = None,
     console: Console | None = None,
+    lidar_unit: tuple[float, bool] | None = None,
 ) -> Trust:
     """The scene's calibration for these options; made now and kept in SCENE/.cache where there is none.
 
@@ -148,6 +149,8 @@ def find_trust(
         cache: another folder than SCENE/.cache.
         training_images: the pictures that are trained on, where the scene does not say so itself.
         console: where progress is shown; nowhere by default.
+        lidar_unit: metres that a count of the LiDAR files stands for, and whether they hold z-depth, where someone
+            said otherwise than the scene.
 
     Raises:
         FileNotFoundError: no scene there.
@@ -155,6 +158,8 @@ def find_trust(
 
     """
     read = read_scene(scene)
+    if lidar_unit is not None:
+        read = dataclasses.replace(read, lidar_metres_per_count=lidar_unit[0], lidar_is_z_depth=lidar_unit[1])
     trust = saved_trust(read, options, cache, training_images)
     if trust is None:
         trust = _calibrate(read, _chosen(read, training_images), options, console)
@@ -163,6 +168,22 @@ def find_trust(
         except OSError:  # a scene that cannot be written: made anew each time
             pass
     return trust
+
+
+def field_of_source(scene: Path) -> Trust | None:
+    """What is known of a scene without LiDAR: how far up and down the maps' network was taught by LiDAR elsewhere.
+
+    Returns:
+        A calibration without errors, or None where the maps' source says nothing about its field.
+
+    """
+    source = read_scene(scene).meta.get("mono")
+    source = source if isinstance(source, dict) else {}
+    field_deg = source.get("field_deg")
+    if not isinstance(field_deg, list) or len(field_deg) != 2 or source.get("trained_on") == "elsewhere":
+        return None
+    low, high = (float(np.radians(value)) for value in field_deg)
+    return Trust("", None, None, (low, high), everywhere=False, drive_fit=None)
 
 
 def _cached(scene: InspectedScene, cache: Path | None, made_of: str) -> Path:
@@ -181,17 +202,20 @@ def _chosen(scene: InspectedScene, training_images: Collection[Path] | None = No
 
 
 def _made_of(scene: InspectedScene, pictures: Sequence[InspectedPicture], options: PriorOptions) -> str:
-    """Key of the options and of the names and sizes of the files: to read a long drive's maps would take minutes."""
+    """Key of the options, of the geometry, and of what is in the files of the pictures that are measured."""
     relevant = dataclasses.asdict(options)
     del relevant["sigma_mode"], relevant["sigma_constant_m"]
-    digest = hashlib.sha256(json.dumps([CACHE_VERSION, relevant, _trained_on(scene)], sort_keys=True).encode())
+    units = [scene.lidar_metres_per_count, scene.lidar_is_z_depth, round(scene.theta_max_rad, 9)]
+    digest = hashlib.sha256(json.dumps([CACHE_VERSION, relevant, _trained_on(scene), units], sort_keys=True).encode())
+    contents: dict[Path, bytes] = {}
     for picture in pictures:
-        sizes = [
-            (layer, path.name, path.stat().st_size)
-            for layer, path in sorted(picture.files.items())
-            if layer in ("lidar", "mono", "mask")
-        ]
-        digest.update(repr((picture.name, sizes, picture.rotation.round(9).tolist())).encode())
+        pose = picture.rotation.round(9).tolist(), picture.position_m.round(6).tolist()
+        digest.update(repr((picture.name, picture.lens, pose)).encode())
+        for layer in ("lidar", "mono", "mask"):
+            path = picture.files.get(layer)
+            if path is not None and path not in contents:
+                contents[path] = hashlib.sha256(path.read_bytes()).digest()
+            digest.update(layer.encode() + (b"" if path is None else contents[path]))
     return digest.hexdigest()[:16]
 
 
@@ -290,8 +314,11 @@ def measure_frame(
             return None
         return float(np.mean(np.abs(estimate_m[in_blocks] - lidar_m[in_blocks]) / lidar_m[in_blocks]))
 
+    count = int(returns.sum())
+    # near the least number those left out decide whose fit it is; the prior has all of them
+    fitted = aligned if count >= 2 * LEAST_RETURNS else align(lidar_m, mono_m, usable, mode)
     return MeasuredFrame(
-        FrameAlignment(name, int(returns.sum()), aligned.fit_of, aligned.fit, error(mono_m), error(aligned.mono_m)),
+        FrameAlignment(name, count, fitted.fit_of, fitted.fit, error(mono_m), error(aligned.mono_m)),
         {feature: values[judged] for feature, values in features.items()},
         np.abs(distance - measured_m[judged]) / distance,
         {feature: values[kept] for feature, values in features.items()},

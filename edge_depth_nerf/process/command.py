@@ -11,7 +11,7 @@ from rich.console import Console
 from edge_depth_nerf.console import say
 from edge_depth_nerf.inspecting.reader import InspectedScene, read_scene
 from edge_depth_nerf.process.options import JbnuDepth360Options, Kitti360Options, ProcessOptions, RigOptions
-from edge_depth_nerf.process.scene import ProcessReport
+from edge_depth_nerf.process.scene import MONO_ENTRY, ProcessReport
 
 
 def process(
@@ -54,6 +54,15 @@ def _check_network(options: ProcessOptions) -> None:
 def _add_mono(scene: InspectedScene, options: ProcessOptions, console: Console) -> None:
     """Give the scene monocular maps, if it has none, and the calibration of those it has."""
     lidar = scene.has("lidar")
+    if scene.has("mono") and options.mono_model is not None:
+        source = scene.meta.get(MONO_ENTRY)
+        if not isinstance(source, dict) or source.get("weights") != options.mono_model.name:
+            say(
+                console,
+                f"{scene.folder}: has monocular maps already, they stay. For those of {options.mono_model}: "
+                "`edge-depth-nerf estimate-depth SCENE --model …`.",
+                "yellow",
+            )
     if not scene.has("mono") and options.estimate_depth:
         if lidar or options.mono_model is not None:
             from edge_depth_nerf.mono.estimate import estimate_depth

@@ -250,6 +250,24 @@ def write_scene(
     for name, mask in masks.items():
         write_mask(output / f"masks/{name}.png", mask)
     work = _pending(output, frames, shifted, layers)
+    notices = []
+    later = _maps_put_in_later(output / TRANSFORMS)
+    if later is not None:
+        images = [_frame_files(frame, ())["image"] for frame in frames]
+        maps = [later.maps.get(image) for image in images]
+        whole = all(file is not None and (output / file).is_file() for file in maps)
+        if not whole or work.frames or work.shifted:
+            later = None
+            notices.append(
+                "The monocular maps that were put into this scene later are left out: they are not whole, or the "
+                "scene was written anew. Those of a network of the drive's own are made again; others are to be put "
+                "in again, by `edge-depth-nerf estimate-depth`."
+            )
+            if "mono" in layers:
+                # in their places belong the drive's
+                for frame in frames:
+                    (output / _frame_files(frame, layers)["mono"]).unlink(missing_ok=True)
+                work = _pending(output, frames, shifted, layers)
     jobs = [
         # the cameras of a moment one after another: they share its sweeps
         *(
@@ -269,11 +287,15 @@ def write_scene(
                 f"{output}: no LiDAR return lies in any training picture. Check the calibration from the scanner to "
                 "the cameras, and the masks (255 = use the pixel)."
             )
-    _write_transforms(output, cameras, scene_cameras, fits, frames, shifted, layers, offset, theta_max_deg, source)
+    content = _transforms(cameras, scene_cameras, fits, frames, shifted, layers, offset, theta_max_deg, source)
+    if later is not None:
+        content[MONO_ENTRY] = later.entry
+        for frame in content["frames"]:
+            frame[LAYERS["mono"][1]] = later.maps[frame["file_path"]]
+    write_json(output / TRANSFORMS, content)
     shutil.rmtree(output / _PARTIAL, ignore_errors=True)
 
     held_out = sum(frame.held_out for frame in frames)
-    notices = []
     if not held_out:
         notices.append("No frame is held out: evaluation runs on the training frames and says little.")
     return ProcessReport(
@@ -626,8 +648,28 @@ def _write_distance(path: Path, distance_m: DistanceMap, size: tuple[int, int], 
 # ---- transforms.json -------------------------------------------------------------------------------------------
 
 
-def _write_transforms(
-    output: Path,
+@dataclass(frozen=True)
+class _LaterMaps:
+    """Monocular maps that were put into the scene since it was written."""
+
+    entry: Any
+    """Where they come from."""
+    maps: dict[str, str]
+    """By picture."""
+
+
+def _maps_put_in_later(written: Path) -> _LaterMaps | None:
+    """Find what a transforms.json says of such maps."""
+    if not written.is_file():
+        return None
+    there = read_json(written)
+    if MONO_ENTRY not in there:
+        return None
+    key = LAYERS["mono"][1]
+    return _LaterMaps(there[MONO_ENTRY], {frame["file_path"]: frame[key] for frame in there["frames"] if key in frame})
+
+
+def _transforms(
     cameras: Sequence[SceneCamera],
     scene_cameras: Mapping[str, KannalaBrandt | Pinhole],
     fits: Mapping[str, CameraFit],
@@ -637,7 +679,7 @@ def _write_transforms(
     offset: Float64[np.ndarray, "3"],
     theta_max_deg: float,
     source: Mapping[str, Any],
-) -> None:
+) -> dict[str, Any]:
     def matrix(camera_to_world: Transform) -> list[list[float]]:
         moved = camera_to_world.copy()
         moved[:3, 3] -= offset
@@ -712,22 +754,4 @@ def _write_transforms(
         content["shifted_views"] = {
             str(metres): [view(item) for item in ordered if item.metres == metres] for metres in distances
         }
-    if "mono" not in layers:
-        _keep_mono(content, output / TRANSFORMS)
-    write_json(output / TRANSFORMS, content)
-
-
-def _keep_mono(content: dict[str, Any], written: Path) -> None:
-    """Keep naming the monocular maps that were put into the scene since it was written.
-
-    Where any of the scene's files were written now, there is no transforms.json any more, and the maps are made anew.
-    """
-    if not written.is_file():
-        return
-    there = read_json(written)
-    key = LAYERS["mono"][1]
-    maps = {frame["file_path"]: frame[key] for frame in there["frames"] if key in frame}
-    if MONO_ENTRY in there and all(frame["file_path"] in maps for frame in content["frames"]):
-        content[MONO_ENTRY] = there[MONO_ENTRY]
-        for frame in content["frames"]:
-            frame[key] = maps[frame["file_path"]]
+    return content
