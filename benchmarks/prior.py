@@ -10,8 +10,9 @@ folder: a run that was stopped goes on there. Then prints, for training and for 
 standard deviation over its seeds, against truth from 1 to 60 m inside the mask:
 
   coverage, AbsRel, RMSE and δ<1.25 of LiDAR alone, mono as it came, fitted by one curve a frame, aligned locally,
-  integrated with a spatial Gaussian (pooled as in the paper, and with the options of the integration), integrated, and
-  completed along the picture's colours (`mono/completion.py`, of mono as it came and of the aligned map);
+  aligned with the returns put in and no kernel, integrated with a spatial Gaussian (pooled as in the paper, and with
+  the options of the integration), integrated, and completed along the picture's colours (`mono/completion.py`, of mono
+  as it came and of the aligned map);
   the same inside and outside LiDAR's field of elevation (± 3°), within 4 px of depth edges, by ring of angle from the
   axis, and by distance in pixels from the nearest return;
   the part of the prior's pixels whose error is within 1 and 2 of its sigma;
@@ -170,6 +171,7 @@ def rivals(frame: Frame, drive_fit: Fit | None, prior: Prior | None, variants: b
         "mono": frame.mono_m,
         "mono, one curve a frame": one_curve,
         "mono aligned": aligned,
+        "aligned, returns kept": np.where(frame.usable & (frame.lidar_m > 0), frame.lidar_m, aligned),
         "spatial Gaussian, pooled": integrated(frame, aligned, integration="spatial-gaussian", **literal),
         "spatial Gaussian": integrated(frame, aligned, integration="spatial-gaussian"),
         "integrated": integrated(frame, aligned),
