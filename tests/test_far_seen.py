@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +12,10 @@ from scenes import FLIP
 
 from edge_depth_nerf.cameras import KannalaBrandt
 from edge_depth_nerf.files import write_distance_png, write_json, write_png
-from edge_depth_nerf.inspecting.reader import InspectedScene, read_scene
+from edge_depth_nerf.inspecting.reader import InspectedPicture, InspectedScene, read_scene
 from edge_depth_nerf.mono import far_seen
 from edge_depth_nerf.mono.examples import load_examples
-from edge_depth_nerf.mono.far_seen import seen_above, static_cloud
+from edge_depth_nerf.mono.far_seen import field_deg, seen_above, static_cloud
 
 LENS = KannalaBrandt(240, 200, 80.0, 80.0, 121.0, 101.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 EYE_M, WALL_M, FIELD_DEG = 1.5, 20.0, 2.0
@@ -48,12 +49,14 @@ def truth_m(position_m: float) -> np.ndarray:
     return np.minimum(ground, distance_to(WALL_M - position_m))
 
 
-def write_drive(folder: Path, extra_m: dict[int, np.ndarray] | None = None) -> InspectedScene:
+def write_drive(
+    folder: Path, extra_m: dict[int, np.ndarray] | None = None, top_deg: float = FIELD_DEG
+) -> InspectedScene:
     """Write a drive towards a wall; `extra_m` are distances of things that one picture alone has before it."""
     entries = []
     for index, position in enumerate(POSITIONS_M):
         distance = np.minimum(truth_m(position), (extra_m or {}).get(index, np.inf))
-        within = (elevation_deg() < FIELD_DEG) & (elevation_deg() > -30) & (distance < 60)
+        within = (elevation_deg() < top_deg) & (elevation_deg() > -30) & (distance < 60)
         name = f"{index:04d}.png"
         write_png(folder / "images" / name, np.full((LENS.height, LENS.width, 3), 90, np.uint8))
         write_distance_png(folder / "lidar" / name, np.where(within, distance, 0))
@@ -140,3 +143,86 @@ def test_one_picture_or_none_knows_nothing_more(tmp_path, pictures):
     cloud = static_cloud(scene, scene.pictures[:pictures])
     found = seen_above(cloud, scene, scene.pictures[0], (LENS.width, LENS.height))
     assert (found > 0).mean() < 0.005
+
+
+# ---- long drives -----------------------------------------------------------------------------------------------
+
+
+def copies(scene: InspectedScene, count: int, apart_m: float = 300.0) -> list[InspectedPicture]:
+    """The drive again and again, one behind the other along x, diagonally into negative coordinates."""
+    return [
+        dataclasses.replace(picture, position_m=picture.position_m + number * np.array([apart_m, -apart_m, 0.0]))
+        for number in range(count)
+        for picture in scene.pictures
+    ]
+
+
+def rows(points_m: np.ndarray) -> np.ndarray:
+    return points_m[np.lexsort(points_m.T)]
+
+
+def test_a_drive_far_away_changes_nothing(tmp_path):
+    # the field ends at the horizon: from far away even the ground lies hardly below it
+    scene = write_drive(tmp_path, top_deg=0.0)
+    alone, both = static_cloud(scene, scene.pictures), static_cloud(scene, copies(scene, 2))
+    here = both.points_m[:, 0] < 150
+    assert len(alone.points_m) > 50
+    np.testing.assert_array_equal(rows(both.points_m[here]), rows(alone.points_m))
+    assert len(alone.spacing_m) == here.sum() == (~here).sum()
+    size = (LENS.width, LENS.height)
+    for picture in scene.pictures:
+        np.testing.assert_array_equal(
+            seen_above(both, scene, picture, size), seen_above(alone, scene, picture, size), strict=True
+        )
+
+
+def test_the_work_grows_with_the_length_of_the_drive(tmp_path, monkeypatch):
+    scene = write_drive(tmp_path, top_deg=0.0)
+    looked_at = {"_is_above": 0, "_votes": 0, "first_in_voxel": 0}
+
+    def counted(name: str, points_at: int):
+        whole = getattr(far_seen, name)
+
+        def call(*arguments):
+            looked_at[name] += len(arguments[points_at])
+            return whole(*arguments)
+
+        monkeypatch.setattr(far_seen, name, call)
+
+    for name, points_at in (("_is_above", 1), ("_votes", 1), ("first_in_voxel", 0)):
+        counted(name, points_at)
+    # one or two drives fill it
+    monkeypatch.setattr(far_seen, "_MERGE_AT", 40_000)
+    costs = []
+    for count in (2, 8):
+        looked_at.update(dict.fromkeys(looked_at, 0))
+        cloud = static_cloud(scene, copies(scene, count))
+        seen_above(cloud, scene, scene.pictures[0], (60, 50))
+        costs.append(dict(looked_at))
+    assert all(costs[0].values())
+    for name in ("_is_above", "_votes"):
+        assert costs[1][name] < 4.4 * costs[0][name], (name, costs)
+    # what is thinned again each time is at most as much as what came since
+    measured = sum(int((far_seen._own(scene, picture)[1] > 0).sum()) for picture in scene.pictures)
+    assert 8 * measured <= costs[1]["first_in_voxel"] < 2.5 * 8 * measured, (measured, costs)
+
+
+def test_near_points_are_those_within_reach(monkeypatch):
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-150, 150, (4000, 3))
+    cloud = far_seen._tiled(points, np.arange(4000, dtype=np.float32))
+    # each keeps its own spacing
+    np.testing.assert_array_equal(points[cloud.spacing_m.astype(int)], cloud.points_m)
+    for place in ([0.0, 0.0, 0.0], [-71.3, 12.5, 40.0], [149.0, -149.0, 0.0], [900.0, 0.0, 0.0]):
+        picture = InspectedPicture("a", "a", 0, LENS, np.array(place), np.eye(3), False, None, {})
+        expected = np.hypot(*(points[:, :2] - place[:2]).T) <= 86
+        np.testing.assert_array_equal(rows(cloud.points_m[cloud.near(picture)]), rows(points[expected]))
+
+
+@pytest.mark.parametrize("top_deg", [2.0, -3.0])
+def test_the_field_is_where_the_returns_are(tmp_path, top_deg):
+    scene = write_drive(tmp_path, top_deg=top_deg)
+    up = [elevation_deg()[far_seen._own(scene, picture)[1] > 0] for picture in scene.pictures]
+    expected = np.quantile(np.concatenate(up), [0.001, 0.999])
+    assert field_deg(scene, scene.pictures) == pytest.approx(expected, abs=0.05)
+    assert field_deg(scene, []) is None

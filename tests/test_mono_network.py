@@ -34,6 +34,7 @@ from edge_depth_nerf.inspecting import reader
 from edge_depth_nerf.inspecting.reader import read_scene
 from edge_depth_nerf.mono.error_model import TRUST_FILE
 from edge_depth_nerf.mono.estimate import (
+    PRESETS,
     WEIGHTS,
     camera_heights_m,
     estimate_depth,
@@ -53,6 +54,7 @@ from edge_depth_nerf.mono.network import (
 from edge_depth_nerf.mono.options import EstimateDepthOptions
 from edge_depth_nerf.mono.scene_maps import write_mono_maps
 from edge_depth_nerf.mono.training import (
+    Batch,
     TrainingOptions,
     augmented,
     make_batch,
@@ -252,6 +254,20 @@ def test_mirrored_and_cut_pictures_still_show_the_plane_they_showed(small_street
     assert 6 <= mirrored <= 18 and cut >= 3
 
 
+@pytest.mark.parametrize(("preset", "sides_px"), [("lite", {192}), ("full", {448, 512})])
+def test_the_presets_cut_what_is_said(preset, sides_px):
+    values = PRESETS[preset]
+    settings = NetworkSettings(values.channels, values.working_px, HEIGHT_M, 5.0)
+    side = values.working_px
+    flat = torch.ones(1, side, side)
+    plain = Batch(torch.zeros(1, 3, side, side), torch.zeros(1, 5, side, side), flat, flat > 0, flat)
+    shapes = {
+        augmented(plain, values.training, settings.multiple_px, np.random.default_rng(seed)).usable.shape[1:]
+        for seed in range(24)
+    }
+    assert shapes == {(height, width) for height in sides_px for width in sides_px}
+
+
 def test_of_several_returns_in_a_pixel_the_one_nearest_its_centre_is_learned(small_street):
     scene = read_scene(small_street)
     picture = scene.pictures[0]
@@ -336,6 +352,15 @@ def test_a_killed_training_goes_on_as_if_nothing_had_been(small_street, tmp_path
     assert shares[0] == pytest.approx(8 / 12) and len(shares) == 5
     assert same(weights_of(whole.network), weights_of(again.network))
     assert (again.best_step, again.abs_rel) == (whole.best_step, whole.abs_rel)
+
+    # one that began with other weights is not taken up
+    one, two = DepthNetwork(TINY), DepthNetwork(TINY)
+    calls = 0
+    with pytest.raises(KilledError):
+        train(examples, kept, TINY, options, start=one, checkpoint=checkpoint, checkpoint_seconds=0.0, report=kill)
+    shares.clear()
+    train(examples, kept, TINY, options, start=two, checkpoint=checkpoint, report=lambda share, e: shares.append(share))
+    assert len(shares) == 12
 
     # one of another training, or a broken one, is not taken up
     other = dataclasses.replace(options, seed=1)
@@ -459,6 +484,120 @@ def test_training_goes_on_from_given_weights(small_street, tmp_path, quiet):
     network, _ = load_network(report.weights)
     assert report.weights == small_street / WEIGHTS and network.settings == settings
     assert float(network.head.weight.detach().abs().max()) > 0
+
+
+def said_by(options: EstimateDepthOptions) -> str:
+    console = Console(file=io.StringIO(), width=1000)
+    estimate_depth(options, console)
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue()
+
+
+@pytest.mark.parametrize("content", ["broken", "older", "header"])
+def test_weights_in_the_scene_that_are_of_no_use_are_made_anew(small_street, content):
+    path = small_street / WEIGHTS
+    if content == "broken":
+        path.write_bytes(b"\x00" * 100)
+    else:
+        architecture = "edge-depth-nerf/u-net-0" if content == "older" else ARCHITECTURE
+        save_file({"a": torch.zeros(2)}, path, {"architecture": architecture, "header": "[]"})
+    said = said_by(EstimateDepthOptions((small_street,), train_steps=1))
+    assert said.count("trained anew") == 1 and str(path) in said
+    assert load_network(path)[1]["steps"] == 1
+
+
+def test_no_file_of_others_is_overwritten(small_street, tmp_path, quiet):
+    path = tmp_path / "theirs.safetensors"
+    for write in (
+        lambda: save_file({"a": torch.zeros(2)}, path, {"format": "pt"}),
+        lambda: path.write_bytes(b"no safetensors"),
+    ):
+        write()
+        before = path.read_bytes()
+        with pytest.raises(InputError, match="holds no weights that `estimate-depth` has written"):
+            estimate_depth(EstimateDepthOptions((small_street,), train_steps=1, output=path), quiet)
+        assert path.read_bytes() == before
+    # what was written by another version of this project may go
+    save_file({"a": torch.zeros(2)}, path, {"architecture": "edge-depth-nerf/u-net-0", "header": "{}"})
+    estimate_depth(EstimateDepthOptions((small_street,), train_steps=1, output=path), quiet)
+    assert load_network(path)[1]["steps"] == 1
+
+
+def test_training_never_writes_over_the_weights_it_starts_from(small_street, tmp_path, monkeypatch, quiet):
+    path = small_street / WEIGHTS
+    save_network(path, DepthNetwork(TINY), {})
+    before = path.read_bytes()
+    monkeypatch.chdir(small_street)
+    for model in (path, Path(WEIGHTS), tmp_path / "street" / ".." / "street" / WEIGHTS):
+        with pytest.raises(InputError, match="Name another file with --output"):
+            estimate_depth(EstimateDepthOptions((small_street,), model=model, train_steps=1), quiet)
+    assert path.read_bytes() == before
+    other = EstimateDepthOptions((small_street,), model=path, train_steps=1, output=tmp_path / "on.safetensors")
+    assert estimate_depth(other, quiet).trained is not None
+    assert estimate_depth(other, quiet).trained is None
+    assert path.read_bytes() == before
+
+
+def test_pictures_kept_for_stopping_without_returns(small_street):
+    # moment 5 is kept
+    write_distance_png(small_street / "lidar" / "0005.png", np.zeros((LENS.height, LENS.width)))
+    said = said_by(EstimateDepthOptions((small_street,), train_steps=2))
+    assert "its error is not known" in said
+    about = load_network(small_street / WEIGHTS)[1]
+    assert about["steps"] == 2 and about["abs_rel"] is None
+
+
+def test_scenes_of_one_name_keep_their_own_trained_frames(tmp_path, quiet):
+    one = write_street(tmp_path / "a" / "scene", frames=10, seed=1)
+    other = write_street(tmp_path / "b" / "scene", frames=4, seed=2)
+    unseen = write_street(tmp_path / "c" / "scene", frames=10, seed=3)
+    report = estimate_depth(EstimateDepthOptions((one, other), train_steps=1), quiet)
+    moved = other.rename(tmp_path / "elsewhere")
+    estimate_depth(EstimateDepthOptions((unseen, moved), model=report.weights), quiet)
+
+    def frames(scene: Path) -> list[str]:
+        return [str(Path(name).stem) for name in read_json(scene / "transforms.json")["mono"]["trained_frames"]]
+
+    assert frames(one) == ["0000", "0001", "0002", "0003", "0006", "0007", "0008", "0009"]
+    assert frames(moved) == ["0000", "0001", "0002", "0003"]
+    assert frames(unseen) == []
+
+
+def test_the_field_of_the_training_returns_goes_with_weights_and_maps(tmp_path, quiet):
+    low, high = (write_street(tmp_path / name, seed=seed) for seed, name in enumerate(("low", "high")))
+    expected = []
+    for folder, sign in ((low, 1), (high, -1)):
+        up = []
+        scene = read_scene(folder)
+        used = {picture.name for picture in training_split(scene)[0]}
+        for picture in scene.pictures:
+            directions, valid = picture.lens.unproject(picture.lens.pixel_centres())
+            world = torch.nan_to_num(directions).numpy() @ (picture.rotation @ np.diag([1.0, -1.0, -1.0])).T
+            elevation = np.degrees(np.arcsin(np.clip(world[..., 2], -1, 1)))
+            # returns of the one scene end 4° above the horizon, those of the other begin 4° below
+            lidar = np.where(sign * elevation < 4, read_distance_png(picture.files["lidar"]), 0)
+            # what is masked, outside the lens or not trained on has no say
+            inside = (valid & (directions[..., 2] >= np.cos(np.radians(95)))).numpy()
+            up.append(elevation[(lidar > 0) & inside & read_mask(picture.files["mask"])])
+            if picture.name not in used:
+                lidar, up = np.where(directions[..., 2].numpy() > 0, 9.0, 0), up[:-1]
+            write_distance_png(picture.files["lidar"], lidar)
+        expected.append(np.quantile(np.concatenate(up), [0.001, 0.999]))
+    expected = [min(e[0] for e in expected), max(e[1] for e in expected)]
+    assert expected[0] < -30 and expected[1] > 30
+    report = estimate_depth(EstimateDepthOptions((low, high), train_steps=1), quiet)
+    # pixels are degrees apart
+    found = load_network(report.weights)[1]["field_deg"]
+    assert found == pytest.approx(expected, abs=0.5)
+    target = write_street(tmp_path / "target", frames=2, seed=5, lidar=False)
+    estimate_depth(EstimateDepthOptions((target,), model=report.weights), quiet)
+    assert read_json(target / "transforms.json")["mono"]["field_deg"] == found
+
+    # weights of before have none
+    save_network(tmp_path / "old.safetensors", DepthNetwork(TINY), {"trained_frames": {"target": ["x"]}})
+    estimate_depth(EstimateDepthOptions((target,), model=tmp_path / "old.safetensors"), quiet)
+    entry = read_json(target / "transforms.json")["mono"]
+    assert "field_deg" not in entry and entry["trained_frames"] == ["x"]
 
 
 def test_bad_weights_are_named(tmp_path, small_street, monkeypatch, capsys):

@@ -41,7 +41,7 @@ from edge_depth_nerf.mono.examples import (
     small_picture,
     view_of,
 )
-from edge_depth_nerf.mono.far_seen import seen_above, static_cloud
+from edge_depth_nerf.mono.far_seen import field_deg, seen_above, static_cloud
 from edge_depth_nerf.mono.files import find_maps
 from edge_depth_nerf.mono.hf import ReadyNetwork, load_ready_network, view_layers
 from edge_depth_nerf.mono.network import (
@@ -49,6 +49,7 @@ from edge_depth_nerf.mono.network import (
     DepthNetwork,
     NetworkSettings,
     distance_m,
+    is_ours,
     load_network,
     log_room_distance,
     ray_geometry,
@@ -154,12 +155,14 @@ def _write_own(
         "trained_on": "scene",
         "weights": weights.name,
         "architecture": ARCHITECTURE,
-        **{key: about[key] for key in ("preset", "steps", "abs_rel", "scenes") if key in about},
+        **{key: about[key] for key in ("preset", "steps", "abs_rel", "scenes", "field_deg") if key in about},
     }
     with _progress(console) as progress, _one_thread():
         for scene in scenes:
             # on these the maps are better than elsewhere
-            seen = about.get("trained_frames", {}).get(_name(scene), [])
+            frames = about.get("trained_frames", {})
+            # weights of before have them by the scenes' names
+            seen = frames.get(_key(scene), frames.get(_name(scene), []))
             write_mono_maps(scene.folder, predicted_maps(network, scene), {**source, "trained_frames": seen}, progress)
 
 
@@ -218,19 +221,28 @@ def _train(
     start: DepthNetwork | None,
     console: Console,
 ) -> tuple[DepthNetwork, Path, dict[str, Any], Trained | None]:
-    """Train, or find that it was done; give the network, its file, what is known about it, and the training."""
+    """Train, or find that it was done; give the network, its file, what is known about it, and the training.
+
+    Raises:
+        InputError: the weights' file is not to be overwritten; a scene cannot be trained on.
+
+    """
     preset = PRESETS[options.preset]
     training = replace(
         preset.training, steps=options.train_steps or preset.training.steps, seconds=options.seconds, seed=options.seed
     )
     weights = options.output or scenes[0].folder / WEIGHTS
+    found, about = _weights_of_before(weights, options, scenes[0].folder / WEIGHTS, console)
     settings = start.settings if start else NetworkSettings(preset.channels, preset.working_px, _EYE_LEVEL_M, 1.0)
     split = [training_split(scene) for scene in scenes]
     split = _thinned(split, settings.working_px, console)
     heights = [camera_heights_m(scene, settings) for scene in scenes]
     count = sum(len(pictures) for both in split for pictures in both)
     with _progress(console) as progress:
-        task = progress.add_task("Gathering LiDAR", total=3 * sum(len(both[0]) for both in split))
+        task = progress.add_task("Gathering LiDAR", total=4 * sum(len(both[0]) for both in split))
+        fields = [
+            field_deg(scene, both[0], lambda: progress.advance(task)) for scene, both in zip(scenes, split, strict=True)
+        ]
         clouds = [
             static_cloud(scene, both[0], lambda: progress.advance(task))
             for scene, both in zip(scenes, split, strict=True)
@@ -258,6 +270,13 @@ def _train(
                 f"{scenes[0].path}: no LiDAR return lies inside the masks of the training pictures, nothing to train "
                 "on. Check the LiDAR maps with `edge-depth-nerf inspect`."
             )
+        if kept is not None and not kept.lidar_m.any():
+            console.print(
+                f"No LiDAR return lies inside the masks of the {len(kept)} pictures kept for stopping: training takes "
+                "all its steps, and its error is not known",
+                soft_wrap=True,
+            )
+            kept = None
         if start is None:
             mean_height_m = float(np.mean([height for by_camera in heights for height in by_camera.values()]))
             settings = replace(settings, camera_height_m=mean_height_m, room_radius_m=room_radius_m(examples))
@@ -268,11 +287,9 @@ def _train(
             "start": None if options.model is None else hashlib.sha256(options.model.read_bytes()).hexdigest(),
         }
         identity = as_json(identity)
-        if weights.is_file() and weights != options.model:
-            network, about = load_network(weights)
-            if about.get("identity") == identity:
-                console.print(f"{weights} is trained already", soft_wrap=True)
-                return network, weights, about, None
+        if found is not None and about.get("identity") == identity:
+            console.print(f"{weights} is trained already", soft_wrap=True)
+            return found, weights, about, None
         task = progress.add_task("Training", total=1.0)
 
         def report(share: float, error: float) -> None:
@@ -281,6 +298,8 @@ def _train(
 
         checkpoint = weights.with_suffix(".checkpoint")
         trained = train(examples, kept, settings, training, start=start, checkpoint=checkpoint, report=report)
+    # some picture has returns, or nothing would have been trained
+    known = [field for field in fields if field is not None]
     about = {
         "made_by": f"edge-depth-nerf {__version__}",
         "preset": options.preset,
@@ -288,8 +307,9 @@ def _train(
         "abs_rel": None if kept is None else round(trained.abs_rel, 5),
         "scenes": [_name(scene) for scene in scenes],
         "trained_frames": {
-            _name(scene): [picture.name for picture in both[0]] for scene, both in zip(scenes, split, strict=True)
+            _key(scene): [picture.name for picture in both[0]] for scene, both in zip(scenes, split, strict=True)
         },
+        "field_deg": [min(low for low, _ in known), max(high for _, high in known)],
         "identity": identity,
     }
     save_network(weights, trained.network, about)
@@ -303,8 +323,48 @@ def _train(
     return trained.network, weights, about, trained
 
 
+def _weights_of_before(
+    weights: Path, options: EstimateDepthOptions, scenes_own: Path, console: Console
+) -> tuple[DepthNetwork | None, dict[str, Any]]:
+    """Load what lies where the weights are to go, after a look whether it may be overwritten.
+
+    Args:
+        weights: where they go.
+        options: of the command.
+        scenes_own: the place of the first scene's weights, which are this project's whatever is in the file.
+        console: where to say that the file is of no use.
+
+    Raises:
+        InputError: the file is what training starts from, or is not this project's.
+
+    """
+    if options.model is not None and weights.resolve() == options.model.resolve():
+        raise InputError(
+            f"{weights}: training would start from these weights and be written over them, and go on from there each "
+            "time. Name another file with --output."
+        )
+    if not weights.exists():
+        return None, {}
+    if weights.resolve() != scenes_own.resolve() and not is_ours(weights):
+        raise InputError(
+            f"--output {weights}: is there already, and holds no weights that `estimate-depth` has written. Name "
+            "another file, or remove this one."
+        )
+    try:
+        return load_network(weights)
+    except InputError:
+        console.print(f"{weights} is broken or of another version: it is trained anew", soft_wrap=True, markup=False)
+        return None, {}
+
+
 def _name(scene: InspectedScene) -> str:
     return scene.folder.resolve().name
+
+
+def _key(scene: InspectedScene) -> str:
+    """What tells a scene's pictures from another's, wherever its folder lies: their names, and their files' sizes."""
+    listed = [(picture.name, picture.files["image"].stat().st_size) for picture in scene.pictures]
+    return hashlib.sha256(repr(sorted(listed)).encode()).hexdigest()[:32]
 
 
 def training_split(scene: InspectedScene) -> tuple[list[InspectedPicture], list[InspectedPicture]]:

@@ -5,6 +5,9 @@ was in the scanner's field when the vehicle was farther away. So the returns of 
 as points in the world, what moved is taken out, and the rest is projected into each picture, above its own returns
 alone: within their field these are denser, and what they do not show is mostly hidden.
 
+A picture is concerned with points within `REACH_M` of it alone. They are found by squares of the ground plane, so that
+the work grows with the length of the drive.
+
 Lengths are metres, distances along the ray, 0 = none.
 """
 
@@ -15,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Float64, Int32
+from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
 from numpy.typing import NDArray
 
 from edge_depth_nerf.inspecting.reader import InspectedPicture, InspectedScene
@@ -29,22 +32,48 @@ SPACING_RAD = 0.0075
 """How far apart returns lie, seen from where they were measured: 0.43°, that of a scanner of 64 beams."""
 FIELD_QUANTILE = 0.99
 """Above this quantile of its own returns' elevation a picture has next to none of its own."""
+REACH_M = 86.0
+"""Horizontally: what is judged ends at 60 m; and farther off than this the ground, too, is so little below a camera
+1.7 m up that `_BELOW_SINE` lets it through."""
+ELEVATION_QUANTILES = (0.001, 0.999)
+"""Between these of its returns' elevations lies a scanner's field, but for strays."""
+_ELEVATION_STEP_DEG = 0.01
 _BELOW_SINE = 0.02
 """Points so little below hide what is above."""
 _AZIMUTHS = 360
 _MERGE_AT = 4_000_000
-"""So many points are collected before they are thinned."""
+"""So many points are collected before they are thinned, and then twice as many as were left."""
+_TILE_M = 20.0
+_TILE_BITS = 32
+"""Bits of a tile's number along y."""
 _SAME, _SAME_M = 1.05, 0.3
 """What differs in distance by less than this ratio or by less than this length may be one thing."""
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """Points in the scene's world."""
+    """Points in the scene's world, in the order of the tiles of the ground plane that they lie in."""
 
     points_m: Float64[np.ndarray, "points 3"]
     spacing_m: Float32[np.ndarray, "points"]
     """How wide a patch of surface each stands for."""
+    tile: Int64[np.ndarray, "points"]
+    """Number of each one's tile, ascending."""
+
+    def part(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> Cloud:
+        """Some of the points; indices are to ascend."""
+        return Cloud(self.points_m[which], self.spacing_m[which], self.tile[which])
+
+    def near(self, picture: InspectedPicture) -> NDArray[np.intp]:
+        """Indices of the points within reach of a picture, ascending."""
+        first, last = (_tile_of(picture.position_m[:2] + side) for side in (-REACH_M, REACH_M))
+        columns = np.arange(first[0], last[0] + 1)
+        # those of one x and neighbouring y lie together
+        starts = np.searchsorted(self.tile, _tile_number(columns, first[1]), "left")
+        ends = np.searchsorted(self.tile, _tile_number(columns, last[1]), "right")
+        around = np.concatenate([np.arange(start, end) for start, end in zip(starts, ends, strict=True)])
+        off_m = self.points_m[around, :2] - picture.position_m[:2]
+        return around[off_m[:, 0] ** 2 + off_m[:, 1] ** 2 <= REACH_M**2]
 
 
 @dataclass(frozen=True)
@@ -79,28 +108,37 @@ def static_cloud(
         tops.append(_field(scene, picture).top_sine)
         advance()
     points, spacings = [np.empty((0, 3))], [np.empty(0, np.float32)]
+    collected, thinned = 0, 0
     for number, picture in enumerate(pictures):
         rays, lidar_m = _own(scene, picture)
         seen = lidar_m > 0
         points.append(_to_world(picture, rays[seen] * lidar_m[seen, None]))
         spacings.append((SPACING_RAD * lidar_m[seen]).astype(np.float32))
-        if number == len(pictures) - 1 or sum(map(len, points)) > _MERGE_AT:
+        collected += int(seen.sum())
+        # one that thins as soon as it is full would soon thin at every picture
+        if number == len(pictures) - 1 or collected > max(_MERGE_AT, 2 * thinned):
             points_m, spacing_m = np.concatenate(points), np.concatenate(spacings)
-            kept = first_in_voxel(points_m, VOXEL_M)
-            kept = kept[_above_any(pictures, tops, points_m[kept])]
-            points, spacings = [points_m[kept]], [spacing_m[kept]]
+            # those that were kept before come first, and stay
+            kept = first_in_voxel(points_m, VOXEL_M)[thinned:]
+            new = _tiled(points_m[kept], spacing_m[kept])
+            new = new.part(_above_any(pictures, tops, new))
+            points = [np.concatenate((points_m[:thinned], new.points_m))]
+            spacings = [np.concatenate((spacing_m[:thinned], new.spacing_m))]
+            collected = thinned = len(points[0])
         advance()
-    votes = np.zeros(len(points[0]), np.int32)
+    cloud = _tiled(points[0], spacings[0])
+    votes = np.zeros(len(cloud.points_m), np.int32)
     for picture in pictures:
-        votes += _votes(picture, points[0], _own(scene, picture)[1])
+        near = cloud.near(picture)
+        votes[near] += _votes(picture, cloud.points_m[near], _own(scene, picture)[1])
         advance()
-    return Cloud(points[0][votes >= 0], spacings[0][votes >= 0])
+    return cloud.part(votes >= 0)
 
 
 def seen_above(
     cloud: Cloud, scene: InspectedScene, picture: InspectedPicture, size: tuple[int, int]
 ) -> Float32[np.ndarray, "h w"]:
-    """Project a cloud into a picture, above the picture's own returns, without what is or may be hidden.
+    """Project what a cloud has within reach into a picture, above its own returns, without what is or may be hidden.
 
     Args:
         cloud: from `static_cloud`.
@@ -110,14 +148,47 @@ def seen_above(
 
     """
     field = _field(scene, picture)
-    high = _is_above(picture, cloud.points_m, field.top_sine)
-    in_camera, spacing_m = torch.from_numpy(_to_camera(picture, cloud.points_m[high])), cloud.spacing_m[high]
-    projected = project_points(in_camera, scaled_lens(picture.lens, size), spacing_m=torch.from_numpy(spacing_m))
+    near = cloud.part(cloud.near(picture))
+    high = near.part(_is_above(picture, near.points_m, field.top_sine))
+    in_camera, spacing_m = torch.from_numpy(_to_camera(picture, high.points_m)), torch.from_numpy(high.spacing_m)
+    projected = project_points(in_camera, scaled_lens(picture.lens, size), spacing_m=spacing_m)
     distance_m = projected.distance_m.float().numpy()
     rays, within = lens_rays(picture.lens, scene.theta_max_rad, size)
     sine = rays @ picture.up_in_camera.astype(np.float32)
     visible = _level_m(distance_m, sine) <= field.reach_m[_azimuth(picture, rays)]
     return np.where(within & (sine > field.top_sine) & visible, distance_m, np.float32(0))
+
+
+def field_deg(
+    scene: InspectedScene, pictures: Sequence[InspectedPicture], advance: Callable[[], None] = lambda: None
+) -> tuple[float, float] | None:
+    """Elevations between which nearly all of some pictures' own returns lie, within the masks.
+
+    Args:
+        scene: the scene.
+        pictures: those whose LiDAR maps are used.
+        advance: called after each picture.
+
+    Returns:
+        Degrees above the world's horizon, to 0.01°: the `ELEVATION_QUANTILES`; None without returns.
+
+    Raises:
+        InputError: a file cannot be decoded, or has another size than its camera.
+
+    """
+    edges = np.arange(-9000, 9001) * _ELEVATION_STEP_DEG
+    counts = np.zeros(len(edges) - 1, np.int64)
+    for picture in pictures:
+        rays, lidar_m = _own(scene, picture)
+        sine = rays[lidar_m > 0] @ picture.up_in_camera.astype(np.float32)
+        counts += np.histogram(np.degrees(np.arcsin(np.clip(sine, -1, 1))), edges)[0]
+        advance()
+    if not counts.any():
+        return None
+    share = np.cumsum(counts) / counts.sum()
+    low, high = (int(np.searchsorted(share, quantile)) for quantile in ELEVATION_QUANTILES)
+    # the field is not to come out narrower than it is
+    return round(float(edges[low]), 2), round(float(edges[high + 1]), 2)
 
 
 def _field(scene: InspectedScene, picture: InspectedPicture) -> _Field:
@@ -154,13 +225,30 @@ def _is_above(
     return from_camera[:, 2] > (top_sine - _BELOW_SINE) * np.linalg.norm(from_camera, axis=1)
 
 
-def _above_any(
-    pictures: Sequence[InspectedPicture], tops: Sequence[float], points_m: Float64[np.ndarray, "n 3"]
-) -> Bool[np.ndarray, "n"]:
-    above = np.zeros(len(points_m), bool)
+def _above_any(pictures: Sequence[InspectedPicture], tops: Sequence[float], cloud: Cloud) -> Bool[np.ndarray, "points"]:
+    above = np.zeros(len(cloud.points_m), bool)
     for picture, top_sine in zip(pictures, tops, strict=True):
-        above |= _is_above(picture, points_m, top_sine)
+        near = cloud.near(picture)
+        near = near[~above[near]]
+        above[near] = _is_above(picture, cloud.points_m[near], top_sine)
     return above
+
+
+def _tiled(points_m: Float64[np.ndarray, "points 3"], spacing_m: Float32[np.ndarray, "points"]) -> Cloud:
+    """Put points in the order of their tiles; those of one tile keep theirs."""
+    x, y = _tile_of(points_m[:, :2]).T
+    tile = _tile_number(x, y)
+    order = np.argsort(tile, kind="stable")
+    return Cloud(points_m[order], spacing_m[order], tile[order])
+
+
+def _tile_of(place_m: Float64[np.ndarray, "*places 2"]) -> Int64[np.ndarray, "*places 2"]:
+    """Number of a place's tile along x and along y."""
+    return np.floor(place_m / _TILE_M).astype(np.int64)
+
+
+def _tile_number(x: Int64[np.ndarray, "n"], y: Int64[np.ndarray, "n"] | np.int64) -> Int64[np.ndarray, "n"]:
+    return (x << _TILE_BITS) + y
 
 
 def _own(

@@ -10,6 +10,7 @@ forward).
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import json
 import math
@@ -27,6 +28,8 @@ from edge_depth_nerf.files import write_bytes
 
 ARCHITECTURE = "edge-depth-nerf/u-net-1"
 """Raised whenever the same weights would give another prediction."""
+_FAMILY = "edge-depth-nerf/"
+"""What all architectures of ours begin with."""
 NEAREST_M, FARTHEST_M = 0.1, 1000.0
 """Predictions never leave these."""
 _GROUPS = 8
@@ -209,6 +212,26 @@ def load_network(path: Path) -> tuple[DepthNetwork, dict[str, Any]]:
     return network.eval(), dict(header.get("about") or {})
 
 
+def weights_key(network: DepthNetwork) -> str:
+    """What tells one network's weights from another's."""
+    digest = hashlib.sha256()
+    for name, tensor in network.state_dict().items():
+        digest.update(f"{name}{tensor.dtype}{tuple(tensor.shape)}".encode())
+        digest.update(tensor.detach().cpu().contiguous().numpy().data)
+    return digest.hexdigest()[:32]
+
+
+def is_ours(path: Path) -> bool:
+    """Whether this project wrote a file of tensors, of this or of another architecture."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt") as file:
+            return (file.metadata() or {}).get("architecture", "").startswith(_FAMILY)
+    except (SafetensorError, OSError):
+        return False
+
+
 def settings_from(found: Any, path: Path) -> NetworkSettings:
     """Check settings that a file brings.
 
@@ -260,7 +283,10 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             if metadata.get("architecture") == ARCHITECTURE:
-                return {name: file.get_tensor(name) for name in file.keys()}, json.loads(metadata["header"])
+                header = json.loads(metadata["header"])
+                if not isinstance(header, dict):
+                    raise KeyError("its header is no JSON object")
+                return {name: file.get_tensor(name) for name in file.keys()}, header
             names = list(file.keys())
     except (SafetensorError, KeyError, json.JSONDecodeError) as error:
         raise InputError(
