@@ -102,7 +102,7 @@ def measured(which: str, scene: Path) -> dict[str, float]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("scene", type=Path)
     parser.add_argument("--frames", type=int, nargs="+", default=[10, 100, 300])
     parser.add_argument("--json", type=Path)
