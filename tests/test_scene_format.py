@@ -17,7 +17,6 @@ from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_distance_png, read_json, write_distance_png, write_json, write_mask, write_png
 from edge_depth_nerf.inspecting.reader import read_scene
 from edge_depth_nerf.mono.estimate import estimate_depth
-from edge_depth_nerf.mono.examples import read_lidar
 from edge_depth_nerf.mono.options import EstimateDepthOptions
 from edge_depth_nerf.mono.scene_maps import write_mono_maps
 from edge_depth_nerf.mono.trust import calibrate_scene, find_trust, saved_trust
@@ -62,14 +61,14 @@ def test_monocular_maps_do_not_make_z_depth_a_distance(tmp_path: Path, npy: bool
     folder = others_scene(tmp_path, npy)
     before = read_scene(folder)
     assert before.lidar_is_z_depth
-    lidar = [read_lidar(before, picture) for picture in before.pictures]
+    lidar = [before.lidar_m(picture) for picture in before.pictures]
     # everything lies on a ball of 6 m around the world's origin
     assert 4 < np.median(lidar[0][lidar[0] > 0]) < 8
     put_in(folder)
     after = read_scene(folder)
     assert after.lidar_is_z_depth and not after.own
     for picture, expected in zip(after.pictures, lidar, strict=True):
-        np.testing.assert_array_equal(read_lidar(after, picture), expected)
+        np.testing.assert_array_equal(after.lidar_m(picture), expected)
         whole = after.maps(picture, with_prior=False).lidar_m
         assert whole is not None
         np.testing.assert_array_equal(whole, expected)
@@ -163,7 +162,7 @@ def test_without_lidar_a_network_is_believed_where_it_was_taught(tmp_path: Path)
 def test_a_frame_near_the_least_number_of_returns_is_reported_as_the_prior_has_it(tmp_path: Path) -> None:
     scene = write_scene(tmp_path)
     picture = read_scene(scene).pictures[0]
-    lidar = read_lidar(read_scene(scene), picture)
+    lidar = read_scene(scene).lidar_m(picture)
     mono = read_distance_png(picture.files["mono"])
     rows, columns = np.nonzero((lidar > 0) & (mono > 0) & read_scene(scene).maps(picture, with_prior=False).usable)
     few = np.zeros_like(lidar)

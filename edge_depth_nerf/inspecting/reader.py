@@ -179,14 +179,8 @@ class InspectedScene:
 
         """
         found = {layer: self._read(layer, path) for layer, path in picture.files.items()}
-        width, height = picture.lens.width, picture.lens.height
         for layer, pixels in found.items():
-            if pixels.shape[:2] != (height, width):
-                raise InputError(
-                    f"{picture.files[layer]}: is {'×'.join(map(str, pixels.shape[1::-1]))} pixels (width × height), "
-                    f"but {self.path} gives the camera of {picture.name} {width}×{height}. Pictures, masks and "
-                    "distance maps of a frame must have one size; make the file again at that size."
-                )
+            self._check_size(picture, layer, pixels)
         # after the check: the size in transforms.json may be anything, that of the decoded picture is in memory
         lens, cos_theta = _rays(picture.lens, self.theta_max_rad)
         usable = found["mask"] & lens if "mask" in found else lens
@@ -209,14 +203,17 @@ class InspectedScene:
 
         """
         pixels = self._read("lidar", picture.files["lidar"])
-        width, height = picture.lens.width, picture.lens.height
-        if pixels.shape != (height, width):
-            raise InputError(
-                f"{picture.files['lidar']}: is {'×'.join(map(str, pixels.shape[1::-1]))} pixels (width × height), but "
-                f"the camera of {picture.name} is {width}×{height}. Pictures, masks and distance maps of a frame must "
-                "have one size; make the file again at that size."
-            )
+        self._check_size(picture, "lidar", pixels)
         return self._as_distance(pixels, *_rays(picture.lens, self.theta_max_rad)) if self.lidar_is_z_depth else pixels
+
+    def _check_size(self, picture: InspectedPicture, layer: str, pixels: NDArray) -> None:
+        width, height = picture.lens.width, picture.lens.height
+        if pixels.shape[:2] != (height, width):
+            raise InputError(
+                f"{picture.files[layer]}: is {'×'.join(map(str, pixels.shape[1::-1]))} pixels (width × height), "
+                f"but {self.path} gives the camera of {picture.name} {width}×{height}. Pictures, masks and "
+                "distance maps of a frame must have one size; make the file again at that size."
+            )
 
     def _as_distance(
         self, pixels: NDArray[np.float32], lens: NDArray[np.bool_], cos_theta: NDArray[np.float32]

@@ -16,7 +16,7 @@ from jaxtyping import Float32
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.inspecting.reader import InspectedPicture, InspectedScene
 from edge_depth_nerf.mono.alignment import LEAST_RETURNS
-from edge_depth_nerf.mono.examples import read_lidar, view_of
+from edge_depth_nerf.mono.examples import view_of
 from edge_depth_nerf.mono.relative import (
     WRONG_WAY,
     Kind,
@@ -106,7 +106,7 @@ class FittedMaps:
     def _seen(self, picture: InspectedPicture) -> tuple[Sequence[Layer], Samples]:
         layers = self.layers(picture)
         usable = self._usable(picture)
-        lidar_m = read_lidar(self.scene, picture) if "lidar" in picture.files else np.zeros(usable.shape, np.float32)
+        lidar_m = self.scene.lidar_m(picture) if "lidar" in picture.files else np.zeros(usable.shape, np.float32)
         return layers, take_samples(layers, lidar_m, usable, _SAMPLES)
 
     def _usable(self, picture: InspectedPicture) -> np.ndarray:
@@ -115,7 +115,7 @@ class FittedMaps:
     def _returns(self, picture: InspectedPicture) -> int:
         if "lidar" not in picture.files:
             return 0
-        return int((self._usable(picture) & (read_lidar(self.scene, picture) > 0)).sum())
+        return int((self._usable(picture) & (self.scene.lidar_m(picture) > 0)).sum())
 
     def _blended(
         self, picture: InspectedPicture, layers: Sequence[Layer], lines: Sequence[Line]

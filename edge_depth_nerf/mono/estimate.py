@@ -36,7 +36,6 @@ from edge_depth_nerf.mono.examples import (
     camera_height_m,
     lens_rays,
     load_examples,
-    read_lidar,
     room_radius_m,
     small_picture,
     view_of,
@@ -463,7 +462,7 @@ def without_sky(
 
     """
     usable = view_of(picture, scene.theta_max_rad, max(metres.shape)).usable
-    lidar_m = read_lidar(scene, picture) if "lidar" in picture.files else np.zeros_like(metres)
+    lidar_m = scene.lidar_m(picture) if "lidar" in picture.files else np.zeros_like(metres)
     rgb = read_image(picture.files["image"])
     sky = find_sky(rgb, usable, picture.up_in_camera, picture.lens, lidar_m, known_m)
     return np.where(sky, 0, metres)

@@ -186,7 +186,7 @@ def small_picture(picture: InspectedPicture, size: tuple[int, int]) -> UInt8[np.
 
 def small_lidar(scene: InspectedScene, picture: InspectedPicture, view: View) -> Float32[np.ndarray, "h w"]:
     """LiDAR at the network's size: of the returns in a pixel the one nearest to its centre."""
-    return _reduced(read_lidar(scene, picture), view)
+    return _reduced(scene.lidar_m(picture), view)
 
 
 def _reduced(lidar_m: Float32[np.ndarray, "rows columns"], view: View) -> Float32[np.ndarray, "h w"]:
@@ -203,11 +203,6 @@ def _reduced(lidar_m: Float32[np.ndarray, "rows columns"], view: View) -> Float3
     small[small_row[farthest_first], small_column[farthest_first]] = lidar_m[row, column][farthest_first]
     small[~view.usable] = 0
     return small
-
-
-def read_lidar(scene: InspectedScene, picture: InspectedPicture) -> Float32[np.ndarray, "h w"]:
-    """A picture's own LiDAR map, as distances."""
-    return scene.lidar_m(picture)
 
 
 def check_size(pixels: np.ndarray, picture: InspectedPicture, layer: str) -> None:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from edge_depth_nerf.inspecting.reader import InspectedPicture, InspectedScene
 from edge_depth_nerf.lidar.projection import project_points
 from edge_depth_nerf.lidar.voxels import first_in_voxel
-from edge_depth_nerf.mono.examples import lens_rays, read_lidar, scaled_lens, view_of
+from edge_depth_nerf.mono.examples import lens_rays, scaled_lens, view_of
 
 VOXEL_M = 0.05
 """The cloud holds one point of each cube of this size."""
@@ -256,7 +256,7 @@ def _own(
 ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
     """A picture's rays, and its LiDAR map within the mask, at its own size."""
     view = view_of(picture, scene.theta_max_rad, max(picture.lens.width, picture.lens.height))
-    return view.rays, np.where(view.usable, read_lidar(scene, picture), np.float32(0))
+    return view.rays, np.where(view.usable, scene.lidar_m(picture), np.float32(0))
 
 
 def _to_world(picture: InspectedPicture, in_camera: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
