@@ -11,11 +11,11 @@ is kept beside this file, or in the user's cache if that folder cannot be writte
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import numpy as np
-from numba import njit
+
+from edge_depth_nerf.compiled import compiled
 
 TILE = 512
 """Centres of one row worked on together: nine rows of windows stay in a core's cache (larger gains nothing)."""
@@ -35,13 +35,7 @@ _ROUND = 1.5 * 2.0**52
 _C2, _C3, _C4, _C5, _C6, _C7, _C8, _C9, _C10 = (1 / math.factorial(n) for n in range(2, 11))
 
 
-def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile without Python's lock; on disk if there is a folder for it, else anew in each process."""
-    options = {"nogil": True, "fastmath": {"contract"}}
-    try:
-        return njit(cache=True, **options)(function)
-    except RuntimeError:  # Numba found no folder that can be written
-        return njit(**options)(function)
+_compiled = compiled(fastmath={"contract"})
 
 
 @_compiled

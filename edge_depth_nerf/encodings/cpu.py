@@ -7,8 +7,7 @@ nerfstudio's torch form and no fused multiply-add: it is the same to the last bi
 Threads are Python's own: they wait for each other without spinning, and unlike Numba's they allow concurrent callers
 and forked processes. There are as many as torch may use, and none where a call is small.
 
-Importing this module imports Numba. The first calls ever on a machine compile (a second or two); the result is kept
-beside this file, or in the user's cache if that folder cannot be written.
+Importing this module imports Numba.
 """
 
 from __future__ import annotations
@@ -22,8 +21,9 @@ from typing import Any, no_type_check
 import numpy as np
 import torch
 from jaxtyping import Float
-from numba import njit
 from torch import Tensor
+
+from edge_depth_nerf.compiled import compiled
 
 TILE = 256
 """Points worked on together: their rows and offsets stay in the nearest cache."""
@@ -38,15 +38,7 @@ PRIME_Y, PRIME_Z = np.uint32(2654435761), np.uint32(805459861)
 ONE = np.float32(1)
 
 
-def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile without Python's lock; on disk if there is a folder for it, else anew in each process."""
-    try:
-        return njit(cache=True, nogil=True)(function)
-    except RuntimeError:  # Numba found no folder that can be written
-        return njit(nogil=True)(function)
-
-
-@_compiled
+@compiled()
 @no_type_check  # the tests' type checker would wrap what Numba has to read
 def _find_corners(x, y, z, count, scaling, mask, rows, offsets):
     """Give the table rows of the eight corners around each of `count` points, and the points' places between them.
@@ -75,7 +67,7 @@ def _find_corners(x, y, z, count, scaling, mask, rows, offsets):
         rows[7 * TILE + j] = (x1 ^ y1 ^ z1) & mask
 
 
-@_compiled
+@compiled()
 @no_type_check
 def _corners_of(rows, j):
     """Give the eight rows of one point of a tile."""
@@ -91,7 +83,7 @@ def _corners_of(rows, j):
     )
 
 
-@_compiled
+@compiled()
 @no_type_check
 def _encode_points(axes, table, scalings, encoded, first_point, last_point):
     """Encode some points; calls for different points may run at once. `axes` are the positions, [3, points]."""
@@ -120,7 +112,7 @@ def _encode_points(axes, table, scalings, encoded, first_point, last_point):
                         encoded[first + j, column + c] = high * z + low * rest_z
 
 
-@_compiled
+@compiled()
 @no_type_check
 def _add_to_grid(axes, scaling, gradient, column, grid_gradient, first_point, last_point):
     """Add to one level's gradient, [rows, features], what some points give; calls for different ones may run at once.
@@ -150,7 +142,7 @@ def _add_to_grid(axes, scaling, gradient, column, grid_gradient, first_point, la
                 grid_gradient[r7, c] += g * high_high * x
 
 
-@_compiled
+@compiled()
 @no_type_check
 def _differentiate_points(axes, table, scalings, gradient, to_positions, first_point, last_point):
     """Give the gradient to some positions, [points, 3]; calls for different points may run at once."""

@@ -1,0 +1,27 @@
+"""What all functions compiled by Numba share.
+
+Importing this module imports Numba. The first calls ever on a machine compile (a second or two each module); the
+result is kept beside the module, or in the user's cache if that folder cannot be written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from numba import njit
+
+
+def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Compile a function without Python's lock; on disk if there is a folder for it, else anew in each process.
+
+    Put `no_type_check` below it: the tests' type checker would wrap what Numba has to read. `options` are njit's.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        try:
+            return njit(cache=True, nogil=True, **options)(function)
+        except RuntimeError:  # Numba found no folder that can be written
+            return njit(nogil=True, **options)(function)
+
+    return decorate
