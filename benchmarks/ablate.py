@@ -4,9 +4,10 @@
         "pipeline.model.depth_loss=none" "pipeline.model.depth_loss_mult=0.001" "pipeline.model.depth_loss_mult=0.01"
 
 Each variant is one or more overrides of edge-depth-nerf-lite, joined by commas ("" for none). Every variant starts from
-the same seed and is judged on the same 3,000 random pixels inside the mask of every held-out view, which is much faster
-than whole views and within some hundredths of a dB of them. Use a drive of its own for choosing options: not the one
-that a table is made of.
+the same seeds and is judged on the same 3,000 random pixels inside the mask of every held-out view, which is much
+faster than whole views and within some hundredths of a dB of them. With several `--seeds`, what a variant differs by
+from the first one is given as mean and range over pairs of the same seed. `--json FILE` keeps each training's figures,
+and takes up from there. Use a drive of its own for choosing options: not the one that a table is made of.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from rich.console import Console
 from rich.table import Table
 
 from edge_depth_nerf.config import apply_overrides
+from edge_depth_nerf.files import read_json, write_json
 from edge_depth_nerf.metrics import DepthErrors
 
 PIXELS_PER_VIEW = 3000
@@ -100,7 +102,11 @@ def train(scene: Path, overrides: dict[str, Any], steps: int, seed: int) -> dict
         for callback in callbacks:
             callback.run_callback_at_location(step, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
     seconds = (time.monotonic() - started) / steps
-    return {"s/step": seconds, **judge(pipeline, pixels)}
+    return {"seconds a step": seconds, **judge(pipeline, pixels)}
+
+
+def key_of(options: argparse.Namespace, variant: str, seed: int) -> str:
+    return f"{options.scene.resolve().name}, {options.steps} steps, seed {seed}: {variant or '(defaults)'}"
 
 
 def main() -> None:
@@ -108,15 +114,35 @@ def main() -> None:
     parser.add_argument("scene", type=Path)
     parser.add_argument("variants", nargs="+")
     parser.add_argument("--steps", type=int, default=400)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--json", type=Path)
     options = parser.parse_args()
-    table: Table | None = None
-    for variant in options.variants:
-        figures = train(options.scene, parse(variant), options.steps, options.seed)
-        if table is None:
-            table = Table("variant", *figures, title=f"{options.scene}, {options.steps} steps, seed {options.seed}")
-        table.add_row(variant or "(defaults)", *(f"{value:.4g}" for value in figures.values()))
-        Console(width=200).print(table)
+    done: dict[str, dict[str, float]] = {}
+    if options.json and options.json.is_file():
+        done = read_json(options.json)
+    console = Console(width=200)
+    for seed in options.seeds:
+        for variant in options.variants:
+            key = key_of(options, variant, seed)
+            if key not in done:
+                done[key] = train(options.scene, parse(variant), options.steps, seed)
+                if options.json:
+                    write_json(options.json, done)
+            console.print(key, {name: round(value, 4) for name, value in done[key].items()})
+    by_variant = [[done[key_of(options, variant, seed)] for seed in options.seeds] for variant in options.variants]
+    names = list(by_variant[0][0])
+    seeds = ", ".join(map(str, options.seeds))
+    table = Table("variant", *names, title=f"{options.scene.name}, {options.steps} steps, seeds {seeds}")
+    for variant, found in zip(options.variants, by_variant, strict=True):
+        table.add_row(variant or "(defaults)", *(f"{np.mean([each[name] for each in found]):.4g}" for name in names))
+        if len(options.seeds) > 1 and found is not by_variant[0]:
+            pairs = list(zip(found, by_variant[0], strict=True))
+            differences = [[each[name] - first[name] for each, first in pairs] for name in names]
+            table.add_row(
+                "  less the first",
+                *(f"{np.mean(each):+.3g} ({min(each):+.3g} to {max(each):+.3g})" for each in differences),
+            )
+    console.print(table)
 
 
 if __name__ == "__main__":
