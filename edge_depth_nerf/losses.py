@@ -88,6 +88,11 @@ def edge_loss(
     weights, starts, ends, prior, sigma = (tensor.to(dtype) for tensor in inputs)
 
     has_prior = (prior > 0) & torch.isfinite(prior) & (sigma > 0) & torch.isfinite(sigma)
+    if weights.device.type == "cpu":
+        # a GPU would have to wait for how many there are
+        chosen = has_prior.nonzero()[:, 0]
+        weights, starts, ends = (tensor[chosen] for tensor in (weights, starts, ends))
+        prior, sigma, has_prior = (tensor[chosen] for tensor in (prior, sigma, has_prior))
     counts = has_prior[:, None] & (ends > starts) & torch.isfinite(starts) & torch.isfinite(ends)
     # what does not count gets harmless values before the arithmetic: `where` after it would let NaN into gradients
     prior, sigma = torch.where(has_prior, prior, 1)[:, None], torch.where(has_prior, sigma, 1)[:, None]

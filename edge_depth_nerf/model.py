@@ -12,9 +12,10 @@ from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
-from nerfstudio.cameras.rays import RaySamples
+from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.field_components.spatial_distortions import SceneContraction
 from nerfstudio.model_components.losses import ds_nerf_depth_loss, urban_radiance_field_depth_loss
+from nerfstudio.model_components.renderers import DepthRenderer
 from nerfstudio.model_components.scene_colliders import NearFarCollider
 from nerfstudio.models.nerfacto import NerfactoModel, NerfactoModelConfig
 from nerfstudio.utils.external import TCNN_EXISTS
@@ -70,6 +71,24 @@ class CubeContraction(SceneContraction):
         """Contract positions in scene units to -2..2."""
         norm = positions.abs().amax(dim=-1, keepdim=True)
         return torch.where(norm < 1, positions, (2 - 1 / norm) * (positions / norm))
+
+
+class DepthInEvaluation(DepthRenderer):
+    """nerfstudio's depth; nothing in training, where nobody reads it."""
+
+    def forward(self, weights: Tensor, ray_samples: RaySamples, *args: Any, **kwargs: Any) -> Any:
+        """Give the depth, [rays, 1]; in training None."""
+        if self.training:
+            return None
+        return super().forward(weights, ray_samples, *args, **kwargs)
+
+
+class Psnr(torch.nn.Module):
+    """torchmetrics' PSNR of values in 0..1, without the state that it keeps over batches."""
+
+    def forward(self, image: Tensor, other: Tensor) -> Tensor:
+        """PSNR of two pictures, dB."""
+        return -10 * torch.log10(torch.nn.functional.mse_loss(image.detach(), other))
 
 
 class LpipsAtFirstUse:
@@ -128,6 +147,10 @@ class EdgeDepthNerfModel(NerfactoModel):
             for network in (self.field, *self.proposal_networks):
                 network.spatial_distortion = CubeContraction(order=float("inf"))
         self.lpips = LpipsAtFirstUse()
+        self.psnr = Psnr()
+        self.renderer_depth = DepthInEvaluation(method="median")
+        if self.config.depth_loss != "urban-nerf":
+            self.renderer_expected_depth = DepthInEvaluation(method="expected")
         # the near plane is not reset at evaluation: nothing was trained in front of it
         self.collider = NearFarCollider(
             near_plane=self.config.near_m / self.metres_per_unit,
@@ -135,6 +158,11 @@ class EdgeDepthNerfModel(NerfactoModel):
             reset_near_plane=False,
         )
         self.reset_depth_errors()
+
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
+        """Nerfacto's outputs; in training without the depths that no loss reads."""
+        outputs = super().get_outputs(ray_bundle)
+        return {name: value for name, value in outputs.items() if value is not None}
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
         """Nerfacto's metrics and, in training, the share of rays with a prior."""
