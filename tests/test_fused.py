@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
 import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
 
+from edge_depth_nerf.config import FusedAdamConfig
 from edge_depth_nerf.model import EdgeDepthNerfModel
 
 
@@ -31,6 +34,43 @@ def build(**options) -> EdgeDepthNerfModel:
     config = replace(config, camera_optimizer=camera_optimizer, **options)
     box = SceneBox(aabb=torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
     return config.setup(scene_box=box, num_train_data=3, metadata={"metres_per_unit": 20.0}, device="cpu")
+
+
+def train(model: EdgeDepthNerfModel, optimiser: AdamOptimizerConfig, steps: int) -> list[dict[str, float]]:
+    """The losses of some steps, from random numbers of one seed."""
+    model.train()
+    steps_of = optimiser.setup([p for group in model.get_param_groups().values() for p in group])
+    history = []
+    for step in range(steps):
+        rays = bundle(64, seed=step)
+        generator = torch.Generator().manual_seed(step)
+        prior = 3 + 10 * torch.rand(64, 1, generator=generator)
+        prior[::4] = 0
+        batch = {
+            "image": torch.rand(64, 3, generator=generator),
+            "prior_distance_m": prior,
+            "prior_sigma_m": 0.1 * prior + 0.01,
+        }
+        torch.manual_seed(step)
+        outputs = model(rays)
+        losses = model.get_loss_dict(outputs, batch, model.get_metrics_dict(outputs, batch))
+        steps_of.zero_grad()
+        torch.stack(list(losses.values())).sum().backward()
+        steps_of.step()
+        history.append({name: float(loss.detach()) for name, loss in losses.items()})
+    return history
+
+
+@pytest.mark.parametrize("options", [{}, {"poses": "SO3xR3"}, {"depth_loss": "urban-nerf"}], ids=str)
+def test_training_goes_as_with_torch(options):
+    """The same seed gives the same losses, step after step, with nerfstudio's arithmetic and with the fused one."""
+    torch_history = train(build(implementation="torch", **options), AdamOptimizerConfig(lr=1e-2, eps=1e-15), 6)
+    fused_history = train(build(implementation="fused", **options), FusedAdamConfig(lr=1e-2, eps=1e-15), 6)
+    assert torch_history[-1]["rgb_loss"] < torch_history[0]["rgb_loss"]
+    for expected, found in zip(torch_history, fused_history, strict=True):
+        assert set(found) == set(expected)
+        for name, value in expected.items():
+            assert found[name] == pytest.approx(value, rel=2e-3, abs=1e-7), name
 
 
 def test_training_renders_no_depth_that_nobody_reads():
