@@ -42,6 +42,7 @@ from edge_depth_nerf.mono.error_model import Trust
 from edge_depth_nerf.mono.trust import field_of_source, find_trust
 from edge_depth_nerf.pixel_table import TABLE_VERSION, PixelBatch, PixelTable, PixelTableWriter
 from edge_depth_nerf.prior import CACHE_VERSION, Prior, PriorCache, PriorOptions, View, view_of
+from edge_depth_nerf.ray_table import TableRayGenerator
 
 KEPT_TABLES = 8
 """So many tables of pixels are kept of a scene, those used last; one of 300 pictures of 1400×1400 px takes 6 GB."""
@@ -193,7 +194,7 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         """Integrate the prior of every training frame and write the table of training pixels, or find it."""
         table = self._table(self.train_dataset, "Integrating depth", with_prior=True)
         self.train_pixel_sampler = TablePixelSampler(table, self.config.train_num_rays_per_batch)
-        self.train_ray_generator = RayGenerator(self.train_dataset.cameras.to(self.device))
+        self.train_ray_generator = self._ray_generator(self.train_dataset)
         CONSOLE.log(
             f"{len(self.train_dataset)} training pictures, {len(table):,} valid pixels, "
             f"{table.share_with_prior:.1%} of them with a depth prior"
@@ -203,7 +204,7 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         """Write or find the table of held-out pixels (no prior) and prepare the loaders of whole views."""
         table = self._table(self.eval_dataset, "Reading held-out pictures", with_prior=False)
         self.eval_pixel_sampler = TablePixelSampler(table, self.config.eval_num_rays_per_batch)
-        self.eval_ray_generator = RayGenerator(self.eval_dataset.cameras.to(self.device))
+        self.eval_ray_generator = self._ray_generator(self.eval_dataset)
         self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(
             input_dataset=self.eval_dataset, device=self.device
         )
@@ -221,6 +222,18 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         assert self.eval_pixel_sampler is not None
         return self._serve(self.eval_pixel_sampler.sample(), self.eval_ray_generator)
 
+    def _ray_generator(self, dataset: FisheyeDepthDataset) -> RayGenerator:
+        """The table of rays where the cameras allow one, else nerfstudio's generator."""
+        cameras = dataset.cameras.to(self.device)
+        if TableRayGenerator.suits(cameras):
+            return TableRayGenerator(cameras, self._cache_dir() / "rays")
+        # its grid of pixels has to lie where the indices do
+        return RayGenerator(cameras).to(self.device)
+
+    def _cache_dir(self) -> Path:
+        data = Path(self.config.dataparser.data)
+        return self.config.cache_dir or (data.parent if data.suffix == ".json" else data) / ".cache"
+
     def _serve(self, batch: PixelBatch, generator: RayGenerator) -> tuple[RayBundle, dict[str, Any]]:
         rays = generator(batch.indices.to(self.device))
         return rays, {
@@ -233,8 +246,7 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
     def _table(self, dataset: FisheyeDepthDataset, description: str, with_prior: bool) -> PixelTable:
         """The table of a split's pixels: the one on disk, if it was made of the same things, or a new one."""
         data = Path(self.config.dataparser.data)
-        scene = data.parent if data.suffix == ".json" else data
-        cache_dir = self.config.cache_dir or scene / ".cache"
+        cache_dir = self._cache_dir()
         options: PriorOptions | None = None
         trust: Trust | None = None
         has_lidar = bool(dataset.metadata["lidar_filenames"])

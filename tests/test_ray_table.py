@@ -1,0 +1,65 @@
+"""Rays read from the table of a lens against nerfstudio's own."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.model_components.ray_generators import RayGenerator
+
+from edge_depth_nerf.ray_table import TableRayGenerator
+
+
+def cameras(kind: CameraType = CameraType.FISHEYE, **extra) -> Cameras:
+    """Five cameras with two lenses of different sizes, turned and moved."""
+    generator = torch.Generator().manual_seed(0)
+    turned, _ = torch.linalg.qr(torch.randn(5, 3, 3, generator=generator))
+    second = torch.tensor([0, 1, 0, 1, 1])[:, None]
+    return Cameras(
+        camera_to_worlds=torch.cat([turned, torch.randn(5, 3, 1, generator=generator)], dim=-1),
+        fx=20.0 + 3 * second,
+        fy=21.0 + second,
+        cx=15.5 + second,
+        cy=14.0 + second,
+        width=32 + 4 * second,
+        height=28 + 2 * second,
+        distortion_params=torch.tensor([0.02, -0.004, 0.0, 0.0, 1e-3, 2e-3]) * (1 + second),
+        camera_type=kind,
+        **extra,
+    )
+
+
+@pytest.mark.parametrize("kind", [CameraType.FISHEYE, CameraType.PERSPECTIVE])
+def test_rays_of_the_table_are_nerfstudios(tmp_path, kind, monkeypatch):
+    given = cameras(kind)
+    assert TableRayGenerator.suits(given)
+    indices = torch.stack([torch.randint(5, (300,)), torch.randint(28, (300,)), torch.randint(32, (300,))], dim=-1)
+    indices[:2] = torch.tensor([[1, 29, 35], [0, 27, 31]])  # last pixels
+    expected = RayGenerator(given)(indices)
+    made = TableRayGenerator(given, tmp_path / "rays")
+    assert len(list(tmp_path.rglob("*.npy"))) == 1
+    monkeypatch.setattr("edge_depth_nerf.ray_table._make", lambda *_: pytest.fail("made again"))
+    for generator in (made, TableRayGenerator(given, tmp_path / "rays")):
+        rays = generator(indices)
+        assert torch.equal(rays.origins, expected.origins)
+        assert torch.equal(rays.camera_indices, expected.camera_indices)
+        torch.testing.assert_close(rays.directions, expected.directions, rtol=0, atol=3e-7)
+        torch.testing.assert_close(rays.pixel_area, expected.pixel_area, rtol=2e-4, atol=0)
+        torch.testing.assert_close(rays.metadata["directions_norm"], expected.metadata["directions_norm"])
+
+
+def test_a_broken_table_of_rays_is_made_anew_and_one_that_cannot_be_kept_stays_in_memory(tmp_path):
+    given = cameras()
+    expected = TableRayGenerator(given, tmp_path / "rays").table.clone()
+    (path,) = (tmp_path / "rays").iterdir()
+    path.write_bytes(path.read_bytes()[:1000])
+    assert torch.equal(TableRayGenerator(given, tmp_path / "rays").table, expected)
+    (tmp_path / "file").write_text("in the way")
+    assert torch.equal(TableRayGenerator(given, tmp_path / "file").table, expected)
+
+
+def test_cameras_without_a_table(monkeypatch):
+    assert not TableRayGenerator.suits(cameras(CameraType.EQUIRECTANGULAR))
+    assert not TableRayGenerator.suits(cameras(times=torch.zeros(5, 1)))
+    monkeypatch.setattr("edge_depth_nerf.ray_table.MOST_PIXELS", 1000)
+    assert not TableRayGenerator.suits(cameras())
