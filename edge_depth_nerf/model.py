@@ -24,6 +24,7 @@ from torch import Tensor
 
 from edge_depth_nerf.compat import lpips_not_built
 from edge_depth_nerf.encodings.fused import FusedHashEncoding, use_fused_encodings
+from edge_depth_nerf.fused.sampler import FusedPDFSampler
 from edge_depth_nerf.losses import edge_loss
 from edge_depth_nerf.metrics import DepthErrors, load_lpips, masked_lpips, masked_psnr, masked_ssim
 from edge_depth_nerf.pictures import colour_distance
@@ -138,6 +139,10 @@ class EdgeDepthNerfModel(NerfactoModel):
             super().populate_modules()
         if implementation == "fused":
             use_fused_encodings(self)
+            pdf = self.proposal_sampler.pdf_sampler
+            self.proposal_sampler.pdf_sampler = FusedPDFSampler(
+                include_original=pdf.include_original, single_jitter=pdf.single_jitter
+            )
             # nerfacto's field asks for a gradient to the positions at every step, for normals or poses
             if not self.config.predict_normals and self.config.camera_optimizer.mode == "off":
                 for part in self.modules():

@@ -10,8 +10,10 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.model_components.ray_samplers import PDFSampler, UniformLinDispPiecewiseSampler
 
 from edge_depth_nerf.config import FusedAdamConfig
+from edge_depth_nerf.fused.sampler import FusedPDFSampler, edges_of
 from edge_depth_nerf.model import EdgeDepthNerfModel
 
 
@@ -25,6 +27,28 @@ def bundle(count: int = 40, seed: int = 1) -> RayBundle:
         nears=torch.full((count, 1), 0.01),
         fars=torch.full((count, 1), 50.0),
     )
+
+
+@pytest.mark.parametrize("training", [True, False])
+@pytest.mark.parametrize("single_jitter", [True, False])
+def test_samples_lie_where_nerfstudio_puts_them(training, single_jitter):
+    rays = bundle()
+    first = UniformLinDispPiecewiseSampler(num_samples=30).train(training)(rays)
+    generator = torch.Generator().manual_seed(5)
+    weights = torch.rand(40, 30, 1, generator=generator) ** 8
+    weights[3] = 0
+    weights[4] = 0
+    weights[4, 7] = 1
+    weights[5, :] = 1e-9
+    found = []
+    for kind in (PDFSampler, FusedPDFSampler):
+        sampler = kind(include_original=False, single_jitter=single_jitter).train(training)
+        torch.manual_seed(2)
+        samples = sampler(rays, first, weights, num_samples=17)
+        found.append((edges_of(samples), samples.frustums.starts, samples.frustums.ends))
+    for expected, placed in zip(*found, strict=True):
+        torch.testing.assert_close(placed, expected, rtol=1e-4, atol=1e-5)
+    assert found[1][0].diff().min() >= 0
 
 
 def build(**options) -> EdgeDepthNerfModel:
