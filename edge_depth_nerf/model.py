@@ -24,7 +24,8 @@ from torch import Tensor
 
 from edge_depth_nerf.compat import lpips_not_built
 from edge_depth_nerf.encodings.fused import FusedHashEncoding, use_fused_encodings
-from edge_depth_nerf.fused.sampler import FusedPDFSampler
+from edge_depth_nerf.fused.losses import distortion_loss, proposal_loss
+from edge_depth_nerf.fused.sampler import FusedPDFSampler, edges_of
 from edge_depth_nerf.losses import edge_loss
 from edge_depth_nerf.metrics import DepthErrors, load_lpips, masked_lpips, masked_psnr, masked_ssim
 from edge_depth_nerf.pictures import colour_distance
@@ -135,6 +136,7 @@ class EdgeDepthNerfModel(NerfactoModel):
             implementation = "tcnn" if TCNN_EXISTS and on_gpu else "fused"
         # nerfstudio knows two of them; the model's own configuration says which was built
         self.config = replace(self.config, implementation="tcnn" if implementation == "tcnn" else "torch")
+        self._fused = implementation == "fused"
         with lpips_not_built():
             super().populate_modules()
         if implementation == "fused":
@@ -171,7 +173,17 @@ class EdgeDepthNerfModel(NerfactoModel):
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
         """Nerfacto's metrics and, in training, the share of rays with a prior."""
-        metrics = super().get_metrics_dict(outputs, batch)
+        if self.training and self._fused:
+            rendered = outputs["rgb"]
+            metrics = {
+                "psnr": self.psnr(rendered, self.renderer_rgb.blend_background(batch["image"].to(self.device))),
+                "distortion": distortion_loss(
+                    edges_of(outputs["ray_samples_list"][-1]), outputs["weights_list"][-1][..., 0]
+                ),
+            }
+            self.camera_optimizer.get_metrics_dict(metrics)
+        else:
+            metrics = super().get_metrics_dict(outputs, batch)
         if self.training and self.config.depth_loss != "none":
             metrics["share_with_prior"] = (batch["prior_distance_m"] > 0).float().mean()
         return metrics
@@ -180,7 +192,10 @@ class EdgeDepthNerfModel(NerfactoModel):
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Any] | None = None
     ) -> dict[str, Tensor]:
         """Nerfacto's losses and the one on the distance prior: L_color + λ·L_edge."""
-        losses = super().get_loss_dict(outputs, batch, metrics_dict)
+        if self.training and self._fused and metrics_dict is not None and not self.config.predict_normals:
+            losses = self._nerfacto_losses(outputs, batch, metrics_dict)
+        else:
+            losses = super().get_loss_dict(outputs, batch, metrics_dict)
         if self.training and self.config.depth_loss != "none":
             levels = list(zip(outputs["weights_list"], outputs["ray_samples_list"], strict=True))
             if self.config.depth_loss_levels == "final":
@@ -188,6 +203,26 @@ class EdgeDepthNerfModel(NerfactoModel):
             per_level = [self._depth_loss(weights, samples, outputs, batch) for weights, samples in levels]
             name = "edge_loss" if self.config.depth_loss == "edge" else "depth_loss"
             losses[name] = self.config.depth_loss_mult * torch.stack(per_level).mean()
+        return losses
+
+    def _nerfacto_losses(
+        self, outputs: dict[str, Any], batch: dict[str, Any], metrics: dict[str, Any]
+    ) -> dict[str, Tensor]:
+        """Nerfacto's losses without normals, in fewer passes."""
+        rendered, image = self.renderer_rgb.blend_background_for_loss_computation(
+            outputs["rgb"], outputs["accumulation"], batch["image"].to(self.device)
+        )
+        *proposals, final = (
+            (edges_of(samples), weights[..., 0])
+            for samples, weights in zip(outputs["ray_samples_list"], outputs["weights_list"], strict=True)
+        )
+        bounds = [proposal_loss(final[0], final[1].detach(), *proposal) for proposal in proposals]
+        losses = {
+            "rgb_loss": self.rgb_loss(image, rendered),
+            "interlevel_loss": self.config.interlevel_loss_mult * torch.stack(bounds).sum(),
+            "distortion_loss": self.config.distortion_loss_mult * metrics["distortion"],
+        }
+        self.camera_optimizer.get_loss_dict(losses)
         return losses
 
     def _depth_loss(

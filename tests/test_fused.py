@@ -10,9 +10,11 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.model_components.losses import lossfun_distortion, lossfun_outer
 from nerfstudio.model_components.ray_samplers import PDFSampler, UniformLinDispPiecewiseSampler
 
 from edge_depth_nerf.config import FusedAdamConfig
+from edge_depth_nerf.fused.losses import distortion_loss, proposal_loss
 from edge_depth_nerf.fused.sampler import FusedPDFSampler, edges_of
 from edge_depth_nerf.model import EdgeDepthNerfModel
 
@@ -49,6 +51,47 @@ def test_samples_lie_where_nerfstudio_puts_them(training, single_jitter):
     for expected, placed in zip(*found, strict=True):
         torch.testing.assert_close(placed, expected, rtol=1e-4, atol=1e-5)
     assert found[1][0].diff().min() >= 0
+
+
+def histograms(seed: int = 0, rays: int = 50) -> tuple[torch.Tensor, ...]:
+    """Edges and weights of final samples and of a proposal; some edges are common to both."""
+    generator = torch.Generator().manual_seed(seed)
+    outer_edges = torch.rand(rays, 13, generator=generator).sort(dim=1)[0]
+    edges = torch.rand(rays, 9, generator=generator).sort(dim=1)[0]
+    edges[: rays // 2, 2:5] = outer_edges[: rays // 2, 4:7]
+    edges = edges.sort(dim=1)[0]
+    return (
+        edges,
+        torch.rand(rays, 8, generator=generator) / 8,
+        outer_edges,
+        torch.rand(rays, 12, generator=generator) / 20,
+    )
+
+
+def test_the_proposal_loss_is_nerfstudios():
+    edges, weights, outer_edges, outer = histograms()
+    outers = [outer.clone().requires_grad_() for _ in range(2)]
+    expected = lossfun_outer(edges, weights, outer_edges, outers[0]).mean()
+    found = proposal_loss(edges, weights, outer_edges, outers[1])
+    assert float(found) == pytest.approx(float(expected), rel=1e-5)
+    assert expected > 0
+    expected.backward()
+    found.backward()
+    assert outers[0].grad is not None and outers[1].grad is not None
+    torch.testing.assert_close(outers[1].grad, outers[0].grad, rtol=1e-4, atol=1e-7)
+    assert not proposal_loss(edges, weights, outer_edges, outer).requires_grad
+
+
+def test_the_distortion_loss_is_nerfstudios():
+    edges, weights, _, _ = histograms()
+    both = [weights.clone().requires_grad_() for _ in range(2)]
+    expected = lossfun_distortion(edges, both[0]).mean()
+    found = distortion_loss(edges, both[1])
+    assert float(found) == pytest.approx(float(expected), rel=1e-5)
+    expected.backward()
+    found.backward()
+    assert both[0].grad is not None and both[1].grad is not None
+    torch.testing.assert_close(both[1].grad, both[0].grad, rtol=1e-4, atol=1e-7)
 
 
 def build(**options) -> EdgeDepthNerfModel:
