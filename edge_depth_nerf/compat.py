@@ -10,7 +10,6 @@ from contextlib import contextmanager
 
 import numpy as np
 import torch
-import torchmetrics.image.lpip
 
 
 def allow_numpy_scalars_in_checkpoints() -> None:
@@ -36,7 +35,8 @@ def lpips_not_built() -> Iterator[None]:
     nerfacto's `populate_modules` imports the class at that moment, so the name in torchmetrics is swapped for
     the duration. Ends with: a nerfstudio that builds its metrics at first use.
     """
-    module = torchmetrics.image.lpip
+    import torchmetrics.image.lpip as module  # a second and more; nerfstudio's commands start without it
+
     original = module.LearnedPerceptualImagePatchSimilarity
     module.LearnedPerceptualImagePatchSimilarity = lambda **_: None
     try:

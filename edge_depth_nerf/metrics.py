@@ -19,8 +19,6 @@ from urllib.parse import urlparse
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torchmetrics.functional.image import structural_similarity_index_measure
-from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 from torchvision.models import AlexNet_Weights
 
 from edge_depth_nerf.errors import InputError
@@ -99,6 +97,9 @@ def masked_ssim(
             f"masked_ssim: the mask {tuple(mask.shape)} has no {SSIM_SIZE_PX}×{SSIM_SIZE_PX} window inside; "
             "it is too thin, or the picture too small, for SSIM."
         )
+    # torchmetrics takes a second and more to import; no command of nerfstudio's should wait for it at its start
+    from torchmetrics.functional.image import structural_similarity_index_measure
+
     _, full = structural_similarity_index_measure(
         _blacked_out(pred, mask), _blacked_out(target, mask), data_range=1.0, return_full_image=True
     )
@@ -151,6 +152,8 @@ def load_lpips() -> torch.nn.Module | None:
     if not path.is_file():
         _say_once(f"LPIPS is left out: no AlexNet weights at {path}. To have it, put the file of {url} there.")
         return None
+    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
     try:
         return LearnedPerceptualImagePatchSimilarity(net_type="alex", normalize=True).eval()
     except (RuntimeError, OSError, EOFError, pickle.UnpicklingError) as error:
