@@ -23,13 +23,13 @@ from rich.console import Console
 from rich.table import Table
 
 from edge_depth_nerf.files import read_distance_png, read_image, write_png
-from edge_depth_nerf.inspecting.reader import InspectedScene, read_scene
 from edge_depth_nerf.mono.estimate import PRESETS, estimate_depth
 from edge_depth_nerf.mono.examples import lens_rays, view_of
 from edge_depth_nerf.mono.options import EstimateDepthOptions
 from edge_depth_nerf.pictures import colour_distance, side_by_side
 from edge_depth_nerf.process.kitti360 import process_kitti360
 from edge_depth_nerf.process.options import Kitti360Options
+from edge_depth_nerf.scene_reader import SceneFolder, read_scene
 from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 
@@ -48,12 +48,12 @@ def make_scene(output: Path, drive: str, seed: int) -> Path:
     return scene
 
 
-def elevation_deg(scene: InspectedScene, picture) -> NDArray:
+def elevation_deg(scene: SceneFolder, picture) -> NDArray:
     rays, _ = lens_rays(picture.lens, scene.theta_max_rad, (picture.lens.width, picture.lens.height))
     return np.degrees(np.arcsin(np.clip(rays @ picture.up_in_camera, -1, 1)))
 
 
-def field_deg(scene: InspectedScene) -> NDArray:
+def field_deg(scene: SceneFolder) -> NDArray:
     """Lowest and highest elevation with LiDAR, over the training pictures."""
     found = [
         elevation_deg(scene, picture)[read_distance_png(picture.files["lidar"]) > 0]
@@ -71,7 +71,7 @@ def near_edges(truth_m: NDArray) -> NDArray[np.bool_]:
     return cv2.dilate(jump, np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1))) > 0
 
 
-def judge(scene: InspectedScene) -> dict[str, tuple[float, float, int]]:
+def judge(scene: SceneFolder) -> dict[str, tuple[float, float, int]]:
     """AbsRel, δ<1.25 and count by region, over the held-out pictures."""
     low, high = field_deg(scene)
     sums: dict[str, NDArray] = {}
@@ -102,7 +102,7 @@ def judge(scene: InspectedScene) -> dict[str, tuple[float, float, int]]:
     return {name: (total[0] / total[2], total[1] / total[2], int(total[2])) for name, total in sums.items()}
 
 
-def sheet(scene: InspectedScene) -> NDArray[np.uint8]:
+def sheet(scene: SceneFolder) -> NDArray[np.uint8]:
     held_out = [picture for picture in scene.pictures if picture.held_out]
     rows = []
     for picture in held_out[:: max(len(held_out) // 4, 1)][:4]:

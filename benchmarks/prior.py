@@ -41,7 +41,6 @@ from rich.table import Table
 
 from edge_depth_nerf.cameras import MEI
 from edge_depth_nerf.files import read_distance_png, read_image, read_json, write_json, write_png
-from edge_depth_nerf.inspecting.reader import read_scene
 from edge_depth_nerf.integration import integrate_depth
 from edge_depth_nerf.metrics import JUDGED_RANGE_M
 from edge_depth_nerf.mono.alignment import Fit, align
@@ -55,6 +54,7 @@ from edge_depth_nerf.prior import Prior, PriorOptions, View, make_prior, view_of
 from edge_depth_nerf.process.kitti360 import process_kitti360
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.process.scene import FrameContent, SceneCamera, SceneFrame, write_scene
+from edge_depth_nerf.scene_reader import read_scene
 from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 

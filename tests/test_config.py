@@ -123,3 +123,14 @@ def test_the_command_line_imports_nothing_heavy():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_the_plugin_adds_little_to_nerfstudios_commands():
+    """Every ns-* command imports it; what takes long is imported when it is needed."""
+    check = (
+        "import nerfstudio.configs.method_configs, sys; "
+        "heavy = {'numba', 'torchmetrics', 'trimesh', 'transformers', 'scipy.stats'} & set(sys.modules); "
+        "sys.exit(str(heavy) if heavy or 'edge_depth_nerf.config' not in sys.modules else 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

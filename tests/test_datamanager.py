@@ -13,10 +13,10 @@ from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
 from edge_depth_nerf.dataset import FisheyeDepthDataset
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_json, write_json, write_mask
-from edge_depth_nerf.inspecting.reader import read_scene
 from edge_depth_nerf.mono.error_model import read_trust
 from edge_depth_nerf.mono.trust import calibrate_scene, find_trust
 from edge_depth_nerf.prior import make_prior, view_of
+from edge_depth_nerf.scene_reader import read_scene
 
 
 def manager(folder, test_mode="val", parser=None, **options):

@@ -12,10 +12,10 @@ from scenes import FLIP
 
 from edge_depth_nerf.cameras import KannalaBrandt
 from edge_depth_nerf.files import write_distance_png, write_json, write_png
-from edge_depth_nerf.inspecting.reader import InspectedPicture, InspectedScene, read_scene
 from edge_depth_nerf.mono import far_seen
 from edge_depth_nerf.mono.examples import load_examples
 from edge_depth_nerf.mono.far_seen import field_deg, seen_above, static_cloud
+from edge_depth_nerf.scene_reader import SceneFolder, ScenePicture, read_scene
 
 LENS = KannalaBrandt(240, 200, 80.0, 80.0, 121.0, 101.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 EYE_M, WALL_M, FIELD_DEG = 1.5, 20.0, 2.0
@@ -49,9 +49,7 @@ def truth_m(position_m: float) -> np.ndarray:
     return np.minimum(ground, distance_to(WALL_M - position_m))
 
 
-def write_drive(
-    folder: Path, extra_m: dict[int, np.ndarray] | None = None, top_deg: float = FIELD_DEG
-) -> InspectedScene:
+def write_drive(folder: Path, extra_m: dict[int, np.ndarray] | None = None, top_deg: float = FIELD_DEG) -> SceneFolder:
     """Write a drive towards a wall; `extra_m` are distances of things that one picture alone has before it."""
     entries = []
     for index, position in enumerate(POSITIONS_M):
@@ -79,7 +77,7 @@ def write_drive(
     return read_scene(folder)
 
 
-def shown(scene: InspectedScene, index: int) -> np.ndarray:
+def shown(scene: SceneFolder, index: int) -> np.ndarray:
     """What the whole drive's LiDAR shows of one picture."""
     cloud = static_cloud(scene, scene.pictures)
     return seen_above(cloud, scene, scene.pictures[index], (LENS.width, LENS.height))
@@ -148,7 +146,7 @@ def test_one_picture_or_none_knows_nothing_more(tmp_path, pictures):
 # ---- long drives -----------------------------------------------------------------------------------------------
 
 
-def copies(scene: InspectedScene, count: int, apart_m: float = 300.0) -> list[InspectedPicture]:
+def copies(scene: SceneFolder, count: int, apart_m: float = 300.0) -> list[ScenePicture]:
     """The drive again and again, one behind the other along x, diagonally into negative coordinates."""
     return [
         dataclasses.replace(picture, position_m=picture.position_m + number * np.array([apart_m, -apart_m, 0.0]))
@@ -214,7 +212,7 @@ def test_near_points_are_those_within_reach(monkeypatch):
     # each keeps its own spacing
     np.testing.assert_array_equal(points[cloud.spacing_m.astype(int)], cloud.points_m)
     for place in ([0.0, 0.0, 0.0], [-71.3, 12.5, 40.0], [149.0, -149.0, 0.0], [900.0, 0.0, 0.0]):
-        picture = InspectedPicture("a", "a", 0, LENS, np.array(place), np.eye(3), False, None, {})
+        picture = ScenePicture("a", "a", 0, LENS, np.array(place), np.eye(3), False, None, {})
         expected = np.hypot(*(points[:, :2] - place[:2]).T) <= 86
         np.testing.assert_array_equal(rows(cloud.points_m[cloud.near(picture)]), rows(points[expected]))
 

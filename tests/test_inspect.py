@@ -32,7 +32,6 @@ from edge_depth_nerf.inspect_options import InspectOptions
 from edge_depth_nerf.inspecting import inspect_scene
 from edge_depth_nerf.inspecting.figures import measured_moments
 from edge_depth_nerf.inspecting.findings import Finding, find, limited
-from edge_depth_nerf.inspecting.reader import read_scene
 from edge_depth_nerf.inspecting.top_view import HELD_OUT_RGB, TRAINING_RGB, draw_top_view, nice_length
 from edge_depth_nerf.mono.error_model import read_trust
 from edge_depth_nerf.pictures import (
@@ -48,6 +47,7 @@ from edge_depth_nerf.pictures import (
     tinted,
     write_text,
 )
+from edge_depth_nerf.scene_reader import read_scene
 
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / "data" / "sample_drive"

@@ -15,15 +15,15 @@ from scenes import FLIP, RADIUS_M, fisheye, pinhole, write_scene
 from edge_depth_nerf import cli
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_distance_png, read_json, write_distance_png, write_json, write_png
-from edge_depth_nerf.inspecting.reader import InspectedPicture, read_scene
 from edge_depth_nerf.mono.estimate import estimate_depth
 from edge_depth_nerf.mono.files import npy_shape, read_npy
 from edge_depth_nerf.mono.options import EstimateDepthOptions
+from edge_depth_nerf.scene_reader import ScenePicture, read_scene
 
 LENS = fisheye(48, 44)
 
 
-def true_distance(picture: InspectedPicture) -> tuple[np.ndarray, np.ndarray]:
+def true_distance(picture: ScenePicture) -> tuple[np.ndarray, np.ndarray]:
     """Distance inside the ball, and the cosine of each ray to the axis, in float64; 0 outside the lens."""
     directions, valid = picture.lens.unproject(picture.lens.pixel_centres())
     rays = np.where(valid.numpy()[..., None], np.nan_to_num(directions.numpy()), 0)

@@ -16,7 +16,6 @@ from edge_depth_nerf import cli
 from edge_depth_nerf.cameras import Camera, KannalaBrandt
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_distance_png, read_image, read_json, write_distance_png, write_json
-from edge_depth_nerf.inspecting.reader import InspectedPicture, read_scene
 from edge_depth_nerf.mono.elsewhere import FittedMaps
 from edge_depth_nerf.mono.estimate import estimate_depth
 from edge_depth_nerf.mono.examples import lens_rays
@@ -24,6 +23,7 @@ from edge_depth_nerf.mono.hf import load_ready_network, view_layers
 from edge_depth_nerf.mono.options import EstimateDepthOptions
 from edge_depth_nerf.mono.pinhole_views import PinholeView, pinhole_views
 from edge_depth_nerf.mono.relative import Layer, Line, Samples, blend, fit_lines, take_samples
+from edge_depth_nerf.scene_reader import ScenePicture, read_scene
 
 THETA_MAX = np.radians(95.0)
 
@@ -197,7 +197,7 @@ def test_layers_are_blended_by_weight_in_log_distance():
 # ---- scenes -------------------------------------------------------------------------------------------------------
 
 
-def seen_in_the_ball(picture: InspectedPicture, rays: np.ndarray) -> np.ndarray:
+def seen_in_the_ball(picture: ScenePicture, rays: np.ndarray) -> np.ndarray:
     """Distance from a picture of `write_scene` to the wall, along rays of the camera."""
     world = rays @ (picture.rotation @ FLIP[:3, :3]).T
     along = world @ picture.position_m
@@ -214,7 +214,7 @@ def test_frames_with_few_returns_take_the_drives_fit(tmp_path, kind):
     write_distance_png(folder / "lidar/0002.png", lidar)
     scene = read_scene(folder)
 
-    def layers(picture: InspectedPicture) -> list[Layer]:
+    def layers(picture: ScenePicture) -> list[Layer]:
         rng = np.random.default_rng(5)
         odd = 3.0 if picture.held_out else 1.0
         said = []
@@ -255,7 +255,7 @@ def test_maps_of_unknown_scale_need_lidar(tmp_path):
 def test_a_map_that_runs_the_wrong_way_is_told(tmp_path, is_said, kind):
     scene = read_scene(write_scene(tmp_path, [shrunk(FISHEYE, 60)], frames=2, mono=False))
 
-    def layers(picture: InspectedPicture) -> list[Layer]:
+    def layers(picture: ScenePicture) -> list[Layer]:
         rays, within = lens_rays(picture.lens, scene.theta_max_rad, size_of(picture.lens))
         distance = seen_in_the_ball(picture, rays)
         values = 1 / distance if is_said == "inverse" else distance

@@ -19,6 +19,7 @@ from safetensors.torch import load_file, save_file
 from scenes import FLIP, fisheye, write_scene
 
 from edge_depth_nerf import cli
+from edge_depth_nerf import scene_reader as reader
 from edge_depth_nerf.cameras import KannalaBrandt
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import (
@@ -30,8 +31,6 @@ from edge_depth_nerf.files import (
     write_mask,
     write_png,
 )
-from edge_depth_nerf.inspecting import reader
-from edge_depth_nerf.inspecting.reader import read_scene
 from edge_depth_nerf.mono.error_model import TRUST_FILE
 from edge_depth_nerf.mono.estimate import (
     PRESETS,
@@ -62,6 +61,7 @@ from edge_depth_nerf.mono.training import (
     smoothness_loss,
     train,
 )
+from edge_depth_nerf.scene_reader import read_scene
 
 CPU = torch.device("cpu")
 HEIGHT_M = 1.5

@@ -13,7 +13,6 @@ from rich.console import Console
 
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_distance_png, read_json, write_distance_png, write_json
-from edge_depth_nerf.inspecting.reader import read_scene
 from edge_depth_nerf.mono import estimate
 from edge_depth_nerf.mono.error_model import TRUST_FILE, read_trust
 from edge_depth_nerf.mono.estimate import WEIGHTS, PresetValues
@@ -21,6 +20,7 @@ from edge_depth_nerf.mono.scene_maps import write_mono_maps
 from edge_depth_nerf.mono.training import TrainingOptions
 from edge_depth_nerf.process.command import process
 from edge_depth_nerf.process.options import Kitti360Options
+from edge_depth_nerf.scene_reader import read_scene
 
 
 @pytest.fixture(autouse=True)

@@ -25,9 +25,9 @@ from edge_depth_nerf.inspecting.figures import (
     path_figures,
 )
 from edge_depth_nerf.inspecting.findings import find, limited
-from edge_depth_nerf.inspecting.reader import InspectedPicture, InspectedScene, read_scene
 from edge_depth_nerf.inspecting.sheets import draw_sheet
 from edge_depth_nerf.inspecting.top_view import draw_top_view
+from edge_depth_nerf.scene_reader import SceneFolder, ScenePicture, read_scene
 
 SUMMARY = "summary.json"
 TOP_VIEW = "top_view.png"
@@ -116,13 +116,11 @@ def _open_output(output: Path) -> None:
         raise InputError(f"{output}: cannot be written ({error.strerror}). Give another --output.") from error
 
 
-def _sheet_name(picture: InspectedPicture) -> str:
+def _sheet_name(picture: ScenePicture) -> str:
     return f"{re.sub(r'[^A-Za-z0-9_-]+', '_', picture.camera)}_{picture.moment:010d}.png"
 
 
-def _look_at(
-    scene: InspectedScene, picture: InspectedPicture, sheet: Path | None, options: InspectOptions
-) -> PictureFigures:
+def _look_at(scene: SceneFolder, picture: ScenePicture, sheet: Path | None, options: InspectOptions) -> PictureFigures:
     """Measure one picture, and draw its sheet if it is to be shown."""
     maps = scene.maps(picture)
     figures = measure(picture, maps)

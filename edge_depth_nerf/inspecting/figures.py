@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_depth_nerf.inspecting.reader import InspectedPicture, InspectedScene, PictureMaps
 from edge_depth_nerf.pictures import is_distance
+from edge_depth_nerf.scene_reader import PictureMaps, SceneFolder, ScenePicture
 
 MEASURED_PICTURES = 64
 """Maps of so many pictures are measured, unless more are to be shown."""
@@ -32,7 +32,7 @@ STANDING_M = 0.05
 class PictureFigures:
     """What the maps of one picture hold."""
 
-    picture: InspectedPicture
+    picture: ScenePicture
     """Which."""
     used_share: float
     """Share of the picture that the mask leaves, within the lens."""
@@ -72,7 +72,7 @@ class PictureFigures:
         }
 
 
-def measure(picture: InspectedPicture, maps: PictureMaps) -> PictureFigures:
+def measure(picture: ScenePicture, maps: PictureMaps) -> PictureFigures:
     """Take the figures of one picture."""
     usable = maps.usable
     count = max(int(usable.sum()), 1)
@@ -116,7 +116,7 @@ def measure(picture: InspectedPicture, maps: PictureMaps) -> PictureFigures:
     )
 
 
-def measured_moments(scene: InspectedScene, shown: int) -> tuple[list[int], list[int]]:
+def measured_moments(scene: SceneFolder, shown: int) -> tuple[list[int], list[int]]:
     """Choose which moments are measured, and which of them are shown, both spread evenly over the drive."""
     moments = scene.moments()
     wanted = max(MEASURED_PICTURES // len(scene.cameras()), shown, 1)
@@ -134,9 +134,9 @@ def _spread(moments: Sequence[int], count: int) -> list[int]:
 class Step:
     """From one picture of a camera to its next."""
 
-    before: InspectedPicture
+    before: ScenePicture
     """The earlier picture."""
-    after: InspectedPicture
+    after: ScenePicture
     """The later picture."""
     length_m: float
     """Distance between their cameras."""
@@ -146,7 +146,7 @@ class Step:
     """Time between them, where both have a timestamp."""
 
 
-def steps(pictures: Sequence[InspectedPicture]) -> list[Step]:
+def steps(pictures: Sequence[ScenePicture]) -> list[Step]:
     """List the steps of one camera; `pictures` in order of their moments."""
     found = []
     for before, after in pairwise(pictures):
@@ -171,13 +171,13 @@ def usual_length_m(found: Sequence[Step], own: bool) -> float:
     return float(np.median(moved)) if moved else 0.0
 
 
-def reference_camera(scene: InspectedScene) -> str:
+def reference_camera(scene: SceneFolder) -> str:
     """The camera whose path stands for the vehicle's: the one with the most pictures."""
     cameras = scene.cameras()
     return max(cameras, key=lambda name: len(cameras[name]))
 
 
-def path_figures(scene: InspectedScene) -> dict[str, Any]:
+def path_figures(scene: SceneFolder) -> dict[str, Any]:
     """Length, spacing, duration and speed of the drive, as JSON."""
     name = reference_camera(scene)
     pictures = scene.cameras()[name]
@@ -238,7 +238,7 @@ def map_figures(measured: Sequence[PictureFigures]) -> dict[str, Any]:
     }
 
 
-def camera_figures(scene: InspectedScene, name: str, measured: Sequence[PictureFigures]) -> dict[str, Any]:
+def camera_figures(scene: SceneFolder, name: str, measured: Sequence[PictureFigures]) -> dict[str, Any]:
     """One camera: its lens, its fit, and what its maps hold, as JSON."""
     pictures = scene.cameras()[name]
     lens = pictures[0].lens
@@ -259,7 +259,7 @@ def camera_figures(scene: InspectedScene, name: str, measured: Sequence[PictureF
     }
 
 
-def recorded(scene: InspectedScene, table: str, camera: str) -> dict[str, Any]:
+def recorded(scene: SceneFolder, table: str, camera: str) -> dict[str, Any]:
     """What transforms.json says of a camera in one of its tables; nothing in other people's scenes."""
     found = scene.meta.get(table)
     found = found.get(camera) if isinstance(found, dict) else None

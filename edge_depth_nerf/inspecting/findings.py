@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from edge_depth_nerf.inspecting.figures import PictureFigures, Step, recorded, steps, usual_length_m
-from edge_depth_nerf.inspecting.reader import InspectedScene
+from edge_depth_nerf.scene_reader import SceneFolder
 
 GAP_FACTOR = 10
 """Frames so many times farther apart than usual are a gap."""
@@ -46,7 +46,7 @@ class Finding:
         return asdict(self)
 
 
-def find(scene: InspectedScene, measured: Sequence[PictureFigures]) -> list[Finding]:
+def find(scene: SceneFolder, measured: Sequence[PictureFigures]) -> list[Finding]:
     """Look for everything that this module knows; the gravest first."""
     return [
         *_layers(scene),
@@ -68,7 +68,7 @@ def _frames(numbers: Iterable[int]) -> str:
     return f"frame{'s' if len(listed) > 1 else ''} {some}{more}"
 
 
-def _layers(scene: InspectedScene) -> Iterator[Finding]:
+def _layers(scene: SceneFolder) -> Iterator[Finding]:
     has_lidar, has_mono = scene.has("lidar"), scene.has("mono")
     if not has_lidar and not has_mono:
         yield Finding(
@@ -108,7 +108,7 @@ def _layers(scene: InspectedScene) -> Iterator[Finding]:
         )
 
 
-def _split(scene: InspectedScene) -> Iterator[Finding]:
+def _split(scene: SceneFolder) -> Iterator[Finding]:
     if not scene.split_known:
         yield Finding(
             "no_split",
@@ -123,7 +123,7 @@ def _split(scene: InspectedScene) -> Iterator[Finding]:
         )
 
 
-def _path(scene: InspectedScene) -> Iterator[Finding]:
+def _path(scene: SceneFolder) -> Iterator[Finding]:
     gaps: dict[tuple[int, int], list[tuple[Step, float]]] = {}
     jumps: dict[tuple[int, int], list[tuple[Step, float]]] = {}
     for pictures in scene.cameras().values():
@@ -158,7 +158,7 @@ def _path(scene: InspectedScene) -> Iterator[Finding]:
         )
 
 
-def _timestamps(scene: InspectedScene) -> Iterator[Finding]:
+def _timestamps(scene: SceneFolder) -> Iterator[Finding]:
     for name, pictures in scene.cameras().items():
         wrong = [step.after.moment for step in steps(pictures) if step.seconds is not None and step.seconds <= 0]
         if wrong:
@@ -171,7 +171,7 @@ def _timestamps(scene: InspectedScene) -> Iterator[Finding]:
             )
 
 
-def _fits(scene: InspectedScene) -> Iterator[Finding]:
+def _fits(scene: SceneFolder) -> Iterator[Finding]:
     for name in scene.cameras():
         rms_px = recorded(scene, "camera_fits", name).get("rms_px")
         if isinstance(rms_px, (int, float)) and rms_px > LARGEST_FIT_RMS_PX:

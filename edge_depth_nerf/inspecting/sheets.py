@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_depth_nerf.inspecting.figures import PictureFigures
-from edge_depth_nerf.inspecting.reader import InspectedScene, PictureMaps
 from edge_depth_nerf.pictures import (
     DISTANCE,
     RELATIVE_ERROR,
@@ -21,6 +20,7 @@ from edge_depth_nerf.pictures import (
     swatches,
     tinted,
 )
+from edge_depth_nerf.scene_reader import PictureMaps, SceneFolder
 
 HIDDEN_RGB = (205, 50, 60)
 """Tint of what the mask hides."""
@@ -29,7 +29,7 @@ NO_PRIOR_RGB = (60, 110, 230)
 
 
 def draw_sheet(
-    scene: InspectedScene, figures: PictureFigures, maps: PictureMaps, longer_side_px: int
+    scene: SceneFolder, figures: PictureFigures, maps: PictureMaps, longer_side_px: int
 ) -> NDArray[np.uint8]:
     """Draw the sheet of one picture; panels of maps that it does not have are left out.
 
@@ -84,7 +84,7 @@ def _mask_panel(maps: PictureMaps, size: tuple[int, int]) -> NDArray[np.uint8]:
     return panel(picture, "mask", swatches(names, size[0]))
 
 
-def _heading(scene: InspectedScene, figures: PictureFigures) -> list[str]:
+def _heading(scene: SceneFolder, figures: PictureFigures) -> list[str]:
     picture = figures.picture
     split = ("held out" if picture.held_out else "training") if scene.split_known else "no split given"
     facts = [f"uses {figures.used_share:.0%} of the picture"]

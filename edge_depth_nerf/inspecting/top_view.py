@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from edge_depth_nerf.inspecting.figures import reference_camera
 from edge_depth_nerf.inspecting.findings import Finding
-from edge_depth_nerf.inspecting.reader import InspectedPicture, InspectedScene
 from edge_depth_nerf.pictures import INK_RGB, text_width, write_text
+from edge_depth_nerf.scene_reader import SceneFolder, ScenePicture
 
 LARGEST_PX = (1600, 1100)
 """Width and height that the map may take."""
@@ -53,7 +53,7 @@ class _Map:
 
 
 def draw_top_view(
-    scene: InspectedScene, points_m: NDArray[np.float64] | None, findings: Sequence[Finding], shown: Sequence[int]
+    scene: SceneFolder, points_m: NDArray[np.float64] | None, findings: Sequence[Finding], shown: Sequence[int]
 ) -> NDArray[np.uint8]:
     """Draw the scene from above.
 
@@ -98,15 +98,15 @@ def draw_top_view(
     return np.vstack((_title(scene, name, canvas.shape[1]), canvas, _strip(scene, ground, list(cameras), bool(gaps))))
 
 
-def _unit(scene: InspectedScene) -> str:
+def _unit(scene: SceneFolder) -> str:
     return "m" if scene.own else "scene units"
 
 
-def _positions(ground: _Map, pictures: Sequence[InspectedPicture]) -> NDArray[np.int64]:
+def _positions(ground: _Map, pictures: Sequence[ScenePicture]) -> NDArray[np.int64]:
     return ground.pixels(np.array([picture.position_m for picture in pictures]))
 
 
-def _fitting_map(scene: InspectedScene) -> _Map:
+def _fitting_map(scene: SceneFolder) -> _Map:
     """Fit the path with a margin into the picture."""
     positions_m = np.array([picture.position_m[:2] for picture in scene.pictures])
     low, high = positions_m.min(0), positions_m.max(0)
@@ -139,7 +139,7 @@ def _draw_points(canvas: NDArray[np.uint8], ground: _Map, points_m: NDArray[np.f
 
 
 def _draw_views(
-    canvas: NDArray[np.uint8], ground: _Map, pictures: Sequence[InspectedPicture], colour: tuple[int, int, int]
+    canvas: NDArray[np.uint8], ground: _Map, pictures: Sequence[ScenePicture], colour: tuple[int, int, int]
 ) -> None:
     """Draw ticks along the optical axes, of pictures that are far enough apart to tell them."""
     by_place = {(int(x), int(y)): one for one, (x, y) in zip(pictures, _positions(ground, pictures), strict=True)}
@@ -184,14 +184,14 @@ def _draw_travel(canvas: NDArray[np.uint8], path: Sequence[tuple[int, int]]) -> 
         cv2.fillPoly(canvas, [np.rint(corners).astype(np.int32)], TRAINING_RGB, cv2.LINE_AA)
 
 
-def _title(scene: InspectedScene, reference: str, width: int) -> NDArray[np.uint8]:
+def _title(scene: SceneFolder, reference: str, width: int) -> NDArray[np.uint8]:
     bar = np.full((40, width, 3), 255, np.uint8)
     text = f"{scene.path.parent.resolve().name} from above: {len(scene.moments())} moments, path of {reference}"
     write_text(bar, text, (12, 27), 0.7, max_width=width - 24)
     return bar
 
 
-def _strip(scene: InspectedScene, ground: _Map, cameras: Sequence[str], gaps: bool) -> NDArray[np.uint8]:
+def _strip(scene: SceneFolder, ground: _Map, cameras: Sequence[str], gaps: bool) -> NDArray[np.uint8]:
     """The legend: axes, scale bar, what the colours mean."""
     strip = np.full((_STRIP_PX, ground.width, 3), 255, np.uint8)
     strip[0] = 200

@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Float32
 
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.inspecting.reader import InspectedPicture, InspectedScene
 from edge_depth_nerf.mono.alignment import LEAST_RETURNS
 from edge_depth_nerf.mono.examples import view_of
 from edge_depth_nerf.mono.relative import (
@@ -28,6 +27,7 @@ from edge_depth_nerf.mono.relative import (
     rank_correlation,
     take_samples,
 )
+from edge_depth_nerf.scene_reader import SceneFolder, ScenePicture
 
 _SAMPLES = 3000
 _SAMPLES_FOR_THE_DRIVE = 300
@@ -43,9 +43,9 @@ class FittedMaps:
 
     """
 
-    scene: InspectedScene
+    scene: SceneFolder
     kind: Kind
-    layers: Callable[[InspectedPicture], Sequence[Layer]]
+    layers: Callable[[ScenePicture], Sequence[Layer]]
     """What a picture's views say."""
     by_the_drive: list[str] = field(default_factory=list)
     """Pictures that took the drive's fit so far."""
@@ -58,9 +58,9 @@ class FittedMaps:
             if not any(not picture.held_out and self._returns(picture) >= LEAST_RETURNS for picture in pictures):
                 raise self._no_lidar(camera)
 
-    def __iter__(self) -> Iterator[tuple[InspectedPicture, Float32[np.ndarray, "h w"]]]:
+    def __iter__(self) -> Iterator[tuple[ScenePicture, Float32[np.ndarray, "h w"]]]:
         """Give H×W metres along the ray of all pictures; those with few returns come last."""
-        waiting: list[InspectedPicture] = []
+        waiting: list[ScenePicture] = []
         drive: dict[str, list[Samples]] = {}
         for picture in self.scene.pictures:
             if self.kind != "metric" and self._returns(picture) < LEAST_RETURNS:
@@ -103,26 +103,26 @@ class FittedMaps:
             "sweeps, or take a source of metric maps."
         )
 
-    def _seen(self, picture: InspectedPicture) -> tuple[Sequence[Layer], Samples]:
+    def _seen(self, picture: ScenePicture) -> tuple[Sequence[Layer], Samples]:
         layers = self.layers(picture)
         usable = self._usable(picture)
         lidar_m = self.scene.lidar_m(picture) if "lidar" in picture.files else np.zeros(usable.shape, np.float32)
         return layers, take_samples(layers, lidar_m, usable, _SAMPLES)
 
-    def _usable(self, picture: InspectedPicture) -> np.ndarray:
+    def _usable(self, picture: ScenePicture) -> np.ndarray:
         return view_of(picture, self.scene.theta_max_rad, max(picture.lens.width, picture.lens.height)).usable
 
-    def _returns(self, picture: InspectedPicture) -> int:
+    def _returns(self, picture: ScenePicture) -> int:
         if "lidar" not in picture.files:
             return 0
         return int((self._usable(picture) & (self.scene.lidar_m(picture) > 0)).sum())
 
     def _blended(
-        self, picture: InspectedPicture, layers: Sequence[Layer], lines: Sequence[Line]
+        self, picture: ScenePicture, layers: Sequence[Layer], lines: Sequence[Line]
     ) -> Float32[np.ndarray, "h w"]:
         return blend(layers, lines, self.kind, (picture.lens.height, picture.lens.width))
 
-    def _check_direction(self, picture: InspectedPicture, samples: Samples) -> None:
+    def _check_direction(self, picture: ScenePicture, samples: Samples) -> None:
         """Find depth that is declared disparity, or the other way round."""
         returns = np.flatnonzero(samples.lidar_m > 0)
         best = np.where(samples.seen, samples.weight, -1)[:, returns].argmax(0)

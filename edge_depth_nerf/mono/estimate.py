@@ -26,7 +26,6 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from edge_depth_nerf import __version__
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_image
-from edge_depth_nerf.inspecting.reader import InspectedPicture, InspectedScene, read_scene
 from edge_depth_nerf.masks.sky import find_sky
 from edge_depth_nerf.mono.alignment import LEAST_RETURNS
 from edge_depth_nerf.mono.elsewhere import FittedMaps
@@ -59,6 +58,7 @@ from edge_depth_nerf.mono.relative import KIND_SAID, Layer
 from edge_depth_nerf.mono.scene_maps import write_mono_maps
 from edge_depth_nerf.mono.training import Trained, TrainingOptions, as_json, train
 from edge_depth_nerf.mono.trust import calibrate_scene
+from edge_depth_nerf.scene_reader import SceneFolder, ScenePicture, read_scene
 
 WEIGHTS = "mono_network.safetensors"
 """The weights' file in a scene."""
@@ -146,7 +146,7 @@ def estimate_depth(options: EstimateDepthOptions, console: Console | None = None
 
 
 def _write_own(
-    network: DepthNetwork, weights: Path, about: dict[str, Any], scenes: Sequence[InspectedScene], console: Console
+    network: DepthNetwork, weights: Path, about: dict[str, Any], scenes: Sequence[SceneFolder], console: Console
 ) -> None:
     source = {
         "kind": "network",
@@ -165,7 +165,7 @@ def _write_own(
             write_mono_maps(scene.folder, predicted_maps(network, scene), {**source, "trained_frames": seen}, progress)
 
 
-def _write_predicted(network: ReadyNetwork, scenes: Sequence[InspectedScene], console: Console) -> None:
+def _write_predicted(network: ReadyNetwork, scenes: Sequence[SceneFolder], console: Console) -> None:
     console.print(f"{network.name}: {network.model_type}, {KIND_SAID[network.kind]}", soft_wrap=True)
     source = {
         "kind": "ready-made network",
@@ -179,11 +179,11 @@ def _write_predicted(network: ReadyNetwork, scenes: Sequence[InspectedScene], co
     _write_fitted(fitted, source, console)
 
 
-def _layers_by(network: ReadyNetwork, scene: InspectedScene) -> Callable[[InspectedPicture], Sequence[Layer]]:
+def _layers_by(network: ReadyNetwork, scene: SceneFolder) -> Callable[[ScenePicture], Sequence[Layer]]:
     return lambda picture: view_layers(network, picture, read_image(picture.files["image"]), scene.theta_max_rad)
 
 
-def _write_from_files(options: EstimateDepthOptions, scene: InspectedScene, console: Console) -> None:
+def _write_from_files(options: EstimateDepthOptions, scene: SceneFolder, console: Console) -> None:
     assert options.maps is not None and options.maps_kind is not None and options.maps_along is not None
     files = find_maps(scene, options.maps, options.maps_kind, options.maps_along, options.metres_per_count)
     source = {
@@ -215,7 +215,7 @@ def _write_fitted(every: Sequence[FittedMaps], source: dict[str, Any], console: 
 
 
 def _train(
-    scenes: Sequence[InspectedScene],
+    scenes: Sequence[SceneFolder],
     options: EstimateDepthOptions,
     start: DepthNetwork | None,
     console: Console,
@@ -356,17 +356,17 @@ def _weights_of_before(
         return None, {}
 
 
-def _name(scene: InspectedScene) -> str:
+def _name(scene: SceneFolder) -> str:
     return scene.folder.resolve().name
 
 
-def _key(scene: InspectedScene) -> str:
+def _key(scene: SceneFolder) -> str:
     """What tells a scene's pictures from another's, wherever its folder lies: their names, and their files' sizes."""
     listed = [(picture.name, picture.files["image"].stat().st_size) for picture in scene.pictures]
     return hashlib.sha256(repr(sorted(listed)).encode()).hexdigest()[:32]
 
 
-def training_split(scene: InspectedScene) -> tuple[list[InspectedPicture], list[InspectedPicture]]:
+def training_split(scene: SceneFolder) -> tuple[list[ScenePicture], list[ScenePicture]]:
     """Divide a scene's training pictures, whole moments each: to train on, and to stop by.
 
     Raises:
@@ -393,8 +393,8 @@ def training_split(scene: InspectedScene) -> tuple[list[InspectedPicture], list[
 
 
 def _thinned(
-    split: list[tuple[list[InspectedPicture], list[InspectedPicture]]], working_px: int, console: Console
-) -> list[tuple[list[InspectedPicture], list[InspectedPicture]]]:
+    split: list[tuple[list[ScenePicture], list[ScenePicture]]], working_px: int, console: Console
+) -> list[tuple[list[ScenePicture], list[ScenePicture]]]:
     """Take every k-th picture where all would not fit in memory."""
     pictures = [picture for both in split for pictures in both for picture in pictures]
     most = LARGEST_SET_BYTES // bytes_a_picture(pictures, working_px)
@@ -404,7 +404,7 @@ def _thinned(
     return [(used[::step], kept[::step]) for used, kept in split]
 
 
-def camera_heights_m(scene: InspectedScene, settings: NetworkSettings) -> Mapping[str, float]:
+def camera_heights_m(scene: SceneFolder, settings: NetworkSettings) -> Mapping[str, float]:
     """Height of each camera above the ground: from LiDAR of training pictures, else as the network knows it."""
     heights = {}
     for camera, pictures in scene.cameras().items():
@@ -433,7 +433,7 @@ def _progress(console: Console) -> Progress:
 # ---- prediction ------------------------------------------------------------------------------------------------
 
 
-def predicted_maps(network: DepthNetwork, scene: InspectedScene) -> Iterator[tuple[str, Float32[np.ndarray, "h w"]]]:
+def predicted_maps(network: DepthNetwork, scene: SceneFolder) -> Iterator[tuple[str, Float32[np.ndarray, "h w"]]]:
     """Predict all pictures of a scene, one after another: file_path and H×W metres along the ray, 0 in the sky.
 
     The network never learns of the sky, where LiDAR has no returns; so it is looked for in the picture.
@@ -447,8 +447,8 @@ def predicted_maps(network: DepthNetwork, scene: InspectedScene) -> Iterator[tup
 
 
 def without_sky(
-    scene: InspectedScene,
-    picture: InspectedPicture,
+    scene: SceneFolder,
+    picture: ScenePicture,
     metres: Float32[np.ndarray, "h w"],
     known_m: Float32[np.ndarray, "h w"] | None = None,
 ) -> Float32[np.ndarray, "h w"]:
@@ -471,8 +471,8 @@ def without_sky(
 @torch.no_grad()
 def predict(
     network: DepthNetwork,
-    scene: InspectedScene,
-    picture: InspectedPicture,
+    scene: SceneFolder,
+    picture: ScenePicture,
     height_m: float,
     device: torch.device,
 ) -> Float32[np.ndarray, "h w"]:

@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from edge_depth_nerf.cameras import KannalaBrandt, Pinhole
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_image, read_mask
-from edge_depth_nerf.inspecting.reader import InspectedPicture, InspectedScene
+from edge_depth_nerf.scene_reader import SceneFolder, ScenePicture
 
-FarSeen = Callable[[InspectedPicture, tuple[int, int]], NDArray[np.float32]]
+FarSeen = Callable[[ScenePicture, tuple[int, int]], NDArray[np.float32]]
 """Gives for a picture, at (width, height), distances along the ray, 0 = none."""
 LARGEST_SET_BYTES = 8 << 30
 """More pictures than fit in this are thinned evenly."""
@@ -81,7 +81,7 @@ def working_size(width: int, height: int, working_px: int) -> tuple[int, int]:
     return max(round(width * working_px / longer), 1), max(round(height * working_px / longer), 1)
 
 
-def view_of(picture: InspectedPicture, theta_max_rad: float, working_px: int) -> View:
+def view_of(picture: ScenePicture, theta_max_rad: float, working_px: int) -> View:
     """Rays and mask of a picture at the network's size."""
     size = working_size(picture.lens.width, picture.lens.height, working_px)
     rays, within = lens_rays(picture.lens, theta_max_rad, size)
@@ -114,8 +114,8 @@ def lens_rays(
 
 
 def load_examples(
-    scenes: Sequence[InspectedScene],
-    chosen: Sequence[Sequence[InspectedPicture]],
+    scenes: Sequence[SceneFolder],
+    chosen: Sequence[Sequence[ScenePicture]],
     heights_m: Sequence[Mapping[str, float]],
     working_px: int,
     multiple_px: int,
@@ -171,20 +171,20 @@ def load_examples(
     return Examples(rgb, lidar_m, usable, np.stack([ray for _, ray in rays.values()]), lenses, ups, heights)
 
 
-def bytes_a_picture(pictures: Sequence[InspectedPicture], working_px: int) -> int:
+def bytes_a_picture(pictures: Sequence[ScenePicture], working_px: int) -> int:
     """Memory that one picture takes at most."""
     largest = max(np.prod(working_size(p.lens.width, p.lens.height, working_px)) for p in pictures)
     return int(largest) * (3 + 4 + 1)
 
 
-def small_picture(picture: InspectedPicture, size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
+def small_picture(picture: ScenePicture, size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
     """The picture averaged down to (width, height)."""
     pixels = read_image(picture.files["image"])
     check_size(pixels, picture, "image")
     return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def small_lidar(scene: InspectedScene, picture: InspectedPicture, view: View) -> Float32[np.ndarray, "h w"]:
+def small_lidar(scene: SceneFolder, picture: ScenePicture, view: View) -> Float32[np.ndarray, "h w"]:
     """LiDAR at the network's size: of the returns in a pixel the one nearest to its centre."""
     return _reduced(scene.lidar_m(picture), view)
 
@@ -205,7 +205,7 @@ def _reduced(lidar_m: Float32[np.ndarray, "rows columns"], view: View) -> Float3
     return small
 
 
-def check_size(pixels: np.ndarray, picture: InspectedPicture, layer: str) -> None:
+def check_size(pixels: np.ndarray, picture: ScenePicture, layer: str) -> None:
     """Check that a file has its camera's size.
 
     Raises:
@@ -221,7 +221,7 @@ def check_size(pixels: np.ndarray, picture: InspectedPicture, layer: str) -> Non
         )
 
 
-def camera_height_m(scene: InspectedScene, pictures: Sequence[InspectedPicture], working_px: int) -> float | None:
+def camera_height_m(scene: SceneFolder, pictures: Sequence[ScenePicture], working_px: int) -> float | None:
     """Height of the cameras above the ground, from some pictures' returns below the horizon.
 
     Returns:

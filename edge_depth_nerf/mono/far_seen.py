@@ -21,10 +21,10 @@ import torch
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
 from numpy.typing import NDArray
 
-from edge_depth_nerf.inspecting.reader import InspectedPicture, InspectedScene
 from edge_depth_nerf.lidar.projection import project_points
 from edge_depth_nerf.lidar.voxels import first_in_voxel
 from edge_depth_nerf.mono.examples import lens_rays, scaled_lens, view_of
+from edge_depth_nerf.scene_reader import SceneFolder, ScenePicture
 
 VOXEL_M = 0.05
 """The cloud holds one point of each cube of this size."""
@@ -64,7 +64,7 @@ class Cloud:
         """Some of the points; indices are to ascend."""
         return Cloud(self.points_m[which], self.spacing_m[which], self.tile[which])
 
-    def near(self, picture: InspectedPicture) -> NDArray[np.intp]:
+    def near(self, picture: ScenePicture) -> NDArray[np.intp]:
         """Indices of the points within reach of a picture, ascending."""
         first, last = (_tile_of(picture.position_m[:2] + side) for side in (-REACH_M, REACH_M))
         columns = np.arange(first[0], last[0] + 1)
@@ -88,7 +88,7 @@ class _Field:
 
 
 def static_cloud(
-    scene: InspectedScene, pictures: Sequence[InspectedPicture], advance: Callable[[], None] = lambda: None
+    scene: SceneFolder, pictures: Sequence[ScenePicture], advance: Callable[[], None] = lambda: None
 ) -> Cloud:
     """Put the returns of some pictures together, as far as they are above any of these pictures' own.
 
@@ -136,7 +136,7 @@ def static_cloud(
 
 
 def seen_above(
-    cloud: Cloud, scene: InspectedScene, picture: InspectedPicture, size: tuple[int, int]
+    cloud: Cloud, scene: SceneFolder, picture: ScenePicture, size: tuple[int, int]
 ) -> Float32[np.ndarray, "h w"]:
     """Project what a cloud has within reach into a picture, above its own returns, without what is or may be hidden.
 
@@ -160,7 +160,7 @@ def seen_above(
 
 
 def field_deg(
-    scene: InspectedScene, pictures: Sequence[InspectedPicture], advance: Callable[[], None] = lambda: None
+    scene: SceneFolder, pictures: Sequence[ScenePicture], advance: Callable[[], None] = lambda: None
 ) -> tuple[float, float] | None:
     """Elevations between which nearly all of some pictures' own returns lie, within the masks.
 
@@ -191,7 +191,7 @@ def field_deg(
     return round(float(edges[low]), 2), round(float(edges[high + 1]), 2)
 
 
-def _field(scene: InspectedScene, picture: InspectedPicture) -> _Field:
+def _field(scene: SceneFolder, picture: ScenePicture) -> _Field:
     rays, lidar_m = _own(scene, picture)
     rays, lidar_m = rays[lidar_m > 0], lidar_m[lidar_m > 0]
     if not len(lidar_m):
@@ -210,22 +210,20 @@ def _level_m(distance_m: NDArray[np.float32], sine: NDArray[np.float32]) -> NDAr
     return distance_m * np.sqrt(np.maximum(1 - sine**2, 0))
 
 
-def _azimuth(picture: InspectedPicture, rays: Float32[np.ndarray, "*shape 3"]) -> NDArray[np.intp]:
+def _azimuth(picture: ScenePicture, rays: Float32[np.ndarray, "*shape 3"]) -> NDArray[np.intp]:
     """Which of the azimuths rays in the camera's frame have in the world."""
     world = (rays * np.array([1.0, -1.0, -1.0])) @ picture.rotation.T
     turn = np.arctan2(world[..., 1], world[..., 0]) / (2 * np.pi) + 0.5
     return (turn * _AZIMUTHS).astype(np.intp) % _AZIMUTHS
 
 
-def _is_above(
-    picture: InspectedPicture, points_m: Float64[np.ndarray, "n 3"], top_sine: float
-) -> Bool[np.ndarray, "n"]:
+def _is_above(picture: ScenePicture, points_m: Float64[np.ndarray, "n 3"], top_sine: float) -> Bool[np.ndarray, "n"]:
     """Whether points lie above a picture's returns, or so little below that they hide what does."""
     from_camera = points_m - picture.position_m
     return from_camera[:, 2] > (top_sine - _BELOW_SINE) * np.linalg.norm(from_camera, axis=1)
 
 
-def _above_any(pictures: Sequence[InspectedPicture], tops: Sequence[float], cloud: Cloud) -> Bool[np.ndarray, "points"]:
+def _above_any(pictures: Sequence[ScenePicture], tops: Sequence[float], cloud: Cloud) -> Bool[np.ndarray, "points"]:
     above = np.zeros(len(cloud.points_m), bool)
     for picture, top_sine in zip(pictures, tops, strict=True):
         near = cloud.near(picture)
@@ -251,24 +249,22 @@ def _tile_number(x: Int64[np.ndarray, "n"], y: Int64[np.ndarray, "n"] | np.int64
     return (x << _TILE_BITS) + y
 
 
-def _own(
-    scene: InspectedScene, picture: InspectedPicture
-) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
+def _own(scene: SceneFolder, picture: ScenePicture) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
     """A picture's rays, and its LiDAR map within the mask, at its own size."""
     view = view_of(picture, scene.theta_max_rad, max(picture.lens.width, picture.lens.height))
     return view.rays, np.where(view.usable, scene.lidar_m(picture), np.float32(0))
 
 
-def _to_world(picture: InspectedPicture, in_camera: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+def _to_world(picture: ScenePicture, in_camera: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
     return (in_camera * np.array([1.0, -1.0, -1.0])) @ picture.rotation.T + picture.position_m
 
 
-def _to_camera(picture: InspectedPicture, points_m: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+def _to_camera(picture: ScenePicture, points_m: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
     return (points_m - picture.position_m) @ picture.rotation * np.array([1.0, -1.0, -1.0])
 
 
 def _votes(
-    picture: InspectedPicture, points_m: Float64[np.ndarray, "n 3"], lidar_m: Float32[np.ndarray, "h w"]
+    picture: ScenePicture, points_m: Float64[np.ndarray, "n 3"], lidar_m: Float32[np.ndarray, "h w"]
 ) -> Int32[np.ndarray, "n"]:
     """1 for each point that the picture's own returns confirm, -1 for each that they saw through, else 0."""
     in_camera = torch.from_numpy(_to_camera(picture, points_m))

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import DISTANCE_STEPS_PER_METRE, read_distance_png
-from edge_depth_nerf.inspecting.reader import InspectedPicture, InspectedScene
 from edge_depth_nerf.mono.examples import lens_rays
 from edge_depth_nerf.mono.options import Along
 from edge_depth_nerf.mono.relative import Kind, Layer
 from edge_depth_nerf.process.png import read_png_header
+from edge_depth_nerf.scene_reader import SceneFolder, ScenePicture
 
 LEAST_COSINE = 0.02
 """Below (beyond 88.9°) z says nothing of the distance: a count of 4 mm is 0.2 m."""
@@ -33,7 +33,7 @@ class MapFiles:
     metres_per_count: float
     """Of PNGs."""
 
-    def layer(self, scene: InspectedScene, picture: InspectedPicture) -> Layer:
+    def layer(self, scene: SceneFolder, picture: ScenePicture) -> Layer:
         """Read a picture's map.
 
         Raises:
@@ -57,9 +57,7 @@ class MapFiles:
         return Layer(whole, values, cosine, (cosine >= LEAST_COSINE).astype(np.float32))
 
 
-def find_maps(
-    scene: InspectedScene, folder: Path, kind: Kind, along: Along, metres_per_count: float | None
-) -> MapFiles:
+def find_maps(scene: SceneFolder, folder: Path, kind: Kind, along: Along, metres_per_count: float | None) -> MapFiles:
     """Find a map for every picture of a scene, and check all by their headers.
 
     Args:
@@ -101,7 +99,7 @@ def find_maps(
     return MapFiles(found, kind, along, metres_per_count or 1 / DISTANCE_STEPS_PER_METRE)
 
 
-def _find(folder: Path, picture: InspectedPicture) -> Path:
+def _find(folder: Path, picture: ScenePicture) -> Path:
     camera = [part for part in Path(picture.camera).parts if part not in ("..", "/")]
     stem = folder.joinpath(*camera, Path(picture.name).stem)
     choices = [stem.with_name(f"{stem.name}{suffix}") for suffix in (".npy", ".png")]

@@ -17,10 +17,10 @@ import torch
 from numpy.typing import NDArray
 
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.inspecting.reader import InspectedPicture
 from edge_depth_nerf.mono.options import HfOutput
 from edge_depth_nerf.mono.pinhole_views import pinhole_views
 from edge_depth_nerf.mono.relative import Kind, Layer
+from edge_depth_nerf.scene_reader import ScenePicture
 
 Predict = Callable[[Sequence[NDArray[np.uint8]]], Sequence[NDArray[np.float32]]]
 """Pictures (H×W×3, RGB) to maps (H×W) of z, of z up to scale and shift, or of its inverse."""
@@ -149,9 +149,7 @@ def _kind(name: str, config: Any, output: HfOutput) -> Kind:
     )
 
 
-def view_layers(
-    predict: Predict, picture: InspectedPicture, rgb: NDArray[np.uint8], theta_max_rad: float
-) -> list[Layer]:
+def view_layers(predict: Predict, picture: ScenePicture, rgb: NDArray[np.uint8], theta_max_rad: float) -> list[Layer]:
     """Predict the pinhole views of a picture.
 
     Args:

@@ -18,10 +18,10 @@ from rich.progress import Progress
 
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_json, read_mask, write_distance_png, write_json
-from edge_depth_nerf.inspecting.reader import InspectedPicture, InspectedScene, read_scene
 from edge_depth_nerf.mono.error_model import TRUST_FILE
 from edge_depth_nerf.mono.examples import lens_rays
 from edge_depth_nerf.process.scene import LAYERS, MONO_ENTRY
+from edge_depth_nerf.scene_reader import SceneFolder, ScenePicture, read_scene
 
 FARTHEST_M = 200.0
 """What a network puts beyond is the sky, or as good as that: no value."""
@@ -102,7 +102,7 @@ def write_mono_maps(
 
 
 def usable_distance(
-    scene: InspectedScene, picture: InspectedPicture, metres: Float[np.ndarray, "h w"]
+    scene: SceneFolder, picture: ScenePicture, metres: Float[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "h w"]:
     """Leave out of a map what is no distance to anything, or outside the lens and the mask.
 
@@ -129,7 +129,7 @@ def usable_distance(
     return np.where(kept, metres, 0.0)
 
 
-def _target(picture: InspectedPicture) -> str:
+def _target(picture: ScenePicture) -> str:
     """Path of its map in the scene."""
     camera = "/".join(part for part in Path(picture.camera).parts if part not in ("..", "/"))
     return f"{LAYERS['mono'][0].format(camera=camera)}/{Path(picture.name).stem}.png"

@@ -21,7 +21,6 @@ from rich.console import Console
 from rich.progress import Progress
 
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.inspecting.reader import InspectedPicture, InspectedScene, read_scene
 from edge_depth_nerf.mono.alignment import LEAST_RETURNS, align, both, fit_logs
 from edge_depth_nerf.mono.error_model import (
     FIELD_MARGIN_DEG,
@@ -35,6 +34,7 @@ from edge_depth_nerf.mono.error_model import (
 )
 from edge_depth_nerf.mono.far_seen import seen_above, static_cloud
 from edge_depth_nerf.prior import CACHE_VERSION, PriorOptions, View, integrate_frame, view_of
+from edge_depth_nerf.scene_reader import SceneFolder, ScenePicture, read_scene
 
 MOST_FRAMES = 100
 """Of longer drives so many training pictures are used, evenly spread."""
@@ -116,7 +116,7 @@ def calibrate_scene(scene: Path, options: PriorOptions | None = None, console: C
 
 
 def saved_trust(
-    scene: InspectedScene,
+    scene: SceneFolder,
     options: PriorOptions,
     cache: Path | None = None,
     training_images: Collection[Path] | None = None,
@@ -186,11 +186,11 @@ def field_of_source(scene: Path) -> Trust | None:
     return Trust("", None, None, (low, high), everywhere=False, drive_fit=None)
 
 
-def _cached(scene: InspectedScene, cache: Path | None, made_of: str) -> Path:
+def _cached(scene: SceneFolder, cache: Path | None, made_of: str) -> Path:
     return (cache or scene.folder / ".cache") / f"mono_trust_{made_of}.json"
 
 
-def _chosen(scene: InspectedScene, training_images: Collection[Path] | None = None) -> list[InspectedPicture]:
+def _chosen(scene: SceneFolder, training_images: Collection[Path] | None = None) -> list[ScenePicture]:
     if training_images is None:
         training = [picture for picture in scene.pictures if not picture.held_out]
     else:
@@ -201,7 +201,7 @@ def _chosen(scene: InspectedScene, training_images: Collection[Path] | None = No
     return [training[i] for i in np.linspace(0, len(training) - 1, MOST_FRAMES).round().astype(int)]
 
 
-def _made_of(scene: InspectedScene, pictures: Sequence[InspectedPicture], options: PriorOptions) -> str:
+def _made_of(scene: SceneFolder, pictures: Sequence[ScenePicture], options: PriorOptions) -> str:
     """Key of the options, of the geometry, and of what is in the files of the pictures that are measured."""
     relevant = dataclasses.asdict(options)
     del relevant["sigma_mode"], relevant["sigma_constant_m"]
@@ -219,7 +219,7 @@ def _made_of(scene: InspectedScene, pictures: Sequence[InspectedPicture], option
     return digest.hexdigest()[:16]
 
 
-def _trained_on(scene: InspectedScene) -> str:
+def _trained_on(scene: SceneFolder) -> str:
     """Where the maps' source was trained: elsewhere only if it says so."""
     source = scene.meta.get("mono")
     found = source.get("trained_on") if isinstance(source, dict) else None
@@ -227,7 +227,7 @@ def _trained_on(scene: InspectedScene) -> str:
 
 
 def _calibrate(
-    scene: InspectedScene, pictures: Sequence[InspectedPicture], options: PriorOptions, console: Console | None
+    scene: SceneFolder, pictures: Sequence[ScenePicture], options: PriorOptions, console: Console | None
 ) -> Trust:
     missing = [word for layer, word in (("lidar", "LiDAR"), ("mono", "monocular")) if not scene.has(layer)]
     if missing:
@@ -243,7 +243,7 @@ def _calibrate(
             "measured. Process the drive again."
         )
 
-    def measure(numbered: tuple[int, InspectedPicture]) -> MeasuredFrame:
+    def measure(numbered: tuple[int, ScenePicture]) -> MeasuredFrame:
         number, picture = numbered
         maps = scene.maps(picture, with_prior=False)
         assert maps.lidar_m is not None and maps.mono_m is not None

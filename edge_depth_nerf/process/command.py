@@ -9,9 +9,9 @@ from __future__ import annotations
 from rich.console import Console
 
 from edge_depth_nerf.console import say
-from edge_depth_nerf.inspecting.reader import InspectedScene, read_scene
 from edge_depth_nerf.process.options import JbnuDepth360Options, Kitti360Options, ProcessOptions, RigOptions
 from edge_depth_nerf.process.scene import MONO_ENTRY, ProcessReport
+from edge_depth_nerf.scene_reader import SceneFolder, read_scene
 
 
 def process(
@@ -51,7 +51,7 @@ def _check_network(options: ProcessOptions) -> None:
         load_network(options.mono_model)
 
 
-def _add_mono(scene: InspectedScene, options: ProcessOptions, console: Console) -> None:
+def _add_mono(scene: SceneFolder, options: ProcessOptions, console: Console) -> None:
     """Give the scene monocular maps, if it has none, and the calibration of those it has."""
     lidar = scene.has("lidar")
     if scene.has("mono") and options.mono_model is not None:

@@ -1,7 +1,7 @@
-"""A scene folder as it is to be looked at: its pictures with their lenses, poses, maps and moments.
+"""A scene folder on disk: its pictures with their lenses, poses, maps and moments.
 
 Reads this project's scenes and other people's nerfstudio scenes, without nerfstudio, whose import takes longer than
-the whole command. A map that is missing is no error here, a file that is named and missing is one. Maps are H×W,
+most commands. A map that is missing is no error here, a file that is named and missing is one. Maps are H×W,
 distances metres along the ray with 0 = none, masks True = use. Lengths are the scene's, which are metres in scenes of
 this project.
 """
@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import trimesh
 from jaxtyping import Bool, Float32, Float64, UInt8
 from numpy.typing import NDArray
 
@@ -44,7 +43,7 @@ _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
 @dataclass(frozen=True)
-class InspectedPicture:
+class ScenePicture:
     """One picture of the scene."""
 
     name: str
@@ -104,7 +103,7 @@ class PictureMaps:
 
 
 @dataclass(frozen=True)
-class InspectedScene:
+class SceneFolder:
     """A scene folder, checked; maps are read when asked for."""
 
     path: Path
@@ -121,7 +120,7 @@ class InspectedScene:
     """Unit of the LiDAR files."""
     lidar_is_z_depth: bool
     """Whether they hold the coordinate along the axis, as in other people's pinhole scenes."""
-    pictures: tuple[InspectedPicture, ...]
+    pictures: tuple[ScenePicture, ...]
     """By camera, then by moment."""
     split_known: bool
     """Whether transforms.json says which pictures are for training."""
@@ -154,7 +153,7 @@ class InspectedScene:
 
         return saved_trust(self, PriorOptions())
 
-    def cameras(self) -> dict[str, tuple[InspectedPicture, ...]]:
+    def cameras(self) -> dict[str, tuple[ScenePicture, ...]]:
         """The pictures of each camera, in order of their moments."""
         names = dict.fromkeys(picture.camera for picture in self.pictures)
         return {name: tuple(picture for picture in self.pictures if picture.camera == name) for name in names}
@@ -167,7 +166,7 @@ class InspectedScene:
         """Whether any picture has this layer."""
         return any(layer in picture.files for picture in self.pictures)
 
-    def maps(self, picture: InspectedPicture, with_prior: bool = True) -> PictureMaps:
+    def maps(self, picture: ScenePicture, with_prior: bool = True) -> PictureMaps:
         """Read all that a picture has, and make its prior.
 
         Args:
@@ -195,7 +194,7 @@ class InspectedScene:
             prior = make_prior(lidar_m, mono_m, usable, options, self.trust, view)
         return PictureMaps(found["image"], lens, usable, lidar_m, mono_m, found.get("truth"), prior)
 
-    def lidar_m(self, picture: InspectedPicture) -> Float32[np.ndarray, "h w"]:
+    def lidar_m(self, picture: ScenePicture) -> Float32[np.ndarray, "h w"]:
         """Read a picture's LiDAR map alone: metres along the ray, 0 = none.
 
         Raises:
@@ -206,7 +205,7 @@ class InspectedScene:
         self._check_size(picture, "lidar", pixels)
         return self._as_distance(pixels, *_rays(picture.lens, self.theta_max_rad)) if self.lidar_is_z_depth else pixels
 
-    def _check_size(self, picture: InspectedPicture, layer: str, pixels: NDArray) -> None:
+    def _check_size(self, picture: ScenePicture, layer: str, pixels: NDArray) -> None:
         width, height = picture.lens.width, picture.lens.height
         if pixels.shape[:2] != (height, width):
             raise InputError(
@@ -239,6 +238,8 @@ class InspectedScene:
                 f"{self.points_path}: holds {size / 1e9:.1f} GB, at most {LARGEST_PLY_BYTES / 1e9:.1f} GB are drawn. "
                 "Thin the point cloud."
             )
+        import trimesh  # half a second, which every command of nerfstudio would wait for
+
         try:
             loaded: Any = trimesh.load(self.points_path, process=False)
             points = np.asarray(loaded.vertices, dtype=np.float64)
@@ -273,7 +274,7 @@ def _rays(lens: Camera, theta_max_rad: float) -> tuple[Bool[np.ndarray, "h w"], 
     return (valid & (cos_theta >= math.cos(theta_max_rad))).numpy(), cos_theta.numpy()
 
 
-def read_scene(scene: Path) -> InspectedScene:
+def read_scene(scene: Path) -> SceneFolder:
     """Read transforms.json and check what it says.
 
     Args:
@@ -311,7 +312,7 @@ def read_scene(scene: Path) -> InspectedScene:
     held_out, split_known = _held_out(meta)
     moments = _moments(frames)
     pictures = tuple(
-        InspectedPicture(
+        ScenePicture(
             name=frame["file_path"],
             camera=_camera_name(frame),
             moment=moments[frame["file_path"]],
@@ -329,7 +330,7 @@ def read_scene(scene: Path) -> InspectedScene:
     ply = meta.get("ply_file_path")
     points_path = path.parent / ply if isinstance(ply, str) else None
     _check_files(path, pictures, points_path)
-    return InspectedScene(
+    return SceneFolder(
         path=path,
         camera_model=model,
         own=own,
@@ -411,7 +412,7 @@ def _files(frame: dict[str, Any], folder: Path, lidar_key: str) -> dict[str, Pat
     return {layer: folder / frame[key] for layer, key in keys.items() if isinstance(frame.get(key), str)}
 
 
-def _check_files(path: Path, pictures: tuple[InspectedPicture, ...], points_path: Path | None) -> None:
+def _check_files(path: Path, pictures: tuple[ScenePicture, ...], points_path: Path | None) -> None:
     named = dict.fromkeys(file for picture in pictures for file in picture.files.values())
     missing = [file for file in (*named, *([points_path] if points_path else [])) if not file.is_file()]
     if missing:
