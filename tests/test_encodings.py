@@ -8,14 +8,13 @@ import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from models import build
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.configs.method_configs import all_methods
-from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.field_components.encodings import HashEncoding
 from nerfstudio.field_components.spatial_distortions import SceneContraction
 
@@ -358,15 +357,6 @@ def test_state_goes_both_ways():
     other = both(3, **SIZES["lite"])[0]
     other.load_state_dict(fused.state_dict())
     assert torch.equal(other(x), fused(x))
-
-
-def build(**options) -> EdgeDepthNerfModel:
-    torch.manual_seed(0)
-    config = all_methods["edge-depth-nerf-lite"].pipeline.model
-    camera_optimizer = replace(config.camera_optimizer, mode=options.pop("poses", "off"))
-    config = replace(config, camera_optimizer=camera_optimizer, **options)
-    box = SceneBox(aabb=torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
-    return config.setup(scene_box=box, num_train_data=3, metadata={"metres_per_unit": 20.0}, device="cpu")
 
 
 def step(model: EdgeDepthNerfModel) -> dict[str, torch.Tensor]:

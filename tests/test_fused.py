@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
+from models import build
 from nerfstudio.cameras.rays import RayBundle
-from nerfstudio.configs.method_configs import all_methods
-from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.field_components.mlp import MLP
 from nerfstudio.field_components.spatial_distortions import SceneContraction
@@ -185,15 +182,6 @@ def test_the_distortion_loss_is_nerfstudios():
     found.backward()
     assert both[0].grad is not None and both[1].grad is not None
     torch.testing.assert_close(both[1].grad, both[0].grad, rtol=1e-4, atol=1e-7)
-
-
-def build(**options) -> EdgeDepthNerfModel:
-    torch.manual_seed(0)
-    config = all_methods["edge-depth-nerf-lite"].pipeline.model
-    camera_optimizer = replace(config.camera_optimizer, mode=options.pop("poses", "off"))
-    config = replace(config, camera_optimizer=camera_optimizer, **options)
-    box = SceneBox(aabb=torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
-    return config.setup(scene_box=box, num_train_data=3, metadata={"metres_per_unit": 20.0}, device="cpu")
 
 
 def train(model: EdgeDepthNerfModel, optimiser: AdamOptimizerConfig, steps: int) -> list[dict[str, float]]:
