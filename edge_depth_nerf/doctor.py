@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Literal
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from edge_depth_nerf import __version__
@@ -257,7 +258,8 @@ def run_doctor(console: Console | None = None) -> int:
     for heading in ("", "", "found", "what to do"):
         table.add_column(heading, overflow="fold")
     for finding in findings:
-        table.add_row(MARKS[finding.state], finding.what, finding.found, finding.remedy)
+        # what was found is no markup: an extra's name stands in brackets
+        table.add_row(MARKS[finding.state], finding.what, escape(finding.found), escape(finding.remedy))
     console.print(table)
     problems = [finding.what for finding in findings if finding.state == "problem"]
     if problems:

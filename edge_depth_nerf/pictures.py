@@ -59,7 +59,7 @@ class ColourScale:
 
 
 def _opencv_colours(colormap: int) -> NDArray[np.uint8]:
-    return cv2.applyColorMap(np.arange(256, dtype=np.uint8), colormap)[:, 0, ::-1].astype(np.uint8)
+    return cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], colormap)[:, 0, ::-1].astype(np.uint8)
 
 
 def _between(*stops: tuple[int, int, int]) -> NDArray[np.uint8]:

@@ -38,6 +38,19 @@ def test_the_command_is_content_with_this_environment():
         assert what in done.stdout
 
 
+def test_the_name_of_an_extra_is_shown(monkeypatch):
+    """Brackets are no markup there."""
+
+    def lacking():
+        yield Finding("Thing", "note", "[none]", "pip install 'edge-depth-nerf[hf]'")
+
+    console = Console(file=io.StringIO(), width=100)
+    monkeypatch.setattr(doctor, "CHECKS", (lacking,))
+    assert run_doctor(console) == 0
+    assert isinstance(console.file, io.StringIO)
+    assert "[none]" in console.file.getvalue() and "edge-depth-nerf[hf]" in console.file.getvalue()
+
+
 def test_one_problem_is_enough_for_the_exit_status(monkeypatch):
     def broken():
         yield Finding("Thing", "problem", "is not there", "Get it.")

@@ -109,7 +109,8 @@ def _rim_points(brightest: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "n 2"]
             continue
         across = (width / 2 + radius * step[0] - 0.5).astype(np.float32)
         down = (height / 2 + radius * step[1] - 0.5).astype(np.float32)
-        profile = cv2.remap(brightest, across, down, cv2.INTER_LINEAR)[:, 0]
+        # a column: OpenCV 4 and 5 take arrays of one dimension for different shapes
+        profile = cv2.remap(brightest, across[:, None], down[:, None], cv2.INTER_LINEAR)[:, 0]
         dark = float(np.median(profile[: max(3, round(0.02 * side))]))
         rise = np.flatnonzero(profile > dark + _STEP_LEVELS)
         if dark > _DARK_LEVELS or not rise.size or not rise[0]:
