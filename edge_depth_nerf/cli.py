@@ -10,6 +10,7 @@ import tyro
 
 from edge_depth_nerf.demo_options import DemoOptions
 from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.films.options import CameraPathOptions
 from edge_depth_nerf.inspect_options import InspectOptions
 from edge_depth_nerf.mono.options import EstimateDepthOptions
 from edge_depth_nerf.process.options import JbnuDepth360Options, Kitti360Options, RigOptions
@@ -38,6 +39,7 @@ Command = (
     | Annotated[Process, tyro.conf.subcommand("process")]
     | Annotated[EstimateDepthOptions, tyro.conf.subcommand("estimate-depth")]
     | Annotated[InspectOptions, tyro.conf.subcommand("inspect")]
+    | Annotated[CameraPathOptions, tyro.conf.subcommand("camera-path")]
     | Annotated[DemoOptions, tyro.conf.subcommand("demo")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
 )
@@ -66,6 +68,10 @@ def run(command: Command) -> None:
         from edge_depth_nerf.inspecting import inspect_scene
 
         inspect_scene(command)
+    elif isinstance(command, CameraPathOptions):
+        from edge_depth_nerf.films.command import write_camera_path
+
+        write_camera_path(command)
     elif isinstance(command, Doctor):
         from edge_depth_nerf.doctor import run_doctor
 

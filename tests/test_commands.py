@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import os
+import shlex
 import shutil
 import signal
 import socket
@@ -145,6 +146,24 @@ def test_render_interpolate(killed_run, tmp_path):
     )
     film = cv2.VideoCapture(str(tmp_path / "film.mp4"))
     assert film.get(cv2.CAP_PROP_FRAME_COUNT) > 2
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ns-render camera-path writes films with ffmpeg")
+def test_a_film_of_a_camera_path(killed_run, tmp_path):
+    said = call(
+        *("edge-depth-nerf", "camera-path", "--load-config", killed_run / "config.yml", "--camera", "equirectangular"),
+        *("--look", "camera", "--width", 40, "--height", 20, "--fps", 5, "--seconds", 0.4),
+        *("--output", tmp_path / "path.json"),
+    )
+    printed = next(line for line in said.splitlines() if line.strip().startswith("ns-render"))
+    call(*shlex.split(printed))
+    film = cv2.VideoCapture(str(tmp_path / "path.mp4"))
+    assert film.get(cv2.CAP_PROP_FRAME_COUNT) == 2 and film.get(cv2.CAP_PROP_FPS) == 5
+    pictures = [film.read()[1] for _ in range(2)]
+    assert all(picture.shape == (20, 40, 3) for picture in pictures)
+    # it looks elsewhere at the drive's end than at its beginning
+    assert np.abs(pictures[0].astype(int) - pictures[1]).mean() > 2
 
 
 @pytest.mark.skipif(open3d is None, reason="open3d cannot be imported (Debian: apt-get install libusb-1.0-0)")

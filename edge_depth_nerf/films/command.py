@@ -1,0 +1,316 @@
+"""`edge-depth-nerf camera-path`: a path file for `ns-render camera-path`, in the trained model's coordinates.
+
+nerfstudio's own dataparser, with the training's own settings, says where a scene lies in the model's coordinates.
+"""
+
+from __future__ import annotations
+
+import math
+import shlex
+import shutil
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+from rich.console import Console
+
+from edge_depth_nerf import __version__
+from edge_depth_nerf.cameras import KannalaBrandt, Pinhole
+from edge_depth_nerf.console import say
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.files import read_json, write_json
+from edge_depth_nerf.films.options import LARGEST_PX, CameraPathOptions
+from edge_depth_nerf.films.paths import Drive, lane_shift, orbit, replay, up_of
+from edge_depth_nerf.scene_reader import SceneFolder, ScenePicture, read_scene
+
+DEFAULT_RATE_HZ = 10.0
+"""Of drives whose scene knows no times."""
+ORBIT_SECONDS = 6.0
+LARGEST_FILM_FRAMES = 100_000
+SAVED_TRANSFORM = "dataparser_transforms.json"
+"""Beside config.yml: where the scene lay when it was trained on."""
+SAME_PLACE = 1e-3
+"""Scene units by which a camera's place may differ between the path and the training."""
+KEYFRAMES = 12
+"""So many poses are keyframes, from which nerfstudio's viewer draws the path when it loads the file."""
+
+
+@dataclass(frozen=True)
+class FilmLens:
+    """The film's camera, as nerfstudio's path files describe it."""
+
+    width: int
+    height: int
+    focal_px: float
+    """Pixels per unit of tan(angle) (perspective) or per radian (fisheye); of no meaning for the whole sphere."""
+
+    @property
+    def fov_deg(self) -> float:
+        """What path files call fov: nerfstudio takes height / 2 / tan(fov / 2) as the focal length, of any camera."""
+        return math.degrees(2 * math.atan(self.height / 2 / self.focal_px))
+
+
+@dataclass(frozen=True)
+class SceneToModel:
+    """Where a scene lies in the coordinates that its model was trained in."""
+
+    rotation: Float64[np.ndarray, "3 3"]
+    shift_m: Float64[np.ndarray, "3"]
+    """After the turn, before the scale."""
+    units_per_metre: float
+
+    def poses(self, camera_to_scene: Float64[np.ndarray, "n 4 4"]) -> Float64[np.ndarray, "n 4 4"]:
+        """Turn poses in the scene (metres) into poses in the model's coordinates."""
+        moved = camera_to_scene.copy()
+        moved[:, :3, :3] = self.rotation @ camera_to_scene[:, :3, :3]
+        moved[:, :3, 3] = self.units_per_metre * (camera_to_scene[:, :3, 3] @ self.rotation.T + self.shift_m)
+        return moved
+
+
+def write_camera_path(options: CameraPathOptions, console: Console | None = None) -> Path:
+    """Write a path file, and say how a film is made of it.
+
+    Args:
+        options: which scene and training, which way, which camera.
+        console: where it is said.
+
+    Returns:
+        The file.
+
+    Raises:
+        FileNotFoundError: no scene, or no config.yml there.
+        InputError: an option, the scene or the training cannot be used.
+
+    """
+    options.check()
+    console = console or Console()
+    if shutil.which("ffmpeg") is None:
+        say(
+            console,
+            "ns-render writes films with ffmpeg, which is not on this machine: install it before you render "
+            "(apt-get install ffmpeg, brew install ffmpeg), or render with --output-format images.",
+            style="yellow",
+        )
+    scene = None if options.scene is None else read_scene(options.scene)
+    with console.status("Asking nerfstudio where the scene lies in the model's coordinates …"), _without_chatter():
+        scene, to_model = _placed(scene, options)
+
+    pictures = _followed(scene, options.follow)
+    drive = Drive(_times_s(pictures), _poses(pictures), up_of(np.stack([p.rotation for p in scene.pictures])))
+    lens = film_lens(pictures[0].lens, options)
+    fps = options.fps or round(drive.frame_rate_hz, 3)
+    frames = _frames(drive, options, fps)
+    times_s = np.linspace(drive.times_s[0], drive.times_s[-1], frames)
+    forward = options.look == "forward" or (options.look == "auto" and options.camera != "fisheye")
+    where = f"Along {pictures[0].camera}, {drive.duration_s:.1f} s of the drive"
+    if options.kind == "replay":
+        poses = replay(drive, times_s, forward)
+    elif options.kind == "lane-shift":
+        poses = lane_shift(drive, times_s, forward, options.shift_m)
+        where += f", up to {abs(options.shift_m):g} m to the {'left' if options.shift_m > 0 else 'right'}"
+    else:
+        points_m = scene.points_m()
+        poses, radius_m = orbit(drive, frames, options.ahead_m, options.radius_m, points_m)
+        seen = "the scene has no LiDAR points" if points_m is None else "kept clear of LiDAR's returns"
+        where = f"Around a point {options.ahead_m:g} m ahead of the drive's middle, radius {radius_m:.2f} m ({seen})"
+
+    beside = options.load_config.parent if options.load_config else scene.folder
+    output = options.output or beside / "camera_paths" / f"{options.kind}_{options.camera}.json"
+    write_json(output, path_file(to_model.poses(poses), lens, options, fps))
+    say(console, f"{where}: {frames} pictures of {lens.width}×{lens.height}, {frames / fps:.1f} s at {fps:g} a second.")
+    say(console, f"Path: {output}\nThe film:")
+    config = str(options.load_config or "CONFIG.yml")
+    command = ("ns-render", "camera-path", "--load-config", config, "--camera-path-filename", str(output))
+    say(console, f"  {shlex.join((*command, '--output-path', str(output.with_suffix('.mp4'))))}")
+    return output
+
+
+def film_lens(lens: KannalaBrandt | Pinhole, options: CameraPathOptions) -> FilmLens:
+    """Choose the film's size and focal length, where options leave them open, by the drive's own lens.
+
+    Raises:
+        InputError: a size that follows from the other is out of range.
+
+    """
+    aspect = {"fisheye": lens.width / lens.height, "perspective": 16 / 9, "equirectangular": 2.0}[options.camera]
+    width, height = options.width, options.height
+    if width is None:
+        natural = 2.0 * lens.height if options.camera == "equirectangular" else float(lens.width)
+        width = _even(height * aspect if height else natural)
+    height = height or _even(width / aspect)
+    if max(width, height) > LARGEST_PX:
+        raise InputError(
+            f"the film would be {width}×{height} px, more than {LARGEST_PX}. Give both --width and --height."
+        )
+    if options.camera == "equirectangular":
+        return FilmLens(width, height, height / 2)
+    if options.camera == "perspective":
+        return FilmLens(width, height, width / 2 / math.tan(math.radians(options.fov_deg or 90.0) / 2))
+    if options.fov_deg is None and isinstance(lens, KannalaBrandt):
+        return FilmLens(width, height, lens.fx * width / lens.width)
+    return FilmLens(width, height, width / math.radians(options.fov_deg or 180.0))
+
+
+def path_file(
+    camera_to_model: Float64[np.ndarray, "n 4 4"], lens: FilmLens, options: CameraPathOptions, fps: float
+) -> dict[str, Any]:
+    """What nerfstudio reads: the film's poses and lens, and some of the poses as keyframes for its viewer."""
+    frames = len(camera_to_model)
+    seconds = frames / fps
+    aspect = lens.width / lens.height
+    keyframes = np.unique(np.linspace(0, frames - 1, min(frames, KEYFRAMES)).round().astype(int))
+    return {
+        "made_by": f"edge-depth-nerf {__version__}",
+        "camera_type": options.camera,
+        "render_width": lens.width,
+        "render_height": lens.height,
+        "fps": fps,
+        "seconds": seconds,
+        "is_cycle": options.kind == "orbit",
+        "smoothness_value": 0.0,
+        "default_fov": lens.fov_deg,
+        "default_transition_sec": seconds / max(1, len(keyframes) - 1),
+        "keyframes": [
+            {"matrix": camera_to_model[index].flatten().tolist(), "fov": lens.fov_deg, "aspect": aspect}
+            for index in keyframes
+        ],
+        "camera_path": [
+            {"camera_to_world": pose.flatten().tolist(), "fov": lens.fov_deg, "aspect": aspect}
+            for pose in camera_to_model
+        ],
+    }
+
+
+@contextmanager
+def _without_chatter() -> Iterator[None]:
+    """Keep back what nerfstudio says about its own imports and about the split, which is the training's."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)
+        from nerfstudio.utils.rich_utils import CONSOLE
+
+        before, CONSOLE.quiet = CONSOLE.quiet, True
+        try:
+            yield
+        finally:
+            CONSOLE.quiet = before
+
+
+def _even(length: float) -> int:
+    return max(2, 2 * round(length / 2))
+
+
+def _frames(drive: Drive, options: CameraPathOptions, fps: float) -> int:
+    seconds = options.seconds or (ORBIT_SECONDS if options.kind == "orbit" else None)
+    # as long as the drive: its first picture and its last are both in the film
+    frames = round(drive.duration_s * fps) + 1 if seconds is None else round(seconds * fps)
+    if not 2 <= frames <= LARGEST_FILM_FRAMES:
+        raise InputError(
+            f"the film would have {frames} pictures ({fps:g} a second); expected 2 to {LARGEST_FILM_FRAMES}. "
+            "Choose other --seconds or --fps."
+        )
+    return frames
+
+
+def _followed(scene: SceneFolder, name: str | None) -> tuple[ScenePicture, ...]:
+    cameras = scene.cameras()
+    if name is None:
+        return next(iter(cameras.values()))
+    if name not in cameras:
+        raise InputError(f"--follow {name}: {scene.path} has no such camera. It has {', '.join(cameras)}.")
+    return cameras[name]
+
+
+def _times_s(pictures: tuple[ScenePicture, ...]) -> Float64[np.ndarray, "n"]:
+    known = [picture.timestamp_s for picture in pictures]
+    if any(time is None for time in known):
+        return np.array([picture.moment / DEFAULT_RATE_HZ for picture in pictures])
+    times_s = np.array(known, dtype=np.float64)
+    return times_s - times_s[0]
+
+
+def _poses(pictures: tuple[ScenePicture, ...]) -> Float64[np.ndarray, "n 4 4"]:
+    poses = np.tile(np.eye(4), (len(pictures), 1, 1))
+    poses[:, :3, :3] = [picture.rotation for picture in pictures]
+    poses[:, :3, 3] = [picture.position_m for picture in pictures]
+    return poses
+
+
+def _placed(scene: SceneFolder | None, options: CameraPathOptions) -> tuple[SceneFolder, SceneToModel]:
+    """The scene, and where the training's own dataparser puts it."""
+    if options.load_config is None:
+        assert scene is not None
+        from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
+
+        dataparser = FisheyeDepthDataParserConfig(metres_per_unit=options.metres_per_unit)
+    else:
+        dataparser = _training_dataparser(options.load_config)
+        scene = scene or read_scene(Path(dataparser.data))
+    dataparser.data = scene.path
+    outputs = dataparser.setup().get_dataparser_outputs(split="train")
+    if options.load_config is not None:
+        _check_unchanged(outputs, options.load_config.parent / SAVED_TRANSFORM, scene)
+    # both lead from the coordinates before transforms.json, which are nerfstudio's own to change
+    applied = np.vstack((scene.meta.get("applied_transform", np.eye(4)[:3]), [0, 0, 0, 1])).astype(np.float64)
+    transform = outputs.dataparser_transform.numpy().astype(np.float64) @ np.linalg.inv(applied)
+    scale = float(outputs.dataparser_scale) / float(scene.meta.get("applied_scale", 1.0))
+    to_model = SceneToModel(transform[:, :3], transform[:, 3], scale)
+
+    trained = outputs.cameras.camera_to_worlds.numpy()[:, :3, 3].astype(np.float64)
+    ours = to_model.poses(_poses(scene.pictures))[:, :3, 3]
+    furthest = max(float(np.linalg.norm(ours - place, axis=1).min()) for place in trained)
+    if furthest > SAME_PLACE * max(1.0, float(np.abs(trained).max())):
+        raise InputError(
+            f"{scene.path}: the training's dataparser puts the cameras {furthest:.3g} scene units away from where its "
+            "own transform puts them, so a path cannot be placed. Train with fisheye-depth-data or nerfstudio-data."
+        )
+    return scene, to_model
+
+
+def _check_unchanged(outputs: Any, saved: Path, scene: SceneFolder) -> None:
+    """Compare where the scene lies now with what the training wrote down.
+
+    Raises:
+        InputError: they differ.
+
+    """
+    if not saved.is_file():
+        return
+    record = read_json(saved)
+    now = np.append(outputs.dataparser_transform.numpy(), outputs.dataparser_scale)
+    then = np.append(np.asarray(record["transform"], dtype=np.float64), float(record["scale"]))
+    if now.shape != then.shape or not np.allclose(now, then, rtol=1e-4, atol=1e-4):
+        raise InputError(
+            f"{scene.path}: lies elsewhere in the model's coordinates than {saved} says: it is another scene, or was "
+            "changed since the training. Give the scene that the model was trained on, or train again."
+        )
+
+
+def _training_dataparser(config_path: Path) -> Any:
+    """The dataparser's settings of a training."""
+    if not config_path.is_file():
+        raise FileNotFoundError(f"{config_path}: no such file. --load-config takes the config.yml that ns-train wrote.")
+    import yaml
+    from nerfstudio.engine.trainer import TrainerConfig
+
+    try:
+        # as every command of nerfstudio reads it: the file may name any class
+        config = yaml.load(config_path.read_text(encoding="utf-8"), Loader=yaml.Loader)
+    except (yaml.YAMLError, UnicodeDecodeError, ImportError, AttributeError) as error:
+        raise InputError(
+            f"{config_path}: cannot be read ({' '.join(str(error).split())}). --load-config takes the config.yml that "
+            "ns-train wrote; the plugin of its method must be installed."
+        ) from error
+    if not isinstance(config, TrainerConfig):
+        raise InputError(
+            f"{config_path}: is no training's settings. --load-config takes the config.yml that ns-train wrote."
+        )
+    dataparser = getattr(config.pipeline.datamanager, "dataparser", None)
+    if dataparser is None:
+        raise InputError(f"{config_path}: its method {config.method_name} reads no scene folder.")
+    dataparser.data = getattr(config.pipeline.datamanager, "data", None) or dataparser.data
+    return dataparser

@@ -1,0 +1,236 @@
+"""Where a film's camera stands and looks: the drive again, beside it, or around a point.
+
+Frames: the scene (metres) and a camera with OpenGL's axes (x right, y up, z backward); transforms are 4×4, float64.
+Times are seconds of one clock. The vehicle is known by one camera that is fixed to it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Float64
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from edge_depth_nerf.errors import InputError
+
+EASE = 0.25
+"""Share of a shifted film in which the camera moves aside, and again in which it comes back."""
+Z_IS_UP_WITHIN_DEG = 25.0
+"""The scene's z is taken as up if the cameras agree with it to this."""
+LEAST_RADIUS_M = 1.0
+"""So far beside the way the vehicle itself has been."""
+CLEARANCE_M = 1.0
+"""An orbit keeps this far from what LiDAR saw."""
+OBSTACLE_BAND_M = 1.0
+"""Returns at most this far above and below the camera are in an orbit's way: not the road, not the trees' crowns."""
+STRAY_RETURNS = 4
+"""So many returns nearer than the others do not make an obstacle."""
+
+Poses = Float64[np.ndarray, "poses 4 4"]
+Direction = Float64[np.ndarray, "3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """The way of one camera through a scene.
+
+    Raises:
+        InputError: fewer than two poses, or times that do not increase.
+
+    """
+
+    times_s: Float64[np.ndarray, "poses"]
+    """Increasing."""
+    camera_to_scene: Poses
+    """The camera's poses at these times."""
+    up: Direction
+    """Unit vector upwards, in the scene."""
+
+    def __post_init__(self) -> None:
+        if len(self.times_s) < 2:
+            raise InputError(
+                f"a film needs a camera with at least two pictures of the drive, found {len(self.times_s)}."
+            )
+        if not (np.diff(self.times_s) > 0).all():
+            first = int(np.argmax(~(np.diff(self.times_s) > 0)))
+            raise InputError(
+                f"the times of a drive must increase, but picture {first + 2} is of {self.times_s[first + 1]:.6f} s, "
+                f"the one before of {self.times_s[first]:.6f} s."
+            )
+
+    @property
+    def duration_s(self) -> float:
+        """From the first picture to the last."""
+        return float(self.times_s[-1] - self.times_s[0])
+
+    @property
+    def frame_rate_hz(self) -> float:
+        """Pictures a second, by the median of the times between them."""
+        return float(1 / np.median(np.diff(self.times_s)))
+
+    @cached_property
+    def vehicle_in_camera(self) -> Float64[np.ndarray, "3 3"]:
+        """Unit vectors forward, left and up of the vehicle, as columns, in the camera's axes.
+
+        One for the whole drive: the camera is fixed to the vehicle. Forward is the mean direction in which the camera
+        moved, so that a vehicle which stands, or drives backward for a while, still has one.
+
+        Raises:
+            InputError: the camera does not move.
+
+        """
+        rotation, position = self.camera_to_scene[:, :3, :3], self.camera_to_scene[:, :3, 3]
+        up = np.einsum("nji,j->i", rotation, self.up)
+        up /= np.linalg.norm(up)
+        step = np.diff(position, axis=0)
+        forward = np.einsum("nji,nj->i", rotation[:-1], step)
+        forward -= (forward @ up) * up
+        length = np.linalg.norm(forward)
+        if not length > 1e-3 * max(1.0, float(np.abs(position).max())):
+            raise InputError(
+                "the drive's camera does not move, so there is no forward and no side. Take --kind replay --look "
+                "camera."
+            )
+        forward /= length
+        return np.stack((forward, np.cross(up, forward), up), axis=1)
+
+    @cached_property
+    def _splines(self) -> tuple[CubicSpline, RotationSpline]:
+        rotations = Rotation.from_matrix(self.camera_to_scene[:, :3, :3])
+        return CubicSpline(self.times_s, self.camera_to_scene[:, :3, 3]), RotationSpline(self.times_s, rotations)
+
+    def at(self, times_s: Float64[np.ndarray, "times"]) -> Float64[np.ndarray, "times 4 4"]:
+        """The camera's poses at some times within the drive.
+
+        Exactly those of the drive at its own times, and smooth (twice differentiable) between them.
+        """
+        position, rotation = self._splines
+        return _poses(rotation(times_s).as_matrix(), position(times_s))
+
+
+def up_of(rotations: Float64[np.ndarray, "poses 3 3"]) -> Direction:
+    """Which way is up in a scene: z, where its cameras do not contradict, else what is up for them on average.
+
+    Args:
+        rotations: camera to scene (OpenGL's axes), of all cameras.
+
+    """
+    mean = rotations[:, :, 1].mean(axis=0)
+    z = np.array([0.0, 0.0, 1.0])
+    length = float(np.linalg.norm(mean))
+    # cameras that look down all around, or that lie on their side, do not tell
+    if length < 0.1 or mean @ z >= length * np.cos(np.radians(Z_IS_UP_WITHIN_DEG)):
+        return z
+    return mean / length
+
+
+def replay(drive: Drive, times_s: Float64[np.ndarray, "times"], forward: bool) -> Float64[np.ndarray, "times 4 4"]:
+    """The drive again.
+
+    Args:
+        drive: the camera's way.
+        times_s: when the film's pictures are taken.
+        forward: look where the vehicle goes, not where the drive's camera looked.
+
+    Returns:
+        Camera to scene.
+
+    """
+    poses = drive.at(times_s)
+    if forward:
+        ahead, left, up = drive.vehicle_in_camera.T
+        poses[:, :3, :3] = poses[:, :3, :3] @ np.stack((-left, up, -ahead), axis=1)
+    return poses
+
+
+def lane_shift(
+    drive: Drive, times_s: Float64[np.ndarray, "times"], forward: bool, shift_m: float
+) -> Float64[np.ndarray, "times 4 4"]:
+    """The drive again, from beside its way: eased out over the film's first quarter, back over its last.
+
+    Args:
+        drive: the camera's way.
+        times_s: when the film's pictures are taken.
+        forward: as of `replay`.
+        shift_m: how far to the vehicle's left at most; negative to the right.
+
+    Returns:
+        Camera to scene.
+
+    """
+    poses = replay(drive, times_s, forward)
+    left = drive.at(times_s)[:, :3, :3] @ drive.vehicle_in_camera[:, 1]
+    share = (times_s - times_s[0]) / (times_s[-1] - times_s[0])
+    poses[:, :3, 3] += (shift_m * _ease(np.minimum(share, 1 - share) / EASE))[:, None] * left
+    return poses
+
+
+def orbit(
+    drive: Drive, frames: int, ahead_m: float, largest_radius_m: float, points_m: Float[np.ndarray, "points 3"] | None
+) -> tuple[Poses, float]:
+    """Once around a point of the drive's way, level, looking at it.
+
+    The point lies on the way, so that the vehicle has been there, some metres further on than the drive's middle. The
+    circle begins behind it and goes counter-clockwise, seen from above. It is as wide as LiDAR found nothing within
+    it, at most as asked; without LiDAR's points it stays where the vehicle itself has been.
+
+    Args:
+        drive: the camera's way.
+        frames: pictures of the film; the one after the last would be the first.
+        ahead_m: how far from the middle of the way to the point, along it.
+        largest_radius_m: of the circle.
+        points_m: what LiDAR saw, in the scene.
+
+    Returns:
+        Camera to scene, and the circle's radius in metres.
+
+    Raises:
+        InputError: the camera does not move.
+
+    """
+    position = drive.camera_to_scene[:, :3, 3]
+    driven_m = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=1))))
+    heading = drive.camera_to_scene[:, :3, :3] @ drive.vehicle_in_camera[:, 0]
+    reached_m = min(driven_m[-1] / 2 + ahead_m, driven_m[-1])
+    time_s = np.interp(reached_m, driven_m, drive.times_s)
+    centre = drive.at(np.array([time_s]))[0, :3, 3]
+    ahead = heading[np.argmin(np.abs(drive.times_s - time_s))]
+    ahead = ahead - (ahead @ drive.up) * drive.up
+    ahead /= np.linalg.norm(ahead)
+    left = np.cross(drive.up, ahead)
+
+    free_m = _free_radius_m(centre, drive.up, points_m)
+    radius_m = float(np.clip(free_m - CLEARANCE_M, min(LEAST_RADIUS_M, largest_radius_m), largest_radius_m))
+    angle = np.linspace(0, 2 * np.pi, frames, endpoint=False)[:, None]
+    outward = -np.cos(angle) * ahead + np.sin(angle) * -left
+    right = np.cross(-outward, drive.up)
+    rotation = np.stack((right, np.broadcast_to(drive.up, right.shape), outward), axis=2)
+    return _poses(rotation, centre + radius_m * outward), radius_m
+
+
+def _free_radius_m(centre: Direction, up: Direction, points_m: Float[np.ndarray, "points 3"] | None) -> float:
+    """How far LiDAR saw nothing around a point, level with it; 0 if that is not known."""
+    if points_m is None:
+        return 0.0
+    offset = points_m - centre
+    height = offset @ up
+    level = offset[np.abs(height) <= OBSTACLE_BAND_M]
+    distance = np.linalg.norm(level - (level @ up)[:, None] * up, axis=1)
+    if len(distance) <= STRAY_RETURNS:
+        return float("inf") if len(points_m) > STRAY_RETURNS else 0.0
+    return float(np.partition(distance, STRAY_RETURNS)[STRAY_RETURNS])
+
+
+def _ease(share: np.ndarray) -> np.ndarray:
+    """From 0 at 0 to 1 at 1, starting and ending without speed."""
+    share = np.clip(share, 0, 1)
+    return share**2 * (3 - 2 * share)
+
+
+def _poses(rotation: np.ndarray, position: np.ndarray) -> Poses:
+    poses = np.tile(np.eye(4), (len(position), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = rotation, position
+    return poses
