@@ -3,12 +3,13 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: help setup demo test lint format wheel clean
+.PHONY: help setup demo test lint format dist check-dist version clean
 help:
-	@echo "make demo    synthesise a drive, train with and without the depth prior, compare (outputs/demo/)"
-	@echo "make test    run all tests"
-	@echo "make lint    ruff and pyright"
-	@echo "make setup   the virtual environment in $(VENV), with the versions of constraints.txt"
+	@echo "make demo        synthesise a drive, train with and without the depth prior, compare (outputs/demo/)"
+	@echo "make test        run all tests"
+	@echo "make lint        ruff and pyright"
+	@echo "make check-dist  build wheel and sdist (dist/), install them into a fresh environment"
+	@echo "make setup       the virtual environment in $(VENV), with the versions of constraints.txt"
 
 # OpenCV comes in several wheels that overwrite each other; the one with contrib and without a window goes last.
 $(VENV)/.installed: pyproject.toml constraints.txt
@@ -34,8 +35,28 @@ format: setup
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-wheel: setup
-	$(BIN)/python -m build --wheel
+# The wheel is made from the sdist.
+dist: setup
+	rm -rf build dist *.egg-info
+	$(BIN)/python -m build --no-isolation
+
+# What a user's pip takes, without constraints.txt. The sdist goes into the same environment after the wheel: it has the
+# same dependencies, which take minutes to install.
+FRESH := build/fresh
+check-dist: dist
+	$(BIN)/twine check --strict dist/*
+	rm -rf $(FRESH)
+	$(PYTHON) -m venv $(FRESH)
+	$(FRESH)/bin/pip install --quiet --disable-pip-version-check dist/*.whl
+	cd build && fresh/bin/edge-depth-nerf --help >/dev/null && fresh/bin/edge-depth-nerf doctor
+	cd build && fresh/bin/ns-train --help | grep -q edge-depth-nerf-lite
+	cd build && fresh/bin/edge-depth-nerf inspect ../data/sample_drive --frames 1 --output inspection
+	$(FRESH)/bin/pip install --quiet --disable-pip-version-check --no-deps --force-reinstall dist/*.tar.gz
+	cd build && fresh/bin/edge-depth-nerf --help >/dev/null && fresh/bin/edge-depth-nerf doctor
+	rm -rf $(FRESH)
+
+version:
+	@$(PYTHON) -c 'import edge_depth_nerf; print(edge_depth_nerf.__version__)'
 
 clean:
 	rm -rf build dist outputs *.egg-info .pytest_cache .ruff_cache

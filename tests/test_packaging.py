@@ -1,33 +1,78 @@
+import email
 import re
 import shutil
 import subprocess
 import sys
+import tarfile
 import zipfile
 from pathlib import Path
 
 import pytest
+import yaml
+
+import edge_depth_nerf
 
 ROOT = Path(__file__).parents[1]
+WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory) -> Path:
-    """The wheel of the sources, built apart from them: a build leaves folders behind."""
+def dist(tmp_path_factory) -> Path:
+    """Folder of the sdist and of the wheel that is made from it, built apart: a build leaves folders behind."""
     sources = tmp_path_factory.mktemp("sources") / "project"
-    shutil.copytree(ROOT, sources, ignore=shutil.ignore_patterns(".*", "outputs", "build", "dist", "*.egg-info"))
-    build = [
-        sys.executable,
-        "-m",
-        "build",
-        "--wheel",
-        "--no-isolation",
-        "--outdir",
-        str(sources / "dist"),
-        str(sources),
-    ]
+    ignored = (".venv", ".git", ".*_cache", ".cache", ".hypothesis", "outputs", "build", "dist", "*.egg-info")
+    shutil.copytree(ROOT, sources, ignore=shutil.ignore_patterns(*ignored), symlinks=True)
+    build = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(sources / "dist"), str(sources)]
     done = subprocess.run(build, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
-    return next((sources / "dist").glob("*.whl"))
+    return sources / "dist"
+
+
+@pytest.fixture(scope="module")
+def wheel(dist) -> Path:
+    return next(dist.glob("*.whl"))
+
+
+def test_the_sdist_is_the_repository(dist):
+    """With tests, pages, the sample drive and the licence: what is in it can be worked on."""
+    with tarfile.open(next(dist.glob("*.tar.gz"))) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    expected = {
+        str(path.relative_to(ROOT))
+        for folder in ("edge_depth_nerf", "tests", "docs", "benchmarks", "data", ".github", ".ci")
+        for path in (ROOT / folder).rglob("*")
+        if path.is_file() and not {".cache", "__pycache__"} & set(path.parts) and path.suffix != ".pyc"
+    }
+    expected |= {"LICENSE", "README.md", "CHANGELOG.md", "CONTRIBUTING.md", "CITATION.cff", "MANIFEST.in", "Makefile"}
+    expected |= {"pyproject.toml", "constraints.txt", "nerfstudio_method.toml", ".gitignore"}
+    assert "tests/conftest.py" in expected
+    assert not expected - names
+    assert not [
+        name for name in names if "__pycache__" in name or "/.cache" in name or name.startswith((".venv", "outputs"))
+    ]
+
+
+def test_an_index_takes_them(dist):
+    done = subprocess.run(
+        [sys.executable, "-m", "twine", "check", "--strict", *map(str, dist.iterdir())],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0 and done.stdout.count("PASSED") == 2, done.stdout + done.stderr
+
+
+def test_the_wheel_says_what_it_is(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        folder = f"edge_depth_nerf-{edge_depth_nerf.__version__}.dist-info"
+        about = email.message_from_bytes(archive.read(f"{folder}/METADATA"))
+        assert archive.read(f"{folder}/licenses/LICENSE") == (ROOT / "LICENSE").read_bytes()
+    assert about["Version"] == edge_depth_nerf.__version__
+    assert about["License-Expression"] == "Apache-2.0"
+    # the README's badges say the same
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert "python-3.10_--_3.12" in readme and about["Requires-Python"].split(",") == ["<3.13", ">=3.10"]
+    assert "licence-Apache--2.0" in readme
 
 
 def test_the_wheel_holds_the_whole_package(wheel):
@@ -57,7 +102,13 @@ def test_the_wheel_works_without_the_sources(wheel, tmp_path):
     assert done.returncode == 0, done.stderr
 
 
-PAGES = ["README.md", "data/README.md", *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md")))]
+PAGES = [
+    "README.md",
+    "CONTRIBUTING.md",
+    "CHANGELOG.md",
+    "data/README.md",
+    *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md"))),
+]
 
 
 @pytest.mark.parametrize("page", PAGES)
@@ -68,3 +119,70 @@ def test_pages_link_to_what_exists(page):
     assert page != "README.md" or len(links) > 3
     for link in links:
         assert ((ROOT / page).parent / link).exists(), link
+
+
+def test_the_citation_is_of_this_version():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert citation["cff-version"] == "1.2.0"
+    assert citation["version"] == edge_depth_nerf.__version__
+    assert citation["license"] == "Apache-2.0"
+    paper = citation["references"][0]
+    assert paper["title"] in (ROOT / "README.md").read_text(encoding="utf-8").replace("\n", " ")
+    assert (paper["volume"], paper["issue"], paper["start"]) == (24, 21, 6790)
+
+
+def test_the_changelog_knows_this_version():
+    """As a release of its own, or as the one that comes next."""
+    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert re.search(rf"^## \[{re.escape(edge_depth_nerf.__version__)}\]", text, re.MULTILINE) or re.search(
+        rf"^## \[Unreleased\]\n\nWill be {re.escape(edge_depth_nerf.__version__)}\b", text, re.MULTILINE
+    )
+
+
+def make_targets() -> set[str]:
+    return set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+
+
+def test_make_has_what_is_called_phony():
+    phony = re.search(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    assert phony and set(phony[1].split()) <= make_targets()
+
+
+@pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.name)
+def test_workflows_call_what_exists(path):
+    workflow = yaml.safe_load(path.read_text(encoding="utf-8"))
+    # YAML 1.1 reads the key `on` as true
+    assert {"name", "jobs", "permissions", True} <= set(workflow)
+    called = []
+    for job in workflow["jobs"].values():
+        assert job["runs-on"] and job["timeout-minutes"]
+        for step in job["steps"]:
+            assert ("run" in step) != ("uses" in step)
+            assert re.fullmatch(r"[\w-]+/[\w-]+@v\d+", step.get("uses", "actions/checkout@v4"))
+            called += re.findall(r"\bmake (?:--\S+ )?([a-z-]+)", step.get("run", ""))
+    assert called and set(called) <= make_targets()
+
+
+def test_the_workflows_cover_every_python():
+    ci = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text(encoding="utf-8"))
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    supported = re.findall(r"Programming Language :: Python :: (3\.\d+)", text)
+    assert ci["jobs"]["tests"]["strategy"]["matrix"]["python"] == supported
+    assert {"lint", "tests", "distribution"} == set(ci["jobs"])
+
+
+@pytest.mark.parametrize("name", ["bug", "question", "feature"])
+def test_issue_forms(name):
+    form = yaml.safe_load((ROOT / f".github/ISSUE_TEMPLATE/{name}.yml").read_text(encoding="utf-8"))
+    assert form["name"] and form["description"]
+    ids = [field["id"] for field in form["body"]]
+    assert len(set(ids)) == len(ids) and all(field["attributes"]["label"] for field in form["body"])
+
+
+def test_contributing_names_what_exists():
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"(?:`|^    )make ([a-z-]+)", text, re.MULTILINE))
+    assert {"setup", "test", "lint"} < named and named <= make_targets()
+    for name in re.findall(r"`([\w./]+\.(?:py|toml|txt|cff)|[\w]+/)`", text):
+        folders = (ROOT, ROOT / "edge_depth_nerf", ROOT / "edge_depth_nerf/process", ROOT / "tests")
+        assert name in ("rig.toml", "tests/test_MODULE.py") or any((folder / name).exists() for folder in folders), name
