@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import time
 from copy import deepcopy
 from pathlib import Path
@@ -28,11 +27,9 @@ from nerfstudio.engine.optimizers import Optimizers
 from rich.console import Console
 from rich.table import Table
 
+from edge_depth_nerf.compare.judging import PIXELS_PER_VIEW, choose_pixels, judge_pixels
 from edge_depth_nerf.config import apply_overrides
 from edge_depth_nerf.files import read_json, write_json
-from edge_depth_nerf.metrics import DepthErrors
-
-PIXELS_PER_VIEW = 3000
 
 
 def parse(variant: str) -> dict[str, Any]:
@@ -46,32 +43,6 @@ def parse(variant: str) -> dict[str, Any]:
     return overrides
 
 
-def judge(pipeline: Any, pixels: list[tuple[int, torch.Tensor, dict[str, Any]]]) -> dict[str, float]:
-    """Mean over views of the PSNR against the noisy and the noise-free picture; pooled depth errors."""
-    pipeline.eval()
-    psnr: dict[str, list[float]] = {"image": [], "truth_rgb": []}
-    errors = {"lidar": DepthErrors(), "truth": DepthErrors()}
-    for view, at, item in pixels:
-        rays = pipeline.datamanager.eval_ray_generator(torch.cat([torch.full((len(at), 1), view), at], dim=1))
-        with torch.no_grad():
-            outputs = pipeline.model(rays)
-        row, column = at.T
-        for key, found in psnr.items():
-            if key in item:
-                squared = (outputs["rgb"].clamp(0, 1) - item[key][row, column, :3]).square().mean()
-                found.append(-10 * math.log10(float(squared)))
-        distance_m = outputs["depth"][:, 0] * pipeline.model.metres_per_unit
-        for name, pool in errors.items():
-            if f"{name}_distance_m" in item:
-                true_m = item[f"{name}_distance_m"][row, column, 0]
-                pool.update(distance_m[None], true_m[None], torch.ones(1, len(at), dtype=torch.bool))
-    pipeline.train()
-    figures = {key: float(np.mean(found)) for key, found in psnr.items() if found}
-    for name, pool in errors.items():
-        figures |= pool.compute(f"{name}_")
-    return figures
-
-
 def train(scene: Path, overrides: dict[str, Any], steps: int, seed: int) -> dict[str, float]:
     config = deepcopy(all_methods["edge-depth-nerf-lite"])
     apply_overrides(config, overrides, "command line")
@@ -82,12 +53,7 @@ def train(scene: Path, overrides: dict[str, Any], steps: int, seed: int) -> dict
     attributes = TrainingCallbackAttributes(optimizers=optimisers, grad_scaler=None, pipeline=pipeline, trainer=None)
     callbacks = pipeline.get_training_callbacks(attributes)
     dataset = pipeline.datamanager.eval_dataset
-    generator = torch.Generator().manual_seed(seed)
-    pixels = []
-    for view in range(len(dataset)):
-        item = dataset[view]
-        at = item["mask"][..., 0].nonzero()
-        pixels.append((view, at[torch.randperm(len(at), generator=generator)[:PIXELS_PER_VIEW]], item))
+    pixels = choose_pixels(dataset, most=PIXELS_PER_VIEW * len(dataset))
 
     pipeline.train()
     started = time.monotonic()
@@ -102,7 +68,7 @@ def train(scene: Path, overrides: dict[str, Any], steps: int, seed: int) -> dict
         for callback in callbacks:
             callback.run_callback_at_location(step, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
     seconds = (time.monotonic() - started) / steps
-    return {"seconds a step": seconds, **judge(pipeline, pixels)}
+    return {"seconds a step": seconds, **judge_pixels(pipeline, pixels)}
 
 
 def key_of(options: argparse.Namespace, variant: str, seed: int) -> str:

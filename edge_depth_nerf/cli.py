@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from edge_depth_nerf.compare.options import CompareOptions
 from edge_depth_nerf.demo_options import DemoOptions
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.films.options import CameraPathOptions
@@ -40,6 +41,7 @@ Command = (
     | Annotated[EstimateDepthOptions, tyro.conf.subcommand("estimate-depth")]
     | Annotated[InspectOptions, tyro.conf.subcommand("inspect")]
     | Annotated[CameraPathOptions, tyro.conf.subcommand("camera-path")]
+    | Annotated[CompareOptions, tyro.conf.subcommand("compare")]
     | Annotated[DemoOptions, tyro.conf.subcommand("demo")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
 )
@@ -72,6 +74,10 @@ def run(command: Command) -> None:
         from edge_depth_nerf.films.command import write_camera_path
 
         write_camera_path(command)
+    elif isinstance(command, CompareOptions):
+        from edge_depth_nerf.compare.command import compare
+
+        compare(command)
     elif isinstance(command, Doctor):
         from edge_depth_nerf.doctor import run_doctor
 

@@ -57,6 +57,10 @@ class FisheyeDepthDataset(InputDataset):
         """H×W, True where the lens model gives a ray within the scene's theta_max."""
         return self._rays_of(image_idx)[0]
 
+    def cos_theta(self, image_idx: int) -> NDArray[np.float64]:
+        """H×W cosine of the rays' angle from the optical axis; NaN where there is no ray."""
+        return self._rays_of(image_idx)[1]
+
     def _rays_of(self, image_idx: int) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
         """Validity and cosine of the angle from the axis, H×W each; made once a camera, it takes seconds."""
         camera = self.camera(image_idx)

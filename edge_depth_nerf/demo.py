@@ -6,12 +6,8 @@ the output folder is not done again. The two models differ in the depth loss alo
 
 from __future__ import annotations
 
-import json
 import os
 import platform
-import re
-import shlex
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -25,21 +21,16 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import Progress
 from rich.table import Table
 
 from edge_depth_nerf.demo_options import DemoOptions
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_distance_png, read_image, read_json, read_mask, write_json, write_png
-from edge_depth_nerf.pictures import colour_distance, side_by_side
+from edge_depth_nerf.files import read_json, write_json, write_png
+from edge_depth_nerf.pictures import side_by_side
 from edge_depth_nerf.process.command import process
 from edge_depth_nerf.process.options import Kitti360Options
+from edge_depth_nerf.runs import LoggedCommands, compared_views, progress_bars, step_of_line, steps_done, viewer_command
 from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 
@@ -108,7 +99,7 @@ def run_demo(options: DemoOptions, console: Console | None = None) -> dict[str, 
 
     runs = [_Run(name, scene, output / "runs", options) for name in RUNS]
     # side by side, each on its share of the cores: two threads do not make one training twice as fast
-    with _progress(console) as progress, ThreadPoolExecutor(len(runs)) as pool:
+    with progress_bars(console) as progress, ThreadPoolExecutor(len(runs)) as pool:
         for stage in (_Run.train, _Run.evaluate):
             with clock.stage(stage.__name__):
                 try:
@@ -185,15 +176,12 @@ class _Run:
         self.checkpoints = self.folder / "nerfstudio_models"
         self.config = self.folder / "config.yml"
         self.metrics = runs / name / "metrics.json"
-        self._process: subprocess.Popen[str] | None = None
-        self.viewer_command = f"ns-viewer --load-config {self.config} --viewer.websocket-host 127.0.0.1"
-
-    def _last_step(self) -> int:
-        steps = [int(path.stem.removeprefix("step-")) for path in self.checkpoints.glob("step-*.ckpt")]
-        return max(steps, default=-1)
+        self.viewer_command = viewer_command(self.config)
+        self._commands = LoggedCommands()
+        self.stop = self._commands.stop
 
     def train(self, progress: Progress) -> None:
-        done = self._last_step() + 1
+        done = steps_done(self.checkpoints)
         remaining = self.options.steps - done
         if remaining <= 0:
             return
@@ -220,68 +208,27 @@ class _Run:
     def figures(self) -> dict[str, float]:
         return read_json(self.metrics)["results"]
 
-    def stop(self) -> None:
-        if self._process is not None:
-            self._process.kill()
-
     def _call(self, stage: str, arguments: list[Any], progress: Progress, title: str, total: int | None) -> None:
-        log = self.runs / self.name / f"{stage}.log"
-        log.parent.mkdir(parents=True, exist_ok=True)
-        command = [str(argument) for argument in arguments]
-        program = Path(sys.executable).with_name(command[0])
-        threads = str(max(1, (os.cpu_count() or 1) // len(RUNS)))
+        program, *rest = (str(argument) for argument in arguments)
         task = progress.add_task(title, total=total)
-        with log.open("a", encoding="utf-8") as sink:
-            sink.write(f"$ {shlex.join(command)}\n")
-            sink.flush()
-            self._process = subprocess.Popen(
-                [str(program), *command[1:]],
-                env={"OMP_NUM_THREADS": threads, "PYTHONUNBUFFERED": "1", **os.environ},
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                text=True,
-            )
-            assert self._process.stdout is not None
-            for line in self._process.stdout:
-                sink.write(line)
-                step = re.match(r"\s*(\d+) \(\d", line)
-                if step and total:
-                    progress.update(task, completed=int(step.group(1)))
-            status = self._process.wait()
-        if status:
-            raise InputError(
-                f"{program.name} ended with status {status}. What it said is in {log}; the command was\n"
-                f"{shlex.join(command)}"
-            )
+
+        def on_line(line: str) -> None:
+            step = step_of_line(line)
+            if step is not None and total:
+                progress.update(task, completed=step)
+
+        self._commands.call(
+            [Path(sys.executable).with_name(program), *rest],
+            self.runs / self.name / f"{stage}.log",
+            max(1, (os.cpu_count() or 1) // len(RUNS)),
+            on_line,
+        )
         progress.update(task, total=total or 1, completed=total or 1)
-
-
-def _progress(console: Console) -> Progress:
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    return Progress(*columns, console=console)
 
 
 def _comparison(scene: Path, runs: Path) -> np.ndarray:
     """Truth, nerfacto and ours, colours and distance, for some held-out views."""
-    transforms = json.loads((scene / "transforms.json").read_text())
-    held_out = set(transforms["test_filenames"])
-    frames = sorted((f for f in transforms["frames"] if f["file_path"] in held_out), key=lambda f: f["file_path"])
-    chosen = np.linspace(0, len(frames) - 1, min(VIEWS, len(frames))).round().astype(int)
-    rows = []
-    for index in chosen:
-        frame = frames[index]
-        mask = read_mask(scene / frame["mask_path"])
-        true_rgb = read_image(scene / frame["file_path"])
-        true_distance = read_distance_png(scene / frame["truth_distance_file_path"])
-        colours, distances = [true_rgb], [colour_distance(true_distance, mask)]
-        for name in RUNS:
-            views = runs / name / "views"
-            # nerfstudio saves truth and rendering side by side
-            colours.append(read_image(views / f"eval_img_{index:04d}.png")[:, true_rgb.shape[1] :])
-            distances.append(read_image(views / f"eval_distance_{index:04d}.png"))
-        hidden = ~mask
-        for picture in colours[1:]:
-            picture[hidden] = 0
-        rows.append([*colours, *distances])
+    views = compared_views(scene, {name: runs / name / "views" for name in RUNS}, VIEWS)
     names = ["truth", *RUNS]
+    rows = [[*colours, *distances] for colours, distances in views]
     return side_by_side(rows, [*names, *(f"{name}: distance" for name in names)])

@@ -302,5 +302,5 @@ def side_by_side(rows: Sequence[Sequence[NDArray[np.uint8]]], titles: Sequence[s
         for row, pictures in enumerate(rows):
             top = bar + row * (height + gap)
             sheet[top : top + height, left : left + width] = pictures[column]
-        write_text(sheet, title, (left + width // 2, 23), align=0.5)
+        write_text(sheet, title, (left + width // 2, 23), align=0.5, max_width=width)
     return sheet

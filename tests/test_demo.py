@@ -18,6 +18,7 @@ from edge_depth_nerf.demo_options import DemoOptions
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_image, read_json
 from edge_depth_nerf.pictures import NO_VALUE_RGB, colour_distance, side_by_side
+from edge_depth_nerf.runs import progress_bars
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +86,7 @@ def test_a_stage_that_fails_names_its_log(finished, tmp_path, monkeypatch):
     options, _ = finished
     run = demo._Run("nerfacto", tmp_path / "no scene", tmp_path / "runs", options)
     with pytest.raises(InputError, match=r"train\.log.*\n.*ns-train edge-depth-nerf-lite"):
-        run.train(demo._progress(Console(quiet=True)))
+        run.train(progress_bars(Console(quiet=True)))
     assert "no such file" in (tmp_path / "runs" / "nerfacto" / "train.log").read_text()
 
 

@@ -1,0 +1,361 @@
+"""`edge-depth-nerf compare`: checks, runs what is missing side by side, then writes tables, pictures and plots."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import sys
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import Progress, TaskID
+from rich.table import Table
+
+from edge_depth_nerf.compare.methods import METHODS, Setting, default_methods
+from edge_depth_nerf.compare.options import CompareOptions, MethodName
+from edge_depth_nerf.compare.plots import draw_plots
+from edge_depth_nerf.compare.results import Results, check_fair, read_results, write_rows
+from edge_depth_nerf.compare.search import show_search, write_search
+from edge_depth_nerf.compare.specification import FIGURES, SPECIFICATION, WORK, RunSpecification
+from edge_depth_nerf.compare.tables import MadeTable, as_latex, as_markdown, make_tables
+from edge_depth_nerf.console import say
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.files import read_json, write_json, write_png, write_text
+from edge_depth_nerf.pictures import DISTANCE, colour_bar, resize, side_by_side
+from edge_depth_nerf.runs import LoggedCommands, compared_views, progress_bars, viewer_command
+
+RECORD = "compare.json"
+RUNS = "runs"
+LOG = "run.log"
+VIEWS_SHOWN = 3
+LEAST_WIDTH_PX, MOST_WIDTH_PX = 220, 350
+"""Of each picture in comparison_SCENE.png."""
+
+
+def compare(options: CompareOptions, console: Console | None = None) -> Results:
+    """Run or finish a comparison, or a search with `--search`.
+
+    Returns:
+        All that the output folder holds.
+
+    Raises:
+        InputError: options, scenes or the output folder cannot be used, or a run failed (its log is named).
+
+    """
+    console = console or Console()
+    options.check()
+    methods = options.methods or default_methods(options.preset, with_loss=options.search)
+    scenes = {scene.resolve().name: scene.resolve() for scene in options.scenes}
+    if len(scenes) < len(options.scenes):
+        raise InputError(
+            f"scenes {', '.join(map(str, options.scenes))}: two have one folder name, which is what the tables call "
+            "them. Rename one, or give each scene once."
+        )
+    digests = {name: check_scene(folder, methods, options.preset) for name, folder in scenes.items()}
+    tuned = {} if options.tuned is None else read_tuned(options.tuned)
+    open_output(options, tuned)
+
+    specifications = [
+        RunSpecification(
+            scene=str(scenes[scene]),
+            scene_sha256=digests[scene],
+            preset=options.preset,
+            method=name,
+            seed=seed,
+            steps=options.steps,
+            weight=setting.weight,
+            sigma_m=setting.sigma_m,
+            implementation=options.rivals_implementation if METHODS[name].rival else "same",
+            whole_views=not options.search,
+        )
+        # the first seeds of all drives come first: tables of an unfinished comparison are of whole rows
+        for seed in options.seeds
+        for scene in scenes
+        for name in methods
+        for setting in _settings(options, name, tuned)
+    ]
+    runs = [Run(specification, options.output / RUNS) for specification in specifications]
+    for run in runs:
+        run.open()
+    do_runs([run for run in runs if not run.finished], options.jobs, console)
+
+    results = read_results(options.output / RUNS)
+    if not options.search:
+        check_fair(results)
+    results.options = read_json(options.output / RECORD)
+    results.versions = {name: version(name) for name in ("edge-depth-nerf", "nerfstudio", "torch", "numpy")}
+    results.versions["python"] = platform.python_version()
+    results.cores = os.cpu_count() or 1
+    if options.search:
+        write_search(options.output, results)
+        show_search(options.output, results, console)
+        return results
+    tables = make_tables(results)
+    write_rows(options.output, results)
+    write_text(options.output / "tables.md", as_markdown(results, tables))
+    write_text(options.output / "tables.tex", as_latex(results, tables))
+    draw_plots(options.output, results)
+    for scene in results.scenes():
+        _draw_comparison(options.output, results, scene)
+    _show(options.output, results, tables, console)
+    return results
+
+
+def _settings(options: CompareOptions, name: MethodName, tuned: dict[str, Setting]) -> Iterable[Setting]:
+    if options.search:
+        return [Setting(weight, sigma_m) for weight in options.lambdas for sigma_m in options.sigmas_m]
+    return [tuned.get(name, Setting())]
+
+
+def check_scene(folder: Path, methods: Sequence[MethodName], preset: str) -> str:
+    """Make sure that every method can be trained on a scene; give the SHA-256 of its transforms.json.
+
+    Raises:
+        FileNotFoundError: there is no scene.
+        InputError: it has no split, or lacks the maps that a method needs.
+
+    """
+    path = folder / "transforms.json"
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"{path}: no such file. compare takes scene folders; `edge-depth-nerf process` makes one from a raw drive."
+        )
+    meta = read_json(path)
+    frames, held_out = meta.get("frames") or [{}], meta.get("test_filenames") or []
+    if not held_out or set(held_out) & set(meta.get("train_filenames", [])):
+        raise InputError(
+            f"{path}: found {len(held_out)} pictures under test_filenames that are not trained on, too; expected at "
+            "least one to judge by. Process the drive with --holdout-every 2 or more."
+        )
+    has = {source for source in ("lidar", "mono") if f"{source}_file_path" in frames[0]}
+    if "depth_file_path" in frames[0]:
+        has.add("lidar")
+    for name in methods:
+        missing = [source for source in METHODS[name].needs if source not in has]
+        if missing:
+            words = {"lidar": "LiDAR maps", "mono": "monocular maps"}
+            remedy = {
+                "lidar": "process the drive with its LiDAR",
+                "mono": "make them by `edge-depth-nerf estimate-depth`",
+            }
+            raise InputError(
+                f"{path}: has no {' and no '.join(words[source] for source in missing)}, which the method {name} "
+                f"(preset {preset}) needs. {' and '.join(remedy[source] for source in missing).capitalize()}, or "
+                "choose other --methods."
+            )
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def read_tuned(path: Path) -> dict[str, Setting]:
+    """Read λ and σ by method: {"methods": {"ds-nerf": {"lambda": 0.01, "sigma_m": 0.5}}}.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: it does not have that form.
+
+    """
+    content = read_json(path)
+    methods = content.get("methods") if isinstance(content, dict) else None
+    form = 'expected {"methods": {"ds-nerf": {"lambda": 0.01, "sigma_m": 0.5}}}, with sigma_m metres or "own"'
+    if not isinstance(methods, dict):
+        raise InputError(f"{path}: has no methods; {form}.")
+    found = {}
+    for name, entry in methods.items():
+        if name not in get_args(MethodName) or METHODS[name].sigma_field is None:
+            raise InputError(f"{path}: {name!r} is no method with λ and σ; {form}.")
+        weight, sigma_m = (entry.get("lambda"), entry.get("sigma_m")) if isinstance(entry, dict) else (None, None)
+        if not (_positive(weight) and (sigma_m == "own" or _positive(sigma_m))):
+            raise InputError(f"{path}: {name}: found {entry!r}; {form}.")
+        found[name] = Setting(weight, sigma_m)
+    return found
+
+
+def _positive(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value < float("inf")
+
+
+def open_output(options: CompareOptions, tuned: dict[str, Setting]) -> None:
+    """Begin the output folder, or make sure that it was begun with what all its runs share.
+
+    Raises:
+        InputError: it holds another comparison, or something else.
+
+    """
+    record = {
+        "kind": "search" if options.search else "comparison",
+        "preset": options.preset,
+        "steps": options.steps,
+        "rivals_implementation": options.rivals_implementation,
+        "tuned": {name: {"lambda": setting.weight, "sigma_m": setting.sigma_m} for name, setting in tuned.items()},
+        "tuned_on": None if options.tuned is None else read_json(options.tuned).get("scene"),
+    }
+    path = options.output / RECORD
+    if path.is_file():
+        found = read_json(path)
+        different = [name for name in record if record[name] != found.get(name)]
+        if different:
+            name = different[0]
+            raise InputError(
+                f"{path}: this folder holds a comparison with {name} {found.get(name)}, not {record[name]}. Choose "
+                "another --output, or remove the folder."
+            )
+        return
+    if options.output.is_dir() and any(options.output.iterdir()):
+        raise InputError(f"{options.output}: holds other things. Choose a new or empty folder for --output.")
+    write_json(path, record)
+
+
+class Run:
+    """A training with its judgement, in a folder of its own."""
+
+    def __init__(self, specification: RunSpecification, runs: Path) -> None:
+        self.specification = specification
+        run = specification
+        scene = Path(run.scene).name
+        setting = ""
+        if not run.whole_views:
+            setting = f"_lambda-{run.weight:g}_sigma-{run.sigma_m}"
+        self.title = f"{scene} {run.method}{setting.replace('_', ' ')} seed {run.seed}"
+        self.folder = runs / scene / f"{run.method}{setting}_seed-{run.seed}"
+        self.log = self.folder / LOG
+        self._commands = LoggedCommands()
+        self.stop = self._commands.stop
+
+    @property
+    def finished(self) -> bool:
+        """Whether its figures are there."""
+        return (self.folder / FIGURES).is_file()
+
+    def open(self) -> None:
+        """Write what is to be trained, or make sure that what was begun is the same.
+
+        Raises:
+            InputError: the folder holds the run of another scene or of other settings.
+
+        """
+        path, wanted = self.folder / SPECIFICATION, self.specification.to_dict()
+        if path.is_file():
+            found = read_json(path)
+            different = [name for name in wanted if wanted[name] != found.get(name)]
+            if different:
+                name = different[0]
+                raise InputError(
+                    f"{path}: this run was begun with {name} {found.get(name)}, not {wanted[name]}. Choose another "
+                    f"--output, or remove {self.folder}."
+                )
+            return
+        write_json(path, wanted)
+
+    def do(self, progress: Progress, overall: TaskID, threads: int) -> None:
+        """Train and judge it, or what is left of that."""
+        task = progress.add_task(self.title, total=1.0)
+        done = 0.0
+
+        def on_line(line: str) -> None:
+            nonlocal done
+            if line.startswith(WORK):
+                share = float(line.removeprefix(WORK))
+                progress.update(task, completed=share)
+                progress.advance(overall, share - done)
+                done = share
+
+        command = [sys.executable, "-m", "edge_depth_nerf.compare.worker", self.folder]
+        try:
+            self._commands.call(command, self.log, threads, on_line)
+        finally:
+            progress.remove_task(task)
+        progress.advance(overall, 1.0 - done)
+
+
+def do_runs(runs: Sequence[Run], jobs: int | None, console: Console) -> None:
+    """Do runs side by side; the first that fails stops all, and what they have done so far is kept.
+
+    Raises:
+        InputError: a run failed; its log is named.
+
+    """
+    if not runs:
+        return
+    cores = os.cpu_count() or 1
+    if jobs is None:
+        import torch  # takes seconds
+
+        jobs = 1 if torch.cuda.is_available() else cores
+    # the same for the last run, which is alone: what its seconds are compared with had no more
+    threads = max(1, cores // jobs)
+    jobs = min(jobs, len(runs))
+    say(console, f"Runs to do: {len(runs)}; side by side: {jobs}; threads of each: {threads}.")
+    failures: list[InputError] = []
+
+    def stop_all() -> None:
+        for run in runs:
+            run.stop()
+
+    def do(run: Run) -> None:
+        if failures:
+            return
+        try:
+            run.do(progress, overall, threads)
+        except InputError as error:
+            # those that are stopped fail later
+            failures.append(error)
+            stop_all()
+
+    with progress_bars(console) as progress, ThreadPoolExecutor(jobs) as pool:
+        overall = progress.add_task("All runs", total=float(len(runs)))
+        futures = [pool.submit(do, run) for run in runs]
+        try:
+            for future in as_completed(futures):
+                future.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            stop_all()
+            raise
+    if failures:
+        raise failures[0]
+
+
+def _draw_comparison(output: Path, results: Results, scene: str) -> None:
+    """Draw some held-out views, a row of colours and one of distances each: truth, then the methods' first seeds."""
+    first: dict[MethodName, Any] = {}
+    for run in results.runs:
+        if run.scene == scene and (run.method not in first or run.seed < first[run.method].seed):
+            first[run.method] = run
+    chosen = [first[name] for name in METHODS if name in first]
+    views_of = {METHODS[run.method].title: run.folder / "views" for run in chosen}
+    views = compared_views(Path(chosen[0].specification["scene"]), views_of, VIEWS_SHOWN)
+    rows = [[_shown(picture) for picture in row] for colours, distances in views for row in (colours, distances)]
+    sheet = side_by_side(rows, ["truth", *views_of])
+    legend = colour_bar(DISTANCE, min(sheet.shape[1], 600))
+    below = np.full((legend.shape[0], sheet.shape[1], 3), 255, np.uint8)
+    below[:, : legend.shape[1]] = legend
+    write_png(output / f"comparison_{scene}.png", np.vstack((sheet, below)))
+
+
+def _shown(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A picture in a size in which many stand side by side, with legible titles."""
+    height, width = picture.shape[:2]
+    shown = min(max(width, LEAST_WIDTH_PX), MOST_WIDTH_PX)
+    return resize(picture, (shown, round(height * shown / width)))
+
+
+def _show(output: Path, results: Results, tables: Sequence[MadeTable], console: Console) -> None:
+    for made in tables:
+        if not made.on_terminal:
+            continue
+        table = Table("", title=f"Table {made.label}. {made.title}", caption=made.caption)
+        for group, heading in made.headings():
+            table.add_column(f"{group}\n{heading}" if group else heading, justify="right")
+        for row in made.rows:
+            table.add_row(row.title, *(cell.text() for cell in row.cells))
+        console.print(table)
+    say(console, f"Tables: {output / 'tables.md'}, {output / 'tables.tex'}; all figures: {output / 'results.csv'}")
+    for run in results.runs[:1]:
+        say(console, f"To look around in what was trained: {viewer_command(next(run.folder.rglob('config.yml')))}")

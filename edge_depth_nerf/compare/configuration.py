@@ -1,0 +1,100 @@
+"""The configuration of a run: one preset for all methods, and the named fields of the method."""
+
+from __future__ import annotations
+
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+from nerfstudio.engine.trainer import TrainerConfig
+
+from edge_depth_nerf.compare.methods import LAMBDA, METHODS, Setting
+from edge_depth_nerf.compare.options import MethodName, Preset
+from edge_depth_nerf.compare.specification import RunSpecification
+from edge_depth_nerf.config import apply_overrides, make_specifications, read_method_file
+
+REGISTERED: dict[Preset, str] = {
+    "lite": "edge-depth-nerf-lite",
+    "full": "edge-depth-nerf",
+    "paper": "edge-depth-nerf-paper",
+}
+"""The registered method that each preset begins with."""
+COMMON = {
+    # a training that judges now and then, by the trainer's own measure, would not be timed alone
+    "steps_per_eval_batch": 0,
+    "steps_per_eval_image": 0,
+    "steps_per_eval_all_images": 0,
+    "vis": "tensorboard",
+    "logging.local_writer.max_log_size": 0,
+    "timestamp": "run",
+}
+"""What a compared training sets beyond its preset."""
+
+
+def literal_form() -> dict[str, Any]:
+    """The published method to the letter: what the preset paper sets otherwise than full, which is its size."""
+    presets = read_method_file()["presets"]
+    return {name: value for name, value in presets["paper"].items() if presets["full"].get(name) != value}
+
+
+def configuration(run: RunSpecification, folder: Path | None = None) -> tuple[TrainerConfig, set[str]]:
+    """Resolve the configuration of a run.
+
+    Args:
+        run: what is trained.
+        folder: the run's folder; nerfstudio's files go to a folder in it.
+
+    Returns:
+        The configuration, and the dotted names in which its method may differ from others.
+
+    """
+    config = make_specifications(read_method_file())[REGISTERED[run.preset]].config
+    method = METHODS[run.method]
+    shared: dict[str, Any] = {
+        **COMMON,
+        "machine.seed": run.seed,
+        "pipeline.datamanager.data": Path(run.scene),
+        **({} if run.steps is None else {"max_num_iterations": run.steps}),
+        **({} if folder is None else {"output_dir": folder.parent, "experiment_name": folder.name}),
+    }
+    named = {
+        **(literal_form() if method.literal else {}),
+        **method.overrides,
+        **Setting(run.weight, run.sigma_m).overrides(method),
+        **({"pipeline.model.implementation": "torch"} if run.implementation == "torch" else {}),
+    }
+    apply_overrides(config, {**shared, **named}, f"method {run.method}")
+    return config, set(named)
+
+
+def setting_of(config: TrainerConfig, name: MethodName) -> tuple[float | None, float | str | None]:
+    """λ and σ (metres, or the prior's own as its sigma_mode) that a configuration ends up with; None without a loss."""
+    method = METHODS[name]
+    if method.sigma_field is None:
+        return None, None
+    values = flattened(config)
+    mode = values["pipeline.datamanager.sigma_mode"]
+    takes_own = "pipeline.datamanager.sigma_mode" in method.sigma and mode != "constant"
+    return values[LAMBDA], mode if takes_own else values[method.sigma_field]
+
+
+def flattened(config: Any, prefix: str = "") -> dict[str, Any]:
+    """A configuration as dotted names and values."""
+    if is_dataclass(config) and not isinstance(config, type):
+        children = {entry.name: getattr(config, entry.name) for entry in fields(config)}
+    elif isinstance(config, dict):
+        children = config
+    else:
+        return {prefix: config}
+    found: dict[str, Any] = {}
+    for name, child in children.items():
+        found |= flattened(child, f"{prefix}.{name}" if prefix else str(name))
+    return found
+
+
+def described(config: TrainerConfig) -> dict[str, str]:
+    """A configuration as dotted names and words, the same in every process."""
+    return {
+        name: value.__qualname__ if callable(value) and hasattr(value, "__qualname__") else repr(value)
+        for name, value in flattened(config).items()
+    }

@@ -1,0 +1,104 @@
+"""Figures beyond the metrics of every evaluation: after a colour fit, and binned. Pure.
+
+Pictures are `[h, w, 3]` in 0 to 1, masks `[h, w]` (True = judge the pixel), distances `[h, w]` metres along the ray.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from edge_depth_nerf.metrics import JUDGED_RANGE_M, LEAST_SQUARED_ERROR
+
+ANGLE_EDGES_DEG = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0, 90.0, 100.0, 120.0)
+"""Bins of the angle from the optical axis."""
+DISTANCE_EDGES_M = (1.0, 2.0, 4.0, 7.0, 12.0, 20.0, 35.0, 60.0)
+"""Bins of the true distance."""
+
+
+def affine_fitted(
+    pred: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"]
+) -> Float[Tensor, "h w 3"]:
+    """Give a picture the colours of another as far as one affine map of colours can (least squares in the mask).
+
+    A held-out picture's exposure is nothing that the other pictures tell; what is left after the fit is structure.
+
+    Returns:
+        pred under the 3×4 map that brings it nearest to target, clamped to 0..1.
+
+    """
+
+    def with_one(colours: Tensor) -> Tensor:
+        return torch.cat([colours, torch.ones_like(colours[..., :1])], dim=-1).double().cpu()
+
+    # the CPU's solver also takes pictures of one colour
+    solution = torch.linalg.lstsq(with_one(pred[mask]), target[mask].double().cpu(), driver="gelsd").solution
+    return (with_one(pred) @ solution).clamp(0, 1).to(pred)
+
+
+class BinnedErrors:
+    """Errors of colour and distance in bins of some quantity, pooled over the pixels of all pictures given."""
+
+    def __init__(self, edges: Sequence[float]) -> None:
+        self.edges = torch.tensor(edges, dtype=torch.float64)
+        bins = len(edges) - 1
+        self._pixels, self._squared, self._with_distance, self._relative = (
+            torch.zeros(bins, dtype=torch.float64) for _ in range(4)
+        )
+
+    def update(
+        self,
+        values: Float[Tensor, "h w"],
+        mask: Bool[Tensor, "h w"],
+        pred: Float[Tensor, "h w 3"],
+        target: Float[Tensor, "h w 3"],
+        pred_m: Float[Tensor, "h w"],
+        true_m: Float[Tensor, "h w"] | None = None,
+    ) -> None:
+        """Add a picture.
+
+        Args:
+            values: the quantity at each pixel; outside all bins or not finite = not counted.
+            mask: True = judge.
+            pred: rendered colours.
+            target: true colours.
+            pred_m: rendered distance, metres.
+            true_m: true distance, metres; counted from 1 to 60 m, the range of all distance errors.
+
+        """
+        low, high = self.edges[0], self.edges[-1]
+        values = values.double()
+        counted = mask & (values >= low) & (values < high)
+        where = torch.bucketize(values[counted], self.edges, right=True) - 1
+        bins = len(self._pixels)
+        self._pixels += torch.bincount(where, minlength=bins)
+        squared = (pred[counted].double() - target[counted].double()).square().mean(dim=-1)
+        self._squared += torch.bincount(where, squared, minlength=bins)
+        if true_m is not None:
+            true = true_m[counted].double()
+            known = (true >= JUDGED_RANGE_M[0]) & (true <= JUDGED_RANGE_M[1])
+            relative = (pred_m[counted].double()[known] - true[known]).abs() / true[known]
+            self._with_distance += torch.bincount(where[known], minlength=bins)
+            self._relative += torch.bincount(where[known], relative, minlength=bins)
+
+    def compute(self) -> list[dict[str, float]]:
+        """The bins that have pixels: low, high, pixels, psnr (dB) and, where distances are known, abs_rel."""
+        found = []
+        for index, pixels in enumerate(self._pixels.tolist()):
+            if not pixels:
+                continue
+            mean = max(float(self._squared[index]) / pixels, LEAST_SQUARED_ERROR)
+            figures = {
+                "low": float(self.edges[index]),
+                "high": float(self.edges[index + 1]),
+                "pixels": pixels,
+                "psnr": -10 * math.log10(mean),
+            }
+            if self._with_distance[index]:
+                figures["abs_rel"] = float(self._relative[index] / self._with_distance[index])
+            found.append(figures)
+        return found

@@ -1,0 +1,236 @@
+"""Judges a model: on random pixels, cheaply and often, and on whole views, held out and from beside the path.
+
+Host-facing. Masks and metrics of whole views are those of `ns-eval`, the same for all methods.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from torch import Tensor
+
+from edge_depth_nerf.compare.figures import ANGLE_EDGES_DEG, DISTANCE_EDGES_M, BinnedErrors, affine_fitted
+from edge_depth_nerf.dataset import FisheyeDepthDataset
+from edge_depth_nerf.files import read_distance_png, read_image, read_json, write_png
+from edge_depth_nerf.metrics import LEAST_SQUARED_ERROR, DepthErrors, masked_psnr
+from edge_depth_nerf.model import EdgeDepthNerfModel
+
+PIXELS_PER_VIEW = 3000
+MOST_PIXELS = 20_000
+"""Over all views; so many take about a second on one core."""
+COLOURS = {"psnr": "image", "truth_psnr": "truth_rgb"}
+DISTANCES = {"lidar": "lidar_distance_m", "truth": "truth_distance_m"}
+
+
+@contextmanager
+def evaluated(model: EdgeDepthNerfModel) -> Iterator[None]:
+    """Let a model in training be judged as after loading it, without any trace in the training."""
+    sampler = model.proposal_sampler
+    kept = {name: getattr(sampler, name) for name in ("_anneal", "_steps_since_update")}
+    was_training = model.training
+    model.eval()
+    # what a loaded model has; a training reaches it after its first hundreds of steps
+    sampler.set_anneal(1.0)
+    try:
+        with torch.no_grad():
+            yield
+    finally:
+        for name, value in kept.items():
+            setattr(sampler, name, value)
+        model.train(was_training)
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedView:
+    """A view to render, with what it is judged by."""
+
+    number: int
+    """Of the held-out picture whose lens and mask it has."""
+    camera: Cameras
+    batch: dict[str, Any]
+    """As the dataset gives it."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChosenPixels:
+    """Some pixels of a held-out view with what they are judged by."""
+
+    indices: Tensor
+    """n×3: picture, row, column."""
+    known: dict[str, Tensor]
+    """By the dataset's names: colours n×3, distances n×1 metres."""
+
+
+def choose_pixels(
+    dataset: FisheyeDepthDataset, per_view: int = PIXELS_PER_VIEW, most: int = MOST_PIXELS
+) -> list[ChosenPixels]:
+    """Choose random pixels inside the mask of every held-out view; always the same ones."""
+    generator = torch.Generator().manual_seed(0)
+    per_view = max(1, min(per_view, most // len(dataset)))
+    chosen = []
+    for view in range(len(dataset)):
+        item = dataset[view]
+        at = item["mask"][..., 0].nonzero()
+        at = at[torch.randperm(len(at), generator=generator)[:per_view]]
+        row, column = at.T
+        known = {
+            name: item[name][row, column]
+            for name in (*COLOURS.values(), *DISTANCES.values())
+            if item.get(name) is not None
+        }
+        chosen.append(ChosenPixels(torch.cat([torch.full((len(at), 1), view), at], dim=1), known))
+    return chosen
+
+
+def judge_pixels(pipeline: Any, chosen: list[ChosenPixels]) -> dict[str, float]:
+    """Judge the pixels of all views.
+
+    Returns:
+        psnr and, where it is known, truth_psnr against the picture without noise: means over views, dB; and the
+        depth errors against LiDAR and truth, pooled over pixels.
+
+    """
+    model = pipeline.model
+    psnr: dict[str, list[float]] = {name: [] for name in COLOURS}
+    errors = {name: DepthErrors() for name in DISTANCES}
+    with evaluated(model):
+        for view in chosen:
+            parts = [
+                model(pipeline.datamanager.eval_ray_generator(part.to(model.device)))
+                for part in view.indices.split(model.config.eval_num_rays_per_chunk)
+            ]
+            rgb = torch.cat([part["rgb"] for part in parts]).cpu().clamp(0, 1)
+            distance_m = torch.cat([part["depth"][:, 0] for part in parts]).cpu() * model.metres_per_unit
+            for name, key in COLOURS.items():
+                if key in view.known:
+                    squared = float((rgb - view.known[key][:, :3]).square().mean())
+                    psnr[name].append(-10 * math.log10(max(squared, LEAST_SQUARED_ERROR)))
+            for name, key in DISTANCES.items():
+                if key in view.known:
+                    everywhere = torch.ones(1, len(rgb), dtype=torch.bool)
+                    errors[name].update(distance_m[None], view.known[key][None, :, 0], everywhere)
+    figures = {name: float(np.mean(found)) for name, found in psnr.items() if found}
+    for name, pool in errors.items():
+        figures |= pool.compute(f"{name}_")
+    return figures
+
+
+def shifted_views(scene: Path, dataset: FisheyeDepthDataset) -> dict[str, list[Callable[[], JudgedView]]]:
+    """The views from beside the path whose truth a rendered drive brings; none in recorded ones.
+
+    Returns:
+        By the metres that they lie sideways, what loads each. They have lens and mask of the first held-out picture
+        of their camera.
+
+    """
+    meta = read_json(scene / "transforms.json")
+    outputs = dataset._dataparser_outputs
+    to_scene = outputs.dataparser_transform.double()
+    cameras = {scene / frame["file_path"]: frame.get("camera") for frame in meta["frames"]}
+    of_camera: dict[str | None, int] = {}
+    for number, image in enumerate(dataset.image_filenames):
+        of_camera.setdefault(cameras[image], number)
+
+    def load(entry: dict[str, Any]) -> JudgedView:
+        number = of_camera[entry["camera"]]
+        pose = to_scene @ torch.tensor(entry["transform_matrix"], dtype=torch.float64)
+        pose[:, 3] *= outputs.dataparser_scale
+        camera = dataset.cameras[number : number + 1]
+        camera.camera_to_worlds = pose[None].to(camera.camera_to_worlds)
+        rgb = read_image(scene / entry["truth_rgb_file_path"]).astype(np.float32) / 255
+        distance_m = read_distance_png(scene / entry["truth_distance_file_path"])
+        return JudgedView(
+            number,
+            camera,
+            {
+                "image": torch.from_numpy(rgb),
+                "mask": torch.from_numpy(dataset.mask(number))[..., None],
+                "truth_distance_m": torch.from_numpy(distance_m)[..., None],
+            },
+        )
+
+    return {
+        metres: [partial(load, entry) for entry in entries if entry["camera"] in of_camera]
+        for metres, entries in meta.get("shifted_views", {}).items()
+    }
+
+
+class ViewJudge:
+    """Judges whole views, one after the other."""
+
+    def __init__(self, pipeline: Any, on_view: Callable[[], None]) -> None:
+        """Take a pipeline; `on_view` is called after each view."""
+        self.pipeline = pipeline
+        self.model: EdgeDepthNerfModel = pipeline.model
+        self.on_view = on_view
+
+    def held_out(self, folder: Path) -> tuple[dict[str, float], dict[str, list[dict[str, float]]]]:
+        """Judge all held-out views; colours and distance of each are saved in a folder, as `ns-eval` names them.
+
+        Returns:
+            The figures of `ns-eval` and, under affine_… and truth_affine_…, those after a colour fit; and the bins
+            by_angle_deg and by_distance_m, against the truth where it is known, else against picture and LiDAR.
+
+        """
+        dataset = self.pipeline.datamanager.eval_dataset
+        by_angle, by_distance = BinnedErrors(ANGLE_EDGES_DEG), BinnedErrors(DISTANCE_EDGES_M)
+
+        def look(view: JudgedView, outputs: dict[str, Tensor], images: dict[str, Tensor]) -> None:
+            number, batch = view.number, view.batch
+            for name in ("img", "distance"):
+                pixels = (images[name].clamp(0, 1).cpu().numpy() * 255).round().astype(np.uint8)
+                write_png(folder / f"eval_{name}_{number:04d}.png", pixels)
+            rgb = outputs["rgb"].clamp(0, 1).cpu()
+            distance_m = outputs["depth"][..., 0].cpu() * self.model.metres_per_unit
+            mask = batch["mask"][..., 0].cpu()
+            target = batch.get("truth_rgb", batch["image"])[..., :3].cpu()
+            true_m = batch.get("truth_distance_m", batch.get("lidar_distance_m"))
+            true_m = None if true_m is None else true_m[..., 0].cpu()
+            angle_deg = torch.rad2deg(torch.from_numpy(np.arccos(np.clip(dataset.cos_theta(number), -1, 1))))
+            by_angle.update(angle_deg, mask, rgb, target, distance_m, true_m)
+            if true_m is not None:
+                by_distance.update(true_m, mask, rgb, target, distance_m, true_m)
+
+        loader = self.pipeline.datamanager.fixed_indices_eval_dataloader
+        views = (JudgedView(number, camera, batch) for number, (camera, batch) in enumerate(loader))
+        figures = self._mean(views, look)
+        return figures, {"by_angle_deg": by_angle.compute(), "by_distance_m": by_distance.compute()}
+
+    def shifted(self, views: dict[str, list[Callable[[], JudgedView]]]) -> dict[str, float]:
+        """Judge views from beside the path against their truth, inside the mask; shifted_1m_masked_psnr and so on."""
+        figures: dict[str, float] = {}
+        kept = ("masked_", "affine_", "truth_")
+        for metres, chosen in views.items():
+            found = self._mean((load() for load in chosen), lambda *_: None) if chosen else {}
+            figures |= {f"shifted_{metres}m_{name}": found[name] for name in found if name.startswith(kept)}
+        return figures
+
+    def _mean(self, views: Iterator[JudgedView], look: Callable[..., None]) -> dict[str, float]:
+        """Means over views of the model's own figures and of those after a colour fit; depth errors are pooled."""
+        model, found = self.model, []
+        model.reset_depth_errors()
+        with evaluated(model):
+            for view in views:
+                outputs = model.get_outputs_for_camera(view.camera.to(model.device))
+                figures, images = model.get_image_metrics_and_images(outputs, view.batch)
+                rgb = outputs["rgb"].clamp(0, 1).cpu()
+                mask = view.batch["mask"][..., 0].cpu()
+                for prefix, key in (("", "image"), ("truth_", "truth_rgb")):
+                    if key in view.batch:
+                        target = view.batch[key][..., :3].cpu()
+                        fitted = affine_fitted(rgb, target, mask)
+                        figures[f"{prefix}affine_masked_psnr"] = float(masked_psnr(fitted, target, mask))
+                look(view, outputs, images)
+                found.append(figures)
+                self.on_view()
+        means = {name: float(np.mean([figures[name] for figures in found])) for name in found[0]}
+        return {name: value for name, value in means.items() if math.isfinite(value)} | model.pooled_depth_errors()

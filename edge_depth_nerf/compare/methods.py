@@ -1,0 +1,112 @@
+"""The compared methods: what each overrides of the one configuration. Light to import."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, get_args
+
+from edge_depth_nerf.compare.options import MethodName, Preset, Sigma
+
+LAMBDA = "pipeline.model.depth_loss_mult"
+"""The weight of the depth loss, in every method."""
+_SOURCE = "pipeline.datamanager.depth_source"
+_LOSS = "pipeline.model.depth_loss"
+_LOSS_SIGMA = "pipeline.model.depth_sigma"
+_PRIOR_SIGMA = "pipeline.datamanager.sigma_constant"
+
+
+@dataclass(frozen=True)
+class Method:
+    """A row of the tables."""
+
+    name: MethodName
+    title: str
+    """What the tables call it."""
+    overrides: Mapping[str, Any]
+    """Dotted names of the configuration that it sets; in all else it is the preset."""
+    needs: tuple[str, ...] = ()
+    """What a scene must have for it: "lidar", "mono"."""
+    sigma: Mapping[str, Any] = field(default_factory=dict)
+    """Further overrides that come with a σ of its own; `sigma_field` takes the number."""
+    sigma_field: str | None = None
+    """Dotted name of σ, metres; None without a depth loss."""
+    literal: bool = False
+    """Whether it is the published method to the letter: what the preset paper sets beyond the size of full, from
+    nerfstudio_method.toml."""
+    rival: bool = False
+    """Whether it is nerfstudio's, not ours."""
+
+
+def _edge(name: MethodName, title: str, needs: tuple[str, ...], literal: bool = False, **overrides: Any) -> Method:
+    dotted = {f"pipeline.datamanager.{key}": value for key, value in overrides.items()}
+    # a σ in metres takes the place of the one that the prior has at each pixel
+    sigma = {"pipeline.datamanager.sigma_mode": "constant"}
+    return Method(name, title, {_LOSS: "edge", **dotted}, needs, sigma, _PRIOR_SIGMA, literal=literal)
+
+
+METHODS: dict[MethodName, Method] = {
+    method.name: method
+    for method in (
+        Method("nerfacto", "nerfacto", {_LOSS: "none"}, rival=True),
+        Method(
+            "urban-nerf",
+            "UrbanNeRF loss",
+            {_LOSS: "urban-nerf", _SOURCE: "lidar", LAMBDA: 0.01, _LOSS_SIGMA: 0.5},
+            ("lidar",),
+            sigma_field=_LOSS_SIGMA,
+            rival=True,
+        ),
+        Method(
+            "ds-nerf",
+            "DS-NeRF loss",
+            {_LOSS: "ds-nerf", _SOURCE: "lidar", LAMBDA: 0.01, _LOSS_SIGMA: 0.5},
+            ("lidar",),
+            sigma_field=_LOSS_SIGMA,
+            rival=True,
+        ),
+        _edge("edge-lidar", "LiDAR alone", ("lidar",), depth_source="lidar"),
+        _edge("edge-mono", "monocular alone", ("mono",), depth_source="mono"),
+        _edge(
+            "edge-gaussian",
+            "spatial Gaussian",
+            ("lidar", "mono"),
+            depth_source="integrated",
+            integration="spatial-gaussian",
+        ),
+        _edge("edge-paper", "as published", ("lidar", "mono"), literal=True, depth_source="integrated"),
+        _edge("edge", "ours", ("lidar", "mono"), depth_source="integrated"),
+    )
+}
+"""λ and σ of the rivals stand here; those of edge-… are the configuration's own, unless a search found better ones."""
+
+assert tuple(METHODS) == get_args(MethodName)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """λ and σ that a method is trained with; None: its own."""
+
+    weight: float | None = None
+    """λ, the weight of the depth loss."""
+    sigma_m: Sigma | None = None
+    """σ, metres, or own."""
+
+    def overrides(self, method: Method) -> dict[str, Any]:
+        """The dotted names that it sets for a method."""
+        found: dict[str, Any] = {} if self.weight is None else {LAMBDA: self.weight}
+        if isinstance(self.sigma_m, (int, float)) and method.sigma_field is not None:
+            found |= {**method.sigma, method.sigma_field: float(self.sigma_m)}
+        return found
+
+    def __str__(self) -> str:
+        return f"lambda {self.weight:g}, sigma {self.sigma_m}" + (" m" if self.sigma_m != "own" else "")
+
+
+def default_methods(preset: Preset, with_loss: bool = False) -> tuple[MethodName, ...]:
+    """All methods that differ from each other under a preset; `with_loss`: those that have a λ."""
+    return tuple(
+        method.name
+        for method in METHODS.values()
+        if not (preset == "paper" and method.literal) and not (with_loss and method.sigma_field is None)
+    )

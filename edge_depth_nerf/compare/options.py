@@ -1,0 +1,111 @@
+"""Options of `edge-depth-nerf compare`; a module of its own so that the command line starts fast."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from edge_depth_nerf.errors import InputError
+
+Preset = Literal["lite", "full", "paper"]
+Implementation = Literal["same", "torch"]
+MethodName = Literal[
+    "nerfacto", "urban-nerf", "ds-nerf", "edge-lidar", "edge-mono", "edge-gaussian", "edge-paper", "edge"
+]
+Sigma = float | Literal["own"]
+
+LEAST_LAMBDAS, LEAST_SIGMAS = 4, 3
+"""A search over less says little."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompareOptions:
+    """Train each method on each scene with one configuration, judge all alike, and make the paper's tables.
+
+    Stopped at any moment, the same command takes up where it was. The folder takes more scenes, methods and seeds
+    later; its tables are of all that it holds.
+    """
+
+    scenes: tyro.conf.Positional[tuple[Path, ...]]
+    """Scene folders, as `edge-depth-nerf process` writes them; the tables call a drive by its folder's name."""
+    output: Path
+    """Folder for the runs, results.csv and results.json, tables.md and tables.tex, pictures and plots."""
+    methods: tuple[MethodName, ...] = ()
+    """Which methods. None named: all, with --preset paper without edge-paper, which is edge there."""
+    steps: int | None = None
+    """Training steps of each run. Not set: the preset's."""
+    seeds: tuple[int, ...] = (0,)
+    """Seeds of the training; each method is trained once with each."""
+    preset: Preset = "lite"
+    """The configuration that all methods share. lite: a laptop's CPU; full: a GPU; paper: full size, and what edge-…
+    stands for is the literal method."""
+    tuned: Path | None = None
+    """λ and σ of the methods: tuned.json of a search, or a file of that form. Not set: the defaults."""
+    rivals_implementation: Implementation = "same"
+    """torch: nerfacto, urban-nerf and ds-nerf are computed by nerfstudio's own torch code, with the same results, for
+    figures at equal seconds."""
+    jobs: int | None = None
+    """Trainings side by side. Not set: one a core, on a GPU one."""
+    search: bool = False
+    """Instead of tables: train each method with each λ and σ on one tuning scene and seed, and write the best to
+    tuned.json."""
+    lambdas: tuple[float, ...] = ()
+    """With --search: the weights λ of the depth loss to try, 4 at least."""
+    sigmas_m: tuple[Sigma, ...] = ()
+    """With --search: the standard deviations σ to try, metres, 3 at least; own: the one that the method has by itself
+    (for edge-…: the prior's own at each pixel)."""
+
+    def check(self) -> None:
+        """Check what can be checked without looking at the disk.
+
+        Raises:
+            InputError: an option is out of its range, or two do not go together.
+
+        """
+
+        def require(fine: bool, found: str, expected: str) -> None:
+            if not fine:
+                raise InputError(f"{found}: expected {expected}.")
+
+        require(len(self.scenes) > 0, "no scene", "at least one scene folder")
+        require(self.steps is None or self.steps >= 1, f"--steps {self.steps}", "1 or more")
+        require(self.jobs is None or self.jobs >= 1, f"--jobs {self.jobs}", "1 or more")
+        require(len(self.seeds) > 0 and min(self.seeds) >= 0, f"--seeds {self.seeds}", "at least one, each 0 or more")
+        for name, values in (
+            ("methods", self.methods),
+            ("seeds", self.seeds),
+            ("lambdas", self.lambdas),
+            ("sigmas-m", self.sigmas_m),
+        ):
+            require(len(set(values)) == len(values), f"--{name} {' '.join(map(str, values))}", "each once")
+        require(
+            not (self.preset == "paper" and "edge-paper" in self.methods),
+            "--preset paper --methods edge-paper",
+            "edge, which is the literal method in this preset",
+        )
+        if not self.search:
+            require(
+                not self.lambdas and not self.sigmas_m,
+                "--lambdas or --sigmas-m without --search",
+                "both with --search, or --tuned FILE with what a search found",
+            )
+            return
+        require(len(self.scenes) == 1, f"--search with {len(self.scenes)} scenes", "one, which no table uses")
+        require(len(self.seeds) == 1, f"--search with {len(self.seeds)} seeds", "one, which no table uses")
+        require(self.tuned is None, "--search with --tuned", "one of them")
+        require("nerfacto" not in self.methods, "--search --methods nerfacto", "methods with a depth loss")
+        require(
+            len(self.lambdas) >= LEAST_LAMBDAS and all(math.isfinite(x) and x > 0 for x in self.lambdas),
+            f"--lambdas {' '.join(map(str, self.lambdas))}",
+            f"at least {LEAST_LAMBDAS} positive numbers",
+        )
+        require(
+            len(self.sigmas_m) >= LEAST_SIGMAS
+            and all(x == "own" or (math.isfinite(float(x)) and float(x) > 0) for x in self.sigmas_m),
+            f"--sigmas-m {' '.join(map(str, self.sigmas_m))}",
+            f"at least {LEAST_SIGMAS} of positive metres or own",
+        )

@@ -1,0 +1,154 @@
+"""What the runs of a comparison left, read from their folders."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from edge_depth_nerf.compare.methods import METHODS
+from edge_depth_nerf.compare.options import MethodName
+from edge_depth_nerf.compare.specification import FIGURES, OF_A_RUN
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.files import read_json, write_json, write_text
+
+
+@dataclass
+class RunResult:
+    """A finished run."""
+
+    folder: Path
+    """Its folder."""
+    specification: dict[str, Any]
+    """What was trained: the fields of `RunSpecification`."""
+    content: dict[str, Any]
+    """Its figures.json."""
+
+    @property
+    def scene(self) -> str:
+        """Name of the drive."""
+        return Path(self.specification["scene"]).name
+
+    @property
+    def method(self) -> MethodName:
+        """Name of the method."""
+        return self.specification["method"]
+
+    @property
+    def seed(self) -> int:
+        """Seed of the training."""
+        return self.specification["seed"]
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """Figures by name."""
+        return self.content["figures"]
+
+    @property
+    def curve(self) -> list[dict[str, float]]:
+        """Figures of the random pixels on the way: step, seconds, psnr and so on."""
+        return self.content["curve"]
+
+
+@dataclass
+class Results:
+    """All finished runs of a folder."""
+
+    runs: list[RunResult]
+    options: dict[str, Any] = field(default_factory=dict)
+    """What all runs share."""
+    versions: dict[str, str] = field(default_factory=dict)
+    cores: int = 0
+
+    @cached_property
+    def _by_key(self) -> dict[tuple[str, MethodName, int], RunResult]:
+        return {(run.scene, run.method, run.seed): run for run in self.runs}
+
+    def scenes(self) -> list[str]:
+        """Names of the drives, sorted."""
+        return sorted({run.scene for run in self.runs})
+
+    def methods(self) -> list[MethodName]:
+        """Names of the methods, in the tables' order."""
+        return [name for name in METHODS if any(run.method == name for run in self.runs)]
+
+    def seeds(self) -> list[int]:
+        """All seeds."""
+        return sorted({run.seed for run in self.runs})
+
+    def has(self, method: MethodName, seed: int) -> bool:
+        """Whether any drive has a run of a method with a seed."""
+        return any((scene, method, seed) in self._by_key for scene in self.scenes())
+
+    def run(self, scene: str, method: MethodName, seed: int) -> RunResult | None:
+        """One run, if it is there."""
+        return self._by_key.get((scene, method, seed))
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Tidy rows: scene, method, seed, metric, value."""
+        return [
+            {"scene": run.scene, "method": run.method, "seed": run.seed, "metric": metric, "value": value}
+            for run in self.runs
+            for metric, value in run.figures.items()
+        ]
+
+
+def read_results(runs: Path) -> Results:
+    """Read the finished runs under a folder."""
+    found = []
+    for path in sorted(runs.glob(f"*/*/{FIGURES}")):
+        content = read_json(path)
+        found.append(RunResult(path.parent, content["run"], content))
+    return Results(sorted(found, key=lambda run: (run.scene, list(METHODS).index(run.method), run.seed)))
+
+
+def check_fair(results: Results) -> None:
+    """Make sure that runs differ in the fields that their methods name, and in no other.
+
+    Raises:
+        InputError: two runs differ otherwise: one is of another version of the program, or was tampered with.
+
+    """
+    reference = results.runs[0]
+    of_method: dict[MethodName, RunResult] = {}
+    for run in results.runs:
+        first = of_method.setdefault(run.method, run)
+        for other, named in ((first, set()), (reference, {*run.content["named"], *reference.content["named"]})):
+            if other.method == run.method and named:
+                continue
+            ours, theirs = run.content["configuration"], other.content["configuration"]
+            different = {name for name in {*ours, *theirs} if ours.get(name) != theirs.get(name)}
+            unnamed = sorted(different - named - {*OF_A_RUN})
+            if unnamed:
+                name = unnamed[0]
+                raise InputError(
+                    f"{run.folder}: its {name} is {ours.get(name)}, that of {other.folder} is {theirs.get(name)}. "
+                    "Compared runs differ in what their methods name alone; one was trained by another version of "
+                    "this program. Remove its folder, and the same command trains it anew."
+                )
+
+
+def write_rows(output: Path, results: Results) -> None:
+    """Write results.csv (tidy rows) and results.json (the same with options, versions, curves and bins)."""
+    rows = results.rows()
+    text = io.StringIO()
+    table = csv.DictWriter(text, ["scene", "method", "seed", "metric", "value"], lineterminator="\n")
+    table.writeheader()
+    table.writerows(rows)
+    write_text(output / "results.csv", text.getvalue())
+    write_json(
+        output / "results.json",
+        {
+            "options": results.options,
+            "versions": results.versions,
+            "cores": results.cores,
+            "rows": rows,
+            "runs": [
+                {key: value for key, value in run.content.items() if key not in ("figures", "configuration")}
+                for run in results.runs
+            ],
+        },
+    )

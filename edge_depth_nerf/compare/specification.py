@@ -1,0 +1,50 @@
+"""What one run is, and the files in its folder. Light to import."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from edge_depth_nerf.compare.options import Implementation, MethodName, Preset, Sigma
+
+SPECIFICATION = "run.json"
+"""What is trained."""
+FIGURES = "figures.json"
+"""What came out; written last."""
+PROGRESS = "progress.json"
+"""What was measured up to each checkpoint."""
+VIEWS = "views"
+"""Folder of the judged views."""
+WORK = "work done: "
+"""Before the share of the run's work, 0 to 1, in the lines that tell its progress."""
+
+
+OF_A_RUN = ("machine.seed", "pipeline.datamanager.data", "output_dir", "experiment_name")
+"""Fields of the configuration that any two runs may differ in."""
+
+
+@dataclass(frozen=True)
+class RunSpecification:
+    """All that one training depends on."""
+
+    scene: str
+    """The scene folder."""
+    scene_sha256: str
+    """Of its transforms.json."""
+    preset: Preset
+    method: MethodName
+    seed: int
+    steps: int | None
+    """None: the preset's."""
+    weight: float | None = None
+    """λ, where it is not the method's own."""
+    sigma_m: Sigma | None = None
+    """σ, metres, or own; None: the method's own."""
+    implementation: Implementation = "same"
+    """torch: in nerfstudio's own torch code."""
+    whole_views: bool = True
+    """Whether whole views are judged at the end, or only the random pixels."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """What run.json holds."""
+        return asdict(self)

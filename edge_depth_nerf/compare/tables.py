@@ -1,0 +1,448 @@
+"""The paper's four tables, and what it does not report: geometry, views beside the path, time, λ and σ.
+
+A cell is a mean over seeds with its sample standard deviation; an average over drives is taken for each seed first.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from edge_depth_nerf.compare.methods import METHODS
+from edge_depth_nerf.compare.options import MethodName
+from edge_depth_nerf.compare.results import Results, RunResult
+
+PAPER_AHEAD_DB: dict[str, dict[MethodName, float]] = {
+    "1": {"nerfacto": 0.65, "ds-nerf": 0.44},
+    "2": {"nerfacto": 0.12, "ds-nerf": 0.04},
+}
+"""By how much the published method is ahead of a row, by the paper's Tables 1 and 2, dB of PSNR."""
+JBNU = "jbnu-depth360"
+"""The kind of source whose drives make Table 2."""
+
+AVERAGES = (
+    "The paper's averages do not follow from its rows; the differences are those that it states for the averages."
+)
+TEXT = "Some figures of the paper differ between its text and its tables."
+INTEGRATED = "In the paper the integrated depth is ahead of both sources."
+EDGE_AWARE = "In the paper the edge-aware kernel is ahead."
+SAME_ROW = (
+    "The paper's row of LiDAR alone (Table 3) is its row of DS-NeRF (Table 1), another loss; here both are trained: "
+    "Table 3 differs in the source of depth alone."
+)
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A column."""
+
+    name: str
+    """In the figures of a run."""
+    heading: str
+    form: str
+    best: int = 1
+    """1: more is better; -1: less is; 0: neither."""
+
+
+PSNR = Metric("masked_psnr", "PSNR ↑", ".2f")
+TRUE_PSNR = Metric("truth_masked_psnr", "PSNR ↑", ".2f")
+
+
+@dataclass
+class Cell:
+    """A figure: mean and spread over seeds."""
+
+    mean: float | None
+    spread: float | None = None
+    """Sample standard deviation; None for a single seed."""
+    form: str = ".2f"
+    words: str | None = None
+    """Instead of a figure."""
+    best: bool = False
+    """Whether it is the best of its column."""
+
+    def text(self) -> str:
+        """As it is read."""
+        if self.words is not None:
+            return self.words
+        if self.mean is None:
+            return "–"
+        spread = "" if self.spread is None else f" ± {self.spread:{self.form.replace('+', '')}}"
+        return f"{self.mean:{self.form}}{spread}"
+
+
+@dataclass
+class Row:
+    """A row."""
+
+    title: str
+    cells: list[Cell]
+
+
+@dataclass
+class MadeTable:
+    """A table with its headings: groups (drives) of columns."""
+
+    label: str
+    title: str
+    groups: list[tuple[str, list[str]]]
+    rows: list[Row]
+    notes: list[str] = field(default_factory=list)
+    on_terminal: bool = True
+
+    @property
+    def caption(self) -> str:
+        """All notes."""
+        return " ".join(self.notes)
+
+    def headings(self) -> list[tuple[str, str]]:
+        """Group and heading of each column."""
+        return [(group, heading) for group, headings in self.groups for heading in headings]
+
+
+def mean_and_spread(values: Sequence[float]) -> tuple[float | None, float | None]:
+    """Mean and sample standard deviation; None where there is too little for them."""
+    if not values:
+        return None, None
+    return statistics.fmean(values), statistics.stdev(values) if len(values) > 1 else None
+
+
+def per_seed(
+    results: Results, scenes: Sequence[str], method: MethodName, value: Callable[[RunResult], float | None]
+) -> dict[int, float]:
+    """Mean over drives of a run's value, for each seed that all drives have it for."""
+    found = {}
+    for seed in results.seeds():
+        runs = [results.run(scene, method, seed) for scene in scenes]
+        values = [None if run is None else value(run) for run in runs]
+        if all(entry is not None for entry in values):
+            found[seed] = statistics.fmean(entry for entry in values if entry is not None)
+    return found
+
+
+def _cell(
+    results: Results, scenes: Sequence[str], method: MethodName, form: str, value: Callable[[RunResult], float | None]
+) -> Cell:
+    found = list(per_seed(results, scenes, method, value).values())
+    if math.inf in found:
+        return Cell(None, words="never")
+    return Cell(*mean_and_spread(found), form=form)
+
+
+def ahead(results: Results, scenes: Sequence[str], method: MethodName, metric: str) -> Cell:
+    """By how much `edge` is ahead of a method, over the seeds that both have."""
+    ours, theirs = (per_seed(results, scenes, name, lambda run: run.figures.get(metric)) for name in ("edge", method))
+    return Cell(*mean_and_spread([ours[seed] - theirs[seed] for seed in ours if seed in theirs]), form="+.2f")
+
+
+def psnr_metric(results: Results) -> Metric:
+    """PSNR against the truth where all drives have it, else against the pictures."""
+    return TRUE_PSNR if all(TRUE_PSNR.name in run.figures for run in results.runs) else PSNR
+
+
+def quality_metrics(results: Results) -> list[Metric]:
+    """PSNR, SSIM and, where the weights were there, LPIPS, all inside the mask."""
+    truth = "truth_" if psnr_metric(results) is TRUE_PSNR else ""
+    metrics = [
+        psnr_metric(results),
+        Metric(f"{truth}masked_ssim", "SSIM ↑", ".3f"),
+        Metric(f"{truth}masked_lpips", "LPIPS ↓", ".3f", -1),
+    ]
+    return [metric for metric in metrics if any(metric.name in run.figures for run in results.runs)]
+
+
+def _mark_best(rows: Sequence[Row], better: Sequence[int]) -> None:
+    for column, sign in enumerate(better):
+        cells = [row.cells[column] for row in rows if row.cells[column].mean is not None]
+        if sign and len(cells) > 1:
+            texts = {cell.text().split(" ")[0]: cell for cell in cells}
+            best = max(texts, key=lambda text: sign * float(text))
+            for cell in cells:
+                cell.best = cell.text().split(" ")[0] == best
+
+
+def _quality_table(
+    results: Results, label: str, title: str, scenes: list[str], methods: Sequence[MethodName]
+) -> MadeTable:
+    metrics = quality_metrics(results)
+    columns = [*((scene, [scene]) for scene in scenes), *([("average", scenes)] if len(scenes) > 1 else [])]
+    groups = [(name, [metric.heading for metric in metrics]) for name, _ in columns]
+    better = [metric.best for _ in columns for metric in metrics]
+    published = PAPER_AHEAD_DB.get(label, {})
+    shows_ahead = "edge" in methods
+    rows = []
+    for method in methods:
+        cells = [
+            _cell(results, chosen, method, metric.form, lambda run, name=metric.name: run.figures.get(name))
+            for _, chosen in columns
+            for metric in metrics
+        ]
+        if shows_ahead:
+            itself = method == "edge"
+            cells.append(Cell(None) if itself else ahead(results, scenes, method, metrics[0].name))
+            if published:
+                cells.append(Cell(published.get(method) if not itself else None, form="+.2f"))
+        rows.append(Row(METHODS[method].title, cells))
+    if shows_ahead:
+        groups.append(("ours ahead", ["dB", "paper, dB"] if published else ["dB"]))
+        better += [0, 0] if published else [0]
+    _mark_best(rows, better)
+    return MadeTable(label, title, groups, rows, [AVERAGES, TEXT] if published else [])
+
+
+def psnr_at(curve: Sequence[dict[str, float]], seconds: float, name: str, clock: str) -> float:
+    """PSNR of a curve at a time, between its points in a straight line; before the first it is that of the first."""
+    before = curve[0]
+    for point in curve:
+        if point[clock] >= seconds:
+            gap = point[clock] - before[clock]
+            share = (seconds - before[clock]) / gap if gap > 0 else 1.0
+            return before[name] + max(share, 0.0) * (point[name] - before[name])
+        before = point
+    return before[name]
+
+
+def steps_to(curve: Sequence[dict[str, float]], psnr: float, name: str) -> float | None:
+    """Steps after which a curve first reaches a PSNR; None if it never does."""
+    before = None
+    for point in curve:
+        if point[name] >= psnr:
+            if before is None:
+                return point["step"]
+            share = (psnr - before[name]) / (point[name] - before[name])
+            return before["step"] + share * (point["step"] - before["step"])
+        before = point
+    return None
+
+
+def curve_metric(results: Results) -> str:
+    """The PSNR of the random pixels that all curves have: against the truth, if it is known."""
+    return "truth_psnr" if all("truth_psnr" in run.curve[-1] for run in results.runs) else "psnr"
+
+
+CLOCKS = {"seconds": "Seconds", "cpu_seconds": "Processor seconds"}
+
+
+def clock_metric(results: Results) -> str:
+    """What time is counted in: on the CPU its own time, which other work on the machine does not change."""
+    on_cpu = all(run.content["device"] == "cpu" for run in results.runs)
+    return "cpu_seconds" if on_cpu else "seconds"
+
+
+def _detail_tables(results: Results, where: str, scenes: list[str]) -> list[MadeTable]:
+    truth = "truth_" if psnr_metric(results) is TRUE_PSNR else ""
+    reference = "truth" if truth else "lidar"
+    metrics = [
+        psnr_metric(results),
+        Metric(f"{truth}affine_masked_psnr", "fitted ↑", ".2f"),
+        Metric("masked_psnr", "recorded ↑", ".2f"),
+        Metric(f"{reference}_abs_rel", "AbsRel ↓", ".3f", -1),
+        Metric(f"{reference}_rmse_m", "RMSE m ↓", ".2f", -1),
+        Metric(f"{reference}_delta_1_25", "δ<1.25 ↑", ".3f"),
+        Metric("shifted_1m_masked_psnr", "1 m beside ↑", ".2f"),
+        Metric("shifted_2m_masked_psnr", "2 m beside ↑", ".2f"),
+    ]
+    if not truth:
+        del metrics[2]
+    metrics = [metric for metric in metrics if any(metric.name in run.figures for run in results.runs)]
+    rows = [
+        Row(
+            METHODS[method].title,
+            [
+                _cell(results, scenes, method, metric.form, lambda run, name=metric.name: run.figures.get(name))
+                for metric in metrics
+            ],
+        )
+        for method in results.methods()
+    ]
+    _mark_best(rows, [metric.best for metric in metrics])
+    known = "the truth" if truth else "the held-out LiDAR"
+    detail = MadeTable(
+        f"5, {where}",
+        "Pictures and geometry",
+        [("", [metric.heading for metric in metrics])],
+        rows,
+        [
+            "Fitted: PSNR after an affine fit of each view's colours. Recorded: PSNR against the recorded picture. "
+            f"AbsRel, RMSE, δ: rendered median distance against {known}, 1-60 m, pooled over pixels, without sky. "
+            "Beside: PSNR of views moved sideways.",
+        ],
+        on_terminal=where == "average" or len(results.scenes()) == 1,
+    )
+
+    name, clock = curve_metric(results), clock_metric(results)
+
+    def at_our_seconds(run: RunResult) -> float | None:
+        ours = results.run(run.scene, "edge", run.seed)
+        return None if ours is None else psnr_at(run.curve, ours.curve[-1][clock], name, clock)
+
+    def to_nerfacto(run: RunResult) -> float | None:
+        base = results.run(run.scene, "nerfacto", run.seed)
+        if base is None:
+            return None
+        steps = steps_to(run.curve, base.curve[-1][name], name)
+        # one run that never gets there leaves no mean
+        return math.inf if steps is None else steps
+
+    timed = [
+        ("s a step", ".3f", 0, lambda run: run.curve[-1][clock] / run.content["steps"]),
+        ("seconds", ".0f", 0, lambda run: run.curve[-1][clock]),
+        ("PSNR at ours' seconds ↑", ".2f", 1, at_our_seconds),
+        ("PSNR in the end ↑", ".2f", 1, lambda run: run.curve[-1][name]),
+        ("steps to nerfacto's end ↓", ".0f", -1, to_nerfacto),
+    ]
+    rows = [
+        Row(METHODS[method].title, [_cell(results, scenes, method, form, value) for _, form, _, value in timed])
+        for method in results.methods()
+    ]
+    _mark_best(rows, [best for _, _, best, _ in timed])
+    time = MadeTable(
+        f"6, {where}",
+        "Time",
+        [("", [heading for heading, *_ in timed])],
+        rows,
+        [
+            f"{CLOCKS[clock]} of training, without judging, saving and the making of priors; PSNR of random held-out "
+            "pixels. A method that has ended by ours' seconds keeps its last PSNR.",
+        ],
+        on_terminal=detail.on_terminal,
+    )
+    return [detail, time]
+
+
+def _settings_table(results: Results) -> MadeTable:
+    def words(value: float | str | None) -> str:
+        return "–" if value is None else value if isinstance(value, str) else f"{value:g}"
+
+    tuned = results.options.get("tuned", {})
+    rows = []
+    for method in results.methods():
+        found = {
+            (words(run.content["lambda"]), words(run.content["sigma"])) for run in results.runs if run.method == method
+        }
+        weight, sigma = (", ".join(sorted(values)) for values in zip(*found, strict=True))
+        searched = "–" if METHODS[method].sigma_field is None else "searched" if method in tuned else "default"
+        rows.append(Row(METHODS[method].title, [Cell(None, words=text) for text in (weight, sigma, searched)]))
+    notes = ["σ in metres, or how the prior's own is found at each pixel."]
+    searched_on = results.options.get("tuned_on")
+    if searched_on is not None:
+        notes.append(f"Searched on {searched_on}.")
+        if searched_on in {run.specification["scene"] for run in results.runs}:
+            notes.append("That drive is one of these tables, too: its figures flatter what was searched.")
+    return MadeTable("7", "λ and σ", [("", ["λ", "σ", "from"])], rows, notes)
+
+
+def make_tables(results: Results) -> list[MadeTable]:
+    """Make the tables that the runs are enough for."""
+    kinds = {run.scene: run.content.get("source") for run in results.runs}
+    drives = {
+        "1": [scene for scene in results.scenes() if kinds[scene] != JBNU],
+        "2": [scene for scene in results.scenes() if kinds[scene] == JBNU],
+    }
+    rivals: list[MethodName] = ["nerfacto", "urban-nerf", "ds-nerf", "edge-paper", "edge"]
+    wanted: list[tuple[str, str, list[str], list[MethodName], list[str]]] = [
+        ("1", "Rivals, drives of KITTI-360's kind", drives["1"], rivals, []),
+        ("2", "Rivals, drives of JBNU-Depth360", drives["2"], rivals, []),
+        ("3", "Source of depth", results.scenes(), ["edge-lidar", "edge-mono", "edge"], [INTEGRATED, SAME_ROW]),
+        ("4", "Kernel of the integration", results.scenes(), ["edge-gaussian", "edge"], [EDGE_AWARE]),
+    ]
+    tables = []
+    for label, title, scenes, names, notes in wanted:
+        there = {run.method for run in results.runs if run.scene in scenes}
+        methods: list[MethodName] = [name for name in names if name in there]
+        if scenes and len(methods) > 1:
+            made = _quality_table(results, label, title, scenes, methods)
+            made.notes += notes
+            tables.append(made)
+    parts = [*([("average", results.scenes())] if len(results.scenes()) > 1 else [])]
+    parts += [(scene, [scene]) for scene in results.scenes()]
+    for where, scenes in parts:
+        tables += _detail_tables(results, where, scenes)
+    tables.append(_settings_table(results))
+    return tables
+
+
+def introduction(results: Results) -> list[str]:
+    """What was compared and how, in lines."""
+    steps = sorted({run.content["steps"] for run in results.runs})
+    seeds = [
+        f"{METHODS[name].title} {', '.join(str(seed) for seed in results.seeds() if results.has(name, seed))}"
+        for name in results.methods()
+    ]
+    against = "the picture without noise and exposure drift" if psnr_metric(results) is TRUE_PSNR else "the picture"
+    lines = [
+        f"Preset {results.options.get('preset')}, {' and '.join(map(str, steps))} steps a run; drives "
+        f"{', '.join(results.scenes())}.",
+        "Seeds: " + "; ".join(seeds) + ".",
+        f"Means over held-out views, PSNR in dB, inside the mask, against {against}; ± the standard deviation over "
+        "seeds.",
+        "Versions: " + ", ".join(f"{name} {number}" for name, number in results.versions.items()) + ".",
+    ]
+    if not any(name.endswith("lpips") for run in results.runs for name in run.figures):
+        lines.append("LPIPS is left out: its weights were not on this machine.")
+    if any(run.specification["implementation"] == "torch" for run in results.runs):
+        lines.append("nerfacto, UrbanNeRF and DS-NeRF ran in nerfstudio's own torch code.")
+    departures = sorted({text for run in results.runs for text in run.content.get("departures", [])})
+    if departures:
+        lines.append("Other than in the paper: " + "; ".join(departures) + ".")
+    return lines
+
+
+def as_markdown(results: Results, tables: Sequence[MadeTable]) -> str:
+    """All tables as Markdown."""
+    parts = ["# Comparison", *introduction(results)]
+    for table in tables:
+        headings = [f"{group} {heading}".strip() for group, heading in table.headings()]
+        lines = [f"| | {' | '.join(headings)} |", "|---|" + "---|" * len(headings)]
+        for row in table.rows:
+            cells = [f"**{cell.text()}**" if cell.best else cell.text() for cell in row.cells]
+            lines.append(f"| {row.title} | {' | '.join(cells)} |")
+        parts += [f"## Table {table.label}. {table.title}", "\n".join(lines), *([table.caption] if table.notes else [])]
+    return "\n\n".join(parts) + "\n"
+
+
+_LATEX = {
+    "\\": r"\textbackslash{}",
+    **{char: f"\\{char}" for char in "&%$#_{}"},
+    "↑": r"$\uparrow$",
+    "↓": r"$\downarrow$",
+    "±": r"$\pm$",
+    "δ": r"$\delta$",
+    "λ": r"$\lambda$",
+    "σ": r"$\sigma$",
+    "<": "$<$",
+    ">": "$>$",
+    "–": "--",
+    "≥": r"$\geq$",
+}
+
+
+def latex_text(text: str) -> str:
+    """Text as LaTeX takes it."""
+    return "".join(_LATEX.get(char, char) for char in text)
+
+
+def as_latex(results: Results, tables: Sequence[MadeTable]) -> str:
+    """All tables as LaTeX; no package beyond booktabs."""
+    parts = ["% \\usepackage{booktabs}", *(f"% {line}" for line in introduction(results))]
+    for table in tables:
+        columns = sum(len(headings) for _, headings in table.groups)
+        lines = [r"\begin{table}", r"\centering", rf"\caption{{{latex_text(f'{table.title}. {table.caption}')}}}"]
+        lines += [rf"\begin{{tabular}}{{l{'r' * columns}}}", r"\toprule"]
+        if any(group for group, _ in table.groups):
+            spans, rules, first = [], [], 2
+            for group, headings in table.groups:
+                spans.append(rf"\multicolumn{{{len(headings)}}}{{c}}{{{latex_text(group)}}}")
+                rules.append(rf"\cmidrule(lr){{{first}-{first + len(headings) - 1}}}")
+                first += len(headings)
+            lines += [" & " + " & ".join(spans) + r" \\", "".join(rules)]
+        lines += [" & " + " & ".join(latex_text(heading) for _, heading in table.headings()) + r" \\", r"\midrule"]
+        for row in table.rows:
+            cells = [latex_text(cell.text()) for cell in row.cells]
+            bold = [rf"\textbf{{{text}}}" if cell.best else text for text, cell in zip(cells, row.cells, strict=True)]
+            lines.append(f"{latex_text(row.title)} & {' & '.join(bold)} \\\\")
+        lines += [r"\bottomrule", r"\end{tabular}", r"\end{table}"]
+        parts.append(f"% Table {table.label}\n" + "\n".join(lines))
+    return "\n\n".join(parts) + "\n"

@@ -1,0 +1,204 @@
+"""Trains and judges one run: `python -m edge_depth_nerf.compare.worker FOLDER`, with a run.json in the folder.
+
+A process of its own, so that a run that dies takes no other with it, and one process for both, as nerfstudio takes long
+to start. Killed at any moment, it goes on at its last checkpoint.
+"""
+
+from __future__ import annotations
+
+import random
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+
+from edge_depth_nerf.compare.configuration import configuration, described, setting_of
+from edge_depth_nerf.compare.judging import ViewJudge, choose_pixels, judge_pixels, shifted_views
+from edge_depth_nerf.compare.protocol import departures
+from edge_depth_nerf.compare.specification import FIGURES, PROGRESS, SPECIFICATION, VIEWS, WORK, RunSpecification
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.files import read_json, write_json
+from edge_depth_nerf.runs import end_with_parent, steps_done
+from edge_depth_nerf.trainer import EdgeDepthTrainer
+
+CURVE = (0.025, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+"""When the random pixels are judged, as shares of the training."""
+STEP_IN_BATCHES = 3
+"""A step of training takes about as long as rendering so many batches of its rays."""
+
+
+class Clock:
+    """Seconds, and those of the processor, of what is measured."""
+
+    def __init__(self, device: str) -> None:
+        """Measure nothing yet; `device` is what is waited for."""
+        self._on_gpu = device.startswith("cuda")
+        self._since: dict[str, float] | None = None
+        self.passed = {"seconds": 0.0, "cpu_seconds": 0.0}
+        """Up to the last time that it was stopped."""
+
+    def _now(self) -> dict[str, float]:
+        if self._on_gpu:
+            torch.cuda.synchronize()
+        return {"seconds": time.monotonic(), "cpu_seconds": time.process_time()}
+
+    def start(self) -> None:
+        """Go on."""
+        self._since = self._now()
+
+    @contextmanager
+    def stopped(self) -> Iterator[None]:
+        """Stop for something that does not count."""
+        if self._since is not None:
+            now = self._now()
+            self.passed = {name: self.passed[name] + now[name] - self._since[name] for name in now}
+        try:
+            yield
+        finally:
+            self.start()
+
+
+class MeasuredTrainer(EdgeDepthTrainer):
+    """Counts the seconds of training, and stops the clock while it judges the random pixels.
+
+    What was measured is kept with the checkpoints, so that a training that is taken up again goes on with it.
+    """
+
+    def __init__(self, config: Any, progress: Path, total_steps: int) -> None:
+        """Train `config`; `progress` is the file that keeps what was measured."""
+        super().__init__(config)
+        self.progress_path, self.total_steps = progress, total_steps
+        self.curve: list[dict[str, float]] = []
+        self.times: dict[str, dict[str, float]] = {}
+        """The clock at each checkpoint, by steps."""
+        self.clock = Clock(self.device)
+        self.on_step: Callable[[int], None] = lambda _: None
+        self._judged_at = {max(1, round(share * total_steps)) for share in CURVE}
+
+    def setup(self, test_mode: Literal["test", "val", "inference"] = "test") -> None:
+        """Set up as nerfstudio does, and go on from what was measured before."""
+        super().setup(test_mode)
+        self._pixels = choose_pixels(self.pipeline.datamanager.eval_dataset)  # pyright: ignore[reportArgumentType]
+        if self._start_step:
+            measured = read_json(self.progress_path)
+            self.times = {step: passed for step, passed in measured["times"].items() if int(step) <= self._start_step}
+            self.clock.passed = dict(self.times[str(self._start_step)])
+            self.curve = [point for point in measured["curve"] if point["step"] <= self._start_step]
+        self.callbacks.append(
+            TrainingCallback(
+                where_to_run=[TrainingCallbackLocation.AFTER_TRAIN_ITERATION],
+                func=lambda step: self._after_step(step + 1),
+            )
+        )
+
+    def train(self) -> None:
+        """Train to the end, by the clock."""
+        self.clock.start()
+        super().train()
+
+    def save_checkpoint(self, step: int) -> None:
+        """Save what was measured, then the model."""
+        with self.clock.stopped():
+            self.times[str(step + 1)] = dict(self.clock.passed)
+            write_json(self.progress_path, {"times": self.times, "curve": self.curve})
+            super().save_checkpoint(step)
+
+    def _after_step(self, steps: int) -> None:
+        if steps in self._judged_at:
+            with self.clock.stopped():
+                figures = judge_pixels(self.pipeline, self._pixels)
+                self.curve.append({"step": float(steps), **self.clock.passed, **figures})
+        self.on_step(steps)
+
+
+def do_run(folder: Path) -> None:
+    """Train and judge what run.json of a folder says, as far as it is not done; figures.json is written last."""
+    run = RunSpecification(**read_json(folder / SPECIFICATION))
+    config, named = configuration(run, folder)
+    resolved = described(config)
+    steps = config.max_num_iterations
+    random.seed(run.seed)
+    np.random.seed(run.seed)
+    torch.manual_seed(run.seed)
+    if not (config.get_base_dir() / "config.yml").is_file():
+        config.save_config()
+    done = steps_done(config.get_checkpoint_dir())
+    if done:
+        config.load_dir = config.get_checkpoint_dir()
+    # nerfstudio counts the steps that are still to come
+    config.max_num_iterations = steps - done
+    trainer = MeasuredTrainer(config, folder / PROGRESS, steps)
+    trainer.setup()
+    dataset: Any = trainer.pipeline.datamanager.eval_dataset
+    beside = shifted_views(Path(run.scene), dataset) if run.whole_views else {}
+    views = len(dataset) + sum(map(len, beside.values())) if run.whole_views else 0
+    # nerfstudio prints each step; the bar wants the share of all the work
+    rays_of_a_view = int((dataset.cameras.width * dataset.cameras.height).float().mean())
+    batches_of_a_view = rays_of_a_view / trainer.pipeline.datamanager.get_train_rays_per_batch()
+    whole = STEP_IN_BATCHES * steps + batches_of_a_view * views
+    judged = 0
+
+    def tell(steps_behind: int) -> None:
+        share = (STEP_IN_BATCHES * steps_behind + batches_of_a_view * judged) / whole
+        print(f"\n{WORK}{share:.4f}", flush=True)  # noqa: T201
+
+    def on_step(steps_behind: int) -> None:
+        if steps_behind % max(1, steps // 200) == 0:
+            tell(steps_behind)
+
+    def on_view() -> None:
+        nonlocal judged
+        judged += 1
+        tell(steps)
+
+    trainer.on_step = on_step
+    if done < steps:
+        trainer.train()
+
+    last = trainer.curve[-1]
+    figures = {name: last[name] for name in trainer.clock.passed}
+    figures |= {f"pixels_{name}": value for name, value in last.items() if name != "step" and name not in figures}
+    bins: dict[str, Any] = {}
+    if run.whole_views:
+        judge = ViewJudge(trainer.pipeline, on_view)
+        found, bins = judge.held_out(folder / VIEWS)
+        figures |= found | judge.shifted(beside)
+    weight, sigma = setting_of(config, run.method)
+    meta = read_json(Path(run.scene) / "transforms.json")
+    write_json(
+        folder / FIGURES,
+        {
+            "run": run.to_dict(),
+            "named": sorted(named),
+            "configuration": resolved,
+            "lambda": weight,
+            "sigma": sigma,
+            "steps": steps,
+            "device": config.machine.device_type,
+            "source": meta.get("source", {}).get("kind"),
+            "departures": departures(meta) if run.preset == "paper" else [],
+            "figures": figures,
+            "curve": trainer.curve,
+            **bins,
+        },
+    )
+
+
+def main() -> None:
+    """Entry point: errors of input are one paragraph and exit status 2."""
+    end_with_parent()
+    try:
+        do_run(Path(sys.argv[1]))
+    except (InputError, OSError) as error:
+        print(f"edge-depth-nerf: {error}", flush=True)  # noqa: T201
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()
