@@ -21,6 +21,7 @@ from nerfstudio.utils.external import TCNN_EXISTS
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from edge_depth_nerf.allocator import keep_freed_memory
 from edge_depth_nerf.compat import lpips_not_built
 from edge_depth_nerf.fused.fields import CubeContraction, FusedNerfactoField, use_fused_fields
 from edge_depth_nerf.fused.losses import distortion_loss, proposal_loss
@@ -121,6 +122,8 @@ class EdgeDepthNerfModel(NerfactoModel):
         if implementation == "auto":
             on_gpu = torch.device(self.kwargs.get("device", "cpu")).type == "cuda"
             implementation = "tcnn" if TCNN_EXISTS and on_gpu else "fused"
+        if torch.device(self.kwargs.get("device", "cpu")).type == "cpu":
+            keep_freed_memory()
         # nerfstudio knows two of them; the model's own configuration says which was built
         self.config = replace(self.config, implementation="tcnn" if implementation == "tcnn" else "torch")
         self._fused = implementation == "fused"

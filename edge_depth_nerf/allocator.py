@@ -1,0 +1,31 @@
+"""What the C library's allocator does with large tensors on the CPU.
+
+By default glibc takes memory for each tensor above 32 MB from the system and gives it back when the tensor dies, many
+times a step: every page is cleared and mapped again each time. Kept, it is there for the next one after the first few
+steps: a step of the full preset on two cores took 0.56 s in place of 0.71 s, rendering 0.9 s in place of 1.2 s.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import platform
+
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
+"""glibc's numbers of the settings."""
+KEPT_BYTES = 1 << 30
+"""Up to this size freed memory is kept for the next tensor."""
+
+
+def keep_freed_memory() -> bool:
+    """Let freed memory of this process be used again instead of given back; what lies idle now is given back first.
+
+    Returns:
+        Whether the allocator does: glibc's alone has the settings.
+
+    """
+    if platform.libc_ver()[0] != "glibc":
+        return False
+    libc = ctypes.CDLL(None)
+    libc.malloc_trim(0)
+    # the other way round, a limit that is refused would leave the system asked for every tensor above 128 kB
+    return bool(libc.mallopt(M_MMAP_THRESHOLD, KEPT_BYTES) and libc.mallopt(M_TRIM_THRESHOLD, KEPT_BYTES))
