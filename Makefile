@@ -3,11 +3,12 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: help setup demo test lint format dist check-dist version clean
+.PHONY: help setup demo test lint format docs dist check-dist version clean
 help:
 	@echo "make demo        synthesise a drive, train with and without the depth prior, compare (outputs/demo/)"
 	@echo "make test        run all tests"
 	@echo "make lint        ruff and pyright"
+	@echo "make docs        the pages as a site (site/)"
 	@echo "make check-dist  build wheel and sdist (dist/), install them into a fresh environment"
 	@echo "make setup       the virtual environment in $(VENV), with the versions of constraints.txt"
 
@@ -35,6 +36,10 @@ format: setup
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+# Material for MkDocs prints an advertisement for its successor otherwise.
+docs: setup
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
 # The wheel is made from the sdist.
 dist: setup
 	rm -rf build dist *.egg-info
@@ -59,4 +64,4 @@ version:
 	@$(PYTHON) -c 'import edge_depth_nerf; print(edge_depth_nerf.__version__)'
 
 clean:
-	rm -rf build dist outputs *.egg-info .pytest_cache .ruff_cache
+	rm -rf build dist outputs site *.egg-info .pytest_cache .ruff_cache

@@ -44,7 +44,7 @@ def test_the_sdist_is_the_repository(dist):
         if path.is_file() and not {".cache", "__pycache__"} & set(path.parts) and path.suffix != ".pyc"
     }
     expected |= {"LICENSE", "README.md", "CHANGELOG.md", "CONTRIBUTING.md", "CITATION.cff", "MANIFEST.in", "Makefile"}
-    expected |= {"pyproject.toml", "constraints.txt", "nerfstudio_method.toml", ".gitignore"}
+    expected |= {"pyproject.toml", "mkdocs.yml", "constraints.txt", "nerfstudio_method.toml", ".gitignore"}
     assert "tests/conftest.py" in expected
     assert not expected - names
     assert not [
@@ -168,7 +168,7 @@ def test_the_workflows_cover_every_python():
     text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     supported = re.findall(r"Programming Language :: Python :: (3\.\d+)", text)
     assert ci["jobs"]["tests"]["strategy"]["matrix"]["python"] == supported
-    assert {"lint", "tests", "distribution"} == set(ci["jobs"])
+    assert {"lint", "tests", "docs", "distribution"} == set(ci["jobs"])
 
 
 @pytest.mark.parametrize("name", ["bug", "question", "feature"])

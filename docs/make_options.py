@@ -1,0 +1,260 @@
+"""Write docs/options.md, every option of every command and method (`python docs/make_options.py`).
+
+Names, types, defaults and explanations are those of the dataclasses that the commands read.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import dataclasses
+import inspect
+import re
+import textwrap
+import types
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import tyro
+
+from edge_depth_nerf import cli
+from edge_depth_nerf.config import make_specifications, read_method_file
+from edge_depth_nerf.datamanager import FisheyeDepthDataManagerConfig
+from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
+from edge_depth_nerf.files import write_text
+from edge_depth_nerf.model import EdgeDepthNerfModelConfig
+
+PAGE = Path(__file__).with_name("options.md")
+
+HEADER = """# Every option
+
+This page is written by `python docs/make_options.py` from the code itself; a test holds it to that. The commands say
+the same: `edge-depth-nerf COMMAND --help`, `ns-train METHOD --help`.
+
+## The command line
+
+A switch such as `--deskew` is turned off by `--no-deskew`. Several values stand behind one another:
+`--cameras image_02 image_03`. Bare words in capitals are given without a name.
+
+"""
+
+METHODS_HEADER = """## The methods
+
+What `ns-train edge-depth-nerf`, `edge-depth-nerf-lite` and `edge-depth-nerf-paper` add to nerfstudio's nerfacto, or
+set to another value. Switches take `True` or `False`. Where a method has another default, it is named.
+
+"""
+
+DATAPARSER = """They stand last on the line: `ns-train METHOD --data SCENE … fisheye-depth-data --metres-per-unit 10`.
+Other methods of nerfstudio take them in the same way.
+
+"""
+
+PRESETS = """### What each method sets of nerfstudio's own
+
+From [nerfstudio_method.toml](../nerfstudio_method.toml). – is nerfstudio's default.
+
+"""
+
+SHARED = "Of all converters:\n\n"
+
+
+# ---- reading dataclasses ---------------------------------------------------------------------------------------
+
+
+def field_docs(cls: type) -> dict[str, str]:
+    """The docstrings below the fields that a dataclass declares itself, in one line each."""
+    node = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
+    assert isinstance(node, ast.ClassDef)
+    docs = {}
+    for entry, following in zip(node.body, [*node.body[1:], None], strict=True):
+        if isinstance(entry, ast.AnnAssign) and isinstance(entry.target, ast.Name):
+            text = ""
+            if isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant):
+                text = " ".join(str(following.value.value).split())
+            docs[entry.target.id] = text
+    return docs
+
+
+def kind_of(hint: Any) -> str:
+    """What values an option takes, in words."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return kind_of(arguments[0])
+    if origin is Literal:
+        return ", ".join(f"`{value}`" for value in arguments)
+    if origin in (Union, types.UnionType):
+        return ", ".join(kind_of(each) for each in arguments if each is not type(None))
+    if origin in (tuple, list, Mapping):
+        return f"{kind_of(arguments[0])} …"
+    return {bool: "switch", int: "whole number", float: "number", str: "word", Path: "path"}[hint]
+
+
+def shown(value: Any) -> str:
+    """A default, as it is given on the command line."""
+    if value is None:
+        return ""
+    if isinstance(value, tuple | list):
+        return ", ".join(f"`{each}`" for each in value)
+    return f"`{value:g}`" if isinstance(value, float) else f"`{value}`"
+
+
+def default_of(entry: dataclasses.Field) -> Any:
+    """A field's default; MISSING if it must be given."""
+    return entry.default_factory() if entry.default_factory is not dataclasses.MISSING else entry.default
+
+
+def dashed(name: str) -> str:
+    """A field's name as an option."""
+    return name.replace("_", "-")
+
+
+def is_positional(hint: Any) -> bool:
+    """Whether an option is given without its name."""
+    return get_origin(hint) is Annotated and get_args(tyro.conf.Positional[str])[1] in get_args(hint)[1:]
+
+
+def cell(text: str) -> str:
+    """Text of a table's cell."""
+    parts = re.split(r"(`[^`]*`)", text.replace("|", "\\|"))
+    return "".join(part if part.startswith("`") else _prose(part) for part in parts)
+
+
+def _prose(text: str) -> str:
+    """Text outside code: nothing in it is markup, and pages are links."""
+    return re.sub(r"\bdocs/(\w+\.md)", r"[\1](\1)", text.replace("<", "&lt;").replace("*", "\\*"))
+
+
+def table(rows: list[tuple[str, ...]], header: tuple[str, ...]) -> str:
+    """A table in Markdown."""
+    lines = [header, tuple("---" for _ in header), *rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines) + "\n"
+
+
+# ---- our own commands ------------------------------------------------------------------------------------------
+
+
+def commands(union: Any = cli.Command, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], type]]:
+    """All commands: the words that name one, and the dataclass of its options."""
+    for member in get_args(union):
+        cls, marker = get_args(member)[:2]
+        words = (*path, marker.name)
+        hints = get_type_hints(cls, include_extras=True).values()
+        nested = [hint for hint in hints if is_union_of_commands(hint)]
+        if nested:
+            yield from commands(get_args(nested[0])[0], words)
+        else:
+            yield words, cls
+
+
+def is_union_of_commands(hint: Any) -> bool:
+    """Whether a field holds a subcommand."""
+    inner = get_args(hint)[0] if get_origin(hint) is Annotated else hint
+    is_union = get_origin(inner) in (Union, types.UnionType)
+    return is_union and all(get_origin(member) is Annotated for member in get_args(inner))
+
+
+def option_rows(cls: type, declared_by: type) -> list[tuple[str, ...]]:
+    """The options of a command that one of its dataclasses declares."""
+    docs, hints = field_docs(declared_by), get_type_hints(cls, include_extras=True)
+    rows = []
+    for entry in dataclasses.fields(cls):
+        if entry.name not in docs:
+            continue
+        default, name = default_of(entry), f"`--{dashed(entry.name)}`"
+        if is_positional(hints[entry.name]):
+            name = f"`{entry.name.upper()}`"
+        elif isinstance(default, bool):
+            name = f"`--{dashed(entry.name)}`, `--no-{dashed(entry.name)}`"
+        needed = "needed" if default is dataclasses.MISSING else shown(default)
+        if isinstance(default, bool):
+            needed = "on" if default else "off"
+        rows.append((name, kind_of(hints[entry.name]), needed, cell(docs[entry.name])))
+    return rows
+
+
+def own_commands() -> str:
+    """The section of `edge-depth-nerf`."""
+    header = ("option", "values", "default", "what")
+    found = list(commands())
+    groups: dict[str, list[tuple[tuple[str, ...], type]]] = {}
+    for words, cls in found:
+        groups.setdefault(words[0], []).append((words, cls))
+    text = ""
+    for name, members in groups.items():
+        text += f"### `edge-depth-nerf {name}`\n\n"
+        ancestors = [[base for base in cls.__mro__ if dataclasses.is_dataclass(base)] for _, cls in members]
+        shared = [base for base in ancestors[0] if len(members) > 1 and all(base in each for each in ancestors)]
+        for base in shared:
+            text += SHARED + table(option_rows(members[0][1], base), header)
+        for (words, cls), bases in zip(members, ancestors, strict=True):
+            rows = [row for base in reversed(bases) if base not in shared for row in option_rows(cls, base)]
+            about = " ".join((inspect.getdoc(cls) or "").split())
+            text += (f"`edge-depth-nerf {' '.join(words)}`: " if len(members) > 1 else "") + cell(about) + "\n\n"
+            text += table(rows, header) if rows else "It has no options.\n\n"
+    return text
+
+
+# ---- the methods -----------------------------------------------------------------------------------------------
+
+
+def methods() -> str:
+    """The section of what our methods add to nerfstudio."""
+    configs = {name: made.config for name, made in make_specifications(read_method_file()).items()}
+    groups = (
+        ("The depth prior and the training data", "pipeline.datamanager", FisheyeDepthDataManagerConfig),
+        ("The model and its loss", "pipeline.model", EdgeDepthNerfModelConfig),
+        ("The scene", "pipeline.datamanager.dataparser", FisheyeDepthDataParserConfig),
+    )
+    text = METHODS_HEADER
+    for title, place, cls in groups:
+        text += f"### {title}\n\n"
+        is_parser = cls is FisheyeDepthDataParserConfig
+        text += DATAPARSER if is_parser else ""
+        docs, hints = field_docs(cls), get_type_hints(cls, include_extras=True)
+        rows = []
+        for entry in dataclasses.fields(cls):
+            if entry.name not in docs or entry.name in ("_target", "dataparser"):
+                continue
+            values = {name: at(config, f"{place}.{entry.name}") for name, config in configs.items()}
+            first = next(iter(values.values()))
+            default = shown(first)
+            for name, value in values.items():
+                if value != first:
+                    default += f"; {name.removeprefix('edge-depth-nerf-')}: {shown(value)}"
+            option = f"`--{dashed(entry.name)}`" if is_parser else f"`--{place}.{dashed(entry.name)}`"
+            rows.append((option, kind_of(hints[entry.name]), default, cell(docs[entry.name])))
+        text += table(rows, ("option", "values", "default", "what"))
+    return text + presets()
+
+
+def at(config: Any, name: str) -> Any:
+    """A value of a configuration by its dotted name."""
+    for part in name.split("."):
+        config = config[part] if isinstance(config, dict) else getattr(config, part)
+    return config
+
+
+def presets() -> str:
+    """What the file of methods sets that is not in the tables before."""
+    declared = read_method_file()
+    ours = (FisheyeDepthDataManagerConfig, EdgeDepthNerfModelConfig, FisheyeDepthDataParserConfig)
+    known = {name for cls in ours for name in field_docs(cls)}
+    values = {name: declared["presets"][method["preset"]] for name, method in declared["methods"].items()}
+    names = dict.fromkeys(name for preset in values.values() for name in preset if name.split(".")[-1] not in known)
+    rows = [
+        (f"`--{dashed(name)}`", *(shown(preset[name]) if name in preset else "–" for preset in values.values()))
+        for name in names
+    ]
+    return PRESETS + table(rows, ("option", *(f"`{name}`" for name in values)))
+
+
+def page() -> str:
+    """The whole page."""
+    return (HEADER + own_commands() + methods()).rstrip("\n") + "\n"
+
+
+if __name__ == "__main__":
+    argparse.ArgumentParser(description="Write docs/options.md from the code.").parse_args()
+    write_text(PAGE, page())

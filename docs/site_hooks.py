@@ -1,0 +1,63 @@
+"""What MkDocs does beside its own: pages of the repository that lie outside docs/, and links to files there.
+
+In the site docs/ is the repository's root: `../data/README.md` in a page of docs/ becomes `data/README.md`, and what is
+linked is put there. So every link works in the repository and in the site.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = ("data/README.md", "CONTRIBUTING.md", "CHANGELOG.md")
+"""Pages of the site that lie elsewhere in the repository."""
+LINK = re.compile(r"(\]\()(?!https?:|mailto:|#)([^)#\s]+)")
+
+
+def in_site(page: str, link: str) -> str:
+    """What a link of a page becomes in the site; both paths as in the repository, the link from the page's folder.
+
+    Returns:
+        The link from the page's place in the site.
+
+    """
+    folder = (ROOT / page).parent
+    target = (folder / link).resolve()
+    place = target.relative_to(ROOT / "docs") if target.is_relative_to(ROOT / "docs") else target.relative_to(ROOT)
+    own = Path(page).parent
+    depth = len(own.parts) - (own.parts[:1] == ("docs",))
+    return "../" * depth + place.as_posix()
+
+
+def linked_files(page: str, text: str) -> list[str]:
+    """Files outside docs/ that a page links to, as paths in the repository."""
+    targets = [((ROOT / page).parent / link).resolve() for _, link in LINK.findall(text)]
+    return [
+        target.relative_to(ROOT).as_posix()
+        for target in targets
+        if target.is_file() and target.is_relative_to(ROOT) and not target.is_relative_to(ROOT / "docs")
+    ]
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the pages outside docs/ and all files that any page links to."""
+    wanted = dict.fromkeys(PAGES)
+    pages = [f"docs/{file.src_uri}" for file in files.documentation_pages()]
+    for page in (*pages, *PAGES):
+        wanted |= dict.fromkeys(linked_files(page, (ROOT / page).read_text(encoding="utf-8")))
+    for name in wanted:
+        files.append(File.generated(config, name, abs_src_path=str(ROOT / name)))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Make the page's links those of the site."""
+    name = page.file.src_uri
+    if name not in PAGES:
+        name = f"docs/{name}"
+    return LINK.sub(lambda found: found[1] + in_site(name, found[2]), markdown)

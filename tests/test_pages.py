@@ -1,0 +1,583 @@
+"""The pages: what they tell users to type exists and runs, what is generated is current, the site needs no network."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.metadata
+import importlib.util
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import tyro
+import yaml
+
+from edge_depth_nerf import cli
+from edge_depth_nerf.files import read_distance_png, read_image, read_json
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = sorted(
+    str(path.relative_to(ROOT))
+    for path in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "data/README.md", *DOCS.glob("*.md"))
+)
+RUN = "<!-- run -->"
+"""The block after this comment is run, not only parsed."""
+PROGRAM = r"edge-depth-nerf|ns-[a-z]+|python|make"
+TIMEOUT_S = 400
+
+
+def load(name: str) -> Any:
+    """A program of docs/ or docs/examples/ as a module."""
+    path = DOCS / f"{name}.py"
+    specification = importlib.util.spec_from_file_location(path.stem, path)
+    assert specification and specification.loader
+    module = importlib.util.module_from_spec(specification)
+    sys.modules[path.stem] = module  # dataclasses look themselves up there
+    specification.loader.exec_module(module)
+    return module
+
+
+# ---- what the pages say ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Block:
+    """Code of a page that is not of another language."""
+
+    page: str
+    text: str
+    is_run: bool
+
+
+def blocks(page: str, text: str) -> Iterator[Block]:
+    """Fenced and indented blocks."""
+    fenced: list[str] | None = None
+    language, indented, is_run = "", [], False
+    for line in [*text.splitlines(), "end"]:
+        fence = re.match(r"\s*```[\s{.]*(\w*)", line)
+        if fence:
+            if fenced is None:
+                fenced, language = [], fence[1]
+            else:
+                if language in ("", "bash", "sh", "shell", "console"):
+                    yield Block(page, "\n".join(fenced), is_run)
+                fenced, is_run = None, False
+        elif fenced is not None:
+            fenced.append(line)
+        elif line.startswith("    ") or (indented and not line.strip() and indented[-1]):
+            indented.append(line[4:])
+        else:
+            if any(indented):
+                yield Block(page, "\n".join(indented), is_run)
+                is_run = False
+            indented = []
+            is_run = (is_run and not line.strip()) or line.strip() == RUN
+    assert fenced is None, f"{page}: a fence is not closed"
+
+
+def calls(block: Block) -> Iterator[list[str]]:
+    """The words of each call of a program; a loop's variable has its first value."""
+    text = block.text.replace("\\\n", " ")
+    for name, value in re.findall(r"\bfor (\w+) in (\S+)", text):
+        text = text.replace(f"${name}", value)
+    for line in text.splitlines():
+        if not re.match(rf"\s*({PROGRAM})( |$)", line):
+            continue
+        lexer = shlex.shlex(line, posix=True, punctuation_chars="|&;")
+        lexer.whitespace_split = True
+        words: list[str] = []
+        for word in lexer:
+            if set(word) <= set("|&;"):
+                yield words
+                words = []
+            else:
+                words.append(word)
+        yield words
+
+
+ALL_BLOCKS = [block for page in PAGES for block in blocks(page, (ROOT / page).read_text(encoding="utf-8"))]
+ALL_CALLS = [
+    (block, words) for block in ALL_BLOCKS for words in calls(block) if words and re.fullmatch(PROGRAM, words[0])
+]
+PARSED = [
+    pytest.param(words, id=f"{block.page}: {' '.join(words)}")
+    for block, words in ALL_CALLS
+    # of a method that is registered in the block itself; it has to be run
+    if "NERFSTUDIO_METHOD_CONFIGS" not in block.text or not words[0].startswith("ns-")
+]
+
+
+class NotAccepted(AssertionError):
+    """A parser refused a command."""
+
+
+def parse(words: list[str]) -> None:
+    """Let the program's own parser read its options, without running it."""
+    program, *arguments = words
+    try:
+        if program == "edge-depth-nerf":
+            command = tyro.cli(cli.Command, prog=program, args=arguments)
+            options = command.options if isinstance(command, cli.Process) else command
+            check = getattr(options, "check", None)
+            if check is not None:
+                check()
+        else:
+            parse_by_host(program, arguments)
+    except SystemExit as ended:
+        if ended.code:
+            raise NotAccepted(" ".join(words)) from ended
+
+
+def parse_by_host(program: str, arguments: list[str]) -> None:
+    """nerfstudio's entry point, whose main functions do nothing."""
+    (point,) = importlib.metadata.entry_points(group="console_scripts", name=program)
+    entry = point.load()
+    module = sys.modules[entry.__module__]
+    if program == "ns-train":
+        patched = [mock.patch.object(module, "main")]
+    else:
+        classes = [value for value in vars(module).values() if isinstance(value, type) and "main" in vars(value)]
+        patched = [mock.patch.object(cls, "main", autospec=True) for cls in classes]
+    with mock.patch.object(sys, "argv", [program, *arguments]):
+        mains = [patch.start() for patch in patched]
+        try:
+            entry()
+            assert sum(main.call_count for main in mains) == 1
+        finally:
+            mock.patch.stopall()
+
+
+@pytest.mark.usefixtures("unchecked_types")  # nerfstudio's own defaults are not of their types
+@pytest.mark.parametrize("words", PARSED)
+def test_commands_are_understood(words):
+    program = words[0]
+    if program == "make":
+        targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+        assert {word for word in words[1:] if "=" not in word} <= set(targets)
+    elif program == "python":
+        assert (ROOT / words[1]).is_file()
+    else:
+        parse(words)
+
+
+@pytest.mark.usefixtures("unchecked_types")
+@pytest.mark.parametrize(
+    "command",
+    [
+        "edge-depth-nerf inspect SCENE --sises 3",
+        "edge-depth-nerf process kitti360 --root A --sequence B --output C --sweps 3",
+        "edge-depth-nerf camera-path --load-config A --kind lane-shfit",
+        "ns-train edge-depth-nerf --data A --pipeline.model.depth-los none",
+        "ns-train edge-depth-nerf --data A --pipeline.model.depth-loss nothing",
+        "ns-train edge-depth-nerf --data A fisheye-depth-data --metre-per-unit 3",
+        "ns-viewer --load-config A --viewer.websocket-hots 127.0.0.1",
+        "ns-eval --load-config A --outputs B",
+        "ns-render camera-path --load-config A --camera-path-filename B --output-pth C",
+    ],
+)
+def test_options_that_do_not_exist_are_noticed(command):
+    with pytest.raises(NotAccepted):
+        parse(command.split())
+
+
+def test_the_pages_are_read():
+    """Were blocks or calls overlooked, the tests above would pass for nothing."""
+    by_page = {page: [words for block, words in ALL_CALLS if block.page == page] for page in PAGES}
+    assert ["edge-depth-nerf", "inspect", "scenes/drive"] in by_page["README.md"]
+    for page in ("README.md", "docs/quick_start.md", "docs/kitti360.md"):
+        programs = {words[0] for words in by_page[page]}
+        assert {"edge-depth-nerf", "ns-train", "ns-eval", "ns-viewer"} <= programs, page
+    (lists,) = (words for words in by_page["docs/loss_weight.md"] if "synthesize" in words)
+    assert lists[lists.index("--scene") + 1] == "street"
+    for page in PAGES:
+        text = (ROOT / page).read_text(encoding="utf-8")
+        found = len(re.findall(r"^ +(?:edge-depth-nerf|ns-[a-z]+) ", text, re.MULTILINE))
+        assert sum(words[0].startswith(("edge-depth-nerf", "ns-")) for words in by_page[page]) == found, page
+        assert sum(block.is_run for block in ALL_BLOCKS if block.page == page) == text.splitlines().count(RUN), page
+
+
+def dotted_names(config: Any, place: str = "") -> Iterator[str]:
+    """Names of a configuration's options, as nerfstudio's commands have them."""
+    if dataclasses.is_dataclass(config):
+        children = {entry.name: getattr(config, entry.name, None) for entry in dataclasses.fields(config)}
+    else:
+        children = config if isinstance(config, dict) else {}
+    for name, child in children.items():
+        dotted = f"{place}{name}".replace("_", "-")
+        yield dotted
+        yield from dotted_names(child, f"{dotted}.")
+
+
+@pytest.fixture(scope="module")
+def known_options() -> set[str]:
+    """Every option of our commands, of our methods and of nerfstudio's commands."""
+    from nerfstudio.configs.base_config import ViewerConfig
+    from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+    from nerfstudio.scripts import eval as host_eval
+    from nerfstudio.scripts import render
+
+    from edge_depth_nerf.config import edge_depth_nerf
+    from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
+
+    names = set(dotted_names(edge_depth_nerf.config))
+    names |= {f"viewer.{name}" for name in dotted_names(ViewerConfig())}
+    names |= {*dotted_names(FisheyeDepthDataParserConfig()), *dotted_names(NerfstudioDataParserConfig())}
+    own = [cls for _, cls in load("make_options").commands()]
+    for cls in (*own, *vars(render).values(), host_eval.ComputePSNR):
+        if isinstance(cls, type) and dataclasses.is_dataclass(cls):
+            entries = [entry.name.replace("_", "-") for entry in dataclasses.fields(cls)]
+            names |= {*entries, *(f"no-{name}" for name in entries)}
+    # of ns-export, which cannot be imported where open3d misses libusb
+    return {f"--{name}" for name in names} | {"--help", "--normal-method"}
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_options_named_in_the_text_exist(page, known_options):
+    text = re.sub(r"```.*?```", "", (ROOT / page).read_text(encoding="utf-8"), flags=re.DOTALL)
+    spans = [
+        span
+        for span in re.findall(r"`([^`]+)`", text)
+        if not re.match(r"(pip|hf|python|pytest|apt-get|git|ssh) ", span)
+    ]
+    named = {name for span in spans for name in re.findall(r"(?<![\w-])--[a-z][\w.-]*\w", span)}
+    assert not named - known_options - {"--force-reinstall"}
+
+
+# ---- what is generated -----------------------------------------------------------------------------------------
+
+
+def test_the_page_of_options_is_current():
+    assert (DOCS / "options.md").read_text(encoding="utf-8") == load("make_options").page(), (
+        "run python docs/make_options.py"
+    )
+
+
+def test_the_page_of_options_has_them_all(capsys, monkeypatch):
+    """Against the commands' own help, which is made in another way."""
+    monkeypatch.setenv("COLUMNS", "300")
+    text = (DOCS / "options.md").read_text(encoding="utf-8")
+    every = [words for words, _ in load("make_options").commands()]
+    assert {("synthesize",), ("process", "rig"), ("inspect",), ("camera-path",)} < set(every)
+    for words in every:
+        with pytest.raises(SystemExit):
+            tyro.cli(cli.Command, prog="edge-depth-nerf", args=[*words, "--help"])
+        named = set(re.findall(r"(?<![\w-])--[a-z][\w-]+", capsys.readouterr().out)) - {"--help"}
+        assert len(named) > 2 or words == ("doctor",)
+        assert not [name for name in named if f"`{name}`" not in text], words
+    assert "| `--pipeline.model.depth-loss-mult` | number | `0.01`; paper: `1e-05` |" in text
+    assert "| `--pipeline.datamanager.alpha` | number | `0.7` |" in text
+
+
+def test_the_pictures_are_current(tmp_path):
+    figures = load("make_pictures").make_pictures(tmp_path)
+    # Eq. 7 at the edge: what the page says of it
+    text = (DOCS / "method.md").read_text(encoding="utf-8")
+    for metres in figures.values():
+        assert f"{metres:.2f} m" in text
+    assert abs(figures["edge-aware"] / figures["truth"] - 1) < 0.02
+    assert abs(figures["spatial-gaussian"] / figures["truth"] - 1) > 0.2
+    for name in ("method_maps.png", "method_kernel.png"):
+        made, committed = (read_image(folder / name).astype(float) for folder in (tmp_path, DOCS))
+        # another OpenCV may draw text by a shade differently
+        assert made.shape == committed.shape and np.abs(made - committed).mean() < 1, name
+    assert (tmp_path / "method_ray.svg").stat().st_size > 5000
+    committed = [path for path in DOCS.iterdir() if path.name.startswith("method_")]
+    assert {path.name for path in committed} == {path.name for path in tmp_path.iterdir()}
+    assert sum(path.stat().st_size for path in committed) < 1 << 20
+
+
+def test_the_kernel_picture_is_of_eq_7():
+    """The two averages again, Eq. 5 to 7 written out."""
+    module = load("make_pictures")
+    scene = module.read_scene(ROOT / "data" / "sample_drive")
+    picture = next(each for each in scene.pictures if each.moment == module.MOMENT and each.camera == module.CAMERA)
+    maps = scene.maps(picture)
+    mono = module.aligned(scene, maps).astype(float)
+    i, j = module.find_edge(module.aligned(scene, maps), maps, 4)
+    _, figures = module.draw_kernel(scene, maps)
+    for name, has_depth_factor in (("spatial-gaussian", False), ("edge-aware", True)):
+        above = below = 0.0
+        for k in range(-4, 5):
+            for l in range(-4, 5):
+                d, d_hat = float(maps.lidar_m[i + k, j + l]), mono[i + k, j + l]
+                g = np.exp(-(k * k + l * l) / 18) * np.exp(-has_depth_factor * (mono[i, j] - d_hat) ** 2 / 2)
+                weight = g * (0.7 if d > 0 else 0.3)
+                above, below = above + weight * (d if d > 0 else d_hat), below + weight
+        np.testing.assert_allclose(figures[name], above / below, rtol=1e-4)
+
+
+# ---- the site --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory) -> Path:
+    pytest.importorskip("material", reason="pip install edge-depth-nerf[docs]")
+    folder = tmp_path_factory.mktemp("site")
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)],
+        cwd=ROOT,
+        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder
+
+
+class References(HTMLParser):
+    """What a page of HTML loads, and what it links to."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.loads: list[str] = []
+        self.links: list[str] = []
+        self.styles = ""
+        self._in_style = False
+        self.feed(path.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = {name: value or "" for name, value in attrs}
+        self._in_style = tag == "style"
+        if tag == "a":
+            self.links.append(values.get("href", ""))
+        elif tag == "link":
+            self.loads += [values["href"]] if values.get("rel") not in ("canonical", "prev", "next") else []
+        else:
+            self.loads += [values[name] for name in ("src", "srcset", "data", "poster") if values.get(name)]
+        self.styles += values.get("style", "")
+
+    def handle_data(self, data: str) -> None:
+        if self._in_style:
+            self.styles += data
+
+
+def is_elsewhere(reference: str) -> bool:
+    return bool(re.match(r"\s*([a-z]+:)?//", reference))
+
+
+def test_the_site_needs_no_network(site):
+    pages = sorted(site.rglob("*.html"))
+    assert len(pages) > 15
+    for page in pages:
+        found = References(page)
+        assert len(found.loads) > 3, page
+        assert not [each for each in found.loads if is_elsewhere(each)], page
+        assert not re.search(r"(url\(|@import)\s*['\"]?\s*(https?:)?//", found.styles), page
+        # Material fetches its program for diagrams where there are any
+        assert "mermaid" not in page.read_text(encoding="utf-8"), page
+    for style in site.rglob("*.css"):
+        text = style.read_text(encoding="utf-8")
+        assert not re.search(r"(url\(|@import)\s*['\"]?\s*(https?:)?//", text), style
+
+
+def test_what_loads_elsewhere_is_noticed(tmp_path):
+    page = tmp_path / "page.html"
+    page.write_text(
+        '<script src="//x.org/a.js"></script><link rel=stylesheet href="https://x.org/a.css"><img src="a.png">'
+    )
+    assert [is_elsewhere(each) for each in References(page).loads] == [True, True, False]
+
+
+def test_links_and_pictures_of_the_site_are_there(site):
+    for page in site.rglob("*.html"):
+        if page.name == "404.html":
+            continue  # its links are from the server's root
+        found = References(page)
+        local = [each for each in (*found.loads, *found.links) if not re.match(r"([a-z]+:|//|#|$)", each)]
+        assert local, page
+        for reference in local:
+            target = page.parent / reference.partition("#")[0].partition("?")[0]
+            assert target.exists(), f"{page.name}: {reference}"
+
+
+def test_every_page_is_in_the_navigation():
+    config = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
+
+    def pages(entries) -> Iterator[str]:
+        for entry in entries:
+            for value in entry.values():
+                yield from [value] if isinstance(value, str) else pages(value)
+
+    named = list(pages(config["nav"]))
+    assert len(set(named)) == len(named)
+    assert {path.name for path in DOCS.glob("*.md")} <= set(named)
+    assert config["theme"]["font"] is False and config["strict"] is True
+
+
+def test_included_code_is_shown(site):
+    text = re.sub(r"<[^>]+>", "", (site / "extending.html").read_text(encoding="utf-8"))
+    for name in ("new_data_set", "new_loss", "new_network"):
+        assert f"examples/{name}.py" not in text.replace(f"docs/examples/{name}.py", ""), name
+    assert "class RatioModel" in text and "def read_drive" in text and "def predict" in text
+    # the table of figures of README
+    assert "masked PSNR" in (site / "index.html").read_text(encoding="utf-8")
+
+
+# ---- the examples ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def clone(tmp_path) -> Path:
+    """A folder with what commands of the pages use of the repository; the scene is written into."""
+    shutil.copytree(ROOT / "data", tmp_path / "data", ignore=shutil.ignore_patterns(".cache"))
+    shutil.copytree(DOCS / "examples", tmp_path / "docs" / "examples", ignore=shutil.ignore_patterns("__pycache__"))
+    return tmp_path
+
+
+def run_blocks(page: str, folder: Path) -> str:
+    """Run the blocks of a page that are marked, in order, as typed; trainings end after three steps."""
+    marked = [block.text for block in ALL_BLOCKS if block.page == page and block.is_run]
+    script = re.sub(
+        r"^(ns-train \S+)",
+        r"\1 --max-num-iterations 3 --viewer.quit-on-train-completion True",
+        "\n".join(("set -euo pipefail", *marked)),
+        flags=re.MULTILINE,
+    )
+    done = subprocess.run(
+        ["bash", "-c", script.replace("/DATE/", "/*/")],
+        cwd=folder,
+        env={
+            **os.environ,
+            "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+            "OMP_NUM_THREADS": "1",
+        },
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=TIMEOUT_S,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout[-4000:]
+    return done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is missing (Debian: apt-get install ffmpeg)")
+def test_the_quick_start_as_it_is_typed(clone):
+    run_blocks("docs/quick_start.md", clone)
+    assert list((clone / "data/sample_drive_inspection").glob("image_0*.png"))
+    assert np.isfinite(read_json(clone / "figures.json")["results"]["masked_psnr"])
+    film = cv2.VideoCapture(str(clone / "film.mp4"))
+    assert film.get(cv2.CAP_PROP_FRAME_COUNT) >= 11
+    assert (film.get(cv2.CAP_PROP_FRAME_WIDTH), film.get(cv2.CAP_PROP_FRAME_HEIGHT)) == (192, 108)
+
+
+@pytest.mark.slow
+def test_the_examples_as_they_are_typed(clone):
+    said = run_blocks("docs/extending.md", clone)
+    (config,) = (clone / "outputs/sample_drive/ratio").glob("*/config.yml")
+    assert "ratio_delta: 0.2" in config.read_text()
+    # the flat road: every map is there, and of the road it is right
+    meta = read_json(clone / "data/sample_drive/transforms.json")
+    assert meta["mono"]["trained_on"] == "elsewhere"
+    assert len(list((clone / "maps").rglob("*.npy"))) == len(meta["frames"]) == 24
+    assert "mean relative error" in said
+
+
+def test_the_example_of_a_loss():
+    module = load("examples/new_loss")
+    generator = torch.Generator().manual_seed(0)
+    weights = torch.rand(5, 7, generator=generator, dtype=torch.float64).requires_grad_()
+    middles = torch.rand(5, 7, generator=generator, dtype=torch.float64) * 10
+    prior = torch.tensor([3.0, 0, 8, 20, 0.5], dtype=torch.float64)
+    loss = module.ratio_loss(weights, middles, prior, 0.1)
+    ratio = np.log((weights.detach().numpy() * middles.numpy()).sum(1) + 1e-3) - np.log(np.where(prior > 0, prior, 1))
+    huber = np.where(np.abs(ratio) < 0.1, ratio**2 / 2, 0.1 * (np.abs(ratio) - 0.05))
+    assert float(loss.detach()) == pytest.approx(huber[prior.numpy() > 0].mean())
+    loss.backward()
+    assert weights.grad is not None and (weights.grad[1] == 0).all() and (weights.grad[0] != 0).all()
+    assert float(module.ratio_loss(weights.detach(), middles, prior * 0, 0.1)) == 0
+
+
+def test_the_example_of_a_loss_is_a_method_of_its_own():
+    from edge_depth_nerf.config import edge_depth_nerf_lite
+
+    made = load("examples/new_loss").ratio().config
+    lite = edge_depth_nerf_lite.config
+    differing = {
+        entry.name
+        for entry in dataclasses.fields(lite.pipeline.model)
+        if getattr(made.pipeline.model, entry.name) != getattr(lite.pipeline.model, entry.name)
+    }
+    assert differing == {"_target", "depth_loss_mult"}
+    assert lite.method_name == "edge-depth-nerf-lite" and made.method_name == "ratio"
+
+
+def test_the_example_of_a_network():
+    """On the road, distances are those of a plane below the camera."""
+    module = load("examples/new_network")
+    scene = load("make_pictures").read_scene(ROOT / "data" / "sample_drive")
+    picture = scene.pictures[0]
+    predicted = module.predict(read_image(picture.files["image"]), picture)
+    rays, valid = picture.lens.unproject(picture.lens.pixel_centres())
+    # OpenCV's axes to nerfstudio's, then to the world
+    down = -(rays.numpy() * [1, -1, -1] @ picture.rotation.T)[..., 2]
+    steep = valid.numpy() & (down > 0.1)
+    assert steep.sum() > 1000
+    np.testing.assert_allclose((predicted * down)[steep], module.CAMERA_HEIGHT_M, rtol=1e-4)
+    assert (predicted[valid.numpy() & (down < 0)] == module.HORIZON_M).all()
+
+
+def test_the_example_of_a_data_set(tmp_path):
+    """A car that drives through an empty hall, askew, so that each wall shows whether points are de-skewed."""
+    module = load("examples/new_data_set")
+    root, hall = tmp_path / "drive", np.array([[-30.0, -12, 0], [40, 9, 6]])
+    (root / "pictures").mkdir(parents=True)
+    (root / "scans").mkdir()
+    heading = 0.6
+    ahead = np.array([np.cos(heading), np.sin(heading), 0])
+    to_world = np.stack((ahead, [-ahead[1], ahead[0], 0], [0, 0, 1]), 1)
+    along = np.arange(12)[:, None] * 0.8 * ahead
+    np.savetxt(root / "poses.txt", np.column_stack((along[:, :2], np.full(12, heading))))
+
+    def distances(origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            along_ray = (np.where(rays > 0, hall[1], hall[0]) - origin) / rays
+        return np.where(rays == 0, np.inf, along_ray).min(-1)
+
+    azimuth, elevation = np.meshgrid(np.radians(np.arange(0, 360, 0.5)), np.radians(np.linspace(-24, 4, 48)))
+    beams = np.stack(
+        (np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)), -1
+    ).reshape(-1, 3)
+    # clockwise, a turn in 0.1 s, ahead in its middle: the car goes 0.8 m meanwhile
+    turned = -(((azimuth + np.pi) % (2 * np.pi)) - np.pi) / (2 * np.pi)
+    generator = np.random.default_rng(0)
+    for frame, place in enumerate(along):
+        origins = place + 0.8 * turned.reshape(-1, 1) * ahead + [0, 0, 1.8]
+        points = beams * distances(origins, beams @ to_world.T)[:, None]
+        np.save(root / f"scans/{frame:06d}.npy", points.astype(np.float32))
+        picture = generator.integers(0, 255, (96, 128, 3), dtype=np.uint8)
+        cv2.imwrite(str(root / f"pictures/{frame:06d}.png"), picture)
+    options = module.MyDriveOptions(root=root, output=tmp_path / "scene", find_ego=False, sweeps=1, first=2, frames=8)
+    module.convert(options)
+
+    meta = read_json(tmp_path / "scene/transforms.json")
+    assert len(meta["frames"]) == 8
+    rays, _ = module.LENS.unproject(module.LENS.pixel_centres())
+    directions = rays.numpy() @ module.CAMERA_TO_VEHICLE[:3, :3].T @ to_world.T
+    for frame in meta["frames"]:
+        lidar = read_distance_png(tmp_path / "scene" / frame["lidar_file_path"])
+        origin = along[int(Path(frame["file_path"]).stem)] + to_world @ module.CAMERA_TO_VEHICLE[:3, 3]
+        true = distances(origin, directions)
+        found = (lidar > 0) & np.isfinite(true)
+        assert found.sum() > 300
+        # a pixel holds the nearest of the returns that fall into it
+        assert np.median(np.abs(lidar[found] / true[found] - 1)) < 0.006
+    shutil.rmtree(root / "scans")
+    with pytest.raises(module.InputError, match=r"scans/000000\.npy: no such file"):
+        module.read_drive(options)
