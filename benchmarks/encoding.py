@@ -3,10 +3,10 @@
     python benchmarks/encoding.py [--repeat 15] [--threads 1 2] [--device cpu|cuda] [--json FILE]
 
 Three sizes: the lite preset's field, nerfacto's proposal networks, nerfacto's field. Points lie along rays, 32 to a
-ray, as a training batch's do, or (last row of a size) anywhere. The two forms run in turn and a ratio is taken between
-neighbouring runs, so that what else the machine does hits both; median and quartiles over the repeats. Wall time is
-the median; CPU time counts all threads. "with positions" has the gradient to the positions besides the table's.
-Backward's results are compared before it is timed: largest difference by the largest value.
+ray, as a training batch's do, or (last row of a size) anywhere. The two forms run in turn, each from rest, and a ratio
+is taken between neighbouring runs, so that what else the machine does hits both; median and quartiles over the
+repeats. Wall time is the median; CPU time counts all threads. "with positions" has the gradient to the positions
+besides the table's. Backward's results are compared before it is timed: largest difference by the largest value.
 
 On CUDA (Triton) events on the device are timed, and the traffic that cannot be avoided (positions, features or their
 gradient once, eight corners a level, read, or read and written) is set against the time: GB/s.
@@ -29,6 +29,8 @@ from torch import Tensor
 
 from edge_depth_nerf.encodings.fused import use_fused_encodings
 
+PAUSE_S = 0.02
+"""Before each run: torch's threads spin for some milliseconds after their work, which would be the next form's time."""
 # levels, log2 of a level's rows, points, finest resolution
 SIZES = {
     "field, lite": (8, 16, 24576, 512),
@@ -65,6 +67,7 @@ def clock(work: Callable[[], object], device: str) -> tuple[float, float]:
 def one_run(encoding: HashEncoding, x: Tensor, gradient: Tensor, device: str) -> dict[str, tuple[float, float]]:
     """Clock the parts of one step."""
     encoded = [torch.empty(0)]
+    time.sleep(PAUSE_S)
 
     def forward() -> None:
         encoded[0] = encoding(x)

@@ -7,9 +7,10 @@ nerfstudio's nerfacto and depth-nerfacto with its own DataManager and its torch 
 implementation and with the one that `auto` takes. (nerfstudio's nerfacto would read ahead in other processes, which
 two cores do not have; VanillaDataManager, its other one, is used for both.) Each round, every trainer makes the same
 number of whole training iterations (batch, forward, losses, backward, optimisers, schedulers) in turn, at steps spread
-over the whole schedule, since proposal networks are trained less often later. A held-out picture is rendered by each
-in turn, too. Ratios are taken within a round: what else the machine does hits all of them. Median and range over the
-rounds.
+over the whole schedule, since proposal networks are trained less often later. A held-out view, or as many of its rows
+as `--view-rays` allows, is rendered by each in turn, too. Ratios are taken within a round: what else the machine does
+hits all of them. Median and range over the rounds. Each trainer has a process of its own, which sleeps while it is
+another's turn.
 """
 
 from __future__ import annotations
@@ -18,14 +19,15 @@ import argparse
 import copy
 import dataclasses
 import json
+import multiprocessing
 import os
 import platform
 import statistics
 import tempfile
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
-from dataclasses import dataclass
+import warnings
+from collections.abc import Callable, Sequence
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +37,7 @@ from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
-from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.models.depth_nerfacto import DepthNerfactoModelConfig
 from nerfstudio.models.nerfacto import NerfactoModelConfig
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -45,69 +47,128 @@ from edge_depth_nerf import config as ours
 from edge_depth_nerf.compat import lpips_not_built
 
 PRESETS: dict[str, Any] = {"lite": ours.edge_depth_nerf_lite, "full": ours.edge_depth_nerf}
+HOST = {"nerfacto": NerfactoModelConfig, "depth-nerfacto": DepthNerfactoModelConfig}
+OURS = {"ours, torch": "torch", "ours": "auto"}
 REFERENCE = "nerfacto"
 
 
-@dataclass
-class Contestant:
-    """A trainer, and the seconds it took in each round."""
+class Runner:
+    """A trainer in this process."""
 
-    trainer: Trainer
-    step_s: list[float] = dataclasses.field(default_factory=list)
-    render_s: list[float] = dataclasses.field(default_factory=list)
+    def __init__(self, config: TrainerConfig, folder: Path) -> None:
+        config.machine.device_type = "cuda" if torch.cuda.is_available() else "cpu"
+        config.machine.seed = 0
+        config.vis = "tensorboard"
+        config.output_dir = folder
+        config.experiment_name, config.timestamp = "speed", "run"
+        config.logging.local_writer.enable = False
+        torch.manual_seed(0)
+        with lpips_not_built():
+            self.trainer = config.setup(local_rank=0, world_size=1)
+            self.trainer.setup(test_mode="val")
+        self.trainer.pipeline.train()
 
-    def iterate(self, step: int) -> None:
-        """One iteration as nerfstudio's trainer makes it."""
+    def iterate(self, steps: Sequence[int]) -> float:
+        """Seconds of some iterations as nerfstudio's trainer makes them."""
+        return seconds(lambda: [self._iterate(step) for step in steps])
+
+    def _iterate(self, step: int) -> None:
         for callback in self.trainer.callbacks:
             callback.run_callback_at_location(step, location=TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
         self.trainer.train_iteration(step)
         for callback in self.trainer.callbacks:
             callback.run_callback_at_location(step, location=TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
 
+    def render(self, most_rays: int) -> tuple[float, tuple[int, int]]:
+        """Seconds of rendering rows from the middle of the first held-out view, and their height and width."""
+        pipeline: Any = self.trainer.pipeline
+        pipeline.eval()
+        camera = pipeline.datamanager.eval_dataset.cameras[0:1].to(pipeline.device)
+        coords = camera.get_image_coords()
+        height, width = coords.shape[:2]
+        rows = min(height, max(1, most_rays // width))
+        first = (height - rows) // 2
+        indices = torch.zeros(rows, width, 1, dtype=torch.long, device=camera.device)
 
-def configurations(preset: str, scene: Path) -> dict[str, Any]:
-    """The contestants' configurations."""
+        def work() -> None:
+            rays = camera.generate_rays(indices, coords[first : first + rows].to(camera.device))
+            pipeline.model.get_outputs_for_camera_ray_bundle(rays)
+
+        with torch.no_grad():
+            taken = seconds(work)
+        pipeline.train()
+        return taken, (rows, width)
+
+
+def serve(pipe: Connection, config: TrainerConfig) -> None:
+    """A contestant's process: it does what it is asked, one thing after the other."""
+    warnings.simplefilter("ignore")
+    with tempfile.TemporaryDirectory() as folder:
+        runner = Runner(config, Path(folder))
+        pipe.send("ready")
+        while (request := pipe.recv()) is not None:
+            name, argument = request
+            pipe.send(getattr(runner, name)(argument))
+
+
+class Contestant:
+    """A trainer in a process of its own, and the seconds it took in each round."""
+
+    def __init__(self, config: TrainerConfig) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, other = context.Pipe()
+        self._process = context.Process(target=serve, args=(other, config), daemon=True)
+        self._process.start()
+        other.close()
+        self.step_s: list[float] = []
+        self.render_s: list[float] = []
+        self.rendered_px = (0, 0)
+
+    def wait(self) -> None:
+        """Until it is ready."""
+        self._pipe.recv()
+
+    def ask(self, name: str, argument: Any) -> Any:
+        """Let it do one thing."""
+        self._pipe.send((name, argument))
+        return self._pipe.recv()
+
+    def stop(self) -> None:
+        """End its process."""
+        self._pipe.send(None)
+        self._process.join()
+
+
+def configurations(
+    preset: str, scene: Path, names: Sequence[str], change: Callable[[Any], None] = lambda _: None
+) -> dict[str, Any]:
+    """The contestants' configurations; `change` is made to what all of them get."""
     base: Any = copy.deepcopy(PRESETS[preset].config)
     base.pipeline.datamanager.dataparser.data = scene
     base.pipeline.datamanager.data = scene
+    change(base)
     found = {}
-    for name, kind in (("nerfacto", NerfactoModelConfig), ("depth-nerfacto", DepthNerfactoModelConfig)):
+    for name in names:
+        if name in OURS:
+            found[name] = copy.deepcopy(base)
+            found[name].pipeline.model.implementation = OURS[name]
+            continue
         config: Any = copy.deepcopy(method_configs["depth-nerfacto"])
         shared = {
             field.name: copy.deepcopy(getattr(base.pipeline.model, field.name))
             for field in dataclasses.fields(NerfactoModelConfig)
             if field.name not in ("_target", "implementation")
         }
-        config.pipeline.model = kind(**shared, implementation="torch")
+        config.pipeline.model = HOST[name](**shared, implementation="torch")
         data = config.pipeline.datamanager
         data.dataparser = NerfstudioDataParserConfig(data=scene, depth_unit_scale_factor=1 / 256)
-        if kind is NerfactoModelConfig:
+        if name == "nerfacto":
             data._target = VanillaDataManager[InputDataset]
         data.train_num_rays_per_batch = base.pipeline.datamanager.train_num_rays_per_batch
         config.mixed_precision = base.mixed_precision
         config.max_num_iterations = base.max_num_iterations
         found[name] = config
-    for name, implementation in (("ours, torch", "torch"), ("ours", "auto")):
-        config = copy.deepcopy(base)
-        config.pipeline.model.implementation = implementation
-        found[name] = config
     return found
-
-
-def build(config: TrainerConfig, folder: Path) -> Trainer:
-    """A trainer that is ready."""
-    config.machine.device_type = "cuda" if torch.cuda.is_available() else "cpu"
-    config.machine.seed = 0
-    config.vis = "tensorboard"
-    config.output_dir = folder
-    config.experiment_name, config.timestamp = "speed", "run"
-    config.logging.local_writer.enable = False
-    torch.manual_seed(0)
-    with lpips_not_built():
-        trainer = config.setup(local_rank=0, world_size=1)
-        trainer.setup(test_mode="val")
-    trainer.pipeline.train()
-    return trainer
 
 
 def seconds(work: Callable[[], Any]) -> float:
@@ -119,39 +180,41 @@ def seconds(work: Callable[[], Any]) -> float:
     return time.perf_counter() - started
 
 
-def measure(preset: str, scene: Path, rounds: int, steps: int) -> dict[str, Any]:
-    """Run all contestants of a preset."""
-    with ExitStack() as stack:
-        contestants = {}
-        for name, config in configurations(preset, scene).items():
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-            CONSOLE.print(f"Building {name} ({preset})")
-            contestants[name] = Contestant(build(config, folder))
-        schedule = PRESETS[preset].config.max_num_iterations
-        spread = [round((number + 0.5) * schedule / (rounds * steps)) for number in range(rounds * steps)]
-        for contestant in contestants.values():  # kernels are compiled, memory is there
-            for step in range(3):
-                contestant.iterate(step)
-        for number in range(rounds):
-            chosen = spread[number * steps : (number + 1) * steps]
-            for contestant in contestants.values():
-                whole_s = seconds(lambda c=contestant, s=chosen: [c.iterate(step) for step in s])
-                contestant.step_s.append(whole_s / steps)
-            for contestant in contestants.values():
-                pipeline = contestant.trainer.pipeline
-                pipeline.eval()
-                camera = pipeline.datamanager.eval_dataset.cameras[0:1].to(pipeline.device)
-                with torch.no_grad():
-                    contestant.render_s.append(seconds(lambda p=pipeline, c=camera: p.model.get_outputs_for_camera(c)))
-                pipeline.train()
-            CONSOLE.print(f"{preset}: round {number + 1} of {rounds}")
-    rays = PRESETS[preset].config.pipeline.datamanager.train_num_rays_per_batch
+def race(configs: dict[str, Any], rounds: int, steps: int, view_rays: int = 0) -> dict[str, Any]:
+    """Let trainers of these configurations take turns.
+
+    Returns:
+        Of each: rays_per_second (median), seconds of a step and of the rows of a view in each round, and the
+        reference's seconds over its own.
+
+    """
+    some = next(iter(configs.values()))
+    rays, schedule = some.pipeline.datamanager.train_num_rays_per_batch, some.max_num_iterations
+    spread = [round((number + 0.5) * schedule / (rounds * steps)) for number in range(rounds * steps)]
+    contestants = {}
+    for name, config in configs.items():  # one after the other: the first writes what all find in the cache
+        CONSOLE.print(f"Building {name}")
+        contestants[name] = Contestant(config)
+        contestants[name].wait()
+    for contestant in contestants.values():  # kernels are compiled, memory is there
+        contestant.ask("iterate", range(3))
+    for number in range(rounds):
+        chosen = spread[number * steps : (number + 1) * steps]
+        for contestant in contestants.values():
+            contestant.step_s.append(contestant.ask("iterate", chosen) / steps)
+        for contestant in contestants.values() if view_rays else ():
+            taken, contestant.rendered_px = contestant.ask("render", view_rays)
+            contestant.render_s.append(taken)
+        CONSOLE.print(f"Round {number + 1} of {rounds}")
+    for contestant in contestants.values():
+        contestant.stop()
     reference = contestants[REFERENCE]
     return {
         name: {
             "rays_per_second": rays / statistics.median(contestant.step_s),
             "step_s": contestant.step_s,
             "step_ratio": [a / b for a, b in zip(reference.step_s, contestant.step_s, strict=True)],
+            "rendered_px": contestant.rendered_px,
             "render_s": contestant.render_s,
             "render_ratio": [a / b for a, b in zip(reference.render_s, contestant.render_s, strict=True)],
         }
@@ -159,8 +222,27 @@ def measure(preset: str, scene: Path, rounds: int, steps: int) -> dict[str, Any]
     }
 
 
-def spread_of(values: list[float], form: str) -> str:
-    """Median and range."""
+def machine() -> dict[str, Any]:
+    """What a result depends on."""
+    processor = platform.processor() or platform.machine()
+    about = Path("/proc/cpuinfo")
+    if about.is_file():
+        models = [line.split(":")[1].strip() for line in about.read_text().splitlines() if "model name" in line]
+        processor = models[0] if models else processor
+    return {
+        "processor": processor,
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+    }
+
+
+def spread_of(values: Sequence[float], form: str) -> str:
+    """Median and range; a dash where there are none."""
+    if not values:
+        return "–"
     return f"{statistics.median(values):{form}} ({min(values):{form}}-{max(values):{form}})"
 
 
@@ -169,21 +251,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", type=Path, default=Path("data/sample_drive"))
     parser.add_argument("--preset", nargs="+", default=["lite"], choices=list(PRESETS))
+    parser.add_argument("--contestants", nargs="+", default=[*HOST, *OURS], choices=[*HOST, *OURS])
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--steps", type=int, default=10)
+    parser.add_argument("--view-rays", type=int, default=1 << 16, help="at most so many are rendered; 0 for none")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
-    results: dict[str, Any] = {
-        "machine": {
-            "processor": platform.processor() or platform.machine(),
-            "cores": os.cpu_count(),
-            "threads": torch.get_num_threads(),
-            "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
-            "torch": torch.__version__,
-        }
-    }
+    results: dict[str, Any] = {"machine": machine()}
+    names = list(dict.fromkeys([REFERENCE, *options.contestants]))
     for preset in options.preset:
-        results[preset] = measure(preset, options.scene, options.rounds, options.steps)
+        configs = configurations(preset, options.scene, names)
+        results[preset] = race(configs, options.rounds, options.steps, options.view_rays)
         table = Table(
             "", "rays/s", "s a step", "× nerfacto", "s a view", "× nerfacto", title=f"{preset}, {options.scene}"
         )
