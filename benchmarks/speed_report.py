@@ -178,16 +178,20 @@ def draw(results: dict[str, Any], path: Path) -> None:
     panels = [(part, GROWTH[part], "ms a step", step_ms) for part in GROWTH]
     panels.append(("frames", "pictures of 350 px", "memory of training data, MB", data_mb))
     for axis, (part, across, up, value_of) in zip(axes, panels, strict=True):
+        rows = results.get(part, [])
+        if not rows:
+            axis.set_axis_off()
+            continue
         for name, colour in colours.items():
-            rows = results.get(part, [])
             axis.plot([row["value"] for row in rows], [value_of(row, name) for row in rows], "o-", color=colour, ms=4)
         axis.set(xscale="log", yscale="log", xlabel=across, ylabel=up)
-        ticks = [row["value"] for row in results.get(part, [])]
+        ticks = [row["value"] for row in rows]
         axis.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
         axis.minorticks_off()
         axis.grid(color="#dddddd", lw=0.6)
         axis.spines[["top", "right"]].set_visible(False)
-    axes[0].legend(["nerfacto, torch", "ours"], frameon=False)
+    if results.get("rays"):
+        axes[0].legend(["nerfacto, torch", "ours"], frameon=False)
     write_atomically(path, lambda temporary: figure.savefig(temporary, format="svg", metadata={"Date": None}))
     plt.close(figure)
 
