@@ -1,7 +1,7 @@
 """How good the masks are, against the truth of synthetic drives and against KITTI-360's real masks.
 
     python benchmarks/masks.py --output outputs/masks
-    python benchmarks/masks.py --drives /tmp/drives/street350 /tmp/drives/turn350 --overlays outputs/overlays
+    python benchmarks/masks.py --drives drives/street drives/turn --overlays outputs/overlays
 
 Prints tables: the lens circle from the dark rim, the vehicle found from the pictures (of few frames, and under light
 that changes), the sky with and without monocular maps, and what can be said of the real frame. Without --drives it
