@@ -16,7 +16,7 @@ RESULTS = ROOT / "benchmarks" / "results.json"
 @pytest.fixture
 def report(monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    import speed_report
+    import speed_report  # pyright: ignore[reportMissingImports]
 
     yield speed_report
     sys.modules.pop("speed_report")
