@@ -54,7 +54,7 @@ check-dist: dist
 	$(PYTHON) -m venv $(FRESH)
 	$(FRESH)/bin/pip install --quiet --disable-pip-version-check dist/*.whl
 	cd build && fresh/bin/edge-depth-nerf --help >/dev/null && fresh/bin/edge-depth-nerf doctor
-	cd build && fresh/bin/ns-train --help | grep -q edge-depth-nerf-lite
+	cd build && fresh/bin/ns-train --help | grep edge-depth-nerf-lite >/dev/null
 	cd build && fresh/bin/edge-depth-nerf inspect ../data/sample_drive --frames 1 --output inspection
 	$(FRESH)/bin/pip install --quiet --disable-pip-version-check --no-deps --force-reinstall dist/*.tar.gz
 	cd build && fresh/bin/edge-depth-nerf --help >/dev/null && fresh/bin/edge-depth-nerf doctor
