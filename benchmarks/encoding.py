@@ -64,10 +64,12 @@ def clock(work: Callable[[], object], device: str) -> tuple[float, float]:
     return first.elapsed_time(last) / 1000, time.process_time() - start_cpu
 
 
-def one_run(encoding: HashEncoding, x: Tensor, gradient: Tensor, device: str) -> dict[str, tuple[float, float]]:
+def one_run(
+    encoding: HashEncoding, x: Tensor, gradient: Tensor, device: str, pause_s: float
+) -> dict[str, tuple[float, float]]:
     """Clock the parts of one step."""
     encoded = [torch.empty(0)]
-    time.sleep(PAUSE_S)
+    time.sleep(pause_s)
 
     def forward() -> None:
         encoded[0] = encoding(x)
@@ -99,7 +101,9 @@ def quartiles(values: list[float]) -> tuple[float, float, float]:
     return low, middle, high
 
 
-def measure(size: str, device: str, threads: int, repeat: int, *, along_rays: bool, of_positions: bool) -> list[dict]:
+def measure(
+    size: str, device: str, threads: int, repeat: int, *, along_rays: bool, of_positions: bool, pause_s: float = PAUSE_S
+) -> list[dict]:
     """Run the two forms in turn; a dictionary for forward, backward and both."""
     levels, log2_rows, count, finest = SIZES[size]
     torch.manual_seed(0)
@@ -112,7 +116,7 @@ def measure(size: str, device: str, threads: int, repeat: int, *, along_rays: bo
     x = make_points(count, along_rays=along_rays).to(device).requires_grad_(of_positions)
     gradient = torch.randn(count, host.get_out_dim(), device=device)
     difference = differences(host, fused, x, gradient)
-    runs = [[one_run(encoding, x, gradient, device) for encoding in (host, fused)] for _ in range(repeat)]
+    runs = [[one_run(encoding, x, gradient, device, pause_s) for encoding in (host, fused)] for _ in range(repeat)]
     rows = []
     for part in ("forward", "backward", "both"):
         torch_wall, fused_wall = ([pair[form][part][0] for pair in runs] for form in (0, 1))
@@ -152,6 +156,7 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=15, help="how often each form runs")
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2], help="threads that both forms may use")
     parser.add_argument("--device", nargs="+", default=["cpu"] + ["cuda"] * torch.cuda.is_available())
+    parser.add_argument("--pause", type=float, default=PAUSE_S, help="seconds of rest before each run")
     parser.add_argument("--json", type=Path, help="write the figures here too")
     arguments = parser.parse_args()
 
@@ -169,7 +174,13 @@ def main() -> None:
             for threads in arguments.threads if device == "cpu" else [1]:
                 for along_rays, of_positions in ((True, False), (True, True), (False, False)):
                     found = measure(
-                        size, device, threads, arguments.repeat, along_rays=along_rays, of_positions=of_positions
+                        size,
+                        device,
+                        threads,
+                        arguments.repeat,
+                        along_rays=along_rays,
+                        of_positions=of_positions,
+                        pause_s=arguments.pause,
                     )
                     rows += found
                     for row in found:

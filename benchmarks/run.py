@@ -36,6 +36,7 @@ from typing import Any
 
 import cv2
 import encoding
+import integration
 import memory
 import speed
 import torch
@@ -217,15 +218,27 @@ print(json.dumps({"s": time.perf_counter() - started, "cpu_s": used.ru_utime, "p
 """
 
 
+def integration_s(threads: int) -> float:
+    """Best of five: the prior of a frame of 1400 px, in the default form."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    form, frame = integration.package_form(normalise="per-source"), integration.make_frame(1400)
+    form(*frame)
+    best = min(speed.seconds(lambda: form(*frame)) for _ in range(5))
+    torch.set_num_threads(before)
+    return best
+
+
 def preparation(work: Path) -> list[dict[str, Any]]:
-    """`process` of a drive of 1400 px on one core and on all: pictures, sweeps, masks, maps."""
+    """`process` of a drive of 1400 px on one core and on all (pictures, sweeps, masks, maps); integration likewise."""
     raw = drive(work, 1400, LARGE_FRAMES)
     rows = []
     for cores in sorted({1, os.cpu_count() or 1}):
         with temporary(work) as folder:
             command = [sys.executable, "-c", PREPARE, str(cores), *process_command(raw, folder / "scene")]
             done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
-            rows.append({"cores": cores, "pictures": 2 * LARGE_FRAMES, **json.loads(done.stdout.splitlines()[-1])})
+            row = {"cores": cores, "pictures": 2 * LARGE_FRAMES, **json.loads(done.stdout.splitlines()[-1])}
+            rows.append({**row, "integration_s": integration_s(cores)})
     return rows
 
 

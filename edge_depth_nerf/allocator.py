@@ -1,8 +1,8 @@
 """What the C library's allocator does with large tensors on the CPU.
 
 By default glibc takes memory for each tensor above 32 MB from the system and gives it back when the tensor dies, many
-times a step: every page is cleared and mapped again each time. Kept, it is there for the next one after the first few
-steps: a step of the full preset on two cores took 0.56 s in place of 0.71 s, rendering 0.9 s in place of 1.2 s.
+times a step: every page is cleared and mapped again each time. Kept, it is there for the next one after the first
+few steps.
 """
 
 from __future__ import annotations
