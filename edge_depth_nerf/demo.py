@@ -20,17 +20,33 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from edge_depth_nerf.compare.figures import BinnedErrors
+from edge_depth_nerf.compare.options import MethodName
+from edge_depth_nerf.compare.plots import PSNR_LABEL, Bins, plot_bins
+from edge_depth_nerf.compare.tables import Cell, MadeTable, Metric, Row, mark_best
 from edge_depth_nerf.demo_options import DemoOptions
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_json, write_json, write_png
-from edge_depth_nerf.pictures import side_by_side
+from edge_depth_nerf.pictures import distance_of_colours, side_by_side
 from edge_depth_nerf.process.command import process
 from edge_depth_nerf.process.options import Kitti360Options
-from edge_depth_nerf.runs import LoggedCommands, compared_views, progress_bars, step_of_line, steps_done, viewer_command
+from edge_depth_nerf.report.build import Commands, Facts, Plot, Report, write_report
+from edge_depth_nerf.report.views import REPORT, make_drives
+from edge_depth_nerf.runs import (
+    LoggedCommands,
+    command_line,
+    compared_views,
+    logged_commands,
+    progress_bars,
+    step_of_line,
+    steps_done,
+    viewer_command,
+)
 from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 
@@ -38,20 +54,25 @@ METHOD = "edge-depth-nerf-lite"
 RUNS = {"nerfacto": "none", "ours": "edge"}
 """Name of the run: its depth loss. nerfacto is our model without one, so near plane, scale, sampler, mask and
 initial density are the same."""
-TABLE_COLUMNS = {
-    "masked_psnr": ("masked PSNR ↑", ".2f"),
-    "masked_ssim": ("masked SSIM ↑", ".3f"),
-    "truth_masked_psnr": ("PSNR to clean ↑", ".2f"),
-    "lidar_abs_rel": ("AbsRel LiDAR ↓", ".3f"),
-    "truth_abs_rel": ("AbsRel truth ↓", ".3f"),
-    "truth_delta_1_25": ("δ<1.25 truth ↑", ".3f"),
-}
+METHODS: dict[str, MethodName] = {"nerfacto": "nerfacto", "ours": "edge"}
+"""What `compare` calls them; plots draw them alike."""
+COLUMNS = (
+    Metric("masked_psnr", "masked PSNR ↑", ".2f"),
+    Metric("masked_ssim", "masked SSIM ↑", ".3f"),
+    Metric("truth_masked_psnr", "PSNR to clean ↑", ".2f"),
+    Metric("lidar_abs_rel", "AbsRel LiDAR ↓", ".3f", -1),
+    Metric("truth_abs_rel", "AbsRel truth ↓", ".3f", -1),
+    Metric("truth_delta_1_25", "δ<1.25 truth ↑", ".3f"),
+)
 CAPTION = (
     "PSNR (dB) and SSIM inside the mask; clean: the picture without noise and exposure drift; "
-    "AbsRel and δ of the rendered median distance, 1-60 m"
+    "AbsRel and δ of the rendered median distance, 1-60 m."
 )
 VIEWS = 3
 PICTURE = "comparison.png"
+SHOWN_EDGES_M = (2.0, 4.0, 7.0, 12.0, 20.0, 35.0, 48.0)
+"""Bins of the true distance. Rendered ones are read from the saved pictures' colours, which end at 60 m: up to 48 m,
+whatever is farther is wrong by more than a quarter anyway."""
 
 
 def run_demo(options: DemoOptions, console: Console | None = None) -> dict[str, Any]:
@@ -109,7 +130,7 @@ def run_demo(options: DemoOptions, console: Console | None = None) -> dict[str, 
                         run.stop()
                     raise
     figures = {run.name: run.figures() for run in runs}
-    commands = [run.viewer_command for run in runs]
+    viewer_commands = [run.viewer_command for run in runs]
 
     write_png(output / PICTURE, _comparison(scene, output / "runs"))
     results = {
@@ -119,34 +140,97 @@ def run_demo(options: DemoOptions, console: Console | None = None) -> dict[str, 
         "cores": os.cpu_count(),
         "figures": figures,
         "seconds": clock.seconds,
-        "viewer_commands": commands,
+        "commands": [
+            command_line(["edge-depth-nerf", "demo"], options),
+            command_line(["edge-depth-nerf", "synthesize"], synthesis),
+            command_line(["edge-depth-nerf", "process", "kitti360"], processing),
+            *(line for run in runs for log in run.logs for line in logged_commands(log)),
+        ],
+        "viewer_commands": viewer_commands,
     }
+    write_report(output / REPORT, _report(results, output, console))
     write_json(finished, results)
     _show(results, output, console)
     return results
 
 
+def _table(results: dict[str, Any]) -> MadeTable:
+    rows = [
+        Row(name, [Cell(figure.get(metric.name), form=metric.form) for metric in COLUMNS])
+        for name, figure in results["figures"].items()
+    ]
+    mark_best(rows, [metric.best for metric in COLUMNS])
+    notes = [CAPTION]
+    if "masked_lpips" not in results["figures"]["ours"]:
+        notes.append("LPIPS is left out: its weights are not on this machine (nothing is downloaded).")
+    return MadeTable("", "Held-out views", [("", [metric.heading for metric in COLUMNS])], rows, notes)
+
+
+def _setting(results: dict[str, Any]) -> str:
+    return "{scene}, {frames} moments, {size} px, {steps} steps each".format(**results["options"])
+
+
 def _show(results: dict[str, Any], output: Path, console: Console) -> None:
-    options, figures = results["options"], results["figures"]
-    title = "{scene}, {frames} moments, {size} px, {steps} steps each".format(**options)
-    table = Table(
-        "held-out views",
-        title=title,
-        caption=CAPTION,
-    )
-    for heading, _ in TABLE_COLUMNS.values():
+    made = _table(results)
+    table = Table("held-out views", title=_setting(results), caption=made.notes[0])
+    for _, heading in made.headings():
         table.add_column(heading, justify="right")
-    for name, figure in figures.items():
-        cells = [format(figure[key], form) if key in figure else "–" for key, (_, form) in TABLE_COLUMNS.items()]
-        table.add_row(name, *cells)
+    for row in made.rows:
+        table.add_row(row.title, *(cell.text() for cell in row.cells))
     console.print(table)
-    if "masked_lpips" not in figures["ours"]:
-        console.print("LPIPS is left out: its weights are not on this machine (nothing is downloaded).")
+    for note in made.notes[1:]:
+        console.print(note)
     console.print(
-        f"Picture: {output / PICTURE}\nFigures: {output / 'results.json'}\nTo look around in what was trained:"
+        f"To look at, in a browser: {output / REPORT}\nPicture: {output / PICTURE}\n"
+        f"Figures: {output / 'results.json'}\nTo look around in what was trained:"
     )
     for command in results["viewer_commands"]:
         console.print(f"  {command}", soft_wrap=True)
+
+
+def _report(results: dict[str, Any], output: Path, console: Console) -> Report:
+    """What the page shows."""
+    scene, options = output / "scene", results["options"]
+    views_of = {name: output / "runs" / name / "views" for name in RUNS}
+    return Report(
+        title=f"Demo: nerfacto and ours on a rendered {options['scene']}",
+        lead="The same model trained twice on one drive, without depth and with the edge loss on LiDAR and monocular "
+        f"depth integrated: {_setting(results)}.",
+        methods=list(RUNS),
+        drives=make_drives({options["scene"]: (scene, views_of)}, console),
+        tables=[_table(results)],
+        plots=_plots(scene, views_of, options["scene"]),
+        facts=[
+            Facts("Options", {name.replace("_", " ").capitalize(): str(value) for name, value in options.items()}),
+            Facts("Versions", results["versions"]),
+            Facts(
+                "Seconds of each stage",
+                {name.capitalize(): str(seconds) for name, seconds in results["seconds"].items()}
+                | {"Cores of the machine": str(results["cores"])},
+            ),
+        ],
+        commands=[
+            Commands("What made this: the first alone, or the others one after another", results["commands"]),
+            Commands("To look around in what was trained", results["viewer_commands"]),
+        ],
+    )
+
+
+def _plots(scene: Path, views_of: dict[str, Path], title: str) -> list[Plot]:
+    """Figures by the true distance, over all held-out views."""
+    binned = {name: BinnedErrors(SHOWN_EDGES_M) for name in RUNS}
+    for view in compared_views(scene, views_of):
+        target = view.rgb if view.clean_rgb is None else view.clean_rgb
+        mask, true_m = torch.from_numpy(view.mask), torch.from_numpy(view.distance_m)
+        for name, bins in binned.items():
+            pred, clean = (torch.from_numpy(rgb).float() / 255 for rgb in (view.colours[name], target))
+            bins.update(true_m, mask, pred, clean, torch.from_numpy(distance_of_colours(view.distances[name])), true_m)
+    found: dict[MethodName, list[Bins]] = {METHODS[name]: [bins.compute()] for name, bins in binned.items()}
+    titles = {"psnr": ("PSNR by true distance", PSNR_LABEL), "delta_1_25": ("δ<1.25 by true distance", "δ<1.25")}
+    return [
+        plot_bins(words, {title: found}, "distance, m", [(name, label)], logarithmic_x=True)
+        for name, (words, label) in titles.items()
+    ]
 
 
 class _Clock:
@@ -177,6 +261,7 @@ class _Run:
         self.config = self.folder / "config.yml"
         self.metrics = runs / name / "metrics.json"
         self.viewer_command = viewer_command(self.config)
+        self.logs = [runs / name / f"{stage}.log" for stage in ("train", "evaluate")]
         self._commands = LoggedCommands()
         self.stop = self._commands.stop
 
@@ -230,5 +315,5 @@ def _comparison(scene: Path, runs: Path) -> np.ndarray:
     """Truth, nerfacto and ours, colours and distance, for some held-out views."""
     views = compared_views(scene, {name: runs / name / "views" for name in RUNS}, VIEWS)
     names = ["truth", *RUNS]
-    rows = [[*colours, *distances] for colours, distances in views]
+    rows = [[*colours, *distances] for colours, distances in (view.rows() for view in views)]
     return side_by_side(rows, [*names, *(f"{name}: distance" for name in names)])

@@ -47,6 +47,12 @@ class ColourScale:
             return np.log(clipped / self.low) / np.log(self.high / self.low)
         return (clipped - self.low) / (self.high - self.low)
 
+    def values_at(self, positions: NDArray) -> NDArray:
+        """Give the values at places on the scale, 0 to 1."""
+        if self.logarithmic:
+            return self.low * (self.high / self.low) ** positions
+        return self.low + (self.high - self.low) * positions
+
     def coloured(self, values: NDArray, shown: NDArray[np.bool_]) -> NDArray[np.uint8]:
         """Colour H×W values where `shown` is True; the others have the colour of no value.
 
@@ -84,6 +90,10 @@ RELATIVE_ERROR = ColourScale(
     logarithmic=False,
 )
 """Relative errors of a distance in percent: too near is blue, too far is red."""
+COLOUR_ERROR = ColourScale(
+    0.0, 25.0, _opencv_colours(cv2.COLORMAP_INFERNO), (0.0, 5.0, 10.0, 15.0, 20.0, 25.0), "%", logarithmic=False
+)
+"""Errors of a colour in percent of the whole range: right is dark, wrong is bright."""
 
 
 def is_distance(distance_m: NDArray) -> NDArray[np.bool_]:
@@ -104,6 +114,25 @@ def colour_distance(distance_m: NDArray, mask: NDArray[np.bool_] | None = None) 
     """
     shown = is_distance(distance_m)
     return DISTANCE.coloured(distance_m, shown if mask is None else shown & mask)
+
+
+def distance_of_colours(coloured: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Read a distance map back from its colours, as exactly as these tell: to 1.6 %, and no farther than their ends.
+
+    Args:
+        coloured: H×W×3, by `colour_distance`, unharmed but for the last bit.
+
+    Returns:
+        H×W metres, 0 = no value.
+
+    """
+    palette = np.vstack((DISTANCE.colours, [NO_VALUE_RGB])).astype(int)
+    metres = np.append(DISTANCE.values_at(np.arange(256) / 255), 0.0).astype(np.float32)
+    places = np.array((1 << 16, 1 << 8, 1))
+    codes, inverse = np.unique(coloured.reshape(-1, 3).astype(int) @ places, return_inverse=True)
+    there = codes[:, None] // places % 256
+    nearest = np.square(there[:, None] - palette).sum(-1).argmin(1)
+    return metres[nearest][inverse].reshape(coloured.shape[:2])
 
 
 def resize(pixels: NDArray, size: tuple[int, int]) -> NDArray:

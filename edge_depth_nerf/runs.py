@@ -6,12 +6,14 @@ import os
 import re
 import shlex
 import subprocess
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from threading import Lock, Thread
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
+import tyro
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -22,6 +24,9 @@ from edge_depth_nerf.pictures import colour_distance
 
 DISTANCE_KEYS = ("truth_distance_file_path", "lidar_file_path")
 """What a view's distances are shown by, the better one first."""
+
+COMMAND = "$ "
+"""Before each command in a log."""
 
 
 class LoggedCommands:
@@ -52,7 +57,7 @@ class LoggedCommands:
         words = [str(word) for word in command]
         last = ""
         with log.open("a", encoding="utf-8") as sink:
-            sink.write(f"$ {shlex.join(words)}\n")
+            sink.write(f"{COMMAND}{shlex.join(words)}\n")
             sink.flush()
             with self._lock:
                 if self._stopped:
@@ -132,36 +137,116 @@ def held_out_frames(scene: Path) -> list[dict[str, Any]]:
     return sorted(frames, key=lambda frame: frame["file_path"])
 
 
-def compared_views(
-    scene: Path, views_of: Mapping[str, Path], most: int
-) -> list[tuple[list[NDArray[np.uint8]], list[NDArray[np.uint8]]]]:
-    """Colours and distances of some held-out views, spread over the drive: the truth, then each run's.
+@dataclass(frozen=True, eq=False)
+class ComparedView:
+    """A held-out view: what is known of it, and what each run made of it. Pictures are H×W×3 uint8, maps H×W."""
+
+    name: str
+    """Its file in the scene."""
+    rgb: NDArray[np.uint8]
+    """The recorded picture."""
+    clean_rgb: NDArray[np.uint8] | None
+    """The same without noise and exposure drift, where that is known."""
+    mask: NDArray[np.bool_]
+    """True = judge the pixel."""
+    distance_m: NDArray[np.float32]
+    """Metres along the ray, 0 = unknown."""
+    distance_key: str | None
+    """Which of `DISTANCE_KEYS` that is; None without any."""
+    colours: dict[str, NDArray[np.uint8]]
+    """What each run rendered, black outside the mask."""
+    distances: dict[str, NDArray[np.uint8]]
+    """The median distances that it rendered, in the colours of `colour_distance`."""
+
+    def rows(self) -> tuple[list[NDArray[np.uint8]], list[NDArray[np.uint8]]]:
+        """Its colours, then its distances: the recorded ones first, then each run's."""
+        known = colour_distance(self.distance_m, self.mask)
+        return [self.rgb, *self.colours.values()], [known, *self.distances.values()]
+
+
+def spread_over(count: int, most: int) -> list[int]:
+    """Choose at most `most` of `count` numbers from 0 on, evenly spread, the first and the last among them."""
+    return np.linspace(0, count - 1, min(most, count)).round().astype(int).tolist()
+
+
+def compared_view(scene: Path, frame: Mapping[str, Any], index: int, views_of: Mapping[str, Path]) -> ComparedView:
+    """Read a held-out view.
 
     Args:
         scene: the scene folder.
+        frame: one of its `held_out_frames`.
+        index: its place among these.
         views_of: for each run the folder of its judged views, as `ns-eval --render-output-path` writes them.
-        most: how many views at most.
 
-    Returns:
-        For each view its colours (picture, then each run's) and its distances (true ones, or LiDAR's, then each
-        run's), H×W×3 each, black outside the mask.
+    """
+    rgb = read_image(scene / frame["file_path"])
+    mask = read_mask(scene / frame["mask_path"]) if "mask_path" in frame else np.ones(rgb.shape[:2], bool)
+    key = next((key for key in DISTANCE_KEYS if key in frame), None)
+    clean = frame.get("truth_rgb_file_path")
+    colours, distances = {}, {}
+    for name, folder in views_of.items():
+        # nerfstudio saves truth and rendering side by side
+        rendered = read_image(folder / f"eval_img_{index:04d}.png")[:, rgb.shape[1] :]
+        colours[name] = np.where(mask[..., None], rendered, 0).astype(np.uint8)
+        distances[name] = read_image(folder / f"eval_distance_{index:04d}.png")
+    return ComparedView(
+        name=frame["file_path"],
+        rgb=rgb,
+        clean_rgb=None if clean is None else read_image(scene / clean),
+        mask=mask,
+        distance_m=np.zeros(mask.shape, np.float32) if key is None else read_distance_png(scene / frame[key]),
+        distance_key=key,
+        colours=colours,
+        distances=distances,
+    )
+
+
+def compared_views(scene: Path, views_of: Mapping[str, Path], most: int | None = None) -> Iterator[ComparedView]:
+    """Read some held-out views, spread over the drive, or all.
+
+    Args:
+        scene: the scene folder.
+        views_of: for each run the folder of its judged views.
+        most: how many views at most; None: all.
 
     """
     frames = held_out_frames(scene)
-    chosen = np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int)
-    views = []
-    for index in chosen:
-        frame = frames[index]
-        rgb = read_image(scene / frame["file_path"])
-        mask = read_mask(scene / frame["mask_path"]) if "mask_path" in frame else np.ones(rgb.shape[:2], bool)
-        key = next((key for key in DISTANCE_KEYS if key in frame), None)
-        distance_m = np.zeros(mask.shape, np.float32) if key is None else read_distance_png(scene / frame[key])
-        colours, distances = [rgb], [colour_distance(distance_m, mask)]
-        for folder in views_of.values():
-            # nerfstudio saves truth and rendering side by side
-            rendered = read_image(folder / f"eval_img_{index:04d}.png")[:, rgb.shape[1] :]
-            rendered[~mask] = 0
-            colours.append(rendered)
-            distances.append(read_image(folder / f"eval_distance_{index:04d}.png"))
-        views.append((colours, distances))
-    return views
+    for index in spread_over(len(frames), len(frames) if most is None else most):
+        yield compared_view(scene, frames[index], index, views_of)
+
+
+def command_line(words: Sequence[str], options: Any) -> str:
+    """Write the command that gives options: those that are not at their defaults.
+
+    Args:
+        words: the command, such as `edge-depth-nerf demo`.
+        options: its options, a dataclass as tyro reads it; what has no flag comes first.
+
+    """
+    found = [*words]
+    hints = get_type_hints(type(options), include_extras=True)
+    for entry in fields(options):
+        value = getattr(options, entry.name)
+        if value == entry.default:
+            continue
+        values = [str(each) for each in (value if isinstance(value, tuple) else (value,))]
+        if tyro.conf.Positional in getattr(hints[entry.name], "__metadata__", ()):
+            found += values
+            continue
+        flag = entry.name.replace("_", "-")
+        if isinstance(value, bool):
+            found.append(f"--{flag}" if value else f"--no-{flag}")
+        else:
+            found += [f"--{flag}", *values]
+    return shlex.join(found)
+
+
+def logged_commands(log: Path) -> list[str]:
+    """The commands that `LoggedCommands` wrote to a log, each once, programs without their folder."""
+    lines = log.read_text(encoding="utf-8", errors="replace").splitlines() if log.is_file() else []
+    found = []
+    for line in lines:
+        if line.startswith(COMMAND):
+            program, *rest = shlex.split(line.removeprefix(COMMAND))
+            found.append(shlex.join([Path(program).name, *rest]))
+    return list(dict.fromkeys(found))

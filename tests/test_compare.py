@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import html
 import json
 import math
+import re
 import shutil
 import statistics
 import subprocess
@@ -15,6 +17,7 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -183,7 +186,7 @@ def test_binned_errors_are_pooled_over_pictures():
     rng = np.random.default_rng(0)
     edges = (0.0, 10.0, 20.0, 40.0)
     binned = BinnedErrors(edges)
-    pixels = {index: ([], []) for index in range(3)}
+    pixels = {index: ([], [], []) for index in range(3)}
     for _ in range(2):
         values = rng.uniform(-5, 45, (6, 7))
         values[0, 0] = np.nan
@@ -200,13 +203,15 @@ def test_binned_errors_are_pooled_over_pictures():
                     true = true_m[row, column]
                     if 1 <= true <= 60:
                         pixels[index][1].append(abs(pred_m[row, column] - true) / true)
+                        pixels[index][2].append(max(pred_m[row, column] / true, true / pred_m[row, column]) < 1.25)
     found = binned.compute()
     assert [entry["low"] for entry in found] == [0, 10, 20]
     for index, entry in enumerate(found):
-        squared, relative = pixels[index]
+        squared, relative, within = pixels[index]
         assert entry["pixels"] == len(squared)
         assert entry["psnr"] == pytest.approx(-10 * math.log10(np.mean(squared)), abs=1e-4)
         assert entry["abs_rel"] == pytest.approx(np.mean(relative), abs=1e-5)
+        assert entry["delta_1_25"] == pytest.approx(np.mean(within), abs=1e-9)
 
 
 # --- judging ----------------------------------------------------------------------------------------------------------
@@ -536,9 +541,15 @@ def test_a_folder_keeps_what_its_runs_share(tmp_path, monkeypatch):
     with pytest.raises(Stop):
         command.compare(first, QUIET)
     assert read_json(output / "runs" / "x" / "nerfacto_seed-0" / "run.json")["steps"] == 5
-    for more in ({"methods": ("edge",)}, {"seeds": (0, 1)}):  # these come to what is there
+    for more in ({"methods": ("edge",)}, {"seeds": (0, 1)}, {}):  # these come to what is there
         with pytest.raises(Stop):
             command.compare(replace(first, **more), QUIET)
+    begun = f"edge-depth-nerf compare {scene} --output {output} --methods"
+    assert read_json(output / "compare.json")["commands"] == [
+        f"{begun} nerfacto --steps 5",
+        f"{begun} edge --steps 5",
+        f"{begun} nerfacto --steps 5 --seeds 0 1",
+    ]
     with pytest.raises(InputError, match="steps 5, not 6"):
         command.compare(replace(first, steps=6), QUIET)
     with pytest.raises(InputError, match="preset lite, not full"):
@@ -688,13 +699,38 @@ def test_it_leaves_figures_tables_and_pictures(finished):
     text = (asked.output / "tables.md").read_text()
     assert "## Table 1." in text and "## Table 5" in text and "| ours |" in text
     assert r"\bottomrule" in (asked.output / "tables.tex").read_text()
-    for name in ("comparison_sample", "psnr_by_steps", "psnr_by_seconds", "error_by_angle", "error_by_distance"):
-        assert read_image(asked.output / f"{name}.png").std() > 5
+    assert read_image(asked.output / "comparison_sample.png").std() > 5
+    for name in ("psnr_by_steps", "psnr_by_seconds", "error_by_angle", "error_by_distance"):
+        plot = ElementTree.parse(asked.output / f"{name}.svg").getroot()
+        # each method's line in its own colour
+        styles = [each.get("style", "") for each in plot.iter("{http://www.w3.org/2000/svg}path")]
+        assert all(any(f"stroke: {colour}" in style for style in styles) for colour in ("#888888", "#d62828"))
     for run in results.runs:
         assert [point["step"] for point in run.curve][-1] == 12
         seconds = [point["seconds"] for point in run.curve]
         assert seconds == sorted(seconds) and seconds[0] > 0
         assert sum(entry["pixels"] for entry in run.content["by_angle_deg"]) > 1000
+
+
+@pytest.mark.slow
+def test_the_page_shows_what_is_there(finished):
+    asked, results = finished
+    page = (asked.output / "report.html").read_text(encoding="utf-8").replace("&#39;", "&#x27;")
+    for made in tables.make_tables(results):
+        assert f"Table {made.label}</i> {html.escape(made.title)}</span>" in page
+        for row in made.rows:
+            assert all(f">{html.escape(cell.text())}</td>" in page for cell in row.cells)
+    assert "2 of 2 held-out views" in page and page.count('"distance-error": "data:image/webp') == 2 * 2
+    assert page.count("data:image/svg+xml;base64,") == 2 * 4
+    (command_line,) = results.options["commands"]
+    assert command_line.startswith("edge-depth-nerf compare /") and f"<code>{command_line}</code>" in page
+    assert page.count("<code>ns-viewer --load-config ") == 2
+    # of the configuration, what differs and what is shared
+    loss = ['<th scope="row">pipeline.model.depth_loss</th>', "<td>none</td>", "<td>edge</td>"]
+    assert re.search(r"\s*".join(map(re.escape, loss)), page)
+    assert "<dt>pipeline.model.near_m</dt>" in page
+    for name, value in results.versions.items():
+        assert f"<dt>{name}</dt><dd>{value}</dd>" in page
 
 
 @pytest.mark.slow

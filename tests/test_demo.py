@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import shutil
 import subprocess
 import sys
@@ -31,12 +32,21 @@ def test_it_leaves_figures_and_a_picture(finished):
     options, results = finished
     assert read_json(options.output / "results.json") == results
     for name in ("nerfacto", "ours"):
-        assert {*demo.TABLE_COLUMNS} <= set(results["figures"][name])
+        assert {metric.name for metric in demo.COLUMNS} <= set(results["figures"][name])
         assert np.isfinite(list(results["figures"][name].values())).all()
     picture = read_image(options.output / "comparison.png")
     # two moments of two cameras are held out (4 and 12), of which three views are shown: three rows of six pictures
     assert picture.shape == (34 + 3 * 70 - 6, 6 * 70 - 6, 3)
     assert len(results["viewer_commands"]) == 2
+    page = (options.output / "report.html").read_text(encoding="utf-8")
+    assert "<caption><span>Held-out views</span></caption>" in page and "4 of 4 held-out views" in page
+    for metric in demo.COLUMNS:
+        assert f"{results['figures']['ours'][metric.name]:{metric.form}}</td>" in page
+    assert page.count('"colour-error": "data:image/webp') == 4 * 2
+    assert page.count('<img src="data:image/svg+xml;base64,') == 2
+    programs = [command.split()[0] for command in results["commands"]]
+    assert programs == [*["edge-depth-nerf"] * 3, *["ns-train", "ns-eval"] * 2]
+    assert all(html.escape(command) in page.replace("&#39;", "&#x27;") for command in results["commands"])
     assert all("--viewer.websocket-host 127.0.0.1" in command for command in results["viewer_commands"])
 
 

@@ -80,7 +80,13 @@ def test_the_wheel_holds_the_whole_package(wheel):
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
         method_file = archive.read("edge_depth_nerf/nerfstudio_method.toml")
-    assert files <= names
+    # all that is not code as well: what report.html is made of
+    files |= {
+        str(path.relative_to(ROOT))
+        for path in (ROOT / "edge_depth_nerf" / "report").iterdir()
+        if path.is_file() and path.suffix != ".pyc"
+    }
+    assert "edge_depth_nerf/report/template.html.j2" in files and files <= names
     assert method_file == (ROOT / "edge_depth_nerf" / "nerfstudio_method.toml").read_bytes()
     assert not [name for name in names if name.startswith(("tests/", "benchmarks/", "data/"))]
 

@@ -1,4 +1,4 @@
-"""`edge-depth-nerf compare`: checks, runs what is missing side by side, then writes tables, pictures and plots."""
+"""`edge-depth-nerf compare`: checks, runs what is missing side by side, then writes tables, pictures and the page."""
 
 from __future__ import annotations
 
@@ -21,15 +21,18 @@ from rich.table import Table
 from edge_depth_nerf.compare.methods import METHODS, Setting, default_methods
 from edge_depth_nerf.compare.options import CompareOptions, MethodName
 from edge_depth_nerf.compare.plots import draw_plots
+from edge_depth_nerf.compare.report import first_runs, make_report
 from edge_depth_nerf.compare.results import Results, check_fair, read_results, write_rows
 from edge_depth_nerf.compare.search import show_search, write_search
-from edge_depth_nerf.compare.specification import FIGURES, SPECIFICATION, WORK, RunSpecification
+from edge_depth_nerf.compare.specification import FIGURES, SPECIFICATION, VIEWS, WORK, RunSpecification
 from edge_depth_nerf.compare.tables import MadeTable, as_latex, as_markdown, make_tables
 from edge_depth_nerf.console import say
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_json, write_json, write_png, write_text
 from edge_depth_nerf.pictures import DISTANCE, colour_bar, resize, side_by_side
-from edge_depth_nerf.runs import LoggedCommands, compared_views, progress_bars, viewer_command
+from edge_depth_nerf.report.build import write_report
+from edge_depth_nerf.report.views import REPORT
+from edge_depth_nerf.runs import LoggedCommands, command_line, compared_views, progress_bars, viewer_command
 
 RECORD = "compare.json"
 RUNS = "runs"
@@ -101,9 +104,11 @@ def compare(options: CompareOptions, console: Console | None = None) -> Results:
     write_rows(options.output, results)
     write_text(options.output / "tables.md", as_markdown(results, tables))
     write_text(options.output / "tables.tex", as_latex(results, tables))
-    draw_plots(options.output, results)
-    for scene in results.scenes():
-        _draw_comparison(options.output, results, scene)
+    with console.status("Plots and pictures"):
+        plots = draw_plots(options.output, results)
+        for scene in results.scenes():
+            _draw_comparison(options.output, results, scene)
+    write_report(options.output / REPORT, make_report(results, tables, plots, console))
     _show(options.output, results, tables, console)
     return results
 
@@ -196,7 +201,7 @@ def open_output(options: CompareOptions, tuned: dict[str, Setting]) -> None:
         "tuned": {name: {"lambda": setting.weight, "sigma_m": setting.sigma_m} for name, setting in tuned.items()},
         "tuned_on": None if options.tuned is None else read_json(options.tuned).get("scene"),
     }
-    path = options.output / RECORD
+    path, command = options.output / RECORD, command_line(["edge-depth-nerf", "compare"], options)
     if path.is_file():
         found = read_json(path)
         different = [name for name in record if record[name] != found.get(name)]
@@ -206,10 +211,13 @@ def open_output(options: CompareOptions, tuned: dict[str, Setting]) -> None:
                 f"{path}: this folder holds a comparison with {name} {found.get(name)}, not {record[name]}. Choose "
                 "another --output, or remove the folder."
             )
+        commands = found.get("commands", [])
+        if command not in commands:
+            write_json(path, {**found, "commands": [*commands, command]})
         return
     if options.output.is_dir() and any(options.output.iterdir()):
         raise InputError(f"{options.output}: holds other things. Choose a new or empty folder for --output.")
-    write_json(path, record)
+    write_json(path, {**record, "commands": [command]})
 
 
 class Run:
@@ -324,14 +332,10 @@ def do_runs(runs: Sequence[Run], jobs: int | None, console: Console) -> None:
 
 def _draw_comparison(output: Path, results: Results, scene: str) -> None:
     """Draw some held-out views, a row of colours and one of distances each: truth, then the methods' first seeds."""
-    first: dict[MethodName, Any] = {}
-    for run in results.runs:
-        if run.scene == scene and (run.method not in first or run.seed < first[run.method].seed):
-            first[run.method] = run
-    chosen = [first[name] for name in METHODS if name in first]
-    views_of = {METHODS[run.method].title: run.folder / "views" for run in chosen}
+    chosen = first_runs(results, scene)
+    views_of = {METHODS[run.method].title: run.folder / VIEWS for run in chosen}
     views = compared_views(Path(chosen[0].specification["scene"]), views_of, VIEWS_SHOWN)
-    rows = [[_shown(picture) for picture in row] for colours, distances in views for row in (colours, distances)]
+    rows = [[_shown(picture) for picture in row] for view in views for row in view.rows()]
     sheet = side_by_side(rows, ["truth", *views_of])
     legend = colour_bar(DISTANCE, min(sheet.shape[1], 600))
     below = np.full((legend.shape[0], sheet.shape[1], 3), 255, np.uint8)
@@ -356,6 +360,7 @@ def _show(output: Path, results: Results, tables: Sequence[MadeTable], console: 
         for row in made.rows:
             table.add_row(row.title, *(cell.text() for cell in row.cells))
         console.print(table)
+    say(console, f"To look at, in a browser: {output / REPORT}")
     say(console, f"Tables: {output / 'tables.md'}, {output / 'tables.tex'}; all figures: {output / 'results.csv'}")
     for run in results.runs[:1]:
         say(console, f"To look around in what was trained: {viewer_command(next(run.folder.rglob('config.yml')))}")

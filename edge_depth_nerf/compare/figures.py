@@ -46,8 +46,8 @@ class BinnedErrors:
     def __init__(self, edges: Sequence[float]) -> None:
         self.edges = torch.tensor(edges, dtype=torch.float64)
         bins = len(edges) - 1
-        self._pixels, self._squared, self._with_distance, self._relative = (
-            torch.zeros(bins, dtype=torch.float64) for _ in range(4)
+        self._pixels, self._squared, self._with_distance, self._relative, self._within = (
+            torch.zeros(bins, dtype=torch.float64) for _ in range(5)
         )
 
     def update(
@@ -81,12 +81,15 @@ class BinnedErrors:
         if true_m is not None:
             true = true_m[counted].double()
             known = (true >= JUDGED_RANGE_M[0]) & (true <= JUDGED_RANGE_M[1])
-            relative = (pred_m[counted].double()[known] - true[known]).abs() / true[known]
+            pred_there, true = pred_m[counted].double()[known], true[known]
+            relative = (pred_there - true).abs() / true
+            within = (pred_there < 1.25 * true) & (true < 1.25 * pred_there)
             self._with_distance += torch.bincount(where[known], minlength=bins)
             self._relative += torch.bincount(where[known], relative, minlength=bins)
+            self._within += torch.bincount(where[known], within.double(), minlength=bins)
 
     def compute(self) -> list[dict[str, float]]:
-        """The bins that have pixels: low, high, pixels, psnr (dB) and, where distances are known, abs_rel."""
+        """The bins that have pixels: low, high, pixels, psnr (dB); where distances are known abs_rel, delta_1_25."""
         found = []
         for index, pixels in enumerate(self._pixels.tolist()):
             if not pixels:
@@ -100,5 +103,6 @@ class BinnedErrors:
             }
             if self._with_distance[index]:
                 figures["abs_rel"] = float(self._relative[index] / self._with_distance[index])
+                figures["delta_1_25"] = float(self._within[index] / self._with_distance[index])
             found.append(figures)
         return found

@@ -1,11 +1,15 @@
-"""Plots of a comparison: PSNR against steps and seconds, errors by angle and by distance."""
+"""Plots of a comparison: PSNR against steps and seconds, errors by angle and by distance.
+
+Each is drawn twice, on white and for a dark page, as SVG.
+"""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
@@ -13,30 +17,41 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from edge_depth_nerf.compare.methods import METHODS
+from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.results import Results, RunResult
 from edge_depth_nerf.compare.tables import CLOCKS, clock_metric, curve_metric
 from edge_depth_nerf.files import write_bytes
+from edge_depth_nerf.report.build import Plot
 
-STYLES = {
-    # rivals grey to black and dashed, ours in colours; also told apart without colours
-    "nerfacto": ("#888888", "--", "o"),
-    "urban-nerf": ("#b08030", "--", "s"),
-    "ds-nerf": ("#444444", "--", "^"),
-    "edge-lidar": ("#2a9d8f", ":", "v"),
-    "edge-mono": ("#8ab17d", ":", "D"),
-    "edge-gaussian": ("#9b5de5", "-.", "P"),
-    "edge-paper": ("#3a86ff", "-.", "X"),
-    "edge": ("#d62828", "-", "o"),
+STYLES: dict[MethodName, tuple[str, str, str, str]] = {
+    # on white, on dark, line, marker: rivals grey and dashed, ours in colours; also told apart without colours
+    "nerfacto": ("#888888", "#9aa3ad", "--", "o"),
+    "urban-nerf": ("#b08030", "#d9a94a", "--", "s"),
+    "ds-nerf": ("#444444", "#d5dae0", "--", "^"),
+    "edge-lidar": ("#2a9d8f", "#3cc4b3", ":", "v"),
+    "edge-mono": ("#8ab17d", "#a9d39a", ":", "D"),
+    "edge-gaussian": ("#9b5de5", "#bb92f5", "-.", "P"),
+    "edge-paper": ("#3a86ff", "#70a9ff", "-.", "X"),
+    "edge": ("#d62828", "#ff625c", "-", "o"),
 }
 BINS = {"by_angle_deg": "angle from the optical axis, degrees", "by_distance_m": "distance, m"}
+PSNR_LABEL = "PSNR, dB"
+_INK = {False: "#1b2026", True: "#d5dae0"}
+_PAPER = {False: "#ffffff", True: "#161b22"}
+
+Bins = Sequence[Mapping[str, float]]
+"""As `BinnedErrors.compute` gives them."""
+Line = tuple[Sequence[float], Sequence[float]]
+"""x and y."""
 
 
-def _axes(scenes: Sequence[str], rows: int) -> tuple[Figure, np.ndarray]:
+def _axes(titles: Sequence[str], rows: int) -> tuple[Figure, np.ndarray]:
     # no pyplot: it would look for a display
-    figure = Figure(figsize=(max(6.0, 4.6 * len(scenes)), 3.6 * rows + 0.9), layout="constrained")
-    axes = figure.subplots(rows, len(scenes), squeeze=False)
-    for axis, scene in zip(axes[0], scenes, strict=True):
-        axis.set_title(scene)
+    figure = Figure(figsize=(max(6.0, 4.6 * len(titles)), 3.6 * rows + 0.9), layout="constrained")
+    axes = figure.subplots(rows, len(titles), squeeze=False)
+    for axis, title in zip(axes[0], titles, strict=True):
+        # a drive may be called $x$
+        axis.set_title(title, parse_math=False)
     for axis in axes.flat:
         axis.grid(alpha=0.3)
     return figure, axes
@@ -55,24 +70,35 @@ def _logarithmic(axis: Axes) -> None:
     axis.xaxis.set_minor_formatter(NullFormatter())
 
 
-def _finish(figure: Figure, axes: np.ndarray, path: Path) -> None:
+def _finished(figure: Figure, axes: np.ndarray) -> bytes:
     handles = dict(pair for axis in axes.flat for pair in _labelled(axis))
     columns = 3 if axes.shape[1] == 1 else 4
     figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=columns, frameon=False)
     content = io.BytesIO()
-    figure.savefig(content, format=path.suffix[1:], dpi=110)
-    write_bytes(path, content.getvalue())
+    # the same bytes for the same figures
+    figure.savefig(content, format="svg", metadata={"Date": None})
+    return content.getvalue()
 
 
-def _draw(axis: Axes, runs: Sequence[RunResult], x: Sequence[float], y: Sequence[float], marker: bool = True) -> None:
-    method = runs[0].method
-    colour, line, symbol = STYLES[method]
+def _twice(title: str, draw: Callable[[bool], bytes]) -> Plot:
+    drawn = {}
+    for dark in (False, True):
+        ink = dict.fromkeys(
+            ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), _INK[dark]
+        )
+        paper = dict.fromkeys(("figure.facecolor", "axes.facecolor", "savefig.facecolor"), _PAPER[dark])
+        with matplotlib.rc_context({**ink, **paper, "svg.hashsalt": title}):
+            drawn[dark] = draw(dark)
+    return Plot(title, light=drawn[False], dark=drawn[True])
+
+
+def _draw(axis: Axes, method: MethodName, line: Line, dark: bool) -> None:
+    on_white, on_dark, pattern, symbol = STYLES[method]
     axis.plot(
-        x,
-        y,
-        color=colour,
-        linestyle=line,
-        marker=symbol if marker else None,
+        *line,
+        color=on_dark if dark else on_white,
+        linestyle=pattern,
+        marker=symbol,
         markersize=4,
         linewidth=2.2 if method == "edge" else 1.4,
         label=METHODS[method].title,
@@ -80,52 +106,92 @@ def _draw(axis: Axes, runs: Sequence[RunResult], x: Sequence[float], y: Sequence
     )
 
 
-def _runs(results: Results, scene: str) -> list[list[RunResult]]:
+def _runs(results: Results, scene: str) -> dict[MethodName, list[RunResult]]:
     """The runs of a drive, by method."""
-    found = [[run for run in results.runs if run.scene == scene and run.method == name] for name in results.methods()]
-    return [runs for runs in found if runs]
+    found: dict[MethodName, list[RunResult]] = {}
+    for name in results.methods():
+        runs = [run for run in results.runs if run.scene == scene and run.method == name]
+        if runs:
+            found[name] = runs
+    return found
 
 
-def _curves(results: Results, path: Path, key: str, label: str) -> None:
+def _curves(results: Results, title: str, key: str, label: str) -> Plot:
     name = curve_metric(results)
-    figure, axes = _axes(results.scenes(), 1)
-    for axis, scene in zip(axes[0], results.scenes(), strict=True):
-        for runs in _runs(results, scene):
-            x = np.mean([[point[key] for point in run.curve] for run in runs], axis=0)
-            y = np.mean([[point[name] for point in run.curve] for run in runs], axis=0)
-            _draw(axis, runs, x.tolist(), y.tolist())
-        axis.set_xlabel(label)
-        _logarithmic(axis)
-    axes[0, 0].set_ylabel("PSNR of held-out pixels, dB")
-    _finish(figure, axes, path)
+
+    def draw(dark: bool) -> bytes:
+        figure, axes = _axes(results.scenes(), 1)
+        for axis, scene in zip(axes[0], results.scenes(), strict=True):
+            for method, runs in _runs(results, scene).items():
+                x, y = (np.mean([[point[one] for point in run.curve] for run in runs], axis=0) for one in (key, name))
+                _draw(axis, method, (x.tolist(), y.tolist()), dark)
+            axis.set_xlabel(label)
+            _logarithmic(axis)
+        axes[0, 0].set_ylabel("PSNR of held-out pixels, dB")
+        return _finished(figure, axes)
+
+    return _twice(title, draw)
 
 
-def _binned(results: Results, path: Path, key: str) -> None:
-    figure, axes = _axes(results.scenes(), 2)
-    for column, scene in enumerate(results.scenes()):
-        for runs in _runs(results, scene):
-            for row, figure_name in enumerate(("psnr", "abs_rel")):
-                # all runs of a drive have the same bins
-                bins = [[entry for entry in run.content.get(key, []) if figure_name in entry] for run in runs]
-                if not bins[0]:
-                    continue
-                x = [(entry["low"] + entry["high"]) / 2 for entry in bins[0]]
-                y = np.mean([[entry[figure_name] for entry in one] for one in bins], axis=0)
-                _draw(axes[row, column], runs, x, y.tolist())
-        axes[1, column].set_yscale("log")
-        axes[1, column].set_xlabel(BINS[key])
-        if key == "by_distance_m":
-            for axis in axes[:, column]:
-                _logarithmic(axis)
-    axes[0, 0].set_ylabel("PSNR, dB")
-    axes[1, 0].set_ylabel("AbsRel")
-    _finish(figure, axes, path)
+def plot_bins(
+    title: str,
+    bins: Mapping[str, Mapping[MethodName, Sequence[Bins]]],
+    label: str,
+    rows: Sequence[tuple[str, str]],
+    logarithmic_x: bool,
+) -> Plot:
+    """Plot binned errors, a column for each drive.
+
+    Args:
+        title: what the plot shows.
+        bins: by drive and method, those of each run; all runs of a drive have the same.
+        label: what is binned, with its unit.
+        rows: name of a figure and its label, for each row of axes; abs_rel is drawn logarithmically.
+        logarithmic_x: whether equal ratios are equally far apart.
+
+    """
+
+    def draw(dark: bool) -> bytes:
+        figure, axes = _axes(list(bins), len(rows))
+        for column, methods in enumerate(bins.values()):
+            for row, (name, _) in enumerate(rows):
+                for method, of_runs in methods.items():
+                    kept = [[entry for entry in one if name in entry] for one in of_runs]
+                    if kept[0]:
+                        x = [(entry["low"] + entry["high"]) / 2 for entry in kept[0]]
+                        y = np.mean([[entry[name] for entry in one] for one in kept], axis=0)
+                        _draw(axes[row, column], method, (x, y.tolist()), dark)
+                if name == "abs_rel":
+                    axes[row, column].set_yscale("log")
+                if logarithmic_x:
+                    _logarithmic(axes[row, column])
+            axes[-1, column].set_xlabel(label)
+        for row, (_, words) in enumerate(rows):
+            axes[row, 0].set_ylabel(words)
+        return _finished(figure, axes)
+
+    return _twice(title, draw)
 
 
-def draw_plots(output: Path, results: Results) -> None:
+def _binned(results: Results, title: str, key: str) -> Plot:
+    bins: dict[str, dict[MethodName, list[Bins]]] = {}
+    for scene in results.scenes():
+        runs_of = _runs(results, scene)
+        bins[scene] = {method: [run.content.get(key, []) for run in runs] for method, runs in runs_of.items()}
+    return plot_bins(
+        title, bins, BINS[key], [("psnr", PSNR_LABEL), ("abs_rel", "AbsRel")], logarithmic_x=key == "by_distance_m"
+    )
+
+
+def draw_plots(output: Path, results: Results) -> list[Plot]:
     """Draw psnr_by_steps, psnr_by_seconds, error_by_angle and error_by_distance, a column for each drive."""
-    _curves(results, output / "psnr_by_steps.png", "step", "steps")
     clock = clock_metric(results)
-    _curves(results, output / "psnr_by_seconds.png", clock, f"{CLOCKS[clock].lower()} of training")
-    _binned(results, output / "error_by_angle.png", "by_angle_deg")
-    _binned(results, output / "error_by_distance.png", "by_distance_m")
+    plots = {
+        "psnr_by_steps": _curves(results, "PSNR by steps", "step", "steps"),
+        "psnr_by_seconds": _curves(results, "PSNR by time", clock, f"{CLOCKS[clock].lower()} of training"),
+        "error_by_angle": _binned(results, "Errors by the angle from the optical axis", "by_angle_deg"),
+        "error_by_distance": _binned(results, "Errors by true distance", "by_distance_m"),
+    }
+    for name, plot in plots.items():
+        write_bytes(output / f"{name}.svg", plot.light)
+    return list(plots.values())

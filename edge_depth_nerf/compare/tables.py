@@ -153,7 +153,8 @@ def quality_metrics(results: Results) -> list[Metric]:
     return [metric for metric in metrics if any(metric.name in run.figures for run in results.runs)]
 
 
-def _mark_best(rows: Sequence[Row], better: Sequence[int]) -> None:
+def mark_best(rows: Sequence[Row], better: Sequence[int]) -> None:
+    """Mark the best cells of each column; `better` says of each whether more (1), less (-1) or neither (0) is."""
     for column, sign in enumerate(better):
         cells = [row.cells[column] for row in rows if row.cells[column].mean is not None]
         if sign and len(cells) > 1:
@@ -188,7 +189,7 @@ def _quality_table(
     if shows_ahead:
         groups.append(("ours ahead", ["dB", "paper, dB"] if published else ["dB"]))
         better += [0, 0] if published else [0]
-    _mark_best(rows, better)
+    mark_best(rows, better)
     return MadeTable(label, title, groups, rows, [AVERAGES, TEXT] if published else [])
 
 
@@ -257,7 +258,7 @@ def _detail_tables(results: Results, where: str, scenes: list[str]) -> list[Made
         )
         for method in results.methods()
     ]
-    _mark_best(rows, [metric.best for metric in metrics])
+    mark_best(rows, [metric.best for metric in metrics])
     known = "the truth" if truth else "the held-out LiDAR"
     detail = MadeTable(
         f"5, {where}",
@@ -297,7 +298,7 @@ def _detail_tables(results: Results, where: str, scenes: list[str]) -> list[Made
         Row(METHODS[method].title, [_cell(results, scenes, method, form, value) for _, form, _, value in timed])
         for method in results.methods()
     ]
-    _mark_best(rows, [best for _, _, best, _ in timed])
+    mark_best(rows, [best for _, _, best, _ in timed])
     time = MadeTable(
         f"6, {where}",
         "Time",

@@ -1,0 +1,108 @@
+"""What report.html shows of a comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from edge_depth_nerf.compare.methods import METHODS
+from edge_depth_nerf.compare.results import Results, RunResult
+from edge_depth_nerf.compare.specification import OF_A_RUN, VIEWS
+from edge_depth_nerf.compare.tables import Cell, MadeTable, Row, introduction
+from edge_depth_nerf.files import read_json
+from edge_depth_nerf.report.build import Commands, Facts, Plot, Report
+from edge_depth_nerf.report.views import make_drives
+from edge_depth_nerf.runs import viewer_command
+
+
+def make_report(results: Results, tables: Sequence[MadeTable], plots: Sequence[Plot], console: Console) -> Report:
+    """Gather what the page shows; its pictures are made here, of the first seed of each method."""
+    scenes, methods = results.scenes(), [METHODS[name].title for name in results.methods()]
+    first = {scene: first_runs(results, scene) for scene in scenes}
+    drives = {
+        scene: (
+            Path(runs[0].specification["scene"]),
+            {METHODS[run.method].title: run.folder / VIEWS for run in runs},
+        )
+        for scene, runs in first.items()
+    }
+    configs = [next(run.folder.rglob("config.yml")) for runs in first.values() for run in runs]
+    return Report(
+        title=f"Comparison on {' and '.join(scenes) if len(scenes) < 3 else f'{len(scenes)} drives'}",
+        lead=f"{', '.join(methods)}: trained alike but for what each method names, judged alike on held-out views.",
+        methods=methods,
+        drives=make_drives(drives, console),
+        notes=introduction(results),
+        tables=tables,
+        plots=plots,
+        facts=[
+            _shared(results),
+            Facts("Versions", results.versions),
+            *(_of_drive(scene, runs[0]) for scene, runs in first.items()),
+            _configuration(results),
+        ],
+        settings=[_named_fields(results)],
+        commands=[
+            Commands("What made this", results.options.get("commands", [])),
+            Commands("To look around in what was trained", [viewer_command(path) for path in configs]),
+        ],
+    )
+
+
+def first_runs(results: Results, scene: str) -> list[RunResult]:
+    """The run of the first seed of each method on a drive, in the tables' order."""
+    found = [[run for run in results.runs if run.scene == scene and run.method == name] for name in results.methods()]
+    return [min(runs, key=lambda run: run.seed) for runs in found if runs]
+
+
+def _shared(results: Results) -> Facts:
+    options, run = results.options, results.runs[0]
+    entries = {
+        "Preset": options["preset"],
+        "Steps of each run": f"{run.content['steps']:,}",
+        "Seeds": ", ".join(map(str, results.seeds())),
+        "nerfacto, UrbanNeRF and DS-NeRF": "in nerfstudio's torch code"
+        if options.get("rivals_implementation") == "torch"
+        else "in the same kernels as ours",
+        "Trained on": run.content["device"],
+        "Cores of the machine": str(results.cores),
+    }
+    return Facts("Comparison", entries)
+
+
+def _of_drive(scene: str, run: RunResult) -> Facts:
+    folder = Path(run.specification["scene"])
+    meta = read_json(folder / "transforms.json")
+    source = meta.get("source", {})
+    entries = {
+        "Scene folder": str(folder),
+        "SHA-256 of transforms.json": run.specification["scene_sha256"],
+        "Source": source.get("kind", "a nerfstudio scene"),
+        "Pictures trained on": str(len(meta["train_filenames"])),
+        "Pictures held out": str(len(meta["test_filenames"])),
+        "Size": f"{meta['frames'][0]['w']} × {meta['frames'][0]['h']} px" if "w" in meta["frames"][0] else "",
+        "Sweeps around each picture": str(2 * source["sweeps"] + 1) if "sweeps" in source else "",
+    }
+    return Facts(f"Drive {scene}", {name: value for name, value in entries.items() if value})
+
+
+def _named_fields(results: Results) -> MadeTable:
+    """The fields that methods set, and what they came to."""
+    runs = [next(run for run in results.runs if run.method == name) for name in results.methods()]
+    named = sorted({name for run in runs for name in run.content["named"]})
+    rows = [
+        Row(name, [Cell(None, words=run.content["configuration"].get(name, "–").strip("'")) for run in runs])
+        for name in named
+    ]
+    headings = [METHODS[run.method].title for run in runs]
+    note = "The fields of the configuration that methods set. In all others they are the same."
+    return MadeTable("", "What the methods differ in", [("", headings)], rows, [note])
+
+
+def _configuration(results: Results) -> Facts:
+    named = {name for run in results.runs for name in run.content["named"]}
+    shared: Mapping[str, str] = results.runs[0].content["configuration"]
+    entries = {name: value.strip("'") for name, value in sorted(shared.items()) if name not in {*named, *OF_A_RUN}}
+    return Facts(f"The whole configuration that all share ({len(entries)} fields)", entries, folded=True)

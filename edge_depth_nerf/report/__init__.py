@@ -1,0 +1,1 @@
+"""report.html: one page that needs no network: pictures, tables, plots, settings and commands of a comparison."""

@@ -1,0 +1,134 @@
+"""Builds report.html: text in, one page out. It loads nothing, runs its own script alone, and holds all it shows."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+
+from jinja2 import Environment, StrictUndefined
+
+from edge_depth_nerf.compare.tables import MadeTable
+from edge_depth_nerf.files import write_text
+from edge_depth_nerf.report.views import KINDS, Drive, data_uri, legend
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A plot, drawn twice."""
+
+    title: str
+    light: bytes
+    """SVG, on white."""
+    dark: bytes
+    """SVG, for a dark page."""
+
+
+@dataclass(frozen=True)
+class Facts:
+    """Names and values."""
+
+    title: str
+    entries: Mapping[str, str]
+    folded: bool = False
+    """Whether they are hidden at first."""
+
+
+@dataclass(frozen=True)
+class Commands:
+    """What was typed, or can be."""
+
+    title: str
+    lines: Sequence[str]
+
+
+@dataclass(frozen=True)
+class Report:
+    """All that the page shows. Texts are plain; the page escapes them."""
+
+    title: str
+    lead: str
+    """What was compared, in a sentence or two."""
+    drives: Sequence[Drive]
+    tables: Sequence[MadeTable]
+    plots: Sequence[Plot]
+    facts: Sequence[Facts]
+    commands: Sequence[Commands]
+    methods: Sequence[str]
+    """Of the pictures; the last one is shown first."""
+    notes: Sequence[str] = field(default_factory=tuple)
+    """How the tables are to be read."""
+    settings: Sequence[MadeTable] = field(default_factory=tuple)
+    """Settings that are tables."""
+
+
+def build_report(report: Report) -> str:
+    """Build the page."""
+    folder = files("edge_depth_nerf.report")
+    script, style, template = (
+        folder.joinpath(name).read_text(encoding="utf-8") for name in ("script.js", "style.css", "template.html.j2")
+    )
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.globals["svg"] = lambda content: data_uri(content, "image/svg+xml")
+    # only what stands here runs and styles, whatever a text might smuggle in
+    policy = (
+        "default-src 'none'; base-uri 'none'; form-action 'none'; img-src data:; "
+        f"script-src '{_digest(script)}'; style-src '{_digest(style)}'"
+    )
+    return environment.from_string(template).render(
+        report=report,
+        policy=policy,
+        script=script,
+        style=style,
+        data=_pictures(report),
+    )
+
+
+def write_report(path: Path, report: Report) -> None:
+    """Write the page, whole or not at all."""
+    write_text(path, build_report(report))
+
+
+def _digest(text: str) -> str:
+    return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
+
+
+def _pictures(report: Report) -> dict[str, object]:
+    """What the page's script reads: kinds, methods, and each drive's views."""
+
+    def addresses(pictures: Mapping[str, bytes]) -> dict[str, str]:
+        return {kind: data_uri(content, "image/webp") for kind, content in pictures.items()}
+
+    return {
+        "kinds": [
+            {
+                "key": kind.key,
+                "title": kind.title,
+                "explanation": kind.explanation,
+                "legend": None if kind.scale is None else legend(kind.scale),
+            }
+            for kind in KINDS
+        ],
+        "drives": [
+            {
+                "title": drive.title,
+                "note": drive.note,
+                "methods": [name for name in report.methods if all(name in view.rendered for view in drive.views)],
+                "views": [
+                    {
+                        "title": view.title,
+                        "width": view.width,
+                        "height": view.height,
+                        "truth": addresses(view.truth),
+                        "rendered": {name: addresses(pictures) for name, pictures in view.rendered.items()},
+                        "figures": view.figures,
+                    }
+                    for view in drive.views
+                ],
+            }
+            for drive in report.drives
+        ],
+    }

@@ -1,0 +1,205 @@
+"use strict";
+(() => {
+  const data = JSON.parse(document.getElementById("data").textContent);
+  const find = (selector) => document.querySelector(selector);
+  const viewer = find(".viewer");
+  const stage = find(".stage");
+  const wipe = find(".wipe");
+  const sides = { left: find("select[name=left]"), right: find("select[name=right]") };
+  const driveChoice = find("select[name=drive]");
+  const TRUTH = "truth";
+  // what of the truth stands beside an error
+  const OF_TRUTH = { "colour-error": "colour", "distance-error": "distance" };
+  const state = { drive: 0, view: 0, kind: "colour", left: TRUTH, right: "" };
+
+  const drive = () => data.drives[state.drive];
+  const view = () => drive().views[state.view];
+  const kind = () => data.kinds.find((each) => each.key === state.kind);
+  const titleOf = (name) => (name === TRUTH ? "truth" : name.slice(1));
+
+  function make(tag, text, parent) {
+    const element = document.createElement(tag);
+    element.textContent = text;
+    parent.append(element);
+    return element;
+  }
+
+  function pictureOf(name) {
+    const shown = view();
+    if (name === TRUTH) {
+      return shown.truth[OF_TRUTH[state.kind] || state.kind] || shown.truth.colour;
+    }
+    return shown.rendered[name.slice(1)][state.kind];
+  }
+
+  // a kind that a view lacks: no distances are known there
+  function there(key) {
+    return drive().methods.every((name) => view().rendered[name][key]);
+  }
+
+  function slide(percent) {
+    const value = Math.min(Math.max(percent, 0), 100);
+    wipe.value = value;
+    stage.style.setProperty("--wipe", `${value}%`);
+    wipe.setAttribute(
+      "aria-valuetext",
+      `${Math.round(value)} % ${titleOf(state.left)}, ${Math.round(100 - value)} % ${titleOf(state.right)}`,
+    );
+  }
+
+  function drawLegend() {
+    const legend = find(".legend");
+    const scale = kind().legend;
+    legend.hidden = !scale;
+    if (scale) {
+      find(".scale img").src = scale.bar;
+      const ticks = find(".ticks");
+      ticks.replaceChildren();
+      scale.ticks.forEach(([place, label], index) => {
+        const last = index === scale.ticks.length - 1;
+        make("span", last ? `${label} ${scale.unit}` : label, ticks).style.left = `${100 * place}%`;
+      });
+      legend.style.setProperty("--none", scale.none);
+    }
+    find(".explanation").textContent = kind().explanation;
+  }
+
+  function drawFigures() {
+    const figures = find(".figures");
+    figures.replaceChildren();
+    const table = make("table", "", figures);
+    make("caption", view().title, table);
+    const rows = drive().methods.map((name) => [`:${name}`, view().figures[name]]);
+    const columns = Object.keys(rows[0][1]);
+    const head = make("tr", "", make("thead", "", table));
+    make("td", "", head);
+    for (const title of columns) {
+      make("th", title, head).scope = "col";
+    }
+    const body = make("tbody", "", table);
+    for (const [name, found] of rows) {
+      const row = make("tr", "", body);
+      row.className = name === state.left || name === state.right ? "shown" : "";
+      make("th", titleOf(name), row).scope = "row";
+      for (const title of columns) {
+        make("td", found[title], row);
+      }
+    }
+  }
+
+  function draw() {
+    if (!there(state.kind)) {
+      state.kind = "colour";
+    }
+    for (const radio of document.querySelectorAll("input[name=kind]")) {
+      radio.disabled = !there(radio.value);
+      radio.checked = radio.value === state.kind;
+    }
+    const shown = view();
+    stage.style.setProperty("--aspect", String(shown.width / shown.height));
+    for (const [side, picture, tag] of [
+      ["left", ".under", ".tag.left"],
+      ["right", ".over", ".tag.right"],
+    ]) {
+      const name = state[side];
+      const ofTruth = name === TRUTH ? OF_TRUTH[state.kind] || state.kind : state.kind;
+      const image = find(picture);
+      image.src = pictureOf(name);
+      image.alt = `${side}: ${titleOf(name)}, ${ofTruth.replace("-", " ")} of ${shown.title}`;
+      find(tag).textContent = titleOf(name);
+      sides[side].value = name;
+    }
+    slide(Number(wipe.value));
+    drawLegend();
+    drawFigures();
+  }
+
+  function fillSelect(select, names) {
+    select.replaceChildren();
+    for (const name of names) {
+      make("option", titleOf(name), select).value = name;
+    }
+  }
+
+  function openDrive(index) {
+    state.drive = index;
+    state.view = 0;
+    // a mark before each, lest a method's title be "truth"
+    const names = [TRUTH, ...drive().methods.map((name) => `:${name}`)];
+    for (const side of ["left", "right"]) {
+      fillSelect(sides[side], names);
+      if (!names.includes(state[side])) {
+        state[side] = side === "left" ? TRUTH : names[names.length - 1];
+      }
+    }
+    const thumbnails = find(".thumbnails");
+    thumbnails.replaceChildren();
+    drive().views.forEach((each, number) => {
+      const label = make("label", "", thumbnails);
+      const radio = document.createElement("input");
+      radio.type = "radio";
+      radio.name = "view";
+      radio.value = String(number);
+      radio.checked = number === 0;
+      radio.setAttribute("aria-label", `${number + 1}: ${each.title}`);
+      radio.addEventListener("change", () => {
+        state.view = number;
+        draw();
+      });
+      const image = document.createElement("img");
+      image.alt = "";
+      image.draggable = false;
+      image.src = each.truth.colour;
+      label.title = each.title;
+      label.append(radio, image);
+    });
+    find(".drive-note").textContent = drive().note;
+    draw();
+  }
+
+  function follow(event) {
+    const box = stage.getBoundingClientRect();
+    slide((100 * (event.clientX - box.left)) / box.width);
+  }
+
+  stage.addEventListener("pointerdown", (event) => {
+    if (event.button !== 0) {
+      return;
+    }
+    // a click would give the focus to the page
+    event.preventDefault();
+    wipe.focus({ preventScroll: true });
+    stage.setPointerCapture(event.pointerId);
+    follow(event);
+  });
+  stage.addEventListener("pointermove", (event) => {
+    if (stage.hasPointerCapture(event.pointerId)) {
+      follow(event);
+    }
+  });
+  wipe.addEventListener("input", () => slide(Number(wipe.value)));
+  for (const side of ["left", "right"]) {
+    sides[side].addEventListener("change", () => {
+      state[side] = sides[side].value;
+      draw();
+    });
+  }
+  for (const radio of document.querySelectorAll("input[name=kind]")) {
+    radio.addEventListener("change", () => {
+      state.kind = radio.value;
+      draw();
+    });
+  }
+  fillSelect(
+    driveChoice,
+    data.drives.map((_, index) => `:${index}`),
+  );
+  data.drives.forEach((each, index) => {
+    driveChoice.options[index].textContent = each.title;
+  });
+  find(".drive").hidden = data.drives.length < 2;
+  driveChoice.addEventListener("change", () => openDrive(driveChoice.selectedIndex));
+  viewer.hidden = false;
+  find(".without-script").hidden = true;
+  openDrive(0);
+})();

@@ -1,0 +1,257 @@
+"""The report's pictures: colours, distances and the errors of both, of some held-out views.
+
+Distances are read back from the saved pictures' colours, which end at 60 m. Errors are therefore shown where the true
+distance is 2 to 40 m: there, what lies beyond either end is wrong by more than the scale of errors shows anyway.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from edge_depth_nerf.console import run_jobs
+from edge_depth_nerf.metrics import LEAST_SQUARED_ERROR
+from edge_depth_nerf.pictures import (
+    COLOUR_ERROR,
+    DISTANCE,
+    NO_VALUE_RGB,
+    RELATIVE_ERROR,
+    ColourScale,
+    distance_of_colours,
+    is_distance,
+    resize,
+)
+from edge_depth_nerf.runs import ComparedView, compared_view, held_out_frames, spread_over
+
+REPORT = "report.html"
+"""The page's name beside the other results."""
+MOST_VIEWS = 6
+"""Of a drive."""
+MOST_PICTURES = 400
+"""Of all drives and methods; with more of these there are fewer views."""
+MOST_WIDTH_PX = 640
+PICTURES_BYTES = 16_000_000
+"""Of all encoded pictures; a third more in the page, as text."""
+WEBP_QUALITIES = ((1.0, 85), (1.0, 70), (1.0, 50), (0.7, 50), (0.5, 50))
+"""Share of the size and quality: the first at which a picture is small enough, else the last."""
+ERROR_RANGE_M = (2.0, 40.0)
+"""True distances for which errors are shown."""
+WITHIN = 1.25
+"""Ratio to the true distance up to which a rendered one counts as right."""
+SPREAD_PX = 1.6
+"""Radius that a LiDAR return is shown with."""
+DIMMED = 0.35
+"""Brightness of the true picture outside the mask."""
+
+
+@dataclass(frozen=True)
+class KindShown:
+    """What a kind of picture is."""
+
+    key: str
+    title: str
+    explanation: str
+    scale: ColourScale | None = None
+    """What its colours stand for."""
+
+
+KINDS = (
+    KindShown("colour", "Colour", "What was rendered, inside the mask."),
+    KindShown("distance", "Distance", "Median distance along the ray.", DISTANCE),
+    KindShown(
+        "colour-error",
+        "Colour error",
+        "Mean difference of red, green and blue from the truth, in percent of the whole range.",
+        COLOUR_ERROR,
+    ),
+    KindShown(
+        "distance-error",
+        "Distance error",
+        "Rendered against true distance, where that is {:g} to {:g} m: too near is blue, too far is red.".format(
+            *ERROR_RANGE_M
+        ),
+        RELATIVE_ERROR,
+    ),
+)
+
+
+@dataclass(frozen=True)
+class ShownView:
+    """A held-out view as the page shows it; pictures are encoded (WebP)."""
+
+    title: str
+    width: int
+    height: int
+    truth: dict[str, bytes]
+    """Colours and, where any are known, distances."""
+    rendered: dict[str, dict[str, bytes]]
+    """By method, all kinds that there are."""
+    figures: dict[str, dict[str, str]]
+    """By method, figures of this view by name."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """The pictures of a drive."""
+
+    title: str
+    views: Sequence[ShownView]
+    note: str
+    """Which views these are, and what the truth is."""
+
+
+def views_of_a_drive(runs: int) -> int:
+    """How many views of each drive are shown at most, with so many runs over all drives."""
+    return min(max(MOST_PICTURES // (len(KINDS) * runs), 1), MOST_VIEWS)
+
+
+def make_drives(drives: Mapping[str, tuple[Path, Mapping[str, Path]]], console: Console) -> list[Drive]:
+    """Make the pictures of all drives, with progress.
+
+    Args:
+        drives: by title the scene folder and, by method, the folder of its judged views.
+        console: where the progress is shown.
+
+    """
+    runs = sum(len(views_of) for _, views_of in drives.values())
+    most = views_of_a_drive(runs)
+    frames = {title: held_out_frames(scene) for title, (scene, _) in drives.items()}
+    chosen = {title: spread_over(len(found), most) for title, found in frames.items()}
+    pictures = len(KINDS) * sum(len(chosen[title]) * (len(views_of) + 1) for title, (_, views_of) in drives.items())
+
+    def make(title: str, index: int) -> ShownView:
+        scene, views_of = drives[title]
+        return show_view(compared_view(scene, frames[title][index], index, views_of), PICTURES_BYTES // pictures)
+
+    jobs = [partial(make, title, index) for title in drives for index in chosen[title]]
+    made = iter(run_jobs(jobs, f"Pictures for {REPORT}", console))
+    return [
+        Drive(title, [next(made) for _ in chosen[title]], _note(frames[title], len(chosen[title]))) for title in drives
+    ]
+
+
+def _note(frames: Sequence[Mapping[str, object]], shown: int) -> str:
+    """Say which views of a drive are shown, and what counts as their truth."""
+    known = {key for frame in frames for key in frame}
+    parts = [f"{shown} of {len(frames)} held-out views, spread over the drive."]
+    if "truth_rgb_file_path" in known:
+        parts.append("The truth is the picture without noise and exposure drift.")
+    if "truth_distance_file_path" in known:
+        parts.append("True distances are the renderer's.")
+    elif "lidar_file_path" in known:
+        parts.append("True distances are LiDAR's returns, drawn larger.")
+    return " ".join([*parts, "Outside the mask (lens, vehicle) nothing is judged; the truth is dimmed there."])
+
+
+def show_view(view: ComparedView, allowance: int) -> ShownView:
+    """Make all pictures and figures of a view."""
+    height, width = view.mask.shape
+    shown = min(width, MOST_WIDTH_PX)
+    size = (shown, max(round(height * shown / width), 1))
+    sparse = view.distance_key == "lidar_file_path"
+    target = view.rgb if view.clean_rgb is None else view.clean_rgb
+    usual = is_distance(view.distance_m) & view.mask
+    judged = usual & (view.distance_m >= ERROR_RANGE_M[0]) & (view.distance_m <= ERROR_RANGE_M[1])
+    radius = SPREAD_PX * width / shown if sparse else 0.0
+
+    def picture(pixels: NDArray[np.uint8]) -> bytes:
+        return encode(resize(pixels, size) if shown < width else pixels, allowance)
+
+    def map_of(values: NDArray[np.float32], known: NDArray[np.bool_], scale: ColourScale, radius: float = 0.0) -> bytes:
+        values, known = spread(values, known, radius)
+        if shown < width:
+            values, known = resize(values, size), resize(known, size)
+        return encode(scale.coloured(values, known), allowance)
+
+    dimmed = np.where(view.mask[..., None], target, target * DIMMED).astype(np.uint8)
+    truth: dict[str, bytes] = {"colour": picture(dimmed)}
+    if view.distance_key is not None:
+        truth["distance"] = map_of(view.distance_m, usual, DISTANCE, radius)
+    rendered: dict[str, dict[str, bytes]] = {}
+    figures: dict[str, dict[str, str]] = {}
+    for name, colours in view.colours.items():
+        error = colours.astype(np.float32) - target
+        distance_m = distance_of_colours(view.distances[name])
+        rendered[name] = {
+            "colour": picture(colours),
+            "distance": map_of(distance_m, is_distance(distance_m), DISTANCE),
+            "colour-error": map_of(np.abs(error).mean(-1) / 2.55, view.mask, COLOUR_ERROR),
+        }
+        squared = float(np.square(error[view.mask] / 255).mean())
+        figures[name] = {"PSNR, dB": f"{-10 * math.log10(max(squared, LEAST_SQUARED_ERROR)):.2f}"}
+        if judged.any():
+            ratio = np.where(judged, distance_m / np.where(judged, view.distance_m, 1), 1).astype(np.float32)
+            rendered[name]["distance-error"] = map_of(100 * (ratio - 1), judged, RELATIVE_ERROR, radius)
+            ratio = ratio[judged]
+            close = float(((ratio < WITHIN) & (ratio > 1 / WITHIN)).mean())
+            figures[name]["δ<{:g}, {:g}-{:g} m".format(WITHIN, *ERROR_RANGE_M)] = f"{close:.3f}"
+    return ShownView(view.name, *size, truth, rendered, figures)
+
+
+def spread(
+    values: NDArray[np.float32], known: NDArray[np.bool_], radius: float
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Give pixels around known ones the value of the nearest, so that single pixels can be seen.
+
+    Args:
+        values: H×W.
+        known: H×W, where they count.
+        radius: how far, px; 0: nothing is changed.
+
+    Returns:
+        Values and where they count now.
+
+    """
+    if radius <= 0 or not known.any():
+        return values, known
+    # distance to the nearest zero, and which one that is
+    away, labels = cv2.distanceTransformWithLabels(
+        (~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    labels = np.asarray(labels, np.int64)
+    of_label = np.zeros(int(labels.max()) + 1, np.float32)
+    of_label[labels[known]] = values[known]
+    return of_label[labels], away <= radius
+
+
+def encode(pixels: NDArray[np.uint8], allowance: int) -> bytes:
+    """Encode H×W×3 RGB as WebP, coarser and smaller where it would exceed some bytes."""
+    encoded = np.zeros(0, np.uint8)
+    for share, quality in WEBP_QUALITIES:
+        size = (max(round(pixels.shape[1] * share), 1), max(round(pixels.shape[0] * share), 1))
+        smaller = pixels if share == 1 else resize(pixels, size)
+        ok, encoded = cv2.imencode(
+            ".webp", np.ascontiguousarray(smaller[..., ::-1]), [cv2.IMWRITE_WEBP_QUALITY, quality]
+        )
+        if not ok:
+            raise RuntimeError(f"WebP encoding failed for {smaller.dtype} {smaller.shape}")
+        if len(encoded) <= allowance:
+            break
+    return encoded.tobytes()
+
+
+def data_uri(content: bytes, media_type: str) -> str:
+    """Write bytes as an address that holds them."""
+    return f"data:{media_type};base64,{base64.b64encode(content).decode()}"
+
+
+def legend(scale: ColourScale) -> dict[str, object]:
+    """What the page draws the legend of a scale from: a bar of its colours, ticks, and the colour of no value."""
+    ok, bar = cv2.imencode(".png", np.ascontiguousarray(scale.colours[None, :, ::-1]))
+    assert ok
+    places = scale.position(np.array(scale.ticks, float))
+    return {
+        "bar": data_uri(bar.tobytes(), "image/png"),
+        "ticks": [[round(float(place), 4), f"{tick:g}"] for place, tick in zip(places, scale.ticks, strict=True)],
+        "unit": scale.unit,
+        "none": "#{:02x}{:02x}{:02x}".format(*NO_VALUE_RGB),
+    }
