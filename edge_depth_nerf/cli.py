@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Annotated
 
 import tyro
+from rich.console import Console
 
 from edge_depth_nerf.compare.options import CompareOptions
 from edge_depth_nerf.demo_options import DemoOptions
-from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.entry import main
 from edge_depth_nerf.films.options import CameraPathOptions
 from edge_depth_nerf.inspect_options import InspectOptions
 from edge_depth_nerf.mono.options import EstimateDepthOptions
@@ -47,6 +50,23 @@ Command = (
 )
 
 
+def parse(arguments: list[str] | None = None) -> Command:
+    """Read a command line; wrong options and --help end the program."""
+    return tyro.cli(
+        Command,
+        prog="edge-depth-nerf",
+        description="Fisheye driving scenes, integrated depth. With --debug, anywhere, errors come with tracebacks.",
+        args=arguments,
+    )
+
+
+@contextmanager
+def _starting() -> Iterator[None]:
+    """Say that something happens while libraries are imported, which takes seconds."""
+    with Console(stderr=True).status("Starting …"):
+        yield
+
+
 def run(command: Command) -> None:
     """Carry out a command.
 
@@ -55,27 +75,33 @@ def run(command: Command) -> None:
 
     """
     if isinstance(command, SynthesizeOptions):
-        from edge_depth_nerf.synthetic.drive import synthesize_drive
+        with _starting():
+            from edge_depth_nerf.synthetic.drive import synthesize_drive
 
         synthesize_drive(command)
     elif isinstance(command, Process):
-        from edge_depth_nerf.process.command import process
+        with _starting():
+            from edge_depth_nerf.process.command import process
 
         process(command.options)
     elif isinstance(command, EstimateDepthOptions):
-        from edge_depth_nerf.mono.estimate import estimate_depth
+        with _starting():
+            from edge_depth_nerf.mono.estimate import estimate_depth
 
         estimate_depth(command)
     elif isinstance(command, InspectOptions):
-        from edge_depth_nerf.inspecting import inspect_scene
+        with _starting():
+            from edge_depth_nerf.inspecting import inspect_scene
 
         inspect_scene(command)
     elif isinstance(command, CameraPathOptions):
-        from edge_depth_nerf.films.command import write_camera_path
+        with _starting():
+            from edge_depth_nerf.films.command import write_camera_path
 
         write_camera_path(command)
     elif isinstance(command, CompareOptions):
-        from edge_depth_nerf.compare.command import compare
+        with _starting():
+            from edge_depth_nerf.compare.command import compare
 
         compare(command)
     elif isinstance(command, Doctor):
@@ -83,22 +109,10 @@ def run(command: Command) -> None:
 
         sys.exit(run_doctor())
     else:
-        from edge_depth_nerf.demo import run_demo
+        with _starting():
+            from edge_depth_nerf.demo import run_demo
 
         run_demo(command)
-
-
-def main() -> None:
-    """Entry point: errors of input are one paragraph on stderr and exit status 2."""
-    command = tyro.cli(Command, prog="edge-depth-nerf", description="Fisheye driving scenes with integrated depth.")
-    try:
-        run(command)
-    except (InputError, OSError) as error:
-        sys.stderr.write(f"edge-depth-nerf: {error}\n")
-        sys.exit(2)
-    except KeyboardInterrupt:
-        sys.stderr.write("\nStopped. The same command takes up where it was.\n")
-        sys.exit(130)
 
 
 if __name__ == "__main__":

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import copy
 
 import numpy as np
 import torch
+from nerfstudio.cameras.cameras import Cameras, CameraType
 
 
 def allow_numpy_scalars_in_checkpoints() -> None:
@@ -43,3 +45,17 @@ def lpips_not_built() -> Iterator[None]:
         yield
     finally:
         module.LearnedPerceptualImagePatchSimilarity = original
+
+
+def without_undefined_ray(cameras: Cameras) -> Cameras:
+    """Move principal points that lie on a pixel's centre by a thousandth of a pixel, of fisheye cameras.
+
+    nerfstudio's ray of that pixel is 0/0 (its viewer's fisheye preview has one whenever the picture's sides are odd).
+    Ends with: a nerfstudio whose `generate_rays` knows the limit.
+    """
+    on_centre = (cameras.camera_type == CameraType.FISHEYE.value) & (cameras.cx % 1 == 0.5) & (cameras.cy % 1 == 0.5)
+    if not on_centre.any():
+        return cameras
+    moved = copy(cameras)
+    moved.cx = cameras.cx + 1e-3 * on_centre
+    return moved

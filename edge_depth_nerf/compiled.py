@@ -7,9 +7,13 @@ result is kept beside the module, or in the user's cache if that folder cannot b
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from numba import njit
+
+_folders: set[Path] = set()
+"""Where Numba keeps what it compiled."""
 
 
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -20,8 +24,15 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         try:
-            return njit(cache=True, nogil=True, **options)(function)
+            kernel = njit(cache=True, nogil=True, **options)(function)
+            _folders.add(Path(str(kernel.stats.cache_path)))
+            return kernel
         except RuntimeError:  # Numba found no folder that can be written
             return njit(nogil=True, **options)(function)
 
     return decorate
+
+
+def compiled_before() -> bool:
+    """Whether kernels of the modules imported so far lie compiled on disk; otherwise their first calls take long."""
+    return bool(_folders) and all(any(folder.glob("*.nbi")) for folder in _folders)

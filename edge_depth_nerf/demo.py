@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import platform
-import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -41,6 +40,9 @@ from edge_depth_nerf.runs import (
     LoggedCommands,
     command_line,
     compared_views,
+    files_counted,
+    held_out_frames,
+    host_program,
     logged_commands,
     progress_bars,
     step_of_line,
@@ -283,32 +285,38 @@ class _Run:
         if self.metrics.is_file():
             return
         unfinished = self.metrics.with_name("unfinished.json")
+        views = self.runs / self.name / "views"
         arguments = [
             *("ns-eval", "--load-config", self.config, "--output-path", unfinished),
-            *("--render-output-path", self.runs / self.name / "views"),
+            *("--render-output-path", views),
         ]
-        self._call("evaluate", arguments, progress, f"Judging {self.name}", total=None)
+        count = len(held_out_frames(self.scene))
+        self._call("evaluate", arguments, progress, f"Judging {self.name}", count, views)
         unfinished.rename(self.metrics)
 
     def figures(self) -> dict[str, float]:
         return read_json(self.metrics)["results"]
 
-    def _call(self, stage: str, arguments: list[Any], progress: Progress, title: str, total: int | None) -> None:
+    def _call(
+        self, stage: str, arguments: list[Any], progress: Progress, title: str, total: int, views: Path | None = None
+    ) -> None:
         program, *rest = (str(argument) for argument in arguments)
         task = progress.add_task(title, total=total)
 
         def on_line(line: str) -> None:
             step = step_of_line(line)
-            if step is not None and total:
+            if step is not None:
                 progress.update(task, completed=step)
 
-        self._commands.call(
-            [Path(sys.executable).with_name(program), *rest],
-            self.runs / self.name / f"{stage}.log",
-            max(1, (os.cpu_count() or 1) // len(RUNS)),
-            on_line,
-        )
-        progress.update(task, total=total or 1, completed=total or 1)
+        # ns-eval says nothing on its way, but writes a picture of each view
+        with files_counted(views, "eval_img_*.png", lambda done: progress.update(task, completed=done)):
+            self._commands.call(
+                [host_program(program), *rest],
+                self.runs / self.name / f"{stage}.log",
+                max(1, (os.cpu_count() or 1) // len(RUNS)),
+                on_line,
+            )
+        progress.update(task, completed=total)
 
 
 def _comparison(scene: Path, runs: Path) -> np.ndarray:

@@ -253,7 +253,8 @@ def run_doctor(console: Console | None = None) -> int:
 
     """
     console = console or Console()
-    findings = [finding for check in CHECKS for finding in check()]
+    with console.status("Looking at what is installed …"):
+        findings = [finding for check in CHECKS for finding in check()]
     table = Table(title=f"edge-depth-nerf {__version__}", show_edge=False, title_justify="left")
     for heading in ("", "", "found", "what to do"):
         table.add_column(heading, overflow="fold")

@@ -10,9 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle, RaySamples
+from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.model_components.losses import ds_nerf_depth_loss, urban_radiance_field_depth_loss
 from nerfstudio.model_components.renderers import DepthRenderer
 from nerfstudio.model_components.scene_colliders import NearFarCollider
@@ -22,13 +25,14 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from edge_depth_nerf.allocator import keep_freed_memory
-from edge_depth_nerf.compat import lpips_not_built
+from edge_depth_nerf.compat import lpips_not_built, without_undefined_ray
 from edge_depth_nerf.fused.fields import CubeContraction, FusedNerfactoField, use_fused_fields
 from edge_depth_nerf.fused.losses import distortion_loss, proposal_loss
 from edge_depth_nerf.fused.sampler import FusedPDFSampler, edges_of
 from edge_depth_nerf.losses import edge_loss
 from edge_depth_nerf.metrics import DepthErrors, load_lpips, masked_lpips, masked_psnr, masked_ssim
-from edge_depth_nerf.pictures import colour_distance
+from edge_depth_nerf.pictures import DISTANCE, SIGMA, colour_distance
+from edge_depth_nerf.uncertainty import termination_std
 
 LARGEST_NEAR_PLANE_M = 0.5
 """A near plane beyond this cuts off road and car beside the camera."""
@@ -71,6 +75,24 @@ class DepthInEvaluation(DepthRenderer):
         if self.training:
             return None
         return super().forward(weights, ray_samples, *args, **kwargs)
+
+
+class DepthMoments(DepthRenderer):
+    """nerfstudio's expected depth; in evaluation the standard deviation beside it, and in training None unless read."""
+
+    def __init__(self, in_training: bool) -> None:
+        super().__init__(method="expected")
+        self.in_training = in_training
+
+    def forward(self, weights: Tensor, ray_samples: RaySamples, *args: Any, **kwargs: Any) -> Any:
+        """Give [rays, 2]; in training the expected depth alone, [rays, 1], or None."""
+        if self.training and not self.in_training:
+            return None
+        expected = super().forward(weights, ray_samples, *args, **kwargs)
+        if self.training:
+            return expected
+        starts, ends = ray_samples.frustums.starts[..., 0], ray_samples.frustums.ends[..., 0]
+        return torch.cat([expected, termination_std(weights[..., 0], starts, ends)[..., None]], dim=-1)
 
 
 class Psnr(torch.nn.Module):
@@ -130,6 +152,10 @@ class EdgeDepthNerfModel(NerfactoModel):
         with lpips_not_built():
             super().populate_modules()
         if implementation == "fused":
+            from edge_depth_nerf.compiled import compiled_before  # imports Numba, which other commands do without
+
+            if not compiled_before():
+                CONSOLE.print("The first steps compile kernels, which takes about a minute, once on this machine.")
             use_fused_fields(self)
             # bound before the networks were of the fused class
             self.density_fns = [density_fn.__self__.density_fn for density_fn in self.density_fns]
@@ -147,8 +173,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         self.lpips = LpipsAtFirstUse()
         self.psnr = Psnr()
         self.renderer_depth = DepthInEvaluation(method="median")
-        if self.config.depth_loss != "urban-nerf":
-            self.renderer_expected_depth = DepthInEvaluation(method="expected")
+        self.renderer_expected_depth = DepthMoments(in_training=self.config.depth_loss == "urban-nerf")
         # the near plane is not reset at evaluation: nothing was trained in front of it
         self.collider = NearFarCollider(
             near_plane=self.config.near_m / self.metres_per_unit,
@@ -158,9 +183,26 @@ class EdgeDepthNerfModel(NerfactoModel):
         self.reset_depth_errors()
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
-        """Nerfacto's outputs; in training without the depths that no loss reads."""
+        """Nerfacto's outputs; in training without the depths that no loss reads.
+
+        In evaluation also, in metres, the median `distance` and `distance_uncertainty`, the standard deviation of where
+        the ray ends. (nerfstudio divides outputs with "depth" in their name by the scene's scale; these have none.)
+        """
         outputs = super().get_outputs(ray_bundle)
+        if not self.training:
+            outputs["expected_depth"], std = outputs["expected_depth"].split(1, dim=-1)
+            outputs["distance"] = outputs["depth"] * self.metres_per_unit
+            outputs["distance_uncertainty"] = std * self.metres_per_unit
         return {name: value for name, value in outputs.items() if value is not None}
+
+    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
+        """Outputs of a whole view; distance and uncertainty also in colours that always mean the same metres."""
+        outputs = super().get_outputs_for_camera(without_undefined_ray(camera), obb_box)
+        for name, scale in (("distance", DISTANCE), ("distance_uncertainty", SIGMA)):
+            metres = outputs[name][..., 0].cpu().numpy()
+            coloured = torch.from_numpy(scale.coloured(metres, np.isfinite(metres)))
+            outputs[f"{name}_coloured"] = coloured.to(outputs[name]) / 255
+        return outputs
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
         """Nerfacto's metrics and, in training, the share of rays with a prior."""

@@ -14,8 +14,10 @@ import torch
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 
 from edge_depth_nerf.datamanager import FisheyeDepthDataManager, FisheyeDepthDataManagerConfig
+from edge_depth_nerf.entry import say_errors_plainly
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.model import EdgeDepthNerfModel, EdgeDepthNerfModelConfig
+from edge_depth_nerf.viewer import DrivePanel
 
 
 @dataclass
@@ -24,6 +26,11 @@ class EdgeDepthPipelineConfig(VanillaPipelineConfig):
 
     _target: type = field(default_factory=lambda: EdgeDepthPipeline)
     """Target class to instantiate."""
+
+    def setup(self, **kwargs: Any) -> Any:
+        """Build the pipeline; from here on nerfstudio's commands say our errors without a traceback."""
+        say_errors_plainly()
+        return super().setup(**kwargs)
 
 
 class EdgeDepthPipeline(VanillaPipeline):
@@ -50,6 +57,7 @@ class EdgeDepthPipeline(VanillaPipeline):
                 "`edge-depth-nerf estimate-depth`, or train without a prior by "
                 "--pipeline.model.depth-loss none."
             )
+        self.drive = DrivePanel(manager)
 
     def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict[str, Any], dict[str, Any]]:
         """Figures and pictures of one held-out view."""

@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.model_components.ray_generators import RayGenerator
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from edge_depth_nerf.files import write_atomically
@@ -96,7 +97,8 @@ class TableRayGenerator(RayGenerator):
         path = folder / f"{digest.hexdigest()[:32]}.npy"
         table = _read(path, int(pixels.sum()))
         if table is None:
-            made = _make(lenses)
+            with CONSOLE.status("Making the table of rays, once …"):
+                made = _make(lenses)
             try:
                 write_atomically(path, lambda temporary: _save(temporary, made))
             except OSError:

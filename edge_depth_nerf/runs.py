@@ -5,11 +5,15 @@ from __future__ import annotations
 import os
 import re
 import shlex
+import shutil
 import subprocess
+import sys
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
-from threading import Lock, Thread
+from threading import Event, Lock, Thread
 from typing import Any, get_type_hints
 
 import numpy as np
@@ -89,6 +93,39 @@ class LoggedCommands:
             self._stopped = True
             if self._process is not None:
                 self._process.kill()
+
+
+def host_program(name: str) -> Path:
+    """One of nerfstudio's commands: the one beside this Python, or else on the path.
+
+    Raises:
+        InputError: it is in neither place.
+
+    """
+    beside = Path(sys.executable).with_name(name)
+    found = beside if beside.is_file() else shutil.which(name)
+    if found is None:
+        raise InputError(
+            f"{name}: neither beside {sys.executable} nor on PATH. `edge-depth-nerf doctor` says what is amiss."
+        )
+    return Path(found)
+
+
+@contextmanager
+def files_counted(folder: Path | None, pattern: str, tell: Callable[[int], None]) -> Iterator[None]:
+    """Tell, once a second, how many files of a folder have been written since; without a folder nothing."""
+    begun, ended = time.time() - 1.0, Event()  # file systems keep coarser clocks
+
+    def watch(folder: Path) -> None:
+        while not ended.wait(1.0):
+            tell(sum(path.stat().st_mtime >= begun for path in folder.glob(pattern)))
+
+    if folder is not None:
+        Thread(target=watch, args=(folder,), daemon=True).start()
+    try:
+        yield
+    finally:
+        ended.set()
 
 
 def end_with_parent() -> None:

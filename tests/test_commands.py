@@ -123,10 +123,12 @@ def test_a_killed_run_is_taken_up_again(killed_run, scene, tmp_path):
 def test_render_dataset(killed_run, tmp_path):
     call(
         *("ns-render", "dataset", "--load-config", killed_run / "config.yml", "--output-path", tmp_path),
-        *("--split", "test", "--rendered-output-names", "rgb", "depth", "raw-depth", "--image-format", "png"),
+        *("--split", "test", "--rendered-output-names", "rgb", "depth", "raw-depth", "distance_coloured"),
+        *("--image-format", "png"),
     )
     rendered = cv2.imread(str(tmp_path / "test" / "rgb" / "0004.png"))
     assert rendered.shape == (20, 24, 3)
+    assert cv2.imread(str(tmp_path / "test" / "distance_coloured" / "0004.png")).shape == (20, 24, 3)
     with gzip.open(tmp_path / "test" / "raw-depth" / "0012.npy.gz") as file:
         distance_m = np.load(file)
     assert distance_m.shape == (20, 24, 1)

@@ -26,6 +26,7 @@ import tyro
 import yaml
 
 from edge_depth_nerf import cli
+from edge_depth_nerf.entry import DEBUG_OPTION
 from edge_depth_nerf.files import read_distance_png, read_image, read_json
 
 ROOT = Path(__file__).parents[1]
@@ -242,7 +243,7 @@ def known_options() -> set[str]:
             entries = [entry.name.replace("_", "-") for entry in dataclasses.fields(cls)]
             names |= {*entries, *(f"no-{name}" for name in entries)}
     # of ns-export, which cannot be imported where open3d misses libusb
-    return {f"--{name}" for name in names} | {"--help", "--normal-method"}
+    return {f"--{name}" for name in names} | {"--help", "--normal-method", DEBUG_OPTION}
 
 
 @pytest.mark.parametrize("page", PAGES)

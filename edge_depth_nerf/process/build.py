@@ -80,9 +80,10 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
         from edge_depth_nerf.process.colmap_poses import check_colmap
 
         check_colmap(recording, options)
-    source = _source(recording, options)
-    masks = _given_masks(recording, options)
-    check_cameras(_scene_cameras(recording, masks, options), options.theta_max_deg)
+    with console.status("Checking cameras and files …"):
+        source = _source(recording, options)
+        masks = _given_masks(recording, options)
+        check_cameras(_scene_cameras(recording, masks, options), options.theta_max_deg)
     open_scene(options.output, source)
     notices: list[str] = []
     if options.find_ego:

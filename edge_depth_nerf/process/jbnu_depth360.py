@@ -38,7 +38,10 @@ def process_jbnu_depth360(options: JbnuDepth360Options, console: Console | None 
         InputError: an option, a file of the data set, or the output folder cannot be used.
 
     """
-    return process_recording(read_jbnu_depth360(options), options, console)
+    console = console or Console()
+    with console.status("Reading the drive …"):
+        recording = read_jbnu_depth360(options)
+    return process_recording(recording, options, console)
 
 
 def read_jbnu_depth360(options: JbnuDepth360Options) -> Recording:

@@ -48,7 +48,10 @@ def process_kitti360(options: Kitti360Options, console: Console | None = None) -
         InputError: an option, a file of the drive, or the output folder cannot be used.
 
     """
-    return process_recording(read_kitti360(options), options, console)
+    console = console or Console()
+    with console.status("Reading the drive …"):
+        recording = read_kitti360(options)
+    return process_recording(recording, options, console)
 
 
 def read_kitti360(options: Kitti360Options) -> Recording:

@@ -84,7 +84,10 @@ def process_rig(options: RigOptions, console: Console | None = None) -> ProcessR
         InputError: an option, a file of the recording, or the output folder cannot be used.
 
     """
-    return process_recording(read_rig_recording(options), options, console)
+    console = console or Console()
+    with console.status("Reading the drive …"):
+        recording = read_rig_recording(options)
+    return process_recording(recording, options, console)
 
 
 def read_rig_recording(options: RigOptions) -> Recording:

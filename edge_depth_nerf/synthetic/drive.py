@@ -31,6 +31,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from edge_depth_nerf.errors import InputError
@@ -339,8 +340,9 @@ def synthesize_drive(options: SynthesizeOptions) -> Path:
     if not missing and paths.shifted().is_file():
         _log.info("%s: complete", options.output)
         return options.output
-    synthesis = _Synthesis(options)
-    synthesis.write_once()
+    with Console().status(f"Building the {options.scene} …"):
+        synthesis = _Synthesis(options)
+        synthesis.write_once()
     for frame, camera in shown(missing, options):
         if camera is None:
             synthesis.write_sweep(frame)

@@ -31,6 +31,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from edge_depth_nerf.cameras import MEI, Camera, KannalaBrandt, Pinhole
@@ -338,7 +339,8 @@ def _toml(value: Any) -> str:
 
 def synthesize_rig_drive(options: SynthesizeOptions) -> None:
     """Write what is missing of a drive in the layout `rig` or `jbnu-depth360`; its folder is open."""
-    drive = {"rig": _Rig, "jbnu-depth360": _JbnuDepth360}[options.layout](options)
+    with Console().status(f"Building the {options.scene} …"):
+        drive = {"rig": _Rig, "jbnu-depth360": _JbnuDepth360}[options.layout](options)
     jobs: list[Job] = [(frame, name) for frame in range(options.frames) for name in (None, *drive.cameras)]
     missing = [job for job in jobs if not all(path.is_file() for path in drive.files(*job))]
     if missing or not drive.description()[0].is_file():

@@ -1,0 +1,229 @@
+"""How commands end early, as the terminal sees it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from edge_depth_nerf import __version__, cli, entry, files
+from edge_depth_nerf.errors import InputError
+
+STOPPED = "\nStopped. The same command takes up where it was.\n"
+TIMEOUT_S = 120
+
+
+@pytest.fixture(autouse=True)
+def no_debugging(monkeypatch):
+    monkeypatch.setenv(entry.DEBUG_VARIABLE, "")
+
+
+def end_of(monkeypatch, capsys, *arguments: str, error: BaseException | None = None) -> tuple[int, str]:
+    """Exit status and what stands on stderr; `error` is raised in place of the command."""
+    if error is not None:
+
+        def fail(_):
+            raise error
+
+        monkeypatch.setattr(cli, "run", fail)
+    monkeypatch.setattr(sys, "argv", ["edge-depth-nerf", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        entry.main()
+    assert isinstance(ended.value.code, int)
+    return ended.value.code, capsys.readouterr().err
+
+
+def test_a_bug_is_one_paragraph_that_asks_to_be_reported(monkeypatch, capsys):
+    status, said = end_of(monkeypatch, capsys, "doctor", error=KeyError("not\nthere"))
+    assert status == 1
+    assert said.count("\n") == 1 and said.startswith(f"edge-depth-nerf: a bug in version {__version__}: KeyError: ")
+    assert "--debug" in said and "report" in said and "edge-depth-nerf doctor" in said
+    assert "Traceback" not in said
+
+
+def test_a_bug_names_the_line_of_ours(monkeypatch, capsys, tmp_path):
+    try:
+        files.write_json(tmp_path / "x.json", object())
+    except TypeError as error:
+        status, said = end_of(monkeypatch, capsys, "doctor", error=error)
+        assert status == 1 and "in files.py, line " in said and "TypeError" in said
+    else:
+        pytest.fail("written")
+
+
+@pytest.mark.parametrize(
+    "error", [InputError("a.png: is broken. Make it again."), FileNotFoundError("b: no such file")]
+)
+def test_what_the_user_can_mend_is_said_alone(monkeypatch, capsys, error):
+    assert end_of(monkeypatch, capsys, "doctor", error=error) == (2, f"edge-depth-nerf: {error}\n")
+
+
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_debug_gives_the_traceback_wherever_it_stands(monkeypatch, capsys, tmp_path, place):
+    arguments = ["inspect", str(tmp_path / "nowhere")]
+    status, plain = end_of(monkeypatch, capsys, *arguments)
+    assert status == 2 and "Traceback" not in plain and "transforms.json: no such file" in plain
+    arguments.insert(place, "--debug")
+    status, said = end_of(monkeypatch, capsys, *arguments)
+    assert status == 2 and said.startswith("Traceback") and said.endswith(plain)
+    assert "in read_scene" in said
+    assert os.environ[entry.DEBUG_VARIABLE] == "1"  # for what the command starts
+
+
+def test_debug_is_told_of(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["edge-depth-nerf", "--help"])
+    with pytest.raises(SystemExit):
+        entry.main()
+    assert "--debug" in capsys.readouterr().out
+
+
+def interrupted(code: str, until_s: float, *more_s: float, folder: Path | None = None) -> subprocess.CompletedProcess:
+    """Run Python code that prints `go`, and send it Ctrl-C some seconds after that, once or more often."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder
+    )
+    with process:
+        try:
+            assert process.stdout is not None and process.stdout.readline() == "go\n"
+            for wait_s in (until_s, *more_s):
+                time.sleep(wait_s)
+                process.send_signal(signal.SIGINT)
+            out, err = process.communicate(timeout=TIMEOUT_S)
+        finally:
+            process.kill()
+    return subprocess.CompletedProcess(code, process.returncode, out, err)
+
+
+SYNTHESIS = """
+import sys
+from edge_depth_nerf.entry import main
+sys.argv = ["edge-depth-nerf", "synthesize", "--output", "drive", "--frames", "400", "--size", "64"]
+print("go", flush=True)
+main()
+"""
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.1, 1.0, 2.0])
+def test_ctrl_c_while_it_starts(tmp_path, seconds):
+    """While options are read and libraries are imported."""
+    done = interrupted(SYNTHESIS, seconds, folder=tmp_path)
+    assert (done.returncode, done.stderr) == (130, STOPPED)
+
+
+def test_ctrl_c_at_work_leaves_whole_files(tmp_path):
+    code = SYNTHESIS.replace('"400"', '"12"').replace(
+        'print("go", flush=True)', "import edge_depth_nerf.synthetic.drive as d\nshown = d.shown"
+    )
+    code = code.replace(
+        "main()\n",
+        "def told(*a):\n    for n, job in enumerate(shown(*a)):\n        n == 4 and print('go', flush=True)\n"
+        "        yield job\nd.shown = told\nmain()\n",
+    )
+    done = interrupted(code, 0.2, folder=tmp_path)
+    assert (done.returncode, done.stderr) == (130, STOPPED)
+    pictures = list((tmp_path / "drive").rglob("*.png"))
+    assert len(pictures) > 4 and all(files.read_image(path).size for path in pictures if "data_rgb" in str(path))
+    assert not [path for path in (tmp_path / "drive").rglob("*") if path.name.startswith(".")]
+
+
+def test_ctrl_c_again_and_again_while_threads_finish():
+    code = """
+import sys, time
+from rich.console import Console
+from edge_depth_nerf import cli, entry
+from edge_depth_nerf.console import run_jobs
+def work():
+    time.sleep(1.5)
+def run(_):
+    print("go", flush=True)
+    run_jobs([work] * 20, "working", Console(quiet=True))
+cli.run = run
+sys.argv = ["edge-depth-nerf", "doctor"]
+entry.main()
+"""
+    started = time.monotonic()
+    done = interrupted(code, 0.3, 0.3, 0.3)
+    assert (done.returncode, done.stderr) == (130, STOPPED)
+    assert time.monotonic() - started < 20  # what had not begun was not begun
+
+
+@pytest.fixture
+def hook(monkeypatch):
+    """The hook for nerfstudio's commands, and what it passes on."""
+    passed = []
+
+    def before(*exception):
+        passed.append(exception)
+
+    monkeypatch.setattr(sys, "excepthook", before)
+    entry.say_errors_plainly()
+    assert sys.excepthook is not before
+    return passed
+
+
+def raised(call, *arguments) -> tuple:
+    try:
+        call(*arguments)
+    except BaseException:
+        return sys.exc_info()
+    pytest.fail("nothing was raised")
+
+
+def fail(error: BaseException) -> None:
+    raise error
+
+
+def test_nerfstudio_says_our_errors_plainly(hook, capsys, monkeypatch, tmp_path):
+    sys.excepthook(*raised(fail, InputError("scene: has no frames. Make it again.")))
+    said = capsys.readouterr().err
+    assert said.startswith("edge-depth-nerf: scene: has no frames. Make it again.\n") and entry.DEBUG_VARIABLE in said
+    # a missing file in our own words
+    from edge_depth_nerf.scene_reader import read_scene
+
+    sys.excepthook(*raised(read_scene, tmp_path))
+    assert capsys.readouterr().err.startswith(f"edge-depth-nerf: {tmp_path}/transforms.json: no such file.")
+    sys.excepthook(*raised(fail, KeyboardInterrupt()))
+    assert capsys.readouterr().err == "\nStopped.\n"
+    assert hook == []
+    monkeypatch.setenv(entry.DEBUG_VARIABLE, "1")
+    sys.excepthook(*raised(read_scene, tmp_path))
+    assert len(hook) == 1 and capsys.readouterr().err == ""
+
+
+def test_errors_of_others_stay_theirs(hook, capsys, tmp_path):
+    for call, argument in (
+        (fail, ValueError("theirs")),
+        (fail, FileNotFoundError("theirs")),
+        (open, tmp_path / "none"),
+    ):
+        sys.excepthook(*raised(call, argument))
+    # the system's words, wherever they were met
+    sys.excepthook(*raised(files.read_json, tmp_path / "none.json"))
+    assert [kind for kind, *_ in hook][:3] == [ValueError, FileNotFoundError, FileNotFoundError]
+    assert "theirs" not in capsys.readouterr().err
+
+
+def test_the_hook_is_put_in_once(hook):
+    first = sys.excepthook
+    entry.say_errors_plainly()
+    assert sys.excepthook is first
+
+
+@pytest.mark.slow
+def test_ns_train_on_what_is_no_scene(tmp_path):
+    call = [Path(sys.executable).with_name("ns-train"), "edge-depth-nerf-lite", "--data", tmp_path / "nowhere"]
+    done = subprocess.run(
+        [*map(str, call), "--vis", "tensorboard", "--output-dir", str(tmp_path)],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=TIMEOUT_S,
+    )
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    assert f"edge-depth-nerf: {tmp_path}/nowhere/transforms.json: no such file." in done.stderr

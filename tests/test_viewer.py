@@ -1,0 +1,488 @@
+"""What the viewer shows: in numbers, on the server's side, and in a browser."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from copy import deepcopy
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.configs.method_configs import all_methods
+from nerfstudio.viewer.utils import CameraState, get_camera, parse_object
+from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
+from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerElement
+from scenes import RADIUS_M, fisheye, pinhole, write_scene
+
+from edge_depth_nerf.cameras import KannalaBrandt
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.pictures import SIGMA, colour_distance
+from edge_depth_nerf.viewer import AZIMUTHS, RINGS, DriveLayers, _in_order, _spread, lens_cap, rim_rad
+
+METHOD = "edge-depth-nerf-lite"
+SAMPLE = Path(__file__).parents[1] / "data" / "sample_drive"
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+SOFTWARE_WEBGL = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+TIMEOUT_S = 120
+
+
+def pipeline_of(scene: Path, **model):
+    config = deepcopy(all_methods[METHOD].pipeline)
+    config.datamanager.data = scene
+    for name, value in {"num_levels": 2, "log2_hashmap_size": 8, **model}.items():
+        setattr(config.model, name, value)
+    return config.setup(device="cpu", test_mode="test")
+
+
+def until(condition: Callable[[], bool], wait: Callable[[float], None] = time.sleep) -> None:
+    deadline = time.monotonic() + TIMEOUT_S
+    while not condition():
+        assert time.monotonic() < deadline
+        wait(0.1)
+
+
+# ---- lenses ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_rim_of_an_equidistant_lens():
+    """r = f·θ; wider than tall, so that the picture's edge, its corners and theta_max each are the rim somewhere."""
+    camera = KannalaBrandt(100, 60, 25.0, 25.0, 48.0, 31.0, 0.0, 0.0, 0.0, 0.0)
+    azimuth = 2 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS
+    cosine, sine = np.cos(azimuth), np.sin(azimuth)
+    with np.errstate(divide="ignore"):
+        across = np.where(cosine > 0, (100 - 48) / cosine, -48 / cosine) / 25
+        along = np.where(sine > 0, (60 - 31) / sine, -31 / sine) / 25
+    limit = 1.7
+    expected = np.minimum(np.minimum(np.abs(across), np.abs(along)), limit)
+    assert {True, False} == set((expected == limit).tolist())
+    assert np.abs(rim_rad(camera, limit) - expected).max() <= 1.01 * limit / 720
+
+
+@pytest.mark.parametrize("camera", [fisheye(), pinhole()], ids=["fisheye", "pinhole"])
+def test_a_cap_is_the_picture_on_the_sphere(camera):
+    corners, pixels, triangles = lens_cap(camera, math.radians(100))
+    assert corners.shape == ((RINGS + 1) * AZIMUTHS, 3) and np.allclose(np.linalg.norm(corners, axis=1), 1)
+    assert triangles.min() == 0 and triangles.max() == len(corners) - 1
+    # the rays of those pixels lead there
+    rays, valid = camera.unproject(torch.from_numpy(pixels))
+    assert valid[:-AZIMUTHS].all()
+    assert np.nanmax(np.abs(rays.numpy() - corners)) < 1e-6
+    # the triangles leave no gap: their areas add up to the cap's, which follows from the rim
+    edges = corners[triangles[:, 1:]] - corners[triangles[:, :1]]
+    area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).sum() / 2
+    exact = (1 - np.cos(rim_rad(camera, math.radians(100)))).mean() * 2 * np.pi
+    assert area == pytest.approx(exact, rel=0.02)
+
+
+def test_a_lens_that_sees_behind_itself_has_a_cap_beyond_the_half_sphere():
+    camera = KannalaBrandt(200, 200, 50.0, 50.0, 100.0, 100.0, 0.0, 0.0, 0.0, 0.0)
+    assert np.degrees(rim_rad(camera, math.radians(110))) == pytest.approx(110, abs=0.2)
+    assert lens_cap(camera, math.radians(110))[0][:, 2].min() == pytest.approx(math.cos(math.radians(110)), abs=0.01)
+
+
+def test_names_with_numbers_are_in_order():
+    names = ["frame_10.png", "frame_9.png", "frame_1.png", "0003.png"]
+    assert sorted(names, key=lambda name: _in_order(Path(name))) == [names[3], names[2], names[1], names[0]]
+
+
+def test_some_of_many_are_spread():
+    assert _spread(5, 256) == [0, 1, 2, 3, 4]
+    assert _spread(1000, 4) == [0, 333, 666, 999]
+
+
+# ---- outputs ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("scene"), [fisheye(24, 20)])
+
+
+@pytest.fixture(scope="module")
+def pipeline(scene):
+    return pipeline_of(scene)
+
+
+def view_of(pipeline) -> Cameras:
+    return pipeline.datamanager.eval_dataset.cameras[:1]
+
+
+def test_distance_and_its_uncertainty_are_metres(pipeline):
+    pipeline.eval()
+    outputs = pipeline.model.get_outputs_for_camera(view_of(pipeline))
+    assert all(torch.isfinite(value).all() for value in outputs.values())
+    scale = pipeline.model.metres_per_unit
+    assert scale != 1
+    assert torch.allclose(outputs["distance"], outputs["depth"] * scale)
+    assert outputs["distance_uncertainty"].shape == outputs["expected_depth"].shape == outputs["depth"].shape
+    # no wider than a distribution on two points, the near and the far plane
+    assert 0 < outputs["distance_uncertainty"].min() and outputs["distance_uncertainty"].max() < 500
+    coloured = (outputs["distance_coloured"].numpy() * 255).round().astype(np.uint8)
+    assert np.array_equal(coloured, colour_distance(outputs["distance"][..., 0].numpy()))
+    # nerfstudio's renderer divides by the scale what is called depth
+    assert not [name for name in outputs if "distance" in name and "depth" in name]
+
+
+def test_uncertainty_is_of_the_weights_that_colour_the_ray(pipeline):
+    """Taken apart again: the field's own weights, and the spread of many ends drawn by them."""
+    model = pipeline.model.eval()
+    rays = view_of(pipeline).generate_rays(camera_indices=0)[10, 10:12]
+    kept = {}
+    original = model.renderer_accumulation.forward
+    model.renderer_accumulation.forward = lambda weights: kept.update(weights=weights) or original(weights=weights)
+    samples = {}
+    sampler = model.proposal_sampler.forward
+
+    def sampled(*args, **kwargs):
+        result = sampler(*args, **kwargs)
+        samples["final"] = result[0]
+        return result
+
+    model.proposal_sampler.forward = sampled
+    try:
+        with torch.no_grad():
+            outputs = model(rays)
+    finally:
+        model.renderer_accumulation.forward, model.proposal_sampler.forward = original, sampler
+    rng = np.random.default_rng(0)
+    frustums = samples["final"].frustums
+    for ray in range(2):
+        weights = kept["weights"][ray, :, 0].double().numpy()
+        starts, ends = frustums.starts[ray, :, 0].numpy(), frustums.ends[ray, :, 0].numpy()
+        chosen = rng.choice(len(weights), 200_000, p=weights / weights.sum())
+        drawn = starts[chosen] + (ends - starts)[chosen] * rng.random(200_000)
+        expected_m = drawn.std() * model.metres_per_unit
+        assert float(outputs["distance_uncertainty"][ray]) == pytest.approx(expected_m, rel=0.02)
+
+
+def test_training_has_neither(pipeline):
+    pipeline.train()
+    rays, _ = pipeline.datamanager.next_train(0)
+    outputs = pipeline.model(rays)
+    assert not {"distance", "distance_uncertainty", "expected_depth"} & set(outputs)
+
+
+@pytest.mark.parametrize("kind", [CameraType.FISHEYE, CameraType.EQUIRECTANGULAR, CameraType.PERSPECTIVE])
+@pytest.mark.parametrize("implementation", ["fused", "torch"])
+def test_previews_of_any_size_are_whole(scene, kind, implementation):
+    """An odd fisheye picture has its principal point on a pixel's centre, where nerfstudio's ray is 0/0."""
+    pipeline = pipeline_of(scene, implementation=implementation)
+    pipeline.eval()
+    pose = view_of(pipeline).camera_to_worlds[0]
+    camera = get_camera(CameraState(fov=1.5, aspect=1.0, c2w=pose, camera_type=kind), 9, 9)
+    assert bool(camera.generate_rays(camera_indices=0).directions.isnan().any()) == (kind is CameraType.FISHEYE)
+    outputs = pipeline.model.get_outputs_for_camera(camera)
+    assert all(torch.isfinite(value).all() for value in outputs.values())
+    assert float(camera.cx) == 4.5  # the caller's camera is left as it was
+
+
+# ---- layers ----------------------------------------------------------------------------------------------------------
+
+
+def in_scene_m(pipeline, points: np.ndarray) -> np.ndarray:
+    """Points of the model's coordinates, back in the scene's metres."""
+    outputs = pipeline.datamanager.train_dataset._dataparser_outputs
+    transform = outputs.dataparser_transform.numpy().astype(float)
+    return (points / outputs.dataparser_scale - transform[:, 3]) @ transform[:, :3]
+
+
+def test_clouds_lie_where_the_wall_is(pipeline):
+    """The scene is a ball with a wall; cameras stand and look in many ways."""
+    layers = pipeline.drive.layers
+    lidar, prior = layers._lidar(), layers._prior()
+    for cloud, within in ((lidar, 0.02), (prior, 0.8)):
+        assert len(cloud.points) > 500
+        radius = np.linalg.norm(in_scene_m(pipeline, cloud.points), axis=1)
+        assert np.abs(np.median(radius) - RADIUS_M) < within / 4
+        assert np.percentile(np.abs(radius - RADIUS_M), 95) < within
+    wall = in_scene_m(pipeline, lidar.points)
+    # the same wall has the same colours, from wherever it is seen
+    expected = 127 + 120 * np.sin(wall / RADIUS_M * [3.0, 4.0, 5.0] + [0.0, 1.0, 2.0])
+    assert np.abs(lidar.rgb - expected).mean() < 6
+    assert np.allclose(lidar.height_m - lidar.height_m[0], wall[:, 2] - wall[0, 2], atol=1e-3)
+    assert lidar.sigma_m is None and prior.sigma_m is not None and prior.sigma_m.min() > 0
+
+
+def test_colours_of_clouds(pipeline):
+    cloud = pipeline.drive.layers._prior()
+    assert cloud.sigma_m is not None
+    assert np.array_equal(cloud.colours("picture"), cloud.rgb)
+    by_sigma = cloud.colours("sigma").astype(int).sum(1)
+    assert by_sigma[cloud.sigma_m.argmax()] > by_sigma[cloud.sigma_m.argmin()]
+    assert (cloud.colours("sigma")[cloud.sigma_m.argmin()] == SIGMA.colours[0]).all() or cloud.sigma_m.min() > SIGMA.low
+    lowest, highest = (cloud.colours("height")[index].astype(int) for index in
+                       (cloud.height_m.argmin(), cloud.height_m.argmax()))  # fmt: skip
+    assert lowest[2] > lowest[0] and highest[0] > highest[2]
+    lidar = pipeline.drive.layers._lidar()
+    assert np.array_equal(lidar.colours("sigma"), lidar.colours("height"))
+
+
+def test_nerfstudio_finds_the_switches(pipeline):
+    found = parse_object(pipeline, ViewerElement, "Custom Elements")
+    assert [element.name for path, element in found if path.startswith("Custom Elements/drive/")] == [
+        *("Lenses", "Path", "LiDAR points", "Depth prior", "Colour of points"),
+    ]
+    assert len(parse_object(pipeline, ViewerControl, "Custom Elements")) == 1
+    # nothing of it is in a checkpoint
+    assert not [name for name in pipeline.state_dict() if "drive" in name]
+
+
+def test_what_is_not_there_cannot_be_switched_on(tmp_path):
+    pipeline = pipeline_of(write_scene(tmp_path, lidar=False, mono=False), depth_loss="none")
+    switches = pipeline.drive.layers.switches
+    assert {name: switch.disabled for name, switch in switches.items()} == {
+        **{"lenses": False, "path": False, "lidar": True, "prior": True},
+    }
+
+
+def test_nothing_is_made_without_a_viewer(scene, monkeypatch):
+    for name in ("_lidar", "_prior", "_draw_lenses", "_draw_path"):
+        monkeypatch.setattr(DriveLayers, name, lambda *_: pytest.fail("made"))
+    pipeline_of(scene)
+
+
+# ---- the viewer itself, during a training ---------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def training(tmp_path_factory) -> Iterator[SimpleNamespace]:
+    """A training of the sample drive that goes on while it is looked at; `trainer`, `viewer`, `layers`."""
+    folder = tmp_path_factory.mktemp("viewer")
+    shutil.copytree(SAMPLE, folder / "scene", ignore=shutil.ignore_patterns(".cache"))
+    config = deepcopy(all_methods[METHOD])
+    config.data = config.pipeline.datamanager.data = folder / "scene"
+    config.output_dir, config.timestamp, config.experiment_name = folder, "run", "viewer"
+    config.max_num_iterations, config.steps_per_save = 100_000, 100_000
+    config.pipeline.datamanager.train_num_rays_per_batch = 128
+    config.logging.local_writer.enable = False
+    assert config.vis == "viewer"
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        config.viewer.websocket_port = probe.getsockname()[1]
+    config.viewer.default_composite_depth = False  # the first steps' fog would hide what is switched on
+    config.viewer.quit_on_train_completion = True
+    config.get_base_dir().mkdir(parents=True)
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    thread = threading.Thread(target=trainer.train, daemon=True)
+    thread.start()
+    until(lambda: trainer.step > 5)
+    yield SimpleNamespace(
+        trainer=trainer, viewer=trainer.viewer_state, layers=trainer.pipeline.drive.layers, scene=folder / "scene"
+    )
+    trainer.shutdown()
+    thread.join(TIMEOUT_S)
+    assert not thread.is_alive()
+
+
+def seen(training, layer: str) -> bool | None:
+    """Whether the server has a layer's node shown; None where it has none."""
+    frame = training.layers._frames.get(layer)
+    return None if frame is None else frame.visible
+
+
+def nodes(training, layer: str) -> list[str]:
+    known = training.viewer.viser_server.scene._handle_from_node_name
+    return [name for name in known if name.startswith(f"/drive/{layer}/")]
+
+
+def test_it_listens_on_this_machine_alone(training):
+    server = training.viewer.viser_server
+    assert server.get_host() == "127.0.0.1"
+    # on Linux another of this machine's own addresses, which a server on every interface answers at
+    with pytest.raises(OSError), socket.create_connection(("127.0.0.2", server.get_port()), timeout=5):
+        pass
+    with socket.create_connection(("127.0.0.1", server.get_port()), timeout=5):
+        pass
+
+
+def test_lenses_and_path_are_on_from_the_beginning(training):
+    until(lambda: bool(seen(training, "lenses") and seen(training, "path")))
+    count = len(training.trainer.pipeline.datamanager.train_dataset)
+    assert len(nodes(training, "lenses")) == count == 22
+    assert {name.rpartition("/")[2] for name in nodes(training, "path")} == {"image_02", "image_03"}
+    # nerfstudio's pyramids give way
+    assert training.layers._host_frusta.visible is False
+    handles = training.viewer.viser_server.scene._handle_from_node_name
+    poses = training.trainer.pipeline.datamanager.train_dataset.cameras.camera_to_worlds
+    for index in (0, 13):
+        ours, theirs = handles[f"/drive/lenses/{index:05d}"], training.viewer.camera_handles[index]
+        assert np.allclose(ours.position, poses[index, :, 3] * VISER_NERFSTUDIO_SCALE_RATIO, atol=1e-5)
+        assert np.allclose(ours.position, theirs.position, atol=1e-5)
+        assert min(np.abs(ours.wxyz - theirs.wxyz).max(), np.abs(ours.wxyz + theirs.wxyz).max()) < 1e-5
+
+
+@pytest.mark.parametrize("layer", ["lidar", "prior"])
+def test_clouds_are_made_when_first_switched_on_while_training_goes_on(training, layer):
+    switch = training.layers.switches[layer]
+    assert not nodes(training, layer) and seen(training, layer) is None
+    before = training.trainer.step
+    switch.value = True
+    until(lambda: bool(seen(training, layer)) and not switch.gui_handle.disabled)
+    assert nodes(training, layer) == [f"/drive/{layer}/points"]
+    switch.value = False
+    until(lambda: seen(training, layer) is False)
+    until(lambda: training.trainer.step > before + 2)
+
+
+def test_nerfstudio_s_buttons_hide_the_lenses_too(training):
+    until(lambda: bool(seen(training, "lenses")))
+    switch = training.layers.switches["lenses"]
+    training.layers._hide_lenses(True)
+    assert seen(training, "lenses") is False and switch.value
+    training.layers._hide_lenses(False)
+    assert seen(training, "lenses") is True
+    switch.value = False
+    until(lambda: seen(training, "lenses") is False)
+    assert training.layers._host_frusta.visible is True
+    switch.value = True
+    until(lambda: seen(training, "lenses") is True and training.layers._host_frusta.visible is False)
+
+
+def test_a_file_that_went_away_is_said_and_the_switch_goes_back(training, capsys, monkeypatch):
+    def broken(_):
+        raise InputError("lidar/7.png: cannot be decoded. Make it again.")
+
+    monkeypatch.setattr(DriveLayers, "_lidar", broken)
+    kept = training.layers._frames.pop("lidar", None)
+    try:
+        switch = training.layers.switches["lidar"]
+        switch.value = True
+        until(lambda: switch.value is False and not switch.gui_handle.disabled)
+        assert "lidar/7.png: cannot be decoded" in " ".join(capsys.readouterr().out.split())
+    finally:
+        if kept is not None:
+            training.layers._frames["lidar"] = kept
+
+
+# ---- in a browser ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def browser():
+    if CHROMIUM is None:
+        pytest.skip("no Chromium on this machine (Debian: apt-get install chromium)")
+    sync_api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed (pip install playwright)")
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE_WEBGL)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def page(browser, training):
+    """The viewer in a browser without a network, looking at the drive from above; the training waits."""
+    server = training.viewer.viser_server
+    here = f"http://127.0.0.1:{server.get_port()}"
+    page = browser.new_page(viewport={"width": 900, "height": 620})
+    page.route("**", lambda route: route.continue_() if route.request.url.startswith(here) else route.abort())
+    page.goto(here)
+    page.wait_for_selector("text=Output type", timeout=TIMEOUT_S * 1000)
+    training.viewer.control_panel._max_res.value = 128
+    training.trainer.training_state = "paused"
+    until(lambda: bool(server.get_clients()), lambda seconds: page.wait_for_timeout(1000 * seconds))
+    look_from_above(training)
+    yield page
+    training.trainer.training_state = "training"
+
+
+def look_from_above(training) -> None:
+    places = training.trainer.pipeline.datamanager.train_dataset.cameras.camera_to_worlds[:, :, 3].numpy()
+    centre = places.mean(0) * VISER_NERFSTUDIO_SCALE_RATIO
+    for client in training.viewer.viser_server.get_clients().values():
+        client.camera.position = tuple(centre + np.array([-4.0, -3.0, 4.0]))
+        client.camera.look_at = tuple(centre)
+
+
+def canvas(page) -> np.ndarray:
+    """The viewport without title bar and panel."""
+    import cv2
+
+    png = page.screenshot(clip={"x": 0, "y": 60, "width": 570, "height": 550})
+    return cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)
+
+
+def settled(page) -> np.ndarray:
+    """The viewport once it holds still."""
+    pictures = [canvas(page)]
+
+    def still() -> bool:
+        pictures.append(canvas(page))
+        return bool((np.abs(pictures[-1] - pictures[-2]).max(-1) > 30).mean() < 1e-3)
+
+    until(still, lambda seconds: page.wait_for_timeout(10_000 * seconds))
+    return pictures[-1]
+
+
+def changed(one: np.ndarray, other: np.ndarray) -> int:
+    return int((np.abs(one - other).max(-1) > 40).sum())
+
+
+@pytest.mark.slow
+def test_the_page_shows_the_scene(page, training):
+    picture = settled(page)
+    assert picture.std(axis=(0, 1)).max() > 5  # not blank
+    for label in ("Lenses", "Path", "LiDAR points", "Depth prior"):
+        assert page.get_by_label(label).count() == 1, label
+    until(lambda: "distance_coloured" in training.viewer.control_panel._output_render.options)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("label", "layer"),
+    [("LiDAR points", "lidar"), ("Depth prior", "prior"), ("Path", "path"), ("Lenses", "lenses")],
+)
+def test_switches_work(page, training, label, layer):
+    box = page.get_by_label(label)
+    begun = bool(training.layers.switches[layer].value)
+    before = settled(page)
+
+    def turn(shown: bool) -> np.ndarray:
+        box.click()
+        until(
+            lambda: training.layers.switches[layer].value is shown and seen(training, layer) is shown,
+            lambda seconds: page.wait_for_timeout(1000 * seconds),
+        )
+        page.mouse.move(300, 300)
+        return settled(page)
+
+    other = turn(not begun)
+    again = turn(begun)
+    assert changed(before, other) > 150
+    assert changed(before, again) < changed(before, other) / 3
+
+
+@pytest.mark.slow
+def test_outputs_and_the_fisheye_preview(page, training):
+    plain = settled(page)
+    training.viewer.control_panel._output_render.value = "distance_coloured"
+    coloured = settled(page)
+    saturation = [float((picture.max(-1) - picture.min(-1)).mean()) for picture in (plain, coloured)]
+    assert saturation[1] > saturation[0] + 20
+    training.viewer.control_panel._output_render.value = "rgb"
+
+    page.get_by_text("Render", exact=True).first.click()
+    page.get_by_label("Camera type").click()
+    page.get_by_text("Fisheye", exact=True).click()
+    for _ in range(2):
+        page.get_by_text("Add Keyframe").click()
+        page.wait_for_timeout(1000)
+    page.get_by_text("Preview Render").click()
+    until(
+        lambda: (
+            training.viewer.render_tab_state.preview_render
+            and training.viewer.render_tab_state.preview_camera_type == "Fisheye"
+        ),
+        lambda seconds: page.wait_for_timeout(1000 * seconds),
+    )
+    preview = settled(page)
+    assert preview[150:400].std() > 5
+    assert changed(plain, preview) > 5000
