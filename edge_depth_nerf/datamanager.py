@@ -30,7 +30,6 @@ from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, Va
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIndicesEvalDataloader
 from nerfstudio.model_components.ray_generators import RayGenerator
 from nerfstudio.utils.rich_utils import CONSOLE
-from numpy.typing import NDArray
 from rich.progress import track
 
 from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
@@ -40,12 +39,17 @@ from edge_depth_nerf.integration import IntegrationOptions
 from edge_depth_nerf.metrics import has_whole_window
 from edge_depth_nerf.mono.error_model import Trust
 from edge_depth_nerf.mono.trust import field_of_source, find_trust
-from edge_depth_nerf.pixel_table import TABLE_VERSION, PixelBatch, PixelTable, PixelTableWriter
-from edge_depth_nerf.prior import CACHE_VERSION, Prior, PriorCache, PriorOptions, View, view_of
+from edge_depth_nerf.pixel_table import TABLE_VERSION, PicturePixels, PixelBatch, PixelTable, PixelTableWriter
+from edge_depth_nerf.prior import CACHE_VERSION, PriorCache, PriorOptions, View, sky_of, view_of
 from edge_depth_nerf.ray_table import TableRayGenerator
 
 KEPT_TABLES = 8
 """So many tables of pixels are kept of a scene, those used last; one of 300 pictures of 1400×1400 px takes 6 GB."""
+
+
+SURFACE_SIGMA_M = 0.1
+SURFACE_SIGMA_SHARE = 0.05
+"""A prior whose sigma is above these metres plus this share of its distance is too vague for a surface."""
 
 
 @dataclass
@@ -89,6 +93,9 @@ class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig):
     """The standard deviation under sigma_mode constant, metres."""
     prior_weight: float = 1.0
     """How often a pixel with a prior is drawn, against one without."""
+    surface_rays_per_batch: int = 4096
+    """So many further pixels come with each training batch, less those whose prior is vague: their colour is compared
+    with the field's at the prior's distance, at one sample a ray. 0: none."""
     cache_dir: Path | None = None
     """Where integrated priors and tables of training pixels are kept. Not set: .cache/ in the scene folder."""
 
@@ -177,7 +184,7 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
     """DataManager of fisheye scenes.
 
     A batch holds image (n×3), indices (n×3: picture, row, column), prior_distance_m and prior_sigma_m (n×1, metres,
-    0 = no prior).
+    0 = no prior), and sky (n×1, bool: known to show the sky).
     """
 
     config: FisheyeDepthDataManagerConfig
@@ -195,6 +202,9 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         table = self._table(self.train_dataset, "Integrating depth", with_prior=True)
         self.train_pixel_sampler = TablePixelSampler(table, self.config.train_num_rays_per_batch)
         self.train_ray_generator = self._ray_generator(self.train_dataset)
+        self._surface_sampler = None
+        if self.config.surface_rays_per_batch > 0 and table.share_with_prior > 0:
+            self._surface_sampler = TablePixelSampler(table, self.config.surface_rays_per_batch)
         CONSOLE.log(
             f"{len(self.train_dataset)} training pictures, {len(table):,} valid pixels, "
             f"{table.share_with_prior:.1%} of them with a depth prior"
@@ -211,10 +221,18 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         self.eval_dataloader = RandIndicesEvalDataloader(input_dataset=self.eval_dataset, device=self.device)
 
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
-        """Rays of the next training batch and what supervises them."""
+        """Rays of the next training batch and what supervises them; under surface_…, the further pixels."""
         self.train_count += 1
         assert self.train_pixel_sampler is not None
-        return self._serve(self.train_pixel_sampler.sample(step), self.train_ray_generator)
+        rays, batch = self._serve(self.train_pixel_sampler.sample(step), self.train_ray_generator)
+        if self._surface_sampler is not None:
+            pixels = self._surface_sampler.sample(step)
+            vague = pixels.prior_sigma_m > SURFACE_SIGMA_M + SURFACE_SIGMA_SHARE * pixels.prior_distance_m
+            chosen = (pixels.sky | (pixels.prior_distance_m > 0) & ~vague)[:, 0]
+            batch["surface_rays"], surface = self._serve(pixels[chosen], self.train_ray_generator)
+            names = {"prior_distance_m": "distance_m", "prior_sigma_m": "sigma_m"}
+            batch |= {f"surface_{names.get(name, name)}": value for name, value in surface.items()}
+        return rays, batch
 
     def next_eval(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
         """Rays of a batch of held-out pixels and their colours."""
@@ -241,6 +259,7 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
             "indices": batch.indices,
             "prior_distance_m": batch.prior_distance_m.to(self.device),
             "prior_sigma_m": batch.prior_sigma_m.to(self.device),
+            "sky": batch.sky.to(self.device),
         }
 
     def _table(self, dataset: FisheyeDepthDataset, description: str, with_prior: bool) -> PixelTable:
@@ -277,23 +296,21 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         with PixelTableWriter(path, most, prior_weight=weight) as writer:
             loaded = _load(dataset, cache, whole_windows=not with_prior)
             for pixels in track(loaded, f"{description}…", len(dataset), console=CONSOLE, transient=True):
-                writer.add(*pixels)
+                writer.add(pixels)
             writer.finish()
         _remove_old(path.parent)
         return PixelTable(path)
 
 
-def _load(
-    dataset: FisheyeDepthDataset, cache: PriorCache | None, whole_windows: bool
-) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.float32] | None, NDArray[np.float32] | None]]:
-    """Colours, mask, prior and its sigma of each picture.
+def _load(dataset: FisheyeDepthDataset, cache: PriorCache | None, whole_windows: bool) -> Iterator[PicturePixels]:
+    """Colours, mask, prior and its sigma, and the sky of each picture.
 
     Raises:
         InputError: a file cannot be used, or, with `whole_windows`, a mask leaves too little to be judged by.
 
     """
 
-    def load(image_idx: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_], Prior | None]:
+    def load(image_idx: int) -> PicturePixels:
         rgb = dataset.rgb(image_idx)
         mask = dataset.mask(image_idx)
         if whole_windows and not has_whole_window(torch.from_numpy(mask)):
@@ -303,20 +320,23 @@ def _load(
                 "of SSIM, 11×11 px). Mend the mask (255 = use the pixel), or do not hold that picture out."
             )
         if cache is None:
-            return rgb, mask, None
+            return PicturePixels(rgb, mask)
+        uses_mono = cache.options.depth_source != "lidar"
         lidar, mono = dataset.lidar_distance_m(image_idx), dataset.mono_distance_m(image_idx)
-        view = None if cache.trust is None else _view(dataset, image_idx)
-        return rgb, mask, cache.prior(lidar, mono, mask, view)
+        view = _view(dataset, image_idx) if uses_mono and mono is not None else None
+        prior = cache.prior(lidar, mono, mask, view if cache.trust is not None else None)
+        sky = sky_of(mono, lidar, view) if uses_mono and mono is not None and view is not None else None
+        return PicturePixels(rgb, mask, prior.distance_m, prior.sigma_m, sky)
 
     # OpenCV and torch release the interpreter's lock, so two threads read and integrate side by side; a few pictures
     # ahead, not all that the disk can bring
     with ThreadPoolExecutor(max_workers=2) as pool:
         waiting = deque(pool.submit(load, image_idx) for image_idx in range(min(3, len(dataset))))
         for ahead in range(len(dataset)):
-            rgb, mask, prior = waiting.popleft().result()
+            pixels = waiting.popleft().result()
             if ahead + 3 < len(dataset):
                 waiting.append(pool.submit(load, ahead + 3))
-            yield rgb, mask, prior.distance_m if prior else None, prior.sigma_m if prior else None
+            yield pixels
 
 
 def _table_key(dataset: FisheyeDepthDataset, options: PriorOptions | None, trust: Trust | None, weight: float) -> str:

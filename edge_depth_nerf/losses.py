@@ -11,7 +11,7 @@ import math
 from typing import Literal, get_args
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from edge_depth_nerf.errors import InputError
@@ -105,6 +105,21 @@ def edge_loss(
     target = target / math.sqrt(2 * math.pi) if divide_by_norm else target * sigma
     total = -(target * torch.log(weights + EPS)).sum()
     return total / has_prior.sum().clamp(min=1)
+
+
+def sky_loss(weights: Float[Tensor, "rays samples"], sky: Bool[Tensor, "rays"]) -> Float[Tensor, ""]:
+    """Compute what rays into the sky hit: the sum of their weights, mean over them.
+
+    Args:
+        weights: rendering weights, 0 or more.
+        sky: which rays are known to reach the sky.
+
+    Returns:
+        0 where all of them reach the background, 1 where none does; 0, still connected to `weights`, without such rays.
+
+    """
+    hit = torch.where(sky[:, None], weights.to(torch.promote_types(weights.dtype, torch.float32)), 0)
+    return hit.sum() / sky.sum().clamp(min=1)
 
 
 def _point_mass(start: Tensor, length: Tensor) -> Tensor:

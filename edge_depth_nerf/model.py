@@ -16,6 +16,8 @@ from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.model_components.losses import ds_nerf_depth_loss, urban_radiance_field_depth_loss
 from nerfstudio.model_components.renderers import DepthRenderer
 from nerfstudio.model_components.scene_colliders import NearFarCollider
@@ -29,7 +31,7 @@ from edge_depth_nerf.compat import lpips_not_built, without_undefined_ray
 from edge_depth_nerf.fused.fields import CubeContraction, FusedNerfactoField, use_fused_fields
 from edge_depth_nerf.fused.losses import distortion_loss, proposal_loss
 from edge_depth_nerf.fused.sampler import FusedPDFSampler, edges_of
-from edge_depth_nerf.losses import edge_loss
+from edge_depth_nerf.losses import edge_loss, sky_loss
 from edge_depth_nerf.metrics import DepthErrors, load_lpips, masked_lpips, masked_psnr, masked_ssim
 from edge_depth_nerf.pictures import DISTANCE, SIGMA, colour_distance
 from edge_depth_nerf.uncertainty import termination_std
@@ -50,12 +52,30 @@ class EdgeDepthNerfModelConfig(NerfactoModelConfig):
     """How far along the ray to stop sampling, metres (in place of far_plane)."""
     depth_loss: Literal["edge", "ds-nerf", "urban-nerf", "none"] = "edge"
     """The loss on the distance prior: Eq. 4, nerfstudio's DS-NeRF or UrbanNeRF loss, or none (plain nerfacto)."""
-    depth_loss_mult: float = 0.01
+    depth_loss_mult: float = 0.003
     """Weight λ of the loss on the distance prior (not published; how it was chosen: docs/loss_weight.md)."""
     depth_sigma: float = 0.5
     """Standard deviation that the DS-NeRF and UrbanNeRF losses assume, metres. (Eq. 4 takes the prior's own.)"""
     depth_loss_levels: Literal["all", "final"] = "all"
     """Whether the loss acts on the samples of the proposal networks too, or on the final ones alone."""
+    depth_loss_final: float = 0.01
+    """The share of λ that is left after `depth_loss_steps`; until then it falls exponentially. The prior shapes the
+    scene early, and its errors at the outlines of things hold the pictures back late. 1: λ stays."""
+    depth_loss_steps: int = 30000
+    """Steps in which λ falls."""
+    sky_loss_mult: float = 0.01
+    """With the edge loss: weight of what rays into the sky hit, their accumulated weight. 0: the sky is left to
+    colour."""
+    sky_background: bool = True
+    """With the edge loss: what no sample stops is coloured by the field at infinity, where the sky is. False: by the
+    last sample, as in nerfacto, from wherever that is."""
+    surface_loss_mult: float = 1.0
+    """With the edge loss: weight of the colour error of the field at the prior's distance, for the datamanager's
+    `surface_rays_per_batch` further pixels at one sample each."""
+    exposure: Literal["gain", "embedding"] = "gain"
+    """What makes up for a camera's drifting exposure. gain: a factor for each colour of each training picture, their
+    geometric mean 1, with which views are rendered. embedding: nerfacto's appearance embedding, for views the mean of
+    all pictures'; that of a mean is not the mean of what they make."""
     edge_gaussian: Literal["point", "interval"] = "interval"
     """How Eq. 4 weighs a sample: by the Gaussian's value at its middle times its length, or by the Gaussian's mass
     over its interval."""
@@ -67,13 +87,24 @@ class EdgeDepthNerfModelConfig(NerfactoModelConfig):
     checkpoints of its own. auto: tcnn on a GPU where it is installed, else fused."""
 
 
+INFINITELY_FAR = 1e4
+"""Scene units: so far that the place in the contracted scene is the direction alone."""
+LEAST_HIT = 0.05
+"""Rays that stop less than this share of their light are said to hit nothing."""
+
+
 class DepthInEvaluation(DepthRenderer):
-    """nerfstudio's depth; nothing in training, where nobody reads it."""
+    """nerfstudio's depth, of that share of a ray that hits something; nothing in training, where nobody reads it.
+
+    At an outline a pixel is half sky, half house: the house's distance is its distance.
+    """
 
     def forward(self, weights: Tensor, ray_samples: RaySamples, *args: Any, **kwargs: Any) -> Any:
         """Give the depth, [rays, 1]; in training None."""
         if self.training:
             return None
+        hit = weights.sum(dim=-2, keepdim=True)
+        weights = torch.where(hit > LEAST_HIT, weights / hit.clamp(min=LEAST_HIT), weights)
         return super().forward(weights, ray_samples, *args, **kwargs)
 
 
@@ -149,6 +180,12 @@ class EdgeDepthNerfModel(NerfactoModel):
         # nerfstudio knows two of them; the model's own configuration says which was built
         self.config = replace(self.config, implementation="tcnn" if implementation == "tcnn" else "torch")
         self._fused = implementation == "fused"
+        if self.config.exposure == "gain":
+            self.config.use_appearance_embedding = False
+        self._has_sky = self.config.depth_loss == "edge" and self.config.sky_background
+        if self._has_sky:
+            # nothing is added to what samples stop; `get_outputs` adds the colour at infinity
+            self.config.background_color = "black"
         with lpips_not_built():
             super().populate_modules()
         if implementation == "fused":
@@ -180,15 +217,56 @@ class EdgeDepthNerfModel(NerfactoModel):
             far_plane=self.config.far_m / self.metres_per_unit,
             reset_near_plane=False,
         )
+        if self.config.exposure == "gain":
+            self.log_gains = torch.nn.Parameter(torch.zeros(self.num_train_data, 3))
+        self._step = 0
         self.reset_depth_errors()
 
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """Nerfacto's callbacks, and one that tells the step."""
+
+        def remember(step: int) -> None:
+            self._step = step
+
+        return [
+            *super().get_training_callbacks(training_callback_attributes),
+            TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], remember, update_every_num_iters=1),
+        ]
+
+    def get_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
+        """Nerfacto's parameters; the pictures' gains go with the fields."""
+        groups = super().get_param_groups()
+        if self.config.exposure == "gain":
+            groups["fields"].append(self.log_gains)
+        return groups
+
+    def _exposed(self, colours: Float[Tensor, "rays 3"], rays: RayBundle) -> Float[Tensor, "rays 3"]:
+        """Colours as the training pictures that the rays are from have them; as they are at evaluation."""
+        if not self.training or self.config.exposure != "gain":
+            return colours
+        assert rays.camera_indices is not None
+        gains = self.log_gains - self.log_gains.mean(dim=0)
+        return colours * gains[rays.camera_indices[:, 0]].exp()
+
+    def _field_at(self, rays: RayBundle, distance: Float[Tensor, "rays"]) -> Float[Tensor, "rays 3"]:
+        """Colours of the field at one distance along each ray, scene units."""
+        at = distance[:, None, None]
+        samples = rays.get_ray_samples(bin_starts=0.99 * at, bin_ends=1.01 * at)
+        return self.field.forward(samples)[FieldHeadNames.RGB][:, 0]
+
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
-        """Nerfacto's outputs; in training without the depths that no loss reads.
+        """Nerfacto's outputs before the sky; in training without the depths that no loss reads.
 
         In evaluation also, in metres, the median `distance` and `distance_uncertainty`, the standard deviation of where
         the ray ends. (nerfstudio divides outputs with "depth" in their name by the scene's scale; these have none.)
         """
         outputs = super().get_outputs(ray_bundle)
+        if self._has_sky:
+            behind = self._field_at(ray_bundle, ray_bundle.origins.new_full((len(ray_bundle),), INFINITELY_FAR))
+            outputs["rgb"] = outputs["rgb"] + (1 - outputs["accumulation"]) * behind
+        outputs["rgb"] = self._exposed(outputs["rgb"], ray_bundle)
         if not self.training:
             outputs["expected_depth"], std = outputs["expected_depth"].split(1, dim=-1)
             outputs["distance"] = outputs["depth"] * self.metres_per_unit
@@ -235,7 +313,29 @@ class EdgeDepthNerfModel(NerfactoModel):
                 levels = levels[-1:]
             per_level = [self._depth_loss(weights, samples, outputs, batch) for weights, samples in levels]
             name = "edge_loss" if self.config.depth_loss == "edge" else "depth_loss"
-            losses[name] = self.config.depth_loss_mult * torch.stack(per_level).mean()
+            losses[name] = self._depth_weight() * torch.stack(per_level).mean()
+        if self.training and self.config.depth_loss == "edge":
+            losses |= self._sky_and_surface_losses(outputs, batch)
+        return losses
+
+    def _depth_weight(self) -> float:
+        """λ at this step."""
+        share = min(1.0, self._step / max(1, self.config.depth_loss_steps))
+        return self.config.depth_loss_mult * self.config.depth_loss_final**share
+
+    def _sky_and_surface_losses(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
+        losses = {}
+        if self.config.sky_loss_mult > 0:
+            sky = batch["sky"][:, 0].to(self.device)
+            per_level = [sky_loss(weights[..., 0], sky) for weights in outputs["weights_list"]]
+            losses["sky_loss"] = self.config.sky_loss_mult * torch.stack(per_level).mean()
+        if self.config.surface_loss_mult > 0 and "surface_rays" in batch:
+            rays, sky = batch["surface_rays"], batch["surface_sky"][:, 0]
+            # any place within what the prior leaves open may be the surface
+            distance_m, sigma_m = batch["surface_distance_m"][:, 0], batch["surface_sigma_m"][:, 0]
+            distance = (distance_m + sigma_m * torch.randn_like(sigma_m)).clamp(min=0) / self.metres_per_unit
+            colours = self._exposed(self._field_at(rays, torch.where(sky, INFINITELY_FAR, distance)), rays)
+            losses["surface_loss"] = self.config.surface_loss_mult * self.rgb_loss(batch["surface_image"], colours)
         return losses
 
     def _nerfacto_losses(

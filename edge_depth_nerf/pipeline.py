@@ -37,7 +37,7 @@ class EdgeDepthPipeline(VanillaPipeline):
     """nerfstudio's pipeline with pooled depth errors."""
 
     def __init__(self, config: EdgeDepthPipelineConfig, device: str | torch.device, *args: Any, **kwargs: Any) -> None:
-        """Build both parts; a model without depth loss has no prior made for it.
+        """Build both parts; a model gets neither a prior nor further pixels that it would not use.
 
         Raises:
             InputError: the model has a depth loss, but no training pixel has a prior.
@@ -46,6 +46,8 @@ class EdgeDepthPipeline(VanillaPipeline):
         assert isinstance(model, EdgeDepthNerfModelConfig) and isinstance(data, FisheyeDepthDataManagerConfig)
         if model.depth_loss == "none":
             config = replace(config, datamanager=replace(data, depth_source="none"))
+        elif model.depth_loss != "edge" or model.surface_loss_mult == 0:
+            config = replace(config, datamanager=replace(data, surface_rays_per_batch=0))
         super().__init__(config, str(device), *args, **kwargs)
         manager = self.datamanager
         assert isinstance(manager, FisheyeDepthDataManager)

@@ -1,9 +1,9 @@
 """The training pixels that count, on disk in a random order.
 
 Pure. Only valid pixels of each picture are kept, as records of 15 bytes: colour as uint8, prior distance and sigma as
-uint16 in 1/256 m (0 = no prior), and where the pixel is. Their order is random, so that a batch is one contiguous
-read of a memory-mapped file: any number of pictures needs next to no memory of the process's own. A batch holds each
-pixel at most once, and all pixels are passed before one comes again.
+uint16 in 1/256 m (0 = no prior; the sky has no distance and the largest sigma), and where the pixel is. Their order is
+random, so that a batch is one contiguous read of a memory-mapped file: any number of pictures needs next to no memory
+of the process's own. A batch holds each pixel at most once, and all pixels are passed before one comes again.
 
 The order is made in two passes: each pixel goes to one of several files, drawn at random; then each file, small enough
 for memory, is shuffled and appended to the whole. That is a uniformly random permutation.
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import tempfile
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from types import TracebackType
 from typing import IO
@@ -27,7 +27,7 @@ from torch import Tensor
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import DISTANCE_STEPS_PER_METRE, read_json, write_atomically, write_json
 
-TABLE_VERSION = 1
+TABLE_VERSION = 2
 """Raised whenever the form of the file changes."""
 BUCKET_BYTES = 64 << 20
 """So much is shuffled in memory at once."""
@@ -42,6 +42,8 @@ RECORD = np.dtype(
     ]
 )
 """One pixel, packed."""
+SKY = 65535
+"""The sigma, in steps, of a pixel that shows the sky; its distance is 0."""
 LARGEST_SIDE_PX = 1 << 16
 """Rows and columns are kept in 16 bits."""
 
@@ -70,7 +72,13 @@ class PixelBatch:
     prior_distance_m: Float[Tensor, "n 1"]
     """Prior of the distance along the ray, metres, 0 = none."""
     prior_sigma_m: Float[Tensor, "n 1"]
-    """Its standard deviation, metres."""
+    """Its standard deviation, metres; 0 without a prior."""
+    sky: Bool[Tensor, "n 1"]
+    """Whether the pixel is known to show the sky."""
+
+    def __getitem__(self, chosen: Bool[Tensor, "n"]) -> PixelBatch:
+        """Some of the pixels."""
+        return PixelBatch(**{entry.name: getattr(self, entry.name)[chosen] for entry in fields(self)})
 
 
 class PixelTable:
@@ -110,13 +118,29 @@ class PixelTable:
         def metres(steps: NDArray[np.uint16]) -> Tensor:
             return torch.from_numpy(steps.astype(np.float32) / DISTANCE_STEPS_PER_METRE)[:, None]
 
+        sky = (records["distance"] == 0) & (records["sigma"] == SKY)
         where = np.stack([records[name].astype(np.int64) for name in ("picture", "row", "column")], axis=1)
         return PixelBatch(
             indices=torch.from_numpy(where),
             rgb=torch.from_numpy(records["rgb"].astype(np.float32) / 255),
             prior_distance_m=metres(records["distance"]),
-            prior_sigma_m=metres(records["sigma"]),
+            prior_sigma_m=metres(np.where(sky, 0, records["sigma"])),
+            sky=torch.from_numpy(sky)[:, None],
         )
+
+
+@dataclass(frozen=True, eq=False)
+class PicturePixels:
+    """What a table takes of a picture; all maps H×W."""
+
+    rgb: UInt8[np.ndarray, "h w 3"]
+    mask: Bool[np.ndarray, "h w"]
+    """True where a pixel may be used."""
+    prior_distance_m: Float[np.ndarray, "h w"] | None = None
+    """Metres, 0 = none; None: no prior anywhere."""
+    prior_sigma_m: Float[np.ndarray, "h w"] | None = None
+    sky: Bool[np.ndarray, "h w"] | None = None
+    """Where it is known to show the sky; None: nowhere."""
 
 
 class PixelTableWriter:
@@ -160,14 +184,10 @@ class PixelTableWriter:
         """Remove the temporary files."""
         self._stack.close()
 
-    def add(
-        self,
-        rgb: UInt8[np.ndarray, "h w 3"],
-        mask: Bool[np.ndarray, "h w"],
-        prior_distance_m: Float[np.ndarray, "h w"] | None,
-        prior_sigma_m: Float[np.ndarray, "h w"] | None,
-    ) -> None:
-        """Add the next picture; maps of the prior are metres, None means no prior anywhere."""
+    def add(self, pixels: PicturePixels) -> None:
+        """Add the next picture."""
+        rgb, mask = pixels.rgb, pixels.mask
+        prior_distance_m, prior_sigma_m, sky = pixels.prior_distance_m, pixels.prior_sigma_m, pixels.sky
         assert max(mask.shape) < LARGEST_SIDE_PX
         rows, columns = np.nonzero(mask)
         records = np.zeros(len(rows), RECORD)
@@ -176,6 +196,8 @@ class PixelTableWriter:
         if prior_distance_m is not None and prior_sigma_m is not None:
             records["distance"] = to_steps(prior_distance_m[rows, columns])
             records["sigma"] = _sigma_steps(prior_sigma_m[rows, columns])
+        if sky is not None:
+            records["sigma"][sky[rows, columns] & (records["distance"] == 0)] = SKY
         self._pictures += 1
         if max(self._copies) > 1:
             copies = np.asarray(self._copies)[(records["distance"] > 0).astype(int)]

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 import zipfile
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -18,7 +19,7 @@ from typing import Literal, get_args
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 from numpy.typing import NDArray
 
 from edge_depth_nerf.cameras import Camera
@@ -33,6 +34,9 @@ CACHE_VERSION = 4
 
 FARTHEST_M = 200.0
 """A monocular distance beyond means "far": under calibrated sigma there is no prior."""
+
+LOWEST_SKY_DEG = 2.0
+"""Nearer to the horizon a missing monocular distance may be the end of the world's hills as well as sky."""
 
 PriorSigma = Literal["calibrated", "constant", "image", "spread", "combined"]
 
@@ -112,6 +116,17 @@ def view_of(camera: Camera, up_in_camera: Float[np.ndarray, "3"]) -> View:
     elevation = np.arcsin(np.clip(directions @ up_in_camera.astype(np.float32), -1, 1))
     theta = np.arccos(np.clip(directions[..., 2], -1, 1))
     return View(np.nan_to_num(theta, nan=np.pi), np.nan_to_num(elevation, nan=-np.pi / 2))
+
+
+def sky_of(
+    mono_m: Float[np.ndarray, "h w"], lidar_m: Float[np.ndarray, "h w"] | None, view: View
+) -> Bool[np.ndarray, "h w"]:
+    """Where a monocular map says that nothing is there: without distance, above the horizon, and no LiDAR return.
+
+    (`process` and `estimate-depth` take the sky out of the maps.)
+    """
+    sky = ~(np.nan_to_num(mono_m) > 0) & (view.elevation_rad > math.radians(LOWEST_SKY_DEG))
+    return sky if lidar_m is None else sky & ~(np.nan_to_num(lidar_m) > 0)
 
 
 @dataclass(frozen=True)

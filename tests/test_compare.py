@@ -65,9 +65,10 @@ def differing(one, other):
 
 
 LOSS, SOURCE = "pipeline.model.depth_loss", "pipeline.datamanager.depth_source"
-RIVAL = {LOSS, SOURCE, "pipeline.model.depth_loss_mult", "pipeline.model.depth_sigma"}
+RIVAL = {LOSS, SOURCE, "pipeline.model.depth_loss_mult", "pipeline.model.depth_sigma", LOSS + "_final"}
 ALLOWED = {
     "nerfacto": {LOSS, SOURCE},
+    "nerfacto-embedding": {LOSS, SOURCE, "pipeline.model.exposure"},
     "urban-nerf": RIVAL,
     "ds-nerf": RIVAL,
     "edge-lidar": {SOURCE},
@@ -90,7 +91,11 @@ def test_each_method_is_what_its_name_says():
         found = resolved(method)
         return found[LOSS], found[SOURCE], found["pipeline.datamanager.integration"]
 
-    assert loss_and_source("nerfacto")[0] == "none"
+    assert loss_and_source("nerfacto")[0] == loss_and_source("nerfacto-embedding")[0] == "none"
+    exposures = {method: resolved(method)["pipeline.model.exposure"] for method in ALLOWED}
+    assert {name for name, exposure in exposures.items() if exposure == "embedding"} == {"nerfacto-embedding"}
+    # nerfstudio's losses keep their weight
+    assert {resolved(method)[LOSS + "_final"] for method in ("urban-nerf", "ds-nerf")} == {1.0}
     assert loss_and_source("urban-nerf") == ("urban-nerf", "lidar", "edge-aware")
     assert loss_and_source("ds-nerf") == ("ds-nerf", "lidar", "edge-aware")
     assert loss_and_source("edge-lidar") == ("edge", "lidar", "edge-aware")
@@ -225,7 +230,7 @@ def test_judging_leaves_no_trace_in_a_training(tmp_path):
     ends, figures = [], []
     for judged in (False, True):
         pipeline.load_state_dict(start)
-        pipeline.datamanager.train_pixel_sampler._drawn = 0
+        pipeline.datamanager.train_pixel_sampler._drawn = pipeline.datamanager._surface_sampler._drawn = 0
         sampler = pipeline.model.proposal_sampler
         sampler._steps_since_update, sampler._step = 0, 0
         config = make_specifications(read_method_file())["edge-depth-nerf-lite"].config

@@ -12,7 +12,7 @@ from edge_depth_nerf.datamanager import FisheyeDepthDataManagerConfig
 from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
 from edge_depth_nerf.dataset import FisheyeDepthDataset
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_json, write_json, write_mask
+from edge_depth_nerf.files import read_distance_png, read_json, write_distance_png, write_json, write_mask
 from edge_depth_nerf.mono.error_model import read_trust
 from edge_depth_nerf.mono.trust import calibrate_scene, find_trust
 from edge_depth_nerf.prior import make_prior, view_of
@@ -59,6 +59,32 @@ def test_a_batch_carries_colour_prior_and_rays_of_its_pixels(tmp_path):
     in_world = (poses[:, :, :3] @ (directions * torch.tensor([1.0, -1.0, -1.0]))[..., None])[..., 0]
     assert torch.allclose(rays.directions.double(), in_world, atol=1e-5)
     assert torch.isfinite(rays.directions).all()
+
+
+def test_further_pixels_come_for_the_surface_where_the_prior_is_good(tmp_path):
+    scene = write_scene(tmp_path)
+    mono = scene / "mono" / "0000.png"
+    distance = read_distance_png(mono)
+    distance[:8] = 0  # sky, where that is above the horizon
+    write_distance_png(mono, distance)
+    data = manager(scene, train_num_rays_per_batch=100, surface_rays_per_batch=4000)
+    _, batch = data.next_train(0)
+    distance, sigma, sky = (batch[f"surface_{name}"][:, 0] for name in ("distance_m", "sigma_m", "sky"))
+    assert 0 < len(sky) < 4000 and len(batch["surface_rays"]) == len(batch["surface_image"]) == len(sky)
+    assert sky.any() and ((distance > 0) ^ sky).all()
+    assert (sigma <= 0.1 + 0.05 * distance).all()
+    picture, row, column = batch["surface_indices"].T
+    names = [path.name for path in data.train_dataset.image_filenames]
+    assert {names[number] for number in picture[sky]} == {"0000.png"} and (row[sky] < 8).all()
+    for n in range(0, len(sky), 50):
+        rgb = data.train_dataset.rgb(int(picture[n]))[int(row[n]), int(column[n])]
+        assert torch.equal((batch["surface_image"][n] * 255).round().to(torch.uint8), torch.from_numpy(rgb))
+    # the same pixels again after a training is taken up
+    again, _ = (data._surface_sampler.sample(step) for step in (7, 8))
+    other = manager(scene, train_num_rays_per_batch=100, surface_rays_per_batch=4000)
+    other._surface_sampler._first = data._surface_sampler._first
+    assert torch.equal(other._surface_sampler.sample(7).indices, again.indices)
+    assert "surface_rays" not in manager(scene, surface_rays_per_batch=0).next_train(0)[1]
 
 
 def test_held_out_maps_are_in_no_training_prior(tmp_path):

@@ -8,7 +8,7 @@ import reference
 import torch
 
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.losses import EPS, Gaussian, edge_loss
+from edge_depth_nerf.losses import EPS, Gaussian, edge_loss, sky_loss
 
 GAUSSIANS: tuple[Gaussian, ...] = ("point", "interval")
 FORMS = [(gaussian, norm) for gaussian in GAUSSIANS for norm in (False, True)]
@@ -248,3 +248,15 @@ def test_a_number_and_a_tensor_of_sigma_are_the_same():
 def test_wrong_input(change, words, unchecked_types):
     with pytest.raises(InputError, match=words):
         edge_loss(**{**random_rays(7), **change})
+
+
+def test_the_sky_loss_is_the_mean_share_that_is_stopped():
+    weights = torch.tensor([[0.2, 0.3], [0.0, 0.0], [0.9, 0.1], [0.4, 0.5]], dtype=torch.float64, requires_grad=True)
+    loss = sky_loss(weights, torch.tensor([True, True, False, True]))
+    assert float(loss) == pytest.approx((0.5 + 0 + 0.9) / 3)
+    loss.backward()
+    assert weights.grad is not None
+    assert weights.grad.tolist() == [[pytest.approx(1 / 3)] * 2] * 2 + [[0, 0]] + [[pytest.approx(1 / 3)] * 2]
+    none = sky_loss(weights, torch.zeros(4, dtype=torch.bool))
+    assert float(none) == 0 and none.requires_grad
+    assert sky_loss(weights.half(), torch.ones(4, dtype=torch.bool)).dtype == torch.float32

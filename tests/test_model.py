@@ -6,12 +6,14 @@ import torch
 from nerfstudio.cameras.rays import Frustums, RayBundle, RaySamples
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.model_components.losses import ds_nerf_depth_loss, urban_radiance_field_depth_loss
 from nerfstudio.models.nerfacto import NerfactoModel
 
 from edge_depth_nerf.compat import lpips_not_built
 from edge_depth_nerf.losses import edge_loss
-from edge_depth_nerf.model import EdgeDepthNerfModel
+from edge_depth_nerf.model import DepthInEvaluation, EdgeDepthNerfModel
 
 METRES_PER_UNIT = 20.0
 
@@ -43,6 +45,21 @@ def batch(count=16) -> dict:
         "image": torch.rand(count, 3, generator=generator),
         "prior_distance_m": prior,
         "prior_sigma_m": 0.1 * prior,
+        "sky": (torch.arange(count) % 8 == 0)[:, None],
+    }
+
+
+def surface(count=6) -> dict:
+    """Further pixels, the last two of them sky."""
+    generator = torch.Generator().manual_seed(4)
+    sky = (torch.arange(count) >= count - 2)[:, None]
+    distance = torch.where(sky, 0.0, 4 + torch.rand(count, 1, generator=generator))
+    return {
+        "surface_rays": rays(count),
+        "surface_image": torch.rand(count, 3, generator=generator),
+        "surface_distance_m": distance,
+        "surface_sigma_m": torch.where(sky, 0.0, 1e-6),
+        "surface_sky": sky,
     }
 
 
@@ -131,10 +148,103 @@ def test_sigma_of_ds_nerf_is_a_standard_deviation_in_metres():
 def test_without_a_depth_loss_it_is_nerfacto():
     _, losses = trained_step(build(depth_loss="none"))
     assert set(losses) == {"rgb_loss", "interlevel_loss", "distortion_loss"}
-    with_loss = trained_step(build())[1]
-    assert set(with_loss) == {*losses, "edge_loss"}
+    with_loss = trained_step(build(sky_background=False))[1]
+    assert set(with_loss) == {*losses, "edge_loss", "sky_loss"}
     for name, value in losses.items():
         assert torch.equal(value, with_loss[name])
+
+
+def colours_at(model, bundle: RayBundle, distance_units) -> torch.Tensor:
+    """What the field says of places along rays."""
+    places = bundle.get_ray_samples(bin_starts=distance_units[:, None, None], bin_ends=distance_units[:, None, None])
+    return model.field(places)[FieldHeadNames.RGB][:, 0]
+
+
+def test_the_weight_of_the_depth_loss_falls_over_the_training():
+    model = build(depth_loss_mult=0.5, depth_loss_final=0.01, depth_loss_steps=100)
+    expected = float(trained_step(model)[1]["edge_loss"])
+    (tell,) = (
+        callback
+        for callback in model.get_training_callbacks(
+            TrainingCallbackAttributes(optimizers=None, grad_scaler=None, pipeline=None, trainer=None)
+        )
+        if callback.func.__name__ == "remember"
+    )
+    for step, share in ((0, 1.0), (50, 0.1), (100, 0.01), (5000, 0.01)):
+        tell.run_callback_at_location(step, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
+        assert float(trained_step(model)[1]["edge_loss"]) == pytest.approx(expected * share, rel=1e-4)
+
+
+def test_what_nothing_stops_has_the_colour_of_the_direction():
+    """Empty space shows the field at infinity: the same from wherever the camera stands."""
+    model, plain = build().eval(), build(sky_background=False).eval()
+    with torch.no_grad():
+        # a new field has one colour everywhere
+        for of_model, of_plain in zip(model.field.parameters(), plain.field.parameters(), strict=True):
+            of_plain.copy_(of_model.normal_(0, 0.3))
+        behind = colours_at(model, rays(), torch.full((16,), 1e4))
+        elsewhere = replace(rays(), origins=torch.full((16, 3), 0.4))
+        assert torch.allclose(colours_at(model, elsewhere, torch.full((16,), 1e6)), behind, atol=5e-2)
+        assert not torch.allclose(model(rays())["rgb"], behind, atol=5e-2)
+        model.field.average_init_density = 0.0  # nothing anywhere
+        assert torch.allclose(model(rays())["rgb"], behind, atol=1e-3)
+        assert torch.allclose(model(elsewhere)["rgb"], behind, atol=5e-2)
+        plain.field.average_init_density = 0.0
+        assert not torch.allclose(plain(rays())["rgb"], behind, atol=5e-2)
+
+
+def test_views_have_the_geometric_mean_of_the_pictures_gains():
+    model = build()
+    with torch.no_grad():
+        model.log_gains.copy_(torch.tensor([[0.1, 0.2, 0.3], [0.3, 0.2, 0.1], [0.5, 0.2, 0.2]]))
+    bundle = replace(rays(), camera_indices=(torch.arange(16) % 3)[:, None])
+    colours = torch.rand(16, 3)
+    expected = colours * torch.tensor([[-0.2, 0, 0.1], [0, 0, -0.1], [0.2, 0, 0]]).exp()[torch.arange(16) % 3]
+    assert torch.allclose(model.train()._exposed(colours, bundle), expected)
+    assert torch.equal(model.eval()._exposed(colours, bundle), colours)
+    # they are learned, and kept with the rest
+    assert any(parameter is model.log_gains for parameter in model.get_param_groups()["fields"])
+    torch.stack(list(trained_step(model)[1].values())).sum().backward()
+    assert model.log_gains.grad is not None and bool(model.log_gains.grad.abs().sum() > 0)
+    assert "log_gains" in model.state_dict() and model.field.embedding_appearance is None
+    embedded = build(exposure="embedding")
+    assert "log_gains" not in embedded.state_dict() and embedded.field.embedding_appearance is not None
+
+
+def test_the_sky_loss_is_what_rays_into_the_sky_hit():
+    model = build(sky_loss_mult=0.5)
+    outputs, losses = trained_step(model)
+    sky = batch()["sky"][:, 0]
+    hit = [float(weights[sky].sum(dim=1).mean()) for weights in outputs["weights_list"]]
+    assert float(losses["sky_loss"]) == pytest.approx(0.5 * sum(hit) / 3, rel=1e-4)
+    assert "sky_loss" not in trained_step(build(sky_loss_mult=0.0))[1]
+
+
+def test_the_surface_loss_is_the_field_colour_error_at_the_prior():
+    model = build(surface_loss_mult=0.5).train()
+    given = surface()
+    torch.manual_seed(3)
+    outputs = model(rays())
+    supervision = batch() | given
+    losses = model.get_loss_dict(outputs, supervision, model.get_metrics_dict(outputs, supervision))
+    where = torch.where(given["surface_sky"], 1e4, given["surface_distance_m"] / METRES_PER_UNIT)[:, 0]
+    colours = colours_at(model, given["surface_rays"], where)
+    expected = 0.5 * (colours - given["surface_image"]).square().mean()
+    assert float(losses["surface_loss"]) == pytest.approx(float(expected), rel=1e-3)
+    losses["surface_loss"].backward()
+    assert any(p.grad is not None and bool(p.grad.abs().sum() > 0) for p in model.field.mlp_base.parameters())
+
+
+def test_distance_is_that_of_what_a_ray_hits():
+    """A ray that is half sky is as far as what the other half hits; one that hits nothing is far."""
+    starts = torch.arange(4.0)[None, :, None].expand(3, -1, -1)
+    zero = torch.zeros(3, 4, 3)
+    samples = RaySamples(
+        frustums=Frustums(origins=zero, directions=zero, starts=starts, ends=starts + 1, pixel_area=starts)
+    )
+    weights = torch.tensor([[0.0, 0.3, 0.0, 0.0], [0.0, 0.0, 0.8, 0.2], [0.01, 0.0, 0.0, 0.0]])[..., None]
+    renderer = DepthInEvaluation(method="median").eval()
+    assert renderer(weights, samples)[:, 0].tolist() == [1.5, 2.5, 3.5]
 
 
 def test_rays_without_prior_add_nothing():
@@ -222,7 +332,7 @@ class _MeanDifference(torch.nn.Module):
 
 def test_same_parameters_as_nerfacto():
     """Checkpoints go back and forth between nerfacto and this model (but for LPIPS, which nerfacto stores)."""
-    ours = build()
+    ours = build(exposure="embedding")
     with lpips_not_built():
         host = NerfactoModel(config=ours.config, scene_box=ours.scene_box, num_train_data=3)
     shapes = [{name: value.shape for name, value in model.state_dict().items()} for model in (ours, host)]

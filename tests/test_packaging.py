@@ -103,7 +103,7 @@ def test_the_wheel_works_without_the_sources(wheel, tmp_path):
     code = (
         f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import edge_depth_nerf.config as c, edge_depth_nerf; "
         f"assert edge_depth_nerf.__file__.startswith({str(tmp_path)!r}), edge_depth_nerf.__file__; "
-        "assert c.edge_depth_nerf_lite.config.pipeline.model.num_levels == 8"
+        "assert c.edge_depth_nerf_lite.config.pipeline.model.num_levels == 12"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=False)
     assert done.returncode == 0, done.stderr

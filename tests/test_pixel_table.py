@@ -2,11 +2,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from edge_depth_nerf import pixel_table
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_json, write_json
-from edge_depth_nerf.pixel_table import RECORD, PixelTable, PixelTableWriter, to_steps
+from edge_depth_nerf.pixel_table import RECORD, PicturePixels, PixelTable, PixelTableWriter, to_steps
 
 RNG = np.random.default_rng(5)
 
@@ -20,8 +21,7 @@ def picture(height, width):
 def table_of(path: Path, masks, priors=None, seed=0, prior_weight=1.0) -> PixelTable:
     with PixelTableWriter(path, sum(mask.size for mask in masks), seed, prior_weight) as writer:
         for number, mask in enumerate(masks):
-            distance, sigma = priors[number] if priors else (None, None)
-            writer.add(picture(*mask.shape), mask, distance, sigma)
+            writer.add(PicturePixels(picture(*mask.shape), mask, *(priors[number] if priors else ())))
         writer.finish()
     return PixelTable(path)
 
@@ -149,6 +149,22 @@ def test_what_is_not_whole_does_not_open(tmp_path):
 
 def test_an_interrupted_writer_leaves_nothing(tmp_path):
     with pytest.raises(KeyboardInterrupt), PixelTableWriter(tmp_path / "t.npy", 64) as writer:
-        writer.add(picture(8, 8), np.ones((8, 8), bool), None, None)
+        writer.add(PicturePixels(picture(8, 8), np.ones((8, 8), bool)))
         raise KeyboardInterrupt
     assert not list(tmp_path.iterdir())
+
+
+def test_the_sky_is_known_where_there_is_no_prior(tmp_path):
+    distance, sky = np.zeros((6, 7), np.float32), np.zeros((6, 7), bool)
+    distance[3:], sky[:4] = 5.0, True
+    with PixelTableWriter(tmp_path / "t.npy", 42) as writer:
+        writer.add(PicturePixels(picture(6, 7), np.ones((6, 7), bool), distance, distance / 10, sky))
+        writer.finish()
+    table = PixelTable(tmp_path / "t.npy")
+    batch = table.batch(0, 42)
+    rows = batch.indices[:, 1]
+    assert table.share_with_prior == 0.5
+    assert torch.equal(batch.sky[:, 0], rows < 3)  # a distance says more than the colour of the sky
+    assert torch.equal(batch.prior_sigma_m[:, 0] > 0, rows >= 3)
+    chosen = batch[batch.sky[:, 0]]
+    assert torch.equal(chosen.indices, batch.indices[rows < 3]) and chosen.sky.all()

@@ -10,7 +10,7 @@ from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.integration import IntegrationOptions, integrate_depth
 from edge_depth_nerf.mono.alignment import Fit
 from edge_depth_nerf.mono.error_model import KNOTS, ErrorModel, Trust
-from edge_depth_nerf.prior import PriorCache, PriorOptions, View, make_prior, view_of
+from edge_depth_nerf.prior import PriorCache, PriorOptions, View, make_prior, sky_of, view_of
 
 RNG = np.random.default_rng(2)
 
@@ -182,3 +182,12 @@ def test_a_mono_map_of_another_size(unchecked_types):
     lidar, mono, mask = maps()
     with pytest.raises(InputError, match=r"mono_m \(11, 10\)"):
         make_prior(lidar, mono[1:], mask, PriorOptions())
+
+
+def test_sky_is_above_the_horizon_without_any_distance():
+    mono = np.array([[0, 0, 30], [0, np.nan, 30], [0, 0, 30]], np.float32)
+    lidar = np.array([[0, 40, 0], [0, 0, 0], [0, 0, 0]], np.float32)
+    elevation = np.radians([[20.0] * 3, [20.0] * 3, [1.0] * 3]).astype(np.float32)
+    view = View(np.zeros((3, 3), np.float32), elevation)
+    assert sky_of(mono, lidar, view).tolist() == [[True, False, False], [True, True, False], [False] * 3]
+    assert sky_of(mono, None, view)[0].tolist() == [True, True, False]

@@ -13,6 +13,9 @@ LAMBDA = "pipeline.model.depth_loss_mult"
 _SOURCE = "pipeline.datamanager.depth_source"
 _LOSS = "pipeline.model.depth_loss"
 _LOSS_SIGMA = "pipeline.model.depth_sigma"
+_EXPOSURE = "pipeline.model.exposure"
+_FINAL = "pipeline.model.depth_loss_final"
+"""nerfstudio's losses keep their weight."""
 _PRIOR_SIGMA = "pipeline.datamanager.sigma_constant"
 
 
@@ -50,9 +53,15 @@ METHODS: dict[MethodName, Method] = {
     for method in (
         Method("nerfacto", "nerfacto", {_LOSS: "none"}, rival=True),
         Method(
+            "nerfacto-embedding",
+            "nerfacto, appearance embedding",
+            {_LOSS: "none", _EXPOSURE: "embedding"},
+            rival=True,
+        ),
+        Method(
             "urban-nerf",
             "UrbanNeRF loss",
-            {_LOSS: "urban-nerf", _SOURCE: "lidar", LAMBDA: 0.01, _LOSS_SIGMA: 0.5},
+            {_LOSS: "urban-nerf", _SOURCE: "lidar", LAMBDA: 0.01, _LOSS_SIGMA: 0.5, _FINAL: 1.0},
             ("lidar",),
             sigma_field=_LOSS_SIGMA,
             rival=True,
@@ -60,7 +69,7 @@ METHODS: dict[MethodName, Method] = {
         Method(
             "ds-nerf",
             "DS-NeRF loss",
-            {_LOSS: "ds-nerf", _SOURCE: "lidar", LAMBDA: 0.01, _LOSS_SIGMA: 0.5},
+            {_LOSS: "ds-nerf", _SOURCE: "lidar", LAMBDA: 0.01, _LOSS_SIGMA: 0.5, _FINAL: 1.0},
             ("lidar",),
             sigma_field=_LOSS_SIGMA,
             rival=True,
@@ -108,5 +117,6 @@ def default_methods(preset: Preset, with_loss: bool = False) -> tuple[MethodName
     return tuple(
         method.name
         for method in METHODS.values()
-        if not (preset == "paper" and method.literal) and not (with_loss and method.sigma_field is None)
+        if not (preset == "paper" and (method.literal or _EXPOSURE in method.overrides))
+        and not (with_loss and method.sigma_field is None)
     )

@@ -14,7 +14,15 @@ from edge_depth_nerf.errors import InputError
 Preset = Literal["lite", "full", "paper"]
 Implementation = Literal["same", "torch"]
 MethodName = Literal[
-    "nerfacto", "urban-nerf", "ds-nerf", "edge-lidar", "edge-mono", "edge-gaussian", "edge-paper", "edge"
+    "nerfacto",
+    "nerfacto-embedding",
+    "urban-nerf",
+    "ds-nerf",
+    "edge-lidar",
+    "edge-mono",
+    "edge-gaussian",
+    "edge-paper",
+    "edge",
 ]
 Sigma = float | Literal["own"]
 
@@ -97,7 +105,8 @@ class CompareOptions:
         require(len(self.scenes) == 1, f"--search with {len(self.scenes)} scenes", "one, which no table uses")
         require(len(self.seeds) == 1, f"--search with {len(self.seeds)} seeds", "one, which no table uses")
         require(self.tuned is None, "--search with --tuned", "one of them")
-        require("nerfacto" not in self.methods, "--search --methods nerfacto", "methods with a depth loss")
+        without = [name for name in self.methods if name.startswith("nerfacto")]
+        require(not without, f"--search --methods {' '.join(without)}", "methods with a depth loss")
         require(
             len(self.lambdas) >= LEAST_LAMBDAS and all(math.isfinite(x) and x > 0 for x in self.lambdas),
             f"--lambdas {' '.join(map(str, self.lambdas))}",

@@ -26,6 +26,7 @@ from edge_depth_nerf.report.build import Plot
 STYLES: dict[MethodName, tuple[str, str, str, str]] = {
     # on white, on dark, line, marker: rivals grey and dashed, ours in colours; also told apart without colours
     "nerfacto": ("#888888", "#9aa3ad", "--", "o"),
+    "nerfacto-embedding": ("#b5b5b5", "#6f7780", ":", "x"),
     "urban-nerf": ("#b08030", "#d9a94a", "--", "s"),
     "ds-nerf": ("#444444", "#d5dae0", "--", "^"),
     "edge-lidar": ("#2a9d8f", "#3cc4b3", ":", "v"),

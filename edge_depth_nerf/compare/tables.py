@@ -342,7 +342,14 @@ def make_tables(results: Results) -> list[MadeTable]:
         "1": [scene for scene in results.scenes() if kinds[scene] != JBNU],
         "2": [scene for scene in results.scenes() if kinds[scene] == JBNU],
     }
-    rivals: list[MethodName] = ["nerfacto", "urban-nerf", "ds-nerf", "edge-paper", "edge"]
+    rivals: list[MethodName] = [
+        "nerfacto-embedding",
+        "nerfacto",
+        "urban-nerf",
+        "ds-nerf",
+        "edge-paper",
+        "edge",
+    ]
     wanted: list[tuple[str, str, list[str], list[MethodName], list[str]]] = [
         ("1", "Rivals, drives of KITTI-360's kind", drives["1"], rivals, []),
         ("2", "Rivals, drives of JBNU-Depth360", drives["2"], rivals, []),

@@ -115,7 +115,7 @@ class FusedNerfactoField(NerfactoField):
         directions, cameras = ray_samples.frustums.directions, ray_samples.camera_indices
         assert density_embedding is not None
         more_heads = self.use_transient_embedding or self.use_semantics or self.use_pred_normals
-        one_direction_a_ray = directions.ndim == 3 and directions.stride(1) == 0
+        one_direction_a_ray = directions.ndim == 3 and (directions.shape[1] == 1 or directions.stride(1) == 0)
         plain = isinstance(self.mlp_head, FusedMLP) and _in_parts(density_embedding)
         if more_heads or cameras is None or not one_direction_a_ray or not plain:
             return super().get_outputs(ray_samples, density_embedding)
