@@ -1,29 +1,36 @@
-"""Workarounds for faults of the host, each with what it works around and what would end it.
+"""Workarounds for faults of the host: what each works around, the issue that reports it, and what ends it.
 
-Everything here is about nerfstudio 1.1.5 and what it is installed with; no other module patches the host.
+Everything here is about nerfstudio 1.1.5 and what it is installed with; no other module changes anything of the host's.
+(Subclasses that do more than the host's classes, such as the trainer that writes checkpoints whole, stand in modules of
+their own.) The weekly workflow runs the tests against nerfstudio's newest: a workaround that has ended fails there.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from copy import copy
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
-from nerfstudio.cameras.cameras import Cameras, CameraType
+
+if TYPE_CHECKING:
+    from nerfstudio.cameras.cameras import Cameras
 
 
 def allow_numpy_scalars_in_checkpoints() -> None:
-    """Let `torch.load` read the checkpoints that nerfstudio writes.
+    """Let `torch.load` read the checkpoints that nerfstudio writes, with safe loading left on.
 
-    They hold NumPy scalars (learning rates of schedulers), which torch >= 2.6 refuses by default
-    (nerfstudio issue 3561). Naming the three types keeps safe loading on. NumPy 2 calls the module
-    `numpy._core`; files written under either name are to be read under both.
+    They hold NumPy scalars (learning rates of schedulers), which torch >= 2.6 refuses by default. Naming the types that
+    they consist of keeps safe loading on; nerfstudio's own proposal (pull request 3702) switches it off. NumPy 2 calls
+    the module `numpy._core`; files written under either name are to be read under both.
+
+    Works around: https://github.com/nerfstudio-project/nerfstudio/issues/3683.
     Ends with: a nerfstudio that saves Python floats.
     """
-    if tuple(map(int, torch.__version__.split(".")[:2])) < (2, 6):
-        return  # loads everything by default, and knows no second names for what is allowed
+    import torch
+
     scalar = np.float64(0).__reduce__()[0]
     allowed = [(scalar, "numpy.core.multiarray.scalar"), (scalar, "numpy._core.multiarray.scalar"), np.dtype]
     allowed += [type(np.dtype(kind)) for kind in (np.float64, np.float32, np.int64)]
@@ -35,7 +42,10 @@ def lpips_not_built() -> Iterator[None]:
     """Keep nerfacto from building LPIPS, which downloads AlexNet's weights at start and enters the state dict.
 
     nerfacto's `populate_modules` imports the class at that moment, so the name in torchmetrics is swapped for
-    the duration. Ends with: a nerfstudio that builds its metrics at first use.
+    the duration.
+
+    Works around: https://github.com/nerfstudio-project/nerfstudio/issues/2415.
+    Ends with: a nerfstudio that builds its metrics at first use.
     """
     import torchmetrics.image.lpip as module  # a second and more; nerfstudio's commands start without it
 
@@ -51,11 +61,38 @@ def without_undefined_ray(cameras: Cameras) -> Cameras:
     """Move principal points that lie on a pixel's centre by a thousandth of a pixel, of fisheye cameras.
 
     nerfstudio's ray of that pixel is 0/0 (its viewer's fisheye preview has one whenever the picture's sides are odd).
+
+    No issue reports it; this is what brought it.
+
+    Works around: https://github.com/nerfstudio-project/nerfstudio/pull/305.
     Ends with: a nerfstudio whose `generate_rays` knows the limit.
     """
+    from nerfstudio.cameras.cameras import CameraType
+
     on_centre = (cameras.camera_type == CameraType.FISHEYE.value) & (cameras.cx % 1 == 0.5) & (cameras.cy % 1 == 0.5)
     if not on_centre.any():
         return cameras
     moved = copy(cameras)
     moved.cx = cameras.cx + 1e-3 * on_centre
     return moved
+
+
+@contextmanager
+def quiet_host() -> Iterator[None]:
+    """Keep back what nerfstudio says at its import and at each split that its parser reads.
+
+    Its imports warn of names that torch gives up, as in the log of the issue; its parser prints to a console of its
+    own, whatever the level of logging.
+
+    Works around: https://github.com/nerfstudio-project/nerfstudio/issues/3528.
+    Ends with: a nerfstudio that uses torch.amp, and logs through the logging module.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)
+        from nerfstudio.utils.rich_utils import CONSOLE
+
+        before, CONSOLE.quiet = CONSOLE.quiet, True
+        try:
+            yield
+        finally:
+            CONSOLE.quiet = before

@@ -17,9 +17,9 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
 
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import DISTANCE_STEPS_PER_METRE, read_json
+from edge_depth_nerf.files import DISTANCE_STEPS_PER_METRE
 from edge_depth_nerf.scale import default_metres_per_unit
-from edge_depth_nerf.scene_format import is_own_scene
+from edge_depth_nerf.scene_format import INTRINSICS, is_own_scene, pose_of, read_transforms
 
 SUPPORTED_CAMERA_TYPES = (CameraType.PERSPECTIVE, CameraType.FISHEYE)
 
@@ -59,19 +59,13 @@ class FisheyeDepthDataParserConfig(NerfstudioDataParserConfig):
     """How a scene without split files is divided. Interval holds out every eval_interval-th picture."""
 
 
-def check_meta(meta: Any, path: Path) -> list[dict[str, Any]]:
-    """Check what nerfstudio's parser takes for granted; give the list of frames.
+def check_meta(meta: dict[str, Any], path: Path) -> list[dict[str, Any]]:
+    """Check what nerfstudio's parser takes for granted beyond `read_transforms`; give the list of frames.
 
     Raises:
-        InputError: no frames, an unknown camera model, a frame without picture or pose, a map that only some
-            frames have.
+        InputError: an unknown camera model, a frame without pose or intrinsics, a map that only some frames have.
 
     """
-    if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list) or not meta["frames"]:
-        raise InputError(
-            f"{path}: has no list of frames. Expected a transforms.json of nerfstudio's format; "
-            "`edge-depth-nerf process` writes one."
-        )
     model = meta.get("camera_model", "PINHOLE")
     supported = [name for name, kind in CAMERA_MODEL_TO_TYPE.items() if kind in SUPPORTED_CAMERA_TYPES]
     if model not in supported:
@@ -81,21 +75,15 @@ def check_meta(meta: Any, path: Path) -> list[dict[str, Any]]:
         )
     frames = meta["frames"]
     for number, frame in enumerate(frames):
-        for key in ("file_path", "transform_matrix"):
-            if key not in frame:
-                raise InputError(f"{path}: frame {number} has no {key}. Every frame needs a picture and a pose.")
-        for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
-            if key not in meta and key not in frame:
+        if "transform_matrix" not in frame:
+            raise InputError(f"{path}: frame {number} has no transform_matrix. Every frame needs a picture and a pose.")
+        for key in (*INTRINSICS, "w", "h"):
+            if meta.get(key) is None and frame.get(key) is None:
                 raise InputError(
                     f"{path}: frame {number} ({frame['file_path']}) has no {key}, nor has the whole scene. "
                     "Every camera needs fl_x, fl_y, cx, cy, w and h in pixels."
                 )
-        pose = np.asarray(frame["transform_matrix"], dtype=np.float64)
-        if pose.shape != (4, 4) or not np.isfinite(pose).all():
-            raise InputError(
-                f"{path}: frame {number} ({frame['file_path']}): transform_matrix must be 4×4 finite numbers, "
-                f"found shape {pose.shape}."
-            )
+        pose_of(frame, f"{path}: frame {number} ({frame['file_path']})")
     for key in (*MAP_KEYS.values(), "depth_file_path", "mask_path"):
         missing = [frame["file_path"] for frame in frames if key not in frame]
         if missing and len(missing) < len(frames):
@@ -156,7 +144,7 @@ class FisheyeDepth(Nerfstudio):
                 f"{path}: no such file. --data takes a scene folder with a transforms.json; "
                 "`edge-depth-nerf process` makes one from a raw drive."
             )
-        meta = read_json(path)
+        meta = read_transforms(path)
         frames = check_meta(meta, path)
         check_split(meta, path)
         has_maps = any(key in frames[0] for key in MAP_KEYS.values())

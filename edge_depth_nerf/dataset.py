@@ -22,7 +22,7 @@ from torch import Tensor
 
 from edge_depth_nerf.cameras import Camera, KannalaBrandt, Pinhole
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_distance_png, read_image, read_mask
+from edge_depth_nerf.files import picture_size, read_distance_png, read_image, read_mask, read_npy
 
 
 class FisheyeDepthDataset(InputDataset):
@@ -101,10 +101,7 @@ class FisheyeDepthDataset(InputDataset):
             return None
         metres_per_count = self.metadata["lidar_metres_per_count"]
         if path.suffix == ".npy":
-            try:
-                distance = np.load(path, allow_pickle=False).astype(np.float32) * np.float32(metres_per_count)
-            except (ValueError, EOFError) as error:
-                raise InputError(f"{path}: cannot be read as an array ({error}). Make the file again.") from error
+            distance = read_npy(path).astype(np.float32) * np.float32(metres_per_count)
             if distance.ndim == 3 and distance.shape[2] == 1:
                 distance = distance[..., 0]
         else:
@@ -157,10 +154,12 @@ class FisheyeDepthDataset(InputDataset):
         return found
 
     def _decoded(self, image_idx: int, decode: Callable[[int], Any]) -> Any:
+        path = self.image_filenames[image_idx]
+        # Pillow decodes pictures of any size
+        picture_size(path)
         try:
             return decode(image_idx)
-        except (OSError, SyntaxError) as error:  # Pillow raises either on a broken file
-            path = self.image_filenames[image_idx]
+        except Exception as error:  # Pillow raises whatever its readers meet
             raise InputError(f"{path}: cannot be decoded as a picture ({error}). Copy or make it again.") from error
 
     def _map_path(self, name: str, image_idx: int) -> Path | None:

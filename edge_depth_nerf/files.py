@@ -7,9 +7,13 @@ Masks on disk are 8-bit PNGs: 255 = use the pixel, 0 = ignore it. Pictures are R
 from __future__ import annotations
 
 import json
+import math
 import os
 import threading
-from collections.abc import Callable
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +21,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_depth_nerf.bounds import (
+    MAX_JSON_BYTES,
+    MAX_JSON_VALUES,
+    MAX_PICTURE_BYTES,
+    MAX_PIXELS,
+    check_bytes,
+    check_pixels,
+    read_text,
+)
 from edge_depth_nerf.errors import InputError
 
 DISTANCE_STEPS_PER_METRE = 256
@@ -62,15 +75,32 @@ def read_json(path: Path) -> Any:
 
     Raises:
         FileNotFoundError: there is no such file.
-        InputError: the file is not JSON.
+        InputError: the file is not JSON, or far too large.
 
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
+    text = read_text(path, MAX_JSON_BYTES)
+    if text.count(",") + text.count("[") + text.count("{") > MAX_JSON_VALUES:
+        raise InputError(f"{path}: more than {MAX_JSON_VALUES} values. Split the recording.")
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid JSON ({error}). Mend or re-create the file.") from error
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not valid JSON ({error}). Mend or re-create the file.") from None
+
+
+def read_json_object(path: Path, *keys: str) -> dict[str, Any]:
+    """Read JSON that is to be an object with some keys; what is under them is for the caller to check.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: the file is not JSON, no object, or lacks a key.
+
+    """
+    content = read_json(path)
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: holds no JSON object. Delete or re-create the file.")
+    if missing := [key for key in keys if key not in content]:
+        raise InputError(f"{path}: has no {missing[0]!r}. Delete or re-create the file.")
+    return content
 
 
 def write_png(path: Path, image: NDArray) -> None:
@@ -82,11 +112,37 @@ def write_png(path: Path, image: NDArray) -> None:
     write_bytes(path, encoded.tobytes())
 
 
+def picture_size(path: Path) -> tuple[int, int]:
+    """Width and height of a PNG, JPEG, BMP or TIFF, from its header alone.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: not such a picture, or larger than any picture is.
+
+    """
+    from PIL import Image  # not every command reads pictures
+
+    size = check_bytes(path, MAX_PICTURE_BYTES)
+    try:
+        with Image.open(path, formats=("PNG", "JPEG", "BMP", "TIFF")) as image:
+            width, height = image.size
+    except Exception as error:  # Pillow raises whatever its readers meet
+        what = str(error) if isinstance(error, Image.DecompressionBombError) else "truncated or not a picture"
+        raise InputError(
+            f"{path}: cannot be decoded as a picture ({size} bytes; {what}). Copy or make the file again."
+        ) from None
+    check_pixels(width, height, str(path))
+    return width, height
+
+
 def _decode(path: Path, flags: int) -> NDArray:
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
+    # OpenCV allocates what a header promises
+    picture_size(path)
     content = np.fromfile(path, np.uint8)
-    image = cv2.imdecode(content, flags) if content.size else None
+    try:
+        image = cv2.imdecode(content, flags)
+    except cv2.error:
+        image = None
     # libpng fills what a truncated file lacks with zeros, so the end mark is looked for as well
     if image is None or (path.suffix.lower() == ".png" and b"IEND" not in content[-16:].tobytes()):
         raise InputError(
@@ -152,3 +208,90 @@ def read_distance_png(path: Path, metres_per_step: float = 1 / DISTANCE_STEPS_PE
             f"{image.dtype} {image.shape}. 8-bit or colour maps have lost the distance; export the map again."
         )
     return image.astype(np.float32) * np.float32(metres_per_step)
+
+
+ARRAY_ERRORS = (
+    ValueError,
+    TypeError,
+    EOFError,
+    OverflowError,
+    SyntaxError,
+    tokenize.TokenError,
+    RecursionError,
+    MemoryError,
+)
+"""What NumPy raises at headers of arrays that hold anything."""
+
+
+def read_array_header(file: Any, where: str) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape, whether in Fortran's order, and type of an array in NumPy's format; `file` is then at its numbers.
+
+    Raises:
+        InputError: no such header, or of anything but numbers; names `where`.
+
+    """
+    try:
+        version = np.lib.format.read_magic(file)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, fortran, kind = read(file)
+    except ARRAY_ERRORS as error:
+        said = (str(error).splitlines() or [""])[0]
+        raise InputError(f"{where}: cannot be read as an array ({said}). Copy or make the file again.") from None
+    if any(isinstance(side, bool) or side < 0 for side in shape):
+        raise InputError(f"{where}: cannot be read as an array ({kind}, shape {shape}). Copy or make the file again.")
+    return shape, fortran, kind
+
+
+def read_npy(path: Path) -> NDArray:
+    """Read an array of numbers from a .npy file; its header is held against the file's size first.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: not such a file, truncated, of other things than numbers, or of more than `MAX_PIXELS` of them.
+
+    """
+    size = check_bytes(path, 9 * MAX_PIXELS)
+    with path.open("rb") as file:
+        shape, fortran, kind = read_array_header(file, str(path))
+        count, start = math.prod(shape), file.tell()
+        if kind.kind not in "fiu" or count > MAX_PIXELS or count * kind.itemsize > size - start:
+            raise InputError(
+                f"{path}: {size - start} bytes of numbers for an array of {kind} and shape {shape}; expected numbers, "
+                f"all that the header promises, at most {MAX_PIXELS}. Make the file again."
+            )
+        numbers = np.fromfile(file, kind, count)
+    return numbers.reshape(shape, order="F" if fortran else "C")
+
+
+def read_npz(path: Path, names: Iterable[str], most_bytes: int) -> dict[str, NDArray]:
+    """Read some arrays of a .npz archive, none of which may take more than `most_bytes` in memory.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: broken, an array is not there, or larger than that.
+
+    """
+    check_bytes(path, 4 * most_bytes + (1 << 20))
+    found = {}
+    try:
+        with zipfile.ZipFile(path) as archive:
+            for name in names:
+                entry = archive.getinfo(f"{name}.npy")
+                if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                    raise ValueError(f"{name} is compressed in a way of its own")
+                with archive.open(entry) as member:
+                    shape, fortran, kind = read_array_header(member, f"{path}: {name}")
+                    count = math.prod(shape)
+                    if kind.kind not in "fiu":
+                        raise ValueError(f"{name} holds {kind}")
+                    if count * kind.itemsize > most_bytes:
+                        raise ValueError(f"{name} has the shape {shape} of {kind}, more than {most_bytes} bytes")
+                    content = member.read(count * kind.itemsize)
+                found[name] = np.frombuffer(bytearray(content), kind, count).reshape(
+                    shape, order="F" if fortran else "C"
+                )
+    except InputError:
+        raise
+    except (OSError, ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(f"{path}: cannot be read as arrays ({error}). Delete or make the file again.") from None
+    return found

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import DISTANCE_STEPS_PER_METRE, read_json, write_atomically, write_json
+from edge_depth_nerf.files import DISTANCE_STEPS_PER_METRE, read_json_object, write_atomically, write_json
 
 TABLE_VERSION = 2
 """Raised whenever the form of the file changes."""
@@ -91,13 +91,15 @@ class PixelTable:
             InputError, OSError, ValueError: it is not there, of another version, or not whole.
 
         """
-        about = read_json(_about(path))
+        about = read_json_object(_about(path), "pixels", "with_prior")
         self._records: NDArray = np.load(path, mmap_mode="r", allow_pickle=False)
         if about.get("version") != TABLE_VERSION or self._records.dtype != RECORD:
             raise ValueError(f"{path}: a table of version {about.get('version')}, expected {TABLE_VERSION}")
         if len(self._records) != about["pixels"]:
             raise ValueError(f"{path}: {len(self._records)} pixels, expected {about['pixels']}")
-        self._with_prior = int(about["with_prior"])
+        if type(about["with_prior"]) is not int:
+            raise ValueError(f"{path}: with_prior is no number")
+        self._with_prior = about["with_prior"]
 
     def __len__(self) -> int:
         """Number of records: of valid pixels, where each counts once."""

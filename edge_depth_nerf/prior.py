@@ -11,7 +11,6 @@ import dataclasses
 import hashlib
 import json
 import math
-import zipfile
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -24,7 +23,7 @@ from numpy.typing import NDArray
 
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import write_atomically
+from edge_depth_nerf.files import read_npz, write_atomically
 from edge_depth_nerf.integration import DepthSource, IntegrationOptions, SigmaMode, select_prior, sigma_m
 from edge_depth_nerf.mono.alignment import Align, align
 from edge_depth_nerf.mono.error_model import Trust, pixel_features
@@ -266,10 +265,9 @@ class PriorCache:
 
 def _read(path: Path, shape: tuple[int, ...]) -> Prior | None:
     try:
-        # np.load would leave the file open on a broken archive
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            prior = Prior(archive["distance_m"], archive["sigma_m"])
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        found = read_npz(path, ("distance_m", "sigma_m"), 4 * math.prod(shape))
+    except (OSError, InputError):
         return None
-    fits = all(m.shape == shape and m.dtype == np.float32 for m in (prior.distance_m, prior.sigma_m))
-    return prior if fits else None
+    if not all(m.shape == shape and m.dtype == np.float32 for m in found.values()):
+        return None
+    return Prior(found["distance_m"], found["sigma_m"])

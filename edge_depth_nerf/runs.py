@@ -23,8 +23,9 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_distance_png, read_image, read_json, read_mask
+from edge_depth_nerf.files import read_distance_png, read_image, read_mask
 from edge_depth_nerf.pictures import colour_distance
+from edge_depth_nerf.scene_format import read_transforms
 
 DISTANCE_KEYS = ("truth_distance_file_path", "lidar_file_path")
 """What a view's distances are shown by, the better one first."""
@@ -168,8 +169,8 @@ def progress_bars(console: Console) -> Progress:
 
 def held_out_frames(scene: Path) -> list[dict[str, Any]]:
     """The held-out frames of a scene's transforms.json, in the order in which they are judged."""
-    transforms = read_json(scene / "transforms.json")
-    names = {name: number for number, name in enumerate(transforms["test_filenames"])}
+    transforms = read_transforms(scene / "transforms.json")
+    names = set(transforms.get("test_filenames", ()))
     frames = [frame for frame in transforms["frames"] if frame["file_path"] in names]
     return sorted(frames, key=lambda frame: frame["file_path"])
 

@@ -22,11 +22,12 @@ from numpy.typing import NDArray
 
 from edge_depth_nerf.cameras import Camera, KannalaBrandt, Pinhole
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import DISTANCE_STEPS_PER_METRE, read_distance_png, read_image, read_json, read_mask
+from edge_depth_nerf.files import DISTANCE_STEPS_PER_METRE, read_distance_png, read_image, read_mask, read_npy
 from edge_depth_nerf.integration import DepthSource
+from edge_depth_nerf.lidar.scans import read_cloud
 from edge_depth_nerf.mono.error_model import TRUST_FILE, Trust, read_trust
 from edge_depth_nerf.prior import Prior, PriorOptions, make_prior, view_of
-from edge_depth_nerf.scene_format import is_own_scene
+from edge_depth_nerf.scene_format import DISTORTION, INTRINSICS, is_own_scene, number_of, pose_of, read_transforms
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 FISHEYE_MODEL = "OPENCV_FISHEYE"
@@ -36,10 +37,6 @@ KEYS = {"image": "file_path", "mask": "mask_path", **OWN_MAPS}
 """Layers of a picture: their keys in transforms.json."""
 DEPTH_KEY = "depth_file_path"
 """nerfstudio's own depth; counts as LiDAR where there is no other."""
-LARGEST_PLY_BYTES = 1 << 30
-
-_INTRINSICS = ("w", "h", "fl_x", "fl_y", "cx", "cy")
-_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
 @dataclass(frozen=True)
@@ -232,22 +229,13 @@ class SceneFolder:
         """
         if self.points_path is None:
             return None
-        size = self.points_path.stat().st_size
-        if size > LARGEST_PLY_BYTES:
-            raise InputError(
-                f"{self.points_path}: holds {size / 1e9:.1f} GB, at most {LARGEST_PLY_BYTES / 1e9:.1f} GB are drawn. "
-                "Thin the point cloud."
-            )
-        import trimesh  # half a second, which every command of nerfstudio would wait for
-
         try:
-            loaded: Any = trimesh.load(self.points_path, process=False)
-            points = np.asarray(loaded.vertices, dtype=np.float64)
-        except Exception as error:  # trimesh raises whatever its parsers meet
+            points = read_cloud(self.points_path)
+        except InputError as error:
             raise InputError(
-                f"{self.points_path}: cannot be read as a PLY point cloud ({error}). Make the file again, or take "
-                f"ply_file_path out of {self.path}."
-            ) from error
+                f"{error} It cannot be read as a PLY point cloud: make the file again, or take ply_file_path out of "
+                f"{self.path}."
+            ) from None
         return points[np.isfinite(points).all(1)]
 
     def _read(self, layer: str, path: Path) -> np.ndarray:
@@ -258,10 +246,7 @@ class SceneFolder:
         metres_per_count = self.lidar_metres_per_count if layer == "lidar" else 1 / DISTANCE_STEPS_PER_METRE
         if path.suffix != ".npy":
             return read_distance_png(path, metres_per_count)
-        try:
-            counts = np.load(path, allow_pickle=False)
-        except (ValueError, EOFError) as error:
-            raise InputError(f"{path}: cannot be read as an array ({error}). Make the file again.") from error
+        counts = read_npy(path)
         counts = counts[..., 0] if counts.ndim == 3 and counts.shape[2] == 1 else counts
         return counts.astype(np.float32) * np.float32(metres_per_count)
 
@@ -291,12 +276,7 @@ def read_scene(scene: Path) -> SceneFolder:
             f"{path}: no such file. A scene folder has a transforms.json; `edge-depth-nerf process` makes one from a "
             "raw drive."
         )
-    meta = read_json(path)
-    if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list) or not meta["frames"]:
-        raise InputError(
-            f"{path}: has no list of frames. Expected a transforms.json of nerfstudio's format; "
-            "`edge-depth-nerf process` writes one."
-        )
+    meta = read_transforms(path)
     frames = meta["frames"]
     model = meta.get("camera_model", "PINHOLE")
     if model not in (*PINHOLE_MODELS, FISHEYE_MODEL):
@@ -304,9 +284,6 @@ def read_scene(scene: Path) -> SceneFolder:
             f"{path}: camera_model is {model!r}; expected one of {', '.join((*PINHOLE_MODELS, FISHEYE_MODEL))}. "
             "Convert the cameras, for example with `edge-depth-nerf process`."
         )
-    for number, frame in enumerate(frames):
-        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
-            raise InputError(f"{path}: frame {number} has no file_path. Every frame needs a picture and a pose.")
     own = is_own_scene(meta)
     own_lidar = OWN_MAPS["lidar"] in frames[0]
     held_out, split_known = _held_out(meta)
@@ -321,7 +298,7 @@ def read_scene(scene: Path) -> SceneFolder:
             held_out=frame["file_path"] in held_out,
             timestamp_s=None
             if frame.get("timestamp_s") is None
-            else _number(frame["timestamp_s"], f"{path}: {frame['file_path']}: timestamp_s"),
+            else number_of(frame["timestamp_s"], f"{path}: {frame['file_path']}: timestamp_s"),
             files=_files(frame, path.parent, OWN_MAPS["lidar"] if own_lidar else DEPTH_KEY),
         )
         for frame in frames
@@ -335,10 +312,10 @@ def read_scene(scene: Path) -> SceneFolder:
         camera_model=model,
         own=own,
         meta={key: value for key, value in meta.items() if key != "frames"},
-        theta_max_rad=math.radians(_number(meta.get("theta_max_deg", 180.0), f"{path}: theta_max_deg")),
+        theta_max_rad=math.radians(number_of(meta.get("theta_max_deg", 180.0), f"{path}: theta_max_deg")),
         lidar_metres_per_count=1 / DISTANCE_STEPS_PER_METRE
         if own_lidar
-        else _number(meta.get("depth_unit_scale_factor", 1e-3), f"{path}: depth_unit_scale_factor"),
+        else number_of(meta.get("depth_unit_scale_factor", 1e-3), f"{path}: depth_unit_scale_factor"),
         lidar_is_z_depth=not own and model != FISHEYE_MODEL,
         pictures=tuple(sorted(pictures, key=lambda picture: (picture.camera, picture.moment))),
         split_known=split_known,
@@ -374,16 +351,10 @@ def _moments(frames: list[dict[str, Any]]) -> dict[str, int]:
     return {name: moment for names in ordered.values() for moment, name in enumerate(names)}
 
 
-def _number(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise InputError(f"{where} is {value!r}, expected a number. Mend the file, or process the drive again.")
-    return float(value)
-
-
 def _lens(meta: dict[str, Any], frame: dict[str, Any], model: str, path: Path) -> KannalaBrandt | Pinhole:
     where = f"{path}: {frame['file_path']}"
-    size_and_focal = [_number(frame.get(key, meta.get(key)), f"{where}: {key}") for key in _INTRINSICS]
-    distortion = [_number(frame.get(key, meta.get(key, 0.0)), f"{where}: {key}") for key in _DISTORTION]
+    size_and_focal = [number_of(frame.get(key, meta.get(key)), f"{where}: {key}") for key in ("w", "h", *INTRINSICS)]
+    distortion = [number_of(frame.get(key, meta.get(key, 0.0)), f"{where}: {key}") for key in DISTORTION]
     width, height, fx, fy, cx, cy = size_and_focal
     k1, k2, k3, k4, p1, p2 = distortion
     try:
@@ -395,15 +366,7 @@ def _lens(meta: dict[str, Any], frame: dict[str, Any], model: str, path: Path) -
 
 
 def _pose(frame: dict[str, Any], path: Path) -> dict[str, np.ndarray]:
-    try:
-        pose = np.asarray(frame.get("transform_matrix"), dtype=np.float64)
-    except (TypeError, ValueError):
-        pose = np.empty(0)
-    if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise InputError(
-            f"{path}: {frame['file_path']}: transform_matrix must be 4×4 finite numbers. Every frame needs a pose; "
-            "process the drive again, or mend the file."
-        )
+    pose = pose_of(frame, f"{path}: {frame['file_path']}")
     return {"position_m": pose[:3, 3], "rotation": pose[:3, :3]}
 
 

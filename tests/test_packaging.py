@@ -204,7 +204,7 @@ def test_the_workflows_cover_every_python():
     text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     supported = re.findall(r"Programming Language :: Python :: (3\.\d+)", text)
     assert ci["jobs"]["tests"]["strategy"]["matrix"]["python"] == supported
-    assert {"lint", "tests", "docs", "distribution"} == set(ci["jobs"])
+    assert {"lint", "tests", "docs", "distribution", "audit"} == set(ci["jobs"])
 
 
 @pytest.mark.parametrize("name", ["bug", "question", "feature"])

@@ -569,5 +569,5 @@ def test_jpegs_and_patterns(mine: Path) -> None:
     recording = read_rig_recording(options(mine, cameras=("front",)))
     assert [picture.path.name for picture in recording.pictures] == [f"front_{number}.jpg" for number in range(FRAMES)]
     (mine / "front_3.jpg").write_bytes(b"\xff\xd8\xff")
-    with pytest.raises(InputError, match=r"front_3\.jpg: not a picture"):
+    with pytest.raises(InputError, match=r"front_3\.jpg: cannot be decoded as a picture"):
         read_rig_recording(options(mine, cameras=("front",)))

@@ -23,9 +23,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from edge_depth_nerf.bounds import MAX_PIXELS, finite, shown
 from edge_depth_nerf.cameras.distortion import Distortion
 from edge_depth_nerf.errors import InputError
 
+MAX_PARAMETER = 1e9
+"""No parameter of a lens is larger; float32 bears its square."""
 AnyCamera = TypeVar("AnyCamera", bound="Camera")
 
 
@@ -61,8 +64,14 @@ class Camera(ABC):
             value = getattr(self, field.name)
             if not math.isfinite(value):
                 raise InputError(f"{self.model} camera: {field.name} is {value}, expected a finite number.")
+            if abs(value) > MAX_PARAMETER:
+                raise InputError(f"{self.model} camera: {field.name} is {value:g}, expected at most {MAX_PARAMETER:g}.")
             if value <= 0 and field.name in ("width", "height", "fx", "fy"):
                 raise InputError(f"{self.model} camera: {field.name} is {value}, expected more than 0.")
+        if self.width * self.height > MAX_PIXELS:
+            raise InputError(
+                f"{self.model} camera: {self.width}×{self.height} pixels, expected at most {MAX_PIXELS} in all."
+            )
         if not 0 < self.theta_limit_rad <= math.pi:
             raise InputError(
                 f"{self.model} camera: theta_limit_rad is {self.theta_limit_rad}, expected more than 0 and at most pi."
@@ -382,13 +391,12 @@ def camera_from_dict(parameters: dict[str, Any], where: str) -> Camera:
         raise InputError(f"{where}: the {name} camera {' and '.join(faults)}; expected {expected}.")
     numbers = {}
     for key in given:
-        value, whole = parameters[key], key in ("width", "height")
-        # a file may hold 700 for 700.0; True is a number to Python only
-        usable = isinstance(value, (int, float)) and not isinstance(value, bool)
-        if not usable or (whole and value % 1 != 0):
-            kind = "a whole number" if whole else "a number"
-            raise InputError(f"{where}: {key} of the {name} camera is {value!r}, expected {kind}.")
-        numbers[key] = int(value) if whole else float(value)
+        value, whole = finite(parameters[key]), key in ("width", "height")
+        # a file may hold 700 for 700.0
+        if value is None or (whole and value % 1 != 0):
+            kind = "a whole number" if whole else "a finite number"
+            raise InputError(f"{where}: {key} of the {name} camera is {shown(parameters[key])}, expected {kind}.")
+        numbers[key] = int(value) if whole else value
     try:
         return model(**numbers)
     except InputError as error:

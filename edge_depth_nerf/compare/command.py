@@ -18,6 +18,7 @@ from rich.console import Console
 from rich.progress import Progress, TaskID
 from rich.table import Table
 
+from edge_depth_nerf.bounds import finite, shown
 from edge_depth_nerf.compare.methods import METHODS, Setting, default_methods
 from edge_depth_nerf.compare.options import CompareOptions, MethodName
 from edge_depth_nerf.compare.plots import draw_plots
@@ -28,16 +29,19 @@ from edge_depth_nerf.compare.specification import FIGURES, SPECIFICATION, VIEWS,
 from edge_depth_nerf.compare.tables import MadeTable, as_latex, as_markdown, make_tables
 from edge_depth_nerf.console import say
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_json, write_json, write_png, write_text
+from edge_depth_nerf.files import read_json_object, write_json, write_png, write_text
 from edge_depth_nerf.pictures import DISTANCE, colour_bar, resize, side_by_side
 from edge_depth_nerf.report.build import write_report
 from edge_depth_nerf.report.views import REPORT
 from edge_depth_nerf.runs import LoggedCommands, command_line, compared_views, progress_bars, viewer_command
+from edge_depth_nerf.scene_format import read_transforms
 
 RECORD = "compare.json"
 RUNS = "runs"
 LOG = "run.log"
 VIEWS_SHOWN = 3
+MAX_SETTING = 1e6
+"""No λ or σ is larger."""
 LEAST_WIDTH_PX, MOST_WIDTH_PX = 220, 350
 """Of each picture in comparison_SCENE.png."""
 
@@ -92,7 +96,7 @@ def compare(options: CompareOptions, console: Console | None = None) -> Results:
     results = read_results(options.output / RUNS)
     if not options.search:
         check_fair(results)
-    results.options = read_json(options.output / RECORD)
+    results.options = read_json_object(options.output / RECORD)
     results.versions = {name: version(name) for name in ("edge-depth-nerf", "nerfstudio", "torch", "numpy")}
     results.versions["python"] = platform.python_version()
     results.cores = os.cpu_count() or 1
@@ -132,8 +136,8 @@ def check_scene(folder: Path, methods: Sequence[MethodName], preset: str) -> str
         raise FileNotFoundError(
             f"{path}: no such file. compare takes scene folders; `edge-depth-nerf process` makes one from a raw drive."
         )
-    meta = read_json(path)
-    frames, held_out = meta.get("frames") or [{}], meta.get("test_filenames") or []
+    meta = read_transforms(path)
+    frames, held_out = meta["frames"], meta.get("test_filenames") or []
     if not held_out or set(held_out) & set(meta.get("train_filenames", [])):
         raise InputError(
             f"{path}: found {len(held_out)} pictures under test_filenames that are not trained on, too; expected at "
@@ -166,24 +170,28 @@ def read_tuned(path: Path) -> dict[str, Setting]:
         InputError: it does not have that form.
 
     """
-    content = read_json(path)
-    methods = content.get("methods") if isinstance(content, dict) else None
+    content = read_json_object(path)
+    methods = content.get("methods")
     form = 'expected {"methods": {"ds-nerf": {"lambda": 0.01, "sigma_m": 0.5}}}, with sigma_m metres or "own"'
     if not isinstance(methods, dict):
         raise InputError(f"{path}: has no methods; {form}.")
     found = {}
     for name, entry in methods.items():
         if name not in get_args(MethodName) or METHODS[name].sigma_field is None:
-            raise InputError(f"{path}: {name!r} is no method with λ and σ; {form}.")
+            raise InputError(f"{path}: {shown(name)} is no method with λ and σ; {form}.")
         weight, sigma_m = (entry.get("lambda"), entry.get("sigma_m")) if isinstance(entry, dict) else (None, None)
-        if not (_positive(weight) and (sigma_m == "own" or _positive(sigma_m))):
-            raise InputError(f"{path}: {name}: found {entry!r}; {form}.")
-        found[name] = Setting(weight, sigma_m)
+        weight, own = _setting(weight), sigma_m == "own"
+        sigma = _setting(sigma_m)
+        if weight is None or (sigma is None and not own):
+            raise InputError(f"{path}: {name}: found {shown(entry)}; {form}.")
+        found[name] = Setting(weight, "own" if own else sigma)
     return found
 
 
-def _positive(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value < float("inf")
+def _setting(value: Any) -> float | None:
+    """A λ or σ; None if it cannot be one."""
+    found = finite(value)
+    return found if found is not None and 0 < found < MAX_SETTING else None
 
 
 def open_output(options: CompareOptions, tuned: dict[str, Setting]) -> None:
@@ -199,11 +207,11 @@ def open_output(options: CompareOptions, tuned: dict[str, Setting]) -> None:
         "steps": options.steps,
         "rivals_implementation": options.rivals_implementation,
         "tuned": {name: {"lambda": setting.weight, "sigma_m": setting.sigma_m} for name, setting in tuned.items()},
-        "tuned_on": None if options.tuned is None else read_json(options.tuned).get("scene"),
+        "tuned_on": None if options.tuned is None else read_json_object(options.tuned).get("scene"),
     }
     path, command = options.output / RECORD, command_line(["edge-depth-nerf", "compare"], options)
     if path.is_file():
-        found = read_json(path)
+        found = read_json_object(path)
         different = [name for name in record if record[name] != found.get(name)]
         if different:
             name = different[0]
@@ -250,7 +258,7 @@ class Run:
         """
         path, wanted = self.folder / SPECIFICATION, self.specification.to_dict()
         if path.is_file():
-            found = read_json(path)
+            found = read_json_object(path)
             different = [name for name in wanted if wanted[name] != found.get(name)]
             if different:
                 name = different[0]

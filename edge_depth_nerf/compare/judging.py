@@ -20,9 +20,10 @@ from torch import Tensor
 
 from edge_depth_nerf.compare.figures import ANGLE_EDGES_DEG, DISTANCE_EDGES_M, BinnedErrors, affine_fitted
 from edge_depth_nerf.dataset import FisheyeDepthDataset
-from edge_depth_nerf.files import read_distance_png, read_image, read_json, write_png
+from edge_depth_nerf.files import read_distance_png, read_image, write_png
 from edge_depth_nerf.metrics import LEAST_SQUARED_ERROR, DepthErrors, masked_psnr
 from edge_depth_nerf.model import EdgeDepthNerfModel
+from edge_depth_nerf.scene_format import read_transforms
 
 PIXELS_PER_VIEW = 3000
 MOST_PIXELS = 20_000
@@ -132,7 +133,7 @@ def shifted_views(scene: Path, dataset: FisheyeDepthDataset) -> dict[str, list[C
         of their camera.
 
     """
-    meta = read_json(scene / "transforms.json")
+    meta = read_transforms(scene / "transforms.json")
     outputs = dataset._dataparser_outputs
     to_scene = outputs.dataparser_transform.double()
     cameras = {scene / frame["file_path"]: frame.get("camera") for frame in meta["frames"]}

@@ -9,11 +9,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from edge_depth_nerf.bounds import finite
 from edge_depth_nerf.compare.methods import METHODS
 from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.specification import FIGURES, OF_A_RUN
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_json, write_json, write_text
+from edge_depth_nerf.files import read_json_object, write_json, write_text
 
 
 @dataclass
@@ -97,12 +98,46 @@ class Results:
 
 
 def read_results(runs: Path) -> Results:
-    """Read the finished runs under a folder."""
+    """Read the finished runs under a folder.
+
+    Raises:
+        InputError: a file of a run is broken, or of another form.
+
+    """
     found = []
     for path in sorted(runs.glob(f"*/*/{FIGURES}")):
-        content = read_json(path)
+        content = read_json_object(path, "run", "named", "configuration", "figures", "curve", "steps")
+        _check_run(content, path)
+        content["figures"] = _floats(content["figures"])
+        content["curve"] = [_floats(point) for point in content["curve"]]
         found.append(RunResult(path.parent, content["run"], content))
     return Results(sorted(found, key=lambda run: (run.scene, list(METHODS).index(run.method), run.seed)))
+
+
+def _check_run(content: dict[str, Any], path: Path) -> None:
+    run, curve = content["run"], content["curve"]
+    fine = (
+        isinstance(run, dict)
+        and all(isinstance(run.get(key), str) for key in ("scene", "preset"))
+        and run.get("method") in METHODS
+        and isinstance(run.get("seed"), int)
+        and isinstance(content["named"], list)
+        and all(isinstance(name, str) for name in content["named"])
+        and isinstance(content["configuration"], dict)
+        and isinstance(content["steps"], int)
+        and isinstance(curve, list)
+        and all(_is_figures(figures) for figures in (content["figures"], *curve))
+    )
+    if not fine:
+        raise InputError(f"{path}: is not of this form's runs. Remove its folder, and the same command trains it anew.")
+
+
+def _floats(figures: dict[str, Any]) -> dict[str, float]:
+    return {name: float(value) for name, value in figures.items()}
+
+
+def _is_figures(found: Any) -> bool:
+    return isinstance(found, dict) and all(finite(value) is not None for value in found.values())
 
 
 def check_fair(results: Results) -> None:

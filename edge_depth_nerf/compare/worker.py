@@ -12,19 +12,22 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 
+from edge_depth_nerf.bounds import finite, shown
 from edge_depth_nerf.compare.configuration import configuration, described, setting_of
 from edge_depth_nerf.compare.judging import ViewJudge, choose_pixels, judge_pixels, shifted_views
 from edge_depth_nerf.compare.protocol import departures
 from edge_depth_nerf.compare.specification import FIGURES, PROGRESS, SPECIFICATION, VIEWS, WORK, RunSpecification
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_json, write_json
+from edge_depth_nerf.files import read_json_object, write_json
 from edge_depth_nerf.runs import end_with_parent, steps_done
+from edge_depth_nerf.scene_format import read_transforms
 from edge_depth_nerf.trainer import EdgeDepthTrainer
 
 CURVE = (0.025, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
@@ -86,10 +89,18 @@ class MeasuredTrainer(EdgeDepthTrainer):
         super().setup(test_mode)
         self._pixels = choose_pixels(self.pipeline.datamanager.eval_dataset)  # pyright: ignore[reportArgumentType]
         if self._start_step:
-            measured = read_json(self.progress_path)
-            self.times = {step: passed for step, passed in measured["times"].items() if int(step) <= self._start_step}
-            self.clock.passed = dict(self.times[str(self._start_step)])
-            self.curve = [point for point in measured["curve"] if point["step"] <= self._start_step]
+            measured = read_json_object(self.progress_path, "times", "curve")
+            try:
+                self.times = {
+                    step: passed for step, passed in measured["times"].items() if int(step) <= self._start_step
+                }
+                self.clock.passed = dict(self.times[str(self._start_step)])
+                self.curve = [point for point in measured["curve"] if point["step"] <= self._start_step]
+            except (AttributeError, KeyError, TypeError, ValueError) as error:
+                raise InputError(
+                    f"{self.progress_path}: does not go with the checkpoint of step {self._start_step} ({error!r}). "
+                    "Remove the run's folder, and the same command trains it anew."
+                ) from None
         self.callbacks.append(
             TrainingCallback(
                 where_to_run=[TrainingCallbackLocation.AFTER_TRAIN_ITERATION],
@@ -117,14 +128,42 @@ class MeasuredTrainer(EdgeDepthTrainer):
         self.on_step(steps)
 
 
+def read_specification(path: Path) -> RunSpecification:
+    """Read what is to be trained.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: it is not of this form.
+
+    """
+    content, fields = read_json_object(path), get_type_hints(RunSpecification)
+    wrong = [name for name in {*content, *fields} if name not in fields or not _is(content.get(name), fields[name])]
+    if wrong:
+        name = min(wrong)
+        raise InputError(
+            f"{path}: {name} is {shown(content.get(name))}, which no run has. Remove its folder, and the same command "
+            "trains it anew."
+        )
+    return RunSpecification(**content)
+
+
+def _is(value: Any, hint: Any) -> bool:
+    """Whether a value of JSON is of a field's type."""
+    if get_origin(hint) in (Union, UnionType):
+        return any(_is(value, each) for each in get_args(hint))
+    if get_origin(hint) is Literal:
+        return isinstance(value, str) and value in get_args(hint)
+    return finite(value) is not None if hint is float else type(value) is hint
+
+
 def do_run(folder: Path) -> None:
     """Train and judge what run.json of a folder says, as far as it is not done; figures.json is written last."""
-    run = RunSpecification(**read_json(folder / SPECIFICATION))
+    run = read_specification(folder / SPECIFICATION)
     config, named = configuration(run, folder)
     resolved = described(config)
     steps = config.max_num_iterations
     random.seed(run.seed)
-    np.random.seed(run.seed)
+    np.random.seed(run.seed)  # noqa: NPY002 (nerfstudio draws from the global generator)
     torch.manual_seed(run.seed)
     if not (config.get_base_dir() / "config.yml").is_file():
         config.save_config()
@@ -170,7 +209,7 @@ def do_run(folder: Path) -> None:
         found, bins = judge.held_out(folder / VIEWS)
         figures |= found | judge.shifted(beside)
     weight, sigma = setting_of(config, run.method)
-    meta = read_json(Path(run.scene) / "transforms.json")
+    meta = read_transforms(Path(run.scene) / "transforms.json")
     write_json(
         folder / FIGURES,
         {
@@ -181,7 +220,7 @@ def do_run(folder: Path) -> None:
             "sigma": sigma,
             "steps": steps,
             "device": config.machine.device_type,
-            "source": meta.get("source", {}).get("kind"),
+            "source": source.get("kind") if isinstance(source := meta.get("source"), dict) else None,
             "departures": departures(meta) if run.preset == "paper" else [],
             "figures": figures,
             "curve": trainer.curve,

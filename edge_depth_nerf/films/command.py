@@ -8,9 +8,6 @@ from __future__ import annotations
 import math
 import shlex
 import shutil
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,11 +18,13 @@ from rich.console import Console
 
 from edge_depth_nerf import __version__
 from edge_depth_nerf.cameras import KannalaBrandt, Pinhole
+from edge_depth_nerf.compat import quiet_host
 from edge_depth_nerf.console import say
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_json, write_json
+from edge_depth_nerf.files import read_json_object, write_json
 from edge_depth_nerf.films.options import LARGEST_PX, CameraPathOptions
 from edge_depth_nerf.films.paths import Drive, lane_shift, orbit, replay, up_of
+from edge_depth_nerf.films.training import read_dataparser
 from edge_depth_nerf.scene_reader import SceneFolder, ScenePicture, read_scene
 
 DEFAULT_RATE_HZ = 10.0
@@ -97,7 +96,7 @@ def write_camera_path(options: CameraPathOptions, console: Console | None = None
             style="yellow",
         )
     scene = None if options.scene is None else read_scene(options.scene)
-    with console.status("Asking nerfstudio where the scene lies in the model's coordinates …"), _without_chatter():
+    with console.status("Asking nerfstudio where the scene lies in the model's coordinates …"), quiet_host():
         scene, to_model = _placed(scene, options)
 
     pictures = _followed(scene, options.follow)
@@ -186,20 +185,6 @@ def path_file(
     }
 
 
-@contextmanager
-def _without_chatter() -> Iterator[None]:
-    """Keep back what nerfstudio says about its own imports and about the split, which is the training's."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)
-        from nerfstudio.utils.rich_utils import CONSOLE
-
-        before, CONSOLE.quiet = CONSOLE.quiet, True
-        try:
-            yield
-        finally:
-            CONSOLE.quiet = before
-
-
 def _even(length: float) -> int:
     return max(2, 2 * round(length / 2))
 
@@ -248,7 +233,7 @@ def _placed(scene: SceneFolder | None, options: CameraPathOptions) -> tuple[Scen
 
         dataparser = FisheyeDepthDataParserConfig(metres_per_unit=options.metres_per_unit)
     else:
-        dataparser = _training_dataparser(options.load_config)
+        dataparser = read_dataparser(options.load_config)
         scene = scene or read_scene(Path(dataparser.data))
     dataparser.data = scene.path
     outputs = dataparser.setup().get_dataparser_outputs(split="train")
@@ -280,37 +265,14 @@ def _check_unchanged(outputs: Any, saved: Path, scene: SceneFolder) -> None:
     """
     if not saved.is_file():
         return
-    record = read_json(saved)
+    record = read_json_object(saved, "transform", "scale")
     now = np.append(outputs.dataparser_transform.numpy(), outputs.dataparser_scale)
-    then = np.append(np.asarray(record["transform"], dtype=np.float64), float(record["scale"]))
+    try:
+        then = np.append(np.asarray(record["transform"], dtype=np.float64), float(record["scale"]))
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f"{saved}: expected a matrix under transform and a number under scale. Train again.") from None
     if now.shape != then.shape or not np.allclose(now, then, rtol=1e-4, atol=1e-4):
         raise InputError(
             f"{scene.path}: lies elsewhere in the model's coordinates than {saved} says: it is another scene, or was "
             "changed since the training. Give the scene that the model was trained on, or train again."
         )
-
-
-def _training_dataparser(config_path: Path) -> Any:
-    """The dataparser's settings of a training."""
-    if not config_path.is_file():
-        raise FileNotFoundError(f"{config_path}: no such file. --load-config takes the config.yml that ns-train wrote.")
-    import yaml
-    from nerfstudio.engine.trainer import TrainerConfig
-
-    try:
-        # as every command of nerfstudio reads it: the file may name any class
-        config = yaml.load(config_path.read_text(encoding="utf-8"), Loader=yaml.Loader)
-    except (yaml.YAMLError, UnicodeDecodeError, ImportError, AttributeError) as error:
-        raise InputError(
-            f"{config_path}: cannot be read ({' '.join(str(error).split())}). --load-config takes the config.yml that "
-            "ns-train wrote; the plugin of its method must be installed."
-        ) from error
-    if not isinstance(config, TrainerConfig):
-        raise InputError(
-            f"{config_path}: is no training's settings. --load-config takes the config.yml that ns-train wrote."
-        )
-    dataparser = getattr(config.pipeline.datamanager, "dataparser", None)
-    if dataparser is None:
-        raise InputError(f"{config_path}: its method {config.method_name} reads no scene folder.")
-    dataparser.data = getattr(config.pipeline.datamanager, "data", None) or dataparser.data
-    return dataparser

@@ -11,8 +11,8 @@ with the file's size before anything is allocated. A time for each point, where 
 
 from __future__ import annotations
 
+import math
 import struct
-import tokenize
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,17 +20,25 @@ from typing import BinaryIO, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Shaped
+from jaxtyping import Float64, Shaped
 
+from edge_depth_nerf.bounds import check_bytes, shown
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.lidar.sweeps import Sweep, usable_returns
+from edge_depth_nerf.files import ARRAY_ERRORS, read_array_header
+from edge_depth_nerf.lidar.sweeps import MAX_POINTS, Sweep, usable_returns
 
 Encoding = Literal["records", "text", "lzf", "matrix"]
 
 SCAN_SUFFIXES = (".bin", ".npy", ".ply", ".pcd")
 """The formats that can be read."""
-MAX_POINTS = 20_000_000
-"""A file of more points is no single scan."""
+MAX_CLOUD_POINTS = 10_000_000
+"""No point cloud of a scene has more."""
+_MAX_BYTES = 1 << 30
+"""No file is larger: points of a hundred bytes. They are mapped into memory, not read."""
+_MAX_TEXT_BYTES = 1 << 27
+"""No file of text is larger, nor are compressed points when they are unpacked."""
+_MAX_LZF_RATIO = 100
+"""LZF makes at most 264 bytes of three."""
 _MAX_HEADER_BYTES = 1 << 16
 _AGAIN = "Copy or export the file again, or delete it so that its moment is skipped."
 
@@ -129,10 +137,25 @@ def read_scan(path: Path, scan: ScanFormat, moment_s: float = 0.0) -> Sweep:
     return usable_returns(path, torch.from_numpy(points_m), torch.from_numpy(intensity), offset_s)
 
 
+def read_cloud(path: Path) -> Float64[np.ndarray, "points 3"]:
+    """Read the vertices of a .ply file, as they are.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: another format, broken, or of more than `MAX_CLOUD_POINTS`.
+
+    """
+    if path.suffix.lower() != ".ply":
+        raise InputError(f"{path}: a point cloud of unknown format; expected .ply.")
+    scan = ScanFormat()
+    columns = _read_columns(path, _read_header(path, scan, MAX_CLOUD_POINTS), scan)
+    return np.stack([columns[axis] for axis in "xyz"], -1)
+
+
 # ---- headers ---------------------------------------------------------------------------------------------------
 
 
-def _read_header(path: Path, scan: ScanFormat) -> _Header:
+def _read_header(path: Path, scan: ScanFormat, most: int = MAX_POINTS) -> _Header:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     readers = {".bin": _bin_header, ".npy": _npy_header, ".ply": _ply_header, ".pcd": _pcd_header}
@@ -141,7 +164,7 @@ def _read_header(path: Path, scan: ScanFormat) -> _Header:
         raise InputError(
             f"{path}: a scan of unknown format {suffix or '(no suffix)'}; expected one of {', '.join(SCAN_SUFFIXES)}."
         )
-    size = path.stat().st_size
+    size = check_bytes(path, _MAX_BYTES)
     if size == 0:
         raise InputError(f"{path}: an empty file, expected a scan. {_AGAIN}")
     header = readers[suffix](path, size, scan)
@@ -153,10 +176,12 @@ def _read_header(path: Path, scan: ScanFormat) -> _Header:
         )
     if header.count == 0:
         raise InputError(f"{path}: a scan without points. {_AGAIN}")
-    if header.count > MAX_POINTS:
+    if header.count > most:
         raise InputError(
-            f"{path}: {header.count} points, expected at most {MAX_POINTS}: one scan a file, not a whole map."
+            f"{path}: {shown(header.count)} points, expected at most {most}: one scan a file, not a whole map."
         )
+    if header.encoding == "text" and size > _MAX_TEXT_BYTES:
+        raise InputError(f"{path}: {size} bytes of text, expected at most {_MAX_TEXT_BYTES}. Export it as binary.")
     if header.encoding == "records" and header.offset + header.count * header.record.itemsize > size:
         raise InputError(
             f"{path}: {size} bytes, but {header.count} points of {header.record.itemsize} bytes from byte "
@@ -179,10 +204,15 @@ def _bin_header(path: Path, size: int, scan: ScanFormat) -> _Header:
 
 
 def _npy_array(path: Path) -> np.ndarray:
+    with path.open("rb") as file:
+        shape, _, kind = read_array_header(file, str(path))
+        promised, size = file.tell() + math.prod(shape) * kind.itemsize, file.seek(0, 2)
+    if promised > size:
+        raise InputError(f"{path}: {size} bytes, but its header promises {shown(promised)}: truncated. {_AGAIN}")
     try:
-        # mapped, so that a header's promise is compared with the file's size and nothing is allocated
+        # mapped: nothing is allocated
         return np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, EOFError, OSError, SyntaxError, tokenize.TokenError) as error:
+    except (*ARRAY_ERRORS, OSError) as error:
         raise InputError(f"{path}: cannot be read as an array ({error}). {_AGAIN}") from error
 
 
@@ -327,7 +357,8 @@ def _compressed_columns(path: Path, header: _Header, names: list[str]) -> dict[s
     if len(sizes) < 8:
         raise InputError(f"{path}: truncated. {_AGAIN}")
     packed, unpacked = struct.unpack("<II", sizes)
-    if packed > len(compressed) or unpacked != expected:
+    too_large = expected > min(_MAX_TEXT_BYTES, _MAX_LZF_RATIO * len(compressed))
+    if packed > len(compressed) or unpacked != expected or too_large:
         raise InputError(
             f"{path}: {len(compressed)} compressed bytes for {unpacked} bytes of points, expected {packed} for "
             f"{expected}. {_AGAIN}"

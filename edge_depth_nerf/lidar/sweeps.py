@@ -15,12 +15,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from edge_depth_nerf.bounds import check_bytes
 from edge_depth_nerf.errors import InputError
 
 MIN_RANGE_M = 0.5
 """Nearer than this a scanner measures nothing: such a point stands for "no return", or lies on its housing."""
 MAX_RANGE_M = 255.0
 """Beyond this a distance map cannot hold the value; no scanner on a car measures so far."""
+MAX_POINTS = 5_000_000
+"""A file of more points is no single scan."""
 _BYTES_PER_POINT = 16
 
 
@@ -63,12 +66,10 @@ def check_sweep_size(path: Path) -> None:
 
     Raises:
         FileNotFoundError: there is no such file.
-        InputError: the file is empty or truncated.
+        InputError: the file is empty, truncated, or far larger than a sweep.
 
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-    size = path.stat().st_size
+    size = check_bytes(path, MAX_POINTS * _BYTES_PER_POINT)
     if size == 0 or size % _BYTES_PER_POINT:
         raise InputError(
             f"{path}: {size} bytes, expected a multiple of {_BYTES_PER_POINT} above 0 (x, y, z, reflectance as "

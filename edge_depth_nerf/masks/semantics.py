@@ -74,7 +74,7 @@ def read_labels(path: Path) -> UInt8[np.ndarray, "h w"]:
     """
     check_label_header(path)
     labels = cv2.imdecode(np.frombuffer(read_png_bytes(path), np.uint8), cv2.IMREAD_UNCHANGED)
-    if labels is None:
+    if labels is None or labels.ndim != 2:
         raise InputError(f"{path}: cannot be decoded as a picture. Copy or make the file again.")
     unknown = np.setdiff1d(labels, [*range(len(CLASSES)), UNLABELLED])
     if unknown.size:

@@ -28,6 +28,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
+from edge_depth_nerf.bounds import finite, shown
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_json, write_json
 from edge_depth_nerf.mono.alignment import Fit
@@ -52,6 +53,7 @@ FIELD_MARGIN_DEG = 3.0
 """LiDAR's field of elevation counts as so much wider, up and down."""
 TRUST_FILE = "mono_trust.json"
 _VERSION = 1
+_MAX_NUMBER = 1e3
 
 Features = Mapping[str, NDArray[np.float32]]
 """Arrays of one shape under the names of KNOTS."""
@@ -288,10 +290,10 @@ def read_trust(path: Path) -> Trust:
             made_of=str(content["made_of"]),
             error_model=error_model,
             return_model=return_model,
-            field_rad=(float(span[0]), float(span[1])),
+            field_rad=(_number(span[0]), _number(span[1])),
             everywhere=bool(content["everywhere"]),
-            drive_fit=None if drive_fit is None else Fit(**drive_fit),
-            frames=tuple(FrameAlignment(**{**frame, "fit": Fit(**frame["fit"])}) for frame in content["frames"]),
+            drive_fit=None if drive_fit is None else _fit(drive_fit),
+            frames=tuple(_frame(frame) for frame in content["frames"]),
         )
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise InputError(
@@ -300,10 +302,36 @@ def read_trust(path: Path) -> Trust:
         ) from error
 
 
+def _number(value: Any) -> float:
+    """A number of moderate size: logarithms, angles, exponents and relative errors are kept."""
+    found = finite(value)
+    if found is None or abs(found) > _MAX_NUMBER:
+        raise ValueError(f"{shown(value)} for a number")
+    return found
+
+
+def _fit(content: dict[str, Any]) -> Fit:
+    return Fit(**{name: _number(value) for name, value in content.items()})
+
+
+def _frame(content: dict[str, Any]) -> FrameAlignment:
+    if type(content["returns"]) is not int:
+        raise ValueError(f"{shown(content['returns'])} returns")
+    errors = {name: content[name] for name in ("held_out_before", "held_out_after")}
+    return FrameAlignment(
+        frame=str(content["frame"]),
+        returns=content["returns"],
+        fit_of=str(content["fit_of"]),
+        fit=_fit(content["fit"]),
+        **{name: None if value is None else _number(value) for name, value in errors.items()},
+    )
+
+
 def _model(content: dict[str, Any] | None) -> ErrorModel | None:
     if content is None:
         return None
-    model = ErrorModel(**content)
+    factors = {name: [_number(value) for value in values] for name, values in content["log_factors"].items()}
+    model = ErrorModel(_number(content["log_base"]), factors)
     if {name: len(factors) for name, factors in model.log_factors.items()} != {n: len(k) for n, k in KNOTS.items()}:
         raise ValueError("other features")
     return model

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import DISTANCE_STEPS_PER_METRE, read_distance_png
+from edge_depth_nerf.files import DISTANCE_STEPS_PER_METRE, read_array_header, read_distance_png
 from edge_depth_nerf.mono.examples import lens_rays
 from edge_depth_nerf.mono.options import Along
 from edge_depth_nerf.mono.relative import Kind, Layer
@@ -133,12 +133,7 @@ def npy_shape(path: Path) -> tuple[int, int]:
     """
     broken = "Save the map with numpy.save, as H×W floating-point numbers."
     with path.open("rb") as file:
-        try:
-            version = np.lib.format.read_magic(file)
-            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-            shape, _, kind = read(file)
-        except ValueError as error:
-            raise InputError(f"{path}: cannot be read as an array ({str(error).splitlines()[0]}). {broken}") from None
+        shape, _, kind = read_array_header(file, str(path))
         start, size = file.tell(), file.seek(0, 2)
     if kind.kind != "f":
         raise InputError(f"{path}: holds {kind}, expected float16, float32 or float64. {broken}")

@@ -195,8 +195,9 @@ def load_network(path: Path) -> tuple[DepthNetwork, dict[str, Any]]:
     """
     tensors, header = read_tensors(path)
     settings = settings_from(header.get("settings"), path)
-    network = DepthNetwork(settings)
-    expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
+    # without memory: settings may describe a network far larger than the file
+    with torch.device("meta"):
+        expected = {name: tuple(tensor.shape) for name, tensor in DepthNetwork(settings).state_dict().items()}
     found = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
     if expected != found:
         differing = sorted(name for name in {*expected, *found} if expected.get(name) != found.get(name))
@@ -208,8 +209,10 @@ def load_network(path: Path) -> tuple[DepthNetwork, dict[str, Any]]:
         )
     if not all(torch.isfinite(tensor).all() for tensor in tensors.values()):
         raise InputError(f"{path}: holds weights that are not finite. Train it again, without --model.")
+    network = DepthNetwork(settings)
     network.load_state_dict(tensors)
-    return network.eval(), dict(header.get("about") or {})
+    about = header.get("about")
+    return network.eval(), dict(about) if isinstance(about, dict) else {}
 
 
 def weights_key(network: DepthNetwork) -> str:
@@ -288,7 +291,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
                     raise KeyError("its header is no JSON object")
                 return {name: file.get_tensor(name) for name in file.keys()}, header
             names = list(file.keys())
-    except (SafetensorError, KeyError, json.JSONDecodeError) as error:
+    except (SafetensorError, KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(
             f"{path}: cannot be read as weights ({error}). --model takes a .safetensors file that `estimate-depth` has "
             "written; copy or train it again."

@@ -17,10 +17,11 @@ from jaxtyping import Float
 from rich.progress import Progress
 
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_json, read_mask, write_distance_png, write_json
+from edge_depth_nerf.files import read_mask, write_distance_png, write_json
 from edge_depth_nerf.mono.error_model import TRUST_FILE
 from edge_depth_nerf.mono.examples import lens_rays
 from edge_depth_nerf.process.scene import LAYERS, MONO_ENTRY
+from edge_depth_nerf.scene_format import read_transforms
 from edge_depth_nerf.scene_reader import SceneFolder, ScenePicture, read_scene
 
 FARTHEST_M = 200.0
@@ -83,7 +84,7 @@ def write_mono_maps(
                 f"{found.path}: {len(missing)} of {len(pictures)} frames have no monocular map, such as {missing[0]}. "
                 "Give one for every frame."
             )
-        meta = read_json(found.path)
+        meta = read_transforms(found.path)
         for frame in meta["frames"]:
             frame.pop(LAYERS["mono"][1], None)
         # `process` then knows that what lies there is not what it wrote

@@ -8,6 +8,7 @@ Works in a folder of its own, so that a run that was interrupted goes on where i
     database.db      COLMAP's features and matches; these three are deleted once the models are there
     pairs.txt        the pairs of pictures being matched
     models/0, 1, …   COLMAP's models in its own format, which its viewer and other tools read
+    models.json      their checksum
 
 Lenses are known and stay as they are. The pictures are matched in the order they were taken. The rig is not given to
 COLMAP: where its cameras share no view, as KITTI-360's left and right fisheye, COLMAP starts from a pair of moments
@@ -60,6 +61,7 @@ INSTALL = "pip install edge-depth-nerf[colmap]"
 
 _OLDEST = (4, 2)
 _RECORD = "inputs.json"
+_MODELS_SUM = "models.json"
 _VERSION = 1
 """Of what is done with the inputs; raised when results change."""
 _NEIGHBOURS = (1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 20)
@@ -189,7 +191,7 @@ def find_models(recording: Recording, options: ProcessOptions, folder: Path, con
     """
     run = _Run(import_pycolmap(), recording, options, folder, console)
     run.prepare()
-    if not run.models.is_dir():
+    if not run.has_models():
         run.extract()
         run.match()
         run.map()
@@ -441,34 +443,68 @@ class _Run:
                 initial_image_pair_callback=lambda: registered(2),
                 next_image_callback=lambda: registered(1),
             )
+        write_json(self.folder / _MODELS_SUM, {"sha256": sum_of_files(unfinished)})
+        shutil.rmtree(self.models, ignore_errors=True)
         os.replace(unfinished, self.models)
 
+    def has_models(self) -> bool:
+        """Whether models are there, as they were written: COLMAP's reader ends the whole process at a damaged one."""
+        record = self.folder / _MODELS_SUM
+        if not (self.models.is_dir() and record.is_file()):
+            return False
+        return read_json(record) == {"sha256": sum_of_files(self.models)}
+
     def read_models(self) -> list[ColmapModel]:
-        """The models, that with the most pictures first."""
-        index_of = {name: index for index, name in enumerate(self.names)}
+        """The models, that with the most pictures first.
+
+        Raises:
+            InputError: a model in the folder is broken, or of other pictures.
+
+        """
         found = []
         for folder in sorted(self.models.iterdir()):
-            model = self.pycolmap.Reconstruction(folder)
-            poses, views = {}, {}
-            for image in model.images.values():
-                if not image.has_pose:
-                    continue
-                model_to_camera = np.vstack((image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]))
-                seen = [
-                    point
-                    for point in image.get_observation_points2D()
-                    if model.point3D(point.point3D_id).track.length() >= _MIN_TRACK
-                ]
-                pixels = np.array([point.xy for point in seen]).reshape(-1, 2)
-                points = np.array([model.point3D(point.point3D_id).xyz for point in seen]).reshape(-1, 3)
-                in_camera = points @ model_to_camera[:3, :3].T + model_to_camera[:3, 3]
-                index = index_of[image.name]
-                poses[index] = np.linalg.inv(model_to_camera)
-                views[index] = SparseView(
-                    np.array(image.camera.cam_ray_from_img(pixels)).reshape(-1, 3), np.linalg.norm(in_camera, axis=-1)
-                )
-            found.append(ColmapModel(poses, views, model.num_points3D(), model.compute_mean_reprojection_error()))
+            try:
+                found.append(self._read_model(folder))
+            except Exception as error:  # COLMAP raises whatever its readers meet
+                raise InputError(
+                    f"{folder}: cannot be read as a COLMAP model of these pictures ({type(error).__name__}: {error}). "
+                    f"Delete {self.models}; the same command makes it anew."
+                ) from error
         return sorted(found, key=lambda model: -len(model.camera_to_model))
+
+    def _read_model(self, folder: Path) -> ColmapModel:
+        index_of = {name: index for index, name in enumerate(self.names)}
+        model = self.pycolmap.Reconstruction(folder)
+        poses, views = {}, {}
+        for image in model.images.values():
+            if not image.has_pose:
+                continue
+            model_to_camera = np.vstack((image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]))
+            seen = [
+                point
+                for point in image.get_observation_points2D()
+                if model.point3D(point.point3D_id).track.length() >= _MIN_TRACK
+            ]
+            pixels = np.array([point.xy for point in seen]).reshape(-1, 2)
+            points = np.array([model.point3D(point.point3D_id).xyz for point in seen]).reshape(-1, 3)
+            in_camera = points @ model_to_camera[:3, :3].T + model_to_camera[:3, 3]
+            index = index_of[image.name]
+            poses[index] = np.linalg.inv(model_to_camera)
+            views[index] = SparseView(
+                np.array(image.camera.cam_ray_from_img(pixels)).reshape(-1, 3), np.linalg.norm(in_camera, axis=-1)
+            )
+        if not all(np.isfinite(pose).all() for pose in poses.values()):
+            raise ValueError("a pose is not finite")
+        return ColmapModel(poses, views, model.num_points3D(), model.compute_mean_reprojection_error())
+
+
+def sum_of_files(folder: Path) -> str:
+    """What tells the files of a folder, names and bytes, from others."""
+    digest = hashlib.sha256()
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        content = path.read_bytes()
+        digest.update(json.dumps([path.relative_to(folder).as_posix(), len(content)]).encode() + content)
+    return digest.hexdigest()
 
 
 def _chunks(items: Sequence, size: int) -> Iterator[Sequence]:

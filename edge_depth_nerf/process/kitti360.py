@@ -16,6 +16,7 @@ share their moment; the scanner turns clockwise, once a frame. Everything is che
 
 from __future__ import annotations
 
+import re
 import statistics
 from functools import partial
 from pathlib import Path
@@ -32,9 +33,9 @@ from edge_depth_nerf.process.checks import check_distance, check_size
 from edge_depth_nerf.process.kitti360_calibration import Kitti360Rig, read_poses, read_rig
 from edge_depth_nerf.process.kitti360_drive import Kitti360Drive
 from edge_depth_nerf.process.options import Kitti360Options
+from edge_depth_nerf.process.poses import transform_of_rows
 from edge_depth_nerf.process.recording import RecordedCamera, RecordedPicture, RecordedSweep, Recording
 from edge_depth_nerf.process.scene import DistanceMap, Picture, ProcessReport, ShiftedView
-from edge_depth_nerf.process.transforms import check_rigid
 
 FRAME_INTERVAL_S = 0.1
 """Between frames, and of one turn of the scanner, where the drive brings no timestamps."""
@@ -171,21 +172,24 @@ def _shifted_views(drive: Kitti360Drive, rig: Kitti360Rig, taken: set[tuple[str,
     path = drive.truth / "shifted.json"
     if not path.is_file():
         return []
-    poses = {
-        (metres, name, int(frame)): matrix
-        for metres, cameras in read_json(path).items()
-        for name, frames in cameras.items()
-        for frame, matrix in frames.items()
-    }
+    try:
+        poses = {
+            (metres, name, int(frame)): matrix
+            for metres, cameras in read_json(path).items()
+            for name, frames in cameras.items()
+            for frame, matrix in frames.items()
+        }
+    except (AttributeError, ValueError):
+        raise InputError(f"{path}: expected poses by metres, camera and frame. Synthesise the drive again.") from None
     views = []
     for (metres, name, frame), matrix in poses.items():
         if (name, frame) not in taken:
             continue
         where = f"{path}: {metres} m, {name}, frame {frame}"
-        camera_to_world = np.array(matrix, np.float64)
-        if camera_to_world.shape != (4, 4):
-            raise InputError(f"{where}: expected a 4×4 matrix. Synthesise the drive again.")
-        check_rigid(camera_to_world, where)
+        # they become the name of a folder
+        if not re.fullmatch(r"-?[0-9]{1,3}", metres):
+            raise InputError(f"{where}: expected a whole number of metres. Synthesise the drive again.")
+        camera_to_world = transform_of_rows(matrix, where)
         folder = drive.truth / name / f"shifted_{metres}m"
         picture, distance = (folder / kind / f"{frame:010d}.png" for kind in ("rgb", "distance"))
         check_size(picture, rig.cameras[name])

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 
-import cv2
 import numpy as np
 
+from edge_depth_nerf.bounds import shown, text_lines
 from edge_depth_nerf.cameras import MEI
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.process.transforms import Transform, check_rigid
@@ -26,6 +26,9 @@ _MEI_FIELDS = {
     "projection_parameters": ("gamma1", "gamma2", "u0", "v0"),
 }
 _DOWNLOAD = "Copy the file again from the data set."
+_MAX_YAML_VALUES = 1000
+_MAX_FRAME = 10**10
+"""Numbers of frames have ten digits."""
 
 
 @dataclass(frozen=True)
@@ -74,47 +77,43 @@ def read_mei_camera(path: Path) -> MEI:
         InputError: broken, truncated, or another camera model.
 
     """
-    lines = len(_read_text(path).splitlines())
-    try:
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-    except (cv2.error, SystemError) as error:
-        # the binding wraps OpenCV's error, which ends in "file.yaml(17): what is wrong'"
-        found = re.search(r"\((\d+)\): ([^'\n]*'?[^'\n]*'?)'\s*$", str(error.__cause__ or error))
-        where = f"{path}, line {found[1]}: {found[2]}" if found else f"{path}: nothing in it"
-        raise InputError(f"{where}; expected OpenCV's YAML with a MEI camera. {_DOWNLOAD}") from error
+    values, lines = _read_yaml(path)
 
-    def node(*keys: str) -> cv2.FileNode:
-        found = storage.root()
-        for key in keys:
-            found = found.getNode(key) if found.isMap() else cv2.FileNode()
-        if found.isNone() or found.empty():
+    def text(key: str) -> tuple[int, str]:
+        if key not in values:
             raise InputError(
-                f"{path}: ends after line {lines} without {'.'.join(keys)}; expected a MEI camera's parameters. "
+                f"{path}: ends after line {lines} without {key}; expected a MEI camera's parameters. "
                 f"The file is truncated or of another camera. {_DOWNLOAD}"
             )
-        return found
+        return values[key]
 
     def number(*keys: str) -> float:
-        found = node(*keys)
-        if not (found.isReal() or found.isInt()):
-            raise InputError(f"{path}, line {_line_of(path, keys[-1])}: {'.'.join(keys)} is not a number. {_DOWNLOAD}")
-        return found.real()
+        key = ".".join(keys)
+        line, word = text(key)
+        try:
+            return _number(word, path, line)
+        except InputError:
+            raise InputError(f"{path}, line {line}: {key} is not a number: {shown(word)}. {_DOWNLOAD}") from None
 
-    model = node("model_type")
-    if not model.isString() or model.string() != "MEI":
+    line, model = text("model_type")
+    if model.strip("\"'") != "MEI":
         raise InputError(
-            f"{path}, line {_line_of(path, 'model_type')}: model_type is not MEI. Only KITTI-360's fisheye cameras "
-            "image_02 and image_03 can be read."
+            f"{path}, line {line}: model_type is not MEI. Only KITTI-360's fisheye cameras image_02 and image_03 can "
+            "be read."
         )
     xi, k1, k2, p1, p2, gamma1, gamma2, u0, v0 = (
         number(group, key) for group, keys in _MEI_FIELDS.items() for key in keys
     )
     width, height = number("image_width"), number("image_height")
+    for key, size in (("image_width", width), ("image_height", height)):
+        if size % 1:
+            raise InputError(f"{path}, line {values[key][0]}: {key} is {size:g}, expected a whole number. {_DOWNLOAD}")
     for key, centre, size in (("u0", u0, width), ("v0", v0, height)):
         # a number that lost its last digits, or its exponent, is still a number
         if not 0.25 * size <= centre <= 0.75 * size:
+            line, _ = values[f"projection_parameters.{key}"]
             raise InputError(
-                f"{path}, line {_line_of(path, key)}: {key} is {centre:g}, which is not in the middle half of a "
+                f"{path}, line {line}: {key} is {centre:g}, which is not in the middle half of a "
                 f"picture of {size:g} pixels. The file is truncated or of another camera. {_DOWNLOAD}"
             )
     try:
@@ -137,6 +136,8 @@ def read_cam_to_pose(path: Path) -> dict[str, Transform]:
         name, colon, rest = line.partition(":")
         if not colon:
             raise InputError(f"{path}, line {number}: expected 'image_00: ' and 12 numbers. {_DOWNLOAD}")
+        if name.strip() in transforms:
+            raise InputError(f"{path}, line {number}: {shown(name.strip())} is there twice. {_DOWNLOAD}")
         transforms[name.strip()] = _transform(rest, path, number)
     return transforms
 
@@ -165,10 +166,10 @@ def read_poses(path: Path) -> dict[int, Transform]:
     """
     poses: dict[int, Transform] = {}
     for number, line in _lines(path):
-        first, _, rest = line.strip().partition(" ")
+        first, rest = (*line.split(maxsplit=1), "")[:2]
         frame = _number(first, path, number)
-        if frame != int(frame) or frame < 0:
-            raise InputError(f"{path}, line {number}: {first!r} is not the number of a frame. {_DOWNLOAD}")
+        if frame != int(frame) or not 0 <= frame < _MAX_FRAME:
+            raise InputError(f"{path}, line {number}: {shown(first)} is not the number of a frame. {_DOWNLOAD}")
         if int(frame) in poses:
             raise InputError(f"{path}, line {number}: frame {int(frame)} has a pose already. {_DOWNLOAD}")
         poses[int(frame)] = _transform(rest, path, number)
@@ -191,33 +192,55 @@ def read_timestamps(path: Path) -> list[float]:
     times = []
     for number, line in _lines(path):
         # datetime stops at microseconds
-        whole, _, fraction = line.strip().partition(".")
+        whole, _, fraction = line.partition(".")
         try:
             moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc)
+            if not re.fullmatch(r"[0-9]*", fraction):
+                raise ValueError
             times.append(moment.timestamp() + float(f"0.{fraction or 0}"))
         except ValueError:
             raise InputError(
-                f"{path}, line {number}: {line.strip()!r} is not a time like 2013-05-28 08:46:02.123456789. {_DOWNLOAD}"
+                f"{path}, line {number}: {shown(line)} is not a time like 2013-05-28 08:46:02.123456789. {_DOWNLOAD}"
             ) from None
     return times
 
 
-def _read_text(path: Path) -> str:
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file. It is part of the data set's calibration, poses or timestamps.")
-    try:
-        return path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a text file ({error}). {_DOWNLOAD}") from error
-
-
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """Lines with something in them, counted from 1."""
-    return ((number, line) for number, line in enumerate(_read_text(path).splitlines(), 1) if line.strip())
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file. It is part of the data set's calibration, poses or timestamps.")
+    return text_lines(path)
 
 
-def _line_of(path: Path, key: str) -> int:
-    return next((number for number, line in _lines(path) if line.strip().startswith(key)), 0)
+def _read_yaml(path: Path) -> tuple[dict[str, tuple[int, str]], int]:
+    """Read the part of OpenCV's YAML that KITTI-360 uses: values, and tables of values.
+
+    A general parser does more than is wanted: aliases that multiply, tags that build objects, depth without end.
+
+    Returns:
+        Line and text of each value by its dotted name; and the number of the last line.
+
+    """
+    values: dict[str, tuple[int, str]] = {}
+    group, last = "", 0
+    for last, line in _lines(path):
+        if line.startswith(("%", "#", "---", "...")):
+            continue
+        key, colon, value = (part.strip() for part in line.partition(":"))
+        if not colon:
+            raise InputError(f"{path}, line {last}: Missing ':'; expected OpenCV's YAML with a MEI camera. {_DOWNLOAD}")
+        if not value:
+            group = key
+            continue
+        name = f"{group}.{key}" if key in _MEI_FIELDS.get(group, ()) else key
+        if name in values:
+            raise InputError(f"{path}, line {last}: {shown(name)} is there twice. {_DOWNLOAD}")
+        values[name] = last, value
+        if len(values) > _MAX_YAML_VALUES:
+            raise InputError(f"{path}: more than {_MAX_YAML_VALUES} values; expected a MEI camera's. {_DOWNLOAD}")
+    if not values:
+        raise InputError(f"{path}: nothing in it; expected OpenCV's YAML with a MEI camera. {_DOWNLOAD}")
+    return values, last
 
 
 def _number(text: str, path: Path, line: int) -> float:
@@ -226,7 +249,7 @@ def _number(text: str, path: Path, line: int) -> float:
     except ValueError:
         value = np.nan
     if not np.isfinite(value):
-        raise InputError(f"{path}, line {line}: {text!r} is not a finite number. {_DOWNLOAD}")
+        raise InputError(f"{path}, line {line}: {shown(text)} is not a finite number. {_DOWNLOAD}")
     return value
 
 

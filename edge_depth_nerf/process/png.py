@@ -7,6 +7,7 @@ import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
+from edge_depth_nerf.bounds import MAX_PICTURE_BYTES, check_bytes, check_pixels
 from edge_depth_nerf.errors import InputError
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -48,11 +49,10 @@ def read_png_header(path: Path) -> PngHeader:
 
     Raises:
         FileNotFoundError: there is no such file.
-        InputError: not a PNG, or truncated.
+        InputError: not a PNG, truncated, or larger than any picture is.
 
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
+    check_bytes(path, MAX_PICTURE_BYTES)
     with path.open("rb") as file:
         head = file.read(33)
         size = file.seek(0, 2)
@@ -63,6 +63,7 @@ def read_png_header(path: Path) -> PngHeader:
     if len(head) < 33 or _END not in tail:
         raise _broken(path, f"truncated: {size} bytes without the end that a PNG has")
     width, height, bit_depth, colour = struct.unpack(">IIBB", head[16:26])
+    check_pixels(width, height, str(path))
     return PngHeader(width, height, bit_depth, _COLOUR_TYPES.get(colour, f"colour type {colour}"))
 
 

@@ -14,13 +14,15 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
-from edge_depth_nerf.files import write_atomically, write_bytes
+from edge_depth_nerf.files import read_npz, write_atomically, write_bytes
 from edge_depth_nerf.lidar.voxels import first_in_voxel
 
 MAX_POINTS = 200_000
 """points.ply holds at most so many points."""
 VOXEL_M = 0.15
 """points.ply holds one point of each cube of this size; larger cubes where they would be too many."""
+_MAX_PART_BYTES = 1 << 28
+"""No array of a frame's part is larger."""
 _MERGE_AT = 1_000_000
 """So many points are collected before they are thinned; bounds the memory for long drives."""
 
@@ -76,8 +78,8 @@ def merge_parts(parts: Sequence[Path], ply: Path) -> int:
     """
     pending, count = [_Part(np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8))], 0
     for path in parts:
-        with np.load(path) as stored:
-            pending.append(_Part(stored["points_m"], stored["colours"]))
+        stored = read_npz(path, ("points_m", "colours"), _MAX_PART_BYTES)
+        pending.append(_Part(stored["points_m"], stored["colours"]))
         count += len(pending[-1].points_m)
         if count > _MERGE_AT:
             pending, count = [_thinned(pending, VOXEL_M)], 0

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
+from edge_depth_nerf.bounds import MAX_TIME_S, shown, text_lines
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_json
 from edge_depth_nerf.process.transforms import Transform, check_rigid
@@ -39,6 +40,8 @@ def read_tum(path: Path) -> tuple[Float64[np.ndarray, "poses"], Float64[np.ndarr
                 f"{path}, line {line}: {len(values)} numbers, expected 8 (time x y z qx qy qz qw, TUM's format). "
                 "Check the format that the rig file gives for the poses."
             )
+        if abs(values[0]) > MAX_TIME_S:
+            raise InputError(f"{path}, line {line}: its time {values[0]:g} is no time in seconds.")
         if times and not values[0] > times[-1]:
             raise InputError(
                 f"{path}, line {line}: its time {values[0]:.6f} is not after {times[-1]:.6f} of the line before. Sort "
@@ -139,6 +142,7 @@ def pose_of_quaternion(translation: list[float], quaternion: list[float], where:
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
     pose[:3, 3] = translation
+    check_rigid(pose, where)
     return pose
 
 
@@ -155,7 +159,7 @@ def transform_of_rows(rows: object, where: str) -> Transform:
         values = np.empty(0)
     if values.shape not in ((4, 4), (3, 4)) or not np.isfinite(values).all():
         raise InputError(
-            f"{where}: expected 4 rows of 4 numbers, a rotation and a translation in metres; found {rows!r}."
+            f"{where}: expected 4 rows of 4 numbers, a rotation and a translation in metres; found {shown(rows)}."
         )
     pose = np.eye(4)
     pose[: len(values)] = values
@@ -165,12 +169,9 @@ def transform_of_rows(rows: object, where: str) -> Transform:
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Lines with something in them, counted from 1, as words; what follows # is left out."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-    with path.open(encoding="utf-8", errors="replace") as file:
-        for number, line in enumerate(file, 1):
-            if words := line.partition("#")[0].replace(",", " ").split():
-                yield number, words
+    for number, line in text_lines(path):
+        if words := line.partition("#")[0].replace(",", " ").split():
+            yield number, words
 
 
 def _number(word: str, path: Path, line: int) -> float:
@@ -179,7 +180,7 @@ def _number(word: str, path: Path, line: int) -> float:
     except ValueError:
         value = np.nan
     if not np.isfinite(value):
-        raise InputError(f"{path}, line {line}: {word!r} is not a finite number.")
+        raise InputError(f"{path}, line {line}: {shown(word)} is not a finite number.")
     return value
 
 

@@ -18,11 +18,10 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
-from PIL import Image, UnidentifiedImageError
 from rich.console import Console
 
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import DISTANCE_STEPS_PER_METRE
+from edge_depth_nerf.files import DISTANCE_STEPS_PER_METRE, picture_size
 from edge_depth_nerf.lidar.scans import SCAN_SUFFIXES, check_scan, read_scan
 from edge_depth_nerf.lidar.trajectory import MAX_POSE_GAP_S, Trajectory
 from edge_depth_nerf.process.build import process_recording
@@ -207,7 +206,10 @@ def _files(root: Path, given: str, suffixes: tuple[str, ...]) -> list[Path]:
     wild = [number for number, part in enumerate(parts) if any(sign in part for sign in "*?[")]
     if wild:
         folder = root.joinpath(*parts[: wild[0]])
-        found = [file for file in folder.glob(str(Path(*parts[wild[0] :]))) if file.is_file()]
+        try:
+            found = [file for file in folder.glob(str(Path(*parts[wild[0] :]))) if file.is_file()]
+        except ValueError as error:
+            raise InputError(f"{path}: is no pattern of files ({error}); the rig file names it.") from None
         what = "no file has such a name"
     elif path.is_dir():
         present = [file for file in path.iterdir() if file.is_file() and not file.name.startswith(".")]
@@ -226,11 +228,12 @@ def _files(root: Path, given: str, suffixes: tuple[str, ...]) -> list[Path]:
 
 def _natural(path: Path) -> list[tuple[int, str]]:
     """Numbers in names count as numbers."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
+    # [0-9]: Unicode has digits that are no numbers to int
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", path.name)]
 
 
 def _number_in(path: Path) -> float:
-    numbers = re.findall(r"\d+(?:\.\d+)?", path.stem)
+    numbers = re.findall(r"[0-9]+(?:\.[0-9]+)?", path.stem)
     if not numbers:
         raise InputError(f"{path}: no number in its name, which the rig file takes its time from. Give a times_file.")
     return float(numbers[-1])
@@ -555,10 +558,6 @@ def _check_picture(path: Path, camera: RigCamera) -> None:
     if path.suffix.lower() == ".png":
         check_size(path, camera.camera)
         return
-    try:
-        with Image.open(path) as image:
-            width, height = image.size
-    except (OSError, SyntaxError, UnidentifiedImageError) as error:
-        raise InputError(f"{path}: not a picture ({error}). Copy or export it again.") from error
+    width, height = picture_size(path)
     if (width, height) != (camera.camera.width, camera.camera.height):
         raise InputError(size_error(path, width, height, camera.camera))

@@ -1,7 +1,8 @@
 """The file that describes a rig: rig.toml or rig.json. docs/rig.md says what each key means.
 
 It is read strictly: a key that is missing, unknown or of another kind is an error that names the file and the key,
-as in `rig.toml: cameras.front.fx`. Paths in it count from the recording's folder. Nothing else is read here.
+as in `rig.toml: cameras.front.fx`. Paths in it count from the recording's folder and stay in it. Nothing else is read
+here.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from edge_depth_nerf.bounds import MAX_TIME_S, finite, path_inside, read_text, shown
 from edge_depth_nerf.cameras import MEI, Camera, KannalaBrandt, Pinhole
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.lidar.scans import PointTimes, ScanFormat
@@ -32,6 +34,10 @@ VEHICLE = "vehicle"
 """The frame that every sensor's transform leads to."""
 MAX_SIDE_PX = 20_000
 """No picture is larger."""
+MAX_RIG_BYTES = 1 << 18
+"""No rig file is larger: a thousand sensors."""
+_MAX_DOTS = 1000
+"""No line of TOML has more: the parser's time and memory grow with the square of a key's parts."""
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _NAME = r"[A-Za-z0-9_][A-Za-z0-9_-]*"
 
@@ -154,9 +160,11 @@ def read_rig(path: Path, root: Path, prepare: Callable[[dict[str, Any]], None] |
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; it describes the cameras and scanners (docs/rig.md).")
-    parse, suffixes = (json.loads, "JSON") if path.suffix.lower() == ".json" else (tomllib.loads, "TOML")
+    parse, suffixes = (json.loads, "JSON") if path.suffix.lower() == ".json" else (_parse_toml, "TOML")
     try:
-        content = parse(path.read_text(encoding="utf-8"))
+        content = parse(read_text(path, MAX_RIG_BYTES))
+    except InputError:
+        raise
     except (ValueError, RecursionError) as error:
         raise InputError(
             f"{path}: not valid {suffixes} ({error}). Mend the file; docs/rig.md has an example."
@@ -166,6 +174,12 @@ def read_rig(path: Path, root: Path, prepare: Callable[[dict[str, Any]], None] |
     if prepare is not None:
         prepare(content)
     return _rig(_Table(content, path, ""), root)
+
+
+def _parse_toml(text: str) -> dict[str, Any]:
+    if any(line.count(".") > _MAX_DOTS for line in text.splitlines()):
+        raise ValueError(f"a line with more than {_MAX_DOTS} dots")
+    return tomllib.loads(text)
 
 
 class _Table:
@@ -179,7 +193,7 @@ class _Table:
         return f"{self._path}: {self._prefix}{key}"
 
     def wrong(self, key: str, found: object, expected: str) -> InputError:
-        return InputError(f"{self.where(key)} is {found!r}, expected {expected}.")
+        return InputError(f"{self.where(key)} is {shown(found)}, expected {expected}.")
 
     def has(self, key: str) -> bool:
         self._known.append(key)
@@ -194,13 +208,15 @@ class _Table:
             raise InputError(f"{self.where(key)} is missing; expected {expected}.{hint}")
         return self._values.pop(key)
 
-    def number(self, key: str, default: float | None = None, above: float = -math.inf) -> float:
-        expected = "a number" + (f" above {above:g}" if above > -math.inf else "")
+    def number(
+        self, key: str, default: float | None = None, above: float = -math.inf, most: float = MAX_TIME_S
+    ) -> float:
+        expected = "a number" + (f" above {above:g}" if above > -math.inf else "") + f", at most {most:g}"
         if default is not None and not self.has(key):
             return default
         given = self.take(key, expected)
-        value = _finite(given)
-        if value is None or value <= above:
+        value = finite(given)
+        if value is None or value <= above or abs(value) > most:
             raise self.wrong(key, given, expected)
         return value
 
@@ -270,14 +286,6 @@ class _Table:
             )
 
 
-def _finite(value: object) -> float | None:
-    """A number as a float; None if it is none, or not finite."""
-    # True is a number to Python only, and a whole number may be too large for a float
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= sys.float_info.max:
-        return None
-    return float(value)
-
-
 def _rig(table: _Table, root: Path) -> Rig:
     cameras = tuple(_camera(inner, name, root) for name, inner in table.tables("cameras").items())
     lidars = tuple(_lidar(inner, name, root) for name, inner in table.tables("lidars").items())
@@ -314,12 +322,12 @@ def _camera(table: _Table, name: str, root: Path) -> RigCamera:
         name=name,
         camera=_model(table),
         to_vehicle=_to_vehicle(table),
-        images=table.text("images", "the folder of its pictures, or a pattern such as 'front/*.png'"),
+        images=_files(table, "images", "the folder of its pictures, or a pattern such as 'front/*.png'", root),
         clock=_clock(table, root),
         ego_mask=_path(table, "ego_mask", "a PNG, 255 = use the pixel", root),
-        masks=table.optional_text("masks", "the folder of its pictures' masks"),
-        mono=table.optional_text("mono", "the folder of its pictures' monocular distance maps"),
-        depth=_depth(table) if table.has("depth") else None,
+        masks=_files(table, "masks", "the folder of its pictures' masks", root) if table.has("masks") else None,
+        mono=_files(table, "mono", "the folder of its monocular distance maps", root) if table.has("mono") else None,
+        depth=_depth(table, root) if table.has("depth") else None,
     )
     table.finish()
     return found
@@ -354,18 +362,25 @@ def _to_vehicle(table: _Table) -> Transform:
     numbers = []
     for key, count in (("translation", 3), ("quaternion", 4)):
         given = inner.take(key, f"{count} numbers")
-        values = [_finite(item) for item in given] if isinstance(given, list) else []
-        finite = [value for value in values if value is not None]
-        if not len(values) == len(finite) == count:
+        values = [finite(item) for item in given] if isinstance(given, list) else []
+        usable = [value for value in values if value is not None]
+        if not len(values) == len(usable) == count:
             raise inner.wrong(key, given, f"{count} numbers")
-        numbers.append(finite)
+        numbers.append(usable)
     inner.finish()
     return pose_of_quaternion(numbers[0], numbers[1], where)
 
 
 def _path(table: _Table, key: str, expected: str, root: Path) -> Path | None:
     given = table.optional_text(key, expected)
-    return None if given is None else root / given
+    return None if given is None else path_inside(root, given, table.where(key))
+
+
+def _files(table: _Table, key: str, expected: str, root: Path) -> str:
+    """A folder or a pattern, which stays in the recording's folder."""
+    given = table.text(key, expected)
+    path_inside(root, given, table.where(key))
+    return given
 
 
 def _clock(table: _Table, root: Path) -> Clock:
@@ -381,26 +396,26 @@ def _clock(table: _Table, root: Path) -> Clock:
     clock = Clock(
         file=_path(table, "times_file", "a text file with a time for each file", root),
         from_names=given == ["times_from_names"],
-        rate_hz=table.number("rate_hz", above=0.0) if table.has("rate_hz") else None,
+        rate_hz=table.number("rate_hz", above=1e-9) if table.has("rate_hz") else None,
         seconds_per_count=_SECONDS[table.choice("time_unit", tuple(_SECONDS), "s")],
         offset_s=table.number("time_offset_s", 0.0),
     )
     return clock
 
 
-def _depth(table: _Table) -> DepthMaps:
+def _depth(table: _Table, root: Path) -> DepthMaps:
     inner = table.table("depth", "{files = 'depth/front', kind = 'z_depth', metres_per_count = 0.001}")
     found = DepthMaps(
-        files=inner.text("files", "the folder of the maps"),
+        files=_files(inner, "files", "the folder of the maps", root),
         kind=inner.choice("kind", ("z_depth", "distance")),
-        metres_per_count=inner.number("metres_per_count", above=0.0),
+        metres_per_count=inner.number("metres_per_count", above=1e-12, most=1e6),
     )
     inner.finish()
     return found
 
 
 def _lidar(table: _Table, name: str, root: Path) -> RigLidar:
-    scans = table.text("scans", "the folder of its scans, or a pattern such as 'lidar/*.bin'")
+    scans = _files(table, "scans", "the folder of its scans, or a pattern such as 'lidar/*.bin'", root)
     names = {}
     if table.has("names"):
         inner = table.table("names", "a table such as {x = 'X', intensity = 'i'}")
@@ -453,7 +468,7 @@ def _timing(table: _Table) -> tuple[float | None, float, SweepTiming | None]:
             raise InputError(f"{table.where('turn_s')} is missing; {key} says nothing without it.")
     if not table.has("turn_s"):
         return None, 0.0, None
-    turn_s = table.number("turn_s", above=0.0)
+    turn_s = table.number("turn_s", above=1e-9, most=1e5)
     moment = table.choice("timestamp", ("start", "middle", "end"))
     to_middle_s = {"start": turn_s / 2, "middle": 0.0, "end": -turn_s / 2}[moment]
     if not turns:
@@ -465,7 +480,8 @@ def _timing(table: _Table) -> tuple[float | None, float, SweepTiming | None]:
 
 
 def _poses(table: _Table, root: Path, sensors: list[str]) -> RigPoses:
-    file = root / table.text("file", "the file of the poses")
+    expected = "the file of the poses"
+    file = path_inside(root, table.text("file", expected), table.where("file"))
     kind = table.choice("format", ("tum", "kitti", "nerfstudio"))
     clock = _clock(table, root) if kind == "kitti" else None
     found = RigPoses(
@@ -473,7 +489,7 @@ def _poses(table: _Table, root: Path, sensors: list[str]) -> RigPoses:
         format=kind,
         of=VEHICLE if kind == "nerfstudio" else table.choice("of", (VEHICLE, *sensors), VEHICLE),
         clock=clock,
-        metres_per_unit=table.number("metres_per_unit", 1.0, above=0.0),
+        metres_per_unit=table.number("metres_per_unit", 1.0, above=1e-12, most=1e6),
         up=table.choice("up", ("x", "y", "z", "-x", "-y", "-z"), "z"),
     )
     table.finish()

@@ -55,6 +55,7 @@ from edge_depth_nerf.masks.lens import lens_circle
 from edge_depth_nerf.process.png import read_png_bytes, read_png_header
 from edge_depth_nerf.process.points import PointCloud, merge_parts, write_part
 from edge_depth_nerf.process.transforms import Transform, check_rigid, opencv_to_opengl
+from edge_depth_nerf.scene_format import read_transforms
 
 TRANSFORMS = "transforms.json"
 RECORD = "process.json"
@@ -662,7 +663,7 @@ def _maps_put_in_later(written: Path) -> _LaterMaps | None:
     """Find what a transforms.json says of such maps."""
     if not written.is_file():
         return None
-    there = read_json(written)
+    there = read_transforms(written)
     if MONO_ENTRY not in there:
         return None
     key = LAYERS["mono"][1]

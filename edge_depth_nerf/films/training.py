@@ -1,0 +1,119 @@
+"""What a training's config.yml says of its dataparser, read without building what the file names.
+
+nerfstudio's own commands load that file with yaml.Loader, which builds any class and calls any function that it names
+(PyYAML's python tags). Here the file is parsed into nodes, nothing more; from these the settings of a dataparser that
+is known are taken, each checked against its type.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import types
+from pathlib import Path
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from edge_depth_nerf.bounds import finite, read_text, shown
+from edge_depth_nerf.errors import InputError
+
+MAX_CONFIG_BYTES = 1 << 16
+"""No config.yml is larger: nerfstudio's have some 10 kB. The parser takes a second for that much."""
+_PYTHON = "tag:yaml.org,2002:python/"
+_HINT = "--load-config takes the config.yml that ns-train wrote"
+
+
+def read_dataparser(path: Path) -> Any:
+    """Read the dataparser's settings of a training.
+
+    Returns:
+        A `FisheyeDepthDataParserConfig` or nerfstudio's `NerfstudioDataParserConfig`, with `data` set.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: no YAML, no training's settings, or those of another dataparser.
+
+    """
+    import yaml
+    from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+
+    from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
+
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file. {_HINT}.")
+    known = {
+        f"{kind.__module__}.{kind.__name__}": kind
+        for kind in (FisheyeDepthDataParserConfig, NerfstudioDataParserConfig)
+    }
+    try:
+        root = yaml.compose(read_text(path, MAX_CONFIG_BYTES), Loader=yaml.SafeLoader)
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({' '.join(str(error).split())}). {_HINT}.") from None
+    manager = _child(_child(root, "pipeline"), "datamanager")
+    if manager is None or not re.fullmatch(rf"{_PYTHON}object:[\w.]*TrainerConfig", root.tag):
+        raise InputError(f"{path}: is no training's settings. {_HINT}.")
+    node = _child(manager, "dataparser")
+    name = node.tag.removeprefix(f"{_PYTHON}object:") if node is not None else "none"
+    if name not in known:
+        raise InputError(
+            f"{path}: its dataparser is {shown(name)}, expected one of {', '.join(known)}. Train with "
+            "fisheye-depth-data or nerfstudio-data, or give the scene in place of --load-config."
+        )
+    settings = {}
+    hints = get_type_hints(known[name])
+    for field in dataclasses.fields(known[name]):
+        found = _child(node, field.name)
+        if found is None or field.name == "_target":
+            continue
+        value = _value(found)
+        if not _fits(value, hints[field.name]):
+            raise InputError(f"{path}: dataparser.{field.name} is {shown(value)}, which it cannot be. {_HINT}.")
+        settings[field.name] = value
+    data = _value(_child(manager, "data"))
+    return known[name](**{**settings, **({"data": data} if isinstance(data, Path) else {})})
+
+
+def _child(node: Any, key: str) -> Any:
+    """The node under a key of a mapping; None where there is none."""
+    if node is None or node.id != "mapping":
+        return None
+    return next((value for name, value in node.value if name.id == "scalar" and name.value == key), None)
+
+
+class _Unknown:
+    """Stands for what is neither a plain value nor a path."""
+
+
+def _value(node: Any) -> Any:
+    """A plain value, a path or a list of plain values."""
+    from yaml.constructor import ConstructorError, SafeConstructor
+
+    if node is None:
+        return None
+    if node.id == "scalar" and not node.tag.startswith(_PYTHON):
+        try:
+            return SafeConstructor().construct_object(node)
+        except (ConstructorError, ValueError):
+            return _Unknown()
+    if node.id != "sequence" or len(node.value) > 100 or any(item.id != "scalar" for item in node.value):
+        return _Unknown()
+    items = [_value(item) for item in node.value]
+    if re.fullmatch(rf"{_PYTHON}object/apply:pathlib[\w.]*\.\w*Path", node.tag):
+        text = all(isinstance(item, str) and "\0" not in item for item in items)
+        return Path(*items) if text else _Unknown()
+    return tuple(items) if node.tag == f"{_PYTHON}tuple" else items
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a value is of a dataparser's declared type."""
+    origin, inner = get_origin(hint), get_args(hint)
+    if origin is Literal:
+        return isinstance(value, str) and value in inner
+    if origin in (Union, types.UnionType):
+        return any(_fits(value, each) for each in inner)
+    if origin is tuple:
+        return isinstance(value, tuple) and len(value) == len(inner) and all(map(_fits, value, inner))
+    if hint is float:
+        return finite(value) is not None
+    if hint is int:
+        return isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**31
+    return type(value) is hint or (hint is Path and isinstance(value, Path))

@@ -1,0 +1,293 @@
+"""No data makes this program run code, leave its folder, or load more than weights."""
+
+from __future__ import annotations
+
+import ast
+import pickle
+import re
+from pathlib import Path
+from random import Random
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from bad_input import RIG, spoilt
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.utils import eval_utils
+from scenes import write_scene
+from test_bad_input import INPUTS, throw
+
+from edge_depth_nerf import compat
+from edge_depth_nerf.config import edge_depth_nerf_lite
+from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.files import read_json, write_json
+from edge_depth_nerf.films.training import read_dataparser
+from edge_depth_nerf.process.rig_file import read_rig
+from edge_depth_nerf.scene_reader import read_scene
+
+PACKAGE = Path(compat.__file__).parent
+OUTSIDE = ("/etc/passwd", "../outside.png", "images/../../outside.png", "a\0b", "", "a" * 300, 7, None)
+
+
+class Trap:
+    """What a pickle of it does when it is loaded is to write a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self):
+        return Path.write_text, (self.path, "code has run")
+
+
+# ---- code in data ----------------------------------------------------------------------------------------------
+
+
+def calls(tree: ast.AST) -> set[str]:
+    return {ast.unparse(node.func) for node in ast.walk(tree) if isinstance(node, ast.Call)}
+
+
+@pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_nothing_in_the_package_runs_what_it_reads(path):
+    """What ruff's rules (S in pyproject.toml) hold as well; here without exceptions."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    imported = {name.name for node in ast.walk(tree) if isinstance(node, ast.Import) for name in node.names}
+    imported |= {node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    assert not imported & {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "marshal", "shelve"}
+    unsafe = {"eval", "exec", "compile", "__import__", "torch.load", "yaml.load", "yaml.unsafe_load", "os.system"}
+    assert not calls(tree) & unsafe
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            given = {keyword.arg: keyword.value for keyword in node.keywords}
+            shell = given.get("shell")
+            assert shell is None or (isinstance(shell, ast.Constant) and shell.value is False)
+            if ast.unparse(node.func) == "np.load":
+                allowed = given.get("allow_pickle")
+                assert isinstance(allowed, ast.Constant) and allowed.value is False
+
+
+def test_the_linter_holds_it():
+    rules = (PACKAGE.parent / "pyproject.toml").read_text(encoding="utf-8")
+    assert re.search(r'^select = \[.*"S"', rules, re.MULTILINE)
+
+
+# ---- checkpoints -----------------------------------------------------------------------------------------------
+
+
+class Pipeline:
+    def load_pipeline(self, *_) -> None:
+        raise AssertionError("a checkpoint was loaded")
+
+
+def object_scalar(inner: bytes):
+    """A NumPy scalar of type object, which may be said to hold a pickle: its class is allowed in checkpoints."""
+
+    class Scalar:
+        def __reduce__(self):
+            return np.float64(0).__reduce__()[0], (np.dtype("O"), inner)
+
+    return Scalar()
+
+
+@pytest.mark.parametrize("kind", ["in the state", "in a scalar", "plain pickle"])
+def test_a_checkpoint_holds_weights_alone(tmp_path, kind):
+    """As nerfstudio's commands load them, with what the plugin allows."""
+    compat.allow_numpy_scalars_in_checkpoints()
+    sign, folder = tmp_path / "sign", tmp_path / "models"
+    folder.mkdir()
+    trap = Trap(sign)
+    checkpoint = folder / "step-000000007.ckpt"
+    if kind == "in a scalar":
+        torch.save({"step": object_scalar(pickle.dumps(trap)), "pipeline": {}}, checkpoint)
+    elif kind == "plain pickle":
+        checkpoint.write_bytes(pickle.dumps({"step": 7, "pipeline": trap}))
+    else:
+        torch.save({"step": 7, "pipeline": {"weight": torch.ones(2), "trap": trap}}, checkpoint)
+
+    class Config:
+        load_dir, load_step = folder, None
+
+    with pytest.raises((pickle.UnpicklingError, AssertionError, RuntimeError)) as raised:
+        eval_utils.eval_load_checkpoint(Config(), Pipeline())  # pyright: ignore[reportArgumentType]
+    assert not sign.exists()
+    if kind != "in a scalar":
+        assert isinstance(raised.value, pickle.UnpicklingError)
+    # the trap does work
+    pickle.loads(pickle.dumps(trap))
+    assert sign.exists()
+
+
+def test_weights_are_no_pickle(tmp_path):
+    from edge_depth_nerf.mono.network import load_network
+
+    sign = tmp_path / "sign"
+    torch.save({"weight": Trap(sign)}, tmp_path / "a.safetensors")
+    with pytest.raises(InputError, match="cannot be read as weights"):
+        load_network(tmp_path / "a.safetensors")
+    assert not sign.exists()
+
+
+# ---- config.yml ------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory) -> Path:
+    from dataclasses import replace
+
+    settings = edge_depth_nerf_lite.config
+    parser = FisheyeDepthDataParserConfig(metres_per_unit=7.5, eval_interval=5)
+    manager = replace(settings.pipeline.datamanager, dataparser=parser, data=Path("/drives/street"))  # pyright: ignore
+    whole = replace(settings, pipeline=replace(settings.pipeline, datamanager=manager))
+    path = tmp_path_factory.mktemp("config") / "config.yml"
+    path.write_text(yaml.dump(whole))
+    return path
+
+
+def test_settings_are_those_that_nerfstudio_reads(config):
+    host = yaml.load(config.read_text(), Loader=yaml.Loader).pipeline.datamanager
+    found = read_dataparser(config)
+    assert type(found) is type(host.dataparser)
+    assert found.data == host.data == Path("/drives/street")
+    for name in ("metres_per_unit", "eval_interval", "orientation_method", "auto_scale_poses", "mask_color"):
+        assert getattr(found, name) == getattr(host.dataparser, name), name
+
+
+def test_settings_of_the_hosts_parser(config, tmp_path):
+    parser = NerfstudioDataParserConfig(mask_color=(0.0, 0.5, 1.0), downscale_factor=2)
+    text = config.read_text()
+    head, _, tail = text.partition("    dataparser: ")
+    inner = "\n".join(f"      {line}" for line in yaml.dump(parser).splitlines()[1:])
+    rest = re.sub(r"\A.*?(?=^    \w)", "", tail, flags=re.DOTALL | re.MULTILINE)
+    tag = yaml.dump(parser).splitlines()[0]
+    (tmp_path / "config.yml").write_text(f"{head}    dataparser: {tag}\n{inner}\n{rest}")
+    found = read_dataparser(tmp_path / "config.yml")
+    assert isinstance(found, NerfstudioDataParserConfig) and not isinstance(found, FisheyeDepthDataParserConfig)
+    assert found.mask_color == (0.0, 0.5, 1.0) and found.downscale_factor == 2
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("metres_per_unit: 7.5", "metres_per_unit: {call}", "metres_per_unit is"),
+        ("eval_interval: 5", "eval_interval: {call}", "eval_interval is"),
+        ("dataparser.FisheyeDepthDataParserConfig", "trainer.EdgeDepthTrainer", "its dataparser is"),
+        ("max_num_iterations: 2000", "max_num_iterations: {call}", None),
+        ("metres_per_unit: 7.5", "metres_per_unit: .nan", "metres_per_unit is nan"),
+        ("orientation_method: none", "orientation_method: sideways", "orientation_method is 'sideways'"),
+    ],
+)
+def test_a_config_runs_nothing(config, tmp_path, old, new, message):
+    sign = tmp_path / "sign"
+    call = f"!!python/object/apply:os.mkdir ['{sign}']"
+    text = config.read_text()
+    assert old in text
+    path = tmp_path / "config.yml"
+    path.write_text(text.replace(old, new.format(call=call)))
+    if message is None:
+        read_dataparser(path)
+    else:
+        with pytest.raises(InputError, match=message):
+            read_dataparser(path)
+    assert not sign.exists()
+    if "{call}" in new:
+        yaml.load(path.read_text(), Loader=yaml.Loader)
+        assert sign.exists()  # what nerfstudio's own loader does with it
+
+
+def test_a_spoilt_config(config, tmp_path):
+    path, whole = tmp_path / "config.yml", config.read_bytes()
+    laughs = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
+        f"{chr(98 + n)}: &{chr(98 + n)} [{','.join([f'*{chr(97 + n)}'] * 9)}]\n" for n in range(20)
+    )
+    for content in (laughs.encode(), b"[" * 60_000, b"{a: " * 15_000, b"a: 1\n" * 13_000, b"x" * 70_000):
+        path.write_bytes(content)
+        throw(read_dataparser, path)
+    rng = Random(0)
+    for _ in range(max(5, INPUTS // 4)):
+        path.write_bytes(spoilt(whole, "text", rng))
+        throw(read_dataparser, path)
+
+
+# ---- paths -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", OUTSIDE)
+@pytest.mark.parametrize(
+    "key", ["file_path", "mask_path", "depth_file_path", "lidar_file_path", "mono_file_path", "truth_rgb_file_path"]
+)
+def test_a_scene_names_its_own_files(tmp_path, key, name):
+    scene = write_scene(tmp_path / "scene", frames=2)
+    meta = read_json(scene / "transforms.json")
+    meta["frames"][1][key] = name
+    write_json(scene / "transforms.json", meta)
+    for read in (read_scene, lambda path: FisheyeDepthDataParserConfig(data=path).setup().get_dataparser_outputs()):
+        with pytest.raises(InputError, match=rf"frame 1(: {key} is .*not leading out of it| has no file_path)"):
+            read(scene)
+
+
+@pytest.mark.parametrize("name", OUTSIDE[:-1])
+def test_a_point_cloud_is_the_scenes_own(tmp_path, name):
+    scene = write_scene(tmp_path / "scene", frames=2, ply_file_path=name)
+    with pytest.raises(InputError, match=r"ply_file_path is .*not leading out of it"):
+        read_scene(scene)
+
+
+def test_true_views_are_the_scenes_own(tmp_path):
+    view = {"camera": "a", "frame": 0, "transform_matrix": np.eye(4).tolist(), "truth_rgb_file_path": "truth/a.png"}
+    view["truth_distance_file_path"] = "../../a.png"
+    scene = write_scene(tmp_path / "scene", frames=2, shifted_views={"1": [view]})
+    with pytest.raises(InputError, match=r"view 0: truth_distance_file_path is .*not leading out"):
+        read_scene(scene)
+
+
+def test_links_in_a_scene_are_followed(tmp_path):
+    """They are of whoever made the folder: a way to keep pictures elsewhere."""
+    scene = write_scene(tmp_path / "scene", frames=2)
+    (scene / "images").rename(tmp_path / "elsewhere")
+    (scene / "images").symlink_to(tmp_path / "elsewhere")
+    found = read_scene(scene)
+    assert found.maps(found.pictures[0]).rgb.any()
+
+
+@pytest.mark.parametrize("name", ["/etc", "../other", "images/../../other", "/etc/*.png", "../*"])
+@pytest.mark.parametrize("key", ["images", "times_file", "masks", "file", "scans"])
+def test_a_rig_names_files_of_the_recording(tmp_path, key, name):
+    path = tmp_path / "rig.toml"
+    path.write_text(re.sub(rf'^{key} = "[^"]*"', f'{key} = "{name}"', RIG, flags=re.MULTILINE))
+    with pytest.raises(InputError, match=rf"{key} is .*not leading out of it"):
+        read_rig(path, tmp_path)
+
+
+# ---- the host ----------------------------------------------------------------------------------------------------
+
+
+def test_each_workaround_names_its_issue_and_its_end():
+    found = [value for name, value in vars(compat).items() if getattr(value, "__module__", "") == compat.__name__]
+    assert len(found) >= 3
+    for function in found:
+        text = function.__doc__ or ""
+        assert re.search(r"Works around: https://github\.com/[\w.-]+/[\w.-]+/(issues|pull)/\d+\.$", text, re.MULTILINE)
+        assert re.search(r"Ends with: \S.*\.$", text, re.MULTILINE), function
+
+
+@pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_no_other_module_changes_the_host(path):
+    """Attributes of what is imported from nerfstudio, torch or torchmetrics are set in compat.py alone."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    host = set()
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.Import, ast.ImportFrom)):
+            module = node.module or "" if isinstance(node, ast.ImportFrom) else ""
+            for name in node.names:
+                if (module or name.name).split(".")[0] in ("nerfstudio", "torch", "torchmetrics"):
+                    host.add((name.asname or name.name).split(".")[0])
+    changed = {
+        ast.unparse(target)
+        for node in ast.walk(tree)
+        if isinstance(node, (ast.Assign, ast.AugAssign))
+        for whole in (node.targets if isinstance(node, ast.Assign) else [node.target])
+        for target in ast.walk(whole)
+        if isinstance(target, ast.Attribute) and ast.unparse(target).split(".")[0] in host
+    }
+    assert path.name == "compat.py" or not changed
