@@ -221,7 +221,7 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         self.eval_dataloader = RandIndicesEvalDataloader(input_dataset=self.eval_dataset, device=self.device)
 
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
-        """Rays of the next training batch and what supervises them; under surface_…, the further pixels."""
+        """Rays of the next training batch and what supervises them; under surface_…, the further pixels, if any is of use."""
         self.train_count += 1
         assert self.train_pixel_sampler is not None
         rays, batch = self._serve(self.train_pixel_sampler.sample(step), self.train_ray_generator)
@@ -229,9 +229,11 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
             pixels = self._surface_sampler.sample(step)
             vague = pixels.prior_sigma_m > SURFACE_SIGMA_M + SURFACE_SIGMA_SHARE * pixels.prior_distance_m
             chosen = (pixels.sky | (pixels.prior_distance_m > 0) & ~vague)[:, 0]
-            batch["surface_rays"], surface = self._serve(pixels[chosen], self.train_ray_generator)
-            names = {"prior_distance_m": "distance_m", "prior_sigma_m": "sigma_m"}
-            batch |= {f"surface_{names.get(name, name)}": value for name, value in surface.items()}
+            # the mean over no pixels would be no number
+            if chosen.any():
+                batch["surface_rays"], surface = self._serve(pixels[chosen], self.train_ray_generator)
+                names = {"prior_distance_m": "distance_m", "prior_sigma_m": "sigma_m"}
+                batch |= {f"surface_{names.get(name, name)}": value for name, value in surface.items()}
         return rays, batch
 
     def next_eval(self, step: int) -> tuple[RayBundle, dict[str, Any]]:

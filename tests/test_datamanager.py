@@ -87,6 +87,14 @@ def test_further_pixels_come_for_the_surface_where_the_prior_is_good(tmp_path):
     assert "surface_rays" not in manager(scene, surface_rays_per_batch=0).next_train(0)[1]
 
 
+def test_no_further_pixels_come_where_every_prior_is_vague(tmp_path):
+    data = manager(write_scene(tmp_path), sigma_mode="constant", sigma_constant=100.0)
+    assert data._surface_sampler is not None
+    _, batch = data.next_train(0)
+    assert (batch["prior_distance_m"] > 0).any() and not batch["sky"].any()
+    assert not [name for name in batch if name.startswith("surface_")]
+
+
 def test_held_out_maps_are_in_no_training_prior(tmp_path):
     """The prior of every training frame is made from its own files alone; held-out sweeps are not even opened."""
     scene = write_scene(tmp_path)
