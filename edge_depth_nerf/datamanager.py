@@ -221,7 +221,7 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         self.eval_dataloader = RandIndicesEvalDataloader(input_dataset=self.eval_dataset, device=self.device)
 
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
-        """Rays of the next training batch and what supervises them; under surface_…, the further pixels, if any is of use."""
+        """Rays of the next training batch and what supervises them; surface_…: further pixels of use, if any."""
         self.train_count += 1
         assert self.train_pixel_sampler is not None
         rays, batch = self._serve(self.train_pixel_sampler.sample(step), self.train_ray_generator)
