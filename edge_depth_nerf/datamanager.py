@@ -11,6 +11,7 @@ table is kept on disk: the next training of the same scene with the same prior r
 from __future__ import annotations
 
 import dataclasses
+import errno
 import hashlib
 import json
 import os
@@ -31,7 +32,9 @@ from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIn
 from nerfstudio.model_components.ray_generators import RayGenerator
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import track
+from torch import Tensor
 
+from edge_depth_nerf.checked_cache import keep_last, used
 from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
 from edge_depth_nerf.dataset import FisheyeDepthDataset
 from edge_depth_nerf.errors import InputError
@@ -39,7 +42,14 @@ from edge_depth_nerf.integration import IntegrationOptions
 from edge_depth_nerf.metrics import has_whole_window
 from edge_depth_nerf.mono.error_model import Trust
 from edge_depth_nerf.mono.trust import field_of_source, find_trust
-from edge_depth_nerf.pixel_table import TABLE_VERSION, PicturePixels, PixelBatch, PixelTable, PixelTableWriter
+from edge_depth_nerf.pixel_table import (
+    RECORD,
+    TABLE_VERSION,
+    PicturePixels,
+    PixelBatch,
+    PixelTable,
+    PixelTableWriter,
+)
 from edge_depth_nerf.prior import CACHE_VERSION, PriorCache, PriorOptions, View, sky_of, view_of
 from edge_depth_nerf.ray_table import TableRayGenerator
 
@@ -192,6 +202,8 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
     eval_dataset: FisheyeDepthDataset
     train_pixel_sampler: TablePixelSampler | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
     eval_pixel_sampler: TablePixelSampler | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    trained_on: Tensor
+    """Picture, row and column of each ray of the last training batch."""
 
     def __init__(self, config: FisheyeDepthDataManagerConfig, *args: Any, **kwargs: Any):
         self._temporary: list[tempfile.TemporaryDirectory[str]] = []
@@ -224,17 +236,24 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         """Rays of the next training batch and what supervises them; surface_…: further pixels of use, if any."""
         self.train_count += 1
         assert self.train_pixel_sampler is not None
-        rays, batch = self._serve(self.train_pixel_sampler.sample(step), self.train_ray_generator)
+        pixels = self.train_pixel_sampler.sample(step)
+        self.trained_on = pixels.indices
+        rays, batch = self._serve(pixels, self.train_ray_generator)
         if self._surface_sampler is not None:
-            pixels = self._surface_sampler.sample(step)
-            vague = pixels.prior_sigma_m > SURFACE_SIGMA_M + SURFACE_SIGMA_SHARE * pixels.prior_distance_m
-            chosen = (pixels.sky | (pixels.prior_distance_m > 0) & ~vague)[:, 0]
+            further = self._surface_sampler.sample(step)
+            vague = further.prior_sigma_m > SURFACE_SIGMA_M + SURFACE_SIGMA_SHARE * further.prior_distance_m
+            chosen = (further.sky | (further.prior_distance_m > 0) & ~vague)[:, 0]
             # the mean over no pixels would be no number
             if chosen.any():
-                batch["surface_rays"], surface = self._serve(pixels[chosen], self.train_ray_generator)
+                batch["surface_rays"], surface = self._serve(further[chosen], self.train_ray_generator)
                 names = {"prior_distance_m": "distance_m", "prior_sigma_m": "sigma_m"}
                 batch |= {f"surface_{names.get(name, name)}": value for name, value in surface.items()}
         return rays, batch
+
+    def pictures_of(self, rays: Tensor | None = None) -> list[str]:
+        """Names of the pictures that the last training batch is from; of some of its rays, where these are said."""
+        chosen = self.trained_on[:, 0] if rays is None else self.trained_on[rays.cpu(), 0]
+        return [str(self.train_dataset.image_filenames[image_idx]) for image_idx in chosen.unique().tolist()]
 
     def next_eval(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
         """Rays of a batch of held-out pixels and their colours."""
@@ -285,7 +304,7 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         path = cache_dir / "pixels" / f"{_table_key(dataset, options, trust, weight)}.npy"
         try:
             table = PixelTable(path)
-            os.utime(path)
+            used(path)
             return table
         except (OSError, ValueError, KeyError, InputError):
             pass  # not there, or not whole: made now
@@ -295,12 +314,23 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
             path = Path(self._temporary[-1].name) / path.name
         cache = None if options is None else PriorCache(cache_dir / "prior", options, trust)
         most = int((dataset.cameras.width * dataset.cameras.height).sum())
-        with PixelTableWriter(path, most, prior_weight=weight) as writer:
-            loaded = _load(dataset, cache, whole_windows=not with_prior)
-            for pixels in track(loaded, f"{description}…", len(dataset), console=CONSOLE, transient=True):
-                writer.add(pixels)
-            writer.finish()
+        try:
+            with PixelTableWriter(path, most, prior_weight=weight) as writer:
+                loaded = _load(dataset, cache, whole_windows=not with_prior)
+                for pixels in track(loaded, f"{description}…", len(dataset), console=CONSOLE, transient=True):
+                    writer.add(pixels)
+                writer.finish()
+        except OSError as error:
+            if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+                raise
+            raise InputError(
+                f"{path.parent}: the table of pixels cannot be written ({os.strerror(error.errno)}); it takes up to "
+                f"{most * RECORD.itemsize / 1e9:.2g} GB. Free some space there, or choose another place by "
+                "--pipeline.datamanager.cache-dir."
+            ) from error
         _remove_old(path.parent)
+        if cache is not None:
+            cache.remove_old(len(dataset))
         return PixelTable(path)
 
 
@@ -376,8 +406,7 @@ def _writable(folder: Path) -> bool:
 
 def _remove_old(folder: Path) -> None:
     """Keep the tables that were used last."""
-    # names that begin with a dot are files that another process is writing
-    tables = sorted(folder.glob("[!.]*.npy"), key=lambda path: path.stat().st_mtime_ns)
-    for path in tables[:-KEPT_TABLES]:
-        path.with_suffix(".json").unlink(missing_ok=True)
-        path.unlink(missing_ok=True)
+    keep_last(folder, "*.npy", KEPT_TABLES)
+    for about in folder.glob("[!.]*.json"):
+        if not about.with_suffix(".npy").exists():
+            about.unlink(missing_ok=True)

@@ -40,7 +40,7 @@ def main() -> None:
         if _debugging():
             traceback.print_exc()
         is_input = isinstance(error, (InputError, OSError))
-        sys.stderr.write(f"{PROGRAM}: {error if is_input else _bug(error)}\n")
+        sys.stderr.write(f"{PROGRAM}: {_explained(error) if is_input else _bug(error)}\n")
         sys.exit(INPUT_STATUS if is_input else BUG_STATUS)
 
 
@@ -85,6 +85,13 @@ def _bug(error: Exception) -> str:
         f"give the same command with {DEBUG_OPTION}, and put what it prints and what `{PROGRAM} doctor` says into an "
         "issue."
     )
+
+
+def _explained(error: Exception) -> str:
+    """What to tell of it, with what to do about a full disk."""
+    from edge_depth_nerf.files import explain  # OpenCV: not before it is needed
+
+    return explain(error)
 
 
 def _is_ours(error: BaseException, trace: TracebackType | None) -> bool:

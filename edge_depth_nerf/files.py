@@ -6,10 +6,14 @@ Masks on disk are 8-bit PNGs: 255 = use the pixel, 0 = ignore it. Pictures are R
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
+import platform
+import re
 import threading
+import time
 import tokenize
 import zipfile
 import zlib
@@ -36,19 +40,81 @@ DISTANCE_STEPS_PER_METRE = 256
 """A distance PNG counts in 1/256 m."""
 
 
+FORGOTTEN_AFTER_S = 24 * 3600.0
+"""A temporary file that nothing was written to for so long is nobody's any more, whatever its name says."""
+_TEMPORARY = re.compile(r"\..+\.(?P<host>[\w.-]*)~(?P<process>\d+)~\d+(\.\w+)?")
+
+
 def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
     """Let `write` fill a temporary file beside `path`, then move it into place.
 
     A reader sees the old file or the whole new one, never a part of it.
+
+    Raises:
+        OSError: it cannot be written; with the file's name, which the system leaves out for a full disk.
+
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # two threads may write one file
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{threading.get_native_id()}{path.suffix}")
+    # two threads, processes or machines may write one file
+    writer = f"{platform.node()}~{os.getpid()}~{threading.get_native_id()}"
+    temporary = path.with_name(f".{path.stem}.{writer}{path.suffix}")
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         write(temporary)
         os.replace(temporary, path)
+    except OSError as error:
+        if error.errno is None:
+            raise
+        raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        try:
+            temporary.unlink(missing_ok=True)
+        except OSError:
+            pass  # what went wrong is told by the first error
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove what `write_atomically` leaves in a folder and those below when its process is killed.
+
+    What another process is writing at this moment stays.
+    """
+    for path in folder.rglob(".*"):
+        named = _TEMPORARY.fullmatch(path.name)
+        if named is None:
+            continue
+        try:
+            ended = named["host"] == platform.node() and not _runs(int(named["process"]))
+            if ended or time.time() - path.stat().st_mtime > FORGOTTEN_AFTER_S:
+                path.unlink()
+        except OSError:
+            pass  # its writer has just moved it into place, or the folder cannot be written
+
+
+def _runs(process: int) -> bool:
+    """Whether there is a process of this number."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
+def explain(error: Exception) -> str:
+    """What to tell of an error that the user can mend: one paragraph, with what to do about a disk or a folder."""
+    remedies = {
+        errno.ENOSPC: "The disk is full: free some space there, or choose another one",
+        errno.EDQUOT: "Your share of the disk is used up: free some space there, or choose another disk",
+        errno.EFBIG: "Files may not grow so large there: see `ulimit -f`, or choose another disk",
+        errno.EROFS: "The disk can only be read: choose another folder",
+        errno.EACCES: "This user may not do that there: see who owns the folder, or choose another one",
+        errno.EPERM: "This user may not do that there: see who owns the folder, or choose another one",
+    }
+    remedy = remedies.get(error.errno or 0) if isinstance(error, OSError) else None
+    if not isinstance(error, OSError) or remedy is None:
+        return str(error)
+    where = f"{error.filename}: " if error.filename else ""
+    return f"{where}{error.strerror}. {remedy}; what is done is kept, and the same command takes up where it was."
 
 
 def write_bytes(path: Path, content: bytes) -> None:

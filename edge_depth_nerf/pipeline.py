@@ -19,6 +19,13 @@ from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.model import EdgeDepthNerfModel, EdgeDepthNerfModelConfig
 from edge_depth_nerf.viewer import DrivePanel
 
+FARTHEST_UNITS = 1e6
+"""nerfstudio's sampler turns a distance x beyond 1 into 1 - 1/(2x): float32 has no such number below 1 from 2^23 on."""
+STEPS_PER_CHECK = 50
+"""On a GPU the losses are looked at once in so many steps; NaN in a parameter stays, so it is found then."""
+MOST_NAMED = 5
+"""An error names so many pictures."""
+
 
 @dataclass
 class EdgeDepthPipelineConfig(VanillaPipelineConfig):
@@ -33,6 +40,10 @@ class EdgeDepthPipelineConfig(VanillaPipelineConfig):
         return super().setup(**kwargs)
 
 
+class NotFiniteError(InputError):
+    """A loss became NaN or infinite: by a picture or map, or by options of the training."""
+
+
 class EdgeDepthPipeline(VanillaPipeline):
     """nerfstudio's pipeline with pooled depth errors."""
 
@@ -40,7 +51,8 @@ class EdgeDepthPipeline(VanillaPipeline):
         """Build both parts; a model gets neither a prior nor further pixels that it would not use.
 
         Raises:
-            InputError: the model has a depth loss, but no training pixel has a prior.
+            InputError: the model has a depth loss, but no training pixel has a prior; or its far plane is out of range.
+
         """
         model, data = config.model, config.datamanager
         assert isinstance(model, EdgeDepthNerfModelConfig) and isinstance(data, FisheyeDepthDataManagerConfig)
@@ -51,6 +63,14 @@ class EdgeDepthPipeline(VanillaPipeline):
         super().__init__(config, str(device), *args, **kwargs)
         manager = self.datamanager
         assert isinstance(manager, FisheyeDepthDataManager)
+        metres_per_unit = manager.train_dataset.metadata["metres_per_unit"]
+        if model.far_m / metres_per_unit > FARTHEST_UNITS:
+            raise InputError(
+                f"{manager.get_datapath()}: the far plane of {model.far_m:g} m is at "
+                f"{model.far_m / metres_per_unit:.3g} scene units ({metres_per_unit:.3g} m each); beyond "
+                f"{FARTHEST_UNITS:g} the samples along a ray can no longer be told apart. Lower "
+                "--pipeline.model.far-m, or leave --pipeline.datamanager.dataparser.metres-per-unit at its default."
+            )
         sampler = manager.train_pixel_sampler
         if model.depth_loss != "none" and sampler is not None and sampler.table.share_with_prior == 0:
             raise InputError(
@@ -60,6 +80,38 @@ class EdgeDepthPipeline(VanillaPipeline):
                 "--pipeline.model.depth-loss none."
             )
         self.drive = DrivePanel(manager)
+
+    def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Any], dict[str, Any]]:
+        """Outputs, losses and metrics of the next batch, as nerfstudio gives them.
+
+        Raises:
+            NotFiniteError: a loss is not finite; before the step is taken. On a GPU, which would have to be waited for,
+                this is looked at in some steps only.
+
+        """
+        outputs, losses, metrics = super().get_train_loss_dict(step)
+        if str(self.device) == "cpu" or step % STEPS_PER_CHECK == 0:
+            if not math.isfinite(sum(losses.values())):
+                raise NotFiniteError(self._not_finite(step, outputs, losses))
+        return outputs, losses, metrics
+
+    def _not_finite(self, step: int, outputs: dict[str, Any], losses: dict[str, Any]) -> str:
+        """Say which losses are not finite, and in which pictures."""
+        manager = self.datamanager
+        assert isinstance(manager, FisheyeDepthDataManager)
+        odd = [f"{name} is {float(loss)}" for name, loss in losses.items() if not math.isfinite(loss)]
+        count = len(manager.trained_on)
+        rendered = [outputs["rgb"], *(weights.flatten(1) for weights in outputs.get("weights_list", ()))]
+        bad = ~torch.cat([torch.isfinite(values) for values in rendered], dim=-1).all(-1)
+        some = 0 < int(bad.sum()) < count
+        names = manager.pictures_of(bad.nonzero()[:, 0] if some else None)
+        rays = f"{int(bad.sum())} of {count} rays are not finite" if some else f"its {count} rays"
+        listed = f"{', '.join(names[:MOST_NAMED])}{' …' if len(names) > MOST_NAMED else ''}"
+        return (
+            f"Step {step}: {', '.join(odd) or 'the sum of the losses is not finite'}; {rays}, from {len(names)} "
+            f"pictures: {listed}. Look at them with `edge-depth-nerf inspect`; if they are fine, lower the learning "
+            "rate or the weights of the losses, or leave mixed precision off (--mixed-precision False)."
+        )
 
     def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict[str, Any], dict[str, Any]]:
         """Figures and pictures of one held-out view."""

@@ -16,7 +16,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, fields
 from pathlib import Path
 from types import TracebackType
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 import torch
@@ -24,8 +24,9 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
+from edge_depth_nerf.checked_cache import is_whole, write_checked
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import DISTANCE_STEPS_PER_METRE, read_json_object, write_atomically, write_json
+from edge_depth_nerf.files import DISTANCE_STEPS_PER_METRE, read_json_object, write_json
 
 TABLE_VERSION = 2
 """Raised whenever the form of the file changes."""
@@ -85,12 +86,14 @@ class PixelTable:
     """All valid pixels of some pictures, in a random order, memory-mapped."""
 
     def __init__(self, path: Path):
-        """Open a table that `PixelTableWriter` wrote.
+        """Open a table that `PixelTableWriter` wrote; all of it is read once, to see whether it is as it was written.
 
         Raises:
             InputError, OSError, ValueError: it is not there, of another version, or not whole.
 
         """
+        if not is_whole(path, TABLE_VERSION):
+            raise InputError(f"{path}: not there, not as it was written, or of another version")
         about = read_json_object(_about(path), "pixels", "with_prior")
         self._records: NDArray = np.load(path, mmap_mode="r", allow_pickle=False)
         if about.get("version") != TABLE_VERSION or self._records.dtype != RECORD:
@@ -225,18 +228,17 @@ class PixelTableWriter:
                 "Masks are 255 where a pixel may be used; check that they are not inverted."
             )
 
-        def write(temporary: Path) -> None:
-            with temporary.open("wb") as out:
-                header = {"descr": np.lib.format.dtype_to_descr(RECORD), "fortran_order": False}
-                np.lib.format.write_array_header_1_0(out, {**header, "shape": (self._pixels,)})
-                for file in self._buckets:
-                    file.seek(0)
-                    records = np.frombuffer(file.read(), RECORD)
-                    out.write(records[self._rng.permutation(len(records))].tobytes())
-                    file.seek(0)
-                    file.truncate()
+        def write(out: Any) -> None:
+            header = {"descr": np.lib.format.dtype_to_descr(RECORD), "fortran_order": False}
+            np.lib.format.write_array_header_1_0(out, {**header, "shape": (self._pixels,)})
+            for file in self._buckets:
+                file.seek(0)
+                records = np.frombuffer(file.read(), RECORD)
+                out.write(records[self._rng.permutation(len(records))].tobytes())
+                file.seek(0)
+                file.truncate()
 
-        write_atomically(self.path, write)
+        write_checked(self.path, TABLE_VERSION, write)
         about = {"version": TABLE_VERSION, "pixels": self._pixels, "with_prior": self._with_prior}
         write_json(_about(self.path), {**about, "pictures": self._pictures})
 

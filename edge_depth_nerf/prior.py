@@ -1,7 +1,7 @@
 """The depth prior of a frame: aligned, integrated once, kept on disk.
 
 Maps are H×W metres along the ray, 0 = no prior. A cached prior carries a key of everything it was made of (the
-maps, the mask, the options, the calibration, the version of this format); a file that does not load or does not fit
+maps, the mask, the options, the calibration, the version of this format); a file that is not whole or does not fit
 is made anew.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import io
 import json
 import math
 from dataclasses import dataclass, field
@@ -22,14 +23,17 @@ from jaxtyping import Bool, Float, Float32
 from numpy.typing import NDArray
 
 from edge_depth_nerf.cameras import Camera
+from edge_depth_nerf.checked_cache import content_of, keep_last, used, write_checked
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_npz, write_atomically
 from edge_depth_nerf.integration import DepthSource, IntegrationOptions, SigmaMode, select_prior, sigma_m
 from edge_depth_nerf.mono.alignment import Align, align
 from edge_depth_nerf.mono.error_model import Trust, pixel_features
 
 CACHE_VERSION = 4
 """Part of every key: raised whenever the same inputs give another prior."""
+
+KEPT_SETS = 4
+"""So many priors of each training picture are kept, those used last: of so many settings of the integration."""
 
 FARTHEST_M = 200.0
 """A monocular distance beyond means "far": under calibrated sigma there is no prior."""
@@ -245,15 +249,17 @@ class PriorCache:
             return cached
         prior = make_prior(lidar_m, mono_m, mask, self.options, self.trust, view)
 
-        def write(temporary: Path) -> None:
-            with temporary.open("wb") as file:
-                np.savez_compressed(file, distance_m=prior.distance_m, sigma_m=prior.sigma_m)
-
+        archive = io.BytesIO()
+        np.savez_compressed(archive, distance_m=prior.distance_m, sigma_m=prior.sigma_m)
         try:
-            write_atomically(path, write)
+            write_checked(path, CACHE_VERSION, lambda file: file.write(archive.getbuffer()))
         except OSError:
             pass
         return prior
+
+    def remove_old(self, pictures: int) -> None:
+        """Keep the last `KEPT_SETS` priors of so many pictures."""
+        keep_last(self.folder, "*.npz", KEPT_SETS * pictures)
 
     def _key(self, *maps: NDArray | None) -> str:
         digest = hashlib.sha256(self._options_key)
@@ -264,10 +270,12 @@ class PriorCache:
 
 
 def _read(path: Path, shape: tuple[int, ...]) -> Prior | None:
-    try:
-        found = read_npz(path, ("distance_m", "sigma_m"), 4 * math.prod(shape))
-    except (OSError, InputError):
+    content = content_of(path, CACHE_VERSION)
+    if content is None:
         return None
-    if not all(m.shape == shape and m.dtype == np.float32 for m in found.values()):
+    with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+        prior = Prior(archive["distance_m"], archive["sigma_m"])
+    if any(m.shape != shape or m.dtype != np.float32 for m in (prior.distance_m, prior.sigma_m)):
         return None
-    return Prior(found["distance_m"], found["sigma_m"])
+    used(path)
+    return prior

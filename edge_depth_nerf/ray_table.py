@@ -20,10 +20,12 @@ from nerfstudio.model_components.ray_generators import RayGenerator
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from edge_depth_nerf.files import write_atomically
+from edge_depth_nerf.checked_cache import is_whole, keep_last, used, write_checked
 
-TABLE_VERSION = 1
+TABLE_VERSION = 2
 """Raised whenever the form of the file changes."""
+KEPT_TABLES = 4
+"""So many tables are kept of a scene, those used last: one for each set of lenses that was trained or shown."""
 MOST_PIXELS = 1 << 24
 """Lenses with more pixels than this in all (a table of 335 MB) get no table."""
 STRIP = 1 << 16
@@ -68,17 +70,17 @@ def _make(lenses: Tensor) -> np.ndarray:
 
 
 def _read(path: Path, pixels: int) -> Tensor | None:
+    if not is_whole(path, TABLE_VERSION):
+        return None
     try:
         # copy on write: torch wants what it could write to, and nobody does
         table = np.load(path, mmap_mode="c", allow_pickle=False)
     except (OSError, ValueError):
         return None
-    return torch.from_numpy(table) if table.shape == (pixels, 5) and table.dtype == np.float32 else None
-
-
-def _save(path: Path, table: np.ndarray) -> None:
-    with path.open("wb") as file:
-        np.save(file, table)
+    if table.shape != (pixels, 5) or table.dtype != np.float32:
+        return None
+    used(path)
+    return torch.from_numpy(table)
 
 
 class TableRayGenerator(RayGenerator):
@@ -100,12 +102,15 @@ class TableRayGenerator(RayGenerator):
             with CONSOLE.status("Making the table of rays, once …"):
                 made = _make(lenses)
             try:
-                write_atomically(path, lambda temporary: _save(temporary, made))
+                write_checked(path, TABLE_VERSION, lambda file: np.save(file, made))
             except OSError:
-                table = torch.from_numpy(made)
+                table = None
             else:
+                # from the file, so that processes share the memory
                 table = _read(path, len(made))
-                assert table is not None
+                keep_last(folder, "*.npy", KEPT_TABLES)
+            if table is None:
+                table = torch.from_numpy(made)
         first = torch.cumsum(pixels, 0) - pixels
         for name, value in (("table", table), ("lens", lens), ("first", first)):
             self.register_buffer(name, value.to(cameras.device), persistent=False)

@@ -9,6 +9,8 @@ import shutil
 import subprocess
 import sys
 import time
+import zipfile
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
@@ -144,10 +146,31 @@ def end_with_parent() -> None:
     Thread(target=wait, daemon=True).start()
 
 
+def checkpoints_in(folder: Path) -> list[Path]:
+    """Files of a folder that have a checkpoint's name, the newest last."""
+    return sorted(path for path in folder.glob("step-*.ckpt") if re.fullmatch(r"step-\d{9,}", path.stem))
+
+
+def newest_checkpoint(folder: Path) -> Path | None:
+    """The newest checkpoint of a folder that is whole: torch writes archives with a checksum of each part.
+
+    nerfstudio's own trainer writes in place, so a killed training may leave half a file.
+    """
+    return next((path for path in reversed(checkpoints_in(folder)) if _is_whole(path)), None)
+
+
+def _is_whole(archive: Path) -> bool:
+    try:
+        with zipfile.ZipFile(archive) as opened:
+            return opened.testzip() is None
+    except (OSError, ValueError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error):
+        return False
+
+
 def steps_done(checkpoints: Path) -> int:
-    """How many steps the newest checkpoint of a folder has behind it; 0 without any."""
-    steps = [int(path.stem.removeprefix("step-")) for path in checkpoints.glob("step-*.ckpt")]
-    return max(steps, default=-1) + 1
+    """How many steps the newest whole checkpoint of a folder has behind it; 0 without any."""
+    newest = newest_checkpoint(checkpoints)
+    return 0 if newest is None else int(newest.stem.removeprefix("step-")) + 1
 
 
 def step_of_line(line: str) -> int | None:

@@ -31,7 +31,13 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def options(root: Path, **changes) -> JbnuDepth360Options:
-    given = {"root": root, "calibration": root / "calibration.toml", "output": root.parent / "scene", **changes}
+    given = {
+        "root": root,
+        "calibration": root / "calibration.toml",
+        "output": root.parent / "scene",
+        "strict": True,
+        **changes,
+    }
     return JbnuDepth360Options(**given)
 
 

@@ -70,7 +70,10 @@ def process(drive: RoomDrive | Path, output: Path, **options: Any) -> ProcessRep
     root = drive if isinstance(drive, Path) else drive.root
     console = options.pop("console", Console(quiet=True))
     return process_kitti360(
-        Kitti360Options(**{"root": root, "sequence": SEQUENCE, "output": output, "sweeps": 0} | options), console
+        Kitti360Options(
+            **{"root": root, "sequence": SEQUENCE, "output": output, "sweeps": 0, "strict": True} | options
+        ),
+        console,
     )
 
 

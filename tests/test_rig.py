@@ -57,7 +57,8 @@ def mine(drive: Path, tmp_path: Path) -> Path:
 
 
 def options(root: Path, **changes) -> RigOptions:
-    return RigOptions(**{"root": root, "output": root.parent / "scene", "theta_max_deg": 110.0, **changes})
+    given = {"root": root, "output": root.parent / "scene", "theta_max_deg": 110.0, "strict": True, **changes}
+    return RigOptions(**given)
 
 
 def edit(root: Path, *changes: tuple[str, str], file: str = "rig.toml") -> Path:

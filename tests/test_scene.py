@@ -6,6 +6,7 @@ import functools
 import json
 import math
 import os
+import platform
 import threading
 from collections.abc import Callable
 from dataclasses import replace
@@ -411,15 +412,15 @@ def test_interrupted_run_is_continued(tmp_path: Path, monkeypatch: pytest.Monkey
     output = tmp_path / "scene"
     with pytest.raises(KeyboardInterrupt):
         write(output, given=frames(load=functools.partial(load, stop_at=3)))
-    # the next one may have begun
-    assert loaded[:4] == [0, 1, 2, 3] and len(loaded) <= 5
+    # those after it may have begun, and be done, before it was heard of
+    assert loaded[:4] == [0, 1, 2, 3]
     assert not (output / "transforms.json").exists()
     # what a killed process leaves
-    (output / "images/image_02/.0000000003.4711.png").write_bytes(b"half")
+    (output / f"images/image_02/.0000000003.{platform.node()}~{2**22 + 1}~7.png").write_bytes(b"half")
 
     loaded.clear()
     report = write(output, given=frames(load=functools.partial(load, stop_at=None)))
-    assert loaded in ([3, 4, 5], [3, 5])
+    assert loaded in ([3, 4, 5], [3, 5], [3])
     assert report.written == len(loaded)
     assert tree(output) == tree(tmp_path / "whole")
 

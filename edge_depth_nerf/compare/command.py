@@ -30,6 +30,7 @@ from edge_depth_nerf.compare.tables import MadeTable, as_latex, as_markdown, mak
 from edge_depth_nerf.console import say
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_json_object, write_json, write_png, write_text
+from edge_depth_nerf.one_writer import only_writer
 from edge_depth_nerf.pictures import DISTANCE, colour_bar, resize, side_by_side
 from edge_depth_nerf.report.build import write_report
 from edge_depth_nerf.report.views import REPORT
@@ -58,6 +59,11 @@ def compare(options: CompareOptions, console: Console | None = None) -> Results:
     """
     console = console or Console()
     options.check()
+    with only_writer(options.output, console):
+        return _compare(options, console)
+
+
+def _compare(options: CompareOptions, console: Console) -> Results:
     methods = options.methods or default_methods(options.preset, with_loss=options.search)
     scenes = {scene.resolve().name: scene.resolve() for scene in options.scenes}
     if len(scenes) < len(options.scenes):

@@ -25,7 +25,7 @@ from edge_depth_nerf.compare.judging import ViewJudge, choose_pixels, judge_pixe
 from edge_depth_nerf.compare.protocol import departures
 from edge_depth_nerf.compare.specification import FIGURES, PROGRESS, SPECIFICATION, VIEWS, WORK, RunSpecification
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_json_object, write_json
+from edge_depth_nerf.files import explain, read_json_object, write_json
 from edge_depth_nerf.runs import end_with_parent, steps_done
 from edge_depth_nerf.scene_format import read_transforms
 from edge_depth_nerf.trainer import EdgeDepthTrainer
@@ -235,7 +235,7 @@ def main() -> None:
     try:
         do_run(Path(sys.argv[1]))
     except (InputError, OSError) as error:
-        print(f"edge-depth-nerf: {error}", flush=True)  # noqa: T201
+        print(f"edge-depth-nerf: {explain(error)}", flush=True)  # noqa: T201
         sys.exit(2)
 
 

@@ -238,7 +238,7 @@ def table_gradient(
     grids = np.empty((levels, size, features), np.float32)
     threads = _threads(points, levels)
     order = [level for thread in range(threads) for level in range(thread, levels, threads)]
-    own_grids: list[tuple[int, np.ndarray]] = []
+    own_grids: dict[tuple[int, int], np.ndarray] = {}
 
     def work(stretch: tuple[int, int]) -> None:
         for place in range(stretch[0] // max(1, points), levels):
@@ -251,11 +251,12 @@ def table_gradient(
                 grid[:] = 0
             else:
                 grid = np.zeros((size, features), np.float32)
-                own_grids.append((level, grid))
+                own_grids[level, first] = grid
             _add_to_grid(axes, scaling_of[level], given, level * features, grid, first, last)
 
     _share_out(work, _stretches(points * levels, threads))
-    for level, grid in own_grids:
+    # in one order, whichever thread was ready first: the same sums each time
+    for (level, _), grid in sorted(own_grids.items(), key=lambda item: item[0]):
         grids[level] += grid
     return torch.from_numpy(grids).view(rows, features)
 

@@ -18,6 +18,8 @@ held out there, but returns can be held against their neighbours.
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -268,8 +270,14 @@ class Trust:
         return {"version": _VERSION, **asdict(self)}
 
     def write(self, path: Path) -> None:
-        """Write JSON, atomically."""
-        write_json(path, self.to_dict())
+        """Write JSON with its checksum, atomically."""
+        content = self.to_dict()
+        write_json(path, {**content, "sha256": _checksum(content)})
+
+
+def _checksum(content: dict[str, Any]) -> str:
+    """Of what a file holds beside it, as JSON."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def read_trust(path: Path) -> Trust:
@@ -284,6 +292,9 @@ def read_trust(path: Path) -> Trust:
     try:
         if content["version"] != _VERSION:
             raise ValueError(f"version {content['version']}")
+        # files of before have none
+        if content.get("sha256") not in (None, _checksum({k: v for k, v in content.items() if k != "sha256"})):
+            raise ValueError("its checksum does not fit")
         span, drive_fit = content["field_rad"], content["drive_fit"]
         error_model, return_model = (_model(content[name]) for name in ("error_model", "return_model"))
         return Trust(

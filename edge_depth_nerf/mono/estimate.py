@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -58,6 +58,7 @@ from edge_depth_nerf.mono.relative import KIND_SAID, Layer
 from edge_depth_nerf.mono.scene_maps import write_mono_maps
 from edge_depth_nerf.mono.training import Trained, TrainingOptions, as_json, train
 from edge_depth_nerf.mono.trust import calibrate_scene
+from edge_depth_nerf.one_writer import only_writer
 from edge_depth_nerf.scene_reader import SceneFolder, ScenePicture, read_scene
 
 WEIGHTS = "mono_network.safetensors"
@@ -119,6 +120,22 @@ def estimate_depth(options: EstimateDepthOptions, console: Console | None = None
     scenes = [read_scene(path) for path in options.scenes]
     if len({scene.path.resolve() for scene in scenes}) < len(scenes):
         raise InputError("a scene is given twice. Name each scene once.")
+    with ExitStack() as stack:
+        # in one order, lest two wait for each other
+        for folder in sorted(scene.folder.resolve() for scene in scenes):
+            stack.enter_context(only_writer(folder, console))
+        # another process may have written to them meanwhile
+        return _estimate(options, [read_scene(path) for path in options.scenes], start, about, ready, console)
+
+
+def _estimate(
+    options: EstimateDepthOptions,
+    scenes: Sequence[SceneFolder],
+    start: DepthNetwork | None,
+    about: dict[str, Any],
+    ready: ReadyNetwork | None,
+    console: Console,
+) -> EstimateReport:
     trained = None
     if ready is not None:
         weights = Path(ready.name)
@@ -288,6 +305,7 @@ def _train(
         identity = as_json(identity)
         if found is not None and about.get("identity") == identity:
             console.print(f"{weights} is trained already", soft_wrap=True)
+            weights.with_suffix(".checkpoint").unlink(missing_ok=True)
             return found, weights, about, None
         task = progress.add_task("Training", total=1.0)
 
@@ -439,7 +457,8 @@ def predicted_maps(network: DepthNetwork, scene: SceneFolder) -> Iterator[tuple[
     The network never learns of the sky, where LiDAR has no returns; so it is looked for in the picture.
     """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    network = network.to(device)
+    # as it was trained: weights in another order in memory round otherwise
+    network = network.to(device).to(memory_format=torch.channels_last)
     heights = camera_heights_m(scene, network.settings)
     for picture in scene.pictures:
         metres = predict(network, scene, picture, heights[picture.camera], device)

@@ -262,12 +262,17 @@ def settings_from(found: Any, path: Path) -> NetworkSettings:
 
 
 def write_tensors(path: Path, tensors: dict[str, Tensor], header: dict[str, Any]) -> None:
-    """Write tensors with a JSON header and this architecture's name, atomically."""
+    """Write tensors with a JSON header and this architecture's name, atomically; the same ones as the same bytes."""
     from safetensors.torch import save
 
     plain = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
     metadata = {"architecture": ARCHITECTURE, "header": json.dumps(header, allow_nan=False)}
-    write_bytes(path, save(plain, metadata))
+    stored = save(plain, metadata)
+    # the library puts the header's keys into an order of chance: its length (8 bytes), JSON, then the tensors
+    end = 8 + int.from_bytes(stored[:8], "little")
+    ordered = json.dumps(json.loads(stored[8:end]), sort_keys=True, separators=(",", ":")).encode()
+    ordered += b" " * (-len(ordered) % 8)
+    write_bytes(path, len(ordered).to_bytes(8, "little") + ordered + stored[end:])
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import Progress
 
+from edge_depth_nerf.checked_cache import keep_last, used
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.mono.alignment import LEAST_RETURNS, align, both, fit_logs
 from edge_depth_nerf.mono.error_model import (
@@ -36,6 +37,8 @@ from edge_depth_nerf.mono.far_seen import seen_above, static_cloud
 from edge_depth_nerf.prior import CACHE_VERSION, PriorOptions, View, integrate_frame, view_of
 from edge_depth_nerf.scene_reader import SceneFolder, ScenePicture, read_scene
 
+KEPT_CALIBRATIONS = 16
+"""So many calibrations are kept of a scene beside its own, those used last."""
 MOST_FRAMES = 100
 """Of longer drives so many training pictures are used, evenly spread."""
 HELD_OUT_BLOCK_SHARE = 64 / 1400
@@ -129,6 +132,8 @@ def saved_trust(
         except (OSError, InputError):
             continue
         if trust.made_of == made_of:
+            if path.name != TRUST_FILE:
+                used(path)
             return trust
     return None
 
@@ -163,8 +168,10 @@ def find_trust(
     trust = saved_trust(read, options, cache, training_images)
     if trust is None:
         trust = _calibrate(read, _chosen(read, training_images), options, console)
+        path = _cached(read, cache, trust.made_of)
         try:
-            trust.write(_cached(read, cache, trust.made_of))
+            trust.write(path)
+            keep_last(path.parent, "mono_trust_*.json", KEPT_CALIBRATIONS)
         except OSError:  # a scene that cannot be written: made anew each time
             pass
     return trust

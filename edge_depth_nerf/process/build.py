@@ -59,6 +59,8 @@ EGO_MASKS = "ego_masks"
 """Folder of the scene with the vehicle's masks that were found, in the size of the raw pictures."""
 FOUND_POSES = "found_poses.json"
 """File of the scene with the poses that were found from the pictures: camera, frame, held out, camera to world."""
+MOST_LISTED = 50
+"""So many files that were left out are listed."""
 _EGO_PICTURES = 60
 """The vehicle is looked for in so many pictures of a camera, spread over the drive."""
 _RIM_PICTURES = 4
@@ -119,11 +121,13 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
         source=source,
         theta_max_deg=options.theta_max_deg,
         shifted=[view for view in recording.shifted if view.frame in held_out],
+        strict=options.strict,
         console=console,
     )
     report = dataclasses.replace(
         report,
         skipped=recording.skipped,
+        left_out=(*recording.left_out, *report.left_out),
         notices=(*recording.notices, *notices, *builder.notices(), *report.notices),
     )
     _show(report, console)
@@ -178,6 +182,9 @@ def _find_mask(
 ) -> tuple[NDArray[np.bool_], str]:
     """Find the vehicle and the lens's dark rim in a camera's pictures, at their own size."""
     spread = [files[index] for index in np.unique(np.linspace(0, len(files) - 1, _EGO_PICTURES).astype(int))]
+    if not options.strict:
+        # those that cannot be read are told of when their turn comes
+        spread = [file for file in spread if _readable(file)]
     with console.status("Looking for the vehicle in the pictures"):
         rim = dark_rim(read_image(file) for file in spread[:: max(len(spread) // _RIM_PICTURES, 1)])
         mask = np.ones((camera.height, camera.width), bool) if rim is None else rim
@@ -187,6 +194,14 @@ def _find_mask(
     if isinstance(found, EgoMask):
         return mask & found.keep, f"the vehicle was found by itself and hides {found.share:.1%} of the lens."
     return mask, f"the vehicle's own mask was not found: {found.reason.rstrip('.')}."
+
+
+def _readable(picture: Path) -> bool:
+    try:
+        read_image(picture)
+    except (InputError, FileNotFoundError):
+        return False
+    return True
 
 
 def _scene_cameras(
@@ -228,6 +243,7 @@ class _Builder:
             reach=options.sweeps,
             deskew=options.deskew,
             held_out=held_out,
+            strict=options.strict,
         )
         self._usable: dict[str, NDArray[np.bool_]] = {}
         for scene_camera in _scene_cameras(recording, masks, options):
@@ -486,5 +502,11 @@ def _show(report: ProcessReport, console: Console) -> None:
         )
     for notice in report.notices:
         say(console, notice, "yellow")
+    for item in report.left_out[:MOST_LISTED]:
+        say(console, f"Left out: {item.key}. {item.fault}", "yellow")
+    if report.left_out:
+        count = len(report.left_out)
+        more = f", {count - MOST_LISTED} of them not listed here" if count > MOST_LISTED else ""
+        say(console, f"{count} broken or missing files{more}; with --strict the first one is an error.", "yellow")
     done = "" if report.written else "; nothing was left to do"
     say(console, f"{report.scene}: {report.training} pictures for training, {report.held_out} held out{done}")

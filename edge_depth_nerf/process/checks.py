@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -81,3 +85,72 @@ def require_folder(folder: Path, remedy: str) -> None:
     listed = f"{', '.join(there[:12])}{' …' if len(there) > 12 else ''}" if there else "nothing"
     what = "is not a folder" if folder.exists() else "no such folder"
     raise FileNotFoundError(f"{folder}: {what}; {parent.resolve()} holds {listed}. {remedy[0].upper()}{remedy[1:]}.")
+
+
+MOST_LEFT_OUT = 0.1
+"""A drive may have so many broken or missing files, as a share of its pictures; one in any case. More are a mistake."""
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A picture or a sweep that cannot be used."""
+
+    frame: int | None
+    """Number of its moment; None = between the moments taken."""
+    camera: str
+    """Name of the camera, or of the scanner."""
+    fault: str
+    """What is wrong, with the file's name."""
+
+    @property
+    def key(self) -> str:
+        """Which one, for people: "image_02, frame 7"."""
+        return self.camera if self.frame is None else f"{self.camera}, frame {self.frame}"
+
+
+class Tolerance:
+    """Collects what cannot be used and is left out; several threads may find it.
+
+    Args:
+        strict: nothing may be left out.
+        pictures: how many there are in all.
+
+    """
+
+    def __init__(self, strict: bool, pictures: int) -> None:
+        self.strict = strict
+        self._most = 0 if strict else max(1, int(MOST_LEFT_OUT * pictures))
+        self._lock = threading.Lock()
+        self._found: dict[tuple[int | None, str, str], LeftOut] = {}
+
+    @property
+    def left_out(self) -> tuple[LeftOut, ...]:
+        """What was found, in order of cameras and frames."""
+        return tuple(
+            sorted(self._found.values(), key=lambda item: (item.camera, -1 if item.frame is None else item.frame))
+        )
+
+    def add(self, frame: int | None, camera: str, error: InputError | FileNotFoundError) -> None:
+        """Leave something out.
+
+        Raises:
+            InputError, FileNotFoundError: `error`, where nothing more can be left out.
+
+        """
+        with self._lock:
+            if self.strict:
+                raise error
+            self._found[frame, camera, str(error)] = LeftOut(frame, camera, str(error))
+            if len(self._found) > self._most:
+                raise InputError(
+                    f"{error} {len(self._found)} of this drive's files cannot be used; up to {self._most} would be "
+                    "left out."
+                ) from error
+
+    @contextmanager
+    def of(self, frame: int | None, camera: str) -> Iterator[None]:
+        """Leave out what cannot be read here."""
+        try:
+            yield
+        except (InputError, FileNotFoundError) as error:
+            self.add(frame, camera, error)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from rich.console import Console
 
 from edge_depth_nerf.console import say
+from edge_depth_nerf.one_writer import only_writer
 from edge_depth_nerf.process.options import JbnuDepth360Options, Kitti360Options, ProcessOptions, RigOptions
 from edge_depth_nerf.process.scene import MONO_ENTRY, ProcessReport
 from edge_depth_nerf.scene_reader import SceneFolder, read_scene
@@ -27,6 +28,11 @@ def process(
     console = console or Console()
     options.check()
     _check_network(options)
+    with only_writer(options.output, console):
+        return _process(options, console)
+
+
+def _process(options: Kitti360Options | JbnuDepth360Options | RigOptions, console: Console) -> ProcessReport:
     if isinstance(options, Kitti360Options):
         from edge_depth_nerf.process.kitti360 import process_kitti360
 

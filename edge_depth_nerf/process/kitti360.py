@@ -29,7 +29,7 @@ from edge_depth_nerf.files import read_json
 from edge_depth_nerf.lidar import SweepTiming, check_sweep_size, read_sweep
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.process.build import load_distance, load_picture, process_recording
-from edge_depth_nerf.process.checks import check_distance, check_size
+from edge_depth_nerf.process.checks import Tolerance, check_distance, check_size
 from edge_depth_nerf.process.kitti360_calibration import Kitti360Rig, read_poses, read_rig
 from edge_depth_nerf.process.kitti360_drive import Kitti360Drive
 from edge_depth_nerf.process.options import Kitti360Options
@@ -37,6 +37,8 @@ from edge_depth_nerf.process.poses import transform_of_rows
 from edge_depth_nerf.process.recording import RecordedCamera, RecordedPicture, RecordedSweep, Recording
 from edge_depth_nerf.process.scene import DistanceMap, Picture, ProcessReport, ShiftedView
 
+SCANNER = "velodyne"
+"""Name of the scanner."""
 FRAME_INTERVAL_S = 0.1
 """Between frames, and of one turn of the scanner, where the drive brings no timestamps."""
 
@@ -67,7 +69,18 @@ def read_kitti360(options: Kitti360Options) -> Recording:
     rig = read_rig(drive.calibration, options.cameras)
     poses = read_poses(drive.poses) if options.poses == "recorded" else None
     kept, skipped = drive.select(poses)
-    files = drive.check_files(rig, kept)
+    tolerance = Tolerance(options.strict, len(kept))
+    numbers = _near(
+        np.array(sorted(drive.sweep_numbers())), np.array(sorted({frame for _, frame in kept})), 2 * options.sweeps
+    )
+    whole = set()
+    for number in numbers.tolist():
+        with tolerance.of(number, SCANNER):
+            check_sweep_size(drive.sweep_file(number))
+            whole.add(number)
+    # a moment needs a sweep of its own
+    kept = [(name, frame) for name, frame in kept if frame in whole]
+    files = drive.check_files(rig, kept, tolerance)
     moments = sorted({frame for _, frame in kept})
     stamps = {name: drive.read_timestamps(name, moments) for name in options.cameras}
     clock = _Clock(next((times for times in stamps.values() if times), []))
@@ -88,25 +101,20 @@ def read_kitti360(options: Kitti360Options) -> Recording:
         )
         for (name, frame), found in files.items()
     )
-    # a picture's sweeps are checked against those around them, as far again
-    reach = 2 * options.sweeps
-    numbers = _near(np.array(sorted(drive.sweep_numbers())), np.array(moments), reach).tolist()
     timing = SweepTiming(clock.interval_s)
-    sweeps = []
-    for number in numbers:
-        path = drive.sweep_file(number)
-        check_sweep_size(path)
-        sweeps.append(
-            RecordedSweep(
-                path=path,
-                time_s=clock.time_s(number),
-                frame=number,
-                scanner="velodyne",
-                to_vehicle=rig.velo_to_pose,
-                read=partial(read_sweep, path),
-                timing=timing,
-            )
+    sweeps = [
+        RecordedSweep(
+            path=drive.sweep_file(number),
+            time_s=clock.time_s(number),
+            frame=number,
+            scanner=SCANNER,
+            to_vehicle=rig.velo_to_pose,
+            read=partial(read_sweep, drive.sweep_file(number)),
+            timing=timing,
         )
+        # a picture's sweeps are checked against those around them, as far again
+        for number in _near(np.array(sorted(whole)), np.array(moments), 2 * options.sweeps).tolist()
+    ]
     return Recording(
         cameras=tuple(RecordedCamera(name, rig.cameras[name], rig.camera_to_pose[name]) for name in options.cameras),
         pictures=pictures,
@@ -125,6 +133,7 @@ def read_kitti360(options: Kitti360Options) -> Recording:
             *(drive.calibration / f"{name}.yaml" for name in options.cameras),
         ),
         skipped=tuple(skipped),
+        left_out=tolerance.left_out,
         notices=tuple(
             f"{drive.timestamps_file(name)}: no such file; the frames of {name} have no timestamp_s."
             for name, times in stamps.items()

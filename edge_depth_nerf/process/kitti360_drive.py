@@ -13,7 +13,7 @@ from pathlib import Path
 
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.masks.semantics import check_label_header, label_path
-from edge_depth_nerf.process.checks import check_distance, check_size, require_folder
+from edge_depth_nerf.process.checks import Tolerance, check_distance, check_size, require_folder
 from edge_depth_nerf.process.kitti360_calibration import Kitti360Rig, read_timestamps
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.process.scene import Skipped, ranges, summarise
@@ -135,53 +135,57 @@ class Kitti360Drive:
         """Frames that have a sweep."""
         return _numbered(self.sweeps, ".bin")
 
-    def check_files(self, rig: Kitti360Rig, kept: Sequence[tuple[str, int]]) -> dict[tuple[str, int], FrameFiles]:
-        """Find every file that will be read, and check its size or header.
+    def check_files(
+        self, rig: Kitti360Rig, kept: Sequence[tuple[str, int]], tolerance: Tolerance
+    ) -> dict[tuple[str, int], FrameFiles]:
+        """Find every file that will be read, and check its size or header; pictures that lack one are left out.
 
         Raises:
-            FileNotFoundError: a mask, monocular or true map is missing.
-            InputError: a file is truncated, or not of its camera's size or kind.
+            FileNotFoundError: a mask, monocular or true map is missing, and may not be left out.
+            InputError: a file is truncated, or not of its camera's size or kind, and may not be left out.
 
         """
-        options = self.options
         found = {}
         for name, frame in kept:
-            camera, file, truth = rig.cameras[name], f"{frame:010d}.png", self.truth / name
-            files = FrameFiles(
-                image=self.image_folder(name) / file,
-                mask=None if options.frame_masks is None else options.frame_masks / name / file,
-                semantics=labels
-                if (labels := label_path(options.root, options.sequence, name, frame)).is_file()
-                else None,
-                mono=None if options.mono is None else options.mono / name / file,
-                truth_distance=truth / "distance" / file if self.has_truth else None,
-                truth_rgb=truth / "rgb" / file if self.has_truth else None,
-            )
-            check_size(files.image, camera)
-            for option, path in (("--mono", files.mono), ("--frame-masks", files.mask)):
-                if path is not None and not path.is_file():
-                    frames = ranges([number for other, number in kept if other == name])
-                    raise FileNotFoundError(
-                        f"{path}: no such file; {option} needs one for every frame taken ({frames} of {name}). Make "
-                        f"the missing ones, choose other frames, or leave out {option}."
-                    )
-            for path in (files.truth_distance, files.truth_rgb):
-                if path is not None and not path.is_file():
-                    raise FileNotFoundError(
-                        f"{path}: no such file; the drive's truth is incomplete. Synthesise the drive again, or move "
-                        f"{self.truth} away to go on without it."
-                    )
-            for path in (files.mask, files.truth_rgb):
-                if path is not None:
-                    check_size(path, camera)
-            if files.semantics is not None:
-                check_size(files.semantics, camera)
-                check_label_header(files.semantics)
-            for path in (files.mono, files.truth_distance):
-                if path is not None:
-                    check_distance(path, camera)
-            found[name, frame] = files
+            with tolerance.of(frame, name):
+                found[name, frame] = self._check_picture(rig, kept, name, frame)
         return found
+
+    def _check_picture(self, rig: Kitti360Rig, kept: Sequence[tuple[str, int]], name: str, frame: int) -> FrameFiles:
+        options = self.options
+        camera, file, truth = rig.cameras[name], f"{frame:010d}.png", self.truth / name
+        files = FrameFiles(
+            image=self.image_folder(name) / file,
+            mask=None if options.frame_masks is None else options.frame_masks / name / file,
+            semantics=labels if (labels := label_path(options.root, options.sequence, name, frame)).is_file() else None,
+            mono=None if options.mono is None else options.mono / name / file,
+            truth_distance=truth / "distance" / file if self.has_truth else None,
+            truth_rgb=truth / "rgb" / file if self.has_truth else None,
+        )
+        check_size(files.image, camera)
+        for option, path in (("--mono", files.mono), ("--frame-masks", files.mask)):
+            if path is not None and not path.is_file():
+                frames = ranges([number for other, number in kept if other == name])
+                raise FileNotFoundError(
+                    f"{path}: no such file; {option} needs one for every frame taken ({frames} of {name}). Make "
+                    f"the missing ones, choose other frames, or leave out {option}."
+                )
+        for path in (files.truth_distance, files.truth_rgb):
+            if path is not None and not path.is_file():
+                raise FileNotFoundError(
+                    f"{path}: no such file; the drive's truth is incomplete. Synthesise the drive again, or move "
+                    f"{self.truth} away to go on without it."
+                )
+        for path in (files.mask, files.truth_rgb):
+            if path is not None:
+                check_size(path, camera)
+        if files.semantics is not None:
+            check_size(files.semantics, camera)
+            check_label_header(files.semantics)
+        for path in (files.mono, files.truth_distance):
+            if path is not None:
+                check_distance(path, camera)
+        return files
 
     def read_timestamps(self, camera: str, frames: Iterable[int]) -> list[float]:
         """Read the times of a camera's frames from 0 on, seconds since 1970; empty where the drive has no such file.

@@ -67,6 +67,9 @@ class ProcessOptions:
     """Size of the drive's own network; lite: some minutes on a laptop's CPU; full: for a GPU."""
     mono_seconds: float | None = None
     """The drive's own network is trained for so many seconds at most. Not set: all steps of its preset."""
+    strict: bool = False
+    """Stop at the first picture, sweep or map that is broken or missing. Otherwise up to a tenth of them are left out
+    of the scene and named at the end."""
     sky: bool = True
     """Leave the sky without monocular distance, instead of a wrong one."""
 

@@ -25,6 +25,8 @@ _MAX_PART_BYTES = 1 << 28
 """No array of a frame's part is larger."""
 _MERGE_AT = 1_000_000
 """So many points are collected before they are thinned; bounds the memory for long drives."""
+_MOST_KEPT = 5
+"""So many times `MAX_POINTS` are kept on the way; beyond, cubes grow before all parts are read."""
 
 
 @dataclass(frozen=True)
@@ -76,14 +78,18 @@ def merge_parts(parts: Sequence[Path], ply: Path) -> int:
         The number of points; with none, no file is written.
 
     """
+    voxel_m = VOXEL_M
     pending, count = [_Part(np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8))], 0
     for path in parts:
         stored = read_npz(path, ("points_m", "colours"), _MAX_PART_BYTES)
         pending.append(_Part(stored["points_m"], stored["colours"]))
         count += len(pending[-1].points_m)
         if count > _MERGE_AT:
-            pending, count = [_thinned(pending, VOXEL_M)], 0
-    voxel_m = VOXEL_M
+            pending, count = [_thinned(pending, voxel_m)], 0
+            while len(pending[0].points_m) > _MOST_KEPT * MAX_POINTS:
+                # a drive so long that it would be thinned further in the end, too
+                voxel_m *= 1.2
+                pending = [_thinned(pending, voxel_m)]
     merged = _thinned(pending, voxel_m)
     while len(merged.points_m) > MAX_POINTS:
         voxel_m *= 1.2

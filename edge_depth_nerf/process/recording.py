@@ -16,6 +16,7 @@ from typing import Any, Literal
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.lidar import Sweep, SweepTiming
 from edge_depth_nerf.lidar.trajectory import Trajectory
+from edge_depth_nerf.process.checks import LeftOut
 from edge_depth_nerf.process.scene import ShiftedView, Skipped
 from edge_depth_nerf.process.transforms import Transform
 
@@ -120,6 +121,8 @@ class Recording:
     """Small files that belong to the whole drive (calibration, poses): their bytes are part of its fingerprint."""
     skipped: tuple[Skipped, ...] = ()
     """What was asked for and cannot be taken."""
+    left_out: tuple[LeftOut, ...] = ()
+    """What is broken or missing, and so not in here."""
     notices: tuple[str, ...] = ()
     """What the user should know."""
     shifted: tuple[ShiftedView, ...] = field(default=())

@@ -25,7 +25,7 @@ from edge_depth_nerf.files import DISTANCE_STEPS_PER_METRE, picture_size
 from edge_depth_nerf.lidar.scans import SCAN_SUFFIXES, check_scan, read_scan
 from edge_depth_nerf.lidar.trajectory import MAX_POSE_GAP_S, Trajectory
 from edge_depth_nerf.process.build import process_recording
-from edge_depth_nerf.process.checks import check_size, size_error
+from edge_depth_nerf.process.checks import Tolerance, check_size, size_error
 from edge_depth_nerf.process.options import JbnuDepth360Options, RigOptions
 from edge_depth_nerf.process.poses import read_kitti, read_nerfstudio, read_times, read_tum
 from edge_depth_nerf.process.recording import (
@@ -157,12 +157,14 @@ def recording_of_rig(rig: Rig, root: Path, options: RigOptions | JbnuDepth360Opt
 
     by_name = {camera.name: camera for camera in cameras}
     companions = _Companions(root, cameras, options)
-    recorded = tuple(
-        companions.picture(by_name[name], frame, picture, camera_poses.get(picture.path))
-        for frame, pictures in sorted(kept.items())
-        for name, picture in sorted(pictures.items())
-    )
-    sweeps = _sweeps(scans, {frame: _time(pictures) for frame, pictures in kept.items()}, path, options.sweeps)
+    tolerance = Tolerance(options.strict, sum(map(len, kept.values())))
+    recorded = []
+    for frame, pictures in sorted(kept.items()):
+        for name, picture in sorted(pictures.items()):
+            with tolerance.of(frame, name):
+                recorded.append(companions.picture(by_name[name], frame, picture, camera_poses.get(picture.path)))
+    moments_s = {frame: _time(pictures) for frame, pictures in kept.items()}
+    sweeps = _sweeps(scans, moments_s, path, options.sweeps, tolerance)
     for lidar in rig.lidars:
         if lidar.timing is None and lidar.format.times is None:
             notices.append(
@@ -176,7 +178,7 @@ def recording_of_rig(rig: Rig, root: Path, options: RigOptions | JbnuDepth360Opt
         clocks += [rig.poses.clock] if rig.poses.clock else []
     return Recording(
         cameras=tuple(RecordedCamera(c.name, c.camera, c.to_vehicle, c.ego_mask) for c in cameras),
-        pictures=recorded,
+        pictures=tuple(recorded),
         sweeps=tuple(sweeps),
         trajectory=path,
         source=source,
@@ -186,6 +188,7 @@ def recording_of_rig(rig: Rig, root: Path, options: RigOptions | JbnuDepth360Opt
             *(clock.file for clock in clocks if clock.file),
         ),
         skipped=tuple(skipped),
+        left_out=tolerance.left_out,
         notices=tuple(notices),
     )
 
@@ -444,7 +447,7 @@ def _check_clocks(rig: Rig, files: dict[str, list[_Timed]], scans: Sequence[_Sca
 
 
 def _sweeps(
-    scans: Sequence[_Scans], moments_s: dict[int, float], path: Trajectory | None, reach: int
+    scans: Sequence[_Scans], moments_s: dict[int, float], path: Trajectory | None, reach: int, tolerance: Tolerance
 ) -> list[RecordedSweep]:
     """The scans that the moments taken can use, checked by their headers, each with the moment it belongs to."""
     frames, times_s = np.array(list(moments_s)), np.array(list(moments_s.values()))
@@ -459,14 +462,19 @@ def _sweeps(
         for item, middle_s in list(zip(scanner.files, scanner.middles_s.tolist(), strict=True))[first : last + 1]:
             if path is not None and path.outside_s(middle_s) > scanner.turn_s:
                 continue
-            check_scan(item.path, lidar.format)
             apart = np.abs(times_s - middle_s)
             belongs = apart.min() <= scanner.turn_s / 2 * (1 + 1e-6)
+            frame = int(frames[apart.argmin()]) if belongs else None
+            try:
+                check_scan(item.path, lidar.format)
+            except (InputError, FileNotFoundError) as error:
+                tolerance.add(frame, lidar.name, error)
+                continue
             found.append(
                 RecordedSweep(
                     path=item.path,
                     time_s=middle_s,
-                    frame=int(frames[apart.argmin()]) if belongs else None,
+                    frame=frame,
                     scanner=lidar.name,
                     to_vehicle=lidar.to_vehicle,
                     read=partial(read_scan, item.path, lidar.format, middle_s if absolute else lidar.to_middle_s),

@@ -45,6 +45,7 @@ from edge_depth_nerf.files import (
     read_distance_png,
     read_image,
     read_json,
+    remove_leftovers,
     write_bytes,
     write_distance_png,
     write_json,
@@ -52,6 +53,7 @@ from edge_depth_nerf.files import (
     write_png,
 )
 from edge_depth_nerf.masks.lens import lens_circle
+from edge_depth_nerf.process.checks import LeftOut, Tolerance
 from edge_depth_nerf.process.png import read_png_bytes, read_png_header
 from edge_depth_nerf.process.points import PointCloud, merge_parts, write_part
 from edge_depth_nerf.process.transforms import Transform, check_rigid, opencv_to_opengl
@@ -60,6 +62,8 @@ from edge_depth_nerf.scene_format import read_transforms
 TRANSFORMS = "transforms.json"
 RECORD = "process.json"
 POINTS = "points.ply"
+LEFT_OUT = "left_out.json"
+"""Pictures of the drive that are not in the scene, because one of their files is broken: what is wrong with each."""
 LAYERS = {
     "mask": ("masks/{camera}", "mask_path"),
     "lidar": ("lidar/{camera}", "lidar_file_path"),
@@ -132,6 +136,11 @@ class SceneFrame:
     inputs: tuple[Path, ...] = ()
     """Files that a loaded content comes from: if one is newer than what was written, it is written again."""
 
+    @property
+    def key(self) -> str:
+        """What names it in files: camera and number."""
+        return f"{self.camera}/{self.frame:010d}"
+
 
 @dataclass(frozen=True)
 class ShiftedView:
@@ -180,7 +189,9 @@ class ProcessReport:
     mask_share: dict[str, float]
     """Which part of each camera's pictures is used, 0 to 1."""
     skipped: tuple[Skipped, ...] = ()
-    """Frames that were asked for and left out."""
+    """Frames that were asked for and that the drive does not have."""
+    left_out: tuple[LeftOut, ...] = ()
+    """What is broken or missing, and so not in the scene."""
     notices: tuple[str, ...] = ()
     """What the user should know."""
 
@@ -219,6 +230,7 @@ def write_scene(
     source: Mapping[str, Any],
     theta_max_deg: float = 95.0,
     shifted: Sequence[ShiftedView] = (),
+    strict: bool = True,
     console: Console | None = None,
 ) -> ProcessReport:
     """Write a scene folder, or continue one.
@@ -232,6 +244,7 @@ def write_scene(
         source: what the scene is made of, as JSON; decides whether a folder that exists is the same scene.
         theta_max_deg: rays further from the axis are masked out; less, where a camera's own range ends before.
         shifted: true views from beside the path.
+        strict: a frame whose content cannot be read is an error; otherwise it is left out, up to a tenth of them.
         console: where progress is shown.
 
     Raises:
@@ -250,6 +263,12 @@ def write_scene(
     open_scene(output, source)
     for name, mask in masks.items():
         write_mask(output / f"masks/{name}.png", mask)
+    tolerance = Tolerance(strict, len(frames))
+    broken = _broken_before(output, frames)
+    for frame in frames:
+        if frame.key in broken:
+            tolerance.add(frame.frame, frame.camera, InputError(broken[frame.key]))
+    frames = [frame for frame in frames if frame.key not in broken]
     work = _pending(output, frames, shifted, layers)
     notices = []
     later = _maps_put_in_later(output / TRANSFORMS)
@@ -272,7 +291,7 @@ def write_scene(
     jobs = [
         # the cameras of a moment one after another: they share its sweeps
         *(
-            partial(_write_frame, output, frame, masks[frame.camera], layers, offset)
+            partial(_try_frame, tolerance, output, frame, masks[frame.camera], layers, offset)
             for frame in sorted(work.frames, key=lambda frame: (frame.frame, frame.camera))
         ),
         *(partial(_write_shifted, output, view, by_name[view.camera].original) for view in work.shifted),
@@ -281,6 +300,9 @@ def write_scene(
         # a reader is not to find a scene whose maps are being replaced
         (output / TRANSFORMS).unlink(missing_ok=True)
         run_jobs(jobs, "Writing the scene", console)
+    left_out = {(item.camera, item.frame) for item in tolerance.left_out}
+    frames = [frame for frame in frames if (frame.camera, frame.frame) not in left_out]
+    _check_split(frames)
     if work.cloud:
         parts = [output / _cloud_path(frame) for frame in frames if not frame.held_out]
         if not merge_parts(parts, output / POINTS):
@@ -293,6 +315,12 @@ def write_scene(
         content[MONO_ENTRY] = later.entry
         for frame in content["frames"]:
             frame[LAYERS["mono"][1]] = later.maps[frame["file_path"]]
+    if left_out:
+        faults = {f"{item.camera}/{item.frame:010d}": item.fault for item in tolerance.left_out}
+        if not (output / LEFT_OUT).is_file() or read_json(output / LEFT_OUT) != faults:
+            write_json(output / LEFT_OUT, faults)
+    else:
+        (output / LEFT_OUT).unlink(missing_ok=True)
     write_json(output / TRANSFORMS, content)
     shutil.rmtree(output / _PARTIAL, ignore_errors=True)
 
@@ -306,6 +334,7 @@ def write_scene(
         written=len(work.frames),
         fits=fits,
         mask_share={name: float(mask.mean()) for name, mask in masks.items()},
+        left_out=tolerance.left_out,
         notices=tuple(notices),
     )
 
@@ -325,10 +354,7 @@ def _check(
         raise InputError(f"theta_max_deg is {theta_max_deg}; expected degrees from the axis, above 0, up to 180.")
     if unknown := set(layers) - {*LAYERS, CLOUD}:
         raise InputError(f"unknown layers {sorted(unknown)}; expected some of {', '.join((*LAYERS, CLOUD))}.")
-    if not frames:
-        raise InputError("no frames to make a scene of.")
-    if all(frame.held_out for frame in frames):
-        raise InputError("all frames are held out; none is left for training.")
+    _check_split(frames)
     if len(by_name) != len(cameras):
         raise InputError(f"two cameras have one name: {', '.join(camera.name for camera in cameras)}.")
     for name in by_name:
@@ -346,6 +372,13 @@ def _check(
     twice = [key for key, count in Counter((frame.camera, frame.frame) for frame in frames).items() if count > 1]
     if twice:
         raise InputError(f"frame {twice[0][1]} of {twice[0][0]} is given twice.")
+
+
+def _check_split(frames: Sequence[SceneFrame]) -> None:
+    if not frames:
+        raise InputError("no frames to make a scene of.")
+    if all(frame.held_out for frame in frames):
+        raise InputError("all frames are held out; none is left for training.")
 
 
 def _size_error(what: str, found: tuple[int, ...], expected: tuple[int, int]) -> str:
@@ -366,6 +399,7 @@ def open_scene(output: Path, source: Mapping[str, Any]) -> None:
     path = output / RECORD
     if output.exists() and not output.is_dir():
         raise InputError(f"{output}: is a file; --output takes a folder.")
+    remove_leftovers(output)
     if path.is_file():
         there = read_json(path)
         there = there if isinstance(there, dict) else {}
@@ -380,10 +414,6 @@ def open_scene(output: Path, source: Mapping[str, Any]) -> None:
                 f"{output}: holds another scene: {key} is {there.get(key)!r} there, {record.get(key)!r} now{others}. "
                 "Give another --output, or delete that folder first."
             )
-        for leftover in output.rglob(".*"):
-            # what write_atomically leaves behind when it is killed
-            if re.fullmatch(r"\..+\.\d+\.\w+", leftover.name) and leftover.is_file():
-                leftover.unlink()
         return
     if output.is_dir() and (foreign := sorted(entry.name for entry in output.iterdir())):
         raise InputError(
@@ -537,20 +567,36 @@ def _cloud_path(frame: SceneFrame) -> str:
     return f"{_PARTIAL}/{frame.camera}/{frame.frame:010d}.npz"
 
 
+def _modified_ns(path: Path) -> int:
+    try:
+        return path.stat().st_mtime_ns
+    except FileNotFoundError:
+        return 0
+
+
+def _broken_before(output: Path, frames: Sequence[SceneFrame]) -> dict[str, str]:
+    """Which frames an earlier run left out, and why, as far as none of their files has changed since."""
+    path = output / LEFT_OUT
+    if not path.is_file():
+        return {}
+    found, written_ns = read_json(path), _modified_ns(path)
+    return {
+        frame.key: str(found[frame.key])
+        for frame in frames
+        if isinstance(found, dict)
+        and frame.key in found
+        and max((_modified_ns(file) for file in frame.inputs), default=0) < written_ns
+    }
+
+
 def _pending(
     output: Path, frames: Sequence[SceneFrame], shifted: Sequence[ShiftedView], layers: Collection[str]
 ) -> _Work:
     """Find what is missing, or older than what it is made from."""
 
-    def modified_ns(path: Path) -> int:
-        try:
-            return path.stat().st_mtime_ns
-        except FileNotFoundError:
-            return 0
-
     def fresh(files: Collection[str], inputs: tuple[Path, ...]) -> bool:
-        newest = max((modified_ns(path) for path in inputs), default=0)
-        return all(modified_ns(output / file) > newest for file in files)
+        newest = max((_modified_ns(path) for path in inputs), default=0)
+        return all(_modified_ns(output / file) > newest for file in files)
 
     def current(frame: SceneFrame, files: Collection[str]) -> bool:
         # content given in memory has no date
@@ -569,6 +615,23 @@ def _pending(
             )
         ]
     return _Work(stale, [view for view in shifted if not fresh(_shifted_files(view), view.inputs)], cloud)
+
+
+def _try_frame(
+    tolerance: Tolerance,
+    output: Path,
+    frame: SceneFrame,
+    camera_mask: NDArray[np.bool_],
+    layers: Collection[str],
+    offset: Float64[np.ndarray, "3"],
+) -> None:
+    """Write a frame, or leave it out, without any file of it."""
+    try:
+        _write_frame(output, frame, camera_mask, layers, offset)
+    except (InputError, FileNotFoundError) as error:
+        tolerance.add(frame.frame, frame.camera, error)
+        for file in (*_frame_files(frame, layers).values(), _cloud_path(frame)):
+            (output / file).unlink(missing_ok=True)
 
 
 def _write_frame(

@@ -25,6 +25,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.lidar import transform_points
 from edge_depth_nerf.lidar.free_space import FreeSpace
 from edge_depth_nerf.lidar.trajectory import MAX_POSE_GAP_S, Trajectory
@@ -105,6 +106,7 @@ class _Scanner:
         reach: int,
         deskew: bool,
         held_out: Collection[int],
+        strict: bool,
     ) -> None:
         self.sweeps = sorted(sweeps, key=lambda sweep: sweep.time_s)
         self.times_s = np.array([sweep.time_s for sweep in self.sweeps])
@@ -120,6 +122,7 @@ class _Scanner:
             for time in self.times_s.tolist()
         ]
         self._reach, self._trajectory, self._deskew, self._count = reach, trajectory, deskew, count
+        self._strict = strict
         # of two pictures in work at once, each with its window and what its window's sweeps are checked against
         window = 4 * reach + 4
         self._loaded: _Shared[_Loaded] = _Shared(self._load, window)
@@ -139,11 +142,21 @@ class _Scanner:
         first, last = max(index - self._reach, 0), min(index + self._reach, len(self.sweeps) - 1)
         return [i for i in range(first, last + 1) if i != index and self.trains[i] and self._bridged[i]]
 
+    def readable(self, index: int) -> bool:
+        """Whether a sweep can be read; under `strict` one that cannot is an error."""
+        try:
+            self._loaded.get(index)
+        except (InputError, FileNotFoundError):
+            if self._strict:
+                raise
+            return False
+        return True
+
     def _seen_through(self, index: int) -> Bool[Tensor, "returns"]:
         """Which points of a sweep another one saw through."""
         world = self._loaded.get(index).world
         passed = torch.zeros(len(world.points_m), dtype=torch.bool)
-        for other in self.around(index):
+        for other in filter(self.readable, self.around(index)):
             free_space = self._loaded.get(other).free_space
             assert free_space is not None
             passed |= free_space.seen_through(world.points_m)
@@ -176,6 +189,7 @@ class SweepStore:
         reach: how many sweeps before and after a picture are taken.
         deskew: whether each point is moved by the pose of its own time.
         held_out: numbers of the moments that training must not see.
+        strict: a sweep that cannot be read is an error; otherwise only for the pictures of its own moment.
 
     """
 
@@ -187,6 +201,7 @@ class SweepStore:
         reach: int,
         deskew: bool,
         held_out: Collection[int],
+        strict: bool = True,
     ) -> None:
         self._left_out: dict[Path, tuple[int, int]] = {}
         by_scanner: dict[str, list[RecordedSweep]] = {}
@@ -198,7 +213,7 @@ class SweepStore:
 
         self._held_out = frozenset(held_out)
         self._scanners = [
-            _Scanner(found, trajectory, count, reach=reach, deskew=deskew, held_out=self._held_out)
+            _Scanner(found, trajectory, count, reach=reach, deskew=deskew, held_out=self._held_out, strict=strict)
             for found in by_scanner.values()
         ]
 
@@ -239,6 +254,7 @@ class SweepStore:
         found = _Gathered(viewpoint_in_world[:3, 3])
         for scanner in self._scanners:
             window = self._window(scanner, frame, time_s)
+            window = [*window[:1], *filter(scanner.readable, window[1:])]
             for rank, index in enumerate(window):
                 age_s = abs(float(scanner.times_s[index]) - time_s)
                 if rank == 0 and age_s <= scanner.half_turn_s:

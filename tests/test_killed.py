@@ -1,0 +1,418 @@
+"""Killed at any moment, broken caches, two at once, full disks: what is there afterwards is right, or made again."""
+
+from __future__ import annotations
+
+import copy
+import errno
+import io
+import os
+import platform
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from drives import SEQUENCE, RoomDrive, write_room_drive
+from rich.console import Console
+from scenes import write_scene
+
+from edge_depth_nerf import cli, datamanager
+from edge_depth_nerf.checked_cache import content_of, is_whole, keep_last, write_checked
+from edge_depth_nerf.datamanager import FisheyeDepthDataManagerConfig
+from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.files import explain, remove_leftovers, write_bytes, write_text
+from edge_depth_nerf.mono import estimate, scene_maps
+from edge_depth_nerf.mono.error_model import read_trust
+from edge_depth_nerf.mono.network import DepthNetwork, NetworkSettings, read_tensors, write_tensors
+from edge_depth_nerf.mono.options import EstimateDepthOptions
+from edge_depth_nerf.mono.scene_maps import write_mono_maps
+from edge_depth_nerf.mono.training import TrainingOptions
+from edge_depth_nerf.mono.trust import calibrate_scene
+from edge_depth_nerf.one_writer import only_writer
+from edge_depth_nerf.process.command import process
+from edge_depth_nerf.process.options import Kitti360Options
+from edge_depth_nerf.runs import newest_checkpoint, steps_done
+from edge_depth_nerf.scene_reader import read_scene
+
+DEAD = 2**22 + 1
+"""No process has such a number."""
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> RoomDrive:
+    return write_room_drive(tmp_path_factory.mktemp("room") / "drive", frames=5, beams=800, size=32)
+
+
+def options_of(room: RoomDrive, output: Path, **changes) -> Kitti360Options:
+    given = {"root": room.root, "sequence": SEQUENCE, "output": output, "sweeps": 1, "find_ego": False}
+    return Kitti360Options(**{**given, "estimate_depth": False, **changes})
+
+
+# ---- files and caches ------------------------------------------------------------------------------------------
+
+
+def test_a_sealed_file_is_whole_or_not_there(tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    write_checked(path, 3, lambda file: [file.write(b"one"), file.write(b" two")])
+    assert content_of(path, 3) == b"one two" and is_whole(path, 3)
+    stored = path.read_bytes()
+    spoiled = [stored[:-1], stored[1:], b"", stored + b"x", stored[:5]]
+    spoiled += [stored[:i] + bytes([stored[i] ^ 4]) + stored[i + 1 :] for i in range(len(stored))]
+    for broken in spoiled:
+        path.write_bytes(broken)
+        assert content_of(path, 3) is None and not is_whole(path, 3), broken
+    path.write_bytes(stored)
+    assert is_whole(path, 3) and not is_whole(path, 4) and content_of(path, 4) is None
+    assert not is_whole(tmp_path / "none", 3) and content_of(tmp_path / "none", 3) is None
+
+
+def spoil(path: Path, how: str) -> None:
+    content = bytearray(path.read_bytes())
+    if how == "cut":
+        content = content[: len(content) // 2]
+    elif how == "flipped":
+        content[len(content) // 2] ^= 16
+    elif how == "of another version":
+        content[-8] ^= 1  # the seal: mark, version, checksum
+    else:
+        content = bytearray()
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("kind", ["prior", "rays", "pixels"])
+@pytest.mark.parametrize("how", ["cut", "flipped", "of another version", "empty"])
+def test_a_spoiled_cache_is_made_again(tmp_path: Path, kind: str, how: str) -> None:
+    scene = write_scene(tmp_path, frames=3)
+    config = FisheyeDepthDataManagerConfig(dataparser=FisheyeDepthDataParserConfig(data=scene))
+
+    def first_batch() -> tuple[torch.Tensor, ...]:
+        torch.manual_seed(0)
+        rays, batch = config.setup(test_mode="val").next_train(0)
+        return rays.directions, batch["indices"], batch["image"], batch["prior_distance_m"], batch["prior_sigma_m"]
+
+    whole = first_batch()
+    folder = scene / ".cache" / kind
+    files = sorted(folder.glob("*.np[yz]"))
+    before = {path: path.read_bytes() for path in files}
+    for path in files:
+        spoil(path, how)
+    if kind == "prior":
+        shutil.rmtree(scene / ".cache" / "pixels")  # or nobody would look at them
+    assert all(torch.equal(now, then) for now, then in zip(first_batch(), whole, strict=True))
+    assert {path: path.read_bytes() for path in sorted(folder.glob("*.np[yz]"))} == before
+
+
+def test_a_changed_calibration_is_not_believed(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path, frames=4)
+    calibrate_scene(scene)
+    path = scene / "mono_trust.json"
+    text = path.read_text()
+    read_trust(path)
+    place = text.index('"field_rad"') + 20
+    digit = next(i for i in range(place, len(text)) if text[i].isdigit())
+    path.write_text(text[:digit] + str((int(text[digit]) + 1) % 10) + text[digit + 1 :])
+    with pytest.raises(InputError, match="checksum"):
+        read_trust(path)
+
+
+def test_caches_do_not_grow_without_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("edge_depth_nerf.prior.KEPT_SETS", 2)
+    monkeypatch.setattr("edge_depth_nerf.mono.trust.KEPT_CALIBRATIONS", 2)
+    scene = write_scene(tmp_path, frames=3)
+    config = FisheyeDepthDataManagerConfig(dataparser=FisheyeDepthDataParserConfig(data=scene))
+    for alpha in (0.3, 0.4, 0.5, 0.6):
+        config.alpha = alpha
+        # what a killed process left
+        write_bytes(scene / ".cache/prior" / f".x.{platform.node()}~{DEAD}~1.npz", b"half")
+        config.setup(test_mode="val")
+    count = len(config.setup(test_mode="val").train_dataset)
+    assert len(list((scene / ".cache/prior").glob("*.npz"))) == 2 * count
+    assert len(list((scene / ".cache").glob("mono_trust_*"))) == 2
+    assert len(list((scene / ".cache/rays").iterdir())) == 1
+
+
+def test_the_files_used_last_are_kept(tmp_path: Path) -> None:
+    for number in range(4):
+        path = tmp_path / f"{number}.npy"
+        path.write_bytes(b"x")
+        os.utime(path, ns=(number, number))
+    (tmp_path / ".being_written.npy").write_bytes(b"x")
+    keep_last(tmp_path, "*.npy", 2)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".being_written.npy", "2.npy", "3.npy"]
+
+
+def test_leftovers_of_killed_processes_alone_are_removed(tmp_path: Path) -> None:
+    here = platform.node()
+    left = {
+        f".a.{here}~{DEAD}~7.png": False,
+        f".a.{here}~{os.getpid()}~7.png": True,  # being written
+        f".a.elsewhere.example~{DEAD}~7.png": True,  # perhaps being written on another machine
+        ".hidden.png": True,
+        "a.png": True,
+    }
+    for name in left:
+        (tmp_path / name).write_bytes(b"")
+    old = tmp_path / f".b.elsewhere~{DEAD}~7.npz"
+    old.write_bytes(b"")
+    os.utime(old, (0, 0))
+    remove_leftovers(tmp_path)
+    assert {name: (tmp_path / name).exists() for name in left} == left and not old.exists()
+
+
+def test_a_file_that_is_being_written_has_such_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+    monkeypatch.setattr(os, "replace", lambda temporary, path: seen.append(temporary))
+    write_text(tmp_path / "a.json", "{}")
+    (tmp_path / seen[0].name.replace(f"~{os.getpid()}~", f"~{DEAD}~")).write_bytes(b"")
+    remove_leftovers(tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_same_weights_are_the_same_bytes(tmp_path: Path) -> None:
+    """safetensors orders its header by chance."""
+    tensors = {name: torch.arange(6.0).view(2, 3) + number for number, name in enumerate("cab")}
+    for number in range(20):
+        write_tensors(tmp_path / f"{number}.safetensors", tensors, {"settings": {"b": 1, "a": [2]}})
+    assert len(set(contents(tmp_path).values())) == 1
+    found, header = read_tensors(tmp_path / "0.safetensors")
+    assert header == {"settings": {"b": 1, "a": [2]}}
+    assert all(torch.equal(found[name], tensors[name]) for name in tensors)
+
+
+# ---- two at once -----------------------------------------------------------------------------------------------
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from rich.console import Console
+from edge_depth_nerf.one_writer import only_writer
+with only_writer(Path(sys.argv[1]), Console()):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_a_second_writer_waits_until_the_first_is_gone(tmp_path: Path) -> None:
+    folder = tmp_path / "not" / "there"
+    with subprocess.Popen([sys.executable, "-c", HOLD, str(folder)], stdout=subprocess.PIPE, text=True) as first:
+        assert first.stdout is not None and first.stdout.readline() == "held\n"
+        console = Console(file=io.StringIO(), width=300)
+        threading.Timer(0.6, lambda: first.send_signal(signal.SIGKILL)).start()
+        begun = time.monotonic()
+        with only_writer(folder, console), only_writer(folder, console):
+            assert time.monotonic() - begun > 0.4
+            write_text(folder / "a", "")
+        assert isinstance(console.file, io.StringIO)
+        assert console.file.getvalue().count("another process writes there") == 1
+    assert (folder / "a").exists()
+
+
+def test_a_folder_that_nothing_was_written_to_is_taken_away(tmp_path: Path) -> None:
+    with pytest.raises(InputError), only_writer(tmp_path / "a" / "b", Console(quiet=True)):
+        assert (tmp_path / "a" / "b").is_dir()
+        raise InputError("in vain")
+    assert not (tmp_path / "a").exists()
+
+
+def test_two_processes_on_one_scene(room: RoomDrive, tmp_path: Path) -> None:
+    process(options_of(room, tmp_path / "alone"), Console(quiet=True))
+    code = "from edge_depth_nerf.cli import main; main()"
+    command = [sys.executable, "-c", code, "process", "kitti360", "--root", room.root, "--sequence", SEQUENCE]
+    command += ["--output", tmp_path / "scene", "--sweeps", "1", "--no-find-ego", "--no-estimate-depth"]
+    both = [
+        subprocess.Popen([str(word) for word in command], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        for _ in range(2)
+    ]
+    said = [process.communicate()[0] for process in both]
+    assert [process.returncode for process in both] == [0, 0], said
+    assert sum("nothing was left to do" in text for text in said) == 1
+    assert contents(tmp_path / "scene") == contents(tmp_path / "alone")
+
+
+# ---- killed ----------------------------------------------------------------------------------------------------
+
+DIE_AT_REPLACE = """
+import os, sys
+replace, last = os.replace, sys.argv.pop(1)
+def dying(temporary, path):
+    if str(path).endswith(last):
+        os.kill(os.getpid(), 9)
+    return replace(temporary, path)
+os.replace = dying
+from edge_depth_nerf.cli import main
+main()
+"""
+
+
+def test_process_killed_before_a_file_appears(room: RoomDrive, tmp_path: Path) -> None:
+    """One run, killed again and again, each time further on."""
+    process(options_of(room, tmp_path / "whole"), Console(quiet=True))
+    expected = contents(tmp_path / "whole")
+    for last in ("process.json", "image_03/0000000003.npz", "points.ply", "transforms.json"):
+        command = [sys.executable, "-c", DIE_AT_REPLACE, last, "process", "kitti360", "--root", str(room.root)]
+        command += ["--sequence", SEQUENCE, "--output", str(tmp_path / "scene"), "--sweeps", "1", "--no-find-ego"]
+        done = subprocess.run([*command, "--no-estimate-depth"], capture_output=True, text=True, check=False)
+        assert done.returncode == -9, done.stderr
+        assert not (tmp_path / "scene/transforms.json").exists()
+    process(options_of(room, tmp_path / "scene"), Console(quiet=True))
+    assert contents(tmp_path / "scene") == expected
+
+
+def test_estimate_depth_killed_after_its_weights_were_saved(
+    room: RoomDrive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The weights that are read give the maps of those that were trained, to the last bit."""
+    small = estimate.PresetValues((16, 32, 64), 128, TrainingOptions(steps=4, batch=2, evaluate_every=2))
+    monkeypatch.setitem(estimate.PRESETS, "lite", small)
+    quiet, scene = Console(quiet=True), tmp_path / "scene"
+    options = EstimateDepthOptions((scene,))
+    process(options_of(room, scene), quiet)
+    shutil.copytree(scene, tmp_path / "before")
+    estimate.estimate_depth(options, quiet)
+    expected = contents(scene)
+    # the maps tell the scene's folder: once more in the same one
+    shutil.rmtree(scene)
+    shutil.move(tmp_path / "before", scene)
+
+    def dying(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(estimate, "write_mono_maps", dying)
+        with pytest.raises(KeyboardInterrupt):
+            estimate.estimate_depth(options, quiet)
+    # killed a moment earlier, with the training's own checkpoint still there
+    (scene / "mono_network.checkpoint").write_bytes(b"of no use")
+    estimate.estimate_depth(options, quiet)
+    found = contents(scene)
+    assert sorted(found) == sorted(expected)
+    assert [name for name in expected if found[name] != expected[name]] == []
+
+
+def test_weights_that_were_read_predict_what_trained_ones_did() -> None:
+    """Trained ones lie in another order in memory, and convolutions then add up otherwise."""
+    scene = read_scene(Path(__file__).resolve().parent.parent / "data" / "sample_drive")
+    scene = replace(scene, pictures=scene.pictures[:1])
+    torch.manual_seed(0)
+    network = DepthNetwork(NetworkSettings((16, 32, 64), 128, 1.6, 10.0)).eval()
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, 0, 0.1)
+    trained = copy.deepcopy(network).to(memory_format=torch.channels_last)
+    ((_, read_m),), ((_, trained_m),) = (estimate.predicted_maps(each, scene) for each in (network, trained))
+    assert (read_m > 0).any() and np.array_equal(read_m, trained_m)
+
+
+def test_the_newest_whole_checkpoint_is_taken(tmp_path: Path) -> None:
+    for step in (9, 19, 29, 39):
+        torch.save({"step": step, "weights": torch.arange(4000.0)}, tmp_path / f"step-{step:09d}.ckpt")
+    (tmp_path / "step-latest.ckpt").write_bytes(b"")
+    (tmp_path / "notes.txt").write_text("nerfstudio would stumble over this")
+    assert steps_done(tmp_path) == 40
+    newest = tmp_path / "step-000000039.ckpt"
+    newest.write_bytes(newest.read_bytes()[:-200])
+    flipped = bytearray((tmp_path / "step-000000029.ckpt").read_bytes())
+    flipped[len(flipped) // 2] ^= 1
+    (tmp_path / "step-000000029.ckpt").write_bytes(flipped)
+    assert newest_checkpoint(tmp_path) == tmp_path / "step-000000019.ckpt" and steps_done(tmp_path) == 20
+    (tmp_path / "step-000000019.ckpt").write_bytes(b"")
+    (tmp_path / "step-000000009.ckpt").write_bytes(b"no archive")
+    assert newest_checkpoint(tmp_path) is None and steps_done(tmp_path) == 0
+    assert steps_done(tmp_path / "nowhere") == 0
+
+
+# ---- disks -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EACCES])
+def test_a_file_that_cannot_be_written_is_named(tmp_path: Path, number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_bytes(tmp_path / "a.bin", b"before")
+
+    def refuse(*_: object) -> None:
+        raise OSError(number, os.strerror(number))  # as a full disk does it: without a name
+
+    monkeypatch.setattr(Path, "write_bytes", refuse)
+    with pytest.raises(OSError, match=r"a\.bin") as error:
+        write_bytes(tmp_path / "a.bin", b"after")
+    monkeypatch.undo()
+    assert contents(tmp_path) == {"a.bin": b"before"}
+    said = explain(error.value)
+    assert said.startswith(f"{tmp_path / 'a.bin'}: {os.strerror(number)}. ") and "\n" not in said
+    assert {errno.ENOSPC: "free some space", errno.EROFS: "only be read", errno.EACCES: "may not"}[number] in said
+
+
+def test_a_full_disk_and_then_a_larger_one(room: RoomDrive, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = ["mount", "-t", "tmpfs", "-o", "size=24k", "tmpfs", str(disk)]
+    if os.geteuid() != 0 or shutil.which("mount") is None or subprocess.run(mounted, check=False).returncode:
+        pytest.skip("only root may mount a small disk")
+    try:
+        command = ["edge-depth-nerf", "process", "kitti360", "--root", str(room.root), "--sequence", SEQUENCE]
+        command += ["--output", str(disk / "scene"), "--sweeps", "1", "--no-find-ego", "--no-estimate-depth"]
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(sys, "argv", command)
+            with pytest.raises(SystemExit) as ended:
+                cli.main()
+            assert ended.value.code == 2
+            said = capsys.readouterr().err
+            assert "edge-depth-nerf: " in said and "The disk is full" in said and str(disk / "scene") in said
+            assert not (disk / "scene/transforms.json").exists()
+            assert not [path for path in disk.rglob(".*") if "~" in path.name]
+            subprocess.run(["mount", "-o", "remount,size=4m", str(disk)], check=True)
+            cli.main()
+        process(options_of(room, tmp_path / "alone"), Console(quiet=True))
+        assert contents(disk / "scene") == contents(tmp_path / "alone")
+        # one that can only be read
+        subprocess.run(["mount", "--bind", str(disk), str(disk)], check=True)
+        subprocess.run(["mount", "-o", "remount,bind,ro", str(disk)], check=True)
+        with pytest.raises((OSError, InputError), match="scene"):
+            write_mono_maps(disk / "scene", [], {"trained_on": "elsewhere"})
+        with pytest.raises(InputError, match="cannot be written"):
+            process(options_of(room, disk / "other"), Console(quiet=True))
+        assert contents(disk / "scene") == contents(tmp_path / "alone")
+    finally:
+        while subprocess.run(["umount", "-l", str(disk)], capture_output=True, check=False).returncode == 0:
+            pass
+
+
+def test_a_disk_that_fills_up_while_maps_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = write_scene(tmp_path, frames=3)
+    before, write, left = contents(scene), scene_maps.write_distance_png, [2]
+
+    def filling(path: Path, metres: np.ndarray) -> None:
+        left[0] -= 1
+        if left[0] < 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+        write(path, metres)
+
+    monkeypatch.setattr(scene_maps, "write_distance_png", filling)
+    maps = ((f"images/{number:04d}.png", np.full((28, 32), 3.0)) for number in range(3))
+    with pytest.raises(OSError, match="No space"):
+        write_mono_maps(scene, maps, {"trained_on": "elsewhere"})
+    assert contents(scene) == before
+
+
+def test_no_room_for_the_table_of_pixels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = write_scene(tmp_path, frames=3)
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(datamanager.PixelTableWriter, "add", full)
+    config = FisheyeDepthDataManagerConfig(dataparser=FisheyeDepthDataParserConfig(data=scene))
+    with pytest.raises(InputError, match=r"pixels: the table of pixels cannot be written \(No space.*cache-dir"):
+        config.setup(test_mode="val")
+    monkeypatch.undo()
+    config.setup(test_mode="val")

@@ -1,0 +1,154 @@
+"""Broken and missing files in the middle of a drive: left out and named, not fatal; fatal under --strict."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drives import SEQUENCE, RoomDrive, write_points, write_room_drive
+from rich.console import Console
+
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.files import read_json, write_distance_png
+from edge_depth_nerf.process.command import process
+from edge_depth_nerf.process.options import Kitti360Options
+from edge_depth_nerf.process.scene import ProcessReport
+
+CAMERAS = ("image_02", "image_03")
+
+
+@pytest.fixture
+def drive(tmp_path: Path) -> RoomDrive:
+    room = write_room_drive(tmp_path / "drive", frames=12, beams=400, size=32)
+    for name in CAMERAS:
+        for frame in room.frames:
+            write_distance_png(tmp_path / f"mono/{name}/{frame:010d}.png", np.full((32, 32), 3.0 + frame))
+    return room
+
+
+def run(drive: RoomDrive, scene: str = "scene", **changes) -> tuple[ProcessReport, str]:
+    folder = drive.root.parent
+    options = {"root": drive.root, "sequence": SEQUENCE, "output": folder / scene, "mono": folder / "mono", "sweeps": 1}
+    console = Console(file=io.StringIO(), width=400)
+    report = process(Kitti360Options(**{**options, "find_ego": False, "sky": False, **changes}), console)
+    assert isinstance(console.file, io.StringIO)
+    return report, console.file.getvalue()
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def halve(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def damage(path: Path) -> None:
+    """Its ends and its size stay, so that nobody sees it before it is decoded."""
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 0x5A
+    path.write_bytes(content)
+
+
+def mono(drive: RoomDrive, frame: int) -> Path:
+    return drive.root.parent / f"mono/image_02/{frame:010d}.png"
+
+
+FAULTS: dict[str, tuple[Callable[[RoomDrive], object], set[tuple[str, int]], str]] = {
+    "truncated picture": (lambda d: halve(d.image("image_03", 5)), {("image_03", 5)}, r"0000000005\.png: truncated"),
+    "damaged picture": (
+        lambda d: damage(d.image("image_03", 5)),
+        {("image_03", 5)},
+        r"0000000005\.png: (damaged|cannot be decoded)",
+    ),
+    "empty picture": (lambda d: d.image("image_03", 5).write_bytes(b""), {("image_03", 5)}, "not a PNG"),
+    "truncated sweep": (
+        lambda d: d.sweep(7).write_bytes(d.sweep(7).read_bytes()[:-3]),
+        {("image_02", 7), ("image_03", 7)},
+        r"0000000007\.bin: .* bytes, expected a multiple of 16",
+    ),
+    "sweep of NaN": (
+        lambda d: write_points(d.sweep(7), np.full((50, 3), np.nan)),
+        {("image_02", 7), ("image_03", 7)},
+        r"0000000007\.bin: none of its 50 points can be used",
+    ),
+    "missing monocular map": (lambda d: mono(d, 6).unlink(), {("image_02", 6)}, r"0000000006\.png: no such file"),
+    "damaged monocular map": (
+        lambda d: damage(mono(d, 6)),
+        {("image_02", 6)},
+        r"0000000006\.png: (damaged|cannot be decoded)",
+    ),
+    "empty monocular map": (
+        lambda d: write_distance_png(mono(d, 6), np.zeros((32, 32))),
+        {("image_02", 6)},
+        "no distance anywhere",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_broken_file_is_left_out_and_named(drive: RoomDrive, fault: str) -> None:
+    spoil, missing, message = FAULTS[fault]
+    spoil(drive)
+    sky = fault == "empty monocular map"
+    report, said = run(drive, sky=sky)
+    scene = report.scene
+    meta = read_json(scene / "transforms.json")
+    every = {(name, frame) for name in CAMERAS for frame in drive.frames}
+    assert {(frame["camera"], frame["frame"]) for frame in meta["frames"]} == every - missing
+    assert len(meta["train_filenames"]) + len(meta["test_filenames"]) == report.training + report.held_out
+    assert report.training + report.held_out == 24 - len(missing)
+    # no file of them is left, and all that is named is there
+    for layer in ("images", "lidar", "mono"):
+        there = {(path.parent.name, int(path.stem)) for path in (scene / layer).rglob("*.png")}
+        assert there == every - missing
+    assert len(report.left_out) in (1, 2) and all(re.search(message, item.fault) for item in report.left_out)
+    assert "Left out: " in said and re.search(message, said)
+    # once more: the same is told, nothing is done, no byte changes
+    before = contents(scene)
+    again, said_again = run(drive, sky=sky)
+    assert again.written == 0 and again.left_out == report.left_out and re.search(message, said_again)
+    assert contents(scene) == before
+    with pytest.raises((InputError, FileNotFoundError), match=message):
+        run(drive, "strict", strict=True, sky=sky)
+    assert not (drive.root.parent / "strict/transforms.json").exists()
+
+
+def test_a_picture_that_is_mended_comes_into_the_scene(drive: RoomDrive) -> None:
+    path = drive.image("image_03", 5)
+    whole = path.read_bytes()
+    damage(path)
+    run(drive)
+    path.write_bytes(whole)
+    report, said = run(drive)
+    assert report.written and not report.left_out and "Left out" not in said
+    run(drive, "other")
+    assert contents(report.scene) == contents(drive.root.parent / "other")
+
+
+def test_a_fault_of_the_whole_drive_is_an_error(drive: RoomDrive) -> None:
+    """Up to a tenth is left out: of 24 pictures two."""
+    for frame in (1, 2):
+        damage(drive.image("image_02", frame))
+    assert len(run(drive)[0].left_out) == 2
+    damage(drive.image("image_02", 3))
+    with pytest.raises(
+        InputError, match=r"0000000003\.png: .*3 of this drive's files cannot be used; up to 2 would be left out"
+    ):
+        run(drive, "more")
+    halve(drive.image("image_03", 3))
+    halve(drive.image("image_03", 6))
+    halve(drive.image("image_03", 8))
+    with pytest.raises(InputError, match="up to 2 would be left out"):
+        run(drive, "many")
+    assert not (drive.root.parent / "many").exists()
+
+
+def test_the_vehicle_is_found_beside_a_broken_picture(drive: RoomDrive) -> None:
+    damage(drive.image("image_03", 5))
+    report, _ = run(drive, find_ego=True)
+    assert [item.key for item in report.left_out] == ["image_03, frame 5"]

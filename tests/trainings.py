@@ -1,0 +1,35 @@
+"""Short trainings in this process, on the CPU."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import torch
+from nerfstudio.configs.method_configs import all_methods
+
+from edge_depth_nerf.trainer import EdgeDepthTrainer
+
+
+def trainer_of(scene: Path, output: Path, **changes: Any) -> EdgeDepthTrainer:
+    """edge-depth-nerf-lite, small, set up; `model__x`, `data__x` and `parser__x` go to the parts, others to itself."""
+    config = copy.deepcopy(all_methods["edge-depth-nerf-lite"])
+    config.output_dir, config.experiment_name, config.timestamp = output, "small", "run"
+    config.vis, config.data = "tensorboard", scene
+    config.logging.local_writer.enable = False
+    pipeline = config.pipeline
+    pipeline.datamanager.dataparser.data = scene
+    pipeline.datamanager.train_num_rays_per_batch = 64
+    pipeline.model.num_levels, pipeline.model.log2_hashmap_size = 4, 12
+    parts = {"model": pipeline.model, "data": pipeline.datamanager, "parser": pipeline.datamanager.dataparser}
+    for name, value in changes.items():
+        part, _, field = name.rpartition("__")
+        node = parts[part] if part else config
+        assert hasattr(node, field), name
+        setattr(node, field, value)
+    torch.manual_seed(0)
+    trainer = config.setup()
+    assert isinstance(trainer, EdgeDepthTrainer)
+    trainer.setup()
+    return trainer
