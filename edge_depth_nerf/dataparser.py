@@ -147,6 +147,9 @@ class FisheyeDepth(Nerfstudio):
         meta = read_transforms(path)
         frames = check_meta(meta, path)
         check_split(meta, path)
+        named = [f"{name}_filenames" for name in ("train", "val", "test") if f"{name}_filenames" in meta]
+        if named and f"{split}_filenames" not in named:
+            raise InputError(f"{path}: has {' and '.join(named)}, but no {split}_filenames. Give all three, or none.")
         has_maps = any(key in frames[0] for key in MAP_KEYS.values())
         if has_maps and self.config.downscale_factor not in (None, 1):
             raise InputError(

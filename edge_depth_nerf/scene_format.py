@@ -28,6 +28,7 @@ _MAX_FRAMES = 1_000_000
 """Also an upper bound of the numbers of moments."""
 _NUMBERS = (*INTRINSICS, *DISTORTION, "timestamp_s")
 _SCENE_NUMBERS = ("theta_max_deg", "depth_unit_scale_factor", "applied_scale", "fisheye_crop_radius")
+_MAY_BE_NULL = ("timestamp_s", "fisheye_crop_radius")
 _ORIENTATIONS = ("pca", "up", "vertical", "none")
 
 
@@ -111,9 +112,7 @@ def _check_frame(frame: Mapping[str, Any], where: str, folder: Path) -> None:
     for key in PATHS:
         if key in frame:
             path_inside(folder, frame[key], f"{where}: {key}")
-    for key in _NUMBERS:
-        if frame.get(key) is not None:
-            number_of(frame[key], f"{where}: {key}")
+    _check_numbers(frame, where)
     _check_size(frame, where)
     _check_distortion(frame, where)
     if "transform_matrix" in frame:
@@ -124,6 +123,12 @@ def _check_frame(frame: Mapping[str, Any], where: str, folder: Path) -> None:
     if "camera" in frame:
         # maps lie in folders of cameras' names
         path_inside(folder, frame["camera"], f"{where}: camera")
+
+
+def _check_numbers(entry: Mapping[str, Any], where: str) -> None:
+    for key in (*_NUMBERS, *_SCENE_NUMBERS):
+        if key in entry and not (entry[key] is None and key in _MAY_BE_NULL):
+            number_of(entry[key], f"{where}: {key}")
 
 
 def _check_size(entry: Mapping[str, Any], where: str) -> None:
@@ -142,9 +147,7 @@ def _check_distortion(entry: Mapping[str, Any], where: str) -> None:
 
 
 def _check_scene(meta: Mapping[str, Any], path: Path) -> None:
-    for key in (*_SCENE_NUMBERS, *_NUMBERS):
-        if meta.get(key) is not None:
-            number_of(meta[key], f"{path}: {key}")
+    _check_numbers(meta, str(path))
     _check_size(meta, str(path))
     _check_distortion(meta, str(path))
     # a width of the whole scene with a height of each frame

@@ -167,6 +167,13 @@ FOUND: dict[str, tuple[str, str, str | bytes, str]] = {
         '{"methods": {"ds-nerf": {"lambda": %s, "sigma_m": 1}}}' % ("9" * 400),
         "ds-nerf: found",
     ),
+    "a run of a list for a method": (
+        "figures",
+        "s/r/figures.json",
+        '{"run": {"scene": "s", "preset": "lite", "method": ["x"], "seed": 0}, "named": [], "configuration": {}, '
+        '"figures": {}, "curve": [], "steps": 1}',
+        "is not of this form",
+    ),
     "figures that are none": ("figures", "s/r/figures.json", "[]", "no JSON object"),
     "aliases that multiply": ("kitti yaml", "a.yaml", "a: &a [x]\n" + "b: [*a,*a]\n" * 9, "is there twice|without"),
 }

@@ -21,6 +21,7 @@ from test_bad_input import INPUTS, throw
 from edge_depth_nerf import compat
 from edge_depth_nerf.config import edge_depth_nerf_lite
 from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
+from edge_depth_nerf.dataset import FisheyeDepthDataset
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_json, write_json
 from edge_depth_nerf.films.training import read_dataparser
@@ -207,6 +208,40 @@ def test_a_spoilt_config(config, tmp_path):
     for _ in range(max(5, INPUTS // 4)):
         path.write_bytes(spoilt(whole, "text", rng))
         throw(read_dataparser, path)
+
+
+def test_a_spoilt_scene_as_training_reads_it(tmp_path):
+    path = write_scene(tmp_path, frames=4) / "transforms.json"
+    whole, rng = path.read_bytes(), Random(0)
+
+    def read(scene: Path) -> None:
+        dataset = FisheyeDepthDataset(FisheyeDepthDataParserConfig(data=scene).setup().get_dataparser_outputs("train"))
+        for index in range(len(dataset)):
+            dataset[index]
+
+    for _ in range(INPUTS):
+        path.write_bytes(spoilt(whole, "json", rng))
+        throw(read, path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [({"depth_unit_scale_factor": None}, "depth_unit_scale_factor is None"), ({"fl_x": None}, "fl_x is None")],
+)
+def test_a_null_is_no_number(tmp_path, change, message):
+    scene = write_scene(tmp_path, frames=2)
+    write_json(scene / "transforms.json", {**read_json(scene / "transforms.json"), **change})
+    with pytest.raises(InputError, match=message):
+        FisheyeDepthDataParserConfig(data=scene).setup().get_dataparser_outputs("train")
+
+
+def test_a_split_that_is_not_listed(tmp_path):
+    scene = write_scene(tmp_path, frames=2)
+    meta = read_json(scene / "transforms.json")
+    del meta["val_filenames"]
+    write_json(scene / "transforms.json", meta)
+    with pytest.raises(InputError, match="but no val_filenames"):
+        FisheyeDepthDataParserConfig(data=scene).setup().get_dataparser_outputs("val")
 
 
 # ---- paths -----------------------------------------------------------------------------------------------------

@@ -118,8 +118,8 @@ def _check_run(content: dict[str, Any], path: Path) -> None:
     run, curve = content["run"], content["curve"]
     fine = (
         isinstance(run, dict)
-        and all(isinstance(run.get(key), str) for key in ("scene", "preset"))
-        and run.get("method") in METHODS
+        and all(isinstance(run.get(key), str) for key in ("scene", "preset", "method"))
+        and run["method"] in METHODS
         and isinstance(run.get("seed"), int)
         and isinstance(content["named"], list)
         and all(isinstance(name, str) for name in content["named"])
