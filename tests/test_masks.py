@@ -172,6 +172,23 @@ def test_holes_are_filled_and_islands_dropped() -> None:
     assert iou(~found.keep & world.lens, vehicle_shape() & world.lens) > 0.95
 
 
+def test_white_paint_in_the_sun_is_of_the_vehicle() -> None:
+    x, y = pixels()
+    mirror = np.hypot(x - 82, y - 152) < 10
+    world = SlidingWorld(vehicle_shape() | mirror)
+    # the sun leaves the mirror white, whatever the exposure; far from the vehicle something else is
+    lamp = np.hypot(x - 200, y - 125) < 4
+    world.paint[mirror] = 400
+    pictures = world.drive(20)
+    for picture in pictures:
+        picture[lamp] = 255
+    found = ego.find_ego(pictures, world.lens)
+    assert isinstance(found, ego.EgoMask)
+    assert (~found.keep)[mirror].mean() > 0.99
+    assert found.keep[lamp].all()
+    assert found.keep[:140][world.lens[:140]].all(), "the sky is white as well"
+
+
 def test_why_no_vehicle_is_found() -> None:
     world = SlidingWorld(vehicle_shape())
     few = ego.find_ego(world.drive(ego.MIN_PICTURES - 1), world.lens)

@@ -33,6 +33,7 @@ from edge_depth_nerf.masks.regions import (
     from_nearest,
     means_within,
     opened,
+    touching,
     whole_blocks,
 )
 
@@ -53,6 +54,9 @@ _DARK_LEVELS = 8.0
 """Added to a brightness that is divided by: near black, contrast is nothing but noise."""
 _SATURATED_LEVEL = 240.0
 """From about here on noise is cut off."""
+_ALWAYS_SATURATED = 0.9
+"""Of the pictures: a patch that is white in so many, such as paint in the sun, is not told by its contrast, which
+follows the exposure."""
 _NOISE_FLOOR_LEVELS = 1.0
 """Rounding and compression change a pixel by about this much, however quiet the sensor."""
 _EDGE_CHANGE = 0.15
@@ -78,6 +82,9 @@ _LINK = 1 / 120
 """Bridges narrower than this do not connect, gaps narrower than this do not separate."""
 _OUTLINE = 1 / 350
 """The outline is smoothed over this length."""
+_GROWN = 1 / 175
+"""The mask is larger than what is found: the pixels at the outline show both, and a rim of the vehicle in the pictures
+spoils the scene more than a rim of road that is missing."""
 _SMALLEST_SHARE = 0.003
 """A smaller patch, as a share of the lens, is no part of a vehicle."""
 _LOWER_RIM = 0.3
@@ -157,8 +164,7 @@ def find_ego(pictures: Iterable[Picture | Callable[[], Picture]], lens: Bool[np.
             "What stays the same at the lower rim of the pictures has no clear outline: only along "
             f"{certainty:.0%} of it there is an edge beyond which things change. It may be smooth road."
         )
-    # a little grown: the pixels at the outline show both
-    ego = enlarge(dilated(vehicle, 1.0), factor, (lens.shape[0], lens.shape[1]))
+    ego = enlarge(dilated(vehicle, _GROWN * max(small_lens.shape)), factor, (lens.shape[0], lens.shape[1]))
     ego = from_nearest(ego, lens)
     return EgoMask(~ego, float(ego[lens].mean()), certainty, count)
 
@@ -222,6 +228,7 @@ def _find(
         # the light on the vehicle says nothing far from it
         near = lens & dilated(vehicle, 3 * _SURROUNDINGS * side)
         vehicle = _clean(near & (change < _CHANGED), lens)
+    vehicle = _clean(vehicle | touching(_white_patches(over_time, lens), dilated(vehicle, _LINK * side)), lens)
     outline = lens & dilated(vehicle, 1.0) & ~vehicle
     beyond = lens & dilated(vehicle, 3 * _POOL * side) & ~dilated(vehicle, _POOL * side)
     if not (outline.any() and beyond.any()):
@@ -230,6 +237,13 @@ def _find(
     # pooled with what is clipped: three quarters of the way is clear
     changing = (change[beyond] > 0.75 * _CLEARLY_CHANGED).mean()
     return vehicle, float(min(edged, changing))
+
+
+def _white_patches(over_time: _OverTime, lens: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """What is always saturated and lies below the lens's middle as a whole, which a bright sky does not."""
+    labels, sizes = components(lens & (over_time.saturated >= _ALWAYS_SATURATED))
+    sizes[np.unique(labels[: _middle_row(lens)])] = 0
+    return (sizes > 0)[labels]
 
 
 @dataclass(frozen=True)
@@ -242,6 +256,8 @@ class _OverTime:
     """Mean square of 1/brightness around: times the variance of the noise, it is that of the contrast."""
     light_variance: Float32[np.ndarray, "h w"]
     """Of the brightness around, relative."""
+    saturated: Float32[np.ndarray, "h w"]
+    """Share of the pictures in which it is."""
 
 
 def _over_time(
@@ -249,6 +265,7 @@ def _over_time(
 ) -> _OverTime:
     count = len(stack)
     contrast_sum, contrast_square_sum, inverse_sum, log_sum, log_square_sum = (np.zeros(lens.shape) for _ in range(5))
+    saturated = np.zeros(lens.shape, np.float32)
     for half in stack:
         contrast, light = _contrast(half.astype(np.float32), lens, reference)
         contrast_sum += contrast
@@ -257,11 +274,13 @@ def _over_time(
         log_light = np.log(light)
         log_sum += log_light
         log_square_sum += np.square(log_light, dtype=np.float64)
+        saturated += half > _SATURATED_LEVEL
     return _OverTime(
         mean=(contrast_sum / count).astype(np.float32),
         variance=np.maximum((contrast_square_sum - contrast_sum**2 / count) / (count - 1), 0).astype(np.float32),
         inverse_light=(inverse_sum / count).astype(np.float32),
         light_variance=np.maximum(log_square_sum / count - np.square(log_sum / count), 0).astype(np.float32),
+        saturated=saturated / np.float32(count),
     )
 
 
@@ -303,11 +322,15 @@ def _noise_levels(stack: Float16[np.ndarray, "n h w"], lens: Bool[np.ndarray, "h
 # ---- cleaning up -----------------------------------------------------------------------------------------------
 
 
+def _middle_row(lens: Bool[np.ndarray, "h w"]) -> int:
+    rows = np.flatnonzero(lens.any(1))
+    return int((rows[0] + rows[-1]) / 2)
+
+
 def _clean(still: Bool[np.ndarray, "h w"], lens: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Keep what reaches the lower rim, fill its holes, drop islands, smooth the outline."""
     side = max(lens.shape)
-    rows = np.flatnonzero(lens.any(1))
-    middle, lowest = int((rows[0] + rows[-1]) / 2), int(rows[-1])
+    middle, lowest = _middle_row(lens), int(np.flatnonzero(lens.any(1))[-1])
     rim = lens & ~eroded(lens, _LINK * side)
     rim[: round(middle + _LOWER_RIM * (lowest - middle))] = False
     # outside the lens all is still, lest the patches are rounded off at the rim
