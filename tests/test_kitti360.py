@@ -47,6 +47,7 @@ from edge_depth_nerf.files import (
 )
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.masks.ego import NoEgo
+from edge_depth_nerf.mono.trust import calibrate_scene
 from edge_depth_nerf.process import build, colmap_poses
 from edge_depth_nerf.process.kitti360 import process_kitti360
 from edge_depth_nerf.process.kitti360_calibration import (
@@ -498,6 +499,17 @@ def test_frame_masks_and_mono(drive: RoomDrive, tmp_path: Path) -> None:
         assert (read_distance_png(tmp_path / "scene" / frame["mono_file_path"]) == 3 + frame["frame"]).all()
     world = read_ply(tmp_path / "scene/points.ply")[0]
     assert 0 < len(world) < 3 * 600
+
+
+@pytest.mark.parametrize(("options", "everywhere"), [({}, True), ({"mono_trained_on": "scene"}, False)])
+def test_maps_that_are_brought_count_beyond_lidar_unless_trained_on_it(
+    options: dict[str, Any], everywhere: bool, drive: RoomDrive, tmp_path: Path
+) -> None:
+    for name in CAMERAS:
+        for frame in drive.frames:
+            write_distance_png(tmp_path / f"mono/{name}/{frame:010d}.png", np.full((32, 32), 3.0))
+    process(drive, tmp_path / "scene", mono=tmp_path / "mono", **options)
+    assert calibrate_scene(tmp_path / "scene").everywhere == everywhere
 
 
 @pytest.mark.parametrize("sky", [True, False])

@@ -228,8 +228,11 @@ def _made_of(scene: SceneFolder, pictures: Sequence[ScenePicture], options: Prio
 
 def _trained_on(scene: SceneFolder) -> str:
     """Where the maps' source was trained: elsewhere only if it says so."""
-    source = scene.meta.get("mono")
-    found = source.get("trained_on") if isinstance(source, dict) else None
+    later, drive = scene.meta.get("mono"), scene.meta.get("source")
+    if isinstance(later, dict):
+        found = later.get("trained_on")
+    else:
+        found = drive.get("mono_trained_on") if isinstance(drive, dict) else None
     return "elsewhere" if found == "elsewhere" else "scene"
 
 

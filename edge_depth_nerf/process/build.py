@@ -485,6 +485,7 @@ def _source(recording: Recording, options: ProcessOptions) -> dict[str, Any]:
         "frame_masks": options.frame_masks is not None,
         "moving_classes": list(options.moving_classes),
         "mono": options.mono is not None,
+        **({"mono_trained_on": options.mono_trained_on} if any(picture.mono for picture in recording.pictures) else {}),
         "sky": options.sky,
         "theta_max_deg": options.theta_max_deg,
         "holdout_every": options.holdout_every,

@@ -56,8 +56,11 @@ class ProcessOptions:
     """Classes that are masked out where the drive brings KITTI-360's semantics; none to keep all."""
     mono: Path | None = None
     """Monocular distance maps: a folder with CAMERA/0000000123.png, 16 bit, 1/256 m along the ray, 0 = none. In the
-    size of the raw pictures; one for every frame taken. They count as knowing no more than LiDAR's field;
-    `estimate-depth --maps` takes other forms and says otherwise. Not set: a network of the drive's own makes them."""
+    size of the raw pictures; one for every frame taken. `estimate-depth --maps` takes other forms. Not set: a network
+    of the drive's own makes them."""
+    mono_trained_on: Literal["scene", "elsewhere"] = "elsewhere"
+    """What the maker of the maps that are brought has seen: scene, if it was trained on LiDAR alone and knows nothing
+    beyond a scanner's field of elevation, where no prior is made then."""
     estimate_depth: bool = True
     """Where no monocular maps are given, train a network on the drive's LiDAR, as `edge-depth-nerf estimate-depth`
     does; off to leave the scene without, or to bring maps of other networks by that command."""
