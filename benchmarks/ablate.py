@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -43,12 +44,20 @@ def parse(variant: str) -> dict[str, Any]:
     return overrides
 
 
-def train(scene: Path, overrides: dict[str, Any], steps: int, seed: int) -> dict[str, float]:
+def train(
+    scene: Path,
+    overrides: dict[str, Any],
+    steps: int,
+    seed: int,
+    change: Callable[[Any], None] | None = None,
+) -> dict[str, float]:
     config = deepcopy(all_methods["edge-depth-nerf-lite"])
     apply_overrides(config, overrides, "command line")
     config.pipeline.datamanager.data = scene
     torch.manual_seed(seed)
     pipeline: Any = config.pipeline.setup(device="cpu", test_mode="val")
+    if change is not None:
+        change(pipeline)
     optimisers = Optimizers(deepcopy(config.optimizers), pipeline.get_param_groups())
     attributes = TrainingCallbackAttributes(optimizers=optimisers, grad_scaler=None, pipeline=pipeline, trainer=None)
     callbacks = pipeline.get_training_callbacks(attributes)

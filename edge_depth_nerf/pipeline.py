@@ -91,7 +91,7 @@ class EdgeDepthPipeline(VanillaPipeline):
         """
         outputs, losses, metrics = super().get_train_loss_dict(step)
         if str(self.device) == "cpu" or step % STEPS_PER_CHECK == 0:
-            if not math.isfinite(sum(losses.values())):
+            if not all(bool(loss.detach().isfinite()) for loss in losses.values()):
                 raise NotFiniteError(self._not_finite(step, outputs, losses))
         return outputs, losses, metrics
 
@@ -99,7 +99,9 @@ class EdgeDepthPipeline(VanillaPipeline):
         """Say which losses are not finite, and in which pictures."""
         manager = self.datamanager
         assert isinstance(manager, FisheyeDepthDataManager)
-        odd = [f"{name} is {float(loss)}" for name, loss in losses.items() if not math.isfinite(loss)]
+        odd = [
+            f"{name} is {value}" for name, loss in losses.items() if not math.isfinite(value := float(loss.detach()))
+        ]
         count = len(manager.trained_on)
         rendered = [outputs["rgb"], *(weights.flatten(1) for weights in outputs.get("weights_list", ()))]
         bad = ~torch.cat([torch.isfinite(values) for values in rendered], dim=-1).all(-1)
@@ -108,7 +110,7 @@ class EdgeDepthPipeline(VanillaPipeline):
         rays = f"{int(bad.sum())} of {count} rays are not finite" if some else f"its {count} rays"
         listed = f"{', '.join(names[:MOST_NAMED])}{' …' if len(names) > MOST_NAMED else ''}"
         return (
-            f"Step {step}: {', '.join(odd) or 'the sum of the losses is not finite'}; {rays}, from {len(names)} "
+            f"Step {step}: {', '.join(odd)}; {rays}, from {len(names)} "
             f"pictures: {listed}. Look at them with `edge-depth-nerf inspect`; if they are fine, lower the learning "
             "rate or the weights of the losses, or leave mixed precision off (--mixed-precision False)."
         )
