@@ -81,14 +81,15 @@ def run(command: Command) -> None:
         synthesize_drive(command)
     elif isinstance(command, Process):
         with _starting():
-            from edge_depth_nerf.process.command import process
+            from edge_depth_nerf.process.many import process_drive
 
-        process(command.options)
+        process_drive(command.options)
     elif isinstance(command, EstimateDepthOptions):
         with _starting():
             from edge_depth_nerf.mono.estimate import estimate_depth
+            from edge_depth_nerf.mono.many import estimate_on_cluster
 
-        estimate_depth(command)
+        estimate_depth(command) if command.cluster is None else estimate_on_cluster(command)
     elif isinstance(command, InspectOptions):
         with _starting():
             from edge_depth_nerf.inspecting import inspect_scene

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from typing import TypeVar
 
-import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -28,6 +27,8 @@ def run_jobs(jobs: Sequence[Callable[[], Result]], title: str, console: Console)
     Decoding, encoding and torch leave Python's lock. Torch gets one thread of its own in each job: the jobs share the
     cores already.
     """
+    import torch  # takes seconds, which a worker of a cluster need not wait for
+
     progress = Progress(TextColumn(title), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=console)
     inner_threads = torch.get_num_threads()
     torch.set_num_threads(1)

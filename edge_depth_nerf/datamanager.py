@@ -25,6 +25,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+import torch.distributed as dist
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
@@ -42,6 +43,7 @@ from edge_depth_nerf.integration import IntegrationOptions
 from edge_depth_nerf.metrics import has_whole_window
 from edge_depth_nerf.mono.error_model import Trust
 from edge_depth_nerf.mono.trust import field_of_source, find_trust
+from edge_depth_nerf.one_writer import only_writer
 from edge_depth_nerf.pixel_table import (
     RECORD,
     TABLE_VERSION,
@@ -168,13 +170,23 @@ def _view(dataset: FisheyeDepthDataset, image_idx: int) -> View:
 
 
 class TablePixelSampler:
-    """What nerfstudio calls a pixel sampler; its exporter sets `num_rays_per_batch`."""
+    """What nerfstudio calls a pixel sampler; its exporter sets `num_rays_per_batch`.
 
-    def __init__(self, table: PixelTable, num_rays_per_batch: int):
+    Of several processes that train together (torch.distributed) each reads a part of every batch: all begin at one
+    place, and what the first reads the others leave out.
+    """
+
+    def __init__(self, table: PixelTable, num_rays_per_batch: int, device: torch.device | str = "cpu"):
         self.table = table
         self.num_rays_per_batch = num_rays_per_batch
         # another seed begins elsewhere
-        self._first = int(torch.randint(len(table), ()))
+        first = torch.randint(len(table), ())
+        self._rank, self._world_size = 0, 1
+        if dist.is_available() and dist.is_initialized():
+            self._rank, self._world_size = dist.get_rank(), dist.get_world_size()
+            first = first.to(device)
+            dist.broadcast(first, src=0)
+        self._first = int(first)
         self._drawn = 0
 
     def set_num_rays_per_batch(self, num_rays_per_batch: int) -> None:
@@ -185,7 +197,8 @@ class TablePixelSampler:
         """Read the next batch; at a later step of training, the one that belongs there."""
         # a training that is taken up again goes on where it was; the exporter always says 0
         self._drawn = max(self._drawn, step * self.num_rays_per_batch)
-        batch = self.table.batch(self._first + self._drawn, self.num_rays_per_batch)
+        start = self._first + self._drawn * self._world_size + self._rank * self.num_rays_per_batch
+        batch = self.table.batch(start, self.num_rays_per_batch)
         self._drawn += self.num_rays_per_batch
         return batch
 
@@ -211,12 +224,14 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
 
     def setup_train(self) -> None:
         """Integrate the prior of every training frame and write the table of training pixels, or find it."""
-        table = self._table(self.train_dataset, "Integrating depth", with_prior=True)
-        self.train_pixel_sampler = TablePixelSampler(table, self.config.train_num_rays_per_batch)
-        self.train_ray_generator = self._ray_generator(self.train_dataset)
+        # of several processes that train on a scene the first makes what they share
+        with only_writer(self._cache_dir(), CONSOLE):
+            table = self._table(self.train_dataset, "Integrating depth", with_prior=True)
+            self.train_ray_generator = self._ray_generator(self.train_dataset)
+        self.train_pixel_sampler = TablePixelSampler(table, self.config.train_num_rays_per_batch, self.device)
         self._surface_sampler = None
         if self.config.surface_rays_per_batch > 0 and table.share_with_prior > 0:
-            self._surface_sampler = TablePixelSampler(table, self.config.surface_rays_per_batch)
+            self._surface_sampler = TablePixelSampler(table, self.config.surface_rays_per_batch, self.device)
         CONSOLE.log(
             f"{len(self.train_dataset)} training pictures, {len(table):,} valid pixels, "
             f"{table.share_with_prior:.1%} of them with a depth prior"
@@ -224,9 +239,10 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
 
     def setup_eval(self) -> None:
         """Write or find the table of held-out pixels (no prior) and prepare the loaders of whole views."""
-        table = self._table(self.eval_dataset, "Reading held-out pictures", with_prior=False)
-        self.eval_pixel_sampler = TablePixelSampler(table, self.config.eval_num_rays_per_batch)
-        self.eval_ray_generator = self._ray_generator(self.eval_dataset)
+        with only_writer(self._cache_dir(), CONSOLE):
+            table = self._table(self.eval_dataset, "Reading held-out pictures", with_prior=False)
+            self.eval_ray_generator = self._ray_generator(self.eval_dataset)
+        self.eval_pixel_sampler = TablePixelSampler(table, self.config.eval_num_rays_per_batch, self.device)
         self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(
             input_dataset=self.eval_dataset, device=self.device
         )

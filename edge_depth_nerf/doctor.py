@@ -186,6 +186,7 @@ def check_extras() -> Iterator[Finding]:
     for name, package, extra, what in (
         ("COLMAP", "pycolmap", "colmap", "poses found from pictures (process --poses colmap)"),
         ("transformers", "transformers", "hf", "ready-made depth networks (estimate-depth --hf)"),
+        ("Dask", "distributed", "cluster", "many machines (--cluster)"),
     ):
         there = find_spec(package) is not None
         yield Finding(

@@ -44,7 +44,14 @@ class LoggedCommands:
         self._stopped = False
         self._lock = Lock()
 
-    def call(self, command: Sequence[str | Path], log: Path, threads: int, on_line: Callable[[str], None]) -> None:
+    def call(
+        self,
+        command: Sequence[str | Path],
+        log: Path,
+        threads: int,
+        on_line: Callable[[str], None],
+        environment: Mapping[str, str] | None = None,
+    ) -> None:
         """Run a command to its end.
 
         Its standard input stays open and empty until this process ends, however it ends; a program that reads it
@@ -55,6 +62,7 @@ class LoggedCommands:
             log: file that the command and its output are appended to.
             threads: for OMP_NUM_THREADS, unless the environment has it already.
             on_line: called with each line of output.
+            environment: variables that it gets whatever the environment has.
 
         Raises:
             InputError: it ended with another status than 0; names the log, the command and the last line.
@@ -71,7 +79,7 @@ class LoggedCommands:
                     raise InputError(f"{words[0]}: stopped before it began.")
                 process = self._process = subprocess.Popen(
                     words,
-                    env={"OMP_NUM_THREADS": str(threads), "PYTHONUNBUFFERED": "1", **os.environ},
+                    env={"OMP_NUM_THREADS": str(threads), "PYTHONUNBUFFERED": "1", **os.environ, **(environment or {})},
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE,
                     stderr=subprocess.STDOUT,

@@ -140,22 +140,22 @@ def test_a_configuration_reads_the_same_in_every_process():
 
 
 def test_lambda_and_sigma_go_where_each_method_has_them():
-    rival = resolved("ds-nerf", weight=0.03, sigma_m=0.2)
-    assert (rival["pipeline.model.depth_loss_mult"], rival["pipeline.model.depth_sigma"]) == (0.03, 0.2)
+    rival = resolved("ds-nerf", weight=0.07, sigma_m=0.2)
+    assert (rival["pipeline.model.depth_loss_mult"], rival["pipeline.model.depth_sigma"]) == (0.07, 0.2)
     assert set(differing(rival, resolved("ds-nerf"))) == {LOSS + "_mult", "pipeline.model.depth_sigma"}
-    ours = resolved("edge", weight=0.03, sigma_m=0.2)
+    ours = resolved("edge", weight=0.07, sigma_m=0.2)
     data = "pipeline.datamanager."
     assert (ours[data + "sigma_mode"], ours[data + "sigma_constant"]) == ("constant", 0.2)
-    own = resolved("edge", weight=0.03, sigma_m="own")
+    own = resolved("edge", weight=0.07, sigma_m="own")
     assert set(differing(own, resolved("edge"))) == {LOSS + "_mult"}
 
     def setting(method, **changes):
         run = RunSpecification("/s/a", "", "lite", method, 0, 9, **changes)
         return setting_of(configuration(run)[0], method)
 
-    assert setting("ds-nerf", weight=0.03, sigma_m=0.2) == (0.03, 0.2)
-    assert setting("edge", weight=0.03, sigma_m=0.2) == (0.03, 0.2)
-    assert setting("edge", weight=0.03, sigma_m="own") == (0.03, "calibrated")
+    assert setting("ds-nerf", weight=0.07, sigma_m=0.2) == (0.07, 0.2)
+    assert setting("edge", weight=0.07, sigma_m=0.2) == (0.07, 0.2)
+    assert setting("edge", weight=0.07, sigma_m="own") == (0.07, "calibrated")
     assert setting("nerfacto") == (None, None)
 
 
@@ -569,7 +569,7 @@ def test_a_folder_keeps_what_its_runs_share(tmp_path, monkeypatch):
 
 
 def test_a_run_that_fails_names_its_log(tmp_path, monkeypatch):
-    monkeypatch.setattr(command.sys, "executable", shutil.which("false"))
+    monkeypatch.setattr(sys, "executable", shutil.which("false"))
     scene, output = write_scene(tmp_path / "x"), tmp_path / "out"
     with pytest.raises(InputError, match=r"status 1.*nerfacto_seed-0/run\.log"):
         command.compare(options(scene, output=output, steps=5, methods=("nerfacto", "edge"), jobs=1), QUIET)
@@ -634,7 +634,7 @@ def test_departures_from_the_papers_protocol(tmp_path):
 def test_a_search_writes_what_compare_takes(tmp_path, monkeypatch):
     """Training is replaced by a formula: best at λ = 0.1 and σ = 0.5 m for ds-nerf, λ = 1 and its own σ for edge."""
 
-    def train(runs, jobs, console):
+    def train(runs, options, console):
         for run in runs:
             spec = run.specification
             assert not spec.whole_views

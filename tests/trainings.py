@@ -12,7 +12,7 @@ from nerfstudio.configs.method_configs import all_methods
 from edge_depth_nerf.trainer import EdgeDepthTrainer
 
 
-def trainer_of(scene: Path, output: Path, **changes: Any) -> EdgeDepthTrainer:
+def trainer_of(scene: Path, output: Path, rank: int = 0, world_size: int = 1, **changes: Any) -> EdgeDepthTrainer:
     """edge-depth-nerf-lite, small, set up; `model__x`, `data__x` and `parser__x` go to the parts, others to itself."""
     config = copy.deepcopy(all_methods["edge-depth-nerf-lite"])
     config.output_dir, config.experiment_name, config.timestamp = output, "small", "run"
@@ -28,8 +28,8 @@ def trainer_of(scene: Path, output: Path, **changes: Any) -> EdgeDepthTrainer:
         node = parts[part] if part else config
         assert hasattr(node, field), name
         setattr(node, field, value)
-    torch.manual_seed(0)
-    trainer = config.setup()
+    torch.manual_seed(rank)  # as nerfstudio's own processes
+    trainer = config.setup(local_rank=rank, world_size=world_size)
     assert isinstance(trainer, EdgeDepthTrainer)
     trainer.setup()
     return trainer

@@ -5,9 +5,8 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
-import sys
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import ExitStack
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, get_args
@@ -15,7 +14,6 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import Progress, TaskID
 from rich.table import Table
 
 from edge_depth_nerf.bounds import finite, shown
@@ -25,7 +23,7 @@ from edge_depth_nerf.compare.plots import draw_plots
 from edge_depth_nerf.compare.report import first_runs, make_report
 from edge_depth_nerf.compare.results import Results, check_fair, read_results, write_rows
 from edge_depth_nerf.compare.search import show_search, write_search
-from edge_depth_nerf.compare.specification import FIGURES, SPECIFICATION, VIEWS, WORK, RunSpecification
+from edge_depth_nerf.compare.specification import FIGURES, SPECIFICATION, VIEWS, RunSpecification
 from edge_depth_nerf.compare.tables import MadeTable, as_latex, as_markdown, make_tables
 from edge_depth_nerf.console import say
 from edge_depth_nerf.errors import InputError
@@ -34,8 +32,9 @@ from edge_depth_nerf.one_writer import only_writer
 from edge_depth_nerf.pictures import DISTANCE, colour_bar, resize, side_by_side
 from edge_depth_nerf.report.build import write_report
 from edge_depth_nerf.report.views import REPORT
-from edge_depth_nerf.runs import LoggedCommands, command_line, compared_views, progress_bars, viewer_command
+from edge_depth_nerf.runs import command_line, compared_views, viewer_command
 from edge_depth_nerf.scene_format import read_transforms
+from edge_depth_nerf.tasks import Task, do_tasks, this_machine
 
 RECORD = "compare.json"
 RUNS = "runs"
@@ -97,7 +96,7 @@ def _compare(options: CompareOptions, console: Console) -> Results:
     runs = [Run(specification, options.output / RUNS) for specification in specifications]
     for run in runs:
         run.open()
-    do_runs([run for run in runs if not run.finished], options.jobs, console)
+    do_runs([run for run in runs if not run.finished], options, console)
 
     results = read_results(options.output / RUNS)
     if not options.search:
@@ -247,8 +246,6 @@ class Run:
         self.title = f"{scene} {run.method}{setting.replace('_', ' ')} seed {run.seed}"
         self.folder = runs / scene / f"{run.method}{setting}_seed-{run.seed}"
         self.log = self.folder / LOG
-        self._commands = LoggedCommands()
-        self.stop = self._commands.stop
 
     @property
     def finished(self) -> bool:
@@ -275,73 +272,32 @@ class Run:
             return
         write_json(path, wanted)
 
-    def do(self, progress: Progress, overall: TaskID, threads: int) -> None:
-        """Train and judge it, or what is left of that."""
-        task = progress.add_task(self.title, total=1.0)
-        done = 0.0
-
-        def on_line(line: str) -> None:
-            nonlocal done
-            if line.startswith(WORK):
-                share = float(line.removeprefix(WORK))
-                progress.update(task, completed=share)
-                progress.advance(overall, share - done)
-                done = share
-
-        command = [sys.executable, "-m", "edge_depth_nerf.compare.worker", self.folder]
-        try:
-            self._commands.call(command, self.log, threads, on_line)
-        finally:
-            progress.remove_task(task)
-        progress.advance(overall, 1.0 - done)
+    @property
+    def task(self) -> Task:
+        """What trains and judges it, or does what is left of that."""
+        arguments = ("-m", "edge_depth_nerf.compare.worker", str(self.folder.absolute()))
+        return Task(self.title, arguments, self.log.absolute(), self.folder.absolute() / FIGURES, trains=True)
 
 
-def do_runs(runs: Sequence[Run], jobs: int | None, console: Console) -> None:
+def do_runs(runs: Sequence[Run], options: CompareOptions, console: Console) -> None:
     """Do runs side by side; the first that fails stops all, and what they have done so far is kept.
 
     Raises:
-        InputError: a run failed; its log is named.
+        InputError: a run failed; its log is named. Or the cluster cannot be used.
 
     """
-    if not runs:
+    tasks = [run.task for run in runs]
+    if not tasks:
         return
-    cores = os.cpu_count() or 1
-    if jobs is None:
-        import torch  # takes seconds
+    with ExitStack() as stack:
+        if options.cluster is None:
+            place = stack.enter_context(this_machine(options.jobs, len(tasks), console))
+        else:
+            from edge_depth_nerf.cluster import on_cluster  # imports Dask
 
-        jobs = 1 if torch.cuda.is_available() else cores
-    # the same for the last run, which is alone: what its seconds are compared with had no more
-    threads = max(1, cores // jobs)
-    jobs = min(jobs, len(runs))
-    say(console, f"Runs to do: {len(runs)}; side by side: {jobs}; threads of each: {threads}.")
-    failures: list[InputError] = []
-
-    def stop_all() -> None:
-        for run in runs:
-            run.stop()
-
-    def do(run: Run) -> None:
-        if failures:
-            return
-        try:
-            run.do(progress, overall, threads)
-        except InputError as error:
-            # those that are stopped fail later
-            failures.append(error)
-            stop_all()
-
-    with progress_bars(console) as progress, ThreadPoolExecutor(jobs) as pool:
-        overall = progress.add_task("All runs", total=float(len(runs)))
-        futures = [pool.submit(do, run) for run in runs]
-        try:
-            for future in as_completed(futures):
-                future.result()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            stop_all()
-            raise
-    if failures:
-        raise failures[0]
+            scenes = sorted({Path(run.specification.scene) for run in runs})
+            place = stack.enter_context(on_cluster(options.cluster, tasks, scenes, console))
+        do_tasks(tasks, place, console)
 
 
 def _draw_comparison(output: Path, results: Results, scene: str) -> None:

@@ -9,6 +9,7 @@ from typing import Literal
 
 import tyro
 
+from edge_depth_nerf.cluster_address import check_address
 from edge_depth_nerf.errors import InputError
 
 Preset = Literal["lite", "full", "paper"]
@@ -58,6 +59,9 @@ class CompareOptions:
     figures at equal seconds."""
     jobs: int | None = None
     """Trainings side by side. Not set: one a core, on a GPU one."""
+    cluster: str | None = None
+    """Train on a Dask cluster: local (processes on this machine, one for each GPU or core), or the address of a
+    scheduler, such as tcp://10.0.0.1:8786. Needs `pip install edge-depth-nerf[cluster]`; see docs/cluster.md."""
     search: bool = False
     """Instead of tables: train each method with each λ and σ on one tuning scene and seed, and write the best to
     tuned.json."""
@@ -82,6 +86,12 @@ class CompareOptions:
         require(len(self.scenes) > 0, "no scene", "at least one scene folder")
         require(self.steps is None or self.steps >= 1, f"--steps {self.steps}", "1 or more")
         require(self.jobs is None or self.jobs >= 1, f"--jobs {self.jobs}", "1 or more")
+        check_address(self.cluster)
+        require(
+            self.jobs is None or self.cluster is None,
+            "--jobs with --cluster",
+            "one of them: a cluster trains as many side by side as it has workers",
+        )
         require(len(self.seeds) > 0 and min(self.seeds) >= 0, f"--seeds {self.seeds}", "at least one, each 0 or more")
         for name, values in (
             ("methods", self.methods),

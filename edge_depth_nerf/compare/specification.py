@@ -15,9 +15,6 @@ PROGRESS = "progress.json"
 """What was measured up to each checkpoint."""
 VIEWS = "views"
 """Folder of the judged views."""
-WORK = "work done: "
-"""Before the share of the run's work, 0 to 1, in the lines that tell its progress."""
-
 
 OF_A_RUN = ("machine.seed", "pipeline.datamanager.data", "output_dir", "experiment_name")
 """Fields of the configuration that any two runs may differ in."""

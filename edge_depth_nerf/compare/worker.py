@@ -18,16 +18,19 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 import numpy as np
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from rich.console import Console
 
 from edge_depth_nerf.bounds import finite, shown
 from edge_depth_nerf.compare.configuration import configuration, described, setting_of
 from edge_depth_nerf.compare.judging import ViewJudge, choose_pixels, judge_pixels, shifted_views
 from edge_depth_nerf.compare.protocol import departures
-from edge_depth_nerf.compare.specification import FIGURES, PROGRESS, SPECIFICATION, VIEWS, WORK, RunSpecification
+from edge_depth_nerf.compare.specification import FIGURES, PROGRESS, SPECIFICATION, VIEWS, RunSpecification
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import explain, read_json_object, write_json
+from edge_depth_nerf.one_writer import only_writer
 from edge_depth_nerf.runs import end_with_parent, steps_done
 from edge_depth_nerf.scene_format import read_transforms
+from edge_depth_nerf.tasks import WORK
 from edge_depth_nerf.trainer import EdgeDepthTrainer
 
 CURVE = (0.025, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
@@ -233,7 +236,10 @@ def main() -> None:
     """Entry point: errors of input are one paragraph and exit status 2."""
     end_with_parent()
     try:
-        do_run(Path(sys.argv[1]))
+        folder = Path(sys.argv[1])
+        # one whose worker was lost may take a moment to end
+        with only_writer(folder, Console()):
+            do_run(folder)
     except (InputError, OSError) as error:
         print(f"edge-depth-nerf: {explain(error)}", flush=True)  # noqa: T201
         sys.exit(2)

@@ -115,6 +115,7 @@ def estimate_depth(options: EstimateDepthOptions, console: Console | None = None
     """
     console = console or Console()
     options.check()
+    assert options.cluster is None
     start, about = load_network(options.model) if options.model is not None else (None, {})
     ready = load_ready_network(options.hf, options.hf_output) if options.hf is not None else None
     scenes = [read_scene(path) for path in options.scenes]
@@ -149,6 +150,9 @@ def _estimate(
         else:
             assert start is not None and options.model is not None
             network, weights = start, options.model
+        if not options.predict:
+            console.print(f"Weights, for --model: {weights}", soft_wrap=True)
+            return EstimateReport(weights, trained, 0)
         _write_own(network, weights, about, scenes, console)
     count = sum(len(scene.pictures) for scene in scenes)
     console.print(f"{count} pictures got a monocular map, from {weights}", soft_wrap=True)

@@ -8,6 +8,7 @@ from typing import Literal
 
 import tyro
 
+from edge_depth_nerf.cluster_address import check_address
 from edge_depth_nerf.errors import InputError
 
 Preset = Literal["lite", "full"]
@@ -60,6 +61,13 @@ class EstimateDepthOptions:
     """What their maker has seen: scene, if it was trained on LiDAR alone and knows nothing beyond a scanner's field of
     elevation, where no prior is made then. Not set: elsewhere."""
 
+    predict: bool = True
+    """Write maps; off to train a network and leave it at that, for `--model` later."""
+    cluster: str | None = None
+    """Work on a Dask cluster: local (processes on this machine, one for each GPU or core), or the address of a
+    scheduler, such as tcp://10.0.0.1:8786. The network is trained by one worker, then each scene's maps are a task.
+    Needs `pip install edge-depth-nerf[cluster]`; see docs/cluster.md."""
+
     def check(self) -> None:
         """Check the ranges.
 
@@ -77,8 +85,10 @@ class EstimateDepthOptions:
             raise InputError(f"--seed {self.seed}: expected 0 or more, below 2^63.")
         if self.output is not None and self.output.suffix != ".safetensors":
             raise InputError(f"--output {self.output}: expected a file that ends in .safetensors.")
-
+        check_address(self.cluster)
         self._check_sources()
+        if not self.predict and (self.hf is not None or self.maps is not None or not self.trains):
+            raise InputError("--no-predict: expected a training, for there is nothing else to do. Leave it out.")
 
     def _check_sources(self) -> None:
         """Check that one source of maps is chosen, and that all options belong to it."""

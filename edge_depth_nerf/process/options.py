@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from edge_depth_nerf.cluster_address import check_address
 from edge_depth_nerf.errors import InputError
 
 
@@ -22,6 +23,9 @@ class ProcessOptions:
     pose, picture or sweep are listed and skipped."""
     stride: int = 1
     """Take every stride-th frame."""
+    frames_per_scene: int | None = None
+    """Cut a long drive into scenes of so many frames at most, one after another, as equal as can be: 000, 001 and so
+    on in the output folder. Frames that cannot be used do not count. Not set: one scene."""
     downscale: int = 1
     """Average blocks of this many pixels by this many into one. What does not fill a block, at the right and at the
     bottom, is cut off."""
@@ -75,6 +79,10 @@ class ProcessOptions:
     of the scene and named at the end."""
     sky: bool = True
     """Leave the sky without monocular distance, instead of a wrong one."""
+    cluster: str | None = None
+    """Work on a Dask cluster, each scene as a task: local (processes on this machine, one for each GPU or core), or the
+    address of a scheduler, such as tcp://10.0.0.1:8786. Needs `pip install edge-depth-nerf[cluster]`; see
+    docs/cluster.md."""
 
     def ego_mask_of(self, camera: str) -> Path | None:
         """The mask of the vehicle that is given for a camera, if one is."""
@@ -96,6 +104,9 @@ class ProcessOptions:
         require(self.first >= 0, "first", self.first, "the number of a frame, 0 or more")
         require(self.frames is None or self.frames > 0, "frames", self.frames, "1 or more")
         require(self.stride > 0, "stride", self.stride, "1 or more")
+        scene = self.frames_per_scene
+        require(scene is None or scene >= 2, "frames-per-scene", scene, "2 or more")
+        check_address(self.cluster)
         require(self.downscale > 0, "downscale", self.downscale, "1 or more")
         holdout = self.holdout_every
         require(holdout == 0 or holdout >= 2, "holdout-every", holdout, "2 or more, or 0 to hold out none")

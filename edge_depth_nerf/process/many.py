@@ -1,0 +1,117 @@
+"""`edge-depth-nerf process`: a drive as one scene or cut into several, here or on a cluster."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from edge_depth_nerf.console import say
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.one_writer import only_writer
+from edge_depth_nerf.process.command import process
+from edge_depth_nerf.process.options import JbnuDepth360Options, Kitti360Options, RigOptions
+from edge_depth_nerf.tasks import Task, do_tasks, own_command
+
+DriveOptions = Kitti360Options | JbnuDepth360Options | RigOptions
+KINDS = {Kitti360Options: "kitti360", JbnuDepth360Options: "jbnu-depth360", RigOptions: "rig"}
+"""Their commands' names."""
+
+
+def process_drive(options: DriveOptions, console: Console | None = None) -> list[Path]:
+    """Write the scenes of a drive, or continue them; give their folders.
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        InputError: an option, a file of the drive, an output folder or the cluster cannot be used.
+
+    """
+    console = console or Console()
+    options.check()
+    parts = [options] if options.frames_per_scene is None else cut(options, console)
+    # a scene is held by who writes it
+    held = nullcontext() if options.frames_per_scene is None else only_writer(options.output, console)
+    with held:
+        if options.cluster is not None:
+            _on_cluster(parts, options.cluster, console)
+        else:
+            for number, part in enumerate(parts, 1):
+                if len(parts) > 1:
+                    say(console, f"Scene {number} of {len(parts)}: {part.output}")
+                process(part, console)
+    return [part.output for part in parts]
+
+
+def cut(options: DriveOptions, console: Console) -> list[DriveOptions]:
+    """Options of the scenes that a drive is cut into: each is a stretch of consecutive frames.
+
+    Raises:
+        FileNotFoundError: a file of the drive is missing.
+        InputError: a file of the drive cannot be used, or the output folder is a scene itself.
+
+    """
+    if (options.output / "transforms.json").exists():
+        raise InputError(
+            f"{options.output}: is a scene, which --frames-per-scene would put others into. Choose another --output."
+        )
+    with console.status("Reading the drive …"):
+        frames = usable_frames(options)
+    assert options.frames_per_scene is not None
+    count = -(-len(frames) // options.frames_per_scene)
+    digits = max(3, len(str(count - 1)))
+    parts: list[DriveOptions] = []
+    for number, stretch in enumerate(np.array_split(frames, count)):
+        first, last = int(stretch[0]), int(stretch[-1])
+        parts.append(
+            replace(
+                options,
+                output=options.output / f"{number:0{digits}d}",
+                first=first,
+                frames=(last - first) // options.stride + 1,
+                frames_per_scene=None,
+                cluster=None,
+            )
+        )
+    say(console, f"{len(frames)} frames that can be used, cut into {count} scenes.")
+    return parts
+
+
+def usable_frames(options: DriveOptions) -> list[int]:
+    """Numbers of the frames that a drive's scene would have, in order; every file is looked at.
+
+    Raises:
+        FileNotFoundError: a file of the drive is missing.
+        InputError: an option or a file of the drive cannot be used.
+
+    """
+    if isinstance(options, Kitti360Options):
+        from edge_depth_nerf.process.kitti360 import read_kitti360
+
+        recording = read_kitti360(options)
+    elif isinstance(options, JbnuDepth360Options):
+        from edge_depth_nerf.process.jbnu_depth360 import read_jbnu_depth360
+
+        recording = read_jbnu_depth360(options)
+    else:
+        from edge_depth_nerf.process.rig import read_rig_recording
+
+        recording = read_rig_recording(options)
+    return sorted({picture.frame for picture in recording.pictures})
+
+
+def _on_cluster(parts: list[DriveOptions], cluster: str, console: Console) -> None:
+    from edge_depth_nerf.cluster import on_cluster  # imports Dask
+
+    tasks = []
+    for part in parts:
+        scene = part.output.absolute()
+        trains = part.estimate_depth and part.mono is None and part.mono_model is None
+        words = own_command(("process", KINDS[type(part)]), replace(part, cluster=None))
+        log = scene.with_name(f"{scene.name}.log")
+        tasks.append(Task(str(part.output), words, log, scene / "transforms.json", trains))
+    with on_cluster(cluster, tasks, [parts[0].root.absolute()], console) as place:
+        do_tasks(tasks, place, console)
+    say(console, f"Scenes: {', '.join(task.title for task in tasks)}. What was said of each is in the log beside it.")
