@@ -45,8 +45,8 @@ STUDY: dict[str, tuple[Variant, ...]] = {
         Variant(DEFAULTS),
         Variant("no depth loss, sky or surface: nerfacto", {MODEL + "depth_loss": "none"}),
     ),
-    "λ, 0.03 falling to a hundredth": (
-        *(Variant(f"{value:g}", {MODEL + "depth_loss_mult": value}) for value in (0.003, 0.01, 0.1)),
+    "λ, 0.01 falling to a hundredth": (
+        *(Variant(f"{value:g}", {MODEL + "depth_loss_mult": value}) for value in (0.003, 0.03, 0.1)),
         Variant("falling to a tenth", {MODEL + "depth_loss_final": 0.1}),
         Variant("not falling", {MODEL + "depth_loss_final": 1.0}),
     ),

@@ -52,8 +52,8 @@ class EdgeDepthNerfModelConfig(NerfactoModelConfig):
     """How far along the ray to stop sampling, metres (in place of far_plane)."""
     depth_loss: Literal["edge", "ds-nerf", "urban-nerf", "none"] = "edge"
     """The loss on the distance prior: Eq. 4, nerfstudio's DS-NeRF or UrbanNeRF loss, or none (plain nerfacto)."""
-    depth_loss_mult: float = 0.03
-    """Weight λ of the loss on the distance prior (not published; how it was chosen: docs/loss_weight.md)."""
+    depth_loss_mult: float = 0.01
+    """Weight λ of the loss on the distance prior (not published; how it was chosen: docs/ablation.md)."""
     depth_sigma: float = 0.5
     """Standard deviation that the DS-NeRF and UrbanNeRF losses assume, metres. (Eq. 4 takes the prior's own.)"""
     depth_loss_levels: Literal["all", "final"] = "all"
