@@ -114,7 +114,7 @@ def table(done: dict[str, dict[str, float]], options: argparse.Namespace) -> lis
             lines.append(
                 f"| {variant.title} | {' | '.join(f'{value:.2f}' for value in psnr)} | {np.mean(psnr):.2f} | "
                 f"{np.mean(psnr) - base:+.2f} | {np.mean([one['truth_abs_rel'] for one in each]):.3f} | "
-                f"{np.mean([one['truth_delta_1'] for one in each]):.3f} |"
+                f"{np.mean([one['truth_delta_1_25'] for one in each]):.3f} |"
             )
     return lines
 

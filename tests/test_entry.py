@@ -134,6 +134,7 @@ def test_ctrl_c_at_work_leaves_whole_files(tmp_path):
 def test_ctrl_c_again_and_again_while_threads_finish():
     code = """
 import sys, time
+import torch  # takes its time, in which the first Ctrl-C would meet no threads
 from rich.console import Console
 from edge_depth_nerf import cli, entry
 from edge_depth_nerf.console import run_jobs
