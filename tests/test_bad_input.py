@@ -108,6 +108,7 @@ def frame(**changes: Any) -> str:
 
 
 FOUND: dict[str, tuple[str, str, str | bytes, str]] = {
+    "a picture without a name": ("poses of nerfstudio", "a.json", frame(file_path="."), "has no file_path"),
     # a quarter of a megabyte took all memory of the machine
     "a key of many parts": ("rig toml", "a.toml", "a" + ".a" * 100_000 + " = 1", "not valid TOML .*dots"),
     "a TOML of depth": ("rig toml", "a.toml", "a = " + "[" * 100_000, "not valid TOML"),

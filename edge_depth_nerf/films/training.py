@@ -16,8 +16,8 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 from edge_depth_nerf.bounds import finite, read_text, shown
 from edge_depth_nerf.errors import InputError
 
-MAX_CONFIG_BYTES = 1 << 16
-"""No config.yml is larger: nerfstudio's have some 10 kB. The parser takes a second for that much."""
+MAX_CONFIG_BYTES = 1 << 15
+"""No config.yml is larger: nerfstudio's have some 10 kB. The parser takes up to a third of a second for that much."""
 _PYTHON = "tag:yaml.org,2002:python/"
 _HINT = "--load-config takes the config.yml that ns-train wrote"
 

@@ -92,7 +92,8 @@ def read_nerfstudio(path: Path) -> dict[str, Transform]:
     poses = {}
     for number, frame in enumerate(frames):
         where = f"{path}: frames[{number}]"
-        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+        named = isinstance(frame, dict) and isinstance(frame.get("file_path"), str) and Path(frame["file_path"]).name
+        if not named:
             raise InputError(f"{where} has no file_path; expected nerfstudio's transforms.json.")
         pose = transform_of_rows(frame.get("transform_matrix"), f"{where}.transform_matrix")
         name = str(Path(frame["file_path"]).with_suffix(""))
