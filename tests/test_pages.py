@@ -202,8 +202,8 @@ def test_the_pages_are_read():
     for page in ("README.md", "docs/quick_start.md", "docs/kitti360.md"):
         programs = {words[0] for words in by_page[page]}
         assert {"edge-depth-nerf", "ns-train", "ns-eval", "ns-viewer"} <= programs, page
-    for lists in (words for words in by_page["docs/ablation.md"] if "synthesize" in words):
-        assert lists[lists.index("--scene") + 1] == "street"
+    lists = [words for words in by_page["docs/ablation.md"] if "synthesize" in words]
+    assert [words[words.index("--scene") + 1] for words in lists] == ["street"] * 2
     for page in PAGES:
         text = (ROOT / page).read_text(encoding="utf-8")
         found = len(re.findall(r"^ +(?:edge-depth-nerf|ns-[a-z]+) ", text, re.MULTILINE))

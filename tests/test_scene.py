@@ -8,6 +8,7 @@ import math
 import os
 import platform
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -407,20 +408,23 @@ def test_interrupted_run_is_continued(tmp_path: Path, monkeypatch: pytest.Monkey
             loaded.append(index)
         if index == stop_at:
             raise KeyboardInterrupt
+        if stop_at is not None and index > stop_at:
+            # long enough that a busy machine hears of the stop before the one after it begins
+            time.sleep(2)
         return content(index)
 
     output = tmp_path / "scene"
     with pytest.raises(KeyboardInterrupt):
         write(output, given=frames(load=functools.partial(load, stop_at=3)))
-    # those after it may have begun, and be done, before it was heard of
-    assert loaded[:4] == [0, 1, 2, 3]
+    # the next one may have begun
+    assert loaded[:4] == [0, 1, 2, 3] and len(loaded) <= 5
     assert not (output / "transforms.json").exists()
     # what a killed process leaves
     (output / f"images/image_02/.0000000003.{platform.node()}~{2**22 + 1}~7.png").write_bytes(b"half")
 
     loaded.clear()
     report = write(output, given=frames(load=functools.partial(load, stop_at=None)))
-    assert loaded in ([3, 4, 5], [3, 5], [3])
+    assert loaded in ([3, 4, 5], [3, 5])
     assert report.written == len(loaded)
     assert tree(output) == tree(tmp_path / "whole")
 
