@@ -1,12 +1,19 @@
-"""Trains so that a run killed at any moment can be taken up again, and stops where numbers are no longer finite."""
+"""Trains so that a run stopped at any moment can be taken up again, and stops itself where numbers are not finite."""
 
 from __future__ import annotations
 
 import dataclasses
 import os
+import shlex
 import shutil
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import FrameType
+from typing import Literal
 
 import torch
 import yaml
@@ -14,6 +21,7 @@ from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerC
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from edge_depth_nerf.entry import STOPPED_STATUS
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import remove_leftovers, write_text
 from edge_depth_nerf.pipeline import NotFiniteError
@@ -36,9 +44,62 @@ class EdgeDepthTrainerConfig(TrainerConfig):
 
 
 class EdgeDepthTrainer(Trainer):
-    """nerfstudio's trainer with checkpoints that are whole, and with finite numbers."""
+    """nerfstudio's trainer with checkpoints that are whole, and with finite numbers.
+
+    Ctrl-C ends it after the step it is at, with a checkpoint of that step and a line on how to go on.
+    """
 
     config: EdgeDepthTrainerConfig  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def __init__(self, config: EdgeDepthTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
+        """Take the configuration; see nerfstudio's Trainer."""
+        super().__init__(config, local_rank, world_size)
+        self._interruption = _Interruption()
+        self._last_step: int | None = None  # that this process has taken
+
+    def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
+        """Set up as nerfstudio does; Ctrl-C ends it with one line."""
+        try:
+            super().setup(test_mode)
+        except KeyboardInterrupt:
+            CONSOLE.print("\nStopped before the first step.")
+            raise SystemExit(STOPPED_STATUS) from None
+
+    def train(self) -> None:
+        """Train as nerfstudio does.
+
+        Raises:
+            SystemExit: after Ctrl-C, with status 130 and a checkpoint of the last step. Where the training was done and
+                only its viewer was up, Ctrl-C is how one ends it, and no error.
+
+        """
+        if self.world_size > 1 or threading.current_thread() is not threading.main_thread():
+            super().train()  # nerfstudio ends the processes of its ranks; signals reach the main thread alone
+            return
+        try:
+            with self._interruption.watched():
+                super().train()
+        except KeyboardInterrupt:
+            if self.training_state != "completed":
+                self._stop()
+
+    def _stop(self) -> None:
+        if self._last_step is None:
+            CONSOLE.print("\nStopped before the first step.")
+        else:
+            self.save_checkpoint(self._last_step)
+            remaining = self._start_step + self.config.max_num_iterations - self._last_step - 1
+            goes_on = (
+                " The same command goes on from there with --load-dir "
+                f"{shlex.quote(str(self.checkpoint_dir))} --max-num-iterations {remaining}"
+            )
+            CONSOLE.print(
+                f"\nStopped after step {self._last_step}, which is saved.{goes_on if remaining else ''}",
+                soft_wrap=True,
+                highlight=False,
+                markup=False,
+            )
+        raise SystemExit(STOPPED_STATUS) from None
 
     def train_iteration(self, step: int) -> TRAIN_INTERATION_OUTPUT:
         """Do a step as nerfstudio does.
@@ -48,7 +109,10 @@ class EdgeDepthTrainer(Trainer):
 
         """
         try:
-            return super().train_iteration(step)
+            with self._interruption.put_off():
+                result = super().train_iteration(step)
+                self._last_step = step
+            return result
         except NotFiniteError as error:
             raise InputError(f"{error} {self._kept()}") from error
 
@@ -69,6 +133,10 @@ class EdgeDepthTrainer(Trainer):
                 raise InputError(
                     f"The parameter {name} is no longer finite after step {step}: a gradient was not. {self._kept()}"
                 )
+        with self._interruption.put_off():
+            self._save_whole(step)
+
+    def _save_whole(self, step: int) -> None:
         folder = self.checkpoint_dir
         partial = self.base_dir / ".unfinished_checkpoint"
         shutil.rmtree(partial, ignore_errors=True)
@@ -129,6 +197,40 @@ class EdgeDepthTrainer(Trainer):
         if newest is None:
             return "No checkpoint was saved before."
         return f"The last checkpoint, {newest}, is kept; --load-dir {newest.parent} goes on from it."
+
+
+class _Interruption:
+    """Ctrl-C, kept back while what must be whole is done: a step, a checkpoint."""
+
+    def __init__(self) -> None:
+        self._busy = False
+        self._asked = False
+
+    @contextmanager
+    def watched(self) -> Iterator[None]:
+        """Answer Ctrl-C here, and as before afterwards."""
+        before = signal.signal(signal.SIGINT, self._on_signal)
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGINT, before)
+
+    @contextmanager
+    def put_off(self) -> Iterator[None]:
+        """Raise KeyboardInterrupt after what is done here, if it was asked for meanwhile."""
+        self._busy = True
+        try:
+            yield
+        finally:
+            self._busy = False
+        if self._asked:
+            self._asked = False
+            raise KeyboardInterrupt
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        if not self._busy:
+            raise KeyboardInterrupt
+        self._asked = True
 
 
 def _step_of(checkpoint: Path) -> int:

@@ -1,0 +1,113 @@
+"""Ctrl-C during a training: the step is finished, saved, and can be gone on from."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import pytest
+import torch
+from nerfstudio.pipelines.base_pipeline import Pipeline
+from scenes import write_scene
+from trainings import trainer_of
+
+from edge_depth_nerf.runs import newest_checkpoint
+from edge_depth_nerf.trainer import EdgeDepthTrainer
+
+STEPS = 6
+
+
+@pytest.fixture
+def trainer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> EdgeDepthTrainer:
+    monkeypatch.setenv("COLUMNS", "300")
+    write_scene(tmp_path / "scene")
+    return trainer_of(tmp_path / "scene", tmp_path / "runs", max_num_iterations=STEPS)
+
+
+def ctrl_c_within(trainer: EdgeDepthTrainer, at: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Send it in the middle of a step, between the losses and their gradients."""
+    pipeline = trainer.pipeline
+    given = pipeline.get_train_loss_dict
+
+    def interrupted(*, step: int):
+        result = given(step=step)
+        if step == at:
+            signal.raise_signal(signal.SIGINT)
+        return result
+
+    monkeypatch.setattr(pipeline, "get_train_loss_dict", interrupted)
+
+
+def parameters(pipeline: Pipeline) -> dict[str, torch.Tensor]:
+    return {name: value.detach().clone() for name, value in pipeline.model.named_parameters()}
+
+
+def test_ctrl_c_finishes_the_step_saves_it_and_says_how_to_go_on(trainer, tmp_path, monkeypatch, capsys):
+    before = signal.getsignal(signal.SIGINT)
+    ctrl_c_within(trainer, 3, monkeypatch)
+    with pytest.raises(SystemExit) as ended:
+        trainer.train()
+    assert ended.value.code == 130
+    assert signal.getsignal(signal.SIGINT) is before
+    newest = newest_checkpoint(trainer.checkpoint_dir)
+    assert newest is not None and newest.name == "step-000000003.ckpt"
+    said = capsys.readouterr().out
+    assert "Stopped after step 3, which is saved." in said and "Traceback" not in said
+    assert f"--load-dir {trainer.checkpoint_dir} --max-num-iterations {STEPS - 4}" in said
+    again = trainer_of(trainer.config.data, tmp_path / "again", load_dir=newest.parent, max_num_iterations=STEPS - 4)
+    expected = parameters(trainer.pipeline)
+    assert all(torch.equal(value, expected[name]) for name, value in parameters(again.pipeline).items())
+    again.train()
+    last = newest_checkpoint(again.checkpoint_dir)
+    assert last is not None and last.name == f"step-{STEPS - 1:09}.ckpt"
+
+
+def test_ctrl_c_in_the_last_step_leaves_nothing_to_go_on_with(trainer, monkeypatch, capsys):
+    ctrl_c_within(trainer, STEPS - 1, monkeypatch)
+    with pytest.raises(SystemExit):
+        trainer.train()
+    said = capsys.readouterr().out
+    assert f"Stopped after step {STEPS - 1}, which is saved.\n" in said and "--load-dir" not in said
+
+
+def test_ctrl_c_while_a_checkpoint_is_written_leaves_it_whole(trainer, monkeypatch):
+    save = torch.save
+
+    def interrupted(*arguments, **options):
+        monkeypatch.setattr(torch, "save", save)  # once
+        signal.raise_signal(signal.SIGINT)
+        save(*arguments, **options)
+
+    monkeypatch.setattr(torch, "save", interrupted)
+    trainer.train()  # the last checkpoint: training is complete
+    newest = newest_checkpoint(trainer.checkpoint_dir)
+    assert newest is not None and newest.name == f"step-{STEPS - 1:09}.ckpt"
+    assert os.listdir(trainer.checkpoint_dir) == [newest.name]
+
+
+def test_ctrl_c_ends_the_viewer_of_a_complete_training_without_error(trainer, monkeypatch, capsys):
+    after = trainer._after_train
+
+    def waits() -> None:
+        after()
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(trainer, "_after_train", waits)
+    trainer.train()
+    assert "Stopped" not in capsys.readouterr().out
+
+
+def test_ctrl_c_before_the_first_step(trainer, monkeypatch, capsys):
+    monkeypatch.setattr(trainer, "_init_viewer_state", lambda: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(SystemExit) as ended:
+        trainer.train()
+    assert ended.value.code == 130 and "Stopped before the first step." in capsys.readouterr().out
+    assert newest_checkpoint(trainer.checkpoint_dir) is None
+
+
+def test_ctrl_c_while_it_is_set_up(trainer, monkeypatch, capsys):
+    monkeypatch.setattr(trainer, "setup_optimizers", lambda: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(SystemExit) as ended:
+        trainer.setup()
+    assert ended.value.code == 130 and "Stopped before the first step." in capsys.readouterr().out
