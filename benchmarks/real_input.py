@@ -2,8 +2,9 @@
 
     python benchmarks/real_input.py --real ../shared/real --output outputs/real_input --steps 300
 
-Prints a table and leaves rendered views and figures under the output folder. A scene, run or figure that is there is
-not made again.
+Of the fisheye frame, blocks of LiDAR are held out; of the five stereo pairs, each pair in turn. Prints a table, with
+the mean over the pairs, and leaves rendered views and figures under the output folder. A scene, run or figure that is
+there is not made again.
 """
 
 from __future__ import annotations
@@ -11,8 +12,10 @@ from __future__ import annotations
 import argparse
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -24,7 +27,10 @@ from real_scenes import fisheye_frame_scene, stereo_scene  # noqa: E402  # pyrig
 from edge_depth_nerf.files import read_json  # noqa: E402
 
 METHOD = "edge-depth-nerf-lite"
-SCENES = {"fisheye frame": fisheye_frame_scene, "stereo drive": stereo_scene}
+SCENES = {
+    "fisheye frame": [("", fisheye_frame_scene)],
+    "stereo pairs": [(f" without {frame}", partial(stereo_scene, held_out=frame)) for frame in range(700, 705)],
+}
 LOSSES = {"nerfacto": "none", "ours": "edge"}
 COLUMNS = ("masked_psnr", "masked_ssim", "lidar_abs_rel", "lidar_rmse_m", "lidar_delta_1_25")
 
@@ -46,23 +52,40 @@ def main() -> None:
         sys.exit(f"{options.real}: no such folder; the real excerpts are not part of the project.")
 
     table = Table("scene", "method", *COLUMNS, title=f"{options.steps} steps, held-out LiDAR blocks or pictures")
-    for title, make in SCENES.items():
-        folder = options.output / title.replace(" ", "_")
-        scene = make(options.real, folder / "scene")
-        for name, loss in LOSSES.items():
-            figures = folder / name / "figures.json"
-            config = folder / name / METHOD / "run" / "config.yml"
-            if not figures.is_file():
-                command(
-                    *("ns-train", METHOD, "--data", scene, "--output-dir", folder, "--experiment-name", name),
-                    *("--timestamp", "run", "--vis", "tensorboard", "--max-num-iterations", options.steps),
-                    *("--pipeline.model.depth-loss", loss),
-                )
-                views = figures.with_name("views")
-                command("ns-eval", "--load-config", config, "--output-path", figures, "--render-output-path", views)
-            results = read_json(figures)["results"]
-            table.add_row(title, name, *(f"{results[key]:.3f}" if key in results else "–" for key in COLUMNS))
+    for title, scenes in SCENES.items():
+        found: dict[str, list[dict[str, float]]] = {name: [] for name in LOSSES}
+        for held_out, make in scenes:
+            folder = options.output / f"{title}{held_out}".replace(" ", "_")
+            scene = folder / "scene"
+            if not (scene / "transforms.json").is_file():
+                make(options.real, scene)
+            for name, loss in LOSSES.items():
+                results = figures_of(scene, folder, name, loss, options.steps)
+                found[name].append(results)
+                table.add_row(f"{title}{held_out}", name, *map(shown, (results.get(key) for key in COLUMNS)))
+        for name, results in found.items() if len(scenes) > 1 else ():
+            means = [float(np.mean([each[key] for each in results])) if key in results[0] else None for key in COLUMNS]
+            table.add_row(f"{title}, mean", name, *map(shown, means))
     Console(width=120).print(table)
+
+
+def figures_of(scene: Path, folder: Path, name: str, loss: str, steps: int) -> dict[str, float]:
+    """Train and judge, unless it is done."""
+    figures = folder / name / "figures.json"
+    config = folder / name / METHOD / "run" / "config.yml"
+    if not figures.is_file():
+        command(
+            *("ns-train", METHOD, "--data", scene, "--output-dir", folder, "--experiment-name", name),
+            *("--timestamp", "run", "--vis", "tensorboard", "--max-num-iterations", steps),
+            *("--pipeline.model.depth-loss", loss),
+        )
+        views = figures.with_name("views")
+        command("ns-eval", "--load-config", config, "--output-path", figures, "--render-output-path", views)
+    return read_json(figures)["results"]
+
+
+def shown(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3f}"
 
 
 if __name__ == "__main__":

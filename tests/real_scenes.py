@@ -84,10 +84,10 @@ def stereo_distance(left: np.ndarray, right: np.ndarray, camera: Pinhole, baseli
     return z_depth / directions[..., 2].numpy()
 
 
-def stereo_scene(real_data: Path, output: Path, downscale: int = 4) -> Path:
+def stereo_scene(real_data: Path, output: Path, downscale: int = 4, held_out: int = HELD_OUT_STEREO_FRAME) -> Path:
     """Ten real rectified pictures with poses; distance of the left ones by stereo matching, as a monocular source.
 
-    Both pictures of frame 702 are held out. The right pictures get theirs by matching mirrored pictures.
+    Both pictures of one frame are held out. The right pictures get theirs by matching mirrored pictures.
     """
     folder = real_data / "kitti360_stereo"
     meta = read_json(folder / "transforms.json")
@@ -118,7 +118,7 @@ def stereo_scene(real_data: Path, output: Path, downscale: int = 4) -> Path:
                     frame=int(moment),
                     camera_to_world=poses[f"{moment}_0{side}"] @ opengl_to_opencv,
                     content=content,
-                    held_out=int(moment) == HELD_OUT_STEREO_FRAME,
+                    held_out=int(moment) == held_out,
                 )
             )
     cameras = [SceneCamera(f"image_0{side}", camera.downscaled(downscale)) for side in (0, 1)]
