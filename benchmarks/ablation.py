@@ -139,7 +139,7 @@ def main() -> None:
             for scene in options.scenes if chosen else ():
                 key = key_of(scene.resolve().name, options, group, variant)
                 if key not in done:
-                    # λ falls over this training, as it does over the preset's
+                    # no trainer tells the model how many
                     overrides = {MODEL + "depth_loss_steps": options.steps, **variant.overrides}
                     own[key] = done[key] = train(scene, overrides, options.steps, options.seed, variant.change)
                     if options.json:

@@ -61,8 +61,8 @@ class EdgeDepthNerfModelConfig(NerfactoModelConfig):
     depth_loss_final: float = 0.01
     """The share of λ that is left after `depth_loss_steps`; until then it falls exponentially. The prior shapes the
     scene early, and its errors at the outlines of things hold the pictures back late. 1: λ stays."""
-    depth_loss_steps: int = 30000
-    """Steps in which λ falls."""
+    depth_loss_steps: int | None = None
+    """Steps in which λ falls. None: those of the whole training, or 30,000 where no trainer says how many."""
     sky_loss_mult: float = 0.01
     """With the edge loss: weight of what rays into the sky hit, their accumulated weight. 0: the sky is left to
     colour."""
@@ -220,12 +220,17 @@ class EdgeDepthNerfModel(NerfactoModel):
         if self.config.exposure == "gain":
             self.log_gains = torch.nn.Parameter(torch.zeros(self.num_train_data, 3))
         self._step = 0
+        self._training_steps = 30_000
         self.reset_depth_errors()
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
         """Nerfacto's callbacks, and one that tells the step."""
+        trainer = training_callback_attributes.trainer
+        if trainer is not None:
+            # nerfstudio counts those that are still to come
+            self._training_steps = trainer._start_step + trainer.config.max_num_iterations
 
         def remember(step: int) -> None:
             self._step = step
@@ -320,7 +325,8 @@ class EdgeDepthNerfModel(NerfactoModel):
 
     def _depth_weight(self) -> float:
         """λ at this step."""
-        share = min(1.0, self._step / max(1, self.config.depth_loss_steps))
+        steps = self._training_steps if self.config.depth_loss_steps is None else self.config.depth_loss_steps
+        share = min(1.0, self._step / max(1, steps))
         return self.config.depth_loss_mult * self.config.depth_loss_final**share
 
     def _sky_and_surface_losses(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:

@@ -63,6 +63,19 @@ def test_ctrl_c_finishes_the_step_saves_it_and_says_how_to_go_on(trainer, tmp_pa
     assert last is not None and last.name == f"step-{STEPS - 1:09}.ckpt"
 
 
+def test_lambda_falls_over_the_whole_training_also_of_one_taken_up_again(trainer, tmp_path):
+    whole = trainer.pipeline.model
+    assert whole.config.depth_loss_steps is None and whole.config.depth_loss_final == 0.01
+    trainer.train()
+    last = whole._depth_weight()
+    assert last == pytest.approx(whole.config.depth_loss_mult * 0.01 ** ((STEPS - 1) / STEPS))
+    folder = trainer.checkpoint_dir
+    longer = trainer_of(trainer.config.data, tmp_path / "longer", load_dir=folder, max_num_iterations=STEPS)
+    longer.train()
+    weight = longer.pipeline.model._depth_weight()
+    assert weight == pytest.approx(whole.config.depth_loss_mult * 0.01 ** ((2 * STEPS - 1) / (2 * STEPS)))
+
+
 def test_ctrl_c_in_the_last_step_leaves_nothing_to_go_on_with(trainer, monkeypatch, capsys):
     ctrl_c_within(trainer, STEPS - 1, monkeypatch)
     with pytest.raises(SystemExit):
