@@ -568,6 +568,33 @@ def test_a_folder_keeps_what_its_runs_share(tmp_path, monkeypatch):
         command.compare(first, QUIET)
 
 
+def test_methods_may_be_tuned_after_others(tmp_path):
+    scene, output = write_scene(tmp_path / "x"), tmp_path / "out"
+
+    def open_with(methods: tuple[str, ...], **tuned: float) -> None:
+        path = tmp_path / "tuned.json"
+        content = {name.replace("_", "-"): {"lambda": value, "sigma_m": 0.5} for name, value in tuned.items()}
+        write_json(path, {"scene": "tuning", "methods": content})
+        asked = options(scene, output=output, steps=5, methods=methods, tuned=path)
+        command.open_output(asked, command.read_tuned(path))
+        for name in methods:
+            (output / "runs" / "x" / f"{name}_seed-0").mkdir(parents=True, exist_ok=True)
+
+    open_with(("ds-nerf",), ds_nerf=0.1)
+    open_with(("edge",), ds_nerf=0.1, edge=0.01)
+    assert read_json(output / "compare.json")["tuned"] == {
+        "ds-nerf": {"lambda": 0.1, "sigma_m": 0.5},
+        "edge": {"lambda": 0.01, "sigma_m": 0.5},
+    }
+    open_with(("nerfacto",), ds_nerf=0.1, edge=0.01)
+    for tuned in ({"ds_nerf": 0.1, "edge": 0.02}, {"ds_nerf": 0.1}):  # another value; one that is gone
+        with pytest.raises(InputError, match="holds a comparison with tuned"):
+            open_with(("edge",), **tuned)
+    (output / "runs" / "x" / "edge-lidar_seed-0").mkdir()  # trained with the default
+    with pytest.raises(InputError, match="holds a comparison with tuned"):
+        open_with(("edge-lidar",), ds_nerf=0.1, edge=0.01, edge_lidar=0.01)
+
+
 def test_a_run_that_fails_names_its_log(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "executable", shutil.which("false"))
     scene, output = write_scene(tmp_path / "x"), tmp_path / "out"

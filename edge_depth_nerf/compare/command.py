@@ -217,6 +217,10 @@ def open_output(options: CompareOptions, tuned: dict[str, Setting]) -> None:
     path, command = options.output / RECORD, command_line(["edge-depth-nerf", "compare"], options)
     if path.is_file():
         found = read_json_object(path)
+        added = [name for name in record["tuned"] if name not in found.get("tuned", {})]
+        if not [run for name in added for run in options.output.glob(f"runs/*/{name}_seed-*")]:
+            # methods that have no run yet may be tuned later than the others
+            found["tuned"] = {**found.get("tuned", {}), **{name: record["tuned"][name] for name in added}}
         different = [name for name in record if record[name] != found.get(name)]
         if different:
             name = different[0]
@@ -225,8 +229,8 @@ def open_output(options: CompareOptions, tuned: dict[str, Setting]) -> None:
                 "another --output, or remove the folder."
             )
         commands = found.get("commands", [])
-        if command not in commands:
-            write_json(path, {**found, "commands": [*commands, command]})
+        if command not in commands or added:
+            write_json(path, {**found, "commands": [*commands, *([] if command in commands else [command])]})
         return
     if options.output.is_dir() and any(options.output.iterdir()):
         raise InputError(f"{options.output}: holds other things. Choose a new or empty folder for --output.")
