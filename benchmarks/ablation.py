@@ -20,13 +20,13 @@ from typing import Any
 
 import numpy as np
 from ablate import train
+from pages import with_part
 from rich.console import Console
 from tried import guided_samples, line_of_sight
 
 from edge_depth_nerf.files import read_json, write_json, write_text
 
 MODEL, DATA = "pipeline.model.", "pipeline.datamanager."
-BEGIN, END = "<!-- ablation -->\n", "<!-- end of ablation -->\n"
 
 
 @dataclass(frozen=True)
@@ -145,11 +145,10 @@ def main() -> None:
                     if options.json:
                         write_json(options.json[0], own)
                     console.print(key, {name: round(value, 4) for name, value in done[key].items()})
-    rows = "\n".join(table(done, options)) + "\n"
+    rows = "\n".join(table(done, options))
     console.print(rows)
     if options.page:
-        before, rest = options.page.read_text(encoding="utf-8").split(BEGIN)
-        write_text(options.page, before + BEGIN + rows + END + rest.split(END)[1])
+        write_text(options.page, with_part(options.page.read_text(encoding="utf-8"), "ablation", rows))
 
 
 if __name__ == "__main__":

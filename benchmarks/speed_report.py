@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from edge_depth_nerf.files import write_atomically
+from pages import with_part
 
-OPEN, CLOSE = "<!-- speed: {} -->", "<!-- end -->"
-"""Between these lines a page has a table."""
+from edge_depth_nerf.files import write_atomically
 
 
 def middle(values: Sequence[float]) -> float:
@@ -152,11 +151,8 @@ TABLES = {"summary": summary, "trainers": trainers, "growth": growth, "data": da
 def with_tables(page: str, results: dict[str, Any]) -> str:
     """A page with its tables made anew."""
     for name, make in TABLES.items():
-        begin = page.find(OPEN.format(name))
-        if begin >= 0:
-            begin += len(OPEN.format(name))
-            end = page.index(CLOSE, begin)
-            page = f"{page[:begin]}\n{make(results)}\n{page[end:]}"
+        if f"<!-- speed: {name} -->" in page:
+            page = with_part(page, f"speed: {name}", make(results))
     return page
 
 

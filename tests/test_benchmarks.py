@@ -1,31 +1,44 @@
-"""The benchmark's tables: what README and docs/speed.md say is what its results hold."""
+"""The benchmarks' tables: what README and the pages say is what their results hold."""
 
 from __future__ import annotations
 
+import argparse
+import copy
+import importlib
 import json
 import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+from nerfstudio.configs.method_configs import all_methods
+
+from edge_depth_nerf.config import apply_overrides
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results.json"
 
 
 @pytest.fixture
-def report(monkeypatch):
+def benchmark_module(monkeypatch):
+    """Import a module of benchmarks/ by its name."""
+    before = set(sys.modules)
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    import speed_report  # pyright: ignore[reportMissingImports]
+    yield importlib.import_module
+    for name in set(sys.modules) - before:
+        if (ROOT / "benchmarks" / f"{name}.py").is_file():
+            sys.modules.pop(name)
 
-    yield speed_report
-    sys.modules.pop("speed_report")
+
+@pytest.fixture
+def report(benchmark_module):
+    return benchmark_module("speed_report")
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/speed.md"])
 def test_the_pages_have_the_tables_of_the_results(report, page):
     text = (ROOT / page).read_text(encoding="utf-8")
-    assert report.OPEN.format("summary") in text
+    assert "<!-- speed: summary -->" in text
     assert report.with_tables(text, json.loads(RESULTS.read_text())) == text
 
 
@@ -50,3 +63,53 @@ def test_tables_of_a_run_that_has_not_all_parts(report, tmp_path):
         assert make({}).count("\n") == 1
     report.draw({}, tmp_path / "curves.svg")
     assert ElementTree.parse(tmp_path / "curves.svg").getroot().tag.endswith("svg")
+
+
+def test_a_part_of_a_page_is_replaced_and_nothing_else(benchmark_module, tmp_path, monkeypatch):
+    pages = benchmark_module("pages")
+    page, written = tmp_path / "page.md", tmp_path / "tables.md"
+    page.write_text("# Page\n<!-- a -->\nold\n<!-- end -->\nbetween\n<!-- b -->\nstays\n<!-- end -->\n")
+    written.write_text("# Comparison\n\nwords\n\n## Table 1\n\n| # |\n")
+    monkeypatch.setattr(sys, "argv", ["pages.py", str(page), f"a={written}"])
+    for _ in range(2):  # the second time nothing changes
+        pages.main()
+        assert page.read_text() == (
+            "# Page\n<!-- a -->\nwords\n\n### Table 1\n\n| # |\n<!-- end -->\n"
+            "between\n<!-- b -->\nstays\n<!-- end -->\n"
+        )
+    monkeypatch.setattr(sys, "argv", ["pages.py", str(page), f"c={written}"])
+    with pytest.raises(SystemExit):
+        pages.main()
+
+
+def test_the_ablation_has_a_row_for_what_was_trained_on_every_drive(benchmark_module):
+    ablation = benchmark_module("ablation")
+    options = argparse.Namespace(scenes=[Path("street"), Path("turn")], steps=10, seed=0)
+    (base, *_), group = ablation.STUDY[""], next(name for name in ablation.STUDY if name.startswith("λ"))
+    lower, *others = ablation.STUDY[group]
+
+    def figures(psnr: float) -> dict[str, float]:
+        return {"truth_psnr": psnr, "truth_abs_rel": 0.05, "truth_delta_1_25": 0.9}
+
+    done = {
+        ablation.key_of("street", options, "", base): figures(30.0),
+        ablation.key_of("turn", options, "", base): figures(32.0),
+        ablation.key_of("street", options, group, lower): figures(29.0),
+        ablation.key_of("turn", options, group, lower): figures(32.5),
+        ablation.key_of("turn", options, group, others[0]): figures(40.0),  # not yet on every drive
+    }
+    lines = ablation.table(done, options)
+    assert lines[0] == "| | street | turn | mean PSNR | against “as it is” | AbsRel | δ < 1.25 |"
+    assert lines[2] == "| as it is | 30.00 | 32.00 | 31.00 | +0.00 | 0.050 | 0.900 |"
+    assert lines[4] == f"| {lower.title} | 29.00 | 32.50 | 30.75 | -0.25 | 0.050 | 0.900 |"
+    assert len(lines) == 5
+
+
+def test_no_two_variants_of_the_ablation_are_the_same(benchmark_module):
+    ablation = benchmark_module("ablation")
+    variants = [variant for members in ablation.STUDY.values() for variant in members]
+    settings = [(str(variant.overrides), str(variant.change)) for variant in variants]
+    assert len(set(settings)) == len(settings) > 20
+    for variant in variants:  # what it overrides exists
+        config = copy.deepcopy(all_methods["edge-depth-nerf-lite"])
+        apply_overrides(config, variant.overrides, "ablation")
