@@ -27,6 +27,8 @@ def main() -> None:
 
     Exit status: 0; 1 for a bug; 2 for what the user can mend (also of options); 130 after Ctrl-C.
     """
+    # before OpenMP is loaded, and for the commands that this one starts; why: openmp.py
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     arguments = [argument for argument in sys.argv[1:] if argument != DEBUG_OPTION]
     if len(arguments) < len(sys.argv) - 1:
         os.environ[DEBUG_VARIABLE] = "1"  # for the commands that this one starts, too

@@ -33,6 +33,7 @@ from edge_depth_nerf.fused.losses import distortion_loss, proposal_loss
 from edge_depth_nerf.fused.sampler import FusedPDFSampler, edges_of
 from edge_depth_nerf.losses import edge_loss, sky_loss
 from edge_depth_nerf.metrics import DepthErrors, load_lpips, masked_lpips, masked_psnr, masked_ssim
+from edge_depth_nerf.openmp import let_idle_threads_sleep
 from edge_depth_nerf.pictures import DISTANCE, SIGMA, colour_distance
 from edge_depth_nerf.uncertainty import termination_std
 
@@ -177,6 +178,7 @@ class EdgeDepthNerfModel(NerfactoModel):
             implementation = "tcnn" if TCNN_EXISTS and on_gpu else "fused"
         if torch.device(self.kwargs.get("device", "cpu")).type == "cpu":
             keep_freed_memory()
+            let_idle_threads_sleep()
         # nerfstudio knows two of them; the model's own configuration says which was built
         self.config = replace(self.config, implementation="tcnn" if implementation == "tcnn" else "torch")
         self._fused = implementation == "fused"

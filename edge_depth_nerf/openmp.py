@@ -1,0 +1,55 @@
+"""What OpenMP's threads do on the CPU while they have nothing to do.
+
+GNU's OpenMP, which torch brings, lets a thread that is done with its part turn in a loop for some milliseconds, in case
+that more is to come. A training step here goes back and forth between torch's threads and Numba's, and those that turn
+take the cores from those that work: a step takes a sixth longer, and ten times as long beside another busy process
+(docs/speed.md).
+
+`OMP_WAIT_POLICY=passive` lets them sleep, but is read when the library is loaded; in `ns-train` that is before this
+package is. The library also gives the turning up, but for a moment, once it has made more threads than there are cores
+(`gomp_throttled_spin_count_var`, libgomp's config/linux/wait.h). So some are made that sleep for ever.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+
+import torch
+
+WAIT_POLICY, PASSIVE = "OMP_WAIT_POLICY", "passive"
+_CHOSEN_BY = (WAIT_POLICY, "GOMP_SPINCOUNT")
+"""Where these are set, somebody has chosen already."""
+_ENOUGH = 1 << 17
+"""Numbers that torch adds with all its threads; with up to 32,768 it takes one."""
+_lock = threading.Lock()
+_teams: list[threading.Thread] = []
+
+
+def let_idle_threads_sleep() -> bool:
+    """Let torch's threads sleep when they have nothing to do, in this process, from now on.
+
+    Returns:
+        Whether that was for this function to do: not with other libraries than GNU's, with one thread, or where the
+        environment says how threads wait.
+
+    """
+    threads, cores = torch.get_num_threads(), len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 0
+    if threads < 2 or not cores or any(name in os.environ for name in _CHOSEN_BY):
+        return False
+    if "ATen parallel backend: OpenMP" not in torch.__config__.parallel_info():
+        return False
+    with _lock:
+        # a Python thread that asks for work in parallel gets a team of its own, of which it is one
+        while threads + len(_teams) * (threads - 1) <= cores:
+            ready = threading.Event()
+            _teams.append(threading.Thread(target=_work_once, args=(ready,), name="idle OpenMP team", daemon=True))
+            _teams[-1].start()
+            ready.wait()
+    return True
+
+
+def _work_once(ready: threading.Event) -> None:
+    torch.zeros(_ENOUGH).add_(1.0)
+    ready.set()
+    threading.Event().wait()
