@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -79,11 +80,15 @@ def run(command: Command) -> None:
             from edge_depth_nerf.synthetic.drive import synthesize_drive
 
         synthesize_drive(command)
+        _say_next("Make a scene of it", f"edge-depth-nerf process {_converter(command)} --output SCENE")
     elif isinstance(command, Process):
         with _starting():
             from edge_depth_nerf.process.many import process_drive
 
-        process_drive(command.options)
+        scenes = process_drive(command.options)
+        scene = shlex.quote(str(scenes[0]))
+        _say_next("Look at it", f"edge-depth-nerf inspect {scene}")
+        _say_next("Train (-lite: without a GPU)", f"ns-train edge-depth-nerf-lite --data {scene}")
     elif isinstance(command, EstimateDepthOptions):
         with _starting():
             from edge_depth_nerf.mono.estimate import estimate_depth
@@ -114,6 +119,22 @@ def run(command: Command) -> None:
             from edge_depth_nerf.demo import run_demo
 
         run_demo(command)
+
+
+def _converter(options: SynthesizeOptions) -> str:
+    """What reads a drive that was synthesised, with its options."""
+    root = shlex.quote(str(options.output))
+    if options.layout == "rig":
+        return f"rig --root {root}"
+    if options.layout == "jbnu-depth360":
+        return f"jbnu-depth360 --root {root} --calibration {root}/calibration.toml"
+    return f"kitti360 --root {root} --sequence {options.sequence}"
+
+
+def _say_next(what: str, command: str) -> None:
+    from edge_depth_nerf.console import say
+
+    say(Console(), f"{what}: {command}")
 
 
 if __name__ == "__main__":

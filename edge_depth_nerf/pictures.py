@@ -316,20 +316,22 @@ def lay_out(panels: Sequence[NDArray[np.uint8]], columns: int, heading: Sequence
 
 
 def side_by_side(rows: Sequence[Sequence[NDArray[np.uint8]]], titles: Sequence[str]) -> NDArray[np.uint8]:
-    """Lay out pictures of one size in rows, with a title above each column and a thin gap between them.
+    """Lay out pictures in rows, with a title above each column and a thin gap between them.
 
     Args:
-        rows: each with one H×W×3 picture a column.
+        rows: each with one H×W×3 picture a column, of one size in a row; narrower ones stand in the middle.
         titles: one a column.
 
     """
     gap, bar = 6, 34
-    height, width = rows[0][0].shape[:2]
-    sheet = np.full((bar + len(rows) * (height + gap) - gap, len(titles) * (width + gap) - gap, 3), 255, dtype=np.uint8)
+    heights, width = [row[0].shape[0] for row in rows], max(row[0].shape[1] for row in rows)
+    sheet = np.full((bar + sum(heights) + gap * (len(rows) - 1), len(titles) * (width + gap) - gap, 3), 255, np.uint8)
     for column, title in enumerate(titles):
-        left = column * (width + gap)
-        for row, pictures in enumerate(rows):
-            top = bar + row * (height + gap)
-            sheet[top : top + height, left : left + width] = pictures[column]
+        left, top = column * (width + gap), bar
         write_text(sheet, title, (left + width // 2, 23), align=0.5, max_width=width)
+        for row, height in zip(rows, heights, strict=True):
+            own = row[column].shape[1]
+            begin = left + (width - own) // 2
+            sheet[top : top + height, begin : begin + own] = row[column]
+            top += height + gap
     return sheet

@@ -137,3 +137,12 @@ def test_a_sheet_holds_its_pictures():
     assert sheet.shape == (34 + 46, 66, 3)
     assert (sheet[34:54, :30] == red).all() and (sheet[60:80, 36:] == red).all()
     assert (sheet[34:54, 36:] == green).all()
+
+
+def test_a_sheet_holds_pictures_of_cameras_of_different_sizes():
+    large, small = (np.full((*size, 3), colour, np.uint8) for size, colour in (((20, 30), 10), ((8, 24), 90)))
+    sheet = side_by_side([[small, small], [large, large]], ["a", "b"])
+    assert sheet.shape == (34 + 8 + 6 + 20, 66, 3)
+    assert (sheet[34:42, 3:27] == 90).all() and (sheet[34:42, 39:63] == 90).all()
+    assert (sheet[48:, :30] == 10).all() and (sheet[48:, 36:] == 10).all()
+    assert (sheet[34:42, :3] == 255).all()
