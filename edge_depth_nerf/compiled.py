@@ -6,12 +6,20 @@ result is kept beside the module, or in the user's cache if that folder cannot b
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from numba import njit
 
+TRAINING = (
+    "edge_depth_nerf.encodings.cpu",
+    "edge_depth_nerf.fused.contraction",
+    "edge_depth_nerf.fused.ray_kernels",
+    "edge_depth_nerf.integration_numba",
+)
+"""The modules whose kernels a training on the CPU calls."""
 _folders: set[Path] = set()
 """Where Numba keeps what it compiled."""
 
@@ -33,6 +41,8 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any
     return decorate
 
 
-def compiled_before() -> bool:
-    """Whether kernels of the modules imported so far lie compiled on disk; otherwise their first calls take long."""
+def compiled_before(modules: Sequence[str] = TRAINING) -> bool:
+    """Whether the kernels of modules lie compiled on disk; otherwise their first calls take long."""
+    for module in modules:
+        import_module(module)  # tells its folder
     return bool(_folders) and all(any(folder.glob("*.nbi")) for folder in _folders)

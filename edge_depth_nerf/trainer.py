@@ -18,6 +18,7 @@ from typing import Literal
 import torch
 import yaml
 from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerConfig
+from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
@@ -61,6 +62,9 @@ class EdgeDepthTrainer(Trainer):
         """Set up as nerfstudio does; Ctrl-C ends it with one line."""
         try:
             super().setup(test_mode)
+            if "max_iter" in writer.GLOBAL_BUFFER:
+                # nerfstudio shows steps against those still to come, past 100 % after a resume
+                writer.GLOBAL_BUFFER["max_iter"] = self._start_step + self.config.max_num_iterations
         except KeyboardInterrupt:
             CONSOLE.print("\nStopped before the first step.")
             raise SystemExit(STOPPED_STATUS) from None

@@ -592,7 +592,7 @@ def test_first_frames_and_stride(tmp_path: Path) -> None:
     ("options", "message"),
     [
         ({"first": 3}, "--first 3: reaches frame 3, but the pictures .* are of frames 0 to 2"),
-        ({"frames": 4}, "--first 0 --frames 4 --stride 1: reaches frame 3.*leave out --frames"),
+        ({"frames": 4}, "--first 0 --frames 4 --stride 1: reaches frame 3.*leave out --first and --frames"),
         ({"frames": 2, "stride": 3}, "reaches frame 3"),
         ({"first": -1}, "--first -1: expected"),
         ({"frames": 0}, "--frames 0: expected 1 or more"),

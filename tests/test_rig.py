@@ -389,7 +389,7 @@ LEFT = '[cameras.left]\nimages = "images/left"'
         ("fx = 33.9625035468", "fx = 0", r"cameras\.left\.fx is 0, expected a number above 0"),
         ("fx = 33.9625035468", "fx = true", r"cameras\.left\.fx is True, expected a number"),
         ("fx = 33.9625035468", "fx = nan", r"cameras\.left\.fx is nan, expected a number"),
-        ("fx = 33.9625035468", "fxx = 33.9", r"cameras\.left\.fx is missing.*Is fxx meant"),
+        ("fx = 33.9625035468", "fxx = 33.9", r"cameras\.left\.fx is missing.*There is fxx: is fx meant"),
         ("cx = 64.396", "cx = 643.96", r"cameras\.left\.cx is 643\.96, expected a pixel within the picture, 0 to 128"),
         ("width = 128", "width = 128.5", r"cameras\.left\.width is 128\.5, expected a whole number from 1"),
         ("width = 128", "width = 96", r"000000\.png: 128×128 pixels, but its camera's calibration says 96×128"),

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from nerfstudio.pipelines.base_pipeline import Pipeline
+from nerfstudio.utils import writer
 from scenes import write_scene
 from trainings import trainer_of
 
@@ -71,6 +72,7 @@ def test_lambda_falls_over_the_whole_training_also_of_one_taken_up_again(trainer
     assert last == pytest.approx(whole.config.depth_loss_mult * 0.01 ** ((STEPS - 1) / STEPS))
     folder = trainer.checkpoint_dir
     longer = trainer_of(trainer.config.data, tmp_path / "longer", load_dir=folder, max_num_iterations=STEPS)
+    assert writer.GLOBAL_BUFFER["max_iter"] == 2 * STEPS  # what steps are shown against
     longer.train()
     weight = longer.pipeline.model._depth_weight()
     assert weight == pytest.approx(whole.config.depth_loss_mult * 0.01 ** ((2 * STEPS - 1) / (2 * STEPS)))

@@ -25,6 +25,9 @@ LARGEST_FIT_RMS_PX = 0.1
 """A fit worse than this shifts what training sees against LiDAR."""
 LARGEST_SCALE_FACTOR = 1.25
 """Monocular distance that is off by more than this against LiDAR is not aligned to it."""
+LARGEST_SHAPE_ERROR = 0.2
+"""Where monocular and LiDAR distance differ by more than this whatever the scale, they are not of the same things. On
+rendered drives it is 0.04-0.07, with one camera's transform inverted 0.31."""
 _NAMED = 5
 
 
@@ -57,6 +60,7 @@ def find(scene: SceneFolder, measured: Sequence[PictureFigures]) -> list[Finding
         *_masks(measured),
         *_outliers(measured),
         *_mono_scale(measured),
+        *_mono_shape(measured),
     ]
 
 
@@ -263,6 +267,24 @@ def _mono_scale(measured: Sequence[PictureFigures]) -> Iterator[Finding]:
             (name,),
             () if every else tuple(wrong),
         )
+
+
+def _mono_shape(measured: Sequence[PictureFigures]) -> Iterator[Finding]:
+    """What a wrong transform looks like: LiDAR may cover as much of the pictures, but not with what they show."""
+    for name, figures in _by_camera(measured).items():
+        ratios = [one.mono_over_lidar for one in figures if len(one.mono_over_lidar)]
+        if not ratios:
+            continue
+        # whatever scale each map has
+        off = float(np.median(np.concatenate([np.abs(ratio / np.median(ratio) - 1) for ratio in ratios])))
+        if off > LARGEST_SHAPE_ERROR:
+            yield Finding(
+                "mono_shape",
+                f"Monocular distance and LiDAR's differ by {off:.0%} in {name} (median, with each map's scale set "
+                "right). See in the sheets whether LiDAR lies on the things it hit: if not, a transform or a clock is "
+                "wrong.",
+                (name,),
+            )
 
 
 def limited(findings: Sequence[Finding], of_a_kind: int = _NAMED) -> list[str]:

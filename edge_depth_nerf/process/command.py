@@ -91,4 +91,5 @@ def _add_mono(scene: SceneFolder, options: ProcessOptions, console: Console) -> 
 
         if saved_trust(scene, PriorOptions()) is None:
             trust = calibrate_scene(scene.path, console=console)
-            say(console, f"Monocular maps: {trust.summary()}")
+            summary = trust.summary()
+            say(console, summary[0].upper() + summary[1:])

@@ -203,10 +203,15 @@ class _Table:
         """The value of a key that must be there."""
         self._known.append(key)
         if key not in self._values:
-            similar = difflib.get_close_matches(key, self._values, 1, 0.75)
-            hint = f" Is {similar[0]} meant?" if similar else ""
-            raise InputError(f"{self.where(key)} is missing; expected {expected}.{hint}")
+            raise InputError(f"{self.where(key)} is missing; expected {expected}.{self.slip_for(key)}")
         return self._values.pop(key)
+
+    def slip_for(self, *keys: str) -> str:
+        """A question about a key that is there, if it looks like one of those that are missing."""
+        for key in keys:
+            for found in difflib.get_close_matches(key, self._values, 1, 0.75):
+                return f" There is {found}: is {key} meant?"
+        return ""
 
     def number(
         self, key: str, default: float | None = None, above: float = -math.inf, most: float = MAX_TIME_S
@@ -390,6 +395,7 @@ def _clock(table: _Table, root: Path) -> Clock:
         found = " and ".join(given) if given else "none"
         raise InputError(
             f"{table.where('times_file')}: expected one of {', '.join(keys)}, found {found}: each file needs a time."
+            f"{'' if given else table.slip_for(*keys)}"
         )
     if table.has("times_from_names"):
         table.choice("times_from_names", (True,))
