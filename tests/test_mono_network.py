@@ -429,6 +429,16 @@ def test_held_out_pictures_have_no_say_and_the_command_continues(small_street, t
     assert estimate_depth(EstimateDepthOptions((small_street,), train_steps=7), quiet).trained is not None
 
 
+def test_a_network_whose_time_was_up_early_is_told_of(small_street):
+    said_to = io.StringIO()
+    console = Console(file=said_to, width=200)
+    report = estimate_depth(EstimateDepthOptions((small_street,), train_steps=100_000, seconds=0.3), console)
+    assert report.trained is not None and report.trained.steps < 200
+    said = said_to.getvalue()
+    assert f"Trained {report.trained.steps} steps of 100,000, where its time was up, in " in said
+    assert "make poor maps: give it more seconds" in said
+
+
 def test_weights_know_how_they_were_made_and_predict_other_scenes(small_street, tmp_path, monkeypatch, capsys):
     model = tmp_path / "street.safetensors"
     monkeypatch.setattr(

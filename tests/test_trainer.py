@@ -13,6 +13,7 @@ from nerfstudio.utils import writer
 from scenes import write_scene
 from trainings import trainer_of
 
+from edge_depth_nerf.model import EdgeDepthNerfModel
 from edge_depth_nerf.runs import newest_checkpoint
 from edge_depth_nerf.trainer import EdgeDepthTrainer
 
@@ -66,6 +67,7 @@ def test_ctrl_c_finishes_the_step_saves_it_and_says_how_to_go_on(trainer, tmp_pa
 
 def test_lambda_falls_over_the_whole_training_also_of_one_taken_up_again(trainer, tmp_path):
     whole = trainer.pipeline.model
+    assert isinstance(whole, EdgeDepthNerfModel)
     assert whole.config.depth_loss_steps is None and whole.config.depth_loss_final == 0.01
     trainer.train()
     last = whole._depth_weight()
@@ -74,8 +76,11 @@ def test_lambda_falls_over_the_whole_training_also_of_one_taken_up_again(trainer
     longer = trainer_of(trainer.config.data, tmp_path / "longer", load_dir=folder, max_num_iterations=STEPS)
     assert writer.GLOBAL_BUFFER["max_iter"] == 2 * STEPS  # what steps are shown against
     longer.train()
-    weight = longer.pipeline.model._depth_weight()
-    assert weight == pytest.approx(whole.config.depth_loss_mult * 0.01 ** ((2 * STEPS - 1) / (2 * STEPS)))
+    model = longer.pipeline.model
+    assert isinstance(model, EdgeDepthNerfModel)
+    assert model._depth_weight() == pytest.approx(
+        whole.config.depth_loss_mult * 0.01 ** ((2 * STEPS - 1) / (2 * STEPS))
+    )
 
 
 def test_ctrl_c_in_the_last_step_leaves_nothing_to_go_on_with(trainer, monkeypatch, capsys):

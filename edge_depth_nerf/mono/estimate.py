@@ -65,6 +65,8 @@ WEIGHTS = "mono_network.safetensors"
 """The weights' file in a scene."""
 KEEP_EVERY = 8
 """One training moment of so many is kept for stopping."""
+_FEW_STEPS = 200
+"""Less makes poor maps: on a rendered street the error is 27 % after 42 steps, 4 % after 1,000."""
 _HEIGHT_PICTURES = 20
 """The camera's height is taken from so many pictures of each camera."""
 _EYE_LEVEL_M = 1.6
@@ -335,12 +337,21 @@ def _train(
     }
     save_network(weights, trained.network, about)
     checkpoint.unlink(missing_ok=True)
+    short = not trained.stopped_early and trained.steps < training.steps
     early = ", where it stopped by itself" if trained.stopped_early else ""
+    if short:
+        early = f" of {training.steps:,}, where its time was up,"
     judged = "" if kept is None else f"; error on the {len(kept)} pictures kept for stopping: {trained.abs_rel:.1%}"
     console.print(
         f"Trained {trained.steps} steps{early} in {trained.seconds:.0f} s on {len(examples)} pictures{judged}",
         soft_wrap=True,
     )
+    if short and trained.steps < _FEW_STEPS:
+        console.print(
+            f"Fewer than {_FEW_STEPS} steps make poor maps: give it more seconds, or a machine that does nothing else.",
+            style="yellow",
+            soft_wrap=True,
+        )
     return trained.network, weights, about, trained
 
 
