@@ -78,9 +78,8 @@ def test_lambda_falls_over_the_whole_training_also_of_one_taken_up_again(trainer
     longer.train()
     model = longer.pipeline.model
     assert isinstance(model, EdgeDepthNerfModel)
-    assert model._depth_weight() == pytest.approx(
-        whole.config.depth_loss_mult * 0.01 ** ((2 * STEPS - 1) / (2 * STEPS))
-    )
+    share = 0.01 ** ((2 * STEPS - 1) / (2 * STEPS))
+    assert model._depth_weight() == pytest.approx(whole.config.depth_loss_mult * share)
 
 
 def test_ctrl_c_in_the_last_step_leaves_nothing_to_go_on_with(trainer, monkeypatch, capsys):
