@@ -201,7 +201,7 @@ def _report(results: dict[str, Any], output: Path, console: Console) -> Report:
         methods=list(RUNS),
         drives=make_drives({options["scene"]: (scene, views_of)}, console),
         tables=[_table(results)],
-        plots=_plots(scene, views_of, options["scene"]),
+        plots=_plots(scene, views_of, options["scene"], console),
         facts=[
             Facts("Options", {name.replace("_", " ").capitalize(): str(value) for name, value in options.items()}),
             Facts("Versions", results["versions"]),
@@ -218,15 +218,17 @@ def _report(results: dict[str, Any], output: Path, console: Console) -> Report:
     )
 
 
-def _plots(scene: Path, views_of: dict[str, Path], title: str) -> list[Plot]:
+def _plots(scene: Path, views_of: dict[str, Path], title: str, console: Console) -> list[Plot]:
     """Figures by the true distance, over all held-out views."""
     binned = {name: BinnedErrors(SHOWN_EDGES_M) for name in RUNS}
-    for view in compared_views(scene, views_of):
-        target = view.rgb if view.clean_rgb is None else view.clean_rgb
-        mask, true_m = torch.from_numpy(view.mask), torch.from_numpy(view.distance_m)
-        for name, bins in binned.items():
-            pred, clean = (torch.from_numpy(rgb).float() / 255 for rgb in (view.colours[name], target))
-            bins.update(true_m, mask, pred, clean, torch.from_numpy(distance_of_colours(view.distances[name])), true_m)
+    with console.status("Errors by distance …"):
+        for view in compared_views(scene, views_of):
+            target = view.rgb if view.clean_rgb is None else view.clean_rgb
+            mask, true_m = torch.from_numpy(view.mask), torch.from_numpy(view.distance_m)
+            for name, bins in binned.items():
+                pred, clean = (torch.from_numpy(rgb).float() / 255 for rgb in (view.colours[name], target))
+                seen_m = torch.from_numpy(distance_of_colours(view.distances[name]))
+                bins.update(true_m, mask, pred, clean, seen_m, true_m)
     found: dict[MethodName, list[Bins]] = {METHODS[name]: [bins.compute()] for name, bins in binned.items()}
     titles = {"psnr": ("PSNR by true distance", PSNR_LABEL), "delta_1_25": ("δ<1.25 by true distance", "δ<1.25")}
     return [

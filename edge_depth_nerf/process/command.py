@@ -71,8 +71,9 @@ def _add_mono(scene: SceneFolder, options: ProcessOptions, console: Console) -> 
             )
     if not scene.has("mono") and options.estimate_depth:
         if lidar or options.mono_model is not None:
-            from edge_depth_nerf.mono.estimate import estimate_depth
-            from edge_depth_nerf.mono.options import EstimateDepthOptions
+            with console.status("Starting the depth network …"):
+                from edge_depth_nerf.mono.estimate import estimate_depth
+                from edge_depth_nerf.mono.options import EstimateDepthOptions
 
             estimating = EstimateDepthOptions(
                 (scene.folder,), model=options.mono_model, seconds=options.mono_seconds, preset=options.mono_preset
