@@ -17,6 +17,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from nerfstudio.cameras.cameras import Cameras
+    from nerfstudio.engine.trainer import Trainer
 
 
 def allow_numpy_scalars_in_checkpoints() -> None:
@@ -96,3 +97,24 @@ def quiet_host() -> Iterator[None]:
             yield
         finally:
             CONSOLE.quiet = before
+
+
+def total_steps(trainer: Trainer) -> int:
+    """All steps of a training, those before it was taken up again too; its `max_num_iterations` are those to come.
+
+    Works around: https://github.com/nerfstudio-project/nerfstudio/issues/3096.
+    Ends with: a nerfstudio that has its pull request 3526, where `max_num_iterations` are all steps.
+    """
+    return trainer._start_step + trainer.config.max_num_iterations
+
+
+def count_steps_against_all(trainer: Trainer) -> None:
+    """Let what nerfstudio prints of a training that was taken up again end at 100 %.
+
+    Works around: https://github.com/nerfstudio-project/nerfstudio/issues/1304.
+    Ends with: a nerfstudio that has its pull request 3526.
+    """
+    from nerfstudio.utils import writer
+
+    if "max_iter" in writer.GLOBAL_BUFFER:
+        writer.GLOBAL_BUFFER["max_iter"] = total_steps(trainer)

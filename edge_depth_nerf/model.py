@@ -27,7 +27,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from edge_depth_nerf.allocator import keep_freed_memory
-from edge_depth_nerf.compat import lpips_not_built, without_undefined_ray
+from edge_depth_nerf.compat import lpips_not_built, total_steps, without_undefined_ray
 from edge_depth_nerf.fused.fields import CubeContraction, FusedNerfactoField, use_fused_fields
 from edge_depth_nerf.fused.losses import distortion_loss, proposal_loss
 from edge_depth_nerf.fused.sampler import FusedPDFSampler, edges_of
@@ -231,8 +231,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         """Nerfacto's callbacks, and one that tells the step."""
         trainer = training_callback_attributes.trainer
         if trainer is not None:
-            # nerfstudio counts those that are still to come
-            self._training_steps = trainer._start_step + trainer.config.max_num_iterations
+            self._training_steps = total_steps(trainer)
 
         def remember(step: int) -> None:
             self._step = step

@@ -18,10 +18,10 @@ from typing import Literal
 import torch
 import yaml
 from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerConfig
-from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from edge_depth_nerf.compat import count_steps_against_all, total_steps
 from edge_depth_nerf.entry import STOPPED_STATUS
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import remove_leftovers, write_text
@@ -62,9 +62,7 @@ class EdgeDepthTrainer(Trainer):
         """Set up as nerfstudio does; Ctrl-C ends it with one line."""
         try:
             super().setup(test_mode)
-            if "max_iter" in writer.GLOBAL_BUFFER:
-                # nerfstudio shows steps against those still to come, past 100 % after a resume
-                writer.GLOBAL_BUFFER["max_iter"] = self._start_step + self.config.max_num_iterations
+            count_steps_against_all(self)
         except KeyboardInterrupt:
             CONSOLE.print("\nStopped before the first step.")
             raise SystemExit(STOPPED_STATUS) from None
@@ -92,7 +90,7 @@ class EdgeDepthTrainer(Trainer):
             CONSOLE.print("\nStopped before the first step.")
         else:
             self.save_checkpoint(self._last_step)
-            remaining = self._start_step + self.config.max_num_iterations - self._last_step - 1
+            remaining = total_steps(self) - self._last_step - 1
             goes_on = (
                 " The same command goes on from there with --load-dir "
                 f"{shlex.quote(str(self.checkpoint_dir))} --max-num-iterations {remaining}"
