@@ -17,8 +17,7 @@ import threading
 
 import torch
 
-WAIT_POLICY, PASSIVE = "OMP_WAIT_POLICY", "passive"
-_CHOSEN_BY = (WAIT_POLICY, "GOMP_SPINCOUNT")
+_CHOSEN_BY = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
 """Where these are set, somebody has chosen already."""
 _ENOUGH = 1 << 17
 """Numbers that torch adds with all its threads; with up to 32,768 it takes one."""
