@@ -58,8 +58,10 @@ STUDY: dict[str, tuple[Variant, ...]] = {
         Variant("half of the last samples placed by the prior", change=partial(guided_samples, share=0.5)),
     ),
     "σ̂, measured at returns left out": (
-        Variant("0.2 m", {DATA + "sigma_mode": "constant", DATA + "sigma_constant": 0.2}),
-        Variant("1 m", {DATA + "sigma_mode": "constant", DATA + "sigma_constant": 1.0}),
+        *(
+            Variant(f"{value:g} m", {DATA + "sigma_mode": "constant", DATA + "sigma_constant": value})
+            for value in (0.05, 0.1, 0.2, 1.0)
+        ),
         Variant("one of a frame (the paper)", {DATA + "sigma_mode": "image"}),
         Variant("the spread of what was integrated", {DATA + "sigma_mode": "spread"}),
         Variant("the spread, a floor and a share", {DATA + "sigma_mode": "combined"}),
