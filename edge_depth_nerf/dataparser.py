@@ -124,6 +124,21 @@ def check_split(meta: dict[str, Any], path: Path) -> None:
             )
 
 
+def transforms_path(data: Path) -> Path:
+    """The transforms.json that `--data` means: a scene folder's, or the file itself.
+
+    Raises:
+        FileNotFoundError: no scene there.
+    """
+    path = data if data.suffix == ".json" else data / "transforms.json"
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"{path}: no such file. --data takes a scene folder with a transforms.json; "
+            "`edge-depth-nerf process` makes one from a raw drive."
+        )
+    return path
+
+
 class FisheyeDepth(Nerfstudio):
     """Parser of scene folders."""
 
@@ -137,13 +152,7 @@ class FisheyeDepth(Nerfstudio):
             InputError: the scene cannot be used as it is.
 
         """
-        data = Path(self.config.data)
-        path = data if data.suffix == ".json" else data / "transforms.json"
-        if not path.is_file():
-            raise FileNotFoundError(
-                f"{path}: no such file. --data takes a scene folder with a transforms.json; "
-                "`edge-depth-nerf process` makes one from a raw drive."
-            )
+        path = transforms_path(Path(self.config.data))
         meta = read_transforms(path)
         frames = check_meta(meta, path)
         check_split(meta, path)

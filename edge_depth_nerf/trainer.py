@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import yaml
@@ -22,7 +22,8 @@ from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from edge_depth_nerf.compat import count_steps_against_all, total_steps
-from edge_depth_nerf.entry import STOPPED_STATUS
+from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig, transforms_path
+from edge_depth_nerf.entry import STOPPED_STATUS, say_errors_plainly
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import remove_leftovers, write_text
 from edge_depth_nerf.pipeline import NotFiniteError
@@ -37,7 +38,16 @@ class EdgeDepthTrainerConfig(TrainerConfig):
     """Target class to instantiate."""
 
     def save_config(self) -> None:
-        """Save config.yml as nerfstudio does, but atomically: half of one could not be loaded any more."""
+        """Save config.yml as nerfstudio does, but atomically: half of one could not be loaded any more.
+
+        Raises:
+            FileNotFoundError: no scene where `--data` says; then nothing is written.
+
+        """
+        say_errors_plainly()
+        data: Any = self.pipeline.datamanager
+        if isinstance(data.dataparser, FisheyeDepthDataParserConfig):
+            transforms_path(Path(data.data or data.dataparser.data))
         path = self.get_base_dir() / "config.yml"
         CONSOLE.log(f"Saving config to: {path}")
         write_text(path, yaml.dump(self))

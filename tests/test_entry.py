@@ -219,7 +219,7 @@ def test_the_hook_is_put_in_once(hook):
 def test_ns_train_on_what_is_no_scene(tmp_path):
     call = [Path(sys.executable).with_name("ns-train"), "edge-depth-nerf-lite", "--data", tmp_path / "nowhere"]
     done = subprocess.run(
-        [*map(str, call), "--vis", "tensorboard", "--output-dir", str(tmp_path)],
+        [*map(str, call), "--vis", "tensorboard", "--output-dir", str(tmp_path / "runs")],
         capture_output=True,
         text=True,
         check=False,
@@ -228,3 +228,4 @@ def test_ns_train_on_what_is_no_scene(tmp_path):
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
     assert f"edge-depth-nerf: {tmp_path}/nowhere/transforms.json: no such file." in done.stderr
+    assert not (tmp_path / "runs").exists(), "no run was begun"
