@@ -76,8 +76,7 @@ STUDY: dict[str, tuple[Variant, ...]] = {
     ),
     "The surface, 4,096 pixels": (
         Variant("none", {MODEL + "surface_loss_mult": 0.0, DATA + "surface_rays_per_batch": 0}),
-        Variant("1,024", {DATA + "surface_rays_per_batch": 1024}),
-        Variant("16,384", {DATA + "surface_rays_per_batch": 16384}),
+        *(Variant(f"{count:,}", {DATA + "surface_rays_per_batch": count}) for count in (1024, 16384, 32768)),
     ),
     "The exposure, a gain": (Variant("nerfacto's embedding", {MODEL + "exposure": "embedding"}),),
     "The scene": (

@@ -32,6 +32,7 @@ from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, Va
 from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIndicesEvalDataloader
 from nerfstudio.model_components.ray_generators import RayGenerator
 from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
 from rich.progress import track
 from torch import Tensor
 
@@ -316,6 +317,11 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
                 CONSOLE.log(f"Depth prior: {trust.summary()}.")
             elif has_mono and options.sigma_mode == "calibrated" and options.depth_source == "mono":
                 trust = field_of_source(data)
+            elif self.config.depth_source == "auto" and not has_mono:
+                CONSOLE.log(
+                    f"[yellow]Depth prior: LiDAR alone, for the scene has no monocular maps. `edge-depth-nerf "
+                    f"estimate-depth {escape(str(data))}` makes them, or finishes those that were begun.",
+                )
         weight = self.config.prior_weight if options else 1.0
         path = cache_dir / "pixels" / f"{_table_key(dataset, options, trust, weight)}.npy"
         try:

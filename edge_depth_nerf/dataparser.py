@@ -132,9 +132,13 @@ def transforms_path(data: Path) -> Path:
     """
     path = data if data.suffix == ".json" else data / "transforms.json"
     if not path.is_file():
+        relative = (
+            f" It was looked for in {Path.cwd()}; a config.yml names its scene as the training was told: use it from "
+            "the same folder."
+        )
         raise FileNotFoundError(
-            f"{path}: no such file. --data takes a scene folder with a transforms.json; "
-            "`edge-depth-nerf process` makes one from a raw drive."
+            f"{path}: no such file. --data takes a scene folder with a transforms.json; `edge-depth-nerf process` "
+            f"makes one from a raw drive.{'' if path.is_absolute() else relative}"
         )
     return path
 

@@ -32,6 +32,9 @@ def main() -> None:
     arguments = [argument for argument in sys.argv[1:] if argument != DEBUG_OPTION]
     if len(arguments) < len(sys.argv) - 1:
         os.environ[DEBUG_VARIABLE] = "1"  # for the commands that this one starts, too
+    if arguments == ["--version"]:
+        sys.stdout.write(f"{PROGRAM} {__version__}\n")
+        return
     try:
         from edge_depth_nerf.cli import parse, run
 

@@ -38,6 +38,12 @@ def end_of(monkeypatch, capsys, *arguments: str, error: BaseException | None = N
     return ended.value.code, capsys.readouterr().err
 
 
+def test_version(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["edge-depth-nerf", "--version"])
+    entry.main()
+    assert capsys.readouterr().out == f"edge-depth-nerf {__version__}\n"
+
+
 def test_a_bug_is_one_paragraph_that_asks_to_be_reported(monkeypatch, capsys):
     status, said = end_of(monkeypatch, capsys, "doctor", error=KeyError("not\nthere"))
     assert status == 1

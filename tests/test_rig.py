@@ -300,6 +300,31 @@ def test_a_moment_without_pose_or_scan_is_skipped(mine: Path) -> None:
     assert sorted({picture.frame for picture in recording.pictures}) == [1, 2, 3]
 
 
+@pytest.mark.parametrize("holdout", [0, 2])
+def test_a_moment_between_scans_is_a_picture_without_lidar(mine: Path, holdout: int, capsys) -> None:
+    """A LiDAR of half the cameras' rate: who is held out there gets no scan of its neighbours, which are trained on."""
+    scans = sorted((mine / "lidar").iterdir())
+    for scan in scans[1::2]:
+        scan.unlink()
+    process_rig(options(mine, holdout_every=holdout))
+    said = " ".join(capsys.readouterr().out.split())
+    meta = read_json(mine.parent / "scene" / "transforms.json")
+    has_return = {
+        frame["frame"]: bool(read_distance_png(mine.parent / "scene" / frame["lidar_file_path"]).any())
+        for frame in meta["frames"]
+    }
+    without = {number for number, has in has_return.items() if not has}
+    assert without == ({1, 3} if holdout else set())
+    assert ("No LiDAR return in 6 pictures" in said) is bool(holdout)
+
+
+def test_times_of_the_pictures_reach_the_scene(scene: Path) -> None:
+    times = {frame["frame"]: frame["timestamp_s"] for frame in read_json(scene / "transforms.json")["frames"]}
+    assert [times[number] - times[0] for number in range(FRAMES)] == pytest.approx(
+        [0.1 * number for number in range(FRAMES)], abs=0.02
+    )
+
+
 def test_some_cameras_and_some_moments(mine: Path) -> None:
     recording = read_rig_recording(options(mine, cameras=("front",), first=1, frames=2, stride=2))
     assert [(picture.camera, picture.frame) for picture in recording.pictures] == [("front", 1), ("front", 3)]

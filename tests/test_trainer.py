@@ -117,6 +117,27 @@ def test_ctrl_c_ends_the_viewer_of_a_complete_training_without_error(trainer, mo
     assert "Stopped" not in capsys.readouterr().out
 
 
+def test_a_relative_scene_is_said_to_be_relative(trainer, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    trainer.config.pipeline.datamanager.data = Path("elsewhere")
+    with pytest.raises(FileNotFoundError, match=f"looked for in {tmp_path}; .* use it from the same folder"):
+        trainer.config.save_config()
+
+
+@pytest.mark.parametrize(("method", "said"), [("edge-depth-nerf", True), ("edge-depth-nerf-lite", False)])
+def test_the_full_model_without_a_gpu_is_advised_against(trainer, capsys, method, said):
+    trainer.config.method_name = method
+    trainer.setup()
+    assert ("edge-depth-nerf-lite takes minutes" in " ".join(capsys.readouterr().out.split())) is said
+
+
+@pytest.mark.parametrize("mono", [True, False])
+def test_a_prior_of_lidar_alone_is_said(tmp_path, monkeypatch, capsys, mono):
+    monkeypatch.setenv("COLUMNS", "300")
+    trainer_of(write_scene(tmp_path / "scene", mono=mono), tmp_path / "runs", max_num_iterations=STEPS)
+    assert ("LiDAR alone" in capsys.readouterr().out) is not mono
+
+
 def test_ctrl_c_before_the_first_step(trainer, monkeypatch, capsys):
     monkeypatch.setattr(trainer, "_init_viewer_state", lambda: signal.raise_signal(signal.SIGINT))
     with pytest.raises(SystemExit) as ended:

@@ -191,7 +191,7 @@ def draw_plots(output: Path, results: Results) -> list[Plot]:
         "psnr_by_steps": _curves(results, "PSNR by steps", "step", "steps"),
         "psnr_by_seconds": _curves(results, "PSNR by time", clock, f"{CLOCKS[clock].lower()} of training"),
         "error_by_angle": _binned(results, "Errors by the angle from the optical axis", "by_angle_deg"),
-        "error_by_distance": _binned(results, "Errors by true distance", "by_distance_m"),
+        "error_by_distance": _binned(results, "Errors by distance", "by_distance_m"),
     }
     for name, plot in plots.items():
         write_bytes(output / f"{name}.svg", plot.light)

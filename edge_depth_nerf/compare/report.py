@@ -76,13 +76,14 @@ def _of_drive(scene: str, run: RunResult) -> Facts:
     folder = Path(run.specification["scene"])
     meta = read_json(folder / "transforms.json")
     source = meta.get("source", {})
+    sizes = dict.fromkeys(f"{frame['w']} × {frame['h']}" for frame in meta["frames"] if "w" in frame)
     entries = {
         "Scene folder": str(folder),
         "SHA-256 of transforms.json": run.specification["scene_sha256"],
         "Source": source.get("kind", "a nerfstudio scene"),
         "Pictures trained on": str(len(meta["train_filenames"])),
         "Pictures held out": str(len(meta["test_filenames"])),
-        "Size": f"{meta['frames'][0]['w']} × {meta['frames'][0]['h']} px" if "w" in meta["frames"][0] else "",
+        "Size": f"{', '.join(sizes)} px" if sizes else "",
         "Sweeps around each picture": str(2 * source["sweeps"] + 1) if "sweeps" in source else "",
     }
     return Facts(f"Drive {scene}", {name: value for name, value in entries.items() if value})

@@ -39,7 +39,7 @@ def read_dataparser(path: Path) -> Any:
     from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
 
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file. {_HINT}.")
+        raise FileNotFoundError(f"{path}: {'is a folder' if path.is_dir() else 'no such file'}. {_HINT}.")
     known = {
         f"{kind.__module__}.{kind.__name__}": kind
         for kind in (FisheyeDepthDataParserConfig, NerfstudioDataParserConfig)

@@ -89,8 +89,8 @@ def _layers(scene: SceneFolder) -> Iterator[Finding]:
     elif not has_mono:
         yield Finding(
             "no_mono",
-            "The scene has no monocular maps, so only pixels with a return have a prior; process the drive with "
-            "--mono.",
+            "The scene has no monocular maps, so only pixels with a return have a prior; make them, or finish those "
+            "that were begun, with `edge-depth-nerf estimate-depth`, or process the drive with --mono.",
         )
     if not scene.has("mask"):
         yield Finding(

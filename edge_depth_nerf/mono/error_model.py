@@ -260,8 +260,8 @@ class Trust:
         if not self.everywhere:
             low, high = np.degrees(self.field_rad)
             parts.append(
-                f"no prior but from {low - FIELD_MARGIN_DEG:.0f}° to {high + FIELD_MARGIN_DEG:.0f}° above the horizon, "
-                "where LiDAR reaches"
+                f"a prior only between {low - FIELD_MARGIN_DEG:.0f}° and {high + FIELD_MARGIN_DEG:.0f}° of elevation, "
+                "where LiDAR measured and the network could learn"
             )
         return "; ".join(parts)
 

@@ -342,8 +342,9 @@ class _Builder:
                 only_hides=around.only_hides,
             )
             distance_m, index = seen.distance_m.numpy(), seen.point_index
-            # what moved is in the picture, but no part of the cloud
-            index = torch.where(around.moved[index.clamp(min=0)], -1, index)
+            # what moved is in the picture, but no part of the cloud; -1, no point, is the one put at the end
+            moved = torch.cat([around.moved, around.moved.new_zeros(1)])
+            index = torch.where(moved[index], -1, index)
         else:
             return None, None
         has_return = distance_m[self._usable[picture.camera]] > 0
@@ -509,5 +510,5 @@ def _show(report: ProcessReport, console: Console) -> None:
         count = len(report.left_out)
         more = f", {count - MOST_LISTED} of them not listed here" if count > MOST_LISTED else ""
         say(console, f"{count} broken or missing files{more}; with --strict the first one is an error.", "yellow")
-    done = "" if report.written else "; nothing was left to do"
+    done = "" if report.written else "; all of them were there"
     say(console, f"{report.scene}: {report.training} pictures for training, {report.held_out} held out{done}")

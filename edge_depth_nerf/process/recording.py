@@ -62,7 +62,7 @@ class RecordedPicture:
     camera_to_world: Transform | None = None
     """Where it was taken; None = from the vehicle's path at its time."""
     timestamp_s: float | None = None
-    """Seconds since 1970 for transforms.json; None = not known."""
+    """Seconds of the recording's own clock (KITTI-360's: since 1970) for transforms.json; None = not known."""
     depth: DepthFile | None = None
     """A depth map in place of sweeps."""
     mask: Path | None = None

@@ -530,6 +530,7 @@ class _Companions:
             path=picture.path,
             time_s=picture.time_s,
             camera_to_world=camera_to_world,
+            timestamp_s=picture.time_s,
             depth=None
             if depth is None or camera.depth is None
             else DepthFile(depth, camera.depth.metres_per_count, camera.depth.kind),

@@ -130,7 +130,7 @@ class SceneFrame:
     content: FrameContent | Callable[[], FrameContent]
     """Its maps, or what loads them when their turn comes; called from several threads at once."""
     timestamp_s: float | None = None
-    """Seconds since 1970."""
+    """Seconds of the recording's own clock."""
     held_out: bool = False
     """Whether it is kept from training. All cameras of a moment should agree."""
     inputs: tuple[Path, ...] = ()
