@@ -3,10 +3,10 @@
     python benchmarks/ablation.py SCENE [SCENE ...] [--steps 1000] [--seed 0] [--only WORD ...] \
         [--json FILE] [--page docs/ablation.md]
 
-Each variant differs from edge-depth-nerf-lite in what its row says. All start from the same seed and are judged on the
-same random pixels of every held-out view, as `ablate.py` does. `--json` keeps each training's figures, and takes up
-from there; two processes with different `--only` or scenes and files of their own can work side by side, and a last one
-with all files given to `--json` writes the page.
+Each variant differs from edge-depth-nerf-lite, as it was before this decided about it, in what its row says. All start
+from the same seed and are judged on the same random pixels of every held-out view, as `ablate.py` does. `--json` keeps
+each training's figures, and takes up from there; two processes with different `--only` or scenes and files of their own
+can work side by side, and a last one with all files given to `--json` writes the page.
 """
 
 from __future__ import annotations
@@ -39,7 +39,9 @@ class Variant:
     """What is done to the pipeline before it is trained."""
 
 
-DEFAULTS = "as it is"
+DEFAULTS = "as it was"
+BASE = {DATA + "surface_rays_per_batch": 4096}
+"""In what every row differs from edge-depth-nerf-lite: its options before this table decided about them."""
 STUDY: dict[str, tuple[Variant, ...]] = {
     "": (
         Variant(DEFAULTS),
@@ -141,7 +143,7 @@ def main() -> None:
                 key = key_of(scene.resolve().name, options, group, variant)
                 if key not in done:
                     # no trainer tells the model how many
-                    overrides = {MODEL + "depth_loss_steps": options.steps, **variant.overrides}
+                    overrides = {MODEL + "depth_loss_steps": options.steps, **BASE, **variant.overrides}
                     own[key] = done[key] = train(scene, overrides, options.steps, options.seed, variant.change)
                     if options.json:
                         write_json(options.json[0], own)

@@ -106,7 +106,7 @@ class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig):
     """The standard deviation under sigma_mode constant, metres."""
     prior_weight: float = 1.0
     """How often a pixel with a prior is drawn, against one without."""
-    surface_rays_per_batch: int = 4096
+    surface_rays_per_batch: int = 16384
     """So many further pixels come with each training batch, less those whose prior is vague: their colour is compared
     with the field's at the prior's distance, at one sample a ray. 0: none."""
     cache_dir: Path | None = None

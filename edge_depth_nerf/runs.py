@@ -311,11 +311,16 @@ def command_line(words: Sequence[str], options: Any) -> str:
 
 
 def logged_commands(log: Path) -> list[str]:
-    """The commands that `LoggedCommands` wrote to a log, each once, programs without their folder."""
+    """The commands that `LoggedCommands` wrote to a log, each once, programs without their folder.
+
+    Of a training that was stopped and taken up again the first alone: it asks for all the steps.
+    """
     lines = log.read_text(encoding="utf-8", errors="replace").splitlines() if log.is_file() else []
     found = []
     for line in lines:
         if line.startswith(COMMAND):
             program, *rest = shlex.split(line.removeprefix(COMMAND))
+            if found and "--load-dir" in rest:
+                continue
             found.append(shlex.join([Path(program).name, *rest]))
     return list(dict.fromkeys(found))

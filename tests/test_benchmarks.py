@@ -99,8 +99,8 @@ def test_the_ablation_has_a_row_for_what_was_trained_on_every_drive(benchmark_mo
         ablation.key_of("turn", options, group, others[0]): figures(40.0),  # not yet on every drive
     }
     lines = ablation.table(done, options)
-    assert lines[0] == "| | street | turn | mean PSNR | against “as it is” | AbsRel | δ < 1.25 |"
-    assert lines[2] == "| as it is | 30.00 | 32.00 | 31.00 | +0.00 | 0.050 | 0.900 |"
+    assert lines[0] == "| | street | turn | mean PSNR | against “as it was” | AbsRel | δ < 1.25 |"
+    assert lines[2] == "| as it was | 30.00 | 32.00 | 31.00 | +0.00 | 0.050 | 0.900 |"
     assert lines[4] == f"| {lower.title} | 29.00 | 32.50 | 30.75 | -0.25 | 0.050 | 0.900 |"
     assert len(lines) == 5
 

@@ -221,7 +221,8 @@ def test_commands_are_read_from_logs(tmp_path):
     log = tmp_path / "train.log"
     assert logged_commands(log) == []
     log.write_text(
-        "$ /some/where/ns-train m --data 'a b'\n12 (3%) $ 4\n$ /some/where/ns-train m --data 'a b'\n$ ns-eval\n"
+        "$ /some/where/ns-train m --data 'a b'\n12 (3%) $ 4\n$ /some/where/ns-train m --data 'a b'\n"
+        "$ /some/where/ns-train m --data 'a b' --max-num-iterations 5 --load-dir c\n$ ns-eval\n"
     )
     assert logged_commands(log) == ["ns-train m --data 'a b'", "ns-eval"]
 
