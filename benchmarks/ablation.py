@@ -84,7 +84,10 @@ STUDY: dict[str, tuple[Variant, ...]] = {
     "The scene": (
         Variant("no distortion loss", {MODEL + "distortion_loss_mult": 0.0}),
         Variant("near plane 0.05 m", {MODEL + "near_m": 0.05}),
-        Variant("hashed for cells twice as large", {DATA + "dataparser.hash_resolution": 1024}),
+        *(
+            Variant(f"a unit of {value:g} m in place of 10 to 16", {DATA + "dataparser.metres_per_unit": value})
+            for value in (5.0, 20.0)
+        ),
         Variant("poses refined", {MODEL + "camera_optimizer.mode": "SO3xR3"}),
     ),
 }
