@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 
 import jaxtyping
@@ -10,6 +11,8 @@ import pytest
 
 # more threads than cores only slow each other down when tests run side by side
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# where tests run in the background of a shell Ctrl-C is ignored, by whatever they start, too
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 REAL_DATA = Path(__file__).resolve().parents[2] / "shared" / "real"
 
