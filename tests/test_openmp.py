@@ -68,7 +68,7 @@ def test_one_thread_has_nothing_to_wait_for(monkeypatch):
 
 def test_our_commands_and_theirs_begin_with_it(monkeypatch):
     monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
-    monkeypatch.setattr(sys, "argv", ["edge-depth-nerf", "--version"])
+    monkeypatch.setattr(sys, "argv", ["edge-depth-nerf", "--no-such-option"])
     with pytest.raises(SystemExit):
         entry.main()
     assert os.environ["OMP_WAIT_POLICY"] == "passive"
