@@ -30,7 +30,7 @@ from edge_depth_nerf.pipeline import NotFiniteError
 from edge_depth_nerf.runs import checkpoints_in, newest_checkpoint
 
 FOR_A_GPU = ("edge-depth-nerf", "edge-depth-nerf-paper")
-"""Methods whose training takes most of a day on a CPU."""
+"""Methods of full size."""
 
 
 @dataclass
@@ -75,8 +75,8 @@ class EdgeDepthTrainer(Trainer):
         """Set up as nerfstudio does; Ctrl-C ends it with one line."""
         if self.device == "cpu" and self.config.method_name in FOR_A_GPU and test_mode == "val":
             CONSOLE.print(
-                f"[yellow]{self.config.method_name} is meant for a GPU, and there is none: it takes most of a day. "
-                "edge-depth-nerf-lite takes minutes.",
+                f"[yellow]{self.config.method_name} is meant for a GPU, and there is none: expect hours, where "
+                "edge-depth-nerf-lite takes minutes."
             )
         try:
             super().setup(test_mode)
