@@ -62,6 +62,8 @@ def test_four_fisheyes_make_a_scene(scene: Path, drive: Path) -> None:
             truth = read_distance_png(drive / f"truth/{name}/distance/{frame:06d}.png")
             both = (lidar > 0) & (truth > 0)
             errors.append(np.abs(lidar[both] / truth[both] - 1))
+            # rendered, so its truth comes with it
+            assert np.array_equal(read_distance_png(scene / f"truth/{name}/distance/{frame:010d}.png"), truth)
         assert len(np.concatenate(errors)) > 3000
         # a pixel is 1.5° wide; a return lies anywhere in it
         assert np.median(np.concatenate(errors)) < 0.015

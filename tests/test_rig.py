@@ -370,6 +370,52 @@ def test_options_bring_masks_and_monocular_maps(mine: Path) -> None:
         read_rig_recording(options(mine, frame_masks=mine / "moving"))
 
 
+def test_a_rendered_drive_brings_its_truth(mine: Path, drive: Path) -> None:
+    """As the generator writes it: true distances and clean pictures reach the scene, to judge by."""
+    shutil.copytree(drive / "truth", mine / "truth")
+    edit(
+        mine,
+        *(
+            (f"[cameras.{name}]\n", f"[cameras.{name}]\n{keys}")
+            for name in ("left", "right", "front")
+            for keys in [f'truth_distance = "truth/{name}/distance"\ntruth_rgb = "truth/{name}/rgb"\n']
+        ),
+    )
+    report = process_rig(options(mine, frames=2, holdout_every=2), Console(quiet=True))
+    for frame in read_json(report.scene / "transforms.json")["frames"]:
+        name, number = frame["camera"], frame["frame"]
+        truth = mine / f"truth/{name}/distance/{number:06d}.png"
+        assert np.array_equal(
+            read_distance_png(report.scene / frame["truth_distance_file_path"]), read_distance_png(truth)
+        )
+        assert np.array_equal(
+            read_image(report.scene / frame["truth_rgb_file_path"]),
+            read_image(mine / f"truth/{name}/rgb/{number:06d}.png"),
+        )
+    eight_bits = mine / "truth/left/distance/000001.png"
+    write_png(eight_bits, np.zeros((128, 128), np.uint8))
+    with pytest.raises(InputError, match=r"left/distance/000001\.png: expected a 16-bit grey PNG"):
+        read_rig_recording(options(mine))
+    eight_bits.unlink()
+    with pytest.raises(FileNotFoundError, match=r"000001\.png: no such file; cameras\.left\.truth_distance needs one"):
+        read_rig_recording(options(mine))
+
+
+@pytest.mark.parametrize("key", ["mono", "truth_rgb"])
+def test_maps_of_some_cameras_alone(mine: Path, drive: Path, key: str) -> None:
+    """All that is taken has them, or nothing; before anything is made."""
+    shutil.copytree(drive / "truth", mine / "truth")
+    edit(
+        mine,
+        ('mono = "mono/right"\n', "")
+        if key == "mono"
+        else ("[cameras.left]\n", '[cameras.left]\ntruth_rgb = "truth/left/rgb"\n'),
+    )
+    with pytest.raises(InputError, match=rf"rig\.toml: cameras\.right\.{key} is missing; give it for every camera"):
+        read_rig_recording(options(mine))
+    assert len(read_rig_recording(options(mine, cameras=("left",))).pictures) == FRAMES
+
+
 def test_z_depth_maps_in_place_of_lidar(mine: Path, drive: Path) -> None:
     """Millimetres along the axis become distance along the ray, here against the true distances."""
     recording = read_rig_recording(options(mine))

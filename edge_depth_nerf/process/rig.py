@@ -156,7 +156,7 @@ def recording_of_rig(rig: Rig, root: Path, options: RigOptions | JbnuDepth360Opt
         raise InputError(f"{root}: none of the moments asked for can be used: {summarise(skipped)}.")
 
     by_name = {camera.name: camera for camera in cameras}
-    companions = _Companions(root, cameras, options)
+    companions = _Companions(rig.path, root, cameras, options)
     tolerance = Tolerance(options.strict, sum(map(len, kept.values())))
     recorded = []
     for frame, pictures in sorted(kept.items()):
@@ -494,8 +494,18 @@ class _Companions:
     does.
     """
 
-    def __init__(self, root: Path, cameras: Sequence[RigCamera], options: RigOptions | JbnuDepth360Options) -> None:
+    def __init__(
+        self, rig: Path, root: Path, cameras: Sequence[RigCamera], options: RigOptions | JbnuDepth360Options
+    ) -> None:
         self._options = options
+        keys = ("truth_distance", "truth_rgb") if options.mono else ("mono", "truth_distance", "truth_rgb")
+        for key in keys:
+            lacking = [camera.name for camera in cameras if getattr(camera, key) is None]
+            if 0 < len(lacking) < len(cameras):
+                raise InputError(
+                    f"{rig}: cameras.{lacking[0]}.{key} is missing; give it for every camera that is taken, or for "
+                    "none."
+                )
         self._found = {
             (camera.name, what): {path.stem: path for path in _files(root, given, (".png",))}
             for camera in cameras
@@ -503,6 +513,8 @@ class _Companions:
                 ("masks", camera.masks),
                 ("mono", camera.mono),
                 ("depth.files", camera.depth and camera.depth.files),
+                ("truth_distance", camera.truth_distance),
+                ("truth_rgb", camera.truth_rgb),
             )
             if given is not None
         }
@@ -515,15 +527,20 @@ class _Companions:
         mask = self._by_name(camera, "masks", picture.path) or self._by_number("frame_masks", camera, frame)
         mono = self._by_number("mono", camera, frame) or self._by_name(camera, "mono", picture.path)
         depth = self._by_name(camera, "depth.files", picture.path)
+        truth_distance, truth_rgb = (
+            self._by_name(camera, f"truth_{what}", picture.path) for what in ("distance", "rgb")
+        )
         steps = 1 / DISTANCE_STEPS_PER_METRE
-        for path, metres in ((mono, steps), (depth, camera.depth.metres_per_count if camera.depth else steps)):
+        depth_steps = camera.depth.metres_per_count if camera.depth else steps
+        for path, metres in ((mono, steps), (depth, depth_steps), (truth_distance, steps)):
             if path is not None and not check_size(path, camera.camera).is_distance:
                 raise InputError(
                     f"{path}: expected a 16-bit grey PNG, {metres:g} m a count. Other kinds have lost the distance; "
                     "export the map again."
                 )
-        if mask is not None:
-            check_size(mask, camera.camera)
+        for path in (mask, truth_rgb):
+            if path is not None:
+                check_size(path, camera.camera)
         return RecordedPicture(
             camera=camera.name,
             frame=frame,
@@ -536,6 +553,8 @@ class _Companions:
             else DepthFile(depth, camera.depth.metres_per_count, camera.depth.kind),
             mask=mask,
             mono=mono,
+            truth_distance=truth_distance,
+            truth_rgb=truth_rgb,
         )
 
     def _by_name(self, camera: RigCamera, what: str, picture: Path) -> Path | None:

@@ -90,6 +90,10 @@ class RigCamera:
     """Folder or pattern of masks of single pictures."""
     mono: str | None
     """Folder or pattern of monocular distance maps."""
+    truth_distance: str | None
+    """Folder or pattern of true distance maps, which rendered recordings have."""
+    truth_rgb: str | None
+    """Folder or pattern of pictures without noise and exposure drift, which rendered recordings have."""
     depth: DepthMaps | None
     """Depth maps in place of LiDAR."""
 
@@ -330,8 +334,10 @@ def _camera(table: _Table, name: str, root: Path) -> RigCamera:
         images=_files(table, "images", "the folder of its pictures, or a pattern such as 'front/*.png'", root),
         clock=_clock(table, root),
         ego_mask=_path(table, "ego_mask", "a PNG, 255 = use the pixel", root),
-        masks=_files(table, "masks", "the folder of its pictures' masks", root) if table.has("masks") else None,
-        mono=_files(table, "mono", "the folder of its monocular distance maps", root) if table.has("mono") else None,
+        masks=_optional_files(table, "masks", "the folder of its pictures' masks", root),
+        mono=_optional_files(table, "mono", "the folder of its monocular distance maps", root),
+        truth_distance=_optional_files(table, "truth_distance", "the folder of its true distance maps", root),
+        truth_rgb=_optional_files(table, "truth_rgb", "the folder of its pictures without noise", root),
         depth=_depth(table, root) if table.has("depth") else None,
     )
     table.finish()
@@ -386,6 +392,10 @@ def _files(table: _Table, key: str, expected: str, root: Path) -> str:
     given = table.text(key, expected)
     path_inside(root, given, table.where(key))
     return given
+
+
+def _optional_files(table: _Table, key: str, expected: str, root: Path) -> str | None:
+    return _files(table, key, expected, root) if table.has(key) else None
 
 
 def _clock(table: _Table, root: Path) -> Clock:

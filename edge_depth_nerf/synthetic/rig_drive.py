@@ -171,13 +171,12 @@ class _RigDrive(ABC):
 
     def map(self, kind: str, name: str, frame: int) -> Path:
         """Where a map of a picture lies."""
-        folder = {"mono": f"mono/{name}", "distance": f"truth/{name}/distance", "rgb": f"truth/{name}/rgb"}[kind]
-        return self.root / folder / f"{frame:06d}.png"
+        return self.root / _maps(name)[kind] / f"{frame:06d}.png"
 
     def files(self, frame: int, name: str | None) -> list[Path]:
         if name is None:
             return [self.scan(frame)]
-        return [self.picture(name, frame), *(self.map(kind, name, frame) for kind in ("mono", "distance", "rgb"))]
+        return [self.picture(name, frame), *(self.map(kind, name, frame) for kind in _maps(name))]
 
     def write(self, frame: int, name: str | None) -> None:
         time_s, seed = frame * FRAME_INTERVAL_S, self.options.seed
@@ -190,8 +189,8 @@ class _RigDrive(ABC):
         time_s += mounted.delay_s
         pose = self._drive.pose_to_world(np.array([time_s]))[0] @ _VEHICLE_TO_POSE @ mounted.to_vehicle
         view = camera.view(self._world, pose, time_s)
-        write_distance_png(self.map("distance", name, frame), view.distance_m)
-        write_png(self.map("rgb", name, frame), to_bytes(self._world.to_picture(view.radiance)))
+        write_distance_png(self.map("truth_distance", name, frame), view.distance_m)
+        write_png(self.map("truth_rgb", name, frame), to_bytes(self._world.to_picture(view.radiance)))
         estimate = simulated_estimate(view.distance_m, camera.own_distance_m, camera.lens, frame, seed, number)
         write_distance_png(self.map("mono", name, frame), estimate)
         write_png(self.picture(name, frame), take_picture(self._world, view, seed, number, frame))
@@ -260,7 +259,7 @@ class _Rig(_RigDrive):
                 images=f"images/{name}",
                 times_file=f"times_{name}.txt",
                 ego_mask=f"masks/{name}.png",
-                mono=f"mono/{name}",
+                **_maps(name),
                 **_model(mounted.camera),
                 to_vehicle=mounted.to_vehicle,
             )
@@ -306,10 +305,15 @@ class _JbnuDepth360(_RigDrive):
             model = _model(mounted.camera)
             del model["model"]
             text += f"\n[cameras.{name}]\n" + _table(
-                **model, ego_mask=f"masks/{name}.png", mono=f"mono/{name}", to_vehicle=mounted.to_vehicle
+                **model, ego_mask=f"masks/{name}.png", **_maps(name), to_vehicle=mounted.to_vehicle
             )
         text += "\n[lidars.ouster]\n" + _table(to_vehicle=self.scanner_to_vehicle)
         return self.root / "calibration.toml", text
+
+
+def _maps(name: str) -> dict[str, str]:
+    """Folders of what comes with a camera's pictures, by its key in a rig file."""
+    return {"mono": f"mono/{name}", "truth_distance": f"truth/{name}/distance", "truth_rgb": f"truth/{name}/rgb"}
 
 
 def _model(camera: Camera) -> dict[str, Any]:
