@@ -8,7 +8,15 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from typing import TypeVar
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 _MAX_THREADS = 8
 """More threads would hold more maps in memory at once."""
@@ -21,6 +29,29 @@ def say(console: Console, text: str, style: str | None = None) -> None:
     console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
 
 
+def progress_bars(console: Console, counted: bool = False, transient: bool = False) -> Progress:
+    """Make bars with a description, the time passed and the time left.
+
+    Args:
+        console: where to.
+        counted: show how many of how many are done, too.
+        transient: take the bars away at the end.
+
+    """
+    count: list[ProgressColumn] = [MofNCompleteColumn()] if counted else []
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        *count,
+        TimeElapsedColumn(),
+        TextColumn("·"),
+        TimeRemainingColumn(),
+        TextColumn("left"),
+        console=console,
+        transient=transient,
+    )
+
+
 def run_jobs(jobs: Sequence[Callable[[], Result]], title: str, console: Console) -> list[Result]:
     """Do all jobs, several at once, and give their results in order; the first error ends it.
 
@@ -29,11 +60,11 @@ def run_jobs(jobs: Sequence[Callable[[], Result]], title: str, console: Console)
     """
     import torch  # takes seconds, which a worker of a cluster need not wait for
 
-    progress = Progress(TextColumn(title), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=console)
+    progress = progress_bars(console, counted=True)
     inner_threads = torch.get_num_threads()
     torch.set_num_threads(1)
     with progress, ThreadPoolExecutor(min(os.cpu_count() or 1, _MAX_THREADS)) as pool:
-        task = progress.add_task("", total=len(jobs))
+        task = progress.add_task(title, total=len(jobs))
         futures = [pool.submit(job) for job in jobs]
         try:
             for future in as_completed(futures):

@@ -28,9 +28,10 @@ from edge_depth_nerf.compare.figures import BinnedErrors
 from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.plots import PSNR_LABEL, Bins, plot_bins
 from edge_depth_nerf.compare.tables import Cell, MadeTable, Metric, Row, mark_best
+from edge_depth_nerf.console import progress_bars
 from edge_depth_nerf.demo_options import DemoOptions
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_json, write_json, write_png
+from edge_depth_nerf.files import read_json, read_json_object, write_json, write_png
 from edge_depth_nerf.pictures import distance_of_colours, side_by_side
 from edge_depth_nerf.process.command import process
 from edge_depth_nerf.process.options import Kitti360Options
@@ -44,7 +45,6 @@ from edge_depth_nerf.runs import (
     held_out_frames,
     host_program,
     logged_commands,
-    progress_bars,
     step_of_line,
     steps_done,
     viewer_command,
@@ -284,17 +284,23 @@ class _Run:
         self._call("train", arguments, progress, f"Training {self.name}", total=self.options.steps)
 
     def evaluate(self, progress: Progress) -> None:
-        if self.metrics.is_file():
+        if self._judged():
             return
-        unfinished = self.metrics.with_name("unfinished.json")
         views = self.runs / self.name / "views"
         arguments = [
-            *("ns-eval", "--load-config", self.config, "--output-path", unfinished),
+            *("ns-eval", "--load-config", self.config, "--output-path", self.metrics),
             *("--render-output-path", views),
         ]
         count = len(held_out_frames(self.scene))
         self._call("evaluate", arguments, progress, f"Judging {self.name}", count, views)
-        unfinished.rename(self.metrics)
+
+    def _judged(self) -> bool:
+        """Whether the figures are there as a whole: a killed ns-eval may have written half of them."""
+        try:
+            read_json_object(self.metrics, "results")
+        except (InputError, OSError):
+            return False
+        return True
 
     def figures(self) -> dict[str, float]:
         return read_json(self.metrics)["results"]

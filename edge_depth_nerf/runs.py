@@ -21,8 +21,6 @@ from typing import Any, get_type_hints
 import numpy as np
 import tyro
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_distance_png, read_image, read_mask
@@ -190,12 +188,6 @@ def step_of_line(line: str) -> int | None:
 def viewer_command(config: Path) -> str:
     """How to look around in a trained model, on this machine alone."""
     return f"ns-viewer --load-config {config} --viewer.websocket-host 127.0.0.1"
-
-
-def progress_bars(console: Console) -> Progress:
-    """Bars with a description, the time passed and the time left."""
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    return Progress(*columns, console=console)
 
 
 def held_out_frames(scene: Path) -> list[dict[str, Any]]:

@@ -21,8 +21,8 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 from rich.console import Console
 from rich.progress import Progress, TaskID
 
-from edge_depth_nerf.console import say
-from edge_depth_nerf.runs import LoggedCommands, command_line, progress_bars
+from edge_depth_nerf.console import progress_bars, say
+from edge_depth_nerf.runs import LoggedCommands, command_line
 
 WORK = "work done: "
 """Before the share of a task's work, 0 to 1, in the lines that tell its progress."""

@@ -21,9 +21,9 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from edge_depth_nerf import __version__
+from edge_depth_nerf.console import progress_bars
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_image
 from edge_depth_nerf.masks.sky import find_sky
@@ -179,7 +179,7 @@ def _write_own(
         "architecture": ARCHITECTURE,
         **{key: about[key] for key in ("preset", "steps", "abs_rel", "scenes", "field_deg") if key in about},
     }
-    with _progress(console) as progress, _one_thread():
+    with progress_bars(console) as progress, _one_thread():
         for scene in scenes:
             # on these the maps are better than elsewhere
             frames = about.get("trained_frames", {})
@@ -221,7 +221,7 @@ def _write_from_files(options: EstimateDepthOptions, scene: SceneFolder, console
 
 
 def _write_fitted(every: Sequence[FittedMaps], source: dict[str, Any], console: Console) -> None:
-    with _progress(console) as progress:
+    with progress_bars(console) as progress:
         for fitted in every:
             maps = ((picture.name, without_sky(fitted.scene, picture, metres, metres)) for picture, metres in fitted)
             write_mono_maps(fitted.scene.folder, maps, source, progress)
@@ -260,7 +260,7 @@ def _train(
     split = _thinned(split, settings.working_px, console)
     heights = [camera_heights_m(scene, settings) for scene in scenes]
     count = sum(len(pictures) for both in split for pictures in both)
-    with _progress(console) as progress:
+    with progress_bars(console) as progress:
         task = progress.add_task("Gathering LiDAR", total=4 * sum(len(both[0]) for both in split))
         fields = [
             field_deg(scene, both[0], lambda: progress.advance(task)) for scene, both in zip(scenes, split, strict=True)
@@ -456,11 +456,6 @@ def _one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-def _progress(console: Console) -> Progress:
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("left"))
-    return Progress(*columns, TimeRemainingColumn(), console=console)
 
 
 # ---- prediction ------------------------------------------------------------------------------------------------

@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import Progress
 
 from edge_depth_nerf.checked_cache import keep_last, used
+from edge_depth_nerf.console import progress_bars
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.mono.alignment import LEAST_RETURNS, align, both, fit_logs
 from edge_depth_nerf.mono.error_model import (
@@ -261,7 +261,8 @@ def _calibrate(
         far_seen_m = seen_above(cloud, scene, picture, (picture.lens.width, picture.lens.height))
         return measure_frame(picture.name, number, maps.lidar_m, maps.mono_m, maps.usable, view, options, far_seen_m)
 
-    with Progress(console=console, transient=True, disable=console is None) as progress, ThreadPoolExecutor(2) as pool:
+    bars = progress_bars(console or Console(quiet=True), transient=True)
+    with bars as progress, ThreadPoolExecutor(2) as pool:
         task = progress.add_task("Measuring the prior's error…", total=4 * len(measurable))
         cloud = static_cloud(scene, measurable, lambda: progress.advance(task))
         frames = []

@@ -35,9 +35,9 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from edge_depth_nerf.cameras import Camera, KannalaBrandt, Pinhole, fit_kannala_brandt
+from edge_depth_nerf.console import progress_bars
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import (
     read_json,
@@ -258,10 +258,6 @@ class _Run:
         content = json.dumps([_VERSION, self.pycolmap.__version__, cameras, pictures, related])
         return hashlib.sha256(content.encode()).hexdigest()
 
-    def _progress(self, title: str) -> Progress:
-        columns = (TextColumn(title), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-        return Progress(*columns, console=self.console)
-
     def _error_px(self) -> float:
         """How far a feature may be from where geometry puts it: 0.3° on the axis, within 1 px and COLMAP's own 4."""
         focal_px = np.mean([sum(lens.parameters[:2]) / 2 for lens in self.lenses.values()])
@@ -274,8 +270,8 @@ class _Run:
         colmap = self.pycolmap
         reader = colmap.ImageReaderOptions()
         reader.mask_path = self.masks
-        with self._progress("Finding features") as progress:
-            task = progress.add_task("", total=len(self.names))
+        with progress_bars(self.console, counted=True) as progress:
+            task = progress.add_task("Finding features", total=len(self.names))
             for chunk in _chunks(range(len(self.names)), _CHUNK_PICTURES):
                 self._write_masks(chunk)
                 self._link_pictures(chunk)
@@ -364,8 +360,8 @@ class _Run:
         pairing = colmap.ImportedPairingOptions()
         pairing.match_list_path = self.folder / "pairs.txt"
         pairs = self._pairs()
-        with self._progress("Matching pictures") as progress:
-            task = progress.add_task("", total=len(pairs))
+        with progress_bars(self.console, counted=True) as progress:
+            task = progress.add_task("Matching pictures", total=len(pairs))
             for chunk in _chunks(pairs, _CHUNK_PAIRS):
                 write_text(pairing.match_list_path, "".join(f"{self.names[a]} {self.names[b]}\n" for a, b in chunk))
                 colmap.match_image_pairs(
@@ -428,8 +424,8 @@ class _Run:
         unfinished = self.folder / "models.unfinished"
         shutil.rmtree(unfinished, ignore_errors=True)
         unfinished.mkdir()
-        with self._progress("Finding poses") as progress:
-            task, total = progress.add_task("", total=len(self.names)), len(self.names)
+        with progress_bars(self.console, counted=True) as progress:
+            task, total = progress.add_task("Finding poses", total=len(self.names)), len(self.names)
 
             def registered(pictures: int) -> None:
                 # a picture may be in two models

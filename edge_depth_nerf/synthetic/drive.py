@@ -32,8 +32,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from edge_depth_nerf.console import progress_bars
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import (
     read_json,
@@ -353,8 +353,7 @@ def synthesize_drive(options: SynthesizeOptions) -> Path:
 
 def shown(missing: list[Job], options: SynthesizeOptions) -> Iterator[Job]:
     """Go through what is to be made, and show how far it is."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns) as progress:
+    with progress_bars(Console(), counted=True) as progress:
         task = progress.add_task(f"{options.scene}: pictures and sweeps", total=len(missing))
         for job in missing:
             yield job
