@@ -562,6 +562,11 @@ def test_a_folder_keeps_what_its_runs_share(tmp_path, monkeypatch):
         command.compare(replace(first, steps=6), QUIET)
     with pytest.raises(InputError, match="preset lite, not full"):
         command.compare(replace(first, preset="full"), QUIET)
+    with monkeypatch.context() as patched:
+        # said at once, not after whoever writes there
+        patched.setattr(command, "only_writer", lambda *_: pytest.fail("waits for the folder"))
+        with pytest.raises(InputError, match="steps 5, not 6"):
+            command.compare(replace(first, steps=6), QUIET)
     meta = read_json(scene / "transforms.json")
     write_json(scene / "transforms.json", {**meta, "processed": "anew"})
     with pytest.raises(InputError, match="begun with scene_sha256"):

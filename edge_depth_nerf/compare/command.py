@@ -58,11 +58,14 @@ def compare(options: CompareOptions, console: Console | None = None) -> Results:
     """
     console = console or Console()
     options.check()
+    tuned = {} if options.tuned is None else read_tuned(options.tuned)
+    # who asks for something else need not wait for the one who writes there
+    _record(options, tuned)
     with only_writer(options.output, console):
-        return _compare(options, console)
+        return _compare(options, tuned, console)
 
 
-def _compare(options: CompareOptions, console: Console) -> Results:
+def _compare(options: CompareOptions, tuned: dict[str, Setting], console: Console) -> Results:
     methods = options.methods or default_methods(options.preset, with_loss=options.search)
     scenes = {scene.resolve().name: scene.resolve() for scene in options.scenes}
     if len(scenes) < len(options.scenes):
@@ -71,7 +74,6 @@ def _compare(options: CompareOptions, console: Console) -> Results:
             "them. Rename one, or give each scene once."
         )
     digests = {name: check_scene(folder, methods, options.preset) for name, folder in scenes.items()}
-    tuned = {} if options.tuned is None else read_tuned(options.tuned)
     open_output(options, tuned)
 
     specifications = [
@@ -206,6 +208,21 @@ def open_output(options: CompareOptions, tuned: dict[str, Setting]) -> None:
         InputError: it holds another comparison, or something else.
 
     """
+    path, command = options.output / RECORD, command_line(["edge-depth-nerf", "compare"], options)
+    record = _record(options, tuned)
+    commands = record.get("commands", [])
+    wanted = {**record, "commands": commands if command in commands else [*commands, command]}
+    if not path.is_file() or read_json_object(path) != wanted:
+        write_json(path, wanted)
+
+
+def _record(options: CompareOptions, tuned: dict[str, Setting]) -> dict[str, Any]:
+    """What the output folder's record is to hold of what all its runs share, beside the commands so far.
+
+    Raises:
+        InputError: the folder holds another comparison, or something else.
+
+    """
     record = {
         "kind": "search" if options.search else "comparison",
         "preset": options.preset,
@@ -214,7 +231,7 @@ def open_output(options: CompareOptions, tuned: dict[str, Setting]) -> None:
         "tuned": {name: {"lambda": setting.weight, "sigma_m": setting.sigma_m} for name, setting in tuned.items()},
         "tuned_on": None if options.tuned is None else read_json_object(options.tuned).get("scene"),
     }
-    path, command = options.output / RECORD, command_line(["edge-depth-nerf", "compare"], options)
+    path = options.output / RECORD
     if path.is_file():
         found = read_json_object(path)
         added = [name for name in record["tuned"] if name not in found.get("tuned", {})]
@@ -228,13 +245,10 @@ def open_output(options: CompareOptions, tuned: dict[str, Setting]) -> None:
                 f"{path}: this folder holds a comparison with {name} {found.get(name)}, not {record[name]}. Choose "
                 "another --output, or remove the folder."
             )
-        commands = found.get("commands", [])
-        if command not in commands or added:
-            write_json(path, {**found, "commands": [*commands, *([] if command in commands else [command])]})
-        return
+        return found
     if options.output.is_dir() and any(options.output.iterdir()):
         raise InputError(f"{options.output}: holds other things. Choose a new or empty folder for --output.")
-    write_json(path, {**record, "commands": [command]})
+    return record
 
 
 class Run:
@@ -336,5 +350,6 @@ def _show(output: Path, results: Results, tables: Sequence[MadeTable], console: 
         console.print(table)
     say(console, f"To look at, in a browser: {output / REPORT}")
     say(console, f"Tables: {output / 'tables.md'}, {output / 'tables.tex'}; all figures: {output / 'results.csv'}")
-    for run in results.runs[:1]:
-        say(console, f"To look around in what was trained: {viewer_command(next(run.folder.rglob('config.yml')))}")
+    say(console, "To look around in what was trained:")
+    for run in first_runs(results, results.scenes()[0]):
+        say(console, f"  {viewer_command(next(run.folder.rglob('config.yml')))}")
