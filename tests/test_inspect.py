@@ -178,7 +178,7 @@ def test_the_figures_in_the_terminal(tmp_path):
         "8.9 m (image_02)",
         "KANNALA_BRANDT for MEI",
         "128×128",
-        "all pictures",
+        "measured on all pictures",
     ):
         assert words in said
 
@@ -444,7 +444,7 @@ def test_long_drives_are_sampled_evenly(tmp_path, moments, cameras, measured):
 def test_the_summary_says_that_it_is_of_a_sample(tmp_path):
     scene = write_drive(tmp_path / "drive", 70)
     summary = look(scene, tmp_path / "out", frames=1)
-    assert summary["measured"] == "64 pictures spread evenly over the drive"
+    assert summary["measured"] == "measured on 64 of the 70 pictures, evenly over the drive"
     assert summary["maps"]["measured_pictures"] == len(summary["frames"]) == 64
 
 

@@ -98,7 +98,9 @@ def inspect_scene(options: InspectOptions, console: Console | None = None) -> di
 
 
 def _sample(measured: int, pictures: int) -> str:
-    return "all pictures" if measured == pictures else f"{measured} pictures spread evenly over the drive"
+    if measured == pictures:
+        return "measured on all pictures"
+    return f"measured on {measured} of the {pictures} pictures, evenly over the drive"
 
 
 def _open_output(output: Path) -> None:

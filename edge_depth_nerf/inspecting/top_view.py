@@ -61,7 +61,7 @@ def draw_top_view(
         scene: its poses.
         points_m: N×3 points in the scene; higher ones are drawn darker.
         findings: of these, the gaps are marked.
-        shown: moments that are named beside the path.
+        shown: moments that have a sheet; they are numbered beside the path.
 
     """
     ground = _fitting_map(scene)
@@ -90,9 +90,9 @@ def draw_top_view(
     _draw_travel(canvas, [at[picture.moment] for picture in path])
     _draw_dots(canvas, [at[picture.moment] for picture in path if not picture.held_out], 3, TRAINING_RGB)
     _draw_dots(canvas, [at[picture.moment] for picture in path if picture.held_out], 5, HELD_OUT_RGB)
-    named = {at[moment]: moment for moment in sorted({path[0].moment, path[-1].moment, *shown} & at.keys())}
+    named = {at[moment]: moment for moment in sorted({*shown} & at.keys())}
     for place in named:
-        cv2.circle(canvas, place, 7, INK_RGB, 1, cv2.LINE_AA)
+        _draw_ring(canvas, place)
     for x, y in _apart(list(named), 40.0):
         write_text(canvas, str(named[x, y]), (x + 9, y - 9), 0.5, halo=True)
     return np.vstack((_title(scene, name, canvas.shape[1]), canvas, _strip(scene, ground, list(cameras), bool(gaps))))
@@ -167,6 +167,10 @@ def _draw_dots(
         cv2.circle(canvas, place, radius, colour, -1, cv2.LINE_AA)
 
 
+def _draw_ring(canvas: NDArray[np.uint8], place: tuple[int, int]) -> None:
+    cv2.circle(canvas, place, 7, INK_RGB, 1, cv2.LINE_AA)
+
+
 def _draw_travel(canvas: NDArray[np.uint8], path: Sequence[tuple[int, int]]) -> None:
     """Draw arrow heads on the path, in the direction of travel, some 90 px apart."""
     travelled = 45.0
@@ -216,6 +220,7 @@ def _strip(scene: SceneFolder, ground: _Map, cameras: Sequence[str], gaps: bool)
     x, y = right + 50, 32
     names = [("training" if scene.split_known else "pictures", TRAINING_RGB, "dot")]
     names += [("held out", HELD_OUT_RGB, "dot")] if scene.split_known else []
+    names += [("moment with a sheet", INK_RGB, "ring")]
     names += [("gap", GAP_RGB, "line")] if gaps else []
     names += [
         (f"view of {name}", VIEW_RGBS[number % len(VIEW_RGBS)], "line")
@@ -226,6 +231,8 @@ def _strip(scene: SceneFolder, ground: _Map, cameras: Sequence[str], gaps: bool)
             x, y = right + 50, 62
         if kind == "dot":
             cv2.circle(strip, (x + 10, y - 5), 5, colour, -1, cv2.LINE_AA)
+        elif kind == "ring":
+            _draw_ring(strip, (x + 10, y - 5))
         else:
             cv2.line(strip, (x, y - 5), (x + 20, y - 5), colour, 3, cv2.LINE_AA)
         x += 28 + write_text(strip, name, (x + 28, y), 0.5) + 20
