@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import difflib
 import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, get_args
 
 import tyro
 from rich.console import Console
@@ -15,23 +16,25 @@ from rich.console import Console
 from edge_depth_nerf.compare.options import CompareOptions
 from edge_depth_nerf.demo_options import DemoOptions
 from edge_depth_nerf.entry import main
+from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.films.options import CameraPathOptions
 from edge_depth_nerf.inspect_options import InspectOptions
 from edge_depth_nerf.mono.options import EstimateDepthOptions
 from edge_depth_nerf.process.options import JbnuDepth360Options, Kitti360Options, RigOptions
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 
+Converter = (
+    Annotated[Kitti360Options, tyro.conf.subcommand("kitti360")]
+    | Annotated[JbnuDepth360Options, tyro.conf.subcommand("jbnu-depth360")]
+    | Annotated[RigOptions, tyro.conf.subcommand("rig")]
+)
+
 
 @dataclass
 class Process:
     """Turn a raw drive into a scene folder that nerfstudio trains on."""
 
-    options: Annotated[
-        Annotated[Kitti360Options, tyro.conf.subcommand("kitti360")]
-        | Annotated[JbnuDepth360Options, tyro.conf.subcommand("jbnu-depth360")]
-        | Annotated[RigOptions, tyro.conf.subcommand("rig")],
-        tyro.conf.arg(name=""),
-    ]
+    options: Annotated[Converter, tyro.conf.arg(name="")]
 
 
 @dataclass
@@ -51,14 +54,32 @@ Command = (
 )
 
 
-def parse(arguments: list[str] | None = None) -> Command:
-    """Read a command line; wrong options and --help end the program."""
+def parse(arguments: list[str]) -> Command:
+    """Read a command line; wrong options and --help end the program.
+
+    Raises:
+        InputError: there is no such command.
+
+    """
+    _check_name(arguments, Command, "command")
+    if arguments[:1] == ["process"]:
+        _check_name(arguments[1:], Converter, "converter of `process`")
     return tyro.cli(
         Command,
         prog="edge-depth-nerf",
         description="Fisheye driving scenes, integrated depth. With --debug, anywhere, errors come with tracebacks.",
         args=arguments,
     )
+
+
+def _check_name(words: list[str], choices: object, what: str) -> None:
+    """Of a name with a slip, tyro would speak of its options."""
+    known = [metadata.name for choice in get_args(choices) for metadata in get_args(choice)[1:]]
+    if not words or words[0].startswith("-") or words[0] in known:
+        return
+    close = difflib.get_close_matches(words[0], known, 1, 0.6)
+    meant = f" Is {close[0]} meant?" if close else ""
+    raise InputError(f"{words[0]}: no such {what}.{meant} There are {', '.join(known)}.")
 
 
 @contextmanager

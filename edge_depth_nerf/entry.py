@@ -27,15 +27,16 @@ def main() -> None:
 
     Exit status: 0; 1 for a bug; 2 for what the user can mend (also of options); 130 after Ctrl-C.
     """
-    # before OpenMP is loaded, and for the commands that this one starts; why: openmp.py
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    arguments = [argument for argument in sys.argv[1:] if argument != DEBUG_OPTION]
-    if len(arguments) < len(sys.argv) - 1:
-        os.environ[DEBUG_VARIABLE] = "1"  # for the commands that this one starts, too
-    if arguments == ["--version"]:
-        sys.stdout.write(f"{PROGRAM} {__version__}\n")
-        return
     try:
+        # before OpenMP is loaded, and for the commands that this one starts; why: openmp.py
+        os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+        words = sys.argv[1:]
+        arguments = [word for word in words if word != DEBUG_OPTION]
+        if len(arguments) < len(words):
+            os.environ[DEBUG_VARIABLE] = "1"  # for the commands that this one starts, too
+        if arguments == ["--version"]:
+            sys.stdout.write(f"{PROGRAM} {__version__}\n")
+            return
         from edge_depth_nerf.cli import parse, run
 
         run(parse(arguments))

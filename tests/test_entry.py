@@ -44,6 +44,23 @@ def test_version(monkeypatch, capsys):
     assert capsys.readouterr().out == f"edge-depth-nerf {__version__}\n"
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["synthesise", "--output", "x"], "synthesise: no such command. Is synthesize meant? There are synthesize, "),
+        (["xyz"], "xyz: no such command. There are synthesize, process, "),
+        (
+            ["process", "kitti-360"],
+            "kitti-360: no such converter of `process`. Is kitti360 meant? There are kitti360, ",
+        ),
+    ],
+)
+def test_a_name_with_a_slip(monkeypatch, capsys, words, said):
+    status, stderr = end_of(monkeypatch, capsys, *words)
+    assert status == 2
+    assert stderr.startswith(f"edge-depth-nerf: {said}")
+
+
 def test_a_bug_is_one_paragraph_that_asks_to_be_reported(monkeypatch, capsys):
     status, said = end_of(monkeypatch, capsys, "doctor", error=KeyError("not\nthere"))
     assert status == 1
@@ -108,29 +125,39 @@ def interrupted(code: str, until_s: float, *more_s: float, folder: Path | None =
 SYNTHESIS = """
 import sys
 from edge_depth_nerf.entry import main
-sys.argv = ["edge-depth-nerf", "synthesize", "--output", "drive", "--frames", "400", "--size", "64"]
-print("go", flush=True)
-main()
+WORDS = ["edge-depth-nerf", "synthesize", "--output", "drive", "--size", "64", "--frames"]
 """
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.1, 1.0, 2.0])
 def test_ctrl_c_while_it_starts(tmp_path, seconds):
     """While options are read and libraries are imported."""
-    done = interrupted(SYNTHESIS, seconds, folder=tmp_path)
+    code = """
+class Words(list):
+    def __getitem__(self, key):
+        print("go", flush=True)  # main has begun: Ctrl-C is its business from here on
+        return super().__getitem__(key)
+sys.argv = Words([*WORDS, "400"])
+main()
+"""
+    done = interrupted(SYNTHESIS + code, seconds, folder=tmp_path)
     assert (done.returncode, done.stderr) == (130, STOPPED)
 
 
 def test_ctrl_c_at_work_leaves_whole_files(tmp_path):
-    code = SYNTHESIS.replace('"400"', '"12"').replace(
-        'print("go", flush=True)', "import edge_depth_nerf.synthetic.drive as d\nshown = d.shown"
-    )
-    code = code.replace(
-        "main()\n",
-        "def told(*a):\n    for n, job in enumerate(shown(*a)):\n        n == 4 and print('go', flush=True)\n"
-        "        yield job\nd.shown = told\nmain()\n",
-    )
-    done = interrupted(code, 0.2, folder=tmp_path)
+    code = """
+import edge_depth_nerf.synthetic.drive as drive
+shown = drive.shown
+def told(*arguments):
+    for number, job in enumerate(shown(*arguments)):
+        if number == 4:
+            print("go", flush=True)
+        yield job
+drive.shown = told
+sys.argv = [*WORDS, "12"]
+main()
+"""
+    done = interrupted(SYNTHESIS + code, 0.2, folder=tmp_path)
     assert (done.returncode, done.stderr) == (130, STOPPED)
     pictures = list((tmp_path / "drive").rglob("*.png"))
     assert len(pictures) > 4 and all(files.read_image(path).size for path in pictures if "data_rgb" in str(path))

@@ -170,7 +170,10 @@ def _find_vehicle(
                 files = [picture.path for picture in training if picture.camera == recorded.name]
                 mask, said = _find_mask(recorded.camera, files, options, console)
                 write_mask(path, mask)
-                notices.append(f"{recorded.name}: {said} Look at {path}; correct it there, or give --ego-mask.")
+                notices.append(
+                    f"{recorded.name}: {said} Look at {path}; `edge-depth-nerf process … --ego-mask` takes a corrected "
+                    "one."
+                )
             masks[recorded.name] = read_camera_mask(path, recorded.camera)
             recorded = dataclasses.replace(recorded, ego_mask=path)
         cameras.append(recorded)
