@@ -343,6 +343,16 @@ def table(results, label):
     return next(made for made in tables.make_tables(results) if made.label == label)
 
 
+def test_where_the_weights_come_from(results):
+    results.options |= {"tuned": {"ds-nerf": {}}, "tuned_on": "/scenes/tuning"}
+    made = table(results, "7")
+    assert [row.cells[2].text() for row in made.rows] == ["–", "searched", "default"]
+    assert "Searched on tuning." in made.notes and "flatter" not in made.caption
+    results.options["tuned_on"] = "/scenes/street"
+    made = table(results, "7")
+    assert "Searched on street." in made.notes and "flatter" in made.caption
+
+
 def test_table_1_by_hand(results):
     made = table(results, "1")
     headings = made.headings()

@@ -9,6 +9,7 @@ import math
 import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from edge_depth_nerf.compare.methods import METHODS
 from edge_depth_nerf.compare.options import MethodName
@@ -331,7 +332,7 @@ def _settings_table(results: Results) -> MadeTable:
     notes = ["σ in metres, or how the prior's own is found at each pixel."]
     searched_on = results.options.get("tuned_on")
     if searched_on is not None:
-        notes.append(f"Searched on {searched_on}.")
+        notes.append(f"Searched on {Path(searched_on).name}.")
         if searched_on in {run.specification["scene"] for run in results.runs}:
             notes.append("That drive is one of these tables, too: its figures flatter what was searched.")
     return MadeTable("7", "λ and σ", [("", ["λ", "σ", "from"])], rows, notes)
