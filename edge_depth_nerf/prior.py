@@ -29,7 +29,7 @@ from edge_depth_nerf.integration import DepthSource, IntegrationOptions, SigmaMo
 from edge_depth_nerf.mono.alignment import Align, align
 from edge_depth_nerf.mono.error_model import Trust, pixel_features
 
-CACHE_VERSION = 4
+CACHE_VERSION = 5
 """Part of every key: raised whenever the same inputs give another prior."""
 
 KEPT_SETS = 4

@@ -49,6 +49,20 @@ def test_one_distance_says_nothing_about_the_exponent():
     assert float(fit.apply(np.array([[5.0]], np.float32))[0, 0]) == pytest.approx(6, rel=1e-3)
 
 
+def test_beyond_the_returns_the_curve_goes_on_as_a_factor():
+    mono_m = np.geomspace(4, 20, 400)
+    fit = fit_logs(1.1 * mono_m**1.2, mono_m)
+    assert np.exp([fit.least_log, fit.largest_log]) == pytest.approx([4, 20], rel=0.05)
+    ends_m = np.exp([[fit.least_log, fit.largest_log]]).astype(np.float32)
+    factors = (fit.apply(ends_m) / ends_m)[0]
+    assert factors == pytest.approx(1.1 * ends_m[0] ** 0.2, rel=1e-3)
+    beyond_m = np.array([[0.5, 2.0, 30.0, 60.0]], np.float32)
+    assert fit.apply(beyond_m)[0] == pytest.approx(beyond_m[0] * factors[[0, 0, 1, 1]], rel=1e-5)
+    # nothing is torn where it ends
+    step_m = (ends_m.T * [0.999, 1.001]).astype(np.float32)
+    assert np.diff(np.log(fit.apply(step_m)), axis=1) == pytest.approx(np.full((2, 1), 0.0022), abs=3e-4)
+
+
 def test_a_smooth_error_is_taken_away_near_returns_and_left_far_from_them():
     truth = smooth_truth((240, 480))
     x = np.arange(480)

@@ -1,7 +1,8 @@
 """Monocular distance fitted to LiDAR, frame by frame: first one curve for the picture, then a smooth local correction.
 
 Pure. Maps are H×W metres along the ray, 0 = none. The curve is a line in logarithms, log d = scale + exponent · log m,
-fitted robustly (it measures better than a line in inverse distance: docs/prior.md). What it leaves, log d - log m, is
+fitted robustly (it measures better than a line in inverse distance: docs/prior.md); beyond the distances that have
+returns it goes on as a factor. What it leaves, log d - log m, is
 carried from the returns over the picture on a pyramid of coarse grids over column, row and log m, so that it crosses
 no edge of the monocular map. A cell's value is the mean of its returns, drawn by an imagined return to the value of
 the coarser cell around it; the coarsest is drawn to 0 the same way, so the correction vanishes where there are no
@@ -28,6 +29,8 @@ LEAST_RETURNS = 50
 """With fewer returns a frame takes the drive's fit."""
 EXPONENT_RANGE = (0.5, 2.0)
 """The exponent stays within: beyond, the map has nothing to do with the distances."""
+BEYOND_SHARE = 0.005
+"""This share of the returns, at either end, does not count where the curve's range is taken."""
 OUTLIER_SCALE = 8.0
 """A residual of so many robust standard deviations counts a quarter (the weight is 1 / (1 + u²)²)."""
 
@@ -45,12 +48,20 @@ JUDGING_RETURNS = 0.5
 
 @dataclass(frozen=True)
 class Fit:
-    """d = exp(log_scale) · m ** exponent."""
+    """d = exp(log_scale) · m ** exponent where it was fitted; beyond, d/m stays as it is at the end of that range.
+
+    A floor just before the camera has no returns: an exponent carried on to a tenth of the least fitted distance would
+    be a guess.
+    """
 
     log_scale: float = 0.0
     """Logarithm of the distance in metres that 1 m of the map stands for."""
     exponent: float = 1.0
     """1 for a map that is wrong by a factor alone."""
+    least_log: float = -20.0
+    """Logarithm of the map's least distance that it was fitted to, metres."""
+    largest_log: float = 20.0
+    """The same of the largest."""
 
     def apply(self, mono_m: NDArray[np.float32]) -> NDArray[np.float32]:
         """Fitted distances; what is not a positive number becomes 0."""
@@ -58,7 +69,8 @@ class Fit:
         if self == Fit():
             return np.where(known, mono_m, 0).astype(np.float32)
         logs = np.log(np.where(known, mono_m, 1))
-        return np.where(known, np.exp(self.log_scale + self.exponent * logs), 0).astype(np.float32)
+        fitted = np.clip(logs, self.least_log, self.largest_log)
+        return np.where(known, np.exp(self.log_scale + self.exponent * fitted + logs - fitted), 0).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -113,7 +125,8 @@ def fit_logs(lidar_m: Float[np.ndarray, "n"], mono_m: Float[np.ndarray, "n"]) ->
         variance = (weight * (x - mean_x) ** 2).sum()
         slope = float(np.clip((covariance + hold) / (variance + hold), *EXPONENT_RANGE))
         at_middle = float(mean_y - slope * mean_x)
-    return Fit(at_middle - slope * middle, slope)
+    least_log, largest_log = np.quantile(x + middle, (BEYOND_SHARE, 1 - BEYOND_SHARE)).tolist()
+    return Fit(at_middle - slope * middle, slope, least_log, largest_log)
 
 
 def align(
