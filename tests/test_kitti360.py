@@ -45,8 +45,10 @@ from edge_depth_nerf.files import (
     write_mask,
     write_png,
 )
+from edge_depth_nerf.inspecting.findings import find
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.masks.ego import NoEgo
+from edge_depth_nerf.masks.ego_files import vehicles_unknown
 from edge_depth_nerf.mono.trust import calibrate_scene
 from edge_depth_nerf.process import build, colmap_poses
 from edge_depth_nerf.process.kitti360 import process_kitti360
@@ -62,6 +64,7 @@ from edge_depth_nerf.process.options import Kitti360Options, ProcessOptions
 from edge_depth_nerf.process.recording import Recording
 from edge_depth_nerf.process.scene import ProcessReport, Skipped
 from edge_depth_nerf.process.transforms import opencv_to_opengl
+from edge_depth_nerf.scene_reader import read_scene
 
 CAMERAS = ("image_02", "image_03")
 STEP_M = 1 / 256
@@ -318,8 +321,13 @@ def test_semantics_mask_what_may_move(drive: RoomDrive, tmp_path: Path) -> None:
 def test_vehicle_mask_is_found_corrected_and_kept(tmp_path: Path) -> None:
     """The drive is too short to find it: a mask without the vehicle is written, which a person then corrects."""
     drive = write_room_drive(tmp_path / "drive", frames=3, beams=1000, size=48)
-    report = process(drive, tmp_path / "scene")
-    assert any("own mask was not found" in notice for notice in report.notices)
+    for again in (False, True):
+        report = process(drive, tmp_path / "scene")
+        assert (report.written == 0) is again, "a mask that is looked for again is no other mask"
+        assert sum("own mask was not found" in notice for notice in report.notices) == len(CAMERAS)
+    assert vehicles_unknown(tmp_path / "scene") == list(CAMERAS)
+    found = find(read_scene(tmp_path / "scene"), [])
+    assert [one.cameras for one in found if one.kind == "vehicle"] == [(name,) for name in CAMERAS]
     path = tmp_path / "scene/ego_masks/image_02.png"
     mask = read_mask(path)
     before = (tmp_path / "scene/lidar/image_02/0000000000.png").read_bytes()
@@ -327,6 +335,8 @@ def test_vehicle_mask_is_found_corrected_and_kept(tmp_path: Path) -> None:
     write_mask(path, mask)
     report = process(drive, tmp_path / "scene")
     assert report.written >= 3, "that camera's pictures"
+    assert vehicles_unknown(tmp_path / "scene") == ["image_03"]
+    assert ["image_03: the vehicle's own" in notice for notice in report.notices].count(True) == 1
     assert not read_mask(tmp_path / "scene/masks/image_02.png")[24:].any()
     after = read_distance_png(tmp_path / "scene/lidar/image_02/0000000000.png")
     assert not after[24:].any() and after[:24].any()

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from edge_depth_nerf.inspecting.figures import PictureFigures, Step, recorded, steps, usual_length_m
+from edge_depth_nerf.masks.ego_files import ego_mask_path, vehicles_unknown
 from edge_depth_nerf.scene_reader import SceneFolder
 
 GAP_FACTOR = 10
@@ -57,6 +58,7 @@ def find(scene: SceneFolder, measured: Sequence[PictureFigures]) -> list[Finding
         *_path(scene),
         *_timestamps(scene),
         *_fits(scene),
+        *_vehicles(scene),
         *_masks(measured),
         *_outliers(measured),
         *_mono_scale(measured),
@@ -192,6 +194,19 @@ def _by_camera(measured: Sequence[PictureFigures]) -> dict[str, list[PictureFigu
     for figures in measured:
         found.setdefault(figures.picture.camera, []).append(figures)
     return found
+
+
+def _vehicles(scene: SceneFolder) -> Iterator[Finding]:
+    cameras = scene.cameras()
+    for name in vehicles_unknown(scene.path.parent):
+        if name in cameras:
+            yield Finding(
+                "vehicle",
+                f"The vehicle itself was not found in the pictures of {name}, too few or all alike, so what is seen of "
+                f"it is trained on; paint it black in {ego_mask_path(scene.path.parent, name)} and process the drive "
+                "again.",
+                (name,),
+            )
 
 
 def _masks(measured: Sequence[PictureFigures]) -> Iterator[Finding]:

@@ -118,6 +118,8 @@ class NoEgo:
 
     reason: str
     """Why, as a sentence for the user."""
+    could_tell: bool = True
+    """Whether the pictures were enough to find one."""
 
 
 def find_ego(pictures: Iterable[Picture | Callable[[], Picture]], lens: Bool[np.ndarray, "h w"]) -> EgoMask | NoEgo:
@@ -138,14 +140,18 @@ def find_ego(pictures: Iterable[Picture | Callable[[], Picture]], lens: Bool[np.
     factor = math.ceil(max(lens.shape) / WORKING_PX)
     small_lens = whole_blocks(lens, factor)
     if not small_lens.any():
-        return NoEgo("The lens mask leaves no pixel.")
+        return NoEgo("The lens mask leaves no pixel.", could_tell=False)
     taken, offered = _take_moving(pictures, lens.shape, factor, small_lens)
     if offered < MIN_PICTURES:
-        return NoEgo(f"{offered} pictures are too few, at least {MIN_PICTURES} are needed.")
+        return NoEgo(
+            f"{offered} pictures are too few (held-out ones do not count), at least {MIN_PICTURES} are needed.",
+            could_tell=False,
+        )
     if len(taken) < MIN_PICTURES:
         return NoEgo(
             f"The vehicle stands: only {len(taken)} of {offered} pictures show something new, at least "
-            f"{MIN_PICTURES} are needed."
+            f"{MIN_PICTURES} are needed.",
+            could_tell=False,
         )
     count, stack = len(taken), np.stack(taken)
     del taken

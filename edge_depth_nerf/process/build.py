@@ -26,9 +26,10 @@ from torch import Tensor
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.console import say
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_distance_png, read_image, read_json, write_json, write_mask
+from edge_depth_nerf.files import read_distance_png, read_image, read_json, write_json
 from edge_depth_nerf.lidar import project_points, transform_points
 from edge_depth_nerf.masks.ego import EgoMask, find_ego
+from edge_depth_nerf.masks.ego_files import ego_mask_path, keep_ego_mask, vehicles_unknown
 from edge_depth_nerf.masks.lens import dark_rim, lens_circle
 from edge_depth_nerf.masks.semantics import check_classes, keep_static, read_labels
 from edge_depth_nerf.masks.semantics import sky as sky_of_labels
@@ -55,7 +56,6 @@ from edge_depth_nerf.process.scene import (
 from edge_depth_nerf.process.sweep_store import SweepStore
 from edge_depth_nerf.process.transforms import Transform
 
-EGO_MASKS = "ego_masks"
 """Folder of the scene with the vehicle's masks that were found, in the size of the raw pictures."""
 FOUND_POSES = "found_poses.json"
 """File of the scene with the poses that were found from the pictures: camera, frame, held out, camera to world."""
@@ -165,25 +165,29 @@ def _find_vehicle(
     cameras, notices = [], []
     for recorded in recording.cameras:
         if recorded.name not in masks:
-            path = options.output / EGO_MASKS / f"{recorded.name}.png"
-            if not path.is_file():
+            path = ego_mask_path(options.output, recorded.name)
+            if not path.is_file() or recorded.name in vehicles_unknown(options.output):
                 files = [picture.path for picture in training if picture.camera == recorded.name]
-                mask, said = _find_mask(recorded.camera, files, options, console)
-                write_mask(path, mask)
-                notices.append(
-                    f"{recorded.name}: {said} Look at {path}; `edge-depth-nerf process … --ego-mask` takes a corrected "
-                    "one."
-                )
+                mask, said, could_tell = _find_mask(recorded.camera, files, options, console)
+                keep_ego_mask(options.output, recorded.name, mask, could_tell)
+                notices.append(f"{recorded.name}: {said} {(_LOOK if could_tell else _PAINT).format(path)}")
             masks[recorded.name] = read_camera_mask(path, recorded.camera)
             recorded = dataclasses.replace(recorded, ego_mask=path)
         cameras.append(recorded)
     return dataclasses.replace(recording, cameras=tuple(cameras)), notices
 
 
+_LOOK = "Look at {}: what you correct there counts when the drive is processed again."
+_PAINT = (
+    "It is trained on as if it stood in the world: process more of the drive, or paint it black in {} and process "
+    "again."
+)
+
+
 def _find_mask(
     camera: Camera, files: Sequence[Path], options: ProcessOptions, console: Console
-) -> tuple[NDArray[np.bool_], str]:
-    """Find the vehicle and the lens's dark rim in a camera's pictures, at their own size."""
+) -> tuple[NDArray[np.bool_], str, bool]:
+    """Find the vehicle and the lens's dark rim in a camera's pictures, at their own size; tell how it went."""
     spread = [files[index] for index in np.unique(np.linspace(0, len(files) - 1, _EGO_PICTURES).astype(int))]
     if not options.strict:
         # those that cannot be read are told of when their turn comes
@@ -195,8 +199,8 @@ def _find_mask(
             [partial(read_image, file) for file in spread], lens_circle(camera, options.theta_max_deg) & mask
         )
     if isinstance(found, EgoMask):
-        return mask & found.keep, f"the vehicle was found by itself and hides {found.share:.1%} of the lens."
-    return mask, f"the vehicle's own mask was not found: {found.reason.rstrip('.')}."
+        return mask & found.keep, f"the vehicle was found by itself and hides {found.share:.1%} of the lens.", True
+    return mask, f"the vehicle's own mask was not found: {found.reason.rstrip('.')}.", found.could_tell
 
 
 def _readable(picture: Path) -> bool:

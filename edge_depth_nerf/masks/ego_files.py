@@ -1,0 +1,63 @@
+"""The vehicle's own masks in a scene: `ego_masks/CAMERA.png`, as they were found and as people correct them."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.files import read_json_object, read_mask, write_json, write_mask
+
+EGO_MASKS = "ego_masks"
+_UNKNOWN = "not_found.json"
+"""Beside the masks: SHA-256 of those that were written without knowing where the vehicle is."""
+
+
+def ego_mask_path(scene: Path, camera: str) -> Path:
+    """Where a camera's mask lies: 255 = use the pixel, in the size of the raw pictures."""
+    return scene / EGO_MASKS / f"{camera}.png"
+
+
+def keep_ego_mask(scene: Path, camera: str, mask: NDArray[np.bool_], could_tell: bool) -> None:
+    """Write a mask that was looked for; one that is there already keeps its time of change.
+
+    Args:
+        scene: the scene folder.
+        camera: its name.
+        mask: H×W, True = use the pixel.
+        could_tell: whether the pictures were enough to find the vehicle.
+
+    """
+    path = ego_mask_path(scene, camera)
+    if not (path.is_file() and np.array_equal(read_mask(path), mask)):
+        write_mask(path, mask)
+    unknown = _unknown(scene)
+    wanted = {name: digest for name, digest in unknown.items() if name != camera}
+    if not could_tell:
+        wanted[camera] = _digest(path)
+    if wanted != unknown:
+        write_json(scene / EGO_MASKS / _UNKNOWN, wanted)
+
+
+def vehicles_unknown(scene: Path) -> list[str]:
+    """Cameras whose pictures did not tell where the vehicle is, and whose masks nobody has corrected since."""
+    found = []
+    for camera, digest in _unknown(scene).items():
+        path = ego_mask_path(scene, camera)
+        if path.is_file() and _digest(path) == digest:
+            found.append(camera)
+    return found
+
+
+def _unknown(scene: Path) -> dict[str, object]:
+    try:
+        return read_json_object(scene / EGO_MASKS / _UNKNOWN)
+    except (InputError, OSError):
+        return {}
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
