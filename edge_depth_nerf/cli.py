@@ -14,6 +14,7 @@ import tyro
 from rich.console import Console
 
 from edge_depth_nerf.compare.options import CompareOptions
+from edge_depth_nerf.compat import join_lines_of_option_help
 from edge_depth_nerf.demo_options import DemoOptions
 from edge_depth_nerf.entry import main
 from edge_depth_nerf.errors import InputError
@@ -64,10 +65,12 @@ def parse(arguments: list[str]) -> Command:
     _check_name(arguments, Command, "command")
     if arguments[:1] == ["process"]:
         _check_name(arguments[1:], Converter, "converter of `process`")
+    join_lines_of_option_help()
     return tyro.cli(
         Command,
         prog="edge-depth-nerf",
-        description="Fisheye driving scenes, integrated depth. With --debug, anywhere, errors come with tracebacks.",
+        description="Fisheye driving scenes, integrated depth. With --debug, anywhere, errors come with "
+        "tracebacks; --version says which this is.",
         args=arguments,
     )
 

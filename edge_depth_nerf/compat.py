@@ -13,8 +13,6 @@ from contextlib import contextmanager
 from copy import copy
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 if TYPE_CHECKING:
     from nerfstudio.cameras.cameras import Cameras
     from nerfstudio.engine.trainer import Trainer
@@ -30,6 +28,7 @@ def allow_numpy_scalars_in_checkpoints() -> None:
     Works around: https://github.com/nerfstudio-project/nerfstudio/issues/3683.
     Ends with: a nerfstudio that saves Python floats.
     """
+    import numpy as np
     import torch
 
     scalar = np.float64(0).__reduce__()[0]
@@ -118,3 +117,26 @@ def count_steps_against_all(trainer: Trainer) -> None:
 
     if "max_iter" in writer.GLOBAL_BUFFER:
         writer.GLOBAL_BUFFER["max_iter"] = total_steps(trainer)
+
+
+def join_lines_of_option_help() -> None:
+    """Let tyro wrap an option's help by itself: docstrings keep the line breaks and indentation of the source.
+
+    tyro 1.0 joins such lines only where they are not indented, which those of a class always are; it prints words left
+    alone on a line. For our own command; nerfstudio's help is as it is.
+
+    The issue is of the same code, which joins too much of a class's docstring and too little of a field's.
+
+    Works around: https://github.com/brentyi/tyro/issues/429.
+    Ends with: a tyro that cleans docstrings before it joins their lines.
+    """
+    from tyro import _docstrings
+
+    parse = getattr(_docstrings, "parse_docstring_from_object", None)
+    if parse is None or getattr(parse, "__module__", None) == __name__:
+        return
+
+    def joined(described: object) -> dict[str, str]:
+        return {name: " ".join(text.split()) for name, text in parse(described).items()}
+
+    _docstrings.parse_docstring_from_object = joined

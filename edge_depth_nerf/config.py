@@ -10,6 +10,7 @@ import difflib
 import sys
 from dataclasses import dataclass, fields, is_dataclass
 from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -21,6 +22,7 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from edge_depth_nerf.compat import allow_numpy_scalars_in_checkpoints
 from edge_depth_nerf.datamanager import FisheyeDepthDataManagerConfig
+from edge_depth_nerf.entry import say_config_slips_plainly
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.model import EdgeDepthNerfModelConfig
 from edge_depth_nerf.pipeline import EdgeDepthPipelineConfig
@@ -44,6 +46,8 @@ METHOD_FILE = "nerfstudio_method.toml"
 
 # every ns-* command imports this module and may load a checkpoint afterwards
 allow_numpy_scalars_in_checkpoints()
+if Path(sys.argv[0]).name.startswith("ns-"):
+    say_config_slips_plainly()
 
 
 def read_method_file() -> dict[str, Any]:
