@@ -133,8 +133,8 @@ def transforms_path(data: Path) -> Path:
     path = data if data.suffix == ".json" else data / "transforms.json"
     if not path.is_file():
         relative = (
-            f" It was looked for in {Path.cwd()}; a config.yml names its scene as the training was told: use it from "
-            "the same folder."
+            f" It was looked for in {Path.cwd()}; paths count from the folder you are in, those that a config.yml "
+            "keeps of its training, too."
         )
         raise FileNotFoundError(
             f"{path}: no such file. --data takes a scene folder with a transforms.json; `edge-depth-nerf process` "

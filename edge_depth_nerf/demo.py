@@ -31,8 +31,8 @@ from edge_depth_nerf.compare.tables import Cell, MadeTable, Metric, Row, mark_be
 from edge_depth_nerf.console import progress_bars
 from edge_depth_nerf.demo_options import DemoOptions
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_json, read_json_object, write_json, write_png
-from edge_depth_nerf.pictures import distance_of_colours, side_by_side
+from edge_depth_nerf.files import check_is_folder, read_json, read_json_object, write_json, write_png
+from edge_depth_nerf.pictures import DISTANCE, distance_of_colours, side_by_side, with_colour_bar
 from edge_depth_nerf.process.command import process
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.report.build import Commands, Facts, Plot, Report, write_report
@@ -89,6 +89,7 @@ def run_demo(options: DemoOptions, console: Console | None = None) -> dict[str, 
     """
     console = console or Console()
     output = options.output
+    check_is_folder(output)
     recorded = {key: value for key, value in asdict(options).items() if key != "output"}
     record = output / "demo.json"
     if record.is_file() and read_json(record) != recorded:
@@ -332,4 +333,4 @@ def _comparison(scene: Path, runs: Path) -> np.ndarray:
     views = compared_views(scene, {name: runs / name / "views" for name in RUNS}, VIEWS)
     names = ["truth", *RUNS]
     rows = [[*colours, *distances] for colours, distances in (view.rows() for view in views)]
-    return side_by_side(rows, [*names, *(f"{name}: distance" for name in names)])
+    return with_colour_bar(side_by_side(rows, [*names, *(f"{name}: distance" for name in names)]), DISTANCE)

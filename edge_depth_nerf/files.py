@@ -229,6 +229,17 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     return np.ascontiguousarray(_decode(path, cv2.IMREAD_COLOR)[..., ::-1])
 
 
+def check_is_folder(output: Path) -> None:
+    """Make sure that a folder can be made, or is there.
+
+    Raises:
+        InputError: there is a file of that name.
+
+    """
+    if output.exists() and not output.is_dir():
+        raise InputError(f"{output}: is a file; --output takes a folder.")
+
+
 def read_mask(path: Path) -> NDArray[np.bool_]:
     """Read a mask as H×W bool, True = use the pixel (any value but 0).
 

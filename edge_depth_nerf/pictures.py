@@ -245,6 +245,14 @@ def write_text(
     return width
 
 
+def with_colour_bar(sheet: NDArray[np.uint8], scale: ColourScale) -> NDArray[np.uint8]:
+    """Put the legend of a scale below an H×W×3 sheet, at its left."""
+    legend = colour_bar(scale, min(sheet.shape[1], 600))
+    below = np.full((legend.shape[0], sheet.shape[1], 3), 255, np.uint8)
+    below[:, : legend.shape[1]] = legend
+    return np.vstack((sheet, below))
+
+
 def colour_bar(scale: ColourScale, width: int) -> NDArray[np.uint8]:
     """Draw the legend of a scale: its colours with their values below, and the colour of no value.
 

@@ -36,7 +36,7 @@ def test_it_leaves_figures_and_a_picture(finished):
         assert np.isfinite(list(results["figures"][name].values())).all()
     picture = read_image(options.output / "comparison.png")
     # two moments of two cameras are held out (4 and 12), of which three views are shown: three rows of six pictures
-    assert picture.shape == (34 + 3 * 70 - 6, 6 * 70 - 6, 3)
+    assert picture.shape == (34 + 3 * 70 - 6 + 40, 6 * 70 - 6, 3), "with the scale of distances below"
     assert len(results["viewer_commands"]) == 2
     page = (options.output / "report.html").read_text(encoding="utf-8")
     assert "<caption><span>Held-out views</span></caption>" in page and "4 of 4 held-out views" in page

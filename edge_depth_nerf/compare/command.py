@@ -27,9 +27,9 @@ from edge_depth_nerf.compare.specification import FIGURES, SPECIFICATION, VIEWS,
 from edge_depth_nerf.compare.tables import MadeTable, as_latex, as_markdown, make_tables
 from edge_depth_nerf.console import say
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_json_object, write_json, write_png, write_text
+from edge_depth_nerf.files import check_is_folder, read_json_object, write_json, write_png, write_text
 from edge_depth_nerf.one_writer import only_writer
-from edge_depth_nerf.pictures import DISTANCE, colour_bar, resize, side_by_side
+from edge_depth_nerf.pictures import DISTANCE, resize, side_by_side, with_colour_bar
 from edge_depth_nerf.report.build import write_report
 from edge_depth_nerf.report.views import REPORT
 from edge_depth_nerf.runs import command_line, compared_views, viewer_command
@@ -58,6 +58,7 @@ def compare(options: CompareOptions, console: Console | None = None) -> Results:
     """
     console = console or Console()
     options.check()
+    check_is_folder(options.output)
     tuned = {} if options.tuned is None else read_tuned(options.tuned)
     # who asks for something else need not wait for the one who writes there
     _record(options, tuned)
@@ -243,7 +244,7 @@ def _record(options: CompareOptions, tuned: dict[str, Setting]) -> dict[str, Any
             name = different[0]
             raise InputError(
                 f"{path}: this folder holds a comparison with {name} {found.get(name)}, not {record[name]}. Choose "
-                "another --output, or remove the folder."
+                "another --output."
             )
         return found
     if options.output.is_dir() and any(options.output.iterdir()):
@@ -325,10 +326,7 @@ def _draw_comparison(output: Path, results: Results, scene: str) -> None:
     views = compared_views(Path(chosen[0].specification["scene"]), views_of, VIEWS_SHOWN)
     rows = [[_shown(picture) for picture in row] for view in views for row in view.rows()]
     sheet = side_by_side(rows, ["truth", *views_of])
-    legend = colour_bar(DISTANCE, min(sheet.shape[1], 600))
-    below = np.full((legend.shape[0], sheet.shape[1], 3), 255, np.uint8)
-    below[:, : legend.shape[1]] = legend
-    write_png(output / f"comparison_{scene}.png", np.vstack((sheet, below)))
+    write_png(output / f"comparison_{scene}.png", with_colour_bar(sheet, DISTANCE))
 
 
 def _shown(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -350,6 +348,8 @@ def _show(output: Path, results: Results, tables: Sequence[MadeTable], console: 
         console.print(table)
     say(console, f"To look at, in a browser: {output / REPORT}")
     say(console, f"Tables: {output / 'tables.md'}, {output / 'tables.tex'}; all figures: {output / 'results.csv'}")
-    say(console, "To look around in what was trained:")
-    for run in first_runs(results, results.scenes()[0]):
+    first = results.scenes()[0]
+    more = "" if len(results.runs) == len(results.methods()) else f" (on {first}; for all others see {REPORT})"
+    say(console, f"To look around in what was trained{more}:")
+    for run in first_runs(results, first):
         say(console, f"  {viewer_command(next(run.folder.rglob('config.yml')))}")

@@ -20,8 +20,8 @@ PAPER_AHEAD_DB: dict[str, dict[MethodName, float]] = {
     "2": {"nerfacto": 0.12, "ds-nerf": 0.04},
 }
 """By how much the published method is ahead of a row, by the paper's Tables 1 and 2, dB of PSNR."""
-JBNU = "jbnu-depth360"
-"""The kind of source whose drives make Table 2."""
+KITTI360, JBNU = "kitti360", "jbnu-depth360"
+"""The kinds of source whose drives make Tables 1 and 2; all others come to Table 1."""
 
 AVERAGES = (
     "The paper's averages do not follow from its rows; the differences are those that it states for the averages."
@@ -353,8 +353,10 @@ def make_tables(results: Results) -> list[MadeTable]:
         "edge-paper",
         "edge",
     ]
+    of_the_paper = {*kinds.values()} <= {KITTI360, JBNU}
+    rivals_title = "Rivals, drives of KITTI-360's kind" if of_the_paper else "Rivals"
     wanted: list[tuple[str, str, list[str], list[MethodName], list[str]]] = [
-        ("1", "Rivals, drives of KITTI-360's kind", drives["1"], rivals, []),
+        ("1", rivals_title, drives["1"], rivals, []),
         ("2", "Rivals, drives of JBNU-Depth360", drives["2"], rivals, []),
         ("3", "Source of depth", results.scenes(), ["edge-lidar", "edge-mono", "edge"], [INTEGRATED, SAME_ROW]),
         ("4", "Kernel of the integration", results.scenes(), ["edge-gaussian", "edge"], [EDGE_AWARE]),

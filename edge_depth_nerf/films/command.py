@@ -91,8 +91,8 @@ def write_camera_path(options: CameraPathOptions, console: Console | None = None
     if shutil.which("ffmpeg") is None:
         say(
             console,
-            "ns-render writes films with ffmpeg, which is not on this machine: install it before you render "
-            "(apt-get install ffmpeg, brew install ffmpeg), or render with --output-format images.",
+            "ns-render needs ffmpeg, which is not on this machine: install it before you render (apt-get install "
+            "ffmpeg, brew install ffmpeg).",
             style="yellow",
         )
     scene = None if options.scene is None else read_scene(options.scene)

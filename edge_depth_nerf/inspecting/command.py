@@ -14,7 +14,7 @@ from rich.table import Table
 from edge_depth_nerf import __version__
 from edge_depth_nerf.console import run_jobs, say
 from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_json, write_json, write_png
+from edge_depth_nerf.files import check_is_folder, read_json, write_json, write_png
 from edge_depth_nerf.inspect_options import InspectOptions
 from edge_depth_nerf.inspecting.figures import (
     PictureFigures,
@@ -105,8 +105,7 @@ def _sample(measured: int, pictures: int) -> str:
 
 def _open_output(output: Path) -> None:
     """Make the folder; sheets of an earlier look are removed, so that none of another scene stays among the new."""
-    if output.exists() and not output.is_dir():
-        raise InputError(f"{output}: is a file; --output takes a folder.")
+    check_is_folder(output)
     try:
         output.mkdir(parents=True, exist_ok=True)
         if (output / SUMMARY).is_file():

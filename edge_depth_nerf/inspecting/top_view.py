@@ -218,10 +218,11 @@ def _strip(scene: SceneFolder, ground: _Map, cameras: Sequence[str], gaps: bool)
     write_text(strip, f"{length_m:g} {_unit(scene)}", ((left + right) // 2, 36), 0.5, align=0.5)
 
     x, y = right + 50, 32
-    names = [("training" if scene.split_known else "pictures", TRAINING_RGB, "dot")]
+    names = [("travel", TRAINING_RGB, "arrow"), ("training" if scene.split_known else "pictures", TRAINING_RGB, "dot")]
     names += [("held out", HELD_OUT_RGB, "dot")] if scene.split_known else []
     names += [("moment with a sheet", INK_RGB, "ring")]
     names += [("gap", GAP_RGB, "line")] if gaps else []
+    names += [("points, higher ones darker", (150, 150, 150), "dot")]
     names += [
         (f"view of {name}", VIEW_RGBS[number % len(VIEW_RGBS)], "line")
         for number, name in enumerate(cameras[: len(VIEW_RGBS)])
@@ -231,6 +232,8 @@ def _strip(scene: SceneFolder, ground: _Map, cameras: Sequence[str], gaps: bool)
             x, y = right + 50, 62
         if kind == "dot":
             cv2.circle(strip, (x + 10, y - 5), 5, colour, -1, cv2.LINE_AA)
+        elif kind == "arrow":
+            cv2.fillPoly(strip, [np.array([(x + 20, y - 5), (x + 2, y), (x + 2, y - 10)])], colour, cv2.LINE_AA)
         elif kind == "ring":
             _draw_ring(strip, (x + 10, y - 5))
         else:

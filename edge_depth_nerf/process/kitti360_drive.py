@@ -104,8 +104,8 @@ class Kitti360Drive:
             asked = "" if options.frames is None else f" --frames {options.frames} --stride {options.stride}"
             raise InputError(
                 f"--first {options.first}{asked}: reaches frame {last}, but the pictures of {options.sequence} are of "
-                f"frames {min(present)} to {end}. Ask for fewer frames, or leave out "
-                "--first and --frames to take all."
+                f"frames {min(present)} to {end}. Begin earlier, ask for fewer, or leave "
+                "out --first and --frames to take all."
             )
         kept, skipped = [], []
         for frame in range(options.first, last + 1, options.stride):

@@ -30,8 +30,8 @@ class ProcessOptions:
     """Average blocks of this many pixels by this many into one. What does not fill a block, at the right and at the
     bottom, is cut off."""
     holdout_every: int = 8
-    """One frame of so many is held out of training, for all cameras at once: frames 4, 12, 20 of every 8. 0 holds out
-    none."""
+    """One frame of so many is held out of training, for all cameras at once: with 8 the fifth, the 13th, the 21st …;
+    0 holds out none."""
     theta_max_deg: float = 95.0
     """Rays further than this from the optical axis are masked out, in degrees."""
     poses: Literal["recorded", "colmap"] = "recorded"

@@ -312,8 +312,8 @@ def _select(moments: list[dict[str, _Timed]], options: RigOptions | JbnuDepth360
     if end > last:
         asked = "" if options.frames is None else f" --frames {options.frames} --stride {options.stride}"
         raise InputError(
-            f"--first {options.first}{asked}: reaches moment {end}, but the recording has moments 0 to {last}. Ask for "
-            "fewer, or leave out --first and --frames to take all."
+            f"--first {options.first}{asked}: reaches moment {end}, but the recording has moments 0 to {last}. Begin "
+            "earlier, ask for fewer, or leave out --first and --frames to take all."
         )
     return range(options.first, end + 1, options.stride)
 

@@ -42,6 +42,7 @@ from edge_depth_nerf.console import run_jobs
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import (
     DISTANCE_STEPS_PER_METRE,
+    check_is_folder,
     read_distance_png,
     read_image,
     read_json,
@@ -279,9 +280,8 @@ def write_scene(
         if not whole or work.frames or work.shifted:
             later = None
             notices.append(
-                "The monocular maps that were put into this scene later are left out: they are not whole, or the "
-                "scene was written anew. Those of a network of the drive's own are made again; others are to be put "
-                "in again, by `edge-depth-nerf estimate-depth`."
+                "The scene's pictures or masks are new, so its estimated monocular maps are, too: those of the drive's "
+                "own network are made again; others are to be put in again, by `edge-depth-nerf estimate-depth`."
             )
             if "mono" in layers:
                 # in their places belong the drive's
@@ -397,8 +397,7 @@ def open_scene(output: Path, source: Mapping[str, Any]) -> None:
     """
     record = {"made_by": f"edge-depth-nerf {__version__}", **source}
     path = output / RECORD
-    if output.exists() and not output.is_dir():
-        raise InputError(f"{output}: is a file; --output takes a folder.")
+    check_is_folder(output)
     remove_leftovers(output)
     if path.is_file():
         there = read_json(path)

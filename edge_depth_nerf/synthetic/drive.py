@@ -36,6 +36,7 @@ from rich.console import Console
 from edge_depth_nerf.console import progress_bars
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import (
+    check_is_folder,
     read_json,
     write_bytes,
     write_distance_png,
@@ -155,8 +156,7 @@ def _open_folder(options: SynthesizeOptions) -> None:
 
     """
     folder, manifest = options.output, _manifest(options)
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: is a file, expected a folder to write the drive to. Choose another --output.")
+    check_is_folder(folder)
     path = folder / _MANIFEST
     if path.is_file():
         there = read_json(path)
