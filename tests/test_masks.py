@@ -193,14 +193,14 @@ def test_why_no_vehicle_is_found() -> None:
     world = SlidingWorld(vehicle_shape())
     few = ego.find_ego(world.drive(ego.MIN_PICTURES - 1), world.lens)
     assert isinstance(few, ego.NoEgo)
-    assert "too few" in few.reason
+    assert "too few" in few.reason and not few.could_tell
     standing = ego.find_ego([world.picture(0, k) for k in range(30)], world.lens)
     assert isinstance(standing, ego.NoEgo)
-    assert "stands" in standing.reason
+    assert "stands" in standing.reason and not standing.could_tell
     bare = SlidingWorld(None)
     none = ego.find_ego(bare.drive(30), bare.lens)
-    assert isinstance(none, ego.NoEgo)
-    assert ego.find_ego([], np.zeros((SIZE, SIZE), bool)) == ego.NoEgo("The lens mask leaves no pixel.")
+    assert isinstance(none, ego.NoEgo) and none.could_tell
+    assert ego.find_ego([], np.zeros((SIZE, SIZE), bool)) == ego.NoEgo("The lens mask leaves no pixel.", False)
 
 
 def test_road_without_texture_is_not_taken_for_the_vehicle() -> None:

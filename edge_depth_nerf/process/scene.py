@@ -280,8 +280,9 @@ def write_scene(
         if not whole or work.frames or work.shifted:
             later = None
             notices.append(
-                "The scene's pictures or masks are new, so its estimated monocular maps are, too: those of the drive's "
-                "own network are made again; others are to be put in again, by `edge-depth-nerf estimate-depth`."
+                "The estimated monocular maps of this scene are left out: one is missing, or pictures or masks are "
+                "new. Those of the drive's own network are made again; others are to be put in again, by "
+                "`edge-depth-nerf estimate-depth`."
             )
             if "mono" in layers:
                 # in their places belong the drive's
