@@ -351,6 +351,8 @@ def test_where_the_weights_come_from(results):
     results.options["tuned_on"] = "/scenes/street"
     made = table(results, "7")
     assert "Searched on street." in made.notes and "flatter" in made.caption
+    results.options["tuned_on"] = 7  # a file written by hand
+    assert "Searched on 7." in table(results, "7").notes
 
 
 def test_table_1_by_hand(results):

@@ -332,7 +332,7 @@ def _settings_table(results: Results) -> MadeTable:
     notes = ["σ in metres, or how the prior's own is found at each pixel."]
     searched_on = results.options.get("tuned_on")
     if searched_on is not None:
-        notes.append(f"Searched on {Path(searched_on).name}.")
+        notes.append(f"Searched on {Path(str(searched_on)).name}.")
         if searched_on in {run.specification["scene"] for run in results.runs}:
             notes.append("That drive is one of these tables, too: its figures flatter what was searched.")
     return MadeTable("7", "λ and σ", [("", ["λ", "σ", "from"])], rows, notes)

@@ -12,6 +12,7 @@ from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_json_object, read_mask, write_json, write_mask
 
 EGO_MASKS = "ego_masks"
+"""Folder of the scene with the vehicle's masks that were found, in the size of the raw pictures."""
 _UNKNOWN = "not_found.json"
 """Beside the masks: SHA-256 of those that were written without knowing where the vehicle is."""
 

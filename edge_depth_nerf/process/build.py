@@ -56,7 +56,6 @@ from edge_depth_nerf.process.scene import (
 from edge_depth_nerf.process.sweep_store import SweepStore
 from edge_depth_nerf.process.transforms import Transform
 
-"""Folder of the scene with the vehicle's masks that were found, in the size of the raw pictures."""
 FOUND_POSES = "found_poses.json"
 """File of the scene with the poses that were found from the pictures: camera, frame, held out, camera to world."""
 MOST_LISTED = 50
