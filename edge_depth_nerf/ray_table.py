@@ -9,6 +9,8 @@ memory; a lens of 1400×1400 px takes 39 MB there, and five seconds once.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +23,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from edge_depth_nerf.checked_cache import is_whole, keep_last, used, write_checked
+from edge_depth_nerf.console import progress_bars
 
 TABLE_VERSION = 2
 """Raised whenever the form of the file changes."""
@@ -45,8 +48,8 @@ def _lenses(cameras: Cameras) -> tuple[Float[Tensor, "lenses 13"], Int[Tensor, "
     return torch.unique(table, dim=0, return_inverse=True)
 
 
-def _make(lenses: Tensor) -> np.ndarray:
-    """The table of some lenses, one after the other, each row by row."""
+def _make(lenses: Tensor, advance: Callable[[int], object]) -> np.ndarray:
+    """The table of some lenses, one after the other, each row by row; `advance` is told of pixels that are done."""
     parts = []
     for lens in lenses.float():
         width, height = int(lens[0]), int(lens[1])
@@ -66,6 +69,7 @@ def _make(lenses: Tensor) -> np.ndarray:
             coords = torch.stack([pixels // width, pixels % width], dim=-1) + 0.5
             rays = camera.generate_rays(torch.zeros(len(pixels), 1, dtype=torch.long), coords)
             parts.append(torch.cat([rays.directions, rays.pixel_area, rays.metadata["directions_norm"]], dim=-1))
+            advance(len(pixels))
     return torch.cat(parts).numpy()
 
 
@@ -99,8 +103,9 @@ class TableRayGenerator(RayGenerator):
         path = folder / f"{digest.hexdigest()[:32]}.npy"
         table = _read(path, int(pixels.sum()))
         if table is None:
-            with CONSOLE.status("Making the table of rays, once …"):
-                made = _make(lenses)
+            with progress_bars(CONSOLE, transient=True) as progress:
+                task = progress.add_task("Making the table of rays, once …", total=int(pixels.sum()))
+                made = _make(lenses, partial(progress.advance, task))
             try:
                 write_checked(path, TABLE_VERSION, lambda file: np.save(file, made))
             except OSError:
