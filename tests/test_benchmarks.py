@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 import copy
+import hashlib
 import importlib
 import json
+import lzma
 import sys
 from pathlib import Path
 from xml.etree import ElementTree
@@ -14,6 +16,8 @@ import pytest
 from nerfstudio.configs.method_configs import all_methods
 
 from edge_depth_nerf.config import apply_overrides
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.files import read_json, write_json
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results.json"
@@ -113,3 +117,42 @@ def test_no_two_variants_of_the_ablation_are_the_same(benchmark_module):
     for variant in variants:  # what it overrides exists
         config = copy.deepcopy(all_methods["edge-depth-nerf-lite"])
         apply_overrides(config, variant.overrides, "ablation")
+
+
+def test_kept_runs_are_laid_out_again(benchmark_module, tmp_path):
+    kept = benchmark_module("kept_runs")
+    scene = tmp_path / "here" / "street"
+    scene.mkdir(parents=True)
+    (scene / "transforms.json").write_text("{}")
+    run = {"scene": str(scene), "scene_sha256": hashlib.sha256(b"{}").hexdigest(), "method": "edge", "seed": 1}
+    configuration = {"output_dir": str(tmp_path), "pipeline.model.near_m": "0.05"}
+    folder = tmp_path / "comparison"
+    write_json(
+        folder / "runs/street/edge_seed-1/figures.json", {"run": run, "configuration": configuration, "curve": [1.5]}
+    )
+    write_json(folder / "compare.json", {"steps": 20, "commands": [f"edge-depth-nerf compare {scene}"]})
+    file = tmp_path / "kept.json.xz"
+    assert kept.keep(folder, file) == 1
+    assert str(tmp_path) not in lzma.decompress(file.read_bytes()).decode()
+
+    moved = tmp_path / "there"
+    (tmp_path / "here").rename(moved)
+    again = tmp_path / "again"
+    assert kept.lay(file, again, moved) == 1
+    there = {**run, "scene": str(moved / "street")}
+    assert read_json(again / "runs/street/edge_seed-1/run.json") == there
+    assert read_json(again / "runs/street/edge_seed-1/figures.json") == {
+        "run": there,
+        "configuration": {"pipeline.model.near_m": "0.05"},
+        "curve": [1.5],
+    }
+    assert read_json(again / "compare.json") == {"steps": 20, "commands": []}
+    # what is there is not touched
+    write_json(again / "runs/street/edge_seed-1/figures.json", {"mine": 1})
+    assert kept.lay(file, again, moved) == 0
+    assert read_json(again / "runs/street/edge_seed-1/figures.json") == {"mine": 1}
+    # another scene is none
+    (moved / "street" / "transforms.json").write_text("[]")
+    with pytest.raises(InputError, match=r"is not the scene of .*kept\.json\.xz"):
+        kept.lay(file, tmp_path / "third", moved)
+    assert not (tmp_path / "third").exists()

@@ -817,6 +817,27 @@ def test_what_is_there_is_not_done_again(finished, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("kept", [(), ("edge",)])
+def test_runs_of_which_only_the_figures_are_left_count_in_the_tables(finished, tmp_path, monkeypatch, kept):
+    asked, results = finished
+    output = tmp_path / "out"
+    shutil.copytree(asked.output, output)
+    (output / "comparison_sample.png").unlink()
+    for folder in (output / "runs" / "sample").iterdir():
+        for each in folder.iterdir():
+            if folder.name.partition("_")[0] in kept or each.name in ("run.json", "figures.json"):
+                continue
+            shutil.rmtree(each) if each.is_dir() else each.unlink()
+    monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: pytest.fail("started a command"))
+    assert command.compare(replace(asked, output=output), QUIET).rows() == results.rows()
+    assert "| nerfacto |" in (output / "tables.md").read_text()
+    assert (output / "comparison_sample.png").is_file() == bool(kept)
+    page = (output / "report.html").read_text(encoding="utf-8")
+    assert page.count("<code>ns-viewer --load-config ") == len(kept)
+    assert page.count('"distance-error": "data:image/webp') == 2 * len(kept)
+
+
+@pytest.mark.slow
 def test_an_interrupted_run_goes_on_at_its_checkpoint(finished, tmp_path):
     """As if it had been killed after four of ours' twelve steps."""
     asked, results = finished

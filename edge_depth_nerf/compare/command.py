@@ -322,6 +322,8 @@ def do_runs(runs: Sequence[Run], options: CompareOptions, console: Console) -> N
 def _draw_comparison(output: Path, results: Results, scene: str) -> None:
     """Draw some held-out views, a row of colours and one of distances each: truth, then the methods' first seeds."""
     chosen = first_runs(results, scene)
+    if not chosen:
+        return
     views_of = {METHODS[run.method].title: run.folder / VIEWS for run in chosen}
     views = compared_views(Path(chosen[0].specification["scene"]), views_of, VIEWS_SHOWN)
     rows = [[_shown(picture) for picture in row] for view in views for row in view.rows()]
@@ -348,8 +350,10 @@ def _show(output: Path, results: Results, tables: Sequence[MadeTable], console: 
         console.print(table)
     say(console, f"To look at, in a browser: {output / REPORT}")
     say(console, f"Tables: {output / 'tables.md'}, {output / 'tables.tex'}; all figures: {output / 'results.csv'}")
-    first = results.scenes()[0]
-    more = "" if len(results.runs) == len(results.methods()) else f" (on {first}; for all others see {REPORT})"
-    say(console, f"To look around in what was trained{more}:")
-    for run in first_runs(results, first):
-        say(console, f"  {viewer_command(next(run.folder.rglob('config.yml')))}")
+    there = [(scene, runs) for scene in results.scenes() if (runs := first_runs(results, scene))]
+    for scene, runs in there[:1]:
+        more = "" if len(results.runs) == len(runs) else f" (on {scene}; for all others see {REPORT})"
+        say(console, f"To look around in what was trained{more}:")
+        for run in runs:
+            if run.config:
+                say(console, f"  {viewer_command(run.config)}")

@@ -20,7 +20,7 @@ from edge_depth_nerf.runs import viewer_command
 def make_report(results: Results, tables: Sequence[MadeTable], plots: Sequence[Plot], console: Console) -> Report:
     """Gather what the page shows; its pictures are made here, of the first seed of each method."""
     scenes, methods = results.scenes(), [METHODS[name].title for name in results.methods()]
-    first = {scene: first_runs(results, scene) for scene in scenes}
+    first = {scene: runs for scene in scenes if (runs := first_runs(results, scene))}
     drives = {
         scene: (
             Path(runs[0].specification["scene"]),
@@ -28,7 +28,7 @@ def make_report(results: Results, tables: Sequence[MadeTable], plots: Sequence[P
         )
         for scene, runs in first.items()
     }
-    configs = [next(run.folder.rglob("config.yml")) for runs in first.values() for run in runs]
+    configs = [run.config for runs in first.values() for run in runs if run.config]
     return Report(
         title=f"Comparison on {' and '.join(scenes) if len(scenes) < 3 else f'{len(scenes)} drives'}",
         lead=f"{', '.join(methods)}: trained alike but for what each method names, judged alike on held-out views.",
@@ -52,8 +52,9 @@ def make_report(results: Results, tables: Sequence[MadeTable], plots: Sequence[P
 
 
 def first_runs(results: Results, scene: str) -> list[RunResult]:
-    """The run of the first seed of each method on a drive, in the tables' order."""
-    found = [[run for run in results.runs if run.scene == scene and run.method == name] for name in results.methods()]
+    """Of each method on a drive the run of the first seed that can be looked at, in the tables' order."""
+    runs = [run for run in results.runs if run.scene == scene and run.to_look_at]
+    found = [[run for run in runs if run.method == name] for name in results.methods()]
     return [min(runs, key=lambda run: run.seed) for runs in found if runs]
 
 

@@ -12,7 +12,7 @@ from typing import Any
 from edge_depth_nerf.bounds import finite
 from edge_depth_nerf.compare.methods import METHODS
 from edge_depth_nerf.compare.options import MethodName
-from edge_depth_nerf.compare.specification import FIGURES, OF_A_RUN
+from edge_depth_nerf.compare.specification import FIGURES, OF_A_RUN, VIEWS
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_json_object, write_json, write_text
 
@@ -42,6 +42,16 @@ class RunResult:
     def seed(self) -> int:
         """Seed of the training."""
         return self.specification["seed"]
+
+    @property
+    def to_look_at(self) -> bool:
+        """Whether its judged views and its config.yml are there: all but the figures may be removed to save space."""
+        return (self.folder / VIEWS).is_dir() and self.config is not None
+
+    @property
+    def config(self) -> Path | None:
+        """Its config.yml, beside its checkpoints."""
+        return next(self.folder.rglob("config.yml"), None)
 
     @property
     def figures(self) -> dict[str, float]:

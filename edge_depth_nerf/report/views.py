@@ -111,7 +111,7 @@ class Drive:
 
 def views_of_a_drive(runs: int) -> int:
     """How many views of each drive are shown at most, with so many runs over all drives."""
-    return min(max(MOST_PICTURES // (len(KINDS) * runs), 1), MOST_VIEWS)
+    return min(max(MOST_PICTURES // (len(KINDS) * max(runs, 1)), 1), MOST_VIEWS)
 
 
 def make_drives(drives: Mapping[str, tuple[Path, Mapping[str, Path]]], console: Console) -> list[Drive]:

@@ -1,0 +1,106 @@
+"""The figures of all runs of a comparison in one small file, and a comparison's folder made of it again.
+
+    python benchmarks/kept_runs.py keep comparison benchmarks/comparison.json.xz
+    python benchmarks/kept_runs.py lay benchmarks/comparison.json.xz comparison --scenes scenes
+
+What was laid out is in the tables of the next `edge-depth-nerf compare … --output comparison`, which does not train it
+again; pictures it has none. The scenes are to be the same: the SHA-256 of their transforms.json is checked.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import lzma
+from pathlib import Path
+from typing import Any
+
+from edge_depth_nerf.compare.command import RECORD, RUNS
+from edge_depth_nerf.compare.specification import FIGURES, SPECIFICATION
+from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.files import read_json_object, write_bytes, write_json
+
+
+def with_scene(content: dict[str, Any], scene: str) -> dict[str, Any]:
+    """A run's specification with its scene's path replaced."""
+    return {**content, "scene": scene}
+
+
+def keep(comparison: Path, file: Path) -> int:
+    """Gather the figures of all finished runs; the scenes' folders are left out, their names stay.
+
+    Returns:
+        How many.
+
+    """
+    runs = {}
+    for path in sorted(comparison.glob(f"{RUNS}/*/*/{FIGURES}")):
+        figures = read_json_object(path)
+        name = Path(figures["run"]["scene"]).name
+        figures["run"] = with_scene(figures["run"], name)
+        # of this machine, and another for each run
+        figures["configuration"].pop("output_dir", None)
+        figures["configuration"].pop("pipeline.datamanager.data", None)
+        runs[path.parent.relative_to(comparison / RUNS).as_posix()] = figures
+    record = read_json_object(comparison / RECORD)
+    record["commands"] = []
+    text = json.dumps({"record": record, "runs": runs}, separators=(",", ":"))
+    write_bytes(file, lzma.compress(text.encode(), preset=9 | lzma.PRESET_EXTREME))
+    return len(runs)
+
+
+def lay(file: Path, comparison: Path, scenes: Path) -> int:
+    """Write what `keep` gathered as the folders that `compare` goes on with; what is there stays as it is.
+
+    Returns:
+        How many runs were written.
+
+    Raises:
+        InputError: a scene is another than the one that was trained on.
+
+    """
+    kept = json.loads(lzma.decompress(file.read_bytes()))
+    digests = {}
+    for figures in kept["runs"].values():
+        name, wanted = figures["run"]["scene"], figures["run"]["scene_sha256"]
+        path = scenes.resolve() / name / "transforms.json"
+        digests.setdefault(name, hashlib.sha256(path.read_bytes()).hexdigest())
+        if digests[name] != wanted:
+            raise InputError(
+                f"{path}: is not the scene of {file}: its SHA-256 is {digests[name]}, expected {wanted}. Make it by "
+                "the commands of docs/results.md."
+            )
+    written = 0
+    for name, figures in kept["runs"].items():
+        folder = comparison / RUNS / name
+        if (folder / FIGURES).exists():
+            continue
+        figures["run"] = with_scene(figures["run"], str(scenes.resolve() / figures["run"]["scene"]))
+        write_json(folder / SPECIFICATION, figures["run"])
+        write_json(folder / FIGURES, figures)
+        written += 1
+    if not (comparison / RECORD).exists():
+        write_json(comparison / RECORD, kept["record"])
+    return written
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(dest="command", required=True)
+    keeping = commands.add_parser("keep")
+    keeping.add_argument("comparison", type=Path)
+    keeping.add_argument("file", type=Path)
+    laying = commands.add_parser("lay")
+    laying.add_argument("file", type=Path)
+    laying.add_argument("comparison", type=Path)
+    laying.add_argument("--scenes", type=Path, default=Path("scenes"))
+    options = parser.parse_args()
+    if options.command == "keep":
+        print(f"{keep(options.comparison, options.file)} runs, {options.file.stat().st_size / 1024:.0f} KiB")
+    else:
+        print(f"{lay(options.file, options.comparison, options.scenes)} runs")
+
+
+if __name__ == "__main__":
+    main()
