@@ -15,6 +15,8 @@ from xml.etree import ElementTree
 import pytest
 from nerfstudio.configs.method_configs import all_methods
 
+from edge_depth_nerf.compare.options import MethodName
+from edge_depth_nerf.compare.results import Results, RunResult
 from edge_depth_nerf.config import apply_overrides
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_json, write_json
@@ -156,3 +158,52 @@ def test_kept_runs_are_laid_out_again(benchmark_module, tmp_path):
     with pytest.raises(InputError, match=r"is not the scene of .*kept\.json\.xz"):
         kept.lay(file, tmp_path / "third", moved)
     assert not (tmp_path / "third").exists()
+
+
+def finished_run(scene, method, seed, psnr, **more):
+    steps, seconds = 100, 40.0 if method == "edge" else 80.0
+    curve = [{"step": steps * x, "cpu_seconds": seconds * x, "truth_psnr": psnr * x} for x in (0.5, 1.0)]
+    figures = {"truth_masked_psnr": psnr, "truth_masked_ssim": psnr / 40, "truth_abs_rel": 1 / psnr, **more}
+    figures |= {"truth_delta_1_25": 0.9, "shifted_1m_masked_psnr": psnr - 1}
+    run = {"scene": f"/scenes/{scene}", "method": method, "seed": seed}
+    content = {"curve": curve, "figures": figures, "steps": steps, "device": "cpu"}
+    return RunResult(Path(scene, method), run, content)
+
+
+def test_goals_by_hand(benchmark_module):
+    """Two drives; ours has two seeds of one of them; of Tables 3 and 4 there is LiDAR alone."""
+    goals = benchmark_module("goals")
+    psnr: dict[MethodName, tuple[float, float]] = {
+        "nerfacto": (20.0, 24.0),
+        "urban-nerf": (21.0, 24.0),
+        "ds-nerf": (20.0, 26.0),
+        "edge-lidar": (22.0, 27.0),
+        "edge": (25.0, 27.0),
+    }
+    runs = [
+        finished_run(scene, method, 0, value)
+        for method, values in psnr.items()
+        for scene, value in zip(("street", "turn"), values, strict=True)
+    ]
+    runs.append(finished_run("street", "edge", 1, 26.0))
+    results = Results(runs)
+    found = {goal.title: goal for goal in goals.goals(results)}
+    assert found["PSNR, dB over nerfacto"].found == pytest.approx((25.5 + 27) / 2 - 22)
+    assert found["PSNR, dB over the better of DS-NeRF and UrbanNeRF"].found == pytest.approx(26.25 - 23)
+    least = found["PSNR, dB over the best rival on the drive where that is least"]
+    assert least.found == pytest.approx(1.0) and least.reached
+    assert found["SSIM over the best rival on the drive where that is least"].found == pytest.approx(1 / 40)
+    ratio = ((1 / 25 + 1 / 26) / 2 + 1 / 27) / (1 / 20 + 1 / 26)
+    assert found["AbsRel, share of the best rival's"].found == pytest.approx(ratio)
+    assert not found["AbsRel, share of the best rival's"].reached and not found["δ<1.25"].reached
+    assert found["PSNR 1 m beside, dB over the best rival"].found == pytest.approx(3.25)
+    # ours rises in a straight line; nerfacto has no second seed to compare that of ours with
+    assert found["Steps to nerfacto's end, share of its own"].found == pytest.approx((20 / 25 + 24 / 27) / 2)
+    tables = {title: goal for title, goal in found.items() if title.startswith("Table")}
+    assert [*tables] == ["Table 3: dB over LiDAR alone on the drive where that is least"]
+    (only,) = tables.values()
+    # ahead by nothing on the turn
+    assert only.found == pytest.approx(0.0) and not only.reached and only.row.endswith("| > 0 | +0.00 | **no** |")
+    in_time = [goal.found for goal in goals.goals_in_time(results)]
+    # at ours' 40 s the rivals are half way
+    assert in_time == pytest.approx([26.25 - 11, 26.25 - 11.5])
