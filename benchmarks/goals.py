@@ -2,9 +2,9 @@
 
     python benchmarks/goals.py comparison --torch comparison_torch > goals.md
 
-Of each goal the mean over drives; a mean over seeds is taken before. Goals whose methods the folder lacks are left out.
-`--torch` is a comparison with `--rivals-implementation torch`: its seconds are those that rivals take in nerfstudio's
-own torch code.
+Of each goal the mean over drives and seeds as the comparison's tables have it. Goals whose methods the folder lacks are
+left out. `--torch` is a comparison with `--rivals-implementation torch`: its seconds are those that rivals take in
+nerfstudio's own torch code.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from edge_depth_nerf.compare.command import RUNS
 from edge_depth_nerf.compare.methods import METHODS
 from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.results import Results, RunResult, read_results
-from edge_depth_nerf.compare.tables import clock_metric, curve_metric, psnr_at, steps_to
+from edge_depth_nerf.compare.tables import clock_metric, curve_metric, per_seed, psnr_at, steps_to
 
 LOSSES: tuple[MethodName, ...] = ("urban-nerf", "ds-nerf")
 """The rivals with a depth loss."""
@@ -73,19 +73,15 @@ class Figures:
 
     def by_drive(self, method: MethodName, value: str | Value) -> list[float]:
         """A figure's mean over the seeds that have it, for each drive."""
-        get = (lambda run: run.figures[value]) if isinstance(value, str) else value
-        return [
-            statistics.fmean(
-                found
-                for run in self.results.runs
-                if (run.scene, run.method) == (scene, method) and (found := get(run)) is not None
-            )
-            for scene in self.scenes
-        ]
+        return [self._mean([scene], method, value) for scene in self.scenes]
 
     def mean(self, method: MethodName, value: str | Value) -> float:
-        """Its mean over drives."""
-        return statistics.fmean(self.by_drive(method, value))
+        """Its mean over drives, of the seeds that all drives have it for."""
+        return self._mean(self.scenes, method, value)
+
+    def _mean(self, scenes: Sequence[str], method: MethodName, value: str | Value) -> float:
+        get = (lambda run: run.figures[value]) if isinstance(value, str) else value
+        return statistics.fmean(per_seed(self.results, scenes, method, get).values())
 
     def least_ahead(self, others: Sequence[MethodName], value: str) -> float:
         """By how much ours is ahead of the best of others on the drive where that is least."""

@@ -14,17 +14,11 @@ import hashlib
 import json
 import lzma
 from pathlib import Path
-from typing import Any
 
 from edge_depth_nerf.compare.command import RECORD, RUNS
-from edge_depth_nerf.compare.specification import FIGURES, SPECIFICATION
+from edge_depth_nerf.compare.specification import FIGURES, OF_A_RUN, SPECIFICATION
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_json_object, write_bytes, write_json
-
-
-def with_scene(content: dict[str, Any], scene: str) -> dict[str, Any]:
-    """A run's specification with its scene's path replaced."""
-    return {**content, "scene": scene}
 
 
 def keep(comparison: Path, file: Path) -> int:
@@ -37,11 +31,10 @@ def keep(comparison: Path, file: Path) -> int:
     runs = {}
     for path in sorted(comparison.glob(f"{RUNS}/*/*/{FIGURES}")):
         figures = read_json_object(path)
-        name = Path(figures["run"]["scene"]).name
-        figures["run"] = with_scene(figures["run"], name)
-        # of this machine, and another for each run
-        figures["configuration"].pop("output_dir", None)
-        figures["configuration"].pop("pipeline.datamanager.data", None)
+        figures["run"]["scene"] = Path(figures["run"]["scene"]).name
+        # paths of this machine are among them
+        for name in OF_A_RUN:
+            figures["configuration"].pop(name, None)
         runs[path.parent.relative_to(comparison / RUNS).as_posix()] = figures
     record = read_json_object(comparison / RECORD)
     record["commands"] = []
@@ -76,7 +69,7 @@ def lay(file: Path, comparison: Path, scenes: Path) -> int:
         folder = comparison / RUNS / name
         if (folder / FIGURES).exists():
             continue
-        figures["run"] = with_scene(figures["run"], str(scenes.resolve() / figures["run"]["scene"]))
+        figures["run"]["scene"] = str(scenes.resolve() / figures["run"]["scene"])
         write_json(folder / SPECIFICATION, figures["run"])
         write_json(folder / FIGURES, figures)
         written += 1
