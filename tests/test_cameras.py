@@ -93,6 +93,18 @@ def test_every_valid_pixel_of_the_picture_returns_to_itself(camera: Camera) -> N
     assert directions[~found].isnan().all() and not directions[found].isnan().any()
 
 
+def test_straight_behind_stays_on_its_side() -> None:
+    # in 32 bits π is rounded up, and so is the radius of pixels next to it; the sine beyond π is negative
+    camera = KannalaBrandt(800, 600, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    radius = torch.tensor([math.pi], dtype=torch.float32)
+    assert radius.sin() < 0
+    for pixel in ((radius.item(), 0.0), (0.0, radius.item()), (-radius.item(), 0.0)):
+        pixels = torch.tensor(pixel)
+        direction, found = camera.unproject(pixels)
+        assert found and (direction[:2] * pixels).sum() > 0
+        torch.testing.assert_close(camera.project(direction)[0], pixels)
+
+
 @pytest.mark.parametrize("camera", [p for p in CAMERAS if p.id in ("pinhole-barrel", "mei-parabolic")])
 def test_far_pixels_are_inverted_beside_near_ones(camera: Camera) -> None:
     # up to where r⁵ has brought them: what lies far out must not spoil the start for the others

@@ -301,7 +301,7 @@ def test_it_learns_what_colours_mean(street):
     settings = dataclasses.replace(TINY, working_px=40, channels=(8, 16, 32))
     pictures = [picture for picture in scene.pictures if not picture.held_out]
     examples = load_examples([scene], [pictures], [{"front": HEIGHT_M}], 40, settings.multiple_px)
-    trained = train(examples, None, settings, TrainingOptions(steps=200, learning_rate=5e-3))
+    trained = train(examples, None, settings, TrainingOptions(steps=400, learning_rate=5e-3))
     room = DepthNetwork(settings)
     logs = np.log(examples.lidar_m[examples.lidar_m > 0])
     errors: dict[str, list[np.ndarray]] = {"network": [], "room": [], "constant": []}

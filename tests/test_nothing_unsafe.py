@@ -201,7 +201,7 @@ def test_a_spoilt_config(config, tmp_path):
     laughs = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
         f"{chr(98 + n)}: &{chr(98 + n)} [{','.join([f'*{chr(97 + n)}'] * 9)}]\n" for n in range(20)
     )
-    for content in (laughs.encode(), b"[" * 30_000, b"{a: " * 7_500, b"a: 1\n" * 6_500, b"x" * 70_000):
+    for content in (laughs.encode(), b"[" * 30_000, b"{a: " * 7_500, b"- " * 9_000, b"a: 1\n" * 6_500, b"x" * 70_000):
         path.write_bytes(content)
         throw(read_dataparser, path)
     rng = Random(0)

@@ -315,7 +315,8 @@ class KannalaBrandt(Camera):
         square = (plane * plane).sum(-1, keepdim=True)
         on_axis = square == 0
         theta = torch.where(on_axis, 1.0, square).sqrt()
-        factor = torch.where(on_axis, 1.0, theta.sin() / theta)
+        # straight behind, θ = π may be rounded up, and a sine below zero would turn the ray to the other side
+        factor = torch.where(on_axis, 1.0, theta.sin().abs() / theta)
         return torch.cat((factor * plane, torch.where(on_axis, 1.0, theta.cos())), -1)
 
 

@@ -18,6 +18,8 @@ from edge_depth_nerf.errors import InputError
 
 MAX_CONFIG_BYTES = 1 << 15
 """No config.yml is larger: nerfstudio's have some 10 kB. The parser takes up to a third of a second for that much."""
+MAX_DEPTH = 40
+"""No config.yml is nested deeper: nerfstudio's are some 10 deep. The parser's time grows with the depth's square."""
 _PYTHON = "tag:yaml.org,2002:python/"
 _HINT = "--load-config takes the config.yml that ns-train wrote"
 
@@ -33,8 +35,8 @@ def read_dataparser(path: Path) -> Any:
         InputError: no YAML, no training's settings, or those of another dataparser.
 
     """
-    import yaml
     from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+    from yaml import YAMLError
 
     from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
 
@@ -45,8 +47,8 @@ def read_dataparser(path: Path) -> Any:
         for kind in (FisheyeDepthDataParserConfig, NerfstudioDataParserConfig)
     }
     try:
-        root = yaml.compose(read_text(path, MAX_CONFIG_BYTES), Loader=yaml.SafeLoader)
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        root = _compose(read_text(path, MAX_CONFIG_BYTES))
+    except (YAMLError, ValueError) as error:
         raise InputError(f"{path}: cannot be read ({' '.join(str(error).split())}). {_HINT}.") from None
     manager = _child(_child(root, "pipeline"), "datamanager")
     if manager is None or not re.fullmatch(rf"{_PYTHON}object:[\w.]*TrainerConfig", root.tag):
@@ -70,6 +72,24 @@ def read_dataparser(path: Path) -> Any:
         settings[field.name] = value
     data = _value(_child(manager, "data"))
     return known[name](**{**settings, **({"data": data} if isinstance(data, Path) else {})})
+
+
+def _compose(text: str) -> Any:
+    """A YAML document as nodes; none that is nested more than `MAX_DEPTH` deep is read to its end."""
+    import yaml
+
+    class Shallow(yaml.SafeLoader):
+        depth = 0
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            self.depth += 1
+            if self.depth > MAX_DEPTH:
+                raise yaml.YAMLError(f"nested more than {MAX_DEPTH} deep")
+            node = super().compose_node(parent, index)
+            self.depth -= 1
+            return node
+
+    return yaml.compose(text, Loader=Shallow)
 
 
 def _child(node: Any, key: str) -> Any:
