@@ -61,7 +61,7 @@ KEPT_TABLES = 8
 
 
 SURFACE_SIGMA_M = 0.1
-SURFACE_SIGMA_SHARE = 0.05
+SURFACE_SIGMA_SHARE = 0.15
 """A prior whose sigma is above these metres plus this share of its distance is too vague for a surface."""
 
 
