@@ -65,7 +65,7 @@ def steps(folder: Path, name: str, pause: float = 0.01, code: str = STEPS, train
     return Task(name, arguments, folder / "logs" / f"{name}.log", made, trains)
 
 
-def wait_until(happened: Callable[[], Any], seconds: float = 60.0) -> Any:
+def wait_until(happened: Callable[[], Any], seconds: float = 300.0) -> Any:
     deadline = time.monotonic() + seconds
     while not (found := happened()):
         assert time.monotonic() < deadline
