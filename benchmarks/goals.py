@@ -3,8 +3,7 @@
     python benchmarks/goals.py comparison --torch comparison_torch > goals.md
 
 Of each goal the mean over drives and seeds as the comparison's tables have it. Goals whose methods the folder lacks are
-left out. `--torch` is a comparison with `--rivals-implementation torch`: its seconds are those that rivals take in
-nerfstudio's own torch code.
+left out. `--torch` is the folder of `benchmarks/equal_seconds.py`: the rivals in nerfstudio's own torch code.
 """
 
 from __future__ import annotations
@@ -16,11 +15,13 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from equal_seconds import EqualSeconds, at_equal_seconds
+
 from edge_depth_nerf.compare.command import RUNS
 from edge_depth_nerf.compare.methods import METHODS
 from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.results import Results, RunResult, read_results
-from edge_depth_nerf.compare.tables import clock_metric, curve_metric, per_seed, psnr_at, steps_to
+from edge_depth_nerf.compare.tables import curve_metric, per_seed, steps_to
 
 LOSSES: tuple[MethodName, ...] = ("urban-nerf", "ds-nerf")
 """The rivals with a depth loss."""
@@ -122,21 +123,24 @@ def goals(comparison: Results) -> Iterator[Goal]:
             yield Goal(f"Table {table}: dB over {METHODS[name].title} on the drive where that is least", 0.0, least)
 
 
-def goals_in_time(comparison: Results) -> Iterator[Goal]:
-    """The goals at equal seconds."""
-    figures = Figures(comparison)
-    if not figures.has("edge", *RIVALS):
+def goals_in_time(comparison: Results, torch: Results) -> Iterator[Goal]:
+    """The goals at equal seconds: of the seeds that the rivals in torch have."""
+    ours, rivals = Figures(comparison), Figures(torch)
+    if not ours.has("edge") or not rivals.has(*RIVALS):
         return
-    name, clock = curve_metric(comparison), clock_metric(comparison)
 
-    def at_our_seconds(run: RunResult) -> float | None:
-        ours = comparison.run(run.scene, "edge", run.seed)
-        return None if ours is None else psnr_at(run.curve, ours.curve[-1][clock], name, clock)
+    def of(method: MethodName, value: Callable[[EqualSeconds], float]) -> float:
+        def get(run: RunResult) -> float | None:
+            found = at_equal_seconds(comparison, run)
+            return None if found is None else value(found)
 
-    ours = figures.mean("edge", at_our_seconds)
-    yield Goal("At equal seconds: dB over nerfacto in torch", 4.0, ours - figures.mean("nerfacto", at_our_seconds))
-    better = max(figures.mean(each, at_our_seconds) for each in LOSSES)
-    yield Goal("At equal seconds: dB over the better of DS-NeRF and UrbanNeRF in torch", 2.0, ours - better)
+        return rivals.mean(method, get)
+
+    def ahead(methods: Sequence[MethodName]) -> float:
+        return min(of(each, lambda found: found.ours) - of(each, lambda found: found.psnr) for each in methods)
+
+    yield Goal("At equal seconds: dB over nerfacto in torch", 4.0, ahead(["nerfacto"]))
+    yield Goal("At equal seconds: dB over the better of DS-NeRF and UrbanNeRF in torch", 2.0, ahead(LOSSES))
 
 
 def _share_of_steps(figures: Figures) -> float:
@@ -157,9 +161,10 @@ def main() -> None:
     parser.add_argument("comparison", type=Path)
     parser.add_argument("--torch", type=Path)
     options = parser.parse_args()
-    found = [*goals(read_results(options.comparison / RUNS))]
+    comparison = read_results(options.comparison / RUNS)
+    found = [*goals(comparison)]
     if options.torch:
-        found += goals_in_time(read_results(options.torch / RUNS))
+        found += goals_in_time(comparison, read_results(options.torch / RUNS))
     print("\n".join(["| | goal | found | reached |", "|---|---|---|---|", *(goal.row for goal in found)]))
 
 

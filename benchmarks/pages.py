@@ -1,16 +1,18 @@
 """Pages whose tables are made: what stands between `<!-- NAME -->` and the next `<!-- end -->` is replaced.
 
-    python benchmarks/pages.py PAGE NAME=FILE [NAME=FILE ...]
+    python benchmarks/pages.py PAGE NAME=FILE[#HEADING] [NAME=FILE[#HEADING] ...]
 
 puts Markdown that a command wrote (`tables.md`, `search.md`) into a page, its title left out and its headings one level
-further down: docs/results.md.
+further down, or what stands under one heading alone: docs/results.md.
 """
 
 from __future__ import annotations
 
 import argparse
+import re
 from pathlib import Path
 
+from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import write_text
 
 END = "<!-- end -->"
@@ -32,17 +34,36 @@ def lowered(markdown: str) -> str:
     return "\n".join(f"#{line}" if line.startswith("##") else line for line in lines)
 
 
+def under(markdown: str, heading: str) -> str:
+    """What stands under the first heading that begins with these words, without it.
+
+    Raises:
+        InputError: there is none.
+
+    """
+    parts = re.split(r"^#+ (.*)\n", markdown, flags=re.MULTILINE)
+    for title, content in zip(parts[1::2], parts[2::2], strict=True):
+        if title.startswith(heading):
+            return content
+    raise InputError(f"there is no heading {heading!r}; there are {', '.join(map(repr, parts[1::2]))}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("page", type=Path)
-    parser.add_argument("parts", nargs="+", metavar="NAME=FILE")
+    parser.add_argument("parts", nargs="+", metavar="NAME=FILE[#HEADING]")
     options = parser.parse_args()
     page = options.page.read_text(encoding="utf-8")
     for part in options.parts:
-        name, _, file = part.partition("=")
+        name, _, rest = part.partition("=")
+        file, _, heading = rest.partition("#")
         if f"<!-- {name} -->" not in page:
             parser.error(f"{options.page} has no line <!-- {name} -->")
-        page = with_part(page, name, lowered(Path(file).read_text(encoding="utf-8")))
+        content = Path(file).read_text(encoding="utf-8")
+        try:
+            page = with_part(page, name, under(content, heading) if heading else lowered(content))
+        except InputError as error:
+            parser.error(f"{file}: {error}")
     write_text(options.page, page)
 
 

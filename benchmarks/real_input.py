@@ -4,7 +4,7 @@
 
 Of the fisheye frame, blocks of LiDAR are held out; of the five stereo pairs, each pair in turn. Prints a table, with
 the mean over the pairs, and leaves rendered views and figures under the output folder. A scene, run or figure that is
-there is not made again.
+there is not made again. The table is also written, as Markdown, to table.md there.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ sys.path.insert(0, str(ROOT / "tests"))
 
 from real_scenes import fisheye_frame_scene, stereo_scene  # noqa: E402  # pyright: ignore[reportMissingImports]
 
-from edge_depth_nerf.files import read_json  # noqa: E402
+from edge_depth_nerf.files import read_json, write_text  # noqa: E402
 
 METHOD = "edge-depth-nerf-lite"
 SCENES = {
@@ -51,7 +51,8 @@ def main() -> None:
     if not options.real.is_dir():
         sys.exit(f"{options.real}: no such folder; the real excerpts are not part of the project.")
 
-    table = Table("scene", "method", *COLUMNS, title=f"{options.steps} steps, held-out LiDAR blocks or pictures")
+    names = ("scene", "method", *COLUMNS)
+    rows: list[tuple[str, ...]] = []
     for title, scenes in SCENES.items():
         found: dict[str, list[dict[str, float]]] = {name: [] for name in LOSSES}
         for held_out, make in scenes:
@@ -62,11 +63,16 @@ def main() -> None:
             for name, loss in LOSSES.items():
                 results = figures_of(scene, folder, name, loss, options.steps)
                 found[name].append(results)
-                table.add_row(f"{title}{held_out}", name, *map(shown, (results.get(key) for key in COLUMNS)))
+                rows.append((f"{title}{held_out}", name, *map(shown, (results.get(key) for key in COLUMNS))))
         for name, results in found.items() if len(scenes) > 1 else ():
             means = [float(np.mean([each[key] for each in results])) if key in results[0] else None for key in COLUMNS]
-            table.add_row(f"{title}, mean", name, *map(shown, means))
+            rows.append((f"{title}, mean", name, *map(shown, means)))
+    table = Table(*names, title=f"{options.steps} steps, held-out LiDAR blocks or pictures")
+    for row in rows:
+        table.add_row(*row)
     Console(width=120).print(table)
+    lines = ["| " + " | ".join(row) + " |" for row in (names, ("---",) * len(names), *rows)]
+    write_text(options.output / "table.md", "\n".join([*lines, ""]))
 
 
 def figures_of(scene: Path, folder: Path, name: str, loss: str, steps: int) -> dict[str, float]:

@@ -83,9 +83,14 @@ def test_a_part_of_a_page_is_replaced_and_nothing_else(benchmark_module, tmp_pat
             "# Page\n<!-- a -->\nwords\n\n### Table 1\n\n| # |\n<!-- end -->\n"
             "between\n<!-- b -->\nstays\n<!-- end -->\n"
         )
-    monkeypatch.setattr(sys, "argv", ["pages.py", str(page), f"c={written}"])
-    with pytest.raises(SystemExit):
-        pages.main()
+    written.write_text("# Comparison\n\n## Table 1\n\n| # |\n\n## Table 5, street\n\n| ## 5 |\n\n## Table 6\n")
+    monkeypatch.setattr(sys, "argv", ["pages.py", str(page), f"b={written}#Table 5"])
+    pages.main()
+    assert page.read_text().endswith("between\n<!-- b -->\n| ## 5 |\n<!-- end -->\n")
+    for wrong in (f"c={written}", f"b={written}#Table 7"):
+        monkeypatch.setattr(sys, "argv", ["pages.py", str(page), wrong])
+        with pytest.raises(SystemExit):
+            pages.main()
 
 
 def test_the_ablation_has_a_row_for_what_was_trained_on_every_drive(benchmark_module):
@@ -153,6 +158,11 @@ def test_kept_runs_are_laid_out_again(benchmark_module, tmp_path):
     write_json(again / "runs/street/edge_seed-1/figures.json", {"mine": 1})
     assert kept.lay(file, again, moved) == 0
     assert read_json(again / "runs/street/edge_seed-1/figures.json") == {"mine": 1}
+    # without the record of a comparison
+    (folder / "compare.json").unlink()
+    kept.keep(folder, file)
+    assert kept.lay(file, tmp_path / "second", moved) == 1
+    assert not (tmp_path / "second" / "compare.json").exists()
     # another scene is none
     (moved / "street" / "transforms.json").write_text("[]")
     with pytest.raises(InputError, match=r"is not the scene of .*kept\.json\.xz"):
@@ -205,6 +215,39 @@ def test_goals_by_hand(benchmark_module):
     (only,) = tables.values()
     # ahead by nothing on the turn
     assert only.found == pytest.approx(0.0) and not only.reached and only.row.endswith("| > 0 | +0.00 | **no** |")
-    in_time = [goal.found for goal in goals.goals_in_time(results)]
-    # at ours' 40 s the rivals are half way
-    assert in_time == pytest.approx([26 - 11, 26 - 11.5])
+
+
+def test_equal_seconds_by_hand(benchmark_module):
+    """At ours' 40 s a rival of 80 s is half way. Ours' second seed has no rival and does not count."""
+    goals, equal_seconds = benchmark_module("goals"), benchmark_module("equal_seconds")
+    ours = Results([finished_run("street", "edge", 0, 25.0), finished_run("turn", "edge", 0, 27.0)])
+    ours.runs.append(finished_run("street", "edge", 1, 40.0))
+    psnr: dict[MethodName, tuple[float, float]] = {
+        "nerfacto": (40.0, 44.0),
+        "urban-nerf": (41.0, 44.0),
+        "ds-nerf": (40.0, 46.0),
+    }
+    rivals = Results(
+        [
+            finished_run(scene, method, 0, value)
+            for method, values in psnr.items()
+            for scene, value in zip(("street", "turn"), values, strict=True)
+        ]
+    )
+    found = [goal.found for goal in goals.goals_in_time(ours, rivals)]
+    assert found == pytest.approx([26 - 21, 26 - 21.5])
+    lines = equal_seconds.table(ours, rivals).splitlines()
+    assert lines[0] == "| | street | turn | average | ours ahead dB | steps |"
+    assert lines[2:6] == [
+        "| nerfacto | 20.00 | 22.00 | 21.00 | +5.00 | 50 |",
+        "| UrbanNeRF loss | 20.50 | 22.00 | 21.25 | +4.75 | 50 |",
+        "| DS-NeRF loss | 20.00 | 23.00 | 21.50 | +4.50 | 50 |",
+        "| ours | **25.00** | **27.00** | **26.00** | – | 100 |",
+    ]
+    assert "After 40 processor seconds" in lines[-1]
+    # a rival that was not given as long is no comparison
+    short = finished_run("street", "nerfacto", 0, 40.0)
+    for point in short.curve:
+        point["cpu_seconds"] /= 4
+    with pytest.raises(InputError, match=r"for 20 s, ours for 40 s.*220 --steps"):
+        equal_seconds.at_equal_seconds(ours, short)

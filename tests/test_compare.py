@@ -675,6 +675,14 @@ def test_departures_from_the_papers_protocol(tmp_path):
 # --- search -----------------------------------------------------------------------------------------------------------
 
 
+def test_folders_of_runs_say_their_setting(tmp_path):
+    """As far as they have one: benchmarks/equal_seconds.py trains nerfacto without whole views, too."""
+    nerfacto = RunSpecification("/x/street", "0", "lite", "nerfacto", 3, 10, whole_views=False)
+    searched = replace(nerfacto, method="ds-nerf", weight=0.01, sigma_m="own")
+    names = [command.Run(each, tmp_path).folder.relative_to(tmp_path) for each in (nerfacto, searched)]
+    assert names == [Path("street/nerfacto_seed-3"), Path("street/ds-nerf_lambda-0.01_sigma-own_seed-3")]
+
+
 def test_a_search_writes_what_compare_takes(tmp_path, monkeypatch):
     """Training is replaced by a formula: best at λ = 0.1 and σ = 0.5 m for ds-nerf, λ = 1 and its own σ for edge."""
 

@@ -260,7 +260,7 @@ class Run:
         run = specification
         scene = Path(run.scene).name
         setting = ""
-        if not run.whole_views:
+        if not run.whole_views and run.weight is not None:
             setting = f"_lambda-{run.weight:g}_sigma-{run.sigma_m}"
         self.title = f"{scene} {run.method}{setting.replace('_', ' ')} seed {run.seed}"
         self.folder = runs / scene / f"{run.method}{setting}_seed-{run.seed}"
