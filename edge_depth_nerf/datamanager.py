@@ -379,7 +379,7 @@ def _load(dataset: FisheyeDepthDataset, cache: PriorCache | None, whole_windows:
         lidar, mono = dataset.lidar_distance_m(image_idx), dataset.mono_distance_m(image_idx)
         view = _view(dataset, image_idx) if uses_mono and mono is not None else None
         prior = cache.prior(lidar, mono, mask, view if cache.trust is not None else None)
-        sky = sky_of(mono, lidar, view) if uses_mono and mono is not None and view is not None else None
+        sky = sky_of(mono, lidar, view, rgb, mask) if uses_mono and mono is not None and view is not None else None
         return PicturePixels(rgb, mask, prior.distance_m, prior.sigma_m, sky)
 
     # OpenCV and torch release the interpreter's lock, so two threads read and integrate side by side; a few pictures

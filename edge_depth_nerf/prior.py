@@ -19,13 +19,14 @@ from typing import Literal, get_args
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, UInt8
 from numpy.typing import NDArray
 
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.checked_cache import content_of, keep_last, used, write_checked
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.integration import DepthSource, IntegrationOptions, SigmaMode, select_prior, sigma_m
+from edge_depth_nerf.masks.sky import regions_like_sky
 from edge_depth_nerf.mono.alignment import Align, align
 from edge_depth_nerf.mono.error_model import Trust, pixel_features
 
@@ -122,14 +123,21 @@ def view_of(camera: Camera, up_in_camera: Float[np.ndarray, "3"]) -> View:
 
 
 def sky_of(
-    mono_m: Float[np.ndarray, "h w"], lidar_m: Float[np.ndarray, "h w"] | None, view: View
+    mono_m: Float[np.ndarray, "h w"],
+    lidar_m: Float[np.ndarray, "h w"] | None,
+    view: View,
+    picture: UInt8[np.ndarray, "h w 3"],
+    mask: Bool[np.ndarray, "h w"],
 ) -> Bool[np.ndarray, "h w"]:
-    """Where a monocular map says that nothing is there: without distance, above the horizon, and no LiDAR return.
+    """Where a monocular map says that nothing is there: no distance, above the horizon, bright, and no LiDAR return.
 
-    (`process` and `estimate-depth` take the sky out of the maps.)
+    `process` and `estimate-depth` take the sky out of the maps; maps of one's own may lack a distance elsewhere, too.
     """
-    sky = ~(np.nan_to_num(mono_m) > 0) & (view.elevation_rad > math.radians(LOWEST_SKY_DEG))
-    return sky if lidar_m is None else sky & ~(np.nan_to_num(lidar_m) > 0)
+    sky = mask & ~(np.nan_to_num(mono_m) > 0) & (view.elevation_rad > math.radians(LOWEST_SKY_DEG))
+    if lidar_m is not None:
+        sky &= ~(np.nan_to_num(lidar_m) > 0)
+    # where there is no ray the elevation is -pi/2, but the mask says so
+    return regions_like_sky(picture, sky, mask & (view.elevation_rad < 0))
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,8 @@ from edge_depth_nerf.process.scene import FrameContent, SceneCamera, SceneFrame,
 BLOCK_PX = 64
 HELD_OUT_SHARE = 0.1
 HELD_OUT_STEREO_FRAME = 702
+UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""From a world whose axes are a camera's (x right, y down, z forward) to a scene's, whose z is up."""
 
 
 def nearest_of_blocks(distance_m: np.ndarray, factor: int) -> np.ndarray:
@@ -59,7 +61,7 @@ def fisheye_frame_scene(real_data: Path, output: Path, downscale: int = 4) -> Pa
         SceneFrame(
             camera="image_02",
             frame=number,
-            camera_to_world=np.eye(4),
+            camera_to_world=UPRIGHT,
             content=FrameContent(image=image, lidar=nearest_of_blocks(lidar * kept, downscale)),
             held_out=number == 1,
         )
@@ -116,7 +118,7 @@ def stereo_scene(real_data: Path, output: Path, downscale: int = 4, held_out: in
                 SceneFrame(
                     camera=f"image_0{side}",
                     frame=int(moment),
-                    camera_to_world=poses[f"{moment}_0{side}"] @ opengl_to_opencv,
+                    camera_to_world=UPRIGHT @ poses[f"{moment}_0{side}"] @ opengl_to_opencv,
                     content=content,
                     held_out=int(moment) == held_out,
                 )

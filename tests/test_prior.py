@@ -189,5 +189,24 @@ def test_sky_is_above_the_horizon_without_any_distance():
     lidar = np.array([[0, 40, 0], [0, 0, 0], [0, 0, 0]], np.float32)
     elevation = np.radians([[20.0] * 3, [20.0] * 3, [1.0] * 3]).astype(np.float32)
     view = View(np.zeros((3, 3), np.float32), elevation)
-    assert sky_of(mono, lidar, view).tolist() == [[True, False, False], [True, True, False], [False] * 3]
-    assert sky_of(mono, None, view)[0].tolist() == [True, True, False]
+    picture, mask = np.full((3, 3, 3), 200, np.uint8), np.ones((3, 3), bool)
+    assert sky_of(mono, lidar, view, picture, mask).tolist() == [[True, False, False], [True, True, False], [False] * 3]
+    assert sky_of(mono, None, view, picture, mask)[0].tolist() == [True, True, False]
+    mask[1, 1] = False
+    assert sky_of(mono, lidar, view, picture, mask)[1].tolist() == [True, False, False]
+
+
+def test_dark_holes_of_a_map_are_no_sky():
+    """A map of stereo matching: the sky, crowns without a match, and what one of the two eyes alone sees."""
+    mono = np.full((40, 60), 8, np.float32)
+    picture = np.full((40, 60, 3), 60, np.uint8)
+    elevation = np.radians(np.linspace(19.5, -19.5, 40, dtype=np.float32))[:, None].repeat(60, 1)
+    view = View(np.zeros((40, 60), np.float32), elevation)
+    sky, crown, border = np.s_[:12, 20:40], np.s_[3:9, 45:55], np.s_[:, :6]
+    for hole in (sky, crown, border):
+        mono[hole] = 0
+    picture[sky] = 230
+    picture[4, 24] = 20  # a bird
+    expected = np.zeros((40, 60), bool)
+    expected[sky] = True
+    assert np.array_equal(sky_of(mono, None, view, picture, np.ones_like(expected)), expected)

@@ -14,11 +14,12 @@ from functools import lru_cache
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, Shaped, UInt8
 
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.masks.regions import (
     block_mean,
+    components,
     dilated,
     enlarge,
     from_nearest,
@@ -106,6 +107,33 @@ def find_sky(
     return enlarge(sky, factor, (mask.shape[0], mask.shape[1])) & mask & far
 
 
+def regions_like_sky(
+    picture: UInt8[np.ndarray, "h w 3"], where: Bool[np.ndarray, "h w"], ground: Bool[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "h w"]:
+    """Of regions without distance, those that may be sky: on average as bright as `find_sky` wants it.
+
+    A stereo matcher or a depth camera has nothing to say of dark crowns and of what one eye alone sees, either.
+
+    Args:
+        picture: RGB.
+        where: the regions.
+        ground: where the ground is seen, whose brightness counts.
+
+    """
+    brightness = picture.max(-1)
+    labels, sizes = components(where)
+    sums = np.bincount(labels.ravel(), weights=brightness.ravel(), minlength=len(sizes))
+    return (sums >= np.maximum(sizes, 1) * _darkest(brightness[ground]))[labels] & where
+
+
+def _darkest(ground: Shaped[np.ndarray, "n"]) -> float:
+    """The least brightness of the sky above ground of these."""
+    if not ground.size:
+        return _DARKEST_LEVEL
+    road = float(np.quantile(ground, _ROAD_QUANTILE))
+    return max(_DARKEST_LEVEL, min(_BRIGHTER_THAN_GROUND * road, _BRIGHT_LEVEL))
+
+
 @lru_cache(maxsize=8)
 def _rays(camera: Camera, factor: int) -> Float32[np.ndarray, "h w 3"]:
     """Unit rays of blocks of pixels; NaN outside the camera's range."""
@@ -124,10 +152,7 @@ def _grow(
     brightness = colour.max(-1)
     blue_to_red = np.log((colour[..., 2] + 8) / (colour[..., 0] + 8))
     ground = usable & (height_sine < 0)
-    darkest = _DARKEST_LEVEL
-    if ground.any():
-        road = float(np.quantile(brightness[ground], _ROAD_QUANTILE))
-        darkest = max(darkest, min(_BRIGHTER_THAN_GROUND * road, _BRIGHT_LEVEL))
+    darkest = _darkest(brightness[ground])
     possible = possible & (brightness >= darkest) & (blue_to_red >= math.log(_REDDEST))
     grey = cv2.GaussianBlur(brightness, (0, 0), 0.8)
     slope = np.hypot(cv2.Sobel(grey, -1, 1, 0, scale=1 / 8), cv2.Sobel(grey, -1, 0, 1, scale=1 / 8))
