@@ -86,7 +86,7 @@ def bytes_by_kind(scene: Path) -> dict[str, int]:
 
 def measure(drive: Path, frames: Sequence[int], work: Path) -> dict[str, float]:
     """Rates of one drive: seconds of a core and bytes a picture, and seconds of a core a command."""
-    own = [sys.executable, "-m", "edge_depth_nerf.cli"]
+    own = [sys.executable, "-m", "edge_depth_nerf"]
     (sequence,) = [path.name for path in (drive / "data_2d_raw").iterdir()]
     seconds: dict[str, list[float]] = {"process": [], "maps": [], "prior and tables": []}
     rates: dict[str, float] = {}

@@ -51,7 +51,7 @@ def words(*command: object) -> list[str]:
     """A command of this environment."""
     program, *rest = map(str, command)
     if program == "edge-depth-nerf":
-        return [sys.executable, "-m", "edge_depth_nerf.cli", *rest]
+        return [sys.executable, "-m", "edge_depth_nerf", *rest]
     return [str(Path(sys.executable).with_name(program)), *rest]
 
 

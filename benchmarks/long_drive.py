@@ -131,7 +131,7 @@ def main() -> None:
             spoil(folder / "drive", sequence, pictures // cameras)
         process = watched(
             [
-                *(sys.executable, "-m", "edge_depth_nerf.cli", "process", "kitti360"),
+                *(sys.executable, "-m", "edge_depth_nerf", "process", "kitti360"),
                 *("--root", str(folder / "drive"), "--sequence", sequence),
                 *("--output", str(folder / "scene"), "--mono", str(folder / f"drive/simulated_mono/{sequence}")),
                 *("--sweeps", str(options.sweeps)),

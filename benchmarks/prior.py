@@ -141,7 +141,7 @@ def frames_of(scene: Path, training_stride: int) -> Iterator[Frame]:
     read = read_scene(scene)
     training = [picture for picture in read.pictures if not picture.held_out][::training_stride]
     for picture in [*training, *(picture for picture in read.pictures if picture.held_out)]:
-        maps = read.maps(picture, with_prior=False)
+        maps = read.maps(picture)
         if maps.lidar_m is None or maps.mono_m is None or maps.truth_m is None:
             raise SystemExit(f"{scene}: {picture.name} has not all of LiDAR, mono and truth; nothing to judge by")
         view = view_of(picture.lens, picture.up_in_camera)
@@ -419,7 +419,7 @@ def run_real(arguments: argparse.Namespace, console: Console) -> None:
         mono_m, label = filled(kept_m), "STAND-IN for mono: LiDAR of the other blocks spread smoothly, no network"
     read = read_scene(scene)
     picture = read.pictures[0]
-    found = read.maps(picture, with_prior=False)
+    found = read.maps(picture)
     usable = found.usable
     view = view_of(picture.lens, picture.up_in_camera)
     frame = Frame(found.rgb, kept_m, mono_m, np.where(held_out, lidar_m, np.float32(0)), usable, view, held_out=True)

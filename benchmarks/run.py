@@ -209,7 +209,7 @@ def start_up() -> dict[str, Any]:
 PREPARE = """
 import json, os, resource, sys, time
 os.sched_setaffinity(0, range(int(sys.argv[1])))
-from edge_depth_nerf.cli import main
+from edge_depth_nerf.entry import main
 sys.argv = sys.argv[2:]
 started = time.perf_counter()
 main()

@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from edge_depth_nerf.files import write_atomically, write_png
+from edge_depth_nerf.inspecting.shown_prior import ShownMaps, ShownScene
 from edge_depth_nerf.integration import IntegrationOptions, integrate_depth
 from edge_depth_nerf.losses import edge_loss
 from edge_depth_nerf.mono.alignment import align
@@ -33,7 +34,7 @@ from edge_depth_nerf.pictures import (
     resize,
     write_text,
 )
-from edge_depth_nerf.scene_reader import PictureMaps, SceneFolder, ScenePicture, read_scene
+from edge_depth_nerf.scene_reader import PictureMaps, read_scene
 
 ROOT = Path(__file__).resolve().parents[1]
 MOMENT, CAMERA = 6, "image_02"
@@ -46,7 +47,7 @@ SOFTNESS_M = 0.25
 """Over about so much of a ray a trained surface is met."""
 
 
-def draw_maps(scene: SceneFolder, picture: ScenePicture, maps: PictureMaps) -> NDArray[np.uint8]:
+def draw_maps(scene: ShownScene, maps: ShownMaps) -> NDArray[np.uint8]:
     """Picture, LiDAR, monocular distance as it comes and aligned, prior, its sigma."""
     assert maps.lidar_m is not None and maps.mono_m is not None and maps.prior is not None
     height, width = maps.usable.shape
@@ -68,7 +69,7 @@ def draw_maps(scene: SceneFolder, picture: ScenePicture, maps: PictureMaps) -> N
     return lay_out(panels, 3, [])
 
 
-def aligned(scene: SceneFolder, maps: PictureMaps) -> NDArray[np.float32]:
+def aligned(scene: ShownScene, maps: PictureMaps) -> NDArray[np.float32]:
     """The monocular map after alignment, as the prior has it."""
     assert maps.lidar_m is not None and maps.mono_m is not None
     trust = scene.trust
@@ -104,7 +105,7 @@ def caption(text: str, width: int) -> NDArray[np.uint8]:
     return bar
 
 
-def draw_kernel(scene: SceneFolder, maps: PictureMaps) -> tuple[NDArray[np.uint8], dict[str, float]]:
+def draw_kernel(scene: ShownScene, maps: PictureMaps) -> tuple[NDArray[np.uint8], dict[str, float]]:
     """What one pixel beside an edge averages, without and with the kernel's depth factor (Eq. 7)."""
     lidar_m, truth_m = maps.lidar_m, maps.truth_m
     assert lidar_m is not None and truth_m is not None
@@ -202,10 +203,10 @@ def draw_ray(path: Path) -> None:
 
 def make_pictures(output: Path) -> dict[str, float]:
     """Write all pictures; gives the distances that the kernel's picture names, metres."""
-    scene = read_scene(ROOT / "data" / "sample_drive")
-    picture = next(each for each in scene.pictures if each.moment == MOMENT and each.camera == CAMERA)
+    scene = ShownScene(read_scene(ROOT / "data" / "sample_drive"))
+    picture = next(each for each in scene.scene.pictures if each.moment == MOMENT and each.camera == CAMERA)
     maps = scene.maps(picture)
-    write_png(output / "method_maps.png", draw_maps(scene, picture, maps))
+    write_png(output / "method_maps.png", draw_maps(scene, maps))
     kernel, figures = draw_kernel(scene, maps)
     write_png(output / "method_kernel.png", kernel)
     # without the salt every run would name the parts of the drawing anew

@@ -16,7 +16,6 @@ from rich.console import Console
 from edge_depth_nerf.compare.options import CompareOptions
 from edge_depth_nerf.compat import join_lines_of_option_help
 from edge_depth_nerf.demo_options import DemoOptions
-from edge_depth_nerf.entry import main
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.films.options import CameraPathOptions
 from edge_depth_nerf.inspect_options import InspectOptions
@@ -159,7 +158,3 @@ def _say_next(what: str, command: str) -> None:
     from edge_depth_nerf.console import say
 
     say(Console(), f"{what}: {command}")
-
-
-if __name__ == "__main__":
-    main()

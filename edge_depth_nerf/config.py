@@ -22,10 +22,10 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from edge_depth_nerf.compat import allow_numpy_scalars_in_checkpoints
 from edge_depth_nerf.datamanager import FisheyeDepthDataManagerConfig
-from edge_depth_nerf.entry import say_config_slips_plainly
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.model import EdgeDepthNerfModelConfig
 from edge_depth_nerf.pipeline import EdgeDepthPipelineConfig
+from edge_depth_nerf.plain_errors import say_config_slips_plainly
 from edge_depth_nerf.trainer import EdgeDepthTrainerConfig
 
 if sys.version_info >= (3, 11):

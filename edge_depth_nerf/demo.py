@@ -27,7 +27,6 @@ from rich.table import Table
 from edge_depth_nerf.compare.figures import BinnedErrors
 from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.plots import PSNR_LABEL, Bins, plot_bins
-from edge_depth_nerf.compare.tables import Cell, MadeTable, Metric, Row, mark_best
 from edge_depth_nerf.console import progress_bars
 from edge_depth_nerf.demo_options import DemoOptions
 from edge_depth_nerf.errors import InputError
@@ -36,13 +35,13 @@ from edge_depth_nerf.pictures import DISTANCE, distance_of_colours, side_by_side
 from edge_depth_nerf.process.command import process
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.report.build import Commands, Facts, Plot, Report, write_report
+from edge_depth_nerf.report.compared_views import compared_views, held_out_frames
+from edge_depth_nerf.report.tables import Cell, MadeTable, Metric, Row, mark_best
 from edge_depth_nerf.report.views import REPORT, make_drives
 from edge_depth_nerf.runs import (
     LoggedCommands,
     command_line,
-    compared_views,
     files_counted,
-    held_out_frames,
     host_program,
     logged_commands,
     step_of_line,

@@ -14,9 +14,9 @@ import torch
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 
 from edge_depth_nerf.datamanager import FisheyeDepthDataManager, FisheyeDepthDataManagerConfig
-from edge_depth_nerf.entry import say_errors_plainly
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.model import EdgeDepthNerfModel, EdgeDepthNerfModelConfig
+from edge_depth_nerf.plain_errors import say_errors_plainly
 from edge_depth_nerf.viewer import DrivePanel
 
 FARTHEST_UNITS = 1e6

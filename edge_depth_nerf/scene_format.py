@@ -16,6 +16,19 @@ from edge_depth_nerf.bounds import MAX_LENGTH_M, check_pixels, finite, path_insi
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_json
 
+TRANSFORMS = "transforms.json"
+POINTS = "points.ply"
+LAYERS = {
+    "mask": ("masks/{camera}", "mask_path"),
+    "lidar": ("lidar/{camera}", "lidar_file_path"),
+    "mono": ("mono/{camera}", "mono_file_path"),
+    "truth_distance": ("truth/{camera}/distance", "truth_distance_file_path"),
+    "truth_rgb": ("truth/{camera}/rgb", "truth_rgb_file_path"),
+}
+"""What every frame of a scene has beside its picture, or none: its folder, and its key in transforms.json."""
+MONO_ENTRY = "mono"
+"""Key of transforms.json that says where monocular maps come from that were put into the scene later."""
+
 PATHS = (
     *("file_path", "mask_path", "depth_file_path"),
     *("lidar_file_path", "mono_file_path", "truth_distance_file_path", "truth_rgb_file_path"),

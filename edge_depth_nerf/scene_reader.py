@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +23,7 @@ from numpy.typing import NDArray
 from edge_depth_nerf.cameras import Camera, KannalaBrandt, Pinhole
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import DISTANCE_STEPS_PER_METRE, read_distance_png, read_image, read_mask, read_npy
-from edge_depth_nerf.integration import DepthSource
 from edge_depth_nerf.lidar.scans import read_cloud
-from edge_depth_nerf.mono.error_model import TRUST_FILE, Trust, read_trust
-from edge_depth_nerf.prior import Prior, PriorOptions, make_prior, view_of
 from edge_depth_nerf.scene_format import DISTORTION, INTRINSICS, is_own_scene, number_of, pose_of, read_transforms
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
@@ -72,12 +69,6 @@ class ScenePicture:
         """The scene's upward direction, z, in the camera's axes (OpenCV)."""
         return self.rotation[2] * np.array([1.0, -1.0, -1.0])
 
-    def depth_source(self) -> DepthSource | None:
-        """What training makes its prior of, left to itself."""
-        if "lidar" in self.files:
-            return "integrated" if "mono" in self.files else "lidar"
-        return "mono" if "mono" in self.files else None
-
 
 @dataclass(frozen=True)
 class PictureMaps:
@@ -95,8 +86,6 @@ class PictureMaps:
     """Monocular distance."""
     truth_m: Float32[np.ndarray, "h w"] | None
     """True distance."""
-    prior: Prior | None
-    """What training makes of LiDAR and mono by default; None with neither."""
 
 
 @dataclass(frozen=True)
@@ -131,25 +120,6 @@ class SceneFolder:
         """Where its files are relative to."""
         return self.path.parent
 
-    @cached_property
-    def trust(self) -> Trust | None:
-        """The calibration of its prior beside the maps, if it was made of them as they are.
-
-        Without one sigma is as under sigma_mode combined.
-
-        Raises:
-            InputError: the file is broken.
-
-        """
-        path = self.folder / TRUST_FILE
-        if not path.is_file():
-            return None
-        read_trust(path)
-        # imported here: it reads scenes itself
-        from edge_depth_nerf.mono.trust import saved_trust
-
-        return saved_trust(self, PriorOptions())
-
     def cameras(self) -> dict[str, tuple[ScenePicture, ...]]:
         """The pictures of each camera, in order of their moments."""
         names = dict.fromkeys(picture.camera for picture in self.pictures)
@@ -163,12 +133,11 @@ class SceneFolder:
         """Whether any picture has this layer."""
         return any(layer in picture.files for picture in self.pictures)
 
-    def maps(self, picture: ScenePicture, with_prior: bool = True) -> PictureMaps:
-        """Read all that a picture has, and make its prior.
+    def maps(self, picture: ScenePicture) -> PictureMaps:
+        """Read all that a picture has.
 
         Args:
             picture: one of the scene's.
-            with_prior: False leaves the prior away, which takes most of the time.
 
         Raises:
             InputError: a file cannot be decoded, or has another size than the camera.
@@ -182,14 +151,7 @@ class SceneFolder:
         usable = found["mask"] & lens if "mask" in found else lens
         if "lidar" in found:
             found["lidar"] = self._as_distance(found["lidar"], lens, cos_theta)
-        lidar_m, mono_m = found.get("lidar"), found.get("mono")
-        source = picture.depth_source() if with_prior else None
-        prior = None
-        if source:
-            options = PriorOptions(depth_source=source)
-            view = view_of(picture.lens, picture.up_in_camera) if self.trust else None
-            prior = make_prior(lidar_m, mono_m, usable, options, self.trust, view)
-        return PictureMaps(found["image"], lens, usable, lidar_m, mono_m, found.get("truth"), prior)
+        return PictureMaps(found["image"], lens, usable, found.get("lidar"), found.get("mono"), found.get("truth"))
 
     def lidar_m(self, picture: ScenePicture) -> Float32[np.ndarray, "h w"]:
         """Read a picture's LiDAR map alone: metres along the ray, 0 = none.

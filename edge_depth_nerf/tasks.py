@@ -55,7 +55,12 @@ def own_command(words: Sequence[str], options: Any) -> tuple[str, ...]:
         options: its options, a dataclass as tyro reads it.
 
     """
-    return ("-m", "edge_depth_nerf.child", *shlex.split(command_line(words, with_absolute_paths(options))))
+    return (
+        "-m",
+        "edge_depth_nerf",
+        "--end-with-parent",
+        *shlex.split(command_line(words, with_absolute_paths(options))),
+    )
 
 
 def with_absolute_paths(options: Options) -> Options:

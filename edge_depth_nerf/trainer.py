@@ -23,10 +23,10 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from edge_depth_nerf.compat import count_steps_against_all, total_steps
 from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig, transforms_path
-from edge_depth_nerf.entry import STOPPED_STATUS, say_errors_plainly
-from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.errors import STOPPED_STATUS, InputError
 from edge_depth_nerf.files import remove_leftovers, write_text
 from edge_depth_nerf.pipeline import NotFiniteError
+from edge_depth_nerf.plain_errors import say_errors_plainly
 from edge_depth_nerf.runs import checkpoints_in, newest_checkpoint
 
 FOR_A_GPU = ("edge-depth-nerf", "edge-depth-nerf-paper")

@@ -155,7 +155,7 @@ def scene(folder: Path) -> Path:
 def read_whole_scene(path: Path) -> None:
     found = read_scene(path)
     for each in found.pictures:
-        found.maps(each, with_prior=False)
+        found.maps(each)
     found.points_m()
 
 

@@ -301,14 +301,14 @@ def test_a_command_line_gives_the_options_back(tmp_path: Path) -> None:
         ego_mask=Path("masks"),
         theta_max_deg=92.5,
     )
-    _, module, *words = own_command(("process", "kitti360"), options)
-    assert module == "edge_depth_nerf.child"
+    _, module, ends_with_parent, *words = own_command(("process", "kitti360"), options)
+    assert (module, ends_with_parent) == ("edge_depth_nerf", "--end-with-parent")
     command = cli.parse(words)
     assert isinstance(command, cli.Process)
     here = Path.cwd()
     assert command.options == replace(options, output=here / "scenes/000", ego_mask=here / "masks")
     estimating = EstimateDepthOptions((Path("a"), tmp_path), train_steps=3, predict=False)
-    _, _, *words = own_command(("estimate-depth",), estimating)
+    _, _, _, *words = own_command(("estimate-depth",), estimating)
     assert cli.parse(words) == replace(estimating, scenes=(here / "a", tmp_path))
 
 

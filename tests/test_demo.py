@@ -105,7 +105,7 @@ def test_a_stage_that_fails_names_its_log(finished, tmp_path, monkeypatch):
 def test_the_command_says_what_is_wrong_without_a_traceback(tmp_path):
     done = subprocess.run(
         [
-            *(sys.executable, "-m", "edge_depth_nerf.cli", "process", "kitti360", "--root", str(tmp_path)),
+            *(sys.executable, "-m", "edge_depth_nerf", "process", "kitti360", "--root", str(tmp_path)),
             *("--sequence", "drive", "--output", str(tmp_path / "scene")),
         ],
         capture_output=True,

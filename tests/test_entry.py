@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from edge_depth_nerf import __version__, cli, entry, files
+from edge_depth_nerf import __version__, cli, entry, files, plain_errors
 from edge_depth_nerf.errors import InputError
 
 STOPPED = "\nStopped. The same command takes up where it was.\n"
@@ -195,7 +195,7 @@ def hook(monkeypatch):
         passed.append(exception)
 
     monkeypatch.setattr(sys, "excepthook", before)
-    entry.say_errors_plainly()
+    plain_errors.say_errors_plainly()
     assert sys.excepthook is not before
     return passed
 
@@ -269,7 +269,7 @@ def test_what_goes_wrong_after_the_config_is_nerfstudios_to_say(hook, tmp_path):
 
 
 def test_whoever_reads_the_output_may_go(tmp_path):
-    call = [sys.executable, "-m", "edge_depth_nerf.cli", "compare", "--help"]
+    call = [sys.executable, "-m", "edge_depth_nerf", "compare", "--help"]
     with subprocess.Popen(call, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=tmp_path) as process:
         assert process.stdout is not None and process.stderr is not None
         process.stdout.close()
@@ -279,7 +279,7 @@ def test_whoever_reads_the_output_may_go(tmp_path):
 
 def test_the_hook_is_put_in_once(hook):
     first = sys.excepthook
-    entry.say_errors_plainly()
+    plain_errors.say_errors_plainly()
     assert sys.excepthook is first
 
 

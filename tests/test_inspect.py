@@ -31,6 +31,7 @@ from edge_depth_nerf.inspect_options import InspectOptions
 from edge_depth_nerf.inspecting import inspect_scene
 from edge_depth_nerf.inspecting.figures import measured_moments
 from edge_depth_nerf.inspecting.findings import Finding, find, limited
+from edge_depth_nerf.inspecting.shown_prior import default_source
 from edge_depth_nerf.inspecting.top_view import HELD_OUT_RGB, TRAINING_RGB, draw_top_view, nice_length
 from edge_depth_nerf.pictures import (
     DISTANCE,
@@ -511,7 +512,7 @@ def test_z_depth_of_a_pinhole_scene_becomes_distance(tmp_path):
     for picture in inspected.pictures[:2]:
         maps = inspected.maps(picture)
         assert maps.lidar_m is not None and np.allclose(maps.lidar_m, expected, rtol=1e-4)
-        assert picture.depth_source() == "lidar"
+        assert default_source(picture) == "lidar"
     summary = look(scene, tmp_path / "out", frames=1)
     assert not summary["lengths_are_metres"]
     assert summary["held_out"] is None
@@ -618,7 +619,7 @@ def test_an_output_that_is_a_file(drive):
 def test_the_command_runs_without_nerfstudio(drive, tmp_path):
     """Importing nerfstudio takes longer than the whole command."""
     code = (
-        "import sys; sys.modules['nerfstudio'] = None; from edge_depth_nerf.cli import main; "
+        "import sys; sys.modules['nerfstudio'] = None; from edge_depth_nerf.entry import main; "
         f"sys.argv = ['edge-depth-nerf', 'inspect', {str(drive)!r}, '--output', {str(tmp_path / 'out')!r}, "
         "'--frames', '1', '--size', '64']; main()"
     )

@@ -23,7 +23,7 @@ from drives import SEQUENCE, RoomDrive, write_room_drive
 from rich.console import Console
 from scenes import write_scene
 
-from edge_depth_nerf import cli, datamanager
+from edge_depth_nerf import datamanager, entry
 from edge_depth_nerf.checked_cache import content_of, is_whole, keep_last, write_checked
 from edge_depth_nerf.datamanager import FisheyeDepthDataManagerConfig
 from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
@@ -228,7 +228,7 @@ def test_a_folder_that_nothing_was_written_to_is_taken_away(tmp_path: Path) -> N
 
 def test_two_processes_on_one_scene(room: RoomDrive, tmp_path: Path) -> None:
     process(options_of(room, tmp_path / "alone"), Console(quiet=True))
-    code = "from edge_depth_nerf.cli import main; main()"
+    code = "from edge_depth_nerf.entry import main; main()"
     command = [sys.executable, "-c", code, "process", "kitti360", "--root", room.root, "--sequence", SEQUENCE]
     command += ["--output", tmp_path / "scene", "--sweeps", "1", "--no-find-ego", "--no-estimate-depth"]
     both = [
@@ -251,7 +251,7 @@ def dying(temporary, path):
         os.kill(os.getpid(), 9)
     return replace(temporary, path)
 os.replace = dying
-from edge_depth_nerf.cli import main
+from edge_depth_nerf.entry import main
 main()
 """
 
@@ -364,14 +364,14 @@ def test_a_full_disk_and_then_a_larger_one(room: RoomDrive, tmp_path: Path, caps
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(sys, "argv", command)
             with pytest.raises(SystemExit) as ended:
-                cli.main()
+                entry.main()
             assert ended.value.code == 2
             said = capsys.readouterr().err
             assert "edge-depth-nerf: " in said and "The disk is full" in said and str(disk / "scene") in said
             assert not (disk / "scene/transforms.json").exists()
             assert not [path for path in disk.rglob(".*") if "~" in path.name]
             subprocess.run(["mount", "-o", "remount,size=4m", str(disk)], check=True)
-            cli.main()
+            entry.main()
         process(options_of(room, tmp_path / "alone"), Console(quiet=True))
         assert contents(disk / "scene") == contents(tmp_path / "alone")
         # one that can only be read

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scenes import FLIP, RADIUS_M, fisheye, pinhole, write_scene
 
-from edge_depth_nerf import cli
+from edge_depth_nerf.entry import main
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_distance_png, read_json, write_distance_png, write_json, write_png
 from edge_depth_nerf.mono.estimate import estimate_depth
@@ -171,7 +171,7 @@ def test_frames_with_few_returns_take_the_drives_fit_and_it_is_said(scene, tmp_p
     maps = write_maps(scene, tmp_path / "maps", make)
     command = ["estimate-depth", str(scene), "--maps", str(maps), "--maps-kind", "relative", "--maps-along", "ray"]
     monkeypatch.setattr(sys, "argv", ["edge-depth-nerf", *command])
-    cli.main()
+    main()
     assert error(scene).max() < 0.02
     said = " ".join(capsys.readouterr().out.split())
     assert "2 of 9 pictures have fewer than 50 LiDAR returns to fit to, such as images/0002.png" in said

@@ -12,8 +12,8 @@ import torch
 from lenses import FISHEYE
 from scenes import FLIP, RADIUS_M, fisheye, pinhole, write_scene
 
-from edge_depth_nerf import cli
 from edge_depth_nerf.cameras import Camera, KannalaBrandt
+from edge_depth_nerf.entry import main
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_distance_png, read_image, read_json, write_distance_png, write_json
 from edge_depth_nerf.mono.elsewhere import FittedMaps
@@ -399,7 +399,7 @@ def test_the_command_writes_maps_of_a_ready_made_network(networks, name, tmp_pat
     before = read_json(folder / "transforms.json")
     command = ["edge-depth-nerf", "estimate-depth", str(folder), "--hf", str(networks / name)]
     monkeypatch.setattr(sys, "argv", command)
-    cli.main()
+    main()
     said = capsys.readouterr().out
     assert "depth in metres" in said if name == "anything-metric" else "disparity" in said
     meta = read_json(folder / "transforms.json")
@@ -464,7 +464,7 @@ def test_networks_that_cannot_be_used_are_named(networks, tmp_path, monkeypatch,
         sys, "argv", ["edge-depth-nerf", "estimate-depth", str(folder), "--hf", "nobody/no-such-network"]
     )
     with pytest.raises(SystemExit) as stopped:
-        cli.main()
+        main()
     assert stopped.value.code == 2 and "Nothing is downloaded" in capsys.readouterr().err
 
 

@@ -18,9 +18,9 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from scenes import FLIP, fisheye, write_scene
 
-from edge_depth_nerf import cli
 from edge_depth_nerf import scene_reader as reader
 from edge_depth_nerf.cameras import KannalaBrandt
+from edge_depth_nerf.entry import main
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import (
     read_distance_png,
@@ -444,7 +444,7 @@ def test_weights_know_how_they_were_made_and_predict_other_scenes(small_street, 
     monkeypatch.setattr(
         sys, "argv", ["x", "estimate-depth", str(small_street), "--train-steps", "3", "--output", str(model)]
     )
-    cli.main()
+    main()
     with safe_open(model, framework="pt") as file:
         metadata = file.metadata()
     header = json.loads(metadata["header"])
@@ -458,7 +458,7 @@ def test_weights_know_how_they_were_made_and_predict_other_scenes(small_street, 
     # another scene, without LiDAR
     target = write_street(tmp_path / "target", frames=3, seed=5, lidar=False)
     monkeypatch.setattr(sys, "argv", ["x", "estimate-depth", str(target), "--model", str(model)])
-    cli.main()
+    main()
     assert "3 pictures got a monocular map" in capsys.readouterr().out
     entry = read_json(target / "transforms.json")["mono"]
     assert entry["trained_frames"] == [] and entry["trained_on"] == "scene" and entry["weights"] == "street.safetensors"
@@ -615,7 +615,7 @@ def test_bad_weights_are_named(tmp_path, small_street, monkeypatch, capsys):
     save_file({"encoder.patch_embed.weight": torch.zeros(2)}, path, {"format": "pt"})
     monkeypatch.setattr(sys, "argv", ["x", "estimate-depth", str(small_street), "--model", str(path)])
     with pytest.raises(SystemExit) as stopped:
-        cli.main()
+        main()
     assert stopped.value.code == 2
     message = capsys.readouterr().err
     assert str(path) in message and "another architecture" in message and "encoder.patch_embed.weight" in message

@@ -304,8 +304,10 @@ def test_the_pictures_are_current(tmp_path):
 def test_the_kernel_picture_is_of_eq_7():
     """The two averages again, Eq. 5 to 7 written out."""
     module = load("make_pictures")
-    scene = module.read_scene(ROOT / "data" / "sample_drive")
-    picture = next(each for each in scene.pictures if each.moment == module.MOMENT and each.camera == module.CAMERA)
+    scene = module.ShownScene(module.read_scene(ROOT / "data" / "sample_drive"))
+    picture = next(
+        each for each in scene.scene.pictures if each.moment == module.MOMENT and each.camera == module.CAMERA
+    )
     maps = scene.maps(picture)
     mono = module.aligned(scene, maps).astype(float)
     i, j = module.find_edge(module.aligned(scene, maps), maps, 4)

@@ -15,6 +15,7 @@ from edge_depth_nerf.datamanager import FisheyeDepthDataManagerConfig
 from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_distance_png, read_json, write_distance_png, write_json, write_mask, write_png
+from edge_depth_nerf.inspecting.shown_prior import ShownScene
 from edge_depth_nerf.mono.estimate import estimate_depth
 from edge_depth_nerf.mono.options import EstimateDepthOptions
 from edge_depth_nerf.mono.scene_maps import write_mono_maps
@@ -69,7 +70,7 @@ def test_monocular_maps_do_not_make_z_depth_a_distance(tmp_path: Path, npy: bool
     assert after.lidar_is_z_depth and not after.own
     for picture, expected in zip(after.pictures, lidar, strict=True):
         np.testing.assert_array_equal(after.lidar_m(picture), expected)
-        whole = after.maps(picture, with_prior=False).lidar_m
+        whole = after.maps(picture).lidar_m
         assert whole is not None
         np.testing.assert_array_equal(whole, expected)
     dataset = manager(folder).train_dataset
@@ -112,7 +113,7 @@ def test_another_geometry_makes_a_calibration_stale(tmp_path: Path, change) -> N
     write_json(scene / "transforms.json", meta)
     assert saved_trust(read_scene(scene), PriorOptions()) is None
     # what inspect draws is never made by a stale one
-    assert read_scene(scene).trust is None
+    assert ShownScene(read_scene(scene)).trust is None
 
 
 def test_another_map_of_the_same_size_makes_a_calibration_stale(tmp_path: Path) -> None:
@@ -164,7 +165,7 @@ def test_a_frame_near_the_least_number_of_returns_is_reported_as_the_prior_has_i
     picture = read_scene(scene).pictures[0]
     lidar = read_scene(scene).lidar_m(picture)
     mono = read_distance_png(picture.files["mono"])
-    rows, columns = np.nonzero((lidar > 0) & (mono > 0) & read_scene(scene).maps(picture, with_prior=False).usable)
+    rows, columns = np.nonzero((lidar > 0) & (mono > 0) & read_scene(scene).maps(picture).usable)
     few = np.zeros_like(lidar)
     few[rows[:54], columns[:54]] = lidar[rows[:54], columns[:54]]
     write_distance_png(picture.files["lidar"], few)

@@ -24,15 +24,17 @@ from edge_depth_nerf.compare.report import first_runs, make_report
 from edge_depth_nerf.compare.results import Results, check_fair, read_results, write_rows
 from edge_depth_nerf.compare.search import show_search, write_search
 from edge_depth_nerf.compare.specification import FIGURES, SPECIFICATION, VIEWS, RunSpecification
-from edge_depth_nerf.compare.tables import MadeTable, as_latex, as_markdown, make_tables
+from edge_depth_nerf.compare.tables import as_latex, as_markdown, make_tables
 from edge_depth_nerf.console import say
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import check_is_folder, read_json_object, write_json, write_png, write_text
 from edge_depth_nerf.one_writer import only_writer
 from edge_depth_nerf.pictures import DISTANCE, resize, side_by_side, with_colour_bar
 from edge_depth_nerf.report.build import write_report
+from edge_depth_nerf.report.compared_views import compared_views
+from edge_depth_nerf.report.tables import MadeTable
 from edge_depth_nerf.report.views import REPORT
-from edge_depth_nerf.runs import command_line, compared_views, viewer_command
+from edge_depth_nerf.runs import command_line, viewer_command
 from edge_depth_nerf.scene_format import read_transforms
 from edge_depth_nerf.tasks import Task, do_tasks, this_machine
 

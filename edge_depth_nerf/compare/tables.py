@@ -8,12 +8,12 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
 from edge_depth_nerf.compare.methods import METHODS
 from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.results import Results, RunResult
+from edge_depth_nerf.report.tables import Cell, MadeTable, Metric, Row, mark_best, mean_and_spread
 
 PAPER_AHEAD_DB: dict[str, dict[MethodName, float]] = {
     "1": {"nerfacto": 0.65, "ds-nerf": 0.44},
@@ -35,79 +35,8 @@ SAME_ROW = (
 )
 
 
-@dataclass(frozen=True)
-class Metric:
-    """A column."""
-
-    name: str
-    """In the figures of a run."""
-    heading: str
-    form: str
-    best: int = 1
-    """1: more is better; -1: less is; 0: neither."""
-
-
 PSNR = Metric("masked_psnr", "PSNR ↑", ".2f")
 TRUE_PSNR = Metric("truth_masked_psnr", "PSNR ↑", ".2f")
-
-
-@dataclass
-class Cell:
-    """A figure: mean and spread over seeds."""
-
-    mean: float | None
-    spread: float | None = None
-    """Sample standard deviation; None for a single seed."""
-    form: str = ".2f"
-    words: str | None = None
-    """Instead of a figure."""
-    best: bool = False
-    """Whether it is the best of its column."""
-
-    def text(self) -> str:
-        """As it is read."""
-        if self.words is not None:
-            return self.words
-        if self.mean is None:
-            return "–"
-        spread = "" if self.spread is None else f" ± {self.spread:{self.form.replace('+', '')}}"
-        return f"{self.mean:{self.form}}{spread}"
-
-
-@dataclass
-class Row:
-    """A row."""
-
-    title: str
-    cells: list[Cell]
-
-
-@dataclass
-class MadeTable:
-    """A table with its headings: groups (drives) of columns."""
-
-    label: str
-    title: str
-    groups: list[tuple[str, list[str]]]
-    rows: list[Row]
-    notes: list[str] = field(default_factory=list)
-    on_terminal: bool = True
-
-    @property
-    def caption(self) -> str:
-        """All notes."""
-        return " ".join(self.notes)
-
-    def headings(self) -> list[tuple[str, str]]:
-        """Group and heading of each column."""
-        return [(group, heading) for group, headings in self.groups for heading in headings]
-
-
-def mean_and_spread(values: Sequence[float]) -> tuple[float | None, float | None]:
-    """Mean and sample standard deviation; None where there is too little for them."""
-    if not values:
-        return None, None
-    return statistics.fmean(values), statistics.stdev(values) if len(values) > 1 else None
 
 
 def per_seed(
@@ -152,17 +81,6 @@ def quality_metrics(results: Results) -> list[Metric]:
         Metric(f"{truth}masked_lpips", "LPIPS ↓", ".3f", -1),
     ]
     return [metric for metric in metrics if any(metric.name in run.figures for run in results.runs)]
-
-
-def mark_best(rows: Sequence[Row], better: Sequence[int]) -> None:
-    """Mark the best cells of each column; `better` says of each whether more (1), less (-1) or neither (0) is."""
-    for column, sign in enumerate(better):
-        cells = [row.cells[column] for row in rows if row.cells[column].mean is not None]
-        if sign and len(cells) > 1:
-            texts = {cell.text().split(" ")[0]: cell for cell in cells}
-            best = max(texts, key=lambda text: sign * float(text))
-            for cell in cells:
-                cell.best = cell.text().split(" ")[0] == best
 
 
 def _quality_table(

@@ -26,8 +26,9 @@ from edge_depth_nerf.inspecting.figures import (
 )
 from edge_depth_nerf.inspecting.findings import find, limited
 from edge_depth_nerf.inspecting.sheets import draw_sheet
+from edge_depth_nerf.inspecting.shown_prior import ShownScene
 from edge_depth_nerf.inspecting.top_view import draw_top_view
-from edge_depth_nerf.scene_reader import SceneFolder, ScenePicture, read_scene
+from edge_depth_nerf.scene_reader import ScenePicture, read_scene
 
 SUMMARY = "summary.json"
 TOP_VIEW = "top_view.png"
@@ -62,10 +63,9 @@ def inspect_scene(options: InspectOptions, console: Console | None = None) -> di
     measured, shown = measured_moments(scene, options.frames)
     chosen = [picture for picture in scene.pictures if picture.moment in set(measured)]
     sheets = {picture.name: _sheet_name(picture) for picture in chosen if picture.moment in shown}
-    jobs = [
-        partial(_look_at, scene, picture, output / sheets[picture.name] if picture.name in sheets else None, options)
-        for picture in chosen
-    ]
+    shown_scene = ShownScene(scene)
+    sheet_of = {name: output / sheet for name, sheet in sheets.items()}
+    jobs = [partial(_look_at, shown_scene, picture, sheet_of.get(picture.name), options) for picture in chosen]
     figures = run_jobs(jobs, "Looking at the pictures", console)
 
     findings = find(scene, figures)
@@ -121,12 +121,12 @@ def _sheet_name(picture: ScenePicture) -> str:
     return f"{re.sub(r'[^A-Za-z0-9_-]+', '_', picture.camera)}_{picture.moment:010d}.png"
 
 
-def _look_at(scene: SceneFolder, picture: ScenePicture, sheet: Path | None, options: InspectOptions) -> PictureFigures:
+def _look_at(shown: ShownScene, picture: ScenePicture, sheet: Path | None, options: InspectOptions) -> PictureFigures:
     """Measure one picture, and draw its sheet if it is to be shown."""
-    maps = scene.maps(picture)
+    maps = shown.maps(picture)
     figures = measure(picture, maps)
     if sheet is not None:
-        write_png(sheet, draw_sheet(scene, figures, maps, options.size))
+        write_png(sheet, draw_sheet(shown.scene, figures, maps, options.size))
     return figures
 
 

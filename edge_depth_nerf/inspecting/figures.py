@@ -17,8 +17,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_depth_nerf.inspecting.shown_prior import ShownMaps
 from edge_depth_nerf.pictures import is_distance
-from edge_depth_nerf.scene_reader import PictureMaps, SceneFolder, ScenePicture
+from edge_depth_nerf.scene_reader import SceneFolder, ScenePicture
 
 MEASURED_PICTURES = 64
 """Maps of so many pictures are measured, unless more are to be shown."""
@@ -72,7 +73,7 @@ class PictureFigures:
         }
 
 
-def measure(picture: ScenePicture, maps: PictureMaps) -> PictureFigures:
+def measure(picture: ScenePicture, maps: ShownMaps) -> PictureFigures:
     """Take the figures of one picture."""
     usable = maps.usable
     count = max(int(usable.sum()), 1)

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_depth_nerf.inspecting.figures import PictureFigures
+from edge_depth_nerf.inspecting.shown_prior import ShownMaps
 from edge_depth_nerf.pictures import (
     DISTANCE,
     RELATIVE_ERROR,
@@ -20,7 +21,7 @@ from edge_depth_nerf.pictures import (
     swatches,
     tinted,
 )
-from edge_depth_nerf.scene_reader import PictureMaps, SceneFolder
+from edge_depth_nerf.scene_reader import SceneFolder
 
 HIDDEN_RGB = (205, 50, 60)
 """Tint of what the mask hides."""
@@ -28,9 +29,7 @@ NO_PRIOR_RGB = (60, 110, 230)
 """Tint, hatched, of usable pixels without a prior."""
 
 
-def draw_sheet(
-    scene: SceneFolder, figures: PictureFigures, maps: PictureMaps, longer_side_px: int
-) -> NDArray[np.uint8]:
+def draw_sheet(scene: SceneFolder, figures: PictureFigures, maps: ShownMaps, longer_side_px: int) -> NDArray[np.uint8]:
     """Draw the sheet of one picture; panels of maps that it does not have are left out.
 
     Args:
@@ -58,8 +57,7 @@ def draw_sheet(
     if maps.mono_m is not None:
         panels.append(distance("monocular distance", maps.mono_m))
     if maps.prior is not None:
-        source = figures.picture.depth_source()
-        panels.append(distance(f"prior ({source})", maps.prior.distance_m))
+        panels.append(distance(f"prior ({maps.source})", maps.prior.distance_m))
         has_prior = is_distance(maps.prior.distance_m)
         panels.append(coloured("sigma of the prior", maps.prior.sigma_m, has_prior, SIGMA))
     if "mask" in figures.picture.files or maps.prior is not None:
@@ -74,7 +72,7 @@ def draw_sheet(
     return lay_out(panels, columns, _heading(scene, figures))
 
 
-def _mask_panel(maps: PictureMaps, size: tuple[int, int]) -> NDArray[np.uint8]:
+def _mask_panel(maps: ShownMaps, size: tuple[int, int]) -> NDArray[np.uint8]:
     picture = tinted(resize(maps.rgb, size), resize(~maps.usable, size), HIDDEN_RGB)
     names: list[tuple[str, tuple[int, int, int]]] = [("hidden", HIDDEN_RGB)]
     if maps.prior is not None:

@@ -20,8 +20,7 @@ from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_mask, write_distance_png, write_json
 from edge_depth_nerf.mono.error_model import TRUST_FILE
 from edge_depth_nerf.mono.examples import lens_rays
-from edge_depth_nerf.process.scene import LAYERS, MONO_ENTRY
-from edge_depth_nerf.scene_format import read_transforms
+from edge_depth_nerf.scene_format import LAYERS, MONO_ENTRY, read_transforms
 from edge_depth_nerf.scene_reader import SceneFolder, ScenePicture, read_scene
 
 FARTHEST_M = 200.0

@@ -255,7 +255,7 @@ def _calibrate(
 
     def measure(numbered: tuple[int, ScenePicture]) -> MeasuredFrame:
         number, picture = numbered
-        maps = scene.maps(picture, with_prior=False)
+        maps = scene.maps(picture)
         assert maps.lidar_m is not None and maps.mono_m is not None
         view = view_of(picture.lens, picture.up_in_camera)
         far_seen_m = seen_above(cloud, scene, picture, (picture.lens.width, picture.lens.height))

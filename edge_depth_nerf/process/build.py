@@ -7,7 +7,6 @@ camera, and through its lens to a sparse map of distances; what is hidden from t
 from __future__ import annotations
 
 import dataclasses
-import functools
 import hashlib
 import threading
 from collections import defaultdict
@@ -18,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from numpy.typing import NDArray
 from rich.console import Console
 from torch import Tensor
@@ -34,16 +33,16 @@ from edge_depth_nerf.masks.lens import dark_rim, lens_circle
 from edge_depth_nerf.masks.semantics import check_classes, keep_static, read_labels
 from edge_depth_nerf.masks.semantics import sky as sky_of_labels
 from edge_depth_nerf.masks.sky import find_sky
-from edge_depth_nerf.process.checks import read_camera_mask, size_error
+from edge_depth_nerf.process.checks import read_camera_mask
 from edge_depth_nerf.process.downscale import downscale_distance, downscale_image, downscale_mask
 from edge_depth_nerf.process.options import ProcessOptions
 from edge_depth_nerf.process.points import PointCloud
-from edge_depth_nerf.process.recording import DepthFile, RecordedPicture, Recording
+from edge_depth_nerf.process.reading import load_distance, load_picture, rays_of, read_depth
+from edge_depth_nerf.process.recording import RecordedPicture, Recording
 from edge_depth_nerf.process.scene import (
     CLOUD,
     DistanceMap,
     FrameContent,
-    Picture,
     ProcessReport,
     SceneCamera,
     SceneFrame,
@@ -403,32 +402,6 @@ class _Builder:
         return found
 
 
-def read_depth(depth: DepthFile, camera: Camera) -> Float[np.ndarray, "h w"]:
-    """Read a depth map and turn it into distance along the ray, metres, 0 = none.
-
-    Raises:
-        InputError: broken, or not of the camera's size.
-
-    """
-    distance_m = read_distance_png(depth.path, depth.metres_per_count)
-    if distance_m.shape != (camera.height, camera.width):
-        raise InputError(size_error(depth.path, distance_m.shape[1], distance_m.shape[0], camera))
-    if depth.kind == "distance":
-        return distance_m
-    rays, valid = rays_of(camera)
-    cosine = rays[..., 2].numpy()
-    # a depth along the axis says nothing where the ray is at right angles to it, or points backwards
-    usable = valid.numpy() & (cosine > 0.01)
-    return np.where(usable, distance_m / np.where(usable, cosine, 1), 0).astype(np.float32)
-
-
-@functools.lru_cache(maxsize=8)
-def rays_of(camera: Camera) -> tuple[Float[Tensor, "h w 3"], Bool[Tensor, "h w"]]:
-    """Unit rays of all pixels, 0 where there is none; takes seconds."""
-    rays, valid = camera.unproject(camera.pixel_centres())
-    return torch.where(valid[..., None], rays, 0.0).float(), valid
-
-
 def _cloud(
     point_index: Int[Tensor, "height width"],
     in_camera: Float[Tensor, "points 3"],
@@ -443,16 +416,6 @@ def _cloud(
         colours=image[hit.numpy()],
         pixels=torch.nonzero(hit).numpy(),
     )
-
-
-def load_picture(path: Path, factor: int) -> Picture:
-    """A picture at the scene's size; the file itself where that is its own."""
-    return path if factor == 1 else downscale_image(read_image(path), factor)
-
-
-def load_distance(path: Path, factor: int) -> DistanceMap:
-    """A distance map at the scene's size; the file itself where that is its own."""
-    return path if factor == 1 else downscale_distance(read_distance_png(path), factor)
 
 
 # ---- what the scene says of itself -----------------------------------------------------------------------------

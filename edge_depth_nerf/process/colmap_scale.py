@@ -25,8 +25,8 @@ from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.lidar import transform_points
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.lidar.world import sweep_in_world
-from edge_depth_nerf.process.build import rays_of, read_depth
 from edge_depth_nerf.process.colmap_models import ColmapModel
+from edge_depth_nerf.process.reading import rays_of, read_depth
 from edge_depth_nerf.process.recording import RecordedPicture, RecordedSweep, Recording
 from edge_depth_nerf.process.transforms import Transform
 

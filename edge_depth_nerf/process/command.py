@@ -11,7 +11,8 @@ from rich.console import Console
 from edge_depth_nerf.console import say
 from edge_depth_nerf.one_writer import only_writer
 from edge_depth_nerf.process.options import JbnuDepth360Options, Kitti360Options, ProcessOptions, RigOptions
-from edge_depth_nerf.process.scene import MONO_ENTRY, ProcessReport
+from edge_depth_nerf.process.scene import ProcessReport
+from edge_depth_nerf.scene_format import MONO_ENTRY
 from edge_depth_nerf.scene_reader import SceneFolder, read_scene
 
 

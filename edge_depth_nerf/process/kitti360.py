@@ -28,12 +28,13 @@ from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_json
 from edge_depth_nerf.lidar import SweepTiming, check_sweep_size, read_sweep
 from edge_depth_nerf.lidar.trajectory import Trajectory
-from edge_depth_nerf.process.build import load_distance, load_picture, process_recording
+from edge_depth_nerf.process.build import process_recording
 from edge_depth_nerf.process.checks import Tolerance, check_distance, check_size
 from edge_depth_nerf.process.kitti360_calibration import Kitti360Rig, read_poses, read_rig
 from edge_depth_nerf.process.kitti360_drive import Kitti360Drive
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.process.poses import transform_of_rows
+from edge_depth_nerf.process.reading import load_distance, load_picture
 from edge_depth_nerf.process.recording import RecordedCamera, RecordedPicture, RecordedSweep, Recording
 from edge_depth_nerf.process.scene import DistanceMap, Picture, ProcessReport, ShiftedView
 

@@ -58,25 +58,13 @@ from edge_depth_nerf.process.checks import LeftOut, Tolerance
 from edge_depth_nerf.process.png import read_png_bytes, read_png_header
 from edge_depth_nerf.process.points import PointCloud, merge_parts, write_part
 from edge_depth_nerf.process.transforms import Transform, check_rigid, opencv_to_opengl
-from edge_depth_nerf.scene_format import read_transforms
+from edge_depth_nerf.scene_format import LAYERS, MONO_ENTRY, POINTS, TRANSFORMS, read_transforms
 
-TRANSFORMS = "transforms.json"
 RECORD = "process.json"
-POINTS = "points.ply"
 LEFT_OUT = "left_out.json"
 """Pictures of the drive that are not in the scene, because one of their files is broken: what is wrong with each."""
-LAYERS = {
-    "mask": ("masks/{camera}", "mask_path"),
-    "lidar": ("lidar/{camera}", "lidar_file_path"),
-    "mono": ("mono/{camera}", "mono_file_path"),
-    "truth_distance": ("truth/{camera}/distance", "truth_distance_file_path"),
-    "truth_rgb": ("truth/{camera}/rgb", "truth_rgb_file_path"),
-}
-"""What every frame of a scene has beside its picture, or none: its folder, and its key in transforms.json."""
 CLOUD = "cloud"
 """The layer that becomes points.ply."""
-MONO_ENTRY = "mono"
-"""Key of transforms.json that says where monocular maps come from that were put into the scene later."""
 
 MAX_FIT_RMS_PX = 0.5
 """A camera whose replacement is off by more than this cannot be used."""

@@ -30,7 +30,7 @@ from edge_depth_nerf.pictures import (
     is_distance,
     resize,
 )
-from edge_depth_nerf.runs import ComparedView, compared_view, held_out_frames, spread_over
+from edge_depth_nerf.report.compared_views import ComparedView, compared_view, held_out_frames, spread_over
 
 REPORT = "report.html"
 """The page's name beside the other results."""

@@ -1,0 +1,104 @@
+"""Held-out views of a scene beside what trained models made of them, as `ns-eval` wrote it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_depth_nerf.files import read_distance_png, read_image, read_mask
+from edge_depth_nerf.pictures import colour_distance
+from edge_depth_nerf.scene_format import read_transforms
+
+DISTANCE_KEYS = ("truth_distance_file_path", "lidar_file_path")
+"""What a view's distances are shown by, the better one first."""
+
+
+def held_out_frames(scene: Path) -> list[dict[str, Any]]:
+    """The held-out frames of a scene's transforms.json, in the order in which they are judged."""
+    transforms = read_transforms(scene / "transforms.json")
+    names = set(transforms.get("test_filenames", ()))
+    frames = [frame for frame in transforms["frames"] if frame["file_path"] in names]
+    return sorted(frames, key=lambda frame: frame["file_path"])
+
+
+@dataclass(frozen=True, eq=False)
+class ComparedView:
+    """A held-out view: what is known of it, and what each run made of it. Pictures are H×W×3 uint8, maps H×W."""
+
+    name: str
+    """Its file in the scene."""
+    rgb: NDArray[np.uint8]
+    """The recorded picture."""
+    clean_rgb: NDArray[np.uint8] | None
+    """The same without noise and exposure drift, where that is known."""
+    mask: NDArray[np.bool_]
+    """True = judge the pixel."""
+    distance_m: NDArray[np.float32]
+    """Metres along the ray, 0 = unknown."""
+    distance_key: str | None
+    """Which of `DISTANCE_KEYS` that is; None without any."""
+    colours: dict[str, NDArray[np.uint8]]
+    """What each run rendered, black outside the mask."""
+    distances: dict[str, NDArray[np.uint8]]
+    """The median distances that it rendered, in the colours of `colour_distance`."""
+
+    def rows(self) -> tuple[list[NDArray[np.uint8]], list[NDArray[np.uint8]]]:
+        """Its colours, then its distances: the recorded ones first, then each run's."""
+        known = colour_distance(self.distance_m, self.mask)
+        return [self.rgb, *self.colours.values()], [known, *self.distances.values()]
+
+
+def spread_over(count: int, most: int) -> list[int]:
+    """Choose at most `most` of `count` numbers from 0 on, evenly spread, the first and the last among them."""
+    return np.linspace(0, count - 1, min(most, count)).round().astype(int).tolist()
+
+
+def compared_view(scene: Path, frame: Mapping[str, Any], index: int, views_of: Mapping[str, Path]) -> ComparedView:
+    """Read a held-out view.
+
+    Args:
+        scene: the scene folder.
+        frame: one of its `held_out_frames`.
+        index: its place among these.
+        views_of: for each run the folder of its judged views, as `ns-eval --render-output-path` writes them.
+
+    """
+    rgb = read_image(scene / frame["file_path"])
+    mask = read_mask(scene / frame["mask_path"]) if "mask_path" in frame else np.ones(rgb.shape[:2], bool)
+    key = next((key for key in DISTANCE_KEYS if key in frame), None)
+    clean = frame.get("truth_rgb_file_path")
+    colours, distances = {}, {}
+    for name, folder in views_of.items():
+        # nerfstudio saves truth and rendering side by side
+        rendered = read_image(folder / f"eval_img_{index:04d}.png")[:, rgb.shape[1] :]
+        colours[name] = np.where(mask[..., None], rendered, 0).astype(np.uint8)
+        distances[name] = read_image(folder / f"eval_distance_{index:04d}.png")
+    return ComparedView(
+        name=frame["file_path"],
+        rgb=rgb,
+        clean_rgb=None if clean is None else read_image(scene / clean),
+        mask=mask,
+        distance_m=np.zeros(mask.shape, np.float32) if key is None else read_distance_png(scene / frame[key]),
+        distance_key=key,
+        colours=colours,
+        distances=distances,
+    )
+
+
+def compared_views(scene: Path, views_of: Mapping[str, Path], most: int | None = None) -> Iterator[ComparedView]:
+    """Read some held-out views, spread over the drive, or all.
+
+    Args:
+        scene: the scene folder.
+        views_of: for each run the folder of its judged views.
+        most: how many views at most; None: all.
+
+    """
+    frames = held_out_frames(scene)
+    for index in spread_over(len(frames), len(frames) if most is None else most):
+        yield compared_view(scene, frames[index], index, views_of)
