@@ -28,9 +28,9 @@ from nerfstudio.engine.optimizers import Optimizers
 from rich.console import Console
 from rich.table import Table
 
+from edge_depth_nerf.base.files import read_json, write_json
 from edge_depth_nerf.compare.judging import PIXELS_PER_VIEW, choose_pixels, judge_pixels
-from edge_depth_nerf.config import apply_overrides
-from edge_depth_nerf.files import read_json, write_json
+from edge_depth_nerf.plugin.config import apply_overrides
 
 
 def parse(variant: str) -> dict[str, Any]:

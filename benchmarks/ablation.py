@@ -24,7 +24,7 @@ from pages import with_part
 from rich.console import Console
 from tried import guided_samples, line_of_sight
 
-from edge_depth_nerf.files import read_json, write_json, write_text
+from edge_depth_nerf.base.files import read_json, write_json, write_text
 
 MODEL, DATA = "pipeline.model.", "pipeline.datamanager."
 

@@ -119,8 +119,8 @@ def overhead(work: Path) -> tuple[float, float]:
     """Seconds that a local cluster takes to be there, and what each further task takes beyond its own process."""
     from rich.console import Console
 
-    from edge_depth_nerf.cluster import on_cluster
-    from edge_depth_nerf.tasks import Task, do_tasks
+    from edge_depth_nerf.jobs.cluster import on_cluster
+    from edge_depth_nerf.jobs.tasks import Task, do_tasks
 
     quiet = Console(quiet=True)
     code = "from pathlib import Path; import sys; Path(sys.argv[1]).touch()"

@@ -16,12 +16,12 @@ import time
 from pathlib import Path
 
 import numpy as np
+from edge_depth_nerf.process.kitti360.converter.calibration import read_poses
 from rich.console import Console
 from rich.table import Table
 
-from edge_depth_nerf.process.colmap_poses import colmap_poses
-from edge_depth_nerf.process.kitti360 import read_kitti360
-from edge_depth_nerf.process.kitti360_calibration import read_poses
+from edge_depth_nerf.process.colmap.poses import colmap_poses
+from edge_depth_nerf.process.kitti360.converter import read_kitti360
 from edge_depth_nerf.process.options import Kitti360Options
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))

@@ -18,13 +18,13 @@ from pathlib import Path
 
 from rich.console import Console
 
+from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.compare.command import RUNS, Run, check_scene, do_runs, read_tuned
 from edge_depth_nerf.compare.methods import METHODS, Setting
 from edge_depth_nerf.compare.options import CompareOptions, MethodName
 from edge_depth_nerf.compare.results import Results, RunResult, read_results
 from edge_depth_nerf.compare.specification import RunSpecification
 from edge_depth_nerf.compare.tables import clock_metric, curve_metric, psnr_at
-from edge_depth_nerf.errors import InputError
 
 RIVALS: tuple[MethodName, ...] = ("nerfacto", "urban-nerf", "ds-nerf")
 

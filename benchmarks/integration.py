@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from edge_depth_nerf.integration import IntegrationOptions, integrate_depth
+from edge_depth_nerf.method.integration import IntegrationOptions, integrate_depth
 
 ALPHA, RADIUS, SIGMA_SPACE_PX, SIGMA_DEPTH_M = 0.7, 4, 3.0, 1.0
 

@@ -15,10 +15,10 @@ import json
 import lzma
 from pathlib import Path
 
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_json_object, write_bytes, write_json
 from edge_depth_nerf.compare.command import RECORD, RUNS
 from edge_depth_nerf.compare.specification import FIGURES, OF_A_RUN, SPECIFICATION
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_json_object, write_bytes, write_json
 
 
 def keep(comparison: Path, file: Path) -> int:

@@ -35,8 +35,8 @@ from typing import Any
 
 import torch
 
-from edge_depth_nerf.compat import allow_numpy_scalars_in_checkpoints
-from edge_depth_nerf.runs import newest_checkpoint, steps_done
+from edge_depth_nerf.jobs.runs import newest_checkpoint, steps_done
+from edge_depth_nerf.plugin.compat import allow_numpy_scalars_in_checkpoints
 
 SEQUENCE = "2013_05_28_drive_0000_sync"
 KILLS_A_ROUND = 5

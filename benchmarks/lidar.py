@@ -35,11 +35,11 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from edge_depth_nerf.files import read_distance_png, read_image, read_mask, write_png
+from edge_depth_nerf.base.files import read_distance_png, read_image, read_mask, write_png
+from edge_depth_nerf.base.pictures import lay_out, panel
 from edge_depth_nerf.lidar import project_points, read_sweep, transform_points
 from edge_depth_nerf.lidar.world import sweep_in_world
-from edge_depth_nerf.pictures import lay_out, panel
-from edge_depth_nerf.process.kitti360 import process_kitti360, read_kitti360
+from edge_depth_nerf.process.kitti360.converter import process_kitti360, read_kitti360
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.process.recording import RecordedPicture, Recording
 from edge_depth_nerf.process.sweep_store import SweepStore

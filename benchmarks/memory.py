@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 BATCHES = 10
-CALIBRATE = "import sys, pathlib, edge_depth_nerf.mono.trust as t; t.calibrate_scene(pathlib.Path(sys.argv[1]))"
+CALIBRATE = "import sys, pathlib, edge_depth_nerf.mono.calibration as t; t.calibrate_scene(pathlib.Path(sys.argv[1]))"
 
 
 def anonymous_mb() -> float:
@@ -83,8 +83,8 @@ def build(which: str, scene: Path) -> dict[str, float]:
     from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
     from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
-    from edge_depth_nerf.datamanager import FisheyeDepthDataManagerConfig
-    from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
+    from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
+    from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
 
     torch.manual_seed(0)
     before = anonymous_mb()

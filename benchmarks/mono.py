@@ -22,14 +22,14 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from edge_depth_nerf.files import read_distance_png, read_image, write_png
+from edge_depth_nerf.base.files import read_distance_png, read_image, write_png
+from edge_depth_nerf.base.pictures import colour_distance, side_by_side
 from edge_depth_nerf.mono.estimate import PRESETS, estimate_depth
 from edge_depth_nerf.mono.examples import lens_rays, view_of
 from edge_depth_nerf.mono.options import EstimateDepthOptions
-from edge_depth_nerf.pictures import colour_distance, side_by_side
-from edge_depth_nerf.process.kitti360 import process_kitti360
+from edge_depth_nerf.process.kitti360.converter import process_kitti360
 from edge_depth_nerf.process.options import Kitti360Options
-from edge_depth_nerf.scene_reader import SceneFolder, read_scene
+from edge_depth_nerf.scene.reader import SceneFolder, read_scene
 from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 

@@ -12,8 +12,8 @@ import argparse
 import re
 from pathlib import Path
 
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import write_text
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import write_text
 
 END = "<!-- end -->"
 

@@ -39,22 +39,22 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, write_json, write_png
+from edge_depth_nerf.base.pictures import colour_distance
 from edge_depth_nerf.cameras import MEI
-from edge_depth_nerf.files import read_distance_png, read_image, read_json, write_json, write_png
-from edge_depth_nerf.integration import integrate_depth
-from edge_depth_nerf.metrics import JUDGED_RANGE_M
-from edge_depth_nerf.mono.alignment import Fit, align
+from edge_depth_nerf.method.alignment import Fit, align
+from edge_depth_nerf.method.error_model import Trust
+from edge_depth_nerf.method.integration import integrate_depth
+from edge_depth_nerf.method.metrics import JUDGED_RANGE_M
+from edge_depth_nerf.method.prior import Prior, PriorOptions, View, make_prior, view_of
+from edge_depth_nerf.mono.calibration import find_trust
 from edge_depth_nerf.mono.completion import complete
-from edge_depth_nerf.mono.error_model import Trust
 from edge_depth_nerf.mono.estimate import estimate_depth
 from edge_depth_nerf.mono.options import EstimateDepthOptions
-from edge_depth_nerf.mono.trust import find_trust
-from edge_depth_nerf.pictures import colour_distance
-from edge_depth_nerf.prior import Prior, PriorOptions, View, make_prior, view_of
-from edge_depth_nerf.process.kitti360 import process_kitti360
+from edge_depth_nerf.process.kitti360.converter import process_kitti360
 from edge_depth_nerf.process.options import Kitti360Options
-from edge_depth_nerf.process.scene import FrameContent, SceneCamera, SceneFrame, write_scene
-from edge_depth_nerf.scene_reader import read_scene
+from edge_depth_nerf.scene.reader import read_scene
+from edge_depth_nerf.scene.writer import FrameContent, SceneCamera, SceneFrame, write_scene
 from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 

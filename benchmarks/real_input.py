@@ -24,7 +24,7 @@ sys.path.insert(0, str(ROOT / "tests"))
 
 from real_scenes import fisheye_frame_scene, stereo_scene  # noqa: E402  # pyright: ignore[reportMissingImports]
 
-from edge_depth_nerf.files import read_json, write_text  # noqa: E402
+from edge_depth_nerf.base.files import read_json, write_text  # noqa: E402
 
 METHOD = "edge-depth-nerf-lite"
 SCENES = {

@@ -43,7 +43,7 @@ import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 from speed_report import draw, write_tables
 
-from edge_depth_nerf.files import read_json, write_json
+from edge_depth_nerf.base.files import read_json, write_json
 
 HERE = Path(__file__).resolve().parent
 PROGRAM = Path(sys.executable).with_name("edge-depth-nerf")
@@ -190,7 +190,7 @@ importlib.metadata.entry_points = none_of_nerfstudio
 import nerfstudio.configs.dataparser_configs, nerfstudio.configs.method_configs, sys
 assert not any(name.startswith("edge_depth_nerf") for name in sys.modules)
 started = time.perf_counter()
-import edge_depth_nerf.config, edge_depth_nerf.dataparser_config
+import edge_depth_nerf.plugin.config, edge_depth_nerf.plugin.dataparser_config
 print(time.perf_counter() - started)
 """
 """All of nerfstudio's commands import its methods; what our entry points add is timed alone."""

@@ -43,8 +43,8 @@ from nerfstudio.models.nerfacto import NerfactoModelConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.table import Table
 
-from edge_depth_nerf import config as ours
-from edge_depth_nerf.compat import lpips_not_built
+from edge_depth_nerf.plugin import config as ours
+from edge_depth_nerf.plugin.compat import lpips_not_built
 
 PRESETS: dict[str, Any] = {"lite": ours.edge_depth_nerf_lite, "full": ours.edge_depth_nerf}
 HOST = {"nerfacto": NerfactoModelConfig, "depth-nerfacto": DepthNerfactoModelConfig}

@@ -9,7 +9,7 @@ from typing import Any
 
 from pages import with_part
 
-from edge_depth_nerf.files import write_atomically
+from edge_depth_nerf.base.files import write_atomically
 
 
 def middle(values: Sequence[float]) -> float:

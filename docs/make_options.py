@@ -19,11 +19,11 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 import tyro
 
 from edge_depth_nerf import cli
-from edge_depth_nerf.config import make_specifications, read_method_file
-from edge_depth_nerf.datamanager import FisheyeDepthDataManagerConfig
-from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
-from edge_depth_nerf.files import write_text
-from edge_depth_nerf.model import EdgeDepthNerfModelConfig
+from edge_depth_nerf.base.files import write_text
+from edge_depth_nerf.plugin.config import make_specifications, read_method_file
+from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
+from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
+from edge_depth_nerf.plugin.model import EdgeDepthNerfModelConfig
 
 PAGE = Path(__file__).with_name("options.md")
 

@@ -16,12 +16,8 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from edge_depth_nerf.files import write_atomically, write_png
-from edge_depth_nerf.inspecting.shown_prior import ShownMaps, ShownScene
-from edge_depth_nerf.integration import IntegrationOptions, integrate_depth
-from edge_depth_nerf.losses import edge_loss
-from edge_depth_nerf.mono.alignment import align
-from edge_depth_nerf.pictures import (
+from edge_depth_nerf.base.files import write_atomically, write_png
+from edge_depth_nerf.base.pictures import (
     DISTANCE,
     SIGMA,
     ColourScale,
@@ -34,7 +30,11 @@ from edge_depth_nerf.pictures import (
     resize,
     write_text,
 )
-from edge_depth_nerf.scene_reader import PictureMaps, read_scene
+from edge_depth_nerf.inspecting.shown_prior import ShownMaps, ShownScene
+from edge_depth_nerf.method.alignment import align
+from edge_depth_nerf.method.integration import IntegrationOptions, integrate_depth
+from edge_depth_nerf.method.losses import edge_loss
+from edge_depth_nerf.scene.reader import PictureMaps, read_scene
 
 ROOT = Path(__file__).resolve().parents[1]
 MOMENT, CAMERA = 6, "image_02"

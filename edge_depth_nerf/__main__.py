@@ -9,7 +9,7 @@ from edge_depth_nerf.entry import main
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--end-with-parent"]:
         del sys.argv[1]
-        from edge_depth_nerf.runs import end_with_parent
+        from edge_depth_nerf.jobs.runs import end_with_parent
 
         end_with_parent()
     main()

@@ -13,13 +13,13 @@ from typing import Annotated, get_args
 import tyro
 from rich.console import Console
 
+from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.compare.options import CompareOptions
-from edge_depth_nerf.compat import join_lines_of_option_help
-from edge_depth_nerf.demo_options import DemoOptions
-from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.demo.command.options import DemoOptions
 from edge_depth_nerf.films.options import CameraPathOptions
-from edge_depth_nerf.inspect_options import InspectOptions
+from edge_depth_nerf.inspecting.options import InspectOptions
 from edge_depth_nerf.mono.options import EstimateDepthOptions
+from edge_depth_nerf.plugin.compat import join_lines_of_option_help
 from edge_depth_nerf.process.options import JbnuDepth360Options, Kitti360Options, RigOptions
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 
@@ -120,7 +120,7 @@ def run(command: Command) -> None:
         estimate_depth(command) if command.cluster is None else estimate_on_cluster(command)
     elif isinstance(command, InspectOptions):
         with _starting():
-            from edge_depth_nerf.inspecting import inspect_scene
+            from edge_depth_nerf.inspecting.command import inspect_scene
 
         inspect_scene(command)
     elif isinstance(command, CameraPathOptions):
@@ -139,7 +139,7 @@ def run(command: Command) -> None:
         sys.exit(run_doctor())
     else:
         with _starting():
-            from edge_depth_nerf.demo import run_demo
+            from edge_depth_nerf.demo.command import run_demo
 
         run_demo(command)
 
@@ -155,6 +155,6 @@ def _converter(options: SynthesizeOptions) -> str:
 
 
 def _say_next(what: str, command: str) -> None:
-    from edge_depth_nerf.console import say
+    from edge_depth_nerf.base.console import say
 
     say(Console(), f"{what}: {command}")

@@ -167,7 +167,7 @@ def check_opencv() -> Iterator[Finding]:
 def check_lpips() -> Iterator[Finding]:
     """The weights of one metric."""
     try:
-        from edge_depth_nerf.metrics import lpips_weights
+        from edge_depth_nerf.method.metrics import lpips_weights
     except Exception as error:
         yield _broken("LPIPS", "torchmetrics", error)
         return

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from edge_depth_nerf import __version__
-from edge_depth_nerf.errors import DEBUG_VARIABLE, PROGRAM, STOPPED_STATUS, InputError, debugging, of_package
+from edge_depth_nerf.base.errors import DEBUG_VARIABLE, PROGRAM, STOPPED_STATUS, InputError, debugging, of_package
 
 DEBUG_OPTION = "--debug"
 BUG_STATUS, INPUT_STATUS, PIPE_STATUS = 1, 2, 141
@@ -75,6 +75,6 @@ def _bug(error: Exception) -> str:
 
 def _explained(error: Exception) -> str:
     """What to tell of it, with what to do about a full disk."""
-    from edge_depth_nerf.files import explain  # OpenCV: not before it is needed
+    from edge_depth_nerf.base.files import explain  # OpenCV: not before it is needed
 
     return explain(error)

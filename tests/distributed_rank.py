@@ -16,7 +16,7 @@ from nerfstudio.pipelines import base_pipeline
 from torch.nn.parallel import DistributedDataParallel
 from trainings import trainer_of
 
-from edge_depth_nerf import datamanager, ray_table
+from edge_depth_nerf.plugin import datamanager, ray_table
 
 STEPS = 4
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_depth_nerf.files import write_distance_png, write_mask, write_png
+from edge_depth_nerf.base.files import write_distance_png, write_mask, write_png
 
 SEQUENCE = "2013_05_28_drive_0000_sync"
 FULL_SIZE = 1400
@@ -284,7 +284,7 @@ def aimed_points(drive: RoomDrive, name: str, frame: int, rng: np.random.Generat
 
 
 def _write_shifted(drive: RoomDrive, cameras: tuple[str, ...]) -> None:
-    from edge_depth_nerf.files import write_json
+    from edge_depth_nerf.base.files import write_json
 
     poses: dict[str, dict[str, dict[str, list]]] = {}
     for metres in (1, 2):

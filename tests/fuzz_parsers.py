@@ -16,11 +16,11 @@ from pathlib import Path
 
 import atheris  # pyright: ignore[reportMissingImports]
 
-SEEN = ["edge_depth_nerf.process", "edge_depth_nerf.bounds", "edge_depth_nerf.files"]
+SEEN = ["edge_depth_nerf.process", "edge_depth_nerf.base.bounds", "edge_depth_nerf.base.files"]
 with atheris.instrument_imports(include=SEEN):  # pyright: ignore[reportAttributeAccessIssue]
     from bad_input import OURS
 
-from edge_depth_nerf.errors import InputError  # noqa: E402 (what is instrumented comes first)
+from edge_depth_nerf.base.errors import InputError  # noqa: E402 (what is instrumented comes first)
 
 RUNS = 100_000
 MOST_MEGABYTES = 2048

@@ -8,7 +8,7 @@ import torch
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.data.scene_box import SceneBox
 
-from edge_depth_nerf.model import EdgeDepthNerfModel
+from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
 
 
 def build(**options) -> EdgeDepthNerfModel:

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from edge_depth_nerf.base.files import write_distance_png, write_json, write_mask, write_png
 from edge_depth_nerf.cameras import Camera, KannalaBrandt, Pinhole
-from edge_depth_nerf.files import write_distance_png, write_json, write_mask, write_png
 
 RADIUS_M = 6.0
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV camera axes to OpenGL's

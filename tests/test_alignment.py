@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.mono.alignment import LEAST_RETURNS, Fit, align, fit_logs
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.method.alignment import LEAST_RETURNS, Fit, align, fit_logs
 
 SHAPE = (120, 160)
 EVERYWHERE = np.ones(SHAPE, bool)

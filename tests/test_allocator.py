@@ -8,11 +8,11 @@ import sys
 
 import pytest
 
-from edge_depth_nerf import allocator
+from edge_depth_nerf.kernels import allocator
 
 FAULTS = """
 import resource, sys, torch
-from edge_depth_nerf.allocator import keep_freed_memory
+from edge_depth_nerf.kernels.allocator import keep_freed_memory
 if sys.argv[1] == "kept":
     assert keep_freed_memory()
 def faults():

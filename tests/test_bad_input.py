@@ -24,8 +24,8 @@ from bad_input import READERS, describe, named, npy, npz, pcd, spoilt
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
+from edge_depth_nerf.base.errors import LONGEST_MESSAGE, InputError
 from edge_depth_nerf.cameras import Pinhole
-from edge_depth_nerf.errors import LONGEST_MESSAGE, InputError
 
 INPUTS = int(os.environ.get("BAD_INPUTS", "40"))
 MOST_SECONDS = 1.0
@@ -219,7 +219,7 @@ def test_digits_that_are_no_numbers(tmp_path):
 
 def test_a_damaged_model_of_colmaps_is_told_from_a_whole_one(tmp_path):
     """COLMAP's own reader ends the process at one."""
-    from edge_depth_nerf.process.colmap_models import sum_of_files
+    from edge_depth_nerf.process.colmap.models import sum_of_files
 
     for name in ("cameras.bin", "images.bin"):
         (tmp_path / name).write_bytes(bytes(range(99)))

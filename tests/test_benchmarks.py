@@ -15,11 +15,11 @@ from xml.etree import ElementTree
 import pytest
 from nerfstudio.configs.method_configs import all_methods
 
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_json, write_json
 from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.results import Results, RunResult
-from edge_depth_nerf.config import apply_overrides
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_json, write_json
+from edge_depth_nerf.plugin.config import apply_overrides
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results.json"

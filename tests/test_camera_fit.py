@@ -11,8 +11,8 @@ import pytest
 import torch
 from lenses import FISHEYE, IMAGE_02, IMAGE_03, KITTI, nerfstudio_directions, rays
 
+from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras import MEI, Camera, KannalaBrandt, Pinhole, fit_kannala_brandt, host_residual
-from edge_depth_nerf.errors import InputError
 
 
 @pytest.mark.parametrize(("camera", "rms_px", "max_px"), [(IMAGE_02, 0.012, 0.07), (IMAGE_03, 0.033, 0.16)])

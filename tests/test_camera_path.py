@@ -17,13 +17,13 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from rich.console import Console
 from scenes import fisheye, pinhole, write_scene
 
-from edge_depth_nerf.config import edge_depth_nerf_lite
-from edge_depth_nerf.dataparser import FisheyeDepth, FisheyeDepthDataParserConfig
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_json, write_json
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_json, write_json
 from edge_depth_nerf.films.command import write_camera_path
 from edge_depth_nerf.films.options import CameraPathOptions
 from edge_depth_nerf.films.paths import Drive, lane_shift, orbit, replay, up_of
+from edge_depth_nerf.plugin.config import edge_depth_nerf_lite
+from edge_depth_nerf.plugin.dataparser import FisheyeDepth, FisheyeDepthDataParserConfig
 
 UP = np.array([0.0, 0.0, 1.0])
 RADIUS_M, SPEED_M_S = 20.0, 8.0

@@ -14,9 +14,9 @@ import torch
 from lenses import FISHEYE, IMAGE_02, IMAGE_03, KITTI, angle, nerfstudio_directions, rays
 from torch import Tensor
 
+from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras import MEI, Camera, KannalaBrandt, Pinhole, camera_from_dict
 from edge_depth_nerf.cameras.distortion import Distortion
-from edge_depth_nerf.errors import InputError
 
 CAMERAS = [
     *KITTI,

@@ -22,20 +22,21 @@ import pytest
 from drives import SEQUENCE, RoomDrive, write_room_drive
 from rich.console import Console
 
-from edge_depth_nerf import cli, cluster
-from edge_depth_nerf.cluster import on_cluster
-from edge_depth_nerf.cluster_address import check_address
+from edge_depth_nerf import cli
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_json
 from edge_depth_nerf.compare.command import compare
 from edge_depth_nerf.compare.options import CompareOptions
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_json
+from edge_depth_nerf.jobs import cluster
+from edge_depth_nerf.jobs.cluster import on_cluster
+from edge_depth_nerf.jobs.cluster_address import check_address
+from edge_depth_nerf.jobs.tasks import Task, do_tasks, own_command
 from edge_depth_nerf.mono.estimate import estimate_depth
 from edge_depth_nerf.mono.many import estimate_on_cluster
 from edge_depth_nerf.mono.options import EstimateDepthOptions
 from edge_depth_nerf.process.command import process
 from edge_depth_nerf.process.many import process_drive
 from edge_depth_nerf.process.options import Kitti360Options
-from edge_depth_nerf.tasks import Task, do_tasks, own_command
 
 dask = pytest.importorskip("dask")
 distributed = pytest.importorskip("distributed")
@@ -45,7 +46,7 @@ QUIET = Console(quiet=True)
 STEPS = """
 import sys, time
 from pathlib import Path
-from edge_depth_nerf.runs import end_with_parent
+from edge_depth_nerf.jobs.runs import end_with_parent
 end_with_parent()
 kept, made, pause = Path(sys.argv[1]), Path(sys.argv[2]), float(sys.argv[3])
 done = len(kept.read_text().split()) if kept.exists() else 0

@@ -14,14 +14,14 @@ from drives import MeiTwin
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_mask, write_distance_png, write_mask, write_png
 from edge_depth_nerf.cameras import MEI, KannalaBrandt, Pinhole
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_mask, write_distance_png, write_mask, write_png
 from edge_depth_nerf.lidar import Sweep, SweepTiming
-from edge_depth_nerf.process.colmap_models import ColmapModel, SparseView, colmap_lens
-from edge_depth_nerf.process.colmap_poses import NOT_REGISTERED, colmap_poses
-from edge_depth_nerf.process.colmap_scale import join_models, metric_path
-from edge_depth_nerf.process.kitti360 import read_kitti360
+from edge_depth_nerf.process.colmap.models import ColmapModel, SparseView, colmap_lens
+from edge_depth_nerf.process.colmap.poses import NOT_REGISTERED, colmap_poses
+from edge_depth_nerf.process.colmap.scale import join_models, metric_path
+from edge_depth_nerf.process.kitti360.converter import read_kitti360
 from edge_depth_nerf.process.options import Kitti360Options, ProcessOptions
 from edge_depth_nerf.process.recording import DepthFile, RecordedCamera, RecordedPicture, RecordedSweep, Recording
 from edge_depth_nerf.synthetic.drive import synthesize_drive

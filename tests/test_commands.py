@@ -21,7 +21,7 @@ import torch
 from nerfstudio.utils.eval_utils import eval_setup
 from scenes import fisheye, write_scene
 
-from edge_depth_nerf.files import read_json
+from edge_depth_nerf.base.files import read_json
 
 METHOD = "edge-depth-nerf-lite"
 TIMEOUT_S = 240

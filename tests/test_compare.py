@@ -28,6 +28,8 @@ from rich.console import Console
 from scenes import write_scene
 from test_pipeline import build
 
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_image, read_json, write_json
 from edge_depth_nerf.compare import command, search, tables
 from edge_depth_nerf.compare.configuration import (
     REGISTERED,
@@ -44,9 +46,7 @@ from edge_depth_nerf.compare.options import CompareOptions, Preset
 from edge_depth_nerf.compare.protocol import departures
 from edge_depth_nerf.compare.results import Results, RunResult, check_fair
 from edge_depth_nerf.compare.specification import OF_A_RUN, RunSpecification
-from edge_depth_nerf.config import make_specifications, read_method_file
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_image, read_json, write_json
+from edge_depth_nerf.plugin.config import make_specifications, read_method_file
 
 ROOT = Path(__file__).parents[1]
 QUIET = Console(quiet=True)
@@ -623,7 +623,7 @@ def test_a_run_that_fails_names_its_log(tmp_path, monkeypatch):
 CHILD = """
 import os, sys, time
 from pathlib import Path
-from edge_depth_nerf.runs import end_with_parent
+from edge_depth_nerf.jobs.runs import end_with_parent
 end_with_parent()
 Path(sys.argv[1]).write_text(str(os.getpid()))
 time.sleep(600)
@@ -631,7 +631,7 @@ time.sleep(600)
 PARENT = """
 import sys
 from pathlib import Path
-from edge_depth_nerf.runs import LoggedCommands
+from edge_depth_nerf.jobs.runs import LoggedCommands
 LoggedCommands().call([sys.executable, "-c", sys.argv[1], sys.argv[2]], Path(sys.argv[2] + ".log"), 1, print)
 """
 

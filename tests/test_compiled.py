@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 
-from edge_depth_nerf import compiled
+from edge_depth_nerf.kernels import compiled
 
 
 def test_it_is_known_whether_kernels_lie_compiled_on_disk(tmp_path, monkeypatch):

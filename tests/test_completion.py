@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.mono import completion
 from edge_depth_nerf.mono.completion import CompletionOptions, complete
 

@@ -10,9 +10,9 @@ from nerfstudio.configs.dataparser_configs import all_dataparsers
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.plugins.types import MethodSpecification
 
-from edge_depth_nerf import config
-from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
-from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.plugin import config
+from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
 
 ROOT = Path(__file__).parents[1]
 DECLARED = config.read_method_file()
@@ -130,7 +130,7 @@ def test_the_plugin_adds_little_to_nerfstudios_commands():
     check = (
         "import nerfstudio.configs.method_configs, sys; "
         "heavy = {'numba', 'torchmetrics', 'trimesh', 'transformers', 'scipy.stats'} & set(sys.modules); "
-        "sys.exit(str(heavy) if heavy or 'edge_depth_nerf.config' not in sys.modules else 0)"
+        "sys.exit(str(heavy) if heavy or 'edge_depth_nerf.plugin.config' not in sys.modules else 0)"
     )
     done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

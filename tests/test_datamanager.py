@@ -7,16 +7,16 @@ import torch
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager
 from scenes import fisheye, pinhole, write_scene
 
-from edge_depth_nerf import datamanager as datamanager_module
-from edge_depth_nerf.datamanager import FisheyeDepthDataManagerConfig
-from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
-from edge_depth_nerf.dataset import FisheyeDepthDataset
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_distance_png, read_json, write_distance_png, write_json, write_mask
-from edge_depth_nerf.mono.error_model import read_trust
-from edge_depth_nerf.mono.trust import calibrate_scene, find_trust
-from edge_depth_nerf.prior import make_prior, view_of
-from edge_depth_nerf.scene_reader import read_scene
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_distance_png, read_json, write_distance_png, write_json, write_mask
+from edge_depth_nerf.method.error_model import read_trust
+from edge_depth_nerf.method.prior import make_prior, view_of
+from edge_depth_nerf.mono.calibration import calibrate_scene, find_trust
+from edge_depth_nerf.plugin import datamanager as datamanager_module
+from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
+from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
+from edge_depth_nerf.plugin.dataset import FisheyeDepthDataset
+from edge_depth_nerf.scene.reader import read_scene
 
 
 def manager(folder, test_mode="val", parser=None, **options):
@@ -141,7 +141,7 @@ def test_integration_happens_once(tmp_path, monkeypatch):
     scene = write_scene(tmp_path)
     manager(scene)
     assert len(list((scene / ".cache" / "prior").glob("*.npz"))) == 8
-    monkeypatch.setattr("edge_depth_nerf.prior.make_prior", lambda *_: pytest.fail("integrated again"))
+    monkeypatch.setattr("edge_depth_nerf.method.prior.make_prior", lambda *_: pytest.fail("integrated again"))
     manager(scene)
     with pytest.raises(pytest.fail.Exception):
         manager(scene, alpha=0.5)
@@ -228,7 +228,7 @@ def test_the_calibration_of_training_pictures_is_found_or_made(tmp_path):
 
 
 def test_the_literal_form_measures_nothing(tmp_path, monkeypatch):
-    monkeypatch.setattr("edge_depth_nerf.datamanager.find_trust", lambda *_: pytest.fail("measured"))
+    monkeypatch.setattr("edge_depth_nerf.plugin.datamanager.find_trust", lambda *_: pytest.fail("measured"))
     scene = write_scene(tmp_path)
     data = manager(scene, align="none", sigma_mode="image", keep_returns=False)
     _, batch = data.next_train(0)

@@ -11,15 +11,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from edge_depth_nerf.demo.command.options import DemoOptions
 from rich.console import Console
 
-from edge_depth_nerf import demo
-from edge_depth_nerf.compat import allow_numpy_scalars_in_checkpoints
-from edge_depth_nerf.console import progress_bars
-from edge_depth_nerf.demo_options import DemoOptions
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_image, read_json
-from edge_depth_nerf.pictures import NO_VALUE_RGB, colour_distance, side_by_side
+from edge_depth_nerf.base.console import progress_bars
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_image, read_json
+from edge_depth_nerf.base.pictures import NO_VALUE_RGB, colour_distance, side_by_side
+from edge_depth_nerf.demo.command import command as demo
+from edge_depth_nerf.plugin.compat import allow_numpy_scalars_in_checkpoints
 
 
 @pytest.fixture(scope="module")

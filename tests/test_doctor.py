@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from edge_depth_nerf import doctor, metrics
+from edge_depth_nerf import doctor
 from edge_depth_nerf.doctor import Finding, run_doctor
+from edge_depth_nerf.method import metrics
 
 
 def found(check) -> dict[str, Finding]:

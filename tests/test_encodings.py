@@ -18,11 +18,11 @@ from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.field_components.encodings import HashEncoding
 from nerfstudio.field_components.spatial_distortions import SceneContraction
 
-from edge_depth_nerf.encodings import cpu
-from edge_depth_nerf.encodings.fused import FusedHashEncoding, use_fused_encodings
-from edge_depth_nerf.encodings.hash_grid import back_end
-from edge_depth_nerf.fused.fields import CubeContraction
-from edge_depth_nerf.model import EdgeDepthNerfModel
+from edge_depth_nerf.kernels import hash_grid_numba as cpu
+from edge_depth_nerf.kernels.fields import CubeContraction
+from edge_depth_nerf.kernels.fused_hash_grid import FusedHashEncoding, use_fused_encodings
+from edge_depth_nerf.kernels.hash_grid import back_end
+from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
 
 SIZES = {
     "nerfacto": {"num_levels": 16, "log2_hashmap_size": 19, "max_res": 2048},
@@ -442,7 +442,7 @@ def test_the_choice_of_implementation(monkeypatch):
     for choice, kind in (("auto", FusedHashEncoding), ("fused", FusedHashEncoding), ("torch", HashEncoding)):
         assert [type(part) for part in encodings_of(build(implementation=choice))] == [kind] * 3
     # tiny-cuda-nn serves no CPU
-    monkeypatch.setattr("edge_depth_nerf.model.TCNN_EXISTS", True)
+    monkeypatch.setattr("edge_depth_nerf.plugin.model.TCNN_EXISTS", True)
     assert [type(part) for part in encodings_of(build(implementation="auto"))] == [FusedHashEncoding] * 3
 
 

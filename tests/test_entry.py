@@ -11,8 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from edge_depth_nerf import __version__, cli, entry, files, plain_errors
-from edge_depth_nerf.errors import InputError
+from edge_depth_nerf import __version__, cli, entry
+from edge_depth_nerf.base import files
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.plugin import plain_errors
 
 STOPPED = "\nStopped. The same command takes up where it was.\n"
 TIMEOUT_S = 120
@@ -170,7 +172,7 @@ import sys, time
 import torch  # takes its time, in which the first Ctrl-C would meet no threads
 from rich.console import Console
 from edge_depth_nerf import cli, entry
-from edge_depth_nerf.console import run_jobs
+from edge_depth_nerf.base.console import run_jobs
 def work():
     time.sleep(1.5)
 def run(_):
@@ -217,7 +219,7 @@ def test_nerfstudio_says_our_errors_plainly(hook, capsys, monkeypatch, tmp_path)
     said = capsys.readouterr().err
     assert said.startswith("edge-depth-nerf: scene: has no frames. Make it again.\n") and entry.DEBUG_VARIABLE in said
     # a missing file in our own words
-    from edge_depth_nerf.scene_reader import read_scene
+    from edge_depth_nerf.scene.reader import read_scene
 
     sys.excepthook(*raised(read_scene, tmp_path))
     assert capsys.readouterr().err.startswith(f"edge-depth-nerf: {tmp_path}/transforms.json: no such file.")

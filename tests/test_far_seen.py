@@ -10,12 +10,12 @@ import pytest
 import torch
 from scenes import FLIP
 
+from edge_depth_nerf.base.files import write_distance_png, write_json, write_png
 from edge_depth_nerf.cameras import KannalaBrandt
-from edge_depth_nerf.files import write_distance_png, write_json, write_png
 from edge_depth_nerf.mono import far_seen
 from edge_depth_nerf.mono.examples import load_examples
 from edge_depth_nerf.mono.far_seen import field_deg, seen_above, static_cloud
-from edge_depth_nerf.scene_reader import SceneFolder, ScenePicture, read_scene
+from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
 
 LENS = KannalaBrandt(240, 200, 80.0, 80.0, 121.0, 101.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 EYE_M, WALL_M, FIELD_DEG = 1.5, 20.0, 2.0

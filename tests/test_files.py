@@ -2,8 +2,8 @@ import cv2
 import numpy as np
 import pytest
 
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import (
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import (
     read_distance_png,
     read_image,
     read_json,

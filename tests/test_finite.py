@@ -15,11 +15,11 @@ import pytest
 import torch
 from trainings import trainer_of
 
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_image, read_json, write_distance_png, write_json, write_mask, write_png
-from edge_depth_nerf.fused.losses import distortion_loss, proposal_loss
-from edge_depth_nerf.integration import IntegrationOptions, integrate_depth, select_prior, sigma_m
-from edge_depth_nerf.losses import edge_loss
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_image, read_json, write_distance_png, write_json, write_mask, write_png
+from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss, proposal_loss
+from edge_depth_nerf.method.integration import IntegrationOptions, integrate_depth, select_prior, sigma_m
+from edge_depth_nerf.method.losses import edge_loss
 
 SAMPLE = Path(__file__).resolve().parent.parent / "data" / "sample_drive"
 HALVES = [torch.float16, torch.bfloat16]

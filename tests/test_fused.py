@@ -12,14 +12,14 @@ from nerfstudio.field_components.spatial_distortions import SceneContraction
 from nerfstudio.model_components.losses import lossfun_distortion, lossfun_outer
 from nerfstudio.model_components.ray_samplers import PDFSampler, UniformLinDispPiecewiseSampler
 
-from edge_depth_nerf.config import FusedAdamConfig
-from edge_depth_nerf.fused import network as network_module
-from edge_depth_nerf.fused.contraction import contract
-from edge_depth_nerf.fused.fields import FusedMLP, FusedNerfactoField, use_fused_fields
-from edge_depth_nerf.fused.losses import distortion_loss, proposal_loss
-from edge_depth_nerf.fused.network import network
-from edge_depth_nerf.fused.sampler import FusedPDFSampler, edges_of
-from edge_depth_nerf.model import EdgeDepthNerfModel
+from edge_depth_nerf.kernels import network as network_module
+from edge_depth_nerf.kernels.contraction import contract
+from edge_depth_nerf.kernels.fields import FusedMLP, FusedNerfactoField, use_fused_fields
+from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss, proposal_loss
+from edge_depth_nerf.kernels.network import network
+from edge_depth_nerf.kernels.ray_samplers import FusedPDFSampler, edges_of
+from edge_depth_nerf.plugin.config import FusedAdamConfig
+from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
 
 
 @pytest.fixture(autouse=True)

@@ -17,8 +17,8 @@ import pytest
 from rich.console import Console
 from scenes import pinhole, write_scene
 
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import (
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import (
     read_distance_png,
     read_image,
     read_json,
@@ -27,13 +27,7 @@ from edge_depth_nerf.files import (
     write_mask,
     write_png,
 )
-from edge_depth_nerf.inspect_options import InspectOptions
-from edge_depth_nerf.inspecting import inspect_scene
-from edge_depth_nerf.inspecting.figures import measured_moments
-from edge_depth_nerf.inspecting.findings import Finding, find, limited
-from edge_depth_nerf.inspecting.shown_prior import default_source
-from edge_depth_nerf.inspecting.top_view import HELD_OUT_RGB, TRAINING_RGB, draw_top_view, nice_length
-from edge_depth_nerf.pictures import (
+from edge_depth_nerf.base.pictures import (
     DISTANCE,
     INK_RGB,
     NO_VALUE_RGB,
@@ -46,7 +40,13 @@ from edge_depth_nerf.pictures import (
     tinted,
     write_text,
 )
-from edge_depth_nerf.scene_reader import read_scene
+from edge_depth_nerf.inspecting.command import inspect_scene
+from edge_depth_nerf.inspecting.figures import measured_moments
+from edge_depth_nerf.inspecting.findings import Finding, find, limited
+from edge_depth_nerf.inspecting.options import InspectOptions
+from edge_depth_nerf.inspecting.shown_prior import default_source
+from edge_depth_nerf.inspecting.top_view import HELD_OUT_RGB, TRAINING_RGB, draw_top_view, nice_length
+from edge_depth_nerf.scene.reader import read_scene
 
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / "data" / "sample_drive"

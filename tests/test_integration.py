@@ -14,9 +14,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge_depth_nerf import integration, integration_numba
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.integration import (
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.method import integration, integration_numba
+from edge_depth_nerf.method.integration import (
     IntegratedDepth,
     IntegrationOptions,
     integrate_depth,
@@ -371,7 +371,7 @@ def test_compiles_where_nothing_can_be_kept():
 
 
 def test_numba_is_loaded_only_to_integrate():
-    check = "import sys, edge_depth_nerf.integration; sys.exit('numba' in sys.modules)"
+    check = "import sys, edge_depth_nerf.method.integration; sys.exit('numba' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", check], check=False).returncode == 0
 
 

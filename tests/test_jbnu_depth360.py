@@ -11,9 +11,9 @@ import pytest
 from rich.console import Console
 from test_real import train
 
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_distance_png, read_json, write_png
 from edge_depth_nerf.cameras import KannalaBrandt
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_distance_png, read_json, write_png
 from edge_depth_nerf.process.jbnu_depth360 import process_jbnu_depth360, read_jbnu_depth360
 from edge_depth_nerf.process.options import JbnuDepth360Options
 from edge_depth_nerf.synthetic.drive import synthesize_drive

@@ -23,24 +23,25 @@ from drives import SEQUENCE, RoomDrive, write_room_drive
 from rich.console import Console
 from scenes import write_scene
 
-from edge_depth_nerf import datamanager, entry
-from edge_depth_nerf.checked_cache import content_of, is_whole, keep_last, write_checked
-from edge_depth_nerf.datamanager import FisheyeDepthDataManagerConfig
-from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import explain, remove_leftovers, write_bytes, write_text
+from edge_depth_nerf import entry
+from edge_depth_nerf.base.checked_cache import content_of, is_whole, keep_last, write_checked
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import explain, remove_leftovers, write_bytes, write_text
+from edge_depth_nerf.base.one_writer import only_writer
+from edge_depth_nerf.jobs.runs import newest_checkpoint, steps_done
+from edge_depth_nerf.method.error_model import read_trust
 from edge_depth_nerf.mono import estimate, scene_maps
-from edge_depth_nerf.mono.error_model import read_trust
+from edge_depth_nerf.mono.calibration import calibrate_scene
 from edge_depth_nerf.mono.network import DepthNetwork, NetworkSettings, read_tensors, write_tensors
 from edge_depth_nerf.mono.options import EstimateDepthOptions
 from edge_depth_nerf.mono.scene_maps import write_mono_maps
 from edge_depth_nerf.mono.training import TrainingOptions
-from edge_depth_nerf.mono.trust import calibrate_scene
-from edge_depth_nerf.one_writer import only_writer
+from edge_depth_nerf.plugin import datamanager
+from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
+from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
 from edge_depth_nerf.process.command import process
 from edge_depth_nerf.process.options import Kitti360Options
-from edge_depth_nerf.runs import newest_checkpoint, steps_done
-from edge_depth_nerf.scene_reader import read_scene
+from edge_depth_nerf.scene.reader import read_scene
 
 DEAD = 2**22 + 1
 """No process has such a number."""
@@ -128,8 +129,8 @@ def test_a_changed_calibration_is_not_believed(tmp_path: Path) -> None:
 
 
 def test_caches_do_not_grow_without_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("edge_depth_nerf.prior.KEPT_SETS", 2)
-    monkeypatch.setattr("edge_depth_nerf.mono.trust.KEPT_CALIBRATIONS", 2)
+    monkeypatch.setattr("edge_depth_nerf.method.prior.KEPT_SETS", 2)
+    monkeypatch.setattr("edge_depth_nerf.mono.calibration.KEPT_CALIBRATIONS", 2)
     scene = write_scene(tmp_path, frames=3)
     config = FisheyeDepthDataManagerConfig(dataparser=FisheyeDepthDataParserConfig(data=scene))
     for alpha in (0.3, 0.4, 0.5, 0.6):
@@ -197,7 +198,7 @@ HOLD = """
 import sys, time
 from pathlib import Path
 from rich.console import Console
-from edge_depth_nerf.one_writer import only_writer
+from edge_depth_nerf.base.one_writer import only_writer
 with only_writer(Path(sys.argv[1]), Console()):
     print("held", flush=True)
     time.sleep(60)

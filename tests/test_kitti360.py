@@ -30,12 +30,19 @@ from drives import (
     write_points,
     write_room_drive,
 )
+from edge_depth_nerf.process.kitti360.converter.calibration import (
+    read_cam_to_pose,
+    read_cam_to_velo,
+    read_mei_camera,
+    read_poses,
+    read_rig,
+    read_timestamps,
+)
 from rich.console import Console
 from test_scene import read_ply, tree
 
-from edge_depth_nerf.cameras import MEI, KannalaBrandt, camera_from_dict
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import (
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import (
     read_distance_png,
     read_image,
     read_json,
@@ -45,26 +52,20 @@ from edge_depth_nerf.files import (
     write_mask,
     write_png,
 )
+from edge_depth_nerf.cameras import MEI, KannalaBrandt, camera_from_dict
+from edge_depth_nerf.cameras.transforms import opencv_to_opengl
 from edge_depth_nerf.inspecting.findings import find
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.masks.ego import NoEgo
 from edge_depth_nerf.masks.ego_files import vehicles_unknown
-from edge_depth_nerf.mono.trust import calibrate_scene
-from edge_depth_nerf.process import build, colmap_poses
-from edge_depth_nerf.process.kitti360 import process_kitti360
-from edge_depth_nerf.process.kitti360_calibration import (
-    read_cam_to_pose,
-    read_cam_to_velo,
-    read_mei_camera,
-    read_poses,
-    read_rig,
-    read_timestamps,
-)
+from edge_depth_nerf.mono.calibration import calibrate_scene
+from edge_depth_nerf.process import build
+from edge_depth_nerf.process.colmap import poses as colmap_poses
+from edge_depth_nerf.process.kitti360.converter import process_kitti360
 from edge_depth_nerf.process.options import Kitti360Options, ProcessOptions
 from edge_depth_nerf.process.recording import Recording
-from edge_depth_nerf.process.scene import ProcessReport, Skipped
-from edge_depth_nerf.process.transforms import opencv_to_opengl
-from edge_depth_nerf.scene_reader import read_scene
+from edge_depth_nerf.scene.reader import read_scene
+from edge_depth_nerf.scene.writer import ProcessReport, Skipped
 
 CAMERAS = ("image_02", "image_03")
 STEP_M = 1 / 256

@@ -12,11 +12,11 @@ import pytest
 from drives import SEQUENCE, RoomDrive, write_points, write_room_drive
 from rich.console import Console
 
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_json, write_distance_png
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_json, write_distance_png
 from edge_depth_nerf.process.command import process
 from edge_depth_nerf.process.options import Kitti360Options
-from edge_depth_nerf.process.scene import ProcessReport
+from edge_depth_nerf.scene.writer import ProcessReport
 
 CAMERAS = ("image_02", "image_03")
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras import MEI, Pinhole
-from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.lidar import project_points, read_sweep, transform_points
 
 FISHEYE = MEI(70, 70, 66.8, 66.8, 35.9, 35.3, 2.2134, 0.0168, 1.6549, 4e-4, 4e-4)

@@ -7,8 +7,8 @@ import pytest
 import reference
 import torch
 
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.losses import EPS, Gaussian, edge_loss, sky_loss
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.method.losses import EPS, Gaussian, edge_loss, sky_loss
 
 GAUSSIANS: tuple[Gaussian, ...] = ("point", "interval")
 FORMS = [(gaussian, norm) for gaussian in GAUSSIANS for norm in (False, True)]

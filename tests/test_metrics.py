@@ -8,9 +8,9 @@ import pytest
 import torch
 from torchvision.models import alexnet
 
-from edge_depth_nerf import metrics
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.metrics import DepthErrors, load_lpips, masked_lpips, masked_psnr, masked_ssim
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.method import metrics
+from edge_depth_nerf.method.metrics import DepthErrors, load_lpips, masked_lpips, masked_psnr, masked_ssim
 
 
 def pictures(seed: int = 0, height: int = 40, width: int = 50) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

@@ -11,9 +11,9 @@ from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.model_components.losses import ds_nerf_depth_loss, urban_radiance_field_depth_loss
 from nerfstudio.models.nerfacto import NerfactoModel
 
-from edge_depth_nerf.compat import lpips_not_built
-from edge_depth_nerf.losses import edge_loss
-from edge_depth_nerf.model import DepthInEvaluation, EdgeDepthNerfModel
+from edge_depth_nerf.method.losses import edge_loss
+from edge_depth_nerf.plugin.compat import lpips_not_built
+from edge_depth_nerf.plugin.model import DepthInEvaluation, EdgeDepthNerfModel
 
 METRES_PER_UNIT = 20.0
 
@@ -315,7 +315,7 @@ def test_views_are_judged_inside_the_mask(monkeypatch, tmp_path):
 
 def test_lpips_is_used_where_its_weights_are(monkeypatch):
     model, outputs, truth = judged_view()
-    monkeypatch.setattr("edge_depth_nerf.model.load_lpips", lambda: _MeanDifference())
+    monkeypatch.setattr("edge_depth_nerf.plugin.model.load_lpips", lambda: _MeanDifference())
     metrics, _ = model.get_image_metrics_and_images(outputs, truth)
     difference = (outputs["rgb"] - truth["image"]).abs()
     assert metrics["lpips"] == pytest.approx(difference.mean().item(), abs=1e-5)

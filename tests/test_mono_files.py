@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from scenes import FLIP, RADIUS_M, fisheye, pinhole, write_scene
 
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_distance_png, read_json, write_distance_png, write_json, write_png
 from edge_depth_nerf.entry import main
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_distance_png, read_json, write_distance_png, write_json, write_png
 from edge_depth_nerf.mono.estimate import estimate_depth
 from edge_depth_nerf.mono.files import npy_shape, read_npy
 from edge_depth_nerf.mono.options import EstimateDepthOptions
-from edge_depth_nerf.scene_reader import ScenePicture, read_scene
+from edge_depth_nerf.scene.reader import ScenePicture, read_scene
 
 LENS = fisheye(48, 44)
 

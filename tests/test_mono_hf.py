@@ -12,10 +12,10 @@ import torch
 from lenses import FISHEYE
 from scenes import FLIP, RADIUS_M, fisheye, pinhole, write_scene
 
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, write_distance_png, write_json
 from edge_depth_nerf.cameras import Camera, KannalaBrandt
 from edge_depth_nerf.entry import main
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_distance_png, read_image, read_json, write_distance_png, write_json
 from edge_depth_nerf.mono.elsewhere import FittedMaps
 from edge_depth_nerf.mono.estimate import estimate_depth
 from edge_depth_nerf.mono.examples import lens_rays
@@ -23,7 +23,7 @@ from edge_depth_nerf.mono.hf import load_ready_network, view_layers
 from edge_depth_nerf.mono.options import EstimateDepthOptions
 from edge_depth_nerf.mono.pinhole_views import PinholeView, pinhole_views
 from edge_depth_nerf.mono.relative import Layer, Line, Samples, blend, fit_lines, take_samples
-from edge_depth_nerf.scene_reader import ScenePicture, read_scene
+from edge_depth_nerf.scene.reader import ScenePicture, read_scene
 
 THETA_MAX = np.radians(95.0)
 

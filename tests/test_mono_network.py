@@ -18,11 +18,8 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from scenes import FLIP, fisheye, write_scene
 
-from edge_depth_nerf import scene_reader as reader
-from edge_depth_nerf.cameras import KannalaBrandt
-from edge_depth_nerf.entry import main
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import (
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import (
     read_distance_png,
     read_json,
     read_mask,
@@ -31,7 +28,9 @@ from edge_depth_nerf.files import (
     write_mask,
     write_png,
 )
-from edge_depth_nerf.mono.error_model import TRUST_FILE
+from edge_depth_nerf.cameras import KannalaBrandt
+from edge_depth_nerf.entry import main
+from edge_depth_nerf.method.error_model import TRUST_FILE
 from edge_depth_nerf.mono.estimate import (
     PRESETS,
     WEIGHTS,
@@ -61,7 +60,8 @@ from edge_depth_nerf.mono.training import (
     smoothness_loss,
     train,
 )
-from edge_depth_nerf.scene_reader import read_scene
+from edge_depth_nerf.scene import reader
+from edge_depth_nerf.scene.reader import read_scene
 
 CPU = torch.device("cpu")
 HEIGHT_M = 1.5

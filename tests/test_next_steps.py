@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from edge_depth_nerf import cli
-from edge_depth_nerf.inspect_options import InspectOptions
+from edge_depth_nerf.inspecting.options import InspectOptions
 from edge_depth_nerf.process import many
 from edge_depth_nerf.process.options import JbnuDepth360Options, Kitti360Options, RigOptions
 from edge_depth_nerf.synthetic import drive

@@ -18,17 +18,17 @@ from nerfstudio.utils import eval_utils
 from scenes import write_scene
 from test_bad_input import INPUTS, throw
 
-from edge_depth_nerf import compat
-from edge_depth_nerf.config import edge_depth_nerf_lite
-from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
-from edge_depth_nerf.dataset import FisheyeDepthDataset
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_json, write_json
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_json, write_json
 from edge_depth_nerf.films.training import read_dataparser
+from edge_depth_nerf.plugin import compat
+from edge_depth_nerf.plugin.config import edge_depth_nerf_lite
+from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
+from edge_depth_nerf.plugin.dataset import FisheyeDepthDataset
 from edge_depth_nerf.process.rig_file import read_rig
-from edge_depth_nerf.scene_reader import read_scene
+from edge_depth_nerf.scene.reader import read_scene
 
-PACKAGE = Path(compat.__file__).parent
+PACKAGE = Path(compat.__file__).parents[1]
 OUTSIDE = ("/etc/passwd", "../outside.png", "images/../../outside.png", "a\0b", "", "a" * 300, 7, None)
 
 

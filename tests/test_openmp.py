@@ -9,12 +9,13 @@ import sys
 import pytest
 import torch
 
-from edge_depth_nerf import entry, openmp
+from edge_depth_nerf import entry
+from edge_depth_nerf.kernels import openmp
 
 BURNT = """
 import os, sys, time
 import torch
-from edge_depth_nerf.openmp import let_idle_threads_sleep
+from edge_depth_nerf.kernels.openmp import let_idle_threads_sleep
 torch.set_num_threads(len(os.sched_getaffinity(0)))
 if sys.argv[1] == "sleeping":
     assert let_idle_threads_sleep() and let_idle_threads_sleep()  # once more does nothing

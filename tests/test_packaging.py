@@ -98,10 +98,10 @@ def test_the_wheel_works_without_the_sources(wheel, tmp_path):
         archive.extractall(tmp_path)
         points = next(name for name in archive.namelist() if name.endswith("entry_points.txt"))
         declared = archive.read(points).decode()
-    assert "edge-depth-nerf-lite = edge_depth_nerf.config:edge_depth_nerf_lite" in declared
-    assert "fisheye-depth-data = edge_depth_nerf.dataparser_config:fisheye_depth_data" in declared
+    assert "edge-depth-nerf-lite = edge_depth_nerf.plugin.config:edge_depth_nerf_lite" in declared
+    assert "fisheye-depth-data = edge_depth_nerf.plugin.dataparser_config:fisheye_depth_data" in declared
     code = (
-        f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import edge_depth_nerf.config as c, edge_depth_nerf; "
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import edge_depth_nerf, edge_depth_nerf.plugin.config as c; "
         f"assert edge_depth_nerf.__file__.startswith({str(tmp_path)!r}), edge_depth_nerf.__file__; "
         "assert c.edge_depth_nerf_lite.config.pipeline.model.num_levels == 12"
     )

@@ -26,8 +26,8 @@ import tyro
 import yaml
 
 from edge_depth_nerf import cli
+from edge_depth_nerf.base.files import read_distance_png, read_image, read_json
 from edge_depth_nerf.entry import DEBUG_OPTION
-from edge_depth_nerf.files import read_distance_png, read_image, read_json
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -231,10 +231,10 @@ def known_options() -> set[str]:
     from nerfstudio.scripts import eval as host_eval
     from nerfstudio.scripts import render
 
-    from edge_depth_nerf.config import edge_depth_nerf
-    from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
+    from edge_depth_nerf.plugin.config import edge_depth_nerf
+    from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
 
-    names = set(dotted_names(edge_depth_nerf.config))
+    names = set(dotted_names(edge_depth_nerf.plugin.config))
     names |= {f"viewer.{name}" for name in dotted_names(ViewerConfig())}
     names |= {*dotted_names(FisheyeDepthDataParserConfig()), *dotted_names(NerfstudioDataParserConfig())}
     own = [cls for _, cls in load("make_options").commands()]
@@ -508,7 +508,7 @@ def test_the_example_of_a_loss():
 
 
 def test_the_example_of_a_loss_is_a_method_of_its_own():
-    from edge_depth_nerf.config import edge_depth_nerf_lite
+    from edge_depth_nerf.plugin.config import edge_depth_nerf_lite
 
     made = load("examples/new_loss").ratio().config
     lite = edge_depth_nerf_lite.config

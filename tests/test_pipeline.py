@@ -5,7 +5,7 @@ import pytest
 from nerfstudio.configs.method_configs import all_methods
 from scenes import write_scene
 
-from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.base.errors import InputError
 
 
 def build(scene, **model):
@@ -25,7 +25,7 @@ def test_a_depth_loss_without_any_prior_is_an_error(tmp_path):
 
 
 def test_nothing_is_integrated_for_a_model_without_depth_loss(tmp_path, monkeypatch):
-    monkeypatch.setattr("edge_depth_nerf.datamanager.PriorCache", lambda *_: pytest.fail("integrated"))
+    monkeypatch.setattr("edge_depth_nerf.plugin.datamanager.PriorCache", lambda *_: pytest.fail("integrated"))
     pipeline, config = build(write_scene(tmp_path), depth_loss="none")
     assert pipeline.datamanager.config.depth_source == "none"
     assert config.datamanager.depth_source == "auto"  # what the user gave is left as it was

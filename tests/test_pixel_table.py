@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from edge_depth_nerf import pixel_table
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_json, write_json
-from edge_depth_nerf.pixel_table import RECORD, PicturePixels, PixelTable, PixelTableWriter, to_steps
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_json, write_json
+from edge_depth_nerf.plugin import pixel_table
+from edge_depth_nerf.plugin.pixel_table import RECORD, PicturePixels, PixelTable, PixelTableWriter, to_steps
 
 RNG = np.random.default_rng(5)
 

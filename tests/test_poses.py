@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.process.poses import read_kitti, read_nerfstudio, read_times, read_tum, transform_of_rows
 
 HALF = math.sqrt(0.5)

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from edge_depth_nerf import prior as prior_module
+from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras import KannalaBrandt
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.integration import IntegrationOptions, integrate_depth
-from edge_depth_nerf.mono.alignment import Fit
-from edge_depth_nerf.mono.error_model import KNOTS, ErrorModel, Trust
-from edge_depth_nerf.prior import PriorCache, PriorOptions, View, make_prior, sky_of, view_of
+from edge_depth_nerf.method import prior as prior_module
+from edge_depth_nerf.method.alignment import Fit
+from edge_depth_nerf.method.error_model import KNOTS, ErrorModel, Trust
+from edge_depth_nerf.method.integration import IntegrationOptions, integrate_depth
+from edge_depth_nerf.method.prior import PriorCache, PriorOptions, View, make_prior, sky_of, view_of
 
 RNG = np.random.default_rng(2)
 

@@ -11,16 +11,16 @@ import pytest
 from drives import SEQUENCE, RoomDrive, write_room_drive
 from rich.console import Console
 
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_distance_png, read_json, write_distance_png, write_json
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_distance_png, read_json, write_distance_png, write_json
+from edge_depth_nerf.method.error_model import TRUST_FILE, read_trust
 from edge_depth_nerf.mono import estimate
-from edge_depth_nerf.mono.error_model import TRUST_FILE, read_trust
 from edge_depth_nerf.mono.estimate import WEIGHTS, PresetValues
 from edge_depth_nerf.mono.scene_maps import write_mono_maps
 from edge_depth_nerf.mono.training import TrainingOptions
 from edge_depth_nerf.process.command import process
 from edge_depth_nerf.process.options import Kitti360Options
-from edge_depth_nerf.scene_reader import read_scene
+from edge_depth_nerf.scene.reader import read_scene
 
 
 @pytest.fixture(autouse=True)
@@ -158,7 +158,7 @@ def test_without_lidar_it_says_what_to_do(room: RoomDrive, tmp_path: Path, monke
     for frame in meta["frames"]:
         del frame["lidar_file_path"], frame["depth_file_path"]
     write_json(scene / "transforms.json", meta)
-    monkeypatch.setattr("edge_depth_nerf.process.kitti360.process_kitti360", lambda *_: report)
+    monkeypatch.setattr("edge_depth_nerf.process.kitti360.converter.process_kitti360", lambda *_: report)
     assert "--mono-model" in run(options_of(room, scene))
     assert not read_scene(scene).has("mono")
 

@@ -7,7 +7,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.model_components.ray_generators import RayGenerator
 
-from edge_depth_nerf.ray_table import TableRayGenerator
+from edge_depth_nerf.plugin.ray_table import TableRayGenerator
 
 
 def cameras(kind: CameraType = CameraType.FISHEYE, **extra) -> Cameras:
@@ -38,7 +38,7 @@ def test_rays_of_the_table_are_nerfstudios(tmp_path, kind, monkeypatch):
     expected = RayGenerator(given)(indices)
     made = TableRayGenerator(given, tmp_path / "rays")
     assert len(list(tmp_path.rglob("*.npy"))) == 1
-    monkeypatch.setattr("edge_depth_nerf.ray_table._make", lambda *_: pytest.fail("made again"))
+    monkeypatch.setattr("edge_depth_nerf.plugin.ray_table._make", lambda *_: pytest.fail("made again"))
     for generator in (made, TableRayGenerator(given, tmp_path / "rays")):
         rays = generator(indices)
         assert torch.equal(rays.origins, expected.origins)
@@ -61,5 +61,5 @@ def test_a_broken_table_of_rays_is_made_anew_and_one_that_cannot_be_kept_stays_i
 def test_cameras_without_a_table(monkeypatch):
     assert not TableRayGenerator.suits(cameras(CameraType.EQUIRECTANGULAR))
     assert not TableRayGenerator.suits(cameras(times=torch.zeros(5, 1)))
-    monkeypatch.setattr("edge_depth_nerf.ray_table.MOST_PIXELS", 1000)
+    monkeypatch.setattr("edge_depth_nerf.plugin.ray_table.MOST_PIXELS", 1000)
     assert not TableRayGenerator.suits(cameras())

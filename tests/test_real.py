@@ -11,7 +11,7 @@ from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.optimizers import Optimizers
 from real_scenes import fisheye_frame_scene, stereo_scene
 
-from edge_depth_nerf.files import read_distance_png, read_json, read_mask
+from edge_depth_nerf.base.files import read_distance_png, read_json, read_mask
 
 
 def train(scene, steps, **model):

@@ -17,15 +17,16 @@ import numpy as np
 import pytest
 import tyro
 from browser import open_browser
+from edge_depth_nerf.demo.command.options import DemoOptions
 from rich.console import Console
 from scenes import write_scene
 
 from edge_depth_nerf import cli
+from edge_depth_nerf.base.files import write_png
+from edge_depth_nerf.base.pictures import NO_VALUE_RGB, colour_distance, distance_of_colours
 from edge_depth_nerf.compare.options import CompareOptions, MethodName
 from edge_depth_nerf.compare.plots import Bins, plot_bins
-from edge_depth_nerf.demo_options import DemoOptions
-from edge_depth_nerf.files import write_png
-from edge_depth_nerf.pictures import NO_VALUE_RGB, colour_distance, distance_of_colours
+from edge_depth_nerf.jobs.runs import command_line, logged_commands
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.report import views
 from edge_depth_nerf.report.build import Commands, Facts, Plot, Report, build_report, write_report
@@ -38,7 +39,6 @@ from edge_depth_nerf.report.compared_views import (
 )
 from edge_depth_nerf.report.tables import Cell, MadeTable, Row
 from edge_depth_nerf.report.views import KINDS, Drive, ShownView, encode, make_drives, show_view, spread
-from edge_depth_nerf.runs import command_line, logged_commands
 
 NASTY = "</script><script>window.hacked = 1</script><img src=x onerror='window.hacked=1'> & \"quotes\" {{ 1 }} $x$"
 

@@ -17,9 +17,9 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 from test_real import train
 
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, read_mask, write_json, write_png
 from edge_depth_nerf.cameras import MEI, KannalaBrandt, Pinhole
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_distance_png, read_image, read_json, read_mask, write_json, write_png
 from edge_depth_nerf.process.options import RigOptions
 from edge_depth_nerf.process.rig import process_rig, read_rig_recording
 from edge_depth_nerf.process.rig_file import read_rig, tomllib

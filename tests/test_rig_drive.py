@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_distance_png, read_image, read_json, read_mask
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, read_mask
 from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.options import LayoutName, SynthesizeOptions
 from edge_depth_nerf.synthetic.rig_drive import jbnu_cameras, looking, rig_cameras

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.runs import files_counted, host_program
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.jobs.runs import files_counted, host_program
 
 
 def test_files_are_counted_while_they_are_written(tmp_path):

@@ -11,8 +11,8 @@ from pathlib import Path
 import torch
 from scenes import fisheye, write_scene
 
-from edge_depth_nerf.compat import allow_numpy_scalars_in_checkpoints
-from edge_depth_nerf.encodings import cpu
+from edge_depth_nerf.kernels import hash_grid_numba as cpu
+from edge_depth_nerf.plugin.compat import allow_numpy_scalars_in_checkpoints
 
 STEPS = 25
 

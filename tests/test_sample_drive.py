@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from edge_depth_nerf.files import read_distance_png, read_json, read_mask
+from edge_depth_nerf.base.files import read_distance_png, read_json, read_mask
 
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / "data" / "sample_drive"

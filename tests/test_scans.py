@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.lidar.scans import MAX_POINTS, PointTimes, ScanFormat, _unpack_lzf, check_scan, read_scan
 
 POINTS = np.array([[1.5, -2.25, 0.5], [-8.0, 3.0, -1.75], [40.0, 0.125, 2.0]])

@@ -23,6 +23,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import (
+    read_distance_png,
+    read_image,
+    read_json,
+    read_mask,
+    write_distance_png,
+    write_mask,
+    write_png,
+)
+from edge_depth_nerf.base.png import read_png_bytes, read_png_header
 from edge_depth_nerf.cameras import (
     MEI,
     Camera,
@@ -32,22 +43,12 @@ from edge_depth_nerf.cameras import (
     fit_kannala_brandt,
     host_residual,
 )
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import (
-    read_distance_png,
-    read_image,
-    read_json,
-    read_mask,
-    write_distance_png,
-    write_mask,
-    write_png,
-)
-from edge_depth_nerf.process import points as points_module
-from edge_depth_nerf.process import scene
+from edge_depth_nerf.cameras.transforms import check_rigid, opencv_to_opengl
 from edge_depth_nerf.process.downscale import downscale_distance, downscale_image, downscale_mask
-from edge_depth_nerf.process.png import read_png_bytes, read_png_header
-from edge_depth_nerf.process.points import PointCloud
-from edge_depth_nerf.process.scene import (
+from edge_depth_nerf.scene import points as points_module
+from edge_depth_nerf.scene import writer as scene
+from edge_depth_nerf.scene.points import PointCloud
+from edge_depth_nerf.scene.writer import (
     FrameContent,
     ProcessReport,
     SceneCamera,
@@ -56,7 +57,6 @@ from edge_depth_nerf.process.scene import (
     held_out_frames,
     write_scene,
 )
-from edge_depth_nerf.process.transforms import check_rigid, opencv_to_opengl
 
 SIZE = 32
 FISHEYE = MEI(SIZE, SIZE, 30.5, 30.5, 16.4, 16.1, 2.2134, 0.0168, 1.6549, 4e-4, 4e-4)

@@ -11,17 +11,24 @@ import pytest
 from rich.console import Console
 from scenes import pinhole, write_scene
 
-from edge_depth_nerf.datamanager import FisheyeDepthDataManagerConfig
-from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_distance_png, read_json, write_distance_png, write_json, write_mask, write_png
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import (
+    read_distance_png,
+    read_json,
+    write_distance_png,
+    write_json,
+    write_mask,
+    write_png,
+)
 from edge_depth_nerf.inspecting.shown_prior import ShownScene
+from edge_depth_nerf.method.prior import PriorOptions
+from edge_depth_nerf.mono.calibration import calibrate_scene, find_trust, saved_trust
 from edge_depth_nerf.mono.estimate import estimate_depth
 from edge_depth_nerf.mono.options import EstimateDepthOptions
 from edge_depth_nerf.mono.scene_maps import write_mono_maps
-from edge_depth_nerf.mono.trust import calibrate_scene, find_trust, saved_trust
-from edge_depth_nerf.prior import PriorOptions
-from edge_depth_nerf.scene_reader import read_scene
+from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
+from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
+from edge_depth_nerf.scene.reader import read_scene
 
 
 def manager(folder: Path, parser: dict[str, Any] | None = None, **options: Any):

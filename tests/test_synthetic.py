@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_distance_png, read_image, read_json, read_mask
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, read_mask
 from edge_depth_nerf.synthetic import drive as drive_module
 from edge_depth_nerf.synthetic import lidar, rig
 from edge_depth_nerf.synthetic.drive import WORLD_ORIGIN_M, synthesize_drive

@@ -13,9 +13,9 @@ from nerfstudio.utils import writer
 from scenes import write_scene
 from trainings import trainer_of
 
-from edge_depth_nerf.model import EdgeDepthNerfModel
-from edge_depth_nerf.runs import newest_checkpoint
-from edge_depth_nerf.trainer import EdgeDepthTrainer
+from edge_depth_nerf.jobs.runs import newest_checkpoint
+from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
+from edge_depth_nerf.plugin.trainer import EdgeDepthTrainer
 
 STEPS = 6
 

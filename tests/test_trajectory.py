@@ -8,7 +8,7 @@ import torch
 from scipy.linalg import expm, logm
 from scipy.spatial.transform import Rotation
 
-from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.lidar.trajectory import Trajectory
 
 TIMES = np.array([10.0, 11.0, 11.5, 14.0])

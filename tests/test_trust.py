@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from scenes import write_scene
 
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_distance_png, read_json, write_distance_png, write_json
-from edge_depth_nerf.mono import trust as trust_module
-from edge_depth_nerf.mono.error_model import (
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_distance_png, read_json, write_distance_png, write_json
+from edge_depth_nerf.method.error_model import (
     FIELD_MARGIN_DEG,
     KNOTS,
     LEAST_JUDGED,
@@ -20,8 +19,9 @@ from edge_depth_nerf.mono.error_model import (
     pixel_features,
     read_trust,
 )
-from edge_depth_nerf.mono.trust import calibrate_scene, find_trust, held_out_returns, measure_frame
-from edge_depth_nerf.prior import PriorOptions, View, make_prior
+from edge_depth_nerf.method.prior import PriorOptions, View, make_prior
+from edge_depth_nerf.mono import calibration as trust_module
+from edge_depth_nerf.mono.calibration import calibrate_scene, find_trust, held_out_returns, measure_frame
 
 
 def random_features(count, seed=0, least_nearest=1.0):

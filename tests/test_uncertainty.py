@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from edge_depth_nerf.uncertainty import termination_std
+from edge_depth_nerf.method.uncertainty import termination_std
 
 
 def drawn_std(weights: np.ndarray, edges: np.ndarray, draws: int = 400_000) -> float:

@@ -22,10 +22,10 @@ from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
 from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerElement
 from scenes import RADIUS_M, fisheye, pinhole, write_scene
 
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.pictures import SIGMA, colour_distance
 from edge_depth_nerf.cameras import KannalaBrandt
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.pictures import SIGMA, colour_distance
-from edge_depth_nerf.viewer import AZIMUTHS, RINGS, DriveLayers, _in_order, _spread, lens_cap, rim_rad
+from edge_depth_nerf.plugin.viewer import AZIMUTHS, RINGS, DriveLayers, _in_order, _spread, lens_cap, rim_rad
 
 METHOD = "edge-depth-nerf-lite"
 SAMPLE = Path(__file__).parents[1] / "data" / "sample_drive"

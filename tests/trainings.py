@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from nerfstudio.configs.method_configs import all_methods
 
-from edge_depth_nerf.trainer import EdgeDepthTrainer
+from edge_depth_nerf.plugin.trainer import EdgeDepthTrainer
 
 
 def trainer_of(scene: Path, output: Path, rank: int = 0, world_size: int = 1, **changes: Any) -> EdgeDepthTrainer:

@@ -15,15 +15,15 @@ import numpy as np
 import torch
 import tyro
 
+from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras import KannalaBrandt
-from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.lidar import Sweep, SweepTiming
 from edge_depth_nerf.lidar.sweeps import usable_returns
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.process.build import process_recording
 from edge_depth_nerf.process.options import ProcessOptions
 from edge_depth_nerf.process.recording import RecordedCamera, RecordedPicture, RecordedSweep, Recording
-from edge_depth_nerf.process.scene import ProcessReport
+from edge_depth_nerf.scene.writer import ProcessReport
 
 INTERVAL_S = 0.1
 LENS = KannalaBrandt(width=128, height=96, fx=40.0, fy=40.0, cx=64.0, cy=48.0, k1=0.01, k2=0.0, k3=0.0, k4=0.0)

@@ -15,8 +15,8 @@ from nerfstudio.cameras.rays import RaySamples
 from nerfstudio.plugins.types import MethodSpecification
 from torch import Tensor
 
-from edge_depth_nerf.config import edge_depth_nerf_lite
-from edge_depth_nerf.model import EdgeDepthNerfModel, EdgeDepthNerfModelConfig
+from edge_depth_nerf.plugin.config import edge_depth_nerf_lite
+from edge_depth_nerf.plugin.model import EdgeDepthNerfModel, EdgeDepthNerfModelConfig
 
 
 def ratio_loss(

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_depth_nerf.files import read_image
-from edge_depth_nerf.scene_reader import ScenePicture, read_scene
+from edge_depth_nerf.base.files import read_image
+from edge_depth_nerf.scene.reader import ScenePicture, read_scene
 
 CAMERA_HEIGHT_M = 1.6
 HORIZON_M = 80.0

@@ -19,8 +19,8 @@ import numpy as np
 import torch
 from scipy.optimize import least_squares
 
+from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras.models import Camera, KannalaBrandt, Pinhole
-from edge_depth_nerf.errors import InputError
 
 _FIT_GRID = 150
 """Rays along each side of the grid that is fitted; more change nothing within 1e-3 px."""

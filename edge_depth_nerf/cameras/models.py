@@ -23,9 +23,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from edge_depth_nerf.bounds import MAX_PIXELS, finite, shown
+from edge_depth_nerf.base.bounds import MAX_PIXELS, finite, shown
+from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras.distortion import Distortion
-from edge_depth_nerf.errors import InputError
 
 MAX_PARAMETER = 1e9
 """No parameter of a lens is larger; float32 bears its square."""

@@ -16,7 +16,12 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from edge_depth_nerf.bounds import finite, shown
+from edge_depth_nerf.base.bounds import finite, shown
+from edge_depth_nerf.base.console import say
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import check_is_folder, read_json_object, write_json, write_png, write_text
+from edge_depth_nerf.base.one_writer import only_writer
+from edge_depth_nerf.base.pictures import DISTANCE, resize, side_by_side, with_colour_bar
 from edge_depth_nerf.compare.methods import METHODS, Setting, default_methods
 from edge_depth_nerf.compare.options import CompareOptions, MethodName
 from edge_depth_nerf.compare.plots import draw_plots
@@ -25,18 +30,13 @@ from edge_depth_nerf.compare.results import Results, check_fair, read_results, w
 from edge_depth_nerf.compare.search import show_search, write_search
 from edge_depth_nerf.compare.specification import FIGURES, SPECIFICATION, VIEWS, RunSpecification
 from edge_depth_nerf.compare.tables import as_latex, as_markdown, make_tables
-from edge_depth_nerf.console import say
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import check_is_folder, read_json_object, write_json, write_png, write_text
-from edge_depth_nerf.one_writer import only_writer
-from edge_depth_nerf.pictures import DISTANCE, resize, side_by_side, with_colour_bar
+from edge_depth_nerf.jobs.runs import command_line, viewer_command
+from edge_depth_nerf.jobs.tasks import Task, do_tasks, this_machine
 from edge_depth_nerf.report.build import write_report
 from edge_depth_nerf.report.compared_views import compared_views
 from edge_depth_nerf.report.tables import MadeTable
 from edge_depth_nerf.report.views import REPORT
-from edge_depth_nerf.runs import command_line, viewer_command
-from edge_depth_nerf.scene_format import read_transforms
-from edge_depth_nerf.tasks import Task, do_tasks, this_machine
+from edge_depth_nerf.scene.format import read_transforms
 
 RECORD = "compare.json"
 RUNS = "runs"
@@ -314,7 +314,7 @@ def do_runs(runs: Sequence[Run], options: CompareOptions, console: Console) -> N
         if options.cluster is None:
             place = stack.enter_context(this_machine(options.jobs, len(tasks), console))
         else:
-            from edge_depth_nerf.cluster import on_cluster  # imports Dask
+            from edge_depth_nerf.jobs.cluster import on_cluster  # imports Dask
 
             scenes = sorted({Path(run.specification.scene) for run in runs})
             place = stack.enter_context(on_cluster(options.cluster, tasks, scenes, console))

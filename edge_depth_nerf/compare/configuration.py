@@ -11,7 +11,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from edge_depth_nerf.compare.methods import LAMBDA, METHODS, Setting
 from edge_depth_nerf.compare.options import MethodName, Preset
 from edge_depth_nerf.compare.specification import RunSpecification
-from edge_depth_nerf.config import apply_overrides, make_specifications, read_method_file
+from edge_depth_nerf.plugin.config import apply_overrides, make_specifications, read_method_file
 
 REGISTERED: dict[Preset, str] = {
     "lite": "edge-depth-nerf-lite",

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from edge_depth_nerf.metrics import JUDGED_RANGE_M, LEAST_SQUARED_ERROR
+from edge_depth_nerf.method.metrics import JUDGED_RANGE_M, LEAST_SQUARED_ERROR
 
 ANGLE_EDGES_DEG = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0, 90.0, 100.0, 120.0)
 """Bins of the angle from the optical axis."""

@@ -18,12 +18,12 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
+from edge_depth_nerf.base.files import read_distance_png, read_image, write_png
 from edge_depth_nerf.compare.figures import ANGLE_EDGES_DEG, DISTANCE_EDGES_M, BinnedErrors, affine_fitted
-from edge_depth_nerf.dataset import FisheyeDepthDataset
-from edge_depth_nerf.files import read_distance_png, read_image, write_png
-from edge_depth_nerf.metrics import LEAST_SQUARED_ERROR, DepthErrors, masked_psnr
-from edge_depth_nerf.model import EdgeDepthNerfModel
-from edge_depth_nerf.scene_format import read_transforms
+from edge_depth_nerf.method.metrics import LEAST_SQUARED_ERROR, DepthErrors, masked_psnr
+from edge_depth_nerf.plugin.dataset import FisheyeDepthDataset
+from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
+from edge_depth_nerf.scene.format import read_transforms
 
 PIXELS_PER_VIEW = 3000
 MOST_PIXELS = 20_000

@@ -9,8 +9,8 @@ from typing import Literal
 
 import tyro
 
-from edge_depth_nerf.cluster_address import check_address
-from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.jobs.cluster_address import check_address
 
 Preset = Literal["lite", "full", "paper"]
 Implementation = Literal["same", "torch"]

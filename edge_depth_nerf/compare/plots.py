@@ -16,11 +16,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from edge_depth_nerf.base.files import write_bytes
 from edge_depth_nerf.compare.methods import METHODS
 from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.results import Results, RunResult
 from edge_depth_nerf.compare.tables import CLOCKS, clock_metric, curve_metric
-from edge_depth_nerf.files import write_bytes
 from edge_depth_nerf.report.build import Plot
 
 STYLES: dict[MethodName, tuple[str, str, str, str]] = {

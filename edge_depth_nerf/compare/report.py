@@ -7,15 +7,15 @@ from pathlib import Path
 
 from rich.console import Console
 
+from edge_depth_nerf.base.files import read_json
 from edge_depth_nerf.compare.methods import METHODS
 from edge_depth_nerf.compare.results import Results, RunResult
 from edge_depth_nerf.compare.specification import OF_A_RUN, VIEWS
 from edge_depth_nerf.compare.tables import introduction
-from edge_depth_nerf.files import read_json
+from edge_depth_nerf.jobs.runs import viewer_command
 from edge_depth_nerf.report.build import Commands, Facts, Plot, Report
 from edge_depth_nerf.report.tables import Cell, MadeTable, Row
 from edge_depth_nerf.report.views import make_drives
-from edge_depth_nerf.runs import viewer_command
 
 
 def make_report(results: Results, tables: Sequence[MadeTable], plots: Sequence[Plot], console: Console) -> Report:

@@ -9,12 +9,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from edge_depth_nerf.bounds import finite
+from edge_depth_nerf.base.bounds import finite
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_json_object, write_json, write_text
 from edge_depth_nerf.compare.methods import METHODS
 from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.specification import FIGURES, OF_A_RUN, VIEWS
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_json_object, write_json, write_text
 
 
 @dataclass

@@ -9,12 +9,12 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from edge_depth_nerf.base.console import say
+from edge_depth_nerf.base.files import write_json, write_text
 from edge_depth_nerf.compare.methods import METHODS
 from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.results import Results, write_rows
 from edge_depth_nerf.compare.tables import curve_metric
-from edge_depth_nerf.console import say
-from edge_depth_nerf.files import write_json, write_text
 
 TUNED = "tuned.json"
 

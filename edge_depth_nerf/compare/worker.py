@@ -20,18 +20,18 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from rich.console import Console
 
-from edge_depth_nerf.bounds import finite, shown
+from edge_depth_nerf.base.bounds import finite, shown
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import explain, read_json_object, write_json
+from edge_depth_nerf.base.one_writer import only_writer
 from edge_depth_nerf.compare.configuration import configuration, described, setting_of
 from edge_depth_nerf.compare.judging import ViewJudge, choose_pixels, judge_pixels, shifted_views
 from edge_depth_nerf.compare.protocol import departures
 from edge_depth_nerf.compare.specification import FIGURES, PROGRESS, SPECIFICATION, VIEWS, RunSpecification
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import explain, read_json_object, write_json
-from edge_depth_nerf.one_writer import only_writer
-from edge_depth_nerf.runs import end_with_parent, steps_done
-from edge_depth_nerf.scene_format import read_transforms
-from edge_depth_nerf.tasks import WORK
-from edge_depth_nerf.trainer import EdgeDepthTrainer
+from edge_depth_nerf.jobs.runs import end_with_parent, steps_done
+from edge_depth_nerf.jobs.tasks import WORK
+from edge_depth_nerf.plugin.trainer import EdgeDepthTrainer
+from edge_depth_nerf.scene.format import read_transforms
 
 CURVE = (0.025, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 """When the random pixels are judged, as shares of the training."""

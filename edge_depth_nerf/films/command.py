@@ -17,15 +17,15 @@ from jaxtyping import Float64
 from rich.console import Console
 
 from edge_depth_nerf import __version__
+from edge_depth_nerf.base.console import say
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_json_object, write_json
 from edge_depth_nerf.cameras import KannalaBrandt, Pinhole
-from edge_depth_nerf.compat import quiet_host
-from edge_depth_nerf.console import say
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_json_object, write_json
 from edge_depth_nerf.films.options import LARGEST_PX, CameraPathOptions
 from edge_depth_nerf.films.paths import Drive, lane_shift, orbit, replay, up_of
 from edge_depth_nerf.films.training import read_dataparser
-from edge_depth_nerf.scene_reader import SceneFolder, ScenePicture, read_scene
+from edge_depth_nerf.plugin.compat import quiet_host
+from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
 
 DEFAULT_RATE_HZ = 10.0
 """Of drives whose scene knows no times."""
@@ -229,7 +229,7 @@ def _placed(scene: SceneFolder | None, options: CameraPathOptions) -> tuple[Scen
     """The scene, and where the training's own dataparser puts it."""
     if options.load_config is None:
         assert scene is not None
-        from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
+        from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
 
         dataparser = FisheyeDepthDataParserConfig(metres_per_unit=options.metres_per_unit)
     else:

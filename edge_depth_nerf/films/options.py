@@ -9,7 +9,7 @@ from typing import Literal
 
 import tyro
 
-from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.base.errors import InputError
 
 Kind = Literal["replay", "lane-shift", "orbit"]
 FilmCamera = Literal["fisheye", "perspective", "equirectangular"]

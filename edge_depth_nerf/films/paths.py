@@ -14,7 +14,7 @@ from jaxtyping import Float, Float64
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.base.errors import InputError
 
 EASE = 0.25
 """Share of a shifted film in which the camera moves aside, and again in which it comes back."""

@@ -13,8 +13,8 @@ import types
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from edge_depth_nerf.bounds import finite, read_text, shown
-from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.base.bounds import finite, read_text, shown
+from edge_depth_nerf.base.errors import InputError
 
 MAX_CONFIG_BYTES = 1 << 15
 """No config.yml is larger: nerfstudio's have some 10 kB. The parser takes up to a third of a second for that much."""
@@ -38,7 +38,7 @@ def read_dataparser(path: Path) -> Any:
     from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
     from yaml import YAMLError
 
-    from edge_depth_nerf.dataparser import FisheyeDepthDataParserConfig
+    from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
 
     if not path.is_file():
         raise FileNotFoundError(f"{path}: {'is a folder' if path.is_dir() else 'no such file'}. {_HINT}.")

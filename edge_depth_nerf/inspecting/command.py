@@ -12,10 +12,9 @@ from rich.console import Console
 from rich.table import Table
 
 from edge_depth_nerf import __version__
-from edge_depth_nerf.console import run_jobs, say
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import check_is_folder, read_json, write_json, write_png
-from edge_depth_nerf.inspect_options import InspectOptions
+from edge_depth_nerf.base.console import run_jobs, say
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import check_is_folder, read_json, write_json, write_png
 from edge_depth_nerf.inspecting.figures import (
     PictureFigures,
     camera_figures,
@@ -25,10 +24,11 @@ from edge_depth_nerf.inspecting.figures import (
     path_figures,
 )
 from edge_depth_nerf.inspecting.findings import find, limited
+from edge_depth_nerf.inspecting.options import InspectOptions
 from edge_depth_nerf.inspecting.sheets import draw_sheet
 from edge_depth_nerf.inspecting.shown_prior import ShownScene
 from edge_depth_nerf.inspecting.top_view import draw_top_view
-from edge_depth_nerf.scene_reader import ScenePicture, read_scene
+from edge_depth_nerf.scene.reader import ScenePicture, read_scene
 
 SUMMARY = "summary.json"
 TOP_VIEW = "top_view.png"

@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_depth_nerf.base.pictures import is_distance
 from edge_depth_nerf.inspecting.shown_prior import ShownMaps
-from edge_depth_nerf.pictures import is_distance
-from edge_depth_nerf.scene_reader import SceneFolder, ScenePicture
+from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
 
 MEASURED_PICTURES = 64
 """Maps of so many pictures are measured, unless more are to be shown."""

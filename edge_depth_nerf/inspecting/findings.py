@@ -10,7 +10,7 @@ import numpy as np
 
 from edge_depth_nerf.inspecting.figures import PictureFigures, Step, recorded, steps, usual_length_m
 from edge_depth_nerf.masks.ego_files import ego_mask_path, vehicles_unknown
-from edge_depth_nerf.scene_reader import SceneFolder
+from edge_depth_nerf.scene.reader import SceneFolder
 
 GAP_FACTOR = 10
 """Frames so many times farther apart than usual are a gap."""

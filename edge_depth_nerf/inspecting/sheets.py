@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_depth_nerf.inspecting.figures import PictureFigures
-from edge_depth_nerf.inspecting.shown_prior import ShownMaps
-from edge_depth_nerf.pictures import (
+from edge_depth_nerf.base.pictures import (
     DISTANCE,
     RELATIVE_ERROR,
     SIGMA,
@@ -21,7 +19,9 @@ from edge_depth_nerf.pictures import (
     swatches,
     tinted,
 )
-from edge_depth_nerf.scene_reader import SceneFolder
+from edge_depth_nerf.inspecting.figures import PictureFigures
+from edge_depth_nerf.inspecting.shown_prior import ShownMaps
+from edge_depth_nerf.scene.reader import SceneFolder
 
 HIDDEN_RGB = (205, 50, 60)
 """Tint of what the mask hides."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-from edge_depth_nerf.integration import DepthSource
-from edge_depth_nerf.mono.error_model import TRUST_FILE, Trust, read_trust
-from edge_depth_nerf.mono.trust import saved_trust
-from edge_depth_nerf.prior import Prior, PriorOptions, make_prior, view_of
-from edge_depth_nerf.scene_reader import PictureMaps, SceneFolder, ScenePicture
+from edge_depth_nerf.method.error_model import TRUST_FILE, Trust, read_trust
+from edge_depth_nerf.method.integration import DepthSource
+from edge_depth_nerf.method.prior import Prior, PriorOptions, make_prior, view_of
+from edge_depth_nerf.mono.calibration import saved_trust
+from edge_depth_nerf.scene.reader import PictureMaps, SceneFolder, ScenePicture
 
 
 @dataclass(frozen=True)

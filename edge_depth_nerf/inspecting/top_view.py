@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_depth_nerf.base.pictures import INK_RGB, text_width, write_text
 from edge_depth_nerf.inspecting.figures import reference_camera
 from edge_depth_nerf.inspecting.findings import Finding
-from edge_depth_nerf.pictures import INK_RGB, text_width, write_text
-from edge_depth_nerf.scene_reader import SceneFolder, ScenePicture
+from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
 
 LARGEST_PX = (1600, 1100)
 """Width and height that the map may take."""

@@ -22,9 +22,9 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Shaped
 
-from edge_depth_nerf.bounds import check_bytes, shown
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import ARRAY_ERRORS, read_array_header
+from edge_depth_nerf.base.bounds import check_bytes, shown
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import ARRAY_ERRORS, read_array_header
 from edge_depth_nerf.lidar.sweeps import MAX_POINTS, Sweep, usable_returns
 
 Encoding = Literal["records", "text", "lzf", "matrix"]

@@ -15,8 +15,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from edge_depth_nerf.bounds import check_bytes
-from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.base.bounds import check_bytes
+from edge_depth_nerf.base.errors import InputError
 
 MIN_RANGE_M = 0.5
 """Nearer than this a scanner measures nothing: such a point stands for "no return", or lies on its housing."""

@@ -17,7 +17,7 @@ from jaxtyping import Float, Float64
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.base.errors import InputError
 
 MAX_POSE_GAP_S = 1.0
 """Between poses further apart than this the path is not known well enough to place pictures or points."""

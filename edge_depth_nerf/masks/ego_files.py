@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_json_object, read_mask, write_json, write_mask
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_json_object, read_mask, write_json, write_mask
 
 EGO_MASKS = "ego_masks"
 """Folder of the scene with the vehicle's masks that were found, in the size of the raw pictures."""

@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.process.png import read_png_bytes, read_png_header
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.png import read_png_bytes, read_png_header
 
 CLASSES = (
     *("unlabeled", "ego vehicle", "rectification border", "out of roi", "static", "dynamic", "ground", "road"),

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float32
 
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.mono.alignment import LEAST_RETURNS
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.method.alignment import LEAST_RETURNS
 from edge_depth_nerf.mono.examples import view_of
 from edge_depth_nerf.mono.relative import (
     WRONG_WAY,
@@ -27,7 +27,7 @@ from edge_depth_nerf.mono.relative import (
     rank_correlation,
     take_samples,
 )
-from edge_depth_nerf.scene_reader import SceneFolder, ScenePicture
+from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
 
 _SAMPLES = 3000
 _SAMPLES_FOR_THE_DRIVE = 300

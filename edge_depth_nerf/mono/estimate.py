@@ -23,11 +23,13 @@ from jaxtyping import Float32
 from rich.console import Console
 
 from edge_depth_nerf import __version__
-from edge_depth_nerf.console import progress_bars
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_image
+from edge_depth_nerf.base.console import progress_bars
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_image
+from edge_depth_nerf.base.one_writer import only_writer
 from edge_depth_nerf.masks.sky import find_sky
-from edge_depth_nerf.mono.alignment import LEAST_RETURNS
+from edge_depth_nerf.method.alignment import LEAST_RETURNS
+from edge_depth_nerf.mono.calibration import calibrate_scene
 from edge_depth_nerf.mono.elsewhere import FittedMaps
 from edge_depth_nerf.mono.examples import (
     LARGEST_SET_BYTES,
@@ -57,9 +59,7 @@ from edge_depth_nerf.mono.options import EstimateDepthOptions, Preset
 from edge_depth_nerf.mono.relative import KIND_SAID, Layer
 from edge_depth_nerf.mono.scene_maps import write_mono_maps
 from edge_depth_nerf.mono.training import Trained, TrainingOptions, as_json, train
-from edge_depth_nerf.mono.trust import calibrate_scene
-from edge_depth_nerf.one_writer import only_writer
-from edge_depth_nerf.scene_reader import SceneFolder, ScenePicture, read_scene
+from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
 
 WEIGHTS = "mono_network.safetensors"
 """The weights' file in a scene."""

@@ -20,10 +20,10 @@ import torch
 from jaxtyping import Bool, Float32, UInt8
 from numpy.typing import NDArray
 
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_image, read_mask
 from edge_depth_nerf.cameras import KannalaBrandt, Pinhole
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_image, read_mask
-from edge_depth_nerf.scene_reader import SceneFolder, ScenePicture
+from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
 
 FarSeen = Callable[[ScenePicture, tuple[int, int]], NDArray[np.float32]]
 """Gives for a picture, at (width, height), distances along the ray, 0 = none."""

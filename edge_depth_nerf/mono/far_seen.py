@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from edge_depth_nerf.lidar.projection import project_points
 from edge_depth_nerf.lidar.voxels import first_in_voxel
 from edge_depth_nerf.mono.examples import lens_rays, scaled_lens, view_of
-from edge_depth_nerf.scene_reader import SceneFolder, ScenePicture
+from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
 
 VOXEL_M = 0.05
 """The cloud holds one point of each cube of this size."""

@@ -16,11 +16,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.mono.options import HfOutput
 from edge_depth_nerf.mono.pinhole_views import pinhole_views
 from edge_depth_nerf.mono.relative import Kind, Layer
-from edge_depth_nerf.scene_reader import ScenePicture
+from edge_depth_nerf.scene.reader import ScenePicture
 
 Predict = Callable[[Sequence[NDArray[np.uint8]]], Sequence[NDArray[np.float32]]]
 """Pictures (H×W×3, RGB) to maps (H×W) of z, of z up to scale and shift, or of its inverse."""

@@ -8,13 +8,13 @@ from pathlib import Path
 
 from rich.console import Console
 
-from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.jobs.tasks import Task, do_tasks, own_command
 from edge_depth_nerf.mono.estimate import WEIGHTS, training_split
 from edge_depth_nerf.mono.hf import load_ready_network
 from edge_depth_nerf.mono.network import load_network
 from edge_depth_nerf.mono.options import EstimateDepthOptions
-from edge_depth_nerf.scene_reader import read_scene
-from edge_depth_nerf.tasks import Task, do_tasks, own_command
+from edge_depth_nerf.scene.reader import read_scene
 
 LOG = "estimate_depth.log"
 """In a scene: what the task said that made its maps."""
@@ -60,7 +60,7 @@ def estimate_on_cluster(options: EstimateDepthOptions, console: Console | None =
 
 
 def _do(options: EstimateDepthOptions, tasks: Sequence[Task], folders: Sequence[Path], console: Console) -> None:
-    from edge_depth_nerf.cluster import on_cluster  # imports Dask
+    from edge_depth_nerf.jobs.cluster import on_cluster  # imports Dask
 
     assert options.cluster is not None
     with on_cluster(options.cluster, tasks, folders, console) as place:

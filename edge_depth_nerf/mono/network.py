@@ -23,8 +23,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import write_bytes
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import write_bytes
 
 ARCHITECTURE = "edge-depth-nerf/u-net-1"
 """Raised whenever the same weights would give another prediction."""

@@ -24,7 +24,7 @@ import scipy.stats
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from edge_depth_nerf.mono.alignment import OUTLIER_SCALE
+from edge_depth_nerf.method.alignment import OUTLIER_SCALE
 
 Kind = Literal["metric", "relative", "inverse"]
 

@@ -16,12 +16,12 @@ import numpy as np
 from jaxtyping import Float
 from rich.progress import Progress
 
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_mask, write_distance_png, write_json
-from edge_depth_nerf.mono.error_model import TRUST_FILE
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_mask, write_distance_png, write_json
+from edge_depth_nerf.method.error_model import TRUST_FILE
 from edge_depth_nerf.mono.examples import lens_rays
-from edge_depth_nerf.scene_format import LAYERS, MONO_ENTRY, read_transforms
-from edge_depth_nerf.scene_reader import SceneFolder, ScenePicture, read_scene
+from edge_depth_nerf.scene.format import LAYERS, MONO_ENTRY, read_transforms
+from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
 
 FARTHEST_M = 200.0
 """What a network puts beyond is the sky, or as good as that: no value."""

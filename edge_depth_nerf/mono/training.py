@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.mono.examples import Examples
 from edge_depth_nerf.mono.network import (
     DepthNetwork,

@@ -22,10 +22,11 @@ from numpy.typing import NDArray
 from rich.console import Console
 from torch import Tensor
 
+from edge_depth_nerf.base.console import say
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, write_json
 from edge_depth_nerf.cameras import Camera
-from edge_depth_nerf.console import say
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_distance_png, read_image, read_json, write_json
+from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar import project_points, transform_points
 from edge_depth_nerf.masks.ego import EgoMask, find_ego
 from edge_depth_nerf.masks.ego_files import ego_mask_path, keep_ego_mask, vehicles_unknown
@@ -33,13 +34,14 @@ from edge_depth_nerf.masks.lens import dark_rim, lens_circle
 from edge_depth_nerf.masks.semantics import check_classes, keep_static, read_labels
 from edge_depth_nerf.masks.semantics import sky as sky_of_labels
 from edge_depth_nerf.masks.sky import find_sky
-from edge_depth_nerf.process.checks import read_camera_mask
 from edge_depth_nerf.process.downscale import downscale_distance, downscale_image, downscale_mask
 from edge_depth_nerf.process.options import ProcessOptions
-from edge_depth_nerf.process.points import PointCloud
 from edge_depth_nerf.process.reading import load_distance, load_picture, rays_of, read_depth
 from edge_depth_nerf.process.recording import RecordedPicture, Recording
-from edge_depth_nerf.process.scene import (
+from edge_depth_nerf.process.sweep_store import SweepStore
+from edge_depth_nerf.scene.checks import read_camera_mask
+from edge_depth_nerf.scene.points import PointCloud
+from edge_depth_nerf.scene.writer import (
     CLOUD,
     DistanceMap,
     FrameContent,
@@ -52,8 +54,6 @@ from edge_depth_nerf.process.scene import (
     summarise,
     write_scene,
 )
-from edge_depth_nerf.process.sweep_store import SweepStore
-from edge_depth_nerf.process.transforms import Transform
 
 FOUND_POSES = "found_poses.json"
 """File of the scene with the poses that were found from the pictures: camera, frame, held out, camera to world."""
@@ -77,7 +77,7 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
     options.check()
     check_classes(options.moving_classes)
     if options.poses == "colmap":
-        from edge_depth_nerf.process.colmap_poses import check_colmap
+        from edge_depth_nerf.process.colmap.poses import check_colmap
 
         check_colmap(recording, options)
     with console.status("Checking cameras and files …"):
@@ -90,7 +90,7 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
         training = [picture for picture in recording.pictures if picture.frame not in _held_out(recording, options)]
         recording, notices = _find_vehicle(recording, training, masks, options, console)
     if options.poses == "colmap":
-        from edge_depth_nerf.process.colmap_poses import colmap_poses
+        from edge_depth_nerf.process.colmap.poses import colmap_poses
 
         recording = colmap_poses(recording, options, console)
     if recording.trajectory is None:

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from rich.console import Console
 
-from edge_depth_nerf.console import say
-from edge_depth_nerf.one_writer import only_writer
+from edge_depth_nerf.base.console import say
+from edge_depth_nerf.base.one_writer import only_writer
 from edge_depth_nerf.process.options import JbnuDepth360Options, Kitti360Options, ProcessOptions, RigOptions
-from edge_depth_nerf.process.scene import ProcessReport
-from edge_depth_nerf.scene_format import MONO_ENTRY
-from edge_depth_nerf.scene_reader import SceneFolder, read_scene
+from edge_depth_nerf.scene.format import MONO_ENTRY
+from edge_depth_nerf.scene.reader import SceneFolder, read_scene
+from edge_depth_nerf.scene.writer import ProcessReport
 
 
 def process(
@@ -35,7 +35,7 @@ def process(
 
 def _process(options: Kitti360Options | JbnuDepth360Options | RigOptions, console: Console) -> ProcessReport:
     if isinstance(options, Kitti360Options):
-        from edge_depth_nerf.process.kitti360 import process_kitti360
+        from edge_depth_nerf.process.kitti360.converter import process_kitti360
 
         report = process_kitti360(options, console)
     elif isinstance(options, JbnuDepth360Options):
@@ -88,8 +88,8 @@ def _add_mono(scene: SceneFolder, options: ProcessOptions, console: Console) -> 
             "yellow",
         )
     if scene.has("mono") and lidar:
-        from edge_depth_nerf.mono.trust import calibrate_scene, saved_trust
-        from edge_depth_nerf.prior import PriorOptions
+        from edge_depth_nerf.method.prior import PriorOptions
+        from edge_depth_nerf.mono.calibration import calibrate_scene, saved_trust
 
         if saved_trust(scene, PriorOptions()) is None:
             trust = calibrate_scene(scene.path, console=console)

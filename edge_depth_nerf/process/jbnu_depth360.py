@@ -15,14 +15,14 @@ from typing import Any
 
 from rich.console import Console
 
-from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.process.build import process_recording
-from edge_depth_nerf.process.checks import require_folder
 from edge_depth_nerf.process.options import JbnuDepth360Options
 from edge_depth_nerf.process.recording import Recording
 from edge_depth_nerf.process.rig import recording_of_rig
 from edge_depth_nerf.process.rig_file import read_rig
-from edge_depth_nerf.process.scene import ProcessReport
+from edge_depth_nerf.scene.checks import require_folder
+from edge_depth_nerf.scene.writer import ProcessReport
 
 RATE_HZ = 10.0
 """Pictures and scans a second; the data set has numbers in place of times."""

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from edge_depth_nerf.console import say
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.one_writer import only_writer
+from edge_depth_nerf.base.console import say
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.one_writer import only_writer
+from edge_depth_nerf.jobs.tasks import Task, do_tasks, own_command
 from edge_depth_nerf.process.command import process
 from edge_depth_nerf.process.options import JbnuDepth360Options, Kitti360Options, RigOptions
-from edge_depth_nerf.tasks import Task, do_tasks, own_command
 
 DriveOptions = Kitti360Options | JbnuDepth360Options | RigOptions
 KINDS = {Kitti360Options: "kitti360", JbnuDepth360Options: "jbnu-depth360", RigOptions: "rig"}
@@ -88,7 +88,7 @@ def usable_frames(options: DriveOptions) -> list[int]:
 
     """
     if isinstance(options, Kitti360Options):
-        from edge_depth_nerf.process.kitti360 import read_kitti360
+        from edge_depth_nerf.process.kitti360.converter import read_kitti360
 
         recording = read_kitti360(options)
     elif isinstance(options, JbnuDepth360Options):
@@ -103,7 +103,7 @@ def usable_frames(options: DriveOptions) -> list[int]:
 
 
 def _on_cluster(parts: list[DriveOptions], cluster: str, console: Console) -> None:
-    from edge_depth_nerf.cluster import on_cluster  # imports Dask
+    from edge_depth_nerf.jobs.cluster import on_cluster  # imports Dask
 
     tasks = []
     for part in parts:

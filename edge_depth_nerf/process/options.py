@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from edge_depth_nerf.cluster_address import check_address
-from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.jobs.cluster_address import check_address
 
 
 @dataclass(frozen=True, kw_only=True)

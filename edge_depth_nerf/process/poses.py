@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from edge_depth_nerf.bounds import MAX_TIME_S, shown, text_lines
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_json
-from edge_depth_nerf.process.transforms import Transform, check_rigid
+from edge_depth_nerf.base.bounds import MAX_TIME_S, shown, text_lines
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_json
+from edge_depth_nerf.cameras.transforms import Transform, check_rigid
 
 QUATERNION_TOLERANCE = 1e-3
 """How far a quaternion's length may be from 1; four written digits still pass."""

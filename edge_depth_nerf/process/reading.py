@@ -10,13 +10,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_distance_png, read_image
 from edge_depth_nerf.cameras import Camera
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import read_distance_png, read_image
-from edge_depth_nerf.process.checks import size_error
 from edge_depth_nerf.process.downscale import downscale_distance, downscale_image
 from edge_depth_nerf.process.recording import DepthFile
-from edge_depth_nerf.process.scene import DistanceMap, Picture
+from edge_depth_nerf.scene.checks import size_error
+from edge_depth_nerf.scene.writer import DistanceMap, Picture
 
 
 def read_depth(depth: DepthFile, camera: Camera) -> Float[np.ndarray, "h w"]:

@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 from edge_depth_nerf.cameras import Camera
+from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar import Sweep, SweepTiming
 from edge_depth_nerf.lidar.trajectory import Trajectory
-from edge_depth_nerf.process.checks import LeftOut
-from edge_depth_nerf.process.scene import ShiftedView, Skipped
-from edge_depth_nerf.process.transforms import Transform
+from edge_depth_nerf.scene.checks import LeftOut
+from edge_depth_nerf.scene.writer import ShiftedView, Skipped
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,12 @@ import numpy as np
 from jaxtyping import Float64
 from rich.console import Console
 
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import DISTANCE_STEPS_PER_METRE, picture_size
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE, picture_size
+from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar.scans import SCAN_SUFFIXES, check_scan, read_scan
 from edge_depth_nerf.lidar.trajectory import MAX_POSE_GAP_S, Trajectory
 from edge_depth_nerf.process.build import process_recording
-from edge_depth_nerf.process.checks import Tolerance, check_size, size_error
 from edge_depth_nerf.process.options import JbnuDepth360Options, RigOptions
 from edge_depth_nerf.process.poses import read_kitti, read_nerfstudio, read_times, read_tum
 from edge_depth_nerf.process.recording import (
@@ -36,8 +36,8 @@ from edge_depth_nerf.process.recording import (
     Recording,
 )
 from edge_depth_nerf.process.rig_file import Clock, Rig, RigCamera, RigLidar, RigPoses, read_rig
-from edge_depth_nerf.process.scene import ProcessReport, Skipped, summarise
-from edge_depth_nerf.process.transforms import Transform
+from edge_depth_nerf.scene.checks import Tolerance, check_size, size_error
+from edge_depth_nerf.scene.writer import ProcessReport, Skipped, summarise
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 """Pictures that are found in a folder."""

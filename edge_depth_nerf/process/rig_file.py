@@ -17,13 +17,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from edge_depth_nerf.bounds import MAX_TIME_S, finite, path_inside, read_text, shown
+from edge_depth_nerf.base.bounds import MAX_TIME_S, finite, path_inside, read_text, shown
+from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras import MEI, Camera, KannalaBrandt, Pinhole
-from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar.scans import PointTimes, ScanFormat
 from edge_depth_nerf.lidar.sweeps import SweepTiming
 from edge_depth_nerf.process.poses import pose_of_quaternion, transform_of_rows
-from edge_depth_nerf.process.transforms import Transform
 
 if sys.version_info >= (3, 11):
     import tomllib

@@ -25,14 +25,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar import transform_points
 from edge_depth_nerf.lidar.free_space import FreeSpace
 from edge_depth_nerf.lidar.trajectory import MAX_POSE_GAP_S, Trajectory
 from edge_depth_nerf.lidar.voxels import first_in_voxel
 from edge_depth_nerf.lidar.world import WorldSweep, above_field, sweep_in_world
 from edge_depth_nerf.process.recording import RecordedSweep
-from edge_depth_nerf.process.transforms import Transform
 
 VOXEL_M = 0.05
 """Beyond `MAX_POINTS` the points around a picture are thinned to one of each cube of this size, nearest in time

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from jinja2 import Environment, StrictUndefined
 
-from edge_depth_nerf.files import write_text
+from edge_depth_nerf.base.files import write_text
 from edge_depth_nerf.report.tables import MadeTable
 from edge_depth_nerf.report.views import KINDS, Drive, data_uri, legend
 

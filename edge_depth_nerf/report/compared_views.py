@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_depth_nerf.files import read_distance_png, read_image, read_mask
-from edge_depth_nerf.pictures import colour_distance
-from edge_depth_nerf.scene_format import read_transforms
+from edge_depth_nerf.base.files import read_distance_png, read_image, read_mask
+from edge_depth_nerf.base.pictures import colour_distance
+from edge_depth_nerf.scene.format import read_transforms
 
 DISTANCE_KEYS = ("truth_distance_file_path", "lidar_file_path")
 """What a view's distances are shown by, the better one first."""

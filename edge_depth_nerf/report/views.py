@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from edge_depth_nerf.console import run_jobs
-from edge_depth_nerf.metrics import LEAST_SQUARED_ERROR
-from edge_depth_nerf.pictures import (
+from edge_depth_nerf.base.console import run_jobs
+from edge_depth_nerf.base.pictures import (
     COLOUR_ERROR,
     DISTANCE,
     NO_VALUE_RGB,
@@ -30,6 +29,7 @@ from edge_depth_nerf.pictures import (
     is_distance,
     resize,
 )
+from edge_depth_nerf.method.metrics import LEAST_SQUARED_ERROR
 from edge_depth_nerf.report.compared_views import ComparedView, compared_view, held_out_frames, spread_over
 
 REPORT = "report.html"

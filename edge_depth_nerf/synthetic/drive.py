@@ -33,9 +33,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from edge_depth_nerf.console import progress_bars
-from edge_depth_nerf.errors import InputError
-from edge_depth_nerf.files import (
+from edge_depth_nerf.base.console import progress_bars
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import (
     check_is_folder,
     read_json,
     write_bytes,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from edge_depth_nerf.errors import InputError
+from edge_depth_nerf.base.errors import InputError
 
 SceneName = Literal["street", "parking", "turn"]
 

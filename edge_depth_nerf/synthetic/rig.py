@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_depth_nerf.base.files import write_text
 from edge_depth_nerf.cameras import MEI
-from edge_depth_nerf.files import write_text
 
 CAMERAS = ("image_02", "image_03")
 """The fisheye cameras: left, right."""

@@ -34,8 +34,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
+from edge_depth_nerf.base.files import write_bytes, write_distance_png, write_mask, write_png, write_text
 from edge_depth_nerf.cameras import MEI, Camera, KannalaBrandt, Pinhole
-from edge_depth_nerf.files import write_bytes, write_distance_png, write_mask, write_png, write_text
 from edge_depth_nerf.synthetic import rig
 from edge_depth_nerf.synthetic.drive import WORLD_ORIGIN_M, Job, shown, take_picture, to_bytes
 from edge_depth_nerf.synthetic.lidar import Scanner, Sweep, sweep

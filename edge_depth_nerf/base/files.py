@@ -1,0 +1,374 @@
+"""Reading and writing files: atomically, with errors that name the file.
+
+Distance maps on disk are 16-bit PNGs in units of 1/256 m (0 = no value, 256 m range, 4 mm steps).
+Masks on disk are 8-bit PNGs: 255 = use the pixel, 0 = ignore it. Pictures are RGB in memory.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import math
+import os
+import platform
+import re
+import threading
+import time
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_depth_nerf.base.bounds import (
+    MAX_JSON_BYTES,
+    MAX_JSON_VALUES,
+    MAX_PICTURE_BYTES,
+    MAX_PIXELS,
+    check_bytes,
+    check_pixels,
+    read_text,
+)
+from edge_depth_nerf.base.errors import InputError
+
+DISTANCE_STEPS_PER_METRE = 256
+"""A distance PNG counts in 1/256 m."""
+
+
+FORGOTTEN_AFTER_S = 24 * 3600.0
+"""A temporary file that nothing was written to for so long is nobody's any more, whatever its name says."""
+_TEMPORARY = re.compile(r"\..+\.(?P<host>[\w.-]*)~(?P<process>\d+)~\d+(\.\w+)?")
+
+
+def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
+    """Let `write` fill a temporary file beside `path`, then move it into place.
+
+    A reader sees the old file or the whole new one, never a part of it.
+
+    Raises:
+        OSError: it cannot be written; with the file's name, which the system leaves out for a full disk.
+
+    """
+    # two threads, processes or machines may write one file
+    writer = f"{platform.node()}~{os.getpid()}~{threading.get_native_id()}"
+    temporary = path.with_name(f".{path.stem}.{writer}{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write(temporary)
+        os.replace(temporary, path)
+    except OSError as error:
+        if error.errno is None:
+            raise
+        raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
+    finally:
+        try:
+            temporary.unlink(missing_ok=True)
+        except OSError:
+            pass  # what went wrong is told by the first error
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove what `write_atomically` leaves in a folder and those below when its process is killed.
+
+    What another process is writing at this moment stays.
+    """
+    for path in folder.rglob(".*"):
+        named = _TEMPORARY.fullmatch(path.name)
+        if named is None:
+            continue
+        try:
+            ended = named["host"] == platform.node() and not _runs(int(named["process"]))
+            if ended or time.time() - path.stat().st_mtime > FORGOTTEN_AFTER_S:
+                path.unlink()
+        except OSError:
+            pass  # its writer has just moved it into place, or the folder cannot be written
+
+
+def _runs(process: int) -> bool:
+    """Whether there is a process of this number."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
+def explain(error: Exception) -> str:
+    """What to tell of an error that the user can mend: one paragraph, with what to do about a disk or a folder."""
+    remedies = {
+        errno.ENOSPC: "The disk is full: free some space there, or choose another one",
+        errno.EDQUOT: "Your share of the disk is used up: free some space there, or choose another disk",
+        errno.EFBIG: "Files may not grow so large there: see `ulimit -f`, or choose another disk",
+        errno.EROFS: "The disk can only be read: choose another folder",
+        errno.EACCES: "This user may not do that there: see who owns the folder, or choose another one",
+        errno.EPERM: "This user may not do that there: see who owns the folder, or choose another one",
+    }
+    remedy = remedies.get(error.errno or 0) if isinstance(error, OSError) else None
+    if not isinstance(error, OSError) or remedy is None:
+        return str(error)
+    where = f"{error.filename}: " if error.filename else ""
+    return f"{where}{error.strerror}. {remedy}; what is done is kept, and the same command takes up where it was."
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write bytes atomically."""
+
+    def write(temporary: Path) -> None:
+        temporary.write_bytes(content)
+
+    write_atomically(path, write)
+
+
+def write_text(path: Path, content: str) -> None:
+    """Write UTF-8 text atomically."""
+    write_bytes(path, content.encode())
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON atomically, indented; NaN and infinity are refused."""
+    write_text(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
+
+
+def read_json(path: Path) -> Any:
+    """Read JSON; a broken file is named with the line of its fault.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: the file is not JSON, or far too large.
+
+    """
+    text = read_text(path, MAX_JSON_BYTES)
+    if text.count(",") + text.count("[") + text.count("{") > MAX_JSON_VALUES:
+        raise InputError(f"{path}: more than {MAX_JSON_VALUES} values. Split the recording.")
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not valid JSON ({error}). Mend or re-create the file.") from None
+
+
+def read_json_object(path: Path, *keys: str) -> dict[str, Any]:
+    """Read JSON that is to be an object with some keys; what is under them is for the caller to check.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: the file is not JSON, no object, or lacks a key.
+
+    """
+    content = read_json(path)
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: holds no JSON object. Delete or re-create the file.")
+    if missing := [key for key in keys if key not in content]:
+        raise InputError(f"{path}: has no {missing[0]!r}. Delete or re-create the file.")
+    return content
+
+
+def write_png(path: Path, image: NDArray) -> None:
+    """Write H×W×3 uint8 RGB, H×W uint8 or H×W uint16 as PNG, atomically."""
+    pixels = image[..., ::-1] if image.ndim == 3 else image
+    ok, encoded = cv2.imencode(".png", np.ascontiguousarray(pixels), [cv2.IMWRITE_PNG_COMPRESSION, 4])
+    if not ok:
+        raise RuntimeError(f"{path}: PNG encoding failed for {image.dtype} {image.shape}")
+    write_bytes(path, encoded.tobytes())
+
+
+def picture_size(path: Path) -> tuple[int, int]:
+    """Width and height of a PNG, JPEG, BMP or TIFF, from its header alone.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: not such a picture, or larger than any picture is.
+
+    """
+    from PIL import Image  # not every command reads pictures
+
+    size = check_bytes(path, MAX_PICTURE_BYTES)
+    try:
+        with Image.open(path, formats=("PNG", "JPEG", "BMP", "TIFF")) as image:
+            width, height = image.size
+    except Exception as error:  # Pillow raises whatever its readers meet
+        what = str(error) if isinstance(error, Image.DecompressionBombError) else "truncated or not a picture"
+        raise InputError(
+            f"{path}: cannot be decoded as a picture ({size} bytes; {what}). Copy or make the file again."
+        ) from None
+    check_pixels(width, height, str(path))
+    return width, height
+
+
+def _decode(path: Path, flags: int) -> NDArray:
+    # OpenCV allocates what a header promises
+    picture_size(path)
+    content = np.fromfile(path, np.uint8)
+    try:
+        image = cv2.imdecode(content, flags)
+    except cv2.error:
+        image = None
+    # libpng fills what a truncated file lacks with zeros, so the end mark is looked for as well
+    if image is None or (path.suffix.lower() == ".png" and b"IEND" not in content[-16:].tobytes()):
+        raise InputError(
+            f"{path}: cannot be decoded as a picture ({content.size} bytes; truncated or not a picture). "
+            "Copy or make the file again."
+        )
+    return image
+
+
+def read_image(path: Path) -> NDArray[np.uint8]:
+    """Read a picture as H×W×3 uint8 RGB.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: truncated or not a picture.
+
+    """
+    return np.ascontiguousarray(_decode(path, cv2.IMREAD_COLOR)[..., ::-1])
+
+
+def check_is_folder(output: Path) -> None:
+    """Make sure that a folder can be made, or is there.
+
+    Raises:
+        InputError: there is a file of that name.
+
+    """
+    if output.exists() and not output.is_dir():
+        raise InputError(f"{output}: is a file; --output takes a folder.")
+
+
+def read_mask(path: Path) -> NDArray[np.bool_]:
+    """Read a mask as H×W bool, True = use the pixel (any value but 0).
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: truncated or not a picture.
+
+    """
+    return _decode(path, cv2.IMREAD_GRAYSCALE) > 0
+
+
+def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
+    """Write an H×W mask, True = use the pixel, as 255."""
+    write_png(path, mask.astype(np.uint8) * 255)
+
+
+def write_distance_png(path: Path, distance_m: NDArray) -> None:
+    """Write H×W metres as a 16-bit PNG of 1/256 m.
+
+    What is not finite, not positive or beyond the 255.996 m range is written as 0 (no value); what is
+    positive but below half a step is written as one step, so that it stays a value.
+    """
+    usable = np.isfinite(distance_m) & (distance_m > 0)
+    steps = np.where(usable, distance_m, 0.0).astype(np.float64) * DISTANCE_STEPS_PER_METRE
+    steps = np.where(usable, np.maximum(np.rint(steps), 1), 0)
+    write_png(path, np.where(steps > 65535, 0, steps).astype(np.uint16))
+
+
+def read_distance_png(path: Path, metres_per_step: float = 1 / DISTANCE_STEPS_PER_METRE) -> NDArray[np.float32]:
+    """Read a 16-bit distance PNG as H×W float32 metres, 0 = no value.
+
+    `metres_per_step` is 1/256 m in this project's own files; other people's scenes declare theirs.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: truncated, or not a 16-bit single-channel PNG.
+
+    """
+    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    if image.dtype != np.uint16 or image.ndim != 2:
+        raise InputError(
+            f"{path}: expected a 16-bit single-channel PNG in units of 1/256 m, found "
+            f"{image.dtype} {image.shape}. 8-bit or colour maps have lost the distance; export the map again."
+        )
+    return image.astype(np.float32) * np.float32(metres_per_step)
+
+
+ARRAY_ERRORS = (
+    ValueError,
+    TypeError,
+    EOFError,
+    OverflowError,
+    SyntaxError,
+    tokenize.TokenError,
+    RecursionError,
+    MemoryError,
+)
+"""What NumPy raises at headers of arrays that hold anything."""
+
+
+def read_array_header(file: Any, where: str) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape, whether in Fortran's order, and type of an array in NumPy's format; `file` is then at its numbers.
+
+    Raises:
+        InputError: no such header, or of anything but numbers; names `where`.
+
+    """
+    try:
+        version = np.lib.format.read_magic(file)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, fortran, kind = read(file)
+    except ARRAY_ERRORS as error:
+        said = (str(error).splitlines() or [""])[0]
+        raise InputError(f"{where}: cannot be read as an array ({said}). Copy or make the file again.") from None
+    if any(isinstance(side, bool) or side < 0 for side in shape):
+        raise InputError(f"{where}: cannot be read as an array ({kind}, shape {shape}). Copy or make the file again.")
+    return shape, fortran, kind
+
+
+def read_npy(path: Path) -> NDArray:
+    """Read an array of numbers from a .npy file; its header is held against the file's size first.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: not such a file, truncated, of other things than numbers, or of more than `MAX_PIXELS` of them.
+
+    """
+    size = check_bytes(path, 9 * MAX_PIXELS)
+    with path.open("rb") as file:
+        shape, fortran, kind = read_array_header(file, str(path))
+        count, start = math.prod(shape), file.tell()
+        if kind.kind not in "fiu" or count > MAX_PIXELS or count * kind.itemsize > size - start:
+            raise InputError(
+                f"{path}: {size - start} bytes of numbers for an array of {kind} and shape {shape}; expected numbers, "
+                f"all that the header promises, at most {MAX_PIXELS}. Make the file again."
+            )
+        numbers = np.fromfile(file, kind, count)
+    return numbers.reshape(shape, order="F" if fortran else "C")
+
+
+def read_npz(path: Path, names: Iterable[str], most_bytes: int) -> dict[str, NDArray]:
+    """Read some arrays of a .npz archive, none of which may take more than `most_bytes` in memory.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: broken, an array is not there, or larger than that.
+
+    """
+    check_bytes(path, 4 * most_bytes + (1 << 20))
+    found = {}
+    try:
+        with zipfile.ZipFile(path) as archive:
+            for name in names:
+                entry = archive.getinfo(f"{name}.npy")
+                if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                    raise ValueError(f"{name} is compressed in a way of its own")
+                with archive.open(entry) as member:
+                    shape, fortran, kind = read_array_header(member, f"{path}: {name}")
+                    count = math.prod(shape)
+                    if kind.kind not in "fiu":
+                        raise ValueError(f"{name} holds {kind}")
+                    if count * kind.itemsize > most_bytes:
+                        raise ValueError(f"{name} has the shape {shape} of {kind}, more than {most_bytes} bytes")
+                    content = member.read(count * kind.itemsize)
+                found[name] = np.frombuffer(bytearray(content), kind, count).reshape(
+                    shape, order="F" if fortran else "C"
+                )
+    except InputError:
+        raise
+    except (OSError, ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(f"{path}: cannot be read as arrays ({error}). Delete or make the file again.") from None
+    return found

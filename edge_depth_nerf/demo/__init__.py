@@ -1,0 +1,1 @@
+"""`edge-depth-nerf demo`: the whole way once, from a raw drive to compared figures."""

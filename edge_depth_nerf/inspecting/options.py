@@ -1,0 +1,38 @@
+"""Options of `edge-depth-nerf inspect`; a module of its own so that the command line starts fast."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from edge_depth_nerf.base.errors import InputError
+
+LARGEST_PANEL_PX = 4000
+
+
+@dataclass(frozen=True)
+class InspectOptions:
+    """Look at a scene before training on it: sheets of its maps, a top view, figures and warnings."""
+
+    scene: tyro.conf.Positional[Path]
+    """The scene folder, or its transforms.json; other nerfstudio scenes are shown with what they have."""
+    output: Path | None = None
+    """Folder for the pictures and summary.json. Not set: SCENE_inspection beside the scene."""
+    frames: int = 4
+    """How many moments get a sheet per camera, spread over the drive."""
+    size: int = 640
+    """Longer side of each picture in a sheet, px."""
+
+    def check(self) -> None:
+        """Check the ranges.
+
+        Raises:
+            InputError: an option is out of its range.
+
+        """
+        if self.frames < 1:
+            raise InputError(f"--frames {self.frames}: expected 1 or more moments to show.")
+        if not 64 <= self.size <= LARGEST_PANEL_PX:
+            raise InputError(f"--size {self.size}: expected 64 to {LARGEST_PANEL_PX} px for the pictures of a sheet.")

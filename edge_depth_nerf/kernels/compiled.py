@@ -1,0 +1,48 @@
+"""What all functions compiled by Numba share.
+
+Importing this module imports Numba. The first calls ever on a machine compile (a second or two each module); the
+result is kept beside the module, or in the user's cache if that folder cannot be written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from numba import njit
+
+TRAINING = (
+    "edge_depth_nerf.kernels.hash_grid_numba",
+    "edge_depth_nerf.kernels.contraction",
+    "edge_depth_nerf.kernels.ray_kernels",
+    "edge_depth_nerf.method.integration_numba",
+)
+"""The modules whose kernels a training on the CPU calls."""
+_folders: set[Path] = set()
+"""Where Numba keeps what it compiled."""
+
+
+def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Compile a function without Python's lock; on disk if there is a folder for it, else anew in each process.
+
+    Put `no_type_check` below it: the tests' type checker would wrap what Numba has to read. `options` are njit's.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        try:
+            kernel = njit(cache=True, nogil=True, **options)(function)
+            _folders.add(Path(str(kernel.stats.cache_path)))
+            return kernel
+        except RuntimeError:  # Numba found no folder that can be written
+            return njit(nogil=True, **options)(function)
+
+    return decorate
+
+
+def compiled_before(modules: Sequence[str] = TRAINING) -> bool:
+    """Whether the kernels of modules lie compiled on disk; otherwise their first calls take long."""
+    for module in modules:
+        import_module(module)  # tells its folder
+    return bool(_folders) and all(any(folder.glob("*.nbi")) for folder in _folders)

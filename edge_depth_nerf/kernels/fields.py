@@ -1,0 +1,157 @@
+"""nerfacto's field and proposal networks with their arithmetic fused.
+
+Host-facing. Parameters, their names and initial values stay nerfstudio's, and results are nerfstudio's to float32's
+noise. What a fused form does not cover (a gradient to the positions, for normals or poses; transients; semantics;
+positions in a box) is left to nerfstudio's.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.rays import RaySamples
+from nerfstudio.field_components.activations import trunc_exp
+from nerfstudio.field_components.field_heads import FieldHeadNames
+from nerfstudio.field_components.mlp import MLP
+from nerfstudio.field_components.spatial_distortions import SceneContraction
+from nerfstudio.fields.base_field import get_normalized_directions
+from nerfstudio.fields.density_fields import HashMLPDensityField
+from nerfstudio.fields.nerfacto_field import NerfactoField
+from torch import Tensor, nn
+
+from edge_depth_nerf.kernels.fused_hash_grid import use_fused_encodings
+from edge_depth_nerf.kernels.network import network
+
+
+class CubeContraction(SceneContraction):
+    """nerfacto's contraction into a cube: the same numbers.
+
+    On the CPU torch's infinity norm of three numbers takes 30 times as long as their largest.
+    """
+
+    def forward(self, positions: Float[Tensor, "*bs 3"]) -> Float[Tensor, "*bs 3"]:
+        """Contract positions in scene units to -2..2."""
+        norm = positions.abs().amax(dim=-1, keepdim=True)
+        return torch.where(norm < 1, positions, (2 - 1 / norm) * (positions / norm))
+
+
+def _in_parts(x: Tensor) -> bool:
+    """Whether `network` is for it."""
+    return x.device.type == "cpu" and x.dtype == torch.float32 and not torch.is_autocast_enabled("cpu")
+
+
+def _is_plain(mlp: MLP) -> bool:
+    """Whether it is layers with ReLU between them, in torch."""
+    return mlp.tcnn_encoding is None and not mlp.skip_connections and isinstance(mlp.activation, nn.ReLU)
+
+
+def _parameters(mlp: MLP) -> tuple[list[Any], list[Any]]:
+    """Weights and biases, layer by layer."""
+    return [layer.weight for layer in mlp.layers], [layer.bias for layer in mlp.layers]
+
+
+class FusedMLP(MLP):
+    """nerfstudio's `MLP(implementation="torch")` with ReLU, in parts that stay in the CPU's cache."""
+
+    def forward(self, in_tensor: Float[Tensor, "*bs in_dim"]) -> Float[Tensor, "*bs out_dim"]:
+        """Apply the network."""
+        if not _in_parts(in_tensor) or in_tensor.numel() == 0:
+            return super().forward(in_tensor)
+        flat = in_tensor.reshape(-1, in_tensor.shape[-1])
+        result = network(flat, *_parameters(self)).view(*in_tensor.shape[:-1], -1)
+        return result if self.out_activation is None else self.out_activation(result)
+
+
+def _unit_cube(field: Any, positions: Float[Tensor, "*bs 3"]) -> tuple[Tensor, Tensor]:
+    """Positions in scene units to 0..1, flat, and 1 for those strictly inside (else 0), of shape [*bs, 1]."""
+    flat = positions.reshape(-1, 3)
+    if flat.device.type == "cpu" and flat.dtype == torch.float32:
+        # imported here, because Numba takes half a second to load
+        from edge_depth_nerf.kernels.contraction import contract
+
+        places, inside = contract(flat)
+    else:
+        places = (field.spatial_distortion(flat) + 2) / 4
+        inside = ((places > 0) & (places < 1)).all(dim=-1)
+        places = places * inside[..., None]
+    return places, inside.view(*positions.shape[:-1], 1)
+
+
+class FusedDensityField(HashMLPDensityField):
+    """nerfstudio's proposal network."""
+
+    def density_fn(self, positions: Float[Tensor, "*bs 3"], times: Tensor | None = None) -> Float[Tensor, "*bs 1"]:
+        """Density at positions in scene units."""
+        if not isinstance(self.spatial_distortion, CubeContraction) or self.use_linear or positions.requires_grad:
+            return super().density_fn(positions, times)
+        places, inside = _unit_cube(self, positions)
+        before = self.mlp_base(places).view(*positions.shape[:-1], 1).to(positions)
+        return self.average_init_density * trunc_exp(before) * inside
+
+
+class FusedNerfactoField(NerfactoField):
+    """nerfacto's field; what the samples of a ray share is computed once a ray."""
+
+    follows_positions: bool = True
+    """False: no gradient to the positions in training, where nobody asks for it but nerfstudio's form prepares it."""
+
+    def get_density(self, ray_samples: RaySamples) -> tuple[Tensor, Tensor]:
+        """Density and features of samples."""
+        follows = torch.is_grad_enabled() and (self.follows_positions or not self.training)
+        if follows or not isinstance(self.spatial_distortion, CubeContraction):
+            return super().get_density(ray_samples)
+        positions = ray_samples.frustums.get_positions()
+        places, inside = _unit_cube(self, positions)
+        features = self.mlp_base(places).view(*positions.shape[:-1], -1)
+        before, embedding = torch.split(features, [1, self.geo_feat_dim], dim=-1)
+        return self.average_init_density * trunc_exp(before.to(positions)) * inside, embedding
+
+    def get_outputs(
+        self, ray_samples: RaySamples, density_embedding: Tensor | None = None
+    ) -> dict[FieldHeadNames, Tensor]:
+        """Colours of samples."""
+        directions, cameras = ray_samples.frustums.directions, ray_samples.camera_indices
+        assert density_embedding is not None
+        more_heads = self.use_transient_embedding or self.use_semantics or self.use_pred_normals
+        one_direction_a_ray = directions.ndim == 3 and (directions.shape[1] == 1 or directions.stride(1) == 0)
+        plain = isinstance(self.mlp_head, FusedMLP) and _in_parts(density_embedding)
+        if more_heads or cameras is None or not one_direction_a_ray or not plain:
+            return super().get_outputs(ray_samples, density_embedding)
+        encoded = self.direction_encoding(get_normalized_directions(directions[:, 0]))
+        weights, biases = _parameters(self.mlp_head)
+        of_direction, of_features, of_appearance = torch.split(
+            weights[0], [encoded.shape[1], self.geo_feat_dim, self.appearance_embedding_dim], dim=1
+        )
+        shared = torch.addmm(biases[0], encoded, of_direction.t())
+        if self.embedding_appearance is not None:
+            if self.training:
+                shared = torch.addmm(shared, self.embedding_appearance(cameras[:, 0, 0]), of_appearance.t())
+            elif self.use_average_appearance_embedding:
+                shared = shared + of_appearance @ self.embedding_appearance.mean(dim=0)
+        colours = network(
+            density_embedding.reshape(-1, self.geo_feat_dim),
+            [of_features, *weights[1:]],
+            [shared, *biases[1:]],
+        )
+        return {FieldHeadNames.RGB: torch.sigmoid(colours).view(directions.shape)}
+
+
+FUSED: dict[type[nn.Module], type[nn.Module]] = {
+    MLP: FusedMLP,
+    HashMLPDensityField: FusedDensityField,
+    NerfactoField: FusedNerfactoField,
+}
+
+
+def use_fused_fields(module: nn.Module) -> None:
+    """Let all fields, networks and hash encodings below `module` compute in fused forms.
+
+    In place; parameters stay the same objects.
+    """
+    use_fused_encodings(module)
+    for part in module.modules():
+        if type(part) in FUSED and not (isinstance(part, MLP) and not _is_plain(part)):
+            # the class alone differs; another object would have to be found by all who hold this one
+            part.__class__ = FUSED[type(part)]  # pyright: ignore[reportAttributeAccessIssue]

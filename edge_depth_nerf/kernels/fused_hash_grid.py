@@ -1,0 +1,42 @@
+"""nerfstudio's hash encoding with its arithmetic fused.
+
+Parameters, their names and their initial values stay nerfstudio's, so checkpoints go back and forth.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from nerfstudio.field_components.encodings import HashEncoding
+from torch import Tensor, nn
+
+from edge_depth_nerf.kernels.hash_grid import back_end, hash_grid
+
+
+class FusedHashEncoding(HashEncoding):
+    """nerfstudio's `HashEncoding(implementation="torch")`, several times faster.
+
+    Its results are nerfstudio's: on the CPU to the last bit forward, and to float32's noise else. What the fused form
+    does not do (double precision, a half-precision table, devices without back end) is left to nerfstudio's.
+    """
+
+    def forward(self, in_tensor: Float[Tensor, "*bs 3"]) -> Float[Tensor, "*bs encoded"]:
+        """Encode positions in 0..1 of any leading shape; half precision is encoded in float32, as in nerfstudio."""
+        dtypes = (torch.float32, torch.float16, torch.bfloat16)
+        work = None
+        if self.tcnn_encoding is None and self.hash_table.dtype == torch.float32 and in_tensor.dtype in dtypes:
+            work = back_end(in_tensor.device)
+        if work is None:
+            return super().forward(in_tensor)
+        # moved once, not at each call
+        self.scalings = self.scalings.to(in_tensor.device, torch.float32)
+        encoded = hash_grid(in_tensor.reshape(-1, 3).float(), self.hash_table, self.scalings, work)
+        return encoded.view(*in_tensor.shape[:-1], self.get_out_dim())
+
+
+def use_fused_encodings(module: nn.Module) -> None:
+    """Let all hash encodings below `module` compute in the fused form; in place, parameters stay the same objects."""
+    for part in module.modules():
+        if type(part) is HashEncoding:
+            # the class alone differs; another object would have to be found by all who hold this one
+            part.__class__ = FusedHashEncoding

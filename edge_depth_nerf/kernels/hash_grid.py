@@ -1,0 +1,117 @@
+"""The multiresolution hash grid as nerfstudio computes it, with its gradients, in one fused step.
+
+A point p in [0, 1]^3 (others work too) is scaled, s = p · scaling, at each level; the eight corners of its cell have
+floor(s) or ceil(s) on each axis, and each corner (i, j, k) its row of the table, in the level's own part of it:
+
+    row = (i ⊕ 2654435761 j ⊕ 805459861 k) mod rows of a level     (Müller et al., Instant-NGP, Eq. 4)
+
+The features are interpolated between the corners, linearly on x, then y, then z. Unlike Instant-NGP, nerfstudio hashes
+coarse levels too, takes no half-cell offset, and on a border of cells lower and upper corner are the same, so that
+the gradient to the position is 0 on that axis.
+
+Shapes: positions [points, 3], table [levels * rows, features] with a power of two of rows, scalings [levels], encoded
+[points, levels * features]; float32. Pure: knows nothing of nerfstudio. CPU tensors are worked on by Numba (`cpu`),
+CUDA tensors by Triton (`cuda`).
+"""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from types import ModuleType
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@functools.lru_cache
+def back_end(device: torch.device) -> ModuleType | None:
+    """Give the module that works on tensors of this device, None if there is none.
+
+    On CUDA one point is encoded to find out: Triton may be missing, find no C compiler, or not know the GPU.
+    """
+    # imported here, because Numba and Triton take half a second each to load
+    if device.type == "cpu":
+        from edge_depth_nerf.kernels import hash_grid_numba as cpu
+
+        return cpu
+    if device.type != "cuda":
+        return None
+    try:
+        from edge_depth_nerf.kernels import hash_grid_triton as cuda
+
+        cuda.encode(*(torch.ones(shape, device=device) for shape in ((1, 3), (2, 2), (1,))))
+    except Exception as error:  # whatever keeps Triton from working here
+        warnings.warn(
+            f"The fused hash grid does not work on {device} ({type(error).__name__}: {error}); "
+            "nerfstudio's torch form takes its place, with the same results but slower.",
+            stacklevel=2,
+        )
+        return None
+    return cuda
+
+
+class _HashGrid(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, positions: Tensor, table: Tensor, scalings: Tensor, work: ModuleType) -> Tensor:
+        # without a gradient to the positions the table is not needed again
+        ctx.save_for_backward(positions, table if ctx.needs_input_grad[0] else None, scalings)
+        ctx.work, ctx.rows = work, len(table)
+        return work.encode(positions, table, scalings)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        positions, table, scalings = ctx.saved_tensors
+        rows = ctx.rows if ctx.needs_input_grad[1] else None
+        return *_Gradients.apply(gradients[0], positions, table, scalings, rows, ctx.work), None, None
+
+
+class _Gradients(torch.autograd.Function):
+    """The gradients, as a step of its own that refuses to be differentiated once more."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        gradient: Tensor,
+        positions: Tensor,
+        table: Tensor | None,
+        scalings: Tensor,
+        rows: int | None,
+        work: ModuleType,
+    ) -> tuple[Tensor | None, Tensor | None]:
+        return (
+            None if table is None else work.position_gradient(positions, table, gradient, scalings),
+            None if rows is None else work.table_gradient(positions, gradient, scalings, rows),
+        )
+
+    @staticmethod
+    def backward(ctx: Any, *_: Any) -> Any:
+        raise NotImplementedError(
+            "The fused hash grid has no second derivative. For a loss on gradients (normals that are trained by "
+            "differentiating the density, say) choose --pipeline.model.implementation torch."
+        )
+
+
+def hash_grid(
+    positions: Float[Tensor, "points 3"],
+    table: Float[Tensor, "rows features"],
+    scalings: Float[Tensor, "levels"],
+    work: ModuleType,
+) -> Float[Tensor, "points encoded"]:
+    """Encode points, differentiable once by positions and table.
+
+    Args:
+        positions: float32.
+        table: float32, all levels one after the other, each with the same power of two of rows.
+        scalings: float32, cells along an axis of the unit cube, for each level.
+        work: the back end, from `back_end`.
+
+    Returns:
+        The features of each point, level after level.
+
+    """
+    encoded = _HashGrid.apply(positions, table, scalings, work)
+    assert isinstance(encoded, Tensor)
+    return encoded

@@ -1,0 +1,281 @@
+"""The hash grid on the CPU: loops compiled by Numba, shared out to threads; meaning and shapes as in `hash_grid`.
+
+A level is worked on tile by tile: first the table rows and offsets of a whole tile, in a loop that the compiler turns
+into vector instructions, then the reads or additions, which wait for memory. What is encoded has the order of
+nerfstudio's torch form and no fused multiply-add: it is the same to the last bit.
+
+Threads are Python's own: they wait for each other without spinning, and unlike Numba's they allow concurrent callers
+and forked processes. There are as many as torch may use, and none where a call is small.
+
+Importing this module imports Numba.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, no_type_check
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from edge_depth_nerf.kernels.compiled import compiled
+
+TILE = 256
+"""Points worked on together: their rows and offsets stay in the nearest cache."""
+BLOCK = 1 << 15
+"""Points taken through all levels before the next ones: the more, the longer a level's table stays in the cache; but
+each level writes into all of the block's rows, which should stay near too."""
+LEAST_SHARE = 1 << 14
+"""A thread gets at least so many points times levels, 0.2 ms of work: fewer are not worth its waking."""
+
+PRIME_Y, PRIME_Z = np.uint32(2654435761), np.uint32(805459861)
+"""Instant-NGP's factors of the second and third coordinate; the first's is 1."""
+ONE = np.float32(1)
+
+
+@compiled()
+@no_type_check  # the tests' type checker would wrap what Numba has to read
+def _find_corners(x, y, z, count, scaling, mask, rows, offsets):
+    """Give the table rows of the eight corners around each of `count` points, and the points' places between them.
+
+    Corner k's rows begin at k * TILE; its bits say on which axes it is the upper one (1 = x, 2 = y, 4 = z). A point
+    on a border of cells has the same lower and upper corner there. nerfstudio hashes in int64; the lowest 32 bits,
+    of which the mask keeps some, are those of arithmetic in uint32, for negative coordinates too.
+    """
+    for j in range(count):
+        scaled_x, scaled_y, scaled_z = x[j] * scaling, y[j] * scaling, z[j] * scaling
+        x_low, y_low, z_low = np.int32(np.floor(scaled_x)), np.int32(np.floor(scaled_y)), np.int32(np.floor(scaled_z))
+        x_high, y_high, z_high = np.int32(np.ceil(scaled_x)), np.int32(np.ceil(scaled_y)), np.int32(np.ceil(scaled_z))
+        offsets[j] = scaled_x - np.float32(x_low)
+        offsets[TILE + j] = scaled_y - np.float32(y_low)
+        offsets[2 * TILE + j] = scaled_z - np.float32(z_low)
+        x0, x1 = np.uint32(x_low), np.uint32(x_high)
+        y0, y1 = np.uint32(np.uint32(y_low) * PRIME_Y), np.uint32(np.uint32(y_high) * PRIME_Y)
+        z0, z1 = np.uint32(np.uint32(z_low) * PRIME_Z), np.uint32(np.uint32(z_high) * PRIME_Z)
+        rows[j] = (x0 ^ y0 ^ z0) & mask
+        rows[TILE + j] = (x1 ^ y0 ^ z0) & mask
+        rows[2 * TILE + j] = (x0 ^ y1 ^ z0) & mask
+        rows[3 * TILE + j] = (x1 ^ y1 ^ z0) & mask
+        rows[4 * TILE + j] = (x0 ^ y0 ^ z1) & mask
+        rows[5 * TILE + j] = (x1 ^ y0 ^ z1) & mask
+        rows[6 * TILE + j] = (x0 ^ y1 ^ z1) & mask
+        rows[7 * TILE + j] = (x1 ^ y1 ^ z1) & mask
+
+
+@compiled()
+@no_type_check
+def _corners_of(rows, j):
+    """Give the eight rows of one point of a tile."""
+    return (
+        rows[j],
+        rows[TILE + j],
+        rows[2 * TILE + j],
+        rows[3 * TILE + j],
+        rows[4 * TILE + j],
+        rows[5 * TILE + j],
+        rows[6 * TILE + j],
+        rows[7 * TILE + j],
+    )
+
+
+@compiled()
+@no_type_check
+def _encode_points(axes, table, scalings, encoded, first_point, last_point):
+    """Encode some points; calls for different points may run at once. `axes` are the positions, [3, points]."""
+    size, features = table.shape[0] // len(scalings), table.shape[1]
+    rows, offsets = np.empty(8 * TILE, np.uint32), np.empty(3 * TILE, np.float32)
+    for block in range(first_point, last_point, BLOCK):
+        block_end = min(block + BLOCK, last_point)
+        for level in range(len(scalings)):
+            grid = table[level * size : (level + 1) * size]
+            column = level * features
+            for first in range(block, block_end, TILE):
+                count = min(TILE, block_end - first)
+                x_from, y_from, z_from = axes[0, first:], axes[1, first:], axes[2, first:]
+                _find_corners(x_from, y_from, z_from, count, scalings[level], np.uint32(size - 1), rows, offsets)
+                for j in range(count):
+                    x, y, z = offsets[j], offsets[TILE + j], offsets[2 * TILE + j]
+                    rest_x, rest_y, rest_z = ONE - x, ONE - y, ONE - z
+                    r0, r1, r2, r3, r4, r5, r6, r7 = _corners_of(rows, j)
+                    for c in range(features):
+                        low_low = grid[r1, c] * x + grid[r0, c] * rest_x
+                        high_low = grid[r3, c] * x + grid[r2, c] * rest_x
+                        low_high = grid[r5, c] * x + grid[r4, c] * rest_x
+                        high_high = grid[r7, c] * x + grid[r6, c] * rest_x
+                        low = high_low * y + low_low * rest_y
+                        high = high_high * y + low_high * rest_y
+                        encoded[first + j, column + c] = high * z + low * rest_z
+
+
+@compiled()
+@no_type_check
+def _add_to_grid(axes, scaling, gradient, column, grid_gradient, first_point, last_point):
+    """Add to one level's gradient, [rows, features], what some points give; calls for different ones may run at once.
+
+    The level's features begin at `column` of `gradient`.
+    """
+    size, features = grid_gradient.shape
+    rows, offsets = np.empty(8 * TILE, np.uint32), np.empty(3 * TILE, np.float32)
+    for first in range(first_point, last_point, TILE):
+        count = min(TILE, last_point - first)
+        x_from, y_from, z_from = axes[0, first:], axes[1, first:], axes[2, first:]
+        _find_corners(x_from, y_from, z_from, count, scaling, np.uint32(size - 1), rows, offsets)
+        for j in range(count):
+            x, y, z = offsets[j], offsets[TILE + j], offsets[2 * TILE + j]
+            rest_x, rest_y, rest_z = ONE - x, ONE - y, ONE - z
+            low_low, high_low, low_high, high_high = rest_y * rest_z, y * rest_z, rest_y * z, y * z
+            r0, r1, r2, r3, r4, r5, r6, r7 = _corners_of(rows, j)
+            for c in range(features):
+                g = gradient[first + j, column + c]
+                grid_gradient[r0, c] += g * low_low * rest_x
+                grid_gradient[r1, c] += g * low_low * x
+                grid_gradient[r2, c] += g * high_low * rest_x
+                grid_gradient[r3, c] += g * high_low * x
+                grid_gradient[r4, c] += g * low_high * rest_x
+                grid_gradient[r5, c] += g * low_high * x
+                grid_gradient[r6, c] += g * high_high * rest_x
+                grid_gradient[r7, c] += g * high_high * x
+
+
+@compiled()
+@no_type_check
+def _differentiate_points(axes, table, scalings, gradient, to_positions, first_point, last_point):
+    """Give the gradient to some positions, [points, 3]; calls for different points may run at once."""
+    size, features = table.shape[0] // len(scalings), table.shape[1]
+    rows, offsets = np.empty(8 * TILE, np.uint32), np.empty(3 * TILE, np.float32)
+    to_positions[first_point:last_point] = 0
+    for block in range(first_point, last_point, BLOCK):
+        block_end = min(block + BLOCK, last_point)
+        for level in range(len(scalings)):
+            grid = table[level * size : (level + 1) * size]
+            column, scaling = level * features, scalings[level]
+            for first in range(block, block_end, TILE):
+                count = min(TILE, block_end - first)
+                x_from, y_from, z_from = axes[0, first:], axes[1, first:], axes[2, first:]
+                _find_corners(x_from, y_from, z_from, count, scaling, np.uint32(size - 1), rows, offsets)
+                for j in range(count):
+                    x, y, z = offsets[j], offsets[TILE + j], offsets[2 * TILE + j]
+                    rest_x, rest_y, rest_z = ONE - x, ONE - y, ONE - z
+                    r0, r1, r2, r3, r4, r5, r6, r7 = _corners_of(rows, j)
+                    to_x, to_y, to_z = np.float32(0), np.float32(0), np.float32(0)
+                    for c in range(features):
+                        g = gradient[first + j, column + c]
+                        v0, v1, v2, v3 = grid[r0, c], grid[r1, c], grid[r2, c], grid[r3, c]
+                        v4, v5, v6, v7 = grid[r4, c], grid[r5, c], grid[r6, c], grid[r7, c]
+                        to_x += g * (
+                            ((v1 - v0) * rest_y + (v3 - v2) * y) * rest_z + ((v5 - v4) * rest_y + (v7 - v6) * y) * z
+                        )
+                        low_low, high_low = v1 * x + v0 * rest_x, v3 * x + v2 * rest_x
+                        low_high, high_high = v5 * x + v4 * rest_x, v7 * x + v6 * rest_x
+                        to_y += g * ((high_low - low_low) * rest_z + (high_high - low_high) * z)
+                        to_z += g * ((low_high - low_low) * rest_y + (high_high - high_low) * y)
+                    to_positions[first + j, 0] += to_x * scaling
+                    to_positions[first + j, 1] += to_y * scaling
+                    to_positions[first + j, 2] += to_z * scaling
+
+
+@functools.lru_cache(maxsize=1)
+def _pool(process: int, threads: int) -> ThreadPoolExecutor:
+    """Threads that stay for the next call; a forked process (another `process` id) has to start its own."""
+    return ThreadPoolExecutor(threads, thread_name_prefix="hash-grid")
+
+
+def _threads(points: int, levels: int) -> int:
+    return max(1, min(torch.get_num_threads(), points * levels // LEAST_SHARE))
+
+
+def _share_out(work: Callable[[Any], None], shares: list[Any]) -> None:
+    """Call `work` once for each share, all at once, the first one in this thread."""
+    waiting = [_pool(os.getpid(), len(shares) - 1).submit(work, share) for share in shares[1:]]
+    try:
+        work(shares[0])
+    finally:
+        for future in waiting:
+            future.result()
+
+
+def _stretches(count: int, parts: int) -> list[tuple[int, int]]:
+    return [(count * part // parts, count * (part + 1) // parts) for part in range(parts)]
+
+
+def _axes(positions: Tensor) -> np.ndarray:
+    """[points, 3] to [3, points], so that neighbours in memory are neighbouring points."""
+    return positions.detach().t().contiguous().numpy()
+
+
+def encode(
+    positions: Float[Tensor, "points 3"], table: Float[Tensor, "rows features"], scalings: Float[Tensor, "levels"]
+) -> Float[Tensor, "points encoded"]:
+    """Encode points, float32; see `hash_grid`."""
+    points, levels = len(positions), len(scalings)
+    encoded = torch.empty(points, levels * table.shape[1])
+    arrays = _axes(positions), table.detach().contiguous().numpy(), scalings.numpy(), encoded.numpy()
+    _share_out(lambda part: _encode_points(*arrays, *part), _stretches(points, _threads(points, levels)))
+    return encoded
+
+
+def table_gradient(
+    positions: Float[Tensor, "points 3"],
+    gradient: Float[Tensor, "points encoded"],
+    scalings: Float[Tensor, "levels"],
+    rows: int,
+) -> Float[Tensor, "rows features"]:
+    """Give the gradient to a table of `rows` rows, from the gradient to the encoded values.
+
+    Each thread takes an equal stretch of the levels' points, levels far apart in resolution one after the other (fine
+    ones take longer). Where a stretch begins within a level, which another thread begins, it adds into a table of its
+    own, and that is added in the end.
+    """
+    points, levels = len(positions), len(scalings)
+    size, features = rows // levels, gradient.shape[1] // levels
+    axes, given, scaling_of = _axes(positions), gradient.detach().contiguous().numpy(), scalings.numpy()
+    # NumPy asks the system for large pages, torch does not: a third of the time of a table of 64 MB
+    grids = np.empty((levels, size, features), np.float32)
+    threads = _threads(points, levels)
+    order = [level for thread in range(threads) for level in range(thread, levels, threads)]
+    own_grids: dict[tuple[int, int], np.ndarray] = {}
+
+    def work(stretch: tuple[int, int]) -> None:
+        for place in range(stretch[0] // max(1, points), levels):
+            first, last = max(stretch[0] - place * points, 0), min(stretch[1] - place * points, points)
+            if last <= first and points > 0:
+                break
+            level = order[place]
+            if first == 0:
+                grid = grids[level]
+                grid[:] = 0
+            else:
+                grid = np.zeros((size, features), np.float32)
+                own_grids[level, first] = grid
+            _add_to_grid(axes, scaling_of[level], given, level * features, grid, first, last)
+
+    _share_out(work, _stretches(points * levels, threads))
+    # in one order, whichever thread was ready first: the same sums each time
+    for (level, _), grid in sorted(own_grids.items(), key=lambda item: item[0]):
+        grids[level] += grid
+    return torch.from_numpy(grids).view(rows, features)
+
+
+def position_gradient(
+    positions: Float[Tensor, "points 3"],
+    table: Float[Tensor, "rows features"],
+    gradient: Float[Tensor, "points encoded"],
+    scalings: Float[Tensor, "levels"],
+) -> Float[Tensor, "points 3"]:
+    """Give the gradient to the positions, from the gradient to the encoded values."""
+    points, levels = len(positions), len(scalings)
+    result = torch.empty(points, 3)
+    arrays = (
+        _axes(positions),
+        table.detach().contiguous().numpy(),
+        scalings.numpy(),
+        gradient.detach().contiguous().numpy(),
+        result.numpy(),
+    )
+    _share_out(lambda part: _differentiate_points(*arrays, *part), _stretches(points, _threads(points, levels)))
+    return result

@@ -1,0 +1,59 @@
+"""nerfstudio's placing of samples along rays, in one pass on the CPU.
+
+Host-facing; the numbers are nerfstudio's to float32's noise, from the same random numbers.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from nerfstudio.cameras.rays import RayBundle, RaySamples
+from nerfstudio.model_components.ray_samplers import PDFSampler
+from torch import Tensor
+
+
+class FusedPDFSampler(PDFSampler):
+    """nerfstudio's `PDFSampler(include_original=False)`; on other devices than the CPU it is left to nerfstudio."""
+
+    def generate_ray_samples(
+        self,
+        ray_bundle: RayBundle | None = None,
+        ray_samples: RaySamples | None = None,
+        weights: Tensor | None = None,
+        num_samples: int | None = None,
+        eps: float = 1e-5,
+    ) -> RaySamples:
+        """Place samples by the weights of earlier ones."""
+        assert ray_bundle is not None and ray_samples is not None and weights is not None
+        count = num_samples or self.num_samples
+        if self.include_original or weights.device.type != "cpu" or weights.ndim != 3 or not count:
+            return super().generate_ray_samples(ray_bundle, ray_samples, weights, num_samples, eps)
+        # imported here, because Numba takes half a second to load
+        from edge_depth_nerf.kernels.ray_kernels import place_samples
+
+        places = count + 1
+        wanted = torch.linspace(0, 1 - 1 / places, places).expand(len(weights), -1)
+        if self.train_stratified and self.training:
+            wanted = wanted + torch.rand(len(weights), 1 if self.single_jitter else places) / places
+        else:
+            wanted = wanted + 1 / (2 * places)
+        edges = edges_of(ray_samples)
+        placed = place_samples(weights[..., 0].float(), edges, wanted, self.histogram_padding, eps)[..., None]
+        to_euclidean = ray_samples.spacing_to_euclidean_fn
+        assert to_euclidean is not None
+        distances = to_euclidean(placed[..., 0])[..., None]
+        return ray_bundle.get_ray_samples(
+            bin_starts=distances[:, :-1],
+            bin_ends=distances[:, 1:],
+            spacing_starts=placed[:, :-1],
+            spacing_ends=placed[:, 1:],
+            spacing_to_euclidean_fn=to_euclidean,
+        )
+
+
+def edges_of(samples: RaySamples) -> Tensor:
+    """Where a ray's samples begin and the last one ends, in the spacing of 0..1, [rays, samples + 1]."""
+    starts: Any = samples.spacing_starts
+    ends: Any = samples.spacing_ends
+    return torch.cat([starts[..., 0], ends[..., -1:, 0]], dim=-1)

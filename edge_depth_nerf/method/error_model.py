@@ -1,0 +1,348 @@
+"""How far a prior is trusted: its error at returns that it was not made of, as a function of what is known of a pixel.
+
+Pure. The relative error |d̃ - d| / d̃ is described by a product of factors, one for each feature of the pixel, each a
+curve through its values at a few knots:
+
+distance_m    d̃
+theta_deg     angle of the ray from the optical axis
+nearest_px    distance in the picture from the nearest return that the prior was made of; 0 at a return
+spread        spread of what Eq. 5 averaged, as a part of d̃
+step          largest less least log of the aligned monocular map over 3×3 pixels: an edge is near
+
+σ̂ = d̃ · base · Π factor. The factors are fitted in turn so that in every bin around a knot 95 % of the errors are
+within 2 σ̂. (Errors have heavy tails: with 68 % within 1 σ̂ instead, fewer than 90 % are within 2.)
+
+One such model is of pixels without a return, from held-out returns. Another is of pixels that keep theirs: no return is
+held out there, but returns can be held against their neighbours.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+
+from edge_depth_nerf.base.bounds import finite, shown
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_json, write_json
+from edge_depth_nerf.method.alignment import Fit
+
+KNOTS: dict[str, tuple[float, ...]] = {
+    "distance_m": (1, 2, 4, 8, 16, 32, 64, 128),
+    "theta_deg": (0, 30, 60, 90),
+    "nearest_px": (0, 1, 2, 4, 8, 16, 32, 64),
+    "spread": (0.001, 0.003, 0.01, 0.03, 0.1, 0.3),
+    "step": (0.003, 0.01, 0.03, 0.1, 0.3, 1.0),
+}
+"""Where each feature's factor is kept; between them it is interpolated, beyond them it stays."""
+_LOGARITHMIC = ("distance_m", "spread", "step")
+
+LEAST_JUDGED = 300
+"""With fewer errors there is no error model."""
+LEAST_IN_BIN = 100
+"""A bin with fewer takes its neighbours' factor."""
+LEAST_SIGMA_M = 0.02
+"""About LiDAR's own noise."""
+FIELD_MARGIN_DEG = 3.0
+"""LiDAR's field of elevation counts as so much wider, up and down."""
+TRUST_FILE = "mono_trust.json"
+_VERSION = 1
+_MAX_NUMBER = 1e3
+
+Features = Mapping[str, NDArray[np.float32]]
+"""Arrays of one shape under the names of KNOTS."""
+
+
+def pixel_features(
+    distance_m: Float[np.ndarray, "h w"],
+    spread_m: Float[np.ndarray, "h w"],
+    mono_m: Float[np.ndarray, "h w"],
+    returns: Bool[np.ndarray, "h w"],
+    theta_rad: Float[np.ndarray, "h w"],
+) -> dict[str, NDArray[np.float32]]:
+    """The features of every pixel of a prior, H×W each; where there is no prior they mean nothing.
+
+    Args:
+        distance_m: d̃, 0 = none.
+        spread_m: of what was averaged into it, whether or not a return was kept.
+        mono_m: the aligned monocular map, 0 = none.
+        returns: the returns that the prior was made of.
+        theta_rad: angle of each ray from the optical axis.
+
+    """
+    kernel = np.ones((3, 3), np.uint8)
+    known = mono_m > 0
+    logs = np.log(np.where(known, mono_m, 1)).astype(np.float32)
+    highest = cv2.dilate(np.where(known, logs, np.float32(-1e3)), kernel)
+    lowest = cv2.erode(np.where(known, logs, np.float32(1e3)), kernel)
+    return {
+        "distance_m": distance_m,
+        "theta_deg": np.degrees(theta_rad).astype(np.float32),
+        "nearest_px": np.asarray(cv2.distanceTransform((~returns).astype(np.uint8), cv2.DIST_L2, 5), np.float32),
+        "spread": spread_m / np.maximum(distance_m, 1e-3),
+        "step": np.maximum(highest - lowest, 0),
+    }
+
+
+def _scaled(name: str, values: NDArray) -> NDArray:
+    return np.log(np.maximum(values, 1e-6)) if name in _LOGARITHMIC else np.asarray(values)
+
+
+@dataclass(frozen=True)
+class ErrorModel:
+    """Relative standard deviation of a prior by the features of a pixel."""
+
+    log_base: float
+    log_factors: dict[str, list[float]]
+    """For each feature one number a knot."""
+
+    def log_sigma(self, features: Features) -> NDArray[np.float64]:
+        """Logarithm of σ̂ / d̃."""
+        total = np.float64(self.log_base)
+        for name, factors in self.log_factors.items():
+            total = total + np.interp(_scaled(name, features[name]), _scaled(name, np.array(KNOTS[name])), factors)
+        return np.asarray(total)
+
+    def sigma_m(self, features: Features) -> NDArray[np.float32]:
+        """σ̂, metres."""
+        sigma = features["distance_m"] * np.exp(self.log_sigma(features))
+        return np.maximum(sigma, LEAST_SIGMA_M).astype(np.float32)
+
+
+def _log_scale(scaled_error: NDArray) -> float:
+    """Logarithm of half of what 95 % of the errors are within."""
+    return float(np.log(max(np.quantile(scaled_error, 0.95) / 2, 1e-6)))
+
+
+def fit_error_model(features: Features, relative_error: Float[np.ndarray, "n"]) -> ErrorModel | None:
+    """Fit the factors to errors; None for fewer than LEAST_JUDGED.
+
+    Without any pixel at a return the factor there is that of the next pixel over √2: a held-out error is made of two,
+    that of the prior and that of the held-out return, and at a return only the latter is left.
+
+    Args:
+        features: of the pixels, n each.
+        relative_error: |d̃ - d| / d̃.
+
+    """
+    if len(relative_error) < LEAST_JUDGED:
+        return None
+    bins = {}
+    for name, knots in KNOTS.items():
+        scaled = _scaled(name, np.array(knots))
+        bins[name] = np.searchsorted((scaled[1:] + scaled[:-1]) / 2, _scaled(name, features[name]))
+    log_base, log_factors = _log_scale(relative_error), {name: np.zeros(len(knots)) for name, knots in KNOTS.items()}
+
+    def log_sigma() -> NDArray[np.float64]:
+        return ErrorModel(log_base, {name: list(f) for name, f in log_factors.items()}).log_sigma(features)
+
+    for _ in range(5):
+        for name, factors in log_factors.items():
+            scaled_error = relative_error / np.exp(log_sigma())
+            found = {
+                knot: _log_scale(scaled_error[bins[name] == knot])
+                for knot in range(len(factors))
+                if np.count_nonzero(bins[name] == knot) >= LEAST_IN_BIN
+            }
+            if found:
+                factors += np.interp(np.arange(len(factors)), list(found), list(found.values()))
+        log_base += _log_scale(relative_error / np.exp(log_sigma()))
+    if not (bins["nearest_px"] == 0).any():
+        log_factors["nearest_px"][0] = log_factors["nearest_px"][1] - 0.5 * np.log(2)
+    return ErrorModel(log_base, {name: factors.tolist() for name, factors in log_factors.items()})
+
+
+def error_of_returns(
+    lidar_m: Float[np.ndarray, "h w"], returns: Bool[np.ndarray, "h w"]
+) -> tuple[Bool[np.ndarray, "h w"], NDArray[np.float32]]:
+    """How far returns lie from a line through their two neighbours, in the row or the column, whichever is worse.
+
+    On a plane inverse distance is linear in the picture, nearly so for a fisheye over three pixels. What is left is the
+    noise of three returns, that of one after division by √1.5, with what poses, sweeps of other moments and edges add.
+
+    Returns:
+        Which returns have neighbours, and their relative errors (0 elsewhere).
+
+    """
+    inverse = np.where(returns, 1 / np.where(returns, lidar_m, 1), 0).astype(np.float32)
+    padded = np.pad(inverse, 1)
+    found = np.zeros(returns.shape, bool)
+    error = np.zeros(returns.shape, np.float32)
+    for before, after in ((padded[1:-1, :-2], padded[1:-1, 2:]), (padded[:-2, 1:-1], padded[2:, 1:-1])):
+        has = returns & (before > 0) & (after > 0)
+        off = np.abs(inverse - (before + after) / 2) * lidar_m / np.sqrt(1.5)
+        error = np.where(has, np.maximum(error, off), error).astype(np.float32)
+        found |= has
+    return found, error
+
+
+@dataclass(frozen=True)
+class FrameAlignment:
+    """How well one training frame's monocular map was fitted to its LiDAR."""
+
+    frame: str
+    """Its file_path."""
+    returns: int
+    """Pixels with LiDAR and mono."""
+    fit_of: str
+    """none, frame or drive: see `alignment.Aligned`."""
+    fit: Fit
+    """The picture's curve."""
+    held_out_before: float | None
+    """Mean relative error of the map as it came, at returns left out of the alignment; None if none was."""
+    held_out_after: float | None
+    """The same of the aligned map."""
+
+
+@dataclass(frozen=True)
+class Trust:
+    """What a drive's training frames say about its prior."""
+
+    made_of: str
+    """Key of the files and options it was made from."""
+    error_model: ErrorModel | None
+    """Of pixels without a return; None where too few returns could be held out."""
+    return_model: ErrorModel | None
+    """Of pixels that keep their return; None where error_model says it, too."""
+    field_rad: tuple[float, float]
+    """Elevations above the horizon that LiDAR reached, least and largest."""
+    everywhere: bool
+    """Whether the source of the monocular maps was trained elsewhere: then there is a prior beyond LiDAR's field, too,
+    of a sigma that nothing there was measured by."""
+    drive_fit: Fit | None
+    """Curve of all frames together, for those with few returns."""
+    frames: tuple[FrameAlignment, ...] = field(default=())
+    """The training frames it was made from."""
+
+    def in_field(self, elevation_rad: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+        """Whether each ray points where LiDAR reaches, within the margin."""
+        margin = np.radians(FIELD_MARGIN_DEG)
+        return (elevation_rad >= self.field_rad[0] - margin) & (elevation_rad <= self.field_rad[1] + margin)
+
+    def sigma_m(self, features: Features) -> NDArray[np.float32]:
+        """σ̂, metres, by the models; there must be an error_model."""
+        assert self.error_model is not None
+        sigma = self.error_model.sigma_m(features)
+        if self.return_model is None:
+            return sigma
+        at_return = features["nearest_px"] == 0
+        sigma[at_return] = self.return_model.sigma_m({name: values[at_return] for name, values in features.items()})
+        return sigma
+
+    def summary(self) -> str:
+        """One paragraph for the user."""
+        judged = [f for f in self.frames if f.held_out_before is not None and f.held_out_after is not None]
+        parts = []
+        if judged:
+            before, after = (
+                np.median([getattr(f, name) for f in judged]) for name in ("held_out_before", "held_out_after")
+            )
+            parts.append(
+                f"monocular maps against LiDAR left out of their alignment: mean relative error {before:.3f} before, "
+                f"{after:.3f} after (median of {len(judged)} training pictures)"
+            )
+        poor = [f.frame for f in self.frames if f.fit_of == "drive"]
+        if poor:
+            parts.append(
+                f"{len(poor)} with fewer returns than an alignment needs, {', '.join(poor[:3])}"
+                f"{' …' if len(poor) > 3 else ''}, take the drive's fit"
+            )
+        if self.error_model is None:
+            parts.append("too few LiDAR returns to measure the prior's error: sigma is as under sigma_mode combined")
+        if not self.everywhere:
+            low, high = np.degrees(self.field_rad)
+            parts.append(
+                f"a prior only between {low - FIELD_MARGIN_DEG:.0f}° and {high + FIELD_MARGIN_DEG:.0f}° of elevation, "
+                "where LiDAR measured and the network could learn"
+            )
+        return "; ".join(parts)
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {"version": _VERSION, **asdict(self)}
+
+    def write(self, path: Path) -> None:
+        """Write JSON with its checksum, atomically."""
+        content = self.to_dict()
+        write_json(path, {**content, "sha256": _checksum(content)})
+
+
+def _checksum(content: dict[str, Any]) -> str:
+    """Of what a file holds beside it, as JSON."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def read_trust(path: Path) -> Trust:
+    """Read what `Trust.write` wrote.
+
+    Raises:
+        FileNotFoundError: no such file.
+        InputError: the file is no calibration of this version.
+
+    """
+    content = read_json(path)
+    try:
+        if content["version"] != _VERSION:
+            raise ValueError(f"version {content['version']}")
+        # files of before have none
+        if content.get("sha256") not in (None, _checksum({k: v for k, v in content.items() if k != "sha256"})):
+            raise ValueError("its checksum does not fit")
+        span, drive_fit = content["field_rad"], content["drive_fit"]
+        error_model, return_model = (_model(content[name]) for name in ("error_model", "return_model"))
+        return Trust(
+            made_of=str(content["made_of"]),
+            error_model=error_model,
+            return_model=return_model,
+            field_rad=(_number(span[0]), _number(span[1])),
+            everywhere=bool(content["everywhere"]),
+            drive_fit=None if drive_fit is None else _fit(drive_fit),
+            frames=tuple(_frame(frame) for frame in content["frames"]),
+        )
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        raise InputError(
+            f"{path}: is no calibration of this version's form ({error!r}). Delete it: it is made anew from the "
+            "scene's maps."
+        ) from error
+
+
+def _number(value: Any) -> float:
+    """A number of moderate size: logarithms, angles, exponents and relative errors are kept."""
+    found = finite(value)
+    if found is None or abs(found) > _MAX_NUMBER:
+        raise ValueError(f"{shown(value)} for a number")
+    return found
+
+
+def _fit(content: dict[str, Any]) -> Fit:
+    return Fit(**{name: _number(value) for name, value in content.items()})
+
+
+def _frame(content: dict[str, Any]) -> FrameAlignment:
+    if type(content["returns"]) is not int:
+        raise ValueError(f"{shown(content['returns'])} returns")
+    errors = {name: content[name] for name in ("held_out_before", "held_out_after")}
+    return FrameAlignment(
+        frame=str(content["frame"]),
+        returns=content["returns"],
+        fit_of=str(content["fit_of"]),
+        fit=_fit(content["fit"]),
+        **{name: None if value is None else _number(value) for name, value in errors.items()},
+    )
+
+
+def _model(content: dict[str, Any] | None) -> ErrorModel | None:
+    if content is None:
+        return None
+    factors = {name: [_number(value) for value in values] for name, values in content["log_factors"].items()}
+    model = ErrorModel(_number(content["log_base"]), factors)
+    if {name: len(factors) for name, factors in model.log_factors.items()} != {n: len(k) for n, k in KNOTS.items()}:
+        raise ValueError("other features")
+    return model

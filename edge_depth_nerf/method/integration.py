@@ -1,0 +1,390 @@
+"""The depth prior: LiDAR and monocular distance integrated into one dense map, and how far each pixel is trusted.
+
+All maps are H×W, metres along the ray, any leading batch dimensions; maps of a batch do not mix. `lidar_m` is
+D (0 = no return), `mono_m` D̂ (0 = no estimate), `valid` the pixels that may be used at all (True = use).
+A pixel outside `valid`, or whose d̂ is not a finite positive number, gives no weight and gets none; outside the
+picture there is nothing. Where the prior is 0 there is none. A return that is not finite or not positive is none.
+
+Eq. 7   g  = exp(-(k² + l²) / 2σ_s²) · exp(-(d̂[i,j] - d̂[i+k,j+l])² / 2σ_d²),   k, l in -r .. r, kernel 2r + 1
+Eq. 5   d̃ = (1/η) Σ g · (α d 1(d > 0) + (1-α) d̂ 1(d = 0))                       d, d̂ read at [i+k, j+l]
+Eq. 6   η = Σ g · (α 1(d > 0) + (1-α) 1(d = 0))
+
+Nothing here is differentiated: the prior is data. CPU tensors are integrated by compiled loops
+(`integration_numba`), CUDA tensors by torch; both compute in float64, which keeps the ratios of weights up to
+37 sigma_depth_m.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from edge_depth_nerf.base.errors import InputError
+
+Integration = Literal["edge-aware", "spatial-gaussian"]
+Normalise = Literal["pooled", "per-source"]
+RangeGuide = Literal["mono", "lidar"]
+DepthSource = Literal["integrated", "lidar", "mono"]
+SigmaMode = Literal["constant", "image", "spread", "combined"]
+
+CPU_STRIP_PIXELS = 1 << 16
+"""On the CPU a map is integrated in strips of about so many pixels: the work that a thread takes at a time."""
+CUDA_STRIP_PIXELS = 1 << 18
+"""The same on a GPU, where strips bound the memory: some twenty float64 numbers a pixel."""
+LOWEST_EXPONENT = -700.0
+"""Distance factors (Eq. 7) of lower exponents are 0: float64 ends at -745, the last of it with few digits."""
+
+
+def _check_choice(where: str, value: str, choices: object) -> None:
+    """Refuse a value that the Literal type `choices` does not list.
+
+    Raises:
+        InputError: names `where`, the value and what is allowed.
+
+    """
+    allowed = get_args(choices)
+    if value not in allowed:
+        raise InputError(f"{where} is {value!r}; expected one of {', '.join(map(repr, allowed))}.")
+
+
+def _check_number(where: str, value: float, low: float, high: float = math.inf) -> None:
+    if not (math.isfinite(value) and low <= value <= high):
+        expected = f"a finite number from {low:g}" + (f" to {high:g}" if high < math.inf else "")
+        raise InputError(f"{where} is {value}; expected {expected}.")
+
+
+@dataclass(frozen=True)
+class IntegrationOptions:
+    """How two distance maps become one; the defaults are the paper's.
+
+    Raises:
+        InputError: a field is out of its range; the message names field, value and what was expected.
+
+    """
+
+    alpha: float = 0.7
+    """Weight of a LiDAR return against 1 - alpha of a monocular value, 0 to 1 (Eq. 5)."""
+    kernel_size: int = 9
+    """Width of the square window in pixels, odd (Eq. 7)."""
+    sigma_space_px: float = 3.0
+    """Standard deviation of the kernel over the picture, pixels (Eq. 7)."""
+    sigma_depth_m: float = 1.0
+    """Standard deviation of the kernel over distance, metres (Eq. 7)."""
+    sigma_depth_growth_per_m: float = 0.0
+    """That standard deviation is at least so much times the square of the distance at the centre: neighbouring pixels
+    of the ground lie apart by the square of their distance over the camera's height. 0: Eq. 7."""
+    integration: Integration = "edge-aware"
+    """edge-aware: Eq. 7. spatial-gaussian: Eq. 7 without its distance factor (the rival of Table 4)."""
+    normalise: Normalise = "pooled"
+    """pooled: Eq. 5, each pixel of the window counts. per-source: alpha weighs the two sources, not their counts."""
+    keep_returns: bool = False
+    """Keep a return as it is (d̃ = d, spread 0, monocular share 0) instead of averaging it with its window."""
+    range_guide: RangeGuide = "mono"
+    """What the window's d̂ is compared with: d̂ at the centre (Eq. 7), or LiDAR at the centre where it has a return
+    (the paper's prose)."""
+
+    def __post_init__(self) -> None:
+        _check_number("alpha", self.alpha, 0.0, 1.0)
+        _check_number("sigma_space_px", self.sigma_space_px, 1e-3)
+        _check_number("sigma_depth_m", self.sigma_depth_m, 1e-3)
+        _check_number("sigma_depth_growth_per_m", self.sigma_depth_growth_per_m, 0.0)
+        if not (self.kernel_size >= 1 and self.kernel_size % 2 == 1):
+            raise InputError(f"kernel_size is {self.kernel_size}; expected an odd whole number of pixels from 1.")
+        _check_choice("integration", self.integration, Integration)
+        _check_choice("normalise", self.normalise, Normalise)
+        _check_choice("range_guide", self.range_guide, RangeGuide)
+
+
+@dataclass(frozen=True)
+class IntegratedDepth:
+    """A prior for every pixel; all three maps are 0 where there is none."""
+
+    distance_m: Float[Tensor, "*batch h w"]
+    """d̃, metres along the ray."""
+    spread_m: Float[Tensor, "*batch h w"]
+    """Weighted standard deviation, metres, of the values that were averaged into d̃ (weights as in Eq. 5)."""
+    mono_share: Float[Tensor, "*batch h w"]
+    """The part of d̃'s weight that came from monocular values, 0 to 1; LiDAR gave the rest."""
+
+
+def _check_maps(function: str, **maps: Tensor | None) -> None:
+    shapes = {name: tuple(tensor.shape) for name, tensor in maps.items() if tensor is not None}
+    if len(set(shapes.values())) > 1 or any(len(shape) < 2 for shape in shapes.values()):
+        found = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
+        raise InputError(f"{function}: found {found}; expected maps of one shape (*batch, height, width).")
+
+
+def _is_distance(distance_m: Tensor) -> Tensor:
+    return torch.isfinite(distance_m) & (distance_m > 0)
+
+
+def integrate_depth(
+    lidar_m: Float[Tensor, "*batch h w"],
+    mono_m: Float[Tensor, "*batch h w"],
+    valid: Bool[Tensor, "*batch h w"],
+    options: IntegrationOptions | None = None,
+) -> IntegratedDepth:
+    """Average LiDAR and monocular distances over an edge-aware window (Eq. 5 to 7).
+
+    `spread_m` is the weighted standard deviation of the very values that were averaged, from sums of their
+    differences to the centre's d̂ (so that 80 m do not swallow 8 cm).
+
+    normalise "per-source" first divides each source's weights by the sum of its spatial weights alone, then lets
+    alpha weigh the two: how many pixels a source has in the window no longer counts, how well they agree with the
+    centre still does. (Were each source divided by its whole weight, a lone return behind an edge would get the
+    full alpha, and the edges would be gone.) A source that is alone in the window gets all.
+
+    Args:
+        lidar_m: D, metres along the ray, 0 = no return.
+        mono_m: D̂, metres along the ray, 0 = no estimate.
+        valid: True where the pixel may be used.
+        options: the defaults are the paper's.
+
+    Returns:
+        Three maps in float32, or in float64 if either input was; 0 where there is no prior.
+
+    Raises:
+        InputError: the maps differ in shape.
+
+    """
+    options = options or IntegrationOptions()
+    _check_maps("integrate_depth", lidar_m=lidar_m, mono_m=mono_m, valid=valid)
+    dtype = _work_dtype(lidar_m, mono_m)
+    flat = (math.prod(mono_m.shape[:-2]), *mono_m.shape[-2:])
+    lidar, mono = (maps.detach().reshape(flat).to(dtype) for maps in (lidar_m, mono_m))
+    usable = valid.reshape(flat)
+    # empty, not zeros: torch's own threads, once they have filled so many, spin for a while beside ours
+    result = torch.empty(3, *flat, dtype=dtype, device=mono.device)
+    integrate = _integrate_on_cpu if mono.device.type == "cpu" else _integrate_with_torch
+    for i in range(flat[0]):
+        integrate(lidar[i], mono[i], usable[i], options, result[:, i])
+    distance_m, spread_m, mono_share = result.reshape(3, *mono_m.shape)
+    return IntegratedDepth(distance_m, spread_m, mono_share)
+
+
+def _work_dtype(*maps: Tensor) -> torch.dtype:
+    return torch.float64 if any(tensor.dtype == torch.float64 for tensor in maps) else torch.float32
+
+
+def _axis_weights(options: IntegrationOptions) -> list[float]:
+    """List the spatial weights along one axis; Eq. 7's first factor is the product of two of them."""
+    radius = int(options.kernel_size) // 2
+    return [math.exp(-0.5 * (k / options.sigma_space_px) ** 2) for k in range(-radius, radius + 1)]
+
+
+def _inverse_variance(options: IntegrationOptions) -> float:
+    """Give 1 / σ_d² in 1/m²; 0 makes Eq. 7's second factor 1."""
+    return options.sigma_depth_m**-2 if options.integration == "edge-aware" else 0.0
+
+
+def _integrate_on_cpu(lidar: Tensor, mono: Tensor, valid: Tensor, options: IntegrationOptions, out: Tensor) -> None:
+    """Integrate one map, [h, w] each, into [3, h, w], rows as the fields of IntegratedDepth.
+
+    Threads of our own share the rows out: they wait for each other without spinning, and unlike Numba's they
+    allow concurrent callers and forked processes. There are as many as torch may use.
+    """
+    # imported here, because Numba takes half a second to load
+    from edge_depth_nerf.method.integration_numba import TILE, integrate_rows
+
+    height, width = mono.shape
+    integrate = functools.partial(
+        integrate_rows,
+        *(tensor.contiguous().numpy() for tensor in (lidar, mono, valid)),
+        *(tensor.numpy() for tensor in out),
+        np.array(_axis_weights(options)),
+        _inverse_variance(options),
+        float(options.sigma_depth_growth_per_m),
+        LOWEST_EXPONENT,
+        float(options.alpha),
+        options.normalise == "per-source",
+        options.keep_returns,
+        options.range_guide == "lidar",
+    )
+    strip = max(1, CPU_STRIP_PIXELS // max(TILE, width))
+    tops = range(0, height, strip)
+    bottoms = [min(top + strip, height) for top in tops]
+    threads = min(torch.get_num_threads(), len(tops))
+    if threads > 1:
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(integrate, tops, bottoms))
+    else:
+        list(map(integrate, tops, bottoms))
+
+
+def _integrate_with_torch(lidar: Tensor, mono: Tensor, valid: Tensor, options: IntegrationOptions, out: Tensor) -> None:
+    """As `_integrate_on_cpu`, on any device, strip by strip."""
+    height, width = mono.shape
+    radius = int(options.kernel_size) // 2
+    strip = max(1, CUDA_STRIP_PIXELS // max(1, width))
+    for top in range(0, height, strip):
+        first, bottom = max(0, top - radius), min(top + strip, height)
+        rows = slice(first, bottom + radius)
+        integrated = _integrate_strip(lidar[rows], mono[rows], valid[rows], options)
+        out[:, top:bottom] = integrated[:, top - first : bottom - first]
+
+
+def _integrate_strip(lidar: Tensor, mono: Tensor, valid: Tensor, options: IntegrationOptions) -> Tensor:
+    """Integrate a map by operations on all of it, one for each shift of the window: [h, w] each to [3, h, w]."""
+    usable = valid & _is_distance(mono)
+    returns = usable & _is_distance(lidar)
+    mono = torch.where(usable, mono, 0).double()
+    value = torch.where(returns, lidar.double(), mono)
+    guide = value if options.range_guide == "lidar" else mono
+    inverse_variance = torch.full_like(guide, _inverse_variance(options))
+    if options.sigma_depth_growth_per_m > 0:
+        # where the guide is 0 there is no prior
+        widest = (options.sigma_depth_growth_per_m * guide.square()).clamp(min=1e-100)
+        inverse_variance = torch.minimum(inverse_variance, widest.pow(-2))
+    height, width = mono.shape
+    weights = _axis_weights(options)
+    padded = torch.nn.functional.pad(
+        torch.stack([mono, value, (usable & ~returns).double(), returns.double()]), (len(weights) // 2,) * 4
+    )
+    shifted = [
+        (spatial_k * spatial_l, padded[:, k : k + height, l : l + width])
+        for k, spatial_k in enumerate(weights)
+        for l, spatial_l in enumerate(weights)
+    ]
+
+    factors: list[float] | list[Tensor] = [1 - options.alpha, options.alpha]
+    if options.normalise == "per-source":
+        spatial_sums = torch.zeros(2, height, width, dtype=torch.float64, device=mono.device)
+        for spatial, window in shifted:
+            spatial_sums.add_(window[2:], alpha=spatial)
+        least = torch.finfo(torch.float64).tiny
+        factors = [
+            torch.where(sums > 0, factor / sums.clamp(min=least), 0)
+            for factor, sums in zip(factors, spatial_sums, strict=True)
+        ]
+
+    eta, first, second, eta_mono = torch.zeros(4, height, width, dtype=torch.float64, device=mono.device)
+    for spatial, (mono_there, value_there, is_mono, is_lidar) in shifted:
+        exponent = (mono_there - guide).square_().mul_(inverse_variance).mul_(-0.5)
+        g = torch.where(exponent > LOWEST_EXPONENT, exponent.exp().mul_(spatial), 0)
+        from_mono = (g * is_mono).mul_(factors[0])
+        weight = g.mul_(is_lidar).mul_(factors[1]).add_(from_mono)
+        x = value_there - guide
+        eta.add_(weight)
+        eta_mono.add_(from_mono)
+        first.add_(weight.mul_(x))
+        second.add_(weight.mul_(x))
+
+    exists = usable & (eta > 0)
+    eta = torch.where(exists, eta, 1)
+    mean = first / eta
+    spread = (second / eta - mean.square()).clamp_(min=0).sqrt_()
+    result = torch.stack([guide + mean, spread, eta_mono / eta]) * exists
+    if options.keep_returns:
+        result[0] = torch.where(returns, lidar.double(), result[0])
+        result[1:] *= ~returns
+    return result
+
+
+def select_prior(
+    depth_source: DepthSource,
+    lidar_m: Float[Tensor, "*batch h w"] | None,
+    mono_m: Float[Tensor, "*batch h w"] | None,
+    valid: Bool[Tensor, "*batch h w"],
+    options: IntegrationOptions | None = None,
+) -> IntegratedDepth:
+    """Give the prior made of both sources (`integrate_depth`) or of one alone (the rivals of Table 3).
+
+    LiDAR alone is D where it has a return, spread 0 and monocular share 0; monocular alone is D̂, spread 0 and
+    share 1. Each asks only for the map it uses; the other may be None.
+
+    Raises:
+        InputError: the source needs a map that is None, or the maps differ in shape.
+
+    """
+    _check_choice("depth_source", depth_source, DepthSource)
+    missing = [
+        name
+        for name, tensor, other in (("lidar", lidar_m, "mono"), ("mono", mono_m, "lidar"))
+        if tensor is None and depth_source != other
+    ]
+    if missing:
+        raise InputError(
+            f"depth_source {depth_source!r} needs {' and '.join(missing)} distance maps, and there are none; "
+            "add them to the scene, or choose the depth_source that the scene has."
+        )
+    if depth_source == "integrated":
+        assert lidar_m is not None and mono_m is not None
+        return integrate_depth(lidar_m, mono_m, valid, options)
+    source = lidar_m if depth_source == "lidar" else mono_m
+    assert source is not None
+    _check_maps("select_prior", source=source, valid=valid)
+    exists = valid & _is_distance(source)
+    distance_m = torch.where(exists, source.detach(), 0).to(_work_dtype(source))
+    zero = torch.zeros_like(distance_m)
+    return IntegratedDepth(distance_m, zero, zero if depth_source == "lidar" else exists.to(distance_m.dtype))
+
+
+def sigma_m(
+    prior: IntegratedDepth,
+    mode: SigmaMode,
+    *,
+    mono_m: Float[Tensor, "*batch h w"] | None = None,
+    constant_m: float = 1.0,
+    mono_relative_error: float = 0.1,
+    floor_m: float = 0.05,
+) -> Float[Tensor, "*batch h w"]:
+    """Give σ̂, the standard deviation that Eq. 4 grants the prior, for every pixel.
+
+    constant   `constant_m`.
+    image      one number a map: the standard deviation of d̃ over the map's pixels that have a prior, the literal
+               reading of Eq. 4.
+    spread     the spread of what was averaged. Over smooth monocular maps it claims centimetres where the error
+               is metres: for ablation.
+    combined   σ̂² = spread² + (mono_relative_error · d̂ · monocular share)² + floor_m².
+
+    `image` and `spread` are at least `floor_m`, so that no pixel claims to be exact.
+
+    Args:
+        prior: what `integrate_depth` or `select_prior` gave.
+        mode: see above.
+        mono_m: D̂, for `combined`; may be None for a prior of LiDAR alone.
+        constant_m: metres.
+        mono_relative_error: standard deviation of d̂ as a part of d̂.
+        floor_m: metres; about what LiDAR, its calibration and its alignment leave.
+
+    Returns:
+        Metres, positive where there is a prior and 0 where there is none.
+
+    Raises:
+        InputError: an unknown mode, a constant out of range, or `combined` without mono_m for a prior with a
+            monocular share.
+
+    """
+    _check_choice("sigma mode", mode, SigmaMode)
+    _check_number("constant_m", constant_m, 1e-3)
+    _check_number("mono_relative_error", mono_relative_error, 0.0)
+    _check_number("floor_m", floor_m, 1e-3)
+    distance = prior.distance_m
+    exists = distance > 0
+    if mode == "constant":
+        sigma = torch.full_like(distance, constant_m)
+    elif mode == "image":
+        count = exists.sum((-2, -1), keepdim=True).clamp(min=1)
+        mean = distance.double().sum((-2, -1), keepdim=True) / count
+        variance = torch.where(exists, distance - mean, 0).square().sum((-2, -1), keepdim=True) / count
+        sigma = variance.sqrt().clamp(min=floor_m).to(distance.dtype).expand_as(distance)
+    elif mode == "spread":
+        sigma = prior.spread_m.clamp(min=floor_m)
+    else:
+        if mono_m is None:
+            if prior.mono_share.any():
+                raise InputError("sigma_m: mode 'combined' needs mono_m for a prior with a monocular share.")
+            mono_m = torch.zeros_like(distance)
+        _check_maps("sigma_m", mono_m=mono_m, distance_m=distance)
+        # d̂ may be NaN where there is no prior
+        mono_error = torch.where(exists, mono_m.detach(), 0) * prior.mono_share * mono_relative_error
+        sigma = (prior.spread_m.square() + mono_error.square() + floor_m**2).sqrt()
+    return torch.where(exists, sigma, 0)

@@ -1,0 +1,136 @@
+"""The edge loss (Eq. 4): draws a ray's termination distribution towards the integrated depth prior.
+
+Shapes: `[rays, samples]` along rays, `[rays]` for what a ray has once; no trailing singleton. Lengths are metres,
+so that λ and σ̂ mean the same in every scene. Reduction: sum over the samples, mean over the rays that have a prior.
+Half precision is computed in float32, float64 in float64.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, get_args
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from edge_depth_nerf.base.errors import InputError
+
+Gaussian = Literal["point", "interval"]
+
+EPS = 1e-7
+"""Added to the weights inside the logarithm: a sample of weight 0 counts as one of 1e-7, and the gradient there is
+at most 1e7 times the sample's part of the Gaussian. nerfstudio's depth losses have the same value."""
+
+NARROW = 0.05
+"""Below this length, in units of σ̂, an interval's mass comes from its midpoint (with the second-order term; relative
+error under 1e-6), because the difference of two values of Φ would lose float32's digits."""
+
+
+def edge_loss(
+    weights: Float[Tensor, "rays samples"],
+    starts_m: Float[Tensor, "rays samples"],
+    ends_m: Float[Tensor, "rays samples"],
+    prior_m: Float[Tensor, "rays"],
+    sigma_m: Float[Tensor, "rays"] | float,
+    *,
+    gaussian: Gaussian = "point",
+    divide_by_norm: bool = False,
+) -> Float[Tensor, ""]:
+    """Compute Eq. 4, L = -Σ_k log(w_k) · K_k · Δt_k, mean over the rays that have a prior.
+
+    K_k = exp(-(t_k - d̃)² / 2σ̂²) at the sample's middle t_k, Δt_k its length. Eq. 4 has h_k = w_k / Δt_k for w_k;
+    as samples' places are not learned the gradient is the same.
+
+    The defaults are the literal form, for a σ̂ that is the same everywhere. Where σ̂ differs between pixels,
+    `divide_by_norm` keeps an uncertain pixel from pulling harder than a certain one.
+
+    Args:
+        weights: rendering weights, 0 or more.
+        starts_m: where each sample begins along its ray. A sample of no length, of negative length or with an end
+            that is not finite gives nothing.
+        ends_m: where it ends.
+        prior_m: d̃; a ray where it is 0 or not finite has no prior, adds nothing and is not counted.
+        sigma_m: σ̂; a ray where it is 0 or not finite likewise has no prior. A float must be positive.
+        gaussian: "point" takes K_k · Δt_k; "interval" the Gaussian's integral over the sample, which a Gaussian
+            narrower than the samples cannot slip through.
+        divide_by_norm: divide by σ̂ √(2π), the Gaussian's own integral; "interval" is then Φ(end) - Φ(start).
+
+    Returns:
+        The loss; 0, still connected to `weights`, if no ray has a prior.
+
+    Raises:
+        InputError: shapes that do not fit, a σ̂ that is not positive, or an unknown `gaussian`.
+
+    """
+    if gaussian not in get_args(Gaussian):
+        raise InputError(f"edge_loss: gaussian is {gaussian!r}; expected one of {get_args(Gaussian)}.")
+    if weights.ndim != 2:
+        raise InputError(f"edge_loss: weights {tuple(weights.shape)}; expected two dimensions, (rays, samples).")
+    for name, tensor, rule in (
+        ("starts_m", starts_m, weights.shape),
+        ("ends_m", ends_m, weights.shape),
+        ("prior_m", prior_m, weights.shape[:1]),
+        ("sigma_m", sigma_m, weights.shape[:1]),
+    ):
+        if isinstance(tensor, Tensor) and tensor.shape != rule:
+            raise InputError(
+                f"edge_loss: {name} {tuple(tensor.shape)} does not fit weights {tuple(weights.shape)}; "
+                f"expected {tuple(rule)}."
+            )
+    if not isinstance(sigma_m, Tensor):
+        if not (math.isfinite(sigma_m) and sigma_m > 0):
+            raise InputError(f"edge_loss: sigma_m is {sigma_m}; expected a positive number of metres.")
+        sigma_m = torch.full_like(prior_m, sigma_m, dtype=torch.promote_types(prior_m.dtype, torch.float32))
+
+    inputs = (weights, starts_m, ends_m, prior_m, sigma_m)
+    dtype = torch.float64 if any(tensor.dtype == torch.float64 for tensor in inputs) else torch.float32
+    weights, starts, ends, prior, sigma = (tensor.to(dtype) for tensor in inputs)
+
+    has_prior = (prior > 0) & torch.isfinite(prior) & (sigma > 0) & torch.isfinite(sigma)
+    if weights.device.type == "cpu":
+        # a GPU would have to wait for how many there are
+        chosen = has_prior.nonzero()[:, 0]
+        weights, starts, ends = (tensor[chosen] for tensor in (weights, starts, ends))
+        prior, sigma, has_prior = (tensor[chosen] for tensor in (prior, sigma, has_prior))
+    counts = has_prior[:, None] & (ends > starts) & torch.isfinite(starts) & torch.isfinite(ends)
+    # what does not count gets harmless values before the arithmetic: `where` after it would let NaN into gradients
+    prior, sigma = torch.where(has_prior, prior, 1)[:, None], torch.where(has_prior, sigma, 1)[:, None]
+    starts, ends = torch.where(counts, starts, 0), torch.where(counts, ends, 1)
+
+    # in units of σ̂; the length from the ends themselves, as their distances to a far prior have lost digits
+    start, end, length = (starts - prior) / sigma, (ends - prior) / sigma, (ends - starts) / sigma
+    mass = _point_mass(start, length) if gaussian == "point" else _interval_mass(start, end, length)
+    target = torch.where(counts, mass, 0)
+    target = target / math.sqrt(2 * math.pi) if divide_by_norm else target * sigma
+    total = -(target * torch.log(weights + EPS)).sum()
+    return total / has_prior.sum().clamp(min=1)
+
+
+def sky_loss(weights: Float[Tensor, "rays samples"], sky: Bool[Tensor, "rays"]) -> Float[Tensor, ""]:
+    """Compute what rays into the sky hit: the sum of their weights, mean over them.
+
+    Args:
+        weights: rendering weights, 0 or more.
+        sky: which rays are known to reach the sky.
+
+    Returns:
+        0 where all of them reach the background, 1 where none does; 0, still connected to `weights`, without such rays.
+
+    """
+    hit = torch.where(sky[:, None], weights.to(torch.promote_types(weights.dtype, torch.float32)), 0)
+    return hit.sum() / sky.sum().clamp(min=1)
+
+
+def _point_mass(start: Tensor, length: Tensor) -> Tensor:
+    """Give exp(-z²/2) at the middle, times the length; all in units of σ̂."""
+    middle = start + length / 2
+    return torch.exp(-0.5 * middle**2) * length
+
+
+def _interval_mass(start: Tensor, end: Tensor, length: Tensor) -> Tensor:
+    """Give the integral of exp(-z²/2) from start to end; all in units of σ̂."""
+    middle = start + length / 2
+    narrow = _point_mass(start, length) * (1 + (middle**2 - 1) * length**2 / 24)
+    wide = math.sqrt(math.pi / 2) * (torch.erf(end / math.sqrt(2)) - torch.erf(start / math.sqrt(2)))
+    return torch.where(length < NARROW, narrow, wide)

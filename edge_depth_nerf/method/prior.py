@@ -1,0 +1,289 @@
+"""The depth prior of a frame: aligned, integrated once, kept on disk.
+
+Maps are H×W metres along the ray, 0 = no prior. A cached prior carries a key of everything it was made of (the
+maps, the mask, the options, the calibration, the version of this format); a file that is not whole or does not fit
+is made anew.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import io
+import json
+import math
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, UInt8
+from numpy.typing import NDArray
+
+from edge_depth_nerf.base.checked_cache import content_of, keep_last, used, write_checked
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.cameras import Camera
+from edge_depth_nerf.masks.sky import regions_like_sky
+from edge_depth_nerf.method.alignment import Align, align
+from edge_depth_nerf.method.error_model import Trust, pixel_features
+from edge_depth_nerf.method.integration import DepthSource, IntegrationOptions, SigmaMode, select_prior, sigma_m
+
+CACHE_VERSION = 5
+"""Part of every key: raised whenever the same inputs give another prior."""
+
+KEPT_SETS = 4
+"""So many priors of each training picture are kept, those used last: of so many settings of the integration."""
+
+FARTHEST_M = 200.0
+"""A monocular distance beyond means "far": under calibrated sigma there is no prior."""
+
+LOWEST_SKY_DEG = 2.0
+"""Nearer to the horizon a missing monocular distance may be the end of the world's hills as well as sky."""
+
+PriorSigma = Literal["calibrated", "constant", "image", "spread", "combined"]
+
+
+@dataclass(frozen=True)
+class PriorOptions:
+    """How LiDAR and monocular distance become a prior.
+
+    Raises:
+        InputError: a field is not one of its choices.
+
+    """
+
+    depth_source: DepthSource = "integrated"
+    """Both sources integrated, or one alone."""
+    align: Align = "local"
+    """How the monocular map is fitted to the frame's LiDAR before both are integrated; mono alone stays as it is."""
+    sigma_mode: PriorSigma = "calibrated"
+    """calibrated: by the errors that the drive's training frames show at LiDAR returns left out (see
+    `mono.error_model`), and no prior where nothing is known of the error; without a calibration as combined. The
+    others: see `integration.sigma_m`."""
+    sigma_constant_m: float = 1.0
+    """The standard deviation under sigma_mode constant, metres."""
+    integration: IntegrationOptions = field(
+        default_factory=lambda: IntegrationOptions(
+            normalise="per-source", keep_returns=True, sigma_depth_growth_per_m=0.005
+        )
+    )
+    """Eq. 5-7 and their variants; the default is what measures best (docs/prior.md)."""
+
+    def __post_init__(self) -> None:
+        for name, choices in (("align", Align), ("sigma_mode", PriorSigma)):
+            value, allowed = getattr(self, name), get_args(choices)
+            if value not in allowed:
+                raise InputError(f"{name} is {value!r}; expected one of {', '.join(map(repr, allowed))}.")
+
+    @property
+    def wants_trust(self) -> bool:
+        """Whether a calibration of the drive has a part in the prior."""
+        calibrated = self.sigma_mode == "calibrated" and self.depth_source != "lidar"
+        return calibrated or (self.align != "none" and self.depth_source == "integrated")
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Distance prior and its standard deviation, both H×W float32 metres; 0 = no prior."""
+
+    distance_m: NDArray[np.float32]
+    sigma_m: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class View:
+    """Where the rays of a picture point."""
+
+    theta_rad: Float32[np.ndarray, "h w"]
+    """Angle from the optical axis; pi where there is no ray."""
+    elevation_rad: Float32[np.ndarray, "h w"]
+    """Angle above the world's horizon; -pi/2 where there is no ray."""
+
+
+@lru_cache(maxsize=8)
+def _directions(camera: Camera) -> Float32[np.ndarray, "h w 3"]:
+    """Unit rays, x right, y down, z forward; NaN where there is none. One camera takes seconds at 1400 px."""
+    return camera.unproject(camera.pixel_centres())[0].float().numpy()
+
+
+def view_of(camera: Camera, up_in_camera: Float[np.ndarray, "3"]) -> View:
+    """The angles of a picture's rays.
+
+    Args:
+        camera: its lens.
+        up_in_camera: the world's upward unit vector in the camera's axes (OpenCV).
+
+    """
+    directions = _directions(camera)
+    elevation = np.arcsin(np.clip(directions @ up_in_camera.astype(np.float32), -1, 1))
+    theta = np.arccos(np.clip(directions[..., 2], -1, 1))
+    return View(np.nan_to_num(theta, nan=np.pi), np.nan_to_num(elevation, nan=-np.pi / 2))
+
+
+def sky_of(
+    mono_m: Float[np.ndarray, "h w"],
+    lidar_m: Float[np.ndarray, "h w"] | None,
+    view: View,
+    picture: UInt8[np.ndarray, "h w 3"],
+    mask: Bool[np.ndarray, "h w"],
+) -> Bool[np.ndarray, "h w"]:
+    """Where a monocular map says that nothing is there: no distance, above the horizon, bright, and no LiDAR return.
+
+    `process` and `estimate-depth` take the sky out of the maps; maps of one's own may lack a distance elsewhere, too.
+    """
+    sky = mask & ~(np.nan_to_num(mono_m) > 0) & (view.elevation_rad > math.radians(LOWEST_SKY_DEG))
+    if lidar_m is not None:
+        sky &= ~(np.nan_to_num(lidar_m) > 0)
+    # where there is no ray the elevation is -pi/2, but the mask says so
+    return regions_like_sky(picture, sky, mask & (view.elevation_rad < 0))
+
+
+@dataclass(frozen=True)
+class IntegratedFrame:
+    """A prior with what its error depends on; H×W each, 0 = none."""
+
+    distance_m: NDArray[np.float32]
+    spread_m: NDArray[np.float32]
+    """Of what was averaged, also where a return was kept."""
+    mono_m: NDArray[np.float32]
+    """The aligned monocular map."""
+    returns: NDArray[np.bool_]
+    """The returns that entered."""
+
+
+def integrate_frame(
+    lidar_m: NDArray[np.float32],
+    mono_m: NDArray[np.float32],
+    mask: NDArray[np.bool_],
+    options: PriorOptions,
+    trust: Trust | None = None,
+) -> IntegratedFrame:
+    """Align and integrate a frame under a calibration: the prior whose error `Trust` describes.
+
+    Raises:
+        InputError: the maps differ in size.
+
+    """
+    mask = mask & ~(mono_m > FARTHEST_M)
+    returns = mask & np.isfinite(lidar_m) & (lidar_m > 0)
+    if options.depth_source == "mono":
+        returns = np.zeros_like(mask)
+    else:
+        mono_m = align(lidar_m, mono_m, mask, options.align, trust.drive_fit if trust else None).mono_m
+    # the spread is wanted at returns, too, so they are kept afterwards
+    integration = dataclasses.replace(options.integration, keep_returns=False)
+    lidar, mono, valid = (torch.from_numpy(pixels) for pixels in (lidar_m, mono_m, mask))
+    integrated = select_prior(options.depth_source, lidar, mono, valid, integration)
+    distance = integrated.distance_m.float().numpy()
+    returns &= distance > 0
+    if options.integration.keep_returns:
+        distance = np.where(returns, lidar_m, distance)
+    known = np.where(np.isfinite(mono_m), mono_m, 0)
+    return IntegratedFrame(distance, integrated.spread_m.float().numpy(), known, returns)
+
+
+def make_prior(
+    lidar_m: NDArray[np.float32] | None,
+    mono_m: NDArray[np.float32] | None,
+    mask: NDArray[np.bool_],
+    options: PriorOptions,
+    trust: Trust | None = None,
+    view: View | None = None,
+) -> Prior:
+    """Align a frame's monocular map, integrate (Eq. 5-7), and say how far each pixel is trusted.
+
+    Args:
+        lidar_m: H×W LiDAR distance, 0 = no return; None if the options use monocular distance alone.
+        mono_m: H×W monocular distance, 0 = none; None if the options use LiDAR alone.
+        mask: H×W, True where the picture may be used.
+        options: what is made of them.
+        trust: the drive's calibration; used for the drive's fit, and under sigma_mode calibrated.
+        view: of the picture; under sigma_mode calibrated a trust wants it.
+
+    Raises:
+        InputError: a source that the options need is None, or the maps differ in size.
+
+    """
+    calibrated = options.sigma_mode == "calibrated" and trust is not None and options.depth_source != "lidar"
+    if calibrated and mono_m is not None:
+        assert view is not None and trust is not None
+        mask = mask if trust.everywhere else mask & trust.in_field(view.elevation_rad)
+        if trust.error_model is not None and (lidar_m is not None or options.depth_source == "mono"):
+            lidar_m = np.zeros_like(mono_m) if lidar_m is None else lidar_m
+            frame = integrate_frame(lidar_m, mono_m, mask, options, trust)
+            features = pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, frame.returns, view.theta_rad)
+            sigma = trust.sigma_m(features)
+            return Prior(frame.distance_m, np.where(frame.distance_m > 0, sigma, np.float32(0)))
+    if options.depth_source == "integrated" and lidar_m is not None and mono_m is not None:
+        mono_m = align(lidar_m, mono_m, mask, options.align, trust.drive_fit if trust else None).mono_m
+    lidar, mono = (None if maps is None else torch.from_numpy(maps) for maps in (lidar_m, mono_m))
+    integrated = select_prior(options.depth_source, lidar, mono, torch.from_numpy(mask), options.integration)
+    mode: SigmaMode = "combined" if options.sigma_mode == "calibrated" else options.sigma_mode
+    sigma = sigma_m(integrated, mode, mono_m=mono, constant_m=options.sigma_constant_m)
+    return Prior(integrated.distance_m.float().numpy(), sigma.float().numpy())
+
+
+class PriorCache:
+    """Priors on disk, one file each, found by what they were made of.
+
+    A folder that cannot be written (a read-only scene) is not an error: the prior is then made each time.
+    """
+
+    def __init__(self, folder: Path, options: PriorOptions, trust: Trust | None = None):
+        self.folder = folder
+        self.options = options
+        self.trust = trust
+        described = {
+            "version": CACHE_VERSION,
+            **dataclasses.asdict(options),
+            "trust": None if trust is None else trust.to_dict(),
+        }
+        self._options_key = json.dumps(described, sort_keys=True).encode()
+
+    def prior(
+        self,
+        lidar_m: NDArray[np.float32] | None,
+        mono_m: NDArray[np.float32] | None,
+        mask: NDArray[np.bool_],
+        view: View | None = None,
+    ) -> Prior:
+        """As `make_prior`, from the cache where it is there."""
+        angles = (view.theta_rad, view.elevation_rad) if view is not None else ()
+        path = self.folder / f"{self._key(lidar_m, mono_m, mask, *angles)}.npz"
+        cached = _read(path, mask.shape)
+        if cached is not None:
+            return cached
+        prior = make_prior(lidar_m, mono_m, mask, self.options, self.trust, view)
+
+        archive = io.BytesIO()
+        np.savez_compressed(archive, distance_m=prior.distance_m, sigma_m=prior.sigma_m)
+        try:
+            write_checked(path, CACHE_VERSION, lambda file: file.write(archive.getbuffer()))
+        except OSError:
+            pass
+        return prior
+
+    def remove_old(self, pictures: int) -> None:
+        """Keep the last `KEPT_SETS` priors of so many pictures."""
+        keep_last(self.folder, "*.npz", KEPT_SETS * pictures)
+
+    def _key(self, *maps: NDArray | None) -> str:
+        digest = hashlib.sha256(self._options_key)
+        for pixels in maps:
+            digest.update(b"none" if pixels is None else f"{pixels.dtype}{pixels.shape}".encode())
+            digest.update(b"" if pixels is None else np.ascontiguousarray(pixels).tobytes())
+        return digest.hexdigest()[:32]
+
+
+def _read(path: Path, shape: tuple[int, ...]) -> Prior | None:
+    content = content_of(path, CACHE_VERSION)
+    if content is None:
+        return None
+    with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+        prior = Prior(archive["distance_m"], archive["sigma_m"])
+    if any(m.shape != shape or m.dtype != np.float32 for m in (prior.distance_m, prior.sigma_m)):
+        return None
+    used(path)
+    return prior

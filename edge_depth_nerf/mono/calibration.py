@@ -1,0 +1,388 @@
+"""A drive's calibration of trust: how well its monocular maps fit LiDAR, and how wrong its priors are.
+
+Made from training frames alone. Of each frame some returns are left out, the prior is made of the rest, and compared
+with what was left out: whole blocks of 64 px (of 1400), single returns, and in every second frame LiDAR's lowest and
+highest rows, beyond which a prior is extrapolated. Above a frame's own returns the prior is compared with what the
+returns of the other frames show there. The result is kept beside the scene's maps.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Collection, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from edge_depth_nerf.base.checked_cache import keep_last, used
+from edge_depth_nerf.base.console import progress_bars
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.method.alignment import LEAST_RETURNS, align, both, fit_logs
+from edge_depth_nerf.method.error_model import (
+    FIELD_MARGIN_DEG,
+    TRUST_FILE,
+    FrameAlignment,
+    Trust,
+    error_of_returns,
+    fit_error_model,
+    pixel_features,
+    read_trust,
+)
+from edge_depth_nerf.method.prior import CACHE_VERSION, PriorOptions, View, integrate_frame, view_of
+from edge_depth_nerf.mono.far_seen import seen_above, static_cloud
+from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
+
+KEPT_CALIBRATIONS = 16
+"""So many calibrations are kept of a scene beside its own, those used last."""
+MOST_FRAMES = 100
+"""Of longer drives so many training pictures are used, evenly spread."""
+HELD_OUT_BLOCK_SHARE = 64 / 1400
+"""Side of the blocks that are left out, as a share of the picture's width."""
+HELD_OUT_PART = 0.1
+"""So much of the blocks, and of the single returns, is left out."""
+HELD_OUT_ROWS = (0.1, 0.95)
+"""In every second frame returns below and above these quantiles of their elevation are left out."""
+FIELD_QUANTILES = (0.001, 0.999)
+"""LiDAR's field of elevation, but for stray returns."""
+_JUDGED_A_FRAME = 5_000
+_FOR_THE_DRIVE_A_FRAME = 2_000
+"""So many returns of a frame enter; more tell nothing new."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MeasuredFrame:
+    """One training frame's part in the calibration."""
+
+    alignment: FrameAlignment
+    """How well its map was fitted."""
+    features: dict[str, NDArray[np.float32]]
+    """Of the pixels of left-out returns, and of those that other frames' returns show."""
+    relative_error: NDArray[np.float32]
+    """|d̃ - d| / d̃ there."""
+    return_features: dict[str, NDArray[np.float32]]
+    """Of pixels that keep their return."""
+    return_error: NDArray[np.float32]
+    """Relative error of these returns against their neighbours."""
+    elevation_rad: NDArray[np.float32]
+    """Of all returns, above the horizon."""
+    lidar_m: NDArray[np.float32]
+    """Of pixels with LiDAR and mono."""
+    mono_m: NDArray[np.float32]
+    """The map as it came, at the same pixels."""
+
+
+def held_out_returns(
+    returns: NDArray[np.bool_], elevation_rad: NDArray[np.float32], number: int
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which of a frame's returns to leave out, and which of these lie in whole blocks.
+
+    Args:
+        returns: H×W, True at a return.
+        elevation_rad: H×W, of each ray.
+        number: of the frame in the calibration; seeds the choice.
+
+    """
+    rng = np.random.default_rng([7, number])
+    height, width = returns.shape
+    side = max(4, round(HELD_OUT_BLOCK_SHARE * width))
+    chosen = rng.random((height // side + 1, width // side + 1)) < HELD_OUT_PART
+    in_blocks = np.kron(chosen, np.ones((side, side), bool))[:height, :width] & returns
+    left_out = in_blocks | ((rng.random(returns.shape) < HELD_OUT_PART) & returns)
+    if number % 2 and returns.any():
+        low, high = np.quantile(elevation_rad[returns], HELD_OUT_ROWS)
+        left_out |= returns & ((elevation_rad < low) | (elevation_rad > high))
+    return left_out, in_blocks
+
+
+def calibrate_scene(scene: Path, options: PriorOptions | None = None, console: Console | None = None) -> Trust:
+    """Measure a scene's alignment and errors from its training frames, and keep the result as SCENE/mono_trust.json.
+
+    Args:
+        scene: the folder, or its transforms.json.
+        options: of the prior to be trusted; the default ones by default.
+        console: where progress is shown; nowhere by default.
+
+    Raises:
+        FileNotFoundError: no scene there.
+        InputError: the scene has no LiDAR or no monocular maps, or one of its files is broken.
+
+    """
+    read = read_scene(scene)
+    trust = _calibrate(read, _chosen(read), options or PriorOptions(), console)
+    trust.write(read.folder / TRUST_FILE)
+    return trust
+
+
+def saved_trust(
+    scene: SceneFolder,
+    options: PriorOptions,
+    cache: Path | None = None,
+    training_images: Collection[Path] | None = None,
+) -> Trust | None:
+    """The scene's calibration, if one is there that was made of the files as they are and for these options."""
+    made_of = _made_of(scene, _chosen(scene, training_images), options)
+    for path in (scene.folder / TRUST_FILE, _cached(scene, cache, made_of)):
+        try:
+            trust = read_trust(path)
+        except (OSError, InputError):
+            continue
+        if trust.made_of == made_of:
+            if path.name != TRUST_FILE:
+                used(path)
+            return trust
+    return None
+
+
+def find_trust(
+    scene: Path,
+    options: PriorOptions,
+    cache: Path | None = None,
+    training_images: Collection[Path] | None = None,
+    console: Console | None = None,
+    lidar_unit: tuple[float, bool] | None = None,
+) -> Trust:
+    """The scene's calibration for these options; made now and kept in SCENE/.cache where there is none.
+
+    Args:
+        scene: the folder, or its transforms.json.
+        options: of the prior to be trusted.
+        cache: another folder than SCENE/.cache.
+        training_images: the pictures that are trained on, where the scene does not say so itself.
+        console: where progress is shown; nowhere by default.
+        lidar_unit: metres that a count of the LiDAR files stands for, and whether they hold z-depth, where someone
+            said otherwise than the scene.
+
+    Raises:
+        FileNotFoundError: no scene there.
+        InputError: as `calibrate_scene`.
+
+    """
+    read = read_scene(scene)
+    if lidar_unit is not None:
+        read = dataclasses.replace(read, lidar_metres_per_count=lidar_unit[0], lidar_is_z_depth=lidar_unit[1])
+    trust = saved_trust(read, options, cache, training_images)
+    if trust is None:
+        trust = _calibrate(read, _chosen(read, training_images), options, console)
+        path = _cached(read, cache, trust.made_of)
+        try:
+            trust.write(path)
+            keep_last(path.parent, "mono_trust_*.json", KEPT_CALIBRATIONS)
+        except OSError:  # a scene that cannot be written: made anew each time
+            pass
+    return trust
+
+
+def field_of_source(scene: Path) -> Trust | None:
+    """What is known of a scene without LiDAR: how far up and down the maps' network was taught by LiDAR elsewhere.
+
+    Returns:
+        A calibration without errors, or None where the maps' source says nothing about its field.
+
+    """
+    source = read_scene(scene).meta.get("mono")
+    source = source if isinstance(source, dict) else {}
+    field_deg = source.get("field_deg")
+    if not isinstance(field_deg, list) or len(field_deg) != 2 or source.get("trained_on") == "elsewhere":
+        return None
+    low, high = (float(np.radians(value)) for value in field_deg)
+    return Trust("", None, None, (low, high), everywhere=False, drive_fit=None)
+
+
+def _cached(scene: SceneFolder, cache: Path | None, made_of: str) -> Path:
+    return (cache or scene.folder / ".cache") / f"mono_trust_{made_of}.json"
+
+
+def _chosen(scene: SceneFolder, training_images: Collection[Path] | None = None) -> list[ScenePicture]:
+    if training_images is None:
+        training = [picture for picture in scene.pictures if not picture.held_out]
+    else:
+        images = {path.resolve() for path in training_images}
+        training = [picture for picture in scene.pictures if picture.files["image"].resolve() in images]
+    if len(training) <= MOST_FRAMES:
+        return training
+    return [training[i] for i in np.linspace(0, len(training) - 1, MOST_FRAMES).round().astype(int)]
+
+
+def _made_of(scene: SceneFolder, pictures: Sequence[ScenePicture], options: PriorOptions) -> str:
+    """Key of the options, of the geometry, and of what is in the files of the pictures that are measured."""
+    relevant = dataclasses.asdict(options)
+    del relevant["sigma_mode"], relevant["sigma_constant_m"]
+    units = [scene.lidar_metres_per_count, scene.lidar_is_z_depth, round(scene.theta_max_rad, 9)]
+    digest = hashlib.sha256(json.dumps([CACHE_VERSION, relevant, _trained_on(scene), units], sort_keys=True).encode())
+    contents: dict[Path, bytes] = {}
+    for picture in pictures:
+        pose = picture.rotation.round(9).tolist(), picture.position_m.round(6).tolist()
+        digest.update(repr((picture.name, picture.lens, pose)).encode())
+        for layer in ("lidar", "mono", "mask"):
+            path = picture.files.get(layer)
+            if path is not None and path not in contents:
+                contents[path] = hashlib.sha256(path.read_bytes()).digest()
+            digest.update(layer.encode() + (b"" if path is None else contents[path]))
+    return digest.hexdigest()[:16]
+
+
+def _trained_on(scene: SceneFolder) -> str:
+    """Where the maps' source was trained: elsewhere only if it says so."""
+    later, drive = scene.meta.get("mono"), scene.meta.get("source")
+    if isinstance(later, dict):
+        found = later.get("trained_on")
+    else:
+        found = drive.get("mono_trained_on") if isinstance(drive, dict) else None
+    return "elsewhere" if found == "elsewhere" else "scene"
+
+
+def _calibrate(
+    scene: SceneFolder, pictures: Sequence[ScenePicture], options: PriorOptions, console: Console | None
+) -> Trust:
+    missing = [word for layer, word in (("lidar", "LiDAR"), ("mono", "monocular")) if not scene.has(layer)]
+    if missing:
+        raise InputError(
+            f"{scene.path}: has no {' and no '.join(missing)} distance maps, so there is nothing to measure the "
+            "monocular maps' error by. Process the drive with its sweeps, and make monocular maps with "
+            "`edge-depth-nerf estimate-depth`."
+        )
+    measurable = [p for p in pictures if "lidar" in p.files and "mono" in p.files]
+    if not measurable:
+        raise InputError(
+            f"{scene.path}: no picture for training has a LiDAR and a monocular map, so the prior's error cannot be "
+            "measured. Process the drive again."
+        )
+
+    def measure(numbered: tuple[int, ScenePicture]) -> MeasuredFrame:
+        number, picture = numbered
+        maps = scene.maps(picture)
+        assert maps.lidar_m is not None and maps.mono_m is not None
+        view = view_of(picture.lens, picture.up_in_camera)
+        far_seen_m = seen_above(cloud, scene, picture, (picture.lens.width, picture.lens.height))
+        return measure_frame(picture.name, number, maps.lidar_m, maps.mono_m, maps.usable, view, options, far_seen_m)
+
+    bars = progress_bars(console or Console(quiet=True), transient=True)
+    with bars as progress, ThreadPoolExecutor(2) as pool:
+        task = progress.add_task("Measuring the prior's error…", total=4 * len(measurable))
+        cloud = static_cloud(scene, measurable, lambda: progress.advance(task))
+        frames = []
+        for frame in pool.map(measure, enumerate(measurable)):
+            frames.append(frame)
+            progress.advance(task)
+    return combine(frames, options, _made_of(scene, pictures, options), everywhere=_trained_on(scene) == "elsewhere")
+
+
+def measure_frame(
+    name: str,
+    number: int,
+    lidar_m: NDArray[np.float32],
+    mono_m: NDArray[np.float32],
+    usable: NDArray[np.bool_],
+    view: View,
+    options: PriorOptions,
+    far_seen_m: NDArray[np.float32] | None = None,
+) -> MeasuredFrame:
+    """Leave out some of a frame's returns, make its prior of the rest, and compare.
+
+    Args:
+        name: of the frame, for the report.
+        number: of the frame in the calibration: decides what is left out.
+        lidar_m: H×W LiDAR distance, 0 = no return.
+        mono_m: H×W monocular distance as it came, 0 = none.
+        usable: H×W, True where the picture may be used.
+        view: the angles of its rays.
+        options: of the prior.
+        far_seen_m: H×W distance that the returns of other frames show above this one's, 0 = none.
+
+    Raises:
+        InputError: the maps differ in size.
+
+    """
+    returns = both(lidar_m, mono_m, usable)
+    rng = np.random.default_rng([8, number])
+    left_out, in_blocks = held_out_returns(returns, view.elevation_rad, number)
+    kept_m = np.where(left_out, np.float32(0), lidar_m)
+    # a source alone is not aligned, in the prior either
+    mode = "none" if options.depth_source == "mono" else options.align
+    aligned = align(kept_m, mono_m, usable, mode)
+    frame = integrate_frame(kept_m, mono_m, usable, options)
+    features = pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, frame.returns, view.theta_rad)
+    has_prior = frame.distance_m > 0
+    measured_m, measured = lidar_m, left_out
+    if far_seen_m is not None and returns.any():
+        highest = np.quantile(view.elevation_rad[returns], FIELD_QUANTILES[1]) + np.radians(FIELD_MARGIN_DEG)
+        far_seen = usable & (far_seen_m > 0) & ~returns & (view.elevation_rad <= highest)
+        measured_m, measured = np.where(far_seen, far_seen_m, lidar_m), left_out | far_seen
+    judged = _some(measured & has_prior, _JUDGED_A_FRAME, rng)
+    distance = frame.distance_m[judged]
+    # of a prior that keeps its returns; where none is kept (mono alone), or all are averaged, there is no such pixel
+    found, error_by_neighbours = error_of_returns(lidar_m, frame.returns)
+    kept = _some(found & options.integration.keep_returns, _JUDGED_A_FRAME, rng)
+    for_the_drive = _some(returns, _FOR_THE_DRIVE_A_FRAME, rng)
+
+    def error(estimate_m: NDArray[np.float32]) -> float | None:
+        if not in_blocks.any():
+            return None
+        return float(np.mean(np.abs(estimate_m[in_blocks] - lidar_m[in_blocks]) / lidar_m[in_blocks]))
+
+    count = int(returns.sum())
+    # near the least number those left out decide whose fit it is; the prior has all of them
+    fitted = aligned if count >= 2 * LEAST_RETURNS else align(lidar_m, mono_m, usable, mode)
+    return MeasuredFrame(
+        FrameAlignment(name, count, fitted.fit_of, fitted.fit, error(mono_m), error(aligned.mono_m)),
+        {feature: values[judged] for feature, values in features.items()},
+        np.abs(distance - measured_m[judged]) / distance,
+        {feature: values[kept] for feature, values in features.items()},
+        error_by_neighbours[kept],
+        view.elevation_rad[usable & (lidar_m > 0)],
+        lidar_m[for_the_drive],
+        mono_m[for_the_drive],
+    )
+
+
+def _some(pixels: NDArray[np.bool_], most: int, rng: np.random.Generator) -> tuple[NDArray[np.intp], ...]:
+    """Rows and columns of True pixels, at most so many, drawn evenly."""
+    where = np.flatnonzero(pixels)
+    if len(where) > most:
+        where = rng.choice(where, most, replace=False)
+    return np.unravel_index(where, pixels.shape)
+
+
+def combine(frames: Sequence[MeasuredFrame], options: PriorOptions, made_of: str, everywhere: bool) -> Trust:
+    """Put the measurements of a drive's frames together.
+
+    Args:
+        frames: at least one.
+        options: of the prior.
+        made_of: key of what they were made of.
+        everywhere: whether the monocular maps are to be trusted beyond LiDAR's field of elevation.
+
+    """
+
+    def pooled(values: Iterable[NDArray]) -> NDArray:
+        return np.concatenate(list(values))
+
+    elevations = pooled(frame.elevation_rad for frame in frames)
+    low, high = np.quantile(elevations, FIELD_QUANTILES) if len(elevations) else (0.0, 0.0)
+    lidar_m, mono_m = pooled(frame.lidar_m for frame in frames), pooled(frame.mono_m for frame in frames)
+    aligned = options.align != "none" and options.depth_source == "integrated"
+    drive_fit = fit_logs(lidar_m, mono_m) if aligned and len(lidar_m) >= LEAST_RETURNS else None
+    names = frames[0].features
+    features = {name: pooled(frame.features[name] for frame in frames) for name in names}
+    return_features = {name: pooled(frame.return_features[name] for frame in frames) for name in names}
+    alignments = (frame.alignment for frame in frames)
+    return Trust(
+        made_of=made_of,
+        error_model=fit_error_model(features, pooled(frame.relative_error for frame in frames)),
+        return_model=fit_error_model(return_features, pooled(frame.return_error for frame in frames)),
+        field_rad=(float(low), float(high)),
+        everywhere=everywhere,
+        drive_fit=drive_fit,
+        frames=tuple(
+            # what the prior of a frame with few returns will take
+            dataclasses.replace(found, fit_of="drive", fit=drive_fit)
+            if drive_fit is not None and found.returns < LEAST_RETURNS
+            else found
+            for found in alignments
+        ),
+    )

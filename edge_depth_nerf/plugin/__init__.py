@@ -1,0 +1,1 @@
+"""All that nerfstudio loads: methods, dataparser, dataset, DataManager, model, viewer. Holds no formulas."""

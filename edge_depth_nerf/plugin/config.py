@@ -1,0 +1,149 @@
+"""The methods that nerfstudio registers, made from nerfstudio_method.toml.
+
+An override is a dotted name in the configuration and a value. Names and types are checked against the
+configuration itself; all that is wrong is said in one error.
+"""
+
+from __future__ import annotations
+
+import difflib
+import sys
+from dataclasses import dataclass, fields, is_dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import torch
+from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.plugins.types import MethodSpecification
+
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.plugin.compat import allow_numpy_scalars_in_checkpoints
+from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
+from edge_depth_nerf.plugin.model import EdgeDepthNerfModelConfig
+from edge_depth_nerf.plugin.pipeline import EdgeDepthPipelineConfig
+from edge_depth_nerf.plugin.plain_errors import say_config_slips_plainly
+from edge_depth_nerf.plugin.trainer import EdgeDepthTrainerConfig
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib  # pyright: ignore[reportMissingImports]
+
+
+@dataclass
+class FusedAdamConfig(AdamOptimizerConfig):
+    """Adam in one pass over each tensor, on the CPU and on CUDA: the same steps, half the time."""
+
+    fused: bool = True
+    """torch's fused form; without it, its default."""
+
+
+METHOD_FILE = "nerfstudio_method.toml"
+
+# every ns-* command imports this module and may load a checkpoint afterwards
+allow_numpy_scalars_in_checkpoints()
+if Path(sys.argv[0]).name.startswith("ns-"):
+    say_config_slips_plainly()
+
+
+def read_method_file() -> dict[str, Any]:
+    """The shipped nerfstudio_method.toml as nested dictionaries."""
+    return tomllib.loads((resources.files("edge_depth_nerf") / METHOD_FILE).read_text(encoding="utf-8"))
+
+
+def base_config(method_name: str) -> TrainerConfig:
+    """What all methods share: nerfacto's optimisers, no pose refinement, a viewer that listens on this machine only."""
+
+    def optimiser() -> dict[str, Any]:
+        return {
+            "optimizer": FusedAdamConfig(lr=1e-2, eps=1e-15),
+            "scheduler": ExponentialDecaySchedulerConfig(lr_final=1e-4, max_steps=200000),
+        }
+
+    config = EdgeDepthTrainerConfig(
+        method_name=method_name,
+        # nerfstudio's default is cuda, also where there is none
+        machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
+        pipeline=EdgeDepthPipelineConfig(
+            datamanager=FisheyeDepthDataManagerConfig(),
+            model=EdgeDepthNerfModelConfig(eval_num_rays_per_chunk=1 << 15),
+        ),
+        optimizers={name: optimiser() for name in ("proposal_networks", "fields", "camera_opt")},
+        viewer=ViewerConfig(num_rays_per_chunk=1 << 15, websocket_host="127.0.0.1"),
+        vis="viewer",
+    )
+    config.pipeline.model.camera_optimizer.mode = "off"  # pyright: ignore[reportAttributeAccessIssue]
+    return config
+
+
+def _children(node: Any) -> list[str]:
+    if isinstance(node, dict):
+        return list(node)
+    return [entry.name for entry in fields(node)] if is_dataclass(node) else []
+
+
+def apply_overrides(config: Any, overrides: dict[str, Any], where: str) -> None:
+    """Set dotted names in a configuration, in place.
+
+    Raises:
+        InputError: names that do not exist or values of another type, all of them in one message.
+
+    """
+    problems = []
+    for name, value in overrides.items():
+        *path, last = name.split(".")
+        node = config
+        for part in (*path, last):
+            children = _children(node)
+            if part not in children:
+                near = difflib.get_close_matches(part, children, 1)
+                problems.append(f"{name}: there is no {part!r}" + (f" (did you mean {near[0]!r}?)" if near else ""))
+                break
+            parent, node = node, node[part] if isinstance(node, dict) else getattr(node, part)
+        else:
+            if isinstance(node, tuple) and isinstance(value, list):
+                value = tuple(value)
+            if isinstance(node, float) and isinstance(value, int) and not isinstance(value, bool):
+                value = float(value)
+            if node is not None and type(value) is not type(node):
+                problems.append(f"{name}: expected {type(node).__name__}, found {value!r}")
+            elif isinstance(parent, dict):
+                parent[last] = value
+            else:
+                setattr(parent, last, value)
+    if problems:
+        raise InputError(f"{where}: " + "; ".join(problems))
+
+
+def make_specifications(declared: dict[str, Any]) -> dict[str, MethodSpecification]:
+    """Turn the declarations of a method file into nerfstudio's specifications.
+
+    Raises:
+        InputError: an unknown preset, name or type; the message says where.
+
+    """
+    constants = {name: entry["value"] for name, entry in declared["constants"].items()}
+    specifications = {}
+    for name, method in declared["methods"].items():
+        preset = method["preset"]
+        if preset not in declared["presets"]:
+            raise InputError(
+                f"{METHOD_FILE}: method {name!r} names the preset {preset!r}; "
+                f"there are {', '.join(declared['presets'])}."
+            )
+        config = base_config(name)
+        apply_overrides(config, constants, f"{METHOD_FILE}, [constants]")
+        apply_overrides(config, declared["presets"][preset], f"{METHOD_FILE}, [presets.{preset}]")
+        specifications[name] = MethodSpecification(config=config, description=method["description"])
+    return specifications
+
+
+_specifications = make_specifications(read_method_file())
+
+edge_depth_nerf = _specifications["edge-depth-nerf"]
+edge_depth_nerf_lite = _specifications["edge-depth-nerf-lite"]
+edge_depth_nerf_paper = _specifications["edge-depth-nerf-paper"]

@@ -1,0 +1,434 @@
+"""Serves training rays with colour and depth prior.
+
+Host-facing. The prior of each training frame is integrated once, in `setup_train` (ns-render and the viewer's
+thumbnails never wait for it), from that frame's own maps: a sweep of a held-out moment is in no training frame. How
+far it is trusted is measured on training frames alone (`mono.trust`), once, if the scene does not bring it.
+Batches are read from a table of all valid pixels of all training pictures (see `pixel_table`), so that scenes of one
+picture, of mixed sizes, with masks or without all work; nerfstudio's own pixel sampler fails on some of these. The
+table is kept on disk: the next training of the same scene with the same prior reads no picture at all.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import hashlib
+import json
+import os
+import tempfile
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+import torch.distributed as dist
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
+from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
+from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIndicesEvalDataloader
+from nerfstudio.model_components.ray_generators import RayGenerator
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
+from rich.progress import track
+from torch import Tensor
+
+from edge_depth_nerf.base.checked_cache import keep_last, used
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.one_writer import only_writer
+from edge_depth_nerf.method.error_model import Trust
+from edge_depth_nerf.method.integration import IntegrationOptions
+from edge_depth_nerf.method.metrics import has_whole_window
+from edge_depth_nerf.method.prior import CACHE_VERSION, PriorCache, PriorOptions, View, sky_of, view_of
+from edge_depth_nerf.mono.calibration import field_of_source, find_trust
+from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
+from edge_depth_nerf.plugin.dataset import FisheyeDepthDataset
+from edge_depth_nerf.plugin.pixel_table import (
+    RECORD,
+    TABLE_VERSION,
+    PicturePixels,
+    PixelBatch,
+    PixelTable,
+    PixelTableWriter,
+)
+from edge_depth_nerf.plugin.ray_table import TableRayGenerator
+
+KEPT_TABLES = 8
+"""So many tables of pixels are kept of a scene, those used last; one of 300 pictures of 1400×1400 px takes 6 GB."""
+
+
+SURFACE_SIGMA_M = 0.1
+SURFACE_SIGMA_SHARE = 0.15
+"""A prior whose sigma is above these metres plus this share of its distance is too vague for a surface."""
+
+
+@dataclass
+class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig):
+    """Rays of fisheye pictures with an edge-aware integrated depth prior."""
+
+    _target: type = field(default_factory=lambda: FisheyeDepthDataManager)
+    """Target class to instantiate."""
+    dataparser: AnnotatedDataParserUnion = field(default_factory=FisheyeDepthDataParserConfig)
+    """Specifies the dataparser used to unpack the data."""
+    depth_source: Literal["auto", "integrated", "lidar", "mono", "none"] = "auto"
+    """Where the prior comes from: LiDAR and monocular maps integrated (Eq. 5), or one of them alone (Table 3).
+    auto: what the scene has. none: no prior."""
+    integration: Literal["edge-aware", "spatial-gaussian"] = "edge-aware"
+    """Kernel of the integration: Eq. 7, or Eq. 7 without its depth factor (Table 4)."""
+    alpha: float = 0.7
+    """Weight of LiDAR against monocular distance, 0..1 (Eq. 5, 6)."""
+    kernel_size: int = 9
+    """Side of the integration's window, px, odd (Eq. 7)."""
+    sigma_space: float = 3.0
+    """Standard deviation of the kernel over pixels, px (Eq. 7)."""
+    sigma_depth: float = 1.0
+    """Standard deviation of the kernel over distance, metres (Eq. 7)."""
+    sigma_depth_growth: float = 0.005
+    """That standard deviation is at least so much (1/m) times the square of the distance; 0 for Eq. 7 as written."""
+    normalise: Literal["pooled", "per-source"] = "per-source"
+    """Whether alpha weighs single pixels (Eq. 5, 6) or the averages of the two sources."""
+    keep_returns: bool = True
+    """Keep the LiDAR distance unchanged at pixels with a return."""
+    range_guide: Literal["mono", "lidar"] = "mono"
+    """What the kernel's depth factor compares with the neighbours: monocular distance (Eq. 7 as written), or LiDAR
+    where there is a return (the paper's prose)."""
+    align: Literal["none", "global", "local"] = "local"
+    """How monocular distance is fitted to each frame's LiDAR before both are integrated: not at all, by a scale and an
+    exponent, or also by a smooth correction near returns."""
+    sigma_mode: Literal["calibrated", "constant", "image", "spread", "combined"] = "calibrated"
+    """Standard deviation of the prior: measured at LiDAR returns left out of it (and no prior where nothing could be
+    measured), one number, one number a frame (the paper's words), the spread of what was integrated, or that spread
+    with a floor and a share of the monocular distance."""
+    sigma_constant: float = 1.0
+    """The standard deviation under sigma_mode constant, metres."""
+    prior_weight: float = 1.0
+    """How often a pixel with a prior is drawn, against one without."""
+    surface_rays_per_batch: int = 16384
+    """So many further pixels come with each training batch, less those whose prior is vague: their colour is compared
+    with the field's at the prior's distance, at one sample a ray. 0: none."""
+    cache_dir: Path | None = None
+    """Where integrated priors and tables of training pixels are kept. Not set: .cache/ in the scene folder."""
+
+    def __post_init__(self) -> None:
+        if not 0.01 <= self.prior_weight <= 100:
+            raise InputError(f"prior_weight is {self.prior_weight:g}; expected 0.01 to 100.")
+
+    def prior_options(self, has_lidar: bool, has_mono: bool) -> PriorOptions:
+        """The options of the prior, with depth_source settled by what the scene has.
+
+        Raises:
+            InputError: the depth source asked for is not in the scene, or an option is out of its range.
+
+        """
+        source = self.depth_source
+        assert source != "none"
+        if source == "auto":
+            source = "integrated" if has_lidar and has_mono else "lidar" if has_lidar else "mono"
+        missing = [
+            name
+            for name, has, needed in (
+                ("LiDAR", has_lidar, source in ("integrated", "lidar")),
+                ("monocular", has_mono, source in ("integrated", "mono")),
+            )
+            if needed and not has
+        ]
+        if missing:
+            raise InputError(
+                f"{self.dataparser.data}: the scene has no {' and no '.join(missing)} distance maps, but depth_source "
+                f"{self.depth_source} needs them. Process the drive again (monocular maps alone: `edge-depth-nerf "
+                "estimate-depth`), or choose another --pipeline.datamanager.depth-source (integrated, lidar, mono), or "
+                "train without a prior by --pipeline.model.depth-loss none."
+            )
+        return PriorOptions(
+            depth_source=source,
+            align=self.align,
+            sigma_mode=self.sigma_mode,
+            sigma_constant_m=self.sigma_constant,
+            integration=IntegrationOptions(
+                alpha=self.alpha,
+                kernel_size=self.kernel_size,
+                sigma_space_px=self.sigma_space,
+                sigma_depth_m=self.sigma_depth,
+                sigma_depth_growth_per_m=self.sigma_depth_growth,
+                integration=self.integration,
+                normalise=self.normalise,
+                keep_returns=self.keep_returns,
+                range_guide=self.range_guide,
+            ),
+        )
+
+
+def _view(dataset: FisheyeDepthDataset, image_idx: int) -> View:
+    """Where the rays of a picture point; up is the scene's z before nerfstudio turned it."""
+    outputs = dataset._dataparser_outputs
+    up = outputs.dataparser_transform[:3, :3].double() @ torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    rotation = dataset.cameras.camera_to_worlds[image_idx, :3, :3].double()
+    up_in_camera = (rotation.T @ up).numpy() * np.array([1.0, -1.0, -1.0])  # OpenGL to OpenCV
+    return view_of(dataset.camera(image_idx), up_in_camera)
+
+
+class TablePixelSampler:
+    """What nerfstudio calls a pixel sampler; its exporter sets `num_rays_per_batch`.
+
+    Of several processes that train together (torch.distributed) each reads a part of every batch: all begin at one
+    place, and what the first reads the others leave out.
+    """
+
+    def __init__(self, table: PixelTable, num_rays_per_batch: int, device: torch.device | str = "cpu"):
+        self.table = table
+        self.num_rays_per_batch = num_rays_per_batch
+        # another seed begins elsewhere
+        first = torch.randint(len(table), ())
+        self._rank, self._world_size = 0, 1
+        if dist.is_available() and dist.is_initialized():
+            self._rank, self._world_size = dist.get_rank(), dist.get_world_size()
+            first = first.to(device)
+            dist.broadcast(first, src=0)
+        self._first = int(first)
+        self._drawn = 0
+
+    def set_num_rays_per_batch(self, num_rays_per_batch: int) -> None:
+        """Set the rays of a batch (nerfstudio's interface)."""
+        self.num_rays_per_batch = num_rays_per_batch
+
+    def sample(self, step: int = 0) -> PixelBatch:
+        """Read the next batch; at a later step of training, the one that belongs there."""
+        # a training that is taken up again goes on where it was; the exporter always says 0
+        self._drawn = max(self._drawn, step * self.num_rays_per_batch)
+        start = self._first + self._drawn * self._world_size + self._rank * self.num_rays_per_batch
+        batch = self.table.batch(start, self.num_rays_per_batch)
+        self._drawn += self.num_rays_per_batch
+        return batch
+
+
+class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
+    """DataManager of fisheye scenes.
+
+    A batch holds image (n×3), indices (n×3: picture, row, column), prior_distance_m and prior_sigma_m (n×1, metres,
+    0 = no prior), and sky (n×1, bool: known to show the sky).
+    """
+
+    config: FisheyeDepthDataManagerConfig
+    train_dataset: FisheyeDepthDataset
+    eval_dataset: FisheyeDepthDataset
+    train_pixel_sampler: TablePixelSampler | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    eval_pixel_sampler: TablePixelSampler | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    trained_on: Tensor
+    """Picture, row and column of each ray of the last training batch."""
+
+    def __init__(self, config: FisheyeDepthDataManagerConfig, *args: Any, **kwargs: Any):
+        self._temporary: list[tempfile.TemporaryDirectory[str]] = []
+        super().__init__(config, *args, **kwargs)
+
+    def setup_train(self) -> None:
+        """Integrate the prior of every training frame and write the table of training pixels, or find it."""
+        # of several processes that train on a scene the first makes what they share
+        with only_writer(self._cache_dir(), CONSOLE):
+            table = self._table(self.train_dataset, "Integrating depth", with_prior=True)
+            self.train_ray_generator = self._ray_generator(self.train_dataset)
+        self.train_pixel_sampler = TablePixelSampler(table, self.config.train_num_rays_per_batch, self.device)
+        self._surface_sampler = None
+        if self.config.surface_rays_per_batch > 0 and table.share_with_prior > 0:
+            self._surface_sampler = TablePixelSampler(table, self.config.surface_rays_per_batch, self.device)
+        CONSOLE.log(
+            f"{len(self.train_dataset)} training pictures, {len(table):,} valid pixels, "
+            f"{table.share_with_prior:.1%} of them with a depth prior"
+        )
+
+    def setup_eval(self) -> None:
+        """Write or find the table of held-out pixels (no prior) and prepare the loaders of whole views."""
+        with only_writer(self._cache_dir(), CONSOLE):
+            table = self._table(self.eval_dataset, "Reading held-out pictures", with_prior=False)
+            self.eval_ray_generator = self._ray_generator(self.eval_dataset)
+        self.eval_pixel_sampler = TablePixelSampler(table, self.config.eval_num_rays_per_batch, self.device)
+        self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(
+            input_dataset=self.eval_dataset, device=self.device
+        )
+        self.eval_dataloader = RandIndicesEvalDataloader(input_dataset=self.eval_dataset, device=self.device)
+
+    def next_train(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
+        """Rays of the next training batch and what supervises them; surface_…: further pixels of use, if any."""
+        self.train_count += 1
+        assert self.train_pixel_sampler is not None
+        pixels = self.train_pixel_sampler.sample(step)
+        self.trained_on = pixels.indices
+        rays, batch = self._serve(pixels, self.train_ray_generator)
+        if self._surface_sampler is not None:
+            further = self._surface_sampler.sample(step)
+            vague = further.prior_sigma_m > SURFACE_SIGMA_M + SURFACE_SIGMA_SHARE * further.prior_distance_m
+            chosen = (further.sky | (further.prior_distance_m > 0) & ~vague)[:, 0]
+            # the mean over no pixels would be no number
+            if chosen.any():
+                batch["surface_rays"], surface = self._serve(further[chosen], self.train_ray_generator)
+                names = {"prior_distance_m": "distance_m", "prior_sigma_m": "sigma_m"}
+                batch |= {f"surface_{names.get(name, name)}": value for name, value in surface.items()}
+        return rays, batch
+
+    def pictures_of(self, rays: Tensor | None = None) -> list[str]:
+        """Names of the pictures that the last training batch is from; of some of its rays, where these are said."""
+        chosen = self.trained_on[:, 0] if rays is None else self.trained_on[rays.cpu(), 0]
+        return [str(self.train_dataset.image_filenames[image_idx]) for image_idx in chosen.unique().tolist()]
+
+    def next_eval(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
+        """Rays of a batch of held-out pixels and their colours."""
+        self.eval_count += 1
+        assert self.eval_pixel_sampler is not None
+        return self._serve(self.eval_pixel_sampler.sample(), self.eval_ray_generator)
+
+    def _ray_generator(self, dataset: FisheyeDepthDataset) -> RayGenerator:
+        """The table of rays where the cameras allow one, else nerfstudio's generator."""
+        cameras = dataset.cameras.to(self.device)
+        if TableRayGenerator.suits(cameras):
+            return TableRayGenerator(cameras, self._cache_dir() / "rays")
+        # its grid of pixels has to lie where the indices do
+        return RayGenerator(cameras).to(self.device)
+
+    def _cache_dir(self) -> Path:
+        data = Path(self.config.dataparser.data)
+        return self.config.cache_dir or (data.parent if data.suffix == ".json" else data) / ".cache"
+
+    def _serve(self, batch: PixelBatch, generator: RayGenerator) -> tuple[RayBundle, dict[str, Any]]:
+        rays = generator(batch.indices.to(self.device))
+        return rays, {
+            "image": batch.rgb.to(self.device),
+            "indices": batch.indices,
+            "prior_distance_m": batch.prior_distance_m.to(self.device),
+            "prior_sigma_m": batch.prior_sigma_m.to(self.device),
+            "sky": batch.sky.to(self.device),
+        }
+
+    def _table(self, dataset: FisheyeDepthDataset, description: str, with_prior: bool) -> PixelTable:
+        """The table of a split's pixels: the one on disk, if it was made of the same things, or a new one."""
+        data = Path(self.config.dataparser.data)
+        cache_dir = self._cache_dir()
+        options: PriorOptions | None = None
+        trust: Trust | None = None
+        has_lidar = bool(dataset.metadata["lidar_filenames"])
+        has_mono = bool(dataset.metadata["mono_filenames"])
+        wanted = self.config.depth_source != "none" and (has_lidar or has_mono or self.config.depth_source != "auto")
+        if with_prior and wanted:
+            options = self.config.prior_options(has_lidar, has_mono)
+            if has_lidar and has_mono and options.wants_trust:
+                unit = dataset.metadata["lidar_metres_per_count"], dataset.metadata["lidar_is_z_depth"]
+                trust = find_trust(data, options, cache_dir, dataset.image_filenames, CONSOLE, unit)
+                CONSOLE.log(f"Depth prior: {trust.summary()}.")
+            elif has_mono and options.sigma_mode == "calibrated" and options.depth_source == "mono":
+                trust = field_of_source(data)
+            elif self.config.depth_source == "auto" and not has_mono:
+                CONSOLE.log(
+                    f"[yellow]Depth prior: LiDAR alone, for the scene has no monocular maps. `edge-depth-nerf "
+                    f"estimate-depth {escape(str(data))}` makes them, or finishes those that were begun.",
+                )
+        weight = self.config.prior_weight if options else 1.0
+        path = cache_dir / "pixels" / f"{_table_key(dataset, options, trust, weight)}.npy"
+        try:
+            table = PixelTable(path)
+            used(path)
+            return table
+        except (OSError, ValueError, KeyError, InputError):
+            pass  # not there, or not whole: made now
+        if not _writable(path.parent):
+            # a scene that cannot be written: the table lives as long as this object
+            self._temporary.append(tempfile.TemporaryDirectory(prefix="edge-depth-nerf-"))
+            path = Path(self._temporary[-1].name) / path.name
+        cache = None if options is None else PriorCache(cache_dir / "prior", options, trust)
+        most = int((dataset.cameras.width * dataset.cameras.height).sum())
+        try:
+            with PixelTableWriter(path, most, prior_weight=weight) as writer:
+                loaded = _load(dataset, cache, whole_windows=not with_prior)
+                for pixels in track(loaded, f"{description}…", len(dataset), console=CONSOLE, transient=True):
+                    writer.add(pixels)
+                writer.finish()
+        except OSError as error:
+            if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+                raise
+            raise InputError(
+                f"{path.parent}: the table of pixels cannot be written ({os.strerror(error.errno)}); it takes up to "
+                f"{most * RECORD.itemsize / 1e9:.2g} GB. Free some space there, or choose another place by "
+                "--pipeline.datamanager.cache-dir."
+            ) from error
+        _remove_old(path.parent)
+        if cache is not None:
+            cache.remove_old(len(dataset))
+        return PixelTable(path)
+
+
+def _load(dataset: FisheyeDepthDataset, cache: PriorCache | None, whole_windows: bool) -> Iterator[PicturePixels]:
+    """Colours, mask, prior and its sigma, and the sky of each picture.
+
+    Raises:
+        InputError: a file cannot be used, or, with `whole_windows`, a mask leaves too little to be judged by.
+
+    """
+
+    def load(image_idx: int) -> PicturePixels:
+        rgb = dataset.rgb(image_idx)
+        mask = dataset.mask(image_idx)
+        if whole_windows and not has_whole_window(torch.from_numpy(mask)):
+            raise InputError(
+                f"{dataset.mask_key(image_idx)[0] or dataset.image_filenames[image_idx]}: the mask of the held-out "
+                f"picture {dataset.image_filenames[image_idx].name} keeps too little to judge by (not one window "
+                "of SSIM, 11×11 px). Mend the mask (255 = use the pixel), or do not hold that picture out."
+            )
+        if cache is None:
+            return PicturePixels(rgb, mask)
+        uses_mono = cache.options.depth_source != "lidar"
+        lidar, mono = dataset.lidar_distance_m(image_idx), dataset.mono_distance_m(image_idx)
+        view = _view(dataset, image_idx) if uses_mono and mono is not None else None
+        prior = cache.prior(lidar, mono, mask, view if cache.trust is not None else None)
+        sky = sky_of(mono, lidar, view, rgb, mask) if uses_mono and mono is not None and view is not None else None
+        return PicturePixels(rgb, mask, prior.distance_m, prior.sigma_m, sky)
+
+    # OpenCV and torch release the interpreter's lock, so two threads read and integrate side by side; a few pictures
+    # ahead, not all that the disk can bring
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        waiting = deque(pool.submit(load, image_idx) for image_idx in range(min(3, len(dataset))))
+        for ahead in range(len(dataset)):
+            pixels = waiting.popleft().result()
+            if ahead + 3 < len(dataset):
+                waiting.append(pool.submit(load, ahead + 3))
+            yield pixels
+
+
+def _table_key(dataset: FisheyeDepthDataset, options: PriorOptions | None, trust: Trust | None, weight: float) -> str:
+    """What a table was made of: the files by name, size and date, the cameras, and what the prior is made by."""
+    metadata, cameras = dataset.metadata, dataset.cameras
+    masks = dataset._dataparser_outputs.mask_filenames
+    files = [*dataset.image_filenames, *(masks or [])]
+    if options is not None:
+        files += [*(metadata["lidar_filenames"] or []), *(metadata["mono_filenames"] or [])]
+    stats = [(str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in files]
+    described = {
+        "versions": [TABLE_VERSION, CACHE_VERSION],
+        "files": stats,
+        "weight": weight,
+        "metadata": [metadata[key] for key in ("theta_max_rad", "lidar_metres_per_count", "lidar_is_z_depth")],
+        "prior": None if options is None else dataclasses.asdict(options),
+        "trust": None if trust is None else trust.to_dict(),
+        "turn": dataset._dataparser_outputs.dataparser_transform[:3, :3].tolist(),
+    }
+    digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
+    lenses = (cameras.width, cameras.height, cameras.fx, cameras.fy, cameras.cx, cameras.cy, cameras.camera_type)
+    for values in (*lenses, cameras.distortion_params, cameras.camera_to_worlds[:, :3, :3]):
+        digest.update(b"" if values is None else values.cpu().numpy().tobytes())
+    return digest.hexdigest()[:32]
+
+
+def _writable(folder: Path) -> bool:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False
+
+
+def _remove_old(folder: Path) -> None:
+    """Keep the tables that were used last."""
+    keep_last(folder, "*.npy", KEPT_TABLES)
+    for about in folder.glob("[!.]*.json"):
+        if not about.with_suffix(".npy").exists():
+            about.unlink(missing_ok=True)

@@ -1,0 +1,227 @@
+"""Reads a scene folder: nerfstudio's own format, with metric scale and the maps of this project beside it.
+
+Host-facing. Poses and cameras are read by nerfstudio's parser; here come the scale in metres, the files of LiDAR,
+monocular and true maps, and errors that name what is wrong. The scene's axes are kept (z up), so that a distance
+in scene units times `metres_per_unit` is metres.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
+
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE
+from edge_depth_nerf.plugin.scale import default_metres_per_unit
+from edge_depth_nerf.scene.format import INTRINSICS, is_own_scene, pose_of, read_transforms
+
+SUPPORTED_CAMERA_TYPES = (CameraType.PERSPECTIVE, CameraType.FISHEYE)
+
+MAP_KEYS = {
+    "lidar_filenames": "lidar_file_path",
+    "mono_filenames": "mono_file_path",
+    "truth_distance_filenames": "truth_distance_file_path",
+    "truth_rgb_filenames": "truth_rgb_file_path",
+}
+"""Metadata of the dataset: key of the frame in transforms.json. All frames have a map or none has."""
+
+
+@dataclass
+class FisheyeDepthDataParserConfig(NerfstudioDataParserConfig):
+    """Scene with fisheye (or pinhole) cameras, metric poses and distance maps."""
+
+    _target: type = field(default_factory=lambda: FisheyeDepth)
+    """Target class to instantiate."""
+    metres_per_unit: float | None = None
+    """Metres that one scene unit stands for. Not set: half of the drive's extent, at least 10 m, at most what keeps
+    the finest hash cell at 0.25 m."""
+    hash_resolution: int = 2048
+    """Cells of the finest hash-grid level along one axis, for the choice above (the model's max_res)."""
+    depth_unit_scale_factor: float | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    """Metres per count of the files under depth_file_path. Not set: what transforms.json says, else nerfstudio's
+    0.001."""
+    depth_kind: Literal["auto", "distance", "z_depth"] = "auto"
+    """What the files under depth_file_path hold. auto: distance along the ray in scenes of this project and in
+    fisheye scenes, z_depth (nerfstudio's convention) in other people's pinhole scenes."""
+    downscale_factor: int | None = 1
+    """How much to downscale images; other than 1 needs nerfstudio's images_K folders (not in our scenes)."""
+    orientation_method: Literal["pca", "up", "vertical", "none"] = "none"
+    """The method to use for orientation; the drive's own axes by default."""
+    auto_scale_poses: bool = False
+    """nerfstudio's scaling of all poses into +-1. Kept off: the scale is metres_per_unit."""
+    eval_mode: Literal["fraction", "filename", "interval", "all"] = "interval"
+    """How a scene without split files is divided. Interval holds out every eval_interval-th picture."""
+
+
+def check_meta(meta: dict[str, Any], path: Path) -> list[dict[str, Any]]:
+    """Check what nerfstudio's parser takes for granted beyond `read_transforms`; give the list of frames.
+
+    Raises:
+        InputError: an unknown camera model, a frame without pose or intrinsics, a map that only some frames have.
+
+    """
+    model = meta.get("camera_model", "PINHOLE")
+    supported = [name for name, kind in CAMERA_MODEL_TO_TYPE.items() if kind in SUPPORTED_CAMERA_TYPES]
+    if model not in supported:
+        raise InputError(
+            f"{path}: camera_model is {model!r}; expected one of {', '.join(supported)}. "
+            "Convert the cameras, for example with `edge-depth-nerf process`."
+        )
+    frames = meta["frames"]
+    for number, frame in enumerate(frames):
+        if "transform_matrix" not in frame:
+            raise InputError(f"{path}: frame {number} has no transform_matrix. Every frame needs a picture and a pose.")
+        for key in (*INTRINSICS, "w", "h"):
+            if meta.get(key) is None and frame.get(key) is None:
+                raise InputError(
+                    f"{path}: frame {number} ({frame['file_path']}) has no {key}, nor has the whole scene. "
+                    "Every camera needs fl_x, fl_y, cx, cy, w and h in pixels."
+                )
+        pose_of(frame, f"{path}: frame {number} ({frame['file_path']})")
+    for key in (*MAP_KEYS.values(), "depth_file_path", "mask_path"):
+        missing = [frame["file_path"] for frame in frames if key not in frame]
+        if missing and len(missing) < len(frames):
+            raise InputError(
+                f"{path}: {key} is given for {len(frames) - len(missing)} of {len(frames)} frames; it is missing "
+                f"for {', '.join(missing[:3])}{' …' if len(missing) > 3 else ''}. Give it for every frame or none."
+            )
+    return frames
+
+
+def check_split(meta: dict[str, Any], path: Path) -> None:
+    """Check the lists of training and held-out pictures.
+
+    A moment is either trained on or held out, with all its cameras: they share one LiDAR sweep. (A scene with nothing
+    held out has the same pictures in both lists.)
+
+    Raises:
+        InputError: a name that is no frame's, or a moment that is in both.
+    """
+    by_name = {frame["file_path"]: frame for frame in meta["frames"]}
+    lists = {split: meta[f"{split}_filenames"] for split in ("train", "val", "test") if f"{split}_filenames" in meta}
+    for split, names in lists.items():
+        unknown = [name for name in names if name not in by_name]
+        if unknown:
+            raise InputError(f"{path}: {split}_filenames names {unknown[0]}, which is the file_path of no frame.")
+    if "train" not in lists:
+        return
+    for split in ("val", "test"):
+        held_out = lists.get(split, [])
+        if set(held_out) == set(lists["train"]):
+            continue
+        moments = [{by_name[name].get("frame", name) for name in names} for names in (lists["train"], held_out)]
+        shared = sorted(moments[0] & moments[1], key=str)
+        if shared:
+            raise InputError(
+                f"{path}: frame {shared[0]} is in train_filenames and in {split}_filenames. All cameras of a moment "
+                "share one LiDAR sweep, so a moment is either trained on or held out. Process the drive again."
+            )
+
+
+def transforms_path(data: Path) -> Path:
+    """The transforms.json that `--data` means: a scene folder's, or the file itself.
+
+    Raises:
+        FileNotFoundError: no scene there.
+    """
+    path = data if data.suffix == ".json" else data / "transforms.json"
+    if not path.is_file():
+        relative = (
+            f" It was looked for in {Path.cwd()}; paths count from the folder you are in, those that a config.yml "
+            "keeps of its training, too."
+        )
+        raise FileNotFoundError(
+            f"{path}: no such file. --data takes a scene folder with a transforms.json; `edge-depth-nerf process` "
+            f"makes one from a raw drive.{'' if path.is_absolute() else relative}"
+        )
+    return path
+
+
+class FisheyeDepth(Nerfstudio):
+    """Parser of scene folders."""
+
+    config: FisheyeDepthDataParserConfig
+
+    def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
+        """Cameras, pictures, masks and the files of distance maps of one split.
+
+        Raises:
+            FileNotFoundError: no scene there, or a file it names is missing.
+            InputError: the scene cannot be used as it is.
+
+        """
+        path = transforms_path(Path(self.config.data))
+        meta = read_transforms(path)
+        frames = check_meta(meta, path)
+        check_split(meta, path)
+        named = [f"{name}_filenames" for name in ("train", "val", "test") if f"{name}_filenames" in meta]
+        if named and f"{split}_filenames" not in named:
+            raise InputError(f"{path}: has {' and '.join(named)}, but no {split}_filenames. Give all three, or none.")
+        has_maps = any(key in frames[0] for key in MAP_KEYS.values())
+        if has_maps and self.config.downscale_factor not in (None, 1):
+            raise InputError(
+                f"{path}: downscale_factor is {self.config.downscale_factor}, but the distance maps of this scene "
+                "have one size only. Run `edge-depth-nerf process … --downscale K` instead."
+            )
+        is_fisheye = CAMERA_MODEL_TO_TYPE[meta.get("camera_model", "PINHOLE")] == CameraType.FISHEYE
+
+        positions_m = np.array([frame["transform_matrix"] for frame in frames], dtype=np.float64)[:, :3, 3]
+        metres_per_unit = self.config.metres_per_unit
+        if metres_per_unit is None:
+            metres_per_unit = default_metres_per_unit(positions_m, self.config.hash_resolution)
+        if self.config.auto_scale_poses:
+            raise InputError(
+                "auto_scale_poses would lose the metres that near plane, prior and loss are in. "
+                "Set the scale with fisheye-depth-data --metres-per-unit M instead."
+            )
+        if not (np.isfinite(metres_per_unit) and metres_per_unit > 0):
+            raise InputError(f"metres_per_unit is {metres_per_unit}; expected a positive number of metres.")
+
+        unit = self.config.depth_unit_scale_factor
+        if unit is None:
+            unit = float(meta.get("depth_unit_scale_factor", 1e-3))
+        if len(frames) == 1 and "train_filenames" not in meta:
+            self.config.eval_mode = "all"  # the one picture is for training and for judging
+        # nerfstudio's parser takes the scale from its config
+        self.config.scale_factor = 1.0 / metres_per_unit
+        outputs = super()._generate_dataparser_outputs(split)
+
+        if not outputs.image_filenames:
+            raise InputError(f"{path}: no picture is left for the split {split!r}; it needs one at least.")
+
+        data_dir = path.parent
+        by_image = {self._get_fname(Path(frame["file_path"]), data_dir): frame for frame in frames}
+        chosen = [by_image[image] for image in outputs.image_filenames]
+        metadata: dict[str, Any] = {
+            name: [data_dir / frame[key] for frame in chosen] if key in frames[0] else None
+            for name, key in MAP_KEYS.items()
+        }
+        metadata["lidar_metres_per_count"] = 1 / DISTANCE_STEPS_PER_METRE
+        metadata["lidar_is_z_depth"] = False
+        depth_filenames = outputs.metadata["depth_filenames"]
+        if metadata["lidar_filenames"] is None and depth_filenames is not None:
+            metadata["lidar_filenames"] = depth_filenames
+            metadata["lidar_metres_per_count"] = unit
+            own = is_own_scene(meta) or is_fisheye
+            kind = self.config.depth_kind if self.config.depth_kind != "auto" else ("distance" if own else "z_depth")
+            metadata["lidar_is_z_depth"] = kind == "z_depth"
+        metadata["metres_per_unit"] = metres_per_unit
+        metadata["theta_max_rad"] = np.radians(meta["theta_max_deg"]).item() if "theta_max_deg" in meta else None
+        metadata["depth_unit_scale_factor"] = unit
+        outputs.metadata.update(metadata)
+
+        for files in (
+            outputs.image_filenames,
+            outputs.mask_filenames,
+            *(metadata[name] for name in MAP_KEYS),
+        ):
+            for file in files or []:
+                if not file.is_file():
+                    raise FileNotFoundError(f"{file}: no such file, but {path} names it. Process the drive again.")
+        return outputs

@@ -1,0 +1,443 @@
+"""nerfacto with the edge loss, in metres, judged inside the mask.
+
+Host-facing: formulas stand in `losses` and `metrics`. Lengths in scene units are turned into metres with the
+`metres_per_unit` of the dataset's metadata, so that near, far, sigma and the loss weight mean the same in every
+scene.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.rays import RayBundle, RaySamples
+from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.field_components.field_heads import FieldHeadNames
+from nerfstudio.model_components.losses import ds_nerf_depth_loss, urban_radiance_field_depth_loss
+from nerfstudio.model_components.renderers import DepthRenderer
+from nerfstudio.model_components.scene_colliders import NearFarCollider
+from nerfstudio.models.nerfacto import NerfactoModel, NerfactoModelConfig
+from nerfstudio.utils.external import TCNN_EXISTS
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from edge_depth_nerf.base.pictures import DISTANCE, SIGMA, colour_distance
+from edge_depth_nerf.kernels.allocator import keep_freed_memory
+from edge_depth_nerf.kernels.fields import CubeContraction, FusedNerfactoField, use_fused_fields
+from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss, proposal_loss
+from edge_depth_nerf.kernels.openmp import let_idle_threads_sleep
+from edge_depth_nerf.kernels.ray_samplers import FusedPDFSampler, edges_of
+from edge_depth_nerf.method.losses import edge_loss, sky_loss
+from edge_depth_nerf.method.metrics import DepthErrors, load_lpips, masked_lpips, masked_psnr, masked_ssim
+from edge_depth_nerf.method.uncertainty import termination_std
+from edge_depth_nerf.plugin.compat import lpips_not_built, total_steps, without_undefined_ray
+
+LARGEST_NEAR_PLANE_M = 0.5
+"""A near plane beyond this cuts off road and car beside the camera."""
+
+
+@dataclass
+class EdgeDepthNerfModelConfig(NerfactoModelConfig):
+    """nerfacto supervised by a distance prior."""
+
+    _target: type = field(default_factory=lambda: EdgeDepthNerfModel)
+    """Target class to instantiate."""
+    near_m: float = 0.2
+    """How far along the ray to start sampling, metres (in place of near_plane)."""
+    far_m: float = 1000.0
+    """How far along the ray to stop sampling, metres (in place of far_plane)."""
+    depth_loss: Literal["edge", "ds-nerf", "urban-nerf", "none"] = "edge"
+    """The loss on the distance prior: Eq. 4, nerfstudio's DS-NeRF or UrbanNeRF loss, or none (plain nerfacto)."""
+    depth_loss_mult: float = 0.01
+    """Weight λ of the loss on the distance prior (not published; how it was chosen: docs/ablation.md)."""
+    depth_sigma: float = 0.5
+    """Standard deviation that the DS-NeRF and UrbanNeRF losses assume, metres. (Eq. 4 takes the prior's own.)"""
+    depth_loss_levels: Literal["all", "final"] = "all"
+    """Whether the loss acts on the samples of the proposal networks too, or on the final ones alone."""
+    depth_loss_final: float = 0.01
+    """The share of λ that is left after `depth_loss_steps`; until then it falls exponentially. The prior shapes the
+    scene early, and its errors at the outlines of things hold the pictures back late. 1: λ stays."""
+    depth_loss_steps: int | None = None
+    """Steps in which λ falls. None: those of the whole training, or 30,000 where no trainer says how many."""
+    sky_loss_mult: float = 0.01
+    """With the edge loss: weight of what rays into the sky hit, their accumulated weight. 0: the sky is left to
+    colour."""
+    sky_background: bool = True
+    """With the edge loss: what no sample stops is coloured by the field at infinity, where the sky is. False: by the
+    last sample, as in nerfacto, from wherever that is."""
+    surface_loss_mult: float = 1.0
+    """With the edge loss: weight of the colour error of the field at the prior's distance, for the datamanager's
+    `surface_rays_per_batch` further pixels at one sample each."""
+    exposure: Literal["gain", "embedding"] = "gain"
+    """What makes up for a camera's drifting exposure. gain: a factor for each colour of each training picture, their
+    geometric mean 1, with which views are rendered. embedding: nerfacto's appearance embedding, for views the mean of
+    all pictures'; that of a mean is not the mean of what they make."""
+    edge_gaussian: Literal["point", "interval"] = "interval"
+    """How Eq. 4 weighs a sample: by the Gaussian's value at its middle times its length, or by the Gaussian's mass
+    over its interval."""
+    edge_divide_by_norm: bool = True
+    """Divide Eq. 4's Gaussian by σ̂·√(2π), so that a wide one does not pull harder than a narrow one."""
+    implementation: Literal["auto", "fused", "tcnn", "torch"] = "auto"  # pyright: ignore[reportIncompatibleVariableOverride]
+    """What computes fields, samples and losses. fused: kernels of our own (Numba on the CPU; on CUDA the hash grids, by
+    Triton). torch: nerfstudio's, same results and checkpoints as fused, many times slower. tcnn: tiny-cuda-nn, with
+    checkpoints of its own. auto: tcnn on a GPU where it is installed, else fused."""
+
+
+INFINITELY_FAR = 1e4
+"""Scene units: so far that the place in the contracted scene is the direction alone."""
+LEAST_HIT = 0.05
+"""Rays that stop less than this share of their light are said to hit nothing."""
+
+
+class DepthInEvaluation(DepthRenderer):
+    """nerfstudio's depth, of that share of a ray that hits something; nothing in training, where nobody reads it.
+
+    At an outline a pixel is half sky, half house: the house's distance is its distance.
+    """
+
+    def forward(self, weights: Tensor, ray_samples: RaySamples, *args: Any, **kwargs: Any) -> Any:
+        """Give the depth, [rays, 1]; in training None."""
+        if self.training:
+            return None
+        hit = weights.sum(dim=-2, keepdim=True)
+        weights = torch.where(hit > LEAST_HIT, weights / hit.clamp(min=LEAST_HIT), weights)
+        return super().forward(weights, ray_samples, *args, **kwargs)
+
+
+class DepthMoments(DepthRenderer):
+    """nerfstudio's expected depth; in evaluation the standard deviation beside it, and in training None unless read."""
+
+    def __init__(self, in_training: bool) -> None:
+        super().__init__(method="expected")
+        self.in_training = in_training
+
+    def forward(self, weights: Tensor, ray_samples: RaySamples, *args: Any, **kwargs: Any) -> Any:
+        """Give [rays, 2]; in training the expected depth alone, [rays, 1], or None."""
+        if self.training and not self.in_training:
+            return None
+        expected = super().forward(weights, ray_samples, *args, **kwargs)
+        if self.training:
+            return expected
+        starts, ends = ray_samples.frustums.starts[..., 0], ray_samples.frustums.ends[..., 0]
+        return torch.cat([expected, termination_std(weights[..., 0], starts, ends)[..., None]], dim=-1)
+
+
+class Psnr(torch.nn.Module):
+    """torchmetrics' PSNR of values in 0..1, without the state that it keeps over batches."""
+
+    def forward(self, image: Tensor, other: Tensor) -> Tensor:
+        """PSNR of two pictures, dB."""
+        return -10 * torch.log10(torch.nn.functional.mse_loss(image.detach(), other))
+
+
+class LpipsAtFirstUse:
+    """LPIPS as nerfacto calls it, kept outside the module tree and so outside checkpoints.
+
+    Without AlexNet's weights on disk it says so once and gives NaN, which the model leaves out of its figures.
+    """
+
+    def __init__(self) -> None:
+        self._loaded = False
+        self.network: torch.nn.Module | None = None
+
+    def load(self, device: torch.device) -> torch.nn.Module | None:
+        """The network on `device`, or None where its weights are missing."""
+        if not self._loaded:
+            self._loaded = True
+            self.network = load_lpips()
+        return None if self.network is None else self.network.to(device)
+
+    def __call__(self, image: Tensor, other: Tensor) -> Tensor:
+        """LPIPS of two pictures (1×3×H×W in 0..1), NaN without weights."""
+        network = self.load(image.device)
+        return image.new_tensor(float("nan")) if network is None else network(image, other.clamp(0, 1))
+
+
+class EdgeDepthNerfModel(NerfactoModel):
+    """nerfacto supervised by a distance prior."""
+
+    config: EdgeDepthNerfModelConfig
+
+    def populate_modules(self) -> None:
+        """Build nerfacto with near and far planes in metres."""
+        metadata = self.kwargs.get("metadata") or {}
+        self.metres_per_unit: float = metadata.get("metres_per_unit", 1.0)
+        if self.config.near_m > LARGEST_NEAR_PLANE_M:
+            CONSOLE.print(
+                f"[bold yellow]The near plane is at {self.config.near_m:g} m: what is nearer to a camera is not "
+                "rendered. Set --pipeline.model.near-m 0.2 unless that is meant."
+            )
+        implementation = self.config.implementation
+        if implementation == "auto":
+            on_gpu = torch.device(self.kwargs.get("device", "cpu")).type == "cuda"
+            implementation = "tcnn" if TCNN_EXISTS and on_gpu else "fused"
+        if torch.device(self.kwargs.get("device", "cpu")).type == "cpu":
+            keep_freed_memory()
+            let_idle_threads_sleep()
+        # nerfstudio knows two of them; the model's own configuration says which was built
+        self.config = replace(self.config, implementation="tcnn" if implementation == "tcnn" else "torch")
+        self._fused = implementation == "fused"
+        if self.config.exposure == "gain":
+            self.config.use_appearance_embedding = False
+        self._has_sky = self.config.depth_loss == "edge" and self.config.sky_background
+        if self._has_sky:
+            # nothing is added to what samples stop; `get_outputs` adds the colour at infinity
+            self.config.background_color = "black"
+        with lpips_not_built():
+            super().populate_modules()
+        if implementation == "fused":
+            from edge_depth_nerf.kernels.compiled import (
+                compiled_before,  # imports Numba, which other commands do without
+            )
+
+            if not compiled_before():
+                CONSOLE.print("The first steps compile kernels, which takes about a minute, once on this machine.")
+            use_fused_fields(self)
+            # bound before the networks were of the fused class
+            self.density_fns = [density_fn.__self__.density_fn for density_fn in self.density_fns]
+            pdf = self.proposal_sampler.pdf_sampler
+            self.proposal_sampler.pdf_sampler = FusedPDFSampler(
+                include_original=pdf.include_original, single_jitter=pdf.single_jitter
+            )
+            # nerfacto's field prepares a gradient to the positions at every step, for normals or poses
+            if isinstance(self.field, FusedNerfactoField):
+                poses = self.config.camera_optimizer.mode != "off"
+                self.field.follows_positions = self.config.predict_normals or poses
+        if not self.config.disable_scene_contraction:
+            for network in (self.field, *self.proposal_networks):
+                network.spatial_distortion = CubeContraction(order=float("inf"))
+        self.lpips = LpipsAtFirstUse()
+        self.psnr = Psnr()
+        self.renderer_depth = DepthInEvaluation(method="median")
+        self.renderer_expected_depth = DepthMoments(in_training=self.config.depth_loss == "urban-nerf")
+        # the near plane is not reset at evaluation: nothing was trained in front of it
+        self.collider = NearFarCollider(
+            near_plane=self.config.near_m / self.metres_per_unit,
+            far_plane=self.config.far_m / self.metres_per_unit,
+            reset_near_plane=False,
+        )
+        if self.config.exposure == "gain":
+            self.log_gains = torch.nn.Parameter(torch.zeros(self.num_train_data, 3))
+        self._step = 0
+        self._training_steps = 30_000
+        self.reset_depth_errors()
+
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """Nerfacto's callbacks, and one that tells the step."""
+        trainer = training_callback_attributes.trainer
+        if trainer is not None:
+            self._training_steps = total_steps(trainer)
+
+        def remember(step: int) -> None:
+            self._step = step
+
+        return [
+            *super().get_training_callbacks(training_callback_attributes),
+            TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], remember, update_every_num_iters=1),
+        ]
+
+    def get_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
+        """Nerfacto's parameters; the pictures' gains go with the fields."""
+        groups = super().get_param_groups()
+        if self.config.exposure == "gain":
+            groups["fields"].append(self.log_gains)
+        return groups
+
+    def _exposed(self, colours: Float[Tensor, "rays 3"], rays: RayBundle) -> Float[Tensor, "rays 3"]:
+        """Colours as the training pictures that the rays are from have them; as they are at evaluation."""
+        if not self.training or self.config.exposure != "gain":
+            return colours
+        assert rays.camera_indices is not None
+        gains = self.log_gains - self.log_gains.mean(dim=0)
+        return colours * gains[rays.camera_indices[:, 0]].exp()
+
+    def _field_at(self, rays: RayBundle, distance: Float[Tensor, "rays"]) -> Float[Tensor, "rays 3"]:
+        """Colours of the field at one distance along each ray, scene units."""
+        at = distance[:, None, None]
+        samples = rays.get_ray_samples(bin_starts=0.99 * at, bin_ends=1.01 * at)
+        return self.field.forward(samples)[FieldHeadNames.RGB][:, 0]
+
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
+        """Nerfacto's outputs before the sky; in training without the depths that no loss reads.
+
+        In evaluation also, in metres, the median `distance` and `distance_uncertainty`, the standard deviation of where
+        the ray ends. (nerfstudio divides outputs with "depth" in their name by the scene's scale; these have none.)
+        """
+        outputs = super().get_outputs(ray_bundle)
+        if self._has_sky:
+            behind = self._field_at(ray_bundle, ray_bundle.origins.new_full((len(ray_bundle),), INFINITELY_FAR))
+            outputs["rgb"] = outputs["rgb"] + (1 - outputs["accumulation"]) * behind
+        outputs["rgb"] = self._exposed(outputs["rgb"], ray_bundle)
+        if not self.training:
+            outputs["expected_depth"], std = outputs["expected_depth"].split(1, dim=-1)
+            outputs["distance"] = outputs["depth"] * self.metres_per_unit
+            outputs["distance_uncertainty"] = std * self.metres_per_unit
+        return {name: value for name, value in outputs.items() if value is not None}
+
+    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
+        """Outputs of a whole view; distance and uncertainty also in colours that always mean the same metres."""
+        outputs = super().get_outputs_for_camera(without_undefined_ray(camera), obb_box)
+        for name, scale in (("distance", DISTANCE), ("distance_uncertainty", SIGMA)):
+            metres = outputs[name][..., 0].cpu().numpy()
+            coloured = torch.from_numpy(scale.coloured(metres, np.isfinite(metres)))
+            outputs[f"{name}_coloured"] = coloured.to(outputs[name]) / 255
+        return outputs
+
+    def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
+        """Nerfacto's metrics and, in training, the share of rays with a prior."""
+        if self.training and self._fused:
+            rendered = outputs["rgb"]
+            metrics = {
+                "psnr": self.psnr(rendered, self.renderer_rgb.blend_background(batch["image"].to(self.device))),
+                "distortion": distortion_loss(
+                    edges_of(outputs["ray_samples_list"][-1]), outputs["weights_list"][-1][..., 0]
+                ),
+            }
+            self.camera_optimizer.get_metrics_dict(metrics)
+        else:
+            metrics = super().get_metrics_dict(outputs, batch)
+        if self.training and self.config.depth_loss != "none":
+            metrics["share_with_prior"] = (batch["prior_distance_m"] > 0).float().mean()
+        return metrics
+
+    def get_loss_dict(
+        self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Any] | None = None
+    ) -> dict[str, Tensor]:
+        """Nerfacto's losses and the one on the distance prior: L_color + λ·L_edge."""
+        if self.training and self._fused and metrics_dict is not None and not self.config.predict_normals:
+            losses = self._nerfacto_losses(outputs, batch, metrics_dict)
+        else:
+            losses = super().get_loss_dict(outputs, batch, metrics_dict)
+        if self.training and self.config.depth_loss != "none":
+            levels = list(zip(outputs["weights_list"], outputs["ray_samples_list"], strict=True))
+            if self.config.depth_loss_levels == "final":
+                levels = levels[-1:]
+            per_level = [self._depth_loss(weights, samples, outputs, batch) for weights, samples in levels]
+            name = "edge_loss" if self.config.depth_loss == "edge" else "depth_loss"
+            losses[name] = self._depth_weight() * torch.stack(per_level).mean()
+        if self.training and self.config.depth_loss == "edge":
+            losses |= self._sky_and_surface_losses(outputs, batch)
+        return losses
+
+    def _depth_weight(self) -> float:
+        """λ at this step."""
+        steps = self._training_steps if self.config.depth_loss_steps is None else self.config.depth_loss_steps
+        share = min(1.0, self._step / max(1, steps))
+        return self.config.depth_loss_mult * self.config.depth_loss_final**share
+
+    def _sky_and_surface_losses(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
+        losses = {}
+        if self.config.sky_loss_mult > 0:
+            sky = batch["sky"][:, 0].to(self.device)
+            per_level = [sky_loss(weights[..., 0], sky) for weights in outputs["weights_list"]]
+            losses["sky_loss"] = self.config.sky_loss_mult * torch.stack(per_level).mean()
+        if self.config.surface_loss_mult > 0 and "surface_rays" in batch:
+            rays, sky = batch["surface_rays"], batch["surface_sky"][:, 0]
+            # any place within what the prior leaves open may be the surface
+            distance_m, sigma_m = batch["surface_distance_m"][:, 0], batch["surface_sigma_m"][:, 0]
+            distance = (distance_m + sigma_m * torch.randn_like(sigma_m)).clamp(min=0) / self.metres_per_unit
+            colours = self._exposed(self._field_at(rays, torch.where(sky, INFINITELY_FAR, distance)), rays)
+            losses["surface_loss"] = self.config.surface_loss_mult * self.rgb_loss(batch["surface_image"], colours)
+        return losses
+
+    def _nerfacto_losses(
+        self, outputs: dict[str, Any], batch: dict[str, Any], metrics: dict[str, Any]
+    ) -> dict[str, Tensor]:
+        """Nerfacto's losses without normals, in fewer passes."""
+        rendered, image = self.renderer_rgb.blend_background_for_loss_computation(
+            outputs["rgb"], outputs["accumulation"], batch["image"].to(self.device)
+        )
+        *proposals, final = (
+            (edges_of(samples), weights[..., 0])
+            for samples, weights in zip(outputs["ray_samples_list"], outputs["weights_list"], strict=True)
+        )
+        bounds = [proposal_loss(final[0], final[1].detach(), *proposal) for proposal in proposals]
+        losses = {
+            "rgb_loss": self.rgb_loss(image, rendered),
+            "interlevel_loss": self.config.interlevel_loss_mult * torch.stack(bounds).sum(),
+            "distortion_loss": self.config.distortion_loss_mult * metrics["distortion"],
+        }
+        self.camera_optimizer.get_loss_dict(losses)
+        return losses
+
+    def _depth_loss(
+        self,
+        weights: Float[Tensor, "rays samples 1"],
+        samples: RaySamples,
+        outputs: dict[str, Any],
+        batch: dict[str, Any],
+    ) -> Float[Tensor, ""]:
+        starts_m = samples.frustums.starts * self.metres_per_unit
+        ends_m = samples.frustums.ends * self.metres_per_unit
+        prior_m = batch["prior_distance_m"].to(weights)
+        if self.config.depth_loss == "edge":
+            return edge_loss(
+                weights[..., 0],
+                starts_m[..., 0],
+                ends_m[..., 0],
+                prior_m[..., 0],
+                batch["prior_sigma_m"].to(weights)[..., 0],
+                gaussian=self.config.edge_gaussian,
+                divide_by_norm=self.config.edge_divide_by_norm,
+            )
+        middles_m = (starts_m + ends_m) / 2
+        sigma_m = weights.new_tensor([self.config.depth_sigma])
+        if self.config.depth_loss == "ds-nerf":
+            # nerfstudio divides by 2σ where a Gaussian has 2σ², so what it calls sigma is a variance
+            return ds_nerf_depth_loss(weights, prior_m, middles_m, ends_m - starts_m, sigma_m.square())
+        expected_m = outputs["expected_depth"] * self.metres_per_unit
+        return urban_radiance_field_depth_loss(weights, prior_m, expected_m, middles_m, sigma_m)
+
+    def reset_depth_errors(self) -> None:
+        """Start pooling depth errors anew."""
+        self._depth_errors = {"lidar": DepthErrors(), "truth": DepthErrors()}
+
+    def pooled_depth_errors(self) -> dict[str, float]:
+        """Depth errors over all pixels judged since the last reset."""
+        return {
+            key: value
+            for name, errors in self._depth_errors.items()
+            for key, value in errors.compute(f"{name}_").items()
+        }
+
+    @torch.no_grad()
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Tensor], batch: dict[str, Any]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Nerfacto's metrics over the full frame, ours inside the mask, and depth errors.
+
+        Returns:
+            psnr, ssim and, given weights, lpips over the full frame; masked_* inside the mask; truth_masked_*
+            against the picture without noise where it is known. The pictures hold `distance`, the median distance
+            in metric colours, besides nerfacto's. The errors of the median distance (1-60 m) against LiDAR and
+            truth, where there are any, are in `pooled_depth_errors`: a view without them has no figure of its own.
+
+        """
+        metrics, images = super().get_image_metrics_and_images(outputs, batch)
+        lpips = self.lpips.load(self.device)
+        if lpips is None:
+            del metrics["lpips"]
+        predicted = outputs["rgb"].clamp(0, 1)
+        mask = batch["mask"][..., 0].to(predicted.device)
+        for prefix, key in (("", "image"), ("truth_", "truth_rgb")):
+            if key in batch:
+                target = batch[key][..., :3].to(predicted)
+                metrics[f"{prefix}masked_psnr"] = float(masked_psnr(predicted, target, mask))
+                metrics[f"{prefix}masked_ssim"] = float(masked_ssim(predicted, target, mask))
+                if lpips is not None:
+                    metrics[f"{prefix}masked_lpips"] = float(masked_lpips(predicted, target, mask, lpips))
+        distance_m = outputs["depth"][..., 0] * self.metres_per_unit
+        for name, errors in self._depth_errors.items():
+            if f"{name}_distance_m" in batch:
+                true_m = batch[f"{name}_distance_m"][..., 0].to(distance_m)
+                errors.update(distance_m, true_m, mask)
+        coloured = colour_distance(distance_m.cpu().numpy(), mask.cpu().numpy())
+        images["distance"] = torch.from_numpy(coloured).float() / 255
+        return metrics, images

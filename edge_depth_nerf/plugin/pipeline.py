@@ -1,0 +1,143 @@
+"""Holds model and DataManager together, and pools depth errors over the pixels of all held-out views.
+
+nerfstudio would average depth errors over pictures.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManager, FisheyeDepthDataManagerConfig
+from edge_depth_nerf.plugin.model import EdgeDepthNerfModel, EdgeDepthNerfModelConfig
+from edge_depth_nerf.plugin.plain_errors import say_errors_plainly
+from edge_depth_nerf.plugin.viewer import DrivePanel
+
+FARTHEST_UNITS = 1e6
+"""nerfstudio's sampler turns a distance x beyond 1 into 1 - 1/(2x): float32 has no such number below 1 from 2^23 on."""
+STEPS_PER_CHECK = 50
+"""On a GPU the losses are looked at once in so many steps; NaN in a parameter stays, so it is found then."""
+MOST_NAMED = 5
+"""An error names so many pictures."""
+
+
+@dataclass
+class EdgeDepthPipelineConfig(VanillaPipelineConfig):
+    """nerfstudio's pipeline with pooled depth errors."""
+
+    _target: type = field(default_factory=lambda: EdgeDepthPipeline)
+    """Target class to instantiate."""
+
+    def setup(self, **kwargs: Any) -> Any:
+        """Build the pipeline; from here on nerfstudio's commands say our errors without a traceback."""
+        say_errors_plainly()
+        return super().setup(**kwargs)
+
+
+class NotFiniteError(InputError):
+    """A loss became NaN or infinite: by a picture or map, or by options of the training."""
+
+
+class EdgeDepthPipeline(VanillaPipeline):
+    """nerfstudio's pipeline with pooled depth errors."""
+
+    def __init__(self, config: EdgeDepthPipelineConfig, device: str | torch.device, *args: Any, **kwargs: Any) -> None:
+        """Build both parts; a model gets neither a prior nor further pixels that it would not use.
+
+        Raises:
+            InputError: the model has a depth loss, but no training pixel has a prior; or its far plane is out of range.
+
+        """
+        model, data = config.model, config.datamanager
+        assert isinstance(model, EdgeDepthNerfModelConfig) and isinstance(data, FisheyeDepthDataManagerConfig)
+        if model.depth_loss == "none":
+            config = replace(config, datamanager=replace(data, depth_source="none"))
+        elif model.depth_loss != "edge" or model.surface_loss_mult == 0:
+            config = replace(config, datamanager=replace(data, surface_rays_per_batch=0))
+        super().__init__(config, str(device), *args, **kwargs)
+        manager = self.datamanager
+        assert isinstance(manager, FisheyeDepthDataManager)
+        metres_per_unit = manager.train_dataset.metadata["metres_per_unit"]
+        if model.far_m / metres_per_unit > FARTHEST_UNITS:
+            raise InputError(
+                f"{manager.get_datapath()}: the far plane of {model.far_m:g} m is at "
+                f"{model.far_m / metres_per_unit:.3g} scene units ({metres_per_unit:.3g} m each); beyond "
+                f"{FARTHEST_UNITS:g} the samples along a ray can no longer be told apart. Lower "
+                "--pipeline.model.far-m, or leave --pipeline.datamanager.dataparser.metres-per-unit at its default."
+            )
+        sampler = manager.train_pixel_sampler
+        if model.depth_loss != "none" and sampler is not None and sampler.table.share_with_prior == 0:
+            raise InputError(
+                f"{manager.get_datapath()}: no training pixel has a depth prior, so nothing for the depth loss "
+                f"{model.depth_loss!r}. Process the drive with LiDAR, or make monocular maps by "
+                "`edge-depth-nerf estimate-depth`, or train without a prior by "
+                "--pipeline.model.depth-loss none."
+            )
+        self.drive = DrivePanel(manager)
+
+    def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Any], dict[str, Any]]:
+        """Outputs, losses and metrics of the next batch, as nerfstudio gives them.
+
+        Raises:
+            NotFiniteError: a loss is not finite; before the step is taken. On a GPU, which would have to be waited for,
+                this is looked at in some steps only.
+
+        """
+        outputs, losses, metrics = super().get_train_loss_dict(step)
+        if str(self.device) == "cpu" or step % STEPS_PER_CHECK == 0:
+            if not all(bool(loss.detach().isfinite()) for loss in losses.values()):
+                raise NotFiniteError(self._not_finite(step, outputs, losses))
+        return outputs, losses, metrics
+
+    def _not_finite(self, step: int, outputs: dict[str, Any], losses: dict[str, Any]) -> str:
+        """Say which losses are not finite, and in which pictures."""
+        manager = self.datamanager
+        assert isinstance(manager, FisheyeDepthDataManager)
+        odd = [
+            f"{name} is {value}" for name, loss in losses.items() if not math.isfinite(value := float(loss.detach()))
+        ]
+        count = len(manager.trained_on)
+        rendered = [outputs["rgb"], *(weights.flatten(1) for weights in outputs.get("weights_list", ()))]
+        bad = ~torch.cat([torch.isfinite(values) for values in rendered], dim=-1).all(-1)
+        some = 0 < int(bad.sum()) < count
+        names = manager.pictures_of(bad.nonzero()[:, 0] if some else None)
+        rays = f"{int(bad.sum())} of {count} rays are not finite" if some else f"its {count} rays"
+        listed = f"{', '.join(names[:MOST_NAMED])}{' …' if len(names) > MOST_NAMED else ''}"
+        return (
+            f"Step {step}: {', '.join(odd)}; {rays}, from {len(names)} "
+            f"pictures: {listed}. Look at them with `edge-depth-nerf inspect`; if they are fine, lower the learning "
+            "rate or the weights of the losses, or leave mixed precision off (--mixed-precision False)."
+        )
+
+    def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Figures and pictures of one held-out view."""
+        model = self.model
+        assert isinstance(model, EdgeDepthNerfModel)
+        model.reset_depth_errors()
+        metrics, images = super().get_eval_image_metrics_and_images(step)
+        return {**metrics, **model.pooled_depth_errors()}, images
+
+    def get_average_image_metrics(
+        self,
+        data_loader: Any,
+        image_prefix: str,
+        step: int | None = None,
+        output_path: Path | None = None,
+        get_std: bool = False,
+    ) -> dict[str, Any]:
+        """Nerfstudio's averages over pictures; AbsRel, RMSE and δ are over all their pixels together."""
+        model = self.model
+        assert isinstance(model, EdgeDepthNerfModel)
+        model.reset_depth_errors()
+        metrics = super().get_average_image_metrics(data_loader, image_prefix, step, output_path, get_std)
+        pooled = model.pooled_depth_errors()
+        # a spread over pictures says nothing of a pooled figure, and of a single picture it is NaN
+        spreads = {f"{name}_std" for name in pooled}
+        kept = {name: value for name, value in metrics.items() if name not in spreads and math.isfinite(value)}
+        return {**kept, **pooled}

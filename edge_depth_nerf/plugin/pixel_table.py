@@ -1,0 +1,248 @@
+"""The training pixels that count, on disk in a random order.
+
+Pure. Only valid pixels of each picture are kept, as records of 15 bytes: colour as uint8, prior distance and sigma as
+uint16 in 1/256 m (0 = no prior; the sky has no distance and the largest sigma), and where the pixel is. Their order is
+random, so that a batch is one contiguous read of a memory-mapped file: any number of pictures needs next to no memory
+of the process's own. A batch holds each pixel at most once, and all pixels are passed before one comes again.
+
+The order is made in two passes: each pixel goes to one of several files, drawn at random; then each file, small enough
+for memory, is shuffled and appended to the whole. That is a uniformly random permutation.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from contextlib import ExitStack
+from dataclasses import dataclass, fields
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from numpy.typing import NDArray
+from torch import Tensor
+
+from edge_depth_nerf.base.checked_cache import is_whole, write_checked
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE, read_json_object, write_json
+
+TABLE_VERSION = 3
+"""Raised whenever the form of the file changes."""
+BUCKET_BYTES = 64 << 20
+"""So much is shuffled in memory at once."""
+RECORD = np.dtype(
+    [
+        ("rgb", "u1", 3),
+        ("distance", "<u2"),
+        ("sigma", "<u2"),
+        ("picture", "<u4"),
+        ("row", "<u2"),
+        ("column", "<u2"),
+    ]
+)
+"""One pixel, packed."""
+SKY = 65535
+"""The sigma, in steps, of a pixel that shows the sky; its distance is 0."""
+LARGEST_SIDE_PX = 1 << 16
+"""Rows and columns are kept in 16 bits."""
+
+
+def to_steps(distance_m: NDArray) -> NDArray[np.uint16]:
+    """Metres as counts of 1/256 m; what is beyond the range of 16 bits or not positive becomes 0 (none)."""
+    steps = np.rint(np.nan_to_num(distance_m, nan=0.0, posinf=0.0, neginf=0.0) * DISTANCE_STEPS_PER_METRE)
+    return np.where((steps > 0) & (steps <= 65535), steps, 0).astype(np.uint16)
+
+
+def _sigma_steps(sigma_m: NDArray) -> NDArray[np.uint16]:
+    """As `to_steps`, but what is too small or too large for 16 bits stays a standard deviation."""
+    usable = np.isfinite(sigma_m) & (sigma_m > 0)
+    steps = np.clip(np.rint(np.where(usable, sigma_m, 0) * DISTANCE_STEPS_PER_METRE), 1, 65535)
+    return np.where(usable, steps, 0).astype(np.uint16)
+
+
+@dataclass
+class PixelBatch:
+    """A batch of n training pixels."""
+
+    indices: Int[Tensor, "n 3"]
+    """Picture, row, column."""
+    rgb: Float[Tensor, "n 3"]
+    """Colour in 0..1."""
+    prior_distance_m: Float[Tensor, "n 1"]
+    """Prior of the distance along the ray, metres, 0 = none."""
+    prior_sigma_m: Float[Tensor, "n 1"]
+    """Its standard deviation, metres; 0 without a prior."""
+    sky: Bool[Tensor, "n 1"]
+    """Whether the pixel is known to show the sky."""
+
+    def __getitem__(self, chosen: Bool[Tensor, "n"]) -> PixelBatch:
+        """Some of the pixels."""
+        return PixelBatch(**{entry.name: getattr(self, entry.name)[chosen] for entry in fields(self)})
+
+
+class PixelTable:
+    """All valid pixels of some pictures, in a random order, memory-mapped."""
+
+    def __init__(self, path: Path):
+        """Open a table that `PixelTableWriter` wrote; all of it is read once, to see whether it is as it was written.
+
+        Raises:
+            InputError, OSError, ValueError: it is not there, of another version, or not whole.
+
+        """
+        if not is_whole(path, TABLE_VERSION):
+            raise InputError(f"{path}: not there, not as it was written, or of another version")
+        about = read_json_object(_about(path), "pixels", "with_prior")
+        self._records: NDArray = np.load(path, mmap_mode="r", allow_pickle=False)
+        if about.get("version") != TABLE_VERSION or self._records.dtype != RECORD:
+            raise ValueError(f"{path}: a table of version {about.get('version')}, expected {TABLE_VERSION}")
+        if len(self._records) != about["pixels"]:
+            raise ValueError(f"{path}: {len(self._records)} pixels, expected {about['pixels']}")
+        if type(about["with_prior"]) is not int:
+            raise ValueError(f"{path}: with_prior is no number")
+        self._with_prior = about["with_prior"]
+
+    def __len__(self) -> int:
+        """Number of records: of valid pixels, where each counts once."""
+        return len(self._records)
+
+    @property
+    def share_with_prior(self) -> float:
+        """Share of the records that have a prior."""
+        return self._with_prior / len(self)
+
+    def batch(self, start: int, count: int) -> PixelBatch:
+        """Read `count` pixels from number `start` on; after the last one comes the first again."""
+        first = start % len(self)
+        records = self._records[first : first + count]
+        if len(records) < count:
+            records = self._records[np.arange(first, first + count) % len(self)]
+
+        def metres(steps: NDArray[np.uint16]) -> Tensor:
+            return torch.from_numpy(steps.astype(np.float32) / DISTANCE_STEPS_PER_METRE)[:, None]
+
+        sky = (records["distance"] == 0) & (records["sigma"] == SKY)
+        where = np.stack([records[name].astype(np.int64) for name in ("picture", "row", "column")], axis=1)
+        return PixelBatch(
+            indices=torch.from_numpy(where),
+            rgb=torch.from_numpy(records["rgb"].astype(np.float32) / 255),
+            prior_distance_m=metres(records["distance"]),
+            prior_sigma_m=metres(np.where(sky, 0, records["sigma"])),
+            sky=torch.from_numpy(sky)[:, None],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PicturePixels:
+    """What a table takes of a picture; all maps H×W."""
+
+    rgb: UInt8[np.ndarray, "h w 3"]
+    mask: Bool[np.ndarray, "h w"]
+    """True where a pixel may be used."""
+    prior_distance_m: Float[np.ndarray, "h w"] | None = None
+    """Metres, 0 = none; None: no prior anywhere."""
+    prior_sigma_m: Float[np.ndarray, "h w"] | None = None
+    sky: Bool[np.ndarray, "h w"] | None = None
+    """Where it is known to show the sky; None: nowhere."""
+
+
+class PixelTableWriter:
+    """Writes a table, picture by picture; a context in which temporary files live.
+
+    with PixelTableWriter(path, most_pixels) as writer:
+        writer.add(rgb, mask, distance_m, sigma_m)
+        writer.finish()
+    """
+
+    def __init__(self, path: Path, most_pixels: int, seed: int = 0, prior_weight: float = 1.0):
+        """Begin.
+
+        Args:
+            path: the file to be, .npy; its folder is made.
+            most_pixels: an upper bound of the pixels that will be added.
+            seed: of their order.
+            prior_weight: a pixel with a prior is drawn so many times as often as one without. (It is in the table
+                once or more often: so many times in the mean, or, below 1, one without is.)
+
+        """
+        self.path = path
+        self._rng = np.random.default_rng(seed)
+        self._copies = (max(1.0, 1 / prior_weight), max(1.0, prior_weight))
+        self._most_bytes = int(most_pixels * max(self._copies)) * RECORD.itemsize
+        self._stack = ExitStack()
+        self._buckets: list[IO[bytes]] = []
+        self._pictures = self._pixels = self._with_prior = 0
+
+    def __enter__(self) -> PixelTableWriter:
+        """Open the temporary files."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        for _ in range(max(1, -(-self._most_bytes // BUCKET_BYTES))):
+            file = tempfile.TemporaryFile(dir=self.path.parent, prefix=".pixels.")
+            self._buckets.append(self._stack.enter_context(file))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Remove the temporary files."""
+        self._stack.close()
+
+    def add(self, pixels: PicturePixels) -> None:
+        """Add the next picture."""
+        rgb, mask = pixels.rgb, pixels.mask
+        prior_distance_m, prior_sigma_m, sky = pixels.prior_distance_m, pixels.prior_sigma_m, pixels.sky
+        assert max(mask.shape) < LARGEST_SIDE_PX
+        rows, columns = np.nonzero(mask)
+        records = np.zeros(len(rows), RECORD)
+        records["rgb"] = rgb[rows, columns]
+        records["row"], records["column"], records["picture"] = rows, columns, self._pictures
+        if prior_distance_m is not None and prior_sigma_m is not None:
+            records["distance"] = to_steps(prior_distance_m[rows, columns])
+            records["sigma"] = _sigma_steps(prior_sigma_m[rows, columns])
+        if sky is not None:
+            records["sigma"][sky[rows, columns] & (records["distance"] == 0)] = SKY
+        self._pictures += 1
+        if max(self._copies) > 1:
+            copies = np.asarray(self._copies)[(records["distance"] > 0).astype(int)]
+            records = np.repeat(records, (copies + self._rng.random(len(records))).astype(np.int64))
+        self._pixels += len(records)
+        self._with_prior += int((records["distance"] > 0).sum())
+        bucket = self._rng.integers(len(self._buckets), size=len(records))
+        ordered = records[np.argsort(bucket, kind="stable")]
+        ends = np.cumsum(np.bincount(bucket, minlength=len(self._buckets)))
+        for file, part in zip(self._buckets, np.split(ordered, ends[:-1]), strict=True):
+            file.write(part.tobytes())
+
+    def finish(self) -> None:
+        """Put the pixels into their order and the file in its place.
+
+        Raises:
+            InputError: no valid pixel in any picture.
+
+        """
+        if not self._pixels:
+            raise InputError(
+                f"None of the {self._pictures} pictures has a valid pixel: the masks leave nothing. "
+                "Masks are 255 where a pixel may be used; check that they are not inverted."
+            )
+
+        def write(out: Any) -> None:
+            header = {"descr": np.lib.format.dtype_to_descr(RECORD), "fortran_order": False}
+            np.lib.format.write_array_header_1_0(out, {**header, "shape": (self._pixels,)})
+            for file in self._buckets:
+                file.seek(0)
+                records = np.frombuffer(file.read(), RECORD)
+                out.write(records[self._rng.permutation(len(records))].tobytes())
+                file.seek(0)
+                file.truncate()
+
+        write_checked(self.path, TABLE_VERSION, write)
+        about = {"version": TABLE_VERSION, "pixels": self._pixels, "with_prior": self._with_prior}
+        write_json(_about(self.path), {**about, "pictures": self._pictures})
+
+
+def _about(path: Path) -> Path:
+    """The file that tells that a table is whole."""
+    return path.with_suffix(".json")

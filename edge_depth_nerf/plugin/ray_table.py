@@ -1,0 +1,147 @@
+"""Training rays read from a table of each lens, in place of nerfstudio's undistortion of every batch.
+
+Host-facing. nerfstudio inverts a lens's polynomial by ten iterations for each pixel of each batch, and twice more for
+its neighbours. The table holds what comes out, made once by nerfstudio's own `generate_rays` from a camera that is not
+turned: the numbers are the same but for the rounding of one rotation. It lies in the scene's cache and is mapped into
+memory; a lens of 1400×1400 px takes 39 MB there, and five seconds once.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.model_components.ray_generators import RayGenerator
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from edge_depth_nerf.base.checked_cache import is_whole, keep_last, used, write_checked
+from edge_depth_nerf.base.console import progress_bars
+
+TABLE_VERSION = 2
+"""Raised whenever the form of the file changes."""
+KEPT_TABLES = 4
+"""So many tables are kept of a scene, those used last: one for each set of lenses that was trained or shown."""
+MOST_PIXELS = 1 << 24
+"""Lenses with more pixels than this in all (a table of 335 MB) get no table."""
+STRIP = 1 << 16
+"""So many rays are made at once."""
+DIRECTION, AREA, NORM = slice(0, 3), slice(3, 4), slice(4, 5)
+"""Columns: direction in the camera's frame (OpenGL, unit length), the area of the pixel at distance 1, and the length
+of the direction before it was normalised."""
+
+
+def _lenses(cameras: Cameras) -> tuple[Float[Tensor, "lenses 13"], Int[Tensor, "cameras"]]:
+    """What tells lenses apart, and the lens of each camera."""
+    count = len(cameras)
+    distortion = cameras.distortion_params
+    values = [cameras.width, cameras.height, cameras.camera_type, cameras.fx, cameras.fy, cameras.cx, cameras.cy]
+    values.append(torch.zeros(count, 6) if distortion is None else distortion)
+    table = torch.cat([value.detach().cpu().double().view(count, -1) for value in values], dim=1)
+    return torch.unique(table, dim=0, return_inverse=True)
+
+
+def _make(lenses: Tensor, advance: Callable[[int], object]) -> np.ndarray:
+    """The table of some lenses, one after the other, each row by row; `advance` is told of pixels that are done."""
+    parts = []
+    for lens in lenses.float():
+        width, height = int(lens[0]), int(lens[1])
+        camera = Cameras(
+            torch.eye(4)[None, :3],
+            fx=lens[3].view(1, 1),
+            fy=lens[4].view(1, 1),
+            cx=lens[5].view(1, 1),
+            cy=lens[6].view(1, 1),
+            width=width,
+            height=height,
+            distortion_params=lens[None, 7:],
+            camera_type=int(lens[2]),
+        )
+        for first in range(0, width * height, STRIP):
+            pixels = torch.arange(first, min(first + STRIP, width * height))
+            coords = torch.stack([pixels // width, pixels % width], dim=-1) + 0.5
+            rays = camera.generate_rays(torch.zeros(len(pixels), 1, dtype=torch.long), coords)
+            parts.append(torch.cat([rays.directions, rays.pixel_area, rays.metadata["directions_norm"]], dim=-1))
+            advance(len(pixels))
+    return torch.cat(parts).numpy()
+
+
+def _read(path: Path, pixels: int) -> Tensor | None:
+    if not is_whole(path, TABLE_VERSION):
+        return None
+    try:
+        # copy on write: torch wants what it could write to, and nobody does
+        table = np.load(path, mmap_mode="c", allow_pickle=False)
+    except (OSError, ValueError):
+        return None
+    if table.shape != (pixels, 5) or table.dtype != np.float32:
+        return None
+    used(path)
+    return torch.from_numpy(table)
+
+
+class TableRayGenerator(RayGenerator):
+    """nerfstudio's `RayGenerator`, for cameras that share a few lenses; rays differ by float32's noise at most."""
+
+    table: Tensor
+    lens: Tensor
+    first: Tensor
+
+    def __init__(self, cameras: Cameras, folder: Path) -> None:
+        """Make the table, or find it in `folder`; where that cannot be written the table stays in memory."""
+        super().__init__(cameras)
+        lenses, lens = _lenses(cameras)
+        pixels = (lenses[:, 0] * lenses[:, 1]).long()
+        digest = hashlib.sha256(f"rays {TABLE_VERSION}".encode() + lenses.numpy().tobytes())
+        path = folder / f"{digest.hexdigest()[:32]}.npy"
+        table = _read(path, int(pixels.sum()))
+        if table is None:
+            with progress_bars(CONSOLE, transient=True) as progress:
+                task = progress.add_task("Making the table of rays, once …", total=int(pixels.sum()))
+                made = _make(lenses, partial(progress.advance, task))
+            try:
+                write_checked(path, TABLE_VERSION, lambda file: np.save(file, made))
+            except OSError:
+                table = None
+            else:
+                # from the file, so that processes share the memory
+                table = _read(path, len(made))
+                keep_last(folder, "*.npy", KEPT_TABLES)
+            if table is None:
+                table = torch.from_numpy(made)
+        first = torch.cumsum(pixels, 0) - pixels
+        for name, value in (("table", table), ("lens", lens), ("first", first)):
+            self.register_buffer(name, value.to(cameras.device), persistent=False)
+        self.poses = cameras.camera_to_worlds.detach()
+        self.widths = cameras.width[:, 0]
+
+    @staticmethod
+    def suits(cameras: Cameras) -> bool:
+        """Whether a table can stand for these cameras: few lenses, no times, no metadata of a camera's own."""
+        kinds = (CameraType.PERSPECTIVE.value, CameraType.FISHEYE.value)
+        if cameras.times is not None or cameras.metadata or cameras.camera_to_worlds.requires_grad:
+            return False
+        lenses, _ = _lenses(cameras)
+        return bool(torch.isin(cameras.camera_type, torch.tensor(kinds, device=cameras.device)).all()) and (
+            float((lenses[:, 0] * lenses[:, 1]).sum()) <= MOST_PIXELS
+        )
+
+    def forward(self, ray_indices: Int[Tensor, "num_rays 3"]) -> RayBundle:
+        """Rays of pixels, given by picture, row and column."""
+        picture, row, column = ray_indices.unbind(-1)
+        ray = self.table[self.first[self.lens[picture]] + row * self.widths[picture] + column]
+        pose = self.poses[picture]
+        return RayBundle(
+            origins=pose[:, :3, 3],
+            directions=torch.sum(ray[:, None, DIRECTION] * pose[:, :3, :3], dim=-1),
+            pixel_area=ray[:, AREA],
+            camera_indices=picture[:, None],
+            metadata={"directions_norm": ray[:, NORM]},
+        )

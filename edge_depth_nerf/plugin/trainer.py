@@ -1,0 +1,257 @@
+"""Trains so that a run stopped at any moment can be taken up again, and stops itself where numbers are not finite."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import shlex
+import shutil
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import Any, Literal
+
+import torch
+import yaml
+from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerConfig
+from nerfstudio.utils.decorators import check_main_thread
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from edge_depth_nerf.base.errors import STOPPED_STATUS, InputError
+from edge_depth_nerf.base.files import remove_leftovers, write_text
+from edge_depth_nerf.jobs.runs import checkpoints_in, newest_checkpoint
+from edge_depth_nerf.plugin.compat import count_steps_against_all, total_steps
+from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig, transforms_path
+from edge_depth_nerf.plugin.pipeline import NotFiniteError
+from edge_depth_nerf.plugin.plain_errors import say_errors_plainly
+
+FOR_A_GPU = ("edge-depth-nerf", "edge-depth-nerf-paper")
+"""Methods of full size."""
+
+
+@dataclass
+class EdgeDepthTrainerConfig(TrainerConfig):
+    """nerfstudio's trainer with checkpoints that are whole, and with finite numbers."""
+
+    _target: type = field(default_factory=lambda: EdgeDepthTrainer)
+    """Target class to instantiate."""
+
+    def save_config(self) -> None:
+        """Save config.yml as nerfstudio does, but atomically: half of one could not be loaded any more.
+
+        Raises:
+            FileNotFoundError: no scene where `--data` says; then nothing is written.
+
+        """
+        say_errors_plainly()
+        data: Any = self.pipeline.datamanager
+        if isinstance(data.dataparser, FisheyeDepthDataParserConfig):
+            transforms_path(Path(data.data or data.dataparser.data))
+        path = self.get_base_dir() / "config.yml"
+        CONSOLE.log(f"Saving config to: {path}")
+        write_text(path, yaml.dump(self))
+        remove_leftovers(path.parent)
+
+
+class EdgeDepthTrainer(Trainer):
+    """nerfstudio's trainer with checkpoints that are whole, and with finite numbers.
+
+    Ctrl-C ends it after the step it is at, with a checkpoint of that step and a line on how to go on.
+    """
+
+    config: EdgeDepthTrainerConfig  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def __init__(self, config: EdgeDepthTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
+        """Take the configuration; see nerfstudio's Trainer."""
+        super().__init__(config, local_rank, world_size)
+        self._interruption = _Interruption()
+        self._last_step: int | None = None  # that this process has taken
+
+    def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
+        """Set up as nerfstudio does; Ctrl-C ends it with one line."""
+        if self.device == "cpu" and self.config.method_name in FOR_A_GPU and test_mode == "val":
+            CONSOLE.print(
+                f"[yellow]{self.config.method_name} is meant for a GPU, and there is none: expect hours, where "
+                "edge-depth-nerf-lite takes minutes."
+            )
+        try:
+            super().setup(test_mode)
+            count_steps_against_all(self)
+        except KeyboardInterrupt:
+            CONSOLE.print("\nStopped before the first step.")
+            raise SystemExit(STOPPED_STATUS) from None
+
+    def train(self) -> None:
+        """Train as nerfstudio does.
+
+        Raises:
+            SystemExit: after Ctrl-C, with status 130 and a checkpoint of the last step. Where the training was done and
+                only its viewer was up, Ctrl-C is how one ends it, and no error.
+
+        """
+        if self.world_size > 1 or threading.current_thread() is not threading.main_thread():
+            super().train()  # nerfstudio ends the processes of its ranks; signals reach the main thread alone
+            return
+        try:
+            with self._interruption.watched():
+                super().train()
+        except KeyboardInterrupt:
+            if self.training_state != "completed":
+                self._stop()
+
+    def _stop(self) -> None:
+        if self._last_step is None:
+            CONSOLE.print("\nStopped before the first step.")
+        else:
+            self.save_checkpoint(self._last_step)
+            remaining = total_steps(self) - self._last_step - 1
+            goes_on = (
+                " The same command goes on from there with --load-dir "
+                f"{shlex.quote(str(self.checkpoint_dir))} --max-num-iterations {remaining}"
+            )
+            CONSOLE.print(
+                f"\nStopped after step {self._last_step}, which is saved.{goes_on if remaining else ''}",
+                soft_wrap=True,
+                highlight=False,
+                markup=False,
+            )
+        raise SystemExit(STOPPED_STATUS) from None
+
+    def train_iteration(self, step: int) -> TRAIN_INTERATION_OUTPUT:
+        """Do a step as nerfstudio does.
+
+        Raises:
+            InputError: a loss was not finite; it says in which pictures, and which checkpoint was kept.
+
+        """
+        try:
+            with self._interruption.put_off():
+                result = super().train_iteration(step)
+                self._last_step = step
+            return result
+        except NotFiniteError as error:
+            raise InputError(f"{error} {self._kept()}") from error
+
+    @check_main_thread
+    def save_checkpoint(self, step: int) -> None:
+        """Save into a folder beside the checkpoints, then move the whole file there.
+
+        nerfstudio writes in place: a kill in that moment leaves half a file as the newest checkpoint. The folder
+        lies outside, since resuming parses every name in the checkpoint folder.
+
+        Raises:
+            InputError: a parameter is not finite, or the file cannot be written; the checkpoint before is kept.
+
+        """
+        for name, parameter in self.pipeline.model.named_parameters():
+            # a sum is not finite if one of its terms is not
+            if not torch.isfinite(parameter.detach().sum(dtype=torch.float64)):
+                raise InputError(
+                    f"The parameter {name} is no longer finite after step {step}: a gradient was not. {self._kept()}"
+                )
+        with self._interruption.put_off():
+            self._save_whole(step)
+
+    def _save_whole(self, step: int) -> None:
+        folder = self.checkpoint_dir
+        partial = self.base_dir / ".unfinished_checkpoint"
+        shutil.rmtree(partial, ignore_errors=True)
+        self.checkpoint_dir = partial
+        try:
+            try:
+                super().save_checkpoint(step)
+            finally:
+                self.checkpoint_dir = folder
+            folder.mkdir(parents=True, exist_ok=True)
+            (written,) = partial.iterdir()
+            os.replace(written, folder / written.name)
+        except (OSError, RuntimeError) as error:
+            # torch says no more than that it failed
+            raise InputError(
+                f"{folder}: the checkpoint of step {step} cannot be written ({error}). Is the disk full? {self._kept()}"
+            ) from error
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+        if self.config.save_only_latest_checkpoint:
+            for checkpoint in folder.glob("*.ckpt"):
+                if checkpoint.name != written.name:
+                    checkpoint.unlink()
+
+    def _load_checkpoint(self) -> None:
+        """Load a checkpoint as nerfstudio does; of `load_dir` the newest that is whole.
+
+        Raises:
+            InputError: there is none.
+
+        """
+        folder = self.config.load_dir
+        if folder is None or self.config.load_step is not None:
+            super()._load_checkpoint()
+            return
+        newest = newest_checkpoint(folder)
+        every = checkpoints_in(folder)
+        if newest is None:
+            found = f"{len(every)} checkpoints, none of them whole" if every else "no checkpoint"
+            raise InputError(
+                f"{folder}: found {found}; --load-dir takes the folder nerfstudio_models of a training. Leave it out "
+                "to begin from the start."
+            )
+        if newest != every[-1]:
+            CONSOLE.print(f"[bold yellow]{every[-1]} is not whole; going on from {newest.name}.")
+        given = self.config
+        self.config = dataclasses.replace(given, load_step=_step_of(newest))
+        try:
+            super()._load_checkpoint()
+        finally:
+            self.config = given
+
+    def _kept(self) -> str:
+        """Say what can be gone on from."""
+        newest = newest_checkpoint(self.checkpoint_dir)
+        if newest is None and self.config.load_dir is not None:
+            newest = newest_checkpoint(self.config.load_dir)
+        if newest is None:
+            return "No checkpoint was saved before."
+        return f"The last checkpoint, {newest}, is kept; --load-dir {newest.parent} goes on from it."
+
+
+class _Interruption:
+    """Ctrl-C, kept back while what must be whole is done: a step, a checkpoint."""
+
+    def __init__(self) -> None:
+        self._busy = False
+        self._asked = False
+
+    @contextmanager
+    def watched(self) -> Iterator[None]:
+        """Answer Ctrl-C here, and as before afterwards."""
+        before = signal.signal(signal.SIGINT, self._on_signal)
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGINT, before)
+
+    @contextmanager
+    def put_off(self) -> Iterator[None]:
+        """Raise KeyboardInterrupt after what is done here, if it was asked for meanwhile."""
+        self._busy = True
+        try:
+            yield
+        finally:
+            self._busy = False
+        if self._asked:
+            self._asked = False
+            raise KeyboardInterrupt
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        if not self._busy:
+            raise KeyboardInterrupt
+        self._asked = True
+
+
+def _step_of(checkpoint: Path) -> int:
+    return int(checkpoint.stem.removeprefix("step-"))

@@ -1,0 +1,374 @@
+"""What nerfstudio's viewer shows of a drive besides the rendering: LiDAR, the prior, the path, the lenses.
+
+Host-facing, through nerfstudio's own hooks: it finds the panel's switches and its `ViewerControl` in the pipeline. A
+layer is made in a thread of its own when it is first switched on, and hidden, not removed, when it is switched off, so
+neither a training nor a command without a viewer waits for it.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from threading import Thread
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import torch
+import viser
+import viser.transforms
+from jaxtyping import Float, Float64, Int, UInt8
+from nerfstudio.utils.rich_utils import CONSOLE
+from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
+from nerfstudio.viewer.viewer_elements import ViewerCheckbox, ViewerControl, ViewerDropdown
+from numpy.typing import NDArray
+from torch import Tensor
+
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.pictures import DISTANCE, SIGMA
+from edge_depth_nerf.cameras import Camera
+
+if TYPE_CHECKING:
+    from nerfstudio.viewer.viewer import Viewer
+
+    from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManager
+
+ROOT = "/drive"
+"""The viewer's scene node above all of ours."""
+HOST_FRUSTA = "/cameras"
+"""nerfstudio's node above its own frusta."""
+MOST_POINTS = 200_000
+"""Of a cloud; each takes 15 bytes on the way to the browser."""
+MOST_LENSES = 256
+"""So many lenses are drawn, spread over the drive."""
+LENS_RADIUS_M = 0.3
+"""Radius of a lens's cap at nerfstudio's default --viewer.camera-frustum-scale."""
+HOST_FRUSTUM_SCALE = 0.1
+"""That default."""
+POINT_SIZE_M = 0.06
+"""Side of a point of a cloud."""
+THUMBNAIL_PX = 128
+"""Longer side of the picture on a lens's cap."""
+AZIMUTHS, RINGS = 48, 10
+"""Corners of a cap: around the axis, and from the axis to the rim."""
+SPOKES = 6
+"""Lines from a lens's centre to its rim."""
+THETA_STEPS = 720
+"""The rim is found within theta_max / THETA_STEPS."""
+PATH_COLOURS = ((230, 120, 20), (40, 160, 220), (120, 190, 60), (200, 80, 180), (230, 200, 40), (120, 120, 220))
+"""One for each camera, over and over."""
+COLOURS = ("height", "picture", "sigma")
+"""What the colour of a point can stand for."""
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Points in the model's coordinates (scene units)."""
+
+    points: Float[np.ndarray, "n 3"]
+    rgb: UInt8[np.ndarray, "n 3"]
+    """Of the pictures that they are seen in."""
+    height_m: Float[np.ndarray, "n"]
+    """Along the drive's vertical."""
+    sigma_m: Float[np.ndarray, "n"] | None
+    """Standard deviation of the prior; LiDAR has none."""
+
+    def colours(self, meaning: str) -> UInt8[np.ndarray, "n 3"]:
+        """Colours of the points: of the picture, or by a quantity; by height where there is no sigma."""
+        if meaning == "picture":
+            return self.rgb
+        if meaning == "sigma" and self.sigma_m is not None:
+            return SIGMA.coloured(self.sigma_m[:, None], np.ones((len(self.sigma_m), 1), bool))[:, 0]
+        if not len(self.height_m):
+            return self.rgb
+        low, high = np.percentile(self.height_m, (2, 98))
+        place = np.clip((self.height_m - low) / max(high - low, 1e-6), 0, 1)
+        return DISTANCE.colours[np.rint(255 * (1 - place)).astype(int)]
+
+
+def rim_rad(camera: Camera, theta_max_rad: float) -> Float64[np.ndarray, "azimuths"]:
+    """The angle from the axis up to which a lens sees, for each azimuth (from x to y, evenly spaced).
+
+    The picture ends there, or the lens model's validity, or `theta_max_rad`.
+    """
+    theta = torch.linspace(0, min(theta_max_rad, camera.theta_max_rad), THETA_STEPS + 1, dtype=torch.float64)
+    azimuth = _azimuths()
+    pixels, valid = camera.project(_directions(theta[None, :], azimuth[:, None]))
+    seen = (camera.inside(pixels) & valid).int().cumprod(-1).sum(-1)
+    return theta[(seen - 1).clamp(min=0)].numpy()
+
+
+def lens_cap(
+    camera: Camera, theta_max_rad: float
+) -> tuple[Float64[np.ndarray, "vertices 3"], Float64[np.ndarray, "vertices 2"], Int[np.ndarray, "faces 3"]]:
+    """The part of the unit sphere that a lens sees, in its frame (OpenCV), as a mesh.
+
+    Returns:
+        Corners, ring by ring from the axis to the rim; the pixel (x, y) that each is seen at; triangles.
+
+    """
+    ring = torch.linspace(0, 1, RINGS + 1, dtype=torch.float64)
+    theta = ring[:, None] * torch.from_numpy(rim_rad(camera, theta_max_rad))
+    directions = _directions(theta, _azimuths()[None, :].expand_as(theta)).reshape(-1, 3)
+    pixels, _ = camera.project(directions)
+    inner = np.arange(RINGS * AZIMUTHS)
+    following = inner - inner % AZIMUTHS + (inner + 1) % AZIMUTHS
+    triangles = [(inner, inner + AZIMUTHS, following), (following, inner + AZIMUTHS, following + AZIMUTHS)]
+    return directions.numpy(), pixels.numpy(), np.concatenate([np.stack(corners, -1) for corners in triangles])
+
+
+def _azimuths() -> Float64[Tensor, "azimuths"]:
+    return torch.arange(AZIMUTHS, dtype=torch.float64) * (2 * math.pi / AZIMUTHS)
+
+
+def _directions(theta: Float64[Tensor, "*#shape"], azimuth: Float64[Tensor, "*#shape"]) -> Float64[Tensor, "*shape 3"]:
+    sine = theta.sin()
+    return torch.stack(torch.broadcast_tensors(sine * azimuth.cos(), sine * azimuth.sin(), theta.cos()), -1)
+
+
+def _glb(camera: Camera, theta_max_rad: float, picture: NDArray[np.uint8], radius: float) -> bytes:
+    """A lens as a file for the browser: the picture on its cap, and lines from its centre to the rim."""
+    from PIL import Image
+    from trimesh import Scene, Trimesh, load_path  # half a second, which every command of nerfstudio would wait for
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
+
+    corners, pixels, triangles = lens_cap(camera, theta_max_rad)
+    corners = corners * radius
+    scale = THUMBNAIL_PX / max(camera.width, camera.height)
+    size = (max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+    # as a JPEG, which is a tenth of what trimesh would write
+    small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    thumbnail = Image.open(BytesIO(cv2.imencode(".jpg", small[..., ::-1])[1].tobytes()))
+    # as a light: the browser's lamps would shade it
+    material = PBRMaterial(
+        baseColorFactor=[0, 0, 0, 255],
+        emissiveTexture=thumbnail,
+        emissiveFactor=[1.0, 1.0, 1.0],
+        metallicFactor=0.0,
+        roughnessFactor=1.0,
+        doubleSided=True,
+    )
+    uv = pixels / (camera.width, camera.height)
+    visual = TextureVisuals(uv=np.stack((uv[:, 0], 1 - uv[:, 1]), -1), material=material)
+    cap = Trimesh(corners, triangles, visual=visual, process=False)
+    rim = corners[-AZIMUTHS:]
+    spokes = np.stack([np.stack((np.zeros(3), end)) for end in rim[:: AZIMUTHS // SPOKES]])
+    lines: Any = load_path(np.concatenate((np.stack((rim, np.roll(rim, -1, 0)), 1), spokes)))
+    lines.colors = np.tile((255, 211, 105, 255), (len(lines.entities), 1))
+    data = BytesIO()
+    Scene([cap, lines]).export(data, file_type="glb")
+    return data.getvalue()
+
+
+def _in_order(path: Path) -> list[int | str]:
+    """Sorts names with numbers as people count."""
+    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]
+
+
+class DriveLayers(ViewerControl):
+    """Draws the layers; nerfstudio calls `_setup` once its viewer stands."""
+
+    def __init__(self, manager: FisheyeDepthDataManager) -> None:
+        self.manager = manager
+        sampler = manager.train_pixel_sampler
+        has_prior = sampler is not None and sampler.table.share_with_prior > 0
+        has_lidar = bool(manager.train_dataset.metadata["lidar_filenames"])
+        self.switches = {
+            "lenses": self._switch(
+                "Lenses", "lenses", True, "What each camera sees, in place of nerfstudio's pyramids"
+            ),
+            "path": self._switch("Path", "path", True, "A line through the places of each camera"),
+            "lidar": self._switch("LiDAR points", "lidar", False, "Returns of the training pictures", has_lidar),
+            "prior": self._switch("Depth prior", "prior", False, "What the loss draws the density to", has_prior),
+        }
+        self.meaning = ViewerDropdown(
+            "Colour of points",
+            COLOURS[0],
+            list(COLOURS),
+            cb_hook=lambda _: self._recolour(),
+            hint="Sigma of the prior: dark is sure (0.05 m), bright is unsure (20 m)",
+        )
+        self._frames: dict[str, viser.FrameHandle] = {}
+        self._clouds: dict[str, Cloud] = {}
+        self._hidden = False
+
+    def _switch(self, label: str, layer: str, shown: bool, hint: str, available: bool = True) -> ViewerCheckbox:
+        hint = hint if available else "There is none in this training"
+        return ViewerCheckbox(label, shown, disabled=not available, cb_hook=lambda _: self._update(layer), hint=hint)
+
+    def _setup(self, viewer: Viewer) -> None:
+        """Take hold of the viewer, and draw what is on from the beginning."""
+        super()._setup(viewer)
+        # made before nerfstudio's frusta, it decides over all of them
+        self._host_frusta = viewer.viser_server.scene.add_frame(HOST_FRUSTA, show_axes=False)
+        viewer.hide_images.on_click(lambda _: self._hide_lenses(True))
+        viewer.show_images.on_click(lambda _: self._hide_lenses(False))
+        for layer in self.switches:
+            self._update(layer)
+
+    def _hide_lenses(self, hidden: bool) -> None:
+        self._hidden = hidden
+        self._update("lenses")
+
+    def _update(self, layer: str) -> None:
+        """Make a layer's nodes be seen or not, as its switch says."""
+        shown = bool(self.switches[layer].value)
+        if layer == "lenses":
+            self._host_frusta.visible = not shown
+            shown = shown and not self._hidden
+        if layer in self._frames:
+            self._frames[layer].visible = shown
+        elif shown:
+            self.switches[layer].set_disabled(True)
+            Thread(target=self._make, args=(layer,), daemon=True).start()
+
+    def _make(self, layer: str) -> None:
+        """Draw a layer for the first time."""
+        node = f"{ROOT}/{layer}"
+        frame = self.viser_server.scene.add_frame(node, show_axes=False, visible=False)
+        try:
+            if layer == "lenses":
+                self._draw_lenses(node)
+            elif layer == "path":
+                self._draw_path(node)
+            else:
+                self._clouds[layer] = self._lidar() if layer == "lidar" else self._prior()
+                self._draw_cloud(layer)
+        except (InputError, OSError) as error:
+            CONSOLE.print(f"The viewer cannot show this layer. {error}", style="yellow", markup=False)
+            self.switches[layer].value = False
+            return
+        finally:
+            self.switches[layer].set_disabled(False)
+        self._frames[layer] = frame
+        self._update(layer)
+
+    # ---- lenses and path ----------------------------------------------------------------------------------------
+
+    def _draw_lenses(self, node: str) -> None:
+        dataset = self.manager.train_dataset
+        limit_rad = dataset.metadata["theta_max_rad"] or math.pi
+        radius = self._units(LENS_RADIUS_M) * self.viewer.config.camera_frustum_scale / HOST_FRUSTUM_SCALE
+        for index in _spread(len(dataset), MOST_LENSES):
+            pose = dataset.cameras.camera_to_worlds[index].double().cpu().numpy()
+            # nerfstudio's camera looks along -z, viser's along z
+            rotation = viser.transforms.SO3.from_matrix(pose[:, :3] * (1.0, -1.0, -1.0))
+            lens = self.viser_server.scene.add_glb(
+                f"{node}/{index:05d}",
+                _glb(dataset.camera(index), limit_rad, dataset.rgb(index), radius),
+                wxyz=rotation.wxyz,
+                position=pose[:, 3] * VISER_NERFSTUDIO_SCALE_RATIO,
+            )
+            lens.on_click(self._go_there(index))
+
+    def _go_there(self, index: int) -> Callable[[viser.SceneNodePointerEvent[viser.GlbHandle]], None]:
+        """As on nerfstudio's own frusta: a click takes the browser to the camera."""
+
+        def on_click(event: viser.SceneNodePointerEvent[viser.GlbHandle]) -> None:
+            with event.client.atomic():
+                event.client.camera.position = event.target.position
+                event.client.camera.wxyz = event.target.wxyz
+                self.viewer.current_camera_idx = index
+
+        return on_click
+
+    def _draw_path(self, node: str) -> None:
+        """One line for each folder of pictures, held-out ones included."""
+        places: dict[Path, list[tuple[Path, NDArray]]] = {}
+        for dataset in (self.manager.train_dataset, self.manager.eval_dataset):
+            positions = dataset.cameras.camera_to_worlds[:, :3, 3].cpu().numpy()
+            for file, position in zip(dataset.image_filenames, positions, strict=True):
+                places.setdefault(file.parent, []).append((file, position))
+        for number, (folder, camera) in enumerate(sorted(places.items())):
+            line = np.stack([position for _, position in sorted(camera, key=lambda place: _in_order(place[0]))])
+            if len(line) < 2:
+                continue
+            self.viser_server.scene.add_spline_catmull_rom(
+                f"{node}/{folder.name}",
+                line * VISER_NERFSTUDIO_SCALE_RATIO,
+                line_width=3,
+                color=PATH_COLOURS[number % len(PATH_COLOURS)],
+                segments=4 * len(line),
+            )
+
+    # ---- clouds -------------------------------------------------------------------------------------------------
+
+    def _lidar(self) -> Cloud:
+        """Returns of the training pictures, a share of each."""
+        dataset = self.manager.train_dataset
+        rng = np.random.default_rng(0)
+        pixels, distances, colours = [], [], []
+        for index in range(len(dataset)):
+            distance_m = dataset.lidar_distance_m(index)
+            assert distance_m is not None
+            row, column = np.nonzero(dataset.mask(index) & np.isfinite(distance_m) & (distance_m > 0))
+            chosen = rng.permutation(len(row))[: MOST_POINTS // len(dataset)]
+            row, column = row[chosen], column[chosen]
+            pixels.append(np.stack((np.full(len(row), index), row, column), 1))
+            distances.append(distance_m[row, column])
+            colours.append(dataset.rgb(index)[row, column])
+        return self._cloud(np.concatenate(pixels), np.concatenate(distances), np.concatenate(colours), None)
+
+    def _prior(self) -> Cloud:
+        """Of the table that the training reads, whose order is random, the first pixels with a prior."""
+        assert self.manager.train_pixel_sampler is not None
+        table = self.manager.train_pixel_sampler.table
+        batch = table.batch(0, min(len(table), round(MOST_POINTS / table.share_with_prior)))
+        known = batch.prior_distance_m[:, 0] > 0
+        colours = (batch.rgb[known].numpy() * 255).round().astype(np.uint8)
+        distance_m, sigma_m = (values[known, 0].numpy() for values in (batch.prior_distance_m, batch.prior_sigma_m))
+        return self._cloud(batch.indices[known].numpy(), distance_m, colours, sigma_m)
+
+    def _cloud(
+        self,
+        pixels: Int[np.ndarray, "n 3"],
+        distance_m: Float[np.ndarray, "n"],
+        rgb: UInt8[np.ndarray, "n 3"],
+        sigma_m: Float[np.ndarray, "n"] | None,
+    ) -> Cloud:
+        """Put pixels (picture, row, column) at a distance into the scene."""
+        metadata = self.manager.train_dataset.metadata
+        rays = self.manager.train_ray_generator(torch.from_numpy(pixels).to(self.manager.device))
+        along = torch.from_numpy(distance_m)[:, None] / metadata["metres_per_unit"]
+        points = (rays.origins.cpu() + rays.directions.cpu() * along).float().numpy()
+        transform = self.manager.train_dataset._dataparser_outputs.dataparser_transform
+        up = (transform[:3, :3].double() @ torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)).numpy()
+        return Cloud(points, rgb, points @ up * metadata["metres_per_unit"], sigma_m)
+
+    def _draw_cloud(self, layer: str) -> None:
+        cloud = self._clouds[layer]
+        self.viser_server.scene.add_point_cloud(
+            f"{ROOT}/{layer}/points",
+            cloud.points * VISER_NERFSTUDIO_SCALE_RATIO,
+            cloud.colours(self.meaning.value),
+            point_size=self._units(POINT_SIZE_M),
+        )
+
+    def _recolour(self) -> None:
+        for layer in self._clouds:
+            self._draw_cloud(layer)
+
+    def _units(self, length_m: float) -> float:
+        """A length in the units that the browser draws in."""
+        return length_m / self.manager.train_dataset.metadata["metres_per_unit"] * VISER_NERFSTUDIO_SCALE_RATIO
+
+
+class DrivePanel(torch.nn.Module):
+    """Where nerfstudio finds what belongs into its viewer: it looks through the pipeline's modules."""
+
+    def __init__(self, manager: FisheyeDepthDataManager) -> None:
+        super().__init__()
+        self.layers = DriveLayers(manager)
+        # it shows them in the order of their names
+        for number, element in enumerate((*self.layers.switches.values(), self.layers.meaning)):
+            setattr(self, f"element_{number}", element)
+
+
+def _spread(count: int, most: int) -> list[int]:
+    """At most `most` of `count` numbers, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()

@@ -1,0 +1,1 @@
+"""Poses from the pictures alone by COLMAP, with LiDAR's scale."""

@@ -1,0 +1,508 @@
+"""COLMAP itself: from a recording's pictures to models of camera poses and sparse points, each of its own scale.
+
+Works in a folder of its own, so that a run that was interrupted goes on where it stopped:
+
+    inputs.json      what the folder was made from; with other inputs it is emptied
+    pictures/        links to the pictures, named CAMERA/0000000123.png
+    masks/           what of each picture is searched for features
+    database.db      COLMAP's features and matches; these three are deleted once the models are there
+    pairs.txt        the pairs of pictures being matched
+    models/0, 1, …   COLMAP's models in its own format, which its viewer and other tools read
+    models.json      their checksum
+
+Lenses are known and stay as they are. The pictures are matched in the order they were taken. The rig is not given to
+COLMAP: where its cameras share no view, as KITTI-360's left and right fisheye, COLMAP starts from a pair of moments
+whose scale cannot be seen in a straight drive, and paths come out wrong by 3 to 50 % of their length (synthetic
+drives, COLMAP 4.2). Without it, the cameras that share no view become a model each, and `colmap_scale` joins them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import json
+import math
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float64
+from numpy.typing import NDArray
+from rich.console import Console
+
+from edge_depth_nerf.base.console import progress_bars
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_json, write_atomically, write_bytes, write_json, write_mask, write_text
+from edge_depth_nerf.cameras import Camera, KannalaBrandt, Pinhole, fit_kannala_brandt
+from edge_depth_nerf.cameras.transforms import Transform
+from edge_depth_nerf.masks.lens import lens_circle
+from edge_depth_nerf.masks.semantics import keep_static, read_labels
+from edge_depth_nerf.process.options import ProcessOptions
+from edge_depth_nerf.process.recording import Recording
+from edge_depth_nerf.scene.checks import read_camera_mask
+
+THETA_MAX_DEG = 85.0
+"""Features further from the axis are not used: COLMAP's lenses end at 90°, and calibrations are worst at the rim."""
+
+INSTALL = "pip install edge-depth-nerf[colmap]"
+
+_OLDEST = (4, 2)
+_RECORD = "inputs.json"
+_MODELS_SUM = "models.json"
+_VERSION = 1
+"""Of what is done with the inputs; raised when results change."""
+_NEIGHBOURS = (1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 20)
+"""How many moments apart the pictures that are matched are: densely near, and further for a vehicle that is slow."""
+_SHARED_VIEW_DEG = 30.0
+"""Cameras whose pictures overlap by at least this much are matched with each other."""
+_CHUNK_PICTURES = 16
+_CHUNK_PAIRS = 256
+"""Features and matches are made in lots: between two of them progress is shown and an interruption is heeded."""
+_MIN_TRACK = 3
+"""Points that fewer pictures see have distances that are not to be trusted."""
+_SEED = 0
+
+
+@dataclass(frozen=True)
+class SparseView:
+    """What one picture sees of a model's points."""
+
+    rays: Float64[np.ndarray, "points 3"]
+    """Unit directions in the camera's frame, from the features' pixels."""
+    distance: Float64[np.ndarray, "points"]
+    """From the camera to each point, in the model's unit."""
+
+
+@dataclass(frozen=True)
+class ColmapModel:
+    """Poses and points that hang together, in a world and a unit of their own."""
+
+    camera_to_model: dict[int, Transform]
+    """Of the registered pictures, by their index in the recording; lengths in the model's unit."""
+    views: dict[int, SparseView]
+    """What each of them sees."""
+    points: int
+    """How many points there are."""
+    error_px: float
+    """Mean distance between a point's projection and its feature."""
+
+
+@dataclass(frozen=True)
+class _Lens:
+    """A camera as COLMAP has it."""
+
+    model: str
+    parameters: tuple[float, ...]
+    theta_max_rad: float
+    """Up to which it is used."""
+    rms_px: float
+    """How far it is from the camera it stands for."""
+
+
+@functools.lru_cache(maxsize=64)
+def colmap_lens(camera: Camera, theta_max_rad: float = math.radians(THETA_MAX_DEG)) -> _Lens:
+    """Express a camera in one of COLMAP's models, whose pixel centres are at +0.5 as well.
+
+    COLMAP's THIN_PRISM_FISHEYE without its prism is `KannalaBrandt`, tangential terms included, and its FULL_OPENCV
+    without a denominator is `Pinhole`; any other lens is replaced by the nearest Kannala-Brandt one.
+
+    Raises:
+        InputError: no Kannala-Brandt camera comes near.
+
+    """
+    limit = min(theta_max_rad, camera.theta_max_rad)
+    if isinstance(camera, Pinhole) and not camera.k4:
+        k = camera
+        parameters = (k.fx, k.fy, k.cx, k.cy, k.k1, k.k2, k.p1, k.p2, k.k3, 0.0, 0.0, 0.0)
+        return _Lens("FULL_OPENCV", parameters, limit, 0.0)
+    if isinstance(camera, KannalaBrandt):
+        k, rms = camera, 0.0
+    else:
+        fit = fit_kannala_brandt(camera, limit)
+        k, rms = fit.camera, fit.rms_px
+    parameters = (k.fx, k.fy, k.cx, k.cy, k.k1, k.k2, k.p1, k.p2, k.k3, k.k4, 0.0, 0.0)
+    return _Lens("THIN_PRISM_FISHEYE", parameters, limit, rms)
+
+
+def import_pycolmap() -> Any:
+    """The module pycolmap.
+
+    Raises:
+        InputError: it is not installed, or too old.
+
+    """
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise InputError(
+            f"--poses colmap: needs COLMAP's Python package, which cannot be imported ({error}). Install it with "
+            f"`{INSTALL}`, or use the poses of the recording (--poses recorded)."
+        ) from error
+    if tuple(int(number) for number in pycolmap.__version__.split(".")[:2]) < _OLDEST:
+        raise InputError(
+            f"--poses colmap: pycolmap {pycolmap.__version__} is too old, expected 4.2 or newer. Install it with "
+            f"`{INSTALL}`."
+        )
+    return pycolmap
+
+
+def check_folder(folder: Path) -> None:
+    """Check that a folder to work in is new, or ours.
+
+    Raises:
+        InputError: it holds something else.
+
+    """
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / _RECORD).is_file():
+        raise InputError(
+            f"{folder}: COLMAP's features and models are to go there, but it holds other files. Move them away, or "
+            "choose another --output."
+        )
+
+
+def find_models(recording: Recording, options: ProcessOptions, folder: Path, console: Console) -> list[ColmapModel]:
+    """Let COLMAP find the pictures' poses.
+
+    Args:
+        recording: with at least three pictures; the order of its pictures is that of their moments.
+        options: theta_max_deg and the masks that are not in the recording.
+        folder: the folder to work in, ours alone.
+        console: where the progress is shown.
+
+    Returns:
+        The models, that with the most pictures first; none if no two pictures could be related.
+
+    Raises:
+        InputError: pycolmap is missing, or `folder` holds something else.
+
+    """
+    run = _Run(import_pycolmap(), recording, options, folder, console)
+    run.prepare()
+    if not run.has_models():
+        run.extract()
+        run.match()
+        run.map()
+    # features and descriptors of a long drive take gigabytes
+    (folder / "database.db").unlink(missing_ok=True)
+    for left in (run.masks, run.pictures):
+        shutil.rmtree(left, ignore_errors=True)
+    return run.read_models()
+
+
+class _Run:
+    """One folder's work."""
+
+    def __init__(
+        self, pycolmap: Any, recording: Recording, options: ProcessOptions, folder: Path, console: Console
+    ) -> None:
+        self.pycolmap = pycolmap
+        self.recording = recording
+        self.options = options
+        self.folder = folder
+        self.console = console
+        self.database = folder / "database.db"
+        self.masks = folder / "masks"
+        self.models = folder / "models"
+        theta_max_rad = math.radians(min(options.theta_max_deg, THETA_MAX_DEG))
+        self.lenses = {camera.name: colmap_lens(camera.camera, theta_max_rad) for camera in recording.cameras}
+        self.ego_masks = {
+            camera.name: options.ego_mask_of(camera.name) or camera.ego_mask for camera in recording.cameras
+        }
+        # COLMAP names pictures by their paths below one folder, and a space ends a name
+        self.pictures = folder / "pictures"
+        self.names = [f"{p.camera}/{p.frame:010d}{p.path.suffix.lower()}" for p in recording.pictures]
+        pycolmap.logging.minloglevel = 3  # what it says is replaced by progress bars and our own errors
+        pycolmap.set_random_seed(_SEED)
+
+    def prepare(self) -> None:
+        """Empty the folder unless it was made from the same inputs."""
+        record = self.folder / _RECORD
+        inputs = {"kind": "COLMAP's work for edge-depth-nerf", "digest": self._digest()}
+        if record.is_file() and read_json(record) == inputs:
+            return
+        check_folder(self.folder)
+        shutil.rmtree(self.folder, ignore_errors=True)
+        self.folder.mkdir(parents=True)
+        write_json(record, inputs)
+
+    def _digest(self) -> str:
+        """Of everything the models depend on, pictures and masks by size and time of change."""
+
+        def stamp(path: Path | None) -> list | None:
+            if path is None:
+                return None
+            found = path.stat()
+            return [str(path.absolute()), found.st_size, found.st_mtime_ns]
+
+        cameras = [
+            [c.name, stamp(self.ego_masks[c.name]), dataclasses.asdict(self.lenses[c.name])]
+            for c in self.recording.cameras
+        ]
+        pictures = [
+            [p.camera, p.frame, stamp(p.path), stamp(p.mask), stamp(p.semantics)] for p in self.recording.pictures
+        ]
+        related = [_NEIGHBOURS, sorted(self._shared_views()), self.options.moving_classes]
+        content = json.dumps([_VERSION, self.pycolmap.__version__, cameras, pictures, related])
+        return hashlib.sha256(content.encode()).hexdigest()
+
+    def _error_px(self) -> float:
+        """How far a feature may be from where geometry puts it: 0.3° on the axis, within 1 px and COLMAP's own 4."""
+        focal_px = np.mean([sum(lens.parameters[:2]) / 2 for lens in self.lenses.values()])
+        return float(np.clip(math.radians(0.3) * focal_px, 1.0, 4.0))
+
+    def extract(self) -> None:
+        """Find the features that the masks leave."""
+        if not self.database.is_file():
+            write_atomically(self.database, self._write_database)
+        colmap = self.pycolmap
+        reader = colmap.ImageReaderOptions()
+        reader.mask_path = self.masks
+        with progress_bars(self.console, counted=True) as progress:
+            task = progress.add_task("Finding features", total=len(self.names))
+            for chunk in _chunks(range(len(self.names)), _CHUNK_PICTURES):
+                self._write_masks(chunk)
+                self._link_pictures(chunk)
+                colmap.extract_features(
+                    self.database,
+                    self.pictures,
+                    image_names=[self.names[index] for index in chunk],
+                    reader_options=reader,
+                    device=colmap.Device.cpu,
+                )
+                progress.advance(task, len(chunk))
+
+    def _write_database(self, path: Path) -> None:
+        """Cameras and pictures, each camera a rig of its own: COLMAP's words for "nothing known of one another"."""
+        colmap = self.pycolmap
+        database = colmap.Database.open(path)
+        cameras = {}
+        for number, camera in enumerate(self.recording.cameras, start=1):
+            lens = self.lenses[camera.name]
+            cameras[camera.name] = number
+            entry = colmap.Camera(
+                camera_id=number,
+                model=lens.model,
+                width=camera.camera.width,
+                height=camera.camera.height,
+                params=list(lens.parameters),
+                has_prior_focal_length=True,
+            )
+            database.write_camera(entry, use_camera_id=True)
+            rig = colmap.Rig(rig_id=number)
+            rig.add_ref_sensor(entry.sensor_id)
+            database.write_rig(rig, use_rig_id=True)
+        for index, (name, picture) in enumerate(zip(self.names, self.recording.pictures, strict=True)):
+            image = colmap.Image(name=name, camera_id=cameras[picture.camera], image_id=index + 1)
+            frame = colmap.Frame(frame_id=index + 1, rig_id=cameras[picture.camera])
+            frame.add_data_id(image.data_id)
+            database.write_image(image, use_image_id=True)
+            database.write_frame(frame, use_frame_id=True)
+        database.close()
+
+    def _write_masks(self, chunk: Sequence[int]) -> None:
+        cameras = {camera.name: camera for camera in self.recording.cameras}
+        shared: dict[str, NDArray[np.bool_]] = {}
+        for index in chunk:
+            picture = self.recording.pictures[index]
+            target = self.masks / f"{self.names[index]}.png"
+            if target.is_file():
+                continue
+            if picture.camera not in shared:
+                camera = cameras[picture.camera]
+                shared[picture.camera] = lens_circle(
+                    camera.camera, math.degrees(self.lenses[camera.name].theta_max_rad)
+                )
+                ego_mask = self.ego_masks[camera.name]
+                if ego_mask is not None:
+                    shared[picture.camera] &= read_camera_mask(ego_mask, camera.camera)
+            mask = shared[picture.camera]
+            if picture.mask is not None:
+                mask = mask & read_camera_mask(picture.mask, cameras[picture.camera].camera)
+            if picture.semantics is not None:
+                mask = mask & keep_static(read_labels(picture.semantics), self.options.moving_classes)
+            # a feature at the edge of a mask looks at what is masked
+            reach = 1 + 2 * max(1, round(mask.shape[1] / 350))
+            write_mask(target, cv2.erode(mask.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0)
+
+    def _link_pictures(self, chunk: Sequence[int]) -> None:
+        for index in chunk:
+            source, target = self.recording.pictures[index].path.absolute(), self.pictures / self.names[index]
+            if not target.is_file():
+                target.parent.mkdir(parents=True, exist_ok=True)
+                try:
+                    target.symlink_to(source)
+                except OSError:
+                    # not every system and disk has links
+                    write_bytes(target, source.read_bytes())
+
+    def match(self) -> None:
+        """Match the pictures that were taken shortly after one another, and check each pair's geometry."""
+        colmap = self.pycolmap
+        geometry = colmap.TwoViewGeometryOptions()
+        geometry.ransac.max_error = self._error_px()
+        geometry.ransac.random_seed = _SEED
+        # what stays where it is in the picture is the vehicle, or dirt on the lens
+        geometry.filter_stationary_matches = True
+        geometry.stationary_matches_max_error = 1.0
+        pairing = colmap.ImportedPairingOptions()
+        pairing.match_list_path = self.folder / "pairs.txt"
+        pairs = self._pairs()
+        with progress_bars(self.console, counted=True) as progress:
+            task = progress.add_task("Matching pictures", total=len(pairs))
+            for chunk in _chunks(pairs, _CHUNK_PAIRS):
+                write_text(pairing.match_list_path, "".join(f"{self.names[a]} {self.names[b]}\n" for a, b in chunk))
+                colmap.match_image_pairs(
+                    self.database,
+                    pairing_options=pairing,
+                    verification_options=geometry,
+                    device=colmap.Device.cpu,
+                )
+                progress.advance(task, len(chunk))
+
+    def _shared_views(self) -> set[tuple[str, str]]:
+        """Pairs of cameras, in the recording's order, whose pictures overlap enough."""
+        shared = set()
+        cameras = self.recording.cameras
+        for index, first in enumerate(cameras):
+            for second in cameras[index + 1 :]:
+                between = float(first.to_vehicle[:3, 2] @ second.to_vehicle[:3, 2])
+                reach = sum(_reach_rad(c.camera, self.lenses[c.name].theta_max_rad) for c in (first, second))
+                if reach - math.acos(np.clip(between, -1, 1)) >= math.radians(_SHARED_VIEW_DEG):
+                    shared.add((first.name, second.name))
+        return shared
+
+    def _pairs(self) -> list[tuple[int, int]]:
+        """Pictures to match, as indices."""
+        pictures, shared = self.recording.pictures, self._shared_views()
+        moments = {frame: number for number, frame in enumerate(sorted({p.frame for p in pictures}))}
+        seen: dict[tuple[str, int], int] = {(p.camera, moments[p.frame]): i for i, p in enumerate(pictures)}
+        pairs = []
+        for (camera, moment), index in seen.items():
+            for offset in (0, *_NEIGHBOURS):
+                for other in self.recording.cameras:
+                    related = other.name == camera or bool({(camera, other.name), (other.name, camera)} & shared)
+                    later = seen.get((other.name, moment + offset))
+                    if related and later is not None and (offset > 0 or later > index):
+                        pairs.append((index, later))
+        return pairs
+
+    def map(self) -> None:
+        """Find poses and points, lenses as they are."""
+        colmap = self.pycolmap
+        error_px = self._error_px()
+        options = colmap.IncrementalPipelineOptions()
+        for seeded in (options, options.mapper, options.triangulation):
+            seeded.random_seed = _SEED
+        # threads would add numbers up in another order each time
+        options.num_threads = 1
+        options.extract_colors = False
+        options.ba_refine_focal_length = False
+        options.ba_refine_principal_point = False
+        options.ba_refine_extra_params = False
+        options.min_model_size = 3
+        options.mapper.init_max_error = error_px
+        options.mapper.filter_max_reproj_error = error_px
+        options.mapper.abs_pose_max_error = 3 * error_px
+        # a camera that looks ahead, too, may start a model
+        options.mapper.init_max_forward_motion = 1.0
+        options.mapper.init_min_tri_angle = 8.0
+        options.triangulation.merge_max_reproj_error = error_px
+        options.triangulation.complete_max_reproj_error = error_px
+        unfinished = self.folder / "models.unfinished"
+        shutil.rmtree(unfinished, ignore_errors=True)
+        unfinished.mkdir()
+        with progress_bars(self.console, counted=True) as progress:
+            task, total = progress.add_task("Finding poses", total=len(self.names)), len(self.names)
+
+            def registered(pictures: int) -> None:
+                # a picture may be in two models
+                progress.update(task, completed=min(progress.tasks[0].completed + pictures, total))
+
+            colmap.incremental_mapping(
+                self.database,
+                self.pictures,
+                unfinished,
+                options,
+                initial_image_pair_callback=lambda: registered(2),
+                next_image_callback=lambda: registered(1),
+            )
+        write_json(self.folder / _MODELS_SUM, {"sha256": sum_of_files(unfinished)})
+        shutil.rmtree(self.models, ignore_errors=True)
+        os.replace(unfinished, self.models)
+
+    def has_models(self) -> bool:
+        """Whether models are there, as they were written: COLMAP's reader ends the whole process at a damaged one."""
+        record = self.folder / _MODELS_SUM
+        if not (self.models.is_dir() and record.is_file()):
+            return False
+        return read_json(record) == {"sha256": sum_of_files(self.models)}
+
+    def read_models(self) -> list[ColmapModel]:
+        """The models, that with the most pictures first.
+
+        Raises:
+            InputError: a model in the folder is broken, or of other pictures.
+
+        """
+        found = []
+        for folder in sorted(self.models.iterdir()):
+            try:
+                found.append(self._read_model(folder))
+            except Exception as error:  # COLMAP raises whatever its readers meet
+                raise InputError(
+                    f"{folder}: cannot be read as a COLMAP model of these pictures ({type(error).__name__}: {error}). "
+                    f"Delete {self.models}; the same command makes it anew."
+                ) from error
+        return sorted(found, key=lambda model: -len(model.camera_to_model))
+
+    def _read_model(self, folder: Path) -> ColmapModel:
+        index_of = {name: index for index, name in enumerate(self.names)}
+        model = self.pycolmap.Reconstruction(folder)
+        poses, views = {}, {}
+        for image in model.images.values():
+            if not image.has_pose:
+                continue
+            model_to_camera = np.vstack((image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]))
+            seen = [
+                point
+                for point in image.get_observation_points2D()
+                if model.point3D(point.point3D_id).track.length() >= _MIN_TRACK
+            ]
+            pixels = np.array([point.xy for point in seen]).reshape(-1, 2)
+            points = np.array([model.point3D(point.point3D_id).xyz for point in seen]).reshape(-1, 3)
+            in_camera = points @ model_to_camera[:3, :3].T + model_to_camera[:3, 3]
+            index = index_of[image.name]
+            poses[index] = np.linalg.inv(model_to_camera)
+            views[index] = SparseView(
+                np.array(image.camera.cam_ray_from_img(pixels)).reshape(-1, 3), np.linalg.norm(in_camera, axis=-1)
+            )
+        if not all(np.isfinite(pose).all() for pose in poses.values()):
+            raise ValueError("a pose is not finite")
+        return ColmapModel(poses, views, model.num_points3D(), model.compute_mean_reprojection_error())
+
+
+def sum_of_files(folder: Path) -> str:
+    """What tells the files of a folder, names and bytes, from others."""
+    digest = hashlib.sha256()
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        content = path.read_bytes()
+        digest.update(json.dumps([path.relative_to(folder).as_posix(), len(content)]).encode() + content)
+    return digest.hexdigest()
+
+
+def _chunks(items: Sequence, size: int) -> Iterator[Sequence]:
+    for start in range(0, len(items), size):
+        yield items[start : start + size]
+
+
+def _reach_rad(camera: Camera, theta_max_rad: float) -> float:
+    """The largest angle from the axis, up to a limit, that the middle row of the picture sees."""
+    rays, valid = camera.unproject(camera.pixel_centres()[camera.height // 2])
+    inside = valid & (rays[..., 2] >= math.cos(theta_max_rad))
+    return math.acos(float(rays[..., 2][inside].min())) if inside.any() else 0.0

@@ -1,0 +1,316 @@
+"""From COLMAP's models to the vehicle's path in metres: scale from LiDAR, and models joined by the rig.
+
+A model gives the vehicle's pose wherever one of its pictures is registered, because the rig says where the cameras
+sit on the vehicle; models with moments in common can thus be laid over one another, also where their cameras share no
+view. The unit of a model is found where LiDAR sees what its points are: the median of LiDAR's distance over the
+model's, over all features with returns right beside them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.cameras import Camera
+from edge_depth_nerf.cameras.transforms import Transform
+from edge_depth_nerf.lidar import transform_points
+from edge_depth_nerf.lidar.trajectory import Trajectory
+from edge_depth_nerf.lidar.world import sweep_in_world
+from edge_depth_nerf.process.colmap.models import ColmapModel
+from edge_depth_nerf.process.reading import rays_of, read_depth
+from edge_depth_nerf.process.recording import RecordedPicture, RecordedSweep, Recording
+
+MIN_PAIRS = 30
+"""Fewer features than this with LiDAR beside them give no scale."""
+MIN_COMMON_MOMENTS = 3
+"""Models with fewer moments in common are not joined."""
+
+_MOMENTS = 40
+"""LiDAR of at most so many moments, spread over the drive, is looked at."""
+_WINDOW_RAD = math.radians(0.4)
+"""Returns this near to a feature's ray count; the rings of a 64-beam scanner are 0.42° apart."""
+_AGREE = 0.03
+"""Returns in the window that differ by more than this share see an edge, or past it."""
+_NEIGHBOURS = 8
+_ROUNDS = 4
+_SETTLED = 5e-4
+"""The scale is refined, because points are de-skewed by the path in metres: so often, or until it changes by less."""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How LiDAR's distances compare with a reconstruction's."""
+
+    ratio: float
+    """Median of LiDAR's distance over the reconstruction's."""
+    spread: float
+    """Half the interquartile range of the ratios, as a share of the median."""
+    pairs: int
+    """How many features had LiDAR beside them."""
+
+
+@dataclass(frozen=True)
+class MetricPath:
+    """The vehicle's path in metres, in the world of the first model."""
+
+    moments: dict[int, Transform]
+    """Vehicle to world, by number of moment."""
+    trajectory: Trajectory
+    """The same over time."""
+    members: tuple[ColmapModel, ...]
+    """The models it was made of."""
+    scales: tuple[float, ...]
+    """Metres per unit of each of them."""
+    disagreement_m: float
+    """Median distance between where the cameras of one moment put the vehicle, from their mean; NaN for one camera."""
+
+
+def moment_times(recording: Recording) -> dict[int, float]:
+    """When each moment was: the median of its pictures' times."""
+    times = defaultdict(list)
+    for picture in recording.pictures:
+        times[picture.frame].append(picture.time_s)
+    return {frame: float(np.median(found)) for frame, found in sorted(times.items())}
+
+
+def join_models(recording: Recording, models: Sequence[ColmapModel], scales: ArrayLike) -> MetricPath:
+    """Lay the models over one another and average where they put the vehicle.
+
+    Args:
+        recording: whose pictures and rig the models are of.
+        models: that with the most moments comes first.
+        scales: metres per unit of each. Those of joined models are made to agree with the first's.
+
+    Raises:
+        InputError: the first model has fewer than two moments.
+
+    """
+    times = moment_times(recording)
+    scales = np.array(scales, np.float64)
+    found = _vehicle_poses(recording, models[0], scales[0], times)
+    members, waiting = [0], list(range(1, len(models)))
+    while waiting:
+        # the one with the most in common goes next
+        common = {i: found.keys() & _vehicle_poses(recording, models[i], scales[i], times).keys() for i in waiting}
+        best = max(waiting, key=lambda i: len(common[i]))
+        if len(common[best]) < MIN_COMMON_MOMENTS:
+            break
+        target = {frame: _mean_pose(found[frame]) for frame in sorted(common[best])}
+        # the rig's lever arms are in metres whatever the scale, so the poses depend on it a little beyond a factor
+        for _ in range(2):
+            poses = _vehicle_poses(recording, models[best], scales[best], times)
+            factor, alignment = _similarity({frame: _mean_pose(poses[frame]) for frame in target}, target)
+            scales[best] *= factor
+        poses = _vehicle_poses(recording, models[best], scales[best], times)
+        _, alignment = _similarity({frame: _mean_pose(poses[frame]) for frame in target}, target, factor=1.0)
+        for frame, several in poses.items():
+            found.setdefault(frame, []).extend(alignment @ pose for pose in several)
+        members.append(best)
+        waiting.remove(best)
+    frames = sorted(found)
+    moments = {frame: _mean_pose(found[frame]) for frame in frames}
+    apart = [
+        float(np.linalg.norm(pose[:3, 3] - moments[frame][:3, 3]))
+        for frame in frames
+        for pose in found[frame]
+        if len(found[frame]) > 1
+    ]
+    return MetricPath(
+        moments=moments,
+        trajectory=Trajectory(np.array([times[f] for f in frames]), np.stack([moments[f] for f in frames])),
+        members=tuple(models[i] for i in members),
+        scales=tuple(float(scales[i]) for i in members),
+        disagreement_m=float(np.median(apart)) if apart else math.nan,
+    )
+
+
+def _vehicle_poses(
+    recording: Recording, model: ColmapModel, scale: float, times: Mapping[int, float]
+) -> dict[int, list[Transform]]:
+    """Where each camera of a model puts the vehicle at the moments it is registered at, in metres."""
+    found = defaultdict(list)
+    for camera in recording.cameras:
+        indices = [i for i in model.camera_to_model if recording.pictures[i].camera == camera.name]
+        indices.sort(key=lambda i: recording.pictures[i].time_s)
+        if len(indices) < 2:
+            continue
+        poses = np.stack([model.camera_to_model[i] for i in indices])
+        poses[:, :3, 3] *= scale
+        path = Trajectory(
+            np.array([recording.pictures[i].time_s for i in indices]), poses @ np.linalg.inv(camera.to_vehicle)
+        )
+        frames = [recording.pictures[i].frame for i in indices]
+        for frame, pose in zip(frames, path.at(np.array([times[frame] for frame in frames])), strict=True):
+            found[frame].append(pose)
+    return dict(found)
+
+
+def _mean_pose(poses: Sequence[Transform]) -> Transform:
+    if len(poses) == 1:
+        return poses[0]
+    mean = np.eye(4)
+    mean[:3, :3] = Rotation.from_matrix([pose[:3, :3] for pose in poses]).mean().as_matrix()
+    mean[:3, 3] = np.mean([pose[:3, 3] for pose in poses], axis=0)
+    return mean
+
+
+def _similarity(
+    moved: Mapping[int, Transform], target: Mapping[int, Transform], factor: float | None = None
+) -> tuple[float, Transform]:
+    """The factor (unless given) and the rigid transform that take some poses to others of the same moments.
+
+    The turn is the mean of the poses' own, so that a straight path is no special case.
+    """
+    turn = Rotation.from_matrix([target[f][:3, :3] @ moved[f][:3, :3].T for f in target]).mean().as_matrix()
+    source = np.stack([moved[f][:3, 3] for f in target]) @ turn.T
+    goal = np.stack([target[f][:3, 3] for f in target])
+    centred, centred_goal = source - source.mean(0), goal - goal.mean(0)
+    extent = float((centred**2).sum())
+    if factor is None:
+        factor = float((centred * centred_goal).sum()) / extent if extent > 0 else 1.0
+    transform = np.eye(4)
+    transform[:3, :3] = turn
+    transform[:3, 3] = goal.mean(0) - factor * source.mean(0)
+    return factor, transform
+
+
+def metric_path(recording: Recording, models: Sequence[ColmapModel]) -> tuple[MetricPath, Scale]:
+    """Find the scale from LiDAR, or from the depth maps in its place, and the path in metres.
+
+    Args:
+        recording: with the sweeps, or the depth maps, of the pictures' moments.
+        models: that with the most moments comes first.
+
+    Returns:
+        The path; and the scale as metres per unit of the first model, with its spread.
+
+    Raises:
+        InputError: too few features have LiDAR beside them.
+
+    """
+    # as if each sweep were taken all at once, for a first scale of each model alone
+    first = [_ratios(recording, [model], [1.0], None) for model in models]
+    usable = [i for i, ratios in enumerate(first) if len(ratios) >= MIN_PAIRS]
+    if not usable:
+        raise _too_few(max(map(len, first), default=0), recording)
+    path = join_models(recording, [models[i] for i in usable], [float(np.median(first[i])) for i in usable])
+    ratios = np.ones(0)
+    for _ in range(_ROUNDS):
+        ratios = _ratios(recording, path.members, path.scales, path.trajectory)
+        if len(ratios) < MIN_PAIRS:
+            raise _too_few(len(ratios), recording)
+        change = float(np.median(ratios))
+        path = join_models(recording, path.members, change * np.array(path.scales))
+        if abs(change - 1) < _SETTLED:
+            break
+    low, middle, high = np.percentile(ratios, (25, 50, 75))
+    return path, Scale(path.scales[0], float((high - low) / (2 * middle)), len(ratios))
+
+
+def _too_few(pairs: int, recording: Recording) -> InputError:
+    source = "a depth map's value" if not recording.sweeps else "a LiDAR return"
+    return InputError(
+        f"--poses colmap: only {pairs} of COLMAP's points have {source} beside them, expected {MIN_PAIRS} or more: the "
+        "scale cannot be found. Take more frames, or frames whose sweeps and pictures see the same, and check that "
+        "the calibration of LiDAR and cameras is that of this recording."
+    )
+
+
+def _ratios(
+    recording: Recording, models: Sequence[ColmapModel], scales: Sequence[float], trajectory: Trajectory | None
+) -> Float64[np.ndarray, "pairs"]:
+    """LiDAR's distance over the models' scaled ones, for every feature with returns beside it.
+
+    Args:
+        recording: whose sweeps are used.
+        models: some models.
+        scales: of each.
+        trajectory: the vehicle's path in metres, to de-skew by; None = as if each sweep were taken all at once, at
+            the moment of the picture.
+
+    """
+    registered: dict[int, list[tuple[int, int]]] = defaultdict(list)
+    for number, model in enumerate(models):
+        for index in model.views:
+            registered[recording.pictures[index].frame].append((number, index))
+    frames = sorted(registered)
+    if len(frames) > _MOMENTS:
+        frames = [frames[round(i)] for i in np.linspace(0, len(frames) - 1, _MOMENTS)]
+    sweeps: dict[int, list[RecordedSweep]] = defaultdict(list)
+    for sweep in recording.sweeps:
+        if sweep.frame is not None:
+            sweeps[sweep.frame].append(sweep)
+    found = [np.ones(0)]
+    for frame in frames:
+        scans = [_scan(sweep, trajectory) for sweep in sweeps[frame]]
+        for number, index in sorted(registered[frame]):
+            picture = recording.pictures[index]
+            returns = _returns_in_camera(recording, picture, scans, trajectory)
+            view = models[number].views[index]
+            lidar = _beside(view.rays, returns)
+            fine = np.isfinite(lidar)
+            found.append(lidar[fine] / (scales[number] * view.distance[fine]))
+    return np.concatenate(found)
+
+
+def _scan(sweep: RecordedSweep, trajectory: Trajectory | None) -> Float64[np.ndarray, "returns 3"]:
+    """A sweep's points in the world, each by the vehicle's pose at its time; without a path, in the vehicle's frame."""
+    read = sweep.read()
+    if trajectory is None:
+        return transform_points(torch.from_numpy(sweep.to_vehicle), read.points_m).numpy()
+    return sweep_in_world(read, sweep.time_s, sweep.to_vehicle, trajectory, sweep.timing).points_m.numpy()
+
+
+def _returns_in_camera(
+    recording: Recording,
+    picture: RecordedPicture,
+    scans: Sequence[Float64[np.ndarray, "_ 3"]],
+    trajectory: Trajectory | None,
+) -> Float64[np.ndarray, "returns 3"]:
+    camera = next(camera for camera in recording.cameras if camera.name == picture.camera)
+    if not scans:
+        return _depth_points(picture, camera.camera)
+    to_camera = np.linalg.inv(camera.to_vehicle)
+    if trajectory is not None:
+        to_camera = to_camera @ np.linalg.inv(trajectory.at(np.array([picture.time_s]))[0])
+    return np.concatenate(scans) @ to_camera[:3, :3].T + to_camera[:3, 3]
+
+
+def _depth_points(picture: RecordedPicture, camera: Camera) -> Float64[np.ndarray, "values 3"]:
+    """The points of a depth map in the camera's frame."""
+    if picture.depth is None:
+        return np.zeros((0, 3))
+    distance = torch.from_numpy(read_depth(picture.depth, camera)).double()
+    rays, valid = rays_of(camera)
+    return (rays * distance[..., None])[valid & (distance > 0)].numpy()
+
+
+def _beside(
+    rays: Float64[np.ndarray, "features 3"], returns: Float64[np.ndarray, "returns 3"]
+) -> Float64[np.ndarray, "features"]:
+    """LiDAR's distance along some rays, from the returns beside each; NaN where there are none that agree."""
+    distance = np.linalg.norm(returns, axis=-1)
+    away = distance > 0
+    returns, distance = returns[away], distance[away]
+    if len(returns) < 2 or not len(rays):
+        return np.full(len(rays), np.nan)
+    # the tree is asked a few hundred times, so it pays to build it fast
+    tree = KDTree(returns / distance[:, None], compact_nodes=False, balanced_tree=False)
+    apart, index = tree.query(rays, _NEIGHBOURS, distance_upper_bound=_WINDOW_RAD)
+    near = np.isfinite(apart)
+    values = np.where(near, distance[np.where(near, index, 0)], np.nan)
+    with np.errstate(invalid="ignore"):
+        weight = np.where(near, 1 / (apart + 0.1 * _WINDOW_RAD), 0.0)
+    mean = np.where(near, weight * values, 0).sum(-1) / np.maximum(weight.sum(-1), 1e-12)
+    low, high = np.where(near, values, np.inf).min(-1), np.where(near, values, -np.inf).max(-1)
+    return np.where((near.sum(-1) >= 2) & (high - low <= _AGREE * low), mean, np.nan)

@@ -1,0 +1,1 @@
+"""KITTI-360's raw layout: calibration, the drive's files, the converter."""

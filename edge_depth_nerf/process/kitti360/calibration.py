@@ -1,0 +1,266 @@
+"""KITTI-360's calibration, poses and timestamps, as its files write them.
+
+Frames: cameras (x right, y down, z forward), velodyne (x forward, y left, z up), pose = the vehicle (x forward,
+y right, z down), world (z up). Transforms are 4×4, metres, named a_to_b. All of it is of the unrectified cameras.
+Each error names the file and the line.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+
+import numpy as np
+
+from edge_depth_nerf.base.bounds import shown, text_lines
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.cameras import MEI
+from edge_depth_nerf.cameras.transforms import Transform, check_rigid
+
+_MEI_FIELDS = {
+    "mirror_parameters": ("xi",),
+    "distortion_parameters": ("k1", "k2", "p1", "p2"),
+    "projection_parameters": ("gamma1", "gamma2", "u0", "v0"),
+}
+_DOWNLOAD = "Copy the file again from the data set."
+_MAX_YAML_VALUES = 1000
+_MAX_FRAME = 10**10
+"""Numbers of frames have ten digits."""
+
+
+@dataclass(frozen=True)
+class Kitti360Rig:
+    """Where the cameras and the scanner sit on the vehicle."""
+
+    cameras: dict[str, MEI]
+    """The fisheye cameras at their full size."""
+    camera_to_pose: dict[str, Transform]
+    """From each camera's frame to the vehicle's."""
+    velo_to_pose: Transform
+    """From the scanner's frame to the vehicle's."""
+
+
+def read_rig(calibration: Path, cameras: tuple[str, ...]) -> Kitti360Rig:
+    """Read what the folder `calibration` says of the scanner and some fisheye cameras.
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        InputError: a file is truncated or holds something else.
+
+    """
+    pose_file = calibration / "calib_cam_to_pose.txt"
+    camera_to_pose = read_cam_to_pose(pose_file)
+    for name in ("image_00", *cameras):
+        if name not in camera_to_pose:
+            raise InputError(
+                f"{pose_file}: has no line for {name}, only for {', '.join(camera_to_pose) or 'nothing'}. {_DOWNLOAD}"
+            )
+    cam0_to_velo = read_cam_to_velo(calibration / "calib_cam_to_velo.txt")
+    return Kitti360Rig(
+        cameras={name: read_mei_camera(calibration / f"{name}.yaml") for name in cameras},
+        camera_to_pose={name: camera_to_pose[name] for name in cameras},
+        velo_to_pose=camera_to_pose["image_00"] @ np.linalg.inv(cam0_to_velo),
+    )
+
+
+def read_mei_camera(path: Path) -> MEI:
+    """Read image_02.yaml or image_03.yaml: OpenCV's dialect of YAML, a MEI camera with integer pixel centres.
+
+    Returns:
+        The camera with pixel centres at +0.5: cx = u0 + 0.5.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: broken, truncated, or another camera model.
+
+    """
+    values, lines = _read_yaml(path)
+
+    def text(key: str) -> tuple[int, str]:
+        if key not in values:
+            raise InputError(
+                f"{path}: ends after line {lines} without {key}; expected a MEI camera's parameters. "
+                f"The file is truncated or of another camera. {_DOWNLOAD}"
+            )
+        return values[key]
+
+    def number(*keys: str) -> float:
+        key = ".".join(keys)
+        line, word = text(key)
+        try:
+            return _number(word, path, line)
+        except InputError:
+            raise InputError(f"{path}, line {line}: {key} is not a number: {shown(word)}. {_DOWNLOAD}") from None
+
+    line, model = text("model_type")
+    if model.strip("\"'") != "MEI":
+        raise InputError(
+            f"{path}, line {line}: model_type is not MEI. Only KITTI-360's fisheye cameras image_02 and image_03 can "
+            "be read."
+        )
+    xi, k1, k2, p1, p2, gamma1, gamma2, u0, v0 = (
+        number(group, key) for group, keys in _MEI_FIELDS.items() for key in keys
+    )
+    width, height = number("image_width"), number("image_height")
+    for key, size in (("image_width", width), ("image_height", height)):
+        if size % 1:
+            raise InputError(f"{path}, line {values[key][0]}: {key} is {size:g}, expected a whole number. {_DOWNLOAD}")
+    for key, centre, size in (("u0", u0, width), ("v0", v0, height)):
+        # a number that lost its last digits, or its exponent, is still a number
+        if not 0.25 * size <= centre <= 0.75 * size:
+            line, _ = values[f"projection_parameters.{key}"]
+            raise InputError(
+                f"{path}, line {line}: {key} is {centre:g}, which is not in the middle half of a "
+                f"picture of {size:g} pixels. The file is truncated or of another camera. {_DOWNLOAD}"
+            )
+    try:
+        # KITTI-360 counts integer pixel centres
+        return MEI(int(width), int(height), gamma1, gamma2, u0 + 0.5, v0 + 0.5, xi, k1, k2, p1, p2)
+    except InputError as error:
+        raise InputError(f"{path}: {error} {_DOWNLOAD}") from None
+
+
+def read_cam_to_pose(path: Path) -> dict[str, Transform]:
+    """Read calib_cam_to_pose.txt: a line "image_00: r11 r12 r13 t1 …" for each camera.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: a line is not a name and 12 numbers that are a rotation and a translation.
+
+    """
+    transforms = {}
+    for number, line in _lines(path):
+        name, colon, rest = line.partition(":")
+        if not colon:
+            raise InputError(f"{path}, line {number}: expected 'image_00: ' and 12 numbers. {_DOWNLOAD}")
+        if name.strip() in transforms:
+            raise InputError(f"{path}, line {number}: {shown(name.strip())} is there twice. {_DOWNLOAD}")
+        transforms[name.strip()] = _transform(rest, path, number)
+    return transforms
+
+
+def read_cam_to_velo(path: Path) -> Transform:
+    """Read calib_cam_to_velo.txt: one line of 12 numbers, unrectified camera 0 to the scanner.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: not one line of 12 numbers that are a rotation and a translation.
+
+    """
+    lines = list(_lines(path))
+    if len(lines) != 1:
+        raise InputError(f"{path}: {len(lines)} lines with text, expected one with 12 numbers. {_DOWNLOAD}")
+    return _transform(lines[0][1], path, lines[0][0])
+
+
+def read_poses(path: Path) -> dict[int, Transform]:
+    """Read poses.txt: lines "frame r11 r12 r13 t1 …", the vehicle's pose in the world; not every frame has one.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: a line is not a frame and 12 numbers, or a frame has two poses.
+
+    """
+    poses: dict[int, Transform] = {}
+    for number, line in _lines(path):
+        first, rest = (*line.split(maxsplit=1), "")[:2]
+        frame = _number(first, path, number)
+        if frame != int(frame) or not 0 <= frame < _MAX_FRAME:
+            raise InputError(f"{path}, line {number}: {shown(first)} is not the number of a frame. {_DOWNLOAD}")
+        if int(frame) in poses:
+            raise InputError(f"{path}, line {number}: frame {int(frame)} has a pose already. {_DOWNLOAD}")
+        poses[int(frame)] = _transform(rest, path, number)
+    if not poses:
+        raise InputError(f"{path}: no poses in it. {_DOWNLOAD}")
+    return poses
+
+
+def read_timestamps(path: Path) -> list[float]:
+    """Read timestamps.txt: line i holds "2013-05-28 08:46:02.123456789" for frame i.
+
+    Returns:
+        Seconds since 1970, the times read as UTC; to some 0.2 µs.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: a line is not a time.
+
+    """
+    times = []
+    for number, line in _lines(path):
+        # datetime stops at microseconds
+        whole, _, fraction = line.partition(".")
+        try:
+            moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc)
+            if not re.fullmatch(r"[0-9]*", fraction):
+                raise ValueError
+            times.append(moment.timestamp() + float(f"0.{fraction or 0}"))
+        except ValueError:
+            raise InputError(
+                f"{path}, line {number}: {shown(line)} is not a time like 2013-05-28 08:46:02.123456789. {_DOWNLOAD}"
+            ) from None
+    return times
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Lines with something in them, counted from 1."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file. It is part of the data set's calibration, poses or timestamps.")
+    return text_lines(path)
+
+
+def _read_yaml(path: Path) -> tuple[dict[str, tuple[int, str]], int]:
+    """Read the part of OpenCV's YAML that KITTI-360 uses: values, and tables of values.
+
+    A general parser does more than is wanted: aliases that multiply, tags that build objects, depth without end.
+
+    Returns:
+        Line and text of each value by its dotted name; and the number of the last line.
+
+    """
+    values: dict[str, tuple[int, str]] = {}
+    group, last = "", 0
+    for last, line in _lines(path):
+        if line.startswith(("%", "#", "---", "...")):
+            continue
+        key, colon, value = (part.strip() for part in line.partition(":"))
+        if not colon:
+            raise InputError(f"{path}, line {last}: Missing ':'; expected OpenCV's YAML with a MEI camera. {_DOWNLOAD}")
+        if not value:
+            group = key
+            continue
+        name = f"{group}.{key}" if key in _MEI_FIELDS.get(group, ()) else key
+        if name in values:
+            raise InputError(f"{path}, line {last}: {shown(name)} is there twice. {_DOWNLOAD}")
+        values[name] = last, value
+        if len(values) > _MAX_YAML_VALUES:
+            raise InputError(f"{path}: more than {_MAX_YAML_VALUES} values; expected a MEI camera's. {_DOWNLOAD}")
+    if not values:
+        raise InputError(f"{path}: nothing in it; expected OpenCV's YAML with a MEI camera. {_DOWNLOAD}")
+    return values, last
+
+
+def _number(text: str, path: Path, line: int) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise InputError(f"{path}, line {line}: {shown(text)} is not a finite number. {_DOWNLOAD}")
+    return value
+
+
+def _transform(text: str, path: Path, line: int) -> Transform:
+    numbers = [_number(word, path, line) for word in text.split()]
+    if len(numbers) != 12:
+        raise InputError(
+            f"{path}, line {line}: {len(numbers)} numbers, expected 12 (the 3×4 matrix of rotation and translation, "
+            f"row by row). {_DOWNLOAD}"
+        )
+    transform = np.eye(4)
+    transform[:3] = np.reshape(numbers, (3, 4))
+    check_rigid(transform, f"{path}, line {line}")
+    return transform

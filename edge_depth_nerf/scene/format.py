@@ -1,0 +1,205 @@
+"""transforms.json: what tells this project's scenes from other people's, and the checks that every reader needs.
+
+Light: both readers import it, and so does whoever reads the file for something else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from edge_depth_nerf.base.bounds import MAX_LENGTH_M, check_pixels, finite, path_inside, shown
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_json
+
+TRANSFORMS = "transforms.json"
+POINTS = "points.ply"
+LAYERS = {
+    "mask": ("masks/{camera}", "mask_path"),
+    "lidar": ("lidar/{camera}", "lidar_file_path"),
+    "mono": ("mono/{camera}", "mono_file_path"),
+    "truth_distance": ("truth/{camera}/distance", "truth_distance_file_path"),
+    "truth_rgb": ("truth/{camera}/rgb", "truth_rgb_file_path"),
+}
+"""What every frame of a scene has beside its picture, or none: its folder, and its key in transforms.json."""
+MONO_ENTRY = "mono"
+"""Key of transforms.json that says where monocular maps come from that were put into the scene later."""
+
+PATHS = (
+    *("file_path", "mask_path", "depth_file_path"),
+    *("lidar_file_path", "mono_file_path", "truth_distance_file_path", "truth_rgb_file_path"),
+)
+"""Keys of a frame that name files."""
+INTRINSICS = ("fl_x", "fl_y", "cx", "cy")
+"""Keys of a frame, or of the whole scene, that are numbers of pixels."""
+DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_MAX_FRAMES = 1_000_000
+"""Also an upper bound of the numbers of moments."""
+_NUMBERS = (*INTRINSICS, *DISTORTION, "timestamp_s")
+_SCENE_NUMBERS = ("theta_max_deg", "depth_unit_scale_factor", "applied_scale", "fisheye_crop_radius")
+_MAY_BE_NULL = ("timestamp_s", "fisheye_crop_radius")
+_ORIENTATIONS = ("pca", "up", "vertical", "none")
+
+
+def is_own_scene(meta: Mapping[str, Any]) -> bool:
+    """Whether a scene was written by `process`: its lengths are metres, its maps distances along the ray.
+
+    Monocular maps say nothing about that: `estimate-depth` puts them into other people's scenes, too.
+    """
+    return "world_offset_m" in meta or "lidar_file_path" in meta["frames"][0]
+
+
+def read_transforms(path: Path) -> dict[str, Any]:
+    """Read a transforms.json whose frames have pictures and whose values are what they are taken for.
+
+    What a reader needs beyond that (poses, intrinsics, a model that it knows) is for that reader to check.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: the file is broken, has no frames, a number is none, or a path leads out of the scene's folder.
+
+    """
+    meta = read_json(path)
+    if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list) or not meta["frames"]:
+        raise InputError(
+            f"{path}: has no list of frames. Expected a transforms.json of nerfstudio's format; "
+            "`edge-depth-nerf process` writes one."
+        )
+    if len(meta["frames"]) > _MAX_FRAMES:
+        raise InputError(f"{path}: {len(meta['frames'])} frames, expected at most {_MAX_FRAMES}. Split the scene.")
+    names: set[str] = set()
+    for number, frame in enumerate(meta["frames"]):
+        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+            raise InputError(f"{path}: frame {number} has no file_path. Every frame needs a picture and a pose.")
+        where = f"{path}: frame {number}"
+        _check_frame(frame, where, path.parent)
+        if frame["file_path"] in names:
+            raise InputError(f"{where}: {shown(frame['file_path'])} has a frame already; expected one a picture.")
+        names.add(frame["file_path"])
+    _check_scene(meta, path)
+    return meta
+
+
+def number_of(value: Any, where: str) -> float:
+    """A number as a float.
+
+    Raises:
+        InputError: it is none, or not finite; names `where`.
+
+    """
+    found = finite(value)
+    if found is None:
+        raise InputError(f"{where} is {shown(value)}, expected a number. Mend the file, or process the drive again.")
+    return found
+
+
+def pose_of(frame: Mapping[str, Any], where: str, rows: int = 4) -> Float64[np.ndarray, "rows 4"]:
+    """A frame's transform_matrix: camera (OpenGL) to scene.
+
+    Raises:
+        InputError: it is not 4×4 finite numbers, or lies nowhere near; names `where`.
+
+    """
+    return _matrix(frame.get("transform_matrix"), f"{where}: transform_matrix", rows)
+
+
+def _matrix(value: Any, where: str, rows: int) -> Float64[np.ndarray, "rows 4"]:
+    lists = value if isinstance(value, list) and all(isinstance(row, list) for row in value) else []
+    numbers = [[finite(item) for item in row] for row in lists[: rows + 1]]
+    if len(numbers) != rows or any(len(row) != 4 or None in row for row in numbers):
+        raise InputError(
+            f"{where} must be {rows}×4 finite numbers, found {shown(value)}. Every frame needs a pose; process the "
+            "drive again, or mend the file."
+        )
+    matrix = np.array(numbers, dtype=np.float64)
+    if np.abs(matrix).max() > MAX_LENGTH_M:
+        raise InputError(f"{where} holds {np.abs(matrix).max():.3g}, more than {MAX_LENGTH_M:g}. Is it in metres?")
+    return matrix
+
+
+def _check_frame(frame: Mapping[str, Any], where: str, folder: Path) -> None:
+    for key in PATHS:
+        if key in frame:
+            path_inside(folder, frame[key], f"{where}: {key}")
+    _check_numbers(frame, where)
+    _check_size(frame, where)
+    _check_distortion(frame, where)
+    if "transform_matrix" in frame:
+        pose_of(frame, where)
+    moment = frame.get("frame", 0)
+    if isinstance(moment, bool) or not isinstance(moment, int) or not 0 <= moment < 10**10:
+        raise InputError(f"{where}: frame is {shown(moment)}, expected the number of a moment. Mend the file.")
+    if "camera" in frame:
+        # maps lie in folders of cameras' names
+        path_inside(folder, frame["camera"], f"{where}: camera")
+
+
+def _check_numbers(entry: Mapping[str, Any], where: str) -> None:
+    for key in (*_NUMBERS, *_SCENE_NUMBERS):
+        if key in entry and not (entry[key] is None and key in _MAY_BE_NULL):
+            number_of(entry[key], f"{where}: {key}")
+
+
+def _check_size(entry: Mapping[str, Any], where: str) -> None:
+    sides = [number_of(entry[key], f"{where}: {key}") for key in ("w", "h") if key in entry]
+    if any(side % 1 or not 1 <= side < 2**31 for side in sides):
+        raise InputError(f"{where}: w and h are {sides}, expected whole numbers of pixels. Mend the file.")
+    if len(sides) == 2:
+        check_pixels(int(sides[0]), int(sides[1]), where)
+
+
+def _check_distortion(entry: Mapping[str, Any], where: str) -> None:
+    """Another way of nerfstudio's to write k1 to p2."""
+    given = entry.get("distortion_params", [0.0] * 6)
+    if not isinstance(given, list) or len(given) != 6 or any(finite(value) is None for value in given):
+        raise InputError(f"{where}: distortion_params is {shown(given)}, expected 6 numbers. Mend the file.")
+
+
+def _check_scene(meta: Mapping[str, Any], path: Path) -> None:
+    _check_numbers(meta, str(path))
+    _check_size(meta, str(path))
+    _check_distortion(meta, str(path))
+    # a width of the whole scene with a height of each frame
+    for number, frame in enumerate(meta["frames"]):
+        _check_size({**{key: meta[key] for key in ("w", "h") if key in meta}, **frame}, f"{path}: frame {number}")
+    if "orientation_override" in meta and meta["orientation_override"] not in _ORIENTATIONS:
+        raise InputError(
+            f"{path}: orientation_override is {shown(meta['orientation_override'])}, expected one of "
+            f"{', '.join(_ORIENTATIONS)}. Mend the file."
+        )
+    if "applied_transform" in meta:
+        rows = 4 if isinstance(meta["applied_transform"], list) and len(meta["applied_transform"]) == 4 else 3
+        _matrix(meta["applied_transform"], f"{path}: applied_transform", rows)
+    if meta.get("applied_scale") == 0:
+        raise InputError(f"{path}: applied_scale is 0, expected a number above. Mend the file.")
+    if meta.get("ply_file_path") is not None:
+        path_inside(path.parent, meta["ply_file_path"], f"{path}: ply_file_path")
+    for split in ("train", "val", "test"):
+        names = meta.get(f"{split}_filenames", [])
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise InputError(f"{path}: {split}_filenames is {shown(names)}, expected a list of file_paths.")
+    _check_shifted(meta.get("shifted_views", {}), path)
+
+
+def _check_shifted(views: Any, path: Path) -> None:
+    """The true views beside the path that synthetic drives have."""
+    wrong = InputError(f"{path}: shifted_views are none; expected lists of views by metres. Process the drive again.")
+    if not isinstance(views, dict):
+        raise wrong
+    for metres, entries in views.items():
+        try:
+            if abs(float(metres)) > 1e3 or not isinstance(entries, list):
+                raise wrong
+        except ValueError:
+            raise wrong from None
+        for number, entry in enumerate(entries):
+            where = f"{path}: shifted_views, {metres} m, view {number}"
+            if not isinstance(entry, dict) or not isinstance(entry.get("camera"), str):
+                raise wrong
+            pose_of(entry, where)
+            for key in ("truth_rgb_file_path", "truth_distance_file_path"):
+                path_inside(path.parent, entry.get(key), f"{where}: {key}")

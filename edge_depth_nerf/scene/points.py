@@ -1,0 +1,109 @@
+"""points.ply: a coloured cloud of what the training frames' LiDAR saw, thinned.
+
+Points are metres, in the recording's world when they come and in the scene's (nearer to its origin) when they are
+stored. Each frame's part is kept in a file of its own until all are there, so that work which was interrupted is
+not done twice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
+
+from edge_depth_nerf.base.files import read_npz, write_atomically, write_bytes
+from edge_depth_nerf.lidar.voxels import first_in_voxel
+
+MAX_POINTS = 200_000
+"""points.ply holds at most so many points."""
+VOXEL_M = 0.15
+"""points.ply holds one point of each cube of this size; larger cubes where they would be too many."""
+_MAX_PART_BYTES = 1 << 28
+"""No array of a frame's part is larger."""
+_MERGE_AT = 1_000_000
+"""So many points are collected before they are thinned; bounds the memory for long drives."""
+_MOST_KEPT = 5
+"""So many times `MAX_POINTS` are kept on the way; beyond, cubes grow before all parts are read."""
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Coloured points."""
+
+    points_m: Float64[np.ndarray, "points 3"]
+    """In the recording's world."""
+    colours: UInt8[np.ndarray, "points 3"]
+    """RGB."""
+    pixels: Int64[np.ndarray, "points 2"]
+    """Row and column of each point in its frame's picture."""
+
+
+@dataclass(frozen=True)
+class _Part:
+    points_m: Float32[np.ndarray, "points 3"]
+    """In the scene's world."""
+    colours: UInt8[np.ndarray, "points 3"]
+
+
+def _thinned(parts: Sequence[_Part], voxel_m: float) -> _Part:
+    """Keep the first point of each cube, in the order given."""
+    points_m = np.concatenate([part.points_m for part in parts])
+    colours = np.concatenate([part.colours for part in parts])
+    first = first_in_voxel(points_m, voxel_m)
+    return _Part(points_m[first], colours[first])
+
+
+def write_part(
+    path: Path, cloud: PointCloud, mask: Bool[np.ndarray, "h w"], world_offset_m: Float64[np.ndarray, "3"]
+) -> None:
+    """Write those of one frame's points whose pixels may be used, thinned, atomically."""
+    used = mask[cloud.pixels[:, 0], cloud.pixels[:, 1]]
+    # before the shift float32 would round to fractions of a millimetre, or to centimetres far from the origin
+    points_m = (cloud.points_m[used] - world_offset_m).astype(np.float32)
+    part = _thinned([_Part(points_m, cloud.colours[used])], VOXEL_M)
+
+    def write(temporary: Path) -> None:
+        np.savez(temporary, points_m=part.points_m, colours=part.colours)
+
+    write_atomically(path, write)
+
+
+def merge_parts(parts: Sequence[Path], ply: Path) -> int:
+    """Merge the frames' points into one PLY file (binary: float x, y, z, uchar red, green, blue).
+
+    Returns:
+        The number of points; with none, no file is written.
+
+    """
+    voxel_m = VOXEL_M
+    pending, count = [_Part(np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8))], 0
+    for path in parts:
+        stored = read_npz(path, ("points_m", "colours"), _MAX_PART_BYTES)
+        pending.append(_Part(stored["points_m"], stored["colours"]))
+        count += len(pending[-1].points_m)
+        if count > _MERGE_AT:
+            pending, count = [_thinned(pending, voxel_m)], 0
+            while len(pending[0].points_m) > _MOST_KEPT * MAX_POINTS:
+                # a drive so long that it would be thinned further in the end, too
+                voxel_m *= 1.2
+                pending = [_thinned(pending, voxel_m)]
+    merged = _thinned(pending, voxel_m)
+    while len(merged.points_m) > MAX_POINTS:
+        voxel_m *= 1.2
+        merged = _thinned([merged], voxel_m)
+    if len(merged.points_m):
+        write_bytes(ply, _ply(merged))
+    return len(merged.points_m)
+
+
+def _ply(part: _Part) -> bytes:
+    kinds = {"x": "<f4", "y": "<f4", "z": "<f4", "red": "u1", "green": "u1", "blue": "u1"}
+    rows = np.empty(len(part.points_m), dtype=list(kinds.items()))
+    for column, name in enumerate(kinds):
+        rows[name] = part.points_m[:, column] if column < 3 else part.colours[:, column - 3]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    header += [f"property {'float' if kind == '<f4' else 'uchar'} {name}" for name, kind in kinds.items()]
+    return ("\n".join([*header, "end_header"]) + "\n").encode() + rows.tobytes()

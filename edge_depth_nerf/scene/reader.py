@@ -1,0 +1,348 @@
+"""A scene folder on disk: its pictures with their lenses, poses, maps and moments.
+
+Reads this project's scenes and other people's nerfstudio scenes, without nerfstudio, whose import takes longer than
+most commands. A map that is missing is no error here, a file that is named and missing is one. Maps are H×W,
+distances metres along the ray with 0 = none, masks True = use. Lengths are the scene's, which are metres in scenes of
+this project.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Float64, UInt8
+from numpy.typing import NDArray
+
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE, read_distance_png, read_image, read_mask, read_npy
+from edge_depth_nerf.cameras import Camera, KannalaBrandt, Pinhole
+from edge_depth_nerf.lidar.scans import read_cloud
+from edge_depth_nerf.scene.format import DISTORTION, INTRINSICS, is_own_scene, number_of, pose_of, read_transforms
+
+PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+FISHEYE_MODEL = "OPENCV_FISHEYE"
+OWN_MAPS = {"lidar": "lidar_file_path", "mono": "mono_file_path", "truth": "truth_distance_file_path"}
+"""Maps that only this project's scenes have: their keys in transforms.json."""
+KEYS = {"image": "file_path", "mask": "mask_path", **OWN_MAPS}
+"""Layers of a picture: their keys in transforms.json."""
+DEPTH_KEY = "depth_file_path"
+"""nerfstudio's own depth; counts as LiDAR where there is no other."""
+
+
+@dataclass(frozen=True)
+class ScenePicture:
+    """One picture of the scene."""
+
+    name: str
+    """Its file_path in transforms.json."""
+    camera: str
+    """The frame's own word, or the folder of its pictures."""
+    moment: int
+    """Number of the frame in the drive; in other people's scenes its place in the order of names."""
+    lens: KannalaBrandt | Pinhole
+    """The camera that nerfstudio sees."""
+    position_m: Float64[np.ndarray, "3"]
+    """Centre of the camera in the scene."""
+    rotation: Float64[np.ndarray, "3 3"]
+    """Camera axes (OpenGL: x right, y up, z backward) in the scene, as columns."""
+    held_out: bool
+    """Whether transforms.json keeps it from training."""
+    timestamp_s: float | None
+    """Seconds, where the scene knows them."""
+    files: dict[str, Path]
+    """File of each layer that it has: image, mask, lidar, mono, truth."""
+
+    @property
+    def looks_along(self) -> Float64[np.ndarray, "3"]:
+        """Unit vector of the optical axis in the scene."""
+        return -self.rotation[:, 2]
+
+    @property
+    def up_in_camera(self) -> Float64[np.ndarray, "3"]:
+        """The scene's upward direction, z, in the camera's axes (OpenCV)."""
+        return self.rotation[2] * np.array([1.0, -1.0, -1.0])
+
+
+@dataclass(frozen=True)
+class PictureMaps:
+    """All that one picture has, at its own size."""
+
+    rgb: UInt8[np.ndarray, "h w 3"]
+    """The picture."""
+    lens: Bool[np.ndarray, "h w"]
+    """Where the lens model gives a ray within the scene's theta_max_deg."""
+    usable: Bool[np.ndarray, "h w"]
+    """The mask within the lens: what training draws rays from."""
+    lidar_m: Float32[np.ndarray, "h w"] | None
+    """LiDAR distance."""
+    mono_m: Float32[np.ndarray, "h w"] | None
+    """Monocular distance."""
+    truth_m: Float32[np.ndarray, "h w"] | None
+    """True distance."""
+
+
+@dataclass(frozen=True)
+class SceneFolder:
+    """A scene folder, checked; maps are read when asked for."""
+
+    path: Path
+    """Its transforms.json."""
+    camera_model: str
+    """nerfstudio's name."""
+    own: bool
+    """Whether it has this project's keys: then its lengths are metres."""
+    meta: dict[str, Any]
+    """transforms.json without its frames."""
+    theta_max_rad: float
+    """The angle from the axis beyond which the scene uses no ray."""
+    lidar_metres_per_count: float
+    """Unit of the LiDAR files."""
+    lidar_is_z_depth: bool
+    """Whether they hold the coordinate along the axis, as in other people's pinhole scenes."""
+    pictures: tuple[ScenePicture, ...]
+    """By camera, then by moment."""
+    split_known: bool
+    """Whether transforms.json says which pictures are for training."""
+    incomplete: dict[str, int]
+    """Keys of transforms.json that only some frames have, with how many."""
+    points_path: Path | None
+    """The point cloud it names."""
+
+    @property
+    def folder(self) -> Path:
+        """Where its files are relative to."""
+        return self.path.parent
+
+    def cameras(self) -> dict[str, tuple[ScenePicture, ...]]:
+        """The pictures of each camera, in order of their moments."""
+        names = dict.fromkeys(picture.camera for picture in self.pictures)
+        return {name: tuple(picture for picture in self.pictures if picture.camera == name) for name in names}
+
+    def moments(self) -> list[int]:
+        """All moments that any camera has, in order."""
+        return sorted({picture.moment for picture in self.pictures})
+
+    def has(self, layer: str) -> bool:
+        """Whether any picture has this layer."""
+        return any(layer in picture.files for picture in self.pictures)
+
+    def maps(self, picture: ScenePicture) -> PictureMaps:
+        """Read all that a picture has.
+
+        Args:
+            picture: one of the scene's.
+
+        Raises:
+            InputError: a file cannot be decoded, or has another size than the camera.
+
+        """
+        found = {layer: self._read(layer, path) for layer, path in picture.files.items()}
+        for layer, pixels in found.items():
+            self._check_size(picture, layer, pixels)
+        # after the check: the size in transforms.json may be anything, that of the decoded picture is in memory
+        lens, cos_theta = _rays(picture.lens, self.theta_max_rad)
+        usable = found["mask"] & lens if "mask" in found else lens
+        if "lidar" in found:
+            found["lidar"] = self._as_distance(found["lidar"], lens, cos_theta)
+        return PictureMaps(found["image"], lens, usable, found.get("lidar"), found.get("mono"), found.get("truth"))
+
+    def lidar_m(self, picture: ScenePicture) -> Float32[np.ndarray, "h w"]:
+        """Read a picture's LiDAR map alone: metres along the ray, 0 = none.
+
+        Raises:
+            InputError: it cannot be decoded, or has another size than the camera.
+
+        """
+        pixels = self._read("lidar", picture.files["lidar"])
+        self._check_size(picture, "lidar", pixels)
+        return self._as_distance(pixels, *_rays(picture.lens, self.theta_max_rad)) if self.lidar_is_z_depth else pixels
+
+    def _check_size(self, picture: ScenePicture, layer: str, pixels: NDArray) -> None:
+        width, height = picture.lens.width, picture.lens.height
+        if pixels.shape[:2] != (height, width):
+            raise InputError(
+                f"{picture.files[layer]}: is {'×'.join(map(str, pixels.shape[1::-1]))} pixels (width × height), "
+                f"but {self.path} gives the camera of {picture.name} {width}×{height}. Pictures, masks and "
+                "distance maps of a frame must have one size; make the file again at that size."
+            )
+
+    def _as_distance(
+        self, pixels: NDArray[np.float32], lens: NDArray[np.bool_], cos_theta: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Turn what a LiDAR file holds into metres along the ray."""
+        if not self.lidar_is_z_depth:
+            return pixels
+        ahead = lens & (cos_theta > 0)
+        return np.where(ahead, pixels / np.where(ahead, cos_theta, 1), 0).astype(np.float32)
+
+    def points_m(self) -> Float64[np.ndarray, "points 3"] | None:
+        """Read the point cloud, if there is one.
+
+        Raises:
+            InputError: it cannot be read.
+
+        """
+        if self.points_path is None:
+            return None
+        try:
+            points = read_cloud(self.points_path)
+        except InputError as error:
+            raise InputError(
+                f"{error} It cannot be read as a PLY point cloud: make the file again, or take ply_file_path out of "
+                f"{self.path}."
+            ) from None
+        return points[np.isfinite(points).all(1)]
+
+    def _read(self, layer: str, path: Path) -> np.ndarray:
+        if layer == "image":
+            return read_image(path)
+        if layer == "mask":
+            return read_mask(path)
+        metres_per_count = self.lidar_metres_per_count if layer == "lidar" else 1 / DISTANCE_STEPS_PER_METRE
+        if path.suffix != ".npy":
+            return read_distance_png(path, metres_per_count)
+        counts = read_npy(path)
+        counts = counts[..., 0] if counts.ndim == 3 and counts.shape[2] == 1 else counts
+        return counts.astype(np.float32) * np.float32(metres_per_count)
+
+
+@lru_cache(maxsize=8)
+def _rays(lens: Camera, theta_max_rad: float) -> tuple[Bool[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+    """Whether each pixel has a ray, and the cosine of its angle from the axis."""
+    directions, valid = lens.unproject(lens.pixel_centres(torch.float32))
+    cos_theta = torch.nan_to_num(directions[..., 2])
+    return (valid & (cos_theta >= math.cos(theta_max_rad))).numpy(), cos_theta.numpy()
+
+
+def read_scene(scene: Path) -> SceneFolder:
+    """Read transforms.json and check what it says.
+
+    Args:
+        scene: the folder, or the file itself.
+
+    Raises:
+        FileNotFoundError: no scene there.
+        InputError: the file is broken, or names a file that is missing.
+
+    """
+    path = scene if scene.suffix == ".json" else scene / "transforms.json"
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"{path}: no such file. A scene folder has a transforms.json; `edge-depth-nerf process` makes one from a "
+            "raw drive."
+        )
+    meta = read_transforms(path)
+    frames = meta["frames"]
+    model = meta.get("camera_model", "PINHOLE")
+    if model not in (*PINHOLE_MODELS, FISHEYE_MODEL):
+        raise InputError(
+            f"{path}: camera_model is {model!r}; expected one of {', '.join((*PINHOLE_MODELS, FISHEYE_MODEL))}. "
+            "Convert the cameras, for example with `edge-depth-nerf process`."
+        )
+    own = is_own_scene(meta)
+    own_lidar = OWN_MAPS["lidar"] in frames[0]
+    held_out, split_known = _held_out(meta)
+    moments = _moments(frames)
+    pictures = tuple(
+        ScenePicture(
+            name=frame["file_path"],
+            camera=_camera_name(frame),
+            moment=moments[frame["file_path"]],
+            lens=_lens(meta, frame, model, path),
+            **_pose(frame, path),
+            held_out=frame["file_path"] in held_out,
+            timestamp_s=None
+            if frame.get("timestamp_s") is None
+            else number_of(frame["timestamp_s"], f"{path}: {frame['file_path']}: timestamp_s"),
+            files=_files(frame, path.parent, OWN_MAPS["lidar"] if own_lidar else DEPTH_KEY),
+        )
+        for frame in frames
+    )
+    given = Counter(key for frame in frames for key in (*KEYS.values(), DEPTH_KEY) if key in frame)
+    ply = meta.get("ply_file_path")
+    points_path = path.parent / ply if isinstance(ply, str) else None
+    _check_files(path, pictures, points_path)
+    return SceneFolder(
+        path=path,
+        camera_model=model,
+        own=own,
+        meta={key: value for key, value in meta.items() if key != "frames"},
+        theta_max_rad=math.radians(number_of(meta.get("theta_max_deg", 180.0), f"{path}: theta_max_deg")),
+        lidar_metres_per_count=1 / DISTANCE_STEPS_PER_METRE
+        if own_lidar
+        else number_of(meta.get("depth_unit_scale_factor", 1e-3), f"{path}: depth_unit_scale_factor"),
+        lidar_is_z_depth=not own and model != FISHEYE_MODEL,
+        pictures=tuple(sorted(pictures, key=lambda picture: (picture.camera, picture.moment))),
+        split_known=split_known,
+        incomplete={key: count for key, count in given.items() if count < len(frames)},
+        points_path=points_path,
+    )
+
+
+def _held_out(meta: dict[str, Any]) -> tuple[set[str], bool]:
+    """Names that are kept from training, and whether the scene says so at all."""
+    lists: dict[str, set[str]] = {}
+    for split in ("train", "val", "test"):
+        names = meta.get(f"{split}_filenames")
+        lists[split] = {name for name in names if isinstance(name, str)} if isinstance(names, list) else set()
+    if lists["train"]:
+        # what no list names is not trained on either
+        return {frame["file_path"] for frame in meta["frames"]} - lists["train"], True
+    return lists["val"] | lists["test"], any(lists.values())
+
+
+def _camera_name(frame: dict[str, Any]) -> str:
+    name = frame.get("camera")
+    return name if isinstance(name, str) else Path(frame["file_path"]).parent.as_posix()
+
+
+def _moments(frames: list[dict[str, Any]]) -> dict[str, int]:
+    """The moment of each picture: as the frames say, else their order within their camera."""
+    if all(isinstance(frame.get("frame"), int) for frame in frames):
+        return {frame["file_path"]: frame["frame"] for frame in frames}
+    ordered: dict[str, list[str]] = {}
+    for frame in sorted(frames, key=lambda frame: frame["file_path"]):
+        ordered.setdefault(_camera_name(frame), []).append(frame["file_path"])
+    return {name: moment for names in ordered.values() for moment, name in enumerate(names)}
+
+
+def _lens(meta: dict[str, Any], frame: dict[str, Any], model: str, path: Path) -> KannalaBrandt | Pinhole:
+    where = f"{path}: {frame['file_path']}"
+    size_and_focal = [number_of(frame.get(key, meta.get(key)), f"{where}: {key}") for key in ("w", "h", *INTRINSICS)]
+    distortion = [number_of(frame.get(key, meta.get(key, 0.0)), f"{where}: {key}") for key in DISTORTION]
+    width, height, fx, fy, cx, cy = size_and_focal
+    k1, k2, k3, k4, p1, p2 = distortion
+    try:
+        if model == FISHEYE_MODEL:
+            return KannalaBrandt(int(width), int(height), fx, fy, cx, cy, k1, k2, k3, k4, p1, p2)
+        return Pinhole(int(width), int(height), fx, fy, cx, cy, k1, k2, p1, p2, k3, k4)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+
+
+def _pose(frame: dict[str, Any], path: Path) -> dict[str, np.ndarray]:
+    pose = pose_of(frame, f"{path}: {frame['file_path']}")
+    return {"position_m": pose[:3, 3], "rotation": pose[:3, :3]}
+
+
+def _files(frame: dict[str, Any], folder: Path, lidar_key: str) -> dict[str, Path]:
+    keys = {**KEYS, "lidar": lidar_key}
+    return {layer: folder / frame[key] for layer, key in keys.items() if isinstance(frame.get(key), str)}
+
+
+def _check_files(path: Path, pictures: tuple[ScenePicture, ...], points_path: Path | None) -> None:
+    named = dict.fromkeys(file for picture in pictures for file in picture.files.values())
+    missing = [file for file in (*named, *([points_path] if points_path else [])) if not file.is_file()]
+    if missing:
+        others = f" and {len(missing) - 1} others" if len(missing) > 1 else ""
+        raise InputError(
+            f"{missing[0]}: no such file{others}, but {path} names it. Copy the missing files, or process the drive "
+            "again."
+        )

@@ -1,0 +1,809 @@
+"""The scene folder, and the one writer of it.
+
+    transforms.json                       nerfstudio's format, with this project's keys beside it; written last
+    process.json                          what the scene is made of; written first
+    points.ply                            LiDAR of the training frames, coloured, thinned
+    images/image_02/0000000123.png        picture
+    masks/image_02.png                    what of this camera's pictures is used, 255 = use (lens circle, vehicle)
+    masks/image_02/0000000123.png         the same for one frame, where frames have masks of their own
+    lidar/image_02/0000000123.png         LiDAR distance map
+    mono/image_02/0000000123.png          monocular distance map
+    truth/image_02/{distance,rgb}/…       what is really there, in synthetic drives, for judging alone
+    truth/image_02/shifted_1m/{distance,rgb}/…   the same from beside the path
+
+Distances are metres along the ray, in 16-bit PNGs of 1/256 m, 0 = none. In memory, poses are camera-to-world with
+OpenCV's camera axes, metres, in the recording's own world; in transforms.json they have OpenGL's axes, and the
+world is shifted by `world_offset_m`, whole metres near the mean camera: world = scene + world_offset_m.
+
+A run that was interrupted continues: whole files are kept, unless what they are made from is newer.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import re
+import shutil
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+from numpy.typing import NDArray
+from rich.console import Console
+
+from edge_depth_nerf import __version__
+from edge_depth_nerf.base.console import run_jobs
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import (
+    DISTANCE_STEPS_PER_METRE,
+    check_is_folder,
+    read_distance_png,
+    read_image,
+    read_json,
+    remove_leftovers,
+    write_bytes,
+    write_distance_png,
+    write_json,
+    write_mask,
+    write_png,
+)
+from edge_depth_nerf.base.png import read_png_bytes, read_png_header
+from edge_depth_nerf.cameras import Camera, CameraFit, KannalaBrandt, Pinhole, fit_kannala_brandt, host_residual
+from edge_depth_nerf.cameras.transforms import Transform, check_rigid, opencv_to_opengl
+from edge_depth_nerf.masks.lens import lens_circle
+from edge_depth_nerf.scene.checks import LeftOut, Tolerance
+from edge_depth_nerf.scene.format import LAYERS, MONO_ENTRY, POINTS, TRANSFORMS, read_transforms
+from edge_depth_nerf.scene.points import PointCloud, merge_parts, write_part
+
+RECORD = "process.json"
+LEFT_OUT = "left_out.json"
+"""Pictures of the drive that are not in the scene, because one of their files is broken: what is wrong with each."""
+CLOUD = "cloud"
+"""The layer that becomes points.ply."""
+
+MAX_FIT_RMS_PX = 0.5
+"""A camera whose replacement is off by more than this cannot be used."""
+_PARTIAL = ".partial"
+
+DistanceMap = Path | NDArray[np.float32] | NDArray[np.float64]
+Picture = Path | NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class FrameContent:
+    """The maps of one frame, at the scene's size: arrays, or files, which are copied as they are."""
+
+    image: Picture
+    """H×W×3 RGB."""
+    mask: NDArray[np.bool_] | None = None
+    """This frame's own mask, True = use; the camera's mask is applied as well."""
+    lidar: DistanceMap | None = None
+    """LiDAR distance in metres, 0 = no return; what the mask hides is removed."""
+    mono: DistanceMap | None = None
+    """Monocular distance in metres, 0 = none."""
+    truth_distance: DistanceMap | None = None
+    """True distance in metres, 0 = none."""
+    truth_rgb: Picture | None = None
+    """The picture without noise."""
+    cloud: PointCloud | None = None
+    """Points for points.ply; of training frames only; those that the mask hides are left out."""
+
+
+@dataclass(frozen=True)
+class SceneCamera:
+    """A camera of the scene."""
+
+    name: str
+    """Such as image_02; the name of its folders."""
+    original: Camera
+    """As it was calibrated, at the scene's size."""
+    mask: NDArray[np.bool_] | None = None
+    """What of its pictures may be used, True = use; the lens circle is applied as well."""
+
+
+@dataclass(frozen=True)
+class SceneFrame:
+    """One picture of one camera."""
+
+    camera: str
+    """Name of its camera."""
+    frame: int
+    """Number of its moment."""
+    camera_to_world: Transform
+    """OpenCV's camera axes, the recording's world, metres."""
+    content: FrameContent | Callable[[], FrameContent]
+    """Its maps, or what loads them when their turn comes; called from several threads at once."""
+    timestamp_s: float | None = None
+    """Seconds of the recording's own clock."""
+    held_out: bool = False
+    """Whether it is kept from training. All cameras of a moment should agree."""
+    inputs: tuple[Path, ...] = ()
+    """Files that a loaded content comes from: if one is newer than what was written, it is written again."""
+
+    @property
+    def key(self) -> str:
+        """What names it in files: camera and number."""
+        return f"{self.camera}/{self.frame:010d}"
+
+
+@dataclass(frozen=True)
+class ShiftedView:
+    """A true view from beside the path."""
+
+    metres: int
+    """How far from the path."""
+    camera: str
+    """Name of the camera."""
+    frame: int
+    """Number of the moment."""
+    camera_to_world: Transform
+    """OpenCV's camera axes, the recording's world, metres."""
+    content: Callable[[], tuple[Picture, DistanceMap]]
+    """Loads the picture and the true distance."""
+    inputs: tuple[Path, ...] = ()
+    """Files that the content comes from."""
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """Something that was asked for and cannot be taken."""
+
+    frame: int
+    """Number of the moment."""
+    camera: str | None
+    """The camera, or None for all."""
+    reason: str
+    """Why."""
+
+
+@dataclass(frozen=True)
+class ProcessReport:
+    """What a converter did."""
+
+    scene: Path
+    """The folder written."""
+    training: int
+    """Pictures for training."""
+    held_out: int
+    """Pictures kept from training."""
+    written: int
+    """Pictures whose files were written now; the others were there already."""
+    fits: dict[str, CameraFit]
+    """How far nerfstudio's rays of each camera are off, in pixels."""
+    mask_share: dict[str, float]
+    """Which part of each camera's pictures is used, 0 to 1."""
+    skipped: tuple[Skipped, ...] = ()
+    """Frames that were asked for and that the drive does not have."""
+    left_out: tuple[LeftOut, ...] = ()
+    """What is broken or missing, and so not in the scene."""
+    notices: tuple[str, ...] = ()
+    """What the user should know."""
+
+
+def summarise(skipped: Iterable[Skipped]) -> str:
+    """Group frames left out by the reason: "no pose: 0, 7-9"."""
+    groups: dict[str, list[int]] = {}
+    for item in skipped:
+        reason = item.reason if item.camera is None else f"{item.reason} of {item.camera}"
+        groups.setdefault(reason, []).append(item.frame)
+    return "; ".join(f"{reason}: {ranges(frames)}" for reason, frames in groups.items())
+
+
+def ranges(frames: Sequence[int]) -> str:
+    """Shorten numbers in order: "0, 7-9"."""
+    runs: list[list[int]] = []
+    for frame in frames:
+        if runs and frame == runs[-1][1] + 1:
+            runs[-1][1] = frame
+        else:
+            runs.append([frame, frame])
+    return ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in runs)
+
+
+def held_out_frames(count: int, holdout_every: int) -> list[bool]:
+    """Decide which of `count` moments, in order, are held out: the middle one of every `holdout_every`; 0 = none."""
+    return [holdout_every > 0 and index % holdout_every == holdout_every // 2 for index in range(count)]
+
+
+def write_scene(
+    output: Path,
+    cameras: Sequence[SceneCamera],
+    frames: Sequence[SceneFrame],
+    *,
+    layers: Collection[str],
+    source: Mapping[str, Any],
+    theta_max_deg: float = 95.0,
+    shifted: Sequence[ShiftedView] = (),
+    strict: bool = True,
+    console: Console | None = None,
+) -> ProcessReport:
+    """Write a scene folder, or continue one.
+
+    Args:
+        output: the folder; new, empty, or begun from the same `source`.
+        cameras: the cameras, of any models. A scene has one of nerfstudio's: OPENCV if all are pinholes, else
+            OPENCV_FISHEYE, with a fitted camera in the place of each MEI and pinhole.
+        frames: the pictures, in any order.
+        layers: which of `LAYERS` every frame's content holds; "cloud" for points.ply.
+        source: what the scene is made of, as JSON; decides whether a folder that exists is the same scene.
+        theta_max_deg: rays further from the axis are masked out; less, where a camera's own range ends before.
+        shifted: true views from beside the path.
+        strict: a frame whose content cannot be read is an error; otherwise it is left out, up to a tenth of them.
+        console: where progress is shown.
+
+    Raises:
+        InputError: the cameras, frames or maps cannot make a scene, or the folder holds something else.
+
+    """
+    console = console or Console()
+    by_name = {camera.name: camera for camera in cameras}
+    frames = sorted(frames, key=lambda frame: (frame.camera, frame.frame))
+    _check(by_name, cameras, frames, shifted, layers, theta_max_deg)
+    scene_cameras, fits = _scene_cameras(cameras, theta_max_deg)
+    masks = {camera.name: _camera_mask(camera, theta_max_deg) for camera in cameras}
+    # adding zero turns -0.0 into 0.0
+    offset = np.round(np.mean([frame.camera_to_world[:3, 3] for frame in frames], axis=0)) + 0.0
+
+    open_scene(output, source)
+    for name, mask in masks.items():
+        write_mask(output / f"masks/{name}.png", mask)
+    tolerance = Tolerance(strict, len(frames))
+    broken = _broken_before(output, frames)
+    for frame in frames:
+        if frame.key in broken:
+            tolerance.add(frame.frame, frame.camera, InputError(broken[frame.key]))
+    frames = [frame for frame in frames if frame.key not in broken]
+    work = _pending(output, frames, shifted, layers)
+    notices = []
+    later = _maps_put_in_later(output / TRANSFORMS)
+    if later is not None:
+        images = [_frame_files(frame, ())["image"] for frame in frames]
+        maps = [later.maps.get(image) for image in images]
+        whole = all(file is not None and (output / file).is_file() for file in maps)
+        if not whole or work.frames or work.shifted:
+            later = None
+            notices.append(
+                "The estimated monocular maps of this scene are left out: one is missing, or pictures or masks are "
+                "new. Those of the drive's own network are made again; others are to be put in again, by "
+                "`edge-depth-nerf estimate-depth`."
+            )
+            if "mono" in layers:
+                # in their places belong the drive's
+                for frame in frames:
+                    (output / _frame_files(frame, layers)["mono"]).unlink(missing_ok=True)
+                work = _pending(output, frames, shifted, layers)
+    jobs = [
+        # the cameras of a moment one after another: they share its sweeps
+        *(
+            partial(_try_frame, tolerance, output, frame, masks[frame.camera], layers, offset)
+            for frame in sorted(work.frames, key=lambda frame: (frame.frame, frame.camera))
+        ),
+        *(partial(_write_shifted, output, view, by_name[view.camera].original) for view in work.shifted),
+    ]
+    if jobs:
+        # a reader is not to find a scene whose maps are being replaced
+        (output / TRANSFORMS).unlink(missing_ok=True)
+        run_jobs(jobs, "Writing the scene", console)
+    left_out = {(item.camera, item.frame) for item in tolerance.left_out}
+    frames = [frame for frame in frames if (frame.camera, frame.frame) not in left_out]
+    _check_split(frames)
+    if work.cloud:
+        parts = [output / _cloud_path(frame) for frame in frames if not frame.held_out]
+        if not merge_parts(parts, output / POINTS):
+            raise InputError(
+                f"{output}: no LiDAR return lies in any training picture. Check the calibration from the scanner to "
+                "the cameras, and the masks (255 = use the pixel)."
+            )
+    content = _transforms(cameras, scene_cameras, fits, frames, shifted, layers, offset, theta_max_deg, source)
+    if later is not None:
+        content[MONO_ENTRY] = later.entry
+        for frame in content["frames"]:
+            frame[LAYERS["mono"][1]] = later.maps[frame["file_path"]]
+    if left_out:
+        faults = {f"{item.camera}/{item.frame:010d}": item.fault for item in tolerance.left_out}
+        if not (output / LEFT_OUT).is_file() or read_json(output / LEFT_OUT) != faults:
+            write_json(output / LEFT_OUT, faults)
+    else:
+        (output / LEFT_OUT).unlink(missing_ok=True)
+    write_json(output / TRANSFORMS, content)
+    shutil.rmtree(output / _PARTIAL, ignore_errors=True)
+
+    held_out = sum(frame.held_out for frame in frames)
+    if not held_out:
+        notices.append("No frame is held out: evaluation runs on the training frames and says little.")
+    return ProcessReport(
+        scene=output,
+        training=len(frames) - held_out,
+        held_out=held_out,
+        written=len(work.frames),
+        fits=fits,
+        mask_share={name: float(mask.mean()) for name, mask in masks.items()},
+        left_out=tolerance.left_out,
+        notices=tuple(notices),
+    )
+
+
+# ---- checks ----------------------------------------------------------------------------------------------------
+
+
+def _check(
+    by_name: dict[str, SceneCamera],
+    cameras: Sequence[SceneCamera],
+    frames: Sequence[SceneFrame],
+    shifted: Sequence[ShiftedView],
+    layers: Collection[str],
+    theta_max_deg: float,
+) -> None:
+    if not 0 < theta_max_deg <= 180:
+        raise InputError(f"theta_max_deg is {theta_max_deg}; expected degrees from the axis, above 0, up to 180.")
+    if unknown := set(layers) - {*LAYERS, CLOUD}:
+        raise InputError(f"unknown layers {sorted(unknown)}; expected some of {', '.join((*LAYERS, CLOUD))}.")
+    _check_split(frames)
+    if len(by_name) != len(cameras):
+        raise InputError(f"two cameras have one name: {', '.join(camera.name for camera in cameras)}.")
+    for name in by_name:
+        if not re.fullmatch(r"\w[\w.-]*", name):
+            raise InputError(f"camera {name!r}: expected a name of letters, digits, _ and -; it becomes a folder.")
+    for camera in cameras:
+        size = (camera.original.height, camera.original.width)
+        if camera.mask is not None and camera.mask.shape != size:
+            raise InputError(_size_error(f"the mask of camera {camera.name}", camera.mask.shape, size))
+    for item in (*frames, *shifted):
+        where = f"frame {item.frame} of {item.camera}"
+        if item.camera not in by_name:
+            raise InputError(f"{where}: there is no such camera, only {', '.join(by_name)}.")
+        check_rigid(item.camera_to_world, f"{where}: camera_to_world")
+    twice = [key for key, count in Counter((frame.camera, frame.frame) for frame in frames).items() if count > 1]
+    if twice:
+        raise InputError(f"frame {twice[0][1]} of {twice[0][0]} is given twice.")
+
+
+def _check_split(frames: Sequence[SceneFrame]) -> None:
+    if not frames:
+        raise InputError("no frames to make a scene of.")
+    if all(frame.held_out for frame in frames):
+        raise InputError("all frames are held out; none is left for training.")
+
+
+def _size_error(what: str, found: tuple[int, ...], expected: tuple[int, int]) -> str:
+    return (
+        f"{what}: {'×'.join(map(str, reversed(found[:2])))} pixels, expected {expected[1]}×{expected[0]} as its camera "
+        "has. Make it in the size of the pictures."
+    )
+
+
+def open_scene(output: Path, source: Mapping[str, Any]) -> None:
+    """Begin the folder, or make sure that it was begun from the same things.
+
+    Raises:
+        InputError: it holds something else, or cannot be written.
+
+    """
+    record = {"made_by": f"edge-depth-nerf {__version__}", **source}
+    path = output / RECORD
+    check_is_folder(output)
+    remove_leftovers(output)
+    if path.is_file():
+        there = read_json(path)
+        there = there if isinstance(there, dict) else {}
+        differing = [key for key in dict.fromkeys((*record, *there)) if there.get(key) != record.get(key)]
+        if differing and not any(entry.name != RECORD for entry in output.iterdir()):
+            # a run that failed before it wrote anything does not bind the next one
+            write_json(path, record)
+        elif differing:
+            key = differing[0]
+            others = f" (also: {', '.join(differing[1:])})" if differing[1:] else ""
+            raise InputError(
+                f"{output}: holds another scene: {key} is {there.get(key)!r} there, {record.get(key)!r} now{others}. "
+                "Give another --output, or delete that folder first."
+            )
+        return
+    if output.is_dir() and (foreign := sorted(entry.name for entry in output.iterdir())):
+        raise InputError(
+            f"{output}: holds {', '.join(foreign[:5])}{' …' if len(foreign) > 5 else ''} and no {RECORD}: it was not "
+            "begun by this command. Give another --output, or empty that folder first."
+        )
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        write_json(path, record)
+    except OSError as error:
+        raise InputError(f"{output}: cannot be written ({error.strerror}). Give another --output.") from error
+
+
+# ---- cameras ---------------------------------------------------------------------------------------------------
+
+
+def check_cameras(cameras: Sequence[SceneCamera], theta_max_deg: float) -> None:
+    """Check that a scene can have these cameras and masks, before anything is written.
+
+    Raises:
+        InputError: nerfstudio has no camera that is near enough to one, or its mask hides everything.
+
+    """
+    _scene_cameras(cameras, theta_max_deg)
+    for camera in cameras:
+        _camera_mask(camera, theta_max_deg)
+
+
+def _scene_cameras(
+    cameras: Sequence[SceneCamera], theta_max_deg: float
+) -> tuple[dict[str, KannalaBrandt | Pinhole], dict[str, CameraFit]]:
+    """Find the cameras that nerfstudio knows, and how far they are from the originals."""
+    fisheye = any(not isinstance(camera.original, Pinhole) for camera in cameras)
+    fits = {camera.name: _scene_camera(camera, math.radians(theta_max_deg), fisheye) for camera in cameras}
+    return {name: fit.camera for name, fit in fits.items()}, fits
+
+
+def _scene_camera(camera: SceneCamera, theta_max_rad: float, fisheye: bool) -> CameraFit:
+    """Find the camera that takes the place of one, as an OPENCV_FISHEYE camera or an OPENCV camera."""
+    original = camera.original
+    try:
+        fit, wrong_rad = _replaced(original, theta_max_rad, fisheye)
+    except InputError as error:
+        fault = str(error)
+    else:
+        if fit.rms_px <= MAX_FIT_RMS_PX:
+            return fit
+        off = f"by {fit.rms_px:.2f} px rms up to {math.degrees(fit.theta_max_rad):.0f}°"
+        if math.isinf(fit.rms_px):
+            off = f"without bound from {math.degrees(wrong_rad):.1f}° on, where nerfstudio's iteration goes astray"
+        fault = (
+            f"nerfstudio's {'fisheye' if fisheye else 'pinhole'} camera differs from this {original.model} camera {off}"
+        )
+    remedy = "Check its calibration."
+    if (usable_deg := _usable_deg(original, theta_max_rad, fisheye)) is not None:
+        remedy = f"Give --theta-max-deg {usable_deg}, up to which it can."
+        if isinstance(original, Pinhole) and fisheye:
+            remedy += (
+                " Or limit this camera alone, by theta_max_deg in a rig file. Or make a scene of the pinhole cameras "
+                "alone, where they stay as they are."
+            )
+    raise InputError(
+        f"camera {camera.name}: {fault.rstrip('.')}; at most {MAX_FIT_RMS_PX} px rms can be used. {remedy}"
+    )
+
+
+@functools.lru_cache(maxsize=64)
+def _replaced(original: Camera, theta_max_rad: float, fisheye: bool) -> tuple[CameraFit, float]:
+    """Find the camera for nerfstudio, the residual of its rays, and the angle where one is wrong."""
+    limit_rad = min(theta_max_rad, original.theta_max_rad)
+    if isinstance(original, KannalaBrandt):
+        replacement = _off_pixel_centre(original)
+    elif isinstance(original, Pinhole) and not fisheye:
+        replacement = original
+    else:
+        replacement = _off_pixel_centre(_rounded(fit_kannala_brandt(original, limit_rad).camera))
+    return host_residual(original, replacement, limit_rad)
+
+
+def _usable_deg(original: Camera, theta_max_rad: float, fisheye: bool) -> int | None:
+    """The largest multiple of 5° up to which the camera can be used; None = not even to 20°."""
+    limit_deg = math.degrees(min(theta_max_rad, original.theta_max_rad))
+    for angle_deg in range(math.ceil(limit_deg / 5) * 5 - 5, 15, -5):
+        try:
+            if _replaced(original, math.radians(angle_deg), fisheye)[0].rms_px <= MAX_FIT_RMS_PX:
+                return angle_deg
+        except InputError:
+            continue
+    return None
+
+
+def _rounded(camera: KannalaBrandt | Pinhole) -> KannalaBrandt:
+    """Keep nine digits: the last ones of a fit depend on how its sums were shared among threads."""
+    assert isinstance(camera, KannalaBrandt)
+    names = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")
+    return replace(camera, **{name: float(f"{getattr(camera, name):.9g}") for name in names})
+
+
+def _off_pixel_centre(camera: KannalaBrandt) -> KannalaBrandt:
+    """Move the principal point off a pixel's centre: nerfstudio's fisheye ray is 0/0 exactly there."""
+
+    def near_centre(coordinate: float) -> bool:
+        return abs(coordinate - 0.5 - round(coordinate - 0.5)) < 5e-4
+
+    if near_centre(camera.cx) and near_centre(camera.cy):
+        return replace(camera, cx=round(camera.cx - 0.5) + 0.501)
+    return camera
+
+
+def _camera_mask(camera: SceneCamera, theta_max_deg: float) -> NDArray[np.bool_]:
+    """Lens circle and the camera's own mask."""
+    mask = lens_circle(camera.original, theta_max_deg)
+    if camera.mask is not None:
+        mask &= camera.mask
+    if not mask.any():
+        raise InputError(
+            f"the mask of camera {camera.name} leaves no pixel within {theta_max_deg:g}° of the axis. In mask files "
+            "255 = use the pixel, 0 = ignore it: is it inverted?"
+        )
+    return mask
+
+
+# ---- the files of a frame --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Work:
+    frames: list[SceneFrame]
+    shifted: list[ShiftedView]
+    cloud: bool
+
+
+def _file(folder: str, camera: str, frame: int) -> str:
+    return f"{folder.format(camera=camera)}/{frame:010d}.png"
+
+
+def _frame_files(frame: SceneFrame, layers: Collection[str]) -> dict[str, str]:
+    """Paths in the scene of the frame's maps, by layer."""
+    files = {"image": _file("images/{camera}", frame.camera, frame.frame)}
+    return files | {
+        layer: _file(folder, frame.camera, frame.frame) for layer, (folder, _) in LAYERS.items() if layer in layers
+    }
+
+
+def _shifted_files(view: ShiftedView) -> tuple[str, str]:
+    folder = f"truth/{{camera}}/shifted_{view.metres}m"
+    return (_file(f"{folder}/rgb", view.camera, view.frame), _file(f"{folder}/distance", view.camera, view.frame))
+
+
+def _cloud_path(frame: SceneFrame) -> str:
+    return f"{_PARTIAL}/{frame.camera}/{frame.frame:010d}.npz"
+
+
+def _modified_ns(path: Path) -> int:
+    try:
+        return path.stat().st_mtime_ns
+    except FileNotFoundError:
+        return 0
+
+
+def _broken_before(output: Path, frames: Sequence[SceneFrame]) -> dict[str, str]:
+    """Which frames an earlier run left out, and why, as far as none of their files has changed since."""
+    path = output / LEFT_OUT
+    if not path.is_file():
+        return {}
+    found, written_ns = read_json(path), _modified_ns(path)
+    return {
+        frame.key: str(found[frame.key])
+        for frame in frames
+        if isinstance(found, dict)
+        and frame.key in found
+        and max((_modified_ns(file) for file in frame.inputs), default=0) < written_ns
+    }
+
+
+def _pending(
+    output: Path, frames: Sequence[SceneFrame], shifted: Sequence[ShiftedView], layers: Collection[str]
+) -> _Work:
+    """Find what is missing, or older than what it is made from."""
+
+    def fresh(files: Collection[str], inputs: tuple[Path, ...]) -> bool:
+        newest = max((_modified_ns(path) for path in inputs), default=0)
+        return all(_modified_ns(output / file) > newest for file in files)
+
+    def current(frame: SceneFrame, files: Collection[str]) -> bool:
+        # content given in memory has no date
+        return callable(frame.content) and fresh(files, frame.inputs)
+
+    stale = [frame for frame in frames if not current(frame, _frame_files(frame, layers).values())]
+    training_inputs = tuple(path for frame in frames if not frame.held_out for path in frame.inputs)
+    cloud = CLOUD in layers and (not fresh([POINTS], training_inputs) or any(not frame.held_out for frame in stale))
+    if cloud:
+        stale = [
+            frame
+            for frame in frames
+            if not current(
+                frame,
+                [*_frame_files(frame, layers).values(), *([] if frame.held_out else [_cloud_path(frame)])],
+            )
+        ]
+    return _Work(stale, [view for view in shifted if not fresh(_shifted_files(view), view.inputs)], cloud)
+
+
+def _try_frame(
+    tolerance: Tolerance,
+    output: Path,
+    frame: SceneFrame,
+    camera_mask: NDArray[np.bool_],
+    layers: Collection[str],
+    offset: Float64[np.ndarray, "3"],
+) -> None:
+    """Write a frame, or leave it out, without any file of it."""
+    try:
+        _write_frame(output, frame, camera_mask, layers, offset)
+    except (InputError, FileNotFoundError) as error:
+        tolerance.add(frame.frame, frame.camera, error)
+        for file in (*_frame_files(frame, layers).values(), _cloud_path(frame)):
+            (output / file).unlink(missing_ok=True)
+
+
+def _write_frame(
+    output: Path,
+    frame: SceneFrame,
+    camera_mask: NDArray[np.bool_],
+    layers: Collection[str],
+    offset: Float64[np.ndarray, "3"],
+) -> None:
+    content = frame.content() if callable(frame.content) else frame.content
+    where = f"frame {frame.frame} of {frame.camera}"
+    files = {layer: output / file for layer, file in _frame_files(frame, layers).items()}
+    size = (camera_mask.shape[0], camera_mask.shape[1])
+    for layer in files:
+        if getattr(content, layer) is None:
+            raise InputError(f"{where}: has no {layer}, but every frame of this scene has. Give it for all or none.")
+
+    _write_picture(files["image"], content.image, size, f"{where}: the picture")
+    mask = camera_mask
+    if "mask" in files and content.mask is not None:
+        if content.mask.shape != size:
+            raise InputError(_size_error(f"{where}: its mask", content.mask.shape, size))
+        mask = camera_mask & content.mask
+        write_mask(files["mask"], mask)
+    if "lidar" in files and content.lidar is not None:
+        lidar = read_distance_png(content.lidar) if isinstance(content.lidar, Path) else content.lidar
+        if lidar.shape != size:
+            raise InputError(_size_error(f"{where}: its LiDAR map", lidar.shape, size))
+        write_distance_png(files["lidar"], np.where(mask, lidar, 0.0))
+    if "mono" in files and content.mono is not None:
+        _write_distance(files["mono"], content.mono, size, f"{where}: its monocular map")
+    if "truth_distance" in files and content.truth_distance is not None:
+        _write_distance(files["truth_distance"], content.truth_distance, size, f"{where}: its true distance")
+    if "truth_rgb" in files and content.truth_rgb is not None:
+        _write_picture(files["truth_rgb"], content.truth_rgb, size, f"{where}: its true picture")
+    if CLOUD in layers and not frame.held_out:
+        if content.cloud is None:
+            raise InputError(f"{where}: has no cloud, but every training frame of this scene has.")
+        write_part(output / _cloud_path(frame), content.cloud, mask, offset)
+
+
+def _write_shifted(output: Path, view: ShiftedView, camera: Camera) -> None:
+    picture, distance = view.content()
+    where = f"frame {view.frame} of {view.camera}, shifted by {view.metres} m"
+    size = (camera.height, camera.width)
+    picture_file, distance_file = _shifted_files(view)
+    _write_picture(output / picture_file, picture, size, where)
+    _write_distance(output / distance_file, distance, size, where)
+
+
+def _write_picture(path: Path, picture: Picture, size: tuple[int, int], what: str) -> None:
+    if isinstance(picture, Path):
+        what = f"{what} {picture}"
+        if picture.suffix.lower() == ".png":
+            header = read_png_header(picture)
+            if (header.height, header.width) == size and header.is_picture:
+                write_bytes(path, read_png_bytes(picture))
+                return
+        picture = read_image(picture)
+    if picture.shape[:2] != size:
+        raise InputError(_size_error(what, picture.shape, size))
+    write_png(path, picture)
+
+
+def _write_distance(path: Path, distance_m: DistanceMap, size: tuple[int, int], what: str) -> None:
+    if isinstance(distance_m, Path):
+        header = read_png_header(distance_m)
+        if (header.height, header.width) == size and header.is_distance:
+            write_bytes(path, read_png_bytes(distance_m))
+            return
+        what = f"{what} {distance_m}"
+        distance_m = read_distance_png(distance_m)
+    if distance_m.shape != size:
+        raise InputError(_size_error(what, distance_m.shape, size))
+    write_distance_png(path, distance_m)
+
+
+# ---- transforms.json -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _LaterMaps:
+    """Monocular maps that were put into the scene since it was written."""
+
+    entry: Any
+    """Where they come from."""
+    maps: dict[str, str]
+    """By picture."""
+
+
+def _maps_put_in_later(written: Path) -> _LaterMaps | None:
+    """Find what a transforms.json says of such maps."""
+    if not written.is_file():
+        return None
+    there = read_transforms(written)
+    if MONO_ENTRY not in there:
+        return None
+    key = LAYERS["mono"][1]
+    return _LaterMaps(there[MONO_ENTRY], {frame["file_path"]: frame[key] for frame in there["frames"] if key in frame})
+
+
+def _transforms(
+    cameras: Sequence[SceneCamera],
+    scene_cameras: Mapping[str, KannalaBrandt | Pinhole],
+    fits: Mapping[str, CameraFit],
+    frames: Sequence[SceneFrame],
+    shifted: Sequence[ShiftedView],
+    layers: Collection[str],
+    offset: Float64[np.ndarray, "3"],
+    theta_max_deg: float,
+    source: Mapping[str, Any],
+) -> dict[str, Any]:
+    def matrix(camera_to_world: Transform) -> list[list[float]]:
+        moved = camera_to_world.copy()
+        moved[:3, 3] -= offset
+        return opencv_to_opengl(moved).tolist()
+
+    def entry(frame: SceneFrame) -> dict[str, Any]:
+        camera = scene_cameras[frame.camera]
+        files = _frame_files(frame, layers)
+        found: dict[str, Any] = {
+            "file_path": files["image"],
+            "transform_matrix": matrix(frame.camera_to_world),
+            "w": camera.width,
+            "h": camera.height,
+            "fl_x": camera.fx,
+            "fl_y": camera.fy,
+            "cx": camera.cx,
+            "cy": camera.cy,
+            "k1": camera.k1,
+            "k2": camera.k2,
+            "k3": camera.k3,
+            "k4": camera.k4,
+            "p1": camera.p1,
+            "p2": camera.p2,
+            "mask_path": f"masks/{frame.camera}.png",
+        }
+        found |= {LAYERS[layer][1]: file for layer, file in files.items() if layer != "image"}
+        if "lidar" in layers:
+            found["depth_file_path"] = files["lidar"]
+        found |= {"camera": frame.camera, "frame": frame.frame}
+        if frame.timestamp_s is not None:
+            found["timestamp_s"] = frame.timestamp_s
+        return found
+
+    def view(shifted_view: ShiftedView) -> dict[str, Any]:
+        picture, distance = _shifted_files(shifted_view)
+        return {
+            "camera": shifted_view.camera,
+            "frame": shifted_view.frame,
+            "transform_matrix": matrix(shifted_view.camera_to_world),
+            "truth_rgb_file_path": picture,
+            "truth_distance_file_path": distance,
+        }
+
+    any_fisheye = any(isinstance(camera, KannalaBrandt) for camera in scene_cameras.values())
+    images = {held_out: [_frame_files(f, ())["image"] for f in frames if f.held_out == held_out] for held_out in (0, 1)}
+    evaluation = images[True] or images[False]
+    content: dict[str, Any] = {
+        "camera_model": "OPENCV_FISHEYE" if any_fisheye else "OPENCV",
+        "depth_unit_scale_factor": 1 / DISTANCE_STEPS_PER_METRE,
+        "theta_max_deg": theta_max_deg,
+        "world_offset_m": offset.tolist(),
+        "source": {"made_by": f"edge-depth-nerf {__version__}", **source},
+        "original_cameras": {camera.name: camera.original.to_dict() for camera in cameras},
+        "camera_fits": {
+            name: {
+                "rms_px": round(fit.rms_px, 6),
+                "max_px": round(fit.max_px, 6),
+                "theta_max_deg": math.degrees(fit.theta_max_rad),
+            }
+            for name, fit in fits.items()
+        },
+        "frames": [entry(frame) for frame in frames],
+        "train_filenames": images[False],
+        "val_filenames": evaluation,
+        "test_filenames": evaluation,
+    }
+    if CLOUD in layers:
+        content["ply_file_path"] = POINTS
+    if shifted:
+        ordered = sorted(shifted, key=lambda item: (item.metres, item.camera, item.frame))
+        distances = sorted({item.metres for item in shifted})
+        content["shifted_views"] = {
+            str(metres): [view(item) for item in ordered if item.metres == metres] for metres in distances
+        }
+    return content
