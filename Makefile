@@ -10,7 +10,7 @@ help:
 	@echo "make test-pure   tests of the modules that need no nerfstudio, under NumPy 2"
 	@echo "make fuzz        a thousand spoilt files for every reader, then a coverage-guided fuzzer (half an hour)"
 	@echo "make audit       known faults of the installed packages (asks the network)"
-	@echo "make lint        ruff and pyright"
+	@echo "make lint        ruff, import-linter and pyright"
 	@echo "make docs        the pages as a site (site/)"
 	@echo "make check-dist  build wheel and sdist (dist/), install them into a fresh environment"
 	@echo "make setup       the virtual environment in $(VENV), with the versions of constraints.txt"
@@ -57,6 +57,7 @@ audit: setup
 	$(BIN)/pip-audit --skip-editable --progress-spinner off $(AUDIT_EXCEPTIONS)
 
 lint: setup
+	$(BIN)/lint-imports --no-cache --quiet
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright

@@ -101,7 +101,8 @@ def test_the_wheel_works_without_the_sources(wheel, tmp_path):
     assert "edge-depth-nerf-lite = edge_depth_nerf.plugin.config:edge_depth_nerf_lite" in declared
     assert "fisheye-depth-data = edge_depth_nerf.plugin.dataparser_config:fisheye_depth_data" in declared
     code = (
-        f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import edge_depth_nerf, edge_depth_nerf.plugin.config as c; "
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r}); "
+        "import edge_depth_nerf, edge_depth_nerf.plugin.config as c; "
         f"assert edge_depth_nerf.__file__.startswith({str(tmp_path)!r}), edge_depth_nerf.__file__; "
         "assert c.edge_depth_nerf_lite.config.pipeline.model.num_levels == 12"
     )
