@@ -34,7 +34,7 @@ test: setup
 # compare with nerfstudio have its name in theirs.
 PURE := build/pure
 PURE_TESTS := alignment bad_input camera_fit cameras files integration kitti360 lidar losses masks mono_files \
-	pixel_table poses prior scans scene sweeps_in_world trajectory trust
+	pixel_table poses prior rays scans scene sweeps_in_world trajectory trust
 test-pure:
 	rm -rf $(PURE)
 	$(PYTHON) -m venv $(PURE)
