@@ -33,8 +33,8 @@ test: setup
 # The modules that need no nerfstudio, whose dependencies still pin NumPy 1.26 (its issue 3747), under NumPy 2. Tests that
 # compare with nerfstudio have its name in theirs.
 PURE := build/pure
-PURE_TESTS := alignment bad_input camera_fit cameras completion files integration kitti360 lidar losses masks mono_files \
-	pixel_table poses prior scans scene sweeps_in_world trajectory trust
+PURE_TESTS := alignment bad_input camera_fit cameras files integration kitti360 lidar losses masks mono_files \
+	pixel_table poses prior rays scans scene sweeps_in_world trajectory trust
 test-pure:
 	rm -rf $(PURE)
 	$(PYTHON) -m venv $(PURE)

@@ -149,19 +149,8 @@ def check_opencv() -> Iterator[Finding]:
     except Exception as error:
         yield _broken("OpenCV", "opencv-contrib-python-headless", error)
         return
-    contrib = hasattr(cv2, "ximgproc")
-    found = (
-        f"{cv2.__version__}, {'with' if contrib else 'without'} contrib; installed: {', '.join(wheels) or 'unknown'}"
-    )
-    yield Finding(
-        "OpenCV",
-        "ok" if contrib else "note",
-        found,
-        ""
-        if contrib
-        else "The wheels overwrite each other, the last one wins; all works but the comparison with a filter of "
-        "contrib. For it: pip install --force-reinstall --no-deps opencv-contrib-python-headless",
-    )
+    # they overwrite each other, the last one wins; any of them will do
+    yield Finding("OpenCV", "ok", f"{cv2.__version__}; installed: {', '.join(wheels) or 'unknown'}")
 
 
 def check_lpips() -> Iterator[Finding]:

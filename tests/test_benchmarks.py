@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
-import copy
 import hashlib
 import importlib
 import json
@@ -13,13 +11,11 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
-from nerfstudio.configs.method_configs import all_methods
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json, write_json
 from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.results import Results, RunResult
-from edge_depth_nerf.plugin.config import apply_overrides
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results.json"
@@ -91,39 +87,6 @@ def test_a_part_of_a_page_is_replaced_and_nothing_else(benchmark_module, tmp_pat
         monkeypatch.setattr(sys, "argv", ["pages.py", str(page), wrong])
         with pytest.raises(SystemExit):
             pages.main()
-
-
-def test_the_ablation_has_a_row_for_what_was_trained_on_every_drive(benchmark_module):
-    ablation = benchmark_module("ablation")
-    options = argparse.Namespace(scenes=[Path("street"), Path("turn")], steps=10, seed=0)
-    (base, *_), group = ablation.STUDY[""], next(name for name in ablation.STUDY if name.startswith("λ"))
-    lower, *others = ablation.STUDY[group]
-
-    def figures(psnr: float) -> dict[str, float]:
-        return {"truth_psnr": psnr, "truth_abs_rel": 0.05, "truth_delta_1_25": 0.9}
-
-    done = {
-        ablation.key_of("street", options, "", base): figures(30.0),
-        ablation.key_of("turn", options, "", base): figures(32.0),
-        ablation.key_of("street", options, group, lower): figures(29.0),
-        ablation.key_of("turn", options, group, lower): figures(32.5),
-        ablation.key_of("turn", options, group, others[0]): figures(40.0),  # not yet on every drive
-    }
-    lines = ablation.table(done, options)
-    assert lines[0] == "| | street | turn | mean PSNR | against “as it was” | AbsRel | δ < 1.25 |"
-    assert lines[2] == "| as it was | 30.00 | 32.00 | 31.00 | +0.00 | 0.050 | 0.900 |"
-    assert lines[4] == f"| {lower.title} | 29.00 | 32.50 | 30.75 | -0.25 | 0.050 | 0.900 |"
-    assert len(lines) == 5
-
-
-def test_no_two_variants_of_the_ablation_are_the_same(benchmark_module):
-    ablation = benchmark_module("ablation")
-    variants = [variant for members in ablation.STUDY.values() for variant in members]
-    settings = [(str(variant.overrides), str(variant.change)) for variant in variants]
-    assert len(set(settings)) == len(settings) > 20
-    for variant in variants:  # what it overrides exists
-        config = copy.deepcopy(all_methods["edge-depth-nerf-lite"])
-        apply_overrides(config, variant.overrides, "ablation")
 
 
 def test_kept_runs_are_laid_out_again(benchmark_module, tmp_path):

@@ -3,7 +3,7 @@
 GNU's OpenMP, which torch brings, lets a thread that is done with its part turn in a loop for some milliseconds, in case
 that more is to come. A training step here goes back and forth between torch's threads and Numba's, and those that turn
 take the cores from those that work: a step takes a sixth longer, and five times as long beside one busy process
-(benchmarks/busy.py, docs/speed.md).
+(docs/speed.md).
 
 `OMP_WAIT_POLICY=passive` lets them sleep, but is read when the library is loaded; in `ns-train` that is before this
 package is. The library also gives the turning up, but for a moment, once it has made more threads than there are cores

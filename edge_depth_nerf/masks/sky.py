@@ -9,14 +9,13 @@ removed is lost.
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Float32, Shaped, UInt8
 
 from edge_depth_nerf.cameras import Camera
+from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.masks.regions import (
     block_mean,
     components,
@@ -92,9 +91,9 @@ def find_sky(
     """
     factor = math.ceil(max(mask.shape) / WORKING_PX)
     usable = whole_blocks(mask, factor)
-    height_sine = _rays(camera, factor) @ up_in_camera.astype(np.float32)
-    # comparisons with NaN, outside the camera's range, are false
-    possible = usable & (height_sine > math.sin(math.radians(_HORIZON_DEG)))
+    blocks = rays(camera.downscaled(factor))
+    height_sine = blocks.directions @ up_in_camera.astype(np.float32)
+    possible = usable & blocks.within & (height_sine > math.sin(math.radians(_HORIZON_DEG)))
     far = lidar_m == 0
     possible &= ~dilated(~whole_blocks(far, factor), 1.0)
     if mono_m is not None:
@@ -132,13 +131,6 @@ def _darkest(ground: Shaped[np.ndarray, "n"]) -> float:
         return _DARKEST_LEVEL
     road = float(np.quantile(ground, _ROAD_QUANTILE))
     return max(_DARKEST_LEVEL, min(_BRIGHTER_THAN_GROUND * road, _BRIGHT_LEVEL))
-
-
-@lru_cache(maxsize=8)
-def _rays(camera: Camera, factor: int) -> Float32[np.ndarray, "h w 3"]:
-    """Unit rays of blocks of pixels; NaN outside the camera's range."""
-    smaller = camera.downscaled(factor)
-    return smaller.unproject(smaller.pixel_centres(torch.float32))[0].numpy()
 
 
 def _grow(

@@ -12,17 +12,16 @@ import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Bool, Float32, UInt8
 from numpy.typing import NDArray
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_image, read_mask
 from edge_depth_nerf.cameras import KannalaBrandt, Pinhole
+from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
 
 FarSeen = Callable[[ScenePicture, tuple[int, int]], NDArray[np.float32]]
@@ -84,13 +83,13 @@ def working_size(width: int, height: int, working_px: int) -> tuple[int, int]:
 def view_of(picture: ScenePicture, theta_max_rad: float, working_px: int) -> View:
     """Rays and mask of a picture at the network's size."""
     size = working_size(picture.lens.width, picture.lens.height, working_px)
-    rays, within = lens_rays(picture.lens, theta_max_rad, size)
+    directions, within = lens_rays(picture.lens, theta_max_rad, size)
     if "mask" in picture.files:
         mask = read_mask(picture.files["mask"])
         check_size(mask, picture, "mask")
         # a pixel that a masked one is mixed into is masked as well
         within = within & (cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999)
-    return View(rays, within, picture.up_in_camera.astype(np.float32))
+    return View(directions, within, picture.up_in_camera.astype(np.float32))
 
 
 def scaled_lens(lens: KannalaBrandt | Pinhole, size: tuple[int, int]) -> KannalaBrandt | Pinhole:
@@ -101,16 +100,12 @@ def scaled_lens(lens: KannalaBrandt | Pinhole, size: tuple[int, int]) -> Kannala
     )
 
 
-@lru_cache(maxsize=16)
 def lens_rays(
     lens: KannalaBrandt | Pinhole, theta_max_rad: float, size: tuple[int, int]
 ) -> tuple[Float32[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
     """Rays of the pixels of a picture scaled to (width, height), and which lie within `theta_max_rad` of the axis."""
-    scaled = scaled_lens(lens, size)
-    directions, valid = scaled.unproject(scaled.pixel_centres())
-    within = valid & (directions[..., 2] >= math.cos(theta_max_rad))
-    rays = torch.where(within[..., None], directions, 0.0).to(torch.float32)
-    return rays.numpy(), within.numpy()
+    found = rays(scaled_lens(lens, size), theta_max_rad)
+    return found.directions, found.within
 
 
 def load_examples(
@@ -144,7 +139,7 @@ def load_examples(
     lidar_m = np.zeros((count, height, width), np.float32)
     usable = np.zeros((count, height, width), bool)
     ups, heights, lenses = np.zeros((count, 3), np.float32), np.zeros(count, np.float32), np.zeros(count, np.int64)
-    rays: dict[object, tuple[int, np.ndarray]] = {}
+    rays_of: dict[object, tuple[int, np.ndarray]] = {}
     index = 0
     for number, (scene, pictures, height_m) in enumerate(zip(scenes, chosen, heights_m, strict=True)):
         for picture in pictures:
@@ -160,15 +155,15 @@ def load_examples(
             lidar_m[part] = known_m
             usable[part] = view.usable
             key = (picture.lens, scene.theta_max_rad)
-            if key not in rays:
+            if key not in rays_of:
                 padded = np.zeros((height, width, 3), np.float32)
                 padded[:rows, :columns] = view.rays
-                rays[key] = (len(rays), padded)
-            lenses[index] = rays[key][0]
+                rays_of[key] = (len(rays_of), padded)
+            lenses[index] = rays_of[key][0]
             ups[index], heights[index] = view.up_in_camera, height_m[picture.camera]
             index += 1
             advance()
-    return Examples(rgb, lidar_m, usable, np.stack([ray for _, ray in rays.values()]), lenses, ups, heights)
+    return Examples(rgb, lidar_m, usable, np.stack([padded for _, padded in rays_of.values()]), lenses, ups, heights)
 
 
 def bytes_a_picture(pictures: Sequence[ScenePicture], working_px: int) -> int:

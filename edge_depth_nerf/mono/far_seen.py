@@ -21,9 +21,10 @@ import torch
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
 from numpy.typing import NDArray
 
+from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.lidar.projection import project_points
 from edge_depth_nerf.lidar.voxels import first_in_voxel
-from edge_depth_nerf.mono.examples import lens_rays, scaled_lens, view_of
+from edge_depth_nerf.mono.examples import scaled_lens, view_of
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
 
 VOXEL_M = 0.05
@@ -151,12 +152,13 @@ def seen_above(
     near = cloud.part(cloud.near(picture))
     high = near.part(_is_above(picture, near.points_m, field.top_sine))
     in_camera, spacing_m = torch.from_numpy(_to_camera(picture, high.points_m)), torch.from_numpy(high.spacing_m)
-    projected = project_points(in_camera, scaled_lens(picture.lens, size), spacing_m=spacing_m)
+    lens = scaled_lens(picture.lens, size)
+    projected = project_points(in_camera, lens, spacing_m=spacing_m)
     distance_m = projected.distance_m.float().numpy()
-    rays, within = lens_rays(picture.lens, scene.theta_max_rad, size)
-    sine = rays @ picture.up_in_camera.astype(np.float32)
-    visible = _level_m(distance_m, sine) <= field.reach_m[_azimuth(picture, rays)]
-    return np.where(within & (sine > field.top_sine) & visible, distance_m, np.float32(0))
+    found = rays(lens, scene.theta_max_rad)
+    sine = found.directions @ picture.up_in_camera.astype(np.float32)
+    visible = _level_m(distance_m, sine) <= field.reach_m[_azimuth(picture, found.directions)]
+    return np.where(found.within & (sine > field.top_sine) & visible, distance_m, np.float32(0))
 
 
 def field_deg(

@@ -19,7 +19,7 @@ from jaxtyping import Float, Float32, Float64, UInt8
 from numpy.typing import NDArray
 
 from edge_depth_nerf.cameras import KannalaBrandt, Pinhole
-from edge_depth_nerf.mono.examples import lens_rays
+from edge_depth_nerf.cameras.rays import rays
 
 HALF_ANGLE_DEG = 50.0
 """Of a view, from its axis to the middle of a border: wider, perspective stretches what networks know."""
@@ -87,15 +87,16 @@ def pinhole_views(lens: KannalaBrandt | Pinhole, theta_max_rad: float) -> tuple[
         At least one. Views that are nowhere the best are left out.
 
     """
-    rays, within = lens_rays(lens, theta_max_rad, (lens.width, lens.height))
-    farthest_deg = math.degrees(math.acos(np.clip(rays[..., 2][within].min(initial=1.0), -1, 1)))
+    found = rays(lens, theta_max_rad)
+    directions, within = found.directions, found.within
+    farthest_deg = math.degrees(math.acos(np.clip(found.cos_theta[within].min(initial=1.0), -1, 1)))
     focal_px = (lens.fx + lens.fy) / 2
     if isinstance(lens, Pinhole) or farthest_deg <= SINGLE_HALF_ANGLE_DEG:
-        tangent = np.abs(rays[within][:, :2] / rays[within][:, 2:]).max(0, initial=0.1) * _SINGLE_MARGIN
-        return (_view(lens, rays, np.eye(3), focal_px, float(tangent[0]), float(tangent[1])),)
+        tangent = np.abs(directions[within][:, :2] / directions[within][:, 2:]).max(0, initial=0.1) * _SINGLE_MARGIN
+        return (_view(lens, directions, np.eye(3), focal_px, float(tangent[0]), float(tangent[1])),)
     axes = FRONT_DEG if farthest_deg <= FRONT_REACH_DEG else FRONT_DEG + BACK_DEG
     tangent = math.tan(math.radians(HALF_ANGLE_DEG))
-    views = [_view(lens, rays, _upright(*axis), focal_px, tangent, tangent) for axis in axes]
+    views = [_view(lens, directions, _upright(*axis), focal_px, tangent, tangent) for axis in axes]
     best = np.full(within.shape, -1)
     most = np.zeros(within.shape, np.float32)
     for number, view in enumerate(views):
@@ -121,21 +122,21 @@ def _upright(azimuth_deg: float, elevation_deg: float) -> NDArray[np.float64]:
 
 def _view(
     lens: KannalaBrandt | Pinhole,
-    rays: Float32[np.ndarray, "h w 3"],
+    directions: Float32[np.ndarray, "h w 3"],
     view_to_camera: NDArray[np.float64],
     focal_px: float,
     tangent_x: float,
     tangent_y: float,
 ) -> PinholeView:
-    """Lay out one view; rays are unit vectors, zeros where the lens sees nothing."""
+    """Lay out one view; the picture's directions are unit vectors, zeros where the lens sees nothing."""
     # as fine as the picture's middle; a view never needs to be larger than the picture
     focal_px = min(focal_px, lens.width / (2 * tangent_x), lens.height / (2 * tangent_y))
     width, height = max(round(2 * focal_px * tangent_x), 1), max(round(2 * focal_px * tangent_y), 1)
     x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
-    directions = np.stack([x, y, np.full_like(x, focal_px)], -1) @ view_to_camera.T
-    pixels, valid = lens.project(torch.from_numpy(directions))
+    outward = np.stack([x, y, np.full_like(x, focal_px)], -1) @ view_to_camera.T
+    pixels, valid = lens.project(torch.from_numpy(outward))
     picture_xy = torch.where(valid[..., None], pixels - 0.5, -1e4).numpy().astype(np.float32)
-    seen = rays @ view_to_camera.astype(np.float32)
+    seen = directions @ view_to_camera.astype(np.float32)
     ahead = seen[..., 2] > 1e-3
     plane = np.where(ahead[..., None], seen[..., :2] / np.where(ahead, seen[..., 2], 1)[..., None], np.inf)
     # the middle of the outermost pixels is the border: beyond, the view has no value to interpolate
