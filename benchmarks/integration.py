@@ -127,7 +127,7 @@ def main() -> None:
         ("torch unfold, float32", unfold_form, several, True),
         ("package", package_form(), several, True),
         ("package, per-source", package_form(normalise="per-source"), several, False),
-        ("package, spatial-gaussian", package_form(integration="spatial-gaussian"), several, False),
+        ("package, spatial-gaussian", package_form(kernel="spatial-gaussian"), several, False),
         ("package, range_guide lidar", package_form(range_guide="lidar"), several, False),
     ]
     if torch.cuda.is_available():

@@ -118,9 +118,7 @@ def draw_kernel(scene: ShownScene, maps: PictureMaps) -> tuple[NDArray[np.uint8]
 
     lidar, mono, usable = (torch.from_numpy(each) for each in (lidar_m, mono_m, maps.usable))
     integrated = {
-        kind: float(
-            integrate_depth(lidar, mono, usable, dataclasses.replace(options, integration=kind)).distance_m[i, j]
-        )
+        kind: float(integrate_depth(lidar, mono, usable, dataclasses.replace(options, kernel=kind)).distance_m[i, j])
         for kind in ("spatial-gaussian", "edge-aware")
     }
     k, l = np.mgrid[-radius : radius + 1, -radius : radius + 1]

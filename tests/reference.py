@@ -19,7 +19,7 @@ def integrate_depth(
     sigma_space_px=3.0,
     sigma_depth_m=1.0,
     sigma_depth_growth_per_m=0.0,
-    integration="edge-aware",
+    kernel="edge-aware",
     normalise="pooled",
     keep_returns=False,
     range_guide="mono",
@@ -53,7 +53,7 @@ def integrate_depth(
                         continue
                     spatial = math.exp(-(k**2 + l**2) / (2 * sigma_space_px**2))
                     g = spatial
-                    if integration == "edge-aware":
+                    if kernel == "edge-aware":
                         sigma_m = max(sigma_depth_m, sigma_depth_growth_per_m * centre**2)
                         g *= math.exp(-((centre - mono[y, x]) ** 2) / (2 * sigma_m**2))
                     is_lidar = has_return(y, x)

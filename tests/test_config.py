@@ -11,6 +11,8 @@ from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.plugins.types import MethodSpecification
 
 from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.method.integration import IntegrationOptions
+from edge_depth_nerf.method.prior import PriorOptions
 from edge_depth_nerf.plugin import config
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
 
@@ -53,7 +55,7 @@ def test_the_scale_is_chosen_for_the_grid_of_the_model(name):
 
 
 def test_constants_carry_their_source():
-    assert DECLARED["constants"]["pipeline.datamanager.alpha"]["value"] == 0.7
+    assert DECLARED["constants"]["pipeline.datamanager.prior.integration.alpha"]["value"] == 0.7
     for entry in DECLARED["constants"].values():
         assert "Eq." in entry["source"] or "Table" in entry["source"]
 
@@ -61,9 +63,10 @@ def test_constants_carry_their_source():
 def test_the_paper_preset_is_the_literal_form():
     model, data = (getattr(all_methods["edge-depth-nerf-paper"].pipeline, part) for part in ("model", "datamanager"))
     assert (model.edge_gaussian, model.edge_divide_by_norm, model.depth_loss_levels) == ("point", False, "final")
-    assert (data.sigma_mode, data.normalise, data.keep_returns, data.range_guide) == ("image", "pooled", False, "mono")
-    assert data.align == "none"
-    assert (data.alpha, data.kernel_size, data.sigma_space, data.sigma_depth) == (0.7, 9, 3.0, 1.0)
+    assert data.prior == PriorOptions(align="none", sigma_mode="image", integration=IntegrationOptions())
+    how = data.prior.integration
+    assert (how.normalise, how.keep_returns, how.range_guide) == ("pooled", False, "mono")
+    assert (how.alpha, how.kernel_size, how.sigma_space_px, how.sigma_depth_m) == (0.7, 9, 3.0, 1.0)
 
 
 def test_the_viewer_of_a_training_listens_on_this_machine_only():
@@ -81,7 +84,7 @@ def test_all_that_is_wrong_is_said_in_one_error():
             base,
             {
                 "pipeline.model.num_level": 3,
-                "pipeline.datamanager.alpha": "much",
+                "pipeline.datamanager.prior.integration.alpha": "much",
                 "optimizers.field.optimizer.lr": 0.1,
                 "steps_per_save": 10,
             },

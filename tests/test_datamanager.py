@@ -10,13 +10,19 @@ from scenes import fisheye, pinhole, write_scene
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_json, write_distance_png, write_json, write_mask
 from edge_depth_nerf.method.error_model import read_trust
-from edge_depth_nerf.method.prior import make_prior, view_of
+from edge_depth_nerf.method.integration import IntegrationOptions
+from edge_depth_nerf.method.prior import PriorOptions, make_prior, view_of
 from edge_depth_nerf.mono.calibration import calibrate_scene, find_trust
 from edge_depth_nerf.plugin import datamanager as datamanager_module
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
 from edge_depth_nerf.plugin.dataset import FisheyeDepthDataset
 from edge_depth_nerf.scene.reader import read_scene
+
+
+def alpha(value: float) -> PriorOptions:
+    """A prior that differs from others in its weight of LiDAR."""
+    return PriorOptions(integration=IntegrationOptions(alpha=value))
 
 
 def manager(folder, test_mode="val", parser=None, **options):
@@ -28,17 +34,17 @@ def test_a_batch_carries_colour_prior_and_rays_of_its_pixels(tmp_path):
     data = manager(write_scene(tmp_path), train_num_rays_per_batch=500)
     rays, batch = data.next_train(0)
     dataset = data.train_dataset
-    options = data.config.prior_options(True, True)
-    assert options.depth_source == "integrated"
+    options = data.config.prior
+    assert data.config.source_of_prior({"lidar", "mono"}) == "integrated"
     scene = read_scene(tmp_path)
     by_name = {picture.files["image"].name: picture for picture in scene.pictures}
     pictures = [by_name[path.name] for path in dataset.image_filenames]
-    trust = find_trust(tmp_path, options)
+    trust = find_trust(scene, options)
     priors = [
         make_prior(
-            dataset.lidar_distance_m(i),
-            dataset.mono_distance_m(i),
+            {layer: dataset.distance_m(i, layer) for layer in ("lidar", "mono")},
             dataset.mask(i),
+            "integrated",
             options,
             trust,
             view_of(pictures[i].lens, pictures[i].up_in_camera),
@@ -88,7 +94,7 @@ def test_further_pixels_come_for_the_surface_where_the_prior_is_good(tmp_path):
 
 
 def test_no_further_pixels_come_where_every_prior_is_vague(tmp_path):
-    data = manager(write_scene(tmp_path), sigma_mode="constant", sigma_constant=100.0)
+    data = manager(write_scene(tmp_path), prior=PriorOptions(sigma_mode="constant", sigma_constant_m=100.0))
     assert data._surface_sampler is not None
     _, batch = data.next_train(0)
     assert (batch["prior_distance_m"] > 0).any() and not batch["sky"].any()
@@ -144,7 +150,7 @@ def test_integration_happens_once(tmp_path, monkeypatch):
     monkeypatch.setattr("edge_depth_nerf.method.prior.make_prior", lambda *_: pytest.fail("integrated again"))
     manager(scene)
     with pytest.raises(pytest.fail.Exception):
-        manager(scene, alpha=0.5)
+        manager(scene, prior=alpha(0.5))
 
 
 def test_nothing_is_integrated_for_rendering(tmp_path, monkeypatch):
@@ -157,10 +163,10 @@ def test_nothing_is_integrated_for_rendering(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("has", "source", "message"),
     [
-        (dict(mono=False), "integrated", "no monocular distance maps.*estimate-depth.*depth-source"),
+        (dict(mono=False), "integrated", "no monocular maps.*estimate-depth.*depth-source"),
         (dict(mono=False), "mono", "no monocular"),
         (dict(lidar=False), "lidar", "no LiDAR"),
-        (dict(lidar=False, mono=False), "integrated", "no LiDAR and no monocular"),
+        (dict(lidar=False, mono=False), "integrated", "no LiDAR maps and no monocular maps"),
     ],
 )
 def test_a_source_that_is_not_there(tmp_path, has, source, message):
@@ -173,7 +179,7 @@ def test_a_source_that_is_not_there(tmp_path, has, source, message):
 )
 def test_auto_takes_what_is_there(tmp_path, has, source):
     data = manager(write_scene(tmp_path, **has))
-    assert data.config.prior_options("lidar" not in has, "mono" not in has).depth_source == source
+    assert data.config.source_of_prior({"lidar", "mono"} - set(has)) == source
     assert (data.next_train(0)[1]["prior_distance_m"] > 0).any()
 
 
@@ -184,7 +190,7 @@ def test_a_scene_without_depth_has_no_prior(tmp_path):
 
 def test_options_out_of_range(tmp_path):
     with pytest.raises(InputError, match="alpha"):
-        manager(write_scene(tmp_path), alpha=1.4)
+        manager(write_scene(tmp_path), prior=PriorOptions(integration=IntegrationOptions(alpha=1.4)))
 
 
 def test_the_same_seed_gives_the_same_rays(tmp_path):
@@ -222,7 +228,7 @@ def test_the_calibration_of_training_pictures_is_found_or_made(tmp_path):
     manager(scene)
     # the scene's own was taken, nothing was measured again
     assert not list((scene / ".cache").glob("mono_trust_*"))
-    manager(scene, align="global")
+    manager(scene, prior=PriorOptions(align="global"))
     (other,) = (scene / ".cache").glob("mono_trust_*")
     assert read_trust(other).made_of != made.made_of
 
@@ -230,7 +236,7 @@ def test_the_calibration_of_training_pictures_is_found_or_made(tmp_path):
 def test_the_literal_form_measures_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr("edge_depth_nerf.plugin.datamanager.find_trust", lambda *_: pytest.fail("measured"))
     scene = write_scene(tmp_path)
-    data = manager(scene, align="none", sigma_mode="image", keep_returns=False)
+    data = manager(scene, prior=PriorOptions("none", "image", integration=IntegrationOptions()))
     _, batch = data.next_train(0)
     assert (batch["prior_distance_m"] > 0).any()
 
@@ -287,12 +293,12 @@ def test_only_the_tables_used_last_are_kept(tmp_path, monkeypatch):
     monkeypatch.setattr(datamanager_module, "KEPT_TABLES", 3)
     scene = write_scene(tmp_path)
     for alpha in (0.5, 0.6, 0.7):
-        manager(scene, alpha=alpha)
+        manager(scene, prior=alpha(alpha))
     folder = scene / ".cache" / "pixels"
     assert len(list(folder.glob("*.npy"))) == len(list(folder.glob("*.json"))) == 3
     # held out, 0.6, 0.7
     before = {path.name for path in folder.glob("*.npy")}
-    manager(scene, alpha=0.6)
+    manager(scene, prior=alpha(0.6))
     assert {path.name for path in folder.glob("*.npy")} == before
 
 

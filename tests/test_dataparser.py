@@ -51,8 +51,8 @@ def test_maps_follow_the_pictures(tmp_path):
     outputs = parse(write_scene(tmp_path), "train")
     names = [path.name for path in outputs.image_filenames]
     assert names == [f"{i:04d}.png" for i in (0, 1, 2, 3, 5, 6, 7, 8)]
-    for key in ("lidar_filenames", "mono_filenames", "truth_distance_filenames", "truth_rgb_filenames"):
-        assert [path.name for path in outputs.metadata[key]] == names
+    for layer in ("image", "lidar", "mono", "truth_distance", "truth_rgb"):
+        assert [picture.files[layer].name for picture in outputs.metadata["pictures"]] == names
 
 
 @pytest.mark.parametrize("camera", [fisheye(), pinhole()])
@@ -82,12 +82,12 @@ def test_a_plain_nerfstudio_scene_counts_as_lidar_and_z_becomes_distance(tmp_pat
 
     edit(scene, add_depth)
     dataset = FisheyeDepthDataset(parse(scene))
-    distance = dataset.lidar_distance_m(0)
+    distance = dataset.distance_m(0, "lidar")
     directions, _ = camera.unproject(camera.pixel_centres())
     assert distance is not None
     assert np.allclose(distance, z_depth_m / directions[..., 2].numpy(), rtol=1e-5)
     assert distance.max() > 1.2 * z_depth_m  # the corner's ray is longer
-    taken_as_distance = FisheyeDepthDataset(parse(scene, depth_kind="distance")).lidar_distance_m(0)
+    taken_as_distance = FisheyeDepthDataset(parse(scene, depth_kind="distance")).distance_m(0, "lidar")
     assert taken_as_distance is not None and np.allclose(taken_as_distance, z_depth_m)
 
 
@@ -108,7 +108,7 @@ def test_the_scene_mask_is_within_the_lens(tmp_path):
     dataset = FisheyeDepthDataset(parse(write_scene(tmp_path, theta_max_deg=60.0)))
     mask = dataset.mask(0)
     assert not mask[-5:].any()
-    assert np.array_equal(mask[:-5], dataset.valid_rays(0)[:-5])
+    assert np.array_equal(mask[:-5], dataset.rays(0).within[:-5])
 
 
 def test_an_item_judges(tmp_path):
@@ -138,7 +138,7 @@ def test_another_size_is_named(tmp_path, what):
     dataset = FisheyeDepthDataset(parse(scene))
     with pytest.raises(InputError, match=r"9×9.*32×28"):
         dataset[0]
-        dataset.mono_distance_m(0)
+        dataset.distance_m(0, "mono")
 
 
 def test_no_scene(tmp_path):
@@ -250,12 +250,12 @@ def test_a_truncated_array_is_named(tmp_path):
 
     edit(scene, arrays)
     dataset = FisheyeDepthDataset(parse(scene, depth_unit_scale_factor=2.0))
-    distance = dataset.lidar_distance_m(0)
+    distance = dataset.distance_m(0, "lidar")
     assert distance is not None and distance.shape == (28, 32) and (distance == 2).all()
     path = scene / "depth" / "0000.npy"
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(InputError, match=r"0000\.npy"):
-        dataset.lidar_distance_m(0)
+        dataset.distance_m(0, "lidar")
 
 
 def test_another_parser_is_refused(tmp_path):

@@ -124,7 +124,7 @@ def test_integration_is_finite(dtype: torch.dtype, autocast: Any, normalise: Any
 def test_maps_of_next_to_nothing(shape: tuple[int, ...]) -> None:
     ones = torch.ones(shape)
     for source in ("integrated", "lidar", "mono"):
-        found = select_prior(source, ones, ones, ones > 0)
+        found = select_prior(source, {"lidar": ones, "mono": ones}, ones > 0)
         assert found.distance_m.shape == shape and torch.isfinite(found.distance_m).all()
 
 
@@ -233,7 +233,7 @@ HOSTILE: dict[str, tuple[Callable[[Path], Any], dict[str, Any]]] = {
     "all at 4 mm": (both(fill("mono", 1 / 256), fill("lidar", 1 / 256)), {}),
     "flat maps, no alignment, literal sigma": (
         both(fill("mono", 7.0), fill("lidar", 7.0)),
-        {"data__align": "none", "data__sigma_mode": "image", "model__edge_gaussian": "point"},
+        {"data__prior": PriorOptions(align="none", sigma_mode="image"), "model__edge_gaussian": "point"},
     ),
     "masks of one pixel": (one_pixel, {}),
     "one training picture": (one_training_picture, {}),

@@ -44,8 +44,8 @@ from edge_depth_nerf.inspecting.command import inspect_scene
 from edge_depth_nerf.inspecting.figures import measured_moments
 from edge_depth_nerf.inspecting.findings import Finding, find, limited
 from edge_depth_nerf.inspecting.options import InspectOptions
-from edge_depth_nerf.inspecting.shown_prior import default_source
 from edge_depth_nerf.inspecting.top_view import HELD_OUT_RGB, TRAINING_RGB, draw_top_view, nice_length
+from edge_depth_nerf.method.prior import default_source
 from edge_depth_nerf.scene.reader import read_scene
 
 ROOT = Path(__file__).parents[1]
@@ -512,7 +512,7 @@ def test_z_depth_of_a_pinhole_scene_becomes_distance(tmp_path):
     for picture in inspected.pictures[:2]:
         maps = inspected.maps(picture)
         assert maps.lidar_m is not None and np.allclose(maps.lidar_m, expected, rtol=1e-4)
-        assert default_source(picture) == "lidar"
+        assert default_source(picture.files) == "lidar"
     summary = look(scene, tmp_path / "out", frames=1)
     assert not summary["lengths_are_metres"]
     assert summary["held_out"] is None

@@ -65,7 +65,7 @@ CHOICES = list(
 @pytest.mark.parametrize(("kind", "normalise", "keep_returns", "guide", "alpha"), CHOICES)
 def test_equals_twin(kind, normalise, keep_returns, guide, alpha, dtype):
     options = IntegrationOptions(
-        alpha=alpha, integration=kind, normalise=normalise, keep_returns=keep_returns, range_guide=guide
+        alpha=alpha, kernel=kind, normalise=normalise, keep_returns=keep_returns, range_guide=guide
     )
     lidar, mono, valid = random_maps(CHOICES.index((kind, normalise, keep_returns, guide, alpha)), dtype=dtype)
     result = integrate_depth(lidar, mono, valid, options)
@@ -147,7 +147,7 @@ def test_constant_map_stays(kind, normalise):
     mono = torch.full((12, 15), 73.3)
     lidar = torch.where(torch.rand(12, 15, generator=torch.Generator().manual_seed(0)) < 0.2, 73.3, 0.0)
     valid = random_maps(1, 12, 15)[2]
-    result = integrate_depth(lidar, mono, valid, IntegrationOptions(integration=kind, normalise=normalise))
+    result = integrate_depth(lidar, mono, valid, IntegrationOptions(kernel=kind, normalise=normalise))
     assert torch.equal(result.distance_m > 0, valid)
     torch.testing.assert_close(result.distance_m[valid], mono[valid], rtol=0, atol=1e-5)
     assert float(result.spread_m.max()) < 1e-5
@@ -242,7 +242,7 @@ def test_an_edge_keeps_the_sides_apart():
         near = integrate_depth(lidar, mono, everywhere(mono), IntegrationOptions(normalise=normalise)).distance_m
         torch.testing.assert_close(near[:, :10], mono[:, :10], rtol=0, atol=1e-5)
         assert float(near[4, 12]) > 30.01
-    mixed = integrate_depth(lidar, mono, everywhere(mono), IntegrationOptions(integration="spatial-gaussian"))
+    mixed = integrate_depth(lidar, mono, everywhere(mono), IntegrationOptions(kernel="spatial-gaussian"))
     assert float(mixed.distance_m[4, 9]) > 15
 
 
@@ -351,7 +351,7 @@ def test_distance_factor_is_exact_down_to_the_smallest():
 def test_operations_for_gpus_equal_compiled_loops(kind, normalise, keep_returns, guide, alpha, dtype, monkeypatch):
     monkeypatch.setattr(integration, "CUDA_STRIP_PIXELS", 40)  # three rows
     options = IntegrationOptions(
-        alpha=alpha, integration=kind, normalise=normalise, keep_returns=keep_returns, range_guide=guide
+        alpha=alpha, kernel=kind, normalise=normalise, keep_returns=keep_returns, range_guide=guide
     )
     lidar, mono, valid = random_maps(15, dtype=dtype)
     out = torch.full((3, *mono.shape), torch.nan, dtype=dtype)
@@ -408,7 +408,7 @@ def test_cuda_equals_cpu(normalise):
         ({"kernel_size": -1}, "kernel_size is -1"),
         ({"sigma_space_px": 0.0}, "sigma_space_px is 0.0; expected a finite number from 0.001"),
         ({"sigma_depth_m": float("inf")}, "sigma_depth_m is inf"),
-        ({"integration": "bilateral"}, "integration is 'bilateral'; expected one of 'edge-aware', 'spatial-gaussian'"),
+        ({"kernel": "bilateral"}, "kernel is 'bilateral'; expected one of 'edge-aware', 'spatial-gaussian'"),
         ({"normalise": "none"}, "normalise is 'none'"),
         ({"range_guide": "radar"}, "range_guide is 'radar'"),
     ],
@@ -425,20 +425,20 @@ def test_wrong_shapes(unchecked_types):
     with pytest.raises(InputError, match="integrate_depth"):
         integrate_depth(image[0], image[0], everywhere(image[0]))
     with pytest.raises(InputError, match="select_prior"):
-        select_prior("mono", None, image, everywhere(image.T))
+        select_prior("mono", {"mono": image}, everywhere(image.T))
 
 
 def test_sources_alone():
     lidar, mono, valid = random_maps(11)
-    only_lidar = select_prior("lidar", lidar, None, valid)
+    only_lidar = select_prior("lidar", {"lidar": lidar}, valid)
     returns = valid & torch.isfinite(lidar) & (lidar > 0)
     assert torch.equal(only_lidar.distance_m, torch.where(returns, lidar, 0))
     assert not only_lidar.spread_m.any() and not only_lidar.mono_share.any()
-    only_mono = select_prior("mono", None, mono, valid)
+    only_mono = select_prior("mono", {"mono": mono}, valid)
     usable = valid & torch.isfinite(mono) & (mono > 0)
     assert torch.equal(only_mono.distance_m, torch.where(usable, mono, 0))
     assert torch.equal(only_mono.mono_share > 0, usable)
-    assert_same(select_prior("integrated", lidar, mono, valid), integrate_depth(lidar, mono, valid))
+    assert_same(select_prior("integrated", {"lidar": lidar, "mono": mono}, valid), integrate_depth(lidar, mono, valid))
 
 
 @pytest.mark.parametrize(
@@ -446,7 +446,7 @@ def test_sources_alone():
 )
 def test_a_missing_source_is_named(source, missing):
     with pytest.raises(InputError, match=f"'{source}' needs {missing} distance maps"):
-        select_prior(source, None, None, torch.ones(3, 3, dtype=torch.bool))
+        select_prior(source, {}, torch.ones(3, 3, dtype=torch.bool))
 
 
 def test_sigma_by_hand():
@@ -484,7 +484,7 @@ def test_sigma_is_positive_exactly_where_there_is_a_prior(mode):
 
 def test_combined_sigma_wants_mono_only_where_it_counts(unchecked_types):
     lidar, mono, valid = random_maps(13)
-    assert float(sigma_m(select_prior("lidar", lidar, None, valid), "combined").max()) == pytest.approx(0.05)
+    assert float(sigma_m(select_prior("lidar", {"lidar": lidar}, valid), "combined").max()) == pytest.approx(0.05)
     with pytest.raises(InputError, match="needs mono_m"):
         sigma_m(integrate_depth(lidar, mono, valid), "combined")
     with pytest.raises(InputError, match="sigma mode is 'magic'; expected one of 'constant'"):

@@ -232,7 +232,7 @@ def test_frames_with_few_returns_take_the_drives_fit(tmp_path, kind):
     assert list(maps)[-1] == few and len(maps) == len(scene.pictures)
     assert any(picture.held_out for picture in scene.pictures)
     for picture in scene.pictures:
-        truth = read_distance_png(picture.files["truth"])
+        truth = read_distance_png(picture.files["truth_distance"])
         _, within = lens_rays(picture.lens, np.radians(90), size_of(picture.lens))
         known = within & (truth > 0)
         error = np.abs(maps[picture.name] - truth)[known] / truth[known]

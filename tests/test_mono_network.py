@@ -30,7 +30,6 @@ from edge_depth_nerf.base.files import (
 )
 from edge_depth_nerf.cameras import KannalaBrandt
 from edge_depth_nerf.entry import main
-from edge_depth_nerf.method.error_model import TRUST_FILE
 from edge_depth_nerf.mono.estimate import (
     PRESETS,
     WEIGHTS,
@@ -61,6 +60,7 @@ from edge_depth_nerf.mono.training import (
     train,
 )
 from edge_depth_nerf.scene import reader
+from edge_depth_nerf.scene.format import TRUST_FILE
 from edge_depth_nerf.scene.reader import read_scene
 
 CPU = torch.device("cpu")
@@ -307,7 +307,7 @@ def test_it_learns_what_colours_mean(street):
     errors: dict[str, list[np.ndarray]] = {"network": [], "room": [], "constant": []}
     for picture in scene.pictures:
         if picture.held_out:
-            truth = read_distance_png(picture.files["truth"])
+            truth = read_distance_png(picture.files["truth_distance"])
             judged = read_mask(picture.files["mask"]) & (read_distance_png(picture.files["lidar"]) > 0)
             for name, found in {
                 "network": predict(trained.network, scene, picture, HEIGHT_M, CPU),

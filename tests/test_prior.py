@@ -15,6 +15,11 @@ from edge_depth_nerf.method.prior import PriorCache, PriorOptions, View, make_pr
 RNG = np.random.default_rng(2)
 
 
+def both(lidar: np.ndarray, mono: np.ndarray) -> dict[str, np.ndarray]:
+    """The maps of a picture by source."""
+    return {"lidar": lidar, "mono": mono}
+
+
 def maps(height=12, width=10):
     mono = (5 + RNG.random((height, width))).astype(np.float32)
     lidar = np.where(RNG.random((height, width)) < 0.3, mono * 1.05, 0).astype(np.float32)
@@ -24,7 +29,7 @@ def maps(height=12, width=10):
 
 def test_a_prior_is_where_the_mask_is():
     lidar, mono, mask = maps()
-    prior = make_prior(lidar, mono, mask, PriorOptions())
+    prior = make_prior(both(lidar, mono), mask, "integrated", PriorOptions())
     assert np.array_equal(prior.distance_m > 0, mask)
     assert np.array_equal(prior.sigma_m > 0, mask)
     assert (prior.distance_m[mask] > 4.9).all() and (prior.distance_m[mask] < 6.4).all()
@@ -32,10 +37,10 @@ def test_a_prior_is_where_the_mask_is():
 
 def test_lidar_alone_is_lidar_and_mono_alone_is_mono():
     lidar, mono, mask = maps()
-    only_lidar = make_prior(lidar, None, mask, PriorOptions(depth_source="lidar"))
+    only_lidar = make_prior({"lidar": lidar}, mask, "lidar", PriorOptions())
     assert np.array_equal(only_lidar.distance_m, lidar * mask)
     assert np.allclose(only_lidar.sigma_m[only_lidar.distance_m > 0], 0.05)
-    only_mono = make_prior(None, mono, mask, PriorOptions(depth_source="mono"))
+    only_mono = make_prior({"mono": mono}, mask, "mono", PriorOptions())
     assert np.array_equal(only_mono.distance_m, mono * mask)
     # a tenth of the distance and 5 cm: sqrt((0.1 * 5.5)^2 + 0.05^2) = 0.552 for 5.5 m
     assert np.allclose(only_mono.sigma_m[mask], np.sqrt((0.1 * mono[mask]) ** 2 + 0.05**2))
@@ -43,11 +48,11 @@ def test_lidar_alone_is_lidar_and_mono_alone_is_mono():
 
 def test_the_cache_gives_what_was_made_and_does_not_make_it_again(tmp_path, monkeypatch):
     lidar, mono, mask = maps()
-    cache = PriorCache(tmp_path / "cache", PriorOptions())
-    first = cache.prior(lidar, mono, mask)
+    cache = PriorCache(tmp_path / "cache", "integrated", PriorOptions())
+    first = cache.prior(both(lidar, mono), mask)
     (file,) = (tmp_path / "cache").iterdir()
     monkeypatch.setattr(prior_module, "make_prior", lambda *_: pytest.fail("made again"))
-    second = PriorCache(tmp_path / "cache", PriorOptions()).prior(lidar, mono, mask)
+    second = PriorCache(tmp_path / "cache", "integrated", PriorOptions()).prior(both(lidar, mono), mask)
     assert np.array_equal(first.distance_m, second.distance_m)
     assert np.array_equal(first.sigma_m, second.sigma_m)
     assert file.suffix == ".npz"
@@ -57,36 +62,36 @@ def test_the_cache_gives_what_was_made_and_does_not_make_it_again(tmp_path, monk
 def test_whatever_changes_makes_another_file(tmp_path, change):
     lidar, mono, mask = maps()
     options = PriorOptions()
-    PriorCache(tmp_path, options).prior(lidar, mono, mask)
+    PriorCache(tmp_path, "integrated", options).prior(both(lidar, mono), mask)
     if change == "options":
         options = dataclasses.replace(options, integration=IntegrationOptions(alpha=0.6))
     else:
         changed = {"lidar": lidar, "mono": mono, "mask": mask}[change]
         changed[3, 4] = not changed[3, 4] if change == "mask" else changed[3, 4] + 1
-    again = PriorCache(tmp_path, options).prior(lidar, mono, mask)
+    again = PriorCache(tmp_path, "integrated", options).prior(both(lidar, mono), mask)
     assert len(list(tmp_path.iterdir())) == 2
-    assert np.array_equal(again.distance_m, make_prior(lidar, mono, mask, options).distance_m)
+    assert np.array_equal(again.distance_m, make_prior(both(lidar, mono), mask, "integrated", options).distance_m)
 
 
 @pytest.mark.parametrize("damage", ["truncated", "empty", "another shape", "garbage"])
 def test_a_damaged_file_is_made_anew(tmp_path, damage):
     lidar, mono, mask = maps()
-    cache = PriorCache(tmp_path, PriorOptions())
-    good = cache.prior(lidar, mono, mask)
+    cache = PriorCache(tmp_path, "integrated", PriorOptions())
+    good = cache.prior(both(lidar, mono), mask)
     (file,) = tmp_path.iterdir()
     if damage == "another shape":
         np.savez(file, distance_m=np.zeros((2, 2), np.float32), sigma_m=np.zeros((2, 2), np.float32))
     else:
         content = file.read_bytes()
         file.write_bytes({"truncated": content[:200], "empty": b"", "garbage": b"x" * 500}[damage])
-    assert np.array_equal(cache.prior(lidar, mono, mask).distance_m, good.distance_m)
-    assert np.array_equal(cache.prior(lidar, mono, mask).sigma_m, good.sigma_m)
+    assert np.array_equal(cache.prior(both(lidar, mono), mask).distance_m, good.distance_m)
+    assert np.array_equal(cache.prior(both(lidar, mono), mask).sigma_m, good.sigma_m)
 
 
 def test_a_folder_that_cannot_be_made_is_no_error(tmp_path):
     (tmp_path / "file").write_text("in the way")
     lidar, mono, mask = maps()
-    prior = PriorCache(tmp_path / "file" / "cache", PriorOptions()).prior(lidar, mono, mask)
+    prior = PriorCache(tmp_path / "file" / "cache", "integrated", PriorOptions()).prior(both(lidar, mono), mask)
     assert (prior.distance_m > 0).any()
 
 
@@ -107,7 +112,7 @@ def level_view(shape):
 def test_a_calibrated_prior_is_aligned_and_trusted_by_the_models():
     lidar, mono, mask = maps(60, 50)
     lidar = np.where(lidar > 0, mono * 1.5, 0).astype(np.float32)
-    prior = make_prior(lidar, mono, mask, PriorOptions(), a_trust(), level_view(mask.shape))
+    prior = make_prior(both(lidar, mono), mask, "integrated", PriorOptions(), a_trust(), level_view(mask.shape))
     returns = mask & (lidar > 0)
     np.testing.assert_array_equal(prior.distance_m[returns], lidar[returns])
     elsewhere = mask & ~returns
@@ -125,7 +130,7 @@ def test_a_frame_with_few_returns_takes_the_drives_fit(sigma_mode):
     lidar[3, 3:20] = 1
     trust = a_trust(drive_fit=Fit(float(np.log(3)), 1.0))
     options = PriorOptions(sigma_mode=sigma_mode)
-    prior = make_prior(lidar, mono, mask, options, trust, level_view(mask.shape))
+    prior = make_prior(both(lidar, mono), mask, "integrated", options, trust, level_view(mask.shape))
     assert np.mean(prior.distance_m[20:][mask[20:]]) == pytest.approx(3 * np.mean(mono[20:][mask[20:]]), rel=0.01)
 
 
@@ -134,8 +139,8 @@ def test_without_alignment_and_calibration_it_is_the_literal_form():
     ramp = np.arange(mask.size, dtype=np.float32).reshape(mask.shape) / 4
     mono, lidar = mono + ramp, np.where(lidar > 0, lidar + ramp, 0).astype(np.float32)
     options = PriorOptions(align="none", sigma_mode="image", integration=IntegrationOptions())
-    assert not options.wants_trust
-    literal = make_prior(lidar, mono, mask, options)
+    assert not options.wants_trust("integrated")
+    literal = make_prior(both(lidar, mono), mask, "integrated", options)
     expected = integrate_depth(torch.from_numpy(lidar), torch.from_numpy(mono), torch.from_numpy(mask))
     np.testing.assert_array_equal(literal.distance_m, expected.distance_m.numpy())
     np.testing.assert_allclose(literal.sigma_m[mask], np.std(literal.distance_m[mask]), rtol=1e-4)
@@ -143,8 +148,8 @@ def test_without_alignment_and_calibration_it_is_the_literal_form():
 
 def test_mono_alone_never_sees_lidar():
     lidar, mono, mask = maps(60, 50)
-    options = PriorOptions(depth_source="mono")
-    prior = make_prior(lidar * 2, mono, mask, options, a_trust(return_model=None), level_view(mask.shape))
+    trust, view = a_trust(return_model=None), level_view(mask.shape)
+    prior = make_prior(both(lidar * 2, mono), mask, "mono", PriorOptions(), trust, view)
     np.testing.assert_array_equal(prior.distance_m, mono * mask)
     np.testing.assert_allclose(prior.sigma_m[mask], 0.1 * mono[mask], rtol=1e-5)
 
@@ -152,12 +157,18 @@ def test_mono_alone_never_sees_lidar():
 def test_another_calibration_makes_another_file(tmp_path):
     lidar, mono, mask = maps()
     view = level_view(mask.shape)
-    first = PriorCache(tmp_path, PriorOptions(), a_trust()).prior(lidar, mono, mask, view)
-    second = PriorCache(tmp_path, PriorOptions(), a_trust(error_model=None)).prior(lidar, mono, mask, view)
+    first = PriorCache(tmp_path, "integrated", PriorOptions(), a_trust()).prior(both(lidar, mono), mask, view)
+    second = PriorCache(tmp_path, "integrated", PriorOptions(), a_trust(error_model=None)).prior(
+        both(lidar, mono), mask, view
+    )
     assert len(list(tmp_path.iterdir())) == 2
     assert not np.array_equal(first.sigma_m, second.sigma_m)
     turned = View(view.theta_rad, view.elevation_rad + 2)
-    assert not PriorCache(tmp_path, PriorOptions(), a_trust()).prior(lidar, mono, mask, turned).distance_m.any()
+    assert (
+        not PriorCache(tmp_path, "integrated", PriorOptions(), a_trust())
+        .prior(both(lidar, mono), mask, turned)
+        .distance_m.any()
+    )
 
 
 def test_the_angles_of_a_picture():
@@ -181,7 +192,7 @@ def test_an_unknown_choice(fields, unchecked_types):
 def test_a_mono_map_of_another_size(unchecked_types):
     lidar, mono, mask = maps()
     with pytest.raises(InputError, match=r"mono_m \(11, 10\)"):
-        make_prior(lidar, mono[1:], mask, PriorOptions())
+        make_prior(both(lidar, mono[1:]), mask, "integrated", PriorOptions())
 
 
 def test_sky_is_above_the_horizon_without_any_distance():

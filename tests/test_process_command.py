@@ -13,13 +13,14 @@ from rich.console import Console
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_json, write_distance_png, write_json
-from edge_depth_nerf.method.error_model import TRUST_FILE, read_trust
+from edge_depth_nerf.method.error_model import read_trust
 from edge_depth_nerf.mono import estimate
 from edge_depth_nerf.mono.estimate import WEIGHTS, PresetValues
 from edge_depth_nerf.mono.scene_maps import write_mono_maps
 from edge_depth_nerf.mono.training import TrainingOptions
 from edge_depth_nerf.process.command import process
 from edge_depth_nerf.process.options import Kitti360Options
+from edge_depth_nerf.scene.format import TRUST_FILE
 from edge_depth_nerf.scene.reader import read_scene
 
 

@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 import tyro
 from browser import open_browser
-from edge_depth_nerf.demo.command.options import DemoOptions
 from rich.console import Console
 from scenes import write_scene
 
@@ -26,6 +25,7 @@ from edge_depth_nerf.base.files import write_png
 from edge_depth_nerf.base.pictures import NO_VALUE_RGB, colour_distance, distance_of_colours
 from edge_depth_nerf.compare.options import CompareOptions, MethodName
 from edge_depth_nerf.compare.plots import Bins, plot_bins
+from edge_depth_nerf.demo.options import DemoOptions
 from edge_depth_nerf.jobs.runs import command_line, logged_commands
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.report import views

@@ -69,14 +69,14 @@ def test_monocular_maps_do_not_make_z_depth_a_distance(tmp_path: Path, npy: bool
     folder = others_scene(tmp_path, npy)
     before = read_scene(folder)
     assert before.lidar_is_z_depth
-    lidar = [before.lidar_m(picture) for picture in before.pictures]
+    lidar = [before.distance_m(picture, "lidar") for picture in before.pictures]
     # everything lies on a ball of 6 m around the world's origin
     assert 4 < np.median(lidar[0][lidar[0] > 0]) < 8
     put_in(folder)
     after = read_scene(folder)
     assert after.lidar_is_z_depth and not after.own
     for picture, expected in zip(after.pictures, lidar, strict=True):
-        np.testing.assert_array_equal(after.lidar_m(picture), expected)
+        np.testing.assert_array_equal(after.distance_m(picture, "lidar"), expected)
         whole = after.maps(picture).lidar_m
         assert whole is not None
         np.testing.assert_array_equal(whole, expected)
@@ -84,15 +84,15 @@ def test_monocular_maps_do_not_make_z_depth_a_distance(tmp_path: Path, npy: bool
     by_name = {path.name: number for number, path in enumerate(dataset.image_filenames)}
     for picture, expected in zip(after.pictures, lidar, strict=True):
         if (number := by_name.get(Path(picture.name).name)) is not None:
-            np.testing.assert_allclose(dataset.lidar_distance_m(number), expected, rtol=1e-5)
+            np.testing.assert_allclose(dataset.distance_m(number, "lidar"), expected, rtol=1e-5)
 
 
 def test_what_the_host_says_of_the_unit_is_calibrated_by(tmp_path: Path) -> None:
     folder = others_scene(tmp_path)
     put_in(folder)
     options = PriorOptions()
-    read = find_trust(folder, options)
-    told = find_trust(folder, options, lidar_unit=(2e-3, True))
+    read = find_trust(read_scene(folder), options)
+    told = find_trust(read_scene(folder, depth_metres_per_count=2e-3), options)
     assert read.drive_fit is not None and told.drive_fit is not None
     assert told.drive_fit.log_scale == pytest.approx(read.drive_fit.log_scale + np.log(2), abs=0.01)
     assert told.made_of != read.made_of
@@ -186,7 +186,7 @@ def test_maps_of_unknown_scale_take_no_drives_fit_where_the_split_is_unknown(tmp
     for picture in read_scene(scene).pictures:
         target = tmp_path / "maps" / picture.camera / f"{Path(picture.name).stem}.npy"
         target.parent.mkdir(parents=True, exist_ok=True)
-        np.save(target, read_distance_png(picture.files["truth"]))
+        np.save(target, read_distance_png(picture.files["truth_distance"]))
     write_png(first.files["lidar"], np.zeros((56, 64), np.uint16))
     options = EstimateDepthOptions((scene,), maps=tmp_path / "maps", maps_kind="relative", maps_along="ray")
     with pytest.raises(InputError, match="does not say which these are"):

@@ -24,6 +24,11 @@ from edge_depth_nerf.mono import calibration as trust_module
 from edge_depth_nerf.mono.calibration import calibrate_scene, find_trust, held_out_returns, measure_frame
 
 
+def both(lidar: np.ndarray, mono: np.ndarray) -> dict[str, np.ndarray]:
+    """The maps of a picture by source."""
+    return {"lidar": lidar, "mono": mono}
+
+
 def random_features(count, seed=0, least_nearest=1.0):
     rng = np.random.default_rng(seed)
     return {
@@ -188,7 +193,7 @@ def test_held_out_frames_change_nothing(tmp_path, key):
 def test_the_host_says_which_pictures_are_for_training(tmp_path):
     scene = write_scene(tmp_path, split=False)
     images = [scene / "images" / f"{i:04d}.png" for i in (0, 2, 3)]
-    trust = find_trust(scene, PriorOptions(), training_images=images)
+    trust = find_trust(read_scene(scene), PriorOptions(), training_images=images)
     assert [frame.frame for frame in trust.frames] == [f"images/{i:04d}.png" for i in (0, 2, 3)]
 
 
@@ -204,18 +209,18 @@ def test_few_returns_are_named(tmp_path):
 def test_a_calibration_is_found_until_its_files_change(tmp_path, monkeypatch):
     scene = write_scene(tmp_path)
     options = PriorOptions()
-    made = find_trust(scene, options)
+    made = find_trust(read_scene(scene), options)
     (kept,) = (scene / ".cache").iterdir()
     monkeypatch.setattr(trust_module, "_calibrate", lambda *_: pytest.fail("made again"))
-    assert find_trust(scene, options) == made
+    assert find_trust(read_scene(scene), options) == made
     # sigma's own options have no part in it
-    assert find_trust(scene, dataclasses.replace(options, sigma_mode="combined")) == made
+    assert find_trust(read_scene(scene), dataclasses.replace(options, sigma_mode="combined")) == made
     shutil.move(kept, scene / TRUST_FILE)
-    assert find_trust(scene, options) == made
+    assert find_trust(read_scene(scene), options) == made
     monkeypatch.undo()
     change_map(scene, "mono_file_path", 0, lambda metres: metres + np.arange(metres.size).reshape(metres.shape) % 7)
-    assert find_trust(scene, options) != made
-    assert find_trust(scene, PriorOptions(align="none")).made_of != made.made_of
+    assert find_trust(read_scene(scene), options) != made
+    assert find_trust(read_scene(scene), PriorOptions(align="none")).made_of != made.made_of
 
 
 @pytest.mark.parametrize(
@@ -227,7 +232,7 @@ def test_a_broken_calibration_is_named_and_made_anew(tmp_path, content):
     (scene / TRUST_FILE).write_text(content)
     with pytest.raises(InputError, match=TRUST_FILE):
         read_trust(scene / TRUST_FILE)
-    assert find_trust(scene, PriorOptions()) == made
+    assert find_trust(read_scene(scene), PriorOptions()) == made
 
 
 def test_a_scene_without_maps_to_measure_by(tmp_path):
@@ -265,19 +270,21 @@ def test_no_prior_beyond_lidars_field_but_from_a_source_trained_elsewhere(tmp_pa
     mono[14, 5] = 230  # far beyond
     lidar = np.where(np.random.default_rng(0).random(shape) < 0.3, np.float32(8), 0).astype(np.float32)
     mask = np.ones(shape, bool)
-    prior = make_prior(lidar, mono, mask, PriorOptions(), trust, view)
+    prior = make_prior(both(lidar, mono), mask, "integrated", PriorOptions(), trust, view)
     margin = np.radians(FIELD_MARGIN_DEG)
     expected = (elevation > -0.4 - margin) & (elevation < 0.1 + margin)
     expected[14, 5] = False
     np.testing.assert_array_equal(prior.distance_m > 0, expected)
     np.testing.assert_array_equal(prior.sigma_m > 0, expected)
     # other modes keep to what was asked for
-    literal = make_prior(lidar, mono, mask, PriorOptions(align="none", sigma_mode="image"), trust, view)
+    literal = make_prior(
+        both(lidar, mono), mask, "integrated", PriorOptions(align="none", sigma_mode="image"), trust, view
+    )
     assert (literal.distance_m > 0).all()
 
     meta = read_json(scene / "transforms.json")
     write_json(scene / "transforms.json", {**meta, "mono": {"trained_on": "elsewhere"}})
     elsewhere = calibrate_scene(scene)
     assert elsewhere.everywhere
-    everywhere = make_prior(lidar, mono, mask, PriorOptions(), elsewhere, view)
+    everywhere = make_prior(both(lidar, mono), mask, "integrated", PriorOptions(), elsewhere, view)
     assert (everywhere.distance_m > 0).sum() == mask.sum() - 1

@@ -53,3 +53,19 @@ def rays(camera: Camera, theta_max_rad: float = math.pi) -> Rays:
     for array in (found.directions, found.within):
         array.setflags(write=False)
     return found
+
+
+LEAST_COSINE = 0.02
+"""Below (beyond 88.9°) z-depth says nothing of the distance: a count of 4 mm is 0.2 m."""
+
+
+def distance_from_z_depth(z_depth_m: Float32[np.ndarray, "h w"], rays: Rays) -> Float32[np.ndarray, "h w"]:
+    """Turn coordinates along the optical axis into distances along the ray; 0 where there is no ray, or none ahead.
+
+    Args:
+        z_depth_m: metres, 0 = none.
+        rays: of the pixels.
+
+    """
+    ahead = rays.within & (rays.cos_theta >= LEAST_COSINE)
+    return np.where(ahead, z_depth_m / np.where(ahead, rays.cos_theta, 1), 0).astype(np.float32)

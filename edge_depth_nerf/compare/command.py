@@ -36,7 +36,7 @@ from edge_depth_nerf.report.build import write_report
 from edge_depth_nerf.report.compared_views import compared_views
 from edge_depth_nerf.report.tables import MadeTable
 from edge_depth_nerf.report.views import REPORT
-from edge_depth_nerf.scene.format import read_transforms
+from edge_depth_nerf.scene.format import LAYERS, layers_of, read_transforms
 
 RECORD = "compare.json"
 RUNS = "runs"
@@ -153,20 +153,17 @@ def check_scene(folder: Path, methods: Sequence[MethodName], preset: str) -> str
             f"{path}: found {len(held_out)} pictures under test_filenames that are not trained on, too; expected at "
             "least one to judge by. Process the drive with --holdout-every 2 or more."
         )
-    has = {source for source in ("lidar", "mono") if f"{source}_file_path" in frames[0]}
-    if "depth_file_path" in frames[0]:
-        has.add("lidar")
+    has = layers_of(frames[0])
     for name in methods:
         missing = [source for source in METHODS[name].needs if source not in has]
         if missing:
-            words = {"lidar": "LiDAR maps", "mono": "monocular maps"}
             remedy = {
                 "lidar": "process the drive with its LiDAR",
                 "mono": "make them by `edge-depth-nerf estimate-depth`",
             }
             raise InputError(
-                f"{path}: has no {' and no '.join(words[source] for source in missing)}, which the method {name} "
-                f"(preset {preset}) needs. {' and '.join(remedy[source] for source in missing).capitalize()}, or "
+                f"{path}: has no {' and no '.join(LAYERS[source].words for source in missing)}, which the method "
+                f"{name} (preset {preset}) needs. {' and '.join(remedy[source] for source in missing).capitalize()}, or "
                 "choose other --methods."
             )
     return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -8,7 +8,7 @@ from typing import Any
 
 from nerfstudio.engine.trainer import TrainerConfig
 
-from edge_depth_nerf.compare.methods import LAMBDA, METHODS, Setting
+from edge_depth_nerf.compare.methods import LAMBDA, METHODS, SIGMA_MODE, Setting
 from edge_depth_nerf.compare.options import MethodName, Preset
 from edge_depth_nerf.compare.specification import RunSpecification
 from edge_depth_nerf.plugin.config import apply_overrides, make_specifications, read_method_file
@@ -73,8 +73,8 @@ def setting_of(config: TrainerConfig, name: MethodName) -> tuple[float | None, f
     if method.sigma_field is None:
         return None, None
     values = flattened(config)
-    mode = values["pipeline.datamanager.sigma_mode"]
-    takes_own = "pipeline.datamanager.sigma_mode" in method.sigma and mode != "constant"
+    mode = values[SIGMA_MODE]
+    takes_own = SIGMA_MODE in method.sigma and mode != "constant"
     return values[LAMBDA], mode if takes_own else values[method.sigma_field]
 
 

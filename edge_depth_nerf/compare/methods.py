@@ -16,7 +16,9 @@ _LOSS_SIGMA = "pipeline.model.depth_sigma"
 _EXPOSURE = "pipeline.model.exposure"
 _FINAL = "pipeline.model.depth_loss_final"
 """nerfstudio's losses keep their weight."""
-_PRIOR_SIGMA = "pipeline.datamanager.sigma_constant"
+_PRIOR_SIGMA = "pipeline.datamanager.prior.sigma_constant_m"
+SIGMA_MODE = "pipeline.datamanager.prior.sigma_mode"
+_KERNEL = "pipeline.datamanager.prior.integration.kernel"
 
 
 @dataclass(frozen=True)
@@ -41,11 +43,18 @@ class Method:
     """Whether it is nerfstudio's, not ours."""
 
 
-def _edge(name: MethodName, title: str, needs: tuple[str, ...], literal: bool = False, **overrides: Any) -> Method:
-    dotted = {f"pipeline.datamanager.{key}": value for key, value in overrides.items()}
+def _edge(
+    name: MethodName,
+    title: str,
+    needs: tuple[str, ...],
+    depth_source: str = "integrated",
+    literal: bool = False,
+    overrides: Mapping[str, Any] | None = None,
+) -> Method:
     # a σ in metres takes the place of the one that the prior has at each pixel
-    sigma = {"pipeline.datamanager.sigma_mode": "constant"}
-    return Method(name, title, {_LOSS: "edge", **dotted}, needs, sigma, _PRIOR_SIGMA, literal=literal)
+    sigma = {SIGMA_MODE: "constant"}
+    named = {_LOSS: "edge", _SOURCE: depth_source, **(overrides or {})}
+    return Method(name, title, named, needs, sigma, _PRIOR_SIGMA, literal=literal)
 
 
 METHODS: dict[MethodName, Method] = {
@@ -76,15 +85,9 @@ METHODS: dict[MethodName, Method] = {
         ),
         _edge("edge-lidar", "LiDAR alone", ("lidar",), depth_source="lidar"),
         _edge("edge-mono", "monocular alone", ("mono",), depth_source="mono"),
-        _edge(
-            "edge-gaussian",
-            "spatial Gaussian",
-            ("lidar", "mono"),
-            depth_source="integrated",
-            integration="spatial-gaussian",
-        ),
-        _edge("edge-paper", "as published", ("lidar", "mono"), literal=True, depth_source="integrated"),
-        _edge("edge", "ours", ("lidar", "mono"), depth_source="integrated"),
+        _edge("edge-gaussian", "spatial Gaussian", ("lidar", "mono"), overrides={_KERNEL: "spatial-gaussian"}),
+        _edge("edge-paper", "as published", ("lidar", "mono"), literal=True),
+        _edge("edge", "ours", ("lidar", "mono")),
     )
 }
 """λ and σ of the rivals stand here; those of edge-… are the configuration's own, unless a search found better ones."""

@@ -31,7 +31,7 @@ from edge_depth_nerf.base.pictures import DISTANCE, distance_of_colours, side_by
 from edge_depth_nerf.compare.figures import BinnedErrors
 from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.plots import PSNR_LABEL, Bins, plot_bins
-from edge_depth_nerf.demo.command.options import DemoOptions
+from edge_depth_nerf.demo.options import DemoOptions
 from edge_depth_nerf.jobs.runs import (
     LoggedCommands,
     command_line,

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-from edge_depth_nerf.method.error_model import TRUST_FILE, Trust, read_trust
-from edge_depth_nerf.method.integration import DepthSource
-from edge_depth_nerf.method.prior import Prior, PriorOptions, make_prior, view_of
+from edge_depth_nerf.method.error_model import Trust, read_trust
+from edge_depth_nerf.method.prior import Prior, PriorOptions, default_source, make_prior, view_of
 from edge_depth_nerf.mono.calibration import saved_trust
+from edge_depth_nerf.scene.format import TRUST_FILE
 from edge_depth_nerf.scene.reader import PictureMaps, SceneFolder, ScenePicture
 
 
@@ -16,7 +16,7 @@ from edge_depth_nerf.scene.reader import PictureMaps, SceneFolder, ScenePicture
 class ShownMaps(PictureMaps):
     """All that one picture has, with the prior that training makes of it."""
 
-    source: DepthSource | None
+    source: str | None
     """What the prior is made of; None with neither LiDAR nor monocular distance."""
     prior: Prior | None
     """None without a source."""
@@ -52,17 +52,9 @@ class ShownScene:
 
         """
         maps = self.scene.maps(picture)
-        source = default_source(picture)
+        source = default_source(picture.files)
         prior = None
         if source:
             view = view_of(picture.lens, picture.up_in_camera) if self.trust else None
-            options = PriorOptions(depth_source=source)
-            prior = make_prior(maps.lidar_m, maps.mono_m, maps.usable, options, self.trust, view)
+            prior = make_prior(maps.distances_m, maps.usable, source, PriorOptions(), self.trust, view)
         return ShownMaps(**vars(maps), source=source, prior=prior)
-
-
-def default_source(picture: ScenePicture) -> DepthSource | None:
-    """What training makes a picture's prior of, left to itself."""
-    if "lidar" in picture.files:
-        return "integrated" if "mono" in picture.files else "lidar"
-    return "mono" if "mono" in picture.files else None

@@ -53,7 +53,6 @@ LEAST_SIGMA_M = 0.02
 """About LiDAR's own noise."""
 FIELD_MARGIN_DEG = 3.0
 """LiDAR's field of elevation counts as so much wider, up and down."""
-TRUST_FILE = "mono_trust.json"
 _VERSION = 1
 _MAX_NUMBER = 1e3
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -29,10 +30,11 @@ from torch import Tensor
 
 from edge_depth_nerf.base.errors import InputError
 
-Integration = Literal["edge-aware", "spatial-gaussian"]
+INTEGRATED = "integrated"
+"""The depth source of LiDAR and monocular distance together; every other is the name of one source alone."""
+Kernel = Literal["edge-aware", "spatial-gaussian"]
 Normalise = Literal["pooled", "per-source"]
 RangeGuide = Literal["mono", "lidar"]
-DepthSource = Literal["integrated", "lidar", "mono"]
 SigmaMode = Literal["constant", "image", "spread", "combined"]
 
 CPU_STRIP_PIXELS = 1 << 16
@@ -81,7 +83,7 @@ class IntegrationOptions:
     sigma_depth_growth_per_m: float = 0.0
     """That standard deviation is at least so much times the square of the distance at the centre: neighbouring pixels
     of the ground lie apart by the square of their distance over the camera's height. 0: Eq. 7."""
-    integration: Integration = "edge-aware"
+    kernel: Kernel = "edge-aware"
     """edge-aware: Eq. 7. spatial-gaussian: Eq. 7 without its distance factor (the rival of Table 4)."""
     normalise: Normalise = "pooled"
     """pooled: Eq. 5, each pixel of the window counts. per-source: alpha weighs the two sources, not their counts."""
@@ -98,7 +100,7 @@ class IntegrationOptions:
         _check_number("sigma_depth_growth_per_m", self.sigma_depth_growth_per_m, 0.0)
         if not (self.kernel_size >= 1 and self.kernel_size % 2 == 1):
             raise InputError(f"kernel_size is {self.kernel_size}; expected an odd whole number of pixels from 1.")
-        _check_choice("integration", self.integration, Integration)
+        _check_choice("kernel", self.kernel, Kernel)
         _check_choice("normalise", self.normalise, Normalise)
         _check_choice("range_guide", self.range_guide, RangeGuide)
 
@@ -182,7 +184,7 @@ def _axis_weights(options: IntegrationOptions) -> list[float]:
 
 def _inverse_variance(options: IntegrationOptions) -> float:
     """Give 1 / σ_d² in 1/m²; 0 makes Eq. 7's second factor 1."""
-    return options.sigma_depth_m**-2 if options.integration == "edge-aware" else 0.0
+    return options.sigma_depth_m**-2 if options.kernel == "edge-aware" else 0.0
 
 
 def _integrate_on_cpu(lidar: Tensor, mono: Tensor, valid: Tensor, options: IntegrationOptions, out: Tensor) -> None:
@@ -289,37 +291,36 @@ def _integrate_strip(lidar: Tensor, mono: Tensor, valid: Tensor, options: Integr
 
 
 def select_prior(
-    depth_source: DepthSource,
-    lidar_m: Float[Tensor, "*batch h w"] | None,
-    mono_m: Float[Tensor, "*batch h w"] | None,
+    depth_source: str,
+    maps: Mapping[str, Float[Tensor, "*batch h w"] | None],
     valid: Bool[Tensor, "*batch h w"],
     options: IntegrationOptions | None = None,
 ) -> IntegratedDepth:
-    """Give the prior made of both sources (`integrate_depth`) or of one alone (the rivals of Table 3).
+    """Give the prior made of LiDAR and monocular distance (`integrate_depth`) or of one source alone (Table 3).
 
-    LiDAR alone is D where it has a return, spread 0 and monocular share 0; monocular alone is D̂, spread 0 and
-    share 1. Each asks only for the map it uses; the other may be None.
+    LiDAR alone is D where it has a return, spread 0 and monocular share 0; any other source alone is an estimate: its
+    map, spread 0 and share 1.
+
+    Args:
+        depth_source: integrated, or the name of a source.
+        maps: distance in metres by source, 0 = none; those that are not asked for may be missing or None.
+        valid: where the picture may be used.
+        options: of the integration.
 
     Raises:
-        InputError: the source needs a map that is None, or the maps differ in shape.
+        InputError: the source needs a map that is not there, or the maps differ in shape.
 
     """
-    _check_choice("depth_source", depth_source, DepthSource)
-    missing = [
-        name
-        for name, tensor, other in (("lidar", lidar_m, "mono"), ("mono", mono_m, "lidar"))
-        if tensor is None and depth_source != other
-    ]
-    if missing:
+    needed = ("lidar", "mono") if depth_source == INTEGRATED else (depth_source,)
+    found = {name: pixels for name, pixels in maps.items() if name in needed and pixels is not None}
+    if missing := [name for name in needed if name not in found]:
         raise InputError(
             f"depth_source {depth_source!r} needs {' and '.join(missing)} distance maps, and there are none; "
             "add them to the scene, or choose the depth_source that the scene has."
         )
-    if depth_source == "integrated":
-        assert lidar_m is not None and mono_m is not None
-        return integrate_depth(lidar_m, mono_m, valid, options)
-    source = lidar_m if depth_source == "lidar" else mono_m
-    assert source is not None
+    if depth_source == INTEGRATED:
+        return integrate_depth(found["lidar"], found["mono"], valid, options)
+    source = found[depth_source]
     _check_maps("select_prior", source=source, valid=valid)
     exists = valid & _is_distance(source)
     distance_m = torch.where(exists, source.detach(), 0).to(_work_dtype(source))

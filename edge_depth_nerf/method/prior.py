@@ -12,8 +12,8 @@ import hashlib
 import io
 import json
 import math
+from collections.abc import Container, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -25,10 +25,11 @@ from numpy.typing import NDArray
 from edge_depth_nerf.base.checked_cache import content_of, keep_last, used, write_checked
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras import Camera
+from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.masks.sky import regions_like_sky
 from edge_depth_nerf.method.alignment import Align, align
 from edge_depth_nerf.method.error_model import Trust, pixel_features
-from edge_depth_nerf.method.integration import DepthSource, IntegrationOptions, SigmaMode, select_prior, sigma_m
+from edge_depth_nerf.method.integration import INTEGRATED, IntegrationOptions, SigmaMode, select_prior, sigma_m
 
 CACHE_VERSION = 5
 """Part of every key: raised whenever the same inputs give another prior."""
@@ -42,6 +43,17 @@ FARTHEST_M = 200.0
 LOWEST_SKY_DEG = 2.0
 """Nearer to the horizon a missing monocular distance may be the end of the world's hills as well as sky."""
 
+CALIBRATED = (INTEGRATED, "mono")
+"""The sources whose error is measured against LiDAR returns left out."""
+
+
+def default_source(sources: Container[str]) -> str | None:
+    """What a prior is made of where nobody says: LiDAR and monocular maps, or what there is of them."""
+    if "lidar" in sources:
+        return INTEGRATED if "mono" in sources else "lidar"
+    return "mono" if "mono" in sources else None
+
+
 PriorSigma = Literal["calibrated", "constant", "image", "spread", "combined"]
 
 
@@ -54,8 +66,6 @@ class PriorOptions:
 
     """
 
-    depth_source: DepthSource = "integrated"
-    """Both sources integrated, or one alone."""
     align: Align = "local"
     """How the monocular map is fitted to the frame's LiDAR before both are integrated; mono alone stays as it is."""
     sigma_mode: PriorSigma = "calibrated"
@@ -77,11 +87,14 @@ class PriorOptions:
             if value not in allowed:
                 raise InputError(f"{name} is {value!r}; expected one of {', '.join(map(repr, allowed))}.")
 
-    @property
-    def wants_trust(self) -> bool:
-        """Whether a calibration of the drive has a part in the prior."""
-        calibrated = self.sigma_mode == "calibrated" and self.depth_source != "lidar"
-        return calibrated or (self.align != "none" and self.depth_source == "integrated")
+    def wants_trust(self, depth_source: str) -> bool:
+        """Whether a calibration of the drive has a part in the prior made of a source."""
+        calibrated = self.sigma_mode == "calibrated" and depth_source in CALIBRATED
+        return calibrated or (self.align != "none" and depth_source == INTEGRATED)
+
+
+Maps = Mapping[str, NDArray[np.float32] | None]
+"""H×W distance along the ray by source, metres, 0 = none; None as if the source were missing."""
 
 
 @dataclass(frozen=True)
@@ -102,12 +115,6 @@ class View:
     """Angle above the world's horizon; -pi/2 where there is no ray."""
 
 
-@lru_cache(maxsize=8)
-def _directions(camera: Camera) -> Float32[np.ndarray, "h w 3"]:
-    """Unit rays, x right, y down, z forward; NaN where there is none. One camera takes seconds at 1400 px."""
-    return camera.unproject(camera.pixel_centres())[0].float().numpy()
-
-
 def view_of(camera: Camera, up_in_camera: Float[np.ndarray, "3"]) -> View:
     """The angles of a picture's rays.
 
@@ -116,10 +123,12 @@ def view_of(camera: Camera, up_in_camera: Float[np.ndarray, "3"]) -> View:
         up_in_camera: the world's upward unit vector in the camera's axes (OpenCV).
 
     """
-    directions = _directions(camera)
-    elevation = np.arcsin(np.clip(directions @ up_in_camera.astype(np.float32), -1, 1))
-    theta = np.arccos(np.clip(directions[..., 2], -1, 1))
-    return View(np.nan_to_num(theta, nan=np.pi), np.nan_to_num(elevation, nan=-np.pi / 2))
+    found = rays(camera)
+    elevation = np.arcsin(np.clip(found.directions @ up_in_camera.astype(np.float32), -1, 1))
+    theta = np.arccos(np.clip(found.cos_theta, -1, 1))
+    none = ~found.within
+    theta[none], elevation[none] = np.pi, -np.pi / 2
+    return View(theta, elevation)
 
 
 def sky_of(
@@ -157,10 +166,19 @@ def integrate_frame(
     lidar_m: NDArray[np.float32],
     mono_m: NDArray[np.float32],
     mask: NDArray[np.bool_],
+    depth_source: str,
     options: PriorOptions,
     trust: Trust | None = None,
 ) -> IntegratedFrame:
     """Align and integrate a frame under a calibration: the prior whose error `Trust` describes.
+
+    Args:
+        lidar_m: H×W LiDAR distance, 0 = no return.
+        mono_m: H×W monocular distance, 0 = none.
+        mask: H×W, True where the picture may be used.
+        depth_source: integrated, or mono alone.
+        options: what is made of them.
+        trust: the drive's calibration, for its fit.
 
     Raises:
         InputError: the maps differ in size.
@@ -168,14 +186,14 @@ def integrate_frame(
     """
     mask = mask & ~(mono_m > FARTHEST_M)
     returns = mask & np.isfinite(lidar_m) & (lidar_m > 0)
-    if options.depth_source == "mono":
+    if depth_source == "mono":
         returns = np.zeros_like(mask)
     else:
         mono_m = align(lidar_m, mono_m, mask, options.align, trust.drive_fit if trust else None).mono_m
     # the spread is wanted at returns, too, so they are kept afterwards
     integration = dataclasses.replace(options.integration, keep_returns=False)
     lidar, mono, valid = (torch.from_numpy(pixels) for pixels in (lidar_m, mono_m, mask))
-    integrated = select_prior(options.depth_source, lidar, mono, valid, integration)
+    integrated = select_prior(depth_source, {"lidar": lidar, "mono": mono}, valid, integration)
     distance = integrated.distance_m.float().numpy()
     returns &= distance > 0
     if options.integration.keep_returns:
@@ -185,9 +203,9 @@ def integrate_frame(
 
 
 def make_prior(
-    lidar_m: NDArray[np.float32] | None,
-    mono_m: NDArray[np.float32] | None,
+    maps: Maps,
     mask: NDArray[np.bool_],
+    depth_source: str,
     options: PriorOptions,
     trust: Trust | None = None,
     view: View | None = None,
@@ -195,33 +213,36 @@ def make_prior(
     """Align a frame's monocular map, integrate (Eq. 5-7), and say how far each pixel is trusted.
 
     Args:
-        lidar_m: H×W LiDAR distance, 0 = no return; None if the options use monocular distance alone.
-        mono_m: H×W monocular distance, 0 = none; None if the options use LiDAR alone.
+        maps: H×W distance by source, 0 = none.
         mask: H×W, True where the picture may be used.
+        depth_source: integrated (LiDAR and mono), or the name of a source.
         options: what is made of them.
         trust: the drive's calibration; used for the drive's fit, and under sigma_mode calibrated.
         view: of the picture; under sigma_mode calibrated a trust wants it.
 
     Raises:
-        InputError: a source that the options need is None, or the maps differ in size.
+        InputError: there is no map of a source that is needed, or the maps differ in size.
 
     """
-    calibrated = options.sigma_mode == "calibrated" and trust is not None and options.depth_source != "lidar"
-    if calibrated and mono_m is not None:
-        assert view is not None and trust is not None
+    lidar_m, mono_m = maps.get("lidar"), maps.get("mono")
+    if options.sigma_mode == "calibrated" and depth_source in CALIBRATED and trust is not None and mono_m is not None:
+        assert view is not None
         mask = mask if trust.everywhere else mask & trust.in_field(view.elevation_rad)
-        if trust.error_model is not None and (lidar_m is not None or options.depth_source == "mono"):
+        if trust.error_model is not None and (lidar_m is not None or depth_source == "mono"):
             lidar_m = np.zeros_like(mono_m) if lidar_m is None else lidar_m
-            frame = integrate_frame(lidar_m, mono_m, mask, options, trust)
+            frame = integrate_frame(lidar_m, mono_m, mask, depth_source, options, trust)
             features = pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, frame.returns, view.theta_rad)
             sigma = trust.sigma_m(features)
             return Prior(frame.distance_m, np.where(frame.distance_m > 0, sigma, np.float32(0)))
-    if options.depth_source == "integrated" and lidar_m is not None and mono_m is not None:
-        mono_m = align(lidar_m, mono_m, mask, options.align, trust.drive_fit if trust else None).mono_m
-    lidar, mono = (None if maps is None else torch.from_numpy(maps) for maps in (lidar_m, mono_m))
-    integrated = select_prior(options.depth_source, lidar, mono, torch.from_numpy(mask), options.integration)
+    if depth_source == INTEGRATED and lidar_m is not None and mono_m is not None:
+        aligned = align(lidar_m, mono_m, mask, options.align, trust.drive_fit if trust else None).mono_m
+        maps = {**maps, "mono": aligned}
+    of_source = {name: torch.from_numpy(pixels) for name, pixels in maps.items() if pixels is not None}
+    integrated = select_prior(depth_source, of_source, torch.from_numpy(mask), options.integration)
     mode: SigmaMode = "combined" if options.sigma_mode == "calibrated" else options.sigma_mode
-    sigma = sigma_m(integrated, mode, mono_m=mono, constant_m=options.sigma_constant_m)
+    # beside LiDAR any source is an estimate, whose error grows with the distance
+    estimate = of_source.get("mono" if depth_source in (INTEGRATED, "lidar") else depth_source)
+    sigma = sigma_m(integrated, mode, mono_m=estimate, constant_m=options.sigma_constant_m)
     return Prior(integrated.distance_m.float().numpy(), sigma.float().numpy())
 
 
@@ -231,12 +252,14 @@ class PriorCache:
     A folder that cannot be written (a read-only scene) is not an error: the prior is then made each time.
     """
 
-    def __init__(self, folder: Path, options: PriorOptions, trust: Trust | None = None):
+    def __init__(self, folder: Path, depth_source: str, options: PriorOptions, trust: Trust | None = None):
         self.folder = folder
+        self.depth_source = depth_source
         self.options = options
         self.trust = trust
         described = {
             "version": CACHE_VERSION,
+            "depth_source": depth_source,
             **dataclasses.asdict(options),
             "trust": None if trust is None else trust.to_dict(),
         }
@@ -244,18 +267,18 @@ class PriorCache:
 
     def prior(
         self,
-        lidar_m: NDArray[np.float32] | None,
-        mono_m: NDArray[np.float32] | None,
+        maps: Maps,
         mask: NDArray[np.bool_],
         view: View | None = None,
     ) -> Prior:
         """As `make_prior`, from the cache where it is there."""
         angles = (view.theta_rad, view.elevation_rad) if view is not None else ()
-        path = self.folder / f"{self._key(lidar_m, mono_m, mask, *angles)}.npz"
+        of_sources = [pixels for _, pixels in sorted(maps.items())]
+        path = self.folder / f"{self._key(*of_sources, mask, *angles)}.npz"
         cached = _read(path, mask.shape)
         if cached is not None:
             return cached
-        prior = make_prior(lidar_m, mono_m, mask, self.options, self.trust, view)
+        prior = make_prior(maps, mask, self.depth_source, self.options, self.trust, view)
 
         archive = io.BytesIO()
         np.savez_compressed(archive, distance_m=prior.distance_m, sigma_m=prior.sigma_m)

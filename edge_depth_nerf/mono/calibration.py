@@ -25,7 +25,6 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.method.alignment import LEAST_RETURNS, align, both, fit_logs
 from edge_depth_nerf.method.error_model import (
     FIELD_MARGIN_DEG,
-    TRUST_FILE,
     FrameAlignment,
     Trust,
     error_of_returns,
@@ -33,8 +32,10 @@ from edge_depth_nerf.method.error_model import (
     pixel_features,
     read_trust,
 )
+from edge_depth_nerf.method.integration import INTEGRATED
 from edge_depth_nerf.method.prior import CACHE_VERSION, PriorOptions, View, integrate_frame, view_of
 from edge_depth_nerf.mono.far_seen import seen_above, static_cloud
+from edge_depth_nerf.scene.format import TRUST_FILE
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
 
 KEPT_CALIBRATIONS = 16
@@ -113,7 +114,7 @@ def calibrate_scene(scene: Path, options: PriorOptions | None = None, console: C
 
     """
     read = read_scene(scene)
-    trust = _calibrate(read, _chosen(read), options or PriorOptions(), console)
+    trust = _calibrate(read, _chosen(read), INTEGRATED, options or PriorOptions(), console)
     trust.write(read.folder / TRUST_FILE)
     return trust
 
@@ -123,9 +124,10 @@ def saved_trust(
     options: PriorOptions,
     cache: Path | None = None,
     training_images: Collection[Path] | None = None,
+    depth_source: str = INTEGRATED,
 ) -> Trust | None:
     """The scene's calibration, if one is there that was made of the files as they are and for these options."""
-    made_of = _made_of(scene, _chosen(scene, training_images), options)
+    made_of = _made_of(scene, _chosen(scene, training_images), depth_source, options)
     for path in (scene.folder / TRUST_FILE, _cached(scene, cache, made_of)):
         try:
             trust = read_trust(path)
@@ -139,36 +141,31 @@ def saved_trust(
 
 
 def find_trust(
-    scene: Path,
+    scene: SceneFolder,
     options: PriorOptions,
     cache: Path | None = None,
     training_images: Collection[Path] | None = None,
     console: Console | None = None,
-    lidar_unit: tuple[float, bool] | None = None,
+    depth_source: str = INTEGRATED,
 ) -> Trust:
     """The scene's calibration for these options; made now and kept in SCENE/.cache where there is none.
 
     Args:
-        scene: the folder, or its transforms.json.
+        scene: whose maps they are.
         options: of the prior to be trusted.
         cache: another folder than SCENE/.cache.
         training_images: the pictures that are trained on, where the scene does not say so itself.
         console: where progress is shown; nowhere by default.
-        lidar_unit: metres that a count of the LiDAR files stands for, and whether they hold z-depth, where someone
-            said otherwise than the scene.
+        depth_source: what the prior is made of: integrated, or mono alone.
 
     Raises:
-        FileNotFoundError: no scene there.
         InputError: as `calibrate_scene`.
 
     """
-    read = read_scene(scene)
-    if lidar_unit is not None:
-        read = dataclasses.replace(read, lidar_metres_per_count=lidar_unit[0], lidar_is_z_depth=lidar_unit[1])
-    trust = saved_trust(read, options, cache, training_images)
+    trust = saved_trust(scene, options, cache, training_images, depth_source)
     if trust is None:
-        trust = _calibrate(read, _chosen(read, training_images), options, console)
-        path = _cached(read, cache, trust.made_of)
+        trust = _calibrate(scene, _chosen(scene, training_images), depth_source, options, console)
+        path = _cached(scene, cache, trust.made_of)
         try:
             trust.write(path)
             keep_last(path.parent, "mono_trust_*.json", KEPT_CALIBRATIONS)
@@ -177,14 +174,14 @@ def find_trust(
     return trust
 
 
-def field_of_source(scene: Path) -> Trust | None:
+def field_of_source(scene: SceneFolder) -> Trust | None:
     """What is known of a scene without LiDAR: how far up and down the maps' network was taught by LiDAR elsewhere.
 
     Returns:
         A calibration without errors, or None where the maps' source says nothing about its field.
 
     """
-    source = read_scene(scene).meta.get("mono")
+    source = scene.meta.get("mono")
     source = source if isinstance(source, dict) else {}
     field_deg = source.get("field_deg")
     if not isinstance(field_deg, list) or len(field_deg) != 2 or source.get("trained_on") == "elsewhere":
@@ -208,9 +205,9 @@ def _chosen(scene: SceneFolder, training_images: Collection[Path] | None = None)
     return [training[i] for i in np.linspace(0, len(training) - 1, MOST_FRAMES).round().astype(int)]
 
 
-def _made_of(scene: SceneFolder, pictures: Sequence[ScenePicture], options: PriorOptions) -> str:
+def _made_of(scene: SceneFolder, pictures: Sequence[ScenePicture], depth_source: str, options: PriorOptions) -> str:
     """Key of the options, of the geometry, and of what is in the files of the pictures that are measured."""
-    relevant = dataclasses.asdict(options)
+    relevant = {"depth_source": depth_source, **dataclasses.asdict(options)}
     del relevant["sigma_mode"], relevant["sigma_constant_m"]
     units = [scene.lidar_metres_per_count, scene.lidar_is_z_depth, round(scene.theta_max_rad, 9)]
     digest = hashlib.sha256(json.dumps([CACHE_VERSION, relevant, _trained_on(scene), units], sort_keys=True).encode())
@@ -237,7 +234,11 @@ def _trained_on(scene: SceneFolder) -> str:
 
 
 def _calibrate(
-    scene: SceneFolder, pictures: Sequence[ScenePicture], options: PriorOptions, console: Console | None
+    scene: SceneFolder,
+    pictures: Sequence[ScenePicture],
+    depth_source: str,
+    options: PriorOptions,
+    console: Console | None,
 ) -> Trust:
     missing = [word for layer, word in (("lidar", "LiDAR"), ("mono", "monocular")) if not scene.has(layer)]
     if missing:
@@ -259,7 +260,9 @@ def _calibrate(
         assert maps.lidar_m is not None and maps.mono_m is not None
         view = view_of(picture.lens, picture.up_in_camera)
         far_seen_m = seen_above(cloud, scene, picture, (picture.lens.width, picture.lens.height))
-        return measure_frame(picture.name, number, maps.lidar_m, maps.mono_m, maps.usable, view, options, far_seen_m)
+        return measure_frame(
+            picture.name, number, maps.lidar_m, maps.mono_m, maps.usable, view, options, far_seen_m, depth_source
+        )
 
     bars = progress_bars(console or Console(quiet=True), transient=True)
     with bars as progress, ThreadPoolExecutor(2) as pool:
@@ -269,7 +272,8 @@ def _calibrate(
         for frame in pool.map(measure, enumerate(measurable)):
             frames.append(frame)
             progress.advance(task)
-    return combine(frames, options, _made_of(scene, pictures, options), everywhere=_trained_on(scene) == "elsewhere")
+    made_of = _made_of(scene, pictures, depth_source, options)
+    return combine(frames, options, made_of, _trained_on(scene) == "elsewhere", depth_source)
 
 
 def measure_frame(
@@ -281,6 +285,7 @@ def measure_frame(
     view: View,
     options: PriorOptions,
     far_seen_m: NDArray[np.float32] | None = None,
+    depth_source: str = INTEGRATED,
 ) -> MeasuredFrame:
     """Leave out some of a frame's returns, make its prior of the rest, and compare.
 
@@ -293,6 +298,7 @@ def measure_frame(
         view: the angles of its rays.
         options: of the prior.
         far_seen_m: H×W distance that the returns of other frames show above this one's, 0 = none.
+        depth_source: what the prior is made of: integrated, or mono alone.
 
     Raises:
         InputError: the maps differ in size.
@@ -303,9 +309,9 @@ def measure_frame(
     left_out, in_blocks = held_out_returns(returns, view.elevation_rad, number)
     kept_m = np.where(left_out, np.float32(0), lidar_m)
     # a source alone is not aligned, in the prior either
-    mode = "none" if options.depth_source == "mono" else options.align
+    mode = "none" if depth_source == "mono" else options.align
     aligned = align(kept_m, mono_m, usable, mode)
-    frame = integrate_frame(kept_m, mono_m, usable, options)
+    frame = integrate_frame(kept_m, mono_m, usable, depth_source, options)
     features = pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, frame.returns, view.theta_rad)
     has_prior = frame.distance_m > 0
     measured_m, measured = lidar_m, left_out
@@ -348,7 +354,13 @@ def _some(pixels: NDArray[np.bool_], most: int, rng: np.random.Generator) -> tup
     return np.unravel_index(where, pixels.shape)
 
 
-def combine(frames: Sequence[MeasuredFrame], options: PriorOptions, made_of: str, everywhere: bool) -> Trust:
+def combine(
+    frames: Sequence[MeasuredFrame],
+    options: PriorOptions,
+    made_of: str,
+    everywhere: bool,
+    depth_source: str = INTEGRATED,
+) -> Trust:
     """Put the measurements of a drive's frames together.
 
     Args:
@@ -356,6 +368,7 @@ def combine(frames: Sequence[MeasuredFrame], options: PriorOptions, made_of: str
         options: of the prior.
         made_of: key of what they were made of.
         everywhere: whether the monocular maps are to be trusted beyond LiDAR's field of elevation.
+        depth_source: what the prior is made of: integrated, or mono alone.
 
     """
 
@@ -365,7 +378,7 @@ def combine(frames: Sequence[MeasuredFrame], options: PriorOptions, made_of: str
     elevations = pooled(frame.elevation_rad for frame in frames)
     low, high = np.quantile(elevations, FIELD_QUANTILES) if len(elevations) else (0.0, 0.0)
     lidar_m, mono_m = pooled(frame.lidar_m for frame in frames), pooled(frame.mono_m for frame in frames)
-    aligned = options.align != "none" and options.depth_source == "integrated"
+    aligned = options.align != "none" and depth_source == INTEGRATED
     drive_fit = fit_logs(lidar_m, mono_m) if aligned and len(lidar_m) >= LEAST_RETURNS else None
     names = frames[0].features
     features = {name: pooled(frame.features[name] for frame in frames) for name in names}

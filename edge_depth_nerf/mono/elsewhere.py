@@ -106,7 +106,7 @@ class FittedMaps:
     def _seen(self, picture: ScenePicture) -> tuple[Sequence[Layer], Samples]:
         layers = self.layers(picture)
         usable = self._usable(picture)
-        lidar_m = self.scene.lidar_m(picture) if "lidar" in picture.files else np.zeros(usable.shape, np.float32)
+        lidar_m = self.scene.lidar_m(picture)
         return layers, take_samples(layers, lidar_m, usable, _SAMPLES)
 
     def _usable(self, picture: ScenePicture) -> np.ndarray:

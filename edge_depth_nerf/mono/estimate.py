@@ -491,7 +491,7 @@ def without_sky(
 
     """
     usable = view_of(picture, scene.theta_max_rad, max(metres.shape)).usable
-    lidar_m = scene.lidar_m(picture) if "lidar" in picture.files else np.zeros_like(metres)
+    lidar_m = scene.lidar_m(picture)
     rgb = read_image(picture.files["image"])
     sky = find_sky(rgb, usable, picture.up_in_camera, picture.lens, lidar_m, known_m)
     return np.where(sky, 0, metres)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 import sys
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -86,6 +86,18 @@ def _children(node: Any) -> list[str]:
     return [entry.name for entry in fields(node)] if is_dataclass(node) else []
 
 
+def _set(nodes: list[Any], parts: list[str], value: Any) -> None:
+    """Set the last of `parts` in the last node; a node that cannot change is replaced in the one that holds it."""
+    for node, part in zip(reversed(nodes), reversed(parts), strict=True):
+        if isinstance(node, dict):
+            node[part] = value
+            return
+        if not type(node).__dataclass_params__.frozen:
+            setattr(node, part, value)
+            return
+        value = replace(node, **{part: value})
+
+
 def apply_overrides(config: Any, overrides: dict[str, Any], where: str) -> None:
     """Set dotted names in a configuration, in place.
 
@@ -95,26 +107,24 @@ def apply_overrides(config: Any, overrides: dict[str, Any], where: str) -> None:
     """
     problems = []
     for name, value in overrides.items():
-        *path, last = name.split(".")
-        node = config
-        for part in (*path, last):
-            children = _children(node)
+        nodes = [config]
+        for part in name.split("."):
+            children = _children(nodes[-1])
             if part not in children:
                 near = difflib.get_close_matches(part, children, 1)
                 problems.append(f"{name}: there is no {part!r}" + (f" (did you mean {near[0]!r}?)" if near else ""))
                 break
-            parent, node = node, node[part] if isinstance(node, dict) else getattr(node, part)
+            nodes.append(nodes[-1][part] if isinstance(nodes[-1], dict) else getattr(nodes[-1], part))
         else:
-            if isinstance(node, tuple) and isinstance(value, list):
+            before = nodes.pop()
+            if isinstance(before, tuple) and isinstance(value, list):
                 value = tuple(value)
-            if isinstance(node, float) and isinstance(value, int) and not isinstance(value, bool):
+            if isinstance(before, float) and isinstance(value, int) and not isinstance(value, bool):
                 value = float(value)
-            if node is not None and type(value) is not type(node):
-                problems.append(f"{name}: expected {type(node).__name__}, found {value!r}")
-            elif isinstance(parent, dict):
-                parent[last] = value
+            if before is not None and type(value) is not type(before):
+                problems.append(f"{name}: expected {type(before).__name__}, found {value!r}")
             else:
-                setattr(parent, last, value)
+                _set(nodes, name.split("."), value)
     if problems:
         raise InputError(f"{where}: " + "; ".join(problems))
 

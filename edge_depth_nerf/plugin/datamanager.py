@@ -17,13 +17,12 @@ import json
 import os
 import tempfile
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-import numpy as np
 import torch
 import torch.distributed as dist
 from nerfstudio.cameras.rays import RayBundle
@@ -40,9 +39,17 @@ from edge_depth_nerf.base.checked_cache import keep_last, used
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.one_writer import only_writer
 from edge_depth_nerf.method.error_model import Trust
-from edge_depth_nerf.method.integration import IntegrationOptions
+from edge_depth_nerf.method.integration import INTEGRATED
 from edge_depth_nerf.method.metrics import has_whole_window
-from edge_depth_nerf.method.prior import CACHE_VERSION, PriorCache, PriorOptions, View, sky_of, view_of
+from edge_depth_nerf.method.prior import (
+    CACHE_VERSION,
+    CALIBRATED,
+    PriorCache,
+    PriorOptions,
+    default_source,
+    sky_of,
+    view_of,
+)
 from edge_depth_nerf.mono.calibration import field_of_source, find_trust
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
 from edge_depth_nerf.plugin.dataset import FisheyeDepthDataset
@@ -55,6 +62,7 @@ from edge_depth_nerf.plugin.pixel_table import (
     PixelTableWriter,
 )
 from edge_depth_nerf.plugin.ray_table import TableRayGenerator
+from edge_depth_nerf.scene.format import LAYERS, depth_sources
 
 KEPT_TABLES = 8
 """So many tables of pixels are kept of a scene, those used last; one of 300 pictures of 1400×1400 px takes 6 GB."""
@@ -73,37 +81,11 @@ class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig):
     """Target class to instantiate."""
     dataparser: AnnotatedDataParserUnion = field(default_factory=FisheyeDepthDataParserConfig)
     """Specifies the dataparser used to unpack the data."""
-    depth_source: Literal["auto", "integrated", "lidar", "mono", "none"] = "auto"
-    """Where the prior comes from: LiDAR and monocular maps integrated (Eq. 5), or one of them alone (Table 3).
-    auto: what the scene has. none: no prior."""
-    integration: Literal["edge-aware", "spatial-gaussian"] = "edge-aware"
-    """Kernel of the integration: Eq. 7, or Eq. 7 without its depth factor (Table 4)."""
-    alpha: float = 0.7
-    """Weight of LiDAR against monocular distance, 0..1 (Eq. 5, 6)."""
-    kernel_size: int = 9
-    """Side of the integration's window, px, odd (Eq. 7)."""
-    sigma_space: float = 3.0
-    """Standard deviation of the kernel over pixels, px (Eq. 7)."""
-    sigma_depth: float = 1.0
-    """Standard deviation of the kernel over distance, metres (Eq. 7)."""
-    sigma_depth_growth: float = 0.005
-    """That standard deviation is at least so much (1/m) times the square of the distance; 0 for Eq. 7 as written."""
-    normalise: Literal["pooled", "per-source"] = "per-source"
-    """Whether alpha weighs single pixels (Eq. 5, 6) or the averages of the two sources."""
-    keep_returns: bool = True
-    """Keep the LiDAR distance unchanged at pixels with a return."""
-    range_guide: Literal["mono", "lidar"] = "mono"
-    """What the kernel's depth factor compares with the neighbours: monocular distance (Eq. 7 as written), or LiDAR
-    where there is a return (the paper's prose)."""
-    align: Literal["none", "global", "local"] = "local"
-    """How monocular distance is fitted to each frame's LiDAR before both are integrated: not at all, by a scale and an
-    exponent, or also by a smooth correction near returns."""
-    sigma_mode: Literal["calibrated", "constant", "image", "spread", "combined"] = "calibrated"
-    """Standard deviation of the prior: measured at LiDAR returns left out of it (and no prior where nothing could be
-    measured), one number, one number a frame (the paper's words), the spread of what was integrated, or that spread
-    with a floor and a share of the monocular distance."""
-    sigma_constant: float = 1.0
-    """The standard deviation under sigma_mode constant, metres."""
+    depth_source: str = "auto"
+    """Where the prior comes from. integrated: LiDAR and monocular maps (Eq. 5); lidar, mono (Table 3), or another
+    source that the scene has: it alone. auto: what the scene has. none: no prior."""
+    prior: PriorOptions = field(default_factory=PriorOptions)
+    """How these maps become a prior."""
     prior_weight: float = 1.0
     """How often a pixel with a prior is drawn, against one without."""
     surface_rays_per_batch: int = 16384
@@ -116,58 +98,33 @@ class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig):
         if not 0.01 <= self.prior_weight <= 100:
             raise InputError(f"prior_weight is {self.prior_weight:g}; expected 0.01 to 100.")
 
-    def prior_options(self, has_lidar: bool, has_mono: bool) -> PriorOptions:
-        """The options of the prior, with depth_source settled by what the scene has.
+    def source_of_prior(self, sources: Collection[str]) -> str | None:
+        """The depth source with `auto` settled by what the scene has; None for no prior.
+
+        Args:
+            sources: the layers that all pictures have.
 
         Raises:
-            InputError: the depth source asked for is not in the scene, or an option is out of its range.
+            InputError: the depth source asked for is none, or is not in the scene.
 
         """
-        source = self.depth_source
-        assert source != "none"
-        if source == "auto":
-            source = "integrated" if has_lidar and has_mono else "lidar" if has_lidar else "mono"
-        missing = [
-            name
-            for name, has, needed in (
-                ("LiDAR", has_lidar, source in ("integrated", "lidar")),
-                ("monocular", has_mono, source in ("integrated", "mono")),
-            )
-            if needed and not has
-        ]
+        if self.depth_source == "none":
+            return None
+        if self.depth_source == "auto":
+            return default_source(sources)
+        known = ("auto", INTEGRATED, *depth_sources(), "none")
+        if self.depth_source not in known:
+            raise InputError(f"depth_source is {self.depth_source!r}; expected one of {', '.join(known)}.")
+        needed = ("lidar", "mono") if self.depth_source == INTEGRATED else (self.depth_source,)
+        missing = [LAYERS[name].words for name in needed if name not in sources]
         if missing:
             raise InputError(
-                f"{self.dataparser.data}: the scene has no {' and no '.join(missing)} distance maps, but depth_source "
+                f"{self.dataparser.data}: the scene has no {' and no '.join(missing)}, but depth_source "
                 f"{self.depth_source} needs them. Process the drive again (monocular maps alone: `edge-depth-nerf "
-                "estimate-depth`), or choose another --pipeline.datamanager.depth-source (integrated, lidar, mono), or "
-                "train without a prior by --pipeline.model.depth-loss none."
+                "estimate-depth`), or choose another --pipeline.datamanager.depth-source "
+                f"({', '.join(known[1:-1])}), or train without a prior by --pipeline.model.depth-loss none."
             )
-        return PriorOptions(
-            depth_source=source,
-            align=self.align,
-            sigma_mode=self.sigma_mode,
-            sigma_constant_m=self.sigma_constant,
-            integration=IntegrationOptions(
-                alpha=self.alpha,
-                kernel_size=self.kernel_size,
-                sigma_space_px=self.sigma_space,
-                sigma_depth_m=self.sigma_depth,
-                sigma_depth_growth_per_m=self.sigma_depth_growth,
-                integration=self.integration,
-                normalise=self.normalise,
-                keep_returns=self.keep_returns,
-                range_guide=self.range_guide,
-            ),
-        )
-
-
-def _view(dataset: FisheyeDepthDataset, image_idx: int) -> View:
-    """Where the rays of a picture point; up is the scene's z before nerfstudio turned it."""
-    outputs = dataset._dataparser_outputs
-    up = outputs.dataparser_transform[:3, :3].double() @ torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    rotation = dataset.cameras.camera_to_worlds[image_idx, :3, :3].double()
-    up_in_camera = (rotation.T @ up).numpy() * np.array([1.0, -1.0, -1.0])  # OpenGL to OpenCV
-    return view_of(dataset.camera(image_idx), up_in_camera)
+        return self.depth_source
 
 
 class TablePixelSampler:
@@ -300,30 +257,33 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
             "sky": batch.sky.to(self.device),
         }
 
+    def _recipe(self, dataset: FisheyeDepthDataset) -> PriorRecipe | None:
+        """What the prior of a split's pictures is made of and how; None without any."""
+        options, scene = self.config.prior, dataset.scene
+        sources = dataset.sources()
+        source = self.config.source_of_prior(sources)
+        if source is None:
+            return None
+        trust: Trust | None = None
+        if source in CALIBRATED and {"lidar", "mono"} <= sources and options.wants_trust(source):
+            trust = find_trust(scene, options, self._cache_dir(), dataset.image_filenames, CONSOLE, source)
+            CONSOLE.log(f"Depth prior: {trust.summary()}.")
+        elif source == "mono" and options.sigma_mode == "calibrated":
+            trust = field_of_source(scene)
+        elif self.config.depth_source == "auto" and "mono" not in sources:
+            CONSOLE.log(
+                f"[yellow]Depth prior: LiDAR alone, for the scene has no monocular maps. `edge-depth-nerf "
+                f"estimate-depth {escape(str(self.config.dataparser.data))}` makes them, or finishes those that were "
+                "begun.",
+            )
+        return PriorRecipe(source, options, trust)
+
     def _table(self, dataset: FisheyeDepthDataset, description: str, with_prior: bool) -> PixelTable:
         """The table of a split's pixels: the one on disk, if it was made of the same things, or a new one."""
-        data = Path(self.config.dataparser.data)
         cache_dir = self._cache_dir()
-        options: PriorOptions | None = None
-        trust: Trust | None = None
-        has_lidar = bool(dataset.metadata["lidar_filenames"])
-        has_mono = bool(dataset.metadata["mono_filenames"])
-        wanted = self.config.depth_source != "none" and (has_lidar or has_mono or self.config.depth_source != "auto")
-        if with_prior and wanted:
-            options = self.config.prior_options(has_lidar, has_mono)
-            if has_lidar and has_mono and options.wants_trust:
-                unit = dataset.metadata["lidar_metres_per_count"], dataset.metadata["lidar_is_z_depth"]
-                trust = find_trust(data, options, cache_dir, dataset.image_filenames, CONSOLE, unit)
-                CONSOLE.log(f"Depth prior: {trust.summary()}.")
-            elif has_mono and options.sigma_mode == "calibrated" and options.depth_source == "mono":
-                trust = field_of_source(data)
-            elif self.config.depth_source == "auto" and not has_mono:
-                CONSOLE.log(
-                    f"[yellow]Depth prior: LiDAR alone, for the scene has no monocular maps. `edge-depth-nerf "
-                    f"estimate-depth {escape(str(data))}` makes them, or finishes those that were begun.",
-                )
-        weight = self.config.prior_weight if options else 1.0
-        path = cache_dir / "pixels" / f"{_table_key(dataset, options, trust, weight)}.npy"
+        recipe = self._recipe(dataset) if with_prior else None
+        weight = self.config.prior_weight if recipe else 1.0
+        path = cache_dir / "pixels" / f"{_table_key(dataset, recipe, weight)}.npy"
         try:
             table = PixelTable(path)
             used(path)
@@ -334,7 +294,9 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
             # a scene that cannot be written: the table lives as long as this object
             self._temporary.append(tempfile.TemporaryDirectory(prefix="edge-depth-nerf-"))
             path = Path(self._temporary[-1].name) / path.name
-        cache = None if options is None else PriorCache(cache_dir / "prior", options, trust)
+        cache = None
+        if recipe is not None:
+            cache = PriorCache(cache_dir / "prior", recipe.depth_source, recipe.options, recipe.trust)
         most = int((dataset.cameras.width * dataset.cameras.height).sum())
         try:
             with PixelTableWriter(path, most, prior_weight=weight) as writer:
@@ -356,6 +318,23 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         return PixelTable(path)
 
 
+@dataclass(frozen=True)
+class PriorRecipe:
+    """What a prior is made of, and how."""
+
+    depth_source: str
+    """integrated, or the name of a source."""
+    options: PriorOptions
+    """How its maps become a prior."""
+    trust: Trust | None
+    """The drive's calibration, where it has a part."""
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """The layers that are read: beside the source's own those that say where the sky is."""
+        return ("lidar", "mono") if self.depth_source in CALIBRATED else (self.depth_source,)
+
+
 def _load(dataset: FisheyeDepthDataset, cache: PriorCache | None, whole_windows: bool) -> Iterator[PicturePixels]:
     """Colours, mask, prior and its sigma, and the sky of each picture.
 
@@ -375,11 +354,12 @@ def _load(dataset: FisheyeDepthDataset, cache: PriorCache | None, whole_windows:
             )
         if cache is None:
             return PicturePixels(rgb, mask)
-        uses_mono = cache.options.depth_source != "lidar"
-        lidar, mono = dataset.lidar_distance_m(image_idx), dataset.mono_distance_m(image_idx)
-        view = _view(dataset, image_idx) if uses_mono and mono is not None else None
-        prior = cache.prior(lidar, mono, mask, view if cache.trust is not None else None)
-        sky = sky_of(mono, lidar, view, rgb, mask) if uses_mono and mono is not None and view is not None else None
+        recipe = PriorRecipe(cache.depth_source, cache.options, cache.trust)
+        maps = {layer: dataset.distance_m(image_idx, layer) for layer in recipe.layers}
+        picture, mono = dataset.pictures[image_idx], maps.get("mono")
+        view = view_of(picture.lens, picture.up_in_camera) if mono is not None else None
+        prior = cache.prior(maps, mask, view if cache.trust is not None else None)
+        sky = None if mono is None or view is None else sky_of(mono, maps.get("lidar"), view, rgb, mask)
         return PicturePixels(rgb, mask, prior.distance_m, prior.sigma_m, sky)
 
     # OpenCV and torch release the interpreter's lock, so two threads read and integrate side by side; a few pictures
@@ -393,28 +373,22 @@ def _load(dataset: FisheyeDepthDataset, cache: PriorCache | None, whole_windows:
             yield pixels
 
 
-def _table_key(dataset: FisheyeDepthDataset, options: PriorOptions | None, trust: Trust | None, weight: float) -> str:
+def _table_key(dataset: FisheyeDepthDataset, recipe: PriorRecipe | None, weight: float) -> str:
     """What a table was made of: the files by name, size and date, the cameras, and what the prior is made by."""
-    metadata, cameras = dataset.metadata, dataset.cameras
-    masks = dataset._dataparser_outputs.mask_filenames
-    files = [*dataset.image_filenames, *(masks or [])]
-    if options is not None:
-        files += [*(metadata["lidar_filenames"] or []), *(metadata["mono_filenames"] or [])]
+    layers = ["image", "mask", *(recipe.layers if recipe else ())]
+    files = [picture.files[layer] for layer in layers for picture in dataset.pictures if layer in picture.files]
     stats = [(str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in files]
+    scene = dataset.scene
     described = {
         "versions": [TABLE_VERSION, CACHE_VERSION],
         "files": stats,
         "weight": weight,
-        "metadata": [metadata[key] for key in ("theta_max_rad", "lidar_metres_per_count", "lidar_is_z_depth")],
-        "prior": None if options is None else dataclasses.asdict(options),
-        "trust": None if trust is None else trust.to_dict(),
-        "turn": dataset._dataparser_outputs.dataparser_transform[:3, :3].tolist(),
+        "scene": [scene.theta_max_rad, scene.lidar_metres_per_count, scene.lidar_is_z_depth],
+        "lenses": [repr((picture.lens, picture.up_in_camera.tolist())) for picture in dataset.pictures],
+        "prior": None if recipe is None else [recipe.depth_source, dataclasses.asdict(recipe.options)],
+        "trust": None if recipe is None or recipe.trust is None else recipe.trust.to_dict(),
     }
-    digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
-    lenses = (cameras.width, cameras.height, cameras.fx, cameras.fy, cameras.cx, cameras.cy, cameras.camera_type)
-    for values in (*lenses, cameras.distortion_params, cameras.camera_to_worlds[:, :3, :3]):
-        digest.update(b"" if values is None else values.cpu().numpy().tobytes())
-    return digest.hexdigest()[:32]
+    return hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()[:32]
 
 
 def _writable(folder: Path) -> bool:

@@ -7,7 +7,7 @@ in scene units times `metres_per_unit` is metres.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,19 +17,11 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE
 from edge_depth_nerf.plugin.scale import default_metres_per_unit
-from edge_depth_nerf.scene.format import INTRINSICS, is_own_scene, pose_of, read_transforms
+from edge_depth_nerf.scene.format import INTRINSICS, LAYERS, DepthKind, path_keys, pose_of, read_transforms
+from edge_depth_nerf.scene.reader import ScenePicture, read_scene
 
 SUPPORTED_CAMERA_TYPES = (CameraType.PERSPECTIVE, CameraType.FISHEYE)
-
-MAP_KEYS = {
-    "lidar_filenames": "lidar_file_path",
-    "mono_filenames": "mono_file_path",
-    "truth_distance_filenames": "truth_distance_file_path",
-    "truth_rgb_filenames": "truth_rgb_file_path",
-}
-"""Metadata of the dataset: key of the frame in transforms.json. All frames have a map or none has."""
 
 
 @dataclass
@@ -46,7 +38,7 @@ class FisheyeDepthDataParserConfig(NerfstudioDataParserConfig):
     depth_unit_scale_factor: float | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
     """Metres per count of the files under depth_file_path. Not set: what transforms.json says, else nerfstudio's
     0.001."""
-    depth_kind: Literal["auto", "distance", "z_depth"] = "auto"
+    depth_kind: DepthKind = "auto"
     """What the files under depth_file_path hold. auto: distance along the ray in scenes of this project and in
     fisheye scenes, z_depth (nerfstudio's convention) in other people's pinhole scenes."""
     downscale_factor: int | None = 1
@@ -84,7 +76,7 @@ def check_meta(meta: dict[str, Any], path: Path) -> list[dict[str, Any]]:
                     "Every camera needs fl_x, fl_y, cx, cy, w and h in pixels."
                 )
         pose_of(frame, f"{path}: frame {number} ({frame['file_path']})")
-    for key in (*MAP_KEYS.values(), "depth_file_path", "mask_path"):
+    for key in path_keys():
         missing = [frame["file_path"] for frame in frames if key not in frame]
         if missing and len(missing) < len(frames):
             raise InputError(
@@ -163,14 +155,12 @@ class FisheyeDepth(Nerfstudio):
         named = [f"{name}_filenames" for name in ("train", "val", "test") if f"{name}_filenames" in meta]
         if named and f"{split}_filenames" not in named:
             raise InputError(f"{path}: has {' and '.join(named)}, but no {split}_filenames. Give all three, or none.")
-        has_maps = any(key in frames[0] for key in MAP_KEYS.values())
+        has_maps = any(layer.key in frames[0] for name, layer in LAYERS.items() if name not in ("image", "mask"))
         if has_maps and self.config.downscale_factor not in (None, 1):
             raise InputError(
                 f"{path}: downscale_factor is {self.config.downscale_factor}, but the distance maps of this scene "
                 "have one size only. Run `edge-depth-nerf process … --downscale K` instead."
             )
-        is_fisheye = CAMERA_MODEL_TO_TYPE[meta.get("camera_model", "PINHOLE")] == CameraType.FISHEYE
-
         positions_m = np.array([frame["transform_matrix"] for frame in frames], dtype=np.float64)[:, :3, 3]
         metres_per_unit = self.config.metres_per_unit
         if metres_per_unit is None:
@@ -183,9 +173,6 @@ class FisheyeDepth(Nerfstudio):
         if not (np.isfinite(metres_per_unit) and metres_per_unit > 0):
             raise InputError(f"metres_per_unit is {metres_per_unit}; expected a positive number of metres.")
 
-        unit = self.config.depth_unit_scale_factor
-        if unit is None:
-            unit = float(meta.get("depth_unit_scale_factor", 1e-3))
         if len(frames) == 1 and "train_filenames" not in meta:
             self.config.eval_mode = "all"  # the one picture is for training and for judging
         # nerfstudio's parser takes the scale from its config
@@ -195,33 +182,35 @@ class FisheyeDepth(Nerfstudio):
         if not outputs.image_filenames:
             raise InputError(f"{path}: no picture is left for the split {split!r}; it needs one at least.")
 
-        data_dir = path.parent
-        by_image = {self._get_fname(Path(frame["file_path"]), data_dir): frame for frame in frames}
-        chosen = [by_image[image] for image in outputs.image_filenames]
-        metadata: dict[str, Any] = {
-            name: [data_dir / frame[key] for frame in chosen] if key in frames[0] else None
-            for name, key in MAP_KEYS.items()
-        }
-        metadata["lidar_metres_per_count"] = 1 / DISTANCE_STEPS_PER_METRE
-        metadata["lidar_is_z_depth"] = False
-        depth_filenames = outputs.metadata["depth_filenames"]
-        if metadata["lidar_filenames"] is None and depth_filenames is not None:
-            metadata["lidar_filenames"] = depth_filenames
-            metadata["lidar_metres_per_count"] = unit
-            own = is_own_scene(meta) or is_fisheye
-            kind = self.config.depth_kind if self.config.depth_kind != "auto" else ("distance" if own else "z_depth")
-            metadata["lidar_is_z_depth"] = kind == "z_depth"
-        metadata["metres_per_unit"] = metres_per_unit
-        metadata["theta_max_rad"] = np.radians(meta["theta_max_deg"]).item() if "theta_max_deg" in meta else None
-        metadata["depth_unit_scale_factor"] = unit
-        outputs.metadata.update(metadata)
-
-        for files in (
-            outputs.image_filenames,
-            outputs.mask_filenames,
-            *(metadata[name] for name in MAP_KEYS),
-        ):
-            for file in files or []:
-                if not file.is_file():
-                    raise FileNotFoundError(f"{file}: no such file, but {path} names it. Process the drive again.")
+        scene = read_scene(path, self.config.depth_kind, self.config.depth_unit_scale_factor, check_files=False)
+        names = {self._get_fname(Path(frame["file_path"]), path.parent): frame["file_path"] for frame in frames}
+        by_name = {picture.name: picture for picture in scene.pictures}
+        pictures = [by_name[names[image]] for image in outputs.image_filenames]
+        if self.downscale_factor not in (None, 1):
+            pictures = _downscaled(pictures, outputs, self.downscale_factor)
+        outputs.metadata.update(
+            scene=scene,
+            pictures=pictures,
+            metres_per_unit=metres_per_unit,
+            depth_unit_scale_factor=scene.lidar_metres_per_count,
+        )
+        for file in dict.fromkeys(file for picture in pictures for file in picture.files.values()):
+            if not file.is_file():
+                raise FileNotFoundError(f"{file}: no such file, but {path} names it. Process the drive again.")
         return outputs
+
+
+def _downscaled(pictures: list[ScenePicture], outputs: DataparserOutputs, factor: int) -> list[ScenePicture]:
+    """The pictures of nerfstudio's images_K folders (masks_K, depths_K), with lenses of their size."""
+    folders = {
+        "image": outputs.image_filenames,
+        "mask": outputs.mask_filenames,
+        "lidar": outputs.metadata["depth_filenames"],
+    }
+    found = []
+    for number, picture in enumerate(pictures):
+        size = {"width": int(outputs.cameras.width[number]), "height": int(outputs.cameras.height[number])}
+        pixels = {name: getattr(picture.lens, name) / factor for name in ("fx", "fy", "cx", "cy")}
+        files = {layer: paths[number] for layer, paths in folders.items() if paths}
+        found.append(replace(picture, lens=replace(picture.lens, **size, **pixels), files=files))
+    return found

@@ -28,7 +28,7 @@ from edge_depth_nerf.base.checked_cache import is_whole, write_checked
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE, read_json_object, write_json
 
-TABLE_VERSION = 3
+TABLE_VERSION = 4
 """Raised whenever the form of the file changes."""
 BUCKET_BYTES = 64 << 20
 """So much is shuffled in memory at once."""

@@ -177,7 +177,7 @@ class DriveLayers(ViewerControl):
         self.manager = manager
         sampler = manager.train_pixel_sampler
         has_prior = sampler is not None and sampler.table.share_with_prior > 0
-        has_lidar = bool(manager.train_dataset.metadata["lidar_filenames"])
+        has_lidar = "lidar" in manager.train_dataset.sources()
         self.switches = {
             "lenses": self._switch(
                 "Lenses", "lenses", True, "What each camera sees, in place of nerfstudio's pyramids"
@@ -252,7 +252,7 @@ class DriveLayers(ViewerControl):
 
     def _draw_lenses(self, node: str) -> None:
         dataset = self.manager.train_dataset
-        limit_rad = dataset.metadata["theta_max_rad"] or math.pi
+        limit_rad = dataset.scene.theta_max_rad
         radius = self._units(LENS_RADIUS_M) * self.viewer.config.camera_frustum_scale / HOST_FRUSTUM_SCALE
         for index in _spread(len(dataset), MOST_LENSES):
             pose = dataset.cameras.camera_to_worlds[index].double().cpu().numpy()
@@ -304,7 +304,7 @@ class DriveLayers(ViewerControl):
         rng = np.random.default_rng(0)
         pixels, distances, colours = [], [], []
         for index in range(len(dataset)):
-            distance_m = dataset.lidar_distance_m(index)
+            distance_m = dataset.distance_m(index, "lidar")
             assert distance_m is not None
             row, column = np.nonzero(dataset.mask(index) & np.isfinite(distance_m) & (distance_m > 0))
             chosen = rng.permutation(len(row))[: MOST_POINTS // len(dataset)]

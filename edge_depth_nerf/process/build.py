@@ -26,6 +26,7 @@ from edge_depth_nerf.base.console import say
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, write_json
 from edge_depth_nerf.cameras import Camera
+from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar import project_points, transform_points
 from edge_depth_nerf.masks.ego import EgoMask, find_ego
@@ -36,7 +37,7 @@ from edge_depth_nerf.masks.semantics import sky as sky_of_labels
 from edge_depth_nerf.masks.sky import find_sky
 from edge_depth_nerf.process.downscale import downscale_distance, downscale_image, downscale_mask
 from edge_depth_nerf.process.options import ProcessOptions
-from edge_depth_nerf.process.reading import load_distance, load_picture, rays_of, read_depth
+from edge_depth_nerf.process.reading import load_distance, load_picture, read_depth
 from edge_depth_nerf.process.recording import RecordedPicture, Recording
 from edge_depth_nerf.process.sweep_store import SweepStore
 from edge_depth_nerf.scene.checks import read_camera_mask
@@ -330,7 +331,7 @@ class _Builder:
         camera_to_world = self.pose(picture)
         if picture.depth is not None:
             distance_m = downscale_distance(read_depth(picture.depth, full), self._options.downscale)
-            points = rays_of(camera)[0] * torch.from_numpy(distance_m)[..., None]
+            points = torch.from_numpy(rays(camera).directions * distance_m[..., None])
             index = torch.where(
                 torch.from_numpy(distance_m) > 0, torch.arange(distance_m.size).view(distance_m.shape), -1
             )

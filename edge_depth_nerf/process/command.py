@@ -11,7 +11,6 @@ from rich.console import Console
 from edge_depth_nerf.base.console import say
 from edge_depth_nerf.base.one_writer import only_writer
 from edge_depth_nerf.process.options import JbnuDepth360Options, Kitti360Options, ProcessOptions, RigOptions
-from edge_depth_nerf.scene.format import MONO_ENTRY
 from edge_depth_nerf.scene.reader import SceneFolder, read_scene
 from edge_depth_nerf.scene.writer import ProcessReport
 
@@ -62,7 +61,7 @@ def _add_mono(scene: SceneFolder, options: ProcessOptions, console: Console) -> 
     """Give the scene monocular maps, if it has none, and the calibration of those it has."""
     lidar = scene.has("lidar")
     if scene.has("mono") and options.mono_model is not None:
-        source = scene.meta.get(MONO_ENTRY)
+        source = scene.meta.get("mono")
         if not isinstance(source, dict) or source.get("weights") != options.mono_model.name:
             say(
                 console,

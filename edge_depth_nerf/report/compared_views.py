@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from edge_depth_nerf.base.files import read_distance_png, read_image, read_mask
 from edge_depth_nerf.base.pictures import colour_distance
-from edge_depth_nerf.scene.format import read_transforms
+from edge_depth_nerf.scene.format import LAYERS, read_transforms
 
-DISTANCE_KEYS = ("truth_distance_file_path", "lidar_file_path")
+DISTANCE_KEYS = (LAYERS["truth_distance"].key, LAYERS["lidar"].key)
 """What a view's distances are shown by, the better one first."""
 
 
@@ -71,7 +71,7 @@ def compared_view(scene: Path, frame: Mapping[str, Any], index: int, views_of: M
     rgb = read_image(scene / frame["file_path"])
     mask = read_mask(scene / frame["mask_path"]) if "mask_path" in frame else np.ones(rgb.shape[:2], bool)
     key = next((key for key in DISTANCE_KEYS if key in frame), None)
-    clean = frame.get("truth_rgb_file_path")
+    clean = frame.get(LAYERS["truth_rgb"].key)
     colours, distances = {}, {}
     for name, folder in views_of.items():
         # nerfstudio saves truth and rendering side by side

@@ -6,8 +6,9 @@ Light: both readers import it, and so does whoever reads the file for something 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float64
@@ -18,22 +19,59 @@ from edge_depth_nerf.base.files import read_json
 
 TRANSFORMS = "transforms.json"
 POINTS = "points.ply"
-LAYERS = {
-    "mask": ("masks/{camera}", "mask_path"),
-    "lidar": ("lidar/{camera}", "lidar_file_path"),
-    "mono": ("mono/{camera}", "mono_file_path"),
-    "truth_distance": ("truth/{camera}/distance", "truth_distance_file_path"),
-    "truth_rgb": ("truth/{camera}/rgb", "truth_rgb_file_path"),
-}
-"""What every frame of a scene has beside its picture, or none: its folder, and its key in transforms.json."""
-MONO_ENTRY = "mono"
-"""Key of transforms.json that says where monocular maps come from that were put into the scene later."""
+TRUST_FILE = "mono_trust.json"
+"""The calibration of the prior, beside the maps that it was measured on."""
 
-PATHS = (
-    *("file_path", "mask_path", "depth_file_path"),
-    *("lidar_file_path", "mono_file_path", "truth_distance_file_path", "truth_rgb_file_path"),
-)
-"""Keys of a frame that name files."""
+LayerKind = Literal["picture", "mask", "distance"]
+
+
+@dataclass(frozen=True)
+class Layer:
+    """What a scene's pictures have: every one of them, or none."""
+
+    key: str
+    """Of a frame in transforms.json: names its file."""
+    folder: str
+    """Where `process` and `write_maps` put the files."""
+    kind: LayerKind
+    """picture: RGB. mask: 255 = use. distance: metres along the ray, 0 = none."""
+    words: str
+    """What messages call it."""
+    is_truth: bool = False
+    """Whether it is what is really there: for judging alone, no training reads it."""
+
+
+LAYERS: dict[str, Layer] = {
+    "image": Layer("file_path", "images/{camera}", "picture", "pictures"),
+    "mask": Layer("mask_path", "masks/{camera}", "mask", "masks"),
+    "lidar": Layer("lidar_file_path", "lidar/{camera}", "distance", "LiDAR maps"),
+    "mono": Layer("mono_file_path", "mono/{camera}", "distance", "monocular maps"),
+    "truth_distance": Layer("truth_distance_file_path", "truth/{camera}/distance", "distance", "true distances", True),
+    "truth_rgb": Layer("truth_rgb_file_path", "truth/{camera}/rgb", "picture", "true pictures", True),
+}
+"""The one table of what a scene holds. A distance layer that is not the truth is a source of depth: a prior can be made
+of it (`--pipeline.datamanager.depth-source`). A new source is a line here; see docs/extending.md."""
+DEPTH_KEY = "depth_file_path"
+"""nerfstudio's own key of a depth map; counts as LiDAR where there is no other. What its files hold (unit, distance or
+z-depth) the scene says, or `--depth-unit-scale-factor` and `--depth-kind`."""
+DepthKind = Literal["auto", "distance", "z_depth"]
+
+
+def depth_sources() -> list[str]:
+    """The layers that a prior can be made of."""
+    return [name for name, layer in LAYERS.items() if layer.kind == "distance" and not layer.is_truth]
+
+
+def path_keys() -> list[str]:
+    """Keys of a frame that name files."""
+    return [*(layer.key for layer in LAYERS.values()), DEPTH_KEY]
+
+
+def layers_of(frame: Mapping[str, Any]) -> set[str]:
+    """The layers that a frame of transforms.json has; nerfstudio's own depth counts as LiDAR."""
+    return {name for name, layer in LAYERS.items() if layer.key in frame} | ({"lidar"} if DEPTH_KEY in frame else set())
+
+
 INTRINSICS = ("fl_x", "fl_y", "cx", "cy")
 """Keys of a frame, or of the whole scene, that are numbers of pixels."""
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -50,7 +88,7 @@ def is_own_scene(meta: Mapping[str, Any]) -> bool:
 
     Monocular maps say nothing about that: `estimate-depth` puts them into other people's scenes, too.
     """
-    return "world_offset_m" in meta or "lidar_file_path" in meta["frames"][0]
+    return "world_offset_m" in meta or LAYERS["lidar"].key in meta["frames"][0]
 
 
 def read_transforms(path: Path) -> dict[str, Any]:
@@ -122,7 +160,7 @@ def _matrix(value: Any, where: str, rows: int) -> Float64[np.ndarray, "rows 4"]:
 
 
 def _check_frame(frame: Mapping[str, Any], where: str, folder: Path) -> None:
-    for key in PATHS:
+    for key in path_keys():
         if key in frame:
             path_inside(folder, frame[key], f"{where}: {key}")
     _check_numbers(frame, where)
@@ -201,5 +239,5 @@ def _check_shifted(views: Any, path: Path) -> None:
             if not isinstance(entry, dict) or not isinstance(entry.get("camera"), str):
                 raise wrong
             pose_of(entry, where)
-            for key in ("truth_rgb_file_path", "truth_distance_file_path"):
+            for key in (LAYERS["truth_rgb"].key, LAYERS["truth_distance"].key):
                 path_inside(path.parent, entry.get(key), f"{where}: {key}")

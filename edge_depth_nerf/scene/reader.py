@@ -11,29 +11,33 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float32, Float64, UInt8
 from numpy.typing import NDArray
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE, read_distance_png, read_image, read_mask, read_npy
-from edge_depth_nerf.cameras import Camera, KannalaBrandt, Pinhole
+from edge_depth_nerf.cameras import KannalaBrandt, Pinhole
+from edge_depth_nerf.cameras.rays import Rays, distance_from_z_depth, rays
 from edge_depth_nerf.lidar.scans import read_cloud
-from edge_depth_nerf.scene.format import DISTORTION, INTRINSICS, is_own_scene, number_of, pose_of, read_transforms
+from edge_depth_nerf.scene.format import (
+    DEPTH_KEY,
+    DISTORTION,
+    INTRINSICS,
+    LAYERS,
+    DepthKind,
+    is_own_scene,
+    number_of,
+    path_keys,
+    pose_of,
+    read_transforms,
+)
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 FISHEYE_MODEL = "OPENCV_FISHEYE"
-OWN_MAPS = {"lidar": "lidar_file_path", "mono": "mono_file_path", "truth": "truth_distance_file_path"}
-"""Maps that only this project's scenes have: their keys in transforms.json."""
-KEYS = {"image": "file_path", "mask": "mask_path", **OWN_MAPS}
-"""Layers of a picture: their keys in transforms.json."""
-DEPTH_KEY = "depth_file_path"
-"""nerfstudio's own depth; counts as LiDAR where there is no other."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +61,7 @@ class ScenePicture:
     timestamp_s: float | None
     """Seconds, where the scene knows them."""
     files: dict[str, Path]
-    """File of each layer that it has: image, mask, lidar, mono, truth."""
+    """File of each layer of `LAYERS` that it has."""
 
     @property
     def looks_along(self) -> Float64[np.ndarray, "3"]:
@@ -80,12 +84,23 @@ class PictureMaps:
     """Where the lens model gives a ray within the scene's theta_max_deg."""
     usable: Bool[np.ndarray, "h w"]
     """The mask within the lens: what training draws rays from."""
-    lidar_m: Float32[np.ndarray, "h w"] | None
-    """LiDAR distance."""
-    mono_m: Float32[np.ndarray, "h w"] | None
-    """Monocular distance."""
-    truth_m: Float32[np.ndarray, "h w"] | None
-    """True distance."""
+    distances_m: dict[str, Float32[np.ndarray, "h w"]]
+    """Of each distance layer that the picture has: LiDAR, monocular, true distance."""
+
+    @property
+    def lidar_m(self) -> Float32[np.ndarray, "h w"] | None:
+        """LiDAR distance."""
+        return self.distances_m.get("lidar")
+
+    @property
+    def mono_m(self) -> Float32[np.ndarray, "h w"] | None:
+        """Monocular distance."""
+        return self.distances_m.get("mono")
+
+    @property
+    def truth_m(self) -> Float32[np.ndarray, "h w"] | None:
+        """True distance."""
+        return self.distances_m.get("truth_distance")
 
 
 @dataclass(frozen=True)
@@ -133,6 +148,63 @@ class SceneFolder:
         """Whether any picture has this layer."""
         return any(layer in picture.files for picture in self.pictures)
 
+    def rays(self, picture: ScenePicture) -> Rays:
+        """The rays of a picture's pixels, within the scene's theta_max_deg."""
+        return rays(picture.lens, self.theta_max_rad)
+
+    def rgb(self, picture: ScenePicture, layer: str = "image") -> UInt8[np.ndarray, "h w 3"]:
+        """Read a picture, as it was recorded or in another layer of pictures.
+
+        Raises:
+            InputError: it cannot be decoded, or has another size than the camera.
+
+        """
+        return self._checked(picture, layer, read_image(picture.files[layer]))
+
+    def usable(self, picture: ScenePicture) -> Bool[np.ndarray, "h w"]:
+        """Where a picture may be used: the scene's mask, as far as the lens model gives a ray.
+
+        Raises:
+            InputError: the mask cannot be decoded, or has another size than the camera.
+
+        """
+        # the size in transforms.json may be anything, that of a decoded mask is in memory already
+        mask = self._checked(picture, "mask", read_mask(picture.files["mask"])) if "mask" in picture.files else None
+        within = self.rays(picture).within
+        return within.copy() if mask is None else mask & within
+
+    def distance_m(self, picture: ScenePicture, layer: str) -> Float32[np.ndarray, "h w"] | None:
+        """Read a map of a distance layer: metres along the ray, 0 = none; None if the picture has none.
+
+        Raises:
+            InputError: it cannot be decoded, or has another size than the camera.
+
+        """
+        path = picture.files.get(layer)
+        if path is None:
+            return None
+        metres_per_count = self.lidar_metres_per_count if layer == "lidar" else 1 / DISTANCE_STEPS_PER_METRE
+        if path.suffix == ".npy":
+            counts = read_npy(path)
+            counts = counts[..., 0] if counts.ndim == 3 and counts.shape[2] == 1 else counts
+            metres = counts.astype(np.float32) * np.float32(metres_per_count)
+        else:
+            metres = read_distance_png(path, metres_per_count)
+        metres = self._checked(picture, layer, metres)
+        if layer == "lidar" and self.lidar_is_z_depth:
+            return distance_from_z_depth(metres, self.rays(picture))
+        return metres
+
+    def lidar_m(self, picture: ScenePicture) -> Float32[np.ndarray, "h w"]:
+        """Read a picture's LiDAR map: metres along the ray, 0 = none; all 0 if it has none.
+
+        Raises:
+            InputError: it cannot be decoded, or has another size than the camera.
+
+        """
+        found = self.distance_m(picture, "lidar")
+        return np.zeros((picture.lens.height, picture.lens.width), np.float32) if found is None else found
+
     def maps(self, picture: ScenePicture) -> PictureMaps:
         """Read all that a picture has.
 
@@ -143,44 +215,22 @@ class SceneFolder:
             InputError: a file cannot be decoded, or has another size than the camera.
 
         """
-        found = {layer: self._read(layer, path) for layer, path in picture.files.items()}
-        for layer, pixels in found.items():
-            self._check_size(picture, layer, pixels)
-        # after the check: the size in transforms.json may be anything, that of the decoded picture is in memory
-        lens, cos_theta = _rays(picture.lens, self.theta_max_rad)
-        usable = found["mask"] & lens if "mask" in found else lens
-        if "lidar" in found:
-            found["lidar"] = self._as_distance(found["lidar"], lens, cos_theta)
-        return PictureMaps(found["image"], lens, usable, found.get("lidar"), found.get("mono"), found.get("truth"))
+        rgb = self.rgb(picture)
+        usable = self.usable(picture)
+        found = {layer: self.distance_m(picture, layer) for layer in picture.files if LAYERS[layer].kind == "distance"}
+        distances_m = {layer: metres for layer, metres in found.items() if metres is not None}
+        return PictureMaps(rgb, self.rays(picture).within, usable, distances_m)
 
-    def lidar_m(self, picture: ScenePicture) -> Float32[np.ndarray, "h w"]:
-        """Read a picture's LiDAR map alone: metres along the ray, 0 = none.
-
-        Raises:
-            InputError: it cannot be decoded, or has another size than the camera.
-
-        """
-        pixels = self._read("lidar", picture.files["lidar"])
-        self._check_size(picture, "lidar", pixels)
-        return self._as_distance(pixels, *_rays(picture.lens, self.theta_max_rad)) if self.lidar_is_z_depth else pixels
-
-    def _check_size(self, picture: ScenePicture, layer: str, pixels: NDArray) -> None:
+    def _checked(self, picture: ScenePicture, layer: str, pixels: NDArray) -> NDArray:
+        """The pixels, if they have the size of their camera."""
         width, height = picture.lens.width, picture.lens.height
-        if pixels.shape[:2] != (height, width):
+        if pixels.shape[:2] != (height, width) or pixels.ndim > 3:
             raise InputError(
                 f"{picture.files[layer]}: is {'×'.join(map(str, pixels.shape[1::-1]))} pixels (width × height), "
                 f"but {self.path} gives the camera of {picture.name} {width}×{height}. Pictures, masks and "
                 "distance maps of a frame must have one size; make the file again at that size."
             )
-
-    def _as_distance(
-        self, pixels: NDArray[np.float32], lens: NDArray[np.bool_], cos_theta: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
-        """Turn what a LiDAR file holds into metres along the ray."""
-        if not self.lidar_is_z_depth:
-            return pixels
-        ahead = lens & (cos_theta > 0)
-        return np.where(ahead, pixels / np.where(ahead, cos_theta, 1), 0).astype(np.float32)
+        return pixels
 
     def points_m(self) -> Float64[np.ndarray, "points 3"] | None:
         """Read the point cloud, if there is one.
@@ -200,32 +250,18 @@ class SceneFolder:
             ) from None
         return points[np.isfinite(points).all(1)]
 
-    def _read(self, layer: str, path: Path) -> np.ndarray:
-        if layer == "image":
-            return read_image(path)
-        if layer == "mask":
-            return read_mask(path)
-        metres_per_count = self.lidar_metres_per_count if layer == "lidar" else 1 / DISTANCE_STEPS_PER_METRE
-        if path.suffix != ".npy":
-            return read_distance_png(path, metres_per_count)
-        counts = read_npy(path)
-        counts = counts[..., 0] if counts.ndim == 3 and counts.shape[2] == 1 else counts
-        return counts.astype(np.float32) * np.float32(metres_per_count)
 
-
-@lru_cache(maxsize=8)
-def _rays(lens: Camera, theta_max_rad: float) -> tuple[Bool[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-    """Whether each pixel has a ray, and the cosine of its angle from the axis."""
-    directions, valid = lens.unproject(lens.pixel_centres(torch.float32))
-    cos_theta = torch.nan_to_num(directions[..., 2])
-    return (valid & (cos_theta >= math.cos(theta_max_rad))).numpy(), cos_theta.numpy()
-
-
-def read_scene(scene: Path) -> SceneFolder:
+def read_scene(
+    scene: Path, depth_kind: DepthKind = "auto", depth_metres_per_count: float | None = None, check_files: bool = True
+) -> SceneFolder:
     """Read transforms.json and check what it says.
 
     Args:
         scene: the folder, or the file itself.
+        depth_kind: what files under depth_file_path hold. auto: distance along the ray in scenes of this project and
+            in fisheye scenes, z_depth (nerfstudio's convention) in other people's pinhole scenes.
+        depth_metres_per_count: unit of these files; None: as transforms.json says, else nerfstudio's 0.001.
+        check_files: whether all files that it names have to be there.
 
     Raises:
         FileNotFoundError: no scene there.
@@ -247,7 +283,7 @@ def read_scene(scene: Path) -> SceneFolder:
             "Convert the cameras, for example with `edge-depth-nerf process`."
         )
     own = is_own_scene(meta)
-    own_lidar = OWN_MAPS["lidar"] in frames[0]
+    own_lidar = LAYERS["lidar"].key in frames[0]
     held_out, split_known = _held_out(meta)
     moments = _moments(frames)
     pictures = tuple(
@@ -261,24 +297,30 @@ def read_scene(scene: Path) -> SceneFolder:
             timestamp_s=None
             if frame.get("timestamp_s") is None
             else number_of(frame["timestamp_s"], f"{path}: {frame['file_path']}: timestamp_s"),
-            files=_files(frame, path.parent, OWN_MAPS["lidar"] if own_lidar else DEPTH_KEY),
+            files=_files(frame, path.parent, own_lidar),
         )
         for frame in frames
     )
-    given = Counter(key for frame in frames for key in (*KEYS.values(), DEPTH_KEY) if key in frame)
+    given = Counter(key for frame in frames for key in path_keys() if key in frame)
     ply = meta.get("ply_file_path")
     points_path = path.parent / ply if isinstance(ply, str) else None
-    _check_files(path, pictures, points_path)
+    if check_files:
+        _check_files(path, pictures, points_path)
+    if depth_metres_per_count is None:
+        depth_metres_per_count = number_of(
+            meta.get("depth_unit_scale_factor", 1e-3), f"{path}: depth_unit_scale_factor"
+        )
+    if depth_kind == "auto":
+        depth_kind = "distance" if own or model == FISHEYE_MODEL else "z_depth"
     return SceneFolder(
         path=path,
         camera_model=model,
         own=own,
         meta={key: value for key, value in meta.items() if key != "frames"},
         theta_max_rad=math.radians(number_of(meta.get("theta_max_deg", 180.0), f"{path}: theta_max_deg")),
-        lidar_metres_per_count=1 / DISTANCE_STEPS_PER_METRE
-        if own_lidar
-        else number_of(meta.get("depth_unit_scale_factor", 1e-3), f"{path}: depth_unit_scale_factor"),
-        lidar_is_z_depth=not own and model != FISHEYE_MODEL,
+        # of this project's own key both are known
+        lidar_metres_per_count=1 / DISTANCE_STEPS_PER_METRE if own_lidar else depth_metres_per_count,
+        lidar_is_z_depth=not own_lidar and depth_kind == "z_depth",
         pictures=tuple(sorted(pictures, key=lambda picture: (picture.camera, picture.moment))),
         split_known=split_known,
         incomplete={key: count for key, count in given.items() if count < len(frames)},
@@ -332,8 +374,10 @@ def _pose(frame: dict[str, Any], path: Path) -> dict[str, np.ndarray]:
     return {"position_m": pose[:3, 3], "rotation": pose[:3, :3]}
 
 
-def _files(frame: dict[str, Any], folder: Path, lidar_key: str) -> dict[str, Path]:
-    keys = {**KEYS, "lidar": lidar_key}
+def _files(frame: dict[str, Any], folder: Path, own_lidar: bool) -> dict[str, Path]:
+    keys = {name: layer.key for name, layer in LAYERS.items()}
+    if not own_lidar:
+        keys["lidar"] = DEPTH_KEY
     return {layer: folder / frame[key] for layer, key in keys.items() if isinstance(frame.get(key), str)}
 
 

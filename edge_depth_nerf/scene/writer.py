@@ -57,7 +57,7 @@ from edge_depth_nerf.cameras import Camera, CameraFit, KannalaBrandt, Pinhole, f
 from edge_depth_nerf.cameras.transforms import Transform, check_rigid, opencv_to_opengl
 from edge_depth_nerf.masks.lens import lens_circle
 from edge_depth_nerf.scene.checks import LeftOut, Tolerance
-from edge_depth_nerf.scene.format import LAYERS, MONO_ENTRY, POINTS, TRANSFORMS, read_transforms
+from edge_depth_nerf.scene.format import DEPTH_KEY, LAYERS, POINTS, TRANSFORMS, depth_sources, read_transforms
 from edge_depth_nerf.scene.points import PointCloud, merge_parts, write_part
 
 RECORD = "process.json"
@@ -253,30 +253,8 @@ def write_scene(
     for name, mask in masks.items():
         write_mask(output / f"masks/{name}.png", mask)
     tolerance = Tolerance(strict, len(frames))
-    broken = _broken_before(output, frames)
-    for frame in frames:
-        if frame.key in broken:
-            tolerance.add(frame.frame, frame.camera, InputError(broken[frame.key]))
-    frames = [frame for frame in frames if frame.key not in broken]
-    work = _pending(output, frames, shifted, layers)
-    notices = []
-    later = _maps_put_in_later(output / TRANSFORMS)
-    if later is not None:
-        images = [_frame_files(frame, ())["image"] for frame in frames]
-        maps = [later.maps.get(image) for image in images]
-        whole = all(file is not None and (output / file).is_file() for file in maps)
-        if not whole or work.frames or work.shifted:
-            later = None
-            notices.append(
-                "The estimated monocular maps of this scene are left out: one is missing, or pictures or masks are "
-                "new. Those of the drive's own network are made again; others are to be put in again, by "
-                "`edge-depth-nerf estimate-depth`."
-            )
-            if "mono" in layers:
-                # in their places belong the drive's
-                for frame in frames:
-                    (output / _frame_files(frame, layers)["mono"]).unlink(missing_ok=True)
-                work = _pending(output, frames, shifted, layers)
+    frames = _without_broken_before(output, frames, tolerance)
+    later, work, notices = _kept_later_maps(output, frames, shifted, layers)
     jobs = [
         # the cameras of a moment one after another: they share its sweeps
         *(
@@ -293,23 +271,13 @@ def write_scene(
     frames = [frame for frame in frames if (frame.camera, frame.frame) not in left_out]
     _check_split(frames)
     if work.cloud:
-        parts = [output / _cloud_path(frame) for frame in frames if not frame.held_out]
-        if not merge_parts(parts, output / POINTS):
-            raise InputError(
-                f"{output}: no LiDAR return lies in any training picture. Check the calibration from the scanner to "
-                "the cameras, and the masks (255 = use the pixel)."
-            )
+        _write_cloud(output, frames)
     content = _transforms(cameras, scene_cameras, fits, frames, shifted, layers, offset, theta_max_deg, source)
-    if later is not None:
-        content[MONO_ENTRY] = later.entry
+    for name, maps in later.items():
+        content[name] = maps.entry
         for frame in content["frames"]:
-            frame[LAYERS["mono"][1]] = later.maps[frame["file_path"]]
-    if left_out:
-        faults = {f"{item.camera}/{item.frame:010d}": item.fault for item in tolerance.left_out}
-        if not (output / LEFT_OUT).is_file() or read_json(output / LEFT_OUT) != faults:
-            write_json(output / LEFT_OUT, faults)
-    else:
-        (output / LEFT_OUT).unlink(missing_ok=True)
+            frame[LAYERS[name].key] = maps.of_pictures[frame["file_path"]]
+    _keep_left_out(output, tolerance)
     write_json(output / TRANSFORMS, content)
     shutil.rmtree(output / _PARTIAL, ignore_errors=True)
 
@@ -326,6 +294,35 @@ def write_scene(
         left_out=tolerance.left_out,
         notices=tuple(notices),
     )
+
+
+def _without_broken_before(output: Path, frames: list[SceneFrame], tolerance: Tolerance) -> list[SceneFrame]:
+    """Leave out what an earlier run did, as long as none of its files has changed."""
+    broken = _broken_before(output, frames)
+    for frame in frames:
+        if frame.key in broken:
+            tolerance.add(frame.frame, frame.camera, InputError(broken[frame.key]))
+    return [frame for frame in frames if frame.key not in broken]
+
+
+def _write_cloud(output: Path, frames: Sequence[SceneFrame]) -> None:
+    parts = [output / _cloud_path(frame) for frame in frames if not frame.held_out]
+    if not merge_parts(parts, output / POINTS):
+        raise InputError(
+            f"{output}: no LiDAR return lies in any training picture. Check the calibration from the scanner to "
+            "the cameras, and the masks (255 = use the pixel)."
+        )
+
+
+def _keep_left_out(output: Path, tolerance: Tolerance) -> None:
+    """Write down what is left out and why, for the next run."""
+    path = output / LEFT_OUT
+    if not tolerance.left_out:
+        path.unlink(missing_ok=True)
+        return
+    faults = {f"{item.camera}/{item.frame:010d}": item.fault for item in tolerance.left_out}
+    if not path.is_file() or read_json(path) != faults:
+        write_json(path, faults)
 
 
 # ---- checks ----------------------------------------------------------------------------------------------------
@@ -540,9 +537,10 @@ def _file(folder: str, camera: str, frame: int) -> str:
 
 def _frame_files(frame: SceneFrame, layers: Collection[str]) -> dict[str, str]:
     """Paths in the scene of the frame's maps, by layer."""
-    files = {"image": _file("images/{camera}", frame.camera, frame.frame)}
-    return files | {
-        layer: _file(folder, frame.camera, frame.frame) for layer, (folder, _) in LAYERS.items() if layer in layers
+    return {
+        name: _file(layer.folder, frame.camera, frame.frame)
+        for name, layer in LAYERS.items()
+        if name == "image" or name in layers
     }
 
 
@@ -702,23 +700,56 @@ def _write_distance(path: Path, distance_m: DistanceMap, size: tuple[int, int], 
 
 @dataclass(frozen=True)
 class _LaterMaps:
-    """Monocular maps that were put into the scene since it was written."""
+    """Maps of a source of depth that were put into the scene since it was written."""
 
     entry: Any
     """Where they come from."""
-    maps: dict[str, str]
-    """By picture."""
+    of_pictures: dict[str, str]
+    """File of each picture's map."""
 
 
-def _maps_put_in_later(written: Path) -> _LaterMaps | None:
-    """Find what a transforms.json says of such maps."""
+def _maps_put_in_later(written: Path) -> dict[str, _LaterMaps]:
+    """Find what a transforms.json says of such maps, by layer."""
     if not written.is_file():
-        return None
+        return {}
     there = read_transforms(written)
-    if MONO_ENTRY not in there:
-        return None
-    key = LAYERS["mono"][1]
-    return _LaterMaps(there[MONO_ENTRY], {frame["file_path"]: frame[key] for frame in there["frames"] if key in frame})
+    found = {}
+    for name in depth_sources():
+        if name in there:
+            key = LAYERS[name].key
+            of_pictures = {frame["file_path"]: frame[key] for frame in there["frames"] if key in frame}
+            found[name] = _LaterMaps(there[name], of_pictures)
+    return found
+
+
+def _kept_later_maps(
+    output: Path, frames: Sequence[SceneFrame], shifted: Sequence[ShiftedView], layers: Collection[str]
+) -> tuple[dict[str, _LaterMaps], _Work, list[str]]:
+    """Find which maps that were put in later still fit the pictures, and what is to be written."""
+    work, notices, kept = _pending(output, frames, shifted, layers), [], {}
+    fresh = not (work.frames or work.shifted)
+    images = [_frame_files(frame, ())["image"] for frame in frames]
+    for name, later in _maps_put_in_later(output / TRANSFORMS).items():
+        files = [later.of_pictures.get(image) for image in images]
+        if fresh and all(file is not None and (output / file).is_file() for file in files):
+            kept[name] = later
+            continue
+        remedy = "Put them in again."
+        if name == "mono":
+            remedy = (
+                "Those of the drive's own network are made again; others are to be put in again, by "
+                "`edge-depth-nerf estimate-depth`."
+            )
+        of_what = "estimated monocular maps" if name == "mono" else f"{LAYERS[name].words} put in later"
+        notices.append(
+            f"The {of_what} of this scene are left out: one is missing, or pictures or masks are new. {remedy}"
+        )
+        if name in layers:
+            # in their places belong the drive's
+            for frame in frames:
+                (output / _frame_files(frame, layers)[name]).unlink(missing_ok=True)
+            work = _pending(output, frames, shifted, layers)
+    return kept, work, notices
 
 
 def _transforms(
@@ -757,9 +788,9 @@ def _transforms(
             "p2": camera.p2,
             "mask_path": f"masks/{frame.camera}.png",
         }
-        found |= {LAYERS[layer][1]: file for layer, file in files.items() if layer != "image"}
+        found |= {LAYERS[layer].key: file for layer, file in files.items() if layer != "image"}
         if "lidar" in layers:
-            found["depth_file_path"] = files["lidar"]
+            found[DEPTH_KEY] = files["lidar"]
         found |= {"camera": frame.camera, "frame": frame.frame}
         if frame.timestamp_s is not None:
             found["timestamp_s"] = frame.timestamp_s
@@ -771,8 +802,8 @@ def _transforms(
             "camera": shifted_view.camera,
             "frame": shifted_view.frame,
             "transform_matrix": matrix(shifted_view.camera_to_world),
-            "truth_rgb_file_path": picture,
-            "truth_distance_file_path": distance,
+            LAYERS["truth_rgb"].key: picture,
+            LAYERS["truth_distance"].key: distance,
         }
 
     any_fisheye = any(isinstance(camera, KannalaBrandt) for camera in scene_cameras.values())

@@ -22,12 +22,13 @@ from scipy.spatial.transform import Rotation
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras import Camera
+from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar import transform_points
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.lidar.world import sweep_in_world
 from edge_depth_nerf.process.colmap.models import ColmapModel
-from edge_depth_nerf.process.reading import rays_of, read_depth
+from edge_depth_nerf.process.reading import read_depth
 from edge_depth_nerf.process.recording import RecordedPicture, RecordedSweep, Recording
 
 MIN_PAIRS = 30
@@ -290,9 +291,9 @@ def _depth_points(picture: RecordedPicture, camera: Camera) -> Float64[np.ndarra
     """The points of a depth map in the camera's frame."""
     if picture.depth is None:
         return np.zeros((0, 3))
-    distance = torch.from_numpy(read_depth(picture.depth, camera)).double()
-    rays, valid = rays_of(camera)
-    return (rays * distance[..., None])[valid & (distance > 0)].numpy()
+    distance = read_depth(picture.depth, camera).astype(np.float64)
+    of_pixels = rays(camera)
+    return (of_pixels.directions * distance[..., None])[of_pixels.within & (distance > 0)]
 
 
 def _beside(

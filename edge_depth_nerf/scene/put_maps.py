@@ -1,0 +1,130 @@
+"""Maps of a source of depth put into a scene that exists: whole, or not at all.
+
+The maps are first written beside the scene's own: a run that is killed, or fails on its last map, leaves the scene with
+the maps it had. When all are there transforms.json drops the old ones, they are moved in, and it names them: a run that
+is killed in that moment leaves a scene without maps of that source.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from rich.progress import Progress
+
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import write_distance_png, write_json
+from edge_depth_nerf.scene.format import LAYERS, TRUST_FILE, depth_sources, read_transforms
+from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
+
+FARTHEST_M = 200.0
+"""What an estimate puts beyond is the sky, or as good as that: no value."""
+
+
+def write_maps(
+    scene: Path,
+    layer: str,
+    maps: Iterable[tuple[str, Float[np.ndarray, "h w"]]],
+    source: Mapping[str, Any],
+    progress: Progress | None = None,
+) -> None:
+    """Write a map of a source of depth for every frame of a scene, and name them in its transforms.json.
+
+    Values that are not finite, not positive, beyond 200 m, outside the lens or hidden by the camera's mask are written
+    as 0 = none.
+
+    Args:
+        scene: the folder, or its transforms.json.
+        layer: which source of depth: one of `scene.format.depth_sources()`.
+        maps: `file_path` of a frame in transforms.json, and its H×W metres along the ray. One for every frame, in any
+            order; taken one at a time.
+        source: where they come from, as JSON; kept in transforms.json under the layer's name.
+        progress: where to show how far it is.
+
+    Raises:
+        FileNotFoundError: no scene there.
+        InputError: no such source; a map has another size than its camera, no value at all, or is of no frame; frames
+            without a map.
+
+    """
+    if layer not in depth_sources():
+        raise InputError(f"{layer!r} is no source of depth; expected one of {', '.join(depth_sources())}.")
+    words = "monocular map" if layer == "mono" else f"{layer} map"
+    found = read_scene(scene)
+    pictures = {picture.name: picture for picture in found.pictures}
+    targets = {name: _target(layer, picture) for name, picture in pictures.items()}
+    if len({*targets.values()}) < len(targets):
+        raise InputError(
+            f"{found.path}: two pictures of one camera have the same name but for their ending; their maps would be "
+            "one file. Rename one of them."
+        )
+    partial = found.folder / f".{layer}.partial"
+    shutil.rmtree(partial, ignore_errors=True)
+    task = progress.add_task(f"Writing maps of {found.folder.name}", total=len(pictures)) if progress else None
+    written: set[str] = set()
+    try:
+        for name, metres in maps:
+            if name not in pictures or name in written:
+                fault = "is of no frame of" if name not in pictures else "comes twice for"
+                raise InputError(f"{name}: a {words} {fault} {found.path}. Give one for every file_path in it.")
+            write_distance_png(partial / targets[name], usable_distance(found, pictures[name], metres, words))
+            written.add(name)
+            if progress and task is not None:
+                progress.advance(task)
+        if missing := sorted(pictures.keys() - written):
+            raise InputError(
+                f"{found.path}: {len(missing)} of {len(pictures)} frames have no {words}, such as {missing[0]}. "
+                "Give one for every frame."
+            )
+        meta = read_transforms(found.path)
+        for frame in meta["frames"]:
+            frame.pop(LAYERS[layer].key, None)
+        # `process` then knows that what lies there is not what it wrote
+        write_json(found.path, {**meta, layer: {"unfinished": True}})
+        # what was measured about the errors of the maps before
+        (found.folder / TRUST_FILE).unlink(missing_ok=True)
+        for target in targets.values():
+            (found.folder / target).parent.mkdir(parents=True, exist_ok=True)
+            (partial / target).replace(found.folder / target)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    for frame in meta["frames"]:
+        frame[LAYERS[layer].key] = targets[frame["file_path"]]
+    meta[layer] = dict(source)
+    write_json(found.path, meta)
+
+
+def usable_distance(
+    scene: SceneFolder, picture: ScenePicture, metres: Float[np.ndarray, "h w"], words: str = "monocular map"
+) -> Float[np.ndarray, "h w"]:
+    """Leave out of a map what is no distance to anything, or outside the lens and the mask.
+
+    Raises:
+        InputError: the map has another size than its camera, or nothing is left.
+
+    """
+    size = (picture.lens.width, picture.lens.height)
+    if metres.shape != size[::-1]:
+        raise InputError(
+            f"{picture.name}: its {words} is {metres.shape[1]}×{metres.shape[0]} pixels (width × height), its "
+            f"camera {size[0]}×{size[1]}. Make the map from the scene's own picture, in its size."
+        )
+    usable = scene.usable(picture)
+    # comparisons with NaN are false
+    kept = usable & (metres > 0) & (metres <= FARTHEST_M)
+    if usable.any() and not kept.any():
+        raise InputError(
+            f"{picture.name}: its {words} has no distance between 0 and {FARTHEST_M:g} m anywhere in the mask. "
+            "Expected metres along the ray."
+        )
+    return np.where(kept, metres, 0.0)
+
+
+def _target(layer: str, picture: ScenePicture) -> str:
+    """Path of its map in the scene."""
+    camera = "/".join(part for part in Path(picture.camera).parts if part not in ("..", "/"))
+    return f"{LAYERS[layer].folder.format(camera=camera)}/{Path(picture.name).stem}.png"
