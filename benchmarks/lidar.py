@@ -39,7 +39,8 @@ from edge_depth_nerf.base.files import read_distance_png, read_image, read_mask,
 from edge_depth_nerf.base.pictures import lay_out, panel
 from edge_depth_nerf.lidar import project_points, read_sweep, transform_points
 from edge_depth_nerf.lidar.world import sweep_in_world
-from edge_depth_nerf.process.kitti360.converter import process_kitti360, read_kitti360
+from edge_depth_nerf.process.converters import convert
+from edge_depth_nerf.process.kitti360.converter import read_kitti360
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.process.recording import RecordedPicture, Recording
 from edge_depth_nerf.process.sweep_store import SweepStore
@@ -228,7 +229,7 @@ def processing(made: SynthesizeOptions, output: Path) -> Table:
     watcher = threading.Thread(target=watch)
     watcher.start()
     try:
-        process_kitti360(options(made, output, 3), Console(quiet=True))
+        convert(options(made, output, 3), Console(quiet=True))
     finally:
         done.set()
         watcher.join()

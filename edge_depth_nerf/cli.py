@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Annotated, get_args
+from typing import TYPE_CHECKING, Annotated, Union, get_args
 
 import tyro
 from rich.console import Console
@@ -20,14 +20,15 @@ from edge_depth_nerf.films.options import CameraPathOptions
 from edge_depth_nerf.inspecting.options import InspectOptions
 from edge_depth_nerf.mono.options import EstimateDepthOptions
 from edge_depth_nerf.plugin.compat import join_lines_of_option_help
-from edge_depth_nerf.process.options import JbnuDepth360Options, Kitti360Options, RigOptions
+from edge_depth_nerf.process.converters import CONVERTERS
+from edge_depth_nerf.process.options import ProcessOptions
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 
-Converter = (
-    Annotated[Kitti360Options, tyro.conf.subcommand("kitti360")]
-    | Annotated[JbnuDepth360Options, tyro.conf.subcommand("jbnu-depth360")]
-    | Annotated[RigOptions, tyro.conf.subcommand("rig")]
-)
+if TYPE_CHECKING:
+    Converter = ProcessOptions
+else:
+    _members = tuple(Annotated[each.options, tyro.conf.subcommand(name)] for name, each in CONVERTERS.items())
+    Converter = Union[_members]  # noqa: UP007
 
 
 @dataclass

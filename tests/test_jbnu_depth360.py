@@ -14,7 +14,8 @@ from test_real import train
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_json, write_png
 from edge_depth_nerf.cameras import KannalaBrandt
-from edge_depth_nerf.process.jbnu_depth360 import process_jbnu_depth360, read_jbnu_depth360
+from edge_depth_nerf.process.converters import convert
+from edge_depth_nerf.process.jbnu_depth360 import read_jbnu_depth360
 from edge_depth_nerf.process.options import JbnuDepth360Options
 from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
@@ -43,7 +44,7 @@ def options(root: Path, **changes) -> JbnuDepth360Options:
 
 @pytest.fixture(scope="module")
 def scene(drive: Path) -> Path:
-    report = process_jbnu_depth360(options(drive), Console(quiet=True))
+    report = convert(options(drive), Console(quiet=True))
     assert (report.training, report.held_out, report.skipped) == (16, 4, ())
     # nerfstudio knows the model, and its rays are right up to the lens's rim
     assert [fit.rms_px < 1e-6 for fit in report.fits.values()] == [True] * 4

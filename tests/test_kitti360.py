@@ -53,6 +53,7 @@ from edge_depth_nerf.masks.ego_files import vehicles_unknown
 from edge_depth_nerf.mono.calibration import calibrate_scene
 from edge_depth_nerf.process import build
 from edge_depth_nerf.process.colmap import poses as colmap_poses
+from edge_depth_nerf.process.converters import convert
 from edge_depth_nerf.process.kitti360.calibration import (
     read_cam_to_pose,
     read_cam_to_velo,
@@ -61,7 +62,6 @@ from edge_depth_nerf.process.kitti360.calibration import (
     read_rig,
     read_timestamps,
 )
-from edge_depth_nerf.process.kitti360.converter import process_kitti360
 from edge_depth_nerf.process.options import Kitti360Options, ProcessOptions
 from edge_depth_nerf.process.recording import Recording
 from edge_depth_nerf.scene.reader import read_scene
@@ -74,7 +74,7 @@ STEP_M = 1 / 256
 def process(drive: RoomDrive | Path, output: Path, **options: Any) -> ProcessReport:
     root = drive if isinstance(drive, Path) else drive.root
     console = options.pop("console", Console(quiet=True))
-    return process_kitti360(
+    return convert(
         Kitti360Options(
             **{"root": root, "sequence": SEQUENCE, "output": output, "sweeps": 0, "strict": True} | options
         ),
@@ -934,7 +934,7 @@ def test_killed_run_is_continued(drive: RoomDrive, tmp_path: Path) -> None:
         "build._Builder.content = dying\n"
         "root, sequence, output = sys.argv[1:]\n"
         "options = Kitti360Options(root=Path(root), sequence=sequence, output=Path(output), sweeps=0)\n"
-        "kitti360.process_kitti360(options)\n"
+        "kitti360.convert(options)\n"
     )
     command = [sys.executable, "-c", program, str(drive.root), SEQUENCE, str(tmp_path / "scene")]
     assert subprocess.run(command, capture_output=True, check=False).returncode == -9

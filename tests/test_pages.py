@@ -26,6 +26,7 @@ import tyro
 import yaml
 
 from edge_depth_nerf import cli
+from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_image, read_json
 from edge_depth_nerf.entry import DEBUG_OPTION
 
@@ -490,6 +491,51 @@ def test_the_examples_as_they_are_typed(clone):
     assert meta["mono"]["trained_on"] == "elsewhere"
     assert len(list((clone / "maps").rglob("*.npy"))) == len(meta["frames"]) == 24
     assert "mean relative error" in said
+    # a prior of the radar alone: nothing of the other sources is in the table of training pixels
+    (config,) = (clone / "outputs/radar_drive/radar").glob("*/config.yml")
+    assert "depth_source: radar" in config.read_text()
+    frames = read_json(clone / "radar_drive/transforms.json")["frames"]
+    maps = [read_distance_png(clone / "radar_drive" / frame["radar_file_path"]) for frame in frames]
+    (table,) = (clone / "radar_drive/.cache/pixels").glob("*.npy")
+    shares = [(distance_m > 0).mean() for distance_m in maps]
+    assert 0 < max(shares) < 0.1
+    assert table.stat().st_size > 0
+
+
+def test_a_new_source_of_depth_reaches_the_prior(tmp_path, monkeypatch):
+    """One line in the table of layers: written, read, kept by its key, and the prior is made of it alone."""
+    from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
+    from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
+    from edge_depth_nerf.scene import format as scene_format
+
+    monkeypatch.setattr(scene_format, "LAYERS", scene_format.LAYERS)
+    monkeypatch.setitem(scene_format.LAYERS, "radar", None)  # taken out again at the end
+    module = load("examples/new_depth_source")
+    scene = tmp_path / "scene"
+    shutil.copytree(ROOT / "data" / "sample_drive", scene, ignore=shutil.ignore_patterns(".cache"))
+    module.main(scene)
+    read = module.read_scene(scene)
+    picture = read.pictures[0]
+    lidar_m, radar_m = read.lidar_m(picture), read.distance_m(picture, "radar")
+    assert radar_m is not None
+    seen = radar_m > 0
+    assert 0.05 < seen.sum() / (lidar_m > 0).sum() < 0.2
+    assert np.abs(radar_m - lidar_m)[seen].max() < module.STEP_M / 2 + 0.01
+    parser = FisheyeDepthDataParserConfig(data=scene)
+    config = FisheyeDepthDataManagerConfig(dataparser=parser, depth_source="radar", train_num_rays_per_batch=4096)
+    data = config.setup(test_mode="val")
+    share = data.train_pixel_sampler.table.share_with_prior
+    usable = [read.usable(each) & (read.distance_m(each, "radar") > 0) for each in data.train_dataset.pictures]
+    masks = [read.usable(each) for each in data.train_dataset.pictures]
+    assert share == pytest.approx(sum(map(np.sum, usable)) / sum(map(np.sum, masks)))
+    _, batch = data.next_train(0)
+    at = batch["prior_distance_m"][:, 0] > 0
+    assert at.any()
+    maps = torch.stack([torch.from_numpy(read.distance_m(each, "radar")) for each in data.train_dataset.pictures])
+    image, row, column = batch["indices"][at].T
+    torch.testing.assert_close(batch["prior_distance_m"][at, 0], maps[image, row, column], atol=0.01, rtol=0)
+    with pytest.raises(InputError, match="expected one of auto, integrated, lidar, mono, radar, none"):
+        FisheyeDepthDataManagerConfig(dataparser=parser, depth_source="sonar").setup(test_mode="val")
 
 
 def test_the_example_of_a_loss():

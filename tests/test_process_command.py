@@ -159,7 +159,7 @@ def test_without_lidar_it_says_what_to_do(room: RoomDrive, tmp_path: Path, monke
     for frame in meta["frames"]:
         del frame["lidar_file_path"], frame["depth_file_path"]
     write_json(scene / "transforms.json", meta)
-    monkeypatch.setattr("edge_depth_nerf.process.kitti360.converter.process_kitti360", lambda *_: report)
+    monkeypatch.setattr("edge_depth_nerf.process.command.convert", lambda *_: report)
     assert "--mono-model" in run(options_of(room, scene))
     assert not read_scene(scene).has("mono")
 

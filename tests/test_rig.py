@@ -20,8 +20,9 @@ from test_real import train
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, read_mask, write_json, write_png
 from edge_depth_nerf.cameras import MEI, KannalaBrandt, Pinhole
+from edge_depth_nerf.process.converters import convert
 from edge_depth_nerf.process.options import RigOptions
-from edge_depth_nerf.process.rig import process_rig, read_rig_recording
+from edge_depth_nerf.process.rig import read_rig_recording
 from edge_depth_nerf.process.rig_file import read_rig, tomllib
 from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
@@ -76,7 +77,7 @@ def edit(root: Path, *changes: tuple[str, str], file: str = "rig.toml") -> Path:
 
 @pytest.fixture(scope="module")
 def scene(drive: Path) -> Path:
-    report = process_rig(options(drive), Console(quiet=True))
+    report = convert(options(drive), Console(quiet=True))
     assert (report.training, report.held_out) == (12, 3)
     assert report.skipped == ()
     assert {name: fit.rms_px < 0.01 for name, fit in report.fits.items()} == dict.fromkeys(
@@ -306,7 +307,7 @@ def test_a_moment_between_scans_is_a_picture_without_lidar(mine: Path, holdout: 
     scans = sorted((mine / "lidar").iterdir())
     for scan in scans[1::2]:
         scan.unlink()
-    process_rig(options(mine, holdout_every=holdout))
+    convert(options(mine, holdout_every=holdout))
     said = " ".join(capsys.readouterr().out.split())
     meta = read_json(mine.parent / "scene" / "transforms.json")
     has_return = {
@@ -381,7 +382,7 @@ def test_a_rendered_drive_brings_its_truth(mine: Path, drive: Path) -> None:
             for keys in [f'truth_distance = "truth/{name}/distance"\ntruth_rgb = "truth/{name}/rgb"\n']
         ),
     )
-    report = process_rig(options(mine, frames=2, holdout_every=2), Console(quiet=True))
+    report = convert(options(mine, frames=2, holdout_every=2), Console(quiet=True))
     for frame in read_json(report.scene / "transforms.json")["frames"]:
         name, number = frame["camera"], frame["frame"]
         truth = mine / f"truth/{name}/distance/{number:06d}.png"
@@ -435,7 +436,7 @@ def test_z_depth_maps_in_place_of_lidar(mine: Path, drive: Path) -> None:
         line = f'depth = {{files = "depth/{name}", kind = "z_depth", metres_per_count = 0.001}}\n'
         content = content.replace(f"[cameras.{name}]\n", f"[cameras.{name}]\n{line}")
     (mine / "rig.toml").write_text(content)
-    report = process_rig(options(mine, frames=2, holdout_every=2), Console(quiet=True))
+    report = convert(options(mine, frames=2, holdout_every=2), Console(quiet=True))
     for name in ("left", "front"):
         distance = read_distance_png(report.scene / f"lidar/{name}/0000000000.png")
         truth = read_distance_png(drive / f"truth/{name}/distance/000000.png")
@@ -600,10 +601,10 @@ def test_a_scan_of_nan_is_an_error_when_it_is_read(mine: Path) -> None:
     nothing = struct.pack("<ffffI", math.nan, math.nan, math.nan, 0, 0)
     path.write_bytes(head + b"DATA binary\n" + nothing * (len(points) // len(nothing)))
     with pytest.raises(InputError, match=rf"{path.name}: none of its \d+ points can be used"):
-        process_rig(options(mine, sweeps=0), Console(quiet=True))
+        convert(options(mine, sweeps=0), Console(quiet=True))
     # some NaN among the points are left out and counted
     path.write_bytes(head + b"DATA binary\n" + nothing * 7 + points[7 * len(nothing) :])
-    report = process_rig(options(mine, sweeps=0), Console(quiet=True))
+    report = convert(options(mine, sweeps=0), Console(quiet=True))
     assert any(notice.startswith("7 LiDAR points left out") for notice in report.notices)
 
 

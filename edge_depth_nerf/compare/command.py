@@ -161,10 +161,10 @@ def check_scene(folder: Path, methods: Sequence[MethodName], preset: str) -> str
                 "lidar": "process the drive with its LiDAR",
                 "mono": "make them by `edge-depth-nerf estimate-depth`",
             }
+            remedies = " and ".join(remedy[source] for source in missing).capitalize()
             raise InputError(
                 f"{path}: has no {' and no '.join(LAYERS[source].words for source in missing)}, which the method "
-                f"{name} (preset {preset}) needs. {' and '.join(remedy[source] for source in missing).capitalize()}, or "
-                "choose other --methods."
+                f"{name} (preset {preset}) needs. {remedies}, or choose other --methods."
             )
     return hashlib.sha256(path.read_bytes()).hexdigest()
 

@@ -10,14 +10,13 @@ from rich.console import Console
 
 from edge_depth_nerf.base.console import say
 from edge_depth_nerf.base.one_writer import only_writer
-from edge_depth_nerf.process.options import JbnuDepth360Options, Kitti360Options, ProcessOptions, RigOptions
+from edge_depth_nerf.process.converters import convert
+from edge_depth_nerf.process.options import ProcessOptions
 from edge_depth_nerf.scene.reader import SceneFolder, read_scene
 from edge_depth_nerf.scene.writer import ProcessReport
 
 
-def process(
-    options: Kitti360Options | JbnuDepth360Options | RigOptions, console: Console | None = None
-) -> ProcessReport:
+def process(options: ProcessOptions, console: Console | None = None) -> ProcessReport:
     """Write the scene of a drive, its monocular maps and their calibration, or continue where a run stopped.
 
     Raises:
@@ -29,24 +28,9 @@ def process(
     options.check()
     _check_network(options)
     with only_writer(options.output, console):
-        return _process(options, console)
-
-
-def _process(options: Kitti360Options | JbnuDepth360Options | RigOptions, console: Console) -> ProcessReport:
-    if isinstance(options, Kitti360Options):
-        from edge_depth_nerf.process.kitti360.converter import process_kitti360
-
-        report = process_kitti360(options, console)
-    elif isinstance(options, JbnuDepth360Options):
-        from edge_depth_nerf.process.jbnu_depth360 import process_jbnu_depth360
-
-        report = process_jbnu_depth360(options, console)
-    else:
-        from edge_depth_nerf.process.rig import process_rig
-
-        report = process_rig(options, console)
-    _add_mono(read_scene(report.scene), options, console)
-    return report
+        report = convert(options, console)
+        _add_mono(read_scene(report.scene), options, console)
+        return report
 
 
 def _check_network(options: ProcessOptions) -> None:

@@ -13,35 +13,17 @@ from __future__ import annotations
 
 from typing import Any
 
-from rich.console import Console
-
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.process.build import process_recording
 from edge_depth_nerf.process.options import JbnuDepth360Options
 from edge_depth_nerf.process.recording import Recording
 from edge_depth_nerf.process.rig import recording_of_rig
 from edge_depth_nerf.process.rig_file import read_rig
 from edge_depth_nerf.scene.checks import require_folder
-from edge_depth_nerf.scene.writer import ProcessReport
 
 RATE_HZ = 10.0
 """Pictures and scans a second; the data set has numbers in place of times."""
 SCANNER = "ouster"
 """The scanner's name, if the rig file has none."""
-
-
-def process_jbnu_depth360(options: JbnuDepth360Options, console: Console | None = None) -> ProcessReport:
-    """Write the scene folder that `options` describe, or continue it.
-
-    Raises:
-        FileNotFoundError: a folder or file of the data set is missing.
-        InputError: an option, a file of the data set, or the output folder cannot be used.
-
-    """
-    console = console or Console()
-    with console.status("Reading the drive …"):
-        recording = read_jbnu_depth360(options)
-    return process_recording(recording, options, console)
 
 
 def read_jbnu_depth360(options: JbnuDepth360Options) -> Recording:

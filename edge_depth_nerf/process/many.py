@@ -14,14 +14,11 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.one_writer import only_writer
 from edge_depth_nerf.jobs.tasks import Task, do_tasks, own_command
 from edge_depth_nerf.process.command import process
-from edge_depth_nerf.process.options import JbnuDepth360Options, Kitti360Options, RigOptions
-
-DriveOptions = Kitti360Options | JbnuDepth360Options | RigOptions
-KINDS = {Kitti360Options: "kitti360", JbnuDepth360Options: "jbnu-depth360", RigOptions: "rig"}
-"""Their commands' names."""
+from edge_depth_nerf.process.converters import name_of, read_drive
+from edge_depth_nerf.process.options import ProcessOptions
 
 
-def process_drive(options: DriveOptions, console: Console | None = None) -> list[Path]:
+def process_drive(options: ProcessOptions, console: Console | None = None) -> list[Path]:
     """Write the scenes of a drive, or continue them; give their folders.
 
     Raises:
@@ -45,7 +42,7 @@ def process_drive(options: DriveOptions, console: Console | None = None) -> list
     return [part.output for part in parts]
 
 
-def cut(options: DriveOptions, console: Console) -> list[DriveOptions]:
+def cut(options: ProcessOptions, console: Console) -> list[ProcessOptions]:
     """Options of the scenes that a drive is cut into: each is a stretch of consecutive frames.
 
     Raises:
@@ -62,7 +59,7 @@ def cut(options: DriveOptions, console: Console) -> list[DriveOptions]:
     assert options.frames_per_scene is not None
     count = -(-len(frames) // options.frames_per_scene)
     digits = max(3, len(str(count - 1)))
-    parts: list[DriveOptions] = []
+    parts: list[ProcessOptions] = []
     for number, stretch in enumerate(np.array_split(frames, count)):
         first, last = int(stretch[0]), int(stretch[-1])
         parts.append(
@@ -79,7 +76,7 @@ def cut(options: DriveOptions, console: Console) -> list[DriveOptions]:
     return parts
 
 
-def usable_frames(options: DriveOptions) -> list[int]:
+def usable_frames(options: ProcessOptions) -> list[int]:
     """Numbers of the frames that a drive's scene would have, in order; every file is looked at.
 
     Raises:
@@ -87,29 +84,17 @@ def usable_frames(options: DriveOptions) -> list[int]:
         InputError: an option or a file of the drive cannot be used.
 
     """
-    if isinstance(options, Kitti360Options):
-        from edge_depth_nerf.process.kitti360.converter import read_kitti360
-
-        recording = read_kitti360(options)
-    elif isinstance(options, JbnuDepth360Options):
-        from edge_depth_nerf.process.jbnu_depth360 import read_jbnu_depth360
-
-        recording = read_jbnu_depth360(options)
-    else:
-        from edge_depth_nerf.process.rig import read_rig_recording
-
-        recording = read_rig_recording(options)
-    return sorted({picture.frame for picture in recording.pictures})
+    return sorted({picture.frame for picture in read_drive(options).pictures})
 
 
-def _on_cluster(parts: list[DriveOptions], cluster: str, console: Console) -> None:
+def _on_cluster(parts: list[ProcessOptions], cluster: str, console: Console) -> None:
     from edge_depth_nerf.jobs.cluster import on_cluster  # imports Dask
 
     tasks = []
     for part in parts:
         scene = part.output.absolute()
         trains = part.estimate_depth and part.mono is None and part.mono_model is None
-        words = own_command(("process", KINDS[type(part)]), replace(part, cluster=None))
+        words = own_command(("process", name_of(part)), replace(part, cluster=None))
         log = scene.with_name(f"{scene.name}.log")
         tasks.append(Task(str(part.output), words, log, scene / "transforms.json", trains))
     with on_cluster(cluster, tasks, [parts[0].root.absolute()], console) as place:

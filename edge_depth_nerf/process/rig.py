@@ -18,14 +18,12 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
-from rich.console import Console
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE, picture_size
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar.scans import SCAN_SUFFIXES, check_scan, read_scan
 from edge_depth_nerf.lidar.trajectory import MAX_POSE_GAP_S, Trajectory
-from edge_depth_nerf.process.build import process_recording
 from edge_depth_nerf.process.options import JbnuDepth360Options, RigOptions
 from edge_depth_nerf.process.poses import read_kitti, read_nerfstudio, read_times, read_tum
 from edge_depth_nerf.process.recording import (
@@ -37,7 +35,7 @@ from edge_depth_nerf.process.recording import (
 )
 from edge_depth_nerf.process.rig_file import Clock, Rig, RigCamera, RigLidar, RigPoses, read_rig
 from edge_depth_nerf.scene.checks import Tolerance, check_size, size_error
-from edge_depth_nerf.scene.writer import ProcessReport, Skipped, summarise
+from edge_depth_nerf.scene.writer import Skipped, summarise
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 """Pictures that are found in a folder."""
@@ -73,20 +71,6 @@ class _Scans:
         """The scan whose middle is nearest to a time, and how far it is."""
         apart = np.abs(self.middles_s - time_s)
         return int(apart.argmin()), float(apart.min())
-
-
-def process_rig(options: RigOptions, console: Console | None = None) -> ProcessReport:
-    """Write the scene folder that `options` describe, or continue it.
-
-    Raises:
-        FileNotFoundError: a folder or file of the recording is missing.
-        InputError: an option, a file of the recording, or the output folder cannot be used.
-
-    """
-    console = console or Console()
-    with console.status("Reading the drive …"):
-        recording = read_rig_recording(options)
-    return process_recording(recording, options, console)
 
 
 def read_rig_recording(options: RigOptions) -> Recording:

@@ -22,13 +22,11 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json
 from edge_depth_nerf.lidar import SweepTiming, check_sweep_size, read_sweep
 from edge_depth_nerf.lidar.trajectory import Trajectory
-from edge_depth_nerf.process.build import process_recording
 from edge_depth_nerf.process.kitti360.calibration import Kitti360Rig, read_poses, read_rig
 from edge_depth_nerf.process.kitti360.drive import Kitti360Drive
 from edge_depth_nerf.process.options import Kitti360Options
@@ -36,26 +34,12 @@ from edge_depth_nerf.process.poses import transform_of_rows
 from edge_depth_nerf.process.reading import load_distance, load_picture
 from edge_depth_nerf.process.recording import RecordedCamera, RecordedPicture, RecordedSweep, Recording
 from edge_depth_nerf.scene.checks import Tolerance, check_distance, check_size
-from edge_depth_nerf.scene.writer import DistanceMap, Picture, ProcessReport, ShiftedView
+from edge_depth_nerf.scene.writer import DistanceMap, Picture, ShiftedView
 
 SCANNER = "velodyne"
 """Name of the scanner."""
 FRAME_INTERVAL_S = 0.1
 """Between frames, and of one turn of the scanner, where the drive brings no timestamps."""
-
-
-def process_kitti360(options: Kitti360Options, console: Console | None = None) -> ProcessReport:
-    """Write the scene folder that `options` describe, or continue it.
-
-    Raises:
-        FileNotFoundError: a folder or file of the drive is missing.
-        InputError: an option, a file of the drive, or the output folder cannot be used.
-
-    """
-    console = console or Console()
-    with console.status("Reading the drive …"):
-        recording = read_kitti360(options)
-    return process_recording(recording, options, console)
 
 
 def read_kitti360(options: Kitti360Options) -> Recording:
