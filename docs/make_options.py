@@ -20,6 +20,8 @@ import tyro
 
 from edge_depth_nerf import cli
 from edge_depth_nerf.base.files import write_text
+from edge_depth_nerf.method.integration import IntegrationOptions
+from edge_depth_nerf.method.prior import PriorOptions
 from edge_depth_nerf.plugin.config import make_specifications, read_method_file
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
@@ -203,10 +205,13 @@ def methods() -> str:
     """The section of what our methods add to nerfstudio."""
     configs = {name: made.config for name, made in make_specifications(read_method_file()).items()}
     groups = (
-        ("The depth prior and the training data", "pipeline.datamanager", FisheyeDepthDataManagerConfig),
+        ("The training data", "pipeline.datamanager", FisheyeDepthDataManagerConfig),
+        ("The depth prior", "pipeline.datamanager.prior", PriorOptions),
+        ("Its integration", "pipeline.datamanager.prior.integration", IntegrationOptions),
         ("The model and its loss", "pipeline.model", EdgeDepthNerfModelConfig),
         ("The scene", "pipeline.datamanager.dataparser", FisheyeDepthDataParserConfig),
     )
+    places = [place for _, place, _ in groups]
     text = METHODS_HEADER
     for title, place, cls in groups:
         text += f"### {title}\n\n"
@@ -215,7 +220,8 @@ def methods() -> str:
         docs, hints = field_docs(cls), get_type_hints(cls, include_extras=True)
         rows = []
         for entry in dataclasses.fields(cls):
-            if entry.name not in docs or entry.name in ("_target", "dataparser"):
+            # a group of options has a table of its own
+            if entry.name not in docs or entry.name == "_target" or f"{place}.{entry.name}" in places:
                 continue
             values = {name: at(config, f"{place}.{entry.name}") for name, config in configs.items()}
             first = next(iter(values.values()))
@@ -239,7 +245,10 @@ def at(config: Any, name: str) -> Any:
 def presets() -> str:
     """What the file of methods sets that is not in the tables before."""
     declared = read_method_file()
-    ours = (FisheyeDepthDataManagerConfig, EdgeDepthNerfModelConfig, FisheyeDepthDataParserConfig)
+    ours = (
+        *(FisheyeDepthDataManagerConfig, PriorOptions, IntegrationOptions),
+        *(EdgeDepthNerfModelConfig, FisheyeDepthDataParserConfig),
+    )
     known = {name for cls in ours for name in field_docs(cls)}
     values = {name: declared["presets"][method["preset"]] for name, method in declared["methods"].items()}
     names = dict.fromkeys(name for preset in values.values() for name in preset if name.split(".")[-1] not in known)

@@ -281,7 +281,7 @@ def test_the_page_of_options_has_them_all(capsys, monkeypatch):
         assert len(named) > 2 or words == ("doctor",)
         assert not [name for name in named if f"`{name}`" not in text], words
     assert "| `--pipeline.model.depth-loss-mult` | number | `0.01`; paper: `1e-05` |" in text
-    assert "| `--pipeline.datamanager.alpha` | number | `0.7` |" in text
+    assert "| `--pipeline.datamanager.prior.integration.alpha` | number | `0.7` |" in text
 
 
 def test_the_pictures_are_current(tmp_path):
@@ -508,7 +508,6 @@ def test_a_new_source_of_depth_reaches_the_prior(tmp_path, monkeypatch):
     from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
     from edge_depth_nerf.scene import format as scene_format
 
-    monkeypatch.setattr(scene_format, "LAYERS", scene_format.LAYERS)
     monkeypatch.setitem(scene_format.LAYERS, "radar", None)  # taken out again at the end
     module = load("examples/new_depth_source")
     scene = tmp_path / "scene"
