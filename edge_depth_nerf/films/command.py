@@ -25,6 +25,7 @@ from edge_depth_nerf.files import read_json_object, write_json
 from edge_depth_nerf.films.options import LARGEST_PX, CameraPathOptions
 from edge_depth_nerf.films.paths import Drive, lane_shift, orbit, replay, up_of
 from edge_depth_nerf.films.training import read_dataparser
+from edge_depth_nerf.runs import spread_over
 from edge_depth_nerf.scene_reader import SceneFolder, ScenePicture, read_scene
 
 DEFAULT_RATE_HZ = 10.0
@@ -162,7 +163,7 @@ def path_file(
     frames = len(camera_to_model)
     seconds = frames / fps
     aspect = lens.width / lens.height
-    keyframes = np.unique(np.linspace(0, frames - 1, min(frames, KEYFRAMES)).round().astype(int))
+    keyframes = spread_over(frames, KEYFRAMES)
     return {
         "made_by": f"edge-depth-nerf {__version__}",
         "camera_type": options.camera,
