@@ -22,6 +22,7 @@ from scenes import write_scene
 
 from edge_depth_nerf import cli
 from edge_depth_nerf.base.files import write_png
+from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.base.pictures import NO_VALUE_RGB, colour_distance, distance_of_colours
 from edge_depth_nerf.compare.options import CompareOptions, MethodName
 from edge_depth_nerf.compare.plots import Bins, plot_bins
@@ -30,13 +31,7 @@ from edge_depth_nerf.jobs.runs import command_line, logged_commands
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.report import views
 from edge_depth_nerf.report.build import Commands, Facts, Plot, Report, build_report, write_report
-from edge_depth_nerf.report.compared_views import (
-    DISTANCE_KEYS,
-    ComparedView,
-    compared_views,
-    held_out_frames,
-    spread_over,
-)
+from edge_depth_nerf.report.compared_views import DISTANCE_KEYS, ComparedView, compared_views, held_out_frames
 from edge_depth_nerf.report.tables import Cell, MadeTable, Row
 from edge_depth_nerf.report.views import KINDS, Drive, ShownView, encode, make_drives, show_view, spread
 

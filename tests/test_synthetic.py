@@ -12,7 +12,7 @@ import torch
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, read_mask
-from edge_depth_nerf.synthetic import drive as drive_module
+from edge_depth_nerf.synthetic import layout as layout_module
 from edge_depth_nerf.synthetic import lidar, rig
 from edge_depth_nerf.synthetic.drive import WORLD_ORIGIN_M, synthesize_drive
 from edge_depth_nerf.synthetic.materials import Noise
@@ -38,7 +38,7 @@ def street(tmp_path_factory, street_model):
     options = SynthesizeOptions(tmp_path_factory.mktemp("street") / "drive", "street", frames=FRAMES, size=SIZE)
     with pytest.MonkeyPatch.context() as patch:
         # the same scene, not built twice
-        patch.setattr(drive_module, "build_scene", lambda _: street_model)
+        patch.setattr(layout_module, "build_scene", lambda _: street_model)
         return options, synthesize_drive(options)
 
 
@@ -174,7 +174,7 @@ def test_sensors_stand_as_high_as_kitti360s():
 def test_same_options_same_bytes_and_interrupted_runs_are_continued(parking, tmp_path, monkeypatch):
     options, root = parking
     other = dataclasses.replace(options, output=tmp_path / "again")
-    write, calls = drive_module.write_distance_png, []
+    write, calls = layout_module.write_distance_png, []
 
     def interrupted(path, distance_m):
         calls.append(path)
@@ -183,7 +183,7 @@ def test_same_options_same_bytes_and_interrupted_runs_are_continued(parking, tmp
         write(path, distance_m)
 
     with monkeypatch.context() as patch:
-        patch.setattr(drive_module, "write_distance_png", interrupted)
+        patch.setattr(layout_module, "write_distance_png", interrupted)
         with pytest.raises(KeyboardInterrupt):
             synthesize_drive(other)
     done = files_of(other.output)
@@ -197,7 +197,7 @@ def test_same_options_same_bytes_and_interrupted_runs_are_continued(parking, tmp
     assert files_of(other.output) == reference
     assert kept.stat().st_mtime_ns == moment, "a finished frame was made again"
     with monkeypatch.context() as patch:
-        patch.setattr(drive_module, "build_scene", None)
+        patch.setattr(layout_module, "build_scene", None)
         assert synthesize_drive(other) == other.output, "a complete drive needs no scene"
 
 

@@ -23,9 +23,11 @@ from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerElement
 from scenes import RADIUS_M, fisheye, pinhole, write_scene
 
 from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import as_people_count
+from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.base.pictures import SIGMA, colour_distance
 from edge_depth_nerf.cameras import KannalaBrandt
-from edge_depth_nerf.plugin.viewer import AZIMUTHS, RINGS, DriveLayers, _in_order, _spread, lens_cap, rim_rad
+from edge_depth_nerf.plugin.viewer import AZIMUTHS, RINGS, DriveLayers, lens_cap, rim_rad
 
 METHOD = "edge-depth-nerf-lite"
 SAMPLE = Path(__file__).parents[1] / "data" / "sample_drive"
@@ -90,12 +92,12 @@ def test_a_lens_that_sees_behind_itself_has_a_cap_beyond_the_half_sphere():
 
 def test_names_with_numbers_are_in_order():
     names = ["frame_10.png", "frame_9.png", "frame_1.png", "0003.png"]
-    assert sorted(names, key=lambda name: _in_order(Path(name))) == [names[3], names[2], names[1], names[0]]
+    assert sorted(names, key=lambda name: as_people_count(Path(name))) == [names[3], names[2], names[1], names[0]]
 
 
 def test_some_of_many_are_spread():
-    assert _spread(5, 256) == [0, 1, 2, 3, 4]
-    assert _spread(1000, 4) == [0, 333, 666, 999]
+    assert spread_over(5, 256) == [0, 1, 2, 3, 4]
+    assert spread_over(1000, 4) == [0, 333, 666, 999]
 
 
 # ---- outputs ---------------------------------------------------------------------------------------------------------

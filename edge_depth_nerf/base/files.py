@@ -117,6 +117,12 @@ def explain(error: Exception) -> str:
     return f"{where}{error.strerror}. {remedy}; what is done is kept, and the same command takes up where it was."
 
 
+def as_people_count(path: Path) -> list[tuple[int, str]]:
+    """What files are sorted by so that the numbers in their names count as numbers."""
+    # [0-9]: Unicode has digits that are no numbers to int
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", path.name)]
+
+
 def write_bytes(path: Path, content: bytes) -> None:
     """Write bytes atomically."""
 

@@ -20,6 +20,7 @@ from edge_depth_nerf import __version__
 from edge_depth_nerf.base.console import say
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json_object, write_json
+from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.cameras import KannalaBrandt, Pinhole
 from edge_depth_nerf.films.options import LARGEST_PX, CameraPathOptions
 from edge_depth_nerf.films.paths import Drive, lane_shift, orbit, replay, up_of
@@ -162,7 +163,7 @@ def path_file(
     frames = len(camera_to_model)
     seconds = frames / fps
     aspect = lens.width / lens.height
-    keyframes = np.unique(np.linspace(0, frames - 1, min(frames, KEYFRAMES)).round().astype(int))
+    keyframes = spread_over(frames, KEYFRAMES)
     return {
         "made_by": f"edge-depth-nerf {__version__}",
         "camera_type": options.camera,

@@ -85,6 +85,17 @@ class CameraPathOptions:
                     f"--{name} {value}: expected an even number of {SMALLEST_PX} to {LARGEST_PX} px (films are "
                     "coded in blocks of two pixels)."
                 )
+        self._check_view()
+        for name, value in (("fps", self.fps), ("seconds", self.seconds), ("radius-m", self.radius_m)):
+            if value is not None and not (math.isfinite(value) and value > 0):
+                raise InputError(f"--{name} {value}: expected a positive number.")
+        if not math.isfinite(self.shift_m):
+            raise InputError(f"--shift-m {self.shift_m}: expected a number of metres.")
+        if not (math.isfinite(self.ahead_m) and self.ahead_m >= 0):
+            raise InputError(f"--ahead-m {self.ahead_m}: expected 0 or more metres.")
+
+    def _check_view(self) -> None:
+        """Check what the kind of camera has a say in."""
         if self.camera == "equirectangular":
             if self.fov_deg is not None:
                 raise InputError("--fov-deg: an equirectangular film always shows the whole sphere. Leave it away.")
@@ -98,10 +109,3 @@ class CameraPathOptions:
                 f"--fov-deg {self.fov_deg}: expected 1 to {LARGEST_FOV_DEG[self.camera]:g} degrees for "
                 f"--camera {self.camera}."
             )
-        for name, value in (("fps", self.fps), ("seconds", self.seconds), ("radius-m", self.radius_m)):
-            if value is not None and not (math.isfinite(value) and value > 0):
-                raise InputError(f"--{name} {value}: expected a positive number.")
-        if not math.isfinite(self.shift_m):
-            raise InputError(f"--shift-m {self.shift_m}: expected a number of metres.")
-        if not (math.isfinite(self.ahead_m) and self.ahead_m >= 0):
-            raise InputError(f"--ahead-m {self.ahead_m}: expected 0 or more metres.")

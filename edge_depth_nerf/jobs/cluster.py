@@ -31,7 +31,7 @@ from edge_depth_nerf.base.console import say
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.jobs.cluster_address import LOCAL, check_address
 from edge_depth_nerf.jobs.runs import LoggedCommands
-from edge_depth_nerf.jobs.tasks import Task, share_of
+from edge_depth_nerf.jobs.tasks import Task, shares_told
 
 PACKAGES = ("edge-depth-nerf", "nerfstudio", "torch")
 """A worker has these in the versions that are here."""
@@ -70,11 +70,8 @@ _stopped: set[str] = set()
 """Keys of tasks that are not to begin any more."""
 
 
-def do_task(task: Task, key: str, needs: Surroundings) -> dict[str, Any]:
-    """Do a task on this worker.
-
-    Returns:
-        machine: its name; seconds: how long it took.
+def do_task(task: Task, key: str, needs: Surroundings) -> str:
+    """Do a task on this worker; give the name of its machine.
 
     Raises:
         InputError: the machine is not as it must be, or the command failed.
@@ -82,20 +79,15 @@ def do_task(task: Task, key: str, needs: Surroundings) -> dict[str, Any]:
     """
     from distributed import get_worker
 
+    worker, machine = get_worker(), platform.node()
     # workers that came later have not been looked at
     for name, wanted in needs.versions:
-        _check_version(platform.node(), name, importlib.metadata.version(name), wanted)
+        _check_version(machine, name, importlib.metadata.version(name), wanted)
     if not Path(needs.witness).is_file():
-        raise InputError(_not_shared(platform.node(), Path(needs.witness).parent))
-    worker, begun = get_worker(), time.monotonic()
+        raise InputError(_not_shared(machine, Path(needs.witness).parent))
 
     def tell(share: float, begins: bool = False) -> None:
-        worker.log_event(needs.topic, {"key": key, "share": share, "begins": begins, "machine": platform.node()})
-
-    def on_line(line: str) -> None:
-        share = share_of(line)
-        if share is not None:
-            tell(share)
+        worker.log_event(needs.topic, {"key": key, "share": share, "begins": begins, "machine": machine})
 
     commands = _running[key] = LoggedCommands()
     try:
@@ -103,10 +95,10 @@ def do_task(task: Task, key: str, needs: Surroundings) -> dict[str, Any]:
             commands.stop()
         tell(0.0, begins=True)
         environment = {name: str(needs.threads) for name in THREAD_VARIABLES}
-        commands.call([sys.executable, *task.arguments], task.log, needs.threads, on_line, environment)
+        commands.call([sys.executable, *task.arguments], task.log, needs.threads, shares_told(tell), environment)
     finally:
         del _running[key]
-    return {"machine": platform.node(), "seconds": time.monotonic() - begun}
+    return machine
 
 
 def dask_setup(_: Any) -> None:
@@ -203,7 +195,7 @@ class Cluster:
         from distributed import KilledWorker
 
         try:
-            machine = done.result()["machine"]
+            machine = done.result()
             _wait_for(task.makes, machine)
         except InputError as error:
             ended.set_exception(error)

@@ -75,9 +75,14 @@ def with_absolute_paths(options: Options) -> Options:
     return dataclasses.replace(options, **changes)  # pyright: ignore[reportArgumentType]
 
 
-def share_of(line: str) -> float | None:
-    """The share of its work that a line of a task tells; None for other lines."""
-    return float(line.removeprefix(WORK)) if line.startswith(WORK) else None
+def shares_told(tell: Callable[[float], None]) -> Callable[[str], None]:
+    """What hears a task's lines and hands on the share of its work that some of them tell."""
+
+    def on_line(line: str) -> None:
+        if line.startswith(WORK):
+            tell(float(line.removeprefix(WORK)))
+
+    return on_line
 
 
 @runtime_checkable
@@ -107,18 +112,13 @@ class ThisMachine:
         commands = LoggedCommands()
         self._commands.append(commands)
 
-        def on_line(line: str) -> None:
-            share = share_of(line)
-            if share is not None:
-                tell(share)
-
         def do() -> None:
             # the thread of one that has failed is free before anybody hears of that
             if self._failed:
                 return
             tell(0.0)
             try:
-                commands.call([sys.executable, *task.arguments], task.log, self._threads, on_line)
+                commands.call([sys.executable, *task.arguments], task.log, self._threads, shares_told(tell))
             except BaseException:
                 self._failed = True
                 raise

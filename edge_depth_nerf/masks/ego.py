@@ -171,7 +171,7 @@ def find_ego(pictures: Iterable[Picture | Callable[[], Picture]], lens: Bool[np.
             f"{certainty:.0%} of it there is an edge beyond which things change. It may be smooth road."
         )
     ego = enlarge(dilated(vehicle, _GROWN * max(small_lens.shape)), factor, (lens.shape[0], lens.shape[1]))
-    ego = from_nearest(ego, lens)
+    ego = from_nearest(ego, lens)[0]
     return EgoMask(~ego, float(ego[lens].mean()), certainty, count)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Int32, Int64, UInt8
+from jaxtyping import Bool, Float32, Int32, Int64, Shaped, UInt8
 
 
 def block_mean(values: UInt8[np.ndarray, "H W *c"] | Float32[np.ndarray, "H W"], factor: int) -> np.ndarray:
@@ -114,11 +114,14 @@ def filled(where: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     return ~touching(~where, border)
 
 
-def from_nearest(values: Bool[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Give each pixel the value of the nearest pixel that is known."""
-    _, labels = cv2.distanceTransformWithLabels(
+def from_nearest(
+    values: Shaped[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]
+) -> tuple[Shaped[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+    """Give each pixel the value of the nearest pixel that is known, of which there is one; second, how far that is."""
+    away_px, labels = cv2.distanceTransformWithLabels(
         (~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
-    of_label = np.zeros(int(labels.max()) + 1, bool)
+    labels = np.asarray(labels)
+    of_label = np.zeros(int(labels.max()) + 1, values.dtype)
     of_label[labels[known]] = values[known]
-    return of_label[labels]
+    return of_label[labels], np.asarray(away_px, np.float32)

@@ -20,6 +20,7 @@ from jaxtyping import Bool, UInt8
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.png import read_png_bytes, read_png_header
+from edge_depth_nerf.masks.regions import dilated
 
 CLASSES = (
     *("unlabeled", "ego vehicle", "rectification border", "out of roi", "static", "dynamic", "ground", "road"),
@@ -114,10 +115,7 @@ def keep_static(labels: UInt8[np.ndarray, "h w"], classes: Iterable[str]) -> Boo
         InputError: there is no such class.
 
     """
-    moving = np.isin(labels, check_classes(classes)).astype(np.uint8)
-    size = 2 * max(1, round(MARGIN * max(labels.shape))) + 1
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
-    return ~cv2.dilate(moving, disc).astype(bool)
+    return ~dilated(np.isin(labels, check_classes(classes)), MARGIN * max(labels.shape))
 
 
 def sky(labels: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

@@ -102,7 +102,7 @@ def find_sky(
     sky = _grow(block_mean(picture, factor).astype(np.float32), possible, usable, height_sine)
     if usable.any():
         # blocks that the mask cuts, along the lens's rim, are as those beside them
-        sky = from_nearest(sky, usable)
+        sky = from_nearest(sky, usable)[0]
     return enlarge(sky, factor, (mask.shape[0], mask.shape[1])) & mask & far
 
 

@@ -118,7 +118,7 @@ def fit_logs(lidar_m: Float[np.ndarray, "n"], mono_m: Float[np.ndarray, "n"]) ->
     # a map of one distance says nothing about the exponent: it is held to 1, as by distances that differ by 1 %
     hold = 1e-4 * len(x)
     for _ in range(12):
-        weight = _weights(y - at_middle - slope * x, least_spread=1e-4)
+        weight = robust_weights(y - at_middle - slope * x, least_spread=1e-4)
         total = weight.sum()
         mean_x, mean_y = (weight * x).sum() / total, (weight * y).sum() / total
         covariance = (weight * (x - mean_x) * (y - mean_y)).sum()
@@ -165,7 +165,10 @@ def align(
     return Aligned(aligned, fit, "frame", count)
 
 
-def _weights(residual: NDArray, least_spread: float) -> NDArray:
+def robust_weights(residual: NDArray, least_spread: float) -> NDArray:
+    """Geman and McClure's weights, by the residuals' own spread; an outlier weighs next to nothing."""
+    if not residual.size:
+        return np.ones(0)
     spread = max(least_spread, 1.4826 * float(np.median(np.abs(residual))))
     return 1 / (1 + (residual / (OUTLIER_SCALE * spread)) ** 2) ** 2
 
@@ -181,10 +184,10 @@ def _correct(
     residual = np.log(lidar_m[returns]) - log_of_returns
     places = pyramid.places(returns, log_of_returns)
     # an outlier is one against its neighbours, not against the picture: twice weighted anew
-    weight = _weights(residual, least_spread=0.1)
+    weight = robust_weights(residual, least_spread=0.1)
     for _ in range(2):
         left = residual - pyramid.read(pyramid.grid(places, residual, weight, JUDGING_RETURNS), places)
-        weight = _weights(left, least_spread=1e-3)
+        weight = robust_weights(left, least_spread=1e-3)
     correction = pyramid.read(
         pyramid.grid(places, residual, weight, IMAGINED_RETURNS), pyramid.places(wanted, log_m[wanted])
     )

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -24,7 +25,7 @@ import scipy.stats
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from edge_depth_nerf.method.alignment import OUTLIER_SCALE
+from edge_depth_nerf.method.alignment import robust_weights
 
 Kind = Literal["metric", "relative", "inverse"]
 
@@ -39,6 +40,7 @@ WRONG_WAY = -0.5
 """A rank correlation to LiDAR below this: the map runs against the kind it is said to be of."""
 _LINEAR_ROUNDS = 5
 _ROUNDS = 8
+_robust = partial(robust_weights, least_spread=1e-4)
 _LONGEST_STEP = 0.5
 """Of log distance, in the middle of the pixels."""
 
@@ -304,14 +306,6 @@ class _Problem:
 
 def _share(weight: NDArray, total: float) -> NDArray[np.float64]:
     return weight.astype(np.float64) * (total / max(float(weight.sum()), 1e-12))
-
-
-def _robust(residual: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Geman and McClure's weights."""
-    if not residual.size:
-        return np.ones(0)
-    spread = max(1.4826 * float(np.median(np.abs(residual))), 1e-4)
-    return 1 / (1 + (residual / (OUTLIER_SCALE * spread)) ** 2) ** 2
 
 
 def _absolute(residual: NDArray[np.float64]) -> NDArray[np.float64]:

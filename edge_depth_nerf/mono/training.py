@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -93,6 +93,10 @@ class Batch:
     lidar_m: Float[Tensor, "n h w"]
     """0 = no return."""
 
+    def each(self, change: Callable[[Tensor], Tensor]) -> Batch:
+        """All of it changed in the same way."""
+        return Batch(*(change(getattr(self, entry.name)) for entry in fields(self)))
+
 
 def scale_invariant_loss(
     log_error: Float[Tensor, "n h w"], valid: Bool[Tensor, "n h w"], balance: float
@@ -173,13 +177,8 @@ def augmented(batch: Batch, options: TrainingOptions, multiple_px: int, generato
     rows, row = _cut(height, options.crop, multiple_px, generator)
     columns, column = _cut(width, options.crop, multiple_px, generator)
     part = (..., slice(row, row + rows), slice(column, column + columns))
-    return Batch(
-        rgb=_jittered(batch.rgb[part], options.jitter, generator),
-        geometry=batch.geometry[part],
-        log_room=batch.log_room[part],
-        usable=batch.usable[part],
-        lidar_m=batch.lidar_m[part],
-    )
+    batch = batch.each(lambda values: values[part])
+    return replace(batch, rgb=_jittered(batch.rgb, options.jitter, generator))
 
 
 def _mirror(batch: Batch, which: Bool[Tensor, "n"]) -> Batch:
@@ -190,13 +189,8 @@ def _mirror(batch: Batch, which: Bool[Tensor, "n"]) -> Batch:
 
     sign = torch.ones_like(batch.geometry[:, :, :1, :1])
     sign[:, 0] = torch.where(which, -1.0, 1.0)[:, None, None]
-    return Batch(
-        chosen(batch.rgb),
-        chosen(batch.geometry) * sign,
-        chosen(batch.log_room),
-        chosen(batch.usable),
-        chosen(batch.lidar_m),
-    )
+    batch = batch.each(chosen)
+    return replace(batch, geometry=batch.geometry * sign)
 
 
 def _cut(length: int, least: float, multiple: int, generator: np.random.Generator) -> tuple[int, int]:
@@ -229,6 +223,14 @@ class _State:
     looks_since_best: int = 0
     finished: bool = False
     identity: dict[str, Any] = field(default_factory=dict)
+
+    def is_best(self, error: float) -> bool:
+        """Take note of a look; whether none before was as good."""
+        if not error < self.best:
+            self.looks_since_best += 1
+            return False
+        self.best, self.best_step, self.looks_since_best = error, self.step, 0
+        return True
 
 
 def train(
@@ -265,7 +267,7 @@ def train(
         network.load_state_dict(start.state_dict())
     network = network.to(device).to(memory_format=torch.channels_last)
     optimizer = torch.optim.AdamW(network.parameters(), lr=options.learning_rate, weight_decay=options.weight_decay)
-    best = {name: tensor.detach().clone() for name, tensor in network.state_dict().items()}
+    best = _copied(network)
     identity = {
         "options": asdict(options),
         "settings": asdict(settings),
@@ -288,28 +290,30 @@ def train(
         share = _share(state, options)
         state.finished = share >= 1.0
         if kept is not None and (state.finished or state.step % options.evaluate_every == 0):
-            error = abs_rel(network, kept, settings, device)
-            if error < state.best:
-                state.best, state.best_step, state.looks_since_best = error, state.step, 0
-                best = {name: tensor.detach().clone() for name, tensor in network.state_dict().items()}
-            else:
-                state.looks_since_best += 1
-                state.finished |= state.looks_since_best >= options.patience
+            if state.is_best(abs_rel(network, kept, settings, device)):
+                best = _copied(network)
+            state.finished |= state.looks_since_best >= options.patience
         if checkpoint is not None and (state.finished or time.monotonic() - saved >= checkpoint_seconds):
             _save(checkpoint, state, network, optimizer, best)
             saved = time.monotonic()
         report(1.0 if state.finished else share, state.best)
 
-    if kept is not None:
+    if kept is None:
+        state.best, state.best_step = math.nan, state.step
+    else:
         network.load_state_dict(best)
     return Trained(
         network=network.cpu().eval(),
         steps=state.step,
-        best_step=state.best_step if kept is not None else state.step,
-        abs_rel=state.best if kept is not None else math.nan,
+        best_step=state.best_step,
+        abs_rel=state.best,
         seconds=state.seconds,
         stopped_early=_share(state, options) < 1.0,
     )
+
+
+def _copied(network: DepthNetwork) -> dict[str, Tensor]:
+    return {name: tensor.detach().clone() for name, tensor in network.state_dict().items()}
 
 
 def _share(state: _State, options: TrainingOptions) -> float:

@@ -8,7 +8,6 @@ neither a training nor a command without a viewer waits for it.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from io import BytesIO
@@ -29,6 +28,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import as_people_count
+from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.base.pictures import DISTANCE, SIGMA
 from edge_depth_nerf.cameras import Camera
 
@@ -165,11 +166,6 @@ def _glb(camera: Camera, theta_max_rad: float, picture: NDArray[np.uint8], radiu
     return data.getvalue()
 
 
-def _in_order(path: Path) -> list[int | str]:
-    """Sorts names with numbers as people count."""
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]
-
-
 class DriveLayers(ViewerControl):
     """Draws the layers; nerfstudio calls `_setup` once its viewer stands."""
 
@@ -254,7 +250,7 @@ class DriveLayers(ViewerControl):
         dataset = self.manager.train_dataset
         limit_rad = dataset.scene.theta_max_rad
         radius = self._units(LENS_RADIUS_M) * self.viewer.config.camera_frustum_scale / HOST_FRUSTUM_SCALE
-        for index in _spread(len(dataset), MOST_LENSES):
+        for index in spread_over(len(dataset), MOST_LENSES):
             pose = dataset.cameras.camera_to_worlds[index].double().cpu().numpy()
             # nerfstudio's camera looks along -z, viser's along z
             rotation = viser.transforms.SO3.from_matrix(pose[:, :3] * (1.0, -1.0, -1.0))
@@ -285,7 +281,7 @@ class DriveLayers(ViewerControl):
             for file, position in zip(dataset.image_filenames, positions, strict=True):
                 places.setdefault(file.parent, []).append((file, position))
         for number, (folder, camera) in enumerate(sorted(places.items())):
-            line = np.stack([position for _, position in sorted(camera, key=lambda place: _in_order(place[0]))])
+            line = np.stack([position for _, position in sorted(camera, key=lambda place: as_people_count(place[0]))])
             if len(line) < 2:
                 continue
             self.viser_server.scene.add_spline_catmull_rom(
@@ -367,8 +363,3 @@ class DrivePanel(torch.nn.Module):
         # it shows them in the order of their names
         for number, element in enumerate((*self.layers.switches.values(), self.layers.meaning)):
             setattr(self, f"element_{number}", element)
-
-
-def _spread(count: int, most: int) -> list[int]:
-    """At most `most` of `count` numbers, evenly spread."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE, picture_size
+from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE, as_people_count, picture_size
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar.scans import SCAN_SUFFIXES, check_scan, read_scan
 from edge_depth_nerf.lidar.trajectory import MAX_POSE_GAP_S, Trajectory
@@ -112,8 +112,7 @@ def recording_of_rig(rig: Rig, root: Path, options: RigOptions | JbnuDepth360Opt
     """
     cameras = _chosen(rig, options.cameras)
     files = {camera.name: _timed(_files(root, camera.images, IMAGE_SUFFIXES), camera.clock) for camera in cameras}
-    moments = _moments(files)
-    path, camera_poses, notices = None, {}, []
+    path, camera_poses = None, {}
     if options.poses == "recorded":
         if rig.poses is None:
             raise InputError(
@@ -123,19 +122,7 @@ def recording_of_rig(rig: Rig, root: Path, options: RigOptions | JbnuDepth360Opt
     scans = [_Scans(lidar, _timed(_files(root, lidar.scans, SCAN_SUFFIXES), lidar.clock)) for lidar in rig.lidars]
     _check_clocks(rig, files, scans, path)
 
-    taken = _select(moments, options)
-    skipped: list[Skipped] = []
-    kept: dict[int, dict[str, _Timed]] = {}
-    for frame in taken:
-        reason = _unusable(moments[frame], path, scans)
-        if reason:
-            skipped.append(Skipped(frame, None, reason))
-            continue
-        pictures = moments[frame]
-        lacking = [name for name, picture in pictures.items() if camera_poses and picture.path not in camera_poses]
-        skipped += [Skipped(frame, name, "no pose") for name in lacking]
-        kept[frame] = {name: picture for name, picture in pictures.items() if name not in lacking}
-    kept = {frame: pictures for frame, pictures in kept.items() if pictures}
+    kept, skipped = _usable(_moments(files), options, path, camera_poses, scans)
     if not kept:
         raise InputError(f"{root}: none of the moments asked for can be used: {summarise(skipped)}.")
 
@@ -149,32 +136,31 @@ def recording_of_rig(rig: Rig, root: Path, options: RigOptions | JbnuDepth360Opt
                 recorded.append(companions.picture(by_name[name], frame, picture, camera_poses.get(picture.path)))
     moments_s = {frame: _time(pictures) for frame, pictures in kept.items()}
     sweeps = _sweeps(scans, moments_s, path, options.sweeps, tolerance)
-    for lidar in rig.lidars:
-        if lidar.timing is None and lidar.format.times is None:
-            notices.append(
-                f"{lidar.name}: neither turn_s nor point_times is given; its scans are taken as of one moment."
-            )
     for camera in cameras:
         if camera.ego_mask:
             check_size(camera.ego_mask, camera.camera)
-    clocks = [sensor.clock for sensor in (*cameras, *rig.lidars)]
-    if rig.poses and path:
-        clocks += [rig.poses.clock] if rig.poses.clock else []
     return Recording(
         cameras=tuple(RecordedCamera(c.name, c.camera, c.to_vehicle, c.ego_mask) for c in cameras),
         pictures=tuple(recorded),
         sweeps=tuple(sweeps),
         trajectory=path,
         source=source,
-        whole_inputs=(
-            rig.path,
-            *([rig.poses.file] if rig.poses and path else []),
-            *(clock.file for clock in clocks if clock.file),
-        ),
+        whole_inputs=_whole_inputs(rig, cameras, with_poses=path is not None),
         skipped=tuple(skipped),
         left_out=tolerance.left_out,
-        notices=tuple(notices),
+        notices=tuple(
+            f"{lidar.name}: neither turn_s nor point_times is given; its scans are taken as of one moment."
+            for lidar in rig.lidars
+            if lidar.timing is None and lidar.format.times is None
+        ),
     )
+
+
+def _whole_inputs(rig: Rig, cameras: Sequence[RigCamera], *, with_poses: bool) -> tuple[Path, ...]:
+    """The files whose bytes decide about the scene: the rig file, poses, times."""
+    poses = [rig.poses] if rig.poses and with_poses else []
+    clocks = [described.clock for described in (*cameras, *rig.lidars, *poses)]
+    return (rig.path, *(found.file for found in poses), *(clock.file for clock in clocks if clock and clock.file))
 
 
 def _chosen(rig: Rig, names: Sequence[str]) -> list[RigCamera]:
@@ -210,13 +196,7 @@ def _files(root: Path, given: str, suffixes: tuple[str, ...]) -> list[Path]:
         raise FileNotFoundError(f"{path}: no such folder; the rig file names it.")
     if not found:
         raise FileNotFoundError(f"{path}: {what}; expected {', '.join(suffixes)} files.")
-    return sorted(found, key=_natural)
-
-
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """Numbers in names count as numbers."""
-    # [0-9]: Unicode has digits that are no numbers to int
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", path.name)]
+    return sorted(found, key=as_people_count)
 
 
 def _number_in(path: Path) -> float:
@@ -300,6 +280,28 @@ def _select(moments: list[dict[str, _Timed]], options: RigOptions | JbnuDepth360
             "earlier, ask for fewer, or leave out --first and --frames to take all."
         )
     return range(options.first, end + 1, options.stride)
+
+
+def _usable(
+    moments: list[dict[str, _Timed]],
+    options: RigOptions | JbnuDepth360Options,
+    path: Trajectory | None,
+    camera_poses: dict[Path, Transform],
+    scans: Sequence[_Scans],
+) -> tuple[dict[int, dict[str, _Timed]], list[Skipped]]:
+    """The moments asked for, by number, without those and those of their pictures that cannot be used; and these."""
+    kept: dict[int, dict[str, _Timed]] = {}
+    skipped: list[Skipped] = []
+    for frame in _select(moments, options):
+        pictures = moments[frame]
+        if reason := _unusable(pictures, path, scans):
+            skipped.append(Skipped(frame, None, reason))
+            continue
+        lacking = [name for name, picture in pictures.items() if camera_poses and picture.path not in camera_poses]
+        skipped += [Skipped(frame, name, "no pose") for name in lacking]
+        if len(lacking) < len(pictures):
+            kept[frame] = {name: picture for name, picture in pictures.items() if name not in lacking}
+    return kept, skipped
 
 
 def _unusable(pictures: dict[str, _Timed], path: Trajectory | None, scans: Sequence[_Scans]) -> str | None:

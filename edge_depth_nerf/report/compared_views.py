@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_depth_nerf.base.files import read_distance_png, read_image, read_mask
+from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.base.pictures import colour_distance
 from edge_depth_nerf.scene.format import LAYERS, read_transforms
 
@@ -51,11 +52,6 @@ class ComparedView:
         """Its colours, then its distances: the recorded ones first, then each run's."""
         known = colour_distance(self.distance_m, self.mask)
         return [self.rgb, *self.colours.values()], [known, *self.distances.values()]
-
-
-def spread_over(count: int, most: int) -> list[int]:
-    """Choose at most `most` of `count` numbers from 0 on, evenly spread, the first and the last among them."""
-    return np.linspace(0, count - 1, min(most, count)).round().astype(int).tolist()
 
 
 def compared_view(scene: Path, frame: Mapping[str, Any], index: int, views_of: Mapping[str, Path]) -> ComparedView:

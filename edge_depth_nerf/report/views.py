@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from edge_depth_nerf.base.console import run_jobs
+from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.base.pictures import (
     COLOUR_ERROR,
     DISTANCE,
@@ -29,8 +30,9 @@ from edge_depth_nerf.base.pictures import (
     is_distance,
     resize,
 )
+from edge_depth_nerf.masks.regions import from_nearest
 from edge_depth_nerf.method.metrics import LEAST_SQUARED_ERROR
-from edge_depth_nerf.report.compared_views import ComparedView, compared_view, held_out_frames, spread_over
+from edge_depth_nerf.report.compared_views import ComparedView, compared_view, held_out_frames
 
 REPORT = "report.html"
 """The page's name beside the other results."""
@@ -213,14 +215,8 @@ def spread(
     """
     if radius <= 0 or not known.any():
         return values, known
-    # distance to the nearest zero, and which one that is
-    away, labels = cv2.distanceTransformWithLabels(
-        (~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    labels = np.asarray(labels, np.int64)
-    of_label = np.zeros(int(labels.max()) + 1, np.float32)
-    of_label[labels[known]] = values[known]
-    return of_label[labels], away <= radius
+    nearest, away_px = from_nearest(values, known)
+    return nearest, away_px <= radius
 
 
 def encode(pixels: NDArray[np.uint8], allowance: int) -> bytes:

@@ -24,7 +24,6 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -38,35 +37,23 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import (
     check_is_folder,
     read_json,
-    write_bytes,
-    write_distance_png,
     write_json,
     write_mask,
-    write_png,
     write_text,
 )
 from edge_depth_nerf.synthetic import rig
-from edge_depth_nerf.synthetic.lidar import sweep
+from edge_depth_nerf.synthetic.layout import WORLD_ORIGIN_M, DriveLayout, MountedCamera
+from edge_depth_nerf.synthetic.lidar import Sweep
 from edge_depth_nerf.synthetic.motion import FRAME_INTERVAL_S
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
-from edge_depth_nerf.synthetic.render import FisheyeCamera, View, World, own_car_world
-from edge_depth_nerf.synthetic.scenes import build_scene
-from edge_depth_nerf.synthetic.simulated_mono import simulated_estimate
+from edge_depth_nerf.synthetic.rig_drive import RIG_FILE_LAYOUTS
 
 VERSION = 1
 """Version of what is synthesised: drives of different versions do not mix in one folder."""
 
-WORLD_ORIGIN_M = np.array([1200.0, 3700.0, 115.0])
-"""Where the scene's origin lies in the world of the written poses."""
-
 SHIFTS_M = (1, 2)
 """How far the held-out views are moved to the car's left."""
 
-PICTURE_NOISE = 2.0 / 255
-"""Standard deviation of the sensor's noise, in picture values of 0-1."""
-
-_EXPOSURE_DRIFT = 0.10
-_BLACK_LEVEL = 2.0 / 255
 _MANIFEST = "drive.json"
 _FIRST_MOMENT = datetime(2013, 5, 28, 8, 46, 2)
 _FIRST_NANOSECONDS = 123_456_789
@@ -80,56 +67,6 @@ _log = logging.getLogger(__name__)
 def held_out(frame: int) -> bool:
     """Whether a frame is for judging, not for training."""
     return frame % 8 == 4
-
-
-@dataclass(frozen=True)
-class _Paths:
-    """Where things lie in a drive."""
-
-    root: Path
-    sequence: str
-
-    def shifted(self) -> Path:
-        return self.root / "truth" / self.sequence / "shifted.json"
-
-    def timestamps(self) -> list[Path]:
-        folders = [self.root / "data_2d_raw" / self.sequence / name for name in rig.CAMERAS]
-        folders.append(self.root / "data_3d_raw" / self.sequence / "velodyne_points")
-        return [folder / "timestamps.txt" for folder in folders]
-
-    def picture(self, camera: str, frame: int) -> Path:
-        return self.root / "data_2d_raw" / self.sequence / camera / "data_rgb" / f"{frame:010d}.png"
-
-    def sweep(self, frame: int) -> Path:
-        return self.root / "data_3d_raw" / self.sequence / "velodyne_points" / "data" / f"{frame:010d}.bin"
-
-    def points(self, frame: int) -> Path:
-        return self.root / "truth" / self.sequence / "points" / f"{frame:010d}.bin"
-
-    def truth(self, camera: str, kind: str, frame: int) -> Path:
-        return self.root / "truth" / self.sequence / camera / kind / f"{frame:010d}.png"
-
-    def moving_mask(self, camera: str, frame: int) -> Path:
-        return self.root / "truth" / self.sequence / "moving_masks" / camera / f"{frame:010d}.png"
-
-    def mono(self, camera: str, frame: int) -> Path:
-        return self.root / "simulated_mono" / self.sequence / camera / f"{frame:010d}.png"
-
-    def of_sweep(self, frame: int) -> list[Path]:
-        return [self.sweep(frame), self.points(frame)]
-
-    def of_camera(self, camera: str, frame: int, with_moving_mask: bool) -> list[Path]:
-        files = [self.picture(camera, frame), self.mono(camera, frame)]
-        files += [self.truth(camera, kind, frame) for kind in ("distance", "rgb")]
-        if with_moving_mask:
-            files.append(self.moving_mask(camera, frame))
-        if held_out(frame):
-            files += [
-                self.truth(camera, f"shifted_{shift}m/{kind}", frame)
-                for shift in SHIFTS_M
-                for kind in ("rgb", "distance")
-            ]
-        return files
 
 
 def _manifest(options: SynthesizeOptions) -> dict[str, Any]:
@@ -199,111 +136,75 @@ def _row(frame: int, matrix: NDArray[np.float64]) -> str:
     return " ".join([str(frame), *(f"{value:.10f}" for value in matrix.reshape(-1))]) + "\n"
 
 
-class _Synthesis:
-    """A scene, the cameras, and what a frame of them is made of."""
+class _Kitti360(DriveLayout):
+    """The layout `kitti-360`."""
 
     def __init__(self, options: SynthesizeOptions) -> None:
-        self.options = options
-        self.paths = _Paths(options.output, options.sequence)
-        self._model = build_scene(options)
-        self._world = World(self._model, options.seed)
-        own_car = own_car_world(self._model, options.seed)
-        # that world has z up, its origin on the road below the pose's
-        pose_to_ground = np.diag([1.0, -1.0, -1.0, 1.0])
-        pose_to_ground[2, 3] = rig.POSE_HEIGHT_M
-        self.cameras = {
-            name: FisheyeCamera(rig.camera(name, options.size), own_car, pose_to_ground @ rig.CAMERA_TO_POSE[name])
-            for name in rig.CAMERAS
-        }
+        super().__init__(
+            options,
+            {name: MountedCamera(rig.camera(name, options.size), rig.CAMERA_TO_POSE[name]) for name in rig.CAMERAS},
+        )
+        self._pictures = self.root / "data_2d_raw" / options.sequence
+        self._scans = self.root / "data_3d_raw" / options.sequence / "velodyne_points"
+        self._truth = self.root / "truth" / options.sequence
 
-    def pose(self, frame: int) -> NDArray[np.float64]:
-        """Vehicle to scene, 4×4."""
-        return self._model.drive.pose_to_world(np.array([frame * FRAME_INTERVAL_S]))[0]
+    @property
+    def last_file(self) -> Path:
+        return self._truth / "shifted.json"
 
-    def _camera_pose(self, camera: str, frame: int, to_the_left_m: int = 0) -> NDArray[np.float64]:
-        """Camera to scene, 4×4, with the whole car moved to its left."""
-        sideways = np.eye(4)
-        sideways[1, 3] = -to_the_left_m
-        return self.pose(frame) @ sideways @ rig.CAMERA_TO_POSE[camera]
+    def picture(self, name: str, frame: int) -> Path:
+        return self._pictures / name / "data_rgb" / f"{frame:010d}.png"
+
+    def scan(self, frame: int) -> Path:
+        return self._scans / "data" / f"{frame:010d}.bin"
+
+    def map(self, kind: str, name: str, frame: int) -> Path:
+        mono = self.root / "simulated_mono" / self.options.sequence / name
+        folder = mono if kind == "mono" else self._truth / name / kind.removeprefix("truth_")
+        return folder / f"{frame:010d}.png"
+
+    def true_points(self, frame: int) -> Path:
+        return self._truth / "points" / f"{frame:010d}.bin"
+
+    def moving_mask(self, name: str, frame: int) -> Path | None:
+        return self._truth / "moving_masks" / name / f"{frame:010d}.png" if self.options.moving else None
+
+    def shifted(self, name: str, frame: int) -> dict[int, tuple[Path, Path]]:
+        folders = {metres: self._truth / name / f"shifted_{metres}m" for metres in SHIFTS_M if held_out(frame)}
+        file = f"{frame:010d}.png"
+        return {metres: (folder / "rgb" / file, folder / "distance" / file) for metres, folder in folders.items()}
+
+    def scan_bytes(self, taken: Sweep) -> bytes:
+        return taken.raw.astype("<f4").tobytes()
 
     def write_once(self) -> None:
-        """Calibration, timestamps, poses, masks: what does not belong to one frame."""
-        root, frames = self.options.output, range(self.options.frames)
-        rig.write_calibration(root / "calibration", self.options.size)
-        for path in self.paths.timestamps():
-            write_text(path, _timestamps(self.options.frames))
+        frames = range(self.options.frames)
+        rig.write_calibration(self.root / "calibration", self.options.size)
+        for folder in (*(self._pictures / name for name in self.cameras), self._scans):
+            write_text(folder / "timestamps.txt", _timestamps(self.options.frames))
         to_world = np.eye(4)
         to_world[:3, 3] = WORLD_ORIGIN_M
-        poses = [to_world @ self.pose(frame) for frame in frames]
-        folder = root / "data_poses" / self.options.sequence
+        poses = to_world @ self.drive.pose_to_world(np.array(frames) * FRAME_INTERVAL_S)
+        folder = self.root / "data_poses" / self.options.sequence
         write_text(folder / "poses.txt", "".join(_row(frame, poses[frame][:3]) for frame in frames))
         cam0 = rig.CAMERA_TO_POSE["image_00"]
         write_text(folder / "cam0_to_world.txt", "".join(_row(frame, poses[frame] @ cam0) for frame in frames))
-        for name, camera in self.cameras.items():
-            write_mask(root / "truth" / "masks" / f"{name}_lens.png", camera.lens)
-            write_mask(root / "truth" / "masks" / f"{name}_ego.png", ~camera.own_car)
-            write_mask(root / "truth" / "masks" / f"{name}.png", camera.lens & ~camera.own_car)
+        for name, camera in self.views.items():
+            masks = {"_lens": camera.lens, "_ego": ~camera.own_car, "": camera.lens & ~camera.own_car}
+            for kind, mask in masks.items():
+                write_mask(self.root / "truth" / "masks" / f"{name}{kind}.png", mask)
         shifted = {
-            str(shift): {
+            str(metres): {
                 name: {
-                    str(frame): (to_world @ self._camera_pose(name, frame, shift)).tolist()
+                    str(frame): (to_world @ self.camera_pose(name, frame * FRAME_INTERVAL_S, metres)).tolist()
                     for frame in frames
                     if held_out(frame)
                 }
-                for name in rig.CAMERAS
+                for name in self.cameras
             }
-            for shift in SHIFTS_M
+            for metres in SHIFTS_M
         }
-        # last: where it is, the others are
-        write_json(self.paths.shifted(), shifted)
-
-    def write_sweep(self, frame: int) -> None:
-        rng = np.random.default_rng([self.options.seed, 20, frame])
-        taken = sweep(self._world, self._model.drive, frame * FRAME_INTERVAL_S, rng)
-        write_bytes(self.paths.sweep(frame), taken.raw.astype("<f4").tobytes())
-        write_bytes(self.paths.points(frame), taken.deskewed.astype("<f4").tobytes())
-
-    def write_pictures(self, name: str, frame: int) -> None:
-        number, camera, time_s = rig.CAMERAS.index(name), self.cameras[name], frame * FRAME_INTERVAL_S
-        for shift in SHIFTS_M if held_out(frame) else ():
-            pose = self._camera_pose(name, frame, shift)
-            view = camera.view(self._world, pose, time_s, with_own_car=False)
-            clean = self._world.to_picture(view.radiance)
-            write_png(self.paths.truth(name, f"shifted_{shift}m/rgb", frame), to_bytes(clean))
-            write_distance_png(self.paths.truth(name, f"shifted_{shift}m/distance", frame), view.distance_m)
-        view = camera.view(self._world, self._camera_pose(name, frame), time_s)
-        write_distance_png(self.paths.truth(name, "distance", frame), view.distance_m)
-        write_png(self.paths.truth(name, "rgb", frame), to_bytes(self._world.to_picture(view.radiance)))
-        if self.options.moving:
-            write_mask(self.paths.moving_mask(name, frame), ~view.moving)
-        estimate = simulated_estimate(
-            view.distance_m, camera.own_distance_m, camera.lens, frame, self.options.seed, number
-        )
-        write_distance_png(self.paths.mono(name, frame), estimate)
-        picture = take_picture(self._world, view, self.options.seed, number, frame)
-        write_png(self.paths.picture(name, frame), picture)
-
-
-def take_picture(world: World, view: View, seed: int, camera: int, frame: int) -> NDArray[np.uint8]:
-    """A view as the camera's sensor gives it: H×W×3, with exposure drift and noise."""
-    rng = np.random.default_rng([seed, 31, camera, frame])
-    picture = world.to_picture(view.radiance, _gain(seed, camera, frame))
-    noise = rng.standard_normal(picture.shape, np.float32) * np.float32(PICTURE_NOISE)
-    return to_bytes(np.maximum(picture, _BLACK_LEVEL) + noise)
-
-
-def _gain(seed: int, camera: int, frame: int) -> float:
-    """The exposure's smooth drift: two slow waves, within ±10 %."""
-    rng = np.random.default_rng([seed, 30, camera])
-    phases, periods = rng.uniform(0, 2 * np.pi, 2), rng.uniform((4.0, 1.7), (7.0, 2.9))
-    time_s = frame * FRAME_INTERVAL_S
-    waves = np.sin(2 * np.pi * time_s / periods + phases) * (0.7, 0.3)
-    return float(1 + _EXPOSURE_DRIFT * waves.sum())
-
-
-def to_bytes(picture: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Picture values of 0-1 as bytes."""
-    return np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)
+        write_json(self.last_file, shifted)
 
 
 def synthesize_drive(options: SynthesizeOptions) -> Path:
@@ -320,34 +221,17 @@ def synthesize_drive(options: SynthesizeOptions) -> Path:
     """
     options.check()
     _open_folder(options)
-    if options.layout != "kitti-360":
-        from edge_depth_nerf.synthetic.rig_drive import synthesize_rig_drive
-
-        synthesize_rig_drive(options)
-        return options.output
-    paths = _Paths(options.output, options.sequence)
-
-    def lacks(files: list[Path]) -> bool:
-        return not all(path.is_file() for path in files)
-
-    missing: list[Job] = []
-    for frame in range(options.frames):
-        if lacks(paths.of_sweep(frame)):
-            missing.append((frame, None))
-        for camera in rig.CAMERAS:
-            if lacks(paths.of_camera(camera, frame, options.moving > 0)):
-                missing.append((frame, camera))
-    if not missing and paths.shifted().is_file():
+    drive = {"kitti-360": _Kitti360, **RIG_FILE_LAYOUTS}[options.layout](options)
+    jobs: list[Job] = [(frame, name) for frame in range(options.frames) for name in (None, *drive.cameras)]
+    missing = [job for job in jobs if not all(path.is_file() for path in drive.files(*job))]
+    if not missing and drive.last_file.is_file():
         _log.info("%s: complete", options.output)
         return options.output
     with Console().status(f"Building the {options.scene} …"):
-        synthesis = _Synthesis(options)
-        synthesis.write_once()
-    for frame, camera in shown(missing, options):
-        if camera is None:
-            synthesis.write_sweep(frame)
-        else:
-            synthesis.write_pictures(camera, frame)
+        drive.build()
+        drive.write_once()
+    for job in shown(missing, options):
+        drive.write(*job)
     return options.output
 
 

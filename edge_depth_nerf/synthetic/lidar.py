@@ -17,16 +17,6 @@ from edge_depth_nerf.synthetic.motion import FRAME_INTERVAL_S, Drive
 from edge_depth_nerf.synthetic.render import World
 from edge_depth_nerf.synthetic.rig import VELO_TO_POSE
 
-BEAM_ELEVATION_RAD = np.deg2rad(np.linspace(2.0, -24.8, 64))
-"""Elevations of the beams, from top to bottom."""
-
-FIRINGS = 1800
-"""Firings a turn, 0.2° apart."""
-
-# half a step off the rear, so that no firing lies on the seam of ±180°
-AZIMUTH_RAD = np.deg2rad(180.0 - (np.arange(FIRINGS) + 0.5) * 360.0 / FIRINGS)
-"""Azimuths in the order of firing, counter-clockwise from x."""
-
 
 @dataclass(frozen=True)
 class Scanner:
@@ -39,13 +29,20 @@ class Scanner:
     to_pose: NDArray[np.float64]
     """4×4, from its frame (x forward, y left, z up) to the vehicle's."""
 
+    @staticmethod
+    def turning(top_deg: float, bottom_deg: float, beams: int, firings: int, to_pose: NDArray[np.float64]) -> Scanner:
+        """A scanner whose beams lie evenly between two elevations, and its firings evenly on a turn."""
+        # half a step off the rear, so that no firing lies on the seam of ±180°
+        azimuth_rad = np.deg2rad(180.0 - (np.arange(firings) + 0.5) * 360.0 / firings)
+        return Scanner(np.deg2rad(np.linspace(top_deg, bottom_deg, beams)), azimuth_rad, to_pose)
+
     @property
     def offset_s(self) -> NDArray[np.float64]:
         """When each firing happens, from the moment that the laser faces forwards."""
         return -self.azimuth_rad / (2 * np.pi) * FRAME_INTERVAL_S
 
 
-HDL_64E = Scanner(BEAM_ELEVATION_RAD, AZIMUTH_RAD, VELO_TO_POSE)
+HDL_64E = Scanner.turning(2.0, -24.8, 64, 1800, VELO_TO_POSE)
 """KITTI-360's scanner."""
 
 RANGE_M = (0.9, 80.0)

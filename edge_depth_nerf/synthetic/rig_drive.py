@@ -23,52 +23,33 @@ Both, with c the camera:
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-from edge_depth_nerf.base.files import write_bytes, write_distance_png, write_mask, write_png, write_text
+from edge_depth_nerf.base.files import write_mask, write_text
 from edge_depth_nerf.cameras import MEI, Camera, KannalaBrandt, Pinhole
-from edge_depth_nerf.synthetic import rig
-from edge_depth_nerf.synthetic.drive import WORLD_ORIGIN_M, Job, shown, take_picture, to_bytes
-from edge_depth_nerf.synthetic.lidar import Scanner, Sweep, sweep
+from edge_depth_nerf.synthetic.layout import VEHICLE_TO_POSE, WORLD_ORIGIN_M, DriveLayout, MountedCamera
+from edge_depth_nerf.synthetic.lidar import Scanner, Sweep
 from edge_depth_nerf.synthetic.motion import FRAME_INTERVAL_S
-from edge_depth_nerf.synthetic.options import SynthesizeOptions
-from edge_depth_nerf.synthetic.render import FisheyeCamera, World, own_car_world
-from edge_depth_nerf.synthetic.scenes import build_scene
-from edge_depth_nerf.synthetic.simulated_mono import simulated_estimate
+from edge_depth_nerf.synthetic.options import LayoutName, SynthesizeOptions
 
 POSE_INTERVAL_S = 0.04
 """Time between the written poses; it does not fit the pictures'."""
 
-_VEHICLE_TO_POSE = np.diag([1.0, -1.0, -1.0, 1.0])
 _FIRST_NS = 1_369_730_762_123_456_789
 _MODELS = {MEI: "mei", KannalaBrandt: "kannala-brandt", Pinhole: "pinhole"}
 
 
-@dataclass(frozen=True)
-class MountedCamera:
-    """A camera on the vehicle."""
-
-    camera: Camera
-    """At the size of its pictures."""
-    to_vehicle: NDArray[np.float64]
-    """4×4, from its frame to the vehicle's (x forward, y left, z up)."""
-    lens_theta_deg: float
-    """Half of the lens's field of view."""
-    delay_s: float = 0.0
-    """How long after the frame's moment it fires."""
-
-
 def looking(yaw_deg: float, pitch_deg: float, position_m: tuple[float, float, float]) -> NDArray[np.float64]:
-    """Camera to vehicle, 4×4, of a camera that is turned to the left by `yaw_deg` and down by `pitch_deg`."""
+    """Camera to vehicle (x forward, y left, z up), 4×4, turned to the left by `yaw_deg` and down by `pitch_deg`."""
     yaw, pitch = math.radians(yaw_deg), math.radians(pitch_deg)
     forward = np.array([math.cos(yaw) * math.cos(pitch), math.sin(yaw) * math.cos(pitch), -math.sin(pitch)])
     right = np.array([math.sin(yaw), -math.cos(yaw), 0.0])
@@ -76,6 +57,10 @@ def looking(yaw_deg: float, pitch_deg: float, position_m: tuple[float, float, fl
     transform[:3, :3] = np.stack((right, np.cross(forward, right), forward), -1)
     transform[:3, 3] = position_m
     return transform
+
+
+def _mounted(camera: Camera, to_vehicle: NDArray[np.float64], theta_deg: float, delay_s: float = 0.0) -> MountedCamera:
+    return MountedCamera(camera, VEHICLE_TO_POSE @ to_vehicle, theta_deg, delay_s)
 
 
 def rig_cameras(size: int) -> dict[str, MountedCamera]:
@@ -86,9 +71,9 @@ def rig_cameras(size: int) -> dict[str, MountedCamera]:
     height = round(0.75 * size)
     front = Pinhole(size, height, 0.7 * size, 0.702 * size, 0.503 * size, 0.49 * height, -0.11, 0.03, 4e-4, -3e-4)
     return {
-        "left": MountedCamera(_filled(left, 110.0), looking(88.0, 8.0, (0.73, 0.15, 1.07)), 110.0),
-        "right": MountedCamera(_filled(right, 110.0), looking(-91.0, 6.0, (0.70, -0.75, 1.07)), 110.0, 0.004),
-        "front": MountedCamera(front, looking(1.0, 5.0, (1.58, 0.05, 0.65)), 60.0, 0.012),
+        "left": _mounted(_filled(left, 110.0), looking(88.0, 8.0, (0.73, 0.15, 1.07)), 110.0),
+        "right": _mounted(_filled(right, 110.0), looking(-91.0, 6.0, (0.70, -0.75, 1.07)), 110.0, 0.004),
+        "front": _mounted(front, looking(1.0, 5.0, (1.58, 0.05, 0.65)), 60.0, 0.012),
     }
 
 
@@ -103,7 +88,7 @@ def jbnu_cameras(size: int) -> dict[str, MountedCamera]:
         "rear": (180.0, (-0.7, 0.0, 1.05)),
         "right": (-90.0, (0.5, -0.5, 1.05)),
     }
-    return {name: MountedCamera(camera, looking(yaw, 4.0, place), 91.5) for name, (yaw, place) in places.items()}
+    return {name: _mounted(camera, looking(yaw, 4.0, place), 91.5) for name, (yaw, place) in places.items()}
 
 
 def _filled(camera: Camera, theta_deg: float) -> Camera:
@@ -114,12 +99,7 @@ def _filled(camera: Camera, theta_deg: float) -> Camera:
     return replace(camera, fx=focal, fy=1.001 * focal)
 
 
-def _scanner(top_deg: float, bottom_deg: float, beams: int, firings: int, to_vehicle: NDArray[np.float64]) -> Scanner:
-    azimuth = np.deg2rad(180.0 - (np.arange(firings) + 0.5) * 360.0 / firings)
-    return Scanner(np.deg2rad(np.linspace(top_deg, bottom_deg, beams)), azimuth, _VEHICLE_TO_POSE @ to_vehicle)
-
-
-def _mounted(yaw_deg: float, position_m: tuple[float, float, float]) -> NDArray[np.float64]:
+def _scanner_to_vehicle(yaw_deg: float, position_m: tuple[float, float, float]) -> NDArray[np.float64]:
     """Scanner to vehicle, 4×4."""
     transform = np.eye(4)
     transform[:3, :3] = Rotation.from_euler("z", yaw_deg, degrees=True).as_matrix()
@@ -127,106 +107,51 @@ def _mounted(yaw_deg: float, position_m: tuple[float, float, float]) -> NDArray[
     return transform
 
 
-class _RigDrive(ABC):
-    """A scene seen by a rig; what the two layouts share."""
+class _RigFileLayout(DriveLayout):
+    """What the layouts share that bring a rig file."""
 
-    cameras: dict[str, MountedCamera]
     scanner_to_vehicle: NDArray[np.float64]
-    scanner: Scanner
     first_s = 0.0
     """Time of frame 0."""
 
-    def __init__(self, options: SynthesizeOptions) -> None:
-        self.options, self.root = options, options.output
-        model = build_scene(options)
-        self._drive, self._world = model.drive, World(model, options.seed)
-        own_car = own_car_world(model, options.seed)
-        pose_to_ground = np.diag([1.0, -1.0, -1.0, 1.0])
-        pose_to_ground[2, 3] = rig.POSE_HEIGHT_M
-        self._views = {
-            name: FisheyeCamera(
-                mounted.camera,
-                own_car,
-                pose_to_ground @ _VEHICLE_TO_POSE @ mounted.to_vehicle,
-                mounted.lens_theta_deg,
-            )
-            for name, mounted in self.cameras.items()
-        }
-
     @abstractmethod
-    def picture(self, name: str, frame: int) -> Path:
-        """Where a picture lies."""
-
-    @abstractmethod
-    def scan(self, frame: int) -> Path:
-        """Where a scan lies."""
-
-    @abstractmethod
-    def description(self) -> tuple[Path, str]:
-        """The rig file, and what it says."""
-
-    @abstractmethod
-    def scan_bytes(self, taken: Sweep) -> bytes:
-        """A scan in the layout's own format."""
+    def description(self) -> str:
+        """What the rig file says."""
 
     def map(self, kind: str, name: str, frame: int) -> Path:
-        """Where a map of a picture lies."""
         return self.root / _maps(name)[kind] / f"{frame:06d}.png"
 
-    def files(self, frame: int, name: str | None) -> list[Path]:
-        if name is None:
-            return [self.scan(frame)]
-        return [self.picture(name, frame), *(self.map(kind, name, frame) for kind in _maps(name))]
-
-    def write(self, frame: int, name: str | None) -> None:
-        time_s, seed = frame * FRAME_INTERVAL_S, self.options.seed
-        if name is None:
-            rng = np.random.default_rng([seed, 20, frame])
-            taken = sweep(self._world, self._drive, time_s, rng, self.scanner)
-            write_bytes(self.scan(frame), self.scan_bytes(taken))
-            return
-        number, camera, mounted = list(self.cameras).index(name), self._views[name], self.cameras[name]
-        time_s += mounted.delay_s
-        pose = self._drive.pose_to_world(np.array([time_s]))[0] @ _VEHICLE_TO_POSE @ mounted.to_vehicle
-        view = camera.view(self._world, pose, time_s)
-        write_distance_png(self.map("truth_distance", name, frame), view.distance_m)
-        write_png(self.map("truth_rgb", name, frame), to_bytes(self._world.to_picture(view.radiance)))
-        estimate = simulated_estimate(view.distance_m, camera.own_distance_m, camera.lens, frame, seed, number)
-        write_distance_png(self.map("mono", name, frame), estimate)
-        write_png(self.picture(name, frame), take_picture(self._world, view, seed, number, frame))
-
     def write_once(self) -> None:
-        """Masks, poses, times, and last of all the rig file."""
-        for name, camera in self._views.items():
+        for name, camera in self.views.items():
             write_mask(self.root / "masks" / f"{name}.png", camera.lens & ~camera.own_car)
         end_s = (self.options.frames - 1) * FRAME_INTERVAL_S + 0.2
         times_s = np.arange(-0.2, end_s, POSE_INTERVAL_S)
         lines = []
-        for time_s, pose in zip(times_s, self._drive.pose_to_world(times_s) @ _VEHICLE_TO_POSE, strict=True):
+        for time_s, pose in zip(times_s, self.drive.pose_to_world(times_s) @ VEHICLE_TO_POSE, strict=True):
             position, quaternion = pose[:3, 3] + WORLD_ORIGIN_M, Rotation.from_matrix(pose[:3, :3]).as_quat()
             numbers = " ".join(f"{value:.9f}" for value in (*position, *quaternion))
             lines.append(f"{self.first_s + time_s:.6f} {numbers}\n")
         write_text(self.root / "poses.txt", "# time x y z qx qy qz qw\n" + "".join(lines))
-        for name, mounted in self.cameras.items():
-            moments = [frame * FRAME_INTERVAL_S + mounted.delay_s for frame in range(self.options.frames)]
-            self.write_times(name, moments)
-        write_text(*self.description())
+        self.write_times()
+        write_text(self.last_file, self.description())
 
-    @abstractmethod
-    def write_times(self, name: str, moments_s: list[float]) -> None:
-        """Write when a camera's pictures were taken, where the layout says so."""
+    def write_times(self) -> None:
+        """Write when the pictures were taken, where the layout says so."""
 
 
-class _Rig(_RigDrive):
+class _Rig(_RigFileLayout):
     """The layout `rig`."""
 
     first_s = _FIRST_NS / 1e9
+    scanner_to_vehicle = _scanner_to_vehicle(3.0, (0.8, 0.02, 0.84))
+    scanner = Scanner.turning(12.0, -26.0, 48, 1200, VEHICLE_TO_POSE @ scanner_to_vehicle)
 
     def __init__(self, options: SynthesizeOptions) -> None:
-        self.cameras = rig_cameras(options.size)
-        self.scanner_to_vehicle = _mounted(3.0, (0.8, 0.02, 0.84))
-        self.scanner = _scanner(12.0, -26.0, 48, 1200, self.scanner_to_vehicle)
-        super().__init__(options)
+        super().__init__(options, rig_cameras(options.size))
+
+    @property
+    def last_file(self) -> Path:
+        return self.root / "rig.toml"
 
     def picture(self, name: str, frame: int) -> Path:
         return self.root / "images" / name / f"{frame:06d}.png"
@@ -248,11 +173,13 @@ class _Rig(_RigDrive):
         )
         return header.encode() + points.tobytes()
 
-    def write_times(self, name: str, moments_s: list[float]) -> None:
-        lines = "".join(f"{self.first_s + moment:.6f}\n" for moment in moments_s)
-        write_text(self.root / f"times_{name}.txt", lines)
+    def write_times(self) -> None:
+        for name, mounted in self.cameras.items():
+            moments_s = [frame * FRAME_INTERVAL_S + mounted.delay_s for frame in range(self.options.frames)]
+            lines = "".join(f"{self.first_s + moment:.6f}\n" for moment in moments_s)
+            write_text(self.root / f"times_{name}.txt", lines)
 
-    def description(self) -> tuple[Path, str]:
+    def description(self) -> str:
         text = '[poses]\nfile = "poses.txt"\nformat = "tum"\n'
         for name, mounted in self.cameras.items():
             text += f"\n[cameras.{name}]\n" + _table(
@@ -261,7 +188,7 @@ class _Rig(_RigDrive):
                 ego_mask=f"masks/{name}.png",
                 **_maps(name),
                 **_model(mounted.camera),
-                to_vehicle=mounted.to_vehicle,
+                to_vehicle=VEHICLE_TO_POSE @ mounted.to_pose,
             )
         text += "\n[lidars.roof]\n" + _table(
             scans="lidar",
@@ -275,20 +202,21 @@ class _Rig(_RigDrive):
                 "quaternion": Rotation.from_matrix(self.scanner_to_vehicle[:3, :3]).as_quat(),
             },
         )
-        return self.root / "rig.toml", text
+        return text
 
 
-class _JbnuDepth360(_RigDrive):
+class _JbnuDepth360(_RigFileLayout):
     """The layout `jbnu-depth360`."""
 
-    def write_times(self, name: str, moments_s: list[float]) -> None:
-        """Nothing: the numbers of the pictures and their rate say it."""
+    scanner_to_vehicle = _scanner_to_vehicle(0.0, (0.4, 0.0, 1.2))
+    scanner = Scanner.turning(45.0, -45.0, 32, 1024, VEHICLE_TO_POSE @ scanner_to_vehicle)
 
     def __init__(self, options: SynthesizeOptions) -> None:
-        self.cameras = jbnu_cameras(options.size)
-        self.scanner_to_vehicle = _mounted(0.0, (0.4, 0.0, 1.2))
-        self.scanner = _scanner(45.0, -45.0, 32, 1024, self.scanner_to_vehicle)
-        super().__init__(options)
+        super().__init__(options, jbnu_cameras(options.size))
+
+    @property
+    def last_file(self) -> Path:
+        return self.root / "calibration.toml"
 
     def picture(self, name: str, frame: int) -> Path:
         return self.root / "image" / name / f"{frame:06d}.png"
@@ -299,16 +227,16 @@ class _JbnuDepth360(_RigDrive):
     def scan_bytes(self, taken: Sweep) -> bytes:
         return taken.raw.astype("<f4").tobytes()
 
-    def description(self) -> tuple[Path, str]:
+    def description(self) -> str:
         text = '[poses]\nfile = "poses.txt"\n'
         for name, mounted in self.cameras.items():
             model = _model(mounted.camera)
             del model["model"]
             text += f"\n[cameras.{name}]\n" + _table(
-                **model, ego_mask=f"masks/{name}.png", **_maps(name), to_vehicle=mounted.to_vehicle
+                **model, ego_mask=f"masks/{name}.png", **_maps(name), to_vehicle=VEHICLE_TO_POSE @ mounted.to_pose
             )
         text += "\n[lidars.ouster]\n" + _table(to_vehicle=self.scanner_to_vehicle)
-        return self.root / "calibration.toml", text
+        return text
 
 
 def _maps(name: str) -> dict[str, str]:
@@ -341,13 +269,8 @@ def _toml(value: Any) -> str:
     return f'"{value}"' if isinstance(value, str) else f"{value:.12g}"
 
 
-def synthesize_rig_drive(options: SynthesizeOptions) -> None:
-    """Write what is missing of a drive in the layout `rig` or `jbnu-depth360`; its folder is open."""
-    with Console().status(f"Building the {options.scene} …"):
-        drive = {"rig": _Rig, "jbnu-depth360": _JbnuDepth360}[options.layout](options)
-    jobs: list[Job] = [(frame, name) for frame in range(options.frames) for name in (None, *drive.cameras)]
-    missing = [job for job in jobs if not all(path.is_file() for path in drive.files(*job))]
-    if missing or not drive.description()[0].is_file():
-        drive.write_once()
-    for job in shown(missing, options):
-        drive.write(*job)
+RIG_FILE_LAYOUTS: dict[LayoutName, Callable[[SynthesizeOptions], DriveLayout]] = {
+    "rig": _Rig,
+    "jbnu-depth360": _JbnuDepth360,
+}
+"""The layouts with a rig file."""

@@ -303,6 +303,15 @@ def _movers(
     return movers
 
 
+def _driven_through(
+    options: SynthesizeOptions, site: _Site, lighting: Lighting, route: Route, oncoming: Route, start_m: Real = 0.0
+) -> SceneModel:
+    """The scene with the recording car on its route, from an arc length on, and the cars that drive."""
+    drive = Drive.random(route, start_m, options.mean_speed_m_s, np.random.default_rng([options.seed, 2]))
+    movers = _movers(options, drive, oncoming, -start_m, np.random.default_rng([options.seed, 3]))
+    return SceneModel(site.mesh.build(), movers, lighting, site.contacts, drive)
+
+
 def _street(options: SynthesizeOptions) -> SceneModel:
     rng = np.random.default_rng([options.seed, 1])
     length = options.mean_speed_m_s * options.frames * FRAME_INTERVAL_S
@@ -323,9 +332,7 @@ def _street(options: SynthesizeOptions) -> SceneModel:
         row = _Site()
         _houses(row, (-30.0, 26.0), rng, corner_first=False)
         site.put_site(row, placement(end, 0, 0, yaw))
-    drive = Drive.random(Route((0.0, -1.75)), 0.0, options.mean_speed_m_s, np.random.default_rng([options.seed, 2]))
-    movers = _movers(options, drive, Route((0.0, 1.75), np.pi), 0.0, np.random.default_rng([options.seed, 3]))
-    return SceneModel(mesh.build(), movers, _DAYLIGHT, site.contacts, drive)
+    return _driven_through(options, site, _DAYLIGHT, Route((0.0, -1.75)), Route((0.0, 1.75), np.pi))
 
 
 _CORNER_M = 4.0
@@ -394,10 +401,7 @@ def _turn(options: SynthesizeOptions) -> SceneModel:
         back = objects.thicket(2 * reach, 12.0, rng)
         local.put(back, placement(reach + 25, -reach, 0, np.pi / 2))
         site.put_site(local, placement(centre_x, 0, 0, arm * np.pi / 2))
-    drive = Drive.random(route, start, options.mean_speed_m_s, np.random.default_rng([options.seed, 2]))
-    oncoming = Route((0.0, 1.75), np.pi)
-    movers = _movers(options, drive, oncoming, -start, np.random.default_rng([options.seed, 3]))
-    return SceneModel(mesh.build(), movers, _DAYLIGHT, site.contacts, drive)
+    return _driven_through(options, site, _DAYLIGHT, route, Route((0.0, 1.75), np.pi), start)
 
 
 _CEILING_M = 2.6
@@ -507,9 +511,7 @@ def _parking(options: SynthesizeOptions) -> SceneModel:
         lamp=(1.9, 2.0, 1.8),
         lamp_reach_m=8.0,
     )
-    drive = Drive.random(Route((0.0, -1.1)), 0.0, options.mean_speed_m_s, np.random.default_rng([options.seed, 2]))
-    movers = _movers(options, drive, Route((0.0, 1.6), np.pi), 0.0, np.random.default_rng([options.seed, 3]))
-    return SceneModel(mesh.build(), movers, lighting, site.contacts, drive)
+    return _driven_through(options, site, lighting, Route((0.0, -1.1)), Route((0.0, 1.6), np.pi))
 
 
 _BUILDERS = {"street": _street, "turn": _turn, "parking": _parking}

@@ -74,15 +74,10 @@ def read_kitti360(options: Kitti360Options) -> Recording:
         RecordedPicture(
             camera=name,
             frame=frame,
-            path=found.image,
             time_s=clock.time_s(frame),
             camera_to_world=None if poses is None else poses[frame] @ rig.camera_to_pose[name],
             timestamp_s=stamps[name][frame] if stamps[name] else None,
-            mask=found.mask,
-            semantics=found.semantics,
-            mono=found.mono,
-            truth_distance=found.truth_distance,
-            truth_rgb=found.truth_rgb,
+            **vars(found),
         )
         for (name, frame), found in files.items()
     )

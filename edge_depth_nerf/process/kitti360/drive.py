@@ -24,9 +24,9 @@ FISHEYE_CAMERAS = ("image_02", "image_03")
 
 @dataclass(frozen=True)
 class FrameFiles:
-    """The files that one picture's maps are made from."""
+    """A picture and what its maps are made from, under the names that a `RecordedPicture` has for them."""
 
-    image: Path
+    path: Path
     mask: Path | None
     semantics: Path | None
     mono: Path | None
@@ -156,14 +156,14 @@ class Kitti360Drive:
         options = self.options
         camera, file, truth = rig.cameras[name], f"{frame:010d}.png", self.truth / name
         files = FrameFiles(
-            image=self.image_folder(name) / file,
+            path=self.image_folder(name) / file,
             mask=None if options.frame_masks is None else options.frame_masks / name / file,
             semantics=labels if (labels := label_path(options.root, options.sequence, name, frame)).is_file() else None,
             mono=None if options.mono is None else options.mono / name / file,
             truth_distance=truth / "distance" / file if self.has_truth else None,
             truth_rgb=truth / "rgb" / file if self.has_truth else None,
         )
-        check_size(files.image, camera)
+        check_size(files.path, camera)
         for option, path in (("--mono", files.mono), ("--frame-masks", files.mask)):
             if path is not None and not path.is_file():
                 frames = ranges([number for other, number in kept if other == name])

@@ -1,0 +1,179 @@
+"""What the layouts share that a synthetic drive can be written in: a scene, the sensors in it, and what they record.
+
+A layout says which sensors the vehicle carries, where each of their files lies, and what else a converter wants
+beside them. Rendering, and the order in which files are written, is the same for all.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_depth_nerf.base.files import write_bytes, write_distance_png, write_mask, write_png
+from edge_depth_nerf.cameras import Camera
+from edge_depth_nerf.synthetic.lidar import HDL_64E, Scanner, Sweep, sweep
+from edge_depth_nerf.synthetic.motion import FRAME_INTERVAL_S
+from edge_depth_nerf.synthetic.options import SynthesizeOptions
+from edge_depth_nerf.synthetic.render import LENS_THETA_DEG, FisheyeCamera, World, own_car_world
+from edge_depth_nerf.synthetic.rig import POSE_HEIGHT_M
+from edge_depth_nerf.synthetic.scenes import build_scene
+from edge_depth_nerf.synthetic.simulated_mono import simulated_estimate
+
+WORLD_ORIGIN_M = np.array([1200.0, 3700.0, 115.0])
+"""Where the scene's origin lies in the world of the written poses."""
+
+PICTURE_NOISE = 2.0 / 255
+"""Standard deviation of the sensor's noise, in picture values of 0-1."""
+
+VEHICLE_TO_POSE = np.diag([1.0, -1.0, -1.0, 1.0])
+"""From the vehicle as rigs have it (x forward, y left, z up) to the pose (x forward, y right, z down)."""
+
+_EXPOSURE_DRIFT = 0.10
+_BLACK_LEVEL = 2.0 / 255
+
+
+@dataclass(frozen=True)
+class MountedCamera:
+    """A camera on the vehicle."""
+
+    camera: Camera
+    """At the size of its pictures."""
+    to_pose: NDArray[np.float64]
+    """4×4, from its frame to the pose's (x forward, y right, z down)."""
+    lens_theta_deg: float = LENS_THETA_DEG
+    """Half of the lens's field of view."""
+    delay_s: float = 0.0
+    """How long after the frame's moment it fires."""
+
+
+class DriveLayout(ABC):
+    """A drive in one of the layouts. Before `build` it knows its files alone."""
+
+    scanner: Scanner = HDL_64E
+
+    def __init__(self, options: SynthesizeOptions, cameras: Mapping[str, MountedCamera]) -> None:
+        """Lay out a drive that is seen by these cameras."""
+        self.options, self.root, self.cameras = options, options.output, cameras
+
+    def build(self) -> None:
+        """Build the scene, and what each camera sees of the own car."""
+        model, seed = build_scene(self.options), self.options.seed
+        self.drive, self._world = model.drive, World(model, seed)
+        own_car = own_car_world(model, seed)
+        # that world has z up, its origin on the road below the pose's
+        pose_to_ground = np.diag([1.0, -1.0, -1.0, 1.0])
+        pose_to_ground[2, 3] = POSE_HEIGHT_M
+        self.views = {
+            name: FisheyeCamera(mounted.camera, own_car, pose_to_ground @ mounted.to_pose, mounted.lens_theta_deg)
+            for name, mounted in self.cameras.items()
+        }
+
+    # ---- where things lie ----------------------------------------------------------------------------------------
+
+    @property
+    @abstractmethod
+    def last_file(self) -> Path:
+        """What `write_once` writes last: where it is, the others are."""
+
+    @abstractmethod
+    def picture(self, name: str, frame: int) -> Path:
+        """A picture."""
+
+    @abstractmethod
+    def scan(self, frame: int) -> Path:
+        """A scan."""
+
+    @abstractmethod
+    def map(self, kind: str, name: str, frame: int) -> Path:
+        """A map of a picture: its truth_distance, truth_rgb or mono."""
+
+    def true_points(self, frame: int) -> Path | None:
+        """A scan without noise, moved to the frame's moment; None where the layout has none."""
+        return None
+
+    def moving_mask(self, name: str, frame: int) -> Path | None:
+        """Where a picture shows no car that drives; None where the layout has none."""
+        return None
+
+    def shifted(self, name: str, frame: int) -> dict[int, tuple[Path, Path]]:
+        """Picture and distances as seen from some metres to the car's left; empty where the layout has none."""
+        return {}
+
+    def files(self, frame: int, name: str | None) -> list[Path]:
+        """All files of a frame's picture by the camera `name`, or of its scan."""
+        if name is None:
+            every = [self.scan(frame), self.true_points(frame)]
+        else:
+            every = [self.picture(name, frame), self.moving_mask(name, frame)]
+            every += [self.map(kind, name, frame) for kind in ("mono", "truth_distance", "truth_rgb")]
+            every += [path for pair in self.shifted(name, frame).values() for path in pair]
+        return [path for path in every if path is not None]
+
+    # ---- what is in them -----------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def scan_bytes(self, taken: Sweep) -> bytes:
+        """A scan in the layout's own format."""
+
+    @abstractmethod
+    def write_once(self) -> None:
+        """Write what does not belong to one frame: calibration, times, poses, masks."""
+
+    def camera_pose(self, name: str, time_s: float, to_the_left_m: int = 0) -> NDArray[np.float64]:
+        """Camera to scene, 4×4, with the whole car moved to its left."""
+        sideways = np.eye(4)
+        sideways[1, 3] = -to_the_left_m
+        return self.drive.pose_to_world(np.array([time_s]))[0] @ sideways @ self.cameras[name].to_pose
+
+    def write(self, frame: int, name: str | None) -> None:
+        """Render and write a frame's picture by the camera `name` and its maps, or its scan."""
+        if name is None:
+            self._write_scan(frame)
+        else:
+            self._write_picture(frame, name)
+
+    def _write_scan(self, frame: int) -> None:
+        rng = np.random.default_rng([self.options.seed, 20, frame])
+        taken = sweep(self._world, self.drive, frame * FRAME_INTERVAL_S, rng, self.scanner)
+        write_bytes(self.scan(frame), self.scan_bytes(taken))
+        if path := self.true_points(frame):
+            write_bytes(path, taken.deskewed.astype("<f4").tobytes())
+
+    def _write_picture(self, frame: int, name: str) -> None:
+        number, camera, world = list(self.cameras).index(name), self.views[name], self._world
+        time_s, seed = frame * FRAME_INTERVAL_S + self.cameras[name].delay_s, self.options.seed
+        for metres, (picture, distance) in self.shifted(name, frame).items():
+            view = camera.view(world, self.camera_pose(name, time_s, metres), time_s, with_own_car=False)
+            write_png(picture, _to_bytes(world.to_picture(view.radiance)))
+            write_distance_png(distance, view.distance_m)
+        view = camera.view(world, self.camera_pose(name, time_s), time_s)
+        write_distance_png(self.map("truth_distance", name, frame), view.distance_m)
+        write_png(self.map("truth_rgb", name, frame), _to_bytes(world.to_picture(view.radiance)))
+        if path := self.moving_mask(name, frame):
+            write_mask(path, ~view.moving)
+        estimate = simulated_estimate(view.distance_m, camera.own_distance_m, camera.lens, frame, seed, number)
+        write_distance_png(self.map("mono", name, frame), estimate)
+        # as the camera's sensor gives it, with exposure drift and noise
+        taken = world.to_picture(view.radiance, _gain(seed, number, frame))
+        rng = np.random.default_rng([seed, 31, number, frame])
+        noise = rng.standard_normal(taken.shape, np.float32) * np.float32(PICTURE_NOISE)
+        write_png(self.picture(name, frame), _to_bytes(np.maximum(taken, _BLACK_LEVEL) + noise))
+
+
+def _gain(seed: int, camera: int, frame: int) -> float:
+    """The exposure's smooth drift: two slow waves, within ±10 %."""
+    rng = np.random.default_rng([seed, 30, camera])
+    phases, periods = rng.uniform(0, 2 * np.pi, 2), rng.uniform((4.0, 1.7), (7.0, 2.9))
+    time_s = frame * FRAME_INTERVAL_S
+    waves = np.sin(2 * np.pi * time_s / periods + phases) * (0.7, 0.3)
+    return float(1 + _EXPOSURE_DRIFT * waves.sum())
+
+
+def _to_bytes(picture: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Picture values of 0-1 as bytes."""
+    return np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)
