@@ -16,11 +16,11 @@ import time
 from pathlib import Path
 
 import numpy as np
-from edge_depth_nerf.process.kitti360.converter.calibration import read_poses
 from rich.console import Console
 from rich.table import Table
 
 from edge_depth_nerf.process.colmap.poses import colmap_poses
+from edge_depth_nerf.process.kitti360.calibration import read_poses
 from edge_depth_nerf.process.kitti360.converter import read_kitti360
 from edge_depth_nerf.process.options import Kitti360Options
 

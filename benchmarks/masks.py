@@ -20,7 +20,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from edge_depth_nerf.process.kitti360.converter.calibration import read_cam_to_pose, read_mei_camera, read_poses
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
@@ -30,6 +29,7 @@ from edge_depth_nerf.cameras import MEI
 from edge_depth_nerf.masks.ego import EgoMask, NoEgo, find_ego
 from edge_depth_nerf.masks.lens import dark_rim, lens_circle
 from edge_depth_nerf.masks.sky import find_sky
+from edge_depth_nerf.process.kitti360.calibration import read_cam_to_pose, read_mei_camera, read_poses
 from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.options import SceneName, SynthesizeOptions
 

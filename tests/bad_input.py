@@ -17,13 +17,6 @@ from typing import Any
 import cv2
 import numpy as np
 from drives import CAM0_TO_VELO, CAM_TO_POSE, MeiTwin
-from edge_depth_nerf.process.kitti360.converter.calibration import (
-    read_cam_to_pose,
-    read_cam_to_velo,
-    read_mei_camera,
-    read_poses,
-    read_timestamps,
-)
 from scenes import write_scene
 
 from edge_depth_nerf.base.files import (
@@ -44,6 +37,13 @@ from edge_depth_nerf.lidar.sweeps import read_sweep
 from edge_depth_nerf.masks.semantics import read_labels
 from edge_depth_nerf.method.error_model import read_trust
 from edge_depth_nerf.mono.files import read_npy as read_map
+from edge_depth_nerf.process.kitti360.calibration import (
+    read_cam_to_pose,
+    read_cam_to_velo,
+    read_mei_camera,
+    read_poses,
+    read_timestamps,
+)
 from edge_depth_nerf.process.poses import read_kitti, read_nerfstudio, read_times, read_tum
 from edge_depth_nerf.process.rig_file import read_rig
 from edge_depth_nerf.scene.reader import read_scene

@@ -30,14 +30,6 @@ from drives import (
     write_points,
     write_room_drive,
 )
-from edge_depth_nerf.process.kitti360.converter.calibration import (
-    read_cam_to_pose,
-    read_cam_to_velo,
-    read_mei_camera,
-    read_poses,
-    read_rig,
-    read_timestamps,
-)
 from rich.console import Console
 from test_scene import read_ply, tree
 
@@ -61,6 +53,14 @@ from edge_depth_nerf.masks.ego_files import vehicles_unknown
 from edge_depth_nerf.mono.calibration import calibrate_scene
 from edge_depth_nerf.process import build
 from edge_depth_nerf.process.colmap import poses as colmap_poses
+from edge_depth_nerf.process.kitti360.calibration import (
+    read_cam_to_pose,
+    read_cam_to_velo,
+    read_mei_camera,
+    read_poses,
+    read_rig,
+    read_timestamps,
+)
 from edge_depth_nerf.process.kitti360.converter import process_kitti360
 from edge_depth_nerf.process.options import Kitti360Options, ProcessOptions
 from edge_depth_nerf.process.recording import Recording

@@ -9,13 +9,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from edge_depth_nerf.process.kitti360.converter.calibration import read_cam_to_pose, read_mei_camera
 from numpy.typing import NDArray
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, read_mask, write_png
 from edge_depth_nerf.cameras import Pinhole, camera_from_dict
 from edge_depth_nerf.masks import ego, lens, semantics, sky
+from edge_depth_nerf.process.kitti360.calibration import read_cam_to_pose, read_mei_camera
 
 SIZE = 240
 Mask = NDArray[np.bool_]

@@ -29,8 +29,8 @@ from edge_depth_nerf.base.files import read_json
 from edge_depth_nerf.lidar import SweepTiming, check_sweep_size, read_sweep
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.process.build import process_recording
-from edge_depth_nerf.process.kitti360.converter.calibration import Kitti360Rig, read_poses, read_rig
-from edge_depth_nerf.process.kitti360.converter.drive import Kitti360Drive
+from edge_depth_nerf.process.kitti360.calibration import Kitti360Rig, read_poses, read_rig
+from edge_depth_nerf.process.kitti360.drive import Kitti360Drive
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.process.poses import transform_of_rows
 from edge_depth_nerf.process.reading import load_distance, load_picture

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.masks.semantics import check_label_header, label_path
-from edge_depth_nerf.process.kitti360.converter.calibration import Kitti360Rig, read_timestamps
+from edge_depth_nerf.process.kitti360.calibration import Kitti360Rig, read_timestamps
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.scene.checks import Tolerance, check_distance, check_size, require_folder
 from edge_depth_nerf.scene.writer import Skipped, ranges, summarise
