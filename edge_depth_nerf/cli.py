@@ -15,7 +15,7 @@ from rich.console import Console
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.compare.options import CompareOptions
-from edge_depth_nerf.demo.command.options import DemoOptions
+from edge_depth_nerf.demo.options import DemoOptions
 from edge_depth_nerf.films.options import CameraPathOptions
 from edge_depth_nerf.inspecting.options import InspectOptions
 from edge_depth_nerf.mono.options import EstimateDepthOptions
