@@ -164,6 +164,14 @@ def test_other_options_need_another_folder(finished):
         demo.run_demo(replace(options, steps=9), QUIET)
 
 
+def test_options_are_checked_before_anything_starts(tmp_path):
+    output = tmp_path / "out"
+    for changes, message in (({"steps": 0}, "--steps 0"), ({"frames": 0}, "--frames 0"), ({"seed": -1}, "--seed -1")):
+        with pytest.raises(InputError, match=message):
+            demo.run_demo(replace(DemoOptions(output=output), **changes), QUIET)
+    assert not output.exists()
+
+
 def test_a_training_that_fails_names_its_log(finished, tmp_path, monkeypatch):
     options, _ = finished
     again = moved(options, tmp_path / "out")

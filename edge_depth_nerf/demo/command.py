@@ -95,6 +95,9 @@ def run_demo(options: DemoOptions, console: Console | None = None) -> dict[str, 
     console = console or Console()
     output, stages = options.output, stages_of(options)
     check_is_folder(output)
+    # before the first stage takes its minute
+    for stage in (stages.synthesis, stages.processing, stages.comparison):
+        stage.check()
     recorded = {key: value for key, value in asdict(options).items() if key != "output"}
     record = output / RECORD
     if record.is_file() and read_json(record) != recorded:
