@@ -133,8 +133,11 @@ def _make(options: DemoOptions, stages: Stages, recorded: dict[str, Any], consol
         page = write_comparison(compared, comparison, console)
     show_tables(page.tables, console)
     # the folder may hold more: who liked it compares further methods there
-    found = {name: comparison.run(options.scene, name, options.seed) for name in COMPARED}
-    runs = {METHODS[name].title: run for name, run in found.items() if run is not None}
+    runs = {
+        METHODS[run.method].title: run
+        for run in comparison.runs
+        if run.method in COMPARED and (run.scene, run.seed) == (options.scene, options.seed)
+    }
     results = {
         "options": recorded,
         "versions": comparison.versions,
