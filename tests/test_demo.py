@@ -41,7 +41,7 @@ SHOWN = {
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    options = DemoOptions(output=tmp_path_factory.mktemp("demo") / "out", frames=13, size=64, steps=8, mono_seconds=5)
+    options = DemoOptions(output=tmp_path_factory.mktemp("demo") / "out", frames=13, size=64, steps=8, mono_seconds=5.0)
     return options, demo.run_demo(options, QUIET)
 
 
