@@ -3,103 +3,183 @@
 from __future__ import annotations
 
 import html
+import shlex
 import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from rich.console import Console
 
-from edge_depth_nerf.base.console import progress_bars
+from edge_depth_nerf import cli
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import read_image, read_json
+from edge_depth_nerf.base.files import read_image, read_json, write_json
 from edge_depth_nerf.base.pictures import NO_VALUE_RGB, colour_distance, side_by_side
-from edge_depth_nerf.demo.command import command as demo
+from edge_depth_nerf.demo import command as demo
 from edge_depth_nerf.demo.options import DemoOptions
 from edge_depth_nerf.plugin.compat import allow_numpy_scalars_in_checkpoints
+
+pytestmark = pytest.mark.slow
+
+QUIET = Console(quiet=True)
+SHOWN = {
+    "truth_masked_psnr": ".2f",
+    "truth_masked_ssim": ".3f",
+    "truth_affine_masked_psnr": ".2f",
+    "masked_psnr": ".2f",
+    "truth_abs_rel": ".3f",
+    "truth_rmse_m": ".2f",
+    "truth_delta_1_25": ".3f",
+    "shifted_1m_masked_psnr": ".2f",
+}
+"""Figures in the page's tables."""
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    options = DemoOptions(output=tmp_path_factory.mktemp("demo") / "out", frames=13, size=64, steps=8)
-    return options, demo.run_demo(options, Console(quiet=True))
+    options = DemoOptions(output=tmp_path_factory.mktemp("demo") / "out", frames=13, size=64, steps=8, mono_seconds=5.0)
+    return options, demo.run_demo(options, QUIET)
+
+
+def runs_of(output: Path) -> Path:
+    return output / "comparison" / "runs" / "street"
+
+
+def moved(options: DemoOptions, output: Path) -> DemoOptions:
+    """A copy of a demo's folder that knows where it is, and is not finished."""
+    shutil.copytree(options.output, output)
+    (output / "results.json").unlink()
+    for name in ("run.json", "figures.json"):
+        for path in runs_of(output).rglob(name):
+            path.write_text(path.read_text().replace(str(options.output), str(output)))
+    return replace(options, output=output)
 
 
 def test_it_leaves_figures_and_a_picture(finished):
     options, results = finished
     assert read_json(options.output / "results.json") == results
     for name in ("nerfacto", "ours"):
-        assert {metric.name for metric in demo.COLUMNS} <= set(results["figures"][name])
+        assert {*SHOWN, "masked_ssim", "lidar_abs_rel"} <= set(results["figures"][name])
         assert np.isfinite(list(results["figures"][name].values())).all()
+    assert list(results["figures"]) == ["nerfacto", "ours"]
+    assert set(results["seconds"]) == {"synthesize", "process", "compare"} and min(results["seconds"].values()) > 0
+    assert set(results["versions"]) == {"edge-depth-nerf", "nerfstudio", "torch", "numpy", "python"}
     picture = read_image(options.output / "comparison.png")
-    # two moments of two cameras are held out (4 and 12), of which three views are shown: three rows of six pictures
-    assert picture.shape == (34 + 3 * 70 - 6 + 40, 6 * 70 - 6, 3), "with the scale of distances below"
-    assert len(results["viewer_commands"]) == 2
+    # two moments of two cameras are held out (4 and 12), of which three views are shown: each has a row of colours and
+    # one of distances, of three pictures 220 px wide
+    assert picture.shape == (34 + 6 * 226 - 6 + 40, 3 * 226 - 6, 3), "with the scale of distances below"
     page = (options.output / "report.html").read_text(encoding="utf-8")
-    assert "<caption><span>Held-out views</span></caption>" in page and "4 of 4 held-out views" in page
-    for metric in demo.COLUMNS:
-        assert f"{results['figures']['ours'][metric.name]:{metric.form}}</td>" in page
+    assert "<h1>Demo: nerfacto and ours on a rendered street</h1>" in page and "13 moments, 64 px, 8 steps each" in page
+    assert "Table 1</i> Rivals" in page and "4 of 4 held-out views" in page
+    for name, form in SHOWN.items():
+        assert f">{results['figures']['ours'][name]:{form}}</td>" in page
     assert page.count('"colour-error": "data:image/webp') == 4 * 2
-    assert page.count('<img src="data:image/svg+xml;base64,') == 2
-    programs = [command.split()[0] for command in results["commands"]]
-    assert programs == [*["edge-depth-nerf"] * 3, *["ns-train", "ns-eval"] * 2]
-    assert all(html.escape(command) in page.replace("&#39;", "&#x27;") for command in results["commands"])
-    assert all("--viewer.websocket-host 127.0.0.1" in command for command in results["viewer_commands"])
+    assert page.count('<img src="data:image/svg+xml;base64,') == 4
+    for stage, seconds in results["seconds"].items():
+        assert f"<dt>{stage.capitalize()}</dt><dd>{seconds}</dd>" in page
 
 
-def test_the_two_models_differ_in_the_depth_loss_alone(finished):
+def test_its_commands_are_what_a_user_can_type(finished):
+    options, results = finished
+    typed = [shlex.split(command) for command in results["commands"]]
+    assert [words[:2] for words in typed] == [
+        ["edge-depth-nerf", name] for name in ("demo", "synthesize", "process", "compare")
+    ]
+    stages = demo.stages_of(options)
+    processing = cli.Process(stages.processing)
+    assert [cli.parse(words[1:]) for words in typed] == [options, stages.synthesis, processing, stages.comparison]
+    # what the last one would say of itself
+    assert read_json(options.output / "comparison" / "compare.json")["commands"] == results["commands"][-1:]
+    assert len(results["viewer_commands"]) == 2
+    for command, name in zip(results["viewer_commands"], ("nerfacto", "edge"), strict=True):
+        words = shlex.split(command)
+        assert words[:2] == ["ns-viewer", "--load-config"] and "--viewer.websocket-host 127.0.0.1" in command
+        config = Path(words[2])
+        assert config.is_file() and (runs_of(options.output) / f"{name}_seed-0") in config.parents
+    page = (options.output / "report.html").read_text(encoding="utf-8").replace("&#39;", "&#x27;")
+    assert all(html.escape(command) in page for command in [*results["commands"], *results["viewer_commands"]])
+
+
+def test_the_two_models_differ_in_the_depth_loss_and_its_source_alone(finished):
+    """And the source says the same of both: auto is integrated where a scene has both kinds of maps."""
     options, _ = finished
-    texts = []
-    for name in demo.RUNS:
-        text = next((options.output / "runs" / name).rglob("config.yml")).read_text()
-        texts.append(text.replace(f"experiment_name: {name}", "experiment_name: X").splitlines())
-    different = [(a, b) for a, b in zip(*texts, strict=True) if a != b]
-    assert [(a.strip(), b.strip()) for a, b in different] == [("depth_loss: none", "depth_loss: edge")]
+    texts = [
+        next((runs_of(options.output) / f"{name}_seed-0").rglob("config.yml")).read_text().splitlines()
+        for name in demo.COMPARED
+    ]
+    different = {(a.strip(), b.strip()) for a, b in zip(*texts, strict=True) if a != b}
+    assert different == {
+        ("experiment_name: nerfacto_seed-0", "experiment_name: edge_seed-0"),
+        ("depth_loss: none", "depth_loss: edge"),
+        ("depth_source: auto", "depth_source: integrated"),
+    }
 
 
-def test_what_is_there_is_not_done_again(finished, monkeypatch):
+def test_what_is_there_is_not_done_again(finished, monkeypatch, capsys):
     options, results = finished
     monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: pytest.fail("started a command"))
-    again = demo.run_demo(options, Console(quiet=True))
-    assert again["figures"] == results["figures"]
+    written = {path: path.stat().st_mtime_ns for path in options.output.rglob("*") if path.is_file()}
+    again = demo.run_demo(options, Console(width=200))
+    assert again == results
+    assert written == {path: path.stat().st_mtime_ns for path in options.output.rglob("*") if path.is_file()}
+    said = capsys.readouterr().out
+    assert f"{results['figures']['ours']['truth_masked_psnr']:.2f}" in said
+    assert str(options.output / "report.html") in said and results["viewer_commands"][1] in said
 
 
 def test_an_interrupted_demo_is_finished(finished, tmp_path):
     """As if it had been stopped after four of ours' eight steps: only the rest is done, from the checkpoint."""
     options, results = finished
-    output = tmp_path / "out"
-    shutil.copytree(options.output, output)
-    (output / "results.json").unlink()
-    metrics = output / "runs" / "ours" / "metrics.json"
-    metrics.write_text(metrics.read_text()[:100])  # killed while it was written
-    folder = output / "runs" / "ours" / demo.METHOD / "run" / "nerfstudio_models"
+    again = moved(options, tmp_path / "out")
+    ours = runs_of(again.output) / "edge_seed-0"
+    before = read_json(ours / "figures.json")["curve"]
+    (ours / "figures.json").unlink()
+    folder = next(ours.rglob("nerfstudio_models"))
     allow_numpy_scalars_in_checkpoints()
     saved = torch.load(folder / "step-000000007.ckpt", weights_only=True)
     (folder / "step-000000007.ckpt").unlink()
     torch.save({**saved, "step": 3}, folder / "step-000000003.ckpt")
-    again = demo.run_demo(replace(options, output=output), Console(quiet=True))
-    assert again["figures"]["nerfacto"] == results["figures"]["nerfacto"]
-    assert again["figures"]["ours"].keys() == results["figures"]["ours"].keys()
+    at_four = {"seconds": 100.0, "cpu_seconds": 50.0}
+    write_json(ours / "progress.json", {**read_json(ours / "progress.json"), "times": {"4": at_four}})
+    found = demo.run_demo(again, QUIET)
+    assert found["figures"]["nerfacto"] == results["figures"]["nerfacto"]
+    assert found["figures"]["ours"].keys() == results["figures"]["ours"].keys()
     assert [path.name for path in folder.iterdir()] == ["step-000000007.ckpt"]
-    assert "--max-num-iterations 4" in (output / "runs" / "ours" / "train.log").read_text()
-    assert again["seconds"]["train"] > results["seconds"]["train"]
+    after = read_json(ours / "figures.json")["curve"]
+    steps = [point["step"] for point in before]
+    assert [point["step"] for point in after] == steps and steps[-1] == 8
+    kept = steps.index(4) + 1
+    assert after[:kept] == before[:kept] and after[kept:] != before[kept:]
+    assert found["figures"]["ours"]["seconds"] > 100
+    assert found["seconds"]["compare"] > results["seconds"]["compare"]
 
 
 def test_other_options_need_another_folder(finished):
     options, _ = finished
     with pytest.raises(InputError, match="other options"):
-        demo.run_demo(replace(options, steps=9), Console(quiet=True))
+        demo.run_demo(replace(options, steps=9), QUIET)
 
 
-def test_a_stage_that_fails_names_its_log(finished, tmp_path, monkeypatch):
+def test_options_are_checked_before_anything_starts(tmp_path):
+    output = tmp_path / "out"
+    for changes, message in (({"steps": 0}, "--steps 0"), ({"frames": 0}, "--frames 0"), ({"seed": -1}, "--seed -1")):
+        with pytest.raises(InputError, match=message):
+            demo.run_demo(replace(DemoOptions(output=output), **changes), QUIET)
+    assert not output.exists()
+
+
+def test_a_training_that_fails_names_its_log(finished, tmp_path, monkeypatch):
     options, _ = finished
-    run = demo._Run("nerfacto", tmp_path / "no scene", tmp_path / "runs", options)
-    with pytest.raises(InputError, match=r"train\.log.*\n.*ns-train edge-depth-nerf-lite"):
-        run.train(progress_bars(Console(quiet=True)))
-    assert "no such file" in (tmp_path / "runs" / "nerfacto" / "train.log").read_text()
+    again = moved(options, tmp_path / "out")
+    shutil.rmtree(again.output / "comparison")
+    monkeypatch.setattr(sys, "executable", shutil.which("false"))
+    with pytest.raises(InputError, match=r"_seed-0/run\.log.*\n.* edge_depth_nerf\.compare\.worker "):
+        demo.run_demo(again, QUIET)
+    assert not (again.output / "results.json").exists()
 
 
 def test_the_command_says_what_is_wrong_without_a_traceback(tmp_path):

@@ -27,7 +27,7 @@ from edge_depth_nerf.base.pictures import NO_VALUE_RGB, colour_distance, distanc
 from edge_depth_nerf.compare.options import CompareOptions, MethodName
 from edge_depth_nerf.compare.plots import Bins, plot_bins
 from edge_depth_nerf.demo.options import DemoOptions
-from edge_depth_nerf.jobs.runs import command_line, logged_commands
+from edge_depth_nerf.jobs.runs import command_line
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.report import views
 from edge_depth_nerf.report.build import Commands, Facts, Plot, Report, build_report, write_report
@@ -209,16 +209,6 @@ def test_a_command_gives_its_options_again(words, options):
     assert program == "edge-depth-nerf"
     found = tyro.cli(cli.Command, prog=program, args=arguments)
     assert (found.options if isinstance(found, cli.Process) else found) == options
-
-
-def test_commands_are_read_from_logs(tmp_path):
-    log = tmp_path / "train.log"
-    assert logged_commands(log) == []
-    log.write_text(
-        "$ /some/where/ns-train m --data 'a b'\n12 (3%) $ 4\n$ /some/where/ns-train m --data 'a b'\n"
-        "$ /some/where/ns-train m --data 'a b' --max-num-iterations 5 --load-dir c\n$ ns-eval\n"
-    )
-    assert logged_commands(log) == ["ns-train m --data 'a b'", "ns-eval"]
 
 
 # --- the page as text -------------------------------------------------------------------------------------------------

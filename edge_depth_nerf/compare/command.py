@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
-from collections.abc import Iterable, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, get_args
@@ -32,7 +32,7 @@ from edge_depth_nerf.compare.specification import FIGURES, SPECIFICATION, VIEWS,
 from edge_depth_nerf.compare.tables import as_latex, as_markdown, make_tables
 from edge_depth_nerf.jobs.runs import command_line, viewer_command
 from edge_depth_nerf.jobs.tasks import Task, do_tasks, this_machine
-from edge_depth_nerf.report.build import write_report
+from edge_depth_nerf.report.build import Report, write_report
 from edge_depth_nerf.report.compared_views import compared_views
 from edge_depth_nerf.report.tables import MadeTable
 from edge_depth_nerf.report.views import REPORT
@@ -59,16 +59,39 @@ def compare(options: CompareOptions, console: Console | None = None) -> Results:
 
     """
     console = console or Console()
+    with finished_runs(options, console) as results:
+        if options.search:
+            write_search(options.output, results)
+            show_search(options.output, results, console)
+        else:
+            page = write_comparison(options.output, results, console)
+            write_report(options.output / REPORT, page)
+            show_tables(page.tables, console)
+            _show_places(options.output, results, console)
+    return results
+
+
+@contextmanager
+def finished_runs(options: CompareOptions, console: Console) -> Iterator[Results]:
+    """Train and judge what is missing, and hold the output folder while all that is in it is written up.
+
+    Raises:
+        InputError: options, scenes or the output folder cannot be used, or a run failed (its log is named).
+
+    """
     options.check()
     check_is_folder(options.output)
     tuned = {} if options.tuned is None else read_tuned(options.tuned)
     # who asks for something else need not wait for the one who writes there
     _record(options, tuned)
     with only_writer(options.output, console):
-        return _compare(options, tuned, console)
+        runs = _opened_runs(options, tuned)
+        do_runs([run for run in runs if not run.finished], options, console)
+        yield read_comparison(options.output)
 
 
-def _compare(options: CompareOptions, tuned: dict[str, Setting], console: Console) -> Results:
+def _opened_runs(options: CompareOptions, tuned: dict[str, Setting]) -> list[Run]:
+    """Check the scenes, and begin the folders of all runs that are asked for."""
     methods = options.methods or default_methods(options.preset, with_loss=options.search)
     scenes = {scene.resolve().name: scene.resolve() for scene in options.scenes}
     if len(scenes) < len(options.scenes):
@@ -101,30 +124,37 @@ def _compare(options: CompareOptions, tuned: dict[str, Setting], console: Consol
     runs = [Run(specification, options.output / RUNS) for specification in specifications]
     for run in runs:
         run.open()
-    do_runs([run for run in runs if not run.finished], options, console)
+    return runs
 
-    results = read_results(options.output / RUNS)
-    if not options.search:
+
+def read_comparison(output: Path) -> Results:
+    """Read what the output folder of a comparison or of a search holds.
+
+    Raises:
+        InputError: runs differ in what they should share, or a file is broken.
+
+    """
+    results = read_results(output / RUNS)
+    results.options = read_json_object(output / RECORD)
+    if results.options.get("kind") != "search":
         check_fair(results)
-    results.options = read_json_object(options.output / RECORD)
     results.versions = {name: version(name) for name in ("edge-depth-nerf", "nerfstudio", "torch", "numpy")}
     results.versions["python"] = platform.python_version()
     results.cores = os.cpu_count() or 1
-    if options.search:
-        write_search(options.output, results)
-        show_search(options.output, results, console)
-        return results
-    tables = make_tables(results)
-    write_rows(options.output, results)
-    write_text(options.output / "tables.md", as_markdown(results, tables))
-    write_text(options.output / "tables.tex", as_latex(results, tables))
-    with console.status("Plots and pictures"):
-        plots = draw_plots(options.output, results)
-        for scene in results.scenes():
-            _draw_comparison(options.output, results, scene)
-    write_report(options.output / REPORT, make_report(results, tables, plots, console))
-    _show(options.output, results, tables, console)
     return results
+
+
+def write_comparison(output: Path, results: Results, console: Console) -> Report:
+    """Write tables, figures, plots and pictures of a comparison; give what its page shows."""
+    tables = make_tables(results)
+    write_rows(output, results)
+    write_text(output / "tables.md", as_markdown(results, tables))
+    write_text(output / "tables.tex", as_latex(results, tables))
+    with console.status("Plots and pictures"):
+        plots = draw_plots(output, results)
+        for scene in results.scenes():
+            _draw_comparison(output, results, scene)
+    return make_report(results, tables, plots, console)
 
 
 def _settings(options: CompareOptions, name: MethodName, tuned: dict[str, Setting]) -> Iterable[Setting]:
@@ -318,6 +348,11 @@ def do_runs(runs: Sequence[Run], options: CompareOptions, console: Console) -> N
         do_tasks(tasks, place, console)
 
 
+def picture_name(scene: str) -> str:
+    """Name the picture of a drive in the output folder."""
+    return f"comparison_{scene}.png"
+
+
 def _draw_comparison(output: Path, results: Results, scene: str) -> None:
     """Draw some held-out views, a row of colours and one of distances each: truth, then the methods' first seeds."""
     chosen = first_runs(results, scene)
@@ -327,7 +362,7 @@ def _draw_comparison(output: Path, results: Results, scene: str) -> None:
     views = compared_views(Path(chosen[0].specification["scene"]), views_of, VIEWS_SHOWN)
     rows = [[_shown(picture) for picture in row] for view in views for row in view.rows()]
     sheet = side_by_side(rows, ["truth", *views_of])
-    write_png(output / f"comparison_{scene}.png", with_colour_bar(sheet, DISTANCE))
+    write_png(output / picture_name(scene), with_colour_bar(sheet, DISTANCE))
 
 
 def _shown(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -337,7 +372,8 @@ def _shown(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return resize(picture, (shown, round(height * shown / width)))
 
 
-def _show(output: Path, results: Results, tables: Sequence[MadeTable], console: Console) -> None:
+def show_tables(tables: Sequence[MadeTable], console: Console) -> None:
+    """Print the tables that fit a terminal."""
     for made in tables:
         if not made.on_terminal:
             continue
@@ -347,6 +383,9 @@ def _show(output: Path, results: Results, tables: Sequence[MadeTable], console: 
         for row in made.rows:
             table.add_row(row.title, *(cell.text() for cell in row.cells))
         console.print(table)
+
+
+def _show_places(output: Path, results: Results, console: Console) -> None:
     say(console, f"To look at, in a browser: {output / REPORT}")
     say(console, f"Tables: {output / 'tables.md'}, {output / 'tables.tex'}; all figures: {output / 'results.csv'}")
     there = [(scene, runs) for scene in results.scenes() if (runs := first_runs(results, scene))]

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from edge_depth_nerf.compare.methods import METHODS
@@ -151,49 +152,59 @@ def clock_metric(results: Results) -> str:
     return "cpu_seconds" if on_cpu else "seconds"
 
 
-def _detail_tables(results: Results, where: str, scenes: list[str]) -> list[MadeTable]:
+@dataclass(frozen=True)
+class _Column:
+    """A column of a table with a row for each method."""
+
+    heading: str
+    form: str
+    value: Callable[[RunResult], float | None]
+    best: int = 1
+    """As in `Metric`."""
+
+
+def _column(metric: Metric) -> _Column:
+    return _Column(metric.heading, metric.form, lambda run: run.figures.get(metric.name), metric.best)
+
+
+def _table(
+    results: Results, label: str, title: str, scenes: Sequence[str], columns: Sequence[_Column], note: str
+) -> MadeTable:
+    rows = [
+        Row(METHODS[method].title, [_cell(results, scenes, method, column.form, column.value) for column in columns])
+        for method in results.methods()
+    ]
+    mark_best(rows, [column.best for column in columns])
+    return MadeTable(label, title, [("", [column.heading for column in columns])], rows, [note])
+
+
+def _geometry_table(results: Results, where: str, scenes: Sequence[str]) -> MadeTable:
+    """Pictures after a colour fit, distances, and views beside the path."""
     truth = "truth_" if psnr_metric(results) is TRUE_PSNR else ""
-    reference = "truth" if truth else "lidar"
+    reference, known = ("truth", "the truth") if truth else ("lidar", "the held-out LiDAR")
     metrics = [
         psnr_metric(results),
         Metric(f"{truth}affine_masked_psnr", "fitted ↑", ".2f"),
-        Metric("masked_psnr", "recorded ↑", ".2f"),
+        *([Metric("masked_psnr", "recorded ↑", ".2f")] if truth else []),
         Metric(f"{reference}_abs_rel", "AbsRel ↓", ".3f", -1),
         Metric(f"{reference}_rmse_m", "RMSE m ↓", ".2f", -1),
         Metric(f"{reference}_delta_1_25", "δ<1.25 ↑", ".3f"),
         Metric("shifted_1m_masked_psnr", "1 m beside ↑", ".2f"),
         Metric("shifted_2m_masked_psnr", "2 m beside ↑", ".2f"),
     ]
-    if not truth:
-        del metrics[2]
     metrics = [metric for metric in metrics if any(metric.name in run.figures for run in results.runs)]
-    rows = [
-        Row(
-            METHODS[method].title,
-            [
-                _cell(results, scenes, method, metric.form, lambda run, name=metric.name: run.figures.get(name))
-                for metric in metrics
-            ],
-        )
-        for method in results.methods()
-    ]
-    mark_best(rows, [metric.best for metric in metrics])
-    known = "the truth" if truth else "the held-out LiDAR"
     notes = ["Fitted: PSNR after an affine fit of each view's colours."]
     if truth:
         notes.append("Recorded: PSNR against the recorded picture.")
     notes.append(f"AbsRel, RMSE, δ: rendered median distance against {known}, 1-60 m, pooled over pixels, without sky.")
     if any(metric.name.startswith("shifted_") for metric in metrics):
         notes.append("Beside: PSNR of views moved sideways.")
-    detail = MadeTable(
-        f"5, {where}",
-        "Pictures and geometry",
-        [("", [metric.heading for metric in metrics])],
-        rows,
-        [" ".join(notes)],
-        on_terminal=where == "average" or len(results.scenes()) == 1,
-    )
+    columns = [_column(metric) for metric in metrics]
+    return _table(results, f"5, {where}", "Pictures and geometry", scenes, columns, " ".join(notes))
 
+
+def _time_table(results: Results, where: str, scenes: Sequence[str]) -> MadeTable:
+    """Seconds, and the PSNR that they bring."""
     name, clock = curve_metric(results), clock_metric(results)
 
     def at_our_seconds(run: RunResult) -> float | None:
@@ -208,30 +219,18 @@ def _detail_tables(results: Results, where: str, scenes: list[str]) -> list[Made
         # one run that never gets there leaves no mean
         return math.inf if steps is None else steps
 
-    timed = [
-        ("s a step", ".3f", 0, lambda run: run.curve[-1][clock] / run.content["steps"]),
-        ("seconds", ".0f", 0, lambda run: run.curve[-1][clock]),
-        ("PSNR at ours' seconds ↑", ".2f", 1, at_our_seconds),
-        ("PSNR in the end ↑", ".2f", 1, lambda run: run.curve[-1][name]),
-        ("steps to nerfacto's end ↓", ".0f", -1, to_nerfacto),
+    columns = [
+        _Column("s a step", ".3f", lambda run: run.curve[-1][clock] / run.content["steps"], 0),
+        _Column("seconds", ".0f", lambda run: run.curve[-1][clock], 0),
+        _Column("PSNR at ours' seconds ↑", ".2f", at_our_seconds),
+        _Column("PSNR in the end ↑", ".2f", lambda run: run.curve[-1][name]),
+        _Column("steps to nerfacto's end ↓", ".0f", to_nerfacto, -1),
     ]
-    rows = [
-        Row(METHODS[method].title, [_cell(results, scenes, method, form, value) for _, form, _, value in timed])
-        for method in results.methods()
-    ]
-    mark_best(rows, [best for _, _, best, _ in timed])
-    time = MadeTable(
-        f"6, {where}",
-        "Time",
-        [("", [heading for heading, *_ in timed])],
-        rows,
-        [
-            f"{CLOCKS[clock]} of training, without judging, saving and the making of priors; PSNR of random held-out "
-            "pixels. A method that has ended by ours' seconds keeps its last PSNR.",
-        ],
-        on_terminal=detail.on_terminal,
+    note = (
+        f"{CLOCKS[clock]} of training, without judging, saving and the making of priors; PSNR of random held-out "
+        "pixels. A method that has ended by ours' seconds keeps its last PSNR."
     )
-    return [detail, time]
+    return _table(results, f"6, {where}", "Time", scenes, columns, note)
 
 
 def _settings_table(results: Results) -> MadeTable:
@@ -289,8 +288,10 @@ def make_tables(results: Results) -> list[MadeTable]:
             tables.append(made)
     parts = [*([("average", results.scenes())] if len(results.scenes()) > 1 else [])]
     parts += [(scene, [scene]) for scene in results.scenes()]
-    for where, scenes in parts:
-        tables += _detail_tables(results, where, scenes)
+    for place, (where, scenes) in enumerate(parts):
+        for make in (_geometry_table, _time_table):
+            # the average stands for its drives, which the page folds away
+            tables.append(replace(make(results, where, scenes), on_terminal=place == 0))
     tables.append(_settings_table(results))
     return tables
 

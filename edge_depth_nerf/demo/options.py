@@ -9,13 +9,13 @@ from typing import Literal
 
 @dataclass
 class DemoOptions:
-    """Synthesise a drive, train its depth network, then nerfacto and edge-depth-nerf-lite, and compare these two.
+    """Synthesise a drive, process it with a depth network of its own, and compare nerfacto and ours on it.
 
     Stopped at any moment, the same command takes up where it was.
     """
 
     output: Path = Path("outputs/demo")
-    """Folder for the drive, the scene, the trained models, results.json and the pictures."""
+    """Folder for the drive, the scene, the comparison, report.html, results.json and a picture."""
     scene: Literal["street", "parking", "turn"] = "street"
     """What the drive passes."""
     frames: int = 40

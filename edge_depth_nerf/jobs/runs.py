@@ -1,29 +1,22 @@
-"""What `demo` and `compare` share: trainings in processes of their own, their logs, checkpoints and pictures."""
+"""Commands in processes of their own, with logs; the checkpoints of trainings; commands as a user would type them."""
 
 from __future__ import annotations
 
 import os
 import re
 import shlex
-import shutil
 import subprocess
-import sys
-import time
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from threading import Event, Lock, Thread
+from threading import Lock, Thread
 from typing import Any, get_type_hints
 
 import tyro
 
 from edge_depth_nerf.base.errors import InputError
-
-COMMAND = "$ "
-"""Before each command in a log."""
 
 
 class LoggedCommands:
@@ -62,7 +55,7 @@ class LoggedCommands:
         words = [str(word) for word in command]
         last = ""
         with log.open("a", encoding="utf-8") as sink:
-            sink.write(f"{COMMAND}{shlex.join(words)}\n")
+            sink.write(f"$ {shlex.join(words)}\n")
             sink.flush()
             with self._lock:
                 if self._stopped:
@@ -94,39 +87,6 @@ class LoggedCommands:
             self._stopped = True
             if self._process is not None:
                 self._process.kill()
-
-
-def host_program(name: str) -> Path:
-    """One of nerfstudio's commands: the one beside this Python, or else on the path.
-
-    Raises:
-        InputError: it is in neither place.
-
-    """
-    beside = Path(sys.executable).with_name(name)
-    found = beside if beside.is_file() else shutil.which(name)
-    if found is None:
-        raise InputError(
-            f"{name}: neither beside {sys.executable} nor on PATH. `edge-depth-nerf doctor` says what is amiss."
-        )
-    return Path(found)
-
-
-@contextmanager
-def files_counted(folder: Path | None, pattern: str, tell: Callable[[int], None]) -> Iterator[None]:
-    """Tell, once a second, how many files of a folder have been written since; without a folder nothing."""
-    begun, ended = time.time() - 1.0, Event()  # file systems keep coarser clocks
-
-    def watch(folder: Path) -> None:
-        while not ended.wait(1.0):
-            tell(sum(path.stat().st_mtime >= begun for path in folder.glob(pattern)))
-
-    if folder is not None:
-        Thread(target=watch, args=(folder,), daemon=True).start()
-    try:
-        yield
-    finally:
-        ended.set()
 
 
 def end_with_parent() -> None:
@@ -171,12 +131,6 @@ def steps_done(checkpoints: Path) -> int:
     return 0 if newest is None else int(newest.stem.removeprefix("step-")) + 1
 
 
-def step_of_line(line: str) -> int | None:
-    """The step that a line of nerfstudio's progress tells; None for other lines."""
-    step = re.match(r"\s*(\d+) \(\d", line)
-    return int(step.group(1)) if step else None
-
-
 def viewer_command(config: Path) -> str:
     """How to look around in a trained model, on this machine alone."""
     return f"ns-viewer --load-config {config} --viewer.websocket-host 127.0.0.1"
@@ -206,19 +160,3 @@ def command_line(words: Sequence[str], options: Any) -> str:
         else:
             found += [f"--{flag}", *values]
     return shlex.join(found)
-
-
-def logged_commands(log: Path) -> list[str]:
-    """The commands that `LoggedCommands` wrote to a log, each once, programs without their folder.
-
-    Of a training that was stopped and taken up again the first alone: it asks for all the steps.
-    """
-    lines = log.read_text(encoding="utf-8", errors="replace").splitlines() if log.is_file() else []
-    found = []
-    for line in lines:
-        if line.startswith(COMMAND):
-            program, *rest = shlex.split(line.removeprefix(COMMAND))
-            if found and "--load-dir" in rest:
-                continue
-            found.append(shlex.join([Path(program).name, *rest]))
-    return list(dict.fromkeys(found))

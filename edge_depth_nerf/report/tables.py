@@ -1,4 +1,4 @@
-"""Tables of figures that `demo` and `compare` share.
+"""Tables of figures, as the page, the terminal, Markdown and LaTeX show them.
 
 A cell is a mean over seeds with its sample standard deviation.
 """
