@@ -175,7 +175,7 @@ def recording_of_rig(rig: Rig, root: Path, options: RigOptions | JbnuDepth360Opt
             check_size(camera.ego_mask, camera.camera)
     clocks = [sensor.clock for sensor in (*cameras, *rig.lidars)]
     if rig.poses and path:
-        clocks += [rig.poses.clock] if rig.poses.clock else []
+        clocks += [rig.poses.clock] if rig.poses.format == "kitti" else []
     return Recording(
         cameras=tuple(RecordedCamera(c.name, c.camera, c.to_vehicle, c.ego_mask) for c in cameras),
         pictures=tuple(recorded),
