@@ -28,7 +28,7 @@ from edge_depth_nerf.base.pictures import (
     lay_out,
     panel,
     resize,
-    write_text,
+    text_bar,
 )
 from edge_depth_nerf.inspecting.shown_prior import ShownMaps, ShownScene
 from edge_depth_nerf.method.alignment import align
@@ -98,13 +98,6 @@ def find_edge(mono_m: NDArray[np.float32], maps: PictureMaps, radius: int) -> tu
     return found
 
 
-def caption(text: str, width: int) -> NDArray[np.uint8]:
-    """A line of text, as high as a legend."""
-    bar = np.full((40, width, 3), 255, np.uint8)
-    write_text(bar, text, (2, 24), 0.55, max_width=width - 4)
-    return bar
-
-
 def draw_kernel(scene: ShownScene, maps: PictureMaps) -> tuple[NDArray[np.uint8], dict[str, float]]:
     """What one pixel beside an edge averages, without and with the kernel's depth factor (Eq. 7)."""
     lidar_m, truth_m = maps.lidar_m, maps.truth_m
@@ -141,9 +134,9 @@ def draw_kernel(scene: ShownScene, maps: PictureMaps) -> tuple[NDArray[np.uint8]
 
     def weights(values: NDArray, title: str, kind: str) -> NDArray[np.uint8]:
         grey = np.repeat(np.rint(enlarged(values) * 255).astype(np.uint8)[..., None], 3, axis=-1)
-        return panel(marked(grey), title, caption(f"their average: {integrated[kind]:.2f} m", side))
+        return panel(marked(grey), title, text_bar(f"their average: {integrated[kind]:.2f} m", side, 40))
 
-    truth = caption(f"truth in the framed pixel: {truth_m[i, j]:.2f} m", side)
+    truth = text_bar(f"truth in the framed pixel: {truth_m[i, j]:.2f} m", side, 40)
     shown = np.where(is_distance(lidar_m[window]), lidar_m[window], mono_m[window])
     panels = [
         panel(marked(colour_distance(enlarged(shown))), "distance (rings: LiDAR)", truth),

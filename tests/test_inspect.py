@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from rich.console import Console
 from scenes import pinhole, write_scene
 
@@ -29,22 +31,23 @@ from edge_depth_nerf.base.files import (
 )
 from edge_depth_nerf.base.pictures import (
     DISTANCE,
-    INK_RGB,
     NO_VALUE_RGB,
     RELATIVE_ERROR,
     SIGMA,
     colour_bar,
     colour_distance,
     draw_points,
+    drawn,
+    legend,
     resize,
+    text_bar,
     tinted,
-    write_text,
 )
 from edge_depth_nerf.inspecting.command import inspect_scene
 from edge_depth_nerf.inspecting.figures import measured_moments
 from edge_depth_nerf.inspecting.findings import Finding, find, limited
 from edge_depth_nerf.inspecting.options import InspectOptions
-from edge_depth_nerf.inspecting.top_view import HELD_OUT_RGB, TRAINING_RGB, draw_top_view, nice_length
+from edge_depth_nerf.inspecting.top_view import GAP, GREYS, HELD_OUT, PATH, TRAINING, top_view
 from edge_depth_nerf.method.prior import default_source
 from edge_depth_nerf.scene.reader import read_scene
 
@@ -157,8 +160,8 @@ def test_a_sheet_shows_the_maps(sample):
     _, output = sample
     sheet = read_image(output / "image_02_0000000003.png")
     # two rows of four panels of 64 px, under two lines
-    assert sheet.shape == (14 + 2 * 28 + 6 + 2 * (64 + 70 + 14), 14 + 4 * (64 + 14), 3)
-    top, left = 14 + 2 * 28 + 6 + 30, 14
+    assert sheet.shape == (2 * 28 + 2 * (64 + 70 + 14), 4 * (64 + 14), 3)
+    top, left = 2 * 28 + 7 + 30, 7
     picture = cv2.resize(read_image(SAMPLE / "images/image_02/0000000003.png"), (64, 64), interpolation=cv2.INTER_AREA)
     assert (sheet[top : top + 64, left : left + 64] == picture).all()
     truth = read_distance_png(SAMPLE / "truth/image_02/distance/0000000003.png")
@@ -483,7 +486,7 @@ def test_panels_of_what_is_missing_are_left_out(drive, tmp_path, missing, panels
     height, width = read_image(tmp_path / "out" / name).shape[:2]
     columns = min(panels, 3)
     rows = -(-panels // 3)
-    assert (height, width) == (14 + 2 * 28 + 6 + rows * (150 + 70 + 14), 14 + columns * (200 + 14))
+    assert (height, width) == (2 * 28 + rows * (150 + 70 + 14), columns * (200 + 14))
 
 
 # ---- other people's scenes -------------------------------------------------------------------------------------
@@ -678,13 +681,35 @@ def test_scales():
     assert np.ptp(RELATIVE_ERROR.coloured(np.zeros((1, 1)), np.ones((1, 1), bool)).astype(int)) < 5  # neutral
 
 
-def test_a_legend_has_its_ticks_where_their_colours_are():
-    bar = colour_bar(DISTANCE, 500)
-    ticks = np.nonzero((bar[19] == INK_RGB).all(-1))[0]
-    assert len(ticks) == len(DISTANCE.ticks)
-    expected = colour_distance(np.array([DISTANCE.ticks]))[0].astype(int)
-    assert np.abs(bar[10, ticks].astype(int) - expected).max() <= 4
-    assert (bar[10] == NO_VALUE_RGB).all(-1).sum() == 30
+@pytest.mark.parametrize(("width", "ticks"), [(640, DISTANCE.ticks), (100, (1.0, 60.0))])
+def test_a_legend_has_its_ticks_where_their_colours_are(width, ticks):
+    bar = colour_bar(DISTANCE, width)
+    assert bar.shape == (40, width, 3)
+    coloured = np.nonzero(np.ptp(bar[10].astype(int), axis=-1) > 20)[0]
+    # below the colours: the ticks, whose lines may share two columns
+    dark = np.nonzero((bar[20, : coloured[-1] + 3] < 200).all(-1))[0]
+    places = [group.mean() for group in np.split(dark, np.nonzero(np.diff(dark) > 2)[0] + 1)]
+    low, high = coloured[0], coloured[-1] + 1
+    expected = [low + (high - low) * np.log(tick) / np.log(60) for tick in ticks]
+    assert np.array(places) + 0.5 == pytest.approx(expected, abs=1.5)
+    for place, tick in zip(places, ticks, strict=True):
+        at = int(np.clip(round(place), low, high - 1))
+        steps = np.abs(DISTANCE.colours.astype(int) - bar[10, at]).sum(-1)
+        assert steps.argmin() == pytest.approx(255 * np.log(tick) / np.log(60), abs=256 * 2 / (high - low) + 1)
+    assert (bar[20, coloured[-1] + 3 :] == NO_VALUE_RGB).all(-1).any()
+
+
+def test_a_legend_of_colours():
+    drawn_legend = legend([("hidden", (205, 50, 60)), ("used, without prior", (60, 110, 230))], 640)
+    first, second = ((drawn_legend == colour).all(-1).any(0).nonzero()[0] for colour in ((205, 50, 60), (60, 110, 230)))
+    assert len(first) > 10 and len(second) > 10 and first.max() < second.min()
+
+
+def test_drawings_of_several_threads_are_the_same():
+    widths = [300 + 20 * number for number in range(8)] * 3
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda width: colour_bar(SIGMA, width), widths))
+    assert all((one == colour_bar(SIGMA, width)).all() for one, width in zip(found, widths, strict=True))
 
 
 def test_maps_keep_their_values_when_they_shrink():
@@ -703,56 +728,59 @@ def test_tints():
     assert (hatched[:12] == (0, 0, 200)).all(-1).mean() == pytest.approx(0.25, abs=0.05)
 
 
-def test_text_that_is_too_long_becomes_smaller():
-    sheet = np.full((40, 100, 3), 255, np.uint8)
-    assert write_text(sheet, "a long title for a small place", (2, 30), max_width=90) <= 92
-    columns = np.nonzero((sheet != 255).any((0, 2)))[0]
-    assert len(columns) and columns.max() < 96
+@pytest.mark.parametrize("text", ["a long title for a small place, σ in m, 90° ü", "$a$_{b", ""])
+def test_text_that_is_too_long_becomes_smaller(text):
+    bar = text_bar(text, 100)
+    assert bar.shape == (30, 100, 3)
+    columns = np.nonzero((bar != 255).any((0, 2)))[0]
+    assert bool(len(columns)) == bool(text)
+    assert not text or (columns.min() >= 1 and columns.max() < 99)
 
 
-@pytest.mark.parametrize(("largest", "nice"), [(0.99, 0.5), (1.0, 1.0), (4.9, 2.0), (5.0, 5.0), (73.0, 50.0)])
-def test_lengths_of_scale_bars(largest, nice):
-    assert nice_length(largest) == pytest.approx(nice)
-
-
-def positions(picture: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray:
-    """Pixels (x, y) of one colour in the map, between title and legend."""
-    return np.argwhere((picture[40:-84] == colour).all(-1))[:, ::-1] + (0, 40)
+def near(figure: Figure, x_m: float, y_m: float) -> set[str]:
+    """Colours within a pixel of a place of the map."""
+    picture = drawn(figure)
+    x, from_below = figure.axes[0].transData.transform((x_m, y_m))
+    row, column = int(len(picture) - from_below), int(x)
+    return {
+        "#{:02x}{:02x}{:02x}".format(*one) for one in picture[row - 1 : row + 2, column - 1 : column + 2].reshape(-1, 3)
+    }
 
 
 def test_the_top_view_is_to_scale(drive):
-    """A path of 5.5 m against the scale bar of 2 m; held-out frames at their places; points, y up."""
+    """Dots at their places by the axes' numbers; the higher point is darker."""
     scene = read_scene(drive)
-    picture = draw_top_view(scene, scene.points_m(), [], shown=[])
-    training = positions(picture, TRAINING_RGB)
-    path_px = np.ptp(training[:, 0])
-    bar = picture[-84 + 50]
-    bar_px = np.ptp(np.nonzero((bar[100:] == INK_RGB).all(-1))[0])
-    assert bar_px / path_px == pytest.approx(2 / 5.5, rel=0.01)
-    held_out = positions(picture, HELD_OUT_RGB)
-    assert held_out[:, 0].mean() - training[:, 0].min() == pytest.approx(4 / 11 * path_px, abs=6)
-    grey = np.argwhere(np.ptp(picture[40:-84].astype(int), axis=-1) == 0)[:, ::-1] + (0, 40)
-    grey = grey[np.abs(grey[:, 1] - training[:, 1].mean()) > 40]  # away from the numbers beside the path
-    shades = picture[grey[:, 1], grey[:, 0], 0]
-    low, high = grey[shades == 225].mean(0), grey[shades == 110].mean(0)
-    px_per_m = path_px / 5.5
-    # points at (1, 3, 0) and (4, -2, 1), the higher one darker
-    assert high[0] - low[0] == pytest.approx(3 * px_per_m, rel=0.03)
-    assert high[1] - low[1] == pytest.approx(5 * px_per_m, rel=0.03)
+    figure = top_view(scene, scene.points_m(), [], shown=[])
+    drawn(figure)
+    axes = figure.axes[0]
+    (x0, y0), (x1, y1) = axes.transData.transform([(0, 0), (1, 1)])
+    assert x1 - x0 == pytest.approx(y1 - y0, rel=1e-6) and x1 - x0 > 20
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("x, m", "y, m")
+    assert TRAINING in near(figure, 0.0, 0.0) and TRAINING in near(figure, 5.5, 0.0)
+    assert HELD_OUT in near(figure, 2.0, 0.0) and HELD_OUT not in near(figure, 2.5, 0.0)
+    assert GREYS[0] in near(figure, 1.0, 3.0) and GREYS[-1] in near(figure, 4.0, -2.0)
+    assert near(figure, 1.0, -3.0) == near(figure, 4.0, 2.0) == {"#ffffff"}
+    words = {text.get_text() for text in figure.legends[0].get_texts()}
+    assert words == {"points, higher ones darker", "view of left", "travel", "training", "held out"}
+
+
+def test_the_top_view_names_moments_with_a_sheet(drive):
+    figure = top_view(read_scene(drive), None, [], shown=[1, 9])
+    assert [text.get_text() for text in figure.axes[0].texts] == ["1", "9"]
+    assert "moment with a sheet" in {text.get_text() for text in figure.legends[0].get_texts()}
 
 
 def test_the_top_view_marks_gaps(drive):
+    """From 2 m to 9.5 m of a path from 0 to 12.5 m."""
     change(drive, shift_from(5, 7))
     scene = read_scene(drive)
-    gap = (210, 20, 40)
-    findings = find(scene, [])
-    marked = positions(draw_top_view(scene, None, findings, []), gap)
-    assert len(marked) and not len(positions(draw_top_view(scene, None, [], []), gap))
-    # from 2 m to 9.5 m of a path from 0 to 12.5 m
-    training = positions(draw_top_view(scene, None, findings, []), TRAINING_RGB)
-    left, width = training[:, 0].min(), np.ptp(training[:, 0])
-    assert (marked[:, 0].min() - left) / width == pytest.approx(2 / 12.5, abs=0.02)
-    assert (marked[:, 0].max() - left) / width == pytest.approx(9.5 / 12.5, abs=0.02)
+    figure = top_view(scene, None, find(scene, []), [])
+    assert [text.get_text() for text in figure.axes[0].texts] == ["7.5 m"]
+    for x_m in (3.0, 9.0):
+        assert GAP in near(figure, x_m, 0.0)
+        assert PATH in near(top_view(scene, None, [], []), x_m, 0.0)
+    for x_m in (1.75, 9.75):
+        assert GAP not in near(figure, x_m, 0.0)
 
 
 def test_a_scene_of_one_picture(tmp_path):

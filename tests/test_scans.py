@@ -9,11 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.lidar.scans import MAX_POINTS, PointTimes, ScanFormat, _unpack_lzf, check_scan, read_scan
+from edge_depth_nerf.lidar.scans import MAX_POINTS, PointTimes, ScanFormat, check_scan, read_scan
 
 POINTS = np.array([[1.5, -2.25, 0.5], [-8.0, 3.0, -1.75], [40.0, 0.125, 2.0]])
 INTENSITY = np.array([0.25, 0.5, 1.0])
@@ -243,24 +241,15 @@ def test_what_a_header_tells_is_found_without_reading_the_points(tmp_path: Path)
     check_scan(saved(tmp_path / "a.npy", np.full((4, 4), np.nan)), ScanFormat())
 
 
-# ---- LZF -------------------------------------------------------------------------------------------------------
-
-
-def test_lzf_references() -> None:
-    # 3 literals; then 2 + 2 = 4 bytes from 3 back: "abc" again and its first; then 7 + 1 + 2 = 10 bytes from 1 back
-    packed = b"\x02abc" + bytes([2 << 5, 2]) + bytes([7 << 5, 1, 0])
-    assert _unpack_lzf(packed, 17) == b"abcabca" + b"a" * 10
-
-
-@given(st.binary(min_size=1, max_size=300), st.integers(0, 255), st.data())
-def test_lzf_undoes_itself_and_damage_is_noticed(content: bytes, distance: int, data: st.DataObject) -> None:
-    packed, whole = lzf_literals(content), content
-    if distance < len(content):
-        # five bytes from `distance` + 1 back, which may reach into themselves
-        packed += bytes([3 << 5, distance])
-        for _ in range(5):
-            whole += whole[-distance - 1 :][:1]
-    assert _unpack_lzf(packed, len(whole)) == whole
-    cut = data.draw(st.integers(0, len(packed) - 1))
-    with pytest.raises((ValueError, IndexError)):
-        _unpack_lzf(packed[:cut], len(whole))
+def test_compressed_points_with_references(tmp_path: Path) -> None:
+    """Three times three floats of bytes 0x40: one literal, and 7 + 26 + 2 = 35 bytes from one byte back."""
+    packed = b"\x00@" + bytes([7 << 5, 26, 0])
+    header = "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 3\nHEIGHT 1\nDATA binary_compressed\n"
+    path = named(tmp_path, "a.pcd", header.encode() + struct.pack("<II", len(packed), 36) + packed)
+    (value,) = struct.unpack("<f", b"@@@@")
+    assert read_scan(path, ScanFormat()).points_m.tolist() == [[value] * 3] * 3
+    # shorter, or leading before the beginning
+    for spoilt in (packed[:2], packed[:4], b"\x00@" + bytes([7 << 5, 25, 0]), b"\x00@" + bytes([7 << 5, 26, 1])):
+        named(tmp_path, "a.pcd", header.encode() + struct.pack("<II", len(spoilt), 36) + spoilt)
+        with pytest.raises(InputError, match=r"a\.pcd: its compressed points are damaged"):
+            read_scan(path, ScanFormat())

@@ -51,12 +51,13 @@ def path_inside(folder: Path, name: object, where: str) -> Path:
 
     """
     if isinstance(name, str) and name and "\0" not in name:
-        inner = Path(os.path.normpath(name))
+        # no Path: a long drive's transforms.json has hundreds of thousands of names
+        inner = os.path.normpath(name)
         try:
-            longest = max((len(os.fsencode(part)) for part in Path(name).parts), default=0)
+            longest = max(len(os.fsencode(part)) for part in name.replace(os.altsep or os.sep, os.sep).split(os.sep))
         except UnicodeEncodeError:
             longest = _MAX_NAME_BYTES + 1
-        leaves = inner.is_absolute() or bool(inner.drive) or inner.parts[:1] == ("..",)
+        leaves = os.path.isabs(inner) or bool(os.path.splitdrive(inner)[0]) or inner.split(os.sep)[0] == os.pardir
         if not leaves and longest <= _MAX_NAME_BYTES:
             return folder / name
     raise InputError(

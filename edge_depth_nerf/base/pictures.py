@@ -1,7 +1,7 @@
 """Pictures to look at: maps as colour, points over a picture, panels with titles and legends, side by side.
 
-Pure. Pictures are H×W×3 uint8 RGB, distances H×W metres along the ray. Text is drawn by OpenCV, which knows ASCII
-alone.
+Pure. Pictures are H×W×3 uint8 RGB, distances H×W metres along the ray. Letters and legends are matplotlib's; pictures
+stand beside them pixel by pixel.
 """
 
 from __future__ import annotations
@@ -9,18 +9,25 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 NEAREST_M, FARTHEST_M = 1.0, 60.0
 """The colours of a distance run over these, logarithmically."""
 NO_VALUE_RGB = (40, 40, 40)
 """Colour of pixels without a distance."""
-INK_RGB = (30, 30, 30)
+INK = "#1e1e1e"
 """Colour of text and lines on white."""
-_FONT = cv2.FONT_HERSHEY_SIMPLEX
+
+
+Colour = tuple[int, int, int]
+"""Red, green, blue, 0 to 255."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +75,7 @@ def _opencv_colours(colormap: int) -> NDArray[np.uint8]:
     return cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], colormap)[:, 0, ::-1].astype(np.uint8)
 
 
-def _between(*stops: tuple[int, int, int]) -> NDArray[np.uint8]:
+def _between(*stops: Colour) -> NDArray[np.uint8]:
     """256 colours that pass through evenly spaced stops."""
     places = np.linspace(0, 255, len(stops))
     channels = [np.interp(np.arange(256), places, channel) for channel in np.transpose(stops)]
@@ -191,7 +198,7 @@ def draw_points(
 
 
 def tinted(
-    picture: NDArray[np.uint8], where: NDArray[np.bool_], colour: tuple[int, int, int], hatched: bool = False
+    picture: NDArray[np.uint8], where: NDArray[np.bool_], colour: Colour, hatched: bool = False
 ) -> NDArray[np.uint8]:
     """Tint a part of a picture; `hatched` adds diagonal lines in the full colour, for those who confuse two tints."""
     mixed = cv2.addWeighted(picture, 0.5, np.full_like(picture, colour), 0.5, 0)
@@ -201,103 +208,91 @@ def tinted(
     return np.where(where[..., None], mixed, picture)
 
 
-def text_width(text: str, scale: float) -> int:
-    """Say how wide `write_text` makes a text, px."""
-    return cv2.getTextSize(text, _FONT, scale, 1)[0][0]
+def _blank(width: int, height: int) -> Figure:
+    """A white figure of so many pixels, to be written and drawn on."""
+    from matplotlib.figure import (
+        Figure,
+    )  # takes a third of a second; and no pyplot, which keeps one state for all threads
+
+    # with 64 pixels an inch, a power of two, none gets lost in rounding
+    return Figure((width / 64, height / 64), dpi=64)
 
 
-def write_text(
-    sheet: NDArray[np.uint8],
-    text: str,
-    at: tuple[int, int],
-    scale: float = 0.6,
-    *,
-    align: float = 0.0,
-    max_width: int | None = None,
-    colour: tuple[int, int, int] = INK_RGB,
-    halo: bool = False,
-) -> int:
-    """Write ASCII text into a picture, in place.
+def drawn(figure: Figure) -> NDArray[np.uint8]:
+    """Draw a figure of matplotlib's in its own size: H×W×3 RGB."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def text_bar(
+    text: str, width: int, height: int = 30, size: float = 19.0, *, centred: bool = False
+) -> NDArray[np.uint8]:
+    """Write a line of text on white, smaller where it would be wider.
 
     Args:
-        sheet: the picture.
-        text: one line; what is not ASCII becomes a question mark.
-        at: x and baseline y, px.
-        scale: 1 is about 22 px high.
-        align: 0 = the text begins at x, 0.5 = it is centred there, 1 = it ends there.
-        max_width: the text is made smaller where it would be wider, px.
-        colour: RGB.
-        halo: whether it gets a white rim, to be read over lines.
-
-    Returns:
-        Its width, px.
+        text: the line, as it is ($ is no formula).
+        width: of what is made, px.
+        height: of what is made, px.
+        size: of the letters, points.
+        centred: whether it stands in the middle, or else at the left.
 
     """
-    text = text.encode("ascii", "replace").decode()
-    width = text_width(text, scale)
-    if max_width is not None and width > max_width:
-        scale *= max_width / width
-        width = text_width(text, scale)
-    x = at[0] - round(align * width)
-    if halo:
-        cv2.putText(sheet, text, (x, at[1]), _FONT, scale, (255, 255, 255), 4, cv2.LINE_AA)
-    cv2.putText(sheet, text, (x, at[1]), _FONT, scale, colour, 1, cv2.LINE_AA)
-    return width
+    figure = _blank(width, height)
+    place, align = (0.5, "center") if centred else (2 / width, "left")
+    line = figure.text(place, 0.5, text, size=size, ha=align, va="center_baseline", color=INK, parse_math=False)
+    # step by step: hinted letters do not shrink evenly
+    while size > 1 and line.get_window_extent().width > width - 4:
+        size *= 0.95
+        line.set_fontsize(size)
+    return drawn(figure)
 
 
 def with_colour_bar(sheet: NDArray[np.uint8], scale: ColourScale) -> NDArray[np.uint8]:
     """Put the legend of a scale below an H×W×3 sheet, at its left."""
-    legend = colour_bar(scale, min(sheet.shape[1], 600))
-    below = np.full((legend.shape[0], sheet.shape[1], 3), 255, np.uint8)
-    below[:, : legend.shape[1]] = legend
-    return np.vstack((sheet, below))
+    bar = colour_bar(scale, min(sheet.shape[1], 600))
+    return np.vstack((sheet, _padded(bar, (0, 0), (0, sheet.shape[1] - bar.shape[1]))))
 
 
 def colour_bar(scale: ColourScale, width: int) -> NDArray[np.uint8]:
-    """Draw the legend of a scale: its colours with their values below, and the colour of no value.
-
-    Returns:
-        40 px high, `width` px wide, on white.
-
-    """
-    bar = np.full((40, width, 3), 255, np.uint8)
-    none_width, margin = 70, 16
-    length = max(width - none_width - 2 * margin, 2)
-    steps = np.rint(np.linspace(0, 255, length)).astype(int)
-    bar[6:18, margin : margin + length] = scale.colours[steps]
-    places = scale.position(np.array(scale.ticks, float))
-    labels = [*(f"{tick:g}" for tick in scale.ticks[:-1]), f"{scale.ticks[-1]:g} {scale.unit}"]
-    room = width
-    for where, label in zip(places[::-1], labels[::-1], strict=True):
-        x = margin + round(float(where) * (length - 1))
-        bar[18:22, x] = INK_RGB
-        half = text_width(label, 0.42) // 2
-        if x + half < room:  # where ticks are too near to each other, the lower one goes without
-            write_text(bar, label, (x, 36), 0.42, align=0.5)
-            room = x - half - 4
-    left = margin + length + margin
-    bar[6:18, left + 22 : left + 52] = NO_VALUE_RGB
-    write_text(bar, "none", (left + 37, 36), 0.42, align=0.5)
-    return bar
+    """Draw the legend of a scale: its colours with their values below, and the colour of no value."""
+    return legend([("none", NO_VALUE_RGB)], width, scale)
 
 
-def swatches(names: Sequence[tuple[str, tuple[int, int, int]]], width: int) -> NDArray[np.uint8]:
-    """Draw a legend of named colours, as high as a colour bar."""
-    bar = np.full((40, width, 3), 255, np.uint8)
-    x = 8
-    for name, colour in names:
-        bar[10:26, x : x + 24] = colour
-        x += 32
-        x += write_text(bar, name, (x, 24), 0.5, max_width=max(width - x, 1)) + 18
-    return bar
+def legend(names: Sequence[tuple[str, Colour]], width: int, scale: ColourScale | None = None) -> NDArray[np.uint8]:
+    """Draw a legend of named colours, at the right of a scale's if there is one: 40 px high, on white."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import ListedColormap, LogNorm, Normalize
+    from matplotlib.patches import Patch
+
+    figure, size = _blank(width, 40), min(14.0, width / 30)
+    patches = [Patch(color="#{:02x}{:02x}{:02x}".format(*colour), label=name) for name, colour in names]
+    place = "center left" if scale is None else "center right"
+    figure.legend(
+        handles=patches, loc=place, ncols=len(names), fontsize=size, frameon=False, borderpad=0, handlelength=1.4
+    )
+    if scale is not None:
+        norm = (LogNorm if scale.logarithmic else Normalize)(scale.low, scale.high)
+        ticks = list(scale.ticks if width >= 300 else (scale.low, scale.high))
+        axes = figure.add_axes((0.04, 0.55, 0.76, 0.3))
+        bar = figure.colorbar(ScalarMappable(norm, ListedColormap(scale.colours / 255)), axes, orientation="horizontal")
+        bar.set_ticks(ticks, labels=[f"{tick:g}{f' {scale.unit}' * (tick == ticks[-1])}" for tick in ticks], size=size)
+        bar.minorticks_off()
+        bar.outline.set_visible(False)
+    return drawn(figure)
 
 
 def panel(picture: NDArray[np.uint8], title: str, legend: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
     """Put a title above a picture and a legend of its width below it; without one that place stays white."""
-    width = picture.shape[1]
-    bar = np.full((30, width, 3), 255, np.uint8)
-    write_text(bar, title, (2, 21), max_width=width - 4)
-    return np.vstack((bar, picture, np.full((40, width, 3), 255, np.uint8) if legend is None else legend))
+    below = np.full((40, picture.shape[1], 3), 255, np.uint8) if legend is None else legend
+    return np.vstack((text_bar(title, picture.shape[1]), picture, below))
+
+
+def _padded(picture: NDArray[np.uint8], rows: tuple[int, int], columns: tuple[int, int]) -> NDArray[np.uint8]:
+    """Put white above and below, left and right of a picture."""
+    return np.pad(picture, (rows, columns, (0, 0)), constant_values=255)
 
 
 def lay_out(panels: Sequence[NDArray[np.uint8]], columns: int, heading: Sequence[str]) -> NDArray[np.uint8]:
@@ -309,18 +304,12 @@ def lay_out(panels: Sequence[NDArray[np.uint8]], columns: int, heading: Sequence
         heading: the lines, the first one large.
 
     """
-    gap, line = 14, 28
-    height, width = panels[0].shape[:2]
-    rows = -(-len(panels) // columns)
-    top = gap + line * len(heading) + 6
-    made = np.full((top + rows * (height + gap), gap + columns * (width + gap), 3), 255, np.uint8)
-    for number, text in enumerate(heading):
-        at = (gap, gap + line * number + 18)
-        write_text(made, text, at, 0.55 if number else 0.75, max_width=made.shape[1] - 2 * gap)
-    for number, one in enumerate(panels):
-        y, x = top + number // columns * (height + gap), gap + number % columns * (width + gap)
-        made[y : y + height, x : x + width] = one
-    return made
+    cells = [_padded(one, (7, 7), (7, 7)) for one in panels]
+    cells += [np.full_like(cells[0], 255)] * (-len(cells) % columns)
+    rows = [np.hstack(cells[first : first + columns]) for first in range(0, len(cells), columns)]
+    width = rows[0].shape[1] - 14
+    lines = [text_bar(text, width, 28, 17.0 if number else 24.0) for number, text in enumerate(heading)]
+    return np.vstack([*(_padded(line, (0, 0), (7, 7)) for line in lines), *rows])
 
 
 def side_by_side(rows: Sequence[Sequence[NDArray[np.uint8]]], titles: Sequence[str]) -> NDArray[np.uint8]:
@@ -331,15 +320,11 @@ def side_by_side(rows: Sequence[Sequence[NDArray[np.uint8]]], titles: Sequence[s
         titles: one a column.
 
     """
-    gap, bar = 6, 34
-    heights, width = [row[0].shape[0] for row in rows], max(row[0].shape[1] for row in rows)
-    sheet = np.full((bar + sum(heights) + gap * (len(rows) - 1), len(titles) * (width + gap) - gap, 3), 255, np.uint8)
-    for column, title in enumerate(titles):
-        left, top = column * (width + gap), bar
-        write_text(sheet, title, (left + width // 2, 23), align=0.5, max_width=width)
-        for row, height in zip(rows, heights, strict=True):
-            own = row[column].shape[1]
-            begin = left + (width - own) // 2
-            sheet[top : top + height, begin : begin + own] = row[column]
-            top += height + gap
-    return sheet
+    gap, width = 6, max(row[0].shape[1] for row in rows)
+    lines = [[text_bar(title, width, 34 - gap, centred=True) for title in titles], *rows]
+    sheet = [
+        np.hstack([_padded(one, (0, gap), (spare // 2, gap + spare - spare // 2)) for one in line])
+        for line in lines
+        for spare in [width - line[0].shape[1]]
+    ]
+    return np.vstack(sheet)[:-gap, :-gap]

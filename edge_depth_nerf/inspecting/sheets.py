@@ -9,14 +9,15 @@ from edge_depth_nerf.base.pictures import (
     DISTANCE,
     RELATIVE_ERROR,
     SIGMA,
+    Colour,
     ColourScale,
     colour_bar,
     draw_points,
     is_distance,
     lay_out,
+    legend,
     panel,
     resize,
-    swatches,
     tinted,
 )
 from edge_depth_nerf.inspecting.figures import PictureFigures
@@ -74,12 +75,12 @@ def draw_sheet(scene: SceneFolder, figures: PictureFigures, maps: ShownMaps, lon
 
 def _mask_panel(maps: ShownMaps, size: tuple[int, int]) -> NDArray[np.uint8]:
     picture = tinted(resize(maps.rgb, size), resize(~maps.usable, size), HIDDEN_RGB)
-    names: list[tuple[str, tuple[int, int, int]]] = [("hidden", HIDDEN_RGB)]
+    names: list[tuple[str, Colour]] = [("hidden", HIDDEN_RGB)]
     if maps.prior is not None:
         without = maps.usable & ~is_distance(maps.prior.distance_m)
         picture = tinted(picture, resize(without, size), NO_PRIOR_RGB, hatched=True)
         names.append(("used, without prior", NO_PRIOR_RGB))
-    return panel(picture, "mask", swatches(names, size[0]))
+    return panel(picture, "mask", legend(names, size[0]))
 
 
 def _heading(scene: SceneFolder, figures: PictureFigures) -> list[str]:
@@ -99,5 +100,5 @@ def _heading(scene: SceneFolder, figures: PictureFigures) -> list[str]:
         facts.append(f"prior against truth: AbsRel {np.abs(figures.prior_over_truth - 1).mean():.3f}")
     return [
         f"{picture.camera}, frame {picture.moment} ({split})",
-        f"{picture.lens.width} x {picture.lens.height} px; " + "; ".join(facts),
+        f"{picture.lens.width}×{picture.lens.height} px; " + "; ".join(facts),
     ]

@@ -159,7 +159,8 @@ def recording_of_rig(rig: Rig, root: Path, options: RigOptions | JbnuDepth360Opt
 def _whole_inputs(rig: Rig, cameras: Sequence[RigCamera], *, with_poses: bool) -> tuple[Path, ...]:
     """The files whose bytes decide about the scene: the rig file, poses, times."""
     poses = [rig.poses] if rig.poses and with_poses else []
-    clocks = [described.clock for described in (*cameras, *rig.lidars, *poses)]
+    clocks = [sensor.clock for sensor in (*cameras, *rig.lidars)]
+    clocks += [found.clock for found in poses if found.format == "kitti"]
     return (rig.path, *(found.file for found in poses), *(clock.file for clock in clocks if clock and clock.file))
 
 

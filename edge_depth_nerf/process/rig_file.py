@@ -2,7 +2,8 @@
 
 It is read strictly: a key that is missing, unknown or of another kind is an error that names the file and the key,
 as in `rig.toml: cameras.front.fx`. Paths in it count from the recording's folder and stay in it. Nothing else is read
-here.
+here. The classes are the tables of the file, held against their types by pydantic; what their validators raise is what
+stands behind the name of the key.
 """
 
 from __future__ import annotations
@@ -12,12 +13,27 @@ import json
 import math
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
-from edge_depth_nerf.base.bounds import MAX_TIME_S, finite, path_inside, read_text, shown
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    ValidationError,
+    WrapValidator,
+    field_validator,
+    model_validator,
+)
+from pydantic.fields import FieldInfo
+
+from edge_depth_nerf.base.bounds import MAX_TIME_S, path_inside, read_text, shown
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras import MEI, Camera, KannalaBrandt, Pinhole
 from edge_depth_nerf.cameras.transforms import Transform
@@ -40,6 +56,110 @@ _MAX_DOTS = 1000
 """No line of TOML has more: the parser's time and memory grow with the square of a key's parts."""
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _NAME = r"[A-Za-z0-9_][A-Za-z0-9_-]*"
+_MODEL_KEYS = {
+    "mei": ("xi", "k1", "k2", "p1", "p2"),
+    "kannala-brandt": ("k1", "k2", "k3", "k4"),
+    "pinhole": ("k1", "k2", "p1", "p2", "k3"),
+}
+"""Models, and what they have beside focal lengths and principal point; 0 if it is left out, but for ξ."""
+
+
+def _inside(value: object, info: Any) -> Path:
+    return path_inside(info.context["root"], value, "")
+
+
+def _sensor_name(name: str) -> str:
+    if not re.fullmatch(_NAME, name) or name == VEHICLE:
+        raise InputError(f": a sensor's name is letters, digits, _ and -, and not {VEHICLE!r}; it becomes a folder.")
+    return name
+
+
+def _different(names: list[str]) -> list[str]:
+    if not names or len(set(names)) != len(names):
+        raise InputError(f" is {shown(names)}, expected different names, such as ['x', 'y', 'z', 'intensity'].")
+    return names
+
+
+def _transform(value: object, read: Callable[[Any], Any]) -> Transform:
+    if not isinstance(value, dict):
+        return transform_of_rows(value, "")
+    pose: _Pose = read(value)
+    return pose_of_quaternion(pose.translation, pose.quaternion, "")
+
+
+Number = Annotated[float, Field(ge=-MAX_TIME_S, le=MAX_TIME_S, description=f"a number, at most {MAX_TIME_S:g}")]
+Positive = Annotated[float, Field(gt=0, le=MAX_TIME_S, description=f"a number above 0, at most {MAX_TIME_S:g}")]
+Scale = Annotated[float, Field(gt=1e-12, le=1e6, description="a number above 1e-12, at most 1e+06")]
+Side = Annotated[int, Field(ge=1, le=MAX_SIDE_PX, description=f"a whole number from 1 to {MAX_SIDE_PX}")]
+Text = Annotated[str, Field(min_length=1, description="a name")]
+File = Annotated[Path, BeforeValidator(_inside), Field(description="a file in the recording's folder")]
+Files = Annotated[
+    str,
+    BeforeValidator(lambda value, info: _inside(value, info) and value),
+    Field(description="a folder, or a pattern such as 'front/*.png'"),
+]
+"""In the recording's folder."""
+SensorName = Annotated[str, AfterValidator(_sensor_name)]
+Unit = Literal["s", "ms", "us", "ns"]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(strict=True, allow_inf_nan=False, frozen=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _check_keys(cls, values: Any) -> Any:
+        """Look for missing and unknown keys, and say which is meant."""
+        if not isinstance(values, dict):
+            raise InputError(f" is {shown(values)}, expected a table.")
+        for name, field in cls.model_fields.items():
+            if field.is_required() and name not in values:
+                close = difflib.get_close_matches(name, values.keys() - cls.model_fields.keys(), 1, 0.75)
+                slip = f" There is {close[0]}: is {name} meant?" if close else ""
+                raise InputError(f".{name} is missing; expected {_expected(field)}.{slip}")
+        for name in values:
+            if name not in cls.model_fields:
+                close = difflib.get_close_matches(name, cls.model_fields, 1, 0.6)
+                slip = f" Is {close[0]} meant?" if close else ""
+                raise InputError(f".{name}: unknown key;{slip} known are {', '.join(cls.model_fields)}.")
+        return values
+
+    @field_validator("*", mode="wrap")
+    @classmethod
+    def _check_value(cls, value: Any, read: Callable[[Any], Any], info: Any) -> Any:
+        """Say in our words what is expected."""
+        try:
+            return read(value)
+        except ValidationError as error:
+            first = error.errors()[0]
+            if first["loc"] or "error" in first.get("ctx", {}):
+                raise
+            expected = _expected(cls.model_fields[str(info.field_name)]) or first["msg"].removeprefix(
+                "Input should be "
+            )
+            raise InputError(f" is {shown(value)}, expected {expected}.") from None
+
+
+def _expected(field: FieldInfo) -> str | None:
+    """What a value is, in words."""
+    kinds = [field.annotation, *get_args(field.annotation)]
+    for kind in kinds:
+        if choices := [one for one in get_args(kind) if isinstance(one, str)]:
+            return f"one of {', '.join(map(repr, choices))}"
+    metadata = [meta for kind in kinds for meta in getattr(kind, "__metadata__", ()) if isinstance(meta, FieldInfo)]
+    return field.description or next((meta.description for meta in metadata), None)
+
+
+class _Pose(_Table):
+    translation: Annotated[list[Number], Field(min_length=3, max_length=3, description="3 numbers")]
+    quaternion: Annotated[list[Number], Field(min_length=4, max_length=4, description="4 numbers")]
+
+
+if TYPE_CHECKING:
+    ToVehicle = Transform
+else:
+    _FORMS = "4 rows of 4 numbers, or {translation = [x, y, z], quaternion = [qx, qy, qz, qw]}"
+    ToVehicle = Annotated[_Pose, WrapValidator(_transform), Field(description=_FORMS)]
 
 
 @dataclass(frozen=True)
@@ -58,84 +178,194 @@ class Clock:
     """Added to each time, to bring it to the clock of the poses."""
 
 
-@dataclass(frozen=True)
-class DepthMaps:
+class _Timed(_Table):
+    times_file: File | None = None
+    times_from_names: Literal[True] | None = None
+    rate_hz: Positive | None = None
+    time_unit: Unit = "s"
+    time_offset_s: Number = 0.0
+
+    @cached_property
+    def clock(self) -> Clock:
+        """How its times are told."""
+        keys = ("times_file", "times_from_names", "rate_hz")
+        given = [name for name in keys if getattr(self, name) is not None]
+        if len(given) != 1:
+            found = " and ".join(given) or "none"
+            raise InputError(f".times_file: expected one of {', '.join(keys)}, found {found}: each file needs a time.")
+        unit = _SECONDS[self.time_unit]
+        return Clock(self.times_file, given == ["times_from_names"], self.rate_hz, unit, self.time_offset_s)
+
+
+class _Sensor(_Timed):
+    _name: str = PrivateAttr("")
+
+    @property
+    def name(self) -> str:
+        """Its table's; becomes a folder."""
+        return self._name
+
+
+class DepthMaps(_Table):
     """Depth maps that come with a camera's pictures, in place of LiDAR."""
 
-    files: str
-    """Folder, or pattern."""
-    kind: Literal["distance", "z_depth"]
-    """Along the ray, or along the optical axis."""
-    metres_per_count: float
-    """What one count of a file is."""
+    files: Files
+    kind: Literal["z_depth", "distance"]
+    """Along the optical axis, or along the ray."""
+    metres_per_count: Scale
 
 
-@dataclass(frozen=True)
-class RigCamera:
+class RigCamera(_Sensor):
     """A camera of the rig."""
 
-    name: str
-    """Its name; becomes a folder."""
-    camera: Camera
-    """Its model, pixel centres at +0.5."""
-    to_vehicle: Transform
+    model: Literal["mei", "kannala-brandt", "pinhole"]
+    width: Side
+    height: Side
+    fx: Positive
+    fy: Positive
+    cx: Number
+    cy: Number
+    pixel_centre: float = 0
+    xi: Number | None = None
+    k1: Number = 0.0
+    k2: Number = 0.0
+    k3: Number = 0.0
+    k4: Number = 0.0
+    p1: Number = 0.0
+    p2: Number = 0.0
+    theta_max_deg: Positive = 180.0
+    to_vehicle: ToVehicle
     """From its frame to the vehicle's."""
-    images: str
-    """Folder, or pattern, of its pictures."""
-    clock: Clock
-    """When they were taken."""
-    ego_mask: Path | None
+    images: Files
+    ego_mask: File | None = None
     """What of its pictures is never used."""
-    masks: str | None
-    """Folder or pattern of masks of single pictures."""
-    mono: str | None
-    """Folder or pattern of monocular distance maps."""
-    truth_distance: str | None
-    """Folder or pattern of true distance maps, which rendered recordings have."""
-    truth_rgb: str | None
-    """Folder or pattern of pictures without noise and exposure drift, which rendered recordings have."""
-    depth: DepthMaps | None
-    """Depth maps in place of LiDAR."""
+    masks: Files | None = None
+    mono: Files | None = None
+    truth_distance: Files | None = None
+    truth_rgb: Files | None = None
+    depth: DepthMaps | None = None
+
+    @cached_property
+    def camera(self) -> Camera:
+        """Its model, pixel centres at +0.5."""
+        for key, value, size in (("cx", self.cx, self.width), ("cy", self.cy, self.height)):
+            if not 0 < value < size:
+                raise InputError(f".{key} is {value}, expected a pixel within the picture, 0 to {size}.")
+        if self.pixel_centre not in (0, 0.5, 1):
+            raise InputError(f".pixel_centre is {self.pixel_centre}, expected one of 0, 0.5, 1.")
+        own = _MODEL_KEYS[self.model]
+        if wrong := self.model_fields_set & {"xi", "k1", "k2", "k3", "k4", "p1", "p2"} - {*own}:
+            raise InputError(f".{min(wrong)}: unknown key; a camera of model {self.model} has {', '.join(own)}.")
+        if "xi" in own and self.xi is None:
+            raise InputError(".xi is missing; expected a number.")
+        shift = 0.5 - self.pixel_centre
+        common = (self.width, self.height, self.fx, self.fy, self.cx + shift, self.cy + shift)
+        kinds: dict[str, Any] = {"mei": MEI, "kannala-brandt": KannalaBrandt, "pinhole": Pinhole}
+        limit_rad = min(math.radians(self.theta_max_deg), math.pi)
+        try:
+            return kinds[self.model](*common, **{key: getattr(self, key) for key in own}, theta_limit_rad=limit_rad)
+        except InputError as error:
+            raise InputError(f".model: {error}") from None
+
+    @model_validator(mode="after")
+    def _check(self) -> RigCamera:
+        assert self.clock and self.camera
+        return self
 
 
-@dataclass(frozen=True)
-class RigLidar:
+class _Names(_Table):
+    x: Text = "x"
+    y: Text = "y"
+    z: Text = "z"
+    intensity: Text = "intensity"
+
+
+class _PointTimes(_Table):
+    column: Text
+    unit: Unit = "s"
+    counted_from: Literal["timestamp", "clock"]
+
+
+class RigLidar(_Sensor):
     """A scanner of the rig."""
 
-    name: str
-    """Its name."""
-    to_vehicle: Transform
+    to_vehicle: ToVehicle
     """From its frame to the vehicle's."""
-    scans: str
-    """Folder, or pattern, of its scans."""
-    format: ScanFormat
-    """What their columns mean."""
-    clock: Clock
-    """When they were taken."""
-    turn_s: float | None
+    scans: Files
+    columns: Annotated[list[Text], AfterValidator(_different)] = list(ScanFormat().columns)
+    dtype: Literal["float32", "float64"] = "float32"
+    names: _Names = _Names()
+    point_times: _PointTimes | None = None
+    turn_s: Annotated[float, Field(gt=1e-9, le=1e5, description="a number above 1e-09, at most 100000")] | None = None
     """How long a scan takes; None = from one to the next."""
-    to_middle_s: float
-    """From a scan's timestamp to its middle."""
-    timing: SweepTiming | None
-    """When each azimuth is measured, counted from the middle; None = unknown, or points have times."""
+    timestamp: Literal["start", "middle", "end"] | None = None
+    direction: Literal["clockwise", "counter-clockwise"] | None = None
+    start_azimuth_deg: Number = 180.0
+
+    @cached_property
+    def format(self) -> ScanFormat:
+        """What its columns mean."""
+        times = self.point_times
+        return ScanFormat(
+            columns=tuple(self.columns),
+            dtype=self.dtype,
+            names=self.names.model_dump(),
+            times=times and PointTimes(times.column, _SECONDS[times.unit], absolute=times.counted_from == "clock"),
+        )
+
+    @property
+    def to_middle_s(self) -> float:
+        """From a scan's timestamp to its middle."""
+        return {"start": 0.5, "end": -0.5}.get(self.timestamp or "middle", 0.0) * (self.turn_s or 0.0)
+
+    @cached_property
+    def timing(self) -> SweepTiming | None:
+        """When each azimuth is measured, counted from the middle; None = unknown, or points have times."""
+        if self.turn_s is None or self.direction is None:
+            return None
+        # in the middle of a turn the scanner looks away from where it begins
+        reference_rad = math.remainder(math.radians(self.start_azimuth_deg + 180.0), 2 * math.pi)
+        return SweepTiming(self.turn_s, self.direction == "clockwise", reference_rad)
+
+    @model_validator(mode="after")
+    def _check(self) -> RigLidar:
+        assert self.clock
+        without_turn = sorted({"direction", "start_azimuth_deg", "timestamp"} & self.model_fields_set)
+        if self.turn_s is None and without_turn:
+            raise InputError(f".turn_s is missing; {without_turn[-1]} says nothing without it.")
+        if self.turn_s is not None and self.timestamp is None:
+            raise InputError(".timestamp is missing; expected one of 'start', 'middle', 'end'.")
+        if self.timing is not None and self.point_times is not None:
+            raise InputError(
+                ".direction: points with times of their own (point_times) need no direction; take one away."
+            )
+        return self
 
 
-@dataclass(frozen=True)
-class RigPoses:
-    """Where the poses come from."""
+class RigPoses(_Timed):
+    """Where the poses come from; KITTI's have a clock."""
 
-    file: Path
-    """The file."""
+    file: File
     format: Literal["tum", "kitti", "nerfstudio"]
-    """Its format."""
-    of: str
+    of: Text = VEHICLE
     """Whose poses they are: the vehicle's, or a sensor's."""
-    clock: Clock | None
-    """When they were taken, in KITTI's format."""
-    metres_per_unit: float
-    """What one unit of their positions is."""
-    up: str
+    metres_per_unit: Scale = 1.0
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
     """Which axis of their world points up."""
+
+    @model_validator(mode="after")
+    def _check(self) -> RigPoses:
+        if self.format == "kitti":
+            assert self.clock
+        elif clock := self.model_fields_set & _Timed.model_fields.keys():
+            raise InputError(f".{min(clock)}: unknown key; poses of format {self.format} bring their times.")
+        return self
+
+
+class _Whole(_Table):
+    cameras: dict[SensorName, RigCamera] = Field({}, description="tables [cameras.NAME]")
+    lidars: dict[SensorName, RigLidar] = Field({}, description="tables [lidars.NAME]")
+    poses: RigPoses | None = None
 
 
 @dataclass(frozen=True)
@@ -177,7 +407,13 @@ def read_rig(path: Path, root: Path, prepare: Callable[[dict[str, Any]], None] |
         raise InputError(f"{path}: expected tables [cameras.NAME], [lidars.NAME] and [poses].")
     if prepare is not None:
         prepare(content)
-    return _rig(_Table(content, path, ""), root)
+    try:
+        return _rig(_Whole.model_validate(content, context={"root": root}), path)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"] if part != "[key]")
+        said = first.get("ctx", {}).get("error") or f" is {shown(first['input'])}: {first['msg']}."
+        raise InputError(f"{path}: {f'{key}{said}'.removeprefix('.')}") from None
 
 
 def _parse_toml(text: str) -> dict[str, Any]:
@@ -186,122 +422,15 @@ def _parse_toml(text: str) -> dict[str, Any]:
     return tomllib.loads(text)
 
 
-class _Table:
-    """A table of the file; each key is taken once, and what is left over at the end is an error."""
-
-    def __init__(self, values: Mapping[str, Any], path: Path, prefix: str) -> None:
-        self._values, self._path, self._prefix = dict(values), path, prefix
-        self._known: list[str] = []
-
-    def where(self, key: str) -> str:
-        return f"{self._path}: {self._prefix}{key}"
-
-    def wrong(self, key: str, found: object, expected: str) -> InputError:
-        return InputError(f"{self.where(key)} is {shown(found)}, expected {expected}.")
-
-    def has(self, key: str) -> bool:
-        self._known.append(key)
-        return key in self._values
-
-    def take(self, key: str, expected: str) -> Any:
-        """The value of a key that must be there."""
-        self._known.append(key)
-        if key not in self._values:
-            raise InputError(f"{self.where(key)} is missing; expected {expected}.{self.slip_for(key)}")
-        return self._values.pop(key)
-
-    def slip_for(self, *keys: str) -> str:
-        """A question about a key that is there, if it looks like one of those that are missing."""
-        for key in keys:
-            for found in difflib.get_close_matches(key, self._values, 1, 0.75):
-                return f" There is {found}: is {key} meant?"
-        return ""
-
-    def number(
-        self, key: str, default: float | None = None, above: float = -math.inf, most: float = MAX_TIME_S
-    ) -> float:
-        expected = "a number" + (f" above {above:g}" if above > -math.inf else "") + f", at most {most:g}"
-        if default is not None and not self.has(key):
-            return default
-        given = self.take(key, expected)
-        value = finite(given)
-        if value is None or value <= above or abs(value) > most:
-            raise self.wrong(key, given, expected)
-        return value
-
-    def whole(self, key: str, low: int, high: int) -> int:
-        expected = f"a whole number from {low} to {high}"
-        value = self.take(key, expected)
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            raise self.wrong(key, value, expected)
-        return value
-
-    def text(self, key: str, expected: str) -> str:
-        value = self.take(key, expected)
-        if not isinstance(value, str) or not value:
-            raise self.wrong(key, value, expected)
-        return value
-
-    def optional_text(self, key: str, expected: str) -> str | None:
-        return self.text(key, expected) if self.has(key) else None
-
-    def choice(self, key: str, choices: tuple[Any, ...], default: Any = None) -> Any:
-        expected = f"one of {', '.join(map(repr, choices))}"
-        if default is not None and not self.has(key):
-            return default
-        value = self.take(key, expected)
-        # 1 equals True to Python only
-        if not any(value == choice and isinstance(value, bool) == isinstance(choice, bool) for choice in choices):
-            raise self.wrong(key, value, expected)
-        return value
-
-    def texts(self, key: str, default: tuple[str, ...]) -> tuple[str, ...]:
-        if not self.has(key):
-            return default
-        expected = "a list of different names, such as ['x', 'y', 'z', 'intensity']"
-        value = self.take(key, expected)
-        if not isinstance(value, list) or not all(isinstance(item, str) and item for item in value):
-            raise self.wrong(key, value, expected)
-        if not value or len(set(value)) != len(value):
-            raise self.wrong(key, value, expected)
-        return tuple(value)
-
-    def table(self, key: str, expected: str) -> _Table:
-        value = self.take(key, expected)
-        if not isinstance(value, dict):
-            raise self.wrong(key, value, expected)
-        return _Table(value, self._path, f"{self._prefix}{key}.")
-
-    def tables(self, key: str) -> dict[str, _Table]:
-        """Tables by their names; none if there is no such key."""
-        if not self.has(key):
-            return {}
-        inner = self.table(key, f"tables [{key}.NAME]")
-        for name in inner._values:
-            if not re.fullmatch(_NAME, name) or name == VEHICLE:
-                raise InputError(
-                    f"{inner.where(name)}: a sensor's name is letters, digits, _ and -, and not {VEHICLE!r}; it "
-                    "becomes a folder."
-                )
-        return {name: inner.table(name, f"a table [{key}.{name}]") for name in list(inner._values)}
-
-    def finish(self) -> None:
-        """Every key that is left is one that nobody knows."""
-        for key in self._values:
-            similar = difflib.get_close_matches(key, self._known, 1, 0.6)
-            hint = f" Is {similar[0]} meant?" if similar else ""
-            raise InputError(
-                f"{self.where(key)}: unknown key;{hint} known are {', '.join(dict.fromkeys(self._known))}."
-            )
-
-
-def _rig(table: _Table, root: Path) -> Rig:
-    cameras = tuple(_camera(inner, name, root) for name, inner in table.tables("cameras").items())
-    lidars = tuple(_lidar(inner, name, root) for name, inner in table.tables("lidars").items())
+def _rig(whole: _Whole, path: Path) -> Rig:
+    for sensors in (whole.cameras, whole.lidars):
+        for name, sensor in sensors.items():
+            sensor._name = name
+    cameras, lidars, poses = tuple(whole.cameras.values()), tuple(whole.lidars.values()), whole.poses
     names = [sensor.name for sensor in (*cameras, *lidars)]
-    poses = _poses(table.table("poses", "a table [poses]"), root, names) if table.has("poses") else None
-    table.finish()
-    path = Path(table.where("").removesuffix(": "))
+    if poses and poses.of not in (VEHICLE, *names):
+        known = ", ".join(map(repr, (VEHICLE, *names)))
+        raise InputError(f"{path}: poses.of is {shown(poses.of)}, expected one of {known}.")
     if not cameras:
         raise InputError(f"{path}: has no camera; expected a table [cameras.NAME] for each (docs/rig.md).")
     if twice := {name for name in names if names.count(name) > 1}:
@@ -316,197 +445,3 @@ def _rig(table: _Table, root: Path) -> Rig:
         lacking = next(camera.name for camera in cameras if not camera.depth)
         raise InputError(f"{path}: cameras.{lacking}.depth is missing; give depth maps for every camera or for none.")
     return Rig(path, cameras, lidars, poses)
-
-
-_MODEL_KEYS = {
-    "mei": ("xi", "k1", "k2", "p1", "p2"),
-    "kannala-brandt": ("k1", "k2", "k3", "k4"),
-    "pinhole": ("k1", "k2", "p1", "p2", "k3"),
-}
-"""Models, and what they have beside focal lengths and principal point; 0 if it is left out, but for ξ."""
-
-
-def _camera(table: _Table, name: str, root: Path) -> RigCamera:
-    found = RigCamera(
-        name=name,
-        camera=_model(table),
-        to_vehicle=_to_vehicle(table),
-        images=_files(table, "images", "the folder of its pictures, or a pattern such as 'front/*.png'", root),
-        clock=_clock(table, root),
-        ego_mask=_path(table, "ego_mask", "a PNG, 255 = use the pixel", root),
-        masks=_optional_files(table, "masks", "the folder of its pictures' masks", root),
-        mono=_optional_files(table, "mono", "the folder of its monocular distance maps", root),
-        truth_distance=_optional_files(table, "truth_distance", "the folder of its true distance maps", root),
-        truth_rgb=_optional_files(table, "truth_rgb", "the folder of its pictures without noise", root),
-        depth=_depth(table, root) if table.has("depth") else None,
-    )
-    table.finish()
-    return found
-
-
-def _model(table: _Table) -> Camera:
-    model = table.choice("model", tuple(_MODEL_KEYS))
-    width, height = (table.whole(key, 1, MAX_SIDE_PX) for key in ("width", "height"))
-    fx, fy = (table.number(key, above=0.0) for key in ("fx", "fy"))
-    cx, cy = (table.number(key) for key in ("cx", "cy"))
-    centre = table.choice("pixel_centre", (0, 0.5, 1), default=0)
-    for key, value, size in (("cx", cx, width), ("cy", cy, height)):
-        if not 0 < value < size:
-            raise table.wrong(key, value, f"a pixel within the picture, 0 to {size}")
-    rest = {key: table.number(key, None if key == "xi" else 0.0) for key in _MODEL_KEYS[model]}
-    limit_rad = math.radians(table.number("theta_max_deg", 180.0, above=0.0))
-    common = (width, height, fx, fy, cx + 0.5 - centre, cy + 0.5 - centre)
-    kinds: dict[str, Any] = {"mei": MEI, "kannala-brandt": KannalaBrandt, "pinhole": Pinhole}
-    try:
-        return kinds[model](*common, **rest, theta_limit_rad=min(limit_rad, math.pi))
-    except InputError as error:
-        raise InputError(f"{table.where('model')}: {error}") from None
-
-
-def _to_vehicle(table: _Table) -> Transform:
-    expected = "4 rows of 4 numbers, or {translation = [x, y, z], quaternion = [qx, qy, qz, qw]}"
-    where = table.where("to_vehicle")
-    value = table.take("to_vehicle", expected)
-    if not isinstance(value, dict):
-        return transform_of_rows(value, where)
-    inner = _Table(value, table._path, f"{table._prefix}to_vehicle.")
-    numbers = []
-    for key, count in (("translation", 3), ("quaternion", 4)):
-        given = inner.take(key, f"{count} numbers")
-        values = [finite(item) for item in given] if isinstance(given, list) else []
-        usable = [value for value in values if value is not None]
-        if not len(values) == len(usable) == count:
-            raise inner.wrong(key, given, f"{count} numbers")
-        numbers.append(usable)
-    inner.finish()
-    return pose_of_quaternion(numbers[0], numbers[1], where)
-
-
-def _path(table: _Table, key: str, expected: str, root: Path) -> Path | None:
-    given = table.optional_text(key, expected)
-    return None if given is None else path_inside(root, given, table.where(key))
-
-
-def _files(table: _Table, key: str, expected: str, root: Path) -> str:
-    """A folder or a pattern, which stays in the recording's folder."""
-    given = table.text(key, expected)
-    path_inside(root, given, table.where(key))
-    return given
-
-
-def _optional_files(table: _Table, key: str, expected: str, root: Path) -> str | None:
-    return _files(table, key, expected, root) if table.has(key) else None
-
-
-def _clock(table: _Table, root: Path) -> Clock:
-    keys = ("times_file", "times_from_names", "rate_hz")
-    given = [key for key in keys if table.has(key)]
-    if len(given) != 1:
-        found = " and ".join(given) if given else "none"
-        raise InputError(
-            f"{table.where('times_file')}: expected one of {', '.join(keys)}, found {found}: each file needs a time."
-            f"{'' if given else table.slip_for(*keys)}"
-        )
-    if table.has("times_from_names"):
-        table.choice("times_from_names", (True,))
-    clock = Clock(
-        file=_path(table, "times_file", "a text file with a time for each file", root),
-        from_names=given == ["times_from_names"],
-        rate_hz=table.number("rate_hz", above=1e-9) if table.has("rate_hz") else None,
-        seconds_per_count=_SECONDS[table.choice("time_unit", tuple(_SECONDS), "s")],
-        offset_s=table.number("time_offset_s", 0.0),
-    )
-    return clock
-
-
-def _depth(table: _Table, root: Path) -> DepthMaps:
-    inner = table.table("depth", "{files = 'depth/front', kind = 'z_depth', metres_per_count = 0.001}")
-    found = DepthMaps(
-        files=_files(inner, "files", "the folder of the maps", root),
-        kind=inner.choice("kind", ("z_depth", "distance")),
-        metres_per_count=inner.number("metres_per_count", above=1e-12, most=1e6),
-    )
-    inner.finish()
-    return found
-
-
-def _lidar(table: _Table, name: str, root: Path) -> RigLidar:
-    scans = _files(table, "scans", "the folder of its scans, or a pattern such as 'lidar/*.bin'", root)
-    names = {}
-    if table.has("names"):
-        inner = table.table("names", "a table such as {x = 'X', intensity = 'i'}")
-        for quantity in ("x", "y", "z", "intensity"):
-            if (called := inner.optional_text(quantity, "a column's name")) is not None:
-                names[quantity] = called
-        inner.finish()
-    scan = ScanFormat(
-        columns=table.texts("columns", ScanFormat().columns),
-        dtype=table.choice("dtype", ("float32", "float64"), "float32"),
-        names=names,
-        times=_point_times(table),
-    )
-    turn_s, to_middle_s, timing = _timing(table)
-    if timing is not None and scan.times is not None:
-        where = table.where("direction")
-        raise InputError(f"{where}: points with times of their own (point_times) need no direction; take one away.")
-    found = RigLidar(
-        name=name,
-        to_vehicle=_to_vehicle(table),
-        scans=scans,
-        format=scan,
-        clock=_clock(table, root),
-        turn_s=turn_s,
-        to_middle_s=to_middle_s,
-        timing=timing,
-    )
-    table.finish()
-    return found
-
-
-def _point_times(table: _Table) -> PointTimes | None:
-    if not table.has("point_times"):
-        return None
-    inner = table.table("point_times", "{column = 't', unit = 'ns', counted_from = 'timestamp'}")
-    found = PointTimes(
-        column=inner.text("column", "a column's name"),
-        seconds_per_count=_SECONDS[inner.choice("unit", tuple(_SECONDS), "s")],
-        absolute=inner.choice("counted_from", ("timestamp", "clock")) == "clock",
-    )
-    inner.finish()
-    return found
-
-
-def _timing(table: _Table) -> tuple[float | None, float, SweepTiming | None]:
-    """How long a turn takes, how long after a scan's timestamp its middle is, and when each azimuth is measured."""
-    turns = table.has("direction")
-    for key in ("direction", "start_azimuth_deg", "timestamp"):
-        if table.has(key) and not table.has("turn_s"):
-            raise InputError(f"{table.where('turn_s')} is missing; {key} says nothing without it.")
-    if not table.has("turn_s"):
-        return None, 0.0, None
-    turn_s = table.number("turn_s", above=1e-9, most=1e5)
-    moment = table.choice("timestamp", ("start", "middle", "end"))
-    to_middle_s = {"start": turn_s / 2, "middle": 0.0, "end": -turn_s / 2}[moment]
-    if not turns:
-        return turn_s, to_middle_s, None
-    clockwise = table.choice("direction", ("clockwise", "counter-clockwise")) == "clockwise"
-    # in the middle of a turn the scanner looks away from where it begins
-    reference_rad = math.radians(table.number("start_azimuth_deg", 180.0) + 180.0)
-    return turn_s, to_middle_s, SweepTiming(turn_s, clockwise, math.remainder(reference_rad, 2 * math.pi))
-
-
-def _poses(table: _Table, root: Path, sensors: list[str]) -> RigPoses:
-    expected = "the file of the poses"
-    file = path_inside(root, table.text("file", expected), table.where("file"))
-    kind = table.choice("format", ("tum", "kitti", "nerfstudio"))
-    clock = _clock(table, root) if kind == "kitti" else None
-    found = RigPoses(
-        file=file,
-        format=kind,
-        of=VEHICLE if kind == "nerfstudio" else table.choice("of", (VEHICLE, *sensors), VEHICLE),
-        clock=clock,
-        metres_per_unit=table.number("metres_per_unit", 1.0, above=1e-12, most=1e6),
-        up=table.choice("up", ("x", "y", "z", "-x", "-y", "-z"), "z"),
-    )
-    table.finish()
-    return found
