@@ -812,6 +812,7 @@ def test_judging_gives_the_figures_of_ns_eval(finished):
     run = next(run for run in results.runs if run.method == "edge")
     _, pipeline, *_ = eval_setup(next(run.folder.rglob("config.yml")), test_mode="test")
     found: Any = pipeline.get_average_eval_image_metrics()
+    assert {"masked_psnr", "truth_masked_ssim", "lidar_abs_rel"} <= set(found)
     for name, value in found.items():
         if name not in ("fps", "num_rays_per_sec"):
             assert run.figures[name] == pytest.approx(value, rel=1e-4, abs=1e-4), name

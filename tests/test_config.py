@@ -40,6 +40,7 @@ def test_configurations_hold_what_the_file_says(name):
     method = all_methods[name]
     overrides = DECLARED["presets"][DECLARED["methods"][name]["preset"]]
     constants = {key: entry["value"] for key, entry in DECLARED["constants"].items()}
+    assert constants
     for dotted, value in {**constants, **overrides}.items():
         found = lookup(method, dotted)
         assert (list(found) if isinstance(found, tuple) else found) == value, dotted
@@ -67,7 +68,7 @@ def test_the_paper_preset_is_the_literal_form():
 
 
 def test_the_viewer_of_a_training_listens_on_this_machine_only():
-    assert all(all_methods[name].viewer.websocket_host == "127.0.0.1" for name in DECLARED["methods"])
+    assert {all_methods[name].viewer.websocket_host for name in DECLARED["methods"]} == {"127.0.0.1"}
 
 
 def test_the_dataparser_is_registered():

@@ -12,13 +12,12 @@ from edge_depth_nerf.mono.alignment import Fit
 from edge_depth_nerf.mono.error_model import KNOTS, ErrorModel, Trust
 from edge_depth_nerf.prior import PriorCache, PriorOptions, View, make_prior, sky_of, view_of
 
-RNG = np.random.default_rng(2)
 
-
-def maps(height=12, width=10):
-    mono = (5 + RNG.random((height, width))).astype(np.float32)
-    lidar = np.where(RNG.random((height, width)) < 0.3, mono * 1.05, 0).astype(np.float32)
-    mask = RNG.random((height, width)) < 0.8
+def maps(height=12, width=10, seed=2):
+    rng = np.random.default_rng(seed)
+    mono = (5 + rng.random((height, width))).astype(np.float32)
+    lidar = np.where(rng.random((height, width)) < 0.3, mono * 1.05, 0).astype(np.float32)
+    mask = rng.random((height, width)) < 0.8
     return lidar, mono, mask
 
 

@@ -349,7 +349,9 @@ def test_times_by_name_and_by_rate(mine: Path) -> None:
     named = [f"{number:06d}.png {time}" for number, time in enumerate(lines)]
     (mine / "times_left.txt").write_text("\n".join(reversed(named)))
     edit(mine, ('times_file = "times_right.txt"', f"rate_hz = 10\ntime_offset_s = {FIRST_S}"))
-    for picture in read_rig_recording(options(mine)).pictures:
+    pictures = read_rig_recording(options(mine)).pictures
+    assert {picture.camera for picture in pictures} == {"left", "right", "front"}
+    for picture in pictures:
         moment = FIRST_S + 0.1 * picture.frame
         assert abs(picture.time_s - moment) < 0.0121
 

@@ -42,6 +42,7 @@ def test_the_same_options_give_the_same_bytes_also_when_continued(tmp_path: Path
 
 
 def test_what_the_lenses_see() -> None:
+    assert len(rig_cameras(256)) == 3 and len(jbnu_cameras(192)) == 4
     for mounted in rig_cameras(256).values():
         camera = mounted.camera
         seen, valid = camera.unproject(camera.pixel_centres())

@@ -249,6 +249,7 @@ def test_frame_masks_are_joined_with_the_cameras(tmp_path: Path) -> None:
     write(tmp_path / "scene", given=given, mask=own, layers=("lidar", "mask"))
     meta = read_json(tmp_path / "scene/transforms.json")
     camera_mask = read_mask(tmp_path / "scene/masks/image_02.png")
+    assert masks
     for frame, mask in zip(meta["frames"], masks, strict=True):
         assert frame["mask_path"] == f"masks/image_02/{frame['frame']:010d}.png"
         joined = read_mask(tmp_path / "scene" / frame["mask_path"])
