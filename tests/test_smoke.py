@@ -8,12 +8,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from scenes import fisheye, write_scene
 
 HERE = Path(__file__).parent
 STEPS = 5
 
 
+@pytest.mark.usefixtures("may_start_programs")
 def test_some_steps_have_finite_losses_and_a_checkpoint(tmp_path: Path) -> None:
     scene = write_scene(tmp_path / "scene", [fisheye(24, 20)], frames=5)
     command = [sys.executable, HERE / "smoke.py", scene, tmp_path / "runs", str(STEPS)]
