@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from pathlib import Path
 
+import numpy as np
 from rich.console import Console
+from scenes import FLIP, fisheye, view, write_scene
 
 from edge_depth_nerf.compare.options import CompareOptions
 from edge_depth_nerf.compare.results import RunResult
+from edge_depth_nerf.files import read_json, write_distance_png, write_json, write_png
 
-ROOT = Path(__file__).parents[1]
 QUIET = Console(quiet=True)
 
 
@@ -34,6 +38,37 @@ def fake(scene, method, seed, psnr=20.0, steps=100, seconds=10.0, named=(), **mo
         "curve": curve,
     }
     return RunResult(Path(f"/runs/{scene}/{method}_seed-{seed}"), content["run"], content)
+
+
+def copied(output: Path, folder: Path) -> Path:
+    """A copy of a comparison's folder; checkpoints, which are large and never written to again, are linked."""
+
+    def copy(source: str, target: str) -> None:
+        (os.link if source.endswith(".ckpt") else shutil.copy2)(source, target)
+
+    return Path(shutil.copytree(output, folder, copy_function=copy))
+
+
+def write_compared_scene(folder: Path) -> Path:
+    """A small scene that has all that is compared: two held-out views, and true ones beside the first of them."""
+    camera = fisheye(44, 40)
+    meta = read_json(write_scene(folder, [camera], frames=13) / "transforms.json")
+    for frame in meta["frames"]:
+        frame["camera"] = "only"
+    held_out = next(frame for frame in meta["frames"] if frame["file_path"] == meta["test_filenames"][0])
+    meta["shifted_views"] = {}
+    for metres in (1, 2):
+        pose = np.array(held_out["transform_matrix"])
+        pose[0, 3] += metres
+        colours, distance, _ = view(camera, pose @ FLIP)
+        files = {kind: f"truth/shifted_{metres}m/{kind}.png" for kind in ("rgb", "distance")}
+        write_png(folder / files["rgb"], colours)
+        write_distance_png(folder / files["distance"], distance)
+        entry = {"camera": "only", "frame": 4, "transform_matrix": pose.tolist()}
+        entry |= {f"truth_{kind}_file_path": path for kind, path in files.items()}
+        meta["shifted_views"][str(metres)] = [entry]
+    write_json(folder / "transforms.json", meta)
+    return folder
 
 
 def options(*scenes, **changes):

@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import torch
-from comparisons import QUIET, ROOT, options
+from comparisons import QUIET, copied, options, write_compared_scene
 from nerfstudio.utils.eval_utils import eval_setup
 
 from edge_depth_nerf.compare import command, tables
@@ -25,8 +25,9 @@ from edge_depth_nerf.files import read_image, read_json, write_json
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("compare")
-    shutil.copytree(ROOT / "data" / "sample_drive", folder / "sample")
-    asked = options(folder / "sample", output=folder / "out", methods=("nerfacto", "edge"), steps=12, jobs=2)
+    asked = options(
+        write_compared_scene(folder / "sample"), output=folder / "out", methods=("nerfacto", "edge"), steps=12, jobs=2
+    )
     return asked, command.compare(asked, QUIET)
 
 
@@ -123,7 +124,7 @@ def test_what_is_there_is_not_done_again(finished, monkeypatch):
 def test_runs_of_which_only_the_figures_are_left_count_in_the_tables(finished, tmp_path, monkeypatch, kept):
     asked, results = finished
     output = tmp_path / "out"
-    shutil.copytree(asked.output, output)
+    copied(asked.output, output)
     (output / "comparison_sample.png").unlink()
     for folder in (output / "runs" / "sample").iterdir():
         for each in folder.iterdir():
@@ -144,7 +145,7 @@ def test_an_interrupted_run_goes_on_at_its_checkpoint(finished, tmp_path):
     """As if it had been killed after four of ours' twelve steps."""
     asked, results = finished
     output = tmp_path / "out"
-    shutil.copytree(asked.output, output)
+    copied(asked.output, output)
     folder = output / "runs" / "sample" / "edge_seed-0"
     (folder / "figures.json").unlink()
     checkpoints = next(folder.rglob("nerfstudio_models"))

@@ -126,6 +126,7 @@ def test_the_command_line_imports_nothing_heavy():
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_the_plugin_adds_little_to_nerfstudios_commands():
     """Every ns-* command imports it; what takes long is imported when it is needed."""
     check = (

@@ -21,6 +21,8 @@ from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_image, read_json
 from edge_depth_nerf.pictures import NO_VALUE_RGB, colour_distance, side_by_side
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):

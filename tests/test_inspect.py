@@ -615,6 +615,7 @@ def test_an_output_that_is_a_file(drive):
         look(drive, drive / "points.ply")
 
 
+@pytest.mark.slow
 def test_the_command_runs_without_nerfstudio(drive, tmp_path):
     """Importing nerfstudio takes longer than the whole command."""
     code = (

@@ -42,6 +42,8 @@ from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.runs import newest_checkpoint, steps_done
 from edge_depth_nerf.scene_reader import read_scene
 
+pytestmark = pytest.mark.slow
+
 DEAD = 2**22 + 1
 """No process has such a number."""
 

@@ -206,6 +206,7 @@ def seen_in_the_ball(picture: ScenePicture, rays: np.ndarray) -> np.ndarray:
     return -along + np.sqrt(along**2 + RADIUS_M**2 - picture.position_m @ picture.position_m)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["relative", "inverse"])
 def test_frames_with_few_returns_take_the_drives_fit(tmp_path, kind):
     """Scales differ from view to view, but not from frame to frame, except in the held-out one."""
@@ -395,6 +396,7 @@ def test_a_network_is_shown_its_own_preparation_of_the_picture(networks):
     assert np.abs(found - expected[0].numpy()).max() < 0.01 * np.ptp(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["anything-metric", "dpt"])
 def test_the_command_writes_maps_of_a_ready_made_network(networks, name, tmp_path, monkeypatch, capsys):
     folder = write_scene(tmp_path / "scene", [fisheye(48, 44)], mono=False)

@@ -245,6 +245,7 @@ def test_true_views_are_the_scenes_own(tmp_path):
         read_scene(scene)
 
 
+@pytest.mark.slow
 def test_links_in_a_scene_are_followed(tmp_path):
     """They are of whoever made the folder: a way to keep pictures elsewhere."""
     scene = write_scene(tmp_path / "scene", frames=2)

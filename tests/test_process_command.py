@@ -22,6 +22,8 @@ from edge_depth_nerf.process.command import process
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.scene_reader import read_scene
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(autouse=True)
 def small_network(monkeypatch: pytest.MonkeyPatch) -> None:

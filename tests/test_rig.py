@@ -26,6 +26,8 @@ from edge_depth_nerf.process.rig_file import read_rig, tomllib
 from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 
+pytestmark = pytest.mark.slow
+
 PAGE = Path(__file__).parents[1] / "docs" / "rig.md"
 FRAMES = 5
 FIRST_S = 1369730762.123456789

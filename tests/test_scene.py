@@ -546,6 +546,7 @@ BENT = KannalaBrandt(SIZE, SIZE, 7.0, 7.0, 16.4, 16.1, 0.0652, 0.0189, -0.0042, 
 """nerfstudio's iteration goes astray beyond some 90°."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("cameras", "theta_max_deg", "message"),
     [

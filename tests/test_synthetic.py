@@ -22,6 +22,8 @@ from edge_depth_nerf.synthetic.render import Caster, World
 from edge_depth_nerf.synthetic.scenes import _movers, build_scene
 from edge_depth_nerf.synthetic.simulated_mono import simulated_estimate
 
+pytestmark = pytest.mark.slow
+
 SEQUENCE = SynthesizeOptions(Path()).sequence
 FRAMES = 5
 SIZE = 128
