@@ -59,7 +59,7 @@ test-pure:
 	$(PYTHON) -m venv $(PURE)
 	$(PURE)/bin/pip install --quiet --disable-pip-version-check 'numpy>=2' torch scipy opencv-contrib-python-headless numba \
 		jaxtyping 'beartype>=0.18' tyro rich safetensors trimesh embreex Pillow PyYAML pycolmap \
-		'pytest>=8' 'pytest-xdist>=3' 'hypothesis>=6'
+		'pytest>=8' 'pytest-xdist>=3.7' 'hypothesis>=6'
 	$(PURE)/bin/pip install --quiet --disable-pip-version-check --no-deps -e .
 	$(PURE)/bin/pytest $(PURE_TESTS:%=tests/test_%.py) -k 'not nerfstudio and not all_models and not tuned'
 

@@ -1,7 +1,7 @@
 """Several commands, one after another in one process, as starting nerfstudio takes 10 s: `host_commands.py JOBS.json`.
 
-Each job has the `words` of a command and a `log` for what it says. Beside the log, LOG.status gets its exit status; a
-job without one was not begun.
+Each job has the `words` of a command, an `environment` of its own and a `log` for what it says. Beside the log,
+LOG.status gets its exit status; a job without one was not begun.
 """
 
 from __future__ import annotations
@@ -33,7 +33,11 @@ def main() -> None:
         with log.open("w") as file:
             os.dup2(file.fileno(), 1)
             os.dup2(file.fileno(), 2)
+            before = dict(os.environ)
+            os.environ.update(job["environment"])
             status = status_of(job["words"])
+            os.environ.clear()
+            os.environ.update(before)
             sys.stdout.flush()
             sys.stderr.flush()
         log.with_name(f"{log.name}.status").write_text(str(status))
