@@ -51,6 +51,13 @@ def pytest_configure(config: pytest.Config) -> None:
         sys.meta_path.insert(0, SkipWhatImportsTheHost())  # pyright: ignore[reportArgumentType]
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Import no module whose tests are slow all together."""
+    if config.getoption("--fast") and collection_path.suffix == ".py":
+        return "\npytestmark = pytest.mark.slow" in collection_path.read_text(encoding="utf-8") or None
+    return None
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Let files with slow tests go first, so that none of them is left for one worker at the end; or leave them out."""
     slow = [item for item in items if item.get_closest_marker("slow")]

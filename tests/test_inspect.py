@@ -47,6 +47,8 @@ from edge_depth_nerf.pictures import (
 )
 from edge_depth_nerf.scene_reader import read_scene
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / "data" / "sample_drive"
 
@@ -615,7 +617,6 @@ def test_an_output_that_is_a_file(drive):
         look(drive, drive / "points.ply")
 
 
-@pytest.mark.slow
 def test_the_command_runs_without_nerfstudio(drive, tmp_path):
     """Importing nerfstudio takes longer than the whole command."""
     code = (

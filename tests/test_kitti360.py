@@ -66,6 +66,8 @@ from edge_depth_nerf.process.scene import ProcessReport, Skipped
 from edge_depth_nerf.process.transforms import opencv_to_opengl
 from edge_depth_nerf.scene_reader import read_scene
 
+pytestmark = pytest.mark.slow
+
 CAMERAS = ("image_02", "image_03")
 STEP_M = 1 / 256
 
@@ -258,7 +260,6 @@ def test_without_deskewing_points_are_where_the_scanner_was_not(room: RoomDrive,
     assert np.quantile(moved, 0.99) < 0.05 < 0.1 < np.quantile(skewed, 0.99)
 
 
-@pytest.mark.slow
 def test_sweeps_around_add_to_each_picture_but_for_those_held_out(tmp_path: Path) -> None:
     drive = write_room_drive(tmp_path / "drive", beams=1000)
     process(drive, tmp_path / "one")
@@ -271,7 +272,6 @@ def test_sweeps_around_add_to_each_picture_but_for_those_held_out(tmp_path: Path
     assert np.quantile(off_the_walls(drive, tmp_path / "many"), 0.99) < 0.05
 
 
-@pytest.mark.slow
 def test_training_maps_do_not_depend_on_held_out_sweeps(tmp_path: Path) -> None:
     """Another sweep at the moment held out: not a byte of what training reads changes."""
     scenes = []
@@ -400,7 +400,6 @@ def found_by(options: dict[int, float], monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(colmap_poses, "colmap_poses", found)
 
 
-@pytest.mark.slow
 def test_other_poses_found_make_other_maps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As if the search had been made anew: what was held out by the old poses is not by the new ones."""
     drive = write_room_drive(tmp_path / "drive", frames=9, beams=300, size=32)
@@ -464,7 +463,6 @@ def test_shifted_views(room: RoomDrive, scene: Path) -> None:
             assert read_image(scene / view["truth_rgb_file_path"]).shape == (70, 70, 3)
 
 
-@pytest.mark.slow
 def test_downscaled_scene_agrees_with_the_camera(room: RoomDrive, tmp_path: Path) -> None:
     mono = room.root / "truth" / SEQUENCE
     mono_folder = tmp_path / "mono"
@@ -926,7 +924,6 @@ def test_other_options_or_other_input_are_another_scene(drive: RoomDrive, tmp_pa
     assert tree(tmp_path / "scene") == before
 
 
-@pytest.mark.slow
 def test_killed_run_is_continued(drive: RoomDrive, tmp_path: Path) -> None:
     """SIGKILL in the middle: what is whole stays, the rest is made, and the result is the same."""
     program = (
@@ -1038,7 +1035,6 @@ def test_report_says_how_well_the_cameras_fit(drive: RoomDrive, tmp_path: Path) 
     assert replace(report, notices=()).scene == tmp_path / "scene"
 
 
-@pytest.mark.slow
 def test_synthesised_drive(tmp_path: Path) -> None:
     """What the generator writes is read as it is, and its LiDAR agrees with its true distances."""
     from edge_depth_nerf.synthetic.drive import synthesize_drive

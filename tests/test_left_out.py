@@ -18,6 +18,8 @@ from edge_depth_nerf.process.command import process
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.process.scene import ProcessReport
 
+pytestmark = pytest.mark.slow
+
 CAMERAS = ("image_02", "image_03")
 
 
@@ -90,7 +92,6 @@ FAULTS: dict[str, tuple[Callable[[RoomDrive], object], set[tuple[str, int]], str
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_broken_file_is_left_out_and_named(drive: RoomDrive, fault: str) -> None:
     spoil, missing, message = FAULTS[fault]
@@ -119,7 +120,6 @@ def test_a_broken_file_is_left_out_and_named(drive: RoomDrive, fault: str) -> No
     assert not (drive.root.parent / "strict/transforms.json").exists()
 
 
-@pytest.mark.slow
 def test_a_picture_that_is_mended_comes_into_the_scene(drive: RoomDrive) -> None:
     path = drive.image("image_03", 5)
     whole = path.read_bytes()

@@ -20,6 +20,8 @@ from edge_depth_nerf.mono.files import npy_shape, read_npy
 from edge_depth_nerf.mono.options import EstimateDepthOptions
 from edge_depth_nerf.scene_reader import ScenePicture, read_scene
 
+pytestmark = pytest.mark.slow
+
 LENS = fisheye(48, 44)
 
 

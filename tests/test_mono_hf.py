@@ -25,6 +25,8 @@ from edge_depth_nerf.mono.pinhole_views import PinholeView, pinhole_views
 from edge_depth_nerf.mono.relative import Layer, Line, Samples, blend, fit_lines, take_samples
 from edge_depth_nerf.scene_reader import ScenePicture, read_scene
 
+pytestmark = pytest.mark.slow
+
 THETA_MAX = np.radians(95.0)
 
 
@@ -206,7 +208,6 @@ def seen_in_the_ball(picture: ScenePicture, rays: np.ndarray) -> np.ndarray:
     return -along + np.sqrt(along**2 + RADIUS_M**2 - picture.position_m @ picture.position_m)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["relative", "inverse"])
 def test_frames_with_few_returns_take_the_drives_fit(tmp_path, kind):
     """Scales differ from view to view, but not from frame to frame, except in the held-out one."""
@@ -396,7 +397,6 @@ def test_a_network_is_shown_its_own_preparation_of_the_picture(networks):
     assert np.abs(found - expected[0].numpy()).max() < 0.01 * np.ptp(found)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["anything-metric", "dpt"])
 def test_the_command_writes_maps_of_a_ready_made_network(networks, name, tmp_path, monkeypatch, capsys):
     folder = write_scene(tmp_path / "scene", [fisheye(48, 44)], mono=False)

@@ -63,6 +63,8 @@ from edge_depth_nerf.mono.training import (
 )
 from edge_depth_nerf.scene_reader import read_scene
 
+pytestmark = pytest.mark.slow
+
 CPU = torch.device("cpu")
 HEIGHT_M = 1.5
 TINY = NetworkSettings((8, 16), 32, HEIGHT_M, 5.0)
@@ -295,7 +297,6 @@ def test_the_camera_height_is_that_above_the_floor(small_street):
 # ---- training --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_it_learns_what_colours_mean(street):
     """Held-out pictures of a toy street, against truth, beside the best constant and the plain room."""
     examples, scene = examples_of(street), read_scene(street)
@@ -410,7 +411,6 @@ def test_what_is_kept_for_stopping_are_whole_training_moments(tmp_path):
 # ---- the command -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_held_out_pictures_have_no_say_and_the_command_continues(small_street, tmp_path, quiet):
     other = tmp_path / "other"
     shutil.copytree(small_street, other)
@@ -559,7 +559,6 @@ def test_pictures_kept_for_stopping_without_returns(small_street):
     assert about["steps"] == 2 and about["abs_rel"] is None
 
 
-@pytest.mark.slow
 def test_scenes_of_one_name_keep_their_own_trained_frames(tmp_path, quiet):
     one = write_street(tmp_path / "a" / "scene", frames=10, seed=1)
     other = write_street(tmp_path / "b" / "scene", frames=4, seed=2)
@@ -576,7 +575,6 @@ def test_scenes_of_one_name_keep_their_own_trained_frames(tmp_path, quiet):
     assert frames(unseen) == []
 
 
-@pytest.mark.slow
 def test_the_field_of_the_training_returns_goes_with_weights_and_maps(tmp_path, quiet):
     low, high = (write_street(tmp_path / name, seed=seed) for seed, name in enumerate(("low", "high")))
     expected = []
