@@ -26,7 +26,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    options = DemoOptions(output=tmp_path_factory.mktemp("demo") / "out", frames=13, size=64, steps=8)
+    options = DemoOptions(output=tmp_path_factory.mktemp("demo") / "out", frames=13, size=64, steps=8, mono_seconds=3.0)
     return options, demo.run_demo(options, Console(quiet=True))
 
 

@@ -14,6 +14,8 @@ from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.options import LayoutName, SynthesizeOptions
 from edge_depth_nerf.synthetic.rig_drive import jbnu_cameras, looking, rig_cameras
 
+pytestmark = pytest.mark.slow
+
 
 def contents(root: Path) -> dict[str, bytes]:
     return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
