@@ -41,7 +41,7 @@ def fake(scene, method, seed, psnr=20.0, steps=100, seconds=10.0, named=(), **mo
 
 
 def copied(output: Path, folder: Path) -> Path:
-    """A copy of a comparison's folder; checkpoints, which are large and never written to again, are linked."""
+    """A copy of what a comparison or a demo left; checkpoints, which are large and not written to again, are linked."""
 
     def copy(source: str, target: str) -> None:
         (os.link if source.endswith(".ckpt") else shutil.copy2)(source, target)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -11,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from comparisons import copied
 from rich.console import Console
 
 from edge_depth_nerf import demo
@@ -73,7 +73,7 @@ def test_an_interrupted_demo_is_finished(finished, tmp_path):
     """As if it had been stopped after four of ours' eight steps: only the rest is done, from the checkpoint."""
     options, results = finished
     output = tmp_path / "out"
-    shutil.copytree(options.output, output)
+    copied(options.output, output)
     (output / "results.json").unlink()
     metrics = output / "runs" / "ours" / "metrics.json"
     metrics.write_text(metrics.read_text()[:100])  # killed while it was written
