@@ -1,10 +1,14 @@
-"""Shared fixtures: where real data may lie, and no surprises from the machine."""
+"""Shared fixtures and options: which tests are fast, where real data may lie, no surprises from the machine."""
 
 from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import jaxtyping
 import pytest
@@ -14,7 +18,61 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 # where tests run in the background of a shell Ctrl-C is ignored, by whatever they start, too
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
+HOST = "nerfstudio"
+LARGE_BYTES = 2 << 20
 REAL_DATA = Path(__file__).resolve().parents[2] / "shared" / "real"
+
+
+class SkipWhatImportsTheHost:
+    """A finder that skips whatever module of tests, or test, comes to import nerfstudio, which takes 10 s."""
+
+    def find_spec(self, name: str, *_: object) -> None:
+        if name.partition(".")[0] == HOST:
+            pytest.skip(f"imports {HOST}, and is part of `make test`", allow_module_level=True)
+
+
+class NoProcess(subprocess.Popen):
+    """Skips whatever test starts a program: most of these import nerfstudio."""
+
+    allowed = False
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        if not self.allowed:
+            pytest.skip("starts a program, and is part of `make test`")
+        super().__init__(*arguments, **options)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--fast", action="store_true", help=f"nothing that imports {HOST}, starts a program or is slow")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if config.getoption("--fast"):
+        sys.meta_path.insert(0, SkipWhatImportsTheHost())  # pyright: ignore[reportArgumentType]
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Import no module whose tests are slow all together."""
+    if config.getoption("--fast") and collection_path.suffix == ".py":
+        return "\npytestmark = pytest.mark.slow" in collection_path.read_text(encoding="utf-8") or None
+    return None
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Let files with slow tests go first, so that none of them is left for one worker at the end; or leave them out."""
+    slow = [item for item in items if item.get_closest_marker("slow")]
+    if config.getoption("--fast"):
+        subprocess.Popen = NoProcess  # not earlier: pytest-xdist starts its workers with it
+        config.hook.pytest_deselected(items=slow)
+        items[:] = [item for item in items if item not in slow]
+    files = {item.path for item in slow}
+    items.sort(key=lambda item: item.path not in files)
+
+
+@pytest.fixture
+def may_start_programs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For tests that have to, with --fast as well."""
+    monkeypatch.setattr(NoProcess, "allowed", True)
 
 
 @pytest.fixture
@@ -23,6 +81,22 @@ def real_data() -> Path:
     if not REAL_DATA.is_dir():
         pytest.skip("no real data beside the checkout (they are not part of the project)")
     return REAL_DATA
+
+
+@pytest.fixture(scope="module", autouse=True)
+def nothing_large_is_left(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Remove a module's large files, checkpoints above all, once all of its tests have passed.
+
+    Folders and small files stay until the next run: tensorboard's writer lives on in the process and needs its own.
+    """
+    base, failed = tmp_path_factory.getbasetemp(), request.session.testsfailed
+    before = set(base.iterdir())
+    yield
+    if request.session.testsfailed == failed:
+        for folder in set(base.iterdir()) - before:
+            for path in folder.rglob("*"):
+                if path.is_file() and not path.is_symlink() and path.stat().st_size > LARGE_BYTES:
+                    path.unlink()
 
 
 @pytest.fixture

@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.data.scene_box import SceneBox
 
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
+
+
+def shrink(model: Any, num_levels: int, log2_hashmap_size: int) -> None:
+    """Make a configuration's hash tables small, its proposal networks' too: with Adam's moments these are 30 MB."""
+    model.num_levels, model.log2_hashmap_size = num_levels, log2_hashmap_size
+    model.proposal_net_args_list = [
+        {**each, "log2_hashmap_size": min(log2_hashmap_size, each["log2_hashmap_size"])}
+        for each in model.proposal_net_args_list
+    ]
 
 
 def build(**options) -> EdgeDepthNerfModel:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -19,6 +18,7 @@ from typing import Any
 
 import psutil
 import pytest
+from comparisons import write_compared_scene
 from drives import SEQUENCE, RoomDrive, write_room_drive
 from rich.console import Console
 
@@ -41,7 +41,6 @@ from edge_depth_nerf.process.options import Kitti360Options
 dask = pytest.importorskip("dask")
 distributed = pytest.importorskip("distributed")
 
-ROOT = Path(__file__).parents[1]
 QUIET = Console(quiet=True)
 STEPS = """
 import sys, time
@@ -125,6 +124,7 @@ def test_nobody_at_an_address_is_told(tmp_path: Path, monkeypatch: pytest.Monkey
 # ---- processes on this machine -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_killed_workers_task_goes_on_where_it_was(tmp_path: Path) -> None:
     console = Console(file=io.StringIO(), width=200)
     tasks = [steps(tmp_path, "long", 0.5), steps(tmp_path, "short"), steps(tmp_path, "third")]
@@ -142,6 +142,7 @@ def test_a_killed_workers_task_goes_on_where_it_was(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("logs/.cluster-*")) and child_of_worker("kept") is None
 
 
+@pytest.mark.slow
 def test_a_task_that_fails_is_not_done_again_and_names_its_log(tmp_path: Path) -> None:
     wrong = steps(tmp_path, "wrong", code="import sys; print('calib.txt: is empty'); sys.exit(2)")
     others = [steps(tmp_path, name, 60.0) for name in "abcd"]
@@ -154,6 +155,7 @@ def test_a_task_that_fails_is_not_done_again_and_names_its_log(tmp_path: Path) -
     assert not (tmp_path / "logs/d.log").exists()
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_what_runs(tmp_path: Path) -> None:
     tasks = [steps(tmp_path, name, 60.0) for name in "abc"]
 
@@ -169,6 +171,7 @@ def test_ctrl_c_ends_what_runs(tmp_path: Path) -> None:
     assert not (tmp_path / "logs/c.log").exists()
 
 
+@pytest.mark.slow
 def test_workers_are_not_lost_for_ever(tmp_path: Path) -> None:
     task = steps(tmp_path, "a", 60.0)
     kill_worker_of("a.kept", lambda: True)
@@ -231,6 +234,7 @@ def scheduler(tmp_path: Path) -> Iterator[tuple[str, Callable[..., None]]]:
             process.wait()
 
 
+@pytest.mark.slow
 def test_a_training_has_a_gpu_for_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     code = "import os, sys; print('parent', os.getppid());" + STEPS.replace("import sys, time", "import time")
     tasks = [steps(tmp_path, f"train{number}", 0.1, code, trains=True) for number in range(3)]
@@ -369,7 +373,7 @@ def test_a_drive_is_cut_as_by_hand(room: RoomDrive, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_comparison_goes_on_when_a_worker_is_killed(tmp_path: Path) -> None:
-    shutil.copytree(ROOT / "data" / "sample_drive", tmp_path / "sample")
+    write_compared_scene(tmp_path / "sample")
     output = tmp_path / "out"
     asked = CompareOptions(
         scenes=(tmp_path / "sample",), output=output, methods=("nerfacto", "edge"), steps=8, cluster="local"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import json
 import os
 import shlex
 import shutil
@@ -12,6 +13,7 @@ import subprocess
 import sys
 import time
 import urllib.request
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -23,17 +25,16 @@ from scenes import fisheye, write_scene
 
 from edge_depth_nerf.base.files import read_json
 
+pytestmark = pytest.mark.slow
+
 METHOD = "edge-depth-nerf-lite"
 TIMEOUT_S = 240
 SMALL = (
     *("--pipeline.datamanager.train-num-rays-per-batch", "128", "--pipeline.model.num-levels", "4"),
     *("--pipeline.model.log2-hashmap-size", "12", "--logging.local-writer.max-log-size", "0", "--vis", "tensorboard"),
+    *("--pipeline.model.proposal-net-args-list.0.log2-hashmap-size", "10"),
+    *("--pipeline.model.proposal-net-args-list.1.log2-hashmap-size", "10"),
 )
-
-try:
-    import open3d
-except (ImportError, OSError):
-    open3d = None
 
 
 def command(*arguments) -> list[str]:
@@ -80,13 +81,89 @@ def killed_run(scene, tmp_path_factory) -> Path:
     return run
 
 
+@pytest.fixture(scope="module")
+def torch_home(tmp_path_factory) -> Path:
+    """nerfstudio's own methods demand AlexNet's weights; random ones do to see whether they read our scene."""
+    from torchvision.models import alexnet
+
+    home = tmp_path_factory.mktemp("torch_home")
+    checkpoints = home / "hub" / "checkpoints"
+    checkpoints.mkdir(parents=True)
+    torch.save(alexnet(weights=None).state_dict(), checkpoints / "alexnet-owt-7be5be79.pth")
+    return home
+
+
+def commands_of(killed_run: Path, scene: Path, outputs: Path) -> dict[str, list[object]]:
+    """Words of the commands that are run in one process, each with an output folder of its name."""
+    load = ("--load-config", killed_run / "config.yml")
+    train = ("--output-dir", outputs / "host", "--machine.device-type", "cpu", "--timestamp", "run")
+    own = ("--experiment-name", "host", "--max-num-iterations", 3, "--pipeline.model.implementation", "torch")
+    data = ("fisheye-depth-data", "--data", scene)
+    return {
+        "eval": ["ns-eval", *load, "--output-path", outputs / "eval" / "figures.json"],
+        "dataset": [
+            *("ns-render", "dataset", *load, "--output-path", outputs / "dataset", "--split", "test"),
+            *("--rendered-output-names", "rgb", "depth", "raw-depth", "distance_coloured", "--image-format", "png"),
+        ],
+        "interpolate": [
+            *("ns-render", "interpolate", *load, "--interpolation-steps", 2, "--pose-source", "train"),
+            *("--output-path", outputs / "interpolate" / "film.mp4"),
+        ],
+        "pointcloud": [
+            *("ns-export", "pointcloud", *load, "--output-dir", outputs / "pointcloud", "--num-points", 500),
+            *("--num-rays-per-batch", 256, "--normal-method", "open3d", "--save-world-frame", "True"),
+            *("--remove-outliers", "False", "--reorient-normals", "False"),
+        ],
+        "resumed": [
+            *("ns-train", METHOD, "--data", scene, "--output-dir", outputs / "resumed"),
+            *("--experiment-name", "resumed", "--timestamp", "run", "--max-num-iterations", 7),
+            *("--load-dir", killed_run / "nerfstudio_models", *SMALL),
+        ],
+        "nerfacto": ["ns-train", "nerfacto", *train, *own, *SMALL, *data],
+        "depth-nerfacto": [
+            *("ns-train", "depth-nerfacto", *train, *own, *SMALL, "--pipeline.model.is-euclidean-depth", "True"),
+            *data,
+        ],
+    }
+
+
+@pytest.fixture(scope="module")
+def done(killed_run, scene, torch_home, tmp_path_factory) -> Callable[[str], tuple[str, Path]]:
+    """Asserts that a command ended well; returns what it said and where it wrote."""
+    outputs = tmp_path_factory.mktemp("outputs")
+    jobs = []
+    for name, words in commands_of(killed_run, scene, outputs).items():
+        (outputs / name).mkdir()
+        jobs.append(
+            {
+                "words": [str(word) for word in words],
+                "environment": {"TORCH_HOME": str(torch_home)} if "nerfacto" in name else {},
+                "log": str(outputs / f"{name}.log"),
+            }
+        )
+    (outputs / "jobs.json").write_text(json.dumps(jobs))
+    subprocess.run(
+        [sys.executable, Path(__file__).with_name("host_commands.py"), outputs / "jobs.json"],
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        timeout=2 * TIMEOUT_S,
+        check=False,
+    )
+
+    def ended_well(name: str) -> tuple[str, Path]:
+        status, said = outputs / f"{name}.log.status", (outputs / f"{name}.log").read_text()
+        assert status.is_file() and status.read_text() == "0", said[-4000:]
+        return said, outputs / name
+
+    return ended_well
+
+
 def last_step(run: Path) -> int:
     return max(int(path.stem[5:]) for path in (run / "nerfstudio_models").glob("step-*.ckpt"))
 
 
-def test_a_killed_run_gives_figures(killed_run, tmp_path):
-    call("ns-eval", "--load-config", killed_run / "config.yml", "--output-path", tmp_path / "figures.json")
-    figures = read_json(tmp_path / "figures.json")["results"]
+def test_a_killed_run_gives_figures(done):
+    _, output = done("eval")
+    figures = read_json(output / "figures.json")["results"]
     for name in ("psnr", "ssim", "masked_psnr", "masked_ssim", "truth_masked_psnr", "lidar_abs_rel", "truth_abs_rel"):
         assert np.isfinite(figures[name]), name
     assert figures["lidar_pixels"] > 20
@@ -101,15 +178,12 @@ def test_what_is_loaded_is_what_was_saved(killed_run):
     assert all(torch.equal(saved[name], loaded[name]) for name in saved)
 
 
-def test_a_killed_run_is_taken_up_again(killed_run, scene, tmp_path):
+def test_a_killed_run_is_taken_up_again(killed_run, done):
     step = last_step(killed_run)
     assert step >= 20
-    said = call(
-        *("ns-train", METHOD, "--data", scene, "--output-dir", tmp_path, "--experiment-name", "resumed"),
-        *("--timestamp", "run", "--max-num-iterations", 7, "--load-dir", killed_run / "nerfstudio_models", *SMALL),
-    )
+    said, output = done("resumed")
     assert f"step-{step:09d}.ckpt" in said.replace("\n", "")
-    resumed = tmp_path / "resumed" / METHOD / "run"
+    resumed = output / "resumed" / METHOD / "run"
     assert last_step(resumed) == step + 7
     assert not list(resumed.glob(".unfinished*"))
     before, after = (
@@ -120,16 +194,12 @@ def test_a_killed_run_is_taken_up_again(killed_run, scene, tmp_path):
     assert ages[1] == ages[0] + 7  # the optimiser's moments went on, too
 
 
-def test_render_dataset(killed_run, tmp_path):
-    call(
-        *("ns-render", "dataset", "--load-config", killed_run / "config.yml", "--output-path", tmp_path),
-        *("--split", "test", "--rendered-output-names", "rgb", "depth", "raw-depth", "distance_coloured"),
-        *("--image-format", "png"),
-    )
-    rendered = cv2.imread(str(tmp_path / "test" / "rgb" / "0004.png"))
+def test_render_dataset(killed_run, done):
+    _, output = done("dataset")
+    rendered = cv2.imread(str(output / "test" / "rgb" / "0004.png"))
     assert rendered.shape == (20, 24, 3)
-    assert cv2.imread(str(tmp_path / "test" / "distance_coloured" / "0004.png")).shape == (20, 24, 3)
-    with gzip.open(tmp_path / "test" / "raw-depth" / "0012.npy.gz") as file:
+    assert cv2.imread(str(output / "test" / "distance_coloured" / "0004.png")).shape == (20, 24, 3)
+    with gzip.open(output / "test" / "raw-depth" / "0012.npy.gz") as file:
         distance_m = np.load(file)
     assert distance_m.shape == (20, 24, 1)
     _, pipeline, _, _ = eval_setup(killed_run / "config.yml", test_mode="test")
@@ -141,12 +211,9 @@ def test_render_dataset(killed_run, tmp_path):
 
 
 @pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ns-render interpolate writes videos with ffmpeg")
-def test_render_interpolate(killed_run, tmp_path):
-    call(
-        *("ns-render", "interpolate", "--load-config", killed_run / "config.yml", "--interpolation-steps", 2),
-        *("--output-path", tmp_path / "film.mp4", "--pose-source", "train"),
-    )
-    film = cv2.VideoCapture(str(tmp_path / "film.mp4"))
+def test_render_interpolate(done):
+    _, output = done("interpolate")
+    film = cv2.VideoCapture(str(output / "film.mp4"))
     assert film.get(cv2.CAP_PROP_FRAME_COUNT) > 2
 
 
@@ -168,14 +235,13 @@ def test_a_film_of_a_camera_path(killed_run, tmp_path):
     assert np.abs(pictures[0].astype(int) - pictures[1]).mean() > 2
 
 
-@pytest.mark.skipif(open3d is None, reason="open3d cannot be imported (Debian: apt-get install libusb-1.0-0)")
-def test_export_pointcloud(killed_run, tmp_path):
-    call(
-        *("ns-export", "pointcloud", "--load-config", killed_run / "config.yml", "--output-dir", tmp_path),
-        *("--num-points", 500, "--num-rays-per-batch", 256, "--normal-method", "open3d", "--save-world-frame", "True"),
-        *("--remove-outliers", "False", "--reorient-normals", "False"),
-    )
-    header = (tmp_path / "point_cloud.ply").read_bytes()[:300].decode("latin1")
+def test_export_pointcloud(done):
+    try:
+        import open3d  # noqa: F401
+    except (ImportError, OSError):
+        pytest.skip("open3d cannot be imported (Debian: apt-get install libusb-1.0-0)")
+    _, output = done("pointcloud")
+    header = (output / "point_cloud.ply").read_bytes()[:300].decode("latin1")
     assert int(header.split("element vertex ")[1].split()[0]) >= 500
 
 
@@ -204,26 +270,7 @@ def test_viewer(killed_run):
             process.kill()
 
 
-@pytest.fixture(scope="module")
-def torch_home(tmp_path_factory) -> Path:
-    """nerfstudio's own methods demand AlexNet's weights; random ones do to see whether they read our scene."""
-    from torchvision.models import alexnet
-
-    home = tmp_path_factory.mktemp("torch_home")
-    checkpoints = home / "hub" / "checkpoints"
-    checkpoints.mkdir(parents=True)
-    torch.save(alexnet(weights=None).state_dict(), checkpoints / "alexnet-owt-7be5be79.pth")
-    return home
-
-
 @pytest.mark.parametrize("method", ["nerfacto", "depth-nerfacto"])
-def test_the_host_methods_read_our_scene(scene, torch_home, tmp_path, method):
-    euclidean = ["--pipeline.model.is-euclidean-depth", "True"] if method == "depth-nerfacto" else []
-    call(
-        *("ns-train", method, "--output-dir", tmp_path, "--machine.device-type", "cpu"),
-        *("--timestamp", "run", "--experiment-name", "host", "--max-num-iterations", 3),
-        *("--pipeline.model.implementation", "torch", *SMALL, *euclidean),
-        *("fisheye-depth-data", "--data", scene),
-        TORCH_HOME=str(torch_home),
-    )
-    assert last_step(tmp_path / "host" / method / "run") == 2
+def test_the_host_methods_read_our_scene(done, method):
+    run = done(method)[1].parent / "host" / "host" / method / "run"
+    assert last_step(run) == 2

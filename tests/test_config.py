@@ -42,6 +42,7 @@ def test_configurations_hold_what_the_file_says(name):
     method = all_methods[name]
     overrides = DECLARED["presets"][DECLARED["methods"][name]["preset"]]
     constants = {key: entry["value"] for key, entry in DECLARED["constants"].items()}
+    assert constants
     for dotted, value in {**constants, **overrides}.items():
         found = lookup(method, dotted)
         assert (list(found) if isinstance(found, tuple) else found) == value, dotted
@@ -70,7 +71,7 @@ def test_the_paper_preset_is_the_literal_form():
 
 
 def test_the_viewer_of_a_training_listens_on_this_machine_only():
-    assert all(all_methods[name].viewer.websocket_host == "127.0.0.1" for name in DECLARED["methods"])
+    assert {all_methods[name].viewer.websocket_host for name in DECLARED["methods"]} == {"127.0.0.1"}
 
 
 def test_the_dataparser_is_registered():
@@ -128,6 +129,7 @@ def test_the_command_line_imports_nothing_heavy():
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_the_plugin_adds_little_to_nerfstudios_commands():
     """Every ns-* command imports it; what takes long is imported when it is needed."""
     check = (

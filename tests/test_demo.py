@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from comparisons import copied
 from rich.console import Console
 
 from edge_depth_nerf import cli
@@ -41,7 +42,7 @@ SHOWN = {
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    options = DemoOptions(output=tmp_path_factory.mktemp("demo") / "out", frames=13, size=64, steps=8, mono_seconds=5.0)
+    options = DemoOptions(output=tmp_path_factory.mktemp("demo") / "out", frames=13, size=64, steps=8, mono_seconds=3.0)
     return options, demo.run_demo(options, QUIET)
 
 
@@ -51,7 +52,7 @@ def runs_of(output: Path) -> Path:
 
 def moved(options: DemoOptions, output: Path) -> DemoOptions:
     """A copy of a demo's folder that knows where it is, and is not finished."""
-    shutil.copytree(options.output, output)
+    copied(options.output, output)
     (output / "results.json").unlink()
     for name in ("run.json", "figures.json"):
         for path in runs_of(output).rglob(name):

@@ -65,6 +65,7 @@ def test_gradients_are_averaged(ranks: list[dict[str, Any]]) -> None:
 @pytest.mark.slow
 def test_parameters_stay_equal(ranks: list[dict[str, Any]]) -> None:
     one, two = ranks
+    assert one["after"]
     for name, value in one["after"].items():
         assert torch.equal(one["before"][name], two["before"][name]), name
         assert torch.equal(value, two["after"][name]), name
@@ -77,6 +78,7 @@ def test_the_first_process_saves_what_one_alone_reads(ranks: list[dict[str, Any]
     scene = Path(checkpoint).parents[5] / "scene"
     trainer = trainer_of(scene, tmp_path, load_dir=Path(checkpoint).parent)
     alone = dict(trainer.pipeline.model.named_parameters())
+    assert {name for name, value in alone.items() if len(value)} == set(ranks[0]["after"])
     for name, value in ranks[0]["after"].items():
         assert torch.equal(alone[name], value), name
 

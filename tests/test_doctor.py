@@ -19,6 +19,7 @@ def found(check) -> dict[str, Finding]:
     return {finding.what: finding for finding in check()}
 
 
+@pytest.mark.slow
 def test_the_command_is_content_with_this_environment():
     """As a user gives it: this environment passes the tests, so there is nothing to mend."""
     program = Path(sys.executable).with_name("edge-depth-nerf")

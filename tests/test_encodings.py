@@ -122,6 +122,7 @@ def test_equals_the_formula(name):
     assert_near(x.grad, expected[2], 1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SIZES)
 def test_equals_nerfstudio(name):
     host, fused = both(**SIZES[name])
@@ -477,6 +478,7 @@ print("all equal")
 """
 
 
+@pytest.mark.slow
 def test_triton_kernels_in_its_interpreter():
     pytest.importorskip("triton")
     done = subprocess.run(

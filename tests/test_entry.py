@@ -146,6 +146,7 @@ main()
     assert (done.returncode, done.stderr) == (130, STOPPED)
 
 
+@pytest.mark.slow
 def test_ctrl_c_at_work_leaves_whole_files(tmp_path):
     code = """
 import edge_depth_nerf.synthetic.drive as drive
@@ -166,6 +167,7 @@ main()
     assert not [path for path in (tmp_path / "drive").rglob("*") if path.name.startswith(".")]
 
 
+@pytest.mark.slow
 def test_ctrl_c_again_and_again_while_threads_finish():
     code = """
 import sys, time

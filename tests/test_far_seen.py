@@ -17,6 +17,8 @@ from edge_depth_nerf.mono.examples import load_examples
 from edge_depth_nerf.mono.far_seen import field_deg, seen_above, static_cloud
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
 
+pytestmark = pytest.mark.slow
+
 LENS = KannalaBrandt(240, 200, 80.0, 80.0, 121.0, 101.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 EYE_M, WALL_M, FIELD_DEG = 1.5, 20.0, 2.0
 POSITIONS_M = (0.0, 3.0, 6.0, 9.0, 12.0, 14.0)

@@ -262,6 +262,7 @@ REFUSED: dict[str, str] = {
 """Said before the first step: what is said."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", HOSTILE)
 def test_a_step_on_a_hostile_scene_is_finite_or_refused(tmp_path: Path, case: str) -> None:
     change, options = HOSTILE[case]
@@ -281,6 +282,7 @@ def test_a_step_on_a_hostile_scene_is_finite_or_refused(tmp_path: Path, case: st
     trainer.save_checkpoint(2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("implementation", ["fused", "torch"])
 def test_a_step_under_autocast_is_finite(tmp_path: Path, implementation: str) -> None:
     trainer = trainer_of(copied(tmp_path / "scene"), tmp_path / "runs", model__implementation=implementation)

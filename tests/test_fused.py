@@ -210,6 +210,7 @@ def train(model: EdgeDepthNerfModel, optimiser: AdamOptimizerConfig, steps: int)
     return history
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{}, {"poses": "SO3xR3"}, {"depth_loss": "urban-nerf"}], ids=str)
 def test_training_goes_as_with_torch(options):
     """The same seed gives the same losses, step after step, with nerfstudio's arithmetic and with the fused one."""

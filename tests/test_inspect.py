@@ -51,6 +51,8 @@ from edge_depth_nerf.inspecting.top_view import GAP, GREYS, HELD_OUT, PATH, TRAI
 from edge_depth_nerf.method.prior import default_source
 from edge_depth_nerf.scene.reader import read_scene
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / "data" / "sample_drive"
 

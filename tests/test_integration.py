@@ -370,6 +370,7 @@ def test_compiles_where_nothing_can_be_kept():
     assert integration_numba._compiled(names["double"])(21) == 42
 
 
+@pytest.mark.slow
 def test_numba_is_loaded_only_to_integrate():
     check = "import sys, edge_depth_nerf.method.integration; sys.exit('numba' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", check], check=False).returncode == 0

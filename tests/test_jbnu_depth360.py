@@ -20,6 +20,8 @@ from edge_depth_nerf.process.options import JbnuDepth360Options
 from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 
+pytestmark = pytest.mark.slow
+
 PAGE = Path(__file__).parents[1] / "docs" / "jbnu_depth360.md"
 CAMERAS = ("front", "left", "rear", "right")
 FRAMES = 5

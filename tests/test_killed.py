@@ -43,6 +43,8 @@ from edge_depth_nerf.process.command import process
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.scene.reader import read_scene
 
+pytestmark = pytest.mark.slow
+
 DEAD = 2**22 + 1
 """No process has such a number."""
 

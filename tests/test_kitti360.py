@@ -67,6 +67,8 @@ from edge_depth_nerf.process.recording import Recording
 from edge_depth_nerf.scene.reader import read_scene
 from edge_depth_nerf.scene.writer import ProcessReport, Skipped
 
+pytestmark = pytest.mark.slow
+
 CAMERAS = ("image_02", "image_03")
 STEP_M = 1 / 256
 
@@ -138,6 +140,7 @@ def test_returns_aimed_at_pixels_land_in_them(tmp_path: Path, camera: str) -> No
     process(drive, tmp_path / "scene")
     mask = read_mask(tmp_path / f"scene/masks/{camera}.png")
     rng = np.random.default_rng(0)
+    assert drive.frames
     for frame in drive.frames:
         _, pixels, distance = aimed_points(drive, camera, frame, rng)
         expected = np.zeros((drive.size, drive.size))
@@ -155,6 +158,7 @@ def test_fitted_camera_and_opengl_pose_put_points_where_the_raw_chain_does(room:
     side = rng.integers(0, 2, 2000)
     axis = rng.integers(0, 3, 2000)
     walls[np.arange(2000), axis] = ROOM[side, axis]
+    assert meta["frames"]
     for frame in meta["frames"]:
         world_to_camera = np.linalg.inv(room.camera_to_world(frame["camera"], frame["frame"]))
         raw = walls @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
@@ -313,7 +317,10 @@ def test_semantics_mask_what_may_move(drive: RoomDrive, tmp_path: Path) -> None:
     process(drive, tmp_path / "scene")
     process(drive, tmp_path / "all", moving_classes=())
     for folder, moving in (("scene", True), ("all", False)):
-        for frame in read_json(tmp_path / folder / "transforms.json")["frames"]:
+        found = read_json(tmp_path / folder / "transforms.json")["frames"]
+        # some of what had semantics, and some of what had none
+        assert {frame["frame"] < 2 for frame in found} == {True, False}
+        for frame in found:
             mask = read_mask(tmp_path / folder / frame["mask_path"])
             assert mask[14:16, 14:18].any() != (moving and frame["frame"] < 2)
             assert mask[16, 24]
@@ -466,6 +473,7 @@ def test_downscaled_scene_agrees_with_the_camera(room: RoomDrive, tmp_path: Path
     process(room, tmp_path / "scene", downscale=4, mono=mono_folder, ego_mask=ego, frames=6)
     meta = read_json(tmp_path / "scene/transforms.json")
     samples = np.stack(np.meshgrid(*[np.linspace(-2, 2, 9)] * 2), -1).reshape(-1, 2)
+    assert len(meta["frames"]) == 2 * 6
     for frame in meta["frames"]:
         name, number = frame["camera"], frame["frame"]
         # 70 = 17 · 4 + 2

@@ -18,6 +18,8 @@ from edge_depth_nerf.process.command import process
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.scene.writer import ProcessReport
 
+pytestmark = pytest.mark.slow
+
 CAMERAS = ("image_02", "image_03")
 
 

@@ -100,6 +100,7 @@ def test_longer_units(gaussian, norm):
 
 def test_weight_at_the_prior_is_best():
     edges = [float(t) for t in range(1, 42)]
+    assert len(FORMS) == 4
     for gaussian, norm in FORMS:
         losses = []
         for sample in (10, 19, 30):  # 19 spans 20 to 21 m

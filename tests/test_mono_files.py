@@ -20,6 +20,8 @@ from edge_depth_nerf.mono.files import npy_shape, read_npy
 from edge_depth_nerf.mono.options import EstimateDepthOptions
 from edge_depth_nerf.scene.reader import ScenePicture, read_scene
 
+pytestmark = pytest.mark.slow
+
 LENS = fisheye(48, 44)
 
 
@@ -199,7 +201,9 @@ def test_values_that_are_no_distance_are_none(scene, tmp_path):
         return distance
 
     take(scene, write_maps(scene, tmp_path / "maps", make))
-    for picture in read_scene(scene).pictures:
+    pictures = read_scene(scene).pictures
+    assert pictures
+    for picture in pictures:
         written = read_distance_png(picture.files["mono"])
         assert (written[20, 20 : 20 + len(bad)] == 0).all() and (written[18, 20 : 20 + len(bad)] > 0).all()
 

@@ -25,6 +25,8 @@ from edge_depth_nerf.mono.pinhole_views import PinholeView, pinhole_views
 from edge_depth_nerf.mono.relative import Layer, Line, Samples, blend, fit_lines, take_samples
 from edge_depth_nerf.scene.reader import ScenePicture, read_scene
 
+pytestmark = pytest.mark.slow
+
 THETA_MAX = np.radians(95.0)
 
 
@@ -101,7 +103,9 @@ def test_a_view_shows_upright_what_lies_along_its_rays():
     rays, within = lens_rays(LENS, THETA_MAX, size_of(LENS))
     # colours say where a ray goes
     picture = np.where(within[..., None], np.rint(127.5 + 127.5 * rays), 0).astype(np.uint8)
-    for view in pinhole_views(LENS, THETA_MAX):
+    views = pinhole_views(LENS, THETA_MAX)
+    assert len(views) == 7
+    for view in views:
         shown = view.cut(picture)
         assert shown.shape == (view.height, view.width, 3)
         expected = 127.5 + 127.5 * view_rays(view)

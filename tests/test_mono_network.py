@@ -63,6 +63,8 @@ from edge_depth_nerf.scene import reader
 from edge_depth_nerf.scene.format import TRUST_FILE
 from edge_depth_nerf.scene.reader import read_scene
 
+pytestmark = pytest.mark.slow
+
 CPU = torch.device("cpu")
 HEIGHT_M = 1.5
 TINY = NetworkSettings((8, 16), 32, HEIGHT_M, 5.0)

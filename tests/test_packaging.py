@@ -92,6 +92,7 @@ def test_the_wheel_holds_the_whole_package(wheel):
     assert not [name for name in names if name.startswith(("tests/", "benchmarks/", "data/"))]
 
 
+@pytest.mark.slow
 def test_the_wheel_works_without_the_sources(wheel, tmp_path):
     """Unpacked elsewhere and put first, it is what is imported, and its methods are made from its own file."""
     with zipfile.ZipFile(wheel) as archive:
@@ -110,6 +111,7 @@ def test_the_wheel_works_without_the_sources(wheel, tmp_path):
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_the_wheel_alone_makes_a_scene(wheel, tmp_path):
     """What the demo begins with, in a folder without the repository; it trains on what comes out."""
     with zipfile.ZipFile(wheel) as archive:

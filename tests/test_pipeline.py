@@ -2,6 +2,7 @@ from copy import deepcopy
 
 import numpy as np
 import pytest
+from models import shrink
 from nerfstudio.configs.method_configs import all_methods
 from scenes import write_scene
 
@@ -11,7 +12,8 @@ from edge_depth_nerf.base.errors import InputError
 def build(scene, **model):
     config = deepcopy(all_methods["edge-depth-nerf-lite"].pipeline)
     config.datamanager.data = scene
-    for name, value in {"num_levels": 2, "log2_hashmap_size": 8, **model}.items():
+    shrink(config.model, 2, 8)
+    for name, value in model.items():
         setattr(config.model, name, value)
     return config.setup(device="cpu", test_mode="val"), config
 

@@ -9,8 +9,6 @@ from edge_depth_nerf.base.files import read_json, write_json
 from edge_depth_nerf.plugin import pixel_table
 from edge_depth_nerf.plugin.pixel_table import RECORD, PicturePixels, PixelTable, PixelTableWriter, to_steps
 
-RNG = np.random.default_rng(5)
-
 
 def picture(height, width):
     """Colours that say where they are from: red = row, green = column."""
@@ -29,7 +27,8 @@ def table_of(path: Path, masks, priors=None, seed=0, prior_weight=1.0) -> PixelT
 @pytest.mark.parametrize("bucket_bytes", [1 << 20, 200])
 def test_every_valid_pixel_comes_once_with_its_own_prior(tmp_path, monkeypatch, bucket_bytes):
     monkeypatch.setattr(pixel_table, "BUCKET_BYTES", bucket_bytes)
-    masks = [RNG.random(size) < 0.5 for size in [(4, 7), (9, 3), (4, 7)]]
+    rng = np.random.default_rng(5)
+    masks = [rng.random(size) < 0.5 for size in [(4, 7), (9, 3), (4, 7)]]
     priors = []
     for number, mask in enumerate(masks):
         distance = (1 + number + np.arange(mask.size).reshape(mask.shape) / 256).astype(np.float32)

@@ -12,18 +12,17 @@ from edge_depth_nerf.method.error_model import KNOTS, ErrorModel, Trust
 from edge_depth_nerf.method.integration import IntegrationOptions, integrate_depth
 from edge_depth_nerf.method.prior import PriorCache, PriorOptions, View, make_prior, sky_of, view_of
 
-RNG = np.random.default_rng(2)
-
 
 def both(lidar: np.ndarray, mono: np.ndarray) -> dict[str, np.ndarray]:
     """The maps of a picture by source."""
     return {"lidar": lidar, "mono": mono}
 
 
-def maps(height=12, width=10):
-    mono = (5 + RNG.random((height, width))).astype(np.float32)
-    lidar = np.where(RNG.random((height, width)) < 0.3, mono * 1.05, 0).astype(np.float32)
-    mask = RNG.random((height, width)) < 0.8
+def maps(height=12, width=10, seed=2):
+    rng = np.random.default_rng(seed)
+    mono = (5 + rng.random((height, width))).astype(np.float32)
+    lidar = np.where(rng.random((height, width)) < 0.3, mono * 1.05, 0).astype(np.float32)
+    mask = rng.random((height, width)) < 0.8
     return lidar, mono, mask
 
 

@@ -6,12 +6,15 @@ from __future__ import annotations
 from copy import deepcopy
 
 import numpy as np
+import pytest
 import torch
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.optimizers import Optimizers
 from real_scenes import fisheye_frame_scene, stereo_scene
 
 from edge_depth_nerf.base.files import read_distance_png, read_json, read_mask
+
+pytestmark = pytest.mark.slow
 
 
 def train(scene, steps, **model):

@@ -27,6 +27,8 @@ from edge_depth_nerf.process.rig_file import read_rig, tomllib
 from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 
+pytestmark = pytest.mark.slow
+
 PAGE = Path(__file__).parents[1] / "docs" / "rig.md"
 FRAMES = 5
 FIRST_S = 1369730762.123456789
@@ -350,7 +352,9 @@ def test_times_by_name_and_by_rate(mine: Path) -> None:
     named = [f"{number:06d}.png {time}" for number, time in enumerate(lines)]
     (mine / "times_left.txt").write_text("\n".join(reversed(named)))
     edit(mine, ('times_file = "times_right.txt"', f"rate_hz = 10\ntime_offset_s = {FIRST_S}"))
-    for picture in read_rig_recording(options(mine)).pictures:
+    pictures = read_rig_recording(options(mine)).pictures
+    assert {picture.camera for picture in pictures} == {"left", "right", "front"}
+    for picture in pictures:
         moment = FIRST_S + 0.1 * picture.frame
         assert abs(picture.time_s - moment) < 0.0121
 

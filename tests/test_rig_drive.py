@@ -14,6 +14,8 @@ from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.options import LayoutName, SynthesizeOptions
 from edge_depth_nerf.synthetic.rig_drive import jbnu_cameras, looking, rig_cameras
 
+pytestmark = pytest.mark.slow
+
 
 def contents(root: Path) -> dict[str, bytes]:
     return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
@@ -42,6 +44,7 @@ def test_the_same_options_give_the_same_bytes_also_when_continued(tmp_path: Path
 
 
 def test_what_the_lenses_see() -> None:
+    assert len(rig_cameras(256)) == 3 and len(jbnu_cameras(192)) == 4
     for mounted in rig_cameras(256).values():
         camera = mounted.camera
         seen, valid = camera.unproject(camera.pixel_centres())

@@ -8,11 +8,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 import torch
 from scenes import fisheye, write_scene
 
 from edge_depth_nerf.kernels import hash_grid_numba as cpu
 from edge_depth_nerf.plugin.compat import allow_numpy_scalars_in_checkpoints
+
+pytestmark = pytest.mark.slow
 
 STEPS = 25
 

@@ -249,6 +249,7 @@ def test_frame_masks_are_joined_with_the_cameras(tmp_path: Path) -> None:
     write(tmp_path / "scene", given=given, mask=own, layers=("lidar", "mask"))
     meta = read_json(tmp_path / "scene/transforms.json")
     camera_mask = read_mask(tmp_path / "scene/masks/image_02.png")
+    assert masks
     for frame, mask in zip(meta["frames"], masks, strict=True):
         assert frame["mask_path"] == f"masks/image_02/{frame['frame']:010d}.png"
         joined = read_mask(tmp_path / "scene" / frame["mask_path"])
@@ -545,6 +546,7 @@ BENT = KannalaBrandt(SIZE, SIZE, 7.0, 7.0, 16.4, 16.1, 0.0652, 0.0189, -0.0042, 
 """nerfstudio's iteration goes astray beyond some 90°."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("cameras", "theta_max_deg", "message"),
     [

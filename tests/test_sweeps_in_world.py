@@ -248,6 +248,7 @@ def test_training_never_gets_a_sweep_that_is_held_out() -> None:
                 assert used == expected - held_out
 
 
+@pytest.mark.slow
 def test_a_held_out_sweep_leaves_no_trace_in_training() -> None:
     """Other points in the sweeps held out change not a bit of what training gets."""
     held_out = {4, 12}

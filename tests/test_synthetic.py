@@ -22,6 +22,8 @@ from edge_depth_nerf.synthetic.render import Caster, World
 from edge_depth_nerf.synthetic.scenes import _movers, build_scene
 from edge_depth_nerf.synthetic.simulated_mono import simulated_estimate
 
+pytestmark = pytest.mark.slow
+
 SEQUENCE = SynthesizeOptions(Path()).sequence
 FRAMES = 5
 SIZE = 128
@@ -394,6 +396,7 @@ def test_five_percent_of_returns_are_lost(street, street_world, monkeypatch):
 
 def test_masks_lens_and_own_car(street):
     _, root = street
+    assert len(rig.CAMERAS) == 2
     for camera in rig.CAMERAS:
         lens = read_mask(root / "truth" / "masks" / f"{camera}_lens.png")
         not_own = read_mask(root / "truth" / "masks" / f"{camera}_ego.png")
@@ -417,6 +420,7 @@ def test_masks_lens_and_own_car(street):
 
 def test_distances_are_zero_exactly_where_nothing_is_known(street, parking):
     _, root = street
+    assert len(rig.CAMERAS) == 2
     for camera in rig.CAMERAS:
         keep = read_mask(root / "truth" / "masks" / f"{camera}.png")
         distance = read_distance_png(truth(root, camera, "distance", 0))

@@ -15,6 +15,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from models import shrink
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.viewer.utils import CameraState, get_camera, parse_object
@@ -29,6 +30,8 @@ from edge_depth_nerf.base.pictures import SIGMA, colour_distance
 from edge_depth_nerf.cameras import KannalaBrandt
 from edge_depth_nerf.plugin.viewer import AZIMUTHS, RINGS, DriveLayers, lens_cap, rim_rad
 
+pytestmark = pytest.mark.slow
+
 METHOD = "edge-depth-nerf-lite"
 SAMPLE = Path(__file__).parents[1] / "data" / "sample_drive"
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -39,7 +42,8 @@ TIMEOUT_S = 120
 def pipeline_of(scene: Path, **model):
     config = deepcopy(all_methods[METHOD].pipeline)
     config.datamanager.data = scene
-    for name, value in {"num_levels": 2, "log2_hashmap_size": 8, **model}.items():
+    shrink(config.model, 2, 8)
+    for name, value in model.items():
         setattr(config.model, name, value)
     return config.setup(device="cpu", test_mode="test")
 
@@ -264,6 +268,7 @@ def training(tmp_path_factory) -> Iterator[SimpleNamespace]:
     config.output_dir, config.timestamp, config.experiment_name = folder, "run", "viewer"
     config.max_num_iterations, config.steps_per_save = 100_000, 100_000
     config.pipeline.datamanager.train_num_rays_per_batch = 128
+    shrink(config.pipeline.model, 8, 14)
     config.logging.local_writer.enable = False
     assert config.vis == "viewer"
     with socket.socket() as probe:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from models import shrink
 from nerfstudio.configs.method_configs import all_methods
 
 from edge_depth_nerf.plugin.trainer import EdgeDepthTrainer
@@ -21,7 +22,7 @@ def trainer_of(scene: Path, output: Path, rank: int = 0, world_size: int = 1, **
     pipeline = config.pipeline
     pipeline.datamanager.dataparser.data = scene
     pipeline.datamanager.train_num_rays_per_batch = 64
-    pipeline.model.num_levels, pipeline.model.log2_hashmap_size = 4, 12
+    shrink(pipeline.model, 4, 12)
     parts = {"model": pipeline.model, "data": pipeline.datamanager, "parser": pipeline.datamanager.dataparser}
     for name, value in changes.items():
         part, _, field = name.rpartition("__")

@@ -1,0 +1,76 @@
+"""Made-up runs and options for tests of comparisons."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from scenes import FLIP, fisheye, view, write_scene
+
+from edge_depth_nerf.base.files import read_json, write_distance_png, write_json, write_png
+from edge_depth_nerf.compare.options import CompareOptions
+from edge_depth_nerf.compare.results import RunResult
+
+QUIET = Console(quiet=True)
+
+
+def fake(scene, method, seed, psnr=20.0, steps=100, seconds=10.0, named=(), **more):
+    """A finished run that nobody trained, with these figures."""
+    figures = {"truth_masked_psnr": psnr, "truth_masked_ssim": psnr / 40, "truth_abs_rel": 1 / psnr, **more}
+    curve = [
+        {"step": steps * share, "seconds": seconds * share, "cpu_seconds": seconds * share, "truth_psnr": psnr * share}
+        for share in (0.5, 1.0)
+    ]
+    content = {
+        "run": {"scene": f"/scenes/{scene}", "method": method, "seed": seed, "implementation": "same"},
+        "named": list(named),
+        "configuration": {"a": "1", "machine.seed": str(seed)},
+        "lambda": None if method == "nerfacto" else 0.01,
+        "sigma": None if method == "nerfacto" else 0.5,
+        "steps": steps,
+        "device": "cpu",
+        "source": "kitti360",
+        "departures": [],
+        "figures": figures,
+        "curve": curve,
+    }
+    return RunResult(Path(f"/runs/{scene}/{method}_seed-{seed}"), content["run"], content)
+
+
+def copied(output: Path, folder: Path) -> Path:
+    """A copy of what a comparison or a demo left; checkpoints, which are large and not written to again, are linked."""
+
+    def copy(source: str, target: str) -> None:
+        (os.link if source.endswith(".ckpt") else shutil.copy2)(source, target)
+
+    return Path(shutil.copytree(output, folder, copy_function=copy))
+
+
+def write_compared_scene(folder: Path) -> Path:
+    """A small scene that has all that is compared: two held-out views, and true ones beside the first of them."""
+    camera = fisheye(44, 40)
+    meta = read_json(write_scene(folder, [camera], frames=13) / "transforms.json")
+    for frame in meta["frames"]:
+        frame["camera"] = "only"
+    held_out = next(frame for frame in meta["frames"] if frame["file_path"] == meta["test_filenames"][0])
+    meta["shifted_views"] = {}
+    for metres in (1, 2):
+        pose = np.array(held_out["transform_matrix"])
+        pose[0, 3] += metres
+        colours, distance, _ = view(camera, pose @ FLIP)
+        files = {kind: f"truth/shifted_{metres}m/{kind}.png" for kind in ("rgb", "distance")}
+        write_png(folder / files["rgb"], colours)
+        write_distance_png(folder / files["distance"], distance)
+        entry = {"camera": "only", "frame": 4, "transform_matrix": pose.tolist()}
+        entry |= {f"truth_{kind}_file_path": path for kind, path in files.items()}
+        meta["shifted_views"][str(metres)] = [entry]
+    write_json(folder / "transforms.json", meta)
+    return folder
+
+
+def options(*scenes, **changes):
+    """Options of a comparison that writes nowhere unless `output` is given."""
+    return CompareOptions(scenes=tuple(scenes), **{"output": Path("/nonexistent/out"), **changes})

@@ -1,0 +1,47 @@
+"""Several commands, one after another in one process, as starting nerfstudio takes 10 s: `host_commands.py JOBS.json`.
+
+Each job has the `words` of a command, an `environment` of its own and a `log` for what it says. Beside the log,
+LOG.status gets its exit status; a job without one was not begun.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import runpy
+import sys
+import traceback
+from pathlib import Path
+
+
+def status_of(words: list[str]) -> int:
+    """Run a program of this Python's environment within this process."""
+    sys.argv = [str(Path(sys.executable).with_name(words[0])), *words[1:]]
+    try:
+        runpy.run_path(sys.argv[0], run_name="__main__")
+    except SystemExit as ended:
+        return ended.code if isinstance(ended.code, int) else int(ended.code is not None)
+    except Exception:
+        traceback.print_exc()
+        return 1
+    return 0
+
+
+def main() -> None:
+    for job in json.loads(Path(sys.argv[1]).read_text()):
+        log = Path(job["log"])
+        with log.open("w") as file:
+            os.dup2(file.fileno(), 1)
+            os.dup2(file.fileno(), 2)
+            before = dict(os.environ)
+            os.environ.update(job["environment"])
+            status = status_of(job["words"])
+            os.environ.clear()
+            os.environ.update(before)
+            sys.stdout.flush()
+            sys.stderr.flush()
+        log.with_name(f"{log.name}.status").write_text(str(status))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,148 @@
+"""Configurations of compared methods, field by field, and what departs from the paper's protocol."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from edge_depth_nerf.compare.configuration import (
+    REGISTERED,
+    configuration,
+    described,
+    flattened,
+    literal_form,
+    setting_of,
+)
+from edge_depth_nerf.compare.methods import default_methods
+from edge_depth_nerf.compare.options import Preset
+from edge_depth_nerf.compare.protocol import departures
+from edge_depth_nerf.compare.specification import OF_A_RUN, RunSpecification
+from edge_depth_nerf.plugin.config import make_specifications, read_method_file
+
+
+def resolved(method, preset: Preset = "lite", **changes):
+    run = RunSpecification(scene="/scenes/a", scene_sha256="", preset=preset, method=method, seed=0, steps=10)
+    return flattened(configuration(replace(run, **changes))[0])
+
+
+def differing(one, other):
+    return {name: (one[name], other[name]) for name in one if repr(one[name]) != repr(other[name])}
+
+
+LOSS, SOURCE = "pipeline.model.depth_loss", "pipeline.datamanager.depth_source"
+PRIOR = "pipeline.datamanager.prior."
+RIVAL = {LOSS, SOURCE, "pipeline.model.depth_loss_mult", "pipeline.model.depth_sigma", LOSS + "_final"}
+ALLOWED = {
+    "nerfacto": {LOSS, SOURCE},
+    "nerfacto-embedding": {LOSS, SOURCE, "pipeline.model.exposure"},
+    "urban-nerf": RIVAL,
+    "ds-nerf": RIVAL,
+    "edge-lidar": {SOURCE},
+    "edge-mono": {SOURCE},
+    "edge-gaussian": {"pipeline.datamanager.prior.integration.kernel"},
+    "edge": set(),
+}
+
+
+@pytest.mark.parametrize("preset", ["lite", "full", "paper"])
+@pytest.mark.parametrize("method", ALLOWED)
+def test_configurations_differ_in_the_named_fields_alone(preset, method):
+    ours, other = resolved("edge", preset), resolved(method, preset)
+    assert set(ours) == set(other) and len(ours) > 100
+    assert set(differing(ours, other)) <= ALLOWED[method]
+
+
+def test_each_method_is_what_its_name_says():
+    def loss_and_source(method):
+        found = resolved(method)
+        return found[LOSS], found[SOURCE], found["pipeline.datamanager.prior.integration.kernel"]
+
+    assert loss_and_source("nerfacto")[0] == loss_and_source("nerfacto-embedding")[0] == "none"
+    exposures = {method: resolved(method)["pipeline.model.exposure"] for method in ALLOWED}
+    assert {name for name, exposure in exposures.items() if exposure == "embedding"} == {"nerfacto-embedding"}
+    # nerfstudio's losses keep their weight
+    assert {resolved(method)[LOSS + "_final"] for method in ("urban-nerf", "ds-nerf")} == {1.0}
+    assert loss_and_source("urban-nerf") == ("urban-nerf", "lidar", "edge-aware")
+    assert loss_and_source("ds-nerf") == ("ds-nerf", "lidar", "edge-aware")
+    assert loss_and_source("edge-lidar") == ("edge", "lidar", "edge-aware")
+    assert loss_and_source("edge-mono") == ("edge", "mono", "edge-aware")
+    assert loss_and_source("edge-gaussian") == ("edge", "integrated", "spatial-gaussian")
+    assert loss_and_source("edge") == loss_and_source("edge-paper") == ("edge", "integrated", "edge-aware")
+
+
+@pytest.mark.parametrize("preset", ["lite", "full"])
+def test_the_literal_method_is_the_registered_one_in_another_size(preset):
+    ours, literal = resolved("edge", preset), resolved("edge-paper", preset)
+    paper = flattened(make_specifications(read_method_file())[REGISTERED["paper"]].config)
+    changed = differing(ours, literal)
+    assert {PRIOR + "sigma_mode", PRIOR + "align", LOSS + "_mult"} <= set(changed)
+    assert set(changed) <= {*literal_form()}
+    for name in changed:
+        assert literal[name] == paper[name], name
+
+
+def test_the_paper_has_the_size_of_full():
+    presets = read_method_file()["presets"]
+    assert {**presets["paper"], **presets["full"]} == presets["paper"]
+    assert not [name for name in literal_form() if not name.startswith(("pipeline.model.", "pipeline.datamanager."))]
+
+
+def test_under_the_preset_paper_edge_is_the_literal_method():
+    literal, ours = resolved("edge-paper", "full"), resolved("edge", "paper")
+    assert set(differing(literal, ours)) <= {"method_name"}
+    assert "edge-paper" not in default_methods("paper") and "edge-paper" in default_methods("lite")
+
+
+def test_only_seed_scene_and_folder_are_a_runs_own():
+    one = flattened(configuration(RunSpecification("/s/a", "", "lite", "edge", 0, 9), Path("/o/a/edge_seed-0"))[0])
+    two = flattened(configuration(RunSpecification("/s/b", "", "lite", "edge", 1, 9), Path("/o/b/edge_seed-1"))[0])
+    assert set(differing(one, two)) == {*OF_A_RUN}
+
+
+def test_a_configuration_reads_the_same_in_every_process():
+    words = described(configuration(RunSpecification("/s/a", "", "lite", "edge", 0, 9))[0])
+    assert words["pipeline.datamanager.collate_fn"] == "nerfstudio_collate"
+    assert not [name for name, word in words.items() if " at 0x" in word]
+
+
+def test_lambda_and_sigma_go_where_each_method_has_them():
+    rival = resolved("ds-nerf", weight=0.07, sigma_m=0.2)
+    assert (rival["pipeline.model.depth_loss_mult"], rival["pipeline.model.depth_sigma"]) == (0.07, 0.2)
+    assert set(differing(rival, resolved("ds-nerf"))) == {LOSS + "_mult", "pipeline.model.depth_sigma"}
+    ours = resolved("edge", weight=0.07, sigma_m=0.2)
+    assert (ours[PRIOR + "sigma_mode"], ours[PRIOR + "sigma_constant_m"]) == ("constant", 0.2)
+    own = resolved("edge", weight=0.07, sigma_m="own")
+    assert set(differing(own, resolved("edge"))) == {LOSS + "_mult"}
+
+    def setting(method, **changes):
+        run = RunSpecification("/s/a", "", "lite", method, 0, 9, **changes)
+        return setting_of(configuration(run)[0], method)
+
+    assert setting("ds-nerf", weight=0.07, sigma_m=0.2) == (0.07, 0.2)
+    assert setting("edge", weight=0.07, sigma_m=0.2) == (0.07, 0.2)
+    assert setting("edge", weight=0.07, sigma_m="own") == (0.07, "calibrated")
+    assert setting("nerfacto") == (None, None)
+
+
+def test_rivals_in_torch_change_nothing_else():
+    assert set(differing(resolved("ds-nerf", implementation="torch"), resolved("ds-nerf"))) == {
+        "pipeline.model.implementation"
+    }
+
+
+def test_departures_from_the_papers_protocol(tmp_path):
+    names = [f"{index:03d}.png" for index in range(188)]
+    meta = {
+        "frames": [{"file_path": name, "frame": index} for index, name in enumerate(names)],
+        "train_filenames": names[:150],
+        "test_filenames": names[150:],
+        "source": {"kind": "kitti360", "sweeps": 0, "deskew": False, "occlusion": False, "find_ego": False},
+    }
+    assert departures(meta) == []
+    meta["source"] |= {"sweeps": 3, "deskew": True, "find_ego": True}
+    meta["train_filenames"] = names[:70]
+    found = " ".join(departures(meta))
+    for part in ("70 training frames, not 150", "35% held out", "7 sweeps", "de-skewed", "vehicle itself"):
+        assert part in found

@@ -1,0 +1,88 @@
+"""Judging: on which pixels and views, and without a trace in the training."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.engine.optimizers import Optimizers
+from scenes import write_scene
+from test_pipeline import build
+
+from edge_depth_nerf.base.files import read_json, write_json
+from edge_depth_nerf.compare.judging import choose_pixels, judge_pixels, shifted_views
+from edge_depth_nerf.plugin.config import make_specifications, read_method_file
+
+
+def test_judging_leaves_no_trace_in_a_training(tmp_path):
+    pipeline, _ = build(write_scene(tmp_path), depth_loss="edge", num_proposal_samples_per_ray=(8, 8))
+    pipeline.datamanager.train_pixel_sampler.set_num_rays_per_batch(32)
+    start = deepcopy(pipeline.state_dict())
+    chosen = choose_pixels(pipeline.datamanager.eval_dataset)
+    ends, figures = [], []
+    for judged in (False, True):
+        pipeline.load_state_dict(start)
+        pipeline.datamanager.train_pixel_sampler._drawn = pipeline.datamanager._surface_sampler._drawn = 0
+        sampler = pipeline.model.proposal_sampler
+        sampler._steps_since_update, sampler._step = 0, 0
+        config = make_specifications(read_method_file())["edge-depth-nerf-lite"].config
+        optimisers = Optimizers(deepcopy(config.optimizers), pipeline.get_param_groups())
+        torch.manual_seed(0)
+        pipeline.train()
+        for step in range(16):
+            sampler.set_anneal(0.5)
+            sampler.step_cb(step)
+            optimisers.zero_grad_all()
+            torch.stack(list(pipeline.get_train_loss_dict(0)[1].values())).sum().backward()
+            optimisers.optimizer_step_all()
+            if judged and step in (11, 12, 13):
+                figures.append(judge_pixels(pipeline, chosen))
+                assert pipeline.model.training
+        ends.append(deepcopy(pipeline.state_dict()))
+    assert all(torch.equal(ends[0][name], ends[1][name]) for name in ends[0])
+    assert {"psnr", "truth_psnr", "lidar_abs_rel", "truth_abs_rel"} <= set(figures[0])
+    assert figures[0] != figures[-1]
+
+
+def test_the_pixels_are_always_the_same_and_inside_the_mask(tmp_path):
+    pipeline, _ = build(write_scene(tmp_path))
+    dataset = pipeline.datamanager.eval_dataset
+    one, other = choose_pixels(dataset, most=40), choose_pixels(dataset, most=40)
+    assert torch.equal(one[0].indices, other[0].indices)
+    assert len(one) == len(dataset) and len(one[0].indices) == 40 // len(dataset)
+    for view, chosen in enumerate(one):
+        index, row, column = chosen.indices.T
+        assert (index == view).all() and dataset.mask(view)[row, column].all()
+        assert torch.equal(chosen.known["image"], dataset[view]["image"][row, column])
+
+
+def test_shifted_views_stand_where_the_scene_says(tmp_path):
+    scene = write_scene(tmp_path)
+    meta = read_json(scene / "transforms.json")
+    for frame in meta["frames"]:
+        frame["camera"] = "only"
+    held_out = next(frame for frame in meta["frames"] if frame["file_path"] == meta["test_filenames"][0])
+    moved = np.array(held_out["transform_matrix"])
+    moved[:3, 3] += [0.3, -0.2, 0.1]
+    files = {key: held_out[key] for key in ("truth_rgb_file_path", "truth_distance_file_path")}
+    meta["shifted_views"] = {
+        "0": [{"camera": "only", "transform_matrix": held_out["transform_matrix"], **files}],
+        "1": [
+            {"camera": "only", "transform_matrix": moved.tolist(), **files},
+            {"camera": "none there", "transform_matrix": moved.tolist(), **files},
+        ],
+    }
+    write_json(scene / "transforms.json", meta)
+    pipeline, _ = build(scene)
+    dataset = pipeline.datamanager.eval_dataset
+    views = shifted_views(scene, dataset)
+    assert [len(views[metres]) for metres in ("0", "1")] == [1, 1]
+    same, beside = (views[metres][0]() for metres in ("0", "1"))
+    assert torch.allclose(same.camera.camera_to_worlds[0], dataset.cameras[0].camera_to_worlds, atol=1e-6)
+    offset = beside.camera.camera_to_worlds[0, :, 3] - dataset.cameras[0].camera_to_worlds[:, 3]
+    metres = offset.norm() * dataset.metadata["metres_per_unit"]
+    assert float(metres) == pytest.approx(np.linalg.norm([0.3, -0.2, 0.1]), abs=1e-5)
+    assert same.batch["image"].shape == (28, 32, 3) and same.batch["mask"].shape == (28, 32, 1)
+    assert (same.batch["truth_distance_m"] > 0).any()

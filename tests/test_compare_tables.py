@@ -1,0 +1,174 @@
+"""Tables by hand, of made-up runs."""
+
+from __future__ import annotations
+
+import statistics
+
+import numpy as np
+import pytest
+from comparisons import fake
+
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.compare import tables
+from edge_depth_nerf.compare.results import Results, check_fair
+
+PSNR_OF = {
+    ("street", "nerfacto"): (20.0, 21.0, 22.5),
+    ("turn", "nerfacto"): (24.0, 23.0, 25.0),
+    ("street", "edge"): (23.0, 24.5, 24.0),
+    ("turn", "edge"): (25.0, 26.0, 27.5),
+    ("street", "ds-nerf"): (22.0, 22.0, 22.0),
+    ("turn", "ds-nerf"): (28.0, 25.0, 25.0),
+}
+
+
+@pytest.fixture
+def results():
+    runs = [
+        fake(scene, method, seed, psnr)
+        for (scene, method), figures in PSNR_OF.items()
+        for seed, psnr in enumerate(figures)
+    ]
+    return Results(runs, {"preset": "lite", "tuned": {}}, {"nerfstudio": "1.1.5"}, 2)
+
+
+def table(results, label):
+    return next(made for made in tables.make_tables(results) if made.label == label)
+
+
+def test_where_the_weights_come_from(results):
+    results.options |= {"tuned": {"ds-nerf": {}}, "tuned_on": "/scenes/tuning"}
+    made = table(results, "7")
+    assert [row.cells[2].text() for row in made.rows] == ["–", "searched", "default"]
+    assert "Searched on tuning." in made.notes and "flatter" not in made.caption
+    results.options["tuned_on"] = "/scenes/street"
+    made = table(results, "7")
+    assert "Searched on street." in made.notes and "flatter" in made.caption
+    results.options["tuned_on"] = 7  # a file written by hand
+    assert "Searched on 7." in table(results, "7").notes
+
+
+def test_table_1_by_hand(results):
+    made = table(results, "1")
+    headings = made.headings()
+    assert headings[0] == ("street", "PSNR ↑") and headings[2] == ("turn", "PSNR ↑")
+    assert headings[4] == ("average", "PSNR ↑") and headings[-2:] == [("ours ahead", "dB"), ("ours ahead", "paper, dB")]
+    assert [row.title for row in made.rows] == ["nerfacto", "DS-NeRF loss", "ours"]
+    nerfacto, ds_nerf, ours = made.rows
+    # street, nerfacto: mean of 20, 21, 22.5 = 21.1667; deviation sqrt((1.3611 + 0.0278 + 1.7778) / 2) = 1.2583
+    assert nerfacto.cells[0].text() == "21.17 ± 1.26"
+    # average by seed: (20 + 24) / 2, (21 + 23) / 2, (22.5 + 25) / 2 = 22, 22, 23.75
+    assert nerfacto.cells[4].text() == "22.58 ± 1.01"
+    # ours by seed: 24, 25.25, 25.75; ahead by 2, 3.25, 2
+    assert nerfacto.cells[-2].text() == f"{7.25 / 3:+.2f} ± {statistics.stdev([2, 3.25, 2]):.2f}"
+    assert nerfacto.cells[-1].text() == "+0.65" and ds_nerf.cells[-1].text() == "+0.44"
+    assert ours.cells[-1].text() == ours.cells[-2].text() == "–"
+    assert [row.cells[0].best for row in made.rows] == [False, False, True]
+    assert [row.cells[2].best for row in made.rows] == [False, False, True]  # 24, 26, 26.17
+    assert "averages do not follow" in made.caption
+
+
+def test_one_seed_has_no_spread_and_one_drive_no_average(results):
+    results.runs = [run for run in results.runs if run.seed == 1 and run.scene == "turn"]
+    made = table(results, "1")
+    assert made.rows[0].cells[0].text() == "23.00"
+    assert {group for group, _ in made.headings()} == {"turn", "ours ahead"}
+
+
+def test_a_seed_that_a_drive_lacks_is_left_out_of_the_average(results):
+    results.runs = [run for run in results.runs if (run.scene, run.method, run.seed) != ("turn", "nerfacto", 2)]
+    nerfacto = table(results, "1").rows[0]
+    assert nerfacto.cells[4].text() == "22.00 ± 0.00"
+    assert nerfacto.cells[-2].text() == f"{5.25 / 2:+.2f} ± {statistics.stdev([2, 3.25]):.2f}"
+
+
+def test_tables_2_to_4_are_of_their_methods(results):
+    assert not [made for made in tables.make_tables(results) if made.label in ("2", "3", "4")]
+    results.runs += [
+        fake("street", method, 0, psnr)
+        for method, psnr in (("edge-lidar", 23.5), ("edge-mono", 22.0), ("edge-gaussian", 23.004))
+    ]
+    results.runs += [fake("garage", method, 0, 30.0) for method in ("nerfacto", "ds-nerf", "edge")]
+    for run in results.runs[-3:]:
+        run.content["source"] = "jbnu-depth360"
+    results = Results(results.runs, results.options, results.versions, 2)
+    jbnu = table(results, "2")
+    assert {group for group, _ in jbnu.headings()} == {"garage", "ours ahead"}
+    assert [row.cells[-1].text() for row in jbnu.rows] == ["+0.12", "+0.04", "–"]
+    assert "garage" not in {group for group, _ in table(results, "1").headings()}
+    third = table(results, "3")
+    assert [row.title for row in third.rows] == ["LiDAR alone", "monocular alone", "ours"]
+    assert "row of DS-NeRF" in third.caption
+    fourth = table(results, "4")
+    column = fourth.headings().index(("street", "PSNR ↑"))
+    assert [row.cells[column].text() for row in fourth.rows] == ["23.00", "23.83 ± 0.76"]
+
+
+def test_without_truth_everywhere_figures_are_against_the_pictures(results):
+    results.runs[0].figures["masked_psnr"] = 17.0
+    del results.runs[0].figures["truth_masked_psnr"]
+    assert tables.psnr_metric(results).name == "masked_psnr"
+
+
+CURVE = [
+    {"step": 10.0, "seconds": 1.0, "psnr": 10.0},
+    {"step": 20.0, "seconds": 3.0, "psnr": 16.0},
+    {"step": 40.0, "seconds": 7.0, "psnr": 18.0},
+]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "psnr"), [(0.5, 10.0), (1.0, 10.0), (2.0, 13.0), (3.0, 16.0), (6.0, 17.5), (9.0, 18.0)]
+)
+def test_psnr_at_a_time(seconds, psnr):
+    assert tables.psnr_at(CURVE, seconds, "psnr", "seconds") == pytest.approx(psnr)
+
+
+@pytest.mark.parametrize(("psnr", "steps"), [(9.0, 10), (13.0, 15), (16.0, 20), (17.5, 35), (18.1, None)])
+def test_steps_to_a_psnr(psnr, steps):
+    assert tables.steps_to(CURVE, psnr, "psnr") == (None if steps is None else pytest.approx(steps))
+
+
+def test_time_to_the_psnr_of_nerfacto(results):
+    made = table(results, "6, street")
+    ours = made.rows[-1]
+    # by seed: nerfacto ends at 20, 21, 22.5; ours has 11.5 at 50 steps and 23 at 100, and so on
+    expected = [50 + 50 * (end - own / 2) / (own / 2) for end, own in ((20, 23), (21, 24.5), (22.5, 24))]
+    assert ours.cells[-1].text() == f"{np.mean(expected):.0f} ± {np.std(expected, ddof=1):.0f}"
+
+
+def test_a_run_that_never_gets_there_leaves_no_mean(results):
+    last = next(run for run in results.runs if (run.scene, run.method, run.seed) == ("street", "edge", 2))
+    for point in last.curve:
+        point["truth_psnr"] = 22.4
+    for label in ("6, street", "6, average"):
+        assert table(results, label).rows[-1].cells[-1].text() == "never"
+    assert table(results, "6, turn").rows[-1].cells[-1].text() != "never"
+
+
+def test_latex_and_markdown_hold_the_same_cells(results):
+    made = tables.make_tables(results)
+    markdown, latex = tables.as_markdown(results, made), tables.as_latex(results, made)
+    assert "| nerfacto | 21.17 ± 1.26 |" in markdown
+    assert r"nerfacto & 21.17 $\pm$ 1.26 &" in latex
+    assert latex.count(r"\toprule") == latex.count(r"\bottomrule") == latex.count(r"\end{table}") == len(made)
+    body = "\n".join(line for line in latex.splitlines() if not line.startswith("%"))
+    assert body.isascii() and "\\usepackage" not in body
+    for rows in body.split(r"\begin{tabular}")[1:]:
+        columns = len(rows[: rows.index("\n")].strip("{}"))
+        cells = [line for line in rows.splitlines() if line.endswith(r"\\") and "multicolumn" not in line]
+        assert {line.count(" & ") + 1 for line in cells} == {columns}
+
+
+def test_runs_that_differ_in_unnamed_fields_are_refused(results):
+    check_fair(results)
+    results.runs[-1].content["configuration"]["b"] = "2"
+    with pytest.raises(InputError, match=r"its b is 2, that of .* is None.*another version"):
+        check_fair(results)
+    results.runs[-1].content["named"] = ["b"]
+    with pytest.raises(InputError, match=r"ds-nerf_seed-2: its b"):  # the same method with another seed lacks it
+        check_fair(results)
+    for run in results.runs:
+        if run.method == "ds-nerf":
+            run.content["named"], run.content["configuration"]["b"] = ["b"], "2"
+    check_fair(results)

@@ -1,0 +1,168 @@
+"""The command once for real: worker, report, plots, and going on where it was."""
+
+from __future__ import annotations
+
+import csv
+import html
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import torch
+from comparisons import QUIET, copied, options, write_compared_scene
+from nerfstudio.utils.eval_utils import eval_setup
+
+from edge_depth_nerf.base.files import read_image, read_json, write_json
+from edge_depth_nerf.compare import command, tables
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("compare")
+    asked = options(
+        write_compared_scene(folder / "sample"), output=folder / "out", methods=("nerfacto", "edge"), steps=12, jobs=2
+    )
+    return asked, command.compare(asked, QUIET)
+
+
+@pytest.mark.slow
+def test_it_leaves_figures_tables_and_pictures(finished):
+    asked, results = finished
+    with (asked.output / "results.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {(row["scene"], row["method"], row["seed"]) for row in rows} == {
+        ("sample", "nerfacto", "0"),
+        ("sample", "edge", "0"),
+    }
+    metrics = {row["metric"] for row in rows if row["method"] == "edge"}
+    assert {"masked_psnr", "truth_masked_ssim", "truth_affine_masked_psnr", "truth_abs_rel", "seconds"} <= metrics
+    assert {"shifted_1m_masked_psnr", "shifted_2m_masked_psnr", "shifted_1m_truth_abs_rel"} <= metrics
+    assert np.isfinite([float(row["value"]) for row in rows]).all()
+    tidy = json.loads((asked.output / "results.json").read_text())["rows"]
+    assert [(row["metric"], row["value"]) for row in tidy] == [(row["metric"], float(row["value"])) for row in rows]
+    fitted, plain = (
+        [float(row["value"]) for row in rows if row["metric"] == f"truth_{name}masked_psnr"] for name in ("affine_", "")
+    )
+    assert all(one > other for one, other in zip(fitted, plain, strict=True))
+    text = (asked.output / "tables.md").read_text()
+    assert "## Table 1." in text and "## Table 5" in text and "| ours |" in text
+    assert r"\bottomrule" in (asked.output / "tables.tex").read_text()
+    assert read_image(asked.output / "comparison_sample.png").std() > 5
+    for name in ("psnr_by_steps", "psnr_by_seconds", "error_by_angle", "error_by_distance"):
+        plot = ElementTree.parse(asked.output / f"{name}.svg").getroot()
+        # each method's line in its own colour
+        styles = [each.get("style", "") for each in plot.iter("{http://www.w3.org/2000/svg}path")]
+        assert all(any(f"stroke: {colour}" in style for style in styles) for colour in ("#888888", "#d62828"))
+    for run in results.runs:
+        assert [point["step"] for point in run.curve][-1] == 12
+        seconds = [point["seconds"] for point in run.curve]
+        assert seconds == sorted(seconds) and seconds[0] > 0
+        assert sum(entry["pixels"] for entry in run.content["by_angle_deg"]) > 1000
+
+
+@pytest.mark.slow
+def test_the_page_shows_what_is_there(finished):
+    asked, results = finished
+    page = (asked.output / "report.html").read_text(encoding="utf-8").replace("&#39;", "&#x27;")
+    for made in tables.make_tables(results):
+        assert f"Table {made.label}</i> {html.escape(made.title)}</span>" in page
+        for row in made.rows:
+            assert all(f">{html.escape(cell.text())}</td>" in page for cell in row.cells)
+    assert "2 of 2 held-out views" in page and page.count('"distance-error": "data:image/webp') == 2 * 2
+    assert page.count("data:image/svg+xml;base64,") == 2 * 4
+    (command_line,) = results.options["commands"]
+    assert command_line.startswith("edge-depth-nerf compare /") and f"<code>{command_line}</code>" in page
+    assert page.count("<code>ns-viewer --load-config ") == 2
+    # of the configuration, what differs and what is shared
+    loss = ['<th scope="row">pipeline.model.depth_loss</th>', "<td>none</td>", "<td>edge</td>"]
+    assert re.search(r"\s*".join(map(re.escape, loss)), page)
+    assert "<dt>pipeline.model.near_m</dt>" in page
+    for name, value in results.versions.items():
+        assert f"<dt>{name}</dt><dd>{value}</dd>" in page
+
+
+@pytest.mark.slow
+def test_trained_configurations_differ_in_the_named_fields_alone(finished):
+    _, results = finished
+    nerfacto, ours = (next(run for run in results.runs if run.method == name) for name in ("nerfacto", "edge"))
+    texts = [next(run.folder.rglob("config.yml")).read_text().splitlines() for run in (nerfacto, ours)]
+    different = {(a.strip(), b.strip()) for a, b in zip(*texts, strict=True) if a != b}
+    assert different == {
+        ("experiment_name: nerfacto_seed-0", "experiment_name: edge_seed-0"),
+        ("depth_loss: none", "depth_loss: edge"),
+        ("depth_source: auto", "depth_source: integrated"),
+    }
+
+
+@pytest.mark.slow
+def test_judging_gives_the_figures_of_ns_eval(finished):
+    _, results = finished
+    run = next(run for run in results.runs if run.method == "edge")
+    _, pipeline, *_ = eval_setup(next(run.folder.rglob("config.yml")), test_mode="test")
+    found: Any = pipeline.get_average_eval_image_metrics()
+    assert {"masked_psnr", "truth_masked_ssim", "lidar_abs_rel"} <= set(found)
+    for name, value in found.items():
+        if name not in ("fps", "num_rays_per_sec"):
+            assert run.figures[name] == pytest.approx(value, rel=1e-4, abs=1e-4), name
+
+
+@pytest.mark.slow
+def test_what_is_there_is_not_done_again(finished, monkeypatch):
+    asked, results = finished
+    monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: pytest.fail("started a command"))
+    assert command.compare(asked, QUIET).rows() == results.rows()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kept", [(), ("edge",)])
+def test_runs_of_which_only_the_figures_are_left_count_in_the_tables(finished, tmp_path, monkeypatch, kept):
+    asked, results = finished
+    output = tmp_path / "out"
+    copied(asked.output, output)
+    (output / "comparison_sample.png").unlink()
+    for folder in (output / "runs" / "sample").iterdir():
+        for each in folder.iterdir():
+            if folder.name.partition("_")[0] in kept or each.name in ("run.json", "figures.json"):
+                continue
+            shutil.rmtree(each) if each.is_dir() else each.unlink()
+    monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: pytest.fail("started a command"))
+    assert command.compare(replace(asked, output=output), QUIET).rows() == results.rows()
+    assert "| nerfacto |" in (output / "tables.md").read_text()
+    assert (output / "comparison_sample.png").is_file() == bool(kept)
+    page = (output / "report.html").read_text(encoding="utf-8")
+    assert page.count("<code>ns-viewer --load-config ") == len(kept)
+    assert page.count('"distance-error": "data:image/webp') == 2 * len(kept)
+
+
+@pytest.mark.slow
+def test_an_interrupted_run_goes_on_at_its_checkpoint(finished, tmp_path):
+    """As if it had been killed after four of ours' twelve steps."""
+    asked, results = finished
+    output = tmp_path / "out"
+    copied(asked.output, output)
+    folder = output / "runs" / "sample" / "edge_seed-0"
+    (folder / "figures.json").unlink()
+    checkpoints = next(folder.rglob("nerfstudio_models"))
+    saved = torch.load(checkpoints / "step-000000011.ckpt", weights_only=True)
+    (checkpoints / "step-000000011.ckpt").unlink()
+    torch.save({**saved, "step": 3}, checkpoints / "step-000000003.ckpt")
+    progress = read_json(folder / "progress.json")
+    progress["times"] = {"4": {"seconds": 100.0, "cpu_seconds": 50.0}}
+    write_json(folder / "progress.json", progress)
+    again = command.compare(replace(asked, output=output), QUIET)
+    before, after = (next(run for run in found.runs if run.method == "edge") for found in (results, again))
+    assert [path.name for path in checkpoints.iterdir()] == ["step-000000011.ckpt"]
+    steps = [point["step"] for point in before.curve]
+    assert [point["step"] for point in after.curve] == steps
+    assert after.curve[: steps.index(4.0) + 1] == before.curve[: steps.index(4.0) + 1]
+    assert after.curve[-1] != before.curve[-1]
+    assert 100 < after.figures["seconds"] < 100 + before.figures["seconds"] + 60
+    assert {row["value"] for row in again.rows() if row["method"] == "nerfacto"} == {
+        row["value"] for row in results.rows() if row["method"] == "nerfacto"
+    }
