@@ -41,9 +41,7 @@ test: setup
 
 # Lines and branches of whatever the tests run in their own process, then of the pure rooms alone, which must have 95 %.
 # Functions that Numba or Triton compile run unseen; pyproject.toml leaves them out, and tests compare them with twins.
-PURE_ROOMS := $(patsubst %,edge_depth_nerf/%/*,method scene base cameras lidar masks) $(patsubst %,edge_depth_nerf/%.py, \
-	bounds checked_cache console errors files integration losses metrics mono/alignment mono/error_model one_writer \
-	pictures prior process/png process/scene scene_format scene_reader uncertainty)
+PURE_ROOMS := $(patsubst %,edge_depth_nerf/%/*,method scene base cameras lidar masks)
 coverage: setup
 	@$(call in_a_folder,--cov --cov-report=)
 	$(BIN)/coverage report
@@ -52,7 +50,7 @@ coverage: setup
 # The modules that need no nerfstudio, whose dependencies still pin NumPy 1.26 (its issue 3747), under NumPy 2. Tests that
 # compare with nerfstudio have its name in theirs.
 PURE := build/pure
-PURE_TESTS := alignment bad_input camera_fit cameras files integration kitti360 lidar losses masks mono_files \
+PURE_TESTS := alignment bad_input camera_fit cameras faults files integration kitti360 lidar losses masks mono_files \
 	pixel_table poses prior rays scans scene sweeps_in_world trajectory trust
 test-pure:
 	rm -rf $(PURE)

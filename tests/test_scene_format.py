@@ -28,7 +28,8 @@ from edge_depth_nerf.mono.options import EstimateDepthOptions
 from edge_depth_nerf.mono.scene_maps import write_mono_maps
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
-from edge_depth_nerf.scene.reader import read_scene
+from edge_depth_nerf.scene.format import read_transforms
+from edge_depth_nerf.scene.reader import read_scene, scene_of
 
 
 def manager(folder: Path, parser: dict[str, Any] | None = None, **options: Any):
@@ -91,8 +92,9 @@ def test_what_the_host_says_of_the_unit_is_calibrated_by(tmp_path: Path) -> None
     folder = others_scene(tmp_path)
     put_in(folder)
     options = PriorOptions()
+    path = folder / "transforms.json"
     read = find_trust(read_scene(folder), options)
-    told = find_trust(read_scene(folder, depth_metres_per_count=2e-3), options)
+    told = find_trust(scene_of(read_transforms(path), path, depth_metres_per_count=2e-3), options)
     assert read.drive_fit is not None and told.drive_fit is not None
     assert told.drive_fit.log_scale == pytest.approx(read.drive_fit.log_scale + np.log(2), abs=0.01)
     assert told.made_of != read.made_of

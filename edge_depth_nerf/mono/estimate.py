@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 from rich.console import Console
+from rich.progress import Progress
 
 from edge_depth_nerf import __version__
 from edge_depth_nerf.base.console import progress_bars
@@ -33,6 +34,7 @@ from edge_depth_nerf.mono.calibration import calibrate_scene
 from edge_depth_nerf.mono.elsewhere import FittedMaps
 from edge_depth_nerf.mono.examples import (
     LARGEST_SET_BYTES,
+    Examples,
     bytes_a_picture,
     camera_height_m,
     lens_rays,
@@ -61,6 +63,8 @@ from edge_depth_nerf.mono.scene_maps import write_mono_maps
 from edge_depth_nerf.mono.training import Trained, TrainingOptions, as_json, train
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
 
+Split = tuple[list[ScenePicture], list[ScenePicture]]
+"""Pictures of a scene to train on, and those kept for stopping."""
 WEIGHTS = "mono_network.safetensors"
 """The weights' file in a scene."""
 KEEP_EVERY = 8
@@ -254,64 +258,26 @@ def _train(
         preset.training, steps=options.train_steps or preset.training.steps, seconds=options.seconds, seed=options.seed
     )
     weights = options.output or scenes[0].folder / WEIGHTS
+    checkpoint = weights.with_suffix(".checkpoint")
     found, about = _weights_of_before(weights, options, scenes[0].folder / WEIGHTS, console)
     settings = start.settings if start else NetworkSettings(preset.channels, preset.working_px, _EYE_LEVEL_M, 1.0)
-    split = [training_split(scene) for scene in scenes]
-    split = _thinned(split, settings.working_px, console)
-    heights = [camera_heights_m(scene, settings) for scene in scenes]
-    count = sum(len(pictures) for both in split for pictures in both)
     with progress_bars(console) as progress:
-        task = progress.add_task("Gathering LiDAR", total=4 * sum(len(both[0]) for both in split))
-        fields = [
-            field_deg(scene, both[0], lambda: progress.advance(task)) for scene, both in zip(scenes, split, strict=True)
-        ]
-        clouds = [
-            static_cloud(scene, both[0], lambda: progress.advance(task))
-            for scene, both in zip(scenes, split, strict=True)
-        ]
-        far_seen = [functools.partial(seen_above, cloud, scene) for cloud, scene in zip(clouds, scenes, strict=True)]
-        task = progress.add_task("Reading pictures", total=count)
-        examples, kept = (
-            load_examples(
-                scenes,
-                [both[which] for both in split],
-                heights,
-                settings.working_px,
-                settings.multiple_px,
-                lambda: progress.advance(task),
-                # what stops the training is what these pictures measured themselves
-                far_seen if which == 0 else None,
-            )
-            if any(both[which] for both in split)
-            else None
-            for which in (0, 1)
-        )
-        assert examples is not None
-        if not examples.lidar_m.any():
-            raise InputError(
-                f"{scenes[0].path}: no LiDAR return lies inside the masks of the training pictures, nothing to train "
-                "on. Check the LiDAR maps with `edge-depth-nerf inspect`."
-            )
-        if kept is not None and not kept.lidar_m.any():
-            console.print(
-                f"No LiDAR return lies inside the masks of the {len(kept)} pictures kept for stopping: training takes "
-                "all its steps, and its error is not known",
-                soft_wrap=True,
-            )
-            kept = None
+        material = _gather(scenes, settings, console, progress)
         if start is None:
-            mean_height_m = float(np.mean([height for by_camera in heights for height in by_camera.values()]))
-            settings = replace(settings, camera_height_m=mean_height_m, room_radius_m=room_radius_m(examples))
-        identity = {
-            "training": asdict(training),
-            "settings": asdict(settings),
-            "examples": examples.fingerprint(),
-            "start": None if options.model is None else hashlib.sha256(options.model.read_bytes()).hexdigest(),
-        }
-        identity = as_json(identity)
+            settings = replace(
+                settings, camera_height_m=material.mean_height_m, room_radius_m=room_radius_m(material.examples)
+            )
+        identity = as_json(
+            {
+                "training": asdict(training),
+                "settings": asdict(settings),
+                "examples": material.examples.fingerprint(),
+                "start": None if options.model is None else hashlib.sha256(options.model.read_bytes()).hexdigest(),
+            }
+        )
         if found is not None and about.get("identity") == identity:
             console.print(f"{weights} is trained already", soft_wrap=True)
-            weights.with_suffix(".checkpoint").unlink(missing_ok=True)
+            checkpoint.unlink(missing_ok=True)
             return found, weights, about, None
         task = progress.add_task("Training", total=1.0)
 
@@ -319,31 +285,104 @@ def _train(
             said = "" if np.isinf(error) else f", error {error:.1%} of the distance"
             progress.update(task, completed=share, description=f"Training{said}")
 
-        checkpoint = weights.with_suffix(".checkpoint")
-        trained = train(examples, kept, settings, training, start=start, checkpoint=checkpoint, report=report)
-    # some picture has returns, or nothing would have been trained
-    known = [field for field in fields if field is not None]
+        trained = train(
+            material.examples, material.kept, settings, training, start=start, checkpoint=checkpoint, report=report
+        )
     about = {
         "made_by": f"edge-depth-nerf {__version__}",
         "preset": options.preset,
         "steps": trained.best_step,
-        "abs_rel": None if kept is None else round(trained.abs_rel, 5),
+        "abs_rel": None if material.kept is None else round(trained.abs_rel, 5),
         "scenes": [_name(scene) for scene in scenes],
         "trained_frames": {
-            _key(scene): [picture.name for picture in both[0]] for scene, both in zip(scenes, split, strict=True)
+            _key(scene): [picture.name for picture in both[0]]
+            for scene, both in zip(scenes, material.split, strict=True)
         },
-        "field_deg": [min(low for low, _ in known), max(high for _, high in known)],
+        "field_deg": material.field_deg,
         "identity": identity,
     }
     save_network(weights, trained.network, about)
     checkpoint.unlink(missing_ok=True)
+    _say_trained(trained, training, material, console)
+    return trained.network, weights, about, trained
+
+
+@dataclass(frozen=True)
+class _Material:
+    """What a network is trained on."""
+
+    split: list[Split]
+    """Of each scene, the pictures to train on and those kept for stopping."""
+    examples: Examples
+    """The pictures to train on."""
+    kept: Examples | None
+    """Those kept for stopping; None if they measured nothing."""
+    mean_height_m: float
+    """Of the cameras above the ground."""
+    field_deg: list[float]
+    """Least and largest elevation that LiDAR reached."""
+
+
+def _gather(
+    scenes: Sequence[SceneFolder], settings: NetworkSettings, console: Console, progress: Progress
+) -> _Material:
+    """Read the pictures and LiDAR of scenes.
+
+    Raises:
+        InputError: no LiDAR return lies in any training picture.
+
+    """
+    split = _thinned([training_split(scene) for scene in scenes], settings.working_px, console)
+    training = [pictures for pictures, _ in split]
+    heights = [camera_heights_m(scene, settings) for scene in scenes]
+    task = progress.add_task("Gathering LiDAR", total=4 * sum(map(len, training)))
+    fields, far_seen = [], []
+    for scene, pictures in zip(scenes, training, strict=True):
+        fields.append(field_deg(scene, pictures, lambda: progress.advance(task)))
+    for scene, pictures in zip(scenes, training, strict=True):
+        cloud = static_cloud(scene, pictures, lambda: progress.advance(task))
+        far_seen.append(functools.partial(seen_above, cloud, scene))
+    task = progress.add_task("Reading pictures", total=sum(len(pictures) for both in split for pictures in both))
+
+    def load(chosen: list[list[ScenePicture]], more: list[Any] | None) -> Examples | None:
+        if not any(chosen):
+            return None
+        size = settings.working_px, settings.multiple_px
+        return load_examples(scenes, chosen, heights, *size, lambda: progress.advance(task), more)
+
+    examples = load(training, far_seen)
+    # what stops the training is what these pictures measured themselves
+    kept = load([pictures for _, pictures in split], None)
+    assert examples is not None
+    if not examples.lidar_m.any():
+        raise InputError(
+            f"{scenes[0].path}: no LiDAR return lies inside the masks of the training pictures, nothing to train "
+            "on. Check the LiDAR maps with `edge-depth-nerf inspect`."
+        )
+    if kept is not None and not kept.lidar_m.any():
+        console.print(
+            f"No LiDAR return lies inside the masks of the {len(kept)} pictures kept for stopping: training takes "
+            "all its steps, and its error is not known",
+            soft_wrap=True,
+        )
+        kept = None
+    # some picture has returns
+    known = [field for field in fields if field is not None]
+    mean_height_m = float(np.mean([height for by_camera in heights for height in by_camera.values()]))
+    limits_deg = [min(low for low, _ in known), max(high for _, high in known)]
+    return _Material(split, examples, kept, mean_height_m, limits_deg)
+
+
+def _say_trained(trained: Trained, training: TrainingOptions, material: _Material, console: Console) -> None:
     short = not trained.stopped_early and trained.steps < training.steps
     early = ", where it stopped by itself" if trained.stopped_early else ""
     if short:
         early = f" of {training.steps:,}, where its time was up,"
-    judged = "" if kept is None else f"; error on the {len(kept)} pictures kept for stopping: {trained.abs_rel:.1%}"
+    judged = ""
+    if material.kept is not None:
+        judged = f"; error on the {len(material.kept)} pictures kept for stopping: {trained.abs_rel:.1%}"
     console.print(
-        f"Trained {trained.steps} steps{early} in {trained.seconds:.0f} s on {len(examples)} pictures{judged}",
+        f"Trained {trained.steps} steps{early} in {trained.seconds:.0f} s on {len(material.examples)} pictures{judged}",
         soft_wrap=True,
     )
     if short and trained.steps < _FEW_STEPS:
@@ -352,7 +391,6 @@ def _train(
             style="yellow",
             soft_wrap=True,
         )
-    return trained.network, weights, about, trained
 
 
 def _weights_of_before(
@@ -399,7 +437,7 @@ def _key(scene: SceneFolder) -> str:
     return hashlib.sha256(repr(sorted(listed)).encode()).hexdigest()[:32]
 
 
-def training_split(scene: SceneFolder) -> tuple[list[ScenePicture], list[ScenePicture]]:
+def training_split(scene: SceneFolder) -> Split:
     """Divide a scene's training pictures, whole moments each: to train on, and to stop by.
 
     Raises:
@@ -425,9 +463,7 @@ def training_split(scene: SceneFolder) -> tuple[list[ScenePicture], list[ScenePi
     )
 
 
-def _thinned(
-    split: list[tuple[list[ScenePicture], list[ScenePicture]]], working_px: int, console: Console
-) -> list[tuple[list[ScenePicture], list[ScenePicture]]]:
+def _thinned(split: list[Split], working_px: int, console: Console) -> list[Split]:
     """Take every k-th picture where all would not fit in memory."""
     pictures = [picture for both in split for pictures in both for picture in pictures]
     most = LARGEST_SET_BYTES // bytes_a_picture(pictures, working_px)

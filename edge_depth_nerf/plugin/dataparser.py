@@ -19,7 +19,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, Nerfst
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.plugin.scale import default_metres_per_unit
 from edge_depth_nerf.scene.format import INTRINSICS, LAYERS, DepthKind, path_keys, pose_of, read_transforms
-from edge_depth_nerf.scene.reader import ScenePicture, read_scene
+from edge_depth_nerf.scene.reader import ScenePicture, scene_of
 
 SUPPORTED_CAMERA_TYPES = (CameraType.PERSPECTIVE, CameraType.FISHEYE)
 
@@ -152,37 +152,17 @@ class FisheyeDepth(Nerfstudio):
         meta = read_transforms(path)
         frames = check_meta(meta, path)
         check_split(meta, path)
-        named = [f"{name}_filenames" for name in ("train", "val", "test") if f"{name}_filenames" in meta]
-        if named and f"{split}_filenames" not in named:
-            raise InputError(f"{path}: has {' and '.join(named)}, but no {split}_filenames. Give all three, or none.")
-        has_maps = any(layer.key in frames[0] for name, layer in LAYERS.items() if name not in ("image", "mask"))
-        if has_maps and self.config.downscale_factor not in (None, 1):
-            raise InputError(
-                f"{path}: downscale_factor is {self.config.downscale_factor}, but the distance maps of this scene "
-                "have one size only. Run `edge-depth-nerf process … --downscale K` instead."
-            )
-        positions_m = np.array([frame["transform_matrix"] for frame in frames], dtype=np.float64)[:, :3, 3]
-        metres_per_unit = self.config.metres_per_unit
-        if metres_per_unit is None:
-            metres_per_unit = default_metres_per_unit(positions_m, self.config.hash_resolution)
-        if self.config.auto_scale_poses:
-            raise InputError(
-                "auto_scale_poses would lose the metres that near plane, prior and loss are in. "
-                "Set the scale with fisheye-depth-data --metres-per-unit M instead."
-            )
-        if not (np.isfinite(metres_per_unit) and metres_per_unit > 0):
-            raise InputError(f"metres_per_unit is {metres_per_unit}; expected a positive number of metres.")
-
+        self._check_config(meta, path, split)
+        metres_per_unit = self._metres_per_unit(frames)
         if len(frames) == 1 and "train_filenames" not in meta:
             self.config.eval_mode = "all"  # the one picture is for training and for judging
         # nerfstudio's parser takes the scale from its config
         self.config.scale_factor = 1.0 / metres_per_unit
         outputs = super()._generate_dataparser_outputs(split)
-
         if not outputs.image_filenames:
             raise InputError(f"{path}: no picture is left for the split {split!r}; it needs one at least.")
 
-        scene = read_scene(path, self.config.depth_kind, self.config.depth_unit_scale_factor, check_files=False)
+        scene = scene_of(meta, path, self.config.depth_kind, self.config.depth_unit_scale_factor)
         names = {self._get_fname(Path(frame["file_path"]), path.parent): frame["file_path"] for frame in frames}
         by_name = {picture.name: picture for picture in scene.pictures}
         pictures = [by_name[names[image]] for image in outputs.image_filenames]
@@ -198,6 +178,35 @@ class FisheyeDepth(Nerfstudio):
             if not file.is_file():
                 raise FileNotFoundError(f"{file}: no such file, but {path} names it. Process the drive again.")
         return outputs
+
+    def _check_config(self, meta: dict[str, Any], path: Path, split: str) -> None:
+        """Check what the options ask of the scene."""
+        named = [f"{name}_filenames" for name in ("train", "val", "test") if f"{name}_filenames" in meta]
+        if named and f"{split}_filenames" not in named:
+            raise InputError(f"{path}: has {' and '.join(named)}, but no {split}_filenames. Give all three, or none.")
+        has_maps = any(
+            layer.key in meta["frames"][0] for name, layer in LAYERS.items() if name not in ("image", "mask")
+        )
+        if has_maps and self.config.downscale_factor not in (None, 1):
+            raise InputError(
+                f"{path}: downscale_factor is {self.config.downscale_factor}, but the distance maps of this scene "
+                "have one size only. Run `edge-depth-nerf process … --downscale K` instead."
+            )
+        if self.config.auto_scale_poses:
+            raise InputError(
+                "auto_scale_poses would lose the metres that near plane, prior and loss are in. "
+                "Set the scale with fisheye-depth-data --metres-per-unit M instead."
+            )
+
+    def _metres_per_unit(self, frames: list[dict[str, Any]]) -> float:
+        """The scale that was asked for, or the one that suits the drive."""
+        metres_per_unit = self.config.metres_per_unit
+        if metres_per_unit is None:
+            positions_m = np.array([frame["transform_matrix"] for frame in frames], dtype=np.float64)[:, :3, 3]
+            metres_per_unit = default_metres_per_unit(positions_m, self.config.hash_resolution)
+        if not (np.isfinite(metres_per_unit) and metres_per_unit > 0):
+            raise InputError(f"metres_per_unit is {metres_per_unit}; expected a positive number of metres.")
+        return metres_per_unit
 
 
 def _downscaled(pictures: list[ScenePicture], outputs: DataparserOutputs, factor: int) -> list[ScenePicture]:

@@ -28,6 +28,7 @@ from edge_depth_nerf.scene.format import (
     DISTORTION,
     INTRINSICS,
     LAYERS,
+    TRANSFORMS,
     DepthKind,
     is_own_scene,
     number_of,
@@ -251,30 +252,44 @@ class SceneFolder:
         return points[np.isfinite(points).all(1)]
 
 
-def read_scene(
-    scene: Path, depth_kind: DepthKind = "auto", depth_metres_per_count: float | None = None, check_files: bool = True
-) -> SceneFolder:
+def read_scene(scene: Path) -> SceneFolder:
     """Read transforms.json and check what it says.
 
     Args:
         scene: the folder, or the file itself.
-        depth_kind: what files under depth_file_path hold. auto: distance along the ray in scenes of this project and
-            in fisheye scenes, z_depth (nerfstudio's convention) in other people's pinhole scenes.
-        depth_metres_per_count: unit of these files; None: as transforms.json says, else nerfstudio's 0.001.
-        check_files: whether all files that it names have to be there.
 
     Raises:
         FileNotFoundError: no scene there.
         InputError: the file is broken, or names a file that is missing.
 
     """
-    path = scene if scene.suffix == ".json" else scene / "transforms.json"
+    path = scene if scene.suffix == ".json" else scene / TRANSFORMS
     if not path.is_file():
         raise FileNotFoundError(
             f"{path}: no such file. A scene folder has a transforms.json; `edge-depth-nerf process` makes one from a "
             "raw drive."
         )
-    meta = read_transforms(path)
+    found = scene_of(read_transforms(path), path)
+    _check_files(path, found.pictures, found.points_path)
+    return found
+
+
+def scene_of(
+    meta: dict[str, Any], path: Path, depth_kind: DepthKind = "auto", depth_metres_per_count: float | None = None
+) -> SceneFolder:
+    """The scene that a transforms.json describes; whether its files are there is not looked at.
+
+    Args:
+        meta: what `read_transforms` gave.
+        path: of the file.
+        depth_kind: what files under depth_file_path hold. auto: distance along the ray in scenes of this project and
+            in fisheye scenes, z_depth (nerfstudio's convention) in other people's pinhole scenes.
+        depth_metres_per_count: unit of these files; None: as transforms.json says, else nerfstudio's 0.001.
+
+    Raises:
+        InputError: a camera model that is not known, or a value that cannot be used.
+
+    """
     frames = meta["frames"]
     model = meta.get("camera_model", "PINHOLE")
     if model not in (*PINHOLE_MODELS, FISHEYE_MODEL):
@@ -286,30 +301,15 @@ def read_scene(
     own_lidar = LAYERS["lidar"].key in frames[0]
     held_out, split_known = _held_out(meta)
     moments = _moments(frames)
-    pictures = tuple(
-        ScenePicture(
-            name=frame["file_path"],
-            camera=_camera_name(frame),
-            moment=moments[frame["file_path"]],
-            lens=_lens(meta, frame, model, path),
-            **_pose(frame, path),
-            held_out=frame["file_path"] in held_out,
-            timestamp_s=None
-            if frame.get("timestamp_s") is None
-            else number_of(frame["timestamp_s"], f"{path}: {frame['file_path']}: timestamp_s"),
-            files=_files(frame, path.parent, own_lidar),
-        )
+    pictures = [
+        _picture(meta, frame, path, model, moments[frame["file_path"]], frame["file_path"] in held_out)
         for frame in frames
-    )
+    ]
     given = Counter(key for frame in frames for key in path_keys() if key in frame)
     ply = meta.get("ply_file_path")
-    points_path = path.parent / ply if isinstance(ply, str) else None
-    if check_files:
-        _check_files(path, pictures, points_path)
     if depth_metres_per_count is None:
-        depth_metres_per_count = number_of(
-            meta.get("depth_unit_scale_factor", 1e-3), f"{path}: depth_unit_scale_factor"
-        )
+        declared = meta.get("depth_unit_scale_factor", 1e-3)
+        depth_metres_per_count = number_of(declared, f"{path}: depth_unit_scale_factor")
     if depth_kind == "auto":
         depth_kind = "distance" if own or model == FISHEYE_MODEL else "z_depth"
     return SceneFolder(
@@ -324,7 +324,24 @@ def read_scene(
         pictures=tuple(sorted(pictures, key=lambda picture: (picture.camera, picture.moment))),
         split_known=split_known,
         incomplete={key: count for key, count in given.items() if count < len(frames)},
-        points_path=points_path,
+        points_path=path.parent / ply if isinstance(ply, str) else None,
+    )
+
+
+def _picture(
+    meta: dict[str, Any], frame: dict[str, Any], path: Path, model: str, moment: int, held_out: bool
+) -> ScenePicture:
+    name, time = frame["file_path"], frame.get("timestamp_s")
+    return ScenePicture(
+        name=name,
+        camera=_camera_name(frame),
+        moment=moment,
+        lens=_lens(meta, frame, model, path),
+        **_pose(frame, path),
+        held_out=held_out,
+        timestamp_s=None if time is None else number_of(time, f"{path}: {name}: timestamp_s"),
+        # a scene has one kind of LiDAR maps: its first frame's
+        files=_files(frame, path.parent, LAYERS["lidar"].key in meta["frames"][0]),
     )
 
 

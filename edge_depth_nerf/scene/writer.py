@@ -57,7 +57,15 @@ from edge_depth_nerf.cameras import Camera, CameraFit, KannalaBrandt, Pinhole, f
 from edge_depth_nerf.cameras.transforms import Transform, check_rigid, opencv_to_opengl
 from edge_depth_nerf.masks.lens import lens_circle
 from edge_depth_nerf.scene.checks import LeftOut, Tolerance
-from edge_depth_nerf.scene.format import DEPTH_KEY, LAYERS, POINTS, TRANSFORMS, depth_sources, read_transforms
+from edge_depth_nerf.scene.format import (
+    DEPTH_KEY,
+    DISTORTION,
+    LAYERS,
+    POINTS,
+    TRANSFORMS,
+    depth_sources,
+    read_transforms,
+)
 from edge_depth_nerf.scene.points import PointCloud, merge_parts, write_part
 
 RECORD = "process.json"
@@ -763,49 +771,6 @@ def _transforms(
     theta_max_deg: float,
     source: Mapping[str, Any],
 ) -> dict[str, Any]:
-    def matrix(camera_to_world: Transform) -> list[list[float]]:
-        moved = camera_to_world.copy()
-        moved[:3, 3] -= offset
-        return opencv_to_opengl(moved).tolist()
-
-    def entry(frame: SceneFrame) -> dict[str, Any]:
-        camera = scene_cameras[frame.camera]
-        files = _frame_files(frame, layers)
-        found: dict[str, Any] = {
-            "file_path": files["image"],
-            "transform_matrix": matrix(frame.camera_to_world),
-            "w": camera.width,
-            "h": camera.height,
-            "fl_x": camera.fx,
-            "fl_y": camera.fy,
-            "cx": camera.cx,
-            "cy": camera.cy,
-            "k1": camera.k1,
-            "k2": camera.k2,
-            "k3": camera.k3,
-            "k4": camera.k4,
-            "p1": camera.p1,
-            "p2": camera.p2,
-            "mask_path": f"masks/{frame.camera}.png",
-        }
-        found |= {LAYERS[layer].key: file for layer, file in files.items() if layer != "image"}
-        if "lidar" in layers:
-            found[DEPTH_KEY] = files["lidar"]
-        found |= {"camera": frame.camera, "frame": frame.frame}
-        if frame.timestamp_s is not None:
-            found["timestamp_s"] = frame.timestamp_s
-        return found
-
-    def view(shifted_view: ShiftedView) -> dict[str, Any]:
-        picture, distance = _shifted_files(shifted_view)
-        return {
-            "camera": shifted_view.camera,
-            "frame": shifted_view.frame,
-            "transform_matrix": matrix(shifted_view.camera_to_world),
-            LAYERS["truth_rgb"].key: picture,
-            LAYERS["truth_distance"].key: distance,
-        }
-
     any_fisheye = any(isinstance(camera, KannalaBrandt) for camera in scene_cameras.values())
     images = {held_out: [_frame_files(f, ())["image"] for f in frames if f.held_out == held_out] for held_out in (0, 1)}
     evaluation = images[True] or images[False]
@@ -824,7 +789,7 @@ def _transforms(
             }
             for name, fit in fits.items()
         },
-        "frames": [entry(frame) for frame in frames],
+        "frames": [_frame_entry(frame, scene_cameras[frame.camera], layers, offset) for frame in frames],
         "train_filenames": images[False],
         "val_filenames": evaluation,
         "test_filenames": evaluation,
@@ -835,6 +800,48 @@ def _transforms(
         ordered = sorted(shifted, key=lambda item: (item.metres, item.camera, item.frame))
         distances = sorted({item.metres for item in shifted})
         content["shifted_views"] = {
-            str(metres): [view(item) for item in ordered if item.metres == metres] for metres in distances
+            str(metres): [_shifted_entry(item, offset) for item in ordered if item.metres == metres]
+            for metres in distances
         }
     return content
+
+
+def _matrix(camera_to_world: Transform, offset: Float64[np.ndarray, "3"]) -> list[list[float]]:
+    """A pose as transforms.json has it: OpenGL's camera axes, the scene's origin."""
+    moved = camera_to_world.copy()
+    moved[:3, 3] -= offset
+    return opencv_to_opengl(moved).tolist()
+
+
+def _frame_entry(
+    frame: SceneFrame, camera: KannalaBrandt | Pinhole, layers: Collection[str], offset: Float64[np.ndarray, "3"]
+) -> dict[str, Any]:
+    files = _frame_files(frame, layers)
+    found: dict[str, Any] = {
+        "file_path": files["image"],
+        "transform_matrix": _matrix(frame.camera_to_world, offset),
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        **{name: getattr(camera, name) for name in ("cx", "cy", *DISTORTION)},
+        "mask_path": f"masks/{frame.camera}.png",
+    }
+    found |= {LAYERS[layer].key: file for layer, file in files.items() if layer != "image"}
+    if "lidar" in layers:
+        found[DEPTH_KEY] = files["lidar"]
+    found |= {"camera": frame.camera, "frame": frame.frame}
+    if frame.timestamp_s is not None:
+        found["timestamp_s"] = frame.timestamp_s
+    return found
+
+
+def _shifted_entry(view: ShiftedView, offset: Float64[np.ndarray, "3"]) -> dict[str, Any]:
+    picture, distance = _shifted_files(view)
+    return {
+        "camera": view.camera,
+        "frame": view.frame,
+        "transform_matrix": _matrix(view.camera_to_world, offset),
+        LAYERS["truth_rgb"].key: picture,
+        LAYERS["truth_distance"].key: distance,
+    }
