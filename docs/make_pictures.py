@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import shutil
+import tempfile
 from pathlib import Path
 
 import cv2
@@ -16,10 +18,12 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import write_atomically, write_png
 from edge_depth_nerf.integration import IntegrationOptions, integrate_depth
 from edge_depth_nerf.losses import edge_loss
 from edge_depth_nerf.mono.alignment import align
+from edge_depth_nerf.mono.error_model import TRUST_FILE
 from edge_depth_nerf.pictures import (
     DISTANCE,
     SIGMA,
@@ -36,6 +40,7 @@ from edge_depth_nerf.pictures import (
 from edge_depth_nerf.scene_reader import PictureMaps, SceneFolder, ScenePicture, read_scene
 
 ROOT = Path(__file__).resolve().parents[1]
+SAMPLE = ROOT / "data" / "sample_drive"
 MOMENT, CAMERA = 6, "image_02"
 """The picture that is shown, one of those trained on."""
 PANEL_PX = 360
@@ -44,6 +49,23 @@ CELL_PX = 32
 FIGURE_SIZE_IN = (8.0, 3.2)
 SOFTNESS_M = 0.25
 """Over about so much of a ray a trained surface is met."""
+
+
+def read_sample(folder: Path) -> SceneFolder:
+    """Read the sample drive as the repository has it, copied to a folder without the `.cache` that trainings leave.
+
+    Raises:
+        InputError: its calibration was made by other rules, or of other maps.
+
+    """
+    copied = shutil.copytree(SAMPLE, folder / SAMPLE.name, ignore=shutil.ignore_patterns(".cache"))
+    scene = read_scene(Path(copied))
+    if scene.trust is None:
+        raise InputError(
+            f"{SAMPLE / TRUST_FILE}: was not made of the maps beside it by the present rules, so the pictures would "
+            "show a prior without its calibration. Make the sample drive anew (data/README.md)."
+        )
+    return scene
 
 
 def draw_maps(scene: SceneFolder, picture: ScenePicture, maps: PictureMaps) -> NDArray[np.uint8]:
@@ -201,12 +223,18 @@ def draw_ray(path: Path) -> None:
 
 
 def make_pictures(output: Path) -> dict[str, float]:
-    """Write all pictures; gives the distances that the kernel's picture names, metres."""
-    scene = read_scene(ROOT / "data" / "sample_drive")
-    picture = next(each for each in scene.pictures if each.moment == MOMENT and each.camera == CAMERA)
-    maps = scene.maps(picture)
-    write_png(output / "method_maps.png", draw_maps(scene, picture, maps))
-    kernel, figures = draw_kernel(scene, maps)
+    """Write all pictures; gives the distances that the kernel's picture names, metres.
+
+    Raises:
+        InputError: the sample drive's calibration is not that of its maps.
+
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        scene = read_sample(Path(folder))
+        picture = next(each for each in scene.pictures if each.moment == MOMENT and each.camera == CAMERA)
+        maps = scene.maps(picture)
+        write_png(output / "method_maps.png", draw_maps(scene, picture, maps))
+        kernel, figures = draw_kernel(scene, maps)
     write_png(output / "method_kernel.png", kernel)
     # without the salt every run would name the parts of the drawing anew
     with rc_context({"svg.hashsalt": "edge-depth-nerf", "font.size": 9}):

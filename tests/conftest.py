@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import jaxtyping
@@ -23,6 +24,17 @@ def real_data() -> Path:
     if not REAL_DATA.is_dir():
         pytest.skip("no real data beside the checkout (they are not part of the project)")
     return REAL_DATA
+
+
+@pytest.fixture(scope="session")
+def sample_drive(tmp_path_factory) -> Iterator[Path]:
+    """A copy of the sample drive, without anybody's `.cache`, to be read; tests that write make their own."""
+    from scenes import copy_sample_drive
+
+    scene = copy_sample_drive(tmp_path_factory.mktemp("sample") / "sample_drive")
+    before = {path: path.stat().st_mtime_ns for path in scene.rglob("*")}
+    yield scene
+    assert {path: path.stat().st_mtime_ns for path in scene.rglob("*")} == before, "a test wrote into the shared copy"
 
 
 @pytest.fixture

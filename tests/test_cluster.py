@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -21,6 +20,7 @@ import psutil
 import pytest
 from drives import SEQUENCE, RoomDrive, write_room_drive
 from rich.console import Console
+from scenes import copy_sample_drive
 
 from edge_depth_nerf import cli, cluster
 from edge_depth_nerf.cluster import on_cluster
@@ -40,7 +40,6 @@ from edge_depth_nerf.tasks import Task, do_tasks, own_command
 dask = pytest.importorskip("dask")
 distributed = pytest.importorskip("distributed")
 
-ROOT = Path(__file__).parents[1]
 QUIET = Console(quiet=True)
 STEPS = """
 import sys, time
@@ -368,7 +367,7 @@ def test_a_drive_is_cut_as_by_hand(room: RoomDrive, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_comparison_goes_on_when_a_worker_is_killed(tmp_path: Path) -> None:
-    shutil.copytree(ROOT / "data" / "sample_drive", tmp_path / "sample")
+    copy_sample_drive(tmp_path / "sample")
     output = tmp_path / "out"
     asked = CompareOptions(
         scenes=(tmp_path / "sample",), output=output, methods=("nerfacto", "edge"), steps=8, cluster="local"

@@ -25,7 +25,7 @@ import torch
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.utils.eval_utils import eval_setup
 from rich.console import Console
-from scenes import write_scene
+from scenes import copy_sample_drive, write_scene
 from test_pipeline import build
 
 from edge_depth_nerf.compare import command, search, tables
@@ -48,7 +48,6 @@ from edge_depth_nerf.config import make_specifications, read_method_file
 from edge_depth_nerf.errors import InputError
 from edge_depth_nerf.files import read_image, read_json, write_json
 
-ROOT = Path(__file__).parents[1]
 QUIET = Console(quiet=True)
 
 
@@ -732,7 +731,7 @@ def test_a_search_writes_what_compare_takes(tmp_path, monkeypatch):
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("compare")
-    shutil.copytree(ROOT / "data" / "sample_drive", folder / "sample")
+    copy_sample_drive(folder / "sample")
     asked = options(folder / "sample", output=folder / "out", methods=("nerfacto", "edge"), steps=12, jobs=2)
     return asked, command.compare(asked, QUIET)
 

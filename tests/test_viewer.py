@@ -20,7 +20,7 @@ from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.viewer.utils import CameraState, get_camera, parse_object
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
 from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerElement
-from scenes import RADIUS_M, fisheye, pinhole, write_scene
+from scenes import RADIUS_M, copy_sample_drive, fisheye, pinhole, write_scene
 
 from edge_depth_nerf.cameras import KannalaBrandt
 from edge_depth_nerf.errors import InputError
@@ -28,7 +28,6 @@ from edge_depth_nerf.pictures import SIGMA, colour_distance
 from edge_depth_nerf.viewer import AZIMUTHS, RINGS, DriveLayers, _in_order, _spread, lens_cap, rim_rad
 
 METHOD = "edge-depth-nerf-lite"
-SAMPLE = Path(__file__).parents[1] / "data" / "sample_drive"
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 SOFTWARE_WEBGL = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 TIMEOUT_S = 120
@@ -256,7 +255,7 @@ def test_nothing_is_made_without_a_viewer(scene, monkeypatch):
 def training(tmp_path_factory) -> Iterator[SimpleNamespace]:
     """A training of the sample drive that goes on while it is looked at; `trainer`, `viewer`, `layers`."""
     folder = tmp_path_factory.mktemp("viewer")
-    shutil.copytree(SAMPLE, folder / "scene", ignore=shutil.ignore_patterns(".cache"))
+    copy_sample_drive(folder / "scene")
     config = deepcopy(all_methods[METHOD])
     config.data = config.pipeline.datamanager.data = folder / "scene"
     config.output_dir, config.timestamp, config.experiment_name = folder, "run", "viewer"
