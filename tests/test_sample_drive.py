@@ -59,7 +59,7 @@ def test_its_calibration_is_what_is_measured(sample_drive, tmp_path):
     shipped, found = read_trust(sample_drive / TRUST_FILE), calibrate_scene(copy_sample_drive(tmp_path / "scene"))
     assert found.made_of == shipped.made_of
     assert (found.everywhere, len(found.frames)) == (shipped.everywhere, len(shipped.frames)) == (True, 22)
-    np.testing.assert_allclose(numbers(found), numbers(shipped), atol=0.02)
+    np.testing.assert_allclose(numbers(found), numbers(shipped), atol=0.005)
 
 
 def numbers(trust: Trust) -> list[float]:
