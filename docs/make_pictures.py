@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import shutil
+import tempfile
 from pathlib import Path
 
 import cv2
@@ -16,6 +18,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import write_atomically, write_png
 from edge_depth_nerf.base.pictures import (
     DISTANCE,
@@ -34,9 +37,11 @@ from edge_depth_nerf.inspecting.shown_prior import ShownMaps, ShownScene
 from edge_depth_nerf.method.alignment import align
 from edge_depth_nerf.method.integration import IntegrationOptions, integrate_depth
 from edge_depth_nerf.method.losses import edge_loss
+from edge_depth_nerf.scene.format import TRUST_FILE
 from edge_depth_nerf.scene.reader import PictureMaps, read_scene
 
 ROOT = Path(__file__).resolve().parents[1]
+SAMPLE = ROOT / "data" / "sample_drive"
 MOMENT, CAMERA = 6, "image_02"
 """The picture that is shown, one of those trained on."""
 PANEL_PX = 360
@@ -45,6 +50,23 @@ CELL_PX = 32
 FIGURE_SIZE_IN = (8.0, 3.2)
 SOFTNESS_M = 0.25
 """Over about so much of a ray a trained surface is met."""
+
+
+def read_sample(folder: Path) -> ShownScene:
+    """Read the sample drive as the repository has it, copied to a folder without the `.cache` that trainings leave.
+
+    Raises:
+        InputError: its calibration was made by other rules, or of other maps.
+
+    """
+    copied = shutil.copytree(SAMPLE, folder / SAMPLE.name, ignore=shutil.ignore_patterns(".cache"))
+    scene = ShownScene(read_scene(Path(copied)))
+    if scene.trust is None:
+        raise InputError(
+            f"{SAMPLE / TRUST_FILE}: was not made of the maps beside it by the present rules, so the pictures would "
+            "show a prior without its calibration. Make the sample drive anew (data/README.md)."
+        )
+    return scene
 
 
 def draw_maps(scene: ShownScene, maps: ShownMaps) -> NDArray[np.uint8]:
@@ -193,12 +215,18 @@ def draw_ray(path: Path) -> None:
 
 
 def make_pictures(output: Path) -> dict[str, float]:
-    """Write all pictures; gives the distances that the kernel's picture names, metres."""
-    scene = ShownScene(read_scene(ROOT / "data" / "sample_drive"))
-    picture = next(each for each in scene.scene.pictures if each.moment == MOMENT and each.camera == CAMERA)
-    maps = scene.maps(picture)
-    write_png(output / "method_maps.png", draw_maps(scene, maps))
-    kernel, figures = draw_kernel(scene, maps)
+    """Write all pictures; gives the distances that the kernel's picture names, metres.
+
+    Raises:
+        InputError: the sample drive's calibration is not that of its maps.
+
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        scene = read_sample(Path(folder))
+        picture = next(each for each in scene.scene.pictures if each.moment == MOMENT and each.camera == CAMERA)
+        maps = scene.maps(picture)
+        write_png(output / "method_maps.png", draw_maps(scene, maps))
+        kernel, figures = draw_kernel(scene, maps)
     write_png(output / "method_kernel.png", kernel)
     # without the salt every run would name the parts of the drawing anew
     with rc_context({"svg.hashsalt": "edge-depth-nerf", "font.size": 9}):

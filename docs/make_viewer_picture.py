@@ -2,8 +2,9 @@
 
 python docs/make_viewer_picture.py --load-config outputs/sample_drive/edge-depth-nerf-lite/DATE/config.yml
 
-It needs Chromium and Playwright (`pip install playwright`). What is seen depends on the training; the picture in the
-repository is of 300 steps on the sample drive.
+The scene is copied without its `.cache`, so that what earlier trainings left there is not seen. It needs Chromium and
+Playwright (`pip install playwright`). What is seen depends on the training; the picture in the repository is of 300
+steps on the sample drive.
 """
 
 from __future__ import annotations
@@ -15,9 +16,11 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from nerfstudio.data.datasets.base_dataset import InputDataset
+from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils.eval_utils import eval_setup
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
 from playwright.sync_api import sync_playwright
@@ -36,14 +39,23 @@ def take_picture(load_config: Path, output: Path) -> None:
     chromium = shutil.which("chromium") or shutil.which("chromium-browser")
     if chromium is None:
         sys.exit("No Chromium on this machine (Debian: apt-get install chromium).")
-    config, pipeline, _, step = eval_setup(load_config, test_mode="test")
-    dataset, settings = pipeline.datamanager.train_dataset, config.viewer
-    assert dataset is not None
-    settings.websocket_host, settings.default_composite_depth = "127.0.0.1", False
-    with socket.socket() as probe:
-        probe.bind((settings.websocket_host, 0))
-        settings.websocket_port = probe.getsockname()[1]
     with tempfile.TemporaryDirectory() as folder:
+
+        def of_a_copy(config: TrainerConfig) -> TrainerConfig:
+            datamanager: Any = config.pipeline.datamanager
+            scene = Path(datamanager.data or datamanager.dataparser.data)
+            datamanager.data = shutil.copytree(
+                scene, Path(folder) / scene.name, ignore=shutil.ignore_patterns(".cache")
+            )
+            return config
+
+        config, pipeline, _, step = eval_setup(load_config, test_mode="test", update_config_callback=of_a_copy)
+        dataset, settings = pipeline.datamanager.train_dataset, config.viewer
+        assert dataset is not None
+        settings.websocket_host, settings.default_composite_depth = "127.0.0.1", False
+        with socket.socket() as probe:
+            probe.bind((settings.websocket_host, 0))
+            settings.websocket_port = probe.getsockname()[1]
         viewer = Viewer(settings, Path(folder) / "log.txt", pipeline.datamanager.get_datapath(), pipeline)
         viewer.init_scene(dataset, "completed")
         viewer.update_scene(step)

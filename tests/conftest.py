@@ -99,6 +99,17 @@ def nothing_large_is_left(request: pytest.FixtureRequest, tmp_path_factory: pyte
                     path.unlink()
 
 
+@pytest.fixture(scope="session")
+def sample_drive(tmp_path_factory) -> Iterator[Path]:
+    """A copy of the sample drive, without anybody's `.cache`, to be read; tests that write make their own."""
+    from scenes import copy_sample_drive
+
+    scene = copy_sample_drive(tmp_path_factory.mktemp("sample") / "sample_drive")
+    before = {path: path.stat().st_mtime_ns for path in scene.rglob("*")}
+    yield scene
+    assert {path: path.stat().st_mtime_ns for path in scene.rglob("*")} == before, "a test wrote into the shared copy"
+
+
 @pytest.fixture
 def unchecked_types():
     """Switch the tests' type checker off, to reach the package's own errors."""

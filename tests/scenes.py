@@ -1,7 +1,8 @@
-"""Small scene folders with a known truth: cameras inside a ball of 6 m with a coloured wall."""
+"""Small scene folders with a known truth: cameras inside a ball of 6 m with a coloured wall; the sample drive."""
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,14 @@ import torch
 from edge_depth_nerf.base.files import write_distance_png, write_json, write_mask, write_png
 from edge_depth_nerf.cameras import Camera, KannalaBrandt, Pinhole
 
+SAMPLE_DRIVE = Path(__file__).resolve().parents[1] / "data" / "sample_drive"
 RADIUS_M = 6.0
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV camera axes to OpenGL's
+
+
+def copy_sample_drive(folder: Path) -> Path:
+    """Copy data/sample_drive as the repository has it: without the `.cache` of those who trained on it."""
+    return Path(shutil.copytree(SAMPLE_DRIVE, folder, ignore=shutil.ignore_patterns(".cache")))
 
 
 def fisheye(width: int = 32, height: int = 28) -> KannalaBrandt:

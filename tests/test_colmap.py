@@ -15,9 +15,10 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import read_mask, write_distance_png, write_mask, write_png
+from edge_depth_nerf.base.files import read_image, read_mask, write_distance_png, write_mask, write_png
 from edge_depth_nerf.cameras import MEI, KannalaBrandt, Pinhole
 from edge_depth_nerf.lidar import Sweep, SweepTiming
+from edge_depth_nerf.process.colmap import models as colmap_models
 from edge_depth_nerf.process.colmap.models import ColmapModel, SparseView, colmap_lens
 from edge_depth_nerf.process.colmap.poses import NOT_REGISTERED, colmap_poses
 from edge_depth_nerf.process.colmap.scale import join_models, metric_path
@@ -492,25 +493,107 @@ def test_an_interrupted_run_goes_on(found, tmp_path, monkeypatch):
     assert sum(seen[2]) == 0 < sum(seen[3])
 
 
-@pytest.mark.slow
-def test_masked_pixels_have_no_features(drive, found, tmp_path):
-    import pycolmap
-
-    options, _ = found
+def half_masked(drive: Path, folder: Path) -> Path:
+    """Masks that keep the left half of each picture."""
     keep = np.zeros((SIZE, SIZE), bool)
     keep[:, : SIZE // 2] = True
     for name in ("image_02", "image_03"):
-        write_mask(tmp_path / "ego" / f"{name}.png", keep & read_mask(drive / "truth" / "masks" / f"{name}.png"))
-    options = dataclasses.replace(options, output=tmp_path / "scene", ego_mask=tmp_path / "ego", frames=5)
-    colmap_poses(read_kitti360(options), options, QUIET)
-    models = sorted((tmp_path / ".scene.colmap" / "models").iterdir())
-    pixels = np.concatenate(
-        [
-            [point.xy for point in image.points2D]
-            for model in models
-            for image in pycolmap.Reconstruction(model).images.values()
-            if image.num_points2D()
-        ]
+        write_mask(folder / f"{name}.png", keep & read_mask(drive / "truth" / "masks" / f"{name}.png"))
+    return folder
+
+
+@pytest.mark.slow
+def test_masked_pixels_have_no_features(drive, tmp_path, monkeypatch):
+    pycolmap = pytest.importorskip("pycolmap")
+
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    def features(name: str, **masked) -> np.ndarray:
+        sequence, output = SynthesizeOptions(drive).sequence, tmp_path / name
+        options = Kitti360Options(root=drive, sequence=sequence, output=output, poses="colmap", frames=2, **masked)
+        with pytest.raises(KeyboardInterrupt):
+            colmap_poses(read_kitti360(options), options, QUIET)
+        with contextlib.closing(pycolmap.Database.open(tmp_path / f".{name}.colmap" / "database.db")) as opened:
+            found = [opened.read_keypoints(image.image_id) for image in opened.read_all_images()]
+        assert len(found) == 4
+        return np.concatenate([points[:, :2] for points in found])
+
+    # what becomes of the features is another matter
+    monkeypatch.setattr(pycolmap, "match_image_pairs", interrupted)
+    masked = features("masked", ego_mask=half_masked(drive, tmp_path / "ego"))
+    assert len(masked) > 200
+    assert masked[:, 0].max() < SIZE // 2
+    assert (features("whole")[:, 0] > SIZE // 2).sum() > 100
+
+
+# ---- short recordings of small pictures ------------------------------------------------------------------------
+
+
+def five_moments(drive: Path, folder: Path, noise: int) -> tuple[Recording, Kitti360Options]:
+    """Half of each picture masked, and with other noise of one grey value, as if taken again."""
+    options = Kitti360Options(
+        root=drive,
+        sequence=SynthesizeOptions(drive).sequence,
+        output=folder / "scene",
+        poses="colmap",
+        frames=5,
+        ego_mask=half_masked(drive, folder / "ego"),
     )
-    assert len(pixels) > 200
-    assert pixels[:, 0].max() < SIZE // 2
+    recording = read_kitti360(options)
+    rng = np.random.default_rng(noise)
+    pictures = []
+    for picture in recording.pictures:
+        pixels = read_image(picture.path).astype(int)
+        path = folder / "noisy" / picture.camera / picture.path.name
+        write_png(path, np.clip(pixels + pixels.any() * rng.integers(-1, 2, pixels.shape), 0, 255).astype(np.uint8))
+        pictures.append(dataclasses.replace(picture, path=path))
+    return dataclasses.replace(recording, pictures=tuple(pictures)), options
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [2, 3, 5, 7])
+def test_five_moments_are_enough(drive, tmp_path, noise):
+    """With COLMAP's own demands on a picture all four of these end with a model of two pictures."""
+    pytest.importorskip("pycolmap")
+    found = colmap_poses(*five_moments(drive, tmp_path, noise), QUIET)
+    assert found.trajectory is not None
+    truth = true_poses(drive)
+    assert sorted({picture.frame for picture in found.pictures}) == list(range(5))
+    places, true = found.trajectory.vehicle_to_world[:, :3, 3], np.stack([truth[f][:3, 3] for f in range(5)])
+    path_m = np.linalg.norm(true[-1] - true[0])
+    factor, error_m = umeyama(places, true)
+    assert error_m.max() < 0.02 * path_m
+    assert abs(1 / factor - 1) < 0.1
+
+
+@pytest.mark.slow
+def test_a_model_of_two_pictures_is_not_the_end(drive, tmp_path, monkeypatch):
+    pytest.importorskip("pycolmap")
+    paths = []
+    for number, pose_points in enumerate(((10_000, 15), (15,))):
+        monkeypatch.setattr(colmap_models, "_POSE_POINTS", pose_points)
+        found = colmap_poses(*five_moments(drive, tmp_path / str(number), 1), QUIET)
+        assert found.trajectory is not None
+        paths.append(found.trajectory.vehicle_to_world)
+    np.testing.assert_array_equal(*paths)
+    # such a model alone says so, and not that LiDAR saw nothing
+    monkeypatch.setattr(colmap_models, "_POSE_POINTS", (10_000,))
+    with pytest.raises(InputError, match="COLMAP found no poses for the 10 pictures"):
+        colmap_poses(*five_moments(drive, tmp_path / "two", 1), QUIET)
+
+
+@pytest.mark.slow
+def test_most_pictures_decide_which_models_are_kept(drive, tmp_path, monkeypatch):
+    """What was tried later counts only if it gives more pictures a pose."""
+    pytest.importorskip("pycolmap")
+    monkeypatch.setattr(colmap_models, "_POSE_POINTS", (15, 10_000))
+    monkeypatch.setattr(colmap_models, "_ENOUGH", 2.0)
+    found = colmap_poses(*five_moments(drive, tmp_path, 1), QUIET)
+    assert len({picture.frame for picture in found.pictures}) == 5
+    assert sorted(path.name for path in (tmp_path / ".scene.colmap").iterdir()) == [
+        "inputs.json",
+        "models",
+        "models.json",
+        "pairs.txt",
+    ]

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import torch
-from scenes import write_scene
+from scenes import copy_sample_drive, write_scene
 from trainings import trainer_of
 
 HERE = Path(__file__).parent
@@ -86,7 +86,7 @@ def test_the_first_process_saves_what_one_alone_reads(ranks: list[dict[str, Any]
 @pytest.mark.slow
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="wants two GPUs")
 def test_two_gpus_train_together(tmp_path: Path) -> None:
-    command = ["ns-train", "edge-depth-nerf-lite", "--data", str(HERE.parent / "data" / "sample_drive")]
+    command = ["ns-train", "edge-depth-nerf-lite", "--data", str(copy_sample_drive(tmp_path / "scene"))]
     command += ["--machine.num-devices", "2", "--max-num-iterations", "30", "--vis", "tensorboard"]
     command += ["--output-dir", str(tmp_path), "--timestamp", "run"]
     program = Path(sys.executable).with_name(command[0])

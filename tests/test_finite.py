@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scenes import SAMPLE_DRIVE, copy_sample_drive
 from trainings import trainer_of
 
 from edge_depth_nerf.base.errors import InputError
@@ -21,7 +22,6 @@ from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss, proposal_lo
 from edge_depth_nerf.method.integration import IntegrationOptions, integrate_depth, select_prior, sigma_m
 from edge_depth_nerf.method.losses import edge_loss
 
-SAMPLE = Path(__file__).resolve().parent.parent / "data" / "sample_drive"
 HALVES = [torch.float16, torch.bfloat16]
 
 # ---- losses ----------------------------------------------------------------------------------------------------
@@ -133,7 +133,7 @@ def test_maps_of_next_to_nothing(shape: tuple[int, ...]) -> None:
 
 def copied(folder: Path, moments: int = 6) -> Path:
     """A camera's first moments of the sample drive."""
-    shutil.copytree(SAMPLE, folder, ignore=shutil.ignore_patterns(".cache", "truth"))
+    copy_sample_drive(folder)
     meta = read_json(folder / "transforms.json")
     kept = [f for f in meta["frames"] if f["camera"] == "image_02" and f["frame"] < moments]
     for frame in kept:
@@ -386,4 +386,4 @@ def test_pictures_stay_as_they_were(tmp_path: Path) -> None:
     """The copies above, not the sample drive itself, are spoiled."""
     scene = copied(tmp_path / "scene")
     paint(0)(scene)
-    assert read_image(every(SAMPLE, "images")[0]).any()
+    assert read_image(every(SAMPLE_DRIVE, "images")[0]).any()

@@ -53,9 +53,6 @@ from edge_depth_nerf.scene.reader import read_scene
 
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).parents[1]
-SAMPLE = ROOT / "data" / "sample_drive"
-
 
 def look(scene: Path, output: Path, **options: Any) -> dict[str, Any]:
     return inspect_scene(InspectOptions(scene, output, **{"size": 64, **options}), Console(quiet=True))
@@ -65,21 +62,21 @@ def look(scene: Path, output: Path, **options: Any) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def sample(tmp_path_factory):
+def sample(sample_drive, tmp_path_factory):
     """The summary of the sample drive, where it was written, and the scene's files before and after."""
     output = tmp_path_factory.mktemp("inspection") / "out"
 
     def files() -> list[Path]:
-        return sorted(path for path in SAMPLE.rglob("*") if ".cache" not in path.parts)
+        return sorted(sample_drive.rglob("*"))
 
     before = files()
-    summary = look(SAMPLE, output, frames=2)
+    summary = look(sample_drive, output, frames=2)
     assert files() == before  # a look changes nothing
     return summary, output
 
 
-def frames_of(camera: str) -> list[dict[str, Any]]:
-    frames = read_json(SAMPLE / "transforms.json")["frames"]
+def frames_of(scene: Path, camera: str) -> list[dict[str, Any]]:
+    frames = read_json(scene / "transforms.json")["frames"]
     return sorted((frame for frame in frames if frame["camera"] == camera), key=lambda frame: frame["frame"])
 
 
@@ -92,12 +89,12 @@ def test_what_is_returned_is_what_is_written(sample):
     assert summary["warnings"] == []
 
 
-def test_its_counts(sample):
+def test_its_counts(sample, sample_drive):
     summary, _ = sample
     assert (summary["pictures"], summary["moments"], summary["training"], summary["held_out"]) == (24, 12, 22, 2)
-    header = (SAMPLE / "points.ply").read_bytes()[:200].decode("latin1")
+    header = (sample_drive / "points.ply").read_bytes()[:200].decode("latin1")
     assert summary["points"] == int(header.split("element vertex ")[1].split()[0])
-    recorded = read_json(SAMPLE / "transforms.json")["camera_fits"]
+    recorded = read_json(sample_drive / "transforms.json")["camera_fits"]
     for name, camera in summary["cameras"].items():
         assert camera["fit_rms_px"] == recorded[name]["rms_px"]
         assert camera["fit_max_px"] == recorded[name]["max_px"]
@@ -106,28 +103,28 @@ def test_its_counts(sample):
         assert (camera["model"], camera["original_model"]) == ("KANNALA_BRANDT", "MEI")
 
 
-def test_its_path(sample):
+def test_its_path(sample, sample_drive):
     path = sample[0]["path"]
-    poses = [frame["transform_matrix"] for frame in frames_of(path["camera"])]
+    poses = [frame["transform_matrix"] for frame in frames_of(sample_drive, path["camera"])]
     steps = [sum((after[row][3] - before[row][3]) ** 2 for row in range(3)) ** 0.5 for before, after in pairwise(poses)]
     assert path["length_m"] == pytest.approx(sum(steps), rel=1e-5)
     assert path["spacing_median_m"] == pytest.approx(sorted(steps)[5], rel=1e-5)
     assert path["spacing_max_m"] == pytest.approx(max(steps), rel=1e-5)
-    times = [frame["timestamp_s"] for frame in frames_of(path["camera"])]
+    times = [frame["timestamp_s"] for frame in frames_of(sample_drive, path["camera"])]
     assert path["duration_s"] == pytest.approx(times[-1] - times[0], rel=1e-5)
     assert path["speed_mean_mps"] == pytest.approx(sum(steps) / (times[-1] - times[0]), rel=1e-5)
 
 
 @pytest.mark.parametrize("camera", ["image_02", "image_03"])
-def test_its_maps(sample, camera):
+def test_its_maps(sample, sample_drive, camera):
     """Everything counted again with OpenCV, from the files."""
     coverages, monos, used, ratios, lidars, errors = [], [], [], [], [], []
-    for frame in frames_of(camera):
+    for frame in frames_of(sample_drive, camera):
         lidar, mono = (
-            cv2.imread(str(SAMPLE / frame[f"{layer}_file_path"]), cv2.IMREAD_UNCHANGED) / 256
+            cv2.imread(str(sample_drive / frame[f"{layer}_file_path"]), cv2.IMREAD_UNCHANGED) / 256
             for layer in ("lidar", "mono")
         )
-        mask = cv2.imread(str(SAMPLE / frame["mask_path"]), cv2.IMREAD_GRAYSCALE) > 0
+        mask = cv2.imread(str(sample_drive / frame["mask_path"]), cv2.IMREAD_GRAYSCALE) > 0
         coverages.append(((lidar > 0) & mask).sum() / mask.sum())
         monos.append(((mono > 0) & mask).sum() / mask.sum())
         used.append(mask.mean())
@@ -150,24 +147,26 @@ def test_its_maps(sample, camera):
     assert 0.4 < min(monos) and max(monos) < 0.9
     assert found["mono_coverage"]["mean"] == pytest.approx(np.mean(monos), rel=2e-3)
     # maps that were made elsewhere count beyond LiDAR's field, too
-    assert read_json(SAMPLE / "transforms.json")["source"]["mono_trained_on"] == "elsewhere"
+    assert read_json(sample_drive / "transforms.json")["source"]["mono_trained_on"] == "elsewhere"
     assert found["prior_share"]["mean"] == pytest.approx(np.mean(monos), abs=0.005)
     assert found["no_prior_share"] == pytest.approx(1 - found["prior_share"]["mean"], abs=1e-3)
     assert 0.01 < found["prior_against_truth_abs_rel"] < 0.2
     assert 0.05 <= found["sigma_median_m"] < 5
 
 
-def test_a_sheet_shows_the_maps(sample):
+def test_a_sheet_shows_the_maps(sample, sample_drive):
     """The picture is where it should be, and the truth beside it has the truth's colours."""
     _, output = sample
     sheet = read_image(output / "image_02_0000000003.png")
     # two rows of four panels of 64 px, under two lines
     assert sheet.shape == (2 * 28 + 2 * (64 + 70 + 14), 4 * (64 + 14), 3)
     top, left = 2 * 28 + 7 + 30, 7
-    picture = cv2.resize(read_image(SAMPLE / "images/image_02/0000000003.png"), (64, 64), interpolation=cv2.INTER_AREA)
+    picture = cv2.resize(
+        read_image(sample_drive / "images/image_02/0000000003.png"), (64, 64), interpolation=cv2.INTER_AREA
+    )
     assert (sheet[top : top + 64, left : left + 64] == picture).all()
-    truth = read_distance_png(SAMPLE / "truth/image_02/distance/0000000003.png")
-    mask = cv2.imread(str(SAMPLE / "masks/image_02.png"), cv2.IMREAD_GRAYSCALE) > 0
+    truth = read_distance_png(sample_drive / "truth/image_02/distance/0000000003.png")
+    mask = cv2.imread(str(sample_drive / "masks/image_02.png"), cv2.IMREAD_GRAYSCALE) > 0
     below, third = top + 64 + 70 + 14, left + 2 * (64 + 14)
     shown = sheet[below : below + 64, third : third + 64]
     expected = colour_distance(truth, mask)
@@ -175,9 +174,9 @@ def test_a_sheet_shows_the_maps(sample):
     assert max((shown == candidate).all(-1).mean() for candidate in candidates) > 0.99
 
 
-def test_the_figures_in_the_terminal(tmp_path):
+def test_the_figures_in_the_terminal(sample_drive, tmp_path):
     console = Console(record=True, width=100, file=(tmp_path / "log").open("w"))
-    inspect_scene(InspectOptions(SAMPLE, tmp_path / "out", frames=1, size=64), console)
+    inspect_scene(InspectOptions(sample_drive, tmp_path / "out", frames=1, size=64), console)
     said = console.export_text()
     for words in (
         "22 for training, 2 held out",

@@ -304,9 +304,9 @@ def test_estimate_depth_killed_after_its_weights_were_saved(
     assert [name for name in expected if found[name] != expected[name]] == []
 
 
-def test_weights_that_were_read_predict_what_trained_ones_did() -> None:
+def test_weights_that_were_read_predict_what_trained_ones_did(sample_drive: Path) -> None:
     """Trained ones lie in another order in memory, and convolutions then add up otherwise."""
-    scene = read_scene(Path(__file__).resolve().parent.parent / "data" / "sample_drive")
+    scene = read_scene(sample_drive)
     scene = replace(scene, pictures=scene.pictures[:1])
     torch.manual_seed(0)
     network = DepthNetwork(NetworkSettings((16, 32, 64), 128, 1.6, 10.0)).eval()

@@ -405,19 +405,16 @@ def test_incomplete_blocks_of_large_pictures() -> None:
 # ---- a drive, and the real frame -------------------------------------------------------------------------------
 
 
-SAMPLE = Path(__file__).parents[1] / "data" / "sample_drive"
-
-
 @pytest.mark.parametrize("name", ["image_02", "image_03"])
-def test_masks_of_the_sample_drive(name: str) -> None:
-    meta = read_json(SAMPLE / "transforms.json")
+def test_masks_of_the_sample_drive(sample_drive: Path, name: str) -> None:
+    meta = read_json(sample_drive / "transforms.json")
     frames = [frame for frame in meta["frames"] if frame["camera"] == name]
     camera = camera_from_dict(meta["original_cameras"][name], "the sample drive")
-    circle, used = lens.lens_circle(camera, meta["theta_max_deg"]), read_mask(SAMPLE / f"masks/{name}.png")
-    rim = lens.dark_rim(read_image(SAMPLE / frame["file_path"]) for frame in frames[::4])
+    circle, used = lens.lens_circle(camera, meta["theta_max_deg"]), read_mask(sample_drive / f"masks/{name}.png")
+    rim = lens.dark_rim(read_image(sample_drive / frame["file_path"]) for frame in frames[::4])
     assert rim is not None
     assert iou(rim, lens.lens_circle(camera, 98.0)) > 0.97
-    found = ego.find_ego([partial(read_image, SAMPLE / frame["file_path"]) for frame in frames], circle)
+    found = ego.find_ego([partial(read_image, sample_drive / frame["file_path"]) for frame in frames], circle)
     assert isinstance(found, ego.EgoMask)
     assert found.certainty > 0.8
     assert iou(circle & ~found.keep, circle & ~used) > 0.95
@@ -425,9 +422,9 @@ def test_masks_of_the_sample_drive(name: str) -> None:
     for frame in frames[::5]:
         # the camera's axes are OpenGL's, the world's z points up
         up = np.array(frame["transform_matrix"])[2, :3] * (1, -1, -1)
-        truth = read_distance_png(SAMPLE / frame["truth_distance_file_path"])
-        returns, mono = (read_distance_png(SAMPLE / frame[f"{kind}_file_path"]) for kind in ("lidar", "mono"))
-        found_sky = sky.find_sky(read_image(SAMPLE / frame["file_path"]), used, up, camera, returns, mono)
+        truth = read_distance_png(sample_drive / frame["truth_distance_file_path"])
+        returns, mono = (read_distance_png(sample_drive / frame[f"{kind}_file_path"]) for kind in ("lidar", "mono"))
+        found_sky = sky.find_sky(read_image(sample_drive / frame["file_path"]), used, up, camera, returns, mono)
         true = used & (truth == 0)
         assert (found_sky & true).sum() > 0.95 * true.sum()
         assert (found_sky & (truth > 0) & (truth < 80)).sum() < 0.02 * found_sky.sum()

@@ -24,10 +24,11 @@ import pytest
 import torch
 import tyro
 import yaml
+from scenes import copy_sample_drive
 
 from edge_depth_nerf import cli
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import read_distance_png, read_image, read_json
+from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, write_json
 from edge_depth_nerf.entry import DEBUG_OPTION
 
 ROOT = Path(__file__).parents[1]
@@ -302,10 +303,30 @@ def test_the_pictures_are_current(tmp_path):
     assert sum(path.stat().st_size for path in committed) < 1 << 20
 
 
-def test_the_kernel_picture_is_of_eq_7():
+def test_the_pictures_do_not_depend_on_what_trainings_left(sample_drive, tmp_path, monkeypatch):
+    """A calibration in .cache does not stand in for one that the repository's sample drive lacks."""
+    module, scene = load("make_pictures"), copy_sample_drive(tmp_path / "sample_drive")
+    shipped = scene / "mono_trust.json"
+    (scene / ".cache").mkdir()
+    shutil.copy(shipped, scene / ".cache" / f"mono_trust_{read_json(shipped)['made_of']}.json")
+    shipped.unlink()
+    monkeypatch.setattr(module, "SAMPLE", scene)
+    with pytest.raises(InputError, match="was not made of the maps beside it"):
+        module.make_pictures(tmp_path)
+    # it would have been taken: a stale one has the same effect
+    shutil.copy(sample_drive / "mono_trust.json", shipped)
+    stale = {**read_json(shipped), "made_of": "0"}
+    del stale["sha256"]
+    write_json(shipped, stale)
+    assert module.read_scene(scene).trust is not None
+    with pytest.raises(InputError, match="was not made of the maps beside it"):
+        module.make_pictures(tmp_path)
+
+
+def test_the_kernel_picture_is_of_eq_7(sample_drive):
     """The two averages again, Eq. 5 to 7 written out."""
     module = load("make_pictures")
-    scene = module.ShownScene(module.read_scene(ROOT / "data" / "sample_drive"))
+    scene = module.ShownScene(module.read_scene(sample_drive))
     picture = next(
         each for each in scene.scene.pictures if each.moment == module.MOMENT and each.camera == module.CAMERA
     )
@@ -398,9 +419,10 @@ def test_what_loads_elsewhere_is_noticed(tmp_path):
 
 
 def test_links_and_pictures_of_the_site_are_there(site):
-    for page in site.rglob("*.html"):
-        if page.name == "404.html":
-            continue  # its links are from the server's root
+    # the links of 404.html are from the server's root
+    pages = [page for page in site.rglob("*.html") if page.name != "404.html"]
+    assert len(pages) > 10
+    for page in pages:
         found = References(page)
         local = [each for each in (*found.loads, *found.links) if not re.match(r"([a-z]+:|//|#|$)", each)]
         assert local, page
@@ -438,7 +460,7 @@ def test_included_code_is_shown(site):
 @pytest.fixture
 def clone(tmp_path) -> Path:
     """A folder with what commands of the pages use of the repository; the scene is written into."""
-    shutil.copytree(ROOT / "data", tmp_path / "data", ignore=shutil.ignore_patterns(".cache"))
+    copy_sample_drive(tmp_path / "data/sample_drive")
     shutil.copytree(DOCS / "examples", tmp_path / "docs" / "examples", ignore=shutil.ignore_patterns("__pycache__"))
     return tmp_path
 
@@ -487,7 +509,7 @@ def test_the_examples_as_they_are_typed(clone):
     (config,) = (clone / "outputs/sample_drive/ratio").glob("*/config.yml")
     assert "ratio_delta: 0.2" in config.read_text()
     # the flat road: every map is there, and of the road it is right
-    meta = read_json(clone / "data/sample_drive/transforms.json")
+    meta = read_json(clone / "scenes/flat_road/transforms.json")
     assert meta["mono"]["trained_on"] == "elsewhere"
     assert len(list((clone / "maps").rglob("*.npy"))) == len(meta["frames"]) == 24
     assert "mean relative error" in said
@@ -511,7 +533,7 @@ def test_a_new_source_of_depth_reaches_the_prior(tmp_path, monkeypatch):
     monkeypatch.setitem(scene_format.LAYERS, "radar", None)  # taken out again at the end
     module = load("examples/new_depth_source")
     scene = tmp_path / "scene"
-    shutil.copytree(ROOT / "data" / "sample_drive", scene, ignore=shutil.ignore_patterns(".cache"))
+    copy_sample_drive(scene)
     module.main(scene)
     read = module.read_scene(scene)
     picture = read.pictures[0]
@@ -566,10 +588,10 @@ def test_the_example_of_a_loss_is_a_method_of_its_own():
     assert lite.method_name == "edge-depth-nerf-lite" and made.method_name == "ratio"
 
 
-def test_the_example_of_a_network():
+def test_the_example_of_a_network(sample_drive):
     """On the road, distances are those of a plane below the camera."""
     module = load("examples/new_network")
-    scene = load("make_pictures").read_scene(ROOT / "data" / "sample_drive")
+    scene = load("make_pictures").read_scene(sample_drive)
     picture = scene.pictures[0]
     predicted = module.predict(read_image(picture.files["image"]), picture)
     rays, valid = picture.lens.unproject(picture.lens.pixel_centres())

@@ -2,38 +2,43 @@
 
 from __future__ import annotations
 
-import shutil
+import dataclasses
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
+from scenes import copy_sample_drive
 
 from edge_depth_nerf.base.files import read_distance_png, read_json, read_mask
+from edge_depth_nerf.method.error_model import Trust, read_trust
+from edge_depth_nerf.method.prior import PriorOptions
+from edge_depth_nerf.mono.calibration import calibrate_scene, saved_trust
+from edge_depth_nerf.scene.format import TRUST_FILE
+from edge_depth_nerf.scene.reader import read_scene
 
-ROOT = Path(__file__).parents[1]
-SAMPLE = ROOT / "data" / "sample_drive"
 
-
-def test_it_is_small_and_whole():
-    files = [path for path in SAMPLE.rglob("*") if path.is_file() and ".cache" not in path.parts]
+def test_it_is_small_and_whole(sample_drive):
+    files = [path for path in sample_drive.rglob("*") if path.is_file()]
     assert sum(path.stat().st_size for path in files) <= 3_000_000
-    transforms = read_json(SAMPLE / "transforms.json")
+    transforms = read_json(sample_drive / "transforms.json")
     assert len(transforms["frames"]) == 24
     for frame in transforms["frames"]:
         for key, name in frame.items():
             if key.endswith("_path"):
-                assert (SAMPLE / name).is_file(), name
+                assert (sample_drive / name).is_file(), name
     assert not set(transforms["train_filenames"]) & set(transforms["test_filenames"])
 
 
-def test_its_maps_agree():
+def test_its_maps_agree(sample_drive):
     """LiDAR, monocular distance and truth of a frame are of one world."""
-    for frame in read_json(SAMPLE / "transforms.json")["frames"][::5]:
+    frames = read_json(sample_drive / "transforms.json")["frames"][::5]
+    assert frames
+    for frame in frames:
         lidar, mono, truth = (
-            read_distance_png(SAMPLE / frame[f"{name}_file_path"]) for name in ("lidar", "mono", "truth_distance")
+            read_distance_png(sample_drive / frame[f"{name}_file_path"]) for name in ("lidar", "mono", "truth_distance")
         )
-        mask = read_mask(SAMPLE / frame["mask_path"])
+        mask = read_mask(sample_drive / frame["mask_path"])
         returns = (lidar > 0) & (truth > 0)
         assert returns.sum() > 300
         assert not (lidar > 0)[~mask].any()
@@ -44,9 +49,42 @@ def test_its_maps_agree():
         assert 0.01 < np.median(np.abs(mono[both] / truth[both] - 1)) < 0.2
 
 
+def test_its_calibration_is_accepted(sample_drive):
+    """The folder's own file, without any cache; where this fails, the sample drive has to be made anew."""
+    assert not (sample_drive / ".cache").exists()
+    found = saved_trust(read_scene(sample_drive), PriorOptions())
+    assert found is not None and found == read_trust(sample_drive / TRUST_FILE)
+    assert found.drive_fit is not None and found.error_model is not None
+
+
+def test_its_calibration_is_what_is_measured(sample_drive, tmp_path):
+    """Measured again it is of the same files, with the same figures but for the order in which a processor adds."""
+    shipped, found = read_trust(sample_drive / TRUST_FILE), calibrate_scene(copy_sample_drive(tmp_path / "scene"))
+    assert found.made_of == shipped.made_of
+    assert (found.everywhere, len(found.frames)) == (shipped.everywhere, len(shipped.frames)) == (True, 22)
+    np.testing.assert_allclose(numbers(found), numbers(shipped), atol=0.005)
+
+
+def numbers(trust: Trust) -> list[float]:
+    """Fits, logarithms of factors, angles and relative errors, in one order."""
+    assert trust.drive_fit is not None and trust.error_model is not None and trust.return_model is not None
+    found = [*trust.field_rad, *dataclasses.astuple(trust.drive_fit)]
+    for model in (trust.error_model, trust.return_model):
+        found += [model.log_base, *(value for _, values in sorted(model.log_factors.items()) for value in values)]
+    for frame in trust.frames:
+        assert frame.held_out_before is not None and frame.held_out_after is not None
+        found += [*dataclasses.astuple(frame.fit), frame.held_out_before, frame.held_out_after]
+    return found
+
+
+def test_tests_work_on_copies():
+    """Who trains on the repository's own folder leaves a `.cache` there, which no test may see."""
+    named = [path.name for path in Path(__file__).parent.glob("*.py") if '"data" / "sample' in path.read_text()]
+    assert sorted(named) == ["scenes.py", Path(__file__).name]
+
+
 def test_the_stated_command_trains(tmp_path):
-    scene = tmp_path / "sample_drive"
-    shutil.copytree(SAMPLE, scene, ignore=shutil.ignore_patterns(".cache"))
+    scene = copy_sample_drive(tmp_path / "sample_drive")
     command = [
         *(str(Path(sys.executable).with_name("ns-train")), "edge-depth-nerf-lite", "--data", str(scene)),
         *("--output-dir", str(tmp_path / "outputs"), "--max-num-iterations", "5", "--vis", "tensorboard"),
@@ -54,3 +92,5 @@ def test_the_stated_command_trains(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stdout[-3000:]
     assert list((tmp_path / "outputs").rglob("step-000000004.ckpt"))
+    # by the calibration that it brings, which was not made again
+    assert list((scene / ".cache").iterdir()) and not list((scene / ".cache").glob("mono_trust_*"))

@@ -13,7 +13,6 @@ from edge_depth_nerf.method.error_model import (
     FIELD_MARGIN_DEG,
     KNOTS,
     LEAST_JUDGED,
-    TRUST_FILE,
     error_of_returns,
     fit_error_model,
     pixel_features,
@@ -22,6 +21,7 @@ from edge_depth_nerf.method.error_model import (
 from edge_depth_nerf.method.prior import PriorOptions, View, make_prior
 from edge_depth_nerf.mono import calibration as trust_module
 from edge_depth_nerf.mono.calibration import calibrate_scene, find_trust, held_out_returns, measure_frame
+from edge_depth_nerf.scene.format import TRUST_FILE
 
 
 def both(lidar: np.ndarray, mono: np.ndarray) -> dict[str, np.ndarray]:

@@ -21,7 +21,7 @@ from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.viewer.utils import CameraState, get_camera, parse_object
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
 from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerElement
-from scenes import RADIUS_M, fisheye, pinhole, write_scene
+from scenes import RADIUS_M, copy_sample_drive, fisheye, pinhole, write_scene
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import as_people_count
@@ -33,7 +33,6 @@ from edge_depth_nerf.plugin.viewer import AZIMUTHS, RINGS, DriveLayers, lens_cap
 pytestmark = pytest.mark.slow
 
 METHOD = "edge-depth-nerf-lite"
-SAMPLE = Path(__file__).parents[1] / "data" / "sample_drive"
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 SOFTWARE_WEBGL = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 TIMEOUT_S = 120
@@ -262,7 +261,7 @@ def test_nothing_is_made_without_a_viewer(scene, monkeypatch):
 def training(tmp_path_factory) -> Iterator[SimpleNamespace]:
     """A training of the sample drive that goes on while it is looked at; `trainer`, `viewer`, `layers`."""
     folder = tmp_path_factory.mktemp("viewer")
-    shutil.copytree(SAMPLE, folder / "scene", ignore=shutil.ignore_patterns(".cache"))
+    copy_sample_drive(folder / "scene")
     config = deepcopy(all_methods[METHOD])
     config.data = config.pipeline.datamanager.data = folder / "scene"
     config.output_dir, config.timestamp, config.experiment_name = folder, "run", "viewer"

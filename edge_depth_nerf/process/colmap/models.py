@@ -55,7 +55,7 @@ INSTALL = "pip install edge-depth-nerf[colmap]"
 _OLDEST = (4, 2)
 _RECORD = "inputs.json"
 _MODELS_SUM = "models.json"
-_VERSION = 1
+_VERSION = 2
 """Of what is done with the inputs; raised when results change."""
 _NEIGHBOURS = (1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 20)
 """How many moments apart the pictures that are matched are: densely near, and further for a vehicle that is slow."""
@@ -66,6 +66,14 @@ _CHUNK_PAIRS = 256
 """Features and matches are made in lots: between two of them progress is shown and an interruption is heeded."""
 _MIN_TRACK = 3
 """Points that fewer pictures see have distances that are not to be trusted."""
+_POSE_POINTS = (30, 15)
+"""So many of a model's points a picture must see to get its pose: COLMAP's own number, and one for small pictures.
+
+Two of these often have some forty points in common, of which the next one sees half: by its own number COLMAP then ends
+with a model of two pictures, whose points have no distance to be trusted.
+"""
+_ENOUGH = 0.75
+"""Where a smaller share of the pictures gets a pose that way, the second number is tried, too."""
 _SEED = 0
 
 
@@ -91,6 +99,10 @@ class ColmapModel:
     """How many points there are."""
     error_px: float
     """Mean distance between a point's projection and its feature."""
+
+    def placed(self) -> set[int]:
+        """Pictures that see points whose distance is to be trusted; none in a model of two pictures."""
+        return {index for index, view in self.views.items() if len(view.distance)}
 
 
 @dataclass(frozen=True)
@@ -393,7 +405,25 @@ class _Run:
         return pairs
 
     def map(self) -> None:
-        """Find poses and points, lenses as they are."""
+        """Find poses and points, lenses as they are; by the number of points that gives more pictures their pose."""
+        kept, most = self.folder / "models.kept", -1
+        shutil.rmtree(kept, ignore_errors=True)
+        for pose_points in _POSE_POINTS:
+            unfinished = self._map(pose_points)
+            placed = {index for model in self._read_models(unfinished) for index in model.placed()}
+            if len(placed) > most:
+                shutil.rmtree(kept, ignore_errors=True)
+                os.replace(unfinished, kept)
+                most = len(placed)
+            if most >= _ENOUGH * len(self.names):
+                break
+        write_json(self.folder / _MODELS_SUM, {"sha256": sum_of_files(kept)})
+        shutil.rmtree(self.models, ignore_errors=True)
+        os.replace(kept, self.models)
+        shutil.rmtree(self.folder / "models.unfinished", ignore_errors=True)
+
+    def _map(self, pose_points: int) -> Path:
+        """Run COLMAP's mapper; gives the folder with what it wrote."""
         colmap = self.pycolmap
         error_px = self._error_px()
         options = colmap.IncrementalPipelineOptions()
@@ -409,6 +439,7 @@ class _Run:
         options.mapper.init_max_error = error_px
         options.mapper.filter_max_reproj_error = error_px
         options.mapper.abs_pose_max_error = 3 * error_px
+        options.mapper.abs_pose_min_num_inliers = pose_points
         # a camera that looks ahead, too, may start a model
         options.mapper.init_max_forward_motion = 1.0
         options.mapper.init_min_tri_angle = 8.0
@@ -432,9 +463,7 @@ class _Run:
                 initial_image_pair_callback=lambda: registered(2),
                 next_image_callback=lambda: registered(1),
             )
-        write_json(self.folder / _MODELS_SUM, {"sha256": sum_of_files(unfinished)})
-        shutil.rmtree(self.models, ignore_errors=True)
-        os.replace(unfinished, self.models)
+        return unfinished
 
     def has_models(self) -> bool:
         """Whether models are there, as they were written: COLMAP's reader ends the whole process at a damaged one."""
@@ -450,14 +479,17 @@ class _Run:
             InputError: a model in the folder is broken, or of other pictures.
 
         """
+        return self._read_models(self.models)
+
+    def _read_models(self, models: Path) -> list[ColmapModel]:
         found = []
-        for folder in sorted(self.models.iterdir()):
+        for folder in sorted(models.iterdir()):
             try:
                 found.append(self._read_model(folder))
             except Exception as error:  # COLMAP raises whatever its readers meet
                 raise InputError(
                     f"{folder}: cannot be read as a COLMAP model of these pictures ({type(error).__name__}: {error}). "
-                    f"Delete {self.models}; the same command makes it anew."
+                    f"Delete {models}; the same command makes it anew."
                 ) from error
         return sorted(found, key=lambda model: -len(model.camera_to_model))
 

@@ -58,7 +58,7 @@ def colmap_poses(recording: Recording, options: ProcessOptions, console: Console
     """
     check_colmap(recording, options)
     models = find_models(recording, options, _folder(options), console)
-    models = [model for model in models if _spans(recording, model)]
+    models = [model for model in models if _spans(recording, model) and model.placed()]
     if not models:
         cameras = ", ".join(camera.name for camera in recording.cameras)
         raise InputError(
