@@ -13,13 +13,11 @@ from numpy.typing import NDArray
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE, read_array_header, read_distance_png
 from edge_depth_nerf.base.png import read_png_header
+from edge_depth_nerf.cameras.rays import LEAST_COSINE
 from edge_depth_nerf.mono.examples import lens_rays
 from edge_depth_nerf.mono.options import Along
 from edge_depth_nerf.mono.relative import Kind, Layer
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
-
-LEAST_COSINE = 0.02
-"""Below (beyond 88.9°) z says nothing of the distance: a count of 4 mm is 0.2 m."""
 
 
 @dataclass(frozen=True)
