@@ -30,7 +30,7 @@ from edge_depth_nerf.base.files import explain, remove_leftovers, write_bytes, w
 from edge_depth_nerf.base.one_writer import only_writer
 from edge_depth_nerf.jobs.runs import newest_checkpoint, steps_done
 from edge_depth_nerf.method.error_model import read_trust
-from edge_depth_nerf.mono import estimate, scene_maps
+from edge_depth_nerf.mono import estimate
 from edge_depth_nerf.mono.calibration import calibrate_scene
 from edge_depth_nerf.mono.network import DepthNetwork, NetworkSettings, read_tensors, write_tensors
 from edge_depth_nerf.mono.options import EstimateDepthOptions
@@ -41,6 +41,7 @@ from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
 from edge_depth_nerf.process.command import process
 from edge_depth_nerf.process.options import Kitti360Options
+from edge_depth_nerf.scene import put_maps
 from edge_depth_nerf.scene.reader import read_scene
 
 pytestmark = pytest.mark.slow
@@ -392,7 +393,7 @@ def test_a_full_disk_and_then_a_larger_one(room: RoomDrive, tmp_path: Path, caps
 
 def test_a_disk_that_fills_up_while_maps_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = write_scene(tmp_path, frames=3)
-    before, write, left = contents(scene), scene_maps.write_distance_png, [2]
+    before, write, left = contents(scene), put_maps.write_distance_png, [2]
 
     def filling(path: Path, metres: np.ndarray) -> None:
         left[0] -= 1
@@ -400,7 +401,7 @@ def test_a_disk_that_fills_up_while_maps_are_written(tmp_path: Path, monkeypatch
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
         write(path, metres)
 
-    monkeypatch.setattr(scene_maps, "write_distance_png", filling)
+    monkeypatch.setattr(put_maps, "write_distance_png", filling)
     maps = ((f"images/{number:04d}.png", np.full((28, 32), 3.0)) for number in range(3))
     with pytest.raises(OSError, match="No space"):
         write_mono_maps(scene, maps, {"trained_on": "elsewhere"})

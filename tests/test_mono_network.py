@@ -59,7 +59,6 @@ from edge_depth_nerf.mono.training import (
     smoothness_loss,
     train,
 )
-from edge_depth_nerf.scene import reader
 from edge_depth_nerf.scene.format import TRUST_FILE
 from edge_depth_nerf.scene.reader import read_scene
 
@@ -674,10 +673,9 @@ def test_bad_scenes_and_options_are_named(tmp_path, small_street, quiet):
 # ---- maps in scenes --------------------------------------------------------------------------------------------
 
 
-def test_maps_are_put_into_a_scene_and_nothing_else_changes(tmp_path, monkeypatch):
+def test_maps_are_put_into_a_scene_and_nothing_else_changes(tmp_path):
     folder = write_scene(tmp_path / "scene", [fisheye()], frames=4, mono=False, theta_max_deg=60.0)
     (folder / TRUST_FILE).write_text("{}")
-    monkeypatch.setattr(reader, "read_trust", lambda path: None)
     before = read_json(folder / "transforms.json")
     scene = read_scene(folder)
     metres = np.full((28, 32), 7.25, np.float32)

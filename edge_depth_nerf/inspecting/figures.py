@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.base.pictures import is_distance
 from edge_depth_nerf.inspecting.shown_prior import ShownMaps
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
@@ -121,14 +122,9 @@ def measured_moments(scene: SceneFolder, shown: int) -> tuple[list[int], list[in
     """Choose which moments are measured, and which of them are shown, both spread evenly over the drive."""
     moments = scene.moments()
     wanted = max(MEASURED_PICTURES // len(scene.cameras()), shown, 1)
-    measured = _spread(moments, wanted)
+    measured = [moments[index] for index in spread_over(len(moments), wanted)]
     parts = min(shown, len(measured))
     return measured, [measured[(2 * part + 1) * len(measured) // (2 * parts)] for part in range(parts)]
-
-
-def _spread(moments: Sequence[int], count: int) -> list[int]:
-    places = np.linspace(0, len(moments) - 1, min(count, len(moments))).round().astype(int)
-    return [moments[place] for place in places]
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from rich.console import Console
 from edge_depth_nerf.base.checked_cache import keep_last, used
 from edge_depth_nerf.base.console import progress_bars
 from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.method.alignment import LEAST_RETURNS, align, both, fit_logs
 from edge_depth_nerf.method.error_model import (
     FIELD_MARGIN_DEG,
@@ -200,9 +201,7 @@ def _chosen(scene: SceneFolder, training_images: Collection[Path] | None = None)
     else:
         images = {path.resolve() for path in training_images}
         training = [picture for picture in scene.pictures if picture.files["image"].resolve() in images]
-    if len(training) <= MOST_FRAMES:
-        return training
-    return [training[i] for i in np.linspace(0, len(training) - 1, MOST_FRAMES).round().astype(int)]
+    return [training[index] for index in spread_over(len(training), MOST_FRAMES)]
 
 
 def _made_of(scene: SceneFolder, pictures: Sequence[ScenePicture], depth_source: str, options: PriorOptions) -> str:

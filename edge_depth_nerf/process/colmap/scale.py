@@ -21,6 +21,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.cameras.transforms import Transform
@@ -244,9 +245,8 @@ def _ratios(
     for number, model in enumerate(models):
         for index in model.views:
             registered[recording.pictures[index].frame].append((number, index))
-    frames = sorted(registered)
-    if len(frames) > _MOMENTS:
-        frames = [frames[round(i)] for i in np.linspace(0, len(frames) - 1, _MOMENTS)]
+    moments = sorted(registered)
+    frames = [moments[index] for index in spread_over(len(moments), _MOMENTS)]
     sweeps: dict[int, list[RecordedSweep]] = defaultdict(list)
     for sweep in recording.sweeps:
         if sweep.frame is not None:
