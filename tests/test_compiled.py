@@ -25,7 +25,7 @@ def test_it_is_known_whether_kernels_lie_compiled_on_disk(tmp_path, monkeypatch)
 def test_what_a_training_calls_is_looked_at_before_it_is_called():
     """A process that has computed no prior has not imported it."""
     code = (
-        "import sys; from edge_depth_nerf import compiled; compiled.compiled_before()\n"
+        "import sys; from edge_depth_nerf.kernels import compiled; compiled.compiled_before()\n"
         "print(*[module in sys.modules for module in compiled.TRAINING], bool(compiled._folders))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)

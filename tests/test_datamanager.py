@@ -20,7 +20,7 @@ from edge_depth_nerf.plugin.dataset import FisheyeDepthDataset
 from edge_depth_nerf.scene.reader import read_scene
 
 
-def alpha(value: float) -> PriorOptions:
+def weighted(value: float) -> PriorOptions:
     """A prior that differs from others in its weight of LiDAR."""
     return PriorOptions(integration=IntegrationOptions(alpha=value))
 
@@ -150,7 +150,7 @@ def test_integration_happens_once(tmp_path, monkeypatch):
     monkeypatch.setattr("edge_depth_nerf.method.prior.make_prior", lambda *_: pytest.fail("integrated again"))
     manager(scene)
     with pytest.raises(pytest.fail.Exception):
-        manager(scene, prior=alpha(0.5))
+        manager(scene, prior=weighted(0.5))
 
 
 def test_nothing_is_integrated_for_rendering(tmp_path, monkeypatch):
@@ -293,12 +293,12 @@ def test_only_the_tables_used_last_are_kept(tmp_path, monkeypatch):
     monkeypatch.setattr(datamanager_module, "KEPT_TABLES", 3)
     scene = write_scene(tmp_path)
     for alpha in (0.5, 0.6, 0.7):
-        manager(scene, prior=alpha(alpha))
+        manager(scene, prior=weighted(alpha))
     folder = scene / ".cache" / "pixels"
     assert len(list(folder.glob("*.npy"))) == len(list(folder.glob("*.json"))) == 3
     # held out, 0.6, 0.7
     before = {path.name for path in folder.glob("*.npy")}
-    manager(scene, prior=alpha(0.6))
+    manager(scene, prior=weighted(0.6))
     assert {path.name for path in folder.glob("*.npy")} == before
 
 

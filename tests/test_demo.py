@@ -20,7 +20,7 @@ from edge_depth_nerf import cli
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_image, read_json, write_json
 from edge_depth_nerf.base.pictures import NO_VALUE_RGB, colour_distance, side_by_side
-from edge_depth_nerf.demo.command import command as demo
+from edge_depth_nerf.demo import command as demo
 from edge_depth_nerf.demo.options import DemoOptions
 from edge_depth_nerf.plugin.compat import allow_numpy_scalars_in_checkpoints
 

@@ -458,7 +458,7 @@ def test_other_devices_are_left_to_torch():
 
 INTERPRETED = """
 import torch
-from edge_depth_nerf.encodings import cpu, cuda
+from edge_depth_nerf.kernels import hash_grid_numba as cpu, hash_grid_triton as cuda
 torch.manual_seed(0)
 for levels, features, count in ((3, 2, 300), (2, 4, 5), (1, 1, 128)):
     x = torch.rand(count, 3)

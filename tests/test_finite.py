@@ -21,6 +21,7 @@ from edge_depth_nerf.base.files import read_image, read_json, write_distance_png
 from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss, proposal_loss
 from edge_depth_nerf.method.integration import IntegrationOptions, integrate_depth, select_prior, sigma_m
 from edge_depth_nerf.method.losses import edge_loss
+from edge_depth_nerf.method.prior import PriorOptions
 
 HALVES = [torch.float16, torch.bfloat16]
 

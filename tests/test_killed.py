@@ -30,6 +30,8 @@ from edge_depth_nerf.base.files import explain, remove_leftovers, write_bytes, w
 from edge_depth_nerf.base.one_writer import only_writer
 from edge_depth_nerf.jobs.runs import newest_checkpoint, steps_done
 from edge_depth_nerf.method.error_model import read_trust
+from edge_depth_nerf.method.integration import IntegrationOptions
+from edge_depth_nerf.method.prior import PriorOptions
 from edge_depth_nerf.mono import estimate
 from edge_depth_nerf.mono.calibration import calibrate_scene
 from edge_depth_nerf.mono.network import DepthNetwork, NetworkSettings, read_tensors, write_tensors
@@ -137,7 +139,7 @@ def test_caches_do_not_grow_without_end(tmp_path: Path, monkeypatch: pytest.Monk
     scene = write_scene(tmp_path, frames=3)
     config = FisheyeDepthDataManagerConfig(dataparser=FisheyeDepthDataParserConfig(data=scene))
     for alpha in (0.3, 0.4, 0.5, 0.6):
-        config.alpha = alpha
+        config.prior = PriorOptions(integration=IntegrationOptions(alpha=alpha))
         # what a killed process left
         write_bytes(scene / ".cache/prior" / f".x.{platform.node()}~{DEAD}~1.npz", b"half")
         config.setup(test_mode="val")

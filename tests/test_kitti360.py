@@ -930,7 +930,7 @@ def test_killed_run_is_continued(drive: RoomDrive, tmp_path: Path) -> None:
     program = (
         "import os, sys, threading\n"
         "from pathlib import Path\n"
-        "from edge_depth_nerf.process import build, kitti360\n"
+        "from edge_depth_nerf.process import build, converters\n"
         "from edge_depth_nerf.process.options import Kitti360Options\n"
         "os.cpu_count = lambda: 1\n"
         "load, calls = build._Builder.content, []\n"
@@ -942,7 +942,7 @@ def test_killed_run_is_continued(drive: RoomDrive, tmp_path: Path) -> None:
         "build._Builder.content = dying\n"
         "root, sequence, output = sys.argv[1:]\n"
         "options = Kitti360Options(root=Path(root), sequence=sequence, output=Path(output), sweeps=0)\n"
-        "kitti360.convert(options)\n"
+        "converters.convert(options)\n"
     )
     command = [sys.executable, "-c", program, str(drive.root), SEQUENCE, str(tmp_path / "scene")]
     assert subprocess.run(command, capture_output=True, check=False).returncode == -9

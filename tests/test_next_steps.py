@@ -28,6 +28,7 @@ def test_after_a_drive_comes_its_converter(monkeypatch, capsys, tmp_path, layout
     assert found is not None, said
     command = cli.parse(shlex.split(found[1]))
     assert isinstance(command, cli.Process) and isinstance(command.options, expected)
+    assert isinstance(command.options, Kitti360Options | JbnuDepth360Options | RigOptions)
     assert command.options.root == output and command.options.output == Path("SCENE")
 
 

@@ -223,5 +223,5 @@ def test_contributing_names_what_exists():
     named = set(re.findall(r"(?:`|^    )make ([a-z-]+)", text, re.MULTILINE))
     assert {"setup", "test", "lint"} < named and named <= make_targets()
     for name in re.findall(r"`([\w./]+\.(?:py|toml|txt|cff)|[\w]+/)`", text):
-        folders = (ROOT, ROOT / "edge_depth_nerf", ROOT / "edge_depth_nerf/process", ROOT / "tests")
+        folders = (ROOT, ROOT / "edge_depth_nerf", ROOT / "tests")
         assert name in ("rig.toml", "tests/test_MODULE.py") or any((folder / name).exists() for folder in folders), name

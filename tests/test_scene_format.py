@@ -70,14 +70,14 @@ def test_monocular_maps_do_not_make_z_depth_a_distance(tmp_path: Path, npy: bool
     folder = others_scene(tmp_path, npy)
     before = read_scene(folder)
     assert before.lidar_is_z_depth
-    lidar = [before.distance_m(picture, "lidar") for picture in before.pictures]
+    lidar = [before.lidar_m(picture) for picture in before.pictures]
     # everything lies on a ball of 6 m around the world's origin
     assert 4 < np.median(lidar[0][lidar[0] > 0]) < 8
     put_in(folder)
     after = read_scene(folder)
     assert after.lidar_is_z_depth and not after.own
     for picture, expected in zip(after.pictures, lidar, strict=True):
-        np.testing.assert_array_equal(after.distance_m(picture, "lidar"), expected)
+        np.testing.assert_array_equal(after.lidar_m(picture), expected)
         whole = after.maps(picture).lidar_m
         assert whole is not None
         np.testing.assert_array_equal(whole, expected)
@@ -85,7 +85,9 @@ def test_monocular_maps_do_not_make_z_depth_a_distance(tmp_path: Path, npy: bool
     by_name = {path.name: number for number, path in enumerate(dataset.image_filenames)}
     for picture, expected in zip(after.pictures, lidar, strict=True):
         if (number := by_name.get(Path(picture.name).name)) is not None:
-            np.testing.assert_allclose(dataset.distance_m(number, "lidar"), expected, rtol=1e-5)
+            found = dataset.distance_m(number, "lidar")
+            assert found is not None
+            np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
 def test_what_the_host_says_of_the_unit_is_calibrated_by(tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from edge_depth_nerf.method.prior import PriorOptions, View, make_prior
 from edge_depth_nerf.mono import calibration as trust_module
 from edge_depth_nerf.mono.calibration import calibrate_scene, find_trust, held_out_returns, measure_frame
 from edge_depth_nerf.scene.format import TRUST_FILE
+from edge_depth_nerf.scene.reader import read_scene
 
 
 def both(lidar: np.ndarray, mono: np.ndarray) -> dict[str, np.ndarray]:

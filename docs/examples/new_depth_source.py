@@ -17,6 +17,7 @@ from nerfstudio.plugins.types import MethodSpecification
 from numpy.typing import NDArray
 
 from edge_depth_nerf.plugin.config import edge_depth_nerf_lite
+from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
 from edge_depth_nerf.scene.format import LAYERS, Layer
 from edge_depth_nerf.scene.put_maps import write_maps
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
@@ -38,7 +39,9 @@ def radar() -> MethodSpecification:
     """The method that nerfstudio registers: edge-depth-nerf-lite, with the radar for its prior."""
     config = copy.deepcopy(edge_depth_nerf_lite.config)
     config.method_name = "radar"
-    config.pipeline.datamanager.depth_source = "radar"
+    data = config.pipeline.datamanager
+    assert isinstance(data, FisheyeDepthDataManagerConfig)
+    data.depth_source = "radar"
     return MethodSpecification(config=config, description="A prior of radar alone.")
 
 

@@ -97,6 +97,7 @@ def _on_cluster(parts: list[ProcessOptions], cluster: str, console: Console) -> 
         words = own_command(("process", name_of(part)), replace(part, cluster=None))
         log = scene.with_name(f"{scene.name}.log")
         tasks.append(Task(str(part.output), words, log, scene / "transforms.json", trains))
-    with on_cluster(cluster, tasks, [parts[0].root.absolute()], console) as place:
+    root: Path = vars(parts[0])["root"]  # which the options of each converter have
+    with on_cluster(cluster, tasks, [root.absolute()], console) as place:
         do_tasks(tasks, place, console)
     say(console, f"Scenes: {', '.join(task.title for task in tasks)}. What was said of each is in the log beside it.")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.jobs.cluster_address import check_address
@@ -18,9 +18,6 @@ from edge_depth_nerf.jobs.cluster_address import check_address
 @dataclass(frozen=True, kw_only=True)
 class ProcessOptions:
     """What every converter can be told."""
-
-    if TYPE_CHECKING:
-        root: Path  # each converter says for itself what it is
 
     output: Path
     """The scene folder to write. A run that was interrupted is continued by the same command."""
