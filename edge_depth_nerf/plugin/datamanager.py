@@ -300,7 +300,7 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         most = int((dataset.cameras.width * dataset.cameras.height).sum())
         try:
             with PixelTableWriter(path, most, prior_weight=weight) as writer:
-                loaded = _load(dataset, cache, whole_windows=not with_prior)
+                loaded = _load(dataset, recipe, cache, whole_windows=not with_prior)
                 for pixels in track(loaded, f"{description}…", len(dataset), console=CONSOLE, transient=True):
                     writer.add(pixels)
                 writer.finish()
@@ -335,7 +335,9 @@ class PriorRecipe:
         return ("lidar", "mono") if self.depth_source in CALIBRATED else (self.depth_source,)
 
 
-def _load(dataset: FisheyeDepthDataset, cache: PriorCache | None, whole_windows: bool) -> Iterator[PicturePixels]:
+def _load(
+    dataset: FisheyeDepthDataset, recipe: PriorRecipe | None, cache: PriorCache | None, whole_windows: bool
+) -> Iterator[PicturePixels]:
     """Colours, mask, prior and its sigma, and the sky of each picture.
 
     Raises:
@@ -352,13 +354,12 @@ def _load(dataset: FisheyeDepthDataset, cache: PriorCache | None, whole_windows:
                 f"picture {dataset.image_filenames[image_idx].name} keeps too little to judge by (not one window "
                 "of SSIM, 11×11 px). Mend the mask (255 = use the pixel), or do not hold that picture out."
             )
-        if cache is None:
+        if recipe is None or cache is None:
             return PicturePixels(rgb, mask)
-        recipe = PriorRecipe(cache.depth_source, cache.options, cache.trust)
         maps = {layer: dataset.distance_m(image_idx, layer) for layer in recipe.layers}
         picture, mono = dataset.pictures[image_idx], maps.get("mono")
         view = view_of(picture.lens, picture.up_in_camera) if mono is not None else None
-        prior = cache.prior(maps, mask, view if cache.trust is not None else None)
+        prior = cache.prior(maps, mask, view if recipe.trust is not None else None)
         sky = None if mono is None or view is None else sky_of(mono, maps.get("lidar"), view, rgb, mask)
         return PicturePixels(rgb, mask, prior.distance_m, prior.sigma_m, sky)
 
