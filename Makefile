@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 help:
 	@echo "make demo        synthesise a drive, train with and without the depth prior, compare (outputs/demo/)"
 	@echo "make test-fast   tests of what needs no nerfstudio and a smoke run of the plugin, in a minute and a half"
-	@echo "make test        run all tests, in ten minutes"
+	@echo "make test        run all tests, in a quarter of an hour"
 	@echo "make test-pure   tests of the modules that need no nerfstudio, under NumPy 2"
 	@echo "make coverage    all tests, and which lines and branches they run"
 	@echo "make fuzz        a thousand spoilt files for every reader, then a coverage-guided fuzzer (half an hour)"
