@@ -74,7 +74,7 @@ audit: setup
 	$(BIN)/pip-audit --skip-editable --progress-spinner off $(AUDIT_EXCEPTIONS)
 
 lint: setup
-	$(BIN)/lint-imports --no-cache --quiet
+	$(BIN)/lint-imports --no-cache
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
