@@ -440,6 +440,7 @@ def test_gradients_are_finite_on_the_rim_itself(dtype: torch.dtype) -> None:
             assert pixels.grad is not None and pixels.grad.isfinite().all()
 
 
+@pytest.mark.slow
 @each_camera
 def test_derivatives_forward_reverse_and_numerical_agree(camera: Camera) -> None:
     theta = torch.tensor([0.0, 1e-4, 0.4, 0.9], dtype=torch.float64) * camera.theta_max_rad

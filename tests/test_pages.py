@@ -285,6 +285,7 @@ def test_the_page_of_options_has_them_all(capsys, monkeypatch):
     assert "| `--pipeline.datamanager.prior.integration.alpha` | number | `0.7` |" in text
 
 
+@pytest.mark.slow
 def test_the_pictures_are_current(tmp_path):
     figures = load("make_pictures").make_pictures(tmp_path)
     # Eq. 7 at the edge: what the page says of it

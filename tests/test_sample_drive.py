@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 from scenes import copy_sample_drive
 
 from edge_depth_nerf.base.files import read_distance_png, read_json, read_mask
@@ -57,6 +58,7 @@ def test_its_calibration_is_accepted(sample_drive):
     assert found.drive_fit is not None and found.error_model is not None
 
 
+@pytest.mark.slow
 def test_its_calibration_is_what_is_measured(sample_drive, tmp_path):
     """Measured again it is of the same files, with the same figures but for the order in which a processor adds."""
     shipped, found = read_trust(sample_drive / TRUST_FILE), calibrate_scene(copy_sample_drive(tmp_path / "scene"))

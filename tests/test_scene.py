@@ -397,6 +397,7 @@ def test_cloud_without_points_is_an_error(tmp_path: Path) -> None:
 # ---- interrupted, and run again --------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_interrupted_run_is_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "cpu_count", lambda: 1)
     write(tmp_path / "whole", given=frames(load=content))
