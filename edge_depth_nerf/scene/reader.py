@@ -64,6 +64,10 @@ class ScenePicture:
     files: dict[str, Path]
     """File of each layer of `LAYERS` that it has."""
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> ScenePicture:
+        # nothing in it changes, and nerfstudio's dataset copies all that it is given
+        return self
+
     @property
     def looks_along(self) -> Float64[np.ndarray, "3"]:
         """Unit vector of the optical axis in the scene."""
@@ -130,6 +134,10 @@ class SceneFolder:
     """Keys of transforms.json that only some frames have, with how many."""
     points_path: Path | None
     """The point cloud it names."""
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> SceneFolder:
+        # as its pictures: a long drive's would be copied twice
+        return self
 
     @property
     def folder(self) -> Path:
