@@ -69,12 +69,17 @@ def held_out(frame: int) -> bool:
     return frame % 8 == 4
 
 
+_ONCE_ONLY = {"layout": "kitti-360", "camera": "plain"}
+"""What is not written into a drive's options: there was no other choice once."""
+
+
 def _manifest(options: SynthesizeOptions) -> dict[str, Any]:
     fields = dataclasses.asdict(options)
     del fields["output"]
-    if options.layout == "kitti-360":
-        # as when there was no other
-        del fields["layout"]
+    # as when there was no other
+    for name, only in _ONCE_ONLY.items():
+        if fields[name] == only:
+            del fields[name]
     fields["speed_m_s"] = options.mean_speed_m_s
     return {
         "kind": "synthetic drive",
@@ -99,8 +104,7 @@ def _open_folder(options: SynthesizeOptions) -> None:
         there = read_json(path)
         if there != manifest:
             given = there.get("options", {}) if isinstance(there, dict) else {}
-            # this layout is not written down
-            old, new = ({"layout": "kitti-360", **options} for options in (given, manifest["options"]))
+            old, new = ({**_ONCE_ONLY, **options} for options in (given, manifest["options"]))
             changed = [
                 f"{name} is {old.get(name)!r} there and {new.get(name)!r} here"
                 for name in dict.fromkeys((*new, *old))

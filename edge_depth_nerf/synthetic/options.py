@@ -23,6 +23,11 @@ LayoutName = Literal["kitti-360", "jbnu-depth360", "rig"]
 LAYOUTS: tuple[LayoutName, ...] = ("kitti-360", "jbnu-depth360", "rig")
 """The layouts that a drive can be written in."""
 
+CameraName = Literal["plain", "automatic"]
+
+CAMERAS: tuple[CameraName, ...] = ("plain", "automatic")
+"""How the cameras of a drive can expose."""
+
 _SIZE_RANGE_PX = (32, 4096)
 _MOVING_MAX = 8
 _SPEED_MAX_M_S = 40.0
@@ -52,6 +57,10 @@ class SynthesizeOptions:
     """kitti-360: two fisheyes, Velodyne; jbnu-depth360: four 183 degree fisheyes, Ouster; rig: two fisheyes to 110
     degrees, a pinhole and a scanner, described by a rig.toml. --size is the width; other pictures are not square."""
 
+    camera: CameraName = "plain"
+    """plain: exposure drifts by 10 %. automatic: exposure by 40 % and white balance by 10 %, as bright as what is seen
+    asks for; noise grows with the gain, and lenses darken towards their rim."""
+
     @property
     def mean_speed_m_s(self) -> float:
         """The mean speed that applies, in m/s."""
@@ -68,6 +77,8 @@ class SynthesizeOptions:
             raise InputError(f"--scene {self.scene}: no such scene, expected one of {', '.join(SCENES)}.")
         if self.layout not in LAYOUTS:
             raise InputError(f"--layout {self.layout}: no such layout, expected one of {', '.join(LAYOUTS)}.")
+        if self.camera not in CAMERAS:
+            raise InputError(f"--camera {self.camera}: no such camera, expected one of {', '.join(CAMERAS)}.")
         if self.frames < 1:
             raise InputError(f"--frames {self.frames}: expected at least 1.")
         if not _SIZE_RANGE_PX[0] <= self.size <= _SIZE_RANGE_PX[1]:
