@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import deepcopy
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from scenes import write_scene
 from test_pipeline import build
 
 from edge_depth_nerf.base.files import read_json, write_json
-from edge_depth_nerf.compare.judging import choose_pixels, judge_pixels, shifted_views
+from edge_depth_nerf.compare.judging import choose_pixels, judge_beams, judge_pixels, shifted_views
 from edge_depth_nerf.plugin.config import make_specifications, read_method_file
 
 
@@ -86,3 +87,32 @@ def test_shifted_views_stand_where_the_scene_says(tmp_path):
     assert float(metres) == pytest.approx(np.linalg.norm([0.3, -0.2, 0.1]), abs=1e-5)
     assert same.batch["image"].shape == (28, 32, 3) and same.batch["mask"].shape == (28, 32, 1)
     assert (same.batch["truth_distance_m"] > 0).any()
+
+
+def test_training_views_are_judged_by_the_beams_that_were_held_out(tmp_path, monkeypatch):
+    scene = write_scene(tmp_path)
+    meta = read_json(scene / "transforms.json")
+    plain, _ = build(scene)
+    assert judge_beams(plain) == {}
+    for frame in meta["frames"]:
+        frame["beams_file_path"] = frame["truth_distance_file_path"]
+    write_json(scene / "transforms.json", meta)
+    pipeline, _ = build(scene)
+    found = judge_beams(pipeline, most=200)
+    count = len(pipeline.datamanager.train_dataset)
+    assert found["beams_pixels"] <= 200 and found["beams_pixels"] > 0.5 * (200 // count) * count
+    assert found == judge_beams(pipeline, most=200)
+    # a model that renders what is there, from the poses that training ended with
+    dataset, model = pipeline.datamanager.train_dataset, pipeline.model
+    true_m = [torch.from_numpy(dataset.distance_m(view, "beams")) for view in range(count)]
+    moved = []
+
+    def exact(pixels):
+        depth = torch.stack([true_m[view][row, column] for view, row, column in pixels.tolist()])
+        return {"depth": depth[:, None] / model.metres_per_unit}
+
+    monkeypatch.setattr(model, "forward", exact)
+    monkeypatch.setattr(model.camera_optimizer, "apply_to_raybundle", moved.append)
+    manager = SimpleNamespace(train_dataset=dataset, train_ray_generator=lambda pixels: pixels)
+    assert judge_beams(SimpleNamespace(model=model, datamanager=manager), most=200)["beams_abs_rel"] < 1e-6
+    assert len(moved) == count

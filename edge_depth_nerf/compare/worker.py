@@ -25,7 +25,7 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import explain, read_json_object, write_json
 from edge_depth_nerf.base.one_writer import only_writer
 from edge_depth_nerf.compare.configuration import configuration, described, setting_of
-from edge_depth_nerf.compare.judging import ViewJudge, choose_pixels, judge_pixels, shifted_views
+from edge_depth_nerf.compare.judging import ViewJudge, choose_pixels, judge_beams, judge_pixels, shifted_views
 from edge_depth_nerf.compare.protocol import departures
 from edge_depth_nerf.compare.specification import FIGURES, PROGRESS, SPECIFICATION, VIEWS, RunSpecification
 from edge_depth_nerf.jobs.runs import end_with_parent, steps_done
@@ -210,7 +210,7 @@ def do_run(folder: Path) -> None:
     if run.whole_views:
         judge = ViewJudge(trainer.pipeline, on_view)
         found, bins = judge.held_out(folder / VIEWS)
-        figures |= found | judge.shifted(beside)
+        figures |= found | judge.shifted(beside) | judge_beams(trainer.pipeline)
     weight, sigma = setting_of(config, run.method)
     meta = read_transforms(Path(run.scene) / "transforms.json")
     write_json(

@@ -7,7 +7,7 @@ turn, and nothing is corrected for that here.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -59,6 +59,25 @@ class Sweep:
     """How many returns were left out because they lie nearer than 0.5 m (zeros among them) or beyond 255 m."""
     offset_s: Float[Tensor, "returns"] | None = None
     """When each return was measured, from the sweep's own moment, where the file says so; float64."""
+
+
+BEAM_RAD = math.radians(0.4)
+"""Height of the bands of elevation in which beams are held out."""
+
+
+def without_beams(sweep: Sweep, one_of: int) -> tuple[Sweep, Sweep]:
+    """Split a sweep into what is kept and every `one_of`-th band of elevation, `BEAM_RAD` high.
+
+    The same bands of every sweep, whatever the scanner: what lies between its rings is what is asked for.
+    """
+    elevation = torch.atan2(sweep.points_m[:, 2], sweep.points_m[:, :2].norm(dim=-1))
+    held_out = torch.remainder(torch.floor(elevation / BEAM_RAD), one_of) == one_of // 2
+
+    def part(chosen: Tensor) -> Sweep:
+        offset_s = None if sweep.offset_s is None else sweep.offset_s[chosen]
+        return replace(sweep, points_m=sweep.points_m[chosen], reflectance=sweep.reflectance[chosen], offset_s=offset_s)
+
+    return part(~held_out), part(held_out)
 
 
 def check_sweep_size(path: Path) -> None:

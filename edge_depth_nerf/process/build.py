@@ -250,6 +250,7 @@ class _Builder:
             deskew=options.deskew,
             held_out=held_out,
             strict=options.strict,
+            holdout_beams=options.holdout_beams,
         )
         self._usable: dict[str, NDArray[np.bool_]] = {}
         for scene_camera in _scene_cameras(recording, masks, options):
@@ -264,6 +265,7 @@ class _Builder:
             "mask": any(picture.mask or picture.semantics for picture in pictures),
             "lidar": bool(recording.sweeps) or any(picture.depth for picture in pictures),
             "mono": any(picture.mono for picture in pictures),
+            "beams": bool(recording.sweeps) and options.holdout_beams > 0,
             "truth_distance": any(picture.truth_distance for picture in pictures),
             "truth_rgb": any(picture.truth_rgb for picture in pictures),
         }
@@ -305,6 +307,7 @@ class _Builder:
             mask=None if mask is None else downscale_mask(mask, factor),
             lidar=lidar,
             mono=mono,
+            beams=self._beams(picture, camera) if "beams" in self.layers else None,
             truth_distance=None if picture.truth_distance is None else load_distance(picture.truth_distance, factor),
             truth_rgb=None if picture.truth_rgb is None else load_picture(picture.truth_rgb, factor),
             cloud=None if picture.frame in self._held_out else cloud,
@@ -359,6 +362,21 @@ class _Builder:
             if not has_return.any():
                 self._without.append(f"{picture.frame} of {picture.camera}")
         return distance_m, _cloud(index, in_camera, camera_to_world, image)
+
+    def _beams(self, picture: RecordedPicture, full: Camera) -> Float[np.ndarray, "h w"]:
+        """The returns that are held out of everything, as far as nothing hides them."""
+        camera_to_world = self.pose(picture)
+        around = self._store.around(picture.frame, picture.time_s, camera_to_world)
+        beams = self._store.beams(picture.frame, picture.time_s)
+        points_m = torch.cat((around.points_m, beams))
+        seen = project_points(
+            transform_points(torch.from_numpy(np.linalg.inv(camera_to_world)), points_m).float(),
+            full.downscaled(self._options.downscale),
+            spacing_m=torch.cat((around.spacing_m, torch.zeros(len(beams)))),
+            age_s=torch.cat((around.age_s, torch.zeros(len(beams)))),
+            only_hides=torch.arange(len(points_m)) < len(around.points_m),
+        )
+        return seen.distance_m.numpy()
 
     def _mono(
         self,
@@ -460,6 +478,7 @@ def _source(recording: Recording, options: ProcessOptions) -> dict[str, Any]:
         "sky": options.sky,
         "theta_max_deg": options.theta_max_deg,
         "holdout_every": options.holdout_every,
+        **({"holdout_beams": options.holdout_beams} if options.holdout_beams else {}),
         "inputs_sha256": digest.hexdigest(),
     }
 

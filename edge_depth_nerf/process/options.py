@@ -37,6 +37,9 @@ class ProcessOptions:
     holdout_every: int = 8
     """One frame of so many is held out of training, for all cameras at once: with 8 the fifth, the 13th, the 21st …;
     0 holds out none."""
+    holdout_beams: int = 0
+    """One band of elevation of so many, each 0.4° high (a beam or two of a scanner), is held out of every sweep: no
+    prior or network sees it, training views are judged by it. 0 holds out none."""
     theta_max_deg: float = 95.0
     """Rays further than this from the optical axis are masked out, in degrees."""
     poses: Literal["recorded", "colmap"] = "recorded"
@@ -115,6 +118,8 @@ class ProcessOptions:
         require(self.downscale > 0, "downscale", self.downscale, "1 or more")
         holdout = self.holdout_every
         require(holdout == 0 or holdout >= 2, "holdout-every", holdout, "2 or more, or 0 to hold out none")
+        beams = self.holdout_beams
+        require(beams == 0 or 2 <= beams <= 100, "holdout-beams", beams, "2 to 100, or 0 to hold out none")
         require(0 < self.theta_max_deg <= 180, "theta-max-deg", self.theta_max_deg, "degrees above 0, up to 180")
         require(0 <= self.sweeps <= 30, "sweeps", self.sweeps, "0 to 30")
         seconds = self.mono_seconds

@@ -29,6 +29,7 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar import transform_points
 from edge_depth_nerf.lidar.free_space import FreeSpace
+from edge_depth_nerf.lidar.sweeps import Sweep, without_beams
 from edge_depth_nerf.lidar.trajectory import MAX_POSE_GAP_S, Trajectory
 from edge_depth_nerf.lidar.voxels import first_in_voxel
 from edge_depth_nerf.lidar.world import WorldSweep, above_field, sweep_in_world
@@ -75,6 +76,8 @@ class _Shared(Generic[Value]):
 @dataclass(frozen=True)
 class _Loaded:
     world: WorldSweep
+    beams: WorldSweep | None
+    """What is held out of it."""
     free_space: FreeSpace | None
 
 
@@ -107,7 +110,9 @@ class _Scanner:
         deskew: bool,
         held_out: Collection[int],
         strict: bool,
+        holdout_beams: int,
     ) -> None:
+        self._holdout_beams = holdout_beams
         self.sweeps = sorted(sweeps, key=lambda sweep: sweep.time_s)
         self.times_s = np.array([sweep.time_s for sweep in self.sweeps])
         self._of_frame: dict[int | None, list[int]] = {}
@@ -132,10 +137,21 @@ class _Scanner:
         recorded = self.sweeps[index]
         sweep = recorded.read()
         self._count(recorded.path, sweep.not_finite, sweep.out_of_range)
-        world = sweep_in_world(
+        beams = None
+        if self._holdout_beams:
+            sweep, held_out = without_beams(sweep, self._holdout_beams)
+            beams = self._in_world(held_out, recorded) if len(held_out.points_m) else None
+        world = self._in_world(sweep, recorded)
+        return _Loaded(world, beams, FreeSpace.of(world) if self._reach else None)
+
+    def _in_world(self, sweep: Sweep, recorded: RecordedSweep) -> WorldSweep:
+        return sweep_in_world(
             sweep, recorded.time_s, recorded.to_vehicle, self._trajectory, recorded.timing, deskew=self._deskew
         )
-        return _Loaded(world, FreeSpace.of(world) if self._reach else None)
+
+    def beams(self, index: int) -> WorldSweep | None:
+        """What of a sweep is held out of everything."""
+        return self._loaded.get(index).beams
 
     def around(self, index: int) -> list[int]:
         """The sweeps near another that training may see, without it."""
@@ -190,6 +206,7 @@ class SweepStore:
         deskew: whether each point is moved by the pose of its own time.
         held_out: numbers of the moments that training must not see.
         strict: a sweep that cannot be read is an error; otherwise only for the pictures of its own moment.
+        holdout_beams: one band of elevation of so many is kept out of all that is given but `beams`; 0: none.
 
     """
 
@@ -202,6 +219,7 @@ class SweepStore:
         deskew: bool,
         held_out: Collection[int],
         strict: bool = True,
+        holdout_beams: int = 0,
     ) -> None:
         self._left_out: dict[Path, tuple[int, int]] = {}
         by_scanner: dict[str, list[RecordedSweep]] = {}
@@ -213,7 +231,16 @@ class SweepStore:
 
         self._held_out = frozenset(held_out)
         self._scanners = [
-            _Scanner(found, trajectory, count, reach=reach, deskew=deskew, held_out=self._held_out, strict=strict)
+            _Scanner(
+                found,
+                trajectory,
+                count,
+                reach=reach,
+                deskew=deskew,
+                held_out=self._held_out,
+                strict=strict,
+                holdout_beams=holdout_beams,
+            )
             for found in by_scanner.values()
         ]
 
@@ -240,6 +267,16 @@ class SweepStore:
             return [own] if scanner.sweeps[own].frame == frame else []
         window = [own] if scanner.trains[own] else []
         return window + sorted(scanner.around(own), key=lambda index: abs(scanner.times_s[index] - time_s))
+
+    def beams(self, frame: int, time_s: float) -> Float[Tensor, "points 3"]:
+        """What is held out of the sweeps of a picture's own moment, in the world, float64."""
+        found = [torch.empty(0, 3, dtype=torch.float64)]
+        for scanner in self._scanners:
+            own = scanner.own(frame, time_s)
+            beams = None if own is None else scanner.beams(own)
+            if own is not None and beams is not None and abs(scanner.times_s[own] - time_s) <= scanner.half_turn_s:
+                found.append(beams.points_m)
+        return torch.cat(found)
 
     def around(self, frame: int, time_s: float, viewpoint_in_world: Transform, *, hide: bool = True) -> Surroundings:
         """Gather the points around a picture.

@@ -94,6 +94,8 @@ class FrameContent:
     """LiDAR distance in metres, 0 = no return; what the mask hides is removed."""
     mono: DistanceMap | None = None
     """Monocular distance in metres, 0 = none."""
+    beams: DistanceMap | None = None
+    """Distance in metres of the LiDAR beams that no training sees, 0 = none."""
     truth_distance: DistanceMap | None = None
     """True distance in metres, 0 = none."""
     truth_rgb: Picture | None = None
@@ -657,6 +659,8 @@ def _write_frame(
         write_distance_png(files["lidar"], np.where(mask, lidar, 0.0))
     if "mono" in files and content.mono is not None:
         _write_distance(files["mono"], content.mono, size, f"{where}: its monocular map")
+    if "beams" in files and content.beams is not None:
+        _write_distance(files["beams"], content.beams, size, f"{where}: its held-out beams")
     if "truth_distance" in files and content.truth_distance is not None:
         _write_distance(files["truth_distance"], content.truth_distance, size, f"{where}: its true distance")
     if "truth_rgb" in files and content.truth_rgb is not None:
