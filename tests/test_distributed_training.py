@@ -59,7 +59,7 @@ def test_gradients_are_averaged(ranks: list[dict[str, Any]]) -> None:
         assert not torch.equal(one["own"][name], two["own"][name]) or not mean.any(), name
         for found in ranks:
             torch.testing.assert_close(found["averaged"][name], mean, rtol=1e-4, atol=1e-7, msg=name)
-    assert one["averaged"]["log_gains"].any(dim=1).all()  # every picture is in some batch
+    assert one["averaged"]["exposure.log_gains"].any(dim=1).all()  # every picture is in some batch
 
 
 @pytest.mark.slow

@@ -196,19 +196,19 @@ def test_what_nothing_stops_has_the_colour_of_the_direction():
 def test_views_have_the_geometric_mean_of_the_pictures_gains():
     model = build()
     with torch.no_grad():
-        model.log_gains.copy_(torch.tensor([[0.1, 0.2, 0.3], [0.3, 0.2, 0.1], [0.5, 0.2, 0.2]]))
+        model.exposure.log_gains.copy_(torch.tensor([[0.1, 0.2, 0.3], [0.3, 0.2, 0.1], [0.5, 0.2, 0.2]]))
     bundle = replace(rays(), camera_indices=(torch.arange(16) % 3)[:, None])
     colours = torch.rand(16, 3)
     expected = colours * torch.tensor([[-0.2, 0, 0.1], [0, 0, -0.1], [0.2, 0, 0]]).exp()[torch.arange(16) % 3]
     assert torch.allclose(model.train()._exposed(colours, bundle), expected)
     assert torch.equal(model.eval()._exposed(colours, bundle), colours)
     # they are learned, and kept with the rest
-    assert any(parameter is model.log_gains for parameter in model.get_param_groups()["fields"])
+    assert any(parameter is model.exposure.log_gains for parameter in model.get_param_groups()["fields"])
     torch.stack(list(trained_step(model)[1].values())).sum().backward()
-    assert model.log_gains.grad is not None and bool(model.log_gains.grad.abs().sum() > 0)
-    assert "log_gains" in model.state_dict() and model.field.embedding_appearance is None
+    assert model.exposure.log_gains.grad is not None and bool(model.exposure.log_gains.grad.abs().sum() > 0)
+    assert "exposure.log_gains" in model.state_dict() and model.field.embedding_appearance is None
     embedded = build(exposure="embedding")
-    assert "log_gains" not in embedded.state_dict() and embedded.field.embedding_appearance is not None
+    assert embedded.exposure is None and embedded.field.embedding_appearance is not None
 
 
 def test_the_sky_loss_is_what_rays_into_the_sky_hit():

@@ -23,6 +23,7 @@ from edge_depth_nerf.compare.figures import ANGLE_EDGES_DEG, DISTANCE_EDGES_M, B
 from edge_depth_nerf.method.metrics import LEAST_SQUARED_ERROR, DepthErrors, masked_psnr
 from edge_depth_nerf.plugin.dataset import FisheyeDepthDataset
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
+from edge_depth_nerf.plugin.pipeline import JudgedViews
 from edge_depth_nerf.scene.format import read_transforms
 
 PIXELS_PER_VIEW = 3000
@@ -90,6 +91,33 @@ def choose_pixels(
         }
         chosen.append(ChosenPixels(torch.cat([torch.full((len(at), 1), view), at], dim=1), known))
     return chosen
+
+
+def judge_beams(pipeline: Any, most: int = MOST_PIXELS) -> dict[str, float]:
+    """Judge training views by the LiDAR beams that were held out of everything (`process --holdout-beams`).
+
+    Returns:
+        The depth errors beams_abs_rel and so on, pooled over random returns of all training views, rendered from the
+        poses that training ended with; nothing for a scene without such beams.
+
+    """
+    model, manager = pipeline.model, pipeline.datamanager
+    dataset, errors = manager.train_dataset, DepthErrors()
+    if "beams" not in dataset.sources():
+        return {}
+    generator = torch.Generator().manual_seed(0)
+    with evaluated(model):
+        for view in range(len(dataset)):
+            true_m = torch.from_numpy(dataset.distance_m(view, "beams"))
+            at = ((true_m > 0) & torch.from_numpy(dataset.mask(view))).nonzero()
+            at = at[torch.randperm(len(at), generator=generator)[: max(1, most // len(dataset))]]
+            if not len(at):
+                continue
+            rays = manager.train_ray_generator(torch.cat([torch.full((len(at), 1), view), at], 1).to(model.device))
+            model.camera_optimizer.apply_to_raybundle(rays)
+            distance_m = model(rays)["depth"][:, 0].cpu() * model.metres_per_unit
+            errors.update(distance_m[None], true_m[at[:, 0], at[:, 1]][None], torch.ones(1, len(at), dtype=torch.bool))
+    return errors.compute("beams_")
 
 
 def judge_pixels(pipeline: Any, chosen: list[ChosenPixels]) -> dict[str, float]:
@@ -201,7 +229,7 @@ class ViewJudge:
             if true_m is not None:
                 by_distance.update(true_m, mask, rgb, target, distance_m, true_m)
 
-        loader = self.pipeline.datamanager.fixed_indices_eval_dataloader
+        loader = JudgedViews(self.pipeline, self.pipeline.datamanager.fixed_indices_eval_dataloader)
         views = (JudgedView(number, camera, batch) for number, (camera, batch) in enumerate(loader))
         figures = self._mean(views, look)
         return figures, {"by_angle_deg": by_angle.compute(), "by_distance_m": by_distance.compute()}

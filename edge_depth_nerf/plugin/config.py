@@ -76,7 +76,6 @@ def base_config(method_name: str) -> TrainerConfig:
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15, websocket_host="127.0.0.1"),
         vis="viewer",
     )
-    config.pipeline.model.camera_optimizer.mode = "off"  # pyright: ignore[reportAttributeAccessIssue]
     return config
 
 

@@ -61,7 +61,7 @@ from edge_depth_nerf.plugin.pixel_table import (
     PixelTable,
     PixelTableWriter,
 )
-from edge_depth_nerf.plugin.ray_table import TableRayGenerator
+from edge_depth_nerf.plugin.ray_table import PLACE, TableRayGenerator
 from edge_depth_nerf.scene.format import LAYERS, depth_sources
 
 KEPT_TABLES = 8
@@ -248,7 +248,10 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         return self.config.cache_dir or (data.parent if data.suffix == ".json" else data) / ".cache"
 
     def _serve(self, batch: PixelBatch, generator: RayGenerator) -> tuple[RayBundle, dict[str, Any]]:
-        rays = generator(batch.indices.to(self.device))
+        indices = batch.indices.to(self.device)
+        rays = generator(indices)
+        sizes = torch.cat([generator.cameras.width, generator.cameras.height], dim=-1)
+        rays.metadata[PLACE] = (indices[:, 1:].flip(-1) + 0.5) / sizes[indices[:, 0]]
         return rays, {
             "image": batch.rgb.to(self.device),
             "indices": batch.indices,

@@ -172,6 +172,7 @@ class FisheyeDepth(Nerfstudio):
             scene=scene,
             pictures=pictures,
             metres_per_unit=metres_per_unit,
+            moments=[picture.moment for picture in pictures],
             depth_unit_scale_factor=scene.lidar_metres_per_count,
         )
         for file in dict.fromkeys(file for picture in pictures for file in picture.files.values()):

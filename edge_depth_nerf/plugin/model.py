@@ -7,12 +7,15 @@ scene.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.data.scene_box import OrientedBox
@@ -36,6 +39,9 @@ from edge_depth_nerf.method.losses import edge_loss, sky_loss
 from edge_depth_nerf.method.metrics import DepthErrors, load_lpips, masked_lpips, masked_psnr, masked_ssim
 from edge_depth_nerf.method.uncertainty import termination_std
 from edge_depth_nerf.plugin.compat import lpips_not_built, total_steps, without_undefined_ray
+from edge_depth_nerf.plugin.exposure import KINDS
+from edge_depth_nerf.plugin.pose_refinement import MOMENTS, PoseRefiner, PoseRefinerConfig
+from edge_depth_nerf.plugin.ray_table import PLACE
 
 LARGEST_NEAR_PLANE_M = 0.5
 """A near plane beyond this cuts off road and car beside the camera."""
@@ -73,10 +79,15 @@ class EdgeDepthNerfModelConfig(NerfactoModelConfig):
     surface_loss_mult: float = 1.0
     """With the edge loss: weight of the colour error of the field at the prior's distance, for the datamanager's
     `surface_rays_per_batch` further pixels at one sample each."""
-    exposure: Literal["gain", "embedding"] = "gain"
-    """What makes up for a camera's drifting exposure. gain: a factor for each colour of each training picture, their
-    geometric mean 1, with which views are rendered. embedding: nerfacto's appearance embedding, for views the mean of
-    all pictures'; that of a mean is not the mean of what they make."""
+    exposure: Literal["gain", "affine", "grid", "embedding", "none"] = "gain"
+    """What makes up for a camera's drifting exposure and white balance. gain: a factor for each colour of each training
+    picture, their geometric mean 1, with which views are rendered. affine: a 3×4 map of colours for each picture; grid:
+    a bilateral grid of such maps, for vignetting too; their mean is the identity. embedding: nerfacto's appearance
+    embedding, for views the mean of all pictures'; that of a mean is not the mean of what they make. none: nothing."""
+    camera_optimizer: CameraOptimizerConfig = field(default_factory=PoseRefinerConfig)
+    """Poses that training refines."""
+    exposure_mult: float = 0.1
+    """With exposure affine or grid: weight of what their maps do beyond the identity, and unevenly."""
     edge_gaussian: Literal["point", "interval"] = "interval"
     """How Eq. 4 weighs a sample: by the Gaussian's value at its middle times its length, or by the Gaussian's mass
     over its interval."""
@@ -158,6 +169,11 @@ class LpipsAtFirstUse:
         return image.new_tensor(float("nan")) if network is None else network(image, other.clamp(0, 1))
 
 
+def _density_at(density_fn: Callable[..., Tensor], positions: Tensor, *args: Any, **kwargs: Any) -> Tensor:
+    """A proposal network's density, without a gradient to the positions."""
+    return density_fn(positions.detach(), *args, **kwargs)
+
+
 class EdgeDepthNerfModel(NerfactoModel):
     """nerfacto supervised by a distance prior."""
 
@@ -182,7 +198,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         # nerfstudio knows two of them; the model's own configuration says which was built
         self.config = replace(self.config, implementation="tcnn" if implementation == "tcnn" else "torch")
         self._fused = implementation == "fused"
-        if self.config.exposure == "gain":
+        if self.config.exposure != "embedding":
             self.config.use_appearance_embedding = False
         self._has_sky = self.config.depth_loss == "edge" and self.config.sky_background
         if self._has_sky:
@@ -208,6 +224,8 @@ class EdgeDepthNerfModel(NerfactoModel):
             if isinstance(self.field, FusedNerfactoField):
                 poses = self.config.camera_optimizer.mode != "off"
                 self.field.follows_positions = self.config.predict_normals or poses
+        if self.config.camera_optimizer.mode != "off":
+            self._refine_poses(metadata)
         if not self.config.disable_scene_contraction:
             for network in (self.field, *self.proposal_networks):
                 network.spatial_distortion = CubeContraction(order=float("inf"))
@@ -221,11 +239,18 @@ class EdgeDepthNerfModel(NerfactoModel):
             far_plane=self.config.far_m / self.metres_per_unit,
             reset_near_plane=False,
         )
-        if self.config.exposure == "gain":
-            self.log_gains = torch.nn.Parameter(torch.zeros(self.num_train_data, 3))
+        maps = KINDS.get(self.config.exposure)
+        self.exposure = None if maps is None else maps(self.num_train_data)
         self._step = 0
         self._training_steps = 30_000
         self.reset_depth_errors()
+
+    def _refine_poses(self, metadata: dict[str, Any]) -> None:
+        """Let poses be learned from what the field shows, not from where the proposals put their samples."""
+        if isinstance(self.camera_optimizer, PoseRefiner):
+            moments = metadata.get(MOMENTS, list(range(self.num_train_data)))
+            self.camera_optimizer.settle(moments, self.metres_per_unit)
+        self.density_fns = [partial(_density_at, density_fn) for density_fn in self.density_fns]
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
@@ -244,19 +269,18 @@ class EdgeDepthNerfModel(NerfactoModel):
         ]
 
     def get_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
-        """Nerfacto's parameters; the pictures' gains go with the fields."""
+        """Nerfacto's parameters; the pictures' maps of colours go with the fields."""
         groups = super().get_param_groups()
-        if self.config.exposure == "gain":
-            groups["fields"].append(self.log_gains)
+        if self.exposure is not None:
+            groups["fields"].extend(self.exposure.parameters())
         return groups
 
     def _exposed(self, colours: Float[Tensor, "rays 3"], rays: RayBundle) -> Float[Tensor, "rays 3"]:
         """Colours as the training pictures that the rays are from have them; as they are at evaluation."""
-        if not self.training or self.config.exposure != "gain":
+        if not self.training or self.exposure is None:
             return colours
         assert rays.camera_indices is not None
-        gains = self.log_gains - self.log_gains.mean(dim=0)
-        return colours * gains[rays.camera_indices[:, 0]].exp()
+        return self.exposure(colours, rays.camera_indices[:, 0], rays.metadata.get(PLACE))
 
     def _field_at(self, rays: RayBundle, distance: Float[Tensor, "rays"]) -> Float[Tensor, "rays 3"]:
         """Colours of the field at one distance along each ray, scene units."""
@@ -324,6 +348,8 @@ class EdgeDepthNerfModel(NerfactoModel):
             losses[name] = self._depth_weight() * torch.stack(per_level).mean()
         if self.training and self.config.depth_loss == "edge":
             losses |= self._sky_and_surface_losses(outputs, batch)
+        if self.training and self.config.exposure in ("affine", "grid") and self.exposure is not None:
+            losses["exposure_loss"] = self.config.exposure_mult * self.exposure.unevenness()
         return losses
 
     def _depth_weight(self) -> float:
@@ -340,6 +366,7 @@ class EdgeDepthNerfModel(NerfactoModel):
             losses["sky_loss"] = self.config.sky_loss_mult * torch.stack(per_level).mean()
         if self.config.surface_loss_mult > 0 and "surface_rays" in batch:
             rays, sky = batch["surface_rays"], batch["surface_sky"][:, 0]
+            self.camera_optimizer.apply_to_raybundle(rays)
             # any place within what the prior leaves open may be the surface
             distance_m, sigma_m = batch["surface_distance_m"][:, 0], batch["surface_sigma_m"][:, 0]
             distance = (distance_m + sigma_m * torch.randn_like(sigma_m)).clamp(min=0) / self.metres_per_unit

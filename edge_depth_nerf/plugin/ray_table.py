@@ -27,6 +27,8 @@ from edge_depth_nerf.base.console import progress_bars
 
 TABLE_VERSION = 2
 """Raised whenever the form of the file changes."""
+PLACE = "place"
+"""Metadata of training rays: column and row of the pixel, 0 to 1 over its picture."""
 KEPT_TABLES = 4
 """So many tables are kept of a scene, those used last: one for each set of lenses that was trained or shown."""
 MOST_PIXELS = 1 << 24

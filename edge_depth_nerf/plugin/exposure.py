@@ -1,0 +1,100 @@
+"""What a camera does to the colours of a scene, picture by picture: exposure, white balance, vignetting.
+
+Each training picture has a map of colours of its own. Whatever the kind, the maps' mean over the pictures is held at
+the identity, so that a view from elsewhere is rendered without any map, and neutrally. Pure torch.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+GRID_SHAPE = (4, 8, 8)
+"""Cells of a bilateral grid: brightness, rows, columns."""
+_LUMA = (0.299, 0.587, 0.114)
+_CHANNELS = 12
+
+ExposureKind = Literal["gain", "affine", "grid"]
+
+
+class Gains(nn.Module):
+    """A factor for each colour of each picture; their geometric mean is 1."""
+
+    def __init__(self, pictures: int) -> None:
+        super().__init__()
+        self.log_gains = nn.Parameter(torch.zeros(pictures, 3))
+
+    def forward(
+        self, colours: Float[Tensor, "rays 3"], picture: Int[Tensor, "rays"], place: Float[Tensor, "rays 2"] | None
+    ) -> Float[Tensor, "rays 3"]:
+        """Colours as the pictures have them."""
+        gains = self.log_gains - self.log_gains.mean(dim=0)
+        return colours * gains[picture].exp()
+
+    def unevenness(self) -> Float[Tensor, ""]:
+        """How far the maps are from the identity, or from smooth: nothing that needs a penalty."""
+        return self.log_gains.new_zeros(())
+
+
+class AffineMaps(nn.Module):
+    """An affine map of colours for each picture; their mean is the identity."""
+
+    def __init__(self, pictures: int) -> None:
+        super().__init__()
+        self.offsets = nn.Parameter(torch.zeros(pictures, 3, 4))
+
+    def forward(
+        self, colours: Float[Tensor, "rays 3"], picture: Int[Tensor, "rays"], place: Float[Tensor, "rays 2"] | None
+    ) -> Float[Tensor, "rays 3"]:
+        """Colours as the pictures have them."""
+        maps = (self.offsets - self.offsets.mean(dim=0))[picture]
+        return colours + (maps[..., :3] * colours[:, None]).sum(dim=-1) + maps[..., 3]
+
+    def unevenness(self) -> Float[Tensor, ""]:
+        """Mean square of what the maps do beyond the identity."""
+        return self.offsets.square().mean()
+
+
+class BilateralGrids(nn.Module):
+    """Affine maps that vary over each picture and with brightness (Wang et al., SIGGRAPH 2024); their mean is identity.
+
+    A grid of `GRID_SHAPE` for each picture; between its corners maps are interpolated linearly.
+    """
+
+    def __init__(self, pictures: int) -> None:
+        super().__init__()
+        self.offsets = nn.Parameter(torch.zeros(pictures, _CHANNELS, *GRID_SHAPE))
+
+    def forward(
+        self, colours: Float[Tensor, "rays 3"], picture: Int[Tensor, "rays"], place: Float[Tensor, "rays 2"] | None
+    ) -> Float[Tensor, "rays 3"]:
+        """Colours as the pictures have them; `place`: column and row of each pixel, 0 to 1 over its picture."""
+        assert place is not None
+        depth = GRID_SHAPE[0]
+        offsets = self.offsets - self.offsets.mean(dim=0)
+        # all pictures' grids one behind the other: one call for rays of many pictures, no cell between two of them
+        volume = offsets.movedim(1, 0).flatten(1, 2)[None]
+        brightness = (colours * colours.new_tensor(_LUMA)).sum(dim=-1).clamp(0, 1)
+        layers = len(self.offsets) * depth
+        behind = (picture * depth + brightness * (depth - 1)) / max(1, layers - 1)
+        at = 2 * torch.cat([place, behind[:, None]], dim=-1) - 1
+        maps = F.grid_sample(volume, at.view(1, 1, 1, -1, 3), align_corners=True)[0, :, 0, 0].t().view(-1, 3, 4)
+        return colours + (maps[..., :3] * colours[:, None]).sum(dim=-1) + maps[..., 3]
+
+    def unevenness(self) -> Float[Tensor, ""]:
+        """Total variation, squared, and a little of the mean square."""
+        grids = self.offsets
+        steps = [grids.diff(dim=axis).square().mean() for axis in (2, 3, 4)]
+        return torch.stack(steps).sum() + 0.1 * grids.square().mean()
+
+
+KINDS: dict[str, type[Gains | AffineMaps | BilateralGrids]] = {
+    "gain": Gains,
+    "affine": AffineMaps,
+    "grid": BilateralGrids,
+}
+"""The maps by the name of the option."""
