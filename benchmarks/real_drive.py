@@ -1,0 +1,203 @@
+"""A real drive as a benchmark: every method trained on it with several seeds, and what λ does to each.
+
+    python benchmarks/real_drive.py --real REAL --output outputs/real_drive
+    make real REAL=REAL
+
+REAL holds kitti360_drive, a recording that `process rig` reads (docs/results.md says which). It is processed at full
+and at half size: every sixth frame is held out with its LiDAR, and a tenth of the LiDAR's beams is held out of all
+sweeps. λ and σ are those that a search on a rendered drive found (tuned.json), for all methods alike; nothing is chosen
+on this drive. Then each method with a depth loss is trained with other λ, one seed, half size: the curves. Writes
+table.md, table.json, lambda.png and views.png. Stopped at any moment, the same command goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from edge_depth_nerf.base.files import read_image, read_json, write_json, write_png, write_text
+from edge_depth_nerf.compare.command import RUNS
+from edge_depth_nerf.compare.methods import METHODS
+from edge_depth_nerf.compare.options import MethodName
+from edge_depth_nerf.compare.results import Results, RunResult, read_results
+from edge_depth_nerf.compare.specification import VIEWS
+
+ROOT = Path(__file__).parents[1]
+TABLE: tuple[MethodName, ...] = ("nerfacto", "urban-nerf", "ds-nerf", "edge-paper", "edge")
+WITH_LAMBDA: tuple[MethodName, ...] = ("urban-nerf", "ds-nerf", "edge")
+LAMBDAS = (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1)
+SIZES = {"half": 2, "full": 1}
+HOLDOUT = ("--holdout-every", "6", "--holdout-beams", "10")
+
+
+@dataclass(frozen=True)
+class Column:
+    """A figure of the table."""
+
+    title: str
+    metric: str
+    form: str
+    more_is_better: bool
+
+
+COLUMNS = (
+    Column("PSNR", "masked_psnr", ".2f", True),
+    Column("fitted PSNR", "affine_masked_psnr", ".2f", True),
+    Column("SSIM", "masked_ssim", ".3f", True),
+    Column("AbsRel", "lidar_abs_rel", ".3f", False),
+    Column("RMSE, m", "lidar_rmse_m", ".2f", False),
+    Column("δ", "lidar_delta_1_25", ".3f", True),
+    Column("beams' AbsRel", "beams_abs_rel", ".3f", False),
+)
+
+
+def command(*words: object) -> None:
+    """Run one of the project's commands; its output is shown."""
+    program = str(Path(sys.executable).with_name("edge-depth-nerf"))
+    if subprocess.run([program, *map(str, words)], check=False).returncode:
+        sys.exit(f"edge-depth-nerf {' '.join(map(str, words))} failed.")
+
+
+def write_tuned(path: Path, weight: float) -> Path:
+    """Write the tuned values with another λ for every method that has one."""
+    methods = read_json(ROOT / "benchmarks" / "tuned.json")["methods"]
+    write_json(path, {"methods": {name: {**methods[name], "lambda": weight} for name in WITH_LAMBDA}})
+    return path
+
+
+def values(runs: Sequence[RunResult], metric: str) -> list[float]:
+    """A figure of each run that has it."""
+    return [run.figures[metric] for run in runs if metric in run.figures]
+
+
+def rows(results: Results, scene: str) -> Iterator[str]:
+    """The table of one size, as Markdown."""
+    runs = {method: [run for run in results.runs if (run.scene, run.method) == (scene, method)] for method in TABLE}
+    yield "| " + " | ".join(["method", *(column.title for column in COLUMNS), "processor seconds"]) + " |"
+    yield "|---" * (len(COLUMNS) + 2) + "|"
+    for method, found in runs.items():
+        cells = [METHODS[method].title]
+        for column in COLUMNS:
+            each = values(found, column.metric)
+            spread = f" ± {statistics.stdev(each):{column.form}}" if len(each) > 1 else ""
+            cells.append(f"{statistics.mean(each):{column.form}}{spread}" if each else "–")
+        seconds = values(found, "cpu_seconds")
+        yield "| " + " | ".join([*cells, f"{statistics.mean(seconds):.0f}" if seconds else "–"]) + " |"
+
+
+def margins(results: Results, scene: str) -> Iterator[str]:
+    """Ours against the best rival of each figure, seed by seed."""
+    for column in COLUMNS:
+        sign = 1 if column.more_is_better else -1
+        leads = []
+        for seed in results.seeds():
+            run = {method: results.run(scene, method, seed) for method in TABLE}
+            found = {
+                name: each.figures[column.metric]
+                for name, each in run.items()
+                if each and column.metric in each.figures
+            }
+            rivals = [value for name, value in found.items() if name in ("nerfacto", "urban-nerf", "ds-nerf")]
+            if "edge" in found and rivals:
+                leads.append(sign * (found["edge"] - (max(rivals) if sign > 0 else min(rivals))))
+        if leads:
+            ahead = sum(lead > 0 for lead in leads)
+            mean = f"{statistics.mean(leads):+{column.form}}"
+            yield f"* {column.title}: {mean} on average, ahead with {ahead} of {len(leads)} seeds."
+
+
+def draw_lambdas(found: dict[float, Results], path: Path) -> None:
+    """Draw picture and depth over λ."""
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
+    for axis, column in zip(axes, (COLUMNS[0], COLUMNS[3]), strict=True):
+        for method in WITH_LAMBDA:
+            points = sorted(
+                (weight, run.figures[column.metric])
+                for weight, results in found.items()
+                for run in results.runs
+                if run.method == method
+            )
+            axis.plot(*zip(*points, strict=True), marker="o", label=METHODS[method].title)
+        axis.set(xscale="log", xlabel="λ", ylabel=column.title)
+        axis.grid(alpha=0.3)
+    axes[1].set_yscale("log")
+    axes[0].legend()
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def draw_views(results: Results, scene: str, path: Path) -> None:
+    """One held-out picture and its distances, by nerfacto, DS-NeRF's loss and ours, one under the other."""
+    shown: list[np.ndarray] = []
+    for method in ("nerfacto", "ds-nerf", "edge"):
+        run = results.run(scene, method, results.seeds()[0])
+        if run is None:
+            return
+        shown.append(
+            np.hstack([read_image(run.folder / VIEWS / f"eval_{name}_0001.png") for name in ("img", "distance")])
+        )
+    write_png(path, np.vstack(shown))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--real", type=Path, required=True, help="the folder that holds kitti360_drive")
+    parser.add_argument("--output", type=Path, default=Path("outputs/real_drive"))
+    parser.add_argument("--sizes", nargs="+", choices=SIZES, default=list(SIZES))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--steps", type=int, help="of each training; the preset's, if not set")
+    parser.add_argument(
+        "--lambdas", nargs="*", type=float, default=list(LAMBDAS), help="of the curves; none: no curves"
+    )
+    options = parser.parse_args()
+    drive = options.real / "kitti360_drive"
+    if not drive.is_dir():
+        sys.exit(
+            f"{drive}: no such folder; the real drive is not part of the project. docs/results.md says what it is."
+        )
+    steps = ("--steps", options.steps) if options.steps else ()
+    compared = options.output / "compared"
+    scenes = {size: options.output / f"kitti360_{size}" for size in options.sizes}
+    for size, scene in scenes.items():
+        command("process", "rig", "--root", drive, "--output", scene, "--downscale", SIZES[size], *HOLDOUT)
+    tuned = ROOT / "benchmarks" / "tuned.json"
+    for seed in options.seeds:
+        # a seed is whole before the next begins: a stopped benchmark has a table of those it has
+        common = ("--methods", *TABLE, "--tuned", tuned, "--output", compared, *steps)
+        command("compare", *scenes.values(), "--seeds", seed, *common)
+    results = read_results(compared / RUNS)
+    parts = ["# A real drive, by all methods\n"]
+    for scene in results.scenes():
+        parts += [
+            f"\n## {scene}\n",
+            *rows(results, scene),
+            "",
+            "Ours against the best rival:",
+            "",
+            *margins(results, scene),
+        ]
+        draw_views(results, scene, options.output / f"views_{scene}.png")
+    write_text(options.output / "table.md", "\n".join([*parts, ""]))
+    write_json(options.output / "table.json", results.rows())
+
+    curves: dict[float, Results] = {}
+    for weight in options.lambdas:
+        folder = options.output / f"lambda_{weight:g}"
+        given = write_tuned(options.output / f"lambda_{weight:g}.json", weight)
+        scene = scenes.get("half", next(iter(scenes.values())))
+        command("compare", scene, "--methods", *WITH_LAMBDA, "--tuned", given, "--output", folder, *steps)
+        curves[weight] = read_results(folder / RUNS)
+        draw_lambdas(curves, options.output / "lambda.png")
+
+
+if __name__ == "__main__":
+    main()
