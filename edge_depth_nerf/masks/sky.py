@@ -102,7 +102,7 @@ _LEAST_ALIKE = 0.7
 _BRIGHTEST_QUANTILE = 0.98
 _GREY_BESIDE, _BLUE_BESIDE = 0.8, 0.7
 """How bright a grey or white sky, and a blue one, is at least beside the brightest that the picture shows."""
-_LARGEST_GAP_DEG = 1.0
+_LARGEST_GAP_DEG = 0.5
 """Largest hole between twigs (its side), and its largest distance from the sky."""
 
 
@@ -316,18 +316,18 @@ def _fits(blocks: _Blocks, region: Bool[np.ndarray, "h w"], sky: Bool[np.ndarray
 
 
 def _alike(blocks: _Blocks, sky: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """What is like the sky around it."""
+    """What is like the sky around it, by colour alone."""
     (around, blue_around), share = means_within((blocks.brightness, blocks.blue), sky, _AROUND * blocks.side)
     change = np.where(blocks.smooth, _BRIGHTNESS_CHANGE, _STEEP_BRIGHTNESS_CHANGE)
     alike = np.abs(blocks.brightness - around) <= change * around
     alike &= np.abs(blocks.blue - blue_around) <= _COLOUR_CHANGE
-    return blocks.possible & alike & (share > _MIN_SHARE_AROUND)
+    return blocks.like_sky & alike & (share > _MIN_SHARE_AROUND)
 
 
 def _grow(blocks: _Blocks, sky: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """From what is surely sky to all that hangs together with it and looks like it."""
     for _ in range(_ROUNDS):
-        grown = _alike(blocks, sky)
+        grown = blocks.possible & _alike(blocks, sky)
         # what only a bridge one pixel wide connects is another thing
         sky = sky | touching(opened(grown, 1.0), sky)
     # noise in clouds and about the sun leaves holes of a few pixels
@@ -339,6 +339,7 @@ def _with_gaps(blocks: _Blocks, sky: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray
     reach_px = max(1.0, _LARGEST_GAP_DEG / blocks.degrees_per_px)
     for _ in range(_ROUNDS):
         others = _alike(blocks, sky) & ~sky
-        gaps = others & ~larger(others, reach_px**2)
+        # a van with returns on it is one thing, of which they leave pieces
+        gaps = blocks.possible & others & ~larger(others, reach_px**2)
         sky = sky | touching(gaps, gaps & _near(sky, reach_px))
     return sky
