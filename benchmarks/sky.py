@@ -1,6 +1,6 @@
 """How good the sky finder is with any lens and in other light, against the truth of rendered scenes.
 
-    python benchmarks/sky.py --frames 3
+    python benchmarks/sky.py
 
 `benchmarks/masks.py` judges it on the fisheye pictures of synthetic drives. Here the same scenes are seen by fisheyes
 and by pinholes of 60° to 120°. The generator has one kind of light, a bright day with thin clouds. Of each view two
@@ -148,14 +148,13 @@ def judged(view: SkyView, with_lidar: bool, with_mono: bool) -> list[float]:
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--frames", type=int, default=3, help="so many of each drive, evenly over it")
+    parser.add_argument("--frames", type=int, nargs="+", default=[0, 10, 20], help="of each drive")
     parser.add_argument("--size", type=int, default=350, help="of the fisheyes; the pinholes are twice as wide")
     chosen = parser.parse_args()
-    frames = np.unique(np.linspace(0, DRIVE_FRAMES - 1, chosen.frames).round().astype(int)).tolist()
     figures: dict[tuple[str, str, str], list[list[float]]] = defaultdict(list)
     for scene, seed in SCENES:
         options = SynthesizeOptions(output=Path(), scene=scene, frames=DRIVE_FRAMES, size=chosen.size, seed=seed)
-        for view in sky_views(options, frames):
+        for view in sky_views(options, chosen.frames):
             name = "fisheyes" if view.camera_name in rig.CAMERAS else view.camera_name
             for known in ("nothing", "LiDAR", "mono"):
                 figures[name, view.light, known].append(judged(view, known == "LiDAR", known == "mono"))
