@@ -2,8 +2,9 @@
 
 Pure. Only valid pixels of each picture are kept, as records of 15 bytes: colour as uint8, prior distance and sigma as
 uint16 in 1/256 m (0 = no prior; the sky has no distance and the largest sigma), and where the pixel is. A prior that 16
-bits cannot hold, beyond 255.996 m or below 2 mm, is none; a sigma beyond is kept as 255.996 m. Their order is random, so that a batch is one contiguous read of a memory-mapped file: any number of pictures needs next to no memory
-of the process's own. A batch holds each pixel at most once, and all pixels are passed before one comes again.
+bits cannot hold, beyond 255.996 m or below 2 mm, is none; a sigma beyond is kept as 255.996 m. Their order is random,
+so that a batch is one contiguous read of a memory-mapped file: any number of pictures needs next to no memory of the
+process's own. A batch holds each pixel at most once, and all pixels are passed before one comes again.
 
 The order is made in two passes: each pixel goes to one of several files, drawn at random; then each file, small enough
 for memory, is shuffled and appended to the whole. That is a uniformly random permutation.
