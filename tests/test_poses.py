@@ -55,7 +55,8 @@ def test_times(tmp_path: Path) -> None:
     ("read", "content", "message"),
     [
         (read_tum, "0 1 2 3 0 0 0\n", "line 1: 7 numbers, expected 8"),
-        (read_tum, "0 1 2 3 0 0 0 1\n0 1 2 3 0 0 0 1\n", r"line 2: its time 0\.0+ is not after"),
+        (read_tum, "0 1 2 3 0 0 0 1\n0 1.1 2 3 0 0 0 1\n", r"line 2: its time 0\.0+ is not after.* within 2 cm"),
+        (read_tum, "0 1 2 3 0 0 0 1\n0 1 2 3 0 0 0.01 0.99995\n", r"line 2: its time 0\.0+ is not after"),
         (read_tum, "0 1 2 3 1 0 0 1\n", r"line 1: the quaternion 1 0 0 1 has the length 1\.414.*w last"),
         (read_tum, "0 1 2 3 0 0 0 0\n", "has the length 0"),
         (read_tum, "0 1 2 nan 0 0 0 1\n", "line 1: 'nan' is not a finite number"),
