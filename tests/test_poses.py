@@ -30,6 +30,16 @@ def test_tum(tmp_path: Path) -> None:
     assert np.array_equal(poses[1], np.eye(4))
 
 
+def test_poses_of_one_time_are_one(tmp_path: Path) -> None:
+    """Sensors that were read at once bring the vehicle's pose each, with the digits that they have."""
+    times, poses = read_tum(text(tmp_path, "1 1 2 3 0 0 0 1\n1 1.01 2 3 0 0 0.001 1\n2 5 2 3 0 0 0 1\n"))
+    assert times.tolist() == [1, 2]
+    assert poses[0, :3, 3].tolist() == [1, 2, 3]
+    # nanoseconds that float64 cannot tell apart
+    times, _ = read_tum(text(tmp_path, "315968112.449927216 1 2 3 0 0 0 1\n315968112.449927217 1 2 3 0 0 0 1\n"))
+    assert len(times) == 1
+
+
 def test_kitti(tmp_path: Path) -> None:
     poses = read_kitti(text(tmp_path, "0 0 1 7 0 1 0 8 -1 0 0 9\n"))
     assert poses.tolist() == [[[0, 0, 1, 7], [0, 1, 0, 8], [-1, 0, 0, 9], [0, 0, 0, 1]]]

@@ -10,6 +10,7 @@ coverage alone tells nothing: an inverted transform covers a tenth to a third of
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -107,7 +108,7 @@ class _Sums:
     @property
     def correlation(self) -> float:
         """Without the means: contrast has none. 0 without returns."""
-        return self.products / max(np.sqrt(self.first * self.second), 1e-9)
+        return self.products / max(math.sqrt(self.first * self.second), 1e-9)
 
 
 @dataclass(frozen=True)

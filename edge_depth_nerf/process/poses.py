@@ -61,8 +61,8 @@ def read_tum(path: Path) -> tuple[Float64[np.ndarray, "poses"], Float64[np.ndarr
 
 
 def _same(pose: Transform, other: Transform) -> bool:
-    turn = Rotation.from_matrix(pose[:3, :3].T @ other[:3, :3]).magnitude()
-    return float(np.linalg.norm(pose[:3, 3] - other[:3, 3])) <= SAME_POSE_M and np.degrees(turn) <= SAME_POSE_DEG
+    turn_deg = np.degrees(Rotation.from_matrix(pose[:3, :3].T @ other[:3, :3]).magnitude())
+    return bool(np.linalg.norm(pose[:3, 3] - other[:3, 3]) <= SAME_POSE_M and turn_deg <= SAME_POSE_DEG)
 
 
 def read_kitti(path: Path) -> Float64[np.ndarray, "poses 4 4"]:
