@@ -95,7 +95,7 @@ def found(recording: Recording) -> list[Agreement]:
     usable = {}
     for camera in recording.cameras:
         assert camera.ego_mask is not None
-        usable[camera.name] = lens_circle(camera.camera, 95) & read_mask(camera.ego_mask)
+        usable[camera.name] = lens_circle(camera.camera, 95.0) & read_mask(camera.ego_mask)
     return agreements(recording, usable)
 
 
@@ -210,7 +210,7 @@ def test_the_vehicle_is_found_in_few_pictures_with_lidars_help(mine: Path) -> No
     for name in ("left", "right"):
         true, kept = read_mask(mine / f"masks/{name}.png"), read_mask(report.scene / f"ego_masks/{name}.png")
         lens = lens_circle(
-            read_rig_recording(RigOptions(root=mine, output=mine)).cameras[CAMERAS.index(name)].camera, 110
+            read_rig_recording(RigOptions(root=mine, output=mine)).cameras[CAMERAS.index(name)].camera, 110.0
         )
         vehicle, hidden = lens & ~true, lens & ~kept
         assert (vehicle & hidden).sum() > 0.93 * (vehicle | hidden).sum()

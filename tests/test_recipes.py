@@ -57,9 +57,9 @@ def test_lidar_lies_on_the_walls(name: str, tmp_path: Path) -> None:
             lidar = read_distance_png(report.scene / f"lidar/{camera}/{moment:010d}.png")
             there = lidar > 0
             assert there.mean() > 0.1
-            errors = np.abs(lidar / data_sets.true_distance(truth, moment) - 1)[there]
-            # a return lies anywhere in its pixel; 0.1 s off would be a metre
-            assert np.median(errors) < 0.01 and np.mean(errors < 0.04) > 0.9
+            errors = (lidar / data_sets.true_distance(truth, moment) - 1)[there]
+            # a return lies anywhere in its pixel, 1.1° wide, and the floor is flat: on the whole that cancels
+            assert abs(np.median(errors)) < 0.002 and np.mean(np.abs(errors) < 0.04) > 0.9
 
 
 @pytest.mark.parametrize("name", RECIPES)

@@ -57,6 +57,10 @@ _PLY_TYPES = {
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
     **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
 }
+_ARROW_TYPES = {
+    **{"halffloat": "f2", "float": "f4", "double": "f8"},
+    **{f"{sign}int{8 * size}": f"{sign or 'i'}{size}" for sign in ("", "u") for size in (1, 2, 4, 8)},
+}
 _PLY_ENCODINGS: dict[str, tuple[Encoding, str]] = {
     "ascii": ("text", "<"),
     "binary_little_endian": ("records", "<"),
@@ -295,13 +299,8 @@ def _feather_table(path: Path, columns: list[str] | None = None) -> Any:
 
 def _feather_header(path: Path, size: int, scan: ScanFormat) -> _Header:
     table = _feather_table(path)
-    fields = []
-    for name, column in zip(table.column_names, table.columns, strict=True):
-        try:
-            fields.append((name, np.dtype(column.type.to_pandas_dtype())))
-        except (NotImplementedError, TypeError):
-            # text, lists: no column that is used
-            fields.append((name, np.dtype("O")))
+    # text, lists and the like are no numbers
+    fields = [(field.name, _ARROW_TYPES.get(str(field.type), "O")) for field in table.schema]
     return _Header(_record(path, fields), table.num_rows, "table")
 
 

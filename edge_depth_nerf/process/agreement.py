@@ -33,6 +33,8 @@ _WORKING_PX = 320
 """Pictures are averaged down until the longer side is about so long."""
 _PAIRS = 3
 """So many pairs of pictures of a camera, spread over the drive."""
+_TRIED = 60
+"""They are chosen from so many, spread over the drive: where the vehicle stands there is none."""
 _MOVED_M = 0.5
 """How far the camera has moved at least between the pictures of a pair."""
 _APART_S = 0.2
@@ -160,6 +162,8 @@ def _pairs(recording: Recording, camera: RecordedCamera, factor: int) -> list[_P
     """Pictures spread over the drive, each with the next one from another place."""
     assert recording.trajectory is not None
     pictures = sorted((one for one in recording.pictures if one.camera == camera.name), key=lambda one: one.time_s)
+    if not pictures:
+        return []
     vehicle = recording.trajectory.at(np.array([picture.time_s for picture in pictures]))
     poses = [
         to_world @ camera.to_vehicle if picture.camera_to_world is None else picture.camera_to_world
@@ -167,7 +171,7 @@ def _pairs(recording: Recording, camera: RecordedCamera, factor: int) -> list[_P
     ]
     places = np.array([pose[:3, 3] for pose in poses]).reshape(-1, 3)
     pairs = []
-    for first in range(len(pictures)):
+    for first in np.unique(np.linspace(0, len(pictures) - 1, _TRIED).astype(int)).tolist():
         far = np.flatnonzero(np.linalg.norm(places[first + 1 :] - places[first], axis=-1) >= _MOVED_M)
         pairs += [(first, first + 1 + int(far[0]))] if len(far) else []
     found = []
