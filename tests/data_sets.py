@@ -76,7 +76,7 @@ def true_distance(name: str, moment: int) -> NDArray:
 
 def picture(name: str, moment: int) -> NDArray[np.uint8]:
     shade = np.clip(true_distance(name, moment) * 8, 0, 255).astype(np.uint8)
-    return np.stack((shade, 255 - shade, shade // 2), -1)
+    return np.stack((shade, 255 - shade, shade // 2), -1).astype(np.uint8)
 
 
 def points(time_s: float, frame: NDArray) -> NDArray:

@@ -176,8 +176,9 @@ def test_no_fit_is_said_where_the_pictures_could_tell() -> None:
 
 def test_process_says_it_before_the_work(mine: Path) -> None:
     rows = re.compile(r"(\[cameras\.left\].*?to_vehicle = )\[\n(.*?)\n\]", re.S)
-    text = (mine / "rig.toml").read_text()
-    matrix = np.array(ast.literal_eval(f"[{rows.search(text)[2]}]"))
+    given = rows.search((mine / "rig.toml").read_text())
+    assert given is not None
+    matrix = np.array(ast.literal_eval(f"[{given[2]}]"))
     edit(mine, lambda text: rows.sub(lambda match: match[1] + str(np.linalg.inv(matrix).tolist()), text))
     report, said = run(mine)
     (notice,) = [one for one in report.notices if "wrong way round" in one]

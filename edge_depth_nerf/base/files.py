@@ -216,12 +216,12 @@ def _decode(path: Path, flags: int) -> NDArray:
         image = cv2.imdecode(content, flags)
     except cv2.error:
         image = None
-    # libpng fills what a truncated file lacks with zeros, so the end mark is looked for as well
-    if image is None or (path.suffix.lower() == ".png" and b"IEND" not in content[-16:].tobytes()):
-        fault = "truncated or not a picture"
-    else:
+    # libpng fills what a truncated file lacks with zeros, so the end mark is looked for as well; a JPEG of that name has
+    # none
+    fault: str | None = "truncated or not a picture"
+    if image is not None and (path.suffix.lower() != ".png" or b"IEND" in content[-16:].tobytes()):
         fault = _fault_of(path, content.tobytes())
-    if fault is not None:
+    if image is None or fault is not None:
         raise InputError(
             f"{path}: cannot be decoded as a picture ({content.size} bytes; {fault}). Copy or make the file again."
         )
