@@ -216,8 +216,7 @@ def _decode(path: Path, flags: int) -> NDArray:
         image = cv2.imdecode(content, flags)
     except cv2.error:
         image = None
-    # libpng fills what a truncated file lacks with zeros, so the end mark is looked for as well; a JPEG of that name has
-    # none
+    # libpng fills what a truncated file lacks with zeros, so the end mark is looked for as well
     fault: str | None = "truncated or not a picture"
     if image is not None and (path.suffix.lower() != ".png" or b"IEND" in content[-16:].tobytes()):
         fault = _fault_of(path, content.tobytes())
