@@ -21,6 +21,7 @@ def integrate_depth(
     sigma_depth_growth_per_m=0.0,
     kernel="edge-aware",
     normalise="pooled",
+    least_returns=0.0,
     keep_returns=False,
     range_guide="mono",
 ):
@@ -62,7 +63,8 @@ def integrate_depth(
             for is_lidar, _, g, _ in entries:
                 weight = g * (alpha if is_lidar else 1 - alpha)
                 if normalise == "per-source":
-                    weight /= sum(entry[3] for entry in entries if entry[0] == is_lidar)
+                    total = sum(entry[3] for entry in entries if entry[0] == is_lidar)
+                    weight /= max(total, least_returns) if is_lidar else total
                 weights.append(weight)
             eta = sum(weights)
             if eta == 0:

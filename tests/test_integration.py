@@ -92,6 +92,8 @@ def test_equals_twin(kind, normalise, keep_returns, guide, alpha, dtype):
         {"sigma_depth_m": 30.0, "normalise": "per-source"},
         {"sigma_depth_m": 0.05, "sigma_depth_growth_per_m": 0.01},
         {"sigma_depth_growth_per_m": 0.05, "normalise": "per-source", "range_guide": "lidar"},
+        {"least_returns": 4.0, "normalise": "per-source"},
+        {"least_returns": 4.0, "normalise": "pooled"},
     ],
     ids=str,
 )
@@ -127,6 +129,29 @@ def test_one_return_by_hand():
     assert float(result.spread_m[1, 1]) == pytest.approx(0.916515, abs=2e-6)
     # (1, 0) does not see the return in its 3×3 window
     assert float(result.distance_m[1, 0]) == pytest.approx(10.0, abs=1e-6)
+
+
+def test_a_lone_return_makes_no_square():
+    # one return of 12 among 10: with its whole share all of its 9×9 window is 11.4 and what lies beyond is 10;
+    # with least_returns it has the weight s = exp(-(k² + l²)/18) · 0.7 / 4 against 0.3, if less than all of 0.7
+    mono = torch.full((15, 15), 10.0)
+    lidar = torch.zeros(15, 15)
+    lidar[7, 7] = 12.0
+    square = integrate_depth(lidar, mono, everywhere(mono), IntegrationOptions(normalise="per-source")).distance_m
+    assert float(square[7, 8]) == pytest.approx(11.4, abs=1e-5) == float(square[3, 3])
+    assert float(square[7, 12]) == 10
+    options = IntegrationOptions(normalise="per-source", least_returns=4.0)
+    soft = integrate_depth(lidar, mono, everywhere(mono), options).distance_m
+    for down, right in ((0, 1), (2, 3), (4, 4)):
+        weight = 0.7 * np.exp(-(down**2 + right**2) / 18) / 4
+        expected = 10 + 2 * weight / (weight + 0.3)
+        assert float(soft[7 + down, 7 + right]) == pytest.approx(expected, abs=1e-5)
+    # where returns are dense nothing changes
+    dense = torch.full((15, 15), 12.0)
+    dense[:, ::3] = 0
+    replaced = IntegrationOptions(normalise="per-source")
+    known, unchanged = (integrate_depth(dense, mono, everywhere(mono), one) for one in (options, replaced))
+    assert_same(known, unchanged, 0)
 
 
 def test_range_guide_by_hand():

@@ -235,6 +235,69 @@ def test_the_surface_loss_is_the_field_colour_error_at_the_prior():
     assert any(p.grad is not None and bool(p.grad.abs().sum() > 0) for p in model.field.mlp_base.parameters())
 
 
+def test_the_surface_is_drawn_between_the_planes():
+    model = build(near_m=0.2, far_m=50.0).train()
+    count = 4000
+    near, far = torch.full((count, 1), 0.25), torch.full((count, 1), 49.0)
+    given = {"surface_distance_m": torch.cat([near, far]), "surface_sigma_m": torch.cat([0.1 + 0 * near, 4 + 0 * far])}
+    torch.manual_seed(0)
+    drawn_m = model._surface_drawn(given)
+    assert 0.2 <= float(drawn_m.min()) and float(drawn_m.max()) <= 50
+    close, distant = drawn_m.split(count)
+    # it does not pile up at the planes: a tenth of the Gaussian beyond one sigma to the inside is a sixth now
+    assert float((close == 0.2).float().mean()) < 0.01 and float((distant == 50).float().mean()) < 0.01
+    assert float((close > 0.35).float().mean()) == pytest.approx(2 * 0.1587, abs=0.03)
+    assert float((distant < 45).float().mean()) == pytest.approx(2 * 0.1587, abs=0.03)
+    # between them it is the Gaussian
+    given = {"surface_distance_m": torch.full((count, 1), 20.0), "surface_sigma_m": torch.full((count, 1), 2.0)}
+    drawn_m = model._surface_drawn(given)
+    assert float(drawn_m.mean()) == pytest.approx(20, abs=0.15)
+    assert float(drawn_m.std()) == pytest.approx(2, abs=0.1)
+
+
+@pytest.mark.parametrize("distance_m", [0.1, 60.0])
+def test_a_surface_that_is_not_between_the_planes_says_nothing(distance_m):
+    model = build(near_m=0.2, far_m=50.0).train()
+    given = surface()
+    given["surface_distance_m"][0] = distance_m
+    torch.manual_seed(3)
+    outputs = model(rays())
+    supervision = batch() | given
+    image = given["surface_image"].clone()
+    losses = []
+    for red in (0.0, 1.0):
+        given["surface_image"][0] = red
+        found = model.get_loss_dict(outputs, supervision, model.get_metrics_dict(outputs, supervision))
+        losses.append(float(found["surface_loss"]))
+    assert losses[0] == pytest.approx(losses[1], rel=1e-5) and losses[0] > 0
+    # another pixel's colour does matter
+    given["surface_image"][1] = 1 - image[1].round()
+    found = model.get_loss_dict(outputs, supervision, model.get_metrics_dict(outputs, supervision))
+    assert float(found["surface_loss"]) != pytest.approx(losses[0], rel=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["edge", "ds-nerf", "urban-nerf"])
+@pytest.mark.parametrize("distance_m", [0.05, 0.199, 51.0, 255.9])
+def test_a_prior_that_is_not_between_the_planes_is_none(kind, distance_m):
+    model = build(depth_loss=kind, near_m=0.2, far_m=50.0).train()
+    torch.manual_seed(3)
+    outputs = model(rays())
+    name = "edge_loss" if kind == "edge" else "depth_loss"
+    found = []
+    for value in (0.0, distance_m):
+        supervision = batch()
+        supervision["prior_distance_m"][1] = value
+        metrics = model.get_metrics_dict(outputs, supervision)
+        losses = model.get_loss_dict(outputs, supervision, metrics)
+        assert torch.isfinite(losses[name])
+        found.append((float(losses[name]), float(metrics["share_with_prior"])))
+    assert found[0] == found[1] and found[0][1] == 11 / 16
+    # what is just inside counts
+    supervision = batch()
+    supervision["prior_distance_m"][1] = 0.2 if distance_m < 1 else 50.0
+    assert float(model.get_metrics_dict(outputs, supervision)["share_with_prior"]) == 12 / 16
+
+
 def test_distance_is_that_of_what_a_ray_hits():
     """A ray that is half sky is as far as what the other half hits; one that hits nothing is far."""
     starts = torch.arange(4.0)[None, :, None].expand(3, -1, -1)

@@ -123,6 +123,25 @@ def test_a_sigma_beyond_16_bits_stays_a_sigma(tmp_path):
     assert stored == {0: 1 / 256, 1: 65535 / 256, 2: 0.5, 3: 0.0}
 
 
+def test_what_16_bits_cannot_hold_is_no_prior_and_no_sky(tmp_path):
+    distance = np.array([[255.99, 256.0, 300.0, np.inf, 5.0, 0.001, 0.0]], np.float32)
+    sigma = np.array([[256.0, 300.0, 256.0, np.inf, 1e6, 1000.0, 500.0]], np.float32)
+    mask = np.ones(distance.shape, bool)
+    table = table_of(tmp_path / "t.npy", [mask], [(distance, sigma)])
+    batch = table.batch(0, 7)
+    column = batch.indices[:, 2]
+    assert not batch.sky.any()
+    assert torch.equal(batch.prior_distance_m[:, 0] > 0, (column == 0) | (column == 4))
+    assert torch.equal(batch.prior_sigma_m[:, 0], torch.where((column == 0) | (column == 4), 65535 / 256, 0.0))
+    assert table.share_with_prior == pytest.approx(2 / 7)
+    # where the sky is known it stays known
+    with PixelTableWriter(tmp_path / "sky.npy", 7) as writer:
+        writer.add(PicturePixels(picture(1, 7), mask, distance, sigma, np.arange(7)[None] == 2))
+        writer.finish()
+    batch = PixelTable(tmp_path / "sky.npy").batch(0, 7)
+    assert torch.equal(batch.sky[:, 0], batch.indices[:, 2] == 2)
+
+
 def test_a_record_has_no_gaps():
     assert RECORD.itemsize == 15
 

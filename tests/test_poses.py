@@ -30,6 +30,16 @@ def test_tum(tmp_path: Path) -> None:
     assert np.array_equal(poses[1], np.eye(4))
 
 
+def test_poses_of_one_time_are_one(tmp_path: Path) -> None:
+    """Sensors that were read at once bring the vehicle's pose each, with the digits that they have."""
+    times, poses = read_tum(text(tmp_path, "1 1 2 3 0 0 0 1\n1 1.01 2 3 0 0 0.001 1\n2 5 2 3 0 0 0 1\n"))
+    assert times.tolist() == [1, 2]
+    assert poses[0, :3, 3].tolist() == [1, 2, 3]
+    # nanoseconds that float64 cannot tell apart
+    times, _ = read_tum(text(tmp_path, "315968112.449927216 1 2 3 0 0 0 1\n315968112.449927217 1 2 3 0 0 0 1\n"))
+    assert len(times) == 1
+
+
 def test_kitti(tmp_path: Path) -> None:
     poses = read_kitti(text(tmp_path, "0 0 1 7 0 1 0 8 -1 0 0 9\n"))
     assert poses.tolist() == [[[0, 0, 1, 7], [0, 1, 0, 8], [-1, 0, 0, 9], [0, 0, 0, 1]]]
@@ -55,7 +65,8 @@ def test_times(tmp_path: Path) -> None:
     ("read", "content", "message"),
     [
         (read_tum, "0 1 2 3 0 0 0\n", "line 1: 7 numbers, expected 8"),
-        (read_tum, "0 1 2 3 0 0 0 1\n0 1 2 3 0 0 0 1\n", r"line 2: its time 0\.0+ is not after"),
+        (read_tum, "0 1 2 3 0 0 0 1\n0 1.1 2 3 0 0 0 1\n", r"line 2: its time 0\.0+ is not after.* within 2 cm"),
+        (read_tum, "0 1 2 3 0 0 0 1\n0 1 2 3 0 0 0.01 0.99995\n", r"line 2: its time 0\.0+ is not after"),
         (read_tum, "0 1 2 3 1 0 0 1\n", r"line 1: the quaternion 1 0 0 1 has the length 1\.414.*w last"),
         (read_tum, "0 1 2 3 0 0 0 0\n", "has the length 0"),
         (read_tum, "0 1 2 nan 0 0 0 1\n", "line 1: 'nan' is not a finite number"),

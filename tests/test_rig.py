@@ -32,6 +32,7 @@ pytestmark = pytest.mark.slow
 PAGE = Path(__file__).parents[1] / "docs" / "rig.md"
 FRAMES = 5
 FIRST_S = 1369730762.123456789
+TIMES = 'point_times = {column = "t", unit = "ns", counted_from = "timestamp"}'
 
 
 def example() -> str:
@@ -203,6 +204,30 @@ def test_a_turn_says_the_same_as_the_points_own_times(mine: Path) -> None:
     on_clock = read_rig_recording(options(mine)).sweeps[2].read()
     assert on_clock.offset_s is not None
     assert (on_clock.offset_s - by_point.offset_s).abs().max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("moment", "from_start_s"), [("timestamp", 0.0), ("start", 0.0), ("middle", 0.05), ("end", 0.1)]
+)
+def test_scans_that_are_corrected_already(mine: Path, moment: str, from_start_s: float) -> None:
+    """They go to the world by the pose of the moment they are corrected to; the frame they belong to stays."""
+    raw = read_rig_recording(options(mine)).sweeps
+    edit(mine, (TIMES, f'corrected_to = "{moment}"'))
+    recording = read_rig_recording(options(mine))
+    assert not recording.notices
+    for one, before in zip(recording.sweeps, raw, strict=True):
+        assert one.frame == before.frame and one.timing is None and one.read().offset_s is None
+        assert one.time_s - before.time_s == pytest.approx(from_start_s - 0.05, abs=1e-6)
+
+
+def test_points_in_the_vehicles_frame(mine: Path) -> None:
+    in_scanner = read_rig_recording(options(mine)).sweeps[1]
+    edit(mine, ('timestamp = "start"', 'timestamp = "start"\npoints_in = "vehicle"'))
+    in_vehicle = read_rig_recording(options(mine)).sweeps[1]
+    # the scanner stays where it is, and the numbers of the file are the vehicle's
+    assert np.array_equal(in_vehicle.to_vehicle, in_scanner.to_vehicle)
+    moved = in_vehicle.read().points_m.numpy() @ in_vehicle.to_vehicle[:3, :3].T + in_vehicle.to_vehicle[:3, 3]
+    assert moved == pytest.approx(in_scanner.read().points_m.numpy(), abs=1e-9)
 
 
 def test_the_path_is_the_vehicles(mine: Path) -> None:
@@ -523,6 +548,17 @@ LEFT = '[cameras.left]\nimages = "images/left"'
             'scans = "images/front"',
             r"images/front: files of unknown format, such as 000000\.png.*\.pcd",
         ),
+        (
+            'timestamp = "start"',
+            'timestamp = "start"\ncorrected_to = "end"',
+            r"lidars\.roof\.point_times: points that are corrected already \(corrected_to\) need no times",
+        ),
+        (
+            'turn_s = 0.1\ntimestamp = "start"\n' + TIMES,
+            'corrected_to = "middle"',
+            r"lidars\.roof\.turn_s is missing; corrected_to = 'middle' says nothing without it",
+        ),
+        ('timestamp = "start"', 'timestamp = "start"\npoints_in = "world"', r"points_in is 'world', expected one of"),
         ('column = "t"', 'column = "time"', r"\.pcd: has no column time, only x, y, z, intensity, t"),
         (
             LEFT,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -79,6 +80,25 @@ def write_structured_npy(folder: Path) -> tuple[Path, ScanFormat]:
     return folder / "a.npy", replace(TIMED, names={"x": "X", "y": "Y", "z": "Z", "intensity": "i"})
 
 
+def write_npz(folder: Path) -> tuple[Path, ScanFormat]:
+    columns = np.column_stack((POINTS, INTENSITY, COUNTS)).astype(np.float64)
+    np.savez_compressed(folder / "a.npz", data=columns, rings=np.zeros(3))
+    return folder / "a.npz", replace(TIMED, columns=("x", "y", "z", "intensity", "t"), array="data")
+
+
+def write_lone_npz(folder: Path) -> tuple[Path, ScanFormat]:
+    np.savez(folder / "a.npz", np.column_stack((POINTS, INTENSITY, COUNTS)))
+    return folder / "a.npz", replace(TIMED, columns=("x", "y", "z", "intensity", "t"))
+
+
+def write_feather(folder: Path) -> tuple[Path, ScanFormat]:
+    pyarrow = pytest.importorskip("pyarrow", reason="pyarrow is missing, which reads .feather")
+    columns = {name: records()[name] for name in ("x", "y", "z", "intensity", "t")}
+    table = pyarrow.table({**columns, "laser": ["a", "b", "c"]})
+    pytest.importorskip("pyarrow.feather").write_feather(table, str(folder / "a.feather"), compression="lz4")
+    return folder / "a.feather", TIMED
+
+
 def write_compressed_pcd(folder: Path) -> tuple[Path, ScanFormat]:
     content = b"".join(records()[name].tobytes() for name in ("x", "y", "z", "intensity", "t"))
     packed = lzf_literals(content)
@@ -102,6 +122,9 @@ def write_padded_pcd(folder: Path) -> tuple[Path, ScanFormat]:
         write_bin,
         write_npy,
         write_structured_npy,
+        write_npz,
+        write_lone_npz,
+        write_feather,
         pytest.param(lambda folder: (ply(folder / "a.ply", "ascii", lines()), TIMED), id="ply ascii"),
         pytest.param(
             lambda folder: (ply(folder / "a.ply", "binary_little_endian", records().tobytes()), TIMED), id="ply little"
@@ -135,6 +158,46 @@ def test_every_format_gives_the_same_points(tmp_path: Path, write) -> None:
     assert read_scan(path, replace(scan, times=None)).offset_s is None
     later = read_scan(path, scan, 0.05).offset_s
     assert later is not None and later.tolist() == pytest.approx([-0.05, -0.01, 0.049], abs=1e-12)
+
+
+def test_an_archive_says_what_it_lacks(tmp_path: Path) -> None:
+    path, scan = write_npz(tmp_path)
+    for wrong, message in (
+        (replace(scan, array="points"), r"a\.npz: no array 'points'; it holds \['data', 'rings'\].*as array = 'data'"),
+        (replace(scan, array=None), r"a\.npz: 2 arrays"),
+        (replace(scan, array="rings"), r"shape \(3,\); expected points × 5 numbers"),
+        (replace(scan, columns=("x", "y", "z")), r"shape \(3, 5\); expected points × 3 numbers"),
+    ):
+        with pytest.raises(InputError, match=message):
+            check_scan(path, wrong)
+    path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(InputError, match=r"a\.npz: cannot be read as arrays"):
+        check_scan(path, scan)
+    damaged, _ = write_npz(tmp_path)
+    content = bytearray(damaged.read_bytes())
+    content[120] ^= 0xFF
+    damaged.write_bytes(content)
+    with pytest.raises(InputError, match=r"a\.npz"):
+        read_scan(damaged, scan)
+
+
+def test_tables_want_pyarrow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.feather").write_bytes(b"ARROW1 and so on")
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(InputError, match=r"a\.feather: .* pyarrow, which is not installed\. `pip install pyarrow`"):
+        check_scan(tmp_path / "a.feather", ScanFormat())
+
+
+def test_broken_tables_are_named(tmp_path: Path) -> None:
+    path, scan = write_feather(tmp_path)
+    whole = path.read_bytes()
+    for spoilt in (whole[: len(whole) // 2], b"ARROW1" + bytes(200), bytes(50)):
+        path.write_bytes(spoilt)
+        with pytest.raises(InputError, match=r"a\.feather: cannot be read as a table"):
+            check_scan(path, scan)
+    path.write_bytes(whole)
+    with pytest.raises(InputError, match=r"a\.feather: has no column X"):
+        check_scan(path, replace(scan, names={"x": "X"}))
 
 
 def test_times_on_the_clock_keep_their_digits(tmp_path: Path) -> None:

@@ -35,6 +35,7 @@ from edge_depth_nerf.base.bounds import (
     read_text,
 )
 from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.jpeg import is_jpeg, jpeg_fault
 
 DISTANCE_STEPS_PER_METRE = 256
 """A distance PNG counts in 1/256 m."""
@@ -216,12 +217,29 @@ def _decode(path: Path, flags: int) -> NDArray:
     except cv2.error:
         image = None
     # libpng fills what a truncated file lacks with zeros, so the end mark is looked for as well
-    if image is None or (path.suffix.lower() == ".png" and b"IEND" not in content[-16:].tobytes()):
+    fault: str | None = "truncated or not a picture"
+    if image is not None and (path.suffix.lower() != ".png" or b"IEND" in content[-16:].tobytes()):
+        fault = _fault_of(path, content.tobytes())
+    if image is None or fault is not None:
         raise InputError(
-            f"{path}: cannot be decoded as a picture ({content.size} bytes; truncated or not a picture). "
-            "Copy or make the file again."
+            f"{path}: cannot be decoded as a picture ({content.size} bytes; {fault}). Copy or make the file again."
         )
     return image
+
+
+def _fault_of(path: Path, content: bytes) -> str | None:
+    """Find what OpenCV passes over: missing parts of a JPEG, strips of a TIFF that cannot be unpacked."""
+    if is_jpeg(content):
+        return jpeg_fault(content)
+    if content[:4] in (b"II*\0", b"MM\0*"):
+        from PIL import Image
+
+        try:
+            with Image.open(path, formats=("TIFF",)) as picture:
+                picture.load()
+        except (OSError, ValueError, SyntaxError) as error:
+            return f"damaged ({error})"
+    return None
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:

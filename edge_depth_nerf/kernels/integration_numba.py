@@ -97,12 +97,12 @@ def _sum_along_rows(exists, space, sums):
 
 @_compiled
 @no_type_check
-def _divided(share, along_rows, i, j, space):
-    """Divide a source's share by its spatial weight in the window of a centre."""
+def _divided(share, along_rows, i, j, space, least):
+    """Divide a source's share by its spatial weight in the window of a centre, or by `least`, if that is more."""
     total = 0.0
     for k in range(len(space)):
         total += space[k] * along_rows[i + k, j]
-    return share / max(total, _LEAST) if total > 0 else 0.0
+    return share / max(total, least, _LEAST) if total > 0 else 0.0
 
 
 @_compiled
@@ -120,6 +120,7 @@ def integrate_rows(
     lowest_exponent,
     alpha,
     per_source,
+    least_returns,
     keep_returns,
     lidar_guides,
     rows_from,
@@ -140,6 +141,7 @@ def integrate_rows(
         lowest_exponent: distance factors of lower exponents are 0; at least -708, where float64 loses digits.
         alpha: LiDAR's share.
         per_source: divide each source's weights by the sum of its spatial weights.
+        least_returns: but LiDAR's by no less than this.
         keep_returns: a return is its own prior.
         lidar_guides: compare with LiDAR where the centre has a return.
         rows_from: first row.
@@ -175,8 +177,8 @@ def integrate_rows(
                 )
                 mono_factor, lidar_factor = 1 - alpha, alpha
                 if per_source:
-                    mono_factor = _divided(mono_factor, along_rows[0], i, first + j, space)
-                    lidar_factor = _divided(lidar_factor, along_rows[1], i, first + j, space)
+                    mono_factor = _divided(mono_factor, along_rows[0], i, first + j, space, 0.0)
+                    lidar_factor = _divided(lidar_factor, along_rows[1], i, first + j, space, least_returns)
                 centres[MONO_FACTOR * TILE + j] = mono_factor
                 centres[LIDAR_FACTOR * TILE + j] = lidar_factor
             centres[ETA * TILE :] = 0

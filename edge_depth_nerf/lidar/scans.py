@@ -1,7 +1,9 @@
-"""Reading LiDAR scans of any recorder: .bin, .npy, .ply and .pcd files.
+"""Reading LiDAR scans of any recorder: .bin, .npy, .npz, .ply, .pcd and .feather files.
 
     .bin    values one after another, little-endian; their columns and type are declared
     .npy    a structured array, or points × columns, whose columns are declared
+    .npz    the same, one of its arrays
+    .feather    a table of Arrow's with named columns; read by pyarrow, which is not among this project's dependencies
     .ply    the element `vertex`; ascii, binary_little_endian, binary_big_endian
     .pcd    ascii, binary, binary_compressed
 
@@ -18,10 +20,12 @@ from __future__ import annotations
 
 import math
 import struct
+import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import Any, BinaryIO, Literal
 
 import lzf
 import numpy as np
@@ -30,12 +34,12 @@ from jaxtyping import Float64, Shaped
 
 from edge_depth_nerf.base.bounds import check_bytes, shown
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import ARRAY_ERRORS, read_array_header
+from edge_depth_nerf.base.files import ARRAY_ERRORS, read_array_header, read_npz
 from edge_depth_nerf.lidar.sweeps import MAX_POINTS, Sweep, usable_returns
 
-Encoding = Literal["records", "text", "lzf", "matrix"]
+Encoding = Literal["records", "text", "lzf", "matrix", "archive", "table"]
 
-SCAN_SUFFIXES = (".bin", ".npy", ".ply", ".pcd")
+SCAN_SUFFIXES = (".bin", ".npy", ".npz", ".ply", ".pcd", ".feather")
 """The formats that can be read."""
 MAX_CLOUD_POINTS = 10_000_000
 """No point cloud of a scene has more."""
@@ -52,6 +56,10 @@ _PLY_TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
     **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
+}
+_ARROW_TYPES = {
+    **{"halffloat": "f2", "float": "f4", "double": "f8"},
+    **{f"{sign}int{8 * size}": f"{sign or 'i'}{size}" for sign in ("", "u") for size in (1, 2, 4, 8)},
 }
 _PLY_ENCODINGS: dict[str, tuple[Encoding, str]] = {
     "ascii": ("text", "<"),
@@ -80,6 +88,8 @@ class ScanFormat:
     """Names of the columns of .bin files and of .npy files without names. x, y, z are needed."""
     dtype: Literal["float32", "float64"] = "float32"
     """Type of the values in .bin files."""
+    array: str | None = None
+    """Name of the points' array in .npz files; None: the only one there is."""
     names: Mapping[str, str] = field(default_factory=dict)
     """What x, y, z, intensity are called in the files, where they are called something else."""
     times: PointTimes | None = None
@@ -104,7 +114,8 @@ class _Header:
     count: int
     """Number of points."""
     encoding: Encoding
-    """Records one after another, lines of text, PCD's compressed columns, or an array of NumPy's."""
+    """Records one after another, lines of text, PCD's compressed columns, an array of NumPy's, one in an archive, or a
+    table of Arrow's."""
     offset: int = 0
     """Where the points begin, in bytes."""
 
@@ -164,7 +175,10 @@ def read_cloud(path: Path) -> Float64[np.ndarray, "points 3"]:
 def _read_header(path: Path, scan: ScanFormat, most: int = MAX_POINTS) -> _Header:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
-    readers = {".bin": _bin_header, ".npy": _npy_header, ".ply": _ply_header, ".pcd": _pcd_header}
+    readers = {
+        **{".bin": _bin_header, ".npy": _npy_header, ".npz": _npz_header},
+        **{".ply": _ply_header, ".pcd": _pcd_header, ".feather": _feather_header},
+    }
     suffix = path.suffix.lower()
     if suffix not in readers:
         raise InputError(
@@ -224,16 +238,70 @@ def _npy_array(path: Path) -> np.ndarray:
 
 def _npy_header(path: Path, size: int, scan: ScanFormat) -> _Header:
     array = _npy_array(path)
-    if array.dtype.names:
-        if array.ndim == 1:
-            return _Header(array.dtype, len(array), "matrix")
-    elif array.ndim == 2 and array.shape[1] == len(scan.columns) and array.dtype.kind in "fiu":
-        record = np.dtype([(name, array.dtype) for name in scan.columns])
-        return _Header(record, len(array), "matrix")
+    return _array_header(path, array.shape, array.dtype, scan, "matrix")
+
+
+def _array_header(path: Path, shape: tuple[int, ...], kind: np.dtype, scan: ScanFormat, encoding: Encoding) -> _Header:
+    if kind.names and encoding == "matrix":
+        if len(shape) == 1:
+            return _Header(kind, shape[0], encoding)
+    elif len(shape) == 2 and shape[1] == len(scan.columns) and kind.kind in "fiu":
+        return _Header(np.dtype([(name, kind) for name in scan.columns]), shape[0], encoding)
+    structured = "a structured array, or " if encoding == "matrix" else ""
     raise InputError(
-        f"{path}: an array of {array.dtype} and shape {array.shape}; expected a structured array, or points × "
-        f"{len(scan.columns)} numbers ({', '.join(scan.columns)}). Say in the rig file which columns it has."
+        f"{path}: an array of {kind} and shape {shape}; expected {structured}points × {len(scan.columns)} numbers "
+        f"({', '.join(scan.columns)}). Say in the rig file which columns it has."
     )
+
+
+def _npz_name(path: Path, scan: ScanFormat) -> str:
+    """The name of the points' array in an archive."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path}: cannot be read as arrays ({error}). {_AGAIN}") from None
+    wanted = [scan.array] if scan.array is not None else names
+    if len(wanted) != 1 or wanted[0] not in names:
+        asked = f"no array {scan.array!r}" if scan.array is not None else f"{len(names)} arrays"
+        raise InputError(
+            f"{path}: {asked}; it holds {shown(names)}. Name the one of the points in the rig file, as array = 'data'."
+        )
+    return wanted[0]
+
+
+def _npz_header(path: Path, size: int, scan: ScanFormat) -> _Header:
+    name = _npz_name(path, scan)
+    try:
+        with zipfile.ZipFile(path) as archive, archive.open(f"{name}.npy") as member:
+            shape, _, kind = read_array_header(member, f"{path}: {name}")
+    except InputError:
+        raise
+    except (OSError, ValueError, EOFError, RuntimeError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(f"{path}: cannot be read as arrays ({error}). {_AGAIN}") from None
+    return _array_header(path, shape, kind, scan, "archive")
+
+
+def _feather_table(path: Path, columns: list[str] | None = None) -> Any:
+    """Open a table, its columns mapped into memory; compressed ones are unpacked when they are asked for."""
+    try:
+        from pyarrow import ArrowException, feather  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        raise InputError(
+            f"{path}: .feather scans are read by pyarrow, which is not installed. `pip install pyarrow`, or convert "
+            "the scans to .npz."
+        ) from None
+    try:
+        return feather.read_table(path, columns=columns, memory_map=True)
+    except (ArrowException, OSError, ValueError, KeyError) as error:
+        raise InputError(f"{path}: cannot be read as a table ({str(error).splitlines()[0]}). {_AGAIN}") from None
+
+
+def _feather_header(path: Path, size: int, scan: ScanFormat) -> _Header:
+    table = _feather_table(path)
+    # text, lists and the like are no numbers
+    fields = [(field.name, _ARROW_TYPES.get(str(field.type), "O")) for field in table.schema]
+    return _Header(_record(path, fields), table.num_rows, "table")
 
 
 def _header_lines(path: Path, file: BinaryIO, last: str) -> list[list[str]]:
@@ -320,6 +388,13 @@ def _read_columns(path: Path, header: _Header, scan: ScanFormat) -> dict[str, Sh
         array = _npy_array(path)
         index = {name: number for number, name in enumerate(scan.columns)}
         picked = {name: array[name] if array.dtype.names else array[:, index[name]] for name in names}
+    elif header.encoding == "archive":
+        array = read_npz(path, [_npz_name(path, scan)], _MAX_TEXT_BYTES)
+        (matrix,) = array.values()
+        picked = {name: matrix[:, scan.columns.index(name)] for name in names}
+    elif header.encoding == "table":
+        table = _feather_table(path, names)
+        picked = {name: table[name].to_numpy() for name in names}
     elif header.encoding == "text":
         picked = _text_columns(path, header, names)
     elif header.encoding == "lzf":

@@ -122,13 +122,17 @@ class NoEgo:
     """Whether the pictures were enough to find one."""
 
 
-def find_ego(pictures: Iterable[Picture | Callable[[], Picture]], lens: Bool[np.ndarray, "h w"]) -> EgoMask | NoEgo:
+def find_ego(
+    pictures: Iterable[Picture | Callable[[], Picture]], lens: Bool[np.ndarray, "h w"], fewest: int = MIN_PICTURES
+) -> EgoMask | NoEgo:
     """Find the vehicle in the pictures of one camera.
 
     Args:
         pictures: of one drive, in order, upright, some 20 to 200 spread over it; arrays, or what loads them. They are
             taken one by one, loaders called only when needed, and let go.
         lens: True inside the lens circle; all True without one.
+        fewest: fewer pictures between which things have moved are too few. Of fewer than `MIN_PICTURES` smooth road may
+            be taken for the vehicle, however clear its outline: something else must agree.
 
     Returns:
         The mask, or why there is none: too few pictures, a vehicle that stands, or nothing that stays the same.
@@ -142,15 +146,15 @@ def find_ego(pictures: Iterable[Picture | Callable[[], Picture]], lens: Bool[np.
     if not small_lens.any():
         return NoEgo("The lens mask leaves no pixel.", could_tell=False)
     taken, offered = _take_moving(pictures, lens.shape, factor, small_lens)
-    if offered < MIN_PICTURES:
+    if offered < fewest:
         return NoEgo(
-            f"{offered} pictures are too few (held-out ones do not count), at least {MIN_PICTURES} are needed.",
+            f"{offered} pictures are too few (held-out ones do not count), at least {fewest} are needed.",
             could_tell=False,
         )
-    if len(taken) < MIN_PICTURES:
+    if len(taken) < fewest:
         return NoEgo(
             f"The vehicle stands: only {len(taken)} of {offered} pictures show something new, at least "
-            f"{MIN_PICTURES} are needed.",
+            f"{fewest} are needed.",
             could_tell=False,
         )
     count, stack = len(taken), np.stack(taken)

@@ -87,6 +87,9 @@ class IntegrationOptions:
     """edge-aware: Eq. 7. spatial-gaussian: Eq. 7 without its distance factor (the rival of Table 4)."""
     normalise: Normalise = "pooled"
     """pooled: Eq. 5, each pixel of the window counts. per-source: alpha weighs the two sources, not their counts."""
+    least_returns: float = 0.0
+    """per-source: where the returns of a window together weigh less in space than so many at its centre, LiDAR's share
+    is that much smaller. 0: a single return has the whole share, as far as the window reaches, and makes a square."""
     keep_returns: bool = False
     """Keep a return as it is (d̃ = d, spread 0, monocular share 0) instead of averaging it with its window."""
     range_guide: RangeGuide = "mono"
@@ -100,6 +103,7 @@ class IntegrationOptions:
         _check_number("sigma_depth_growth_per_m", self.sigma_depth_growth_per_m, 0.0)
         if not (self.kernel_size >= 1 and self.kernel_size % 2 == 1):
             raise InputError(f"kernel_size is {self.kernel_size}; expected an odd whole number of pixels from 1.")
+        _check_number("least_returns", self.least_returns, 0.0)
         _check_choice("kernel", self.kernel, Kernel)
         _check_choice("normalise", self.normalise, Normalise)
         _check_choice("range_guide", self.range_guide, RangeGuide)
@@ -207,6 +211,7 @@ def _integrate_on_cpu(lidar: Tensor, mono: Tensor, valid: Tensor, options: Integ
         LOWEST_EXPONENT,
         float(options.alpha),
         options.normalise == "per-source",
+        float(options.least_returns),
         options.keep_returns,
         options.range_guide == "lidar",
     )
@@ -261,10 +266,10 @@ def _integrate_strip(lidar: Tensor, mono: Tensor, valid: Tensor, options: Integr
         spatial_sums = torch.zeros(2, height, width, dtype=torch.float64, device=mono.device)
         for spatial, window in shifted:
             spatial_sums.add_(window[2:], alpha=spatial)
-        least = torch.finfo(torch.float64).tiny
+        tiny = torch.finfo(torch.float64).tiny
         factors = [
-            torch.where(sums > 0, factor / sums.clamp(min=least), 0)
-            for factor, sums in zip(factors, spatial_sums, strict=True)
+            torch.where(sums > 0, factor / sums.clamp(min=max(least, tiny)), 0)
+            for factor, sums, least in zip(factors, spatial_sums, (0.0, options.least_returns), strict=True)
         ]
 
     eta, first, second, eta_mono = torch.zeros(4, height, width, dtype=torch.float64, device=mono.device)

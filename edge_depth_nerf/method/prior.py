@@ -76,7 +76,7 @@ class PriorOptions:
     """The standard deviation under sigma_mode constant, metres."""
     integration: IntegrationOptions = field(
         default_factory=lambda: IntegrationOptions(
-            normalise="per-source", keep_returns=True, sigma_depth_growth_per_m=0.005
+            normalise="per-source", least_returns=4.0, keep_returns=True, sigma_depth_growth_per_m=0.005
         )
     )
     """Eq. 5-7 and their variants; the default is what measures best (docs/prior.md)."""

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle, RaySamples
@@ -328,7 +328,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         else:
             metrics = super().get_metrics_dict(outputs, batch)
         if self.training and self.config.depth_loss != "none":
-            metrics["share_with_prior"] = (batch["prior_distance_m"] > 0).float().mean()
+            metrics["share_with_prior"] = self._can_be_met(batch["prior_distance_m"]).float().mean()
         return metrics
 
     def get_loss_dict(
@@ -352,6 +352,13 @@ class EdgeDepthNerfModel(NerfactoModel):
             losses["exposure_loss"] = self.config.exposure_mult * self.exposure.unevenness()
         return losses
 
+    def _can_be_met(self, prior_m: Float[Tensor, "*rays"]) -> Bool[Tensor, "*rays"]:
+        """Where a prior lies between the planes; without one it is 0, in front of the near plane.
+
+        No sample lies elsewhere: such a prior would draw all weight to the first sample or to the last.
+        """
+        return (prior_m >= self.config.near_m) & (prior_m <= self.config.far_m) & (prior_m > 0)
+
     def _depth_weight(self) -> float:
         """λ at this step."""
         steps = self._training_steps if self.config.depth_loss_steps is None else self.config.depth_loss_steps
@@ -367,12 +374,25 @@ class EdgeDepthNerfModel(NerfactoModel):
         if self.config.surface_loss_mult > 0 and "surface_rays" in batch:
             rays, sky = batch["surface_rays"], batch["surface_sky"][:, 0]
             self.camera_optimizer.apply_to_raybundle(rays)
-            # any place within what the prior leaves open may be the surface
-            distance_m, sigma_m = batch["surface_distance_m"][:, 0], batch["surface_sigma_m"][:, 0]
-            distance = (distance_m + sigma_m * torch.randn_like(sigma_m)).clamp(min=0) / self.metres_per_unit
+            distance = self._surface_drawn(batch) / self.metres_per_unit
             colours = self._exposed(self._field_at(rays, torch.where(sky, INFINITELY_FAR, distance)), rays)
+            # no error where the surface is not between the planes; choosing pixels would make a GPU wait
+            told = sky | self._can_be_met(batch["surface_distance_m"][:, 0])
+            colours = torch.where(told[:, None], colours, batch["surface_image"])
             losses["surface_loss"] = self.config.surface_loss_mult * self.rgb_loss(batch["surface_image"], colours)
         return losses
+
+    def _surface_drawn(self, batch: dict[str, Any]) -> Float[Tensor, "rays"]:
+        """Draw where the surface of each further pixel is: any place within what its prior leaves open, in metres.
+
+        Nothing is rendered in front of the near plane or behind the far one: what is drawn there is mirrored at the
+        prior, to its other side.
+        """
+        distance_m, sigma_m = batch["surface_distance_m"][:, 0], batch["surface_sigma_m"][:, 0]
+        off_m = sigma_m * torch.randn_like(sigma_m)
+        drawn_m = distance_m + off_m
+        beyond = (drawn_m < self.config.near_m) | (drawn_m > self.config.far_m)
+        return torch.where(beyond, distance_m - off_m, drawn_m).clamp(self.config.near_m, self.config.far_m)
 
     def _nerfacto_losses(
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics: dict[str, Any]
@@ -404,6 +424,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         starts_m = samples.frustums.starts * self.metres_per_unit
         ends_m = samples.frustums.ends * self.metres_per_unit
         prior_m = batch["prior_distance_m"].to(weights)
+        prior_m = torch.where(self._can_be_met(prior_m), prior_m, 0)
         if self.config.depth_loss == "edge":
             return edge_loss(
                 weights[..., 0],

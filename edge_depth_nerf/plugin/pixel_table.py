@@ -1,9 +1,10 @@
 """The training pixels that count, on disk in a random order.
 
 Pure. Only valid pixels of each picture are kept, as records of 15 bytes: colour as uint8, prior distance and sigma as
-uint16 in 1/256 m (0 = no prior; the sky has no distance and the largest sigma), and where the pixel is. Their order is
-random, so that a batch is one contiguous read of a memory-mapped file: any number of pictures needs next to no memory
-of the process's own. A batch holds each pixel at most once, and all pixels are passed before one comes again.
+uint16 in 1/256 m (0 = no prior; the sky has no distance and the largest sigma), and where the pixel is. A prior that 16
+bits cannot hold, beyond 255.996 m or below 2 mm, is none; a sigma beyond is kept as 255.996 m. Their order is random,
+so that a batch is one contiguous read of a memory-mapped file: any number of pictures needs next to no memory of the
+process's own. A batch holds each pixel at most once, and all pixels are passed before one comes again.
 
 The order is made in two passes: each pixel goes to one of several files, drawn at random; then each file, small enough
 for memory, is shuffled and appended to the whole. That is a uniformly random permutation.
@@ -28,7 +29,7 @@ from edge_depth_nerf.base.checked_cache import is_whole, write_checked
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE, read_json_object, write_json
 
-TABLE_VERSION = 4
+TABLE_VERSION = 5
 """Raised whenever the form of the file changes."""
 BUCKET_BYTES = 64 << 20
 """So much is shuffled in memory at once."""
@@ -200,7 +201,8 @@ class PixelTableWriter:
         records["row"], records["column"], records["picture"] = rows, columns, self._pictures
         if prior_distance_m is not None and prior_sigma_m is not None:
             records["distance"] = to_steps(prior_distance_m[rows, columns])
-            records["sigma"] = _sigma_steps(prior_sigma_m[rows, columns])
+            # without a distance a large sigma would say "sky"
+            records["sigma"] = np.where(records["distance"] > 0, _sigma_steps(prior_sigma_m[rows, columns]), 0)
         if sky is not None:
             records["sigma"][sky[rows, columns] & (records["distance"] == 0)] = SKY
         self._pictures += 1

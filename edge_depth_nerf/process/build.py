@@ -10,7 +10,6 @@ import dataclasses
 import hashlib
 import threading
 from collections import defaultdict
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,18 +28,19 @@ from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar import project_points, transform_points
-from edge_depth_nerf.masks.ego import EgoMask, find_ego
-from edge_depth_nerf.masks.ego_files import ego_mask_path, keep_ego_mask, vehicles_unknown
-from edge_depth_nerf.masks.lens import dark_rim, lens_circle
+from edge_depth_nerf.masks.lens import lens_circle
 from edge_depth_nerf.masks.semantics import check_classes, keep_static, read_labels
 from edge_depth_nerf.masks.semantics import sky as sky_of_labels
 from edge_depth_nerf.masks.sky import find_sky
+from edge_depth_nerf.process.agreement import agreement_notices, agreements
 from edge_depth_nerf.process.downscale import downscale_distance, downscale_image, downscale_mask
 from edge_depth_nerf.process.options import ProcessOptions
 from edge_depth_nerf.process.reading import load_distance, load_picture, read_depth
 from edge_depth_nerf.process.recording import RecordedPicture, Recording
 from edge_depth_nerf.process.sweep_store import SweepStore
+from edge_depth_nerf.process.vehicle import find_vehicle, given_masks
 from edge_depth_nerf.scene.checks import read_camera_mask
+from edge_depth_nerf.scene.format import TRANSFORMS
 from edge_depth_nerf.scene.points import PointCloud
 from edge_depth_nerf.scene.writer import (
     CLOUD,
@@ -60,10 +60,6 @@ FOUND_POSES = "found_poses.json"
 """File of the scene with the poses that were found from the pictures: camera, frame, held out, camera to world."""
 MOST_LISTED = 50
 """So many files that were left out are listed."""
-_EGO_PICTURES = 60
-"""The vehicle is looked for in so many pictures of a camera, spread over the drive."""
-_RIM_PICTURES = 4
-"""The lens's dark rim in so many: what stays dark in different places."""
 
 
 def process_recording(recording: Recording, options: ProcessOptions, console: Console | None = None) -> ProcessReport:
@@ -83,13 +79,13 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
         check_colmap(recording, options)
     with console.status("Checking cameras and files …"):
         source = _source(recording, options)
-        masks = _given_masks(recording, options)
+        masks = given_masks(recording, options)
         check_cameras(_scene_cameras(recording, masks, options), options.theta_max_deg)
     open_scene(options.output, source)
     notices: list[str] = []
     if options.find_ego:
         training = [picture for picture in recording.pictures if picture.frame not in _held_out(recording, options)]
-        recording, notices = _find_vehicle(recording, training, masks, options, console)
+        recording, notices = find_vehicle(recording, training, masks, options, console)
     if options.poses == "colmap":
         from edge_depth_nerf.process.colmap.poses import colmap_poses
 
@@ -112,6 +108,7 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
         )
         for picture in recording.pictures
     ]
+    notices += _disagreements(recording, masks, options, console)
     report = write_scene(
         options.output,
         _scene_cameras(recording, masks, options),
@@ -133,81 +130,25 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
     return report
 
 
+def _disagreements(
+    recording: Recording, masks: dict[str, NDArray[np.bool_]], options: ProcessOptions, console: Console
+) -> list[str]:
+    """What speaks against the transforms that are given; of a scene that is done it has been said."""
+    if (options.output / TRANSFORMS).is_file():
+        return []
+    usable = {}
+    for recorded in recording.cameras:
+        lens = lens_circle(recorded.camera, options.theta_max_deg)
+        usable[recorded.name] = lens & masks[recorded.name] if recorded.name in masks else lens
+    with console.status("Holding LiDAR against the pictures"):
+        return agreement_notices(agreements(recording, usable))
+
+
 def _held_out(recording: Recording, options: ProcessOptions) -> set[int]:
     """Numbers of the moments that are kept from training."""
     moments = sorted({picture.frame for picture in recording.pictures})
     held_out = held_out_frames(len(moments), options.holdout_every)
     return {frame for frame, out in zip(moments, held_out, strict=True) if out}
-
-
-# ---- the vehicle's own mask ------------------------------------------------------------------------------------
-
-
-def _given_masks(recording: Recording, options: ProcessOptions) -> dict[str, NDArray[np.bool_]]:
-    """Read the masks that are given, by camera."""
-    given = {}
-    for recorded in recording.cameras:
-        path = options.ego_mask_of(recorded.name) or recorded.ego_mask
-        if path is not None:
-            given[recorded.name] = read_camera_mask(path, recorded.camera)
-    return given
-
-
-def _find_vehicle(
-    recording: Recording,
-    training: Sequence[RecordedPicture],
-    masks: dict[str, NDArray[np.bool_]],
-    options: ProcessOptions,
-    console: Console,
-) -> tuple[Recording, list[str]]:
-    """Find the masks that are not given, add them to `masks`, and write them into the scene."""
-    cameras, notices = [], []
-    for recorded in recording.cameras:
-        if recorded.name not in masks:
-            path = ego_mask_path(options.output, recorded.name)
-            if not path.is_file() or recorded.name in vehicles_unknown(options.output):
-                files = [picture.path for picture in training if picture.camera == recorded.name]
-                mask, said, could_tell = _find_mask(recorded.camera, files, options, console)
-                keep_ego_mask(options.output, recorded.name, mask, could_tell)
-                notices.append(f"{recorded.name}: {said} {(_LOOK if could_tell else _PAINT).format(path)}")
-            masks[recorded.name] = read_camera_mask(path, recorded.camera)
-            recorded = dataclasses.replace(recorded, ego_mask=path)
-        cameras.append(recorded)
-    return dataclasses.replace(recording, cameras=tuple(cameras)), notices
-
-
-_LOOK = "Look at {}: what you correct there counts when the drive is processed again."
-_PAINT = (
-    "It is trained on as if it stood in the world: process more of the drive, or paint it black in {} and process "
-    "again."
-)
-
-
-def _find_mask(
-    camera: Camera, files: Sequence[Path], options: ProcessOptions, console: Console
-) -> tuple[NDArray[np.bool_], str, bool]:
-    """Find the vehicle and the lens's dark rim in a camera's pictures, at their own size; tell how it went."""
-    spread = [files[index] for index in np.unique(np.linspace(0, len(files) - 1, _EGO_PICTURES).astype(int))]
-    if not options.strict:
-        # those that cannot be read are told of when their turn comes
-        spread = [file for file in spread if _readable(file)]
-    with console.status("Looking for the vehicle in the pictures"):
-        rim = dark_rim(read_image(file) for file in spread[:: max(len(spread) // _RIM_PICTURES, 1)])
-        mask = np.ones((camera.height, camera.width), bool) if rim is None else rim
-        found = find_ego(
-            [partial(read_image, file) for file in spread], lens_circle(camera, options.theta_max_deg) & mask
-        )
-    if isinstance(found, EgoMask):
-        return mask & found.keep, f"the vehicle was found by itself and hides {found.share:.1%} of the lens.", True
-    return mask, f"the vehicle's own mask was not found: {found.reason.rstrip('.')}.", found.could_tell
-
-
-def _readable(picture: Path) -> bool:
-    try:
-        read_image(picture)
-    except (InputError, FileNotFoundError):
-        return False
-    return True
 
 
 def _scene_cameras(
@@ -410,6 +351,16 @@ class _Builder:
     def notices(self) -> list[str]:
         """What the user should know of the maps that were made now."""
         found = self._store.notices()
+        if "lidar" not in self.layers:
+            prior = (
+                "the prior is monocular alone, and nothing checks its scale"
+                if "mono" in self.layers
+                else ("no ray has a prior, and training is plain nerfacto")
+            )
+            found.append(
+                f"The drive has neither LiDAR nor depth maps: {prior}. Name its scans or depth maps where the drive is "
+                "described, or bring monocular maps of true scale by --mono."
+            )
         if self._coverage:
             shares = ", ".join(f"{np.mean(shares):.1%} of {name}" for name, shares in sorted(self._coverage.items()))
             found.append(f"LiDAR covers, of what the masks keep, {shares}.")

@@ -20,10 +20,14 @@ from edge_depth_nerf.cameras.transforms import Transform, check_rigid
 
 QUATERNION_TOLERANCE = 1e-3
 """How far a quaternion's length may be from 1; four written digits still pass."""
+SAME_POSE_M, SAME_POSE_DEG = 0.02, 0.2
+"""Poses of one time that differ by no more are one; the first counts."""
 
 
 def read_tum(path: Path) -> tuple[Float64[np.ndarray, "poses"], Float64[np.ndarray, "poses 4 4"]]:
     """Read TUM's format: lines "time x y z qx qy qz qw"; seconds, metres, a unit quaternion.
+
+    A pose of the same time as the one before is left out if it agrees with it.
 
     Returns:
         Times, increasing, and poses.
@@ -42,14 +46,23 @@ def read_tum(path: Path) -> tuple[Float64[np.ndarray, "poses"], Float64[np.ndarr
             )
         if abs(values[0]) > MAX_TIME_S:
             raise InputError(f"{path}, line {line}: its time {values[0]:g} is no time in seconds.")
+        pose = pose_of_quaternion(values[1:4], values[4:], f"{path}, line {line}")
+        if times and values[0] == times[-1] and _same(pose, poses[-1]):
+            # sensors that were read at once bring the vehicle's pose each
+            continue
         if times and not values[0] > times[-1]:
             raise InputError(
                 f"{path}, line {line}: its time {values[0]:.6f} is not after {times[-1]:.6f} of the line before. Sort "
-                "the poses by time, one pose a time."
+                f"them by time; poses of one time must agree within {100 * SAME_POSE_M:g} cm and {SAME_POSE_DEG:g}°."
             )
         times.append(values[0])
-        poses.append(pose_of_quaternion(values[1:4], values[4:], f"{path}, line {line}"))
+        poses.append(pose)
     return np.array(times, np.float64), np.array(poses, np.float64).reshape(-1, 4, 4)
+
+
+def _same(pose: Transform, other: Transform) -> bool:
+    turn_deg = np.degrees(Rotation.from_matrix(pose[:3, :3].T @ other[:3, :3]).magnitude())
+    return bool(np.linalg.norm(pose[:3, 3] - other[:3, 3]) <= SAME_POSE_M and turn_deg <= SAME_POSE_DEG)
 
 
 def read_kitti(path: Path) -> Float64[np.ndarray, "poses 4 4"]:

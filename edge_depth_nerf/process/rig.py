@@ -11,17 +11,19 @@ import re
 import statistics
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float64
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE, as_people_count, picture_size
 from edge_depth_nerf.cameras.transforms import Transform
+from edge_depth_nerf.lidar import Sweep, transform_points
 from edge_depth_nerf.lidar.scans import SCAN_SUFFIXES, check_scan, read_scan
 from edge_depth_nerf.lidar.trajectory import MAX_POSE_GAP_S, Trajectory
 from edge_depth_nerf.process.options import JbnuDepth360Options, RigOptions
@@ -151,7 +153,7 @@ def recording_of_rig(rig: Rig, root: Path, options: RigOptions | JbnuDepth360Opt
         notices=tuple(
             f"{lidar.name}: neither turn_s nor point_times is given; its scans are taken as of one moment."
             for lidar in rig.lidars
-            if lidar.timing is None and lidar.format.times is None
+            if lidar.timing is None and lidar.format.times is None and lidar.corrected_to is None
         ),
     )
 
@@ -457,18 +459,28 @@ def _sweeps(
             except (InputError, FileNotFoundError) as error:
                 tolerance.add(frame, lidar.name, error)
                 continue
+            counted_from_s = middle_s if absolute else lidar.to_middle_s
             found.append(
                 RecordedSweep(
                     path=item.path,
-                    time_s=middle_s,
+                    time_s=item.time_s + lidar.to_pose_s,
                     frame=frame,
                     scanner=lidar.name,
                     to_vehicle=lidar.to_vehicle,
-                    read=partial(read_scan, item.path, lidar.format, middle_s if absolute else lidar.to_middle_s),
+                    read=partial(_read, item.path, lidar, counted_from_s),
                     timing=lidar.timing,
                 )
             )
     return found
+
+
+def _read(path: Path, lidar: RigLidar, counted_from_s: float) -> Sweep:
+    """Read a scan, in the scanner's frame."""
+    sweep = read_scan(path, lidar.format, counted_from_s)
+    if lidar.points_in == "scanner":
+        return sweep
+    to_scanner = torch.from_numpy(np.linalg.inv(lidar.to_vehicle))
+    return replace(sweep, points_m=transform_points(to_scanner, sweep.points_m))
 
 
 # ---- what comes with the pictures ------------------------------------------------------------------------------

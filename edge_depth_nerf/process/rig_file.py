@@ -294,7 +294,13 @@ class RigLidar(_Sensor):
     scans: Files
     columns: Annotated[list[Text], AfterValidator(_different)] = list(ScanFormat().columns)
     dtype: Literal["float32", "float64"] = "float32"
+    array: Text | None = None
+    """Name of the points' array in .npz files."""
     names: _Names = _Names()
+    points_in: Literal["scanner", "vehicle"] = "scanner"
+    """The frame of its points."""
+    corrected_to: Literal["timestamp", "start", "middle", "end"] | None = None
+    """The moment at which the vehicle is taken to have been where its points say; None = they are as measured."""
     point_times: _PointTimes | None = None
     turn_s: Annotated[float, Field(gt=1e-9, le=1e5, description="a number above 1e-09, at most 100000")] | None = None
     """How long a scan takes; None = from one to the next."""
@@ -309,6 +315,7 @@ class RigLidar(_Sensor):
         return ScanFormat(
             columns=tuple(self.columns),
             dtype=self.dtype,
+            array=self.array,
             names=self.names.model_dump(),
             times=times and PointTimes(times.column, _SECONDS[times.unit], absolute=times.counted_from == "clock"),
         )
@@ -317,6 +324,15 @@ class RigLidar(_Sensor):
     def to_middle_s(self) -> float:
         """From a scan's timestamp to its middle."""
         return {"start": 0.5, "end": -0.5}.get(self.timestamp or "middle", 0.0) * (self.turn_s or 0.0)
+
+    @property
+    def to_pose_s(self) -> float:
+        """From a scan's timestamp to the moment of the pose that its points belong to: its middle, or another one."""
+        if self.corrected_to in (None, "middle"):
+            return self.to_middle_s
+        if self.corrected_to == "timestamp":
+            return 0.0
+        return self.to_middle_s + {"start": -0.5, "end": 0.5}[self.corrected_to] * (self.turn_s or 0.0)
 
     @cached_property
     def timing(self) -> SweepTiming | None:
@@ -335,6 +351,13 @@ class RigLidar(_Sensor):
             raise InputError(f".turn_s is missing; {without_turn[-1]} says nothing without it.")
         if self.turn_s is not None and self.timestamp is None:
             raise InputError(".timestamp is missing; expected one of 'start', 'middle', 'end'.")
+        if self.corrected_to is not None:
+            if wrong := sorted({"direction", "start_azimuth_deg", "point_times"} & self.model_fields_set):
+                raise InputError(
+                    f".{wrong[0]}: points that are corrected already (corrected_to) need no times; take one away."
+                )
+            if self.corrected_to != "timestamp" and self.turn_s is None:
+                raise InputError(f".turn_s is missing; corrected_to = {self.corrected_to!r} says nothing without it.")
         if self.timing is not None and self.point_times is not None:
             raise InputError(
                 ".direction: points with times of their own (point_times) need no direction; take one away."

@@ -1,0 +1,188 @@
+"""The vehicle's own masks: those that are given, and those that are found in the pictures.
+
+Of fewer than `MIN_PICTURES` pictures what stays the same says too little: smooth road does, too. There a mask is
+believed if its outline is clear and the drive's LiDAR agrees: a scanner on the roof has next to no returns on its own
+vehicle, and many on the road. On rendered drives, five to nine pictures: the vehicle has 5 to 10 % of the returns a
+pixel that lie around it, road that was taken for it 21 % and more, and of a front camera or a scanner that looks past
+the bonnet nothing can be told this way.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import defaultdict
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32
+from numpy.typing import NDArray
+from rich.console import Console
+
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_image
+from edge_depth_nerf.lidar import transform_points
+from edge_depth_nerf.masks.ego import MIN_PICTURES, EgoMask, NoEgo, find_ego
+from edge_depth_nerf.masks.ego_files import ego_mask_path, keep_ego_mask, vehicles_unknown
+from edge_depth_nerf.masks.lens import dark_rim, lens_circle
+from edge_depth_nerf.masks.regions import eroded
+from edge_depth_nerf.process.options import ProcessOptions
+from edge_depth_nerf.process.recording import RecordedCamera, RecordedPicture, Recording
+from edge_depth_nerf.scene.checks import read_camera_mask
+
+_PICTURES = 60
+"""The vehicle is looked for in so many pictures of a camera, spread over the drive."""
+_RIM_PICTURES = 4
+"""The lens's dark rim in so many: what stays dark in different places."""
+_FEWEST = 5
+"""Pictures that it can be found in with LiDAR's help."""
+_FEW_CERTAINTY = 0.9
+"""Its outline must be so clear then."""
+_FEW_RETURNS = 0.15
+"""And it may have so many returns a pixel, as a share of what lies around it."""
+_RETURNS_PICTURES = 3
+"""The returns of so many pictures are counted."""
+_INNER = 0.01
+"""So far inside the outline, as a share of the picture's longer side: scanner and camera do not see quite the same."""
+
+_LOOK = "Look at {}: what you correct there counts when the drive is processed again."
+_PAINT = (
+    "What is seen of it is trained on as if it stood in the world: process more of the drive, or give its mask by "
+    "--ego-mask (255 = use the pixel, 0 = the vehicle), or paint it black in {} and process again."
+)
+
+
+def given_masks(recording: Recording, options: ProcessOptions) -> dict[str, NDArray[np.bool_]]:
+    """Read the masks that are given, by camera.
+
+    Raises:
+        FileNotFoundError: one is not there.
+        InputError: broken, or not of its camera's size.
+
+    """
+    given = {}
+    for recorded in recording.cameras:
+        path = options.ego_mask_of(recorded.name) or recorded.ego_mask
+        if path is not None:
+            given[recorded.name] = read_camera_mask(path, recorded.camera)
+    return given
+
+
+def find_vehicle(
+    recording: Recording,
+    training: Sequence[RecordedPicture],
+    masks: dict[str, NDArray[np.bool_]],
+    options: ProcessOptions,
+    console: Console,
+) -> tuple[Recording, list[str]]:
+    """Find the masks that are not given, add them to `masks`, and write them into the scene.
+
+    Args:
+        recording: whose cameras.
+        training: the pictures to look at.
+        masks: those that are known, by camera; True = use the pixel.
+        options: of the scene.
+        console: where progress is shown.
+
+    Returns:
+        The recording with all masks' files, and what the user should know.
+
+    """
+    cameras, notices = [], []
+    not_found: dict[str, list[Path]] = defaultdict(list)
+    for recorded in recording.cameras:
+        if recorded.name not in masks:
+            path = ego_mask_path(options.output, recorded.name)
+            if not path.is_file() or recorded.name in vehicles_unknown(options.output):
+                pictures = [picture for picture in training if picture.camera == recorded.name]
+                mask, found = _find_mask(recording, recorded, pictures, options, console)
+                keep_ego_mask(options.output, recorded.name, mask, isinstance(found, EgoMask) or found.could_tell)
+                if isinstance(found, EgoMask):
+                    said = f"the vehicle was found by itself and hides {found.share:.1%} of the lens."
+                    notices.append(f"{recorded.name}: {said} {_LOOK.format(path)}")
+                elif found.could_tell:
+                    notices.append(f"{recorded.name}: {_NOT_FOUND} {found.reason.rstrip('.')}. {_LOOK.format(path)}")
+                else:
+                    not_found[found.reason].append(path)
+            masks[recorded.name] = read_camera_mask(path, recorded.camera)
+            recorded = dataclasses.replace(recorded, ego_mask=path)
+        cameras.append(recorded)
+    for reason, paths in not_found.items():
+        names = ", ".join(path.stem for path in paths)
+        notices.append(f"{names}: {_NOT_FOUND} {reason} {_PAINT.format(', '.join(map(str, paths)))}")
+    return dataclasses.replace(recording, cameras=tuple(cameras)), notices
+
+
+_NOT_FOUND = "the vehicle's own mask was not found:"
+
+
+def _find_mask(
+    recording: Recording,
+    recorded: RecordedCamera,
+    pictures: Sequence[RecordedPicture],
+    options: ProcessOptions,
+    console: Console,
+) -> tuple[NDArray[np.bool_], EgoMask | NoEgo]:
+    """Find the vehicle and the lens's dark rim in a camera's pictures, at their own size; and how it went."""
+    camera = recorded.camera
+    spread = [pictures[index] for index in np.unique(np.linspace(0, len(pictures) - 1, _PICTURES).astype(int))]
+    if not options.strict:
+        # those that cannot be read are told of when their turn comes
+        spread = [picture for picture in spread if _readable(picture.path)]
+    with console.status("Looking for the vehicle in the pictures"):
+        rim = dark_rim(read_image(picture.path) for picture in spread[:: max(len(spread) // _RIM_PICTURES, 1)])
+        mask = np.ones((camera.height, camera.width), bool) if rim is None else rim
+        lens = lens_circle(camera, options.theta_max_deg) & mask
+        loaders = [partial(read_image, picture.path) for picture in spread]
+        found = find_ego(loaders, lens)
+        if isinstance(found, NoEgo) and not found.could_tell and _FEWEST <= len(spread) and recording.sweeps:
+            few = find_ego(loaders, lens, fewest=_FEWEST)
+            if isinstance(few, EgoMask) and few.pictures < MIN_PICTURES and few.certainty >= _FEW_CERTAINTY:
+                returns = _returns(recording, recorded, spread)
+                found = few if _has_few(returns, ~few.keep & lens, few.keep & lens) else found
+    return (mask & found.keep if isinstance(found, EgoMask) else mask), found
+
+
+def _readable(picture: Path) -> bool:
+    try:
+        read_image(picture)
+    except (InputError, FileNotFoundError):
+        return False
+    return True
+
+
+def _returns(
+    recording: Recording, recorded: RecordedCamera, pictures: Sequence[RecordedPicture]
+) -> Float32[np.ndarray, "h w"]:
+    """How many returns of their own moments' sweeps fall into each pixel of some pictures."""
+    camera = recorded.camera
+    counts = np.zeros((camera.height, camera.width), np.float32)
+    frames = [pictures[index].frame for index in np.linspace(0, len(pictures) - 1, _RETURNS_PICTURES).astype(int)]
+    for sweep in recording.sweeps:
+        if sweep.frame not in frames:
+            continue
+        try:
+            points_m = sweep.read().points_m
+        except (InputError, FileNotFoundError):
+            continue
+        # on the vehicle itself nothing moves
+        to_camera = torch.from_numpy(np.linalg.inv(recorded.to_vehicle) @ sweep.to_vehicle)
+        pixels, valid = camera.project(transform_points(to_camera, points_m).float())
+        column, row = pixels[valid & camera.inside(pixels)].floor().long().numpy().T
+        np.add.at(counts, (row, column), 1)
+    return counts
+
+
+def _has_few(
+    returns: Float32[np.ndarray, "h w"], vehicle: Bool[np.ndarray, "h w"], around: Bool[np.ndarray, "h w"]
+) -> bool:
+    """Whether the vehicle has far fewer returns a pixel than the lower half of what lies around it."""
+    inner = eroded(vehicle, _INNER * max(vehicle.shape))
+    rows = np.flatnonzero((vehicle | around).any(1))
+    below = around.copy()
+    below[: int(rows.mean())] = False
+    if not inner.any() or not returns[below].any():
+        return False
+    return bool(returns[inner].mean() <= _FEW_RETURNS * returns[below].mean())

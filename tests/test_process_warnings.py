@@ -1,0 +1,260 @@
+"""What `process` is given and can do little with is said: broken JPEGs, transforms the wrong way round, a vehicle that
+few pictures show, drives without LiDAR, pictures of any exposure."""
+
+from __future__ import annotations
+
+import ast
+import io
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from rich.console import Console
+
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, read_mask, write_png
+from edge_depth_nerf.masks.lens import lens_circle
+from edge_depth_nerf.process.agreement import Agreement, agreement_notices, agreements
+from edge_depth_nerf.process.converters import convert
+from edge_depth_nerf.process.options import RigOptions
+from edge_depth_nerf.process.recording import Recording
+from edge_depth_nerf.process.rig import read_rig_recording
+from edge_depth_nerf.scene.writer import ProcessReport
+from edge_depth_nerf.synthetic.drive import synthesize_drive
+from edge_depth_nerf.synthetic.options import SynthesizeOptions
+
+pytestmark = pytest.mark.slow
+
+CAMERAS = ("left", "right", "front")
+FRAMES = 7
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("warned") / "drive"
+    synthesize_drive(SynthesizeOptions(root, "street", frames=FRAMES, size=128, layout="rig"))
+    # without what only rendered drives have
+    keep = [line for line in (root / "rig.toml").read_text().splitlines() if not re.match("truth_|mono", line)]
+    (root / "rig.toml").write_text("\n".join(keep))
+    return root
+
+
+@pytest.fixture
+def mine(drive: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(drive, tmp_path / "drive", ignore=shutil.ignore_patterns("truth", "mono")))
+
+
+def edit(root: Path, change: Callable[[str], str]) -> None:
+    (root / "rig.toml").write_text(change((root / "rig.toml").read_text()))
+
+
+def run(root: Path, **changes) -> tuple[ProcessReport, str]:
+    given = {"root": root, "output": root.parent / "scene", "sweeps": 1, "holdout_every": 4, **changes}
+    console = Console(file=io.StringIO(), width=10_000)
+    report = convert(RigOptions(**given), console)
+    assert isinstance(console.file, io.StringIO)
+    return report, console.file.getvalue()
+
+
+# ---- broken pictures ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("downscale", [1, 2])
+def test_a_cut_jpeg_is_left_out_and_named(mine: Path, downscale: int) -> None:
+    for path in sorted((mine / "images/front").iterdir()):
+        cv2.imwrite(str(path.with_suffix(".jpg")), read_image(path)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
+        path.unlink()
+    broken = mine / "images/front/000002.jpg"
+    broken.write_bytes(broken.read_bytes()[:2000])
+    assert cv2.imread(str(broken)) is not None, "OpenCV makes a picture of it"
+    changes = {"downscale": downscale, "cameras": ("front",)}
+    report, said = run(mine, **changes)
+    assert [item.key for item in report.left_out] == ["front, frame 2"]
+    assert re.search(r"Left out: front, frame 2\. .*000002\.jpg: cannot be decoded .*2000 bytes; truncated", said)
+    frames = read_json(report.scene / "transforms.json")["frames"]
+    assert [frame["frame"] for frame in frames] == [0, 1, 3, 4, 5, 6]
+    assert not (report.scene / "images/front/0000000002.png").exists()
+    with pytest.raises(InputError, match=r"000002\.jpg: cannot be decoded"):
+        run(mine, output=mine.parent / "strict", strict=True, **changes)
+
+
+# ---- transforms the wrong way round ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def recording(drive: Path) -> Recording:
+    return read_rig_recording(RigOptions(root=drive, output=drive.parent / "unused"))
+
+
+def found(recording: Recording) -> list[Agreement]:
+    usable = {}
+    for camera in recording.cameras:
+        assert camera.ego_mask is not None
+        usable[camera.name] = lens_circle(camera.camera, 95.0) & read_mask(camera.ego_mask)
+    return agreements(recording, usable)
+
+
+def inverted(recording: Recording, cameras: tuple[str, ...] = (), scanner: bool = False) -> Recording:
+    turned = [
+        replace(camera, to_vehicle=np.linalg.inv(camera.to_vehicle)) if camera.name in cameras else camera
+        for camera in recording.cameras
+    ]
+    sweeps = [replace(one, to_vehicle=np.linalg.inv(one.to_vehicle)) if scanner else one for one in recording.sweeps]
+    return replace(recording, cameras=tuple(turned), sweeps=tuple(sweeps))
+
+
+def test_right_transforms_are_not_warned_of(recording: Recording) -> None:
+    measured = found(recording)
+    assert [one.camera for one in measured] == list(CAMERAS)
+    for one in measured:
+        assert one.given > 0.8 and one.better is None and one.fits
+    assert agreement_notices(measured) == []
+
+
+@pytest.mark.parametrize("which", [*CAMERAS, "all cameras", "scanner", "everything"])
+def test_an_inverse_is_noticed_and_said(recording: Recording, which: str) -> None:
+    wrong = CAMERAS if which in ("all cameras", "everything") else (which,) if which in CAMERAS else ()
+    measured = found(inverted(recording, wrong, scanner=which in ("scanner", "everything")))
+    expected = {"scanner": "scanner", "everything": "both"}.get(which, "camera")
+    concerned = CAMERAS if which in ("scanner", "everything") else wrong
+    assert {one.camera: one.better for one in measured} == {
+        name: expected if name in concerned else None for name in CAMERAS
+    }
+    (said,) = agreement_notices(measured)
+    named = re.search(r"with the inverse of .*? \((.*?)\) the pictures agree better", said)
+    assert named is not None and "wrong way round" in said
+    names = {"camera": ", ".join(wrong), "scanner": "roof", "both": "left, right, front and roof"}[expected]
+    assert named[1] == names
+
+
+def test_poses_of_the_pictures_own_tell_as_well(recording: Recording) -> None:
+    """With --poses colmap the cameras' poses are right whatever the transforms say, and the vehicle's follow them."""
+    assert recording.trajectory is not None
+    front = next(camera for camera in recording.cameras if camera.name == "front")
+    pictures = [
+        replace(picture, camera_to_world=recording.trajectory.at(np.array([picture.time_s]))[0] @ front.to_vehicle)
+        for picture in recording.pictures
+        if picture.camera == "front"
+    ]
+    own = replace(recording, cameras=(front,), pictures=tuple(pictures))
+    assert [one.better for one in found(own)] == [None]
+    assert [one.better for one in found(inverted(own, ("front",)))] == ["camera"]
+
+
+def test_what_tells_nothing_is_not_judged(recording: Recording) -> None:
+    assert recording.trajectory is not None
+    first = [picture for picture in recording.pictures if picture.frame == 0]
+    assert found(replace(recording, pictures=tuple(first))) == [], "a single moment"
+    assert found(replace(recording, sweeps=())) == [], "no LiDAR"
+    still = np.repeat(recording.trajectory.vehicle_to_world[:1], len(recording.trajectory.times_s), 0)
+    stands = replace(recording, trajectory=replace(recording.trajectory, vehicle_to_world=still))
+    assert found(stands) == [], "a vehicle that stands"
+
+
+def test_a_transform_of_other_axes_does_not_fit(recording: Recording) -> None:
+    upright = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    cameras = [
+        replace(camera, to_vehicle=camera.to_vehicle @ upright) if camera.name == "front" else camera
+        for camera in recording.cameras
+    ]
+    (front,) = [one for one in found(replace(recording, cameras=tuple(cameras))) if one.camera == "front"]
+    assert front.given < 0.3
+
+
+def test_no_fit_is_said_where_the_pictures_could_tell() -> None:
+    unfit = Agreement("front", "roof", 0.1, 0.2, 0.1, 0.15, 0.7)
+    (said,) = agreement_notices([unfit])
+    assert "no inverse of a transform fits either: front with roof (0.10)" in said
+    # noise has no agreement either way
+    assert agreement_notices([replace(unfit, still=0.3)]) == []
+
+
+def test_process_says_it_before_the_work(mine: Path) -> None:
+    rows = re.compile(r"(\[cameras\.left\].*?to_vehicle = )\[\n(.*?)\n\]", re.S)
+    given = rows.search((mine / "rig.toml").read_text())
+    assert given is not None
+    matrix = np.array(ast.literal_eval(f"[{given[2]}]"))
+    edit(mine, lambda text: rows.sub(lambda match: match[1] + str(np.linalg.inv(matrix).tolist()), text))
+    report, said = run(mine)
+    (notice,) = [one for one in report.notices if "wrong way round" in one]
+    assert "(left)" in notice and notice in said
+    # a scene that is done is not looked at again
+    again, _ = run(mine)
+    assert again.written == 0 and not any("wrong way round" in one for one in again.notices)
+
+
+def test_the_real_drive(real_data: Path) -> None:
+    options = RigOptions(root=real_data / "kitti360_drive", output=Path("unused"))
+    recording = read_rig_recording(options)
+    usable = {"front": np.ones((376, 1408), bool)}
+    (one,) = agreements(recording, usable)
+    assert one.given > 0.9 and one.better is None
+    (one,) = agreements(inverted(recording, ("front",)), usable)
+    assert one.better == "camera" and one.given < 0.2
+
+
+# ---- the vehicle -------------------------------------------------------------------------------------------------
+
+
+def without_masks(text: str) -> str:
+    return re.sub(r"ego_mask = .*\n", "", text)
+
+
+def test_the_vehicle_is_found_in_few_pictures_with_lidars_help(mine: Path) -> None:
+    edit(mine, without_masks)
+    report, _ = run(mine, theta_max_deg=110.0, holdout_every=0)
+    for name in ("left", "right"):
+        true, kept = read_mask(mine / f"masks/{name}.png"), read_mask(report.scene / f"ego_masks/{name}.png")
+        lens = lens_circle(
+            read_rig_recording(RigOptions(root=mine, output=mine)).cameras[CAMERAS.index(name)].camera, 110.0
+        )
+        vehicle, hidden = lens & ~true, lens & ~kept
+        assert (vehicle & hidden).sum() > 0.93 * (vehicle | hidden).sum()
+        assert any(one.startswith(f"{name}: the vehicle was found by itself") for one in report.notices)
+
+
+def test_a_vehicle_that_is_not_found_is_said_once_with_the_option(mine: Path) -> None:
+    edit(mine, without_masks)
+    report, said = run(mine, frames=4)
+    (notice,) = [one for one in report.notices if "own mask was not found" in one]
+    assert notice.startswith("left, right, front: ") and "too few" in notice
+    assert said.count("--ego-mask") == 1 and all(f"ego_masks/{name}.png" in notice for name in CAMERAS)
+
+
+# ---- no LiDAR ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mono", [False, True])
+def test_neither_lidar_nor_depth_is_said(mine: Path, drive: Path, mono: bool) -> None:
+    edit(mine, lambda text: text[: text.index("[lidars.roof]")])
+    if mono:
+        shutil.copytree(drive / "mono", mine / "mono")
+        edit(mine, lambda text: re.sub(r"\[cameras\.(\w+)\]\n", r'[cameras.\1]\nmono = "mono/\1"\n', text))
+    report, said = run(mine)
+    (notice,) = [one for one in report.notices if "neither LiDAR nor depth maps" in one]
+    assert ("monocular alone" if mono else "plain nerfacto") in notice and notice in said
+
+
+# ---- exposure ----------------------------------------------------------------------------------------------------
+
+
+def test_pictures_of_any_exposure_are_taken(mine: Path) -> None:
+    """Black, saturated, and of four times the exposure from one picture to the next: no crash, no NaN, no warning."""
+    for name in CAMERAS:
+        for number, path in enumerate(sorted((mine / "images" / name).iterdir())):
+            picture = read_image(path).astype(float) * (0.0, 1.0, 0.25, 1.0, 4.0, 1000.0, 1.0)[number]
+            write_png(path, picture.clip(0, 255).astype(np.uint8))
+    edit(mine, without_masks)
+    with np.errstate(invalid="raise", divide="raise", over="raise"):
+        report, _ = run(mine)
+    assert report.training + report.held_out == 3 * FRAMES and not report.left_out
+    assert not any("wrong way round" in one or "does not lie" in one for one in report.notices)
+    for name in CAMERAS:
+        mask = read_mask(report.scene / f"masks/{name}.png")
+        assert mask.mean() > 0.2
+        assert (read_distance_png(report.scene / f"lidar/{name}/0000000000.png") > 0).any()

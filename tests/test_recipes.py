@@ -1,0 +1,79 @@
+"""The recipes for data sets (docs/examples/*_to_rig.py): small drives in the layouts that are published become scenes
+whose LiDAR lies where it is."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import data_sets
+import numpy as np
+import pytest
+from rich.console import Console
+
+from edge_depth_nerf.base.files import read_distance_png, read_json
+from edge_depth_nerf.process.converters import convert
+from edge_depth_nerf.process.options import RigOptions
+from edge_depth_nerf.process.rig import read_rig_recording
+
+pytestmark = pytest.mark.slow
+
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs/rig.md"
+NEEDS_PYARROW = pytest.mark.skipif(
+    importlib.util.find_spec("pyarrow") is None, reason="pyarrow is missing, which reads .feather"
+)
+RECIPES = ["nuscenes", pytest.param("argoverse2", marks=NEEDS_PYARROW), "ddad"]
+
+
+def rig_of(name: str, tmp_path: Path) -> Path:
+    """Write the data set, and run the recipe as the page types it, with other folders."""
+    (typed,) = re.findall(rf"^    python (docs/examples/{name}_to_rig\.py) (.+)$", PAGE.read_text(), re.M)
+    first, *middle, _ = typed[1].split()
+    given = getattr(data_sets, name)(tmp_path / "data")
+    done = subprocess.run(
+        [sys.executable, str(ROOT / typed[0]), str(given), *middle, str(tmp_path / "rig")],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert first.startswith("/") and done.returncode == 0, done.stderr
+    return tmp_path / "rig"
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_lidar_lies_on_the_walls(name: str, tmp_path: Path) -> None:
+    options = RigOptions(root=rig_of(name, tmp_path), output=tmp_path / "scene", find_ego=False, sky=False, strict=True)
+    report = convert(options, Console(quiet=True))
+    assert (report.training, report.held_out) == (10, 2)
+    assert not any("taken as of one moment" in notice for notice in report.notices)
+    cameras = {frame["camera"] for frame in read_json(report.scene / "transforms.json")["frames"]}
+    assert len(cameras) == 2
+    for camera, truth in zip(sorted(cameras), ("front", "side"), strict=True):
+        for moment in range(data_sets.MOMENTS):
+            lidar = read_distance_png(report.scene / f"lidar/{camera}/{moment:010d}.png")
+            there = lidar > 0
+            assert there.mean() > 0.1
+            errors = (lidar / data_sets.true_distance(truth, moment) - 1)[there]
+            # a return lies anywhere in its pixel, 1.1° wide, and the floor is flat: on the whole that cancels
+            assert abs(np.median(errors)) < 0.002 and np.mean(np.abs(errors) < 0.04) > 0.9
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_each_reading_has_its_own_pose(name: str, tmp_path: Path) -> None:
+    root = rig_of(name, tmp_path)
+    recording = read_rig_recording(RigOptions(root=root, output=tmp_path / "scene"))
+    assert recording.trajectory is not None and len(recording.pictures) == 12 and len(recording.sweeps) >= 6
+    first = min(sweep.time_s for sweep in recording.sweeps)
+    for one in (*recording.pictures, *recording.sweeps):
+        expected = data_sets.vehicle(one.time_s - first)
+        expected[:3, 3] += data_sets.OFF
+        assert recording.trajectory.at(np.array([one.time_s]))[0] == pytest.approx(expected, abs=1e-4)
+
+
+def test_the_recipes_are_short() -> None:
+    found = sorted((ROOT / "docs/examples").glob("*_to_rig.py"))
+    assert len(found) == 3 and all(len(path.read_text().splitlines()) < 90 for path in found)
