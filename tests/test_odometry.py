@@ -9,6 +9,7 @@ import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,11 +21,18 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras import Pinhole
 from edge_depth_nerf.lidar import Sweep, SweepTiming
 from edge_depth_nerf.lidar.trajectory import Trajectory
+from edge_depth_nerf.poses.agreement import PATHS_AGREE, compare_paths, read_agreement, write_agreement
 from edge_depth_nerf.poses.breaks import find_break
 from edge_depth_nerf.poses.odometry import TimedSweep, odometry, steps_of
+from edge_depth_nerf.process import pose_checks
+from edge_depth_nerf.process.build import process_recording
+from edge_depth_nerf.process.converters import read_drive
 from edge_depth_nerf.process.lidar_poses import check_sweeps, lidar_poses
-from edge_depth_nerf.process.options import ProcessOptions
+from edge_depth_nerf.process.options import JbnuDepth360Options, Kitti360Options, ProcessOptions, RigOptions
+from edge_depth_nerf.process.pose_checks import lidar_says
 from edge_depth_nerf.process.recording import DepthFile, RecordedCamera, RecordedPicture, RecordedSweep, Recording
+from edge_depth_nerf.scene.reader import read_scene
+from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.lidar import Scanner, sweep
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 from edge_depth_nerf.synthetic.render import World
@@ -171,6 +179,95 @@ def test_pictures_away_from_the_sweeps_are_listed():
     assert [picture.frame for picture in found.pictures] == list(range(8)) and len(found.skipped) == 12
     # the last sweep's turn reaches half a moment further
     assert found.skipped[-1].frame == 19 and found.skipped[-1].reason == "no sweep near it in time"
+
+
+# ---- the whole way ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module", params=["kitti-360", "rig", "jbnu-depth360"])
+def blind(request, tmp_path_factory) -> ProcessOptions:
+    """Options for a rendered drive whose poses are taken away; every second frame is asked for."""
+    pytest.importorskip("kiss_icp")
+    root = tmp_path_factory.mktemp("odometry") / "drive"
+    synthesize_drive(SynthesizeOptions(root, "street", frames=11, size=64, layout=request.param))
+    for path in (*root.rglob("poses.txt"), *root.rglob("cam0_to_world.txt")):
+        path.unlink()
+    for path in root.glob("*.toml"):
+        text = path.read_text()
+        path.write_text(text[text.index("[cameras") :])
+    shared: dict[str, Any] = {"root": root, "output": root.parent / "scene", "poses": "lidar", "stride": 2}
+    shared |= {"find_ego": False, "estimate_depth": False}
+    if request.param == "kitti-360":
+        return Kitti360Options(sequence=SynthesizeOptions(root).sequence, **shared)
+    if request.param == "rig":
+        return RigOptions(**shared)
+    return JbnuDepth360Options(calibration=root / "calibration.toml", **shared)
+
+
+@pytest.mark.slow
+def test_a_drive_without_poses_becomes_a_scene(blind):
+    report = process_recording(read_drive(blind), blind, QUIET)
+    notices = " ".join(report.notices)
+    # every sweep is followed, not only those of the frames asked for: 5 m of 8 m/s
+    assert "followed 11 sweeps of" in notices and "the path is 8." in notices
+    assert "epipolar curves" in notices or "Too few features match" in notices
+    assert not report.skipped
+    scene = read_scene(blind.output)
+    assert len(scene.moments()) == 6
+    assert scene.has("lidar")
+
+
+# ---- how far two paths agree -----------------------------------------------------------------------------------
+
+
+def test_paths_are_compared_in_any_world(tmp_path):
+    first = driven(np.full(30, 8.0), np.linspace(0, 0.5, 30), 0.1)
+    world = np.eye(4)
+    world[:3, :3] = Rotation.from_rotvec([1.0, -2.0, 0.5]).as_matrix()
+    world[:3, 3] = (100, -40, 7)
+    same = Trajectory(first.times_s, world @ first.vehicle_to_world)
+    found = compare_paths(first, same)
+    assert found is not None and found.max_m < 1e-9 and found.scale == pytest.approx(1)
+    assert found.length_m == pytest.approx(8.0 * 2.9)
+    # 2 % too long: its ends lie 1 % of the length off
+    longer = same.vehicle_to_world.copy()
+    longer[:, :3, 3] *= 1.02
+    found = compare_paths(first, Trajectory(first.times_s, longer))
+    assert found is not None and found.scale == pytest.approx(1.02)
+    assert found.max_m == pytest.approx(0.01 * found.length_m, rel=0.1)
+    # what lies beyond the other's ends does not count
+    assert compare_paths(first, Trajectory(first.times_s[:2], first.vehicle_to_world[:2])) is None
+
+    write_agreement(tmp_path, found, first)
+    assert read_agreement(tmp_path) == read_agreement(tmp_path, first) == found
+    assert read_agreement(tmp_path, same) is None
+    assert read_agreement(tmp_path / "elsewhere") is None
+    (tmp_path / PATHS_AGREE).write_text('{"mean_m": "far"}')
+    with pytest.raises(InputError, match=r"paths_agree\.json: expected mean_m"):
+        read_agreement(tmp_path)
+
+
+@pytest.mark.slow
+def test_a_path_from_pictures_is_held_against_lidar(tmp_path, monkeypatch):
+    pytest.importorskip("kiss_icp")
+    recording, poses = scanned("street", 20)
+    times = np.array([sweep.time_s for sweep in recording.sweeps])
+    true = Trajectory(times, poses(times))
+    said = lidar_says(dataclasses.replace(recording, trajectory=true), tmp_path, QUIET)
+    found = read_agreement(tmp_path)
+    assert found is not None and found.max_m < 0.1 and found.scale == pytest.approx(1, abs=0.01)
+    assert len(said) == 1 and found.text() in said[0]
+    # the second time it is read
+    with monkeypatch.context() as patch:
+        patch.setattr(pose_checks, "path_of", None)
+        assert lidar_says(dataclasses.replace(recording, trajectory=true), tmp_path, QUIET) == said
+    # a path that bends where the vehicle does not
+    bent = true.vehicle_to_world.copy()
+    bent[10:, 1, 3] += 0.4 * np.arange(10)
+    said = lidar_says(dataclasses.replace(recording, trajectory=Trajectory(times, bent)), tmp_path, QUIET)
+    assert len(said) == 2 and "one of the two is wrong" in said[1]
+    # where it cannot be told, nothing is said
+    assert lidar_says(dataclasses.replace(recording, trajectory=true, sweeps=()), tmp_path / "other", QUIET) == []
 
 
 # ---- what it cannot do -----------------------------------------------------------------------------------------

@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json, write_json
@@ -82,7 +81,8 @@ def compare_paths(first: Trajectory, second: Trajectory) -> PathAgreement | None
     places = first.vehicle_to_world[common, :3, 3]
     others = second.at(first.times_s[common])[:, :3, 3]
     centred, other_centred = places - places.mean(0), others - others.mean(0)
-    turn, _ = Rotation.align_vectors(centred, other_centred)
-    apart = np.linalg.norm(turn.apply(other_centred) - centred, axis=-1)
+    left, _, right = np.linalg.svd(centred.T @ other_centred)
+    turn = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    apart = np.linalg.norm(other_centred @ turn.T - centred, axis=-1)
     lengths = [float(np.linalg.norm(np.diff(path, axis=0), axis=-1).sum()) for path in (places, others)]
     return PathAgreement(float(apart.mean()), float(apart.max()), lengths[0], lengths[1] / max(lengths[0], 1e-9))
