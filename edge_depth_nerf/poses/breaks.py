@@ -56,7 +56,7 @@ def find_break(path: Trajectory) -> Break | None:
             worst = excess, Break(first, last, what)
         turned = Rotation.from_matrix(poses[first, :3, :3].T @ poses[middle, :3, :3]).magnitude()
         excess = float(turned) / (MOST_RAD_S * before_s + _JITTER_RAD)
-        if excess > (1.0 if worst is None else worst[0]) and turned < 3:
+        if excess > (1.0 if worst is None else worst[0]):
             what = f"within {before_s:.2g} s the vehicle would turn by {math.degrees(turned):.0f}°"
             worst = excess, Break(first, middle, what)
     return None if worst is None else worst[1]

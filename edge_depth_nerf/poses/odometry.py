@@ -33,9 +33,8 @@ INSTALL = "pip install edge-depth-nerf[odometry]"
 MIN_SWEEPS = 5
 """Fewer say too little of the velocity that the drive starts at."""
 _OLDEST = (1, 2)
-_NEAREST_M = 2.0
-"""What is nearer is the vehicle itself."""
-_FURTHEST_M = 100.0
+RANGE_M = (2.0, 100.0)
+"""Nearer to the scanner lies the vehicle itself; further away returns are too far apart."""
 _VOXEL_M = 1.0
 """KISS-ICP's own choice for this reach: of cubes of half the size one point each is kept, of 1.5 of it one is laid."""
 _SETTLED = 1e-4
@@ -63,7 +62,10 @@ class TimedSweep:
     time_s: float
     """Its own moment, which its pose is to be of."""
     read: Callable[[], tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n"]]]
-    """Points in the vehicle's frame, as recorded, and when each was measured, counted from the sweep's moment."""
+    """Points in the vehicle's frame, as recorded, and when each was measured, counted from the sweep's moment.
+
+    Those that are to be used: of `RANGE_M` from the scanner.
+    """
 
 
 def import_kiss_icp() -> Any:
@@ -139,7 +141,7 @@ class _Kiss:
     def parts(self, voxel_m: float, settled: float) -> tuple[Callable[[], Any], Any, Any]:
         """What makes a map, what lays a sweep on it until it settles, and what says how far off the sweep may lie."""
         config = self.config()
-        config.data.max_range = _FURTHEST_M
+        config.data.max_range = RANGE_M[1]
         config.mapping.voxel_size = voxel_m
         config.registration.convergence_criterion = settled
         # threads would add numbers up in another order each time
@@ -190,11 +192,8 @@ def _last_step(sweeps: Sequence[TimedSweep], poses: Sequence[Transform] | np.nda
 
 
 def _in_vehicle(sweep: TimedSweep, path: Trajectory | None) -> Float64[np.ndarray, "n 3"]:
-    """The points that are used, as if measured at the sweep's own moment."""
+    """The points as if measured at the sweep's own moment."""
     points, offset_s = sweep.read()
-    distance = np.linalg.norm(points, axis=-1)
-    used = (distance >= _NEAREST_M) & (distance <= _FURTHEST_M)
-    points, offset_s = points[used], offset_s[used]
     if path is None or not offset_s.any():
         return points
     world_to_vehicle = np.linalg.inv(path.at(np.array([sweep.time_s]))[0])

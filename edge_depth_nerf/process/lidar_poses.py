@@ -25,7 +25,7 @@ from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.lidar import transform_points
 from edge_depth_nerf.lidar.trajectory import MAX_POSE_GAP_S, Trajectory
 from edge_depth_nerf.poses.breaks import find_break
-from edge_depth_nerf.poses.odometry import MIN_SWEEPS, TimedSweep, import_kiss_icp, odometry, steps_of
+from edge_depth_nerf.poses.odometry import MIN_SWEEPS, RANGE_M, TimedSweep, import_kiss_icp, odometry, steps_of
 from edge_depth_nerf.process.found_path import path_length_m, upright, with_path
 from edge_depth_nerf.process.options import ProcessOptions
 from edge_depth_nerf.process.recording import RecordedPicture, RecordedSweep, Recording
@@ -131,15 +131,17 @@ def path_of(sweeps: Sequence[RecordedSweep], console: Console) -> Trajectory:
 
 
 def _read(sweep: RecordedSweep) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n"]]:
-    """A sweep's points in the vehicle's frame, and when each was measured."""
+    """The points of a sweep that are used, in the vehicle's frame, and when each was measured."""
     read = sweep.read()
     offset_s = torch.zeros(len(read.points_m), dtype=torch.float64)
     if read.offset_s is not None:
         offset_s = read.offset_s
     elif sweep.timing is not None:
         offset_s = sweep.timing.offsets_s(read.points_m)
-    in_vehicle = transform_points(torch.from_numpy(sweep.to_vehicle), read.points_m)
-    return in_vehicle.double().numpy(), offset_s.double().numpy()
+    range_m = read.points_m.norm(dim=-1)
+    used = (range_m >= RANGE_M[0]) & (range_m <= RANGE_M[1])
+    in_vehicle = transform_points(torch.from_numpy(sweep.to_vehicle), read.points_m[used])
+    return in_vehicle.double().numpy(), offset_s[used].double().numpy()
 
 
 def _readable(sweep: RecordedSweep) -> bool:
@@ -191,6 +193,6 @@ def _notices(sweeps: Sequence[RecordedSweep], trajectory: Trajectory) -> list[st
     if sweeps[0].timing is None and sweeps[0].read().offset_s is None:
         notices.append(
             f"The sweeps of {sweeps[0].scanner} have no times, so they are taken as corrected for the vehicle's motion "
-            "already. If they are raw, the path is wrong by some per cent: give turn_s and direction, or point_times."
+            "already. If they are raw, give turn_s and direction, or point_times: the vehicle moves during a turn."
         )
     return notices
