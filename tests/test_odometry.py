@@ -118,7 +118,8 @@ def test_the_path_is_right_from_the_first_step(scene):
     found = lidar_poses(recording, OPTIONS, QUIET)
     assert found.trajectory is not None
     apart, steps, length_m = errors(found.trajectory, poses)
-    assert apart[-1] < 0.005 * length_m
+    # of a sixth of a real scanner's returns, on 8 to 11 m
+    assert apart[-1] < 0.01 * length_m
     # the first step is unknown to an odometry that begins with a vehicle that stands: 0.8 m here
     assert steps[:5].max() < 0.06 and steps.mean() < 0.03
     # its world: z up, the first pose its origin, off along x
@@ -213,8 +214,9 @@ def blind(request, tmp_path_factory) -> ProcessOptions:
 def test_a_drive_without_poses_becomes_a_scene(blind):
     report = process_recording(read_drive(blind), blind, QUIET)
     notices = " ".join(report.notices)
-    # every sweep is followed, not only those of the frames asked for: 0.6 s at 8 m/s
-    assert "followed 7 sweeps of" in notices and "the path is 4." in notices
+    # every sweep is followed, not only those of the frames asked for: 0.6 s at some 8 m/s
+    length = re.search(r"followed 7 sweeps of \w+: the path is ([0-9.]+) m long", notices)
+    assert length is not None and 4.4 < float(length[1]) < 5.4
     assert "epipolar curves" in notices or "Too few features match" in notices
     assert not report.skipped
     scene = read_scene(blind.output)
