@@ -174,6 +174,7 @@ def check_extras() -> Iterator[Finding]:
     """Optional libraries and programs."""
     for name, package, extra, what in (
         ("COLMAP", "pycolmap", "colmap", "poses found from pictures (process --poses colmap)"),
+        ("KISS-ICP", "kiss_icp", "odometry", "poses found from LiDAR (process --poses lidar)"),
         ("transformers", "transformers", "hf", "ready-made depth networks (estimate-depth --hf)"),
         ("Dask", "distributed", "cluster", "many machines (--cluster)"),
     ):

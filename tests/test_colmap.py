@@ -18,10 +18,12 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_image, read_mask, write_distance_png, write_mask, write_png
 from edge_depth_nerf.cameras import MEI, KannalaBrandt, Pinhole
 from edge_depth_nerf.lidar import Sweep, SweepTiming
+from edge_depth_nerf.poses.breaks import find_break
 from edge_depth_nerf.process.colmap import models as colmap_models
+from edge_depth_nerf.process.colmap import poses as colmap_poses_module
 from edge_depth_nerf.process.colmap.models import ColmapModel, SparseView, colmap_lens
 from edge_depth_nerf.process.colmap.poses import NOT_REGISTERED, colmap_poses
-from edge_depth_nerf.process.colmap.scale import join_models, metric_path
+from edge_depth_nerf.process.colmap.scale import find_scale_break, join_models, metric_path
 from edge_depth_nerf.process.kitti360.converter import read_kitti360
 from edge_depth_nerf.process.options import Kitti360Options, ProcessOptions
 from edge_depth_nerf.process.recording import DepthFile, RecordedCamera, RecordedPicture, RecordedSweep, Recording
@@ -298,6 +300,80 @@ def test_the_scale_can_come_from_depth_maps(tmp_path):
     drive = dataclasses.replace(drive, pictures=tuple(kept))
     _, scale = metric_path(drive, [model_of(drive, range(6), 1.7, seed=1, points=features)])
     assert scale.ratio == pytest.approx(1.7, rel=3e-3)
+
+
+# ---- a path that breaks ----------------------------------------------------------------------------------------
+
+
+def broken_at(model: ColmapModel, recording: Recording, first: int, scale: float, bend_deg: float) -> ColmapModel:
+    """The model with all moments from one on scaled and turned about the place that they begin at."""
+    index = next(i for i, picture in enumerate(recording.pictures) if picture.frame == first)
+    pivot = model.camera_to_model[index].copy()
+    turn = Rotation.from_euler("y", bend_deg, degrees=True).as_matrix()
+    turn = pivot[:3, :3] @ turn @ pivot[:3, :3].T
+    poses, views = dict(model.camera_to_model), dict(model.views)
+    for number, pose in poses.items():
+        if recording.pictures[number].frame >= first:
+            moved = pose.copy()
+            moved[:3, :3] = turn @ pose[:3, :3]
+            moved[:3, 3] = pivot[:3, 3] + scale * turn @ (pose[:3, 3] - pivot[:3, 3])
+            poses[number] = moved
+            views[number] = dataclasses.replace(views[number], distance=scale * views[number].distance)
+    return dataclasses.replace(model, camera_to_model=poses, views=views)
+
+
+@pytest.fixture(scope="module")
+def measured_drive() -> tuple[Recording, ColmapModel]:
+    features = wall_points(150, seed=5)
+    cloud = cloud_around(features, seed=6)
+    drive = recording(24, sweeps=[turning_scanner(frame, cloud) for frame in range(24)])
+    return drive, model_of(drive, range(len(drive.pictures)), 4.25, seed=1, points=features, noise=0.03)
+
+
+def test_a_scale_that_changes_is_named(measured_drive):
+    drive, model = measured_drive
+    path, scale = metric_path(drive, [model])
+    assert scale.broken is None and find_break(path.trajectory) is None
+    _, scale = metric_path(drive, [broken_at(model, drive, 14, 4.25 / 6.9, 0.0)])
+    assert scale.broken is not None
+    assert scale.broken.first <= 13 <= scale.broken.last <= 15
+    assert scale.broken.after / scale.broken.before == pytest.approx(6.9 / 4.25, rel=0.05)
+    # as numbers of metres per unit, not as shares of the median
+    assert scale.broken.before == pytest.approx(4.25, rel=0.05)
+
+
+@pytest.mark.parametrize("bend_deg", [60.0, -60.0])
+def test_a_path_that_bends_is_named(measured_drive, bend_deg):
+    drive, model = measured_drive
+    path, scale = metric_path(drive, [broken_at(model, drive, 14, 1.0, bend_deg)])
+    assert scale.broken is None
+    found = find_break(path.trajectory)
+    assert found is not None and found.first <= 14 <= found.last <= found.first + 10
+    assert "turn" in found.what
+
+
+def test_a_broken_model_ends_the_command(measured_drive, tmp_path, monkeypatch):
+    pytest.importorskip("pycolmap")
+    drive, model = measured_drive
+    monkeypatch.setattr(colmap_poses_module, "check_colmap", lambda *_: None)
+    options = ProcessOptions(output=tmp_path / "scene", poses="colmap")
+    monkeypatch.setattr(colmap_poses_module, "find_models", lambda *_: [model])
+    assert len(colmap_poses(drive, options, QUIET).pictures) == len(drive.pictures)
+    for scale, bend_deg in ((4.25 / 6.9, 40.0), (1.0, 90.0)):
+        wrong = broken_at(model, drive, 14, scale, bend_deg)
+        monkeypatch.setattr(colmap_poses_module, "find_models", lambda *_, wrong=wrong: [wrong])
+        with pytest.raises(InputError, match=r"path breaks between frames \d+ and 1\d.*--poses lidar.*--stride 1"):
+            colmap_poses(drive, options, QUIET)
+
+
+def test_a_window_needs_features():
+    assert find_scale_break({0: np.ones(0)}) is None
+    assert find_scale_break({frame: np.full(30, 1.0 + (frame > 2)) for frame in range(5)}) is None
+    many = find_scale_break({frame: np.full(50, 1.0 + (frame > 4)) for frame in range(10)})
+    assert many is not None and (many.first, many.last, many.before, many.after) == (4, 5, 1.0, 2.0)
+    # what the spread explains is no break
+    rng = np.random.default_rng(0)
+    assert find_scale_break({frame: 1 + 0.4 * rng.standard_normal(50) for frame in range(40)}) is None
 
 
 def test_too_few_returns_beside_points_are_an_error():

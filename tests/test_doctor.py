@@ -75,9 +75,10 @@ def test_pythons(monkeypatch, running, state):
 def test_missing_libraries_are_findings(monkeypatch):
     spec = doctor.find_spec
     monkeypatch.setattr(doctor, "find_spec", lambda name: None if name in hidden else spec(name))
-    hidden = {"pycolmap", "transformers", "distributed", "tinycudann", "numba"}
+    hidden = {"pycolmap", "kiss_icp", "transformers", "distributed", "tinycudann", "numba"}
     extras = found(doctor.check_extras)
     assert extras["COLMAP"].state == "note" and "edge-depth-nerf[colmap]" in extras["COLMAP"].remedy
+    assert extras["KISS-ICP"].state == "note" and "edge-depth-nerf[odometry]" in extras["KISS-ICP"].remedy
     assert extras["transformers"].state == "note" and "edge-depth-nerf[hf]" in extras["transformers"].remedy
     assert extras["Dask"].state == "note" and "edge-depth-nerf[cluster]" in extras["Dask"].remedy
     assert found(doctor.check_kernels)["Hash grids"].state == "problem"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 import subprocess
@@ -48,7 +49,9 @@ from edge_depth_nerf.inspecting.figures import measured_moments
 from edge_depth_nerf.inspecting.findings import Finding, find, limited
 from edge_depth_nerf.inspecting.options import InspectOptions
 from edge_depth_nerf.inspecting.top_view import GAP, GREYS, HELD_OUT, PATH, TRAINING, top_view
+from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.method.prior import default_source
+from edge_depth_nerf.poses.agreement import compare_paths, write_agreement
 from edge_depth_nerf.scene.reader import read_scene
 
 pytestmark = pytest.mark.slow
@@ -788,3 +791,19 @@ def test_a_scene_of_one_picture(tmp_path):
     summary = look(write_drive(tmp_path / "drive", 1), tmp_path / "out")
     assert summary["path"]["length_m"] == 0 and len(summary["sheets"]) == 1
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["moments"] == 1
+
+
+def test_how_far_another_path_lies(tmp_path):
+    drive = write_drive(tmp_path / "drive", 2)
+    assert look(drive, tmp_path / "out")["paths_agree"] is None
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, 0, 3] = np.arange(4)
+    path = Trajectory(np.arange(4.0), poses)
+    found = compare_paths(path, path)
+    assert found is not None
+    write_agreement(drive, found, path)
+    console = Console(file=io.StringIO(), width=120)
+    summary = inspect_scene(InspectOptions(drive, tmp_path / "out", size=64), console)
+    assert summary["paths_agree"]["length_m"] == 3
+    assert isinstance(console.file, io.StringIO)
+    assert "0.00 m away (mean), 0.00 m at most, over 3.0 m" in console.file.getvalue()

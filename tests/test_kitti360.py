@@ -399,6 +399,7 @@ def found_by(options: dict[int, float], monkeypatch: pytest.MonkeyPatch) -> None
         return replace(recording, pictures=tuple(kept), trajectory=path)
 
     monkeypatch.setattr(colmap_poses, "colmap_poses", found)
+    monkeypatch.setattr(build, "lidar_says", lambda *_: [])
 
 
 def test_other_poses_found_make_other_maps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ from edge_depth_nerf.inspecting.options import InspectOptions
 from edge_depth_nerf.inspecting.sheets import draw_sheet
 from edge_depth_nerf.inspecting.shown_prior import ShownScene
 from edge_depth_nerf.inspecting.top_view import draw_top_view
+from edge_depth_nerf.poses.agreement import read_agreement
 from edge_depth_nerf.scene.reader import ScenePicture, read_scene
 
 SUMMARY = "summary.json"
@@ -58,6 +60,7 @@ def inspect_scene(options: InspectOptions, console: Console | None = None) -> di
     points_m = scene.points_m()
     folder = scene.folder.resolve()
     output = options.output or folder.with_name(f"{folder.name}_inspection")
+    agreement = read_agreement(folder)
     _open_output(output)
 
     measured, shown = measured_moments(scene, options.frames)
@@ -82,6 +85,7 @@ def inspect_scene(options: InspectOptions, console: Console | None = None) -> di
         "held_out": held_out if scene.split_known else None,
         "points": None if points_m is None else len(points_m),
         "path": path_figures(scene),
+        "paths_agree": None if agreement is None else {**asdict(agreement), "text": agreement.text()},
         "measured": _sample(len(figures), len(scene.pictures)),
         "maps": map_figures(figures),
         "cameras": {name: camera_figures(scene, name, figures) for name in scene.cameras()},
@@ -158,6 +162,8 @@ def _show(summary: dict[str, Any], console: Console) -> None:
     if path["duration_s"] is not None:
         speeds = (_number(path[key], ".1f", " m/s") for key in ("speed_mean_mps", "speed_max_mps"))
         drive.add_row("time", "{:.1f} s; {} on average, {} at most".format(path["duration_s"], *speeds))
+    if summary["paths_agree"] is not None:
+        drive.add_row("by LiDAR odometry", summary["paths_agree"]["text"])
     drive.add_row("points.ply", _number(summary["points"], ",", " points"))
     console.print(drive)
 

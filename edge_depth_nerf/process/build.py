@@ -35,6 +35,7 @@ from edge_depth_nerf.masks.sky import find_sky
 from edge_depth_nerf.process.agreement import agreement_notices, agreements
 from edge_depth_nerf.process.downscale import downscale_distance, downscale_image, downscale_mask
 from edge_depth_nerf.process.options import ProcessOptions
+from edge_depth_nerf.process.pose_checks import features_say, lidar_says
 from edge_depth_nerf.process.reading import load_distance, load_picture, read_depth
 from edge_depth_nerf.process.recording import RecordedPicture, Recording
 from edge_depth_nerf.process.sweep_store import SweepStore
@@ -57,7 +58,7 @@ from edge_depth_nerf.scene.writer import (
 )
 
 FOUND_POSES = "found_poses.json"
-"""File of the scene with the poses that were found from the pictures: camera, frame, held out, camera to world."""
+"""File of the scene with the poses that were found: camera, frame, held out, camera to world."""
 MOST_LISTED = 50
 """So many files that were left out are listed."""
 
@@ -77,11 +78,19 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
         from edge_depth_nerf.process.colmap.poses import check_colmap
 
         check_colmap(recording, options)
+    elif options.poses == "lidar":
+        from edge_depth_nerf.process.lidar_poses import check_sweeps
+
+        check_sweeps(recording)
     with console.status("Checking cameras and files …"):
         source = _source(recording, options)
         masks = given_masks(recording, options)
         check_cameras(_scene_cameras(recording, masks, options), options.theta_max_deg)
     open_scene(options.output, source)
+    if options.poses == "lidar":
+        from edge_depth_nerf.process.lidar_poses import lidar_poses
+
+        recording = lidar_poses(recording, options, console)
     notices: list[str] = []
     if options.find_ego:
         training = [picture for picture in recording.pictures if picture.frame not in _held_out(recording, options)]
@@ -90,8 +99,11 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
         from edge_depth_nerf.process.colmap.poses import colmap_poses
 
         recording = colmap_poses(recording, options, console)
+        notices += lidar_says(recording, options.output, console)
+    elif options.poses == "lidar":
+        notices += features_say(recording, options, console)
     if recording.trajectory is None:
-        raise InputError("the recording has no poses. Give them, or find them with --poses colmap.")
+        raise InputError("the recording has no poses. Give them, or find them: --poses lidar, --poses colmap.")
     if recording.skipped:
         say(console, f"Skipped {summarise(recording.skipped)}", "yellow")
     held_out = _held_out(recording, options)

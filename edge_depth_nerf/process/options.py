@@ -42,9 +42,10 @@ class ProcessOptions:
     prior or network sees it, training views are judged by it. 0 holds out none."""
     theta_max_deg: float = 95.0
     """Rays further than this from the optical axis are masked out, in degrees."""
-    poses: Literal["recorded", "colmap"] = "recorded"
+    poses: Literal["recorded", "colmap", "lidar"] = "recorded"
     """recorded: the poses that come with the drive; colmap: found from the pictures, their scale from LiDAR (needs
-    `pip install edge-depth-nerf[colmap]`)."""
+    `pip install edge-depth-nerf[colmap]`); lidar: found from the sweeps (needs `pip install
+    edge-depth-nerf[odometry]`)."""
     sweeps: int = 3
     """Accumulate this many LiDAR sweeps before and after each picture's own. Training never sees a sweep of a moment
     that is held out; a picture that is held out gets its own alone."""

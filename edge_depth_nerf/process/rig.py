@@ -118,7 +118,8 @@ def recording_of_rig(rig: Rig, root: Path, options: RigOptions | JbnuDepth360Opt
     if options.poses == "recorded":
         if rig.poses is None:
             raise InputError(
-                f"{rig.path}: has no table [poses]. Give poses (docs/rig.md), or have them found with --poses colmap."
+                f"{rig.path}: has no table [poses]. Give poses (docs/rig.md), or have them found: --poses lidar, "
+                "--poses colmap."
             )
         path, camera_poses = _path(rig, rig.poses, cameras, files)
     scans = [_Scans(lidar, _timed(_files(root, lidar.scans, SCAN_SUFFIXES), lidar.clock)) for lidar in rig.lidars]

@@ -42,8 +42,8 @@ from edge_depth_nerf.base.files import read_json, write_atomically, write_bytes,
 from edge_depth_nerf.cameras import Camera, KannalaBrandt, Pinhole, fit_kannala_brandt
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.masks.lens import lens_circle
-from edge_depth_nerf.masks.semantics import keep_static, read_labels
 from edge_depth_nerf.process.options import ProcessOptions
+from edge_depth_nerf.process.pose_checks import held_still
 from edge_depth_nerf.process.recording import Recording
 from edge_depth_nerf.scene.checks import read_camera_mask
 
@@ -333,11 +333,7 @@ class _Run:
                 ego_mask = self.ego_masks[camera.name]
                 if ego_mask is not None:
                     shared[picture.camera] &= read_camera_mask(ego_mask, camera.camera)
-            mask = shared[picture.camera]
-            if picture.mask is not None:
-                mask = mask & read_camera_mask(picture.mask, cameras[picture.camera].camera)
-            if picture.semantics is not None:
-                mask = mask & keep_static(read_labels(picture.semantics), self.options.moving_classes)
+            mask = shared[picture.camera] & held_still(picture, cameras[picture.camera].camera, self.options)
             # a feature at the edge of a mask looks at what is masked
             reach = 1 + 2 * max(1, round(mask.shape[1] / 350))
             write_mask(target, cv2.erode(mask.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0)

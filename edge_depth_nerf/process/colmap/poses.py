@@ -1,8 +1,6 @@
 """Poses by COLMAP: the vehicle's path from the pictures alone, its scale from LiDAR.
 
-`colmap_models` runs COLMAP, `colmap_scale` makes metres of what it finds. The world has z up, after the scanner's
-own z axis, averaged over the drive (or the cameras' -y axes without a scanner); the first pose is its origin, and the
-vehicle drives off along x.
+`colmap.models` runs COLMAP, `colmap.scale` makes metres of what it finds, `found_path` chooses the world.
 """
 
 from __future__ import annotations
@@ -12,11 +10,10 @@ import math
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
 from rich.console import Console
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.lidar.trajectory import Trajectory
+from edge_depth_nerf.poses.breaks import find_break
 from edge_depth_nerf.process.colmap.models import (
     THETA_MAX_DEG,
     ColmapModel,
@@ -26,13 +23,12 @@ from edge_depth_nerf.process.colmap.models import (
     import_pycolmap,
 )
 from edge_depth_nerf.process.colmap.scale import MetricPath, Scale, metric_path
+from edge_depth_nerf.process.found_path import path_length_m, upright, with_path
 from edge_depth_nerf.process.options import ProcessOptions
 from edge_depth_nerf.process.recording import Recording
-from edge_depth_nerf.scene.writer import Skipped
 
 NOT_REGISTERED = "COLMAP could not register it"
 _MIN_PICTURES = 3
-_ASKEW_RAD = math.radians(3)
 _WARN_SPREAD = 0.10
 _WARN_ERROR_PX = 2.0
 _WARN_APART_M = 0.2
@@ -53,7 +49,7 @@ def colmap_poses(recording: Recording, options: ProcessOptions, console: Console
 
     Raises:
         InputError: pycolmap is not installed, there are fewer than three pictures, no LiDAR, nothing could be
-            related, or LiDAR and the reconstruction share too little for a scale.
+            related, LiDAR and the reconstruction share too little for a scale, or the path breaks.
 
     """
     check_colmap(recording, options)
@@ -67,25 +63,11 @@ def colmap_poses(recording: Recording, options: ProcessOptions, console: Console
             "and check the calibration of the lenses and the masks."
         )
     path, scale = metric_path(recording, models)
-    trajectory = _upright(recording, path.trajectory)
-    poses = dict(zip(path.moments, trajectory.vehicle_to_world, strict=True))
-    to_vehicle = {camera.name: camera.to_vehicle for camera in recording.cameras}
-    kept, skipped = [], []
-    for picture in recording.pictures:
-        if picture.frame not in poses:
-            skipped.append(Skipped(picture.frame, picture.camera, NOT_REGISTERED))
-            continue
-        vehicle_to_world = trajectory.at(np.array([picture.time_s]))[0]
-        kept.append(dataclasses.replace(picture, camera_to_world=vehicle_to_world @ to_vehicle[picture.camera]))
-    return dataclasses.replace(
-        recording,
-        pictures=tuple(kept),
-        trajectory=trajectory,
-        skipped=(*recording.skipped, *skipped),
-        notices=(*recording.notices, *_notices(recording, models, path, scale, len(kept))),
-        # their poses are of the world that the drive was written in
-        shifted=(),
-    )
+    _check_path(path, scale)
+    trajectory = upright(recording, path.trajectory)
+    posed = with_path(recording, trajectory, lambda p: None if p.frame in path.moments else NOT_REGISTERED)
+    notices = _notices(recording, models, path, scale, len(posed.pictures))
+    return dataclasses.replace(posed, notices=(*posed.notices, *notices))
 
 
 def _folder(options: ProcessOptions) -> Path:
@@ -126,36 +108,32 @@ def _spans(recording: Recording, model: ColmapModel) -> bool:
     return any(seen.count(camera.name) > 1 for camera in recording.cameras)
 
 
-def _upright(recording: Recording, trajectory: Trajectory) -> Trajectory:
-    """Turn and shift a path so that z is up, the first pose the origin, and the drive starts along x."""
-    rotations = trajectory.vehicle_to_world[:, :3, :3]
-    up = (rotations @ _up_in_vehicle(recording)).mean(0)
-    up /= np.linalg.norm(up)
-    positions = trajectory.vehicle_to_world[:, :3, 3]
-    away = positions - positions[0]
-    # horizontally, towards the first place that is half as far as the furthest
-    away = away - (away @ up)[:, None] * up
-    reach = np.linalg.norm(away, axis=-1)
-    ahead = away[int(np.argmax(reach >= reach.max() / 2))] if reach.max() > 0 else np.cross(up, rotations[0, :, 0])
-    ahead = ahead / np.linalg.norm(ahead)
-    to_world = np.eye(4)
-    to_world[:3, :3] = np.stack((ahead, np.cross(up, ahead), up))
-    to_world[:3, 3] = -to_world[:3, :3] @ positions[0]
-    return Trajectory(trajectory.times_s, to_world @ trajectory.vehicle_to_world)
+def _check_path(path: MetricPath, scale: Scale) -> None:
+    """Whether the path hangs together: its scale, and its steps.
 
+    Raises:
+        InputError: it does not; names the moments.
 
-def _up_in_vehicle(recording: Recording) -> Float64[np.ndarray, "3"]:
-    scanners = {sweep.scanner: sweep.to_vehicle for sweep in recording.sweeps}
-    if scanners:
-        up = np.sum([to_vehicle[:3, 2] for to_vehicle in scanners.values()], axis=0)
+    """
+    frames, found = list(path.moments), scale.broken
+    if found is not None:
+        where, why = (
+            (found.first, found.last),
+            (
+                f"LiDAR's scale goes from {found.before:.2f} to {found.after:.2f} m per unit there, and from "
+                f"{found.smallest:.2f} to {found.largest:.2f} along the path"
+            ),
+        )
+    elif (broken := find_break(path.trajectory)) is not None:
+        where, why = (frames[broken.first], frames[broken.last]), broken.what
     else:
-        up = -np.sum([camera.to_vehicle[:3, 1] for camera in recording.cameras], axis=0)
-    up /= np.linalg.norm(up)
-    # scanners sit on a vehicle a little askew; its own frame has an upright axis, which one depends on the recording
-    axis = np.zeros(3)
-    nearest = int(np.abs(up).argmax())
-    axis[nearest] = np.sign(up[nearest])
-    return axis if up @ axis >= math.cos(_ASKEW_RAD) else up
+        return
+    raise InputError(
+        f"--poses colmap: COLMAP's path breaks between frames {where[0]} and {where[1]}: {why}. Find the path from "
+        "LiDAR (--poses lidar); or give COLMAP more to go by: frames closer together (--stride 1), all cameras, the "
+        "lens as it was calibrated, masks of what moves (--frame-masks); or take the frames before or after the break "
+        "alone (--first, --frames)."
+    )
 
 
 def _notices(recording: Recording, models: list[ColmapModel], path: MetricPath, scale: Scale, posed: int) -> list[str]:
@@ -170,10 +148,10 @@ def _notices(recording: Recording, models: list[ColmapModel], path: MetricPath, 
         + (f", {len(members)} models joined by the rig" if len(members) > 1 else "")
         + "."
     ]
-    step = float(np.linalg.norm(np.diff(path.trajectory.vehicle_to_world[:, :3, 3], axis=0), axis=-1).sum())
+    length_m = path_length_m(path.trajectory)
     notices.append(
         f"Scale of COLMAP's poses from LiDAR: {scale.ratio:.4f} m per unit, spread {100 * scale.spread:.1f} % (half "
-        f"the interquartile range of {scale.pairs} points' distances); the path is {step:.1f} m long"
+        f"the interquartile range of {scale.pairs} points' distances); the path is {length_m:.1f} m long"
         + (
             f"; the cameras agree on the vehicle's place within {100 * path.disagreement_m:.1f} cm (median)."
             if np.isfinite(path.disagreement_m)
@@ -186,8 +164,6 @@ def _notices(recording: Recording, models: list[ColmapModel], path: MetricPath, 
             f"{left} more of COLMAP's models could not be joined with the largest (too few moments in common, or too "
             "few points with LiDAR beside them); what only they hold counts as not registered."
         )
-    if recording.shifted:
-        notices.append("The drive's true views from beside the path are left out: COLMAP's world is another.")
     if path.disagreement_m > _WARN_APART_M:
         notices.append(
             "The cameras do not agree on where the vehicle is: check where the calibration puts them on it, and the "

@@ -37,6 +37,12 @@ MIN_PAIRS = 30
 MIN_COMMON_MOMENTS = 3
 """Models with fewer moments in common are not joined."""
 
+_WINDOW_PAIRS = 100
+"""A window along the path is as long as it takes for so many features with LiDAR."""
+_STEADY = 1.15
+"""The scale is broken where windows differ by more than this factor, and what their spread explains."""
+_DOUBTS = 3.0
+"""So many standard errors of both windows are explained."""
 _MOMENTS = 40
 """LiDAR of at most so many moments, spread over the drive, is looked at."""
 _WINDOW_RAD = math.radians(0.4)
@@ -50,6 +56,24 @@ _SETTLED = 5e-4
 
 
 @dataclass(frozen=True)
+class ScaleBreak:
+    """Where a reconstruction changes its scale."""
+
+    first: int
+    """Number of the last moment before the place where it changes most."""
+    last: int
+    """Number of the first moment after it."""
+    before: float
+    """Metres per unit before it."""
+    after: float
+    """Metres per unit after it."""
+    smallest: float
+    """The smallest of all windows along the path."""
+    largest: float
+    """The largest."""
+
+
+@dataclass(frozen=True)
 class Scale:
     """How LiDAR's distances compare with a reconstruction's."""
 
@@ -59,6 +83,8 @@ class Scale:
     """Half the interquartile range of the ratios, as a share of the median."""
     pairs: int
     """How many features had LiDAR beside them."""
+    broken: ScaleBreak | None = None
+    """Where it is not the same along the path."""
 
 
 @dataclass(frozen=True)
@@ -201,14 +227,16 @@ def metric_path(recording: Recording, models: Sequence[ColmapModel]) -> tuple[Me
 
     """
     # as if each sweep were taken all at once, for a first scale of each model alone
-    first = [_ratios(recording, [model], [1.0], None) for model in models]
+    first = [_together(_ratios(recording, [model], [1.0], None)) for model in models]
     usable = [i for i, ratios in enumerate(first) if len(ratios) >= MIN_PAIRS]
     if not usable:
         raise _too_few(max(map(len, first), default=0), recording)
     path = join_models(recording, [models[i] for i in usable], [float(np.median(first[i])) for i in usable])
-    ratios = np.ones(0)
+    along: dict[int, np.ndarray] = {}
+    ratios, change = np.ones(0), 1.0
     for _ in range(_ROUNDS):
-        ratios = _ratios(recording, path.members, path.scales, path.trajectory)
+        along = _ratios(recording, path.members, path.scales, path.trajectory)
+        ratios = _together(along)
         if len(ratios) < MIN_PAIRS:
             raise _too_few(len(ratios), recording)
         change = float(np.median(ratios))
@@ -216,7 +244,56 @@ def metric_path(recording: Recording, models: Sequence[ColmapModel]) -> tuple[Me
         if abs(change - 1) < _SETTLED:
             break
     low, middle, high = np.percentile(ratios, (25, 50, 75))
-    return path, Scale(path.scales[0], float((high - low) / (2 * middle)), len(ratios))
+    metres = path.scales[0] / change
+    return path, Scale(
+        path.scales[0],
+        float((high - low) / (2 * middle)),
+        len(ratios),
+        find_scale_break({frame: metres * found for frame, found in along.items()}),
+    )
+
+
+def find_scale_break(along: Mapping[int, Float64[np.ndarray, "_"]]) -> ScaleBreak | None:
+    """Find where the scale changes along the path, window by window.
+
+    Args:
+        along: by number of moment, in order, LiDAR's distances over the reconstruction's.
+
+    Returns:
+        Where it changes most, if it is nowhere near one scale; None if it is, or too few moments have LiDAR.
+
+    """
+    frames = [frame for frame, found in along.items() if len(found)]
+    counts = np.cumsum([0] + [len(along[frame]) for frame in frames])
+    ratios = np.concatenate([along[frame] for frame in frames]) if frames else np.ones(0)
+    if counts[-1] < 2 * _WINDOW_PAIRS:
+        return None
+    changes = []
+    for boundary in range(1, len(frames)):
+        start = int(np.searchsorted(counts, counts[boundary] - _WINDOW_PAIRS, side="right")) - 1
+        end = int(np.searchsorted(counts, counts[boundary] + _WINDOW_PAIRS))
+        if start < 0 or end > len(frames):
+            continue
+        before, after = ratios[counts[start] : counts[boundary]], ratios[counts[boundary] : counts[end]]
+        changes.append((start, boundary, end, _window(before), _window(after)))
+    if not changes:
+        return None
+    windows = [window for change in changes for window in change[3:]]
+    smallest, largest = min(windows), max(windows)
+    if largest[0] / smallest[0] < _STEADY + _DOUBTS * (smallest[1] + largest[1]):
+        return None
+    start, boundary, end, before, after = max(changes, key=lambda change: abs(math.log(change[4][0] / change[3][0])))
+    return ScaleBreak(frames[boundary - 1], frames[boundary], before[0], after[0], smallest[0], largest[0])
+
+
+def _window(ratios: Float64[np.ndarray, "pairs"]) -> tuple[float, float]:
+    """A window's scale, and the standard error of it as a share: that of a median, from the quartiles."""
+    low, middle, high = np.percentile(ratios, (25, 50, 75))
+    return float(middle), float(0.93 * (high - low) / middle / math.sqrt(len(ratios)))
+
+
+def _together(along: Mapping[int, Float64[np.ndarray, "_"]]) -> Float64[np.ndarray, "pairs"]:
+    return np.concatenate([np.ones(0), *along.values()])
 
 
 def _too_few(pairs: int, recording: Recording) -> InputError:
@@ -230,8 +307,8 @@ def _too_few(pairs: int, recording: Recording) -> InputError:
 
 def _ratios(
     recording: Recording, models: Sequence[ColmapModel], scales: Sequence[float], trajectory: Trajectory | None
-) -> Float64[np.ndarray, "pairs"]:
-    """LiDAR's distance over the models' scaled ones, for every feature with returns beside it.
+) -> dict[int, Float64[np.ndarray, "_"]]:
+    """LiDAR's distance over the models' scaled ones, by number of moment, for every feature with returns beside it.
 
     Args:
         recording: whose sweeps are used.
@@ -251,8 +328,9 @@ def _ratios(
     for sweep in recording.sweeps:
         if sweep.frame is not None:
             sweeps[sweep.frame].append(sweep)
-    found = [np.ones(0)]
+    along = {}
     for frame in frames:
+        found = [np.ones(0)]
         scans = [_scan(sweep, trajectory) for sweep in sweeps[frame]]
         for number, index in sorted(registered[frame]):
             picture = recording.pictures[index]
@@ -261,7 +339,8 @@ def _ratios(
             lidar = _beside(view.rays, returns)
             fine = np.isfinite(lidar)
             found.append(lidar[fine] / (scales[number] * view.distance[fine]))
-    return np.concatenate(found)
+        along[frame] = np.concatenate(found)
+    return along
 
 
 def _scan(sweep: RecordedSweep, trajectory: Trajectory | None) -> Float64[np.ndarray, "returns 3"]:

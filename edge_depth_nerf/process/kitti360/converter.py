@@ -55,9 +55,9 @@ def read_kitti360(options: Kitti360Options) -> Recording:
     poses = read_poses(drive.poses) if options.poses == "recorded" else None
     kept, skipped = drive.select(poses)
     tolerance = Tolerance(options.strict, len(kept))
-    numbers = _near(
-        np.array(sorted(drive.sweep_numbers())), np.array(sorted({frame for _, frame in kept})), 2 * options.sweeps
-    )
+    # a picture's sweeps are checked against those around them, as far again; a path is followed without gaps
+    near = partial(_near, reach=2 * options.sweeps, between=options.poses != "recorded")
+    numbers = near(np.array(sorted(drive.sweep_numbers())), np.array(sorted({frame for _, frame in kept})))
     whole = set()
     for number in numbers.tolist():
         with tolerance.of(number, SCANNER):
@@ -92,8 +92,7 @@ def read_kitti360(options: Kitti360Options) -> Recording:
             read=partial(read_sweep, drive.sweep_file(number)),
             timing=timing,
         )
-        # a picture's sweeps are checked against those around them, as far again
-        for number in _near(np.array(sorted(whole)), np.array(moments), 2 * options.sweeps).tolist()
+        for number in near(np.array(sorted(whole)), np.array(moments)).tolist()
     ]
     return Recording(
         cameras=tuple(RecordedCamera(name, rig.cameras[name], rig.camera_to_pose[name]) for name in options.cameras),
@@ -148,12 +147,13 @@ def _trajectory(poses: dict[int, np.ndarray], clock: _Clock, path: Path) -> Traj
         raise InputError(f"{path}: {error}") from error
 
 
-def _near(numbers: np.ndarray, moments: np.ndarray, reach: int) -> np.ndarray:
-    """Those numbers that are at most so far from a moment."""
+def _near(numbers: np.ndarray, moments: np.ndarray, reach: int, between: bool) -> np.ndarray:
+    """Those numbers that are at most so far from a moment, or also all between the first moment and the last."""
     after = np.searchsorted(moments, numbers).clip(max=len(moments) - 1)
     before = (after - 1).clip(min=0)
     apart = np.minimum(np.abs(moments[after] - numbers), np.abs(moments[before] - numbers))
-    return numbers[apart <= reach]
+    inside = (numbers >= moments[0]) & (numbers <= moments[-1])
+    return numbers[(apart <= reach) | (inside & between)]
 
 
 def _shifted_views(drive: Kitti360Drive, rig: Kitti360Rig, taken: set[tuple[str, int]]) -> list[ShiftedView]:

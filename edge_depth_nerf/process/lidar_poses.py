@@ -1,0 +1,198 @@
+"""Poses by LiDAR odometry: the vehicle's path from the sweeps of one scanner.
+
+Of several scanners the one with the most returns in all is followed; the others are placed by its path. Every sweep of
+the stretch is used, those between the moments taken, too.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import statistics
+from collections import defaultdict
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from rich.console import Console
+from scipy.spatial.transform import Rotation
+
+from edge_depth_nerf.base.console import progress_bars
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.numbers import spread_over
+from edge_depth_nerf.lidar import transform_points
+from edge_depth_nerf.lidar.trajectory import MAX_POSE_GAP_S, Trajectory
+from edge_depth_nerf.poses.breaks import find_break
+from edge_depth_nerf.poses.odometry import MIN_SWEEPS, RANGE_M, TimedSweep, import_kiss_icp, odometry, steps_of
+from edge_depth_nerf.process.found_path import path_length_m, upright, with_path
+from edge_depth_nerf.process.options import ProcessOptions
+from edge_depth_nerf.process.recording import RecordedPicture, RecordedSweep, Recording
+
+NO_SWEEP = "no sweep near it in time"
+_MIN_WAY_M = 1.0
+"""A vehicle that stays within so much of where it begins has no path."""
+_TURNED_RAD = math.radians(20)
+_LOOKED_AT = 5
+"""So many sweeps of each scanner say how many returns it has."""
+_FEW_RETURNS = 5000
+"""Fewer a sweep say too little of the vehicle's roll and pitch; a scanner of 16 rings has some 25,000."""
+
+
+def lidar_poses(recording: Recording, options: ProcessOptions, console: Console) -> Recording:
+    """Find the poses of a recording's pictures by LiDAR odometry.
+
+    Args:
+        recording: its trajectory and its pictures' poses, if any, are not used; its sweeps and its rig are.
+        options: strict, for a sweep that cannot be read.
+        console: where the progress is shown.
+
+    Returns:
+        The recording with the vehicle's path, and with the pictures that were taken between its sweeps, or within
+        half a turn of them; the others are listed in `skipped`. A notice says how long the path is.
+
+    Raises:
+        InputError: KISS-ICP is not installed, there are too few sweeps or a gap between them, a sweep cannot be
+            read, the vehicle stands or turns on the spot, or the path is none of a vehicle.
+
+    """
+    sweeps = [sweep for sweep in check_sweeps(recording) if options.strict or _readable(sweep)]
+    trajectory = upright(recording, path_of(sweeps, console))
+    _check_path(trajectory)
+    slack_s = statistics.median(np.diff(trajectory.times_s).tolist())
+
+    def lacking(picture: RecordedPicture) -> str | None:
+        return NO_SWEEP if trajectory.outside_s(picture.time_s) > slack_s else None
+
+    posed = with_path(recording, trajectory, lacking)
+    if not posed.pictures:
+        raise InputError(
+            f"--poses lidar: none of the {len(recording.pictures)} pictures was taken between the sweeps of "
+            f"{sweeps[0].scanner}. Check the times of pictures and sweeps."
+        )
+    return dataclasses.replace(posed, notices=(*posed.notices, *_notices(sweeps, trajectory)))
+
+
+def check_sweeps(recording: Recording) -> list[RecordedSweep]:
+    """Check what can be checked before the long work; give the sweeps that are followed, in order of time.
+
+    Raises:
+        InputError: KISS-ICP is missing, there are no sweeps, too few, too thin ones, or a gap between them.
+
+    """
+    import_kiss_icp()
+    if not recording.sweeps:
+        maps = any(picture.depth for picture in recording.pictures)
+        found = "depth maps in place of LiDAR sweeps" if maps else "no LiDAR sweeps"
+        raise InputError(
+            f"--poses lidar: the recording has {found}; the path is found from sweeps. Give scans ([lidars] in a rig "
+            "file), or find the path from the pictures (--poses colmap)."
+        )
+    scanners: dict[str, list[RecordedSweep]] = defaultdict(list)
+    for sweep in recording.sweeps:
+        scanners[sweep.scanner].append(sweep)
+    returns = {name: _usual_returns(sweeps) for name, sweeps in scanners.items()}
+    name = max(scanners, key=lambda name: returns[name] * len(scanners[name]))
+    sweeps = sorted(scanners[name], key=lambda sweep: sweep.time_s)
+    if len(sweeps) < MIN_SWEEPS:
+        raise InputError(
+            f"--poses lidar: {len(sweeps)} sweep{'' if len(sweeps) == 1 else 's'} of {name}, expected {MIN_SWEEPS} or "
+            "more one after another: the path comes from what sweeps have in common. Take more frames (--frames), or "
+            "find the path from the pictures (--poses colmap)."
+        )
+    if returns[name] < _FEW_RETURNS:
+        raise InputError(
+            f"--poses lidar: {sweeps[0].path.parent}: {returns[name]:.0f} returns a sweep (median), expected "
+            f"{_FEW_RETURNS} or more: fewer do not say how the vehicle rolls and pitches. Use --poses colmap."
+        )
+    times = np.array([sweep.time_s for sweep in sweeps])
+    widest = int(np.diff(times).argmax())
+    if times[widest + 1] - times[widest] > MAX_POSE_GAP_S:
+        raise InputError(
+            f"--poses lidar: no sweep for {times[widest + 1] - times[widest]:.1f} s after {sweeps[widest].path}; "
+            f"sweeps more than {MAX_POSE_GAP_S:g} s apart have too little in common. Take the frames before or after "
+            "alone (--first, --frames), or find the path from the pictures (--poses colmap)."
+        )
+    return sweeps
+
+
+def path_of(sweeps: Sequence[RecordedSweep], console: Console) -> Trajectory:
+    """The vehicle's path in the frame of its first pose; shows progress.
+
+    Raises:
+        InputError: there are too few sweeps, or one cannot be read.
+
+    """
+    timed = [TimedSweep(sweep.time_s, partial(_read, sweep)) for sweep in sweeps]
+    with progress_bars(console, counted=True) as progress:
+        task = progress.add_task("Following the LiDAR", total=steps_of(len(sweeps)))
+        return odometry(timed, lambda: progress.advance(task))
+
+
+def _read(sweep: RecordedSweep) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n"]]:
+    """The points of a sweep that are used, in the vehicle's frame, and when each was measured."""
+    read = sweep.read()
+    offset_s = torch.zeros(len(read.points_m), dtype=torch.float64)
+    if read.offset_s is not None:
+        offset_s = read.offset_s
+    elif sweep.timing is not None:
+        offset_s = sweep.timing.offsets_s(read.points_m)
+    range_m = read.points_m.norm(dim=-1)
+    used = (range_m >= RANGE_M[0]) & (range_m <= RANGE_M[1])
+    in_vehicle = transform_points(torch.from_numpy(sweep.to_vehicle), read.points_m[used])
+    return in_vehicle.double().numpy(), offset_s[used].double().numpy()
+
+
+def _readable(sweep: RecordedSweep) -> bool:
+    try:
+        sweep.read()
+    except (InputError, FileNotFoundError):
+        return False
+    return True
+
+
+def _usual_returns(sweeps: Sequence[RecordedSweep]) -> float:
+    some = [sweeps[index] for index in dict.fromkeys(spread_over(len(sweeps), _LOOKED_AT))]
+    return float(statistics.median([len(sweep.read().points_m) for sweep in some if _readable(sweep)] or [0]))
+
+
+def _check_path(trajectory: Trajectory) -> None:
+    """Whether the path is that of a vehicle that drives.
+
+    Raises:
+        InputError: it is not.
+
+    """
+    poses = trajectory.vehicle_to_world
+    reach_m = float(np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=-1).max())
+    turned = float(Rotation.from_matrix(poses[0, :3, :3].T @ poses[:, :3, :3]).magnitude().max())
+    if reach_m < _MIN_WAY_M:
+        what = f"turns on the spot, by {math.degrees(turned):.0f}°" if turned > _TURNED_RAD else "stands still"
+        raise InputError(
+            f"--poses lidar: the vehicle {what}: it stays within {reach_m:.2f} m of where it begins. Pictures from one "
+            "place do not say how far away anything is; take frames of a stretch where it drives (--first, --frames)."
+        )
+    if found := find_break(trajectory):
+        first, last = trajectory.times_s[[found.first, found.last]]
+        raise InputError(
+            f"--poses lidar: the path breaks between {first:.2f} and {last:.2f} s: {found.what}. LiDAR's surroundings "
+            "say too little there (an open field, a tunnel, a scanner of few rings), or the sweeps' times are wrong. "
+            "Check turn_s, direction and times, take the frames before or after alone, or use --poses colmap."
+        )
+
+
+def _notices(sweeps: Sequence[RecordedSweep], trajectory: Trajectory) -> list[str]:
+    speed = np.linalg.norm(np.diff(trajectory.vehicle_to_world[:, :3, 3], axis=0), axis=-1) / np.diff(
+        trajectory.times_s
+    )
+    notices = [
+        f"LiDAR odometry followed {len(sweeps)} sweeps of {sweeps[0].scanner}: the path is "
+        f"{path_length_m(trajectory):.1f} m long, at {np.median(speed):.1f} m/s (median), {speed.max():.1f} at most."
+    ]
+    if sweeps[0].timing is None and sweeps[0].read().offset_s is None:
+        notices.append(
+            f"The sweeps of {sweeps[0].scanner} have no times, so they are taken as corrected for the vehicle's motion "
+            "already. If they are raw, give turn_s and direction, or point_times: the vehicle moves during a turn."
+        )
+    return notices

@@ -1,0 +1,136 @@
+"""How good poses that were found are: held against features of the pictures, and against another way to find them."""
+
+from __future__ import annotations
+
+from functools import cache, partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_image
+from edge_depth_nerf.cameras import Camera
+from edge_depth_nerf.masks.lens import lens_circle
+from edge_depth_nerf.masks.semantics import keep_static, read_labels
+from edge_depth_nerf.poses.agreement import compare_paths, read_agreement, write_agreement
+from edge_depth_nerf.poses.matches import PosedPicture, along_drive
+from edge_depth_nerf.process.lidar_poses import check_sweeps, path_of
+from edge_depth_nerf.process.options import ProcessOptions
+from edge_depth_nerf.process.recording import RecordedPicture, Recording
+from edge_depth_nerf.scene.checks import read_camera_mask
+
+_WARN_PX = 2.0
+_WARN_APART_M = 0.2
+_WARN_APART = 0.02
+"""As a share of the path's length."""
+
+
+def features_say(recording: Recording, options: ProcessOptions, console: Console) -> list[str]:
+    """Say how far features of successive pictures lie from their epipolar curves, in pixels of the raw pictures.
+
+    Args:
+        recording: with the poses of its pictures, and the masks of its cameras.
+        options: theta_max_deg, and the masks that are not in the recording.
+        console: where it is said that this takes a while.
+
+    Raises:
+        InputError: under `strict`, a picture or a mask cannot be read.
+
+    """
+    lenses = {camera.name: camera.camera for camera in recording.cameras}
+
+    @cache
+    def of_camera(name: str) -> NDArray[np.bool_]:
+        recorded = next(camera for camera in recording.cameras if camera.name == name)
+        usable = lens_circle(recorded.camera, options.theta_max_deg)
+        ego = options.ego_mask_of(name) or recorded.ego_mask
+        return usable if ego is None else usable & read_camera_mask(ego, recorded.camera)
+
+    def usable(picture: RecordedPicture, lens: Camera) -> NDArray[np.bool_]:
+        return of_camera(picture.camera) & held_still(picture, lens, options)
+
+    posed = [
+        PosedPicture(
+            camera=picture.camera,
+            moment=picture.frame,
+            lens=lenses[picture.camera],
+            camera_to_world=picture.camera_to_world,
+            read_rgb=partial(read_image, picture.path),
+            read_usable=partial(usable, picture, lenses[picture.camera]),
+        )
+        for picture in recording.pictures
+        if picture.camera_to_world is not None
+    ]
+    with console.status("Comparing the poses with features of the pictures"):
+        try:
+            found = [pair for pair in along_drive(posed, apart=(1,)) if np.isfinite(pair.median_px)]
+        except (InputError, FileNotFoundError) as error:
+            if options.strict:
+                raise
+            return [f"The poses are not held against features of the pictures: {error}"]
+    if not found:
+        return ["Too few features match between successive pictures to say how good the poses are."]
+    worst = max(found, key=lambda pair: pair.median_px)
+    median_px = float(np.median([pair.median_px for pair in found]))
+    said = [
+        f"Features of successive pictures lie {median_px:.2f} px from their epipolar curves (median of {len(found)} "
+        f"pairs of pictures; at worst {worst.median_px:.2f} px, frames {worst.first} and {worst.second} of "
+        f"{worst.camera})."
+    ]
+    if median_px > _WARN_PX:
+        said.append(
+            "That is far: check the calibration between LiDAR and cameras, and the times of pictures and sweeps, or "
+            "find the poses from the pictures (--poses colmap)."
+        )
+    return said
+
+
+def lidar_says(recording: Recording, scene: Path, console: Console) -> list[str]:
+    """Hold poses that were found from pictures against LiDAR odometry, and write down in the scene how far they agree.
+
+    Says nothing where KISS-ICP is not installed, or the recording's sweeps cannot be followed.
+
+    Args:
+        recording: with its path.
+        scene: its folder.
+        console: where the progress is shown.
+
+    Raises:
+        InputError: what an earlier run wrote down is broken.
+
+    """
+    assert recording.trajectory is not None
+    # a run that goes on does not begin again
+    found = read_agreement(scene, recording.trajectory)
+    if found is None:
+        try:
+            found = compare_paths(recording.trajectory, path_of(check_sweeps(recording), console))
+        except (InputError, FileNotFoundError):
+            return []
+        if found is None:
+            return []
+        write_agreement(scene, found, recording.trajectory)
+    said = [f"LiDAR odometry's path of the same drive lies {found.text()}; it is {found.scale - 1:+.2%} longer."]
+    if found.max_m > _WARN_APART_M + _WARN_APART * found.length_m:
+        said.append(
+            "That is much: one of the two is wrong. Make the scene with --poses lidar as well, and see which path the "
+            "maps of `edge-depth-nerf inspect` lie better with."
+        )
+    return said
+
+
+def held_still(picture: RecordedPicture, camera: Camera, options: ProcessOptions) -> NDArray[np.bool_]:
+    """What of a picture shows nothing that moves, as far as that is given.
+
+    Raises:
+        InputError: a mask cannot be read.
+
+    """
+    still = np.ones((camera.height, camera.width), bool)
+    if picture.mask is not None:
+        still &= read_camera_mask(picture.mask, camera)
+    if picture.semantics is not None:
+        still &= keep_static(read_labels(picture.semantics), options.moving_classes)
+    return still
