@@ -140,8 +140,8 @@ def find_features(picture: PosedPicture, most: int = MOST_FEATURES) -> Features:
     mask = cv2.resize(usable.astype(np.uint8), smaller.tolist(), interpolation=cv2.INTER_NEAREST)
     # the picture's own border is no edge of the mask: SIFT keeps away from it by itself
     reach = np.ones((2 * _BORDER_PX + 1, 2 * _BORDER_PX + 1), np.uint8)
-    mask = cv2.erode(mask, reach, borderType=cv2.BORDER_CONSTANT, borderValue=1)
-    detector = cv2.SIFT_create(nfeatures=most, enable_precise_upscale=True)
+    mask = cv2.erode(mask, reach)
+    detector = cv2.SIFT_create(nfeatures=most, enable_precise_upscale=True)  # pyright: ignore[reportAttributeAccessIssue]
     found, descriptors = detector.detectAndCompute(grey, 255 * mask)
     if descriptors is None:
         found, descriptors = [], np.zeros((0, 128), np.float32)
