@@ -103,7 +103,7 @@ def world(rng: np.random.Generator, points: int = 500) -> World:
 
 
 def disturbed(path: np.ndarray, rng: np.random.Generator, metres: float = 0.03, degrees: float = 0.1) -> np.ndarray:
-    return np.stack([at @ pose(rng.normal(0, degrees, 3), rng.normal(0, metres, 3)) for at in path])
+    return np.stack([at @ pose([*rng.normal(0, degrees, 3)], [*rng.normal(0, metres, 3)]) for at in path])
 
 
 def step_errors(path: np.ndarray, true: np.ndarray) -> tuple[float, float]:
