@@ -294,18 +294,32 @@ def recorded(given: World, path: np.ndarray, poses_s: float = 0.1, shutter_s: fl
     return Recording(cameras, pictures, (), trajectory, {})
 
 
-def refined(monkeypatch: pytest.MonkeyPatch, given: Recording, matches: list[Matches]) -> Recording:
-    monkeypatch.setattr(refining, "_match", lambda *_: matches)
-    return refining.refine_poses(given, ProcessOptions(output=Path("none")), Console(quiet=True))
+@dataclasses.dataclass
+class Refined:
+    """Refines recordings whose matches are given."""
+
+    monkeypatch: pytest.MonkeyPatch
+    output: Path
+
+    def __call__(self, given: Recording, matches: list[Matches]) -> Recording:
+        self.monkeypatch.setattr(refining, "_match", lambda *_: matches)
+        return refining.refine_poses(given, ProcessOptions(output=self.output), Console(quiet=True))
+
+
+@pytest.fixture
+def refined(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Refined:
+    (tmp_path / "none.png").touch()
+    monkeypatch.chdir(tmp_path)
+    return Refined(monkeypatch, tmp_path)
 
 
 @pytest.mark.slow
-def test_a_recording_moves_as_a_whole(colmap: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_recording_moves_as_a_whole(colmap: Any, refined: Refined) -> None:
     rng = np.random.default_rng(7)
     given = world(rng)
     path = disturbed(given.path, rng)
     drive = recorded(given, path, shutter_s=0.0)
-    moved = refined(monkeypatch, drive, given.matches(0.2, rng))
+    moved = refined(drive, given.matches(0.2, rng))
     assert "Poses refined by" in moved.notices[-1]
     assert moved.trajectory is not None
     poses = np.stack([moved.pose(picture) for picture in moved.pictures])
@@ -318,37 +332,55 @@ def test_a_recording_moves_as_a_whole(colmap: Any, monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.slow
-def test_true_poses_stay(colmap: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_was_found_is_kept_for_the_same_inputs(colmap: Any, refined: Refined) -> None:
+    rng = np.random.default_rng(13)
+    given = world(rng, points=250)
+    drive = recorded(given, disturbed(given.path, rng))
+    first = refined(drive, given.matches(0.2, rng))
+    again = refined(drive, [])
+    assert first.trajectory is not None and again.trajectory is not None
+    np.testing.assert_array_equal(first.trajectory.vehicle_to_world, again.trajectory.vehicle_to_world)
+    assert again.notices == first.notices
+    other = refined(recorded(given, given.path), [])
+    assert "only 0 features" in other.notices[-1]
+
+
+@pytest.mark.slow
+def test_true_poses_stay(colmap: Any, refined: Refined) -> None:
     rng = np.random.default_rng(8)
     given = world(rng)
     drive = recorded(given, given.path, shutter_s=0.0)
-    kept = refined(monkeypatch, drive, given.matches(0.3, rng))
+    kept = refined(drive, given.matches(0.3, rng))
     assert "stay as they are given: features agree with them as well" in kept.notices[-1]
     assert kept.trajectory is drive.trajectory
     assert kept.pictures == drive.pictures
 
 
 @pytest.mark.slow
-def test_poses_that_are_far_off_are_not_trusted_to_features(colmap: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_poses_that_are_far_off_are_not_trusted_to_features(
+    colmap: Any, refined: Refined, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rng = np.random.default_rng(9)
     given = world(rng)
-    monkeypatch.setattr(refining, "FURTHEST_M", 0.02)
-    kept = refined(monkeypatch, recorded(given, disturbed(given.path, rng)), given.matches(0.3, rng))
+    refined.monkeypatch.setattr(refining, "FURTHEST_M", 0.02)
+    kept = refined(recorded(given, disturbed(given.path, rng)), given.matches(0.3, rng))
     assert "too far to be trusted" in kept.notices[-1]
     assert "--poses colmap" in kept.notices[-1]
 
 
-def test_few_features_change_nothing(colmap: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_few_features_change_nothing(colmap: Any, refined: Refined) -> None:
     rng = np.random.default_rng(10)
     given = world(rng, points=6)
-    kept = refined(monkeypatch, recorded(given, disturbed(given.path, rng)), given.matches(0.3, rng))
+    kept = refined(recorded(given, disturbed(given.path, rng)), given.matches(0.3, rng))
     assert "could be matched to judge by" in kept.notices[-1]
-    none = refined(monkeypatch, recorded(given, given.path), [])
+    none = refined(recorded(given, given.path), [])
     assert "only 0 features" in none.notices[-1]
 
 
 @pytest.mark.slow
-def test_a_moment_without_features_moves_with_its_neighbours(colmap: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_moment_without_features_moves_with_its_neighbours(
+    colmap: Any, refined: Refined, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rng = np.random.default_rng(11)
     given = world(rng)
     wanted = pose((0, 0.1, 0), (0.05, 0, 0.02))
@@ -357,8 +389,8 @@ def test_a_moment_without_features_moves_with_its_neighbours(colmap: Any, monkey
     dark = 5
     found = Refinement(given.path.copy(), np.arange(MOMENTS) != dark, 100, 1.0, 0.1, 1000)
     found.vehicle_to_world[dark] = path[dark]
-    monkeypatch.setattr(refining, "refine", lambda *_: found)
-    moved = refined(monkeypatch, recorded(given, path, shutter_s=0.0), matches)
+    refined.monkeypatch.setattr(refining, "refine", lambda *_: found)
+    moved = refined(recorded(given, path, shutter_s=0.0), matches)
     assert moved.trajectory is not None
     np.testing.assert_allclose(moved.trajectory.at(np.array([0.1 * dark]))[0], given.path[dark], atol=1e-6)
     # between the moments, too, and beyond them by no more than at their ends

@@ -11,10 +11,14 @@ their epipolar curves, and nothing has moved further than the given poses can be
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int
@@ -22,7 +26,7 @@ from rich.console import Console
 
 from edge_depth_nerf.base.console import progress_bars
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import read_image
+from edge_depth_nerf.base.files import read_image, read_json, write_json
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.poses.matches import Matches, PosedPicture, epipolar_distance_px, match_pictures
@@ -40,6 +44,7 @@ from edge_depth_nerf.process.colmap.models import (
     ColmapLens,
     FeatureMasks,
     colmap_lens,
+    file_stamp,
     import_pycolmap,
     shared_views,
 )
@@ -57,6 +62,10 @@ FURTHEST_DEG = 1.5
 LEAST_GAIN = 0.05
 """The features that took no part must come nearer to their curves by this share; less is chance."""
 
+REFINED_POSES = "refined_poses.json"
+"""File of the scene with what was found, for the next run."""
+_VERSION = 1
+"""Of what is done with the inputs; raised when results change."""
 _APART = (1, 2, 3, 5, 8)
 """So many moments lie between the pictures of one camera that are matched; 1 is the next."""
 _ACROSS = (0, 1, 2)
@@ -93,13 +102,24 @@ class Refinement:
     judges: int
     """How many matches these medians are of."""
 
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON; a median that is not known is null."""
+        medians = {"before_px": self.before_px, "after_px": self.after_px}
+        return {
+            "vehicle_to_world": self.vehicle_to_world.tolist(),
+            "supported": self.supported.tolist(),
+            "points": self.points,
+            "judges": self.judges,
+            **{key: None if math.isnan(value) else value for key, value in medians.items()},
+        }
+
 
 def refine_poses(recording: Recording, options: ProcessOptions, console: Console) -> Recording:
     """Move the poses of a recording to where its pictures agree with them, and with each other, best.
 
     Args:
         recording: with a path.
-        options: masks, theta_max_deg, strict.
+        options: output, where what was found is kept for the next run; masks, theta_max_deg, strict.
         console: where the progress is shown.
 
     Returns:
@@ -119,9 +139,13 @@ def refine_poses(recording: Recording, options: ProcessOptions, console: Console
         return _kept(recording, "the pictures are not of two moments or more, one after another")
     given = trajectory.at(times_s)
     shots = _shots(recording, moments, given)
-    matches = _match(recording, shots, given, options, console)
-    with console.status("Refining the poses …"):
-        found = refine(pycolmap, shots, matches, given)
+    digest = _digest(pycolmap.__version__, recording, options, given)
+    found = _read_refinement(options.output / REFINED_POSES, digest)
+    if found is None:
+        matches = _match(recording, shots, given, options, console)
+        with console.status("Refining the poses …"):
+            found = refine(pycolmap, shots, matches, given)
+        write_json(options.output / REFINED_POSES, {"digest": digest, **found.to_dict()})
     if found.judges < _LEAST_JUDGES:
         return _kept(recording, f"only {found.judges} features could be matched to judge by")
     distances = f"{found.before_px:.2f} px before, {found.after_px:.2f} px after"
@@ -162,6 +186,36 @@ def _lenses(recording: Recording, options: ProcessOptions) -> dict[str, ColmapLe
 
 def _kept(recording: Recording, why: str) -> Recording:
     return dataclasses.replace(recording, notices=(*recording.notices, f"The poses stay as they are given: {why}."))
+
+
+def _digest(
+    version: str, recording: Recording, options: ProcessOptions, given: Float64[np.ndarray, "moments 4 4"]
+) -> str:
+    """Of everything that the refined poses depend on, pictures and masks by size and time of change."""
+    cameras = [
+        [c.name, c.camera.to_dict(), c.to_vehicle.tolist(), file_stamp(options.ego_mask_of(c.name) or c.ego_mask)]
+        for c in recording.cameras
+    ]
+    pictures = [
+        [p.camera, p.frame, recording.pose(p).tolist(), file_stamp(p.path), file_stamp(p.mask), file_stamp(p.semantics)]
+        for p in recording.pictures
+    ]
+    rest = [_VERSION, version, given.tolist(), options.theta_max_deg, options.moving_classes]
+    return hashlib.sha256(json.dumps([cameras, pictures, rest]).encode()).hexdigest()
+
+
+def _read_refinement(path: Path, digest: str) -> Refinement | None:
+    """What an earlier run found for the same inputs."""
+    found = read_json(path) if path.is_file() else None
+    if not isinstance(found, dict) or found.get("digest") != digest:
+        return None
+    return Refinement(
+        np.array(found["vehicle_to_world"], np.float64),
+        np.array(found["supported"], bool),
+        found["points"],
+        *(math.nan if found[key] is None else found[key] for key in ("before_px", "after_px")),
+        found["judges"],
+    )
 
 
 # ---- what the pictures share -----------------------------------------------------------------------------------
