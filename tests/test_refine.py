@@ -246,6 +246,23 @@ def test_what_judges_takes_no_part(colmap: Any) -> None:
     assert other.after_px > usual.after_px + 1
 
 
+@pytest.mark.slow
+def test_cameras_that_fire_at_other_times_stand_on_the_refined_path(colmap: Any) -> None:
+    rng = np.random.default_rng(14)
+    given = world(rng)
+    matches = given.matches(0.2, rng)
+    path = disturbed(given.path, rng)
+    true = shots_of(given)
+    turns = [pose([*rng.normal(0, 0.1, 3)], (0, 0, 0)) for _ in true]
+    off = [dataclasses.replace(shot, to_vehicle=turn @ shot.to_vehicle) for turn, shot in zip(turns, true, strict=True)]
+    frozen = refine(colmap, off, matches, path)
+    found = refine(colmap, off, matches, path, reshoot=lambda *_: true)
+    after_deg, frozen_deg = (step_errors(one.vehicle_to_world, given.path)[1] for one in (found, frozen))
+    assert after_deg < 0.3 * frozen_deg
+    assert found.before_px == frozen.before_px
+    assert found.after_px < 0.7 * frozen.after_px
+
+
 def test_without_features_poses_are_the_given_ones(colmap: Any) -> None:
     rng = np.random.default_rng(6)
     given = world(rng)
@@ -389,7 +406,7 @@ def test_a_moment_without_features_moves_with_its_neighbours(
     dark = 5
     found = Refinement(given.path.copy(), np.arange(MOMENTS) != dark, 100, 1.0, 0.1, 1000)
     found.vehicle_to_world[dark] = path[dark]
-    refined.monkeypatch.setattr(refining, "refine", lambda *_: found)
+    refined.monkeypatch.setattr(refining, "refine", lambda *_, **__: found)
     moved = refined(recorded(given, path, shutter_s=0.0), matches)
     assert moved.trajectory is not None
     np.testing.assert_allclose(moved.trajectory.at(np.array([0.1 * dark]))[0], given.path[dark], atol=1e-6)

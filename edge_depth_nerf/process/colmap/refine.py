@@ -14,7 +14,7 @@ import dataclasses
 import hashlib
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -64,7 +64,7 @@ LEAST_GAIN = 0.05
 
 REFINED_POSES = "refined_poses.json"
 """File of the scene with what was found, for the next run."""
-_VERSION = 1
+_VERSION = 2
 """Of what is done with the inputs; raised when results change."""
 _APART = (1, 2, 3, 5, 8)
 """So many moments lie between the pictures of one camera that are matched; 1 is the next."""
@@ -73,9 +73,9 @@ _ACROSS = (0, 1, 2)
 _MOST_FEATURES = 2500
 _MOST_SIGHTS = 700
 """Of a picture, in the bundle."""
-_ROUNDS_DEG = (0.6, 0.2, 0.1)
+_ROUNDS_DEG = (0.6, 0.2, 0.1, 0.1)
 """How far features may lie from where the poses put them, round by round."""
-_ROUNDS_LEAST_PX = (3.0, 1.5, 1.0)
+_ROUNDS_LEAST_PX = (3.0, 1.5, 1.0, 1.0)
 """Features are found to some tenths of a pixel, however coarse the picture."""
 _LEAST_SIGHTS = 30
 """A moment whose pictures see fewer points moves as the moments around it do."""
@@ -139,12 +139,18 @@ def refine_poses(recording: Recording, options: ProcessOptions, console: Console
         return _kept(recording, "the pictures are not of two moments or more, one after another")
     given = trajectory.at(times_s)
     shots = _shots(recording, moments, given)
+
+    def reshoot(refined: Float64[np.ndarray, "moments 4 4"], supported: Bool[np.ndarray, "moments"]) -> list[Shot]:
+        """The pictures on the rig, by the path as it is now."""
+        moved, change = _moved(recording, times_s, moments, given, refined, supported)
+        return _shots(moved, moments, given @ change)
+
     digest = _digest(pycolmap.__version__, recording, options, given)
     found = _read_refinement(options.output / REFINED_POSES, digest)
     if found is None:
         matches = _match(recording, shots, given, options, console)
         with console.status("Refining the poses …"):
-            found = refine(pycolmap, shots, matches, given)
+            found = refine(pycolmap, shots, matches, given, reshoot=reshoot)
         write_json(options.output / REFINED_POSES, {"digest": digest, **found.to_dict()})
     if found.judges < _LEAST_JUDGES:
         return _kept(recording, f"only {found.judges} features could be matched to judge by")
@@ -153,7 +159,10 @@ def refine_poses(recording: Recording, options: ProcessOptions, console: Console
         return _kept(recording, f"features agree with them as well as with refined ones ({distances})")
     if found.supported.sum() < 2:
         return _kept(recording, "the pictures of too few moments show features")
-    refined, furthest_m, furthest_deg = _moved(recording, times_s, moments, given, found)
+    refined, change = _moved(recording, times_s, moments, given, found.vehicle_to_world, found.supported)
+    cosine = ((np.trace(change[:, :3, :3], axis1=1, axis2=2) - 1) / 2).clip(-1, 1)
+    furthest_m = float(np.linalg.norm(change[:, :3, 3], axis=-1).max())
+    furthest_deg = float(np.degrees(np.arccos(cosine)).max())
     if furthest_m > FURTHEST_M or furthest_deg > FURTHEST_DEG:
         return _kept(
             recording,
@@ -209,12 +218,14 @@ def _read_refinement(path: Path, digest: str) -> Refinement | None:
     found = read_json(path) if path.is_file() else None
     if not isinstance(found, dict) or found.get("digest") != digest:
         return None
+    before_px, after_px = (math.nan if found[key] is None else found[key] for key in ("before_px", "after_px"))
     return Refinement(
-        np.array(found["vehicle_to_world"], np.float64),
-        np.array(found["supported"], bool),
-        found["points"],
-        *(math.nan if found[key] is None else found[key] for key in ("before_px", "after_px")),
-        found["judges"],
+        vehicle_to_world=np.array(found["vehicle_to_world"], np.float64),
+        supported=np.array(found["supported"], bool),
+        points=found["points"],
+        before_px=before_px,
+        after_px=after_px,
+        judges=found["judges"],
     )
 
 
@@ -314,6 +325,7 @@ def refine(
     matches: Sequence[Matches],
     given: Float64[np.ndarray, "moments 4 4"],
     softness: Softness = SOFTNESS,
+    reshoot: Callable[[Float64[np.ndarray, "moments 4 4"], Bool[np.ndarray, "moments"]], Sequence[Shot]] | None = None,
 ) -> Refinement:
     """Refine poses by matched features, and judge both by those that take no part.
 
@@ -323,6 +335,8 @@ def refine(
         matches: what pairs of them have in common; they count `shots`.
         given: vehicle to world of each moment.
         softness: how softly these are held.
+        reshoot: from refined poses, and which moments features moved, to the pictures on the rig: cameras that fire at
+            other times than the moment's stand where the path has the vehicle then. None = they stay.
 
     """
     groups = features_joined(matches)
@@ -330,7 +344,7 @@ def refine(
     judges = [found.taken(chosen) for found, chosen in zip(matches, judging, strict=True)]
     matches = [found.taken(~chosen) for found, chosen in zip(matches, judging, strict=True)]
     focal_px = float(np.median([(shot.lens.fx + shot.lens.fy) / 2 for shot in shots]))
-    refined, count = given, 0
+    refined, count, given_shots = given, 0, shots
     supported = np.zeros(len(given), bool)
     for limit_deg, least_px in zip(_ROUNDS_DEG, _ROUNDS_LEAST_PX, strict=True):
         limit_px = max(math.radians(limit_deg) * focal_px, least_px)
@@ -341,7 +355,9 @@ def refine(
         if not supported.any():
             break
         refined = adjust_bundle(pycolmap, shots, tracks, points, refined, given, softness)
-    before, after = (_median_px(shots, judges, poses) for poses in (given, refined))
+        if reshoot is not None and supported.sum() > 1:
+            shots = reshoot(refined, supported)
+    before, after = _median_px(given_shots, judges, given), _median_px(shots, judges, refined)
     return Refinement(refined, supported, count, before[0], after[0], min(before[1], after[1]))
 
 
@@ -389,18 +405,18 @@ def _moved(
     times_s: Float64[np.ndarray, "moments"],
     moments: Sequence[int],
     given: Float64[np.ndarray, "moments 4 4"],
-    found: Refinement,
-) -> tuple[Recording, float, float]:
-    """Move the path, and all that lies on it; also by how much at most, in metres and degrees.
+    refined: Float64[np.ndarray, "moments 4 4"],
+    supported: Bool[np.ndarray, "moments"],
+) -> tuple[Recording, Float64[np.ndarray, "moments 4 4"]]:
+    """Move the path, and all that lies on it; also how each moment moved, in the vehicle's frame.
 
-    What moves a moment is taken in the vehicle's own frame and goes over into that of the next one evenly; before the
-    first moment and after the last it stays.
+    A change goes over into that of the next moment evenly; before the first moment and after the last it stays. A
+    picture with a pose of its own moves with its moment.
     """
     trajectory = recording.trajectory
     assert trajectory is not None
-    change = np.linalg.inv(given) @ found.vehicle_to_world
-    known_s = times_s[found.supported]
-    changes = Trajectory(known_s, change[found.supported])
+    known_s = times_s[supported]
+    changes = Trajectory(known_s, (np.linalg.inv(given) @ refined)[supported])
 
     def changed_at(at_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 4 4"]:
         return changes.at(at_s.clip(known_s[0], known_s[-1]))
@@ -409,10 +425,12 @@ def _moved(
     path_s = np.union1d(trajectory.times_s, times_s)
     path_s = path_s[np.concatenate([[True], np.diff(path_s) > 1e-6])]
     path = Trajectory(path_s, trajectory.at(path_s) @ changed_at(path_s))
-    refined = given @ changed_at(times_s)
-    to_new = {frame: new @ np.linalg.inv(old) for frame, old, new in zip(moments, given, refined, strict=True)}
+    change = changed_at(times_s)
+    to_new = {frame: new @ np.linalg.inv(old) for frame, old, new in zip(moments, given, given @ change, strict=True)}
     pictures = tuple(
-        dataclasses.replace(picture, camera_to_world=to_new[picture.frame] @ recording.pose(picture))
+        picture
+        if picture.camera_to_world is None
+        else dataclasses.replace(picture, camera_to_world=to_new[picture.frame] @ picture.camera_to_world)
         for picture in recording.pictures
     )
     shifted = tuple(
@@ -420,10 +438,4 @@ def _moved(
         for view in recording.shifted
         if view.frame in to_new
     )
-    moved = changed_at(times_s)
-    cosine = ((np.trace(moved[:, :3, :3], axis1=1, axis2=2) - 1) / 2).clip(-1, 1)
-    return (
-        dataclasses.replace(recording, trajectory=path, pictures=pictures, shifted=shifted),
-        float(np.linalg.norm(moved[:, :3, 3], axis=-1).max()),
-        float(np.degrees(np.arccos(cosine)).max()),
-    )
+    return dataclasses.replace(recording, trajectory=path, pictures=pictures, shifted=shifted), change
