@@ -17,16 +17,20 @@ from scipy.spatial.transform import Rotation
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_image, read_mask, write_distance_png, write_mask, write_png
 from edge_depth_nerf.cameras import MEI, KannalaBrandt, Pinhole
+from edge_depth_nerf.cameras.transforms import opencv_to_opengl
 from edge_depth_nerf.lidar import Sweep, SweepTiming
 from edge_depth_nerf.poses.breaks import find_break
 from edge_depth_nerf.process.colmap import models as colmap_models
 from edge_depth_nerf.process.colmap import poses as colmap_poses_module
 from edge_depth_nerf.process.colmap.models import ColmapModel, SparseView, colmap_lens
 from edge_depth_nerf.process.colmap.poses import NOT_REGISTERED, colmap_poses
+from edge_depth_nerf.process.colmap.refine import refine_poses
 from edge_depth_nerf.process.colmap.scale import find_scale_break, join_models, metric_path
+from edge_depth_nerf.process.converters import convert
 from edge_depth_nerf.process.kitti360.converter import read_kitti360
 from edge_depth_nerf.process.options import Kitti360Options, ProcessOptions
 from edge_depth_nerf.process.recording import DepthFile, RecordedCamera, RecordedPicture, RecordedSweep, Recording
+from edge_depth_nerf.scene.reader import read_scene
 from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 
@@ -673,3 +677,73 @@ def test_most_pictures_decide_which_models_are_kept(drive, tmp_path, monkeypatch
         "models.json",
         "pairs.txt",
     ]
+
+
+# ---- poses refined ---------------------------------------------------------------------------------------------
+
+
+def steps_off(poses: dict[int, np.ndarray], truth: dict[int, np.ndarray]) -> tuple[float, float]:
+    """Mean error of the steps, metres and degrees."""
+    lengths_m, turns_deg = [], []
+    for frame in range(FRAMES - 2):
+        true = np.linalg.inv(truth[frame]) @ truth[frame + 1]
+        off = np.linalg.inv(true) @ np.linalg.inv(poses[frame]) @ poses[frame + 1]
+        lengths_m.append(np.linalg.norm(off[:3, 3]))
+        turns_deg.append(np.degrees(np.linalg.norm(Rotation.from_matrix(off[:3, :3]).as_rotvec())))
+    return float(np.mean(lengths_m)), float(np.mean(turns_deg))
+
+
+@pytest.mark.slow
+def test_a_drive_with_disturbed_poses_becomes_a_scene_with_better_ones(drive, tmp_path):
+    pytest.importorskip("pycolmap")
+    disturbed, truth = tmp_path / "disturbed", true_poses(drive)
+    shutil.copytree(drive, disturbed)
+    rng = np.random.default_rng(20)
+    lines = []
+    for frame, pose in truth.items():
+        turn, shift = rng.normal(0, math.radians(0.2), 3), rng.normal(0, 0.03, 3)
+        off = np.vstack((np.column_stack((Rotation.from_rotvec(turn).as_matrix(), shift)), [0, 0, 0, 1]))
+        lines.append(" ".join([str(frame), *(f"{value:.9f}" for value in (pose @ off)[:3].ravel())]))
+    next(disturbed.glob("data_poses/*/poses.txt")).write_text("\n".join(lines) + "\n")
+    options = Kitti360Options(
+        root=disturbed,
+        sequence=SynthesizeOptions(drive).sequence,
+        output=tmp_path / "scene",
+        refine_poses=True,
+        find_ego=False,
+        sweeps=0,
+        estimate_depth=False,
+    )
+    report = convert(options, QUIET)
+    assert any(notice.startswith("Poses refined by") for notice in report.notices)
+    to_vehicle = {camera.name: camera.to_vehicle for camera in read_kitti360(options).cameras}
+    scene = read_scene(options.output)
+    poses: dict[str, dict[int, np.ndarray]] = {name: {} for name in to_vehicle}
+    for picture in scene.pictures:
+        camera_to_world = np.eye(4)
+        camera_to_world[:3, :3], camera_to_world[:3, 3] = picture.rotation, picture.position_m
+        at = opencv_to_opengl(camera_to_world) @ np.linalg.inv(to_vehicle[picture.camera])
+        poses[picture.camera][picture.moment] = at
+    given = true_poses(disturbed)
+    before, after = steps_off(given, truth), steps_off(poses["image_02"], truth)
+    assert after[0] < 0.5 * before[0] and after[1] < 0.3 * before[1]
+    # the rig is rigid
+    for frame, at in poses["image_02"].items():
+        np.testing.assert_allclose(at, poses["image_03"][frame], atol=1e-5)
+    # the last moment's pictures are black: it moves as the one before
+    last = [np.linalg.inv(path[FRAMES - 2]) @ path[FRAMES - 1] for path in (given, poses["image_02"])]
+    assert np.linalg.norm(last[0][:3, 3]) == pytest.approx(np.linalg.norm(last[1][:3, 3]), abs=0.005)
+    # the same command takes up what it found, and leaves the scene as it is
+    written = (options.output / "transforms.json").read_bytes()
+    assert not convert(options, QUIET).written
+    assert (options.output / "transforms.json").read_bytes() == written
+
+
+@pytest.mark.slow
+def test_true_poses_of_a_drive_stay(drive, tmp_path):
+    pytest.importorskip("pycolmap")
+    options = Kitti360Options(root=drive, sequence=SynthesizeOptions(drive).sequence, output=tmp_path / "scene")
+    recording = read_kitti360(options)
+    refined = refine_poses(recording, options, QUIET)
+    assert "stay as they are given" in refined.notices[-1]
+    assert refined.pictures == recording.pictures

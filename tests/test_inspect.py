@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
@@ -48,10 +49,13 @@ from edge_depth_nerf.inspecting.command import inspect_scene
 from edge_depth_nerf.inspecting.figures import measured_moments
 from edge_depth_nerf.inspecting.findings import Finding, find, limited
 from edge_depth_nerf.inspecting.options import InspectOptions
+from edge_depth_nerf.inspecting.pose_check import BAD_MEDIAN_PX
+from edge_depth_nerf.inspecting.pose_plot import pose_check_figure
 from edge_depth_nerf.inspecting.top_view import GAP, GREYS, HELD_OUT, PATH, TRAINING, top_view
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.method.prior import default_source
 from edge_depth_nerf.poses.agreement import compare_paths, write_agreement
+from edge_depth_nerf.poses.matches import Agreement
 from edge_depth_nerf.scene.reader import read_scene
 
 pytestmark = pytest.mark.slow
@@ -90,6 +94,73 @@ def test_what_is_returned_is_what_is_written(sample):
     for name in (*summary["sheets"], "top_view.png"):
         assert read_image(output / name).std() > 10
     assert summary["warnings"] == []
+
+
+def test_its_poses_agree_with_its_pictures(sample):
+    summary, output = sample
+    assert summary["epipolar"]["median_px"] < 0.3
+    for camera in summary["cameras"].values():
+        assert camera["epipolar"]["median_px"] < 0.3
+        # pictures of 128 px have few features
+        assert 8 <= camera["epipolar"]["steps"] <= 11
+    assert len(summary["steps"]) == summary["epipolar"]["steps"]
+    assert read_image(output / "poses.png").std() > 10
+
+
+def test_a_pose_that_is_off_is_named(sample_drive, tmp_path):
+    """One moment turned by 3°: 2 px at this size."""
+    shutil.copytree(sample_drive, tmp_path / "drive", ignore=shutil.ignore_patterns(".cache"))
+    turned = frames_of(sample_drive, "image_02")[6]["frame"]
+    cosine, sine = math.cos(math.radians(3)), math.sin(math.radians(3))
+
+    def mend(meta):
+        for frame in meta["frames"]:
+            if frame["frame"] == turned and frame["camera"] == "image_02":
+                pose = np.array(frame["transform_matrix"])
+                pose[:3, :3] = pose[:3, :3] @ [[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]]
+                frame["transform_matrix"] = pose.tolist()
+
+    change(tmp_path / "drive", mend)
+    summary = look(tmp_path / "drive", tmp_path / "out", frames=1)
+    (warning,) = [warning for warning in summary["warnings"] if warning["kind"] == "poses"]
+    assert warning["cameras"] == ("image_02",)
+    assert turned in warning["frames"]
+    assert "--refine-poses" in warning["text"]
+
+
+def agreements(medians_px: Sequence[float]) -> list[Agreement]:
+    return [Agreement("left", n, n + 1, 100, median_px, 0.9) for n, median_px in enumerate(medians_px)]
+
+
+@pytest.mark.parametrize(
+    ("medians_px", "refined", "frames", "words"),
+    [
+        ([0.6] * 9 + [math.nan], False, (), "lie 0.60 px from where the poses have their epipolar lines (median"),
+        ([0.2] * 9 + [1.3], False, (9, 10), "From frame 9 to 10 of left features lie 1.3 px"),
+        ([0.2] * 8 + [2.0, 1.3], False, (8, 9, 10), "and at 1 more steps"),
+        ([0.6] * 9, True, (), "find them anew with --poses lidar or --poses colmap, and check the lens"),
+    ],
+)
+def test_poses_that_disagree_with_the_pictures(drive, medians_px, refined, frames, words):
+    change(drive, lambda meta: meta.update(source={"kind": "rig", "refine_poses": refined}))
+    (warning,) = find(read_scene(drive), [], agreements(medians_px))
+    assert (warning.kind, warning.cameras, warning.frames) == ("poses", ("left",), frames)
+    assert words in warning.text
+    assert ("process the drive with --refine-poses" in warning.text) is not refined
+
+
+def test_poses_that_agree_give_no_warning(drive):
+    scene = read_scene(drive)
+    assert find(scene, [], agreements([0.2, 0.3, 0.9, math.nan])) == []
+    assert find(scene, [], agreements([math.nan] * 5)) == []
+
+
+def test_poses_are_drawn_where_they_are(drive):
+    scene = read_scene(drive)
+    (line, limit) = pose_check_figure(scene, agreements([0.2, math.nan, 0.6])).axes[0].lines
+    assert np.asarray(line.get_xydata()).tolist() == [[0.5, 0.2], [2.5, 0.6]]
+    assert line.get_label() == "left"
+    assert np.asarray(limit.get_ydata())[0] == BAD_MEDIAN_PX
 
 
 def test_its_counts(sample, sample_drive):

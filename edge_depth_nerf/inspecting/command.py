@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -26,6 +27,8 @@ from edge_depth_nerf.inspecting.figures import (
 )
 from edge_depth_nerf.inspecting.findings import find, limited
 from edge_depth_nerf.inspecting.options import InspectOptions
+from edge_depth_nerf.inspecting.pose_check import check_poses, known_steps, pose_figures
+from edge_depth_nerf.inspecting.pose_plot import draw_pose_check
 from edge_depth_nerf.inspecting.sheets import draw_sheet
 from edge_depth_nerf.inspecting.shown_prior import ShownScene
 from edge_depth_nerf.inspecting.top_view import draw_top_view
@@ -34,6 +37,7 @@ from edge_depth_nerf.scene.reader import ScenePicture, read_scene
 
 SUMMARY = "summary.json"
 TOP_VIEW = "top_view.png"
+POSES = "poses.png"
 CAMERAS_IN_A_TABLE = 4
 """More would not fit a terminal."""
 CAPTION = "mean (least to most); coverage of the pixels used; distances: median (5 to 95 %)"
@@ -71,8 +75,11 @@ def inspect_scene(options: InspectOptions, console: Console | None = None) -> di
     jobs = [partial(_look_at, shown_scene, picture, sheet_of.get(picture.name), options) for picture in chosen]
     figures = run_jobs(jobs, "Looking at the pictures", console)
 
-    findings = find(scene, figures)
+    agreements = check_poses(scene, console)
+    findings = find(scene, figures, agreements)
     write_png(output / TOP_VIEW, draw_top_view(scene, points_m, findings, shown))
+    if known_steps(agreements):
+        write_png(output / POSES, draw_pose_check(scene, agreements))
     held_out = sum(picture.held_out for picture in scene.pictures)
     summary = {
         "made_by": f"edge-depth-nerf {__version__}",
@@ -88,16 +95,22 @@ def inspect_scene(options: InspectOptions, console: Console | None = None) -> di
         "paths_agree": None if agreement is None else {**asdict(agreement), "text": agreement.text()},
         "measured": _sample(len(figures), len(scene.pictures)),
         "maps": map_figures(figures),
-        "cameras": {name: camera_figures(scene, name, figures) for name in scene.cameras()},
+        "cameras": {
+            name: {**camera_figures(scene, name, figures), "epipolar": pose_figures(agreements, name)}
+            for name in scene.cameras()
+        },
         "warnings": [finding.to_dict() for finding in findings],
         "frames": [one.to_dict() for one in figures],
+        "epipolar": pose_figures(agreements),
+        "steps": [dataclasses.asdict(one) for one in known_steps(agreements)],
         "sheets": list(sheets.values()),
     }
     write_json(output / SUMMARY, summary)
     _show(summary, console)
     for line in limited(findings):
         say(console, f"Warning: {line}", "yellow")
-    say(console, f"{output}: {len(sheets)} sheets, {TOP_VIEW}, {SUMMARY}")
+    written = [TOP_VIEW, *([POSES] if known_steps(agreements) else []), SUMMARY]
+    say(console, f"{output}: {len(sheets)} sheets, {', '.join(written)}")
     return summary
 
 
@@ -150,6 +163,11 @@ def _quantiles(values: dict[str, float] | None) -> str:
     return "–" if values is None else "{median:.1f} m ({p5:.1f} to {p95:.1f})".format(**values)
 
 
+def _epipolar(values: dict[str, Any] | None) -> str:
+    """Median over the steps, with the smallest and largest in brackets."""
+    return "–" if values is None else "{median_px:.2f} ({min_px:.2f} to {max_px:.2f})".format(**values)
+
+
 def _show(summary: dict[str, Any], console: Console) -> None:
     path, unit = summary["path"], "m" if summary["lengths_are_metres"] else "units"
     drive = Table("drive", "", title=summary["scene"], show_header=False)
@@ -165,6 +183,12 @@ def _show(summary: dict[str, Any], console: Console) -> None:
     if summary["paths_agree"] is not None:
         drive.add_row("by LiDAR odometry", summary["paths_agree"]["text"])
     drive.add_row("points.ply", _number(summary["points"], ",", " points"))
+    if (found := summary["epipolar"]) is not None:
+        drive.add_row(
+            "poses",
+            f"features {found['median_px']:.2f} px from their epipolar lines (median; {found['min_px']:.2f} to "
+            f"{found['max_px']:.2f} over {found['steps']} steps), at the scene's size",
+        )
     console.print(drive)
 
     cameras = summary["cameras"]
@@ -198,6 +222,7 @@ def _rows(cameras: Sequence[dict[str, Any]]) -> list[tuple[str, list[str]]]:
         "lens": lens,
         "size, px": lambda c: "{}×{}".format(*c["size_px"]) + ("" if c["one_lens"] else ", varies"),
         "fit rms / max, px": fit,
+        "to epipolar lines, px": lambda c: _epipolar(c["epipolar"]),
         "used up to": lambda c: _number(c["angle_limit_deg"], ".0f", "°"),
         "used of the picture": lambda c: _spread(c["used_share"], ".0%"),
         "LiDAR coverage": lambda c: _spread(c["lidar_coverage"], ".1%"),

@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 
 from edge_depth_nerf.inspecting.figures import PictureFigures, Step, recorded, steps, usual_length_m
+from edge_depth_nerf.inspecting.pose_check import BAD_MEDIAN_PX, bad_steps, pose_figures
 from edge_depth_nerf.masks.ego_files import ego_mask_path, vehicles_unknown
+from edge_depth_nerf.poses.matches import Agreement
 from edge_depth_nerf.scene.reader import SceneFolder
 
 GAP_FACTOR = 10
@@ -50,12 +52,13 @@ class Finding:
         return asdict(self)
 
 
-def find(scene: SceneFolder, measured: Sequence[PictureFigures]) -> list[Finding]:
+def find(scene: SceneFolder, measured: Sequence[PictureFigures], agreements: Sequence[Agreement] = ()) -> list[Finding]:
     """Look for everything that this module knows; the gravest first."""
     return [
         *_layers(scene),
         *_split(scene),
         *_path(scene),
+        *_poses(scene, agreements),
         *_timestamps(scene),
         *_fits(scene),
         *_vehicles(scene),
@@ -162,6 +165,36 @@ def _path(scene: SceneFolder) -> Iterator[Finding]:
             tuple(step.before.camera for step, _ in seen),
             (before, after),
         )
+
+
+def _poses(scene: SceneFolder, agreements: Sequence[Agreement]) -> Iterator[Finding]:
+    source = scene.meta.get("source")
+    refined = isinstance(source, dict) and source.get("refine_poses") is True
+    remedy = (
+        "find them anew with --poses lidar or --poses colmap, and check the lens and the times of the pictures"
+        if refined
+        else "process the drive with --refine-poses, or find them anew with --poses lidar or --poses colmap"
+    )
+    for name in scene.cameras():
+        figures, bad = pose_figures(agreements, name), bad_steps(agreements, name)
+        if figures is not None and figures["median_px"] > BAD_MEDIAN_PX:
+            yield Finding(
+                "poses",
+                f"Features of {name} lie {figures['median_px']:.2f} px from where the poses have their epipolar lines "
+                f"(median, at the scene's size; 0.1 to 0.2 are usual); {remedy}.",
+                (name,),
+            )
+        elif figures is not None and bad:
+            worst = max(bad, key=lambda one: one.median_px)
+            yield Finding(
+                "poses",
+                f"From frame {worst.first} to {worst.second} of {name}"
+                + (f" and at {len(bad) - 1} more steps" if len(bad) > 1 else "")
+                + f" features lie {worst.median_px:.1f} px from where the poses have their epipolar lines, where "
+                f"{figures['median_px']:.2f} px are usual; {remedy}.",
+                (name,),
+                tuple(sorted({moment for one in bad for moment in (one.first, one.second)})),
+            )
 
 
 def _timestamps(scene: SceneFolder) -> Iterator[Finding]:

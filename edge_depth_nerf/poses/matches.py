@@ -40,8 +40,8 @@ LEAST_MATCHES = 20
 """The median of fewer matches says nothing."""
 _BORDER_PX = 4
 """Features nearer to the edge of a mask look at what is masked."""
-_MEASURED_MOMENTS = 100
-"""`along_drive` looks at so many moments of each camera, spread over the drive."""
+MEASURED_MOMENTS = 100
+"""So many moments of each camera, spread over the drive, are looked at."""
 
 
 @dataclass(frozen=True)
@@ -140,8 +140,8 @@ def find_features(picture: PosedPicture, most: int = MOST_FEATURES) -> Features:
     mask = cv2.resize(usable.astype(np.uint8), smaller.tolist(), interpolation=cv2.INTER_NEAREST)
     # the picture's own border is no edge of the mask: SIFT keeps away from it by itself
     reach = np.ones((2 * _BORDER_PX + 1, 2 * _BORDER_PX + 1), np.uint8)
-    mask = cv2.erode(mask, reach, borderType=cv2.BORDER_CONSTANT, borderValue=1)
-    detector = cv2.SIFT_create(nfeatures=most, enable_precise_upscale=True)
+    mask = cv2.erode(mask, reach)
+    detector = cv2.SIFT_create(nfeatures=most, enable_precise_upscale=True)  # pyright: ignore[reportAttributeAccessIssue]
     found, descriptors = detector.detectAndCompute(grey, 255 * mask)
     if descriptors is None:
         found, descriptors = [], np.zeros((0, 128), np.float32)
@@ -293,18 +293,21 @@ def agreement(camera: str, first: int, second: int, distances_px: Float64[np.nda
     return Agreement(camera, first, second, len(known), float(np.median(known)), float((known < INLIER_PX).mean()))
 
 
-def successive(pictures: Sequence[PosedPicture], apart: Sequence[int] = (1, 2)) -> list[tuple[int, int]]:
+def successive(
+    pictures: Sequence[PosedPicture], apart: Sequence[int] = (1, 2), most: int = MEASURED_MOMENTS
+) -> list[tuple[int, int]]:
     """Pairs of pictures of one camera, so many moments apart, between which the vehicle moved; in order.
 
     Args:
         pictures: some pictures.
         apart: 1 is the next picture of the camera.
+        most: pairs begin at so many moments of each camera, spread over the drive.
 
     """
     pairs = []
     for camera in dict.fromkeys(picture.camera for picture in pictures):
         ordered = sorted((p.moment, i) for i, p in enumerate(pictures) if p.camera == camera)
-        starts = spread_over(len(ordered), _MEASURED_MOMENTS)
+        starts = spread_over(len(ordered), most)
         for start in dict.fromkeys(starts):
             for later in apart:
                 if start + later < len(ordered):
@@ -316,14 +319,14 @@ def successive(pictures: Sequence[PosedPicture], apart: Sequence[int] = (1, 2)) 
 
 
 def along_drive(
-    pictures: Sequence[PosedPicture], apart: Sequence[int] = (1, 2), most: int = MOST_FEATURES
+    pictures: Sequence[PosedPicture], apart: Sequence[int] = (1, 2), most: int = MEASURED_MOMENTS
 ) -> list[Agreement]:
     """Hold the poses of a drive against features matched between successive pictures of each camera.
 
     Args:
-        pictures: of any cameras, in any order; at most a hundred moments of each camera are looked at.
+        pictures: of any cameras, in any order.
         apart: how many moments lie between the two pictures of a pair; 1 is the next.
-        most: so many features of a picture.
+        most: so many moments of each camera, spread over the drive, are looked at.
 
     Returns:
         One for each pair between whose pictures the vehicle moved by 5 cm or more, by camera and moment.
@@ -333,7 +336,7 @@ def along_drive(
 
     """
     found = []
-    for matches in match_pictures(pictures, successive(pictures, apart), most):
+    for matches in match_pictures(pictures, successive(pictures, apart, most)):
         first, second = pictures[matches.first], pictures[matches.second]
         distances_px = epipolar_distance_px(matches, first.camera_to_world, second.camera_to_world)
         found.append(agreement(first.camera, first.moment, second.moment, distances_px))

@@ -58,7 +58,7 @@ from edge_depth_nerf.scene.writer import (
 )
 
 FOUND_POSES = "found_poses.json"
-"""File of the scene with the poses that were found: camera, frame, held out, camera to world."""
+"""File of the scene with poses that were found or refined: camera, frame, held out, camera to world."""
 MOST_LISTED = 50
 """So many files that were left out are listed."""
 
@@ -82,6 +82,10 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
         from edge_depth_nerf.process.lidar_poses import check_sweeps
 
         check_sweeps(recording)
+    if options.refine_poses:
+        from edge_depth_nerf.process.colmap.refine import check_refining
+
+        check_refining(recording, options)
     with console.status("Checking cameras and files …"):
         source = _source(recording, options)
         masks = given_masks(recording, options)
@@ -104,6 +108,10 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
         notices += features_say(recording, options, console)
     if recording.trajectory is None:
         raise InputError("the recording has no poses. Give them, or find them: --poses lidar, --poses colmap.")
+    if options.refine_poses:
+        from edge_depth_nerf.process.colmap.refine import refine_poses
+
+        recording = refine_poses(recording, options, console)
     if recording.skipped:
         say(console, f"Skipped {summarise(recording.skipped)}", "yellow")
     held_out = _held_out(recording, options)
@@ -192,7 +200,7 @@ class _Builder:
         masks: dict[str, NDArray[np.bool_]],
     ) -> None:
         assert recording.trajectory is not None
-        self._options, self._held_out, self._trajectory = options, held_out, recording.trajectory
+        self._options, self._held_out, self._recording = options, held_out, recording
         self._pictures = recording.pictures
         self._cameras = {recorded.name: recorded for recorded in recording.cameras}
         self._ego = {name: options.ego_mask_of(name) or recorded.ego_mask for name, recorded in self._cameras.items()}
@@ -209,7 +217,8 @@ class _Builder:
         for scene_camera in _scene_cameras(recording, masks, options):
             usable = lens_circle(scene_camera.original, options.theta_max_deg)
             self._usable[scene_camera.name] = usable if scene_camera.mask is None else usable & scene_camera.mask
-        self._found = [] if options.poses == "recorded" else [self._keep_poses()]
+        as_recorded = options.poses == "recorded" and not options.refine_poses
+        self._found = [] if as_recorded else [self._keep_poses()]
         self._lock = threading.Lock()
         self._coverage: dict[str, list[float]] = defaultdict(list)
         self._without: list[str] = []
@@ -234,11 +243,8 @@ class _Builder:
         return path
 
     def pose(self, picture: RecordedPicture) -> Transform:
-        """Where a picture was taken: its own pose, or the vehicle's at its time."""
-        if picture.camera_to_world is not None:
-            return picture.camera_to_world
-        vehicle_to_world = self._trajectory.at(np.array([picture.time_s]))[0]
-        return vehicle_to_world @ self._cameras[picture.camera].to_vehicle
+        """Where a picture was taken."""
+        return self._recording.pose(picture)
 
     def inputs(self, picture: RecordedPicture) -> tuple[Path, ...]:
         """Files that a picture's maps are made from."""
@@ -429,6 +435,7 @@ def _source(recording: Recording, options: ProcessOptions) -> dict[str, Any]:
         "stride": options.stride,
         "downscale": options.downscale,
         "poses": options.poses,
+        **({"refine_poses": True} if options.refine_poses else {}),
         "sweeps": options.sweeps,
         "deskew": options.deskew,
         "occlusion": options.occlusion,

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from functools import cache, partial
+import math
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_image
-from edge_depth_nerf.cameras import Camera
-from edge_depth_nerf.masks.lens import lens_circle
-from edge_depth_nerf.masks.semantics import keep_static, read_labels
 from edge_depth_nerf.poses.agreement import compare_paths, read_agreement, write_agreement
 from edge_depth_nerf.poses.matches import PosedPicture, along_drive
+from edge_depth_nerf.process.feature_masks import FeatureMasks
 from edge_depth_nerf.process.lidar_poses import check_sweeps, path_of
 from edge_depth_nerf.process.options import ProcessOptions
-from edge_depth_nerf.process.recording import RecordedPicture, Recording
-from edge_depth_nerf.scene.checks import read_camera_mask
+from edge_depth_nerf.process.recording import Recording
 
 _WARN_PX = 2.0
 _WARN_APART_M = 0.2
@@ -41,16 +38,7 @@ def features_say(recording: Recording, options: ProcessOptions, console: Console
     """
     lenses = {camera.name: camera.camera for camera in recording.cameras}
 
-    @cache
-    def of_camera(name: str) -> NDArray[np.bool_]:
-        recorded = next(camera for camera in recording.cameras if camera.name == name)
-        usable = lens_circle(recorded.camera, options.theta_max_deg)
-        ego = options.ego_mask_of(name) or recorded.ego_mask
-        return usable if ego is None else usable & read_camera_mask(ego, recorded.camera)
-
-    def usable(picture: RecordedPicture, lens: Camera) -> NDArray[np.bool_]:
-        return of_camera(picture.camera) & held_still(picture, lens, options)
-
+    masks = FeatureMasks(recording, options, dict.fromkeys(lenses, math.radians(options.theta_max_deg)))
     posed = [
         PosedPicture(
             camera=picture.camera,
@@ -58,7 +46,7 @@ def features_say(recording: Recording, options: ProcessOptions, console: Console
             lens=lenses[picture.camera],
             camera_to_world=picture.camera_to_world,
             read_rgb=partial(read_image, picture.path),
-            read_usable=partial(usable, picture, lenses[picture.camera]),
+            read_usable=partial(masks.of, picture),
         )
         for picture in recording.pictures
         if picture.camera_to_world is not None
@@ -119,18 +107,3 @@ def lidar_says(recording: Recording, scene: Path, console: Console) -> list[str]
             "maps of `edge-depth-nerf inspect` lie better with."
         )
     return said
-
-
-def held_still(picture: RecordedPicture, camera: Camera, options: ProcessOptions) -> NDArray[np.bool_]:
-    """What of a picture shows nothing that moves, as far as that is given.
-
-    Raises:
-        InputError: a mask cannot be read.
-
-    """
-    still = np.ones((camera.height, camera.width), bool)
-    if picture.mask is not None:
-        still &= read_camera_mask(picture.mask, camera)
-    if picture.semantics is not None:
-        still &= keep_static(read_labels(picture.semantics), options.moving_classes)
-    return still

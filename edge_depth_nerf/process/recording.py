@@ -13,6 +13,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar import Sweep, SweepTiming
@@ -127,3 +129,14 @@ class Recording:
     """What the user should know."""
     shifted: tuple[ShiftedView, ...] = field(default=())
     """True views from beside the path, of synthetic drives."""
+
+    def pose(self, picture: RecordedPicture) -> Transform:
+        """Where a picture was taken, camera to world: its own pose, or from the vehicle's at its time.
+
+        The recording needs a path.
+        """
+        if picture.camera_to_world is not None:
+            return picture.camera_to_world
+        assert self.trajectory is not None
+        to_vehicle = next(camera.to_vehicle for camera in self.cameras if camera.name == picture.camera)
+        return self.trajectory.at(np.array([picture.time_s]))[0] @ to_vehicle

@@ -25,7 +25,7 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,6 @@ from typing import Any
 import cv2
 import numpy as np
 from jaxtyping import Float64
-from numpy.typing import NDArray
 from rich.console import Console
 
 from edge_depth_nerf.base.console import progress_bars
@@ -41,11 +40,9 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json, write_atomically, write_bytes, write_json, write_mask, write_text
 from edge_depth_nerf.cameras import Camera, KannalaBrandt, Pinhole, fit_kannala_brandt
 from edge_depth_nerf.cameras.transforms import Transform
-from edge_depth_nerf.masks.lens import lens_circle
+from edge_depth_nerf.process.feature_masks import FeatureMasks
 from edge_depth_nerf.process.options import ProcessOptions
-from edge_depth_nerf.process.pose_checks import held_still
 from edge_depth_nerf.process.recording import Recording
-from edge_depth_nerf.scene.checks import read_camera_mask
 
 THETA_MAX_DEG = 85.0
 """Features further from the axis are not used: COLMAP's lenses end at 90°, and calibrations are worst at the rim."""
@@ -106,7 +103,7 @@ class ColmapModel:
 
 
 @dataclass(frozen=True)
-class _Lens:
+class ColmapLens:
     """A camera as COLMAP has it."""
 
     model: str
@@ -118,7 +115,7 @@ class _Lens:
 
 
 @functools.lru_cache(maxsize=64)
-def colmap_lens(camera: Camera, theta_max_rad: float = math.radians(THETA_MAX_DEG)) -> _Lens:
+def colmap_lens(camera: Camera, theta_max_rad: float = math.radians(THETA_MAX_DEG)) -> ColmapLens:
     """Express a camera in one of COLMAP's models, whose pixel centres are at +0.5 as well.
 
     COLMAP's THIN_PRISM_FISHEYE without its prism is `KannalaBrandt`, tangential terms included, and its FULL_OPENCV
@@ -132,18 +129,21 @@ def colmap_lens(camera: Camera, theta_max_rad: float = math.radians(THETA_MAX_DE
     if isinstance(camera, Pinhole) and not camera.k4:
         k = camera
         parameters = (k.fx, k.fy, k.cx, k.cy, k.k1, k.k2, k.p1, k.p2, k.k3, 0.0, 0.0, 0.0)
-        return _Lens("FULL_OPENCV", parameters, limit, 0.0)
+        return ColmapLens("FULL_OPENCV", parameters, limit, 0.0)
     if isinstance(camera, KannalaBrandt):
         k, rms = camera, 0.0
     else:
         fit = fit_kannala_brandt(camera, limit)
         k, rms = fit.camera, fit.rms_px
     parameters = (k.fx, k.fy, k.cx, k.cy, k.k1, k.k2, k.p1, k.p2, k.k3, k.k4, 0.0, 0.0)
-    return _Lens("THIN_PRISM_FISHEYE", parameters, limit, rms)
+    return ColmapLens("THIN_PRISM_FISHEYE", parameters, limit, rms)
 
 
-def import_pycolmap() -> Any:
+def import_pycolmap(option: str = "--poses colmap") -> Any:
     """The module pycolmap.
+
+    Args:
+        option: what needs it.
 
     Raises:
         InputError: it is not installed, or too old.
@@ -152,14 +152,18 @@ def import_pycolmap() -> Any:
     try:
         import pycolmap
     except ImportError as error:
+        without = (
+            "leave it out (--no-refine-poses)"
+            if "refine" in option
+            else "use the poses of the recording (--poses recorded)"
+        )
         raise InputError(
-            f"--poses colmap: needs COLMAP's Python package, which cannot be imported ({error}). Install it with "
-            f"`{INSTALL}`, or use the poses of the recording (--poses recorded)."
+            f"{option}: needs COLMAP's Python package, which cannot be imported ({error}). Install it with "
+            f"`{INSTALL}`, or {without}."
         ) from error
     if tuple(int(number) for number in pycolmap.__version__.split(".")[:2]) < _OLDEST:
         raise InputError(
-            f"--poses colmap: pycolmap {pycolmap.__version__} is too old, expected 4.2 or newer. Install it with "
-            f"`{INSTALL}`."
+            f"{option}: pycolmap {pycolmap.__version__} is too old, expected 4.2 or newer. Install it with `{INSTALL}`."
         )
     return pycolmap
 
@@ -207,6 +211,27 @@ def find_models(recording: Recording, options: ProcessOptions, folder: Path, con
     return run.read_models()
 
 
+def file_stamp(path: Path | None) -> list | None:
+    """What tells a file from another version of it without reading it: its place, size and time of change."""
+    if path is None:
+        return None
+    found = path.stat()
+    return [str(path.absolute()), found.st_size, found.st_mtime_ns]
+
+
+def shared_views(recording: Recording, lenses: Mapping[str, ColmapLens]) -> set[tuple[str, str]]:
+    """Pairs of cameras, in the recording's order, whose pictures overlap enough to be matched with each other."""
+    shared = set()
+    cameras = recording.cameras
+    for index, first in enumerate(cameras):
+        for second in cameras[index + 1 :]:
+            between = float(first.to_vehicle[:3, 2] @ second.to_vehicle[:3, 2])
+            reach = sum(_reach_rad(c.camera, lenses[c.name].theta_max_rad) for c in (first, second))
+            if reach - math.acos(np.clip(between, -1, 1)) >= math.radians(_SHARED_VIEW_DEG):
+                shared.add((first.name, second.name))
+    return shared
+
+
 class _Run:
     """One folder's work."""
 
@@ -223,9 +248,10 @@ class _Run:
         self.models = folder / "models"
         theta_max_rad = math.radians(min(options.theta_max_deg, THETA_MAX_DEG))
         self.lenses = {camera.name: colmap_lens(camera.camera, theta_max_rad) for camera in recording.cameras}
-        self.ego_masks = {
-            camera.name: options.ego_mask_of(camera.name) or camera.ego_mask for camera in recording.cameras
-        }
+        self.feature_masks = FeatureMasks(
+            recording, options, {name: lens.theta_max_rad for name, lens in self.lenses.items()}
+        )
+        self.shared_views = shared_views(recording, self.lenses)
         # COLMAP names pictures by their paths below one folder, and a space ends a name
         self.pictures = folder / "pictures"
         self.names = [f"{p.camera}/{p.frame:010d}{p.path.suffix.lower()}" for p in recording.pictures]
@@ -245,21 +271,15 @@ class _Run:
 
     def _digest(self) -> str:
         """Of everything the models depend on, pictures and masks by size and time of change."""
-
-        def stamp(path: Path | None) -> list | None:
-            if path is None:
-                return None
-            found = path.stat()
-            return [str(path.absolute()), found.st_size, found.st_mtime_ns]
-
         cameras = [
-            [c.name, stamp(self.ego_masks[c.name]), dataclasses.asdict(self.lenses[c.name])]
+            [c.name, file_stamp(self.feature_masks.ego_masks[c.name]), dataclasses.asdict(self.lenses[c.name])]
             for c in self.recording.cameras
         ]
         pictures = [
-            [p.camera, p.frame, stamp(p.path), stamp(p.mask), stamp(p.semantics)] for p in self.recording.pictures
+            [p.camera, p.frame, file_stamp(p.path), file_stamp(p.mask), file_stamp(p.semantics)]
+            for p in self.recording.pictures
         ]
-        related = [_NEIGHBOURS, sorted(self._shared_views()), self.options.moving_classes]
+        related = [_NEIGHBOURS, sorted(self.shared_views), self.options.moving_classes]
         content = json.dumps([_VERSION, self.pycolmap.__version__, cameras, pictures, related])
         return hashlib.sha256(content.encode()).hexdigest()
 
@@ -318,22 +338,11 @@ class _Run:
         database.close()
 
     def _write_masks(self, chunk: Sequence[int]) -> None:
-        cameras = {camera.name: camera for camera in self.recording.cameras}
-        shared: dict[str, NDArray[np.bool_]] = {}
         for index in chunk:
-            picture = self.recording.pictures[index]
             target = self.masks / f"{self.names[index]}.png"
             if target.is_file():
                 continue
-            if picture.camera not in shared:
-                camera = cameras[picture.camera]
-                shared[picture.camera] = lens_circle(
-                    camera.camera, math.degrees(self.lenses[camera.name].theta_max_rad)
-                )
-                ego_mask = self.ego_masks[camera.name]
-                if ego_mask is not None:
-                    shared[picture.camera] &= read_camera_mask(ego_mask, camera.camera)
-            mask = shared[picture.camera] & held_still(picture, cameras[picture.camera].camera, self.options)
+            mask = self.feature_masks.of(self.recording.pictures[index])
             # a feature at the edge of a mask looks at what is masked
             reach = 1 + 2 * max(1, round(mask.shape[1] / 350))
             write_mask(target, cv2.erode(mask.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0)
@@ -373,21 +382,9 @@ class _Run:
                 )
                 progress.advance(task, len(chunk))
 
-    def _shared_views(self) -> set[tuple[str, str]]:
-        """Pairs of cameras, in the recording's order, whose pictures overlap enough."""
-        shared = set()
-        cameras = self.recording.cameras
-        for index, first in enumerate(cameras):
-            for second in cameras[index + 1 :]:
-                between = float(first.to_vehicle[:3, 2] @ second.to_vehicle[:3, 2])
-                reach = sum(_reach_rad(c.camera, self.lenses[c.name].theta_max_rad) for c in (first, second))
-                if reach - math.acos(np.clip(between, -1, 1)) >= math.radians(_SHARED_VIEW_DEG):
-                    shared.add((first.name, second.name))
-        return shared
-
     def _pairs(self) -> list[tuple[int, int]]:
         """Pictures to match, as indices."""
-        pictures, shared = self.recording.pictures, self._shared_views()
+        pictures, shared = self.recording.pictures, self.shared_views
         moments = {frame: number for number, frame in enumerate(sorted({p.frame for p in pictures}))}
         seen: dict[tuple[str, int], int] = {(p.camera, moments[p.frame]): i for i, p in enumerate(pictures)}
         pairs = []

@@ -1,0 +1,45 @@
+"""The poses along the drive: how far features lie from their epipolar lines, step by step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from edge_depth_nerf.base.pictures import drawn
+from edge_depth_nerf.inspecting.pose_check import BAD_MEDIAN_PX, known_steps
+from edge_depth_nerf.inspecting.top_view import GAP, VIEWS
+from edge_depth_nerf.poses.matches import Agreement
+from edge_depth_nerf.scene.reader import SceneFolder
+
+_SIZE_INCHES, _DPI = (10.0, 3.6), 100
+
+
+def draw_pose_check(scene: SceneFolder, agreements: Sequence[Agreement]) -> NDArray[np.uint8]:
+    """Draw the medians along the drive, a line for each camera."""
+    return drawn(pose_check_figure(scene, agreements))
+
+
+def pose_check_figure(scene: SceneFolder, agreements: Sequence[Agreement]) -> Figure:
+    """Make the figure of `draw_pose_check`."""
+    figure = Figure(_SIZE_INCHES, dpi=_DPI, layout="constrained")
+    axes = figure.add_subplot()
+    for number, name in enumerate(scene.cameras()):
+        known = known_steps(agreements, name)
+        middles = [(one.first + one.second) / 2 for one in known]
+        medians = [one.median_px for one in known]
+        colour = VIEWS[number % len(VIEWS)]
+        axes.plot(middles, medians, "o-", markersize=3.5, linewidth=1, color=colour, label=name)
+    axes.axhline(BAD_MEDIAN_PX, color=GAP, linewidth=1, linestyle="--")
+    axes.set_ylim(bottom=0)
+    axes.set_xlabel("frame")
+    axes.set_ylabel("px (median)")
+    axes.grid(alpha=0.3)
+    axes.legend(frameon=False, ncols=6)
+    name = scene.path.parent.resolve().name
+    figure.suptitle(
+        f"{name}: how far features matched with the next frame lie from their epipolar lines", parse_math=False
+    )
+    return figure

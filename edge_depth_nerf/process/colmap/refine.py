@@ -1,0 +1,441 @@
+"""Poses refined by the pictures: features tracked with the given poses as the start, and a bundle adjusted to both.
+
+The given path, of LiDAR odometry, a file or COLMAP, is held softly (`bundle.Softness`): features decide from step to
+step, where they are good to hundredths of a degree; scale and drift, of which they know little, stay the given path's.
+All cameras of a moment move with the vehicle as one.
+
+A fifth of the tracks takes no part. By them the path is judged before and after: unless their features come nearer to
+their epipolar curves, and nothing has moved further than the given poses can be off, the given path stays.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int
+from rich.console import Console
+
+from edge_depth_nerf.base.console import progress_bars
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_image, read_json, write_json
+from edge_depth_nerf.cameras import Camera
+from edge_depth_nerf.lidar.trajectory import Trajectory
+from edge_depth_nerf.poses.matches import Matches, PosedPicture, epipolar_distance_px, match_pictures
+from edge_depth_nerf.poses.tracks import (
+    Tracks,
+    features_joined,
+    join_matches,
+    reprojection_px,
+    spread,
+    triangulate,
+)
+from edge_depth_nerf.process.colmap.bundle import Shot, Softness, adjust_bundle
+from edge_depth_nerf.process.colmap.models import (
+    THETA_MAX_DEG,
+    ColmapLens,
+    colmap_lens,
+    file_stamp,
+    import_pycolmap,
+    shared_views,
+)
+from edge_depth_nerf.process.colmap.scale import moment_times
+from edge_depth_nerf.process.feature_masks import FeatureMasks
+from edge_depth_nerf.process.options import ProcessOptions
+from edge_depth_nerf.process.recording import RecordedPicture, Recording
+
+OPTION = "--refine-poses"
+SOFTNESS = Softness(position_m=0.1, turn_rad=math.radians(0.3))
+"""How far given poses are usually off."""
+FURTHEST_M = 0.5
+"""A path that moves further than this from the given one is not taken: five standard deviations."""
+FURTHEST_DEG = 1.5
+"""Likewise for turns."""
+LEAST_GAIN = 0.05
+"""The features that took no part must come nearer to their curves by this share; less is chance."""
+
+REFINED_POSES = "refined_poses.json"
+"""File of the scene with what was found, for the next run."""
+_VERSION = 2
+"""Of what is done with the inputs; raised when results change."""
+_APART = (1, 2, 3, 5, 8)
+"""So many moments lie between the pictures of one camera that are matched; 1 is the next."""
+_ACROSS = (0, 1, 2)
+"""Between those of two cameras whose views overlap."""
+_MOST_FEATURES = 2500
+_MOST_SIGHTS = 700
+"""Of a picture, in the bundle."""
+_ROUNDS_DEG = (0.6, 0.2, 0.1, 0.1)
+"""How far features may lie from where the poses put them, round by round."""
+_ROUNDS_LEAST_PX = (3.0, 1.5, 1.0, 1.0)
+"""Features are found to some tenths of a pixel, however coarse the picture."""
+_LEAST_SIGHTS = 30
+"""A moment whose pictures see fewer points moves as the moments around it do."""
+_LEAST_JUDGES = 100
+"""So many matches that took no part tell whether a path is better."""
+_JUDGING_SHARE = 5
+"""One track of so many takes no part in the bundle."""
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """What became of the given poses."""
+
+    vehicle_to_world: Float64[np.ndarray, "moments 4 4"]
+    """Of each moment, refined."""
+    supported: Bool[np.ndarray, "moments"]
+    """Which moments were moved by features; the others move as those around them do."""
+    points: int
+    """Points in the bundle."""
+    before_px: float
+    """Median distance to the epipolar curves of features that took no part, with the given poses; NaN for too few."""
+    after_px: float
+    """The same with the refined ones."""
+    judges: int
+    """How many matches these medians are of."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON; a median that is not known is null."""
+        medians = {"before_px": self.before_px, "after_px": self.after_px}
+        return {
+            "vehicle_to_world": self.vehicle_to_world.tolist(),
+            "supported": self.supported.tolist(),
+            "points": self.points,
+            "judges": self.judges,
+            **{key: None if math.isnan(value) else value for key, value in medians.items()},
+        }
+
+
+def refine_poses(recording: Recording, options: ProcessOptions, console: Console) -> Recording:
+    """Move the poses of a recording to where its pictures agree with them, and with each other, best.
+
+    Args:
+        recording: with a path.
+        options: output, where what was found is kept for the next run; masks, theta_max_deg, strict.
+        console: where the progress is shown.
+
+    Returns:
+        The recording with the refined path, pictures' and shifted views' poses moved with it; or as it was, if that
+        would not be better. A notice says which.
+
+    Raises:
+        InputError: pycolmap is missing or too old, the recording has no path; with --strict, a picture is broken.
+
+    """
+    pycolmap = import_pycolmap(OPTION)
+    trajectory = recording.trajectory
+    assert trajectory is not None
+    times = moment_times(recording)
+    moments, times_s = list(times), np.array(list(times.values()))
+    if len(moments) < 2 or not (np.diff(times_s) > 0).all():
+        return _kept(recording, "the pictures are not of two moments or more, one after another")
+    given = trajectory.at(times_s)
+    shots = _shots(recording, moments, given)
+
+    def reshoot(refined: Float64[np.ndarray, "moments 4 4"], supported: Bool[np.ndarray, "moments"]) -> list[Shot]:
+        """The pictures on the rig, by the path as it is now."""
+        moved, change = _moved(recording, times_s, moments, given, refined, supported)
+        return _shots(moved, moments, given @ change)
+
+    digest = _digest(pycolmap.__version__, recording, options, given)
+    found = _read_refinement(options.output / REFINED_POSES, digest)
+    if found is None:
+        matches = _match(recording, shots, given, options, console)
+        with console.status("Refining the poses …"):
+            found = refine(pycolmap, shots, matches, given, reshoot=reshoot)
+        write_json(options.output / REFINED_POSES, {"digest": digest, **found.to_dict()})
+    if found.judges < _LEAST_JUDGES:
+        return _kept(recording, f"only {found.judges} features could be matched to judge by")
+    distances = f"{found.before_px:.2f} px before, {found.after_px:.2f} px after"
+    if not found.after_px <= (1 - LEAST_GAIN) * found.before_px:
+        return _kept(recording, f"features agree with them as well as with refined ones ({distances})")
+    if found.supported.sum() < 2:
+        return _kept(recording, "the pictures of too few moments show features")
+    refined, change = _moved(recording, times_s, moments, given, found.vehicle_to_world, found.supported)
+    cosine = ((np.trace(change[:, :3, :3], axis1=1, axis2=2) - 1) / 2).clip(-1, 1)
+    furthest_m = float(np.linalg.norm(change[:, :3, 3], axis=-1).max())
+    furthest_deg = float(np.degrees(np.arccos(cosine)).max())
+    if furthest_m > FURTHEST_M or furthest_deg > FURTHEST_DEG:
+        return _kept(
+            recording,
+            f"refining would move them by up to {furthest_m:.2f} m and {furthest_deg:.1f}°, too far to be trusted; if "
+            "they are that far off, find them anew with --poses colmap",
+        )
+    notice = (
+        f"Poses refined by {found.points} points that the pictures share: median distance of matched features to "
+        f"their epipolar lines {distances} ({found.judges} matches that took no part); moved by up to "
+        f"{100 * furthest_m:.0f} cm and {furthest_deg:.2f}°."
+    )
+    return dataclasses.replace(refined, notices=(*recording.notices, notice))
+
+
+def check_refining(recording: Recording, options: ProcessOptions) -> None:
+    """Check what can be checked before the long work.
+
+    Raises:
+        InputError: pycolmap is missing, or a lens has no counterpart in COLMAP.
+
+    """
+    import_pycolmap(OPTION)
+    _lenses(recording, options)
+
+
+def _lenses(recording: Recording, options: ProcessOptions) -> dict[str, ColmapLens]:
+    limit = math.radians(min(options.theta_max_deg, THETA_MAX_DEG))
+    return {camera.name: colmap_lens(camera.camera, limit) for camera in recording.cameras}
+
+
+def _kept(recording: Recording, why: str) -> Recording:
+    return dataclasses.replace(recording, notices=(*recording.notices, f"The poses stay as they are given: {why}."))
+
+
+def _digest(
+    version: str, recording: Recording, options: ProcessOptions, given: Float64[np.ndarray, "moments 4 4"]
+) -> str:
+    """Of everything that the refined poses depend on, pictures and masks by size and time of change."""
+    cameras = [
+        [c.name, c.camera.to_dict(), c.to_vehicle.tolist(), file_stamp(options.ego_mask_of(c.name) or c.ego_mask)]
+        for c in recording.cameras
+    ]
+    pictures = [
+        [p.camera, p.frame, recording.pose(p).tolist(), file_stamp(p.path), file_stamp(p.mask), file_stamp(p.semantics)]
+        for p in recording.pictures
+    ]
+    rest = [_VERSION, version, given.tolist(), options.theta_max_deg, options.moving_classes]
+    return hashlib.sha256(json.dumps([cameras, pictures, rest]).encode()).hexdigest()
+
+
+def _read_refinement(path: Path, digest: str) -> Refinement | None:
+    """What an earlier run found for the same inputs."""
+    found = read_json(path) if path.is_file() else None
+    if not isinstance(found, dict) or found.get("digest") != digest:
+        return None
+    before_px, after_px = (math.nan if found[key] is None else found[key] for key in ("before_px", "after_px"))
+    return Refinement(
+        vehicle_to_world=np.array(found["vehicle_to_world"], np.float64),
+        supported=np.array(found["supported"], bool),
+        points=found["points"],
+        before_px=before_px,
+        after_px=after_px,
+        judges=found["judges"],
+    )
+
+
+# ---- what the pictures share -----------------------------------------------------------------------------------
+
+
+def _shots(recording: Recording, moments: Sequence[int], given: Float64[np.ndarray, "moments 4 4"]) -> list[Shot]:
+    """The pictures on the rig of their moment: with what the vehicle moved between the moment and the picture."""
+    number = {frame: index for index, frame in enumerate(moments)}
+    lenses = {camera.name: camera.camera for camera in recording.cameras}
+    to_vehicle = np.linalg.inv(given)
+    return [
+        Shot(
+            lenses[picture.camera],
+            number[picture.frame],
+            to_vehicle[number[picture.frame]] @ recording.pose(picture),
+        )
+        for picture in recording.pictures
+    ]
+
+
+def _match(
+    recording: Recording,
+    shots: Sequence[Shot],
+    given: Float64[np.ndarray, "moments 4 4"],
+    options: ProcessOptions,
+    console: Console,
+) -> list[Matches]:
+    """Match the pictures that were taken shortly after one another."""
+    lenses = _lenses(recording, options)
+    masks = FeatureMasks(recording, options, {name: lens.theta_max_rad for name, lens in lenses.items()})
+    posed = [
+        PosedPicture(
+            camera=picture.camera,
+            moment=shot.moment,
+            lens=shot.lens,
+            camera_to_world=pose,
+            read_rgb=partial(_read, picture, shot.lens, options.strict),
+            read_usable=partial(masks.of, picture),
+        )
+        for picture, shot, pose in zip(recording.pictures, shots, _camera_poses(shots, given), strict=True)
+    ]
+    pairs = _pairs(posed, shared_views(recording, lenses))
+    found = []
+    with progress_bars(console, counted=True) as progress:
+        task = progress.add_task("Matching pictures", total=len(pairs))
+        for matches in match_pictures(posed, pairs, _MOST_FEATURES):
+            if len(matches):
+                found.append(matches)
+            progress.advance(task)
+    return found
+
+
+def _read(picture: RecordedPicture, lens: Camera, strict: bool) -> np.ndarray:
+    """A picture; one that is broken is black, and is told of when its turn comes."""
+    try:
+        rgb = read_image(picture.path)
+        if rgb.shape[:2] == (lens.height, lens.width):
+            return rgb
+    except (InputError, FileNotFoundError):
+        if strict:
+            raise
+    return np.zeros((lens.height, lens.width, 3), np.uint8)
+
+
+def _pairs(pictures: Sequence[PosedPicture], shared: set[tuple[str, str]]) -> list[tuple[int, int]]:
+    """Pictures to match, as indices, in the order of the drive."""
+    seen = {(picture.camera, picture.moment): index for index, picture in enumerate(pictures)}
+    pairs = []
+    for (camera, moment), index in sorted(seen.items(), key=lambda item: item[0][1]):
+        for other in dict.fromkeys(picture.camera for picture in pictures):
+            if other == camera:
+                offsets: Sequence[int] = _APART
+            elif {(camera, other), (other, camera)} & shared:
+                offsets = _ACROSS
+            else:
+                continue
+            for offset in offsets:
+                later = seen.get((other, moment + offset))
+                if later is not None and (offset > 0 or later > index):
+                    pairs.append((index, later))
+    return pairs
+
+
+# ---- the bundle ------------------------------------------------------------------------------------------------
+
+
+def _camera_poses(
+    shots: Sequence[Shot], vehicle_to_world: Float64[np.ndarray, "moments 4 4"]
+) -> Float64[np.ndarray, "pictures 4 4"]:
+    return np.stack([vehicle_to_world[shot.moment] @ shot.to_vehicle for shot in shots])
+
+
+def refine(
+    pycolmap: object,
+    shots: Sequence[Shot],
+    matches: Sequence[Matches],
+    given: Float64[np.ndarray, "moments 4 4"],
+    softness: Softness = SOFTNESS,
+    reshoot: Callable[[Float64[np.ndarray, "moments 4 4"], Bool[np.ndarray, "moments"]], Sequence[Shot]] | None = None,
+) -> Refinement:
+    """Refine poses by matched features, and judge both by those that take no part.
+
+    Args:
+        pycolmap: the module.
+        shots: the pictures.
+        matches: what pairs of them have in common; they count `shots`.
+        given: vehicle to world of each moment.
+        softness: how softly these are held.
+        reshoot: from refined poses, and which moments features moved, to the pictures on the rig: cameras that fire at
+            other times than the moment's stand where the path has the vehicle then. None = they stay.
+
+    """
+    groups = features_joined(matches)
+    judging = [np.asarray(_judges(numbers)) for numbers in groups]
+    judges = [found.taken(chosen) for found, chosen in zip(matches, judging, strict=True)]
+    matches = [found.taken(~chosen) for found, chosen in zip(matches, judging, strict=True)]
+    focal_px = float(np.median([(shot.lens.fx + shot.lens.fy) / 2 for shot in shots]))
+    refined, count, given_shots = given, 0, shots
+    supported = np.zeros(len(given), bool)
+    for limit_deg, least_px in zip(_ROUNDS_DEG, _ROUNDS_LEAST_PX, strict=True):
+        limit_px = max(math.radians(limit_deg) * focal_px, least_px)
+        tracks, points = _tracks(matches, _camera_poses(shots, refined), limit_px)
+        of_moment = np.array([shot.moment for shot in shots])[tracks.picture]
+        supported = np.bincount(of_moment, minlength=len(given)) >= _LEAST_SIGHTS
+        count = len(points)
+        if not supported.any():
+            break
+        refined = adjust_bundle(pycolmap, shots, tracks, points, refined, given, softness)
+        if reshoot is not None and supported.sum() > 1:
+            shots = reshoot(refined, supported)
+    before, after = _median_px(given_shots, judges, given), _median_px(shots, judges, refined)
+    return Refinement(refined, supported, count, before[0], after[0], min(before[1], after[1]))
+
+
+def _judges(groups: Int[np.ndarray, "m"]) -> Bool[np.ndarray, "m"]:
+    """Which matches take no part: all of one group, or none."""
+    # a multiplication that scatters, so that neighbours do not go together
+    return (groups * 2654435761) % (1 << 32) < (1 << 32) // _JUDGING_SHARE
+
+
+def _median_px(
+    shots: Sequence[Shot], judges: Sequence[Matches], vehicle_to_world: Float64[np.ndarray, "moments 4 4"]
+) -> tuple[float, int]:
+    """Median distance of matched features to their epipolar curves, and of how many."""
+    poses = _camera_poses(shots, vehicle_to_world)
+    distances = [epipolar_distance_px(found, poses[found.first], poses[found.second]) for found in judges]
+    known = np.concatenate([np.zeros(0), *distances])
+    known = known[np.isfinite(known)]
+    return (float(np.median(known)) if len(known) else math.nan), len(known)
+
+
+def _tracks(
+    matches: Sequence[Matches], camera_to_world: Float64[np.ndarray, "pictures 4 4"], limit_px: float
+) -> tuple[Tracks, Float64[np.ndarray, "points 3"]]:
+    """Tracks that agree with the poses, and where their points are."""
+    near = []
+    for found in matches:
+        distances = epipolar_distance_px(found, camera_to_world[found.first], camera_to_world[found.second])
+        # where there is no curve, the point's image decides
+        near.append(found.taken(~(distances > limit_px)))
+    tracks = join_matches(near)
+    for _ in range(2):
+        off_px = reprojection_px(tracks, triangulate(tracks, camera_to_world), camera_to_world)
+        tracks = tracks.taken(off_px <= limit_px)
+    tracks = spread(tracks, _MOST_SIGHTS)
+    points = triangulate(tracks, camera_to_world)
+    fine = np.isfinite(points).all(-1)
+    return tracks.taken(fine[tracks.track]), points[fine]
+
+
+# ---- the recording with its new path ---------------------------------------------------------------------------
+
+
+def _moved(
+    recording: Recording,
+    times_s: Float64[np.ndarray, "moments"],
+    moments: Sequence[int],
+    given: Float64[np.ndarray, "moments 4 4"],
+    refined: Float64[np.ndarray, "moments 4 4"],
+    supported: Bool[np.ndarray, "moments"],
+) -> tuple[Recording, Float64[np.ndarray, "moments 4 4"]]:
+    """Move the path, and all that lies on it; also how each moment moved, in the vehicle's frame.
+
+    A change goes over into that of the next moment evenly; before the first moment and after the last it stays. A
+    picture with a pose of its own moves with its moment.
+    """
+    trajectory = recording.trajectory
+    assert trajectory is not None
+    known_s = times_s[supported]
+    changes = Trajectory(known_s, (np.linalg.inv(given) @ refined)[supported])
+
+    def changed_at(at_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 4 4"]:
+        return changes.at(at_s.clip(known_s[0], known_s[-1]))
+
+    # the moments' own poses stand in the path, too
+    path_s = np.union1d(trajectory.times_s, times_s)
+    path_s = path_s[np.concatenate([[True], np.diff(path_s) > 1e-6])]
+    path = Trajectory(path_s, trajectory.at(path_s) @ changed_at(path_s))
+    change = changed_at(times_s)
+    to_new = {frame: new @ np.linalg.inv(old) for frame, old, new in zip(moments, given, given @ change, strict=True)}
+    pictures = tuple(
+        picture
+        if picture.camera_to_world is None
+        else dataclasses.replace(picture, camera_to_world=to_new[picture.frame] @ picture.camera_to_world)
+        for picture in recording.pictures
+    )
+    shifted = tuple(
+        dataclasses.replace(view, camera_to_world=to_new[view.frame] @ view.camera_to_world)
+        for view in recording.shifted
+        if view.frame in to_new
+    )
+    return dataclasses.replace(recording, trajectory=path, pictures=pictures, shifted=shifted), change
