@@ -269,6 +269,7 @@ READERS: dict[str, Reader] = {
     "sweep": Reader(named("a.bin", points().tobytes()), read_sweep, "binary"),
     "scan bin": Reader(named("a.bin", points().tobytes()), lambda path: scan(path), "binary"),
     "scan npy": Reader(named("a.npy", npy(points())), lambda path: scan(path), "npy"),
+    "scan npz": Reader(named("a.npz", npz(data=points())), lambda path: scan(path), "binary"),
     "scan ply ascii": Reader(named("a.ply", ply("ascii")), lambda path: scan(path)),
     "scan ply binary": Reader(named("a.ply", ply("binary_little_endian")), lambda path: scan(path), "binary"),
     "scan pcd ascii": Reader(named("a.pcd", pcd("ascii")), lambda path: scan(path)),

@@ -203,6 +203,20 @@ def test_why_no_vehicle_is_found() -> None:
     assert ego.find_ego([], np.zeros((SIZE, SIZE), bool)) == ego.NoEgo("The lens mask leaves no pixel.", False)
 
 
+def test_pictures_of_one_colour_are_no_vehicle() -> None:
+    """Black, grey, white, or of another exposure each: nothing is found, and nothing fails."""
+    for levels in ([0] * 12, [90] * 12, [255] * 12, [0, 60, 255] * 4):
+        pictures = [np.full((SIZE, SIZE, 3), level, np.uint8) for level in levels]
+        found = ego.find_ego(pictures, lens_disc())
+        assert isinstance(found, ego.NoEgo)
+    # flat but for a corner, where sums of squares lose their last digits
+    pictures = [as_picture(np.full((SIZE, SIZE), 100.0), 0, noise=0) for _ in range(12)]
+    for number, picture in enumerate(pictures):
+        picture[:60, :60] = 40 + 15 * number
+        picture[60:120:2] = 30 + 15 * number
+    assert ego.find_ego(pictures, lens_disc()) is not None
+
+
 def test_road_without_texture_is_not_taken_for_the_vehicle() -> None:
     bare = SlidingWorld(None)
     bare.world[130:] = 90

@@ -324,7 +324,8 @@ def _noise_levels(stack: Float16[np.ndarray, "n h w"], lens: Bool[np.ndarray, "h
         grey = half.astype(np.float32)
         usable = eroded(lens & (grey > 2 * _DARK_LEVELS) & (grey < _SATURATED_LEVEL), 4.0)
         if usable.any():
-            power = cv2.blur(cv2.filter2D(grey, -1, kernel) ** 2, (7, 7))
+            # running sums of squares may end a little below 0
+            power = cv2.blur(cv2.filter2D(grey, -1, kernel) ** 2, (7, 7)).clip(min=0)
             found.append(float(np.quantile(power[usable], 0.1)))
     return max(_NOISE_FLOOR_LEVELS, math.sqrt(float(np.median(found)))) if found else _NOISE_FLOOR_LEVELS
 
