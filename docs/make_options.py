@@ -26,6 +26,8 @@ from edge_depth_nerf.plugin.config import make_specifications, read_method_file
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModelConfig
+from edge_depth_nerf.plugin.pipeline import EdgeDepthPipelineConfig
+from edge_depth_nerf.plugin.pose_refinement import PoseRefinerConfig
 
 PAGE = Path(__file__).with_name("options.md")
 
@@ -209,6 +211,8 @@ def methods() -> str:
         ("The depth prior", "pipeline.datamanager.prior", PriorOptions),
         ("Its integration", "pipeline.datamanager.prior.integration", IntegrationOptions),
         ("The model and its loss", "pipeline.model", EdgeDepthNerfModelConfig),
+        ("Poses refined in training", "pipeline.model.camera_optimizer", PoseRefinerConfig),
+        ("How it is judged", "pipeline", EdgeDepthPipelineConfig),
         ("The scene", "pipeline.datamanager.dataparser", FisheyeDepthDataParserConfig),
     )
     places = [place for _, place, _ in groups]
@@ -229,7 +233,7 @@ def methods() -> str:
             for name, value in values.items():
                 if value != first:
                     default += f"; {name.removeprefix('edge-depth-nerf-')}: {shown(value)}"
-            option = f"`--{dashed(entry.name)}`" if is_parser else f"`--{place}.{dashed(entry.name)}`"
+            option = f"`--{dashed(entry.name)}`" if is_parser else f"`--{dashed(place)}.{dashed(entry.name)}`"
             rows.append((option, kind_of(hints[entry.name]), default, cell(docs[entry.name])))
         text += table(rows, ("option", "values", "default", "what"))
     return text + presets()
@@ -247,7 +251,7 @@ def presets() -> str:
     declared = read_method_file()
     ours = (
         *(FisheyeDepthDataManagerConfig, PriorOptions, IntegrationOptions),
-        *(EdgeDepthNerfModelConfig, FisheyeDepthDataParserConfig),
+        *(EdgeDepthNerfModelConfig, PoseRefinerConfig, EdgeDepthPipelineConfig, FisheyeDepthDataParserConfig),
     )
     known = {name for cls in ours for name in field_docs(cls)}
     values = {name: declared["presets"][method["preset"]] for name, method in declared["methods"].items()}
