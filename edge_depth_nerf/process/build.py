@@ -36,6 +36,7 @@ from edge_depth_nerf.masks.semantics import check_classes, keep_static, read_lab
 from edge_depth_nerf.masks.semantics import sky as sky_of_labels
 from edge_depth_nerf.masks.sky import find_sky
 from edge_depth_nerf.process.downscale import downscale_distance, downscale_image, downscale_mask
+from edge_depth_nerf.process.moving import find_moving
 from edge_depth_nerf.process.options import ProcessOptions
 from edge_depth_nerf.process.reading import load_distance, load_picture, read_depth
 from edge_depth_nerf.process.recording import RecordedPicture, Recording
@@ -99,6 +100,9 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
     if recording.skipped:
         say(console, f"Skipped {summarise(recording.skipped)}", "yellow")
     held_out = _held_out(recording, options)
+    if options.find_moving:
+        recording, more = find_moving(recording, options, held_out, masks, console)
+        notices += more
     builder = _Builder(recording, options, held_out, masks)
     frames = [
         SceneFrame(
@@ -239,7 +243,7 @@ class _Builder:
         masks: dict[str, NDArray[np.bool_]],
     ) -> None:
         assert recording.trajectory is not None
-        self._options, self._held_out, self._trajectory = options, held_out, recording.trajectory
+        self._recording, self._options, self._held_out = recording, options, held_out
         self._pictures = recording.pictures
         self._cameras = {recorded.name: recorded for recorded in recording.cameras}
         self._ego = {name: options.ego_mask_of(name) or recorded.ego_mask for name, recorded in self._cameras.items()}
@@ -261,7 +265,7 @@ class _Builder:
         self._without: list[str] = []
         pictures = recording.pictures
         present = {
-            "mask": any(picture.mask or picture.semantics for picture in pictures),
+            "mask": any(picture.mask or picture.moving_mask or picture.semantics for picture in pictures),
             "lidar": bool(recording.sweeps) or any(picture.depth for picture in pictures),
             "mono": any(picture.mono for picture in pictures),
             "truth_distance": any(picture.truth_distance for picture in pictures),
@@ -280,10 +284,7 @@ class _Builder:
 
     def pose(self, picture: RecordedPicture) -> Transform:
         """Where a picture was taken: its own pose, or the vehicle's at its time."""
-        if picture.camera_to_world is not None:
-            return picture.camera_to_world
-        vehicle_to_world = self._trajectory.at(np.array([picture.time_s]))[0]
-        return vehicle_to_world @ self._cameras[picture.camera].to_vehicle
+        return self._recording.pose(picture)
 
     def inputs(self, picture: RecordedPicture) -> tuple[Path, ...]:
         """Files that a picture's maps are made from."""
@@ -319,6 +320,8 @@ class _Builder:
         mask = np.ones((camera.height, camera.width), bool)
         if picture.mask is not None:
             mask &= read_camera_mask(picture.mask, camera)
+        if picture.moving_mask is not None:
+            mask &= read_camera_mask(picture.moving_mask, camera)
         if labels is not None:
             mask &= keep_static(labels, self._options.moving_classes)
         return mask
@@ -454,6 +457,7 @@ def _source(recording: Recording, options: ProcessOptions) -> dict[str, Any]:
         "ego_mask": options.ego_mask is not None,
         "find_ego": options.find_ego,
         "frame_masks": options.frame_masks is not None,
+        **({"find_moving": True} if options.find_moving else {}),
         "moving_classes": list(options.moving_classes),
         "mono": options.mono is not None,
         **({"mono_trained_on": options.mono_trained_on} if any(picture.mono for picture in recording.pictures) else {}),

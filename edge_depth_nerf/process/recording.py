@@ -13,6 +13,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar import Sweep, SweepTiming
@@ -67,6 +69,8 @@ class RecordedPicture:
     """A depth map in place of sweeps."""
     mask: Path | None = None
     """This picture's own mask, 255 = use."""
+    moving_mask: Path | None = None
+    """What moves in this picture, as it was found, 255 = use; beside the mask that is given."""
     semantics: Path | None = None
     """KITTI-360's label ids, 8-bit PNG."""
     mono: Path | None = None
@@ -79,8 +83,8 @@ class RecordedPicture:
     @property
     def inputs(self) -> tuple[Path, ...]:
         """All files there are."""
-        found = [self.path, self.mask, self.semantics, self.mono, self.truth_distance, self.truth_rgb]
-        found.append(None if self.depth is None else self.depth.path)
+        found = [self.path, self.mask, self.moving_mask, self.semantics, self.mono]
+        found += [self.truth_distance, self.truth_rgb, None if self.depth is None else self.depth.path]
         return tuple(path for path in found if path is not None)
 
 
@@ -127,3 +131,11 @@ class Recording:
     """What the user should know."""
     shifted: tuple[ShiftedView, ...] = field(default=())
     """True views from beside the path, of synthetic drives."""
+
+    def pose(self, picture: RecordedPicture) -> Transform:
+        """Where a picture was taken, camera to world: its own pose, or the vehicle's at its time."""
+        if picture.camera_to_world is not None:
+            return picture.camera_to_world
+        assert self.trajectory is not None
+        to_vehicle = next(camera.to_vehicle for camera in self.cameras if camera.name == picture.camera)
+        return self.trajectory.at(np.array([picture.time_s]))[0] @ to_vehicle
