@@ -68,51 +68,58 @@ _COAST_SHARE = 0.3
 # ---- the ground ------------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class Lowest:
+    """The lowest returns of a sweep, by cells of the ground plan."""
+
+    cells: Int[np.ndarray, "cells 2"]
+    height_m: Float[np.ndarray, "cells"]
+
+    @staticmethod
+    def of(points_m: Float[np.ndarray, "points 3"]) -> Lowest:
+        """Take the `_GROUND_RANK`-th lowest of each cell; cells with fewer returns say nothing."""
+        cells, height_m, first, count = _by_cell(_cell_of(points_m), points_m[:, 2])
+        enough = count >= _GROUND_RANK
+        chosen = first[enough] + _GROUND_RANK - 1
+        return Lowest(cells[chosen], height_m[chosen])
+
+
 class Ground:
     """Height of the ground by place, from all sweeps: a thing that stands somewhere for a while is not the ground."""
 
-    def __init__(self) -> None:
-        self._cells: list[Int[np.ndarray, "cells 2"]] = []
-        self._heights: list[Float[np.ndarray, "cells"]] = []
-        self._height: dict[tuple[int, int], float] | None = None
-
-    def add(self, points_m: Float[np.ndarray, "points 3"]) -> None:
-        """Take a sweep into account."""
-        cells = np.floor(points_m[:, :2] / _GROUND_CELL_M).astype(np.int64)
-        order = np.lexsort((points_m[:, 2], cells[:, 1], cells[:, 0]))
-        cells, z = cells[order], points_m[order, 2]
-        first = np.flatnonzero(np.r_[True, np.any(np.diff(cells, axis=0) != 0, axis=1)])
-        count = np.diff(np.r_[first, len(cells)])
-        enough = first[count >= _GROUND_RANK]
-        self._cells.append(cells[enough])
-        self._heights.append(z[enough + _GROUND_RANK - 1])
+    def __init__(self, found: Sequence[Lowest]) -> None:
+        self._height: dict[tuple[int, int], float] = {}
+        if found:
+            all_cells = np.concatenate([lowest.cells for lowest in found])
+            all_m = np.concatenate([lowest.height_m for lowest in found])
+            cells, height_m, first, count = _by_cell(all_cells, all_m)
+            # the lowest fifth: a car stood there in some of the sweeps, a stray lay below in one
+            chosen = first + count // 5
+            self._height = {
+                (x, y): z for (x, y), z in zip(cells[chosen].tolist(), height_m[chosen].tolist(), strict=True)
+            }
 
     def above_m(self, points_m: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points"]:
         """How far points lie above the lowest ground of their cell and those around it; 0 where none is known."""
-        if self._height is None:
-            self._height = self._lowest_by_cell()
-        cells = np.floor(points_m[:, :2] / _GROUND_CELL_M).astype(np.int64)
-        unique, inverse = np.unique(cells, axis=0, return_inverse=True)
-        height = self._height
-        ground = np.array(
-            [
-                min((height.get((x + i, y + j), np.inf) for i in (-1, 0, 1) for j in (-1, 0, 1)), default=np.inf)
-                for x, y in unique.tolist()
-            ]
-        )[inverse.reshape(-1)]
-        return np.where(np.isfinite(ground), points_m[:, 2] - ground, 0.0)
+        cells, of_point = np.unique(_cell_of(points_m), axis=0, return_inverse=True)
+        steps, height = (-1, 0, 1), self._height
+        ground = [min(height.get((x + i, y + j), np.inf) for i in steps for j in steps) for x, y in cells.tolist()]
+        lowest = np.array(ground)[of_point.reshape(-1)] if ground else np.zeros(0)
+        return np.where(np.isfinite(lowest), points_m[:, 2] - lowest, 0.0)
 
-    def _lowest_by_cell(self) -> dict[tuple[int, int], float]:
-        if not self._cells:
-            return {}
-        cells, z = np.concatenate(self._cells), np.concatenate(self._heights)
-        order = np.lexsort((z, cells[:, 1], cells[:, 0]))
-        cells, z = cells[order], z[order]
-        first = np.flatnonzero(np.r_[True, np.any(np.diff(cells, axis=0) != 0, axis=1)])
-        count = np.diff(np.r_[first, len(cells)])
-        # the lowest fifth: a car stood there in some of the sweeps, a stray lay below in one
-        lowest = z[first + count // 5]
-        return {(int(x), int(y)): float(low) for (x, y), low in zip(cells[first], lowest, strict=True)}
+
+def _cell_of(points_m: Float[np.ndarray, "points 3"]) -> Int[np.ndarray, "points 2"]:
+    return np.floor(points_m[:, :2] / _GROUND_CELL_M).astype(np.int64)
+
+
+def _by_cell(
+    cells: Int[np.ndarray, "n 2"], height_m: Float[np.ndarray, "n"]
+) -> tuple[Int[np.ndarray, "n 2"], Float[np.ndarray, "n"], Int[np.ndarray, "cells"], Int[np.ndarray, "cells"]]:
+    """Sort by cell and height; third and fourth, where each cell begins and how many it has."""
+    order = np.lexsort((height_m, cells[:, 1], cells[:, 0]))
+    cells, height_m = cells[order], height_m[order]
+    first = np.flatnonzero(np.r_[True, np.any(np.diff(cells, axis=0) != 0, axis=1)][: len(cells)])
+    return cells, height_m, first, np.diff(np.r_[first, len(cells)])
 
 
 # ---- judging returns -------------------------------------------------------------------------------------------

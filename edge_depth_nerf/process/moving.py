@@ -25,7 +25,17 @@ from edge_depth_nerf.base.files import read_image, read_mask, write_mask
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.lidar import project_points, transform_points
 from edge_depth_nerf.lidar.free_space import FreeSpace
-from edge_depth_nerf.lidar.moving import Ground, Loose, Thing, expected_at, followed, loose_returns, nearby, things_of
+from edge_depth_nerf.lidar.moving import (
+    Ground,
+    Loose,
+    Lowest,
+    Thing,
+    expected_at,
+    followed,
+    loose_returns,
+    nearby,
+    things_of,
+)
 from edge_depth_nerf.lidar.world import WorldSweep
 from edge_depth_nerf.masks.lens import lens_circle
 from edge_depth_nerf.masks.moving import grow_moving, larger_again, smaller, working_factor
@@ -117,35 +127,31 @@ class _ScannersThings:
     def __init__(self, scanner: Scanner, held_out: set[int], console: Console) -> None:
         self.scanner, self._held_out = scanner, held_out
         usable = [index for index in range(len(scanner.sweeps)) if scanner.bridged[index] and scanner.readable(index)]
-        trained = [index for index in usable if scanner.trains[index]]
-        self.ground = Ground()
-        free_spaces = run_jobs([partial(self._look, index) for index in usable], "Reading sweeps", console)
-        self._free = dict(zip(usable, free_spaces, strict=True))
-        for index in trained:
-            self.ground.add(self._free[index][1])
-        self._usable, self._trained = usable, trained
-        judged = run_jobs([partial(self._judge, index) for index in usable], "Finding what moves", console)
-        loose = dict(zip(usable, judged, strict=True))
-        self._things = followed({index: loose[index] for index in trained})
+        self._trained = [index for index in usable if scanner.trains[index]]
+        looked = run_jobs([partial(self._look, index) for index in usable], "Reading sweeps", console)
+        free_spaces = {index: free_space for index, (free_space, _) in zip(usable, looked, strict=True)}
+        self.ground = Ground([low for index, (_, low) in zip(usable, looked, strict=True) if scanner.trains[index]])
+        centres_m = np.array([np.linalg.inv(free_spaces[i].world_to_scanner.numpy())[:3, 3] for i in usable])
+        trains = [scanner.trains[index] for index in usable]
+
+        def judge(place: int) -> Loose:
+            others = [usable[other] for other in nearby(place, centres_m, trains)]
+            moment_s, sweep = scanner.times_s[usable[place]], scanner.whole(usable[place])
+            seen_by = [(float(scanner.times_s[other]), free_spaces[other]) for other in others]
+            return loose_returns(sweep, float(moment_s), self.ground, seen_by)
+
+        jobs = [partial(judge, place) for place in range(len(usable))]
+        loose = dict(zip(usable, run_jobs(jobs, "Finding what moves", console), strict=True))
+        self._things = followed({index: loose[index] for index in self._trained})
         for index in usable:
             if not scanner.trains[index]:
                 self._things[index] = self._of_held_out(index, loose[index])
-        del self._free
 
-    def _look(self, index: int) -> tuple[FreeSpace, Float[np.ndarray, "points 3"]]:
-        """A sweep's free space, and some of its points for the ground."""
+    def _look(self, index: int) -> tuple[FreeSpace, Lowest]:
+        """A sweep's free space, and what it says of the ground."""
         sweep = self.scanner.whole(index)
-        low = sweep.points_m[:, 2] < float(np.linalg.inv(sweep.world_to_scanner)[2, 3])
-        return FreeSpace.of(sweep), sweep.points_m[low].numpy()
-
-    def _judge(self, index: int) -> Loose:
-        centres = np.array(
-            [np.linalg.inv(self._free[other][0].world_to_scanner.numpy())[:3, 3] for other in self._usable]
-        )
-        may = [self.scanner.trains[other] for other in self._usable]
-        chosen = [self._usable[place] for place in nearby(self._usable.index(index), centres, may)]
-        others = [(float(self.scanner.times_s[other]), self._free[other][0]) for other in chosen]
-        return loose_returns(self.scanner.whole(index), float(self.scanner.times_s[index]), self.ground, others)
+        below = sweep.points_m[:, 2] < float(np.linalg.inv(sweep.world_to_scanner)[2, 3])
+        return FreeSpace.of(sweep), Lowest.of(sweep.points_m[below].numpy())
 
     def _of_held_out(self, index: int, loose: Loose) -> list[Thing]:
         """What moves in a sweep that is held out: found by itself, or expected there by the sweeps around it."""
