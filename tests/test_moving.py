@@ -20,7 +20,7 @@ from edge_depth_nerf.lidar.moving import Ground, Lowest, Thing, followed, loose_
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.lidar.world import WorldSweep, sweep_in_world
 from edge_depth_nerf.masks.lens import lens_circle
-from edge_depth_nerf.masks.moving import grow_moving
+from edge_depth_nerf.masks.moving import clearest_edge, grow_moving
 from edge_depth_nerf.process.converters import convert, read_drive
 from edge_depth_nerf.process.moving import MOVING_MASKS, find_moving
 from edge_depth_nerf.process.options import RigOptions
@@ -183,25 +183,25 @@ def test_returns_grow_to_the_outline_that_the_picture_shows() -> None:
     still = np.zeros_like(true)
     still[2::6, 2::4] = True
     still &= ~true
-    found = grow_moving(picture, returns, np.full(len(returns), 6.0), np.zeros((0, 2)), np.zeros(0), still)
+    found = grow_moving(picture, returns, np.full(len(returns), 6.0), still)
     assert (found & true).sum() / true.sum() > 0.99
     assert (found & ~true).sum() / true.sum() < 0.15
-    none = grow_moving(picture, np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2)), np.zeros(0), still)
+    none = grow_moving(picture, np.zeros((0, 2)), np.zeros(0), still)
     assert not none.any()
 
 
-def test_what_the_field_cuts_off_is_found_by_its_colour() -> None:
-    true = np.zeros((120, 160), bool)
-    true[30:90, 50:110] = True
-    picture = np.where(true[..., None], (30, 60, 150), (200, 205, 210)).astype(np.uint8)
-    row, column = np.mgrid[60:90:3, 50:110:3]
-    returns = np.stack((column.ravel(), row.ravel()), -1) + 0.5
-    row, column = np.mgrid[15:60:3, 50:110:3]
-    above = np.stack((column.ravel(), row.ravel()), -1) + 0.5
-    reach = [np.full(len(points), 3.0) for points in (returns, above)]
-    found = grow_moving(picture, returns, reach[0], above, reach[1], np.zeros_like(true))
-    assert (found & true).sum() / true.sum() > 0.97
-    assert (found & ~true).sum() / true.sum() < 0.15
+def test_a_roof_above_the_field_is_where_the_picture_has_an_edge() -> None:
+    bus = np.zeros((120, 160), bool)
+    bus[30:90, 50:110] = True
+    picture = np.where(bus[..., None], (30, 60, 150), (150, 120, 110)).astype(np.uint8)
+    # a brighter edge that is not as long: the sky beside a house
+    picture[:15, 80:] = 250
+    heights = list(range(60, 5, -3))
+    lines = [np.stack((np.arange(52.0, 108.0), np.full(56, y)), -1) for y in heights]
+    found = clearest_edge(picture, lines)
+    assert found is not None and abs(heights[found] - 30) <= 1
+    assert clearest_edge(np.full_like(picture, 90), lines) is None
+    assert clearest_edge(picture, [line[:2] for line in lines]) is None
 
 
 # ---- on a drive ------------------------------------------------------------------------------------------------

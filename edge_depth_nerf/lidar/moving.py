@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_matrix, csr_matrix, identity
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from edge_depth_nerf.lidar.free_space import FreeSpace
 from edge_depth_nerf.lidar.world import WorldSweep
@@ -39,8 +39,11 @@ _GROUND_RANK = 3
 
 _MIN_SCORE = 2.0
 """A return moved if so many more sweeps saw through its place, outside one stretch, than met something there."""
-_SETTLED_MET = 3
-"""A place where so many sweeps met something, and no stretch explains it, holds still."""
+_HELD_MET = 3
+"""A place where so many sweeps met something, and no stretch explains it, seems to hold still."""
+_LASTING_MET, _LASTING_S = 2, 1.0
+"""It does so for certain if so many of them are of moments this far off: what moves hides its own place for as long as
+it takes to leave it."""
 _VOTE_M = 0.5
 """Neighbours within this have a say."""
 _MIN_VOTES = 3
@@ -137,6 +140,8 @@ class Loose:
     """World."""
     moved: Bool[np.ndarray, "n"]
     """Whether the evidence says that they move; the others are unknown."""
+    held: Bool[np.ndarray, "n"]
+    """Whether they seem to hold still, though not for long: they may be of a thing that is expected there."""
 
 
 def one_stretch(
@@ -193,23 +198,24 @@ def loose_returns(
     for number, (_, free_space) in enumerate(others):
         passed, ended = free_space.observed(torch.from_numpy(points))
         seen_through[number], met[number] = passed.numpy(), ended.numpy()
-    own = int(np.searchsorted([moment for moment, _ in others], time_s))
-    score = one_stretch(seen_through, met, own)
+    moments_s = np.array([moment_s for moment_s, _ in others])
+    score = one_stretch(seen_through, met, int(np.searchsorted(moments_s, time_s)))
     moved = score >= _MIN_SCORE
-    settled = ~moved & (met.sum(0) >= _SETTLED_MET) & (score <= 0)
+    held = ~moved & (met.sum(0) >= _HELD_MET) & (score <= 0)
+    lasting = held & (met[np.abs(moments_s - time_s) >= _LASTING_S].sum(0) >= _LASTING_MET)
     if len(points):
-        moved = _outvoted(points, moved, settled)
-    kept = moved | ~settled
-    return Loose(time_s, rows[kept], points[kept], moved[kept])
+        moved = _outvoted(points, moved, held)
+    kept = ~lasting
+    return Loose(time_s, rows[kept], points[kept], moved[kept], held[kept])
 
 
 def _outvoted(
-    points_m: Float[np.ndarray, "n 3"], moved: Bool[np.ndarray, "n"], settled: Bool[np.ndarray, "n"]
+    points_m: Float[np.ndarray, "n 3"], moved: Bool[np.ndarray, "n"], held: Bool[np.ndarray, "n"]
 ) -> Bool[np.ndarray, "n"]:
     """Drop what moved alone, or amid what holds still."""
     cells, of_point = _cells_of(points_m, _VOTE_M)
     near = _neighbours(cells, 1.8)
-    votes = np.stack([np.bincount(of_point, weights=which, minlength=len(cells)) for which in (moved, settled)], -1)
+    votes = np.stack([np.bincount(of_point, weights=which, minlength=len(cells)) for which in (moved, held)], -1)
     for_it, against = (near @ votes).T
     return moved & ((for_it >= _MIN_VOTES) & (for_it > against))[of_point]
 
@@ -224,7 +230,7 @@ def _cells_of(
 
 def _neighbours(cells: Int[np.ndarray, "cells 3"], reach: float) -> csr_matrix:
     """Which cubes lie within `reach` of each other, counted in cubes; each one does of itself."""
-    pairs = cKDTree(cells).query_pairs(reach, output_type="ndarray")
+    pairs = KDTree(cells).query_pairs(reach, output_type="ndarray")
     once = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(cells), len(cells))).tocsr()
     return (once + once.T + identity(len(cells), format="csr")).tocsr()
 
@@ -258,10 +264,10 @@ def things_of(loose: Loose) -> list[Thing]:
         return []
     chosen = loose.moved.copy()
     for _ in range(_JOIN_ROUNDS):
-        open_ = np.flatnonzero(~chosen)
+        open_ = np.flatnonzero(~chosen & ~loose.held)
         if not len(open_):
             break
-        away_m, _ = cKDTree(loose.points_m[chosen]).query(loose.points_m[open_], distance_upper_bound=_JOIN_M)
+        away_m, _ = KDTree(loose.points_m[chosen]).query(loose.points_m[open_], distance_upper_bound=_JOIN_M)
         chosen[open_[np.isfinite(away_m)]] = True
     members = np.flatnonzero(chosen)
     label = _connected(loose.points_m[members], _APART_M)
@@ -386,7 +392,7 @@ def expected_at(thing: Thing, loose: Loose) -> Thing | None:
     near = np.flatnonzero(np.all((loose.points_m > low) & (loose.points_m < high), axis=1))
     if not len(near):
         return None
-    away_m, _ = cKDTree(expected).query(loose.points_m[near], distance_upper_bound=_JOIN_M)
+    away_m, _ = KDTree(expected).query(loose.points_m[near], distance_upper_bound=_JOIN_M)
     members = near[np.isfinite(away_m)]
     if len(members) < max(_COAST_SHARE * len(expected), _MIN_RETURNS):
         return None

@@ -2,12 +2,14 @@
 
 Returns on a thing lie some pixels apart, miss its outline, and end at the upper edge of the scanner's field. What
 lies between them is the thing's; how far it goes beyond them the picture tells: the outline is put where colour
-changes most between the thing's returns and those of what holds still (watershed).
+changes most between the thing's returns and those of what holds still (watershed). Above the scanner's field the roof
+is the height along which the picture has an edge.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -17,9 +19,15 @@ from edge_depth_nerf.masks.regions import block_mean, closed, dilated, enlarge, 
 
 WORKING_PX = 700
 """Pictures are averaged down until the longer side is no longer than this."""
-_FREE_REACH = 1.0
-_FREE_PX = 2.0
-"""The outline may lie beyond a thing's returns by so many times the distance between them, and so many pixels."""
+_FREE_REACH = 0.5
+_FREE_PX = 1.0
+"""A return stands for half the way to the next one; the outline may lie beyond that by so many times the way between
+two, and so many pixels."""
+_STRONG_EDGE, _WEAK_EDGE = 12.0, 4.0
+"""Steepest change from one pixel to the next, in grey levels, that counts; and the least mean along an edge."""
+_STANDS_OUT = 1.2
+"""So many times the median of all lines a line on an edge has."""
+_LEAST_POINTS = 5
 _MARGIN = 1 / 400
 """What was found is widened by this share of the picture's longer side: motion and the lens blur the outline."""
 
@@ -28,8 +36,6 @@ def grow_moving(
     picture: UInt8[np.ndarray, "h w 3"],
     returns_px: Float[np.ndarray, "n 2"],
     reach_px: Float[np.ndarray, "n"],
-    above_px: Float[np.ndarray, "m 2"],
-    above_reach_px: Float[np.ndarray, "m"],
     still: Bool[np.ndarray, "h w"],
 ) -> Bool[np.ndarray, "h w"]:
     """Grow the returns on moving things to the things' outlines.
@@ -38,8 +44,6 @@ def grow_moving(
         picture: RGB.
         returns_px: where returns on moving things are seen, column and row.
         reach_px: how far apart returns are there.
-        above_px: where the things may go on above the scanner's field.
-        above_reach_px: likewise.
         still: pixels with a return on what holds still, and those that are not used.
 
     Returns:
@@ -52,7 +56,7 @@ def grow_moving(
     longest_px = float(np.quantile(reach_px, 0.9))
     core = closed(_discs(shape, returns_px, 0.5 * reach_px), longest_px)
     seeds = _discs(shape, returns_px, np.zeros(len(returns_px)))
-    possible = dilated(core, _FREE_REACH * longest_px + _FREE_PX) | _discs(shape, above_px, above_reach_px)
+    possible = dilated(core, _FREE_REACH * longest_px + _FREE_PX)
     inner = eroded(core, 1.0) | seeds
     against = (still & ~inner) | ~possible
     markers = np.zeros(shape, np.int32)
@@ -60,6 +64,32 @@ def grow_moving(
     smooth = cv2.bilateralFilter(np.ascontiguousarray(picture), 5, 25, 2)
     grown = cv2.watershed(smooth, markers) == 2
     return dilated(filled(grown | inner), max(_MARGIN * max(shape), 1.0))
+
+
+def clearest_edge(picture: UInt8[np.ndarray, "h w 3"], lines_px: Sequence[Float[np.ndarray, "_ 2"]]) -> int | None:
+    """Find which of some lines lies on an edge of the picture.
+
+    Args:
+        picture: RGB.
+        lines_px: points of each line, column and row, inside the picture.
+
+    Returns:
+        Its number; None where none stands out.
+
+    """
+    if all(len(line) < _LEAST_POINTS for line in lines_px):
+        return None
+    grey = cv2.GaussianBlur(picture, (0, 0), 0.8).max(-1).astype(np.float32)
+    slope = np.hypot(cv2.Sobel(grey, -1, 1, 0, scale=1 / 8), cv2.Sobel(grey, -1, 0, 1, scale=1 / 8))
+    # an edge counts by its length, not by how bright the sky is behind a part of it
+    slope = cv2.dilate(np.minimum(slope, _STRONG_EDGE), np.ones((3, 3), np.uint8))
+    means = []
+    for line in lines_px:
+        column, row = np.floor(line).astype(int).T
+        means.append(float(slope[row, column].mean()) if len(line) >= _LEAST_POINTS else 0.0)
+    if max(means) < max(_STANDS_OUT * float(np.median(means)), _WEAK_EDGE):
+        return None
+    return int(np.argmax(means))
 
 
 def _discs(

@@ -7,7 +7,7 @@ that are held out. A picture that is held out gets a mask from its own sweep: it
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
 from rich.console import Console
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from edge_depth_nerf.base.console import run_jobs
 from edge_depth_nerf.base.errors import InputError
@@ -38,7 +38,7 @@ from edge_depth_nerf.lidar.moving import (
 )
 from edge_depth_nerf.lidar.world import WorldSweep
 from edge_depth_nerf.masks.lens import lens_circle
-from edge_depth_nerf.masks.moving import grow_moving, larger_again, smaller, working_factor
+from edge_depth_nerf.masks.moving import clearest_edge, grow_moving, larger_again, smaller, working_factor
 from edge_depth_nerf.process.downscale import downscale_mask
 from edge_depth_nerf.process.options import ProcessOptions
 from edge_depth_nerf.process.recording import RecordedPicture, Recording
@@ -55,8 +55,8 @@ _BODY_ENDS_M = 0.25
 """What the scanner's lowest beams meet goes on down to this above the ground."""
 _EDGE_RAD = 0.015
 """Returns within this of the highest or lowest direction are at the edge of the scanner's field."""
-_TALLEST_M = 1.8
-"""So much higher a thing may be than the scanner's field tells."""
+_TALLEST_M = 3.5
+"""Above the scanner's field a thing is looked for up to this height above the ground: that of a bus."""
 _STEP_M = 0.1
 
 
@@ -205,7 +205,7 @@ class _Returns:
             np.concatenate([part.points_m for part in parts]), np.concatenate([part.spacing_m for part in parts])
         )
 
-    def chosen(self, which: NDArray[np.bool_]) -> _Returns:
+    def chosen(self, which: NDArray[np.bool_] | NDArray[np.int64]) -> _Returns:
         return _Returns(self.points_m[which], self.spacing_m[which])
 
     def raised(self, by_m: float) -> _Returns:
@@ -250,28 +250,41 @@ def _moving_pixels(
     """What of a picture shows a thing that moves."""
     sweep, things, index = seen
     late_s = time_s - float(scanner.scanner.times_s[index])
-    moving, above, taken = _at_moment(sweep, things, late_s, scanner.ground)
+    world_to_camera = np.linalg.inv(camera_to_world)
+    moving, cut_off, taken = _at_moment(sweep, things, late_s, scanner.ground)
+    for highest in cut_off:
+        lines = [highest.chosen(up) for up in _heights(scanner.ground.above_m(highest.points_m))]
+        steps = [line.raised((number + 1) * _STEP_M) for number, line in enumerate(lines)]
+        roof = clearest_edge(image, [_pixels(_in_camera(world_to_camera, step), step, camera)[0] for step in steps])
+        moving = _Returns.joined([moving, *steps[: 0 if roof is None else roof + 1]])
     rest = np.ones(len(sweep.points_m), bool)
     rest[taken] = False
-    still = _Returns(sweep.points_m.numpy()[rest], sweep.spacing_m.numpy()[rest])
-    world_to_camera = np.linalg.inv(camera_to_world)
-    every = _in_camera(world_to_camera, np.concatenate((moving.points_m, still.points_m)))
-    spacing = torch.from_numpy(np.concatenate((moving.spacing_m, still.spacing_m)))
-    chosen = project_points(every.float(), camera, spacing_m=spacing).point_index.numpy()
+    every = _Returns.joined([moving, _Returns(sweep.points_m.numpy()[rest], sweep.spacing_m.numpy()[rest])])
+    in_camera = _in_camera(world_to_camera, every)
+    chosen = project_points(in_camera.float(), camera, spacing_m=torch.from_numpy(every.spacing_m)).point_index.numpy()
     shown = chosen[(chosen >= 0) & (chosen < len(moving.points_m))]
-    returns_px, reach_px = _pixels(every[shown], spacing[shown], camera)
-    above_px, above_reach_px = _pixels(
-        _in_camera(world_to_camera, above.points_m), torch.from_numpy(above.spacing_m), camera
-    )
+    returns_px, reach_px = _pixels(in_camera[shown], every.chosen(shown), camera)
     holds_still = ~usable | (chosen >= len(moving.points_m))
-    return grow_moving(image, returns_px, reach_px, above_px, above_reach_px, holds_still) & usable
+    return grow_moving(image, returns_px, reach_px, holds_still) & usable
+
+
+def _heights(height_m: NDArray[np.float64]) -> Iterator[NDArray[np.bool_]]:
+    """Which points can be raised by one, two, three steps and so on, that lie so far above the ground."""
+    lowest_m = float(height_m.min(initial=_TALLEST_M))
+    for step_m in np.arange(_STEP_M, _TALLEST_M - lowest_m, _STEP_M):
+        yield height_m + step_m < _TALLEST_M
 
 
 def _at_moment(
     sweep: WorldSweep, things: Sequence[Thing], late_s: float, ground: Ground
-) -> tuple[_Returns, _Returns, NDArray[np.int64]]:
-    """Where things are some time after a sweep's moment: their points, what may lie above, and their returns' rows."""
-    moving, above, rows = [_Returns.none()], [_Returns.none()], [np.zeros(0, np.int64)]
+) -> tuple[_Returns, list[_Returns], NDArray[np.int64]]:
+    """Where things are some time after a sweep's moment.
+
+    Returns:
+        Their points; of each thing those at the upper edge of the scanner's field; rows of their returns.
+
+    """
+    moving, cut_off, rows = [_Returns.none()], [], [np.zeros(0, np.int64)]
     for thing in things:
         of_thing = np.concatenate((thing.rows, _feet(sweep, thing, ground)))
         points = sweep.points_m.numpy()[of_thing]
@@ -280,14 +293,13 @@ def _at_moment(
         elevation = _elevation(sweep, of_thing)
         rows.append(of_thing)
         moving.append(returns)
-        # what the field of the scanner cuts off: all that is below, and perhaps something above
+        # below the scanner's field the thing goes on
         lowest = returns.chosen(elevation < sweep.elevation_rad[0] + _EDGE_RAD)
         height = ground.above_m(lowest.points_m)
         for step_m in np.arange(_STEP_M, float(height.max(initial=0)) - _BODY_ENDS_M, _STEP_M):
             moving.append(lowest.chosen(height - step_m > _BODY_ENDS_M).raised(-step_m))
-        highest = returns.chosen(elevation > sweep.elevation_rad[1] - _EDGE_RAD)
-        above += [highest.raised(step_m) for step_m in np.arange(_STEP_M, _TALLEST_M, _STEP_M)]
-    return _Returns.joined(moving), _Returns.joined(above), np.concatenate(rows)
+        cut_off.append(returns.chosen(elevation > sweep.elevation_rad[1] - _EDGE_RAD))
+    return _Returns.joined(moving), cut_off, np.concatenate(rows)
 
 
 def _feet(sweep: WorldSweep, thing: Thing, ground: Ground) -> NDArray[np.int64]:
@@ -297,7 +309,7 @@ def _feet(sweep: WorldSweep, thing: Thing, ground: Ground) -> NDArray[np.int64]:
     near = np.flatnonzero(np.all((points[:, :2] > low[:2]) & (points[:, :2] < high[:2]), axis=1))
     height = ground.above_m(points[near])
     near = near[(height > _FOOT_M[0]) & (height <= _FOOT_M[1])]
-    away_m, _ = cKDTree(thing.points_m[:, :2]).query(points[near, :2], distance_upper_bound=_FOOT_AWAY_M)
+    away_m, _ = KDTree(thing.points_m[:, :2]).query(points[near, :2], distance_upper_bound=_FOOT_AWAY_M)
     return near[np.isfinite(away_m)]
 
 
@@ -307,17 +319,17 @@ def _elevation(sweep: WorldSweep, rows: NDArray[np.int64]) -> NDArray[np.float64
     return torch.atan2(in_scanner[:, 2], in_scanner[:, :2].norm(dim=-1)).numpy()
 
 
-def _in_camera(world_to_camera: NDArray[np.float64], points_m: NDArray[np.float64]) -> torch.Tensor:
-    return transform_points(torch.from_numpy(world_to_camera), torch.from_numpy(points_m))
+def _in_camera(world_to_camera: NDArray[np.float64], returns: _Returns) -> torch.Tensor:
+    return transform_points(torch.from_numpy(world_to_camera), torch.from_numpy(returns.points_m))
 
 
 def _pixels(
-    points_in_camera: torch.Tensor, spacing_m: torch.Tensor, camera: Camera
+    points_in_camera: torch.Tensor, returns: _Returns, camera: Camera
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Where points are seen, and how many pixels their spacing is; those out of view are left out."""
     across = torch.linalg.cross(points_in_camera, points_in_camera.roll(1, dims=-1))
     across = across / across.norm(dim=-1, keepdim=True).clamp(min=1e-9)
     pixels, valid = camera.project(points_in_camera)
-    beside, valid_beside = camera.project(points_in_camera + across * spacing_m[:, None])
+    beside, valid_beside = camera.project(points_in_camera + across * torch.from_numpy(returns.spacing_m)[:, None])
     seen = valid & valid_beside & camera.inside(pixels)
     return pixels[seen].numpy(), (beside - pixels)[seen].norm(dim=-1).numpy()
