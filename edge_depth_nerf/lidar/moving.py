@@ -376,7 +376,8 @@ def _coasted(track: Mapping[int, Thing], ordered: Sequence[Loose]) -> dict[int, 
         for place in sorted(track, reverse=step < 0):
             at, since = place + step, 1
             while 0 <= at < len(ordered) and at not in result and since <= _COASTED:
-                here = expected_at(result[at - step], ordered[at])
+                # as it was when it was seen: what lies beside it must not creep in from sweep to sweep
+                here = expected_at(track[place], ordered[at])
                 if here is None:
                     break
                 result[at] = here
@@ -393,8 +394,12 @@ def expected_at(thing: Thing, loose: Loose) -> Thing | None:
     if not len(near):
         return None
     away_m, _ = KDTree(expected).query(loose.points_m[near], distance_upper_bound=_JOIN_M)
-    members = near[np.isfinite(away_m)]
-    if len(members) < max(_COAST_SHARE * len(expected), _MIN_RETURNS):
+    near = near[np.isfinite(away_m)]
+    enough = max(_COAST_SHARE * len(expected), _MIN_RETURNS)
+    members = near[~loose.held[near]]
+    if len(members) < enough:
+        members = near
+    if len(members) < enough:
         return None
     return Thing(loose.time_s, loose.rows[members], loose.points_m[members], thing.velocity_m_s)
 
