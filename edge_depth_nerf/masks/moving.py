@@ -23,10 +23,12 @@ _FREE_REACH = 0.5
 _FREE_PX = 1.0
 """A return stands for half the way to the next one; the outline may lie beyond that by so many times the way between
 two, and so many pixels."""
-_STRONG_EDGE, _WEAK_EDGE = 12.0, 4.0
+_STRONG_EDGE, _WEAK_EDGE = 6.0, 2.5
 """Steepest change from one pixel to the next, in grey levels, that counts; and the least mean along an edge."""
 _STANDS_OUT = 1.2
 """So many times the median of all lines a line on an edge has."""
+_ABOUT_AS_CLEAR = 0.9
+"""Of lines whose means are this near to the highest the first counts: behind a roof there are others."""
 _LEAST_POINTS = 5
 _MARGIN = 1 / 400
 """What was found is widened by this share of the picture's longer side: motion and the lens blur the outline."""
@@ -74,7 +76,7 @@ def clearest_edge(picture: UInt8[np.ndarray, "h w 3"], lines_px: Sequence[Float[
         lines_px: points of each line, column and row, inside the picture.
 
     Returns:
-        Its number; None where none stands out.
+        Its number, the first of those that are about as clear; None where none stands out.
 
     """
     if all(len(line) < _LEAST_POINTS for line in lines_px):
@@ -89,7 +91,7 @@ def clearest_edge(picture: UInt8[np.ndarray, "h w 3"], lines_px: Sequence[Float[
         means.append(float(slope[row, column].mean()) if len(line) >= _LEAST_POINTS else 0.0)
     if max(means) < max(_STANDS_OUT * float(np.median(means)), _WEAK_EDGE):
         return None
-    return int(np.argmax(means))
+    return next(number for number, mean in enumerate(means) if mean >= _ABOUT_AS_CLEAR * max(means))
 
 
 def _discs(
