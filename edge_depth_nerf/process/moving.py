@@ -57,6 +57,8 @@ _EDGE_RAD = 0.015
 """Returns within this of the highest or lowest direction are at the edge of the scanner's field."""
 _TALLEST_M = 3.5
 """Above the scanner's field a thing is looked for up to this height above the ground: that of a bus."""
+_LONG_M = 2.5
+"""Only what is longer than this may be higher than the field: people are not."""
 _STEP_M = 0.1
 
 
@@ -281,7 +283,7 @@ def _at_moment(
     """Where things are some time after a sweep's moment.
 
     Returns:
-        Their points; of each thing those at the upper edge of the scanner's field; rows of their returns.
+        Their points; of each long thing those at the upper edge of the scanner's field; rows of their returns.
 
     """
     moving, cut_off, rows = [_Returns.none()], [], [np.zeros(0, np.int64)]
@@ -298,7 +300,8 @@ def _at_moment(
         height = ground.above_m(lowest.points_m)
         for step_m in np.arange(_STEP_M, float(height.max(initial=0)) - _BODY_ENDS_M, _STEP_M):
             moving.append(lowest.chosen(height - step_m > _BODY_ENDS_M).raised(-step_m))
-        cut_off.append(returns.chosen(elevation > sweep.elevation_rad[1] - _EDGE_RAD))
+        if np.ptp(thing.points_m[:, :2], axis=0).max() > _LONG_M:
+            cut_off.append(returns.chosen(elevation > sweep.elevation_rad[1] - _EDGE_RAD))
     return _Returns.joined(moving), cut_off, np.concatenate(rows)
 
 
