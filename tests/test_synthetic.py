@@ -21,6 +21,7 @@ from edge_depth_nerf.synthetic.options import SynthesizeOptions
 from edge_depth_nerf.synthetic.render import Caster, World
 from edge_depth_nerf.synthetic.scenes import _movers, build_scene
 from edge_depth_nerf.synthetic.simulated_mono import simulated_estimate
+from edge_depth_nerf.synthetic.traffic import traffic
 
 pytestmark = pytest.mark.slow
 
@@ -578,6 +579,36 @@ def test_movers_drive_and_meet_the_car(scene):
             assert 2.0 < apart.min() < 4.5, "it comes past on the other lane during the drive"
         else:
             assert 7 < apart.min() < 11, "it drives ahead"
+
+
+@pytest.mark.parametrize("frames", [10, 40, 80])
+def test_traffic_passes_stops_and_starts_and_nobody_is_run_over(frames):
+    duration_s = max(0.1 * frames, 3.0)
+    route = Route((0.0, -1.75))
+    drive = Drive.random(route, 0.0, 6.0, np.random.default_rng(0))
+    movers = traffic(drive, 0.1 * frames, np.random.default_rng(frames))
+    assert len(movers) == 8
+    times = np.linspace(0, duration_s, 400)
+    own = drive.pose_to_world(times)[:, :2, 3]
+    standing = 0
+    for mover in movers:
+        place, _ = mover.at(times)
+        apart = np.linalg.norm(place - own, axis=1)
+        assert apart.min() > 1.3, "it does not drive into the recording car"
+        assert apart.min() < 14, "it is met"
+        speed = np.linalg.norm(np.diff(place, axis=0), axis=1) / np.diff(times)
+        assert speed.max() == pytest.approx(mover.speed_m_s, rel=1e-6)
+        assert np.abs(np.diff(speed)).max() < 1.1 * mover.speed_m_s * (times[1] - times[0]), "none jumps"
+        if mover.stands_s is not None:
+            begin, end = mover.stands_s
+            still = (times[:-1] > begin) & (times[1:] < end)
+            assert still.any() and speed[still].max() < 1e-9
+            assert speed[times[1:] > end + 0.3].max() > 0.25 * mover.speed_m_s
+            standing += 1
+    assert standing == 2
+    heights = [mover.geometry.corners[..., 2].max() + mover.ground_m for mover in movers]
+    assert max(heights) > 3.0, "the bus is higher than the scanner sees"
+    assert sum(1.5 < height < 2.1 for height in heights) >= 4, "people"
 
 
 # ------------------------------------------------------------------------------------------------- simulated mono

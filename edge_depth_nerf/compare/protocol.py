@@ -31,7 +31,7 @@ def departures(meta: dict[str, Any]) -> list[str]:
         found.append("hidden returns removed")
     if source.get("ego_mask") or source.get("find_ego"):
         found.append("the vehicle itself masked out")
-    if source.get("frame_masks"):
+    if source.get("frame_masks") or source.get("find_moving"):
         found.append("moving things masked out")
     return found
 

@@ -55,12 +55,23 @@ class FreeSpace:
 
     def seen_through(self, points_in_world: Float[Tensor, "points 3"]) -> Bool[Tensor, "points"]:
         """Whether beams passed each point and ended beyond it."""
+        return self.observed(points_in_world)[0]
+
+    def observed(
+        self, points_in_world: Float[Tensor, "points 3"]
+    ) -> tuple[Bool[Tensor, "points"], Bool[Tensor, "points"]]:
+        """Whether beams passed each point and ended beyond it, and whether they ended about there.
+
+        Neither is so where something nearer hides the point, or nothing was measured.
+        """
         rows = len(self.free_to_m)
         in_scanner = transform_points(self.world_to_scanner, points_in_world)
         row, column, range_m = _cells(in_scanner, self.lowest_rad, self.cell_rad)
         inside = (row >= 0) & (row < rows)
         free_to_m = torch.where(inside, self.free_to_m[row.clamp(0, rows - 1), column], 0)
-        return free_to_m > torch.maximum(range_m * _MARGIN, range_m + _MARGIN_M)
+        margin_m = torch.maximum(range_m * (_MARGIN - 1), torch.tensor(_MARGIN_M))
+        passed = free_to_m > torch.maximum(range_m * _MARGIN, range_m + _MARGIN_M)
+        return passed, ~passed & (free_to_m > range_m - margin_m)
 
 
 def _cells(

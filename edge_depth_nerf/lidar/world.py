@@ -49,6 +49,8 @@ class WorldSweep:
     """At the sweep's own moment."""
     elevation_rad: tuple[float, float]
     """Lowest and highest direction of the returns, from the scanner's horizontal plane."""
+    offset_s: Float[Tensor, "returns"]
+    """When each was measured, from the sweep's own moment; 0 where that is not known or not asked for."""
 
 
 def sweep_in_world(
@@ -91,6 +93,7 @@ def sweep_in_world(
         spacing_rad=spacing_rad,
         world_to_scanner=np.linalg.inv(vehicle_to_world @ scanner_to_vehicle),
         elevation_rad=(float(np.arcsin(low)), float(np.arcsin(high))),
+        offset_s=offset_s,
     )
 
 

@@ -34,6 +34,7 @@ from edge_depth_nerf.masks.semantics import sky as sky_of_labels
 from edge_depth_nerf.masks.sky import find_sky
 from edge_depth_nerf.process.agreement import agreement_notices, agreements
 from edge_depth_nerf.process.downscale import downscale_distance, downscale_image, downscale_mask
+from edge_depth_nerf.process.moving import find_moving
 from edge_depth_nerf.process.options import ProcessOptions
 from edge_depth_nerf.process.pose_checks import features_say, lidar_says
 from edge_depth_nerf.process.reading import load_distance, load_picture, read_depth
@@ -74,18 +75,7 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
     console = console or Console()
     options.check()
     check_classes(options.moving_classes)
-    if options.poses == "colmap":
-        from edge_depth_nerf.process.colmap.poses import check_colmap
-
-        check_colmap(recording, options)
-    elif options.poses == "lidar":
-        from edge_depth_nerf.process.lidar_poses import check_sweeps
-
-        check_sweeps(recording)
-    if options.refine_poses:
-        from edge_depth_nerf.process.colmap.refine import check_refining
-
-        check_refining(recording, options)
+    _check_poses(recording, options)
     with console.status("Checking cameras and files …"):
         source = _source(recording, options)
         masks = given_masks(recording, options)
@@ -99,22 +89,14 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
     if options.find_ego:
         training = [picture for picture in recording.pictures if picture.frame not in _held_out(recording, options)]
         recording, notices = find_vehicle(recording, training, masks, options, console)
-    if options.poses == "colmap":
-        from edge_depth_nerf.process.colmap.poses import colmap_poses
-
-        recording = colmap_poses(recording, options, console)
-        notices += lidar_says(recording, options.output, console)
-    elif options.poses == "lidar":
-        notices += features_say(recording, options, console)
-    if recording.trajectory is None:
-        raise InputError("the recording has no poses. Give them, or find them: --poses lidar, --poses colmap.")
-    if options.refine_poses:
-        from edge_depth_nerf.process.colmap.refine import refine_poses
-
-        recording = refine_poses(recording, options, console)
+    recording, said = _posed(recording, options, console)
+    notices += said
     if recording.skipped:
         say(console, f"Skipped {summarise(recording.skipped)}", "yellow")
     held_out = _held_out(recording, options)
+    if options.find_moving:
+        recording, more = find_moving(recording, options, held_out, masks, console)
+        notices += more
     builder = _Builder(recording, options, held_out, masks)
     frames = [
         SceneFrame(
@@ -162,6 +144,41 @@ def _disagreements(
         usable[recorded.name] = lens & masks[recorded.name] if recorded.name in masks else lens
     with console.status("Holding LiDAR against the pictures"):
         return agreement_notices(agreements(recording, usable))
+
+
+def _check_poses(recording: Recording, options: ProcessOptions) -> None:
+    """Find out before anything long begins whether poses can be found as the options say."""
+    if options.poses == "colmap":
+        from edge_depth_nerf.process.colmap.poses import check_colmap
+
+        check_colmap(recording, options)
+    elif options.poses == "lidar":
+        from edge_depth_nerf.process.lidar_poses import check_sweeps
+
+        check_sweeps(recording)
+    if options.refine_poses:
+        from edge_depth_nerf.process.colmap.refine import check_refining
+
+        check_refining(recording, options)
+
+
+def _posed(recording: Recording, options: ProcessOptions, console: Console) -> tuple[Recording, list[str]]:
+    """Give a recording the poses that the options ask for, those of `--poses lidar` aside, and say how good they are."""
+    notices = []
+    if options.poses == "colmap":
+        from edge_depth_nerf.process.colmap.poses import colmap_poses
+
+        recording = colmap_poses(recording, options, console)
+        notices = lidar_says(recording, options.output, console)
+    elif options.poses == "lidar":
+        notices = features_say(recording, options, console)
+    if recording.trajectory is None:
+        raise InputError("the recording has no poses. Give them, or find them: --poses lidar, --poses colmap.")
+    if options.refine_poses:
+        from edge_depth_nerf.process.colmap.refine import refine_poses
+
+        recording = refine_poses(recording, options, console)
+    return recording, notices
 
 
 def _held_out(recording: Recording, options: ProcessOptions) -> set[int]:
@@ -224,7 +241,7 @@ class _Builder:
         self._without: list[str] = []
         pictures = recording.pictures
         present = {
-            "mask": any(picture.mask or picture.semantics for picture in pictures),
+            "mask": any(picture.mask or picture.moving_mask or picture.semantics for picture in pictures),
             "lidar": bool(recording.sweeps) or any(picture.depth for picture in pictures),
             "mono": any(picture.mono for picture in pictures),
             "beams": bool(recording.sweeps) and options.holdout_beams > 0,
@@ -281,6 +298,8 @@ class _Builder:
         mask = np.ones((camera.height, camera.width), bool)
         if picture.mask is not None:
             mask &= read_camera_mask(picture.mask, camera)
+        if picture.moving_mask is not None:
+            mask &= read_camera_mask(picture.moving_mask, camera)
         if labels is not None:
             mask &= keep_static(labels, self._options.moving_classes)
         return mask
@@ -442,6 +461,7 @@ def _source(recording: Recording, options: ProcessOptions) -> dict[str, Any]:
         "ego_mask": options.ego_mask is not None,
         "find_ego": options.find_ego,
         "frame_masks": options.frame_masks is not None,
+        **({"find_moving": True} if options.find_moving else {}),
         "moving_classes": list(options.moving_classes),
         "mono": options.mono is not None,
         **({"mono_trained_on": options.mono_trained_on} if any(picture.mono for picture in recording.pictures) else {}),

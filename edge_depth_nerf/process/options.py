@@ -65,6 +65,9 @@ class ProcessOptions:
     frame_masks: Path | None = None
     """Masks of single frames, such as moving things: a folder with CAMERA/0000000123.png (255 = use the pixel). In
     the size of the raw pictures; one for every frame taken."""
+    find_moving: bool = False
+    """Find things that move by what LiDAR's sweeps of other moments saw through, and mask them out of the pictures;
+    the masks are written to moving_masks/ in the scene, to be corrected there or given as --frame-masks."""
     moving_classes: tuple[str, ...] = (
         *("person", "rider", "car", "truck", "bus", "caravan", "trailer", "train", "motorcycle", "bicycle"),
         "unknown vehicle",

@@ -69,6 +69,8 @@ class RecordedPicture:
     """A depth map in place of sweeps."""
     mask: Path | None = None
     """This picture's own mask, 255 = use."""
+    moving_mask: Path | None = None
+    """What moves in this picture, as it was found, 255 = use; beside the mask that is given."""
     semantics: Path | None = None
     """KITTI-360's label ids, 8-bit PNG."""
     mono: Path | None = None
@@ -81,8 +83,8 @@ class RecordedPicture:
     @property
     def inputs(self) -> tuple[Path, ...]:
         """All files there are."""
-        found = [self.path, self.mask, self.semantics, self.mono, self.truth_distance, self.truth_rgb]
-        found.append(None if self.depth is None else self.depth.path)
+        found = [self.path, self.mask, self.moving_mask, self.semantics, self.mono]
+        found += [self.truth_distance, self.truth_rgb, None if self.depth is None else self.depth.path]
         return tuple(path for path in found if path is not None)
 
 

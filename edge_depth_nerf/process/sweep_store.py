@@ -97,7 +97,7 @@ class Surroundings:
     """Points of the picture's own sweep that others saw through: there at its moment, and no part of what lasts."""
 
 
-class _Scanner:
+class Scanner:
     """The sweeps of one scanner, in order of time."""
 
     def __init__(
@@ -122,7 +122,7 @@ class _Scanner:
         turn_s = timing.turn_s if timing else min(statistics.median(intervals), _TURN_S) if intervals else _TURN_S
         self.half_turn_s = turn_s / 2
         self.trains = [sweep.frame not in held_out for sweep in self.sweeps]
-        self._bridged = [
+        self.bridged = [
             trajectory.gap_s(time) <= MAX_POSE_GAP_S or 0 < trajectory.outside_s(time) <= self.half_turn_s
             for time in self.times_s.tolist()
         ]
@@ -156,7 +156,7 @@ class _Scanner:
     def around(self, index: int) -> list[int]:
         """The sweeps near another that training may see, without it."""
         first, last = max(index - self._reach, 0), min(index + self._reach, len(self.sweeps) - 1)
-        return [i for i in range(first, last + 1) if i != index and self.trains[i] and self._bridged[i]]
+        return [i for i in range(first, last + 1) if i != index and self.trains[i] and self.bridged[i]]
 
     def readable(self, index: int) -> bool:
         """Whether a sweep can be read; under `strict` one that cannot is an error."""
@@ -230,8 +230,8 @@ class SweepStore:
             self._left_out[path] = (not_finite, out_of_range)
 
         self._held_out = frozenset(held_out)
-        self._scanners = [
-            _Scanner(
+        self.scanners = [
+            Scanner(
                 found,
                 trajectory,
                 count,
@@ -256,9 +256,9 @@ class SweepStore:
 
     def used(self, frame: int, time_s: float) -> list[RecordedSweep]:
         """The sweeps whose points a picture may get."""
-        return [scanner.sweeps[index] for scanner in self._scanners for index in self._window(scanner, frame, time_s)]
+        return [scanner.sweeps[index] for scanner in self.scanners for index in self._window(scanner, frame, time_s)]
 
-    def _window(self, scanner: _Scanner, frame: int, time_s: float) -> list[int]:
+    def _window(self, scanner: Scanner, frame: int, time_s: float) -> list[int]:
         """A picture's sweeps of one scanner, nearest in time first."""
         own = scanner.own(frame, time_s)
         if own is None:
@@ -271,7 +271,7 @@ class SweepStore:
     def beams(self, frame: int, time_s: float) -> Float[Tensor, "points 3"]:
         """What is held out of the sweeps of a picture's own moment, in the world, float64."""
         found = [torch.empty(0, 3, dtype=torch.float64)]
-        for scanner in self._scanners:
+        for scanner in self.scanners:
             own = scanner.own(frame, time_s)
             beams = None if own is None else scanner.beams(own)
             if own is not None and beams is not None and abs(scanner.times_s[own] - time_s) <= scanner.half_turn_s:
@@ -289,7 +289,7 @@ class SweepStore:
 
         """
         found = _Gathered(viewpoint_in_world[:3, 3])
-        for scanner in self._scanners:
+        for scanner in self.scanners:
             window = self._window(scanner, frame, time_s)
             window = [*window[:1], *filter(scanner.readable, window[1:])]
             for rank, index in enumerate(window):

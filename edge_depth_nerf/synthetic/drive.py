@@ -13,7 +13,7 @@ Under the output folder, with SEQ the sequence, k = 2 (left), 3 (right) and ten-
     truth/SEQ/points/*.bin                        the sweep without noise, moved to the frame's moment
     truth/SEQ/shifted.json                        camera-to-world poses 1 m and 2 m to the car's left, held-out frames
     truth/SEQ/image_0k/shifted_{1,2}m/{rgb,distance}/*.png   what is seen there, without the own car
-    truth/SEQ/moving_masks/image_0k/*.png         255 = keep: not a car that drives; only with driving cars
+    truth/SEQ/moving_masks/image_0k/*.png         255 = keep: nothing that moves; only where something does
     simulated_mono/SEQ/image_0k/*.png             made from the truth with a network's faults; no network's estimate
 
 Frame i is held out if i % 8 == 4. World coordinates are metres, z up, with an origin far away, as KITTI-360's are.
@@ -171,7 +171,7 @@ class _Kitti360(DriveLayout):
         return self._truth / "points" / f"{frame:010d}.bin"
 
     def moving_mask(self, name: str, frame: int) -> Path | None:
-        return self._truth / "moving_masks" / name / f"{frame:010d}.png" if self.options.moving else None
+        return self._truth / "moving_masks" / name / f"{frame:010d}.png" if self.options.has_movers else None
 
     def shifted(self, name: str, frame: int) -> dict[int, tuple[Path, Path]]:
         folders = {metres: self._truth / name / f"shifted_{metres}m" for metres in SHIFTS_M if held_out(frame)}

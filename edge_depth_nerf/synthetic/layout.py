@@ -100,7 +100,7 @@ class DriveLayout(ABC):
         return None
 
     def moving_mask(self, name: str, frame: int) -> Path | None:
-        """Where a picture shows no car that drives; None where the layout has none."""
+        """Where a picture shows nothing that moves; None where the drive has none."""
         return None
 
     def shifted(self, name: str, frame: int) -> dict[int, tuple[Path, Path]]:

@@ -1,4 +1,4 @@
-"""Where cars are at any moment: routes on the ground, and the recording car's motion along one.
+"""Where things are at any moment: routes on the ground, what moves along them, and the recording car's own motion.
 
 Frames: world (x, y horizontal, z up, metres), pose = vehicle (x forward, y right, z down). Times in seconds;
 headings in radians, counter-clockwise from world x.
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from edge_depth_nerf.synthetic.geometry import Geometry, Pair, Real
 from edge_depth_nerf.synthetic.rig import POSE_HEIGHT_M
 
 FRAME_INTERVAL_S = 0.1
@@ -111,3 +112,30 @@ class Drive:
         poses[..., :3, 2] = np.cross(forward, -left)
         poses[..., :2, 3], poses[..., 2, 3], poses[..., 3, 3] = position, height, 1
         return poses
+
+
+@dataclass(frozen=True)
+class Mover:
+    """A car, a person or another thing that moves along a route at one speed, and may stand for a while."""
+
+    geometry: Geometry
+    route: Route
+    start_m: Real
+    """Arc length at time 0."""
+    speed_m_s: Real
+    stands_s: Pair | None = None
+    """From when until when it stands; None = never. It loses its speed in the second before, and has it again a second
+    after."""
+    ground_m: Real = 0.0
+    """Height of the ground that it moves on."""
+
+    def at(self, time_s: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Positions on the ground (N×2) and headings (N) at N times."""
+        driven_s = np.asarray(time_s, np.float64)
+        if self.stands_s is not None:
+            begin, end = self.stands_s
+            # the time that would have taken as far at full speed: half of each second of braking and of starting
+            braking, starting = np.clip(driven_s - (begin - 1), 0, 1), np.clip(driven_s - end, 0, 1)
+            before = np.minimum(driven_s, begin - 1) + braking - braking**2 / 2
+            driven_s = before + starting**2 / 2 + np.maximum(driven_s - (end + 1), 0)
+        return self.route.at(self.start_m + self.speed_m_s * driven_s)

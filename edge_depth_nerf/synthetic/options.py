@@ -10,12 +10,12 @@ from typing import Literal
 
 from edge_depth_nerf.base.errors import InputError
 
-SceneName = Literal["street", "parking", "turn"]
+SceneName = Literal["street", "parking", "turn", "traffic"]
 
-SCENES: tuple[SceneName, ...] = ("street", "parking", "turn")
+SCENES: tuple[SceneName, ...] = ("street", "parking", "turn", "traffic")
 """The scenes that can be synthesised."""
 
-DEFAULT_SPEED_M_S: dict[SceneName, float] = {"street": 8.0, "parking": 4.0, "turn": 6.0}
+DEFAULT_SPEED_M_S: dict[SceneName, float] = {"street": 8.0, "parking": 4.0, "turn": 6.0, "traffic": 6.0}
 """How fast the car drives in each scene unless told otherwise; a frame is 0.1 s."""
 
 LayoutName = Literal["kitti-360", "jbnu-depth360", "rig"]
@@ -40,7 +40,8 @@ class SynthesizeOptions:
     output: Path
     """Folder to write the drive to; new, empty, or an unfinished drive of the same options, which is continued."""
     scene: SceneName = "street"
-    """street: houses, trees, parked cars; parking: an underground car park; turn: 90 degrees at a junction."""
+    """street: houses, trees, parked cars; parking: an underground car park; turn: 90 degrees at a junction;
+    traffic: the street with cars that pass, one that stops and starts again, a bus, people on foot and a cyclist."""
     frames: int = 40
     """Number of frames, 0.1 s apart, each with two pictures and one LiDAR sweep."""
     size: int = 350
@@ -50,7 +51,7 @@ class SynthesizeOptions:
     moving: int = 0
     """Number of other cars that drive through the scene; their masks are written as truth/<sequence>/moving_masks."""
     speed_m_s: float | None = None
-    """Mean speed of the car in m/s; none = the scene's own (street 8, parking 4, turn 6)."""
+    """Mean speed of the car in m/s; none = the scene's own (street 8, parking 4, turn 6, traffic 6)."""
     sequence: str = "2013_05_28_drive_0000_sync"
     """Name of the sequence in the folders (KITTI-360's layout alone)."""
     layout: LayoutName = "kitti-360"
@@ -60,6 +61,11 @@ class SynthesizeOptions:
     camera: CameraName = "plain"
     """plain: exposure drifts by 10 %. automatic: exposure by 40 % and white balance by 10 %, as bright as what is seen
     asks for; noise grows with the gain, and lenses darken towards their rim."""
+
+    @property
+    def has_movers(self) -> bool:
+        """Whether anything but the recording car moves."""
+        return self.moving > 0 or self.scene == "traffic"
 
     @property
     def mean_speed_m_s(self) -> float:

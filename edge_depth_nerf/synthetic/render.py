@@ -3,7 +3,7 @@
 Frames: world (z up), camera (x right, y down, z forward); metres, seconds. Distances run along unit rays, `inf`
 where nothing is hit. Radiance is linear RGB; a picture's values come from it by `Lighting.exposure`, clipping at 1
 and sRGB's curve. Surfaces are dull (Lambert) under sun, lamps and a sky, with a slight mirror on glass and paint;
-the sun and lamps cast shadows. Nothing but the cars that drive depends on time.
+the sun and lamps cast shadows. Nothing but what moves depends on time.
 """
 
 from __future__ import annotations
@@ -28,8 +28,9 @@ from edge_depth_nerf.synthetic.materials import (
     Noise,
     reflectance,
 )
+from edge_depth_nerf.synthetic.motion import Mover
 from edge_depth_nerf.synthetic.objects import recording_car
-from edge_depth_nerf.synthetic.scenes import Mover, SceneModel
+from edge_depth_nerf.synthetic.scenes import SceneModel
 
 Array = NDArray[np.float32]
 
@@ -57,6 +58,7 @@ class Caster:
     def __init__(self, geometry: Geometry) -> None:
         self.geometry = geometry
         self.flat_normals = flat_normals(geometry.corners)
+        self.reach_m = _reach_m(geometry)
         faces = np.arange(3 * len(geometry.corners), dtype=np.int32).reshape(-1, 3)
         self._scene = EmbreeScene()
         TriangleMesh(scene=self._scene, vertices=geometry.corners.reshape(-1, 3).astype(np.float32), indices=faces)
@@ -84,7 +86,7 @@ class Hits:
     distance_m: Array
     """N, inf = none."""
     thing: NDArray[np.int32]
-    """N: -1 nothing, 0 the static scene, k the k-th car that drives."""
+    """N: -1 nothing, 0 the static scene, k the k-th thing that moves."""
     triangle: NDArray[np.int32]
     """N, within the thing."""
     barycentric: Array
@@ -115,7 +117,7 @@ class World:
         thing = np.where(triangle >= 0, _STATIC, _NOTHING).astype(np.int32)
         times = np.broadcast_to(np.asarray(time_s, np.float64), (len(origins),))
         for number, (mover, caster) in enumerate(self._movers, start=1):
-            near, its_origins, its_directions, _ = _in_frame_of(mover, times, origins, directions)
+            near, its_origins, its_directions, _ = _in_frame_of(mover, caster.reach_m, times, origins, directions)
             its_distance, its_triangle, its_barycentric = caster.first_hits(its_origins, its_directions)
             closer = its_distance < distance[near]
             rows = near[closer]
@@ -128,7 +130,7 @@ class World:
         reach = np.broadcast_to(np.asarray(reach_m, np.float32), (len(origins),))
         times = np.full(len(origins), time_s)
         for mover, caster in self._movers:
-            near, its_origins, its_directions, _ = _in_frame_of(mover, times, origins, directions)
+            near, its_origins, its_directions, _ = _in_frame_of(mover, caster.reach_m, times, origins, directions)
             free[near] &= ~caster.blocked(its_origins, its_directions, reach[near])
         return free
 
@@ -285,19 +287,25 @@ def _pose_of(mover: Mover, times: NDArray[np.float64]) -> tuple[Array, Array, Ar
     """Cosine and sine of the heading (N) and the position (N×3) at N times."""
     moments, which = np.unique(times, return_inverse=True)
     place, heading = mover.at(moments)
-    shift = np.column_stack((place, np.zeros(len(moments)))).astype(np.float32)
+    shift = np.column_stack((place, np.full(len(moments), float(mover.ground_m)))).astype(np.float32)
     return np.cos(heading).astype(np.float32)[which], np.sin(heading).astype(np.float32)[which], shift[which]
 
 
+def _reach_m(geometry: Geometry) -> float:
+    """Radius of a ball about a point 0.8 m above the ground that holds a thing; a car's is 3 m."""
+    from_middle = geometry.corners.reshape(-1, 3) - (0.0, 0.0, 0.8)
+    return max(3.0, float(np.linalg.norm(from_middle, axis=-1).max()))
+
+
 def _in_frame_of(
-    mover: Mover, times: NDArray[np.float64], origins: Array, directions: Array
+    mover: Mover, reach_m: float, times: NDArray[np.float64], origins: Array, directions: Array
 ) -> tuple[NDArray[np.int64], Array, Array, Array]:
-    """Rays that pass near a car, in the car's frame at each ray's own time: their rows, origins, directions, shifts."""
+    """Rays that pass near a thing, in its frame at each ray's own time: their rows, origins, directions, shifts."""
     cos, sin, shift = _pose_of(mover, times)
     apart = shift + _f32((0, 0, 0.8)) - origins
     along = np.sum(apart * directions, -1)
     off = np.sum(apart * apart, -1) - along * along
-    near = np.flatnonzero((off < 3.0**2) & (along > -3.0))
+    near = np.flatnonzero((off < reach_m**2) & (along > -reach_m))
     cos, sin, shift = cos[near], sin[near], shift[near]
     return near, _rotated_by(origins[near] - shift, cos, -sin), _rotated_by(directions[near], cos, -sin), shift
 
@@ -357,7 +365,7 @@ class View:
     distance_m: Array
     """At pixel centres; 0 = sky, own car or outside the lens."""
     moving: NDArray[np.bool_]
-    """Whether any part of the pixel shows a car that drives."""
+    """Whether any part of the pixel shows a thing that moves."""
 
 
 class FisheyeCamera:

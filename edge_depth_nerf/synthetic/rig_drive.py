@@ -18,6 +18,7 @@ Both, with c the camera:
     masks/c.png                             255 = keep: inside the lens, not the own car
     mono/c/*.png                            made from the truth with a network's faults; no network's estimate
     truth/c/distance/*.png, truth/c/rgb/*.png    metres along the ray in 1/256 m; pictures without drift and noise
+    truth/c/moving_masks/*.png              255 = keep: nothing that moves; in the scene `traffic` alone
 """
 
 from __future__ import annotations
@@ -120,6 +121,11 @@ class _RigFileLayout(DriveLayout):
 
     def map(self, kind: str, name: str, frame: int) -> Path:
         return self.root / _maps(name)[kind] / f"{frame:06d}.png"
+
+    def moving_mask(self, name: str, frame: int) -> Path | None:
+        # drives with --moving had none when this was added
+        wanted = self.options.scene == "traffic"
+        return self.root / "truth" / name / "moving_masks" / f"{frame:06d}.png" if wanted else None
 
     def write_once(self) -> None:
         for name, camera in self.views.items():

@@ -1,7 +1,7 @@
-"""The three scenes: a street, an underground car park, a turn at a junction.
+"""The scenes: a street, the same with traffic, an underground car park, a turn at a junction.
 
 World frame: x along the first stretch of road, y left of it, z up, the road at z = 0, metres. Everything stands
-still and looks the same in every frame, but for the cars that drive.
+still and looks the same in every frame, but for what moves.
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from edge_depth_nerf.synthetic import objects
 from edge_depth_nerf.synthetic.geometry import Colour, Geometry, MeshBuilder, Pair, Real, Triple, placement
 from edge_depth_nerf.synthetic.materials import Material
-from edge_depth_nerf.synthetic.motion import FRAME_INTERVAL_S, Drive, Route
+from edge_depth_nerf.synthetic.motion import FRAME_INTERVAL_S, Drive, Mover, Route
 from edge_depth_nerf.synthetic.options import SceneName, SynthesizeOptions
+from edge_depth_nerf.synthetic.traffic import traffic
 
 LANE_M = 3.5
 KERB_Y_M = 5.7
@@ -52,21 +53,6 @@ class Lighting:
     """A lamp's light at 1 m on what faces it."""
     lamp_reach_m: Real = 8.0
     """Distance at which a lamp's light has faded to nothing."""
-
-
-@dataclass(frozen=True)
-class Mover:
-    """A car that drives along a route at one speed."""
-
-    geometry: Geometry
-    route: Route
-    start_m: Real
-    """Arc length at time 0."""
-    speed_m_s: Real
-
-    def at(self, time_s: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Positions on the ground (N×2) and headings (N) at N times."""
-        return self.route.at(self.start_m + self.speed_m_s * np.asarray(time_s, np.float64))
 
 
 @dataclass(frozen=True)
@@ -309,6 +295,8 @@ def _driven_through(
     """The scene with the recording car on its route, from an arc length on, and the cars that drive."""
     drive = Drive.random(route, start_m, options.mean_speed_m_s, np.random.default_rng([options.seed, 2]))
     movers = _movers(options, drive, oncoming, -start_m, np.random.default_rng([options.seed, 3]))
+    if options.scene == "traffic":
+        movers += traffic(drive, options.frames * FRAME_INTERVAL_S, np.random.default_rng([options.seed, 4]))
     return SceneModel(site.mesh.build(), movers, lighting, site.contacts, drive)
 
 
@@ -514,7 +502,7 @@ def _parking(options: SynthesizeOptions) -> SceneModel:
     return _driven_through(options, site, lighting, Route((0.0, -1.1)), Route((0.0, 1.6), np.pi))
 
 
-_BUILDERS = {"street": _street, "turn": _turn, "parking": _parking}
+_BUILDERS = {"street": _street, "traffic": _street, "turn": _turn, "parking": _parking}
 
 
 def build_scene(options: SynthesizeOptions) -> SceneModel:

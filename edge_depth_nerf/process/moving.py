@@ -1,0 +1,339 @@
+"""Masks of what moves, found by LiDAR: `moving_masks/CAMERA/0000000123.png` in the scene, 255 = use the pixel.
+
+They have the size of the raw pictures, so that the folder can be given as --frame-masks. A mask that is there already
+stays as it is: it may have been corrected. What is found for pictures of training knows nothing of sweeps of moments
+that are held out. A picture that is held out gets a mask from its own sweep: it decides which pixels are judged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from rich.console import Console
+from scipy.spatial import KDTree
+
+from edge_depth_nerf.base.console import run_jobs
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_image, read_mask, write_mask
+from edge_depth_nerf.cameras import Camera
+from edge_depth_nerf.lidar import project_points, transform_points
+from edge_depth_nerf.lidar.free_space import FreeSpace
+from edge_depth_nerf.lidar.moving import (
+    Ground,
+    Loose,
+    Lowest,
+    Thing,
+    expected_at,
+    followed,
+    loose_returns,
+    nearby,
+    things_of,
+)
+from edge_depth_nerf.lidar.world import WorldSweep
+from edge_depth_nerf.masks.lens import lens_circle
+from edge_depth_nerf.masks.moving import clearest_edge, grow_moving, larger_again, smaller, working_factor
+from edge_depth_nerf.process.downscale import downscale_mask
+from edge_depth_nerf.process.options import ProcessOptions
+from edge_depth_nerf.process.recording import RecordedPicture, Recording
+from edge_depth_nerf.process.sweep_store import Scanner, SweepStore
+
+MOVING_MASKS = "moving_masks"
+"""Folder of the scene with the masks of what moves."""
+
+_FOOT_M = (0.06, 0.3)
+"""Returns between these heights above the ground are left out where things are looked for, and are feet and wheels."""
+_FOOT_AWAY_M = 0.25
+"""Of those, the ones within this of a thing, across the ground, are its own."""
+_BODY_ENDS_M = 0.25
+"""What the scanner's lowest beams meet goes on down to this above the ground."""
+_EDGE_RAD = 0.015
+"""Returns within this of the highest or lowest direction are at the edge of the scanner's field."""
+_TALLEST_M = 3.5
+"""Above the scanner's field a thing is looked for up to this height above the ground: that of a bus."""
+_LONG_M = 2.5
+"""Only what is longer than this may be higher than the field: people are not."""
+_STEP_M = 0.1
+
+
+def moving_mask_path(scene: Path, picture: RecordedPicture) -> Path:
+    """Where a picture's mask lies."""
+    return scene / MOVING_MASKS / picture.camera / f"{picture.frame:010d}.png"
+
+
+def find_moving(
+    recording: Recording,
+    options: ProcessOptions,
+    held_out: set[int],
+    ego: Mapping[str, NDArray[np.bool_]],
+    console: Console,
+) -> tuple[Recording, list[str]]:
+    """Find what moves, write the masks that are not there yet, and give them to the recording's pictures.
+
+    Args:
+        recording: with a trajectory.
+        options: the converter's.
+        held_out: numbers of the moments that training must not see.
+        ego: the vehicle's masks, by camera, in the size of the raw pictures.
+        console: where progress is shown.
+
+    Returns:
+        The recording, and what the user should know.
+
+    Raises:
+        InputError: there are no sweeps.
+
+    """
+    assert recording.trajectory is not None
+    if not recording.sweeps:
+        raise InputError(
+            "--find-moving: the drive has no LiDAR sweeps, and what moves is found by what they saw through. Leave it "
+            "out, or give masks with --frame-masks."
+        )
+    paths = {id(picture): moving_mask_path(options.output, picture) for picture in recording.pictures}
+    missing = [picture for picture in recording.pictures if not paths[id(picture)].is_file()]
+    if missing:
+        store = SweepStore(
+            recording.sweeps,
+            recording.trajectory,
+            reach=options.sweeps,
+            deskew=options.deskew,
+            held_out=held_out,
+            strict=options.strict,
+            holdout_beams=options.holdout_beams,
+        )
+        found = [_ScannersThings(scanner, held_out, console) for scanner in store.scanners]
+        jobs = [
+            partial(_write_mask, paths[id(picture)], recording, picture, found, ego, options.theta_max_deg)
+            for picture in missing
+        ]
+        run_jobs(jobs, "Masking what moves", console)
+    pictures = tuple(replace(picture, moving_mask=paths[id(picture)]) for picture in recording.pictures)
+    shares = [1 - float(read_mask(path).mean()) for path in paths.values()]
+    notice = (
+        f"What moves was found in {sum(share > 0 for share in shares)} of {len(shares)} pictures and hides "
+        f"{np.mean(shares):.1%} of them. Look at {options.output / MOVING_MASKS}: what you correct there counts when "
+        "the drive is processed again."
+    )
+    return replace(recording, pictures=pictures), [notice]
+
+
+class _ScannersThings:
+    """What moves in the sweeps of one scanner."""
+
+    def __init__(self, scanner: Scanner, held_out: set[int], console: Console) -> None:
+        self.scanner, self._held_out = scanner, held_out
+        usable = [index for index in range(len(scanner.sweeps)) if scanner.bridged[index] and scanner.readable(index)]
+        self._trained = [index for index in usable if scanner.trains[index]]
+        looked = run_jobs([partial(self._look, index) for index in usable], "Reading sweeps", console)
+        free_spaces = {index: free_space for index, (free_space, _) in zip(usable, looked, strict=True)}
+        self.ground = Ground([low for index, (_, low) in zip(usable, looked, strict=True) if scanner.trains[index]])
+        centres_m = np.array([np.linalg.inv(free_spaces[i].world_to_scanner.numpy())[:3, 3] for i in usable])
+        trains = [scanner.trains[index] for index in usable]
+
+        def judge(place: int) -> Loose:
+            others = [usable[other] for other in nearby(place, centres_m, trains)]
+            moment_s, sweep = scanner.times_s[usable[place]], scanner.whole(usable[place])
+            seen_by = [(float(scanner.times_s[other]), free_spaces[other]) for other in others]
+            return loose_returns(sweep, float(moment_s), self.ground, seen_by)
+
+        jobs = [partial(judge, place) for place in range(len(usable))]
+        loose = dict(zip(usable, run_jobs(jobs, "Finding what moves", console), strict=True))
+        self._things = followed({index: loose[index] for index in self._trained})
+        for index in usable:
+            if not scanner.trains[index]:
+                self._things[index] = self._of_held_out(index, loose[index])
+
+    def _look(self, index: int) -> tuple[FreeSpace, Lowest]:
+        """A sweep's free space, and what it says of the ground."""
+        sweep = self.scanner.whole(index)
+        below = sweep.points_m[:, 2] < float(np.linalg.inv(sweep.world_to_scanner)[2, 3])
+        return FreeSpace.of(sweep), Lowest.of(sweep.points_m[below].numpy())
+
+    def _of_held_out(self, index: int, loose: Loose) -> list[Thing]:
+        """What moves in a sweep that is held out: found by itself, or expected there by the sweeps around it."""
+        around = [other for other in self._trained if other < index][-1:]
+        around += [other for other in self._trained if other > index][:1]
+        expected = [expected_at(thing, loose) for other in around for thing in self._things[other]]
+        expected = [thing for thing in expected if thing is not None]
+        return [*expected, *_not_alone(things_of(loose), expected)]
+
+    def seen_from(self, frame: int, time_s: float) -> tuple[WorldSweep, list[Thing], int] | None:
+        """The sweep of a picture's moment and what moves in it; None without one that the picture may know."""
+        index = self.scanner.own(frame, time_s)
+        if index is None or index not in self._things:
+            return None
+        if frame in self._held_out:
+            if self.scanner.sweeps[index].frame != frame:
+                return None
+        elif not self.scanner.trains[index]:
+            return None
+        return self.scanner.whole(index), self._things[index], index
+
+
+def _not_alone(things: Sequence[Thing], expected: Sequence[Thing]) -> list[Thing]:
+    """Those that share returns with what was expected: their speed is known."""
+    result = []
+    for thing in things:
+        for other in expected:
+            if len(np.intersect1d(thing.rows, other.rows)):
+                result.append(replace(thing, velocity_m_s=other.velocity_m_s))
+                break
+    return result
+
+
+# ---- in a picture ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Returns:
+    """Points that a scanner says something of at a picture's time."""
+
+    points_m: Float[np.ndarray, "n 3"]
+    spacing_m: Float[np.ndarray, "n"]
+
+    @staticmethod
+    def none() -> _Returns:
+        return _Returns(np.zeros((0, 3)), np.zeros(0, np.float32))
+
+    @staticmethod
+    def joined(parts: Sequence[_Returns]) -> _Returns:
+        return _Returns(
+            np.concatenate([part.points_m for part in parts]), np.concatenate([part.spacing_m for part in parts])
+        )
+
+    def chosen(self, which: NDArray[np.bool_] | NDArray[np.int64]) -> _Returns:
+        return _Returns(self.points_m[which], self.spacing_m[which])
+
+    def raised(self, by_m: float) -> _Returns:
+        """The same higher up, in steps that are no wider than the points are apart."""
+        return _Returns(self.points_m + np.array((0.0, 0.0, by_m)), np.maximum(self.spacing_m, np.float32(_STEP_M)))
+
+
+def _write_mask(
+    path: Path,
+    recording: Recording,
+    picture: RecordedPicture,
+    found: Sequence[_ScannersThings],
+    ego: Mapping[str, NDArray[np.bool_]],
+    theta_max_deg: float,
+) -> None:
+    """Find what moves in one picture, and write its mask."""
+    full = next(camera.camera for camera in recording.cameras if camera.name == picture.camera)
+    moving = np.zeros((full.height, full.width), bool)
+    for things in found:
+        seen = things.seen_from(picture.frame, picture.time_s)
+        if seen is not None and seen[1]:
+            factor = working_factor(moving.shape)
+            camera = full.downscaled(factor)
+            usable = lens_circle(camera, theta_max_deg)
+            if picture.camera in ego:
+                usable &= downscale_mask(ego[picture.camera], factor)
+            image = smaller(read_image(picture.path), factor)
+            grown = _moving_pixels(image, camera, usable, recording.pose(picture), picture.time_s, things, seen)
+            moving |= larger_again(grown, factor, (full.height, full.width))
+    write_mask(path, ~moving)
+
+
+def _moving_pixels(
+    image: NDArray[np.uint8],
+    camera: Camera,
+    usable: NDArray[np.bool_],
+    camera_to_world: NDArray[np.float64],
+    time_s: float,
+    scanner: _ScannersThings,
+    seen: tuple[WorldSweep, list[Thing], int],
+) -> NDArray[np.bool_]:
+    """What of a picture shows a thing that moves."""
+    sweep, things, index = seen
+    late_s = time_s - float(scanner.scanner.times_s[index])
+    world_to_camera = np.linalg.inv(camera_to_world)
+    moving, cut_off, taken = _at_moment(sweep, things, late_s, scanner.ground)
+    for highest in cut_off:
+        lines = [highest.chosen(up) for up in _heights(scanner.ground.above_m(highest.points_m))]
+        steps = [line.raised((number + 1) * _STEP_M) for number, line in enumerate(lines)]
+        roof = clearest_edge(image, [_pixels(_in_camera(world_to_camera, step), step, camera)[0] for step in steps])
+        moving = _Returns.joined([moving, *steps[: 0 if roof is None else roof + 1]])
+    rest = np.ones(len(sweep.points_m), bool)
+    rest[taken] = False
+    every = _Returns.joined([moving, _Returns(sweep.points_m.numpy()[rest], sweep.spacing_m.numpy()[rest])])
+    in_camera = _in_camera(world_to_camera, every)
+    chosen = project_points(in_camera.float(), camera, spacing_m=torch.from_numpy(every.spacing_m)).point_index.numpy()
+    shown = chosen[(chosen >= 0) & (chosen < len(moving.points_m))]
+    returns_px, reach_px = _pixels(in_camera[shown], every.chosen(shown), camera)
+    holds_still = ~usable | (chosen >= len(moving.points_m))
+    return grow_moving(image, returns_px, reach_px, holds_still) & usable
+
+
+def _heights(height_m: NDArray[np.float64]) -> Iterator[NDArray[np.bool_]]:
+    """Which points can be raised by one, two, three steps and so on, that lie so far above the ground."""
+    lowest_m = float(height_m.min(initial=_TALLEST_M))
+    for step_m in np.arange(_STEP_M, _TALLEST_M - lowest_m, _STEP_M):
+        yield height_m + step_m < _TALLEST_M
+
+
+def _at_moment(
+    sweep: WorldSweep, things: Sequence[Thing], late_s: float, ground: Ground
+) -> tuple[_Returns, list[_Returns], NDArray[np.int64]]:
+    """Where things are some time after a sweep's moment.
+
+    Returns:
+        Their points; of each long thing those at the upper edge of the scanner's field; rows of their returns.
+
+    """
+    moving, cut_off, rows = [_Returns.none()], [], [np.zeros(0, np.int64)]
+    for thing in things:
+        of_thing = np.concatenate((thing.rows, _feet(sweep, thing, ground)))
+        points = sweep.points_m.numpy()[of_thing]
+        points[:, :2] += (late_s - sweep.offset_s.numpy()[of_thing])[:, None] * thing.velocity_m_s
+        returns = _Returns(points, sweep.spacing_m.numpy()[of_thing])
+        elevation = _elevation(sweep, of_thing)
+        rows.append(of_thing)
+        moving.append(returns)
+        # below the scanner's field the thing goes on
+        lowest = returns.chosen(elevation < sweep.elevation_rad[0] + _EDGE_RAD)
+        height = ground.above_m(lowest.points_m)
+        for step_m in np.arange(_STEP_M, float(height.max(initial=0)) - _BODY_ENDS_M, _STEP_M):
+            moving.append(lowest.chosen(height - step_m > _BODY_ENDS_M).raised(-step_m))
+        if np.ptp(thing.points_m[:, :2], axis=0).max() > _LONG_M:
+            cut_off.append(returns.chosen(elevation > sweep.elevation_rad[1] - _EDGE_RAD))
+    return _Returns.joined(moving), cut_off, np.concatenate(rows)
+
+
+def _feet(sweep: WorldSweep, thing: Thing, ground: Ground) -> NDArray[np.int64]:
+    """Rows of the returns just above the ground that are a thing's."""
+    points = sweep.points_m.numpy()
+    low, high = thing.points_m.min(0) - _FOOT_AWAY_M, thing.points_m.max(0) + _FOOT_AWAY_M
+    near = np.flatnonzero(np.all((points[:, :2] > low[:2]) & (points[:, :2] < high[:2]), axis=1))
+    height = ground.above_m(points[near])
+    near = near[(height > _FOOT_M[0]) & (height <= _FOOT_M[1])]
+    away_m, _ = KDTree(thing.points_m[:, :2]).query(points[near, :2], distance_upper_bound=_FOOT_AWAY_M)
+    return near[np.isfinite(away_m)]
+
+
+def _elevation(sweep: WorldSweep, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Elevations of some of a sweep's returns, as its scanner sees them."""
+    in_scanner = transform_points(torch.from_numpy(sweep.world_to_scanner), sweep.points_m[rows])
+    return torch.atan2(in_scanner[:, 2], in_scanner[:, :2].norm(dim=-1)).numpy()
+
+
+def _in_camera(world_to_camera: NDArray[np.float64], returns: _Returns) -> torch.Tensor:
+    return transform_points(torch.from_numpy(world_to_camera), torch.from_numpy(returns.points_m))
+
+
+def _pixels(
+    points_in_camera: torch.Tensor, returns: _Returns, camera: Camera
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Where points are seen, and how many pixels their spacing is; those out of view are left out."""
+    across = torch.linalg.cross(points_in_camera, points_in_camera.roll(1, dims=-1))
+    across = across / across.norm(dim=-1, keepdim=True).clamp(min=1e-9)
+    pixels, valid = camera.project(points_in_camera)
+    beside, valid_beside = camera.project(points_in_camera + across * torch.from_numpy(returns.spacing_m)[:, None])
+    seen = valid & valid_beside & camera.inside(pixels)
+    return pixels[seen].numpy(), (beside - pixels)[seen].norm(dim=-1).numpy()
