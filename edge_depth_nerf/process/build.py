@@ -163,7 +163,7 @@ def _check_poses(recording: Recording, options: ProcessOptions) -> None:
 
 
 def _posed(recording: Recording, options: ProcessOptions, console: Console) -> tuple[Recording, list[str]]:
-    """Give a recording the poses that the options ask for, those of `--poses lidar` aside, and say how good they are."""
+    """Find or refine the poses as the options ask, but for those of `--poses lidar`, and say how good they are."""
     notices = []
     if options.poses == "colmap":
         from edge_depth_nerf.process.colmap.poses import colmap_poses
