@@ -17,6 +17,8 @@ GRID_SHAPE = (4, 8, 8)
 """Cells of a bilateral grid: brightness, rows, columns."""
 _LUMA = (0.299, 0.587, 0.114)
 _CHANNELS = 12
+_SLOWLY = 0.1
+"""Maps learn at so much of the fields' rate: as fast as these, they follow each batch's noise."""
 
 ExposureKind = Literal["gain", "affine", "grid"]
 
@@ -45,13 +47,18 @@ class AffineMaps(nn.Module):
 
     def __init__(self, pictures: int) -> None:
         super().__init__()
-        self.offsets = nn.Parameter(torch.zeros(pictures, 3, 4))
+        self.slow_offsets = nn.Parameter(torch.zeros(pictures, 3, 4))
+
+    @property
+    def offsets(self) -> Float[Tensor, "pictures 3 4"]:
+        """The maps, less the identity, less their mean."""
+        return _SLOWLY * (self.slow_offsets - self.slow_offsets.mean(dim=0))
 
     def forward(
         self, colours: Float[Tensor, "rays 3"], picture: Int[Tensor, "rays"], place: Float[Tensor, "rays 2"] | None
     ) -> Float[Tensor, "rays 3"]:
         """Colours as the pictures have them."""
-        maps = (self.offsets - self.offsets.mean(dim=0))[picture]
+        maps = self.offsets[picture]
         return colours + (maps[..., :3] * colours[:, None]).sum(dim=-1) + maps[..., 3]
 
     def unevenness(self) -> Float[Tensor, ""]:
@@ -67,7 +74,12 @@ class BilateralGrids(nn.Module):
 
     def __init__(self, pictures: int) -> None:
         super().__init__()
-        self.offsets = nn.Parameter(torch.zeros(pictures, _CHANNELS, *GRID_SHAPE))
+        self.slow_offsets = nn.Parameter(torch.zeros(pictures, _CHANNELS, *GRID_SHAPE))
+
+    @property
+    def offsets(self) -> Float[Tensor, "pictures channels depth rows columns"]:
+        """The maps at the corners of the grids, less the identity, less their mean."""
+        return _SLOWLY * (self.slow_offsets - self.slow_offsets.mean(dim=0))
 
     def forward(
         self, colours: Float[Tensor, "rays 3"], picture: Int[Tensor, "rays"], place: Float[Tensor, "rays 2"] | None
@@ -75,11 +87,11 @@ class BilateralGrids(nn.Module):
         """Colours as the pictures have them; `place`: column and row of each pixel, 0 to 1 over its picture."""
         assert place is not None
         depth = GRID_SHAPE[0]
-        offsets = self.offsets - self.offsets.mean(dim=0)
+        offsets = self.offsets
         # all pictures' grids one behind the other: one call for rays of many pictures, no cell between two of them
         volume = offsets.movedim(1, 0).flatten(1, 2)[None]
         brightness = (colours * colours.new_tensor(_LUMA)).sum(dim=-1).clamp(0, 1)
-        layers = len(self.offsets) * depth
+        layers = len(offsets) * depth
         behind = (picture * depth + brightness * (depth - 1)) / max(1, layers - 1)
         at = 2 * torch.cat([place, behind[:, None]], dim=-1) - 1
         maps = F.grid_sample(volume, at.view(1, 1, 1, -1, 3), align_corners=True)[0, :, 0, 0].t().view(-1, 3, 4)
