@@ -51,6 +51,7 @@ from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.masks.ego import NoEgo
 from edge_depth_nerf.masks.ego_files import vehicles_unknown
 from edge_depth_nerf.mono.calibration import calibrate_scene
+from edge_depth_nerf.process import build
 from edge_depth_nerf.process.colmap import poses as colmap_poses
 from edge_depth_nerf.process.converters import convert
 from edge_depth_nerf.process.kitti360.calibration import (

@@ -156,10 +156,6 @@ def _check_poses(recording: Recording, options: ProcessOptions) -> None:
         from edge_depth_nerf.process.lidar_poses import check_sweeps
 
         check_sweeps(recording)
-    if options.refine_poses:
-        from edge_depth_nerf.process.colmap.refine import check_refining
-
-        check_refining(recording, options)
 
 
 def _posed(recording: Recording, options: ProcessOptions, console: Console) -> tuple[Recording, list[str]]:
@@ -175,9 +171,14 @@ def _posed(recording: Recording, options: ProcessOptions, console: Console) -> t
     if recording.trajectory is None:
         raise InputError("the recording has no poses. Give them, or find them: --poses lidar, --poses colmap.")
     if options.refine_poses:
-        from edge_depth_nerf.process.colmap.refine import refine_poses
+        from edge_depth_nerf.process.colmap.refine import check_refining, refine_poses
 
-        recording = refine_poses(recording, options, console)
+        try:
+            check_refining(recording, options)
+        except InputError as error:
+            notices.append(f"The poses stay as they are given. {error}")
+        else:
+            recording = refine_poses(recording, options, console)
     return recording, notices
 
 

@@ -46,9 +46,9 @@ class ProcessOptions:
     """recorded: the poses that come with the drive; colmap: found from the pictures, their scale from LiDAR (needs
     `pip install edge-depth-nerf[colmap]`); lidar: found from the sweeps (needs `pip install
     edge-depth-nerf[odometry]`)."""
-    refine_poses: bool = False
+    refine_poses: bool = True
     """Refine the poses by the pictures: by features that they share, with the poses held softly, unless that makes
-    them no better (needs `pip install edge-depth-nerf[colmap]`)."""
+    them no better. Needs `pip install edge-depth-nerf[colmap]`; without it the poses stay, and you are told."""
     sweeps: int = 3
     """Accumulate this many LiDAR sweeps before and after each picture's own. Training never sees a sweep of a moment
     that is held out; a picture that is held out gets its own alone."""

@@ -43,7 +43,6 @@ from edge_depth_nerf.process.colmap.models import (
     THETA_MAX_DEG,
     ColmapLens,
     colmap_lens,
-    file_stamp,
     import_pycolmap,
     shared_views,
 )
@@ -202,15 +201,28 @@ def _digest(
 ) -> str:
     """Of everything that the refined poses depend on, pictures and masks by size and time of change."""
     cameras = [
-        [c.name, c.camera.to_dict(), c.to_vehicle.tolist(), file_stamp(options.ego_mask_of(c.name) or c.ego_mask)]
+        [c.name, c.camera.to_dict(), c.to_vehicle.tolist(), _content(options.ego_mask_of(c.name) or c.ego_mask)]
         for c in recording.cameras
     ]
     pictures = [
-        [p.camera, p.frame, recording.pose(p).tolist(), file_stamp(p.path), file_stamp(p.mask), file_stamp(p.semantics)]
+        [p.camera, p.frame, recording.pose(p).tolist(), *map(_stamp, (p.path, p.mask, p.semantics))]
         for p in recording.pictures
     ]
     rest = [_VERSION, version, given.tolist(), options.theta_max_deg, options.moving_classes]
     return hashlib.sha256(json.dumps([cameras, pictures, rest]).encode()).hexdigest()
+
+
+def _content(path: Path | None) -> str | None:
+    """What a small file holds, wherever it lies."""
+    return None if path is None else hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _stamp(path: Path | None) -> list | None:
+    """What tells a file from another version of it, wherever the drive lies."""
+    if path is None:
+        return None
+    found = path.stat()
+    return [path.parent.name, path.name, found.st_size, found.st_mtime_ns]
 
 
 def _read_refinement(path: Path, digest: str) -> Refinement | None:
