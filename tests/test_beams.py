@@ -33,6 +33,7 @@ def test_one_band_of_elevation_of_ten_is_taken_from_a_sweep():
     kept, held_out = without_beams(Sweep(points, order, 3, 4, offset_s=order), 10)
     assert len(kept.points_m) + len(held_out.points_m) == 20_000
     assert set(kept.reflectance.tolist()) | set(held_out.reflectance.tolist()) == set(range(20_000))
+    assert kept.offset_s is not None and held_out.offset_s is not None
     assert torch.equal(kept.offset_s, kept.reflectance) and torch.equal(held_out.offset_s, held_out.reflectance)
     assert 0.08 < len(held_out.points_m) / 20_000 < 0.12
     # the same bands whatever the sweep: ten apart, and nothing of what is kept in them

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 
 from edge_depth_nerf.plugin.exposure import GRID_SHAPE, KINDS
 
 
-def maps(kind: str, pictures: int = 5):
+def maps(kind: str, pictures: int = 5) -> Any:
     found = KINDS[kind](pictures)
     with torch.no_grad():
         for parameter in found.parameters():
@@ -50,7 +52,7 @@ def test_a_new_map_changes_nothing_and_one_picture_keeps_it_so(kind, rays):
 
 
 def test_a_grid_is_of_its_picture_place_and_brightness_alone():
-    found = KINDS["grid"](3)
+    found: Any = KINDS["grid"](3)
     with torch.no_grad():
         # the red offset of the second picture, at its lower right and where it is bright
         found.slow_offsets[1, 3, -1, -1, -1] = 3.0
@@ -73,7 +75,8 @@ def test_what_is_uneven_costs():
     for kind in ("affine", "grid"):
         assert float(KINDS[kind](3).unevenness()) == 0
         assert float(maps(kind).unevenness().detach()) > 1e-3
-    smooth, rough = KINDS["grid"](2), KINDS["grid"](2)
+    smooth: Any = KINDS["grid"](2)
+    rough: Any = KINDS["grid"](2)
     with torch.no_grad():
         smooth.slow_offsets[0] += 1.0
         rough.slow_offsets[0, ..., ::2] += 1.0

@@ -1,5 +1,6 @@
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -195,17 +196,18 @@ def test_what_nothing_stops_has_the_colour_of_the_direction():
 
 def test_views_have_the_geometric_mean_of_the_pictures_gains():
     model = build()
+    gains: Any = model.exposure
     with torch.no_grad():
-        model.exposure.log_gains.copy_(torch.tensor([[0.1, 0.2, 0.3], [0.3, 0.2, 0.1], [0.5, 0.2, 0.2]]))
+        gains.log_gains.copy_(torch.tensor([[0.1, 0.2, 0.3], [0.3, 0.2, 0.1], [0.5, 0.2, 0.2]]))
     bundle = replace(rays(), camera_indices=(torch.arange(16) % 3)[:, None])
     colours = torch.rand(16, 3)
     expected = colours * torch.tensor([[-0.2, 0, 0.1], [0, 0, -0.1], [0.2, 0, 0]]).exp()[torch.arange(16) % 3]
     assert torch.allclose(model.train()._exposed(colours, bundle), expected)
     assert torch.equal(model.eval()._exposed(colours, bundle), colours)
     # they are learned, and kept with the rest
-    assert any(parameter is model.exposure.log_gains for parameter in model.get_param_groups()["fields"])
+    assert any(parameter is gains.log_gains for parameter in model.get_param_groups()["fields"])
     torch.stack(list(trained_step(model)[1].values())).sum().backward()
-    assert model.exposure.log_gains.grad is not None and bool(model.exposure.log_gains.grad.abs().sum() > 0)
+    assert gains.log_gains.grad is not None and bool(gains.log_gains.grad.abs().sum() > 0)
     assert "exposure.log_gains" in model.state_dict() and model.field.embedding_appearance is None
     embedded = build(exposure="embedding")
     assert embedded.exposure is None and embedded.field.embedding_appearance is not None

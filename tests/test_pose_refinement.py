@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from types import SimpleNamespace
+from typing import Literal
 
 import pytest
 import torch
@@ -142,7 +143,8 @@ def test_judged_pictures_are_fitted_on_the_left_and_judged_on_the_right(monkeypa
 
     mask = torch.ones(12, 20, 1, dtype=torch.bool)
     batch = {"image": torch.rand(12, 20, 3), "mask": mask}
-    for poses, expected in (("given", "given camera"), ("refined", "fitted")):
+    cases: list[tuple[Literal["given", "refined"], str]] = [("given", "given camera"), ("refined", "fitted")]
+    for poses, expected in cases:
         pipeline = SimpleNamespace(
             config=EdgeDepthPipelineConfig(eval_poses=poses), model=SimpleNamespace(config=EdgeDepthNerfModelConfig())
         )

@@ -178,6 +178,7 @@ class EdgeDepthNerfModel(NerfactoModel):
     """nerfacto supervised by a distance prior."""
 
     config: EdgeDepthNerfModelConfig
+    density_fns: list[Any]
 
     def populate_modules(self) -> None:
         """Build nerfacto with near and far planes in metres."""

@@ -100,7 +100,8 @@ def lidar_says(recording: Recording, scene: Path, console: Console) -> list[str]
         if found is None:
             return []
         write_agreement(scene, found, recording.trajectory)
-    said = [f"LiDAR odometry's path of the same drive lies {found.text()}; it is {found.scale - 1:+.2%} longer."]
+    longer = "longer" if found.scale > 1 else "shorter"
+    said = [f"LiDAR odometry's path of the same drive lies {found.text()}; it is {abs(found.scale - 1):.2%} {longer}."]
     if found.max_m > _WARN_APART_M + _WARN_APART * found.length_m:
         said.append(
             "That is much: one of the two is wrong. Make the scene with --poses lidar as well, and see which path the "
