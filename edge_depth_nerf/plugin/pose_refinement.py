@@ -63,7 +63,6 @@ class PoseRefiner(CameraOptimizer):
             rows = self.pose_adjustment.new_zeros(int(moment.max()) + 1, 6)
             self.pose_adjustment = torch.nn.Parameter(rows)
 
-    @property
     def sigmas(self) -> Float[Tensor, "6"]:
         """What one means of an adjustment: scene units of translation, radians of rotation."""
         return _sigmas(self.config, self.metres_per_unit, self.pose_adjustment)
@@ -71,7 +70,7 @@ class PoseRefiner(CameraOptimizer):
     def forward(self, indices: Int[Tensor, "rays"]) -> Float[Tensor, "rays 3 4"]:
         """What is to be done to the rays of pictures, in the world: a turn about the camera, and a shift."""
         centred = self.pose_adjustment - self.pose_adjustment.mean(dim=0)
-        return exp_map_SO3xR3(centred * self.sigmas)[self.moment[indices]]
+        return exp_map_SO3xR3(centred * self.sigmas())[self.moment[indices]]
 
     def apply_to_raybundle(self, raybundle: RayBundle) -> None:
         """Move rays, in place."""
