@@ -209,11 +209,13 @@ def _among_neighbours(
     poses = path.vehicle_to_world.copy()
     clouds: dict[int, np.ndarray] = {}
     for index in range(len(sweeps)):
-        around = range(max(index - _NEIGHBOURS, 0), min(index + _NEIGHBOURS + 1, len(sweeps)))
+        # as many at the ends of the drive, where they lie on one side
+        first = max(0, min(index - _NEIGHBOURS, len(sweeps) - 2 * _NEIGHBOURS - 1))
+        around = range(first, min(first + 2 * _NEIGHBOURS + 1, len(sweeps)))
         for other in around:
             if other not in clouds:
                 clouds[other] = kiss.thin(_in_vehicle(sweeps[other], path), _FINE_M)
-        clouds.pop(index - _NEIGHBOURS - 1, None)
+        clouds.pop(first - 1, None)
         known = new_map()
         # a full cube of the map takes no more points: the nearest in time come first
         for other in sorted(around, key=lambda other: abs(other - index)):
