@@ -10,7 +10,9 @@ import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
+from comparisons import fake
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json, write_json
@@ -215,3 +217,38 @@ def test_equal_seconds_by_hand(benchmark_module):
         point["cpu_seconds"] /= 4
     with pytest.raises(InputError, match=r"for 20 s, ours for 40 s.*220 --steps"):
         equal_seconds.at_equal_seconds(ours, short)
+
+
+def test_the_real_drives_table_and_margins(benchmark_module, tmp_path):
+    real = benchmark_module("real_drive")
+    psnr = {"nerfacto": (19.0, 19.2), "ds-nerf": (20.0, 20.4), "edge": (20.5, 20.3)}
+    runs = [
+        fake("drive", method, seed, masked_psnr=value, lidar_abs_rel=1 / value, cpu_seconds=100.0)
+        for method, values in psnr.items()
+        for seed, value in enumerate(values)
+    ]
+    results = Results(runs)
+    header, _, *rows = real.rows(results, "drive")
+    assert header.startswith("| method | PSNR |") and len(rows) == len(real.TABLE)
+    assert "20.40 ± 0.14" in next(row for row in rows if row.startswith("| ours"))
+    assert "–" in next(row for row in rows if row.startswith("| UrbanNeRF"))
+    found = list(real.margins(results, "drive"))
+    # by seed: 20.5 against 20.0, 20.3 against 20.4; AbsRel likewise, less is better
+    assert found[0] == "* PSNR: +0.20 on average, ahead with 1 of 2 seeds."
+    assert found[1].startswith("* AbsRel: +0.000") and "ahead with 1 of 2" in found[1]
+    real.draw_lambdas({0.01: results, 0.1: results}, tmp_path / "lambda.png")
+    assert (tmp_path / "lambda.png").stat().st_size > 5000
+
+
+def test_disturbed_poses_are_off_by_as_much_as_is_said(benchmark_module, tmp_path):
+    poses = benchmark_module("poses")
+    path = tmp_path / "drive" / "data_poses" / poses.SEQUENCE / "poses.txt"
+    path.parent.mkdir(parents=True)
+    rows = [f"{frame} 1 0 0 {frame} 0 1 0 0 0 0 1 0" for frame in range(3000)]
+    path.write_text("\n".join(rows) + "\n")
+    other = poses.disturbed_drive(tmp_path / "drive", tmp_path / "other", shift_m=0.03, turn_deg=0.1)
+    found = np.loadtxt(other / path.relative_to(tmp_path / "drive"))[:, 1:].reshape(-1, 3, 4)
+    shift_m = found[:, :, 3] - [[frame, 0, 0] for frame in range(3000)]
+    assert np.sqrt((shift_m**2).sum(-1).mean()) == pytest.approx(0.03, rel=0.05)
+    cosine = np.clip((np.trace(found[:, :, :3], axis1=1, axis2=2) - 1) / 2, -1, 1)
+    assert np.degrees(np.sqrt((np.arccos(cosine) ** 2).mean())) == pytest.approx(0.1, rel=0.05)

@@ -173,7 +173,8 @@ def _poses(scene: SceneFolder, agreements: Sequence[Agreement]) -> Iterator[Find
     remedy = (
         "find them anew with --poses lidar or --poses colmap, and check the lens and the times of the pictures"
         if refined
-        else "process the drive with --refine-poses (needs pycolmap), or find them anew with --poses lidar or --poses colmap"
+        else "process the drive with --refine-poses (needs pycolmap), or find them anew with --poses lidar or "
+        "--poses colmap"
     )
     for name in scene.cameras():
         figures, bad = pose_figures(agreements, name), bad_steps(agreements, name)
