@@ -62,6 +62,17 @@ def test_the_drive_as_a_whole_stays():
     torch.testing.assert_close(rays.directions, bundle([0, 2]).directions)
 
 
+def test_without_refinement_nothing_moves_and_nothing_is_learned():
+    found = PoseRefiner(PoseRefinerConfig(), 3, "cpu")
+    found.settle([1, 1, 2], METRES_PER_UNIT)
+    assert list(found.parameters()) == []
+    # as nerfstudio's viewer asks for the poses to show
+    torch.testing.assert_close(found(torch.arange(3)), torch.eye(4)[None, :3].tile(3, 1, 1))
+    rays = bundle([0, 2])
+    found.apply_to_raybundle(rays)
+    assert torch.equal(rays.origins, torch.zeros(2, 3))
+
+
 def test_adjustments_cost_their_square_in_standard_deviations():
     found = refiner()
     with torch.no_grad():
