@@ -144,7 +144,7 @@ def judge(made: SynthesizeOptions, reach: int, every: int, *, free_space: bool =
         for kind in KINDS
     }
     for kind, store in stores.items():
-        for scanner in store._scanners if kind != "kept" or not free_space else ():
+        for scanner in store.scanners if kind != "kept" or not free_space else ():
             scanner.moved = partial(nothing_moved, scanner)
     masks = {recorded.name: read_mask(made.output / f"truth/masks/{recorded.name}.png") for recorded in found.cameras}
     counts = {name: Counts() for name in masks}
@@ -197,7 +197,7 @@ def picture(made: SynthesizeOptions, path: Path, reach: int = 5, camera: str = "
     panels = []
     for kind in KINDS:
         store = SweepStore(found.sweeps, found.trajectory, reach=reach, deskew=kind != "recorded", held_out=())
-        for scanner in store._scanners if kind != "kept" else ():
+        for scanner in store.scanners if kind != "kept" else ():
             scanner.moved = partial(nothing_moved, scanner)
         distance_m = mask * project(taken, found, store, everything=kind != "kept")
         fine = right(distance_m, truth)

@@ -79,7 +79,10 @@ def values(runs: Sequence[RunResult], metric: str) -> list[float]:
 
 def rows(results: Results, scene: str) -> Iterator[str]:
     """The table of one size, as Markdown."""
-    runs = {method: [run for run in results.runs if (run.scene, run.method) == (scene, method)] for method in TABLE}
+    runs: dict[MethodName, list[RunResult]] = {method: [] for method in TABLE}
+    for run in results.runs:
+        if run.scene == scene and run.method in runs:
+            runs[run.method].append(run)
     yield "| " + " | ".join(["method", *(column.title for column in COLUMNS), "processor seconds"]) + " |"
     yield "|---" * (len(COLUMNS) + 2) + "|"
     for method, found in runs.items():
