@@ -28,8 +28,8 @@ from edge_depth_nerf.base.errors import LONGEST_MESSAGE, InputError
 from edge_depth_nerf.cameras import Pinhole
 
 INPUTS = int(os.environ.get("BAD_INPUTS", "40"))
-MOST_SECONDS = 2.0
-"""Of the processor, for one input; a busy core takes twice as long as a still one."""
+MOST_SECONDS = 1.0
+"""Of the processor, for one input."""
 MOST_BYTES = 1 << 30
 OUR_ERRORS = (InputError, FileNotFoundError)
 

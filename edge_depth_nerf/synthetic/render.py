@@ -18,6 +18,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
+from edge_depth_nerf.base.interrupts import ctrl_c_put_off
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.synthetic.geometry import Geometry, flat_normals
 from edge_depth_nerf.synthetic.materials import (
@@ -61,7 +62,9 @@ class Caster:
         self.reach_m = _reach_m(geometry)
         faces = np.arange(3 * len(geometry.corners), dtype=np.int32).reshape(-1, 3)
         self._scene = EmbreeScene()
-        TriangleMesh(scene=self._scene, vertices=geometry.corners.reshape(-1, 3).astype(np.float32), indices=faces)
+        # embree's wrapper swallows what is raised while it builds, Ctrl-C included
+        with ctrl_c_put_off():
+            TriangleMesh(scene=self._scene, vertices=geometry.corners.reshape(-1, 3).astype(np.float32), indices=faces)
 
     def first_hits(self, origins: Array, directions: Array) -> tuple[Array, NDArray[np.int32], Array]:
         """Distance (inf = none), triangle (-1 = none) and barycentric u, v of the first hit of N rays."""
