@@ -161,6 +161,8 @@ def main() -> None:
     parser.add_argument(
         "--lambdas", nargs="*", type=float, default=list(LAMBDAS), help="of the curves; none: no curves"
     )
+    parser.add_argument("--curve-steps", type=int, help="of the curves' trainings; the table's, if not set")
+    parser.add_argument("--jobs", type=int, default=1, help="trainings at a time")
     options = parser.parse_args()
     drive = options.real / "kitti360_drive"
     if not drive.is_dir():
@@ -168,6 +170,8 @@ def main() -> None:
             f"{drive}: no such folder; the real drive is not part of the project. docs/results.md says what it is."
         )
     steps = ("--steps", options.steps) if options.steps else ()
+    curve_steps = ("--steps", options.curve_steps) if options.curve_steps else steps
+    jobs = ("--jobs", options.jobs)
     compared = options.output / "compared"
     scenes = {size: options.output / f"kitti360_{size}" for size in options.sizes}
     for size, scene in scenes.items():
@@ -175,7 +179,7 @@ def main() -> None:
     tuned = ROOT / "benchmarks" / "tuned.json"
     for seed in options.seeds:
         # a seed is whole before the next begins: a stopped benchmark has a table of those it has
-        common = ("--methods", *TABLE, "--tuned", tuned, "--output", compared, *steps)
+        common = ("--methods", *TABLE, "--tuned", tuned, "--output", compared, *jobs, *steps)
         command("compare", *scenes.values(), "--seeds", seed, *common)
     results = read_results(compared / RUNS)
     parts = ["# A real drive, by all methods\n"]
@@ -197,7 +201,7 @@ def main() -> None:
         folder = options.output / f"lambda_{weight:g}"
         given = write_tuned(options.output / f"lambda_{weight:g}.json", weight)
         scene = scenes.get("half", next(iter(scenes.values())))
-        command("compare", scene, "--methods", *WITH_LAMBDA, "--tuned", given, "--output", folder, *steps)
+        command("compare", scene, "--methods", *WITH_LAMBDA, "--tuned", given, "--output", folder, *jobs, *curve_steps)
         curves[weight] = read_results(folder / RUNS)
         draw_lambdas(curves, options.output / "lambda.png")
 

@@ -20,6 +20,8 @@ MAX_CONFIG_BYTES = 1 << 15
 """No config.yml is larger: nerfstudio's have some 10 kB. The parser takes up to a third of a second for that much."""
 MAX_DEPTH = 40
 """No config.yml is nested deeper: nerfstudio's are some 10 deep. The parser's time grows with the depth's square."""
+MAX_NODES = 5000
+"""No config.yml has more names, values and lists: nerfstudio's have some 500. Short ones fill a file with many."""
 _PYTHON = "tag:yaml.org,2002:python/"
 _HINT = "--load-config takes the config.yml that ns-train wrote"
 
@@ -75,14 +77,16 @@ def read_dataparser(path: Path) -> Any:
 
 
 def _compose(text: str) -> Any:
-    """A YAML document as nodes; none that is nested more than `MAX_DEPTH` deep is read to its end."""
+    """A YAML document as nodes; with more than `MAX_NODES`, or `MAX_DEPTH` deep, it is not read to its end."""
     import yaml
 
     class Shallow(yaml.SafeLoader):
-        depth = 0
+        depth = nodes = 0
 
         def compose_node(self, parent: Any, index: Any) -> Any:
-            self.depth += 1
+            self.depth, self.nodes = self.depth + 1, self.nodes + 1
+            if self.nodes > MAX_NODES:
+                raise yaml.YAMLError(f"it has more than {MAX_NODES} names and values")
             if self.depth > MAX_DEPTH:
                 raise yaml.YAMLError(f"nested more than {MAX_DEPTH} deep")
             node = super().compose_node(parent, index)
