@@ -12,6 +12,7 @@ from nerfstudio.field_components.spatial_distortions import SceneContraction
 from nerfstudio.model_components.losses import lossfun_distortion, lossfun_outer
 from nerfstudio.model_components.ray_samplers import PDFSampler, UniformLinDispPiecewiseSampler
 
+from edge_depth_nerf.kernels import hash_grid_numba
 from edge_depth_nerf.kernels import network as network_module
 from edge_depth_nerf.kernels.contraction import contract
 from edge_depth_nerf.kernels.fields import FusedMLP, FusedNerfactoField, use_fused_fields
@@ -222,6 +223,39 @@ def test_training_goes_as_with_torch(options):
         assert set(found) == set(expected)
         for name, value in expected.items():
             assert found[name] == pytest.approx(value, rel=2e-3, abs=1e-7), name
+
+
+TABLE = "field.mlp_base.model.0.hash_table"
+
+
+def surface(count: int = 30) -> dict[str, torch.Tensor]:
+    torch.manual_seed(0)
+    return {
+        "surface_rays": bundle(count),
+        "surface_distance_m": torch.rand(count, 1) * 20 + 1,
+        "surface_sigma_m": torch.full((count, 1), 0.01),
+        "surface_sky": (torch.arange(count) % 5 == 0)[:, None],
+    }
+
+
+def test_samples_sky_and_surfaces_are_looked_up_together(monkeypatch):
+    """One gradient of the field's table a step, not three that are added; the numbers are those of torch's calls."""
+    models = [build(implementation=kind).train() for kind in ("torch", "fused")]
+    models[1].load_state_dict(models[0].state_dict())
+    table = models[1].get_parameter(TABLE)
+    made = []
+    whole = hash_grid_numba.table_gradient
+    monkeypatch.setattr(hash_grid_numba, "table_gradient", lambda *a: (made.append(a[-1]), whole(*a))[1])
+    found = []
+    for model in models:
+        torch.manual_seed(1)
+        outputs = model(bundle(), surface())
+        (outputs["rgb"].sum() + outputs["surface_rgb"].square().sum()).backward()
+        found.append((outputs["rgb"], outputs["surface_rgb"], model.get_parameter(TABLE).grad))
+    assert made.count(len(table)) == 1
+    assert found[0][1].shape == (30, 3)
+    for expected, other in zip(*found, strict=True):
+        torch.testing.assert_close(other, expected, rtol=1e-3, atol=1e-6)
 
 
 @pytest.mark.parametrize("average", [True, False])

@@ -226,8 +226,8 @@ def test_the_surface_loss_is_the_field_colour_error_at_the_prior():
     model = build(surface_loss_mult=0.5).train()
     given = surface()
     torch.manual_seed(3)
-    outputs = model(rays())
     supervision = batch() | given
+    outputs = model(rays(), supervision)
     losses = model.get_loss_dict(outputs, supervision, model.get_metrics_dict(outputs, supervision))
     where = torch.where(given["surface_sky"], 1e4, given["surface_distance_m"] / METRES_PER_UNIT)[:, 0]
     colours = colours_at(model, given["surface_rays"], where)
@@ -263,8 +263,8 @@ def test_a_surface_that_is_not_between_the_planes_says_nothing(distance_m):
     given = surface()
     given["surface_distance_m"][0] = distance_m
     torch.manual_seed(3)
-    outputs = model(rays())
     supervision = batch() | given
+    outputs = model(rays(), supervision)
     image = given["surface_image"].clone()
     losses = []
     for red in (0.0, 1.0):

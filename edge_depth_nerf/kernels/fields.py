@@ -67,14 +67,14 @@ class FusedMLP(MLP):
 def _unit_cube(field: Any, positions: Float[Tensor, "*bs 3"]) -> tuple[Tensor, Tensor]:
     """Positions in scene units to 0..1, flat, and 1 for those strictly inside (else 0), of shape [*bs, 1]."""
     flat = positions.reshape(-1, 3)
-    if flat.device.type == "cpu" and flat.dtype == torch.float32:
+    if flat.device.type == "cpu" and flat.dtype == torch.float32 and not flat.requires_grad:
         # imported here, because Numba takes half a second to load
         from edge_depth_nerf.kernels.contraction import contract
 
         places, inside = contract(flat)
     else:
         places = (field.spatial_distortion(flat) + 2) / 4
-        inside = ((places > 0) & (places < 1)).all(dim=-1)
+        inside = ((places > 0) & (places < 1)).all(dim=-1).to(flat)
         places = places * inside[..., None]
     return places, inside.view(*positions.shape[:-1], 1)
 
@@ -105,8 +105,41 @@ class FusedNerfactoField(NerfactoField):
         positions = ray_samples.frustums.get_positions()
         places, inside = _unit_cube(self, positions)
         features = self.mlp_base(places).view(*positions.shape[:-1], -1)
+        return self._density(features, inside)
+
+    def _density(self, features: Tensor, inside: Tensor) -> tuple[Tensor, Tensor]:
+        """Density and what colours are made of, from the first network's outputs."""
         before, embedding = torch.split(features, [1, self.geo_feat_dim], dim=-1)
-        return self.average_init_density * trunc_exp(before.to(positions)) * inside, embedding
+        return self.average_init_density * trunc_exp(before.to(inside)) * inside, embedding
+
+    def forward_also_at(
+        self, ray_samples: RaySamples, points: RaySamples
+    ) -> tuple[dict[FieldHeadNames, Tensor], Tensor]:
+        """Evaluate samples along rays and, in the same pass through the hash grid, further points.
+
+        A pass of their own would fill a gradient of the size of the table for them, and add it to the other one.
+
+        Args:
+            ray_samples: [rays, samples].
+            points: [points, 1].
+
+        Returns:
+            What `forward` gives for the samples, without normals, and the colours of the points, [points, 3].
+
+        """
+        if not isinstance(self.spatial_distortion, CubeContraction) or self.use_pred_normals:
+            return self.forward(ray_samples), self.forward(points)[FieldHeadNames.RGB][:, 0]
+        parts = [each.frustums.get_positions() for each in (ray_samples, points)]
+        counts = [each[..., 0].numel() for each in parts]
+        places, inside = _unit_cube(self, torch.cat([each.reshape(-1, 3) for each in parts]))
+        results = []
+        for samples, *values in zip(
+            (ray_samples, points), self.mlp_base(places).split(counts), inside.split(counts), strict=True
+        ):
+            features, valid = (value.view(*samples.frustums.shape, -1) for value in values)
+            density, embedding = self._density(features, valid)
+            results.append({FieldHeadNames.DENSITY: density, **self.get_outputs(samples, embedding)})
+        return results[0], results[1][FieldHeadNames.RGB][:, 0]
 
     def get_outputs(
         self, ray_samples: RaySamples, density_embedding: Tensor | None = None

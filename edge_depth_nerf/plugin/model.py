@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, TypeGuard
 
 import numpy as np
 import torch
@@ -21,7 +21,11 @@ from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.field_components.field_heads import FieldHeadNames
-from nerfstudio.model_components.losses import ds_nerf_depth_loss, urban_radiance_field_depth_loss
+from nerfstudio.model_components.losses import (
+    ds_nerf_depth_loss,
+    scale_gradients_by_distance_squared,
+    urban_radiance_field_depth_loss,
+)
 from nerfstudio.model_components.renderers import DepthRenderer
 from nerfstudio.model_components.scene_colliders import NearFarCollider
 from nerfstudio.models.nerfacto import NerfactoModel, NerfactoModelConfig
@@ -283,28 +287,101 @@ class EdgeDepthNerfModel(NerfactoModel):
         assert rays.camera_indices is not None
         return self.exposure(colours, rays.camera_indices[:, 0], rays.metadata.get(PLACE))
 
-    def _field_at(self, rays: RayBundle, distance: Float[Tensor, "rays"]) -> Float[Tensor, "rays 3"]:
-        """Colours of the field at one distance along each ray, scene units."""
-        at = distance[:, None, None]
-        samples = rays.get_ray_samples(bin_starts=0.99 * at, bin_ends=1.01 * at)
-        return self.field.forward(samples)[FieldHeadNames.RGB][:, 0]
+    def forward(self, ray_bundle: RayBundle, batch: dict[str, Any] | None = None) -> dict[str, Any]:
+        """Outputs of a batch of rays.
 
-    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
+        Args:
+            ray_bundle: the rays.
+            batch: in training what the datamanager serves beside them; of its further pixels, where it has any, the
+                outputs hold the colours that the field has at their surfaces, `surface_rgb`.
+
+        """
+        if self.collider is not None:
+            ray_bundle = self.collider(ray_bundle)
+        return self.get_outputs(ray_bundle, batch)
+
+    def get_outputs(self, ray_bundle: RayBundle, batch: dict[str, Any] | None = None) -> dict[str, Any]:
         """Nerfacto's outputs before the sky; in training without the depths that no loss reads.
 
         In evaluation also, in metres, the median `distance` and `distance_uncertainty`, the standard deviation of where
         the ray ends. (nerfstudio divides outputs with "depth" in their name by the scene's scale; these have none.)
         """
-        outputs = super().get_outputs(ray_bundle)
+        outputs, further = self._rendered(ray_bundle, batch)
         if self._has_sky:
-            behind = self._field_at(ray_bundle, ray_bundle.origins.new_full((len(ray_bundle),), INFINITELY_FAR))
+            behind, further = further[: len(ray_bundle)], further[len(ray_bundle) :]
             outputs["rgb"] = outputs["rgb"] + (1 - outputs["accumulation"]) * behind
+        if self._has_surface(batch):
+            outputs["surface_rgb"] = self._exposed(further, batch["surface_rays"])
         outputs["rgb"] = self._exposed(outputs["rgb"], ray_bundle)
         if not self.training:
             outputs["expected_depth"], std = outputs["expected_depth"].split(1, dim=-1)
             outputs["distance"] = outputs["depth"] * self.metres_per_unit
             outputs["distance_uncertainty"] = std * self.metres_per_unit
         return {name: value for name, value in outputs.items() if value is not None}
+
+    def _has_surface(self, batch: dict[str, Any] | None) -> TypeGuard[dict[str, Any]]:
+        """Whether there are further pixels whose colour at their surface is compared."""
+        return self.training and self.config.surface_loss_mult > 0 and batch is not None and "surface_rays" in batch
+
+    def _places(self, rays: RayBundle, batch: dict[str, Any] | None) -> RaySamples | None:
+        """Where the field is asked for colours beside the samples: the sky behind each ray, then the surfaces."""
+        bundles, distances = [], []
+        if self._has_sky:
+            bundles.append(rays)
+            distances.append(rays.origins.new_full((len(rays),), INFINITELY_FAR))
+        if self._has_surface(batch):
+            self.camera_optimizer.apply_to_raybundle(batch["surface_rays"])
+            bundles.append(batch["surface_rays"])
+            distance = self._surface_drawn(batch) / self.metres_per_unit
+            distances.append(torch.where(batch["surface_sky"][:, 0], INFINITELY_FAR, distance))
+        if not bundles:
+            return None
+        origins, directions, areas, pictures = (
+            torch.cat([getattr(bundle, name) for bundle in bundles])
+            for name in ("origins", "directions", "pixel_area", "camera_indices")
+        )
+        every = RayBundle(origins, directions, areas, pictures)
+        at = torch.cat(distances)[:, None, None]
+        return every.get_ray_samples(bin_starts=0.99 * at, bin_ends=1.01 * at)
+
+    def _rendered(self, rays: RayBundle, batch: dict[str, Any] | None) -> tuple[dict[str, Any], Tensor]:
+        """Nerfacto's outputs, and the field's colours at `_places`, [places, 3]."""
+        if self.config.predict_normals:
+            outputs = super().get_outputs(rays)
+            places = self._places(rays, batch)
+            further = rays.origins[:0] if places is None else self.field.forward(places)[FieldHeadNames.RGB][:, 0]
+            return outputs, further
+        if self.training:
+            self.camera_optimizer.apply_to_raybundle(rays)
+        samples, weights_list, samples_list = self.proposal_sampler(rays, density_fns=self.density_fns)
+        places = self._places(rays, batch)
+        if places is None:
+            found, further = self.field.forward(samples), rays.origins[:0]
+        elif isinstance(self.field, FusedNerfactoField):
+            found, further = self.field.forward_also_at(samples, places)
+        else:
+            found = self.field.forward(samples)
+            further = self.field.forward(places)[FieldHeadNames.RGB][:, 0]
+        if self.config.use_gradient_scaling:
+            found = scale_gradients_by_distance_squared(found, samples)
+        weights = samples.get_weights(found[FieldHeadNames.DENSITY])
+        weights_list.append(weights)
+        samples_list.append(samples)
+        with torch.no_grad():
+            depths = [
+                self.renderer_depth(weights=each, ray_samples=its)
+                for each, its in zip(weights_list, samples_list, strict=True)
+            ]
+        outputs = {
+            "rgb": self.renderer_rgb(rgb=found[FieldHeadNames.RGB], weights=weights),
+            "accumulation": self.renderer_accumulation(weights=weights),
+            "depth": depths.pop(),
+            "expected_depth": self.renderer_expected_depth(weights=weights, ray_samples=samples),
+            **{f"prop_depth_{number}": depth for number, depth in enumerate(depths)},
+        }
+        if self.training:
+            outputs |= {"weights_list": weights_list, "ray_samples_list": samples_list}
+        return outputs, further
 
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
         """Outputs of a whole view; distance and uncertainty also in colours that always mean the same metres."""
@@ -372,11 +449,8 @@ class EdgeDepthNerfModel(NerfactoModel):
             sky = batch["sky"][:, 0].to(self.device)
             per_level = [sky_loss(weights[..., 0], sky) for weights in outputs["weights_list"]]
             losses["sky_loss"] = self.config.sky_loss_mult * torch.stack(per_level).mean()
-        if self.config.surface_loss_mult > 0 and "surface_rays" in batch:
-            rays, sky = batch["surface_rays"], batch["surface_sky"][:, 0]
-            self.camera_optimizer.apply_to_raybundle(rays)
-            distance = self._surface_drawn(batch) / self.metres_per_unit
-            colours = self._exposed(self._field_at(rays, torch.where(sky, INFINITELY_FAR, distance)), rays)
+        if "surface_rgb" in outputs:
+            colours, sky = outputs["surface_rgb"], batch["surface_sky"][:, 0]
             # no error where the surface is not between the planes; choosing pixels would make a GPU wait
             told = sky | self._can_be_met(batch["surface_distance_m"][:, 0])
             colours = torch.where(told[:, None], colours, batch["surface_image"])

@@ -95,7 +95,11 @@ class EdgeDepthPipeline(VanillaPipeline):
                 this is looked at in some steps only.
 
         """
-        outputs, losses, metrics = super().get_train_loss_dict(step)
+        rays, batch = self.datamanager.next_train(step)
+        # the wrapped model, where several processes train; nerfstudio gives it the rays alone
+        outputs = self._model(rays, batch)
+        metrics = self.model.get_metrics_dict(outputs, batch)
+        losses = self.model.get_loss_dict(outputs, batch, metrics)
         if str(self.device) == "cpu" or step % STEPS_PER_CHECK == 0:
             if not all(bool(loss.detach().isfinite()) for loss in losses.values()):
                 raise NotFiniteError(self._not_finite(step, outputs, losses))
