@@ -17,6 +17,8 @@ from edge_depth_nerf.plugin.compat import lpips_not_built
 from edge_depth_nerf.plugin.model import DepthInEvaluation, EdgeDepthNerfModel
 
 METRES_PER_UNIT = 20.0
+LOSSES = ("edge", "ds-nerf", "urban-nerf")
+NO_EXTRAS = {"sky_loss_mult": 0.0, "sky_background": False, "surface_loss_mult": 0.0, "depth_loss_final": 1.0}
 
 
 def build(**options) -> EdgeDepthNerfModel:
@@ -155,6 +157,42 @@ def test_without_a_depth_loss_it_is_nerfacto():
         assert torch.equal(value, with_loss[name])
 
 
+def step_with_surface(model):
+    """Outputs and losses of a training step that brings further pixels."""
+    model.train()
+    torch.manual_seed(3)
+    with torch.no_grad():
+        for parameter in model.field.parameters():
+            parameter.normal_(0, 0.3)  # a new field has one colour everywhere
+    outputs, supervision = model(rays()), batch() | surface()
+    return outputs, model.get_loss_dict(outputs, supervision, model.get_metrics_dict(outputs, supervision))
+
+
+@pytest.mark.parametrize("kind", LOSSES)
+def test_surface_sky_and_falling_weight_are_options_of_any_depth_loss(kind):
+    name = "edge_loss" if kind == "edge" else "depth_loss"
+    model, plain = build(depth_loss=kind), build(depth_loss=kind, **NO_EXTRAS)
+    outputs, losses = step_with_surface(model)
+    plain_outputs, without = step_with_surface(plain)
+    assert set(losses) - set(without) == {"sky_loss", "surface_loss"} and name in without
+    of_edge = step_with_surface(build())[1]
+    # the same samples: what surface and sky make of them has nothing to do with the depth loss
+    for extra in ("sky_loss", "surface_loss"):
+        assert float(losses[extra].detach()) == pytest.approx(float(of_edge[extra].detach()), rel=1e-5)
+    assert not torch.allclose(outputs["rgb"], plain_outputs["rgb"], atol=1e-2)
+    for each, share in ((model, 0.01), (plain, 1.0)):
+        weight = each._depth_weight()
+        each._step = 30_000
+        assert each._depth_weight() == pytest.approx(share * weight)
+
+
+def test_without_weight_the_prior_serves_surface_and_sky_alone():
+    outputs, losses = step_with_surface(build(depth_loss_mult=0.0))
+    of_edge_outputs, of_edge = step_with_surface(build())
+    assert set(of_edge) - set(losses) == {"edge_loss"} and {"sky_loss", "surface_loss"} < set(losses)
+    assert torch.equal(outputs["rgb"], of_edge_outputs["rgb"])
+
+
 def colours_at(model, bundle: RayBundle, distance_units) -> torch.Tensor:
     """What the field says of places along rays."""
     places = bundle.get_ray_samples(bin_starts=distance_units[:, None, None], bin_ends=distance_units[:, None, None])
@@ -278,7 +316,7 @@ def test_a_surface_that_is_not_between_the_planes_says_nothing(distance_m):
     assert float(found["surface_loss"]) != pytest.approx(losses[0], rel=1e-3)
 
 
-@pytest.mark.parametrize("kind", ["edge", "ds-nerf", "urban-nerf"])
+@pytest.mark.parametrize("kind", LOSSES)
 @pytest.mark.parametrize("distance_m", [0.05, 0.199, 51.0, 255.9])
 def test_a_prior_that_is_not_between_the_planes_is_none(kind, distance_m):
     model = build(depth_loss=kind, near_m=0.2, far_m=50.0).train()

@@ -29,7 +29,7 @@ from edge_depth_nerf.compare.report import first_runs, make_report
 from edge_depth_nerf.compare.results import Results, check_fair, read_results, write_rows
 from edge_depth_nerf.compare.search import show_search, write_search
 from edge_depth_nerf.compare.specification import FIGURES, SPECIFICATION, VIEWS, RunSpecification
-from edge_depth_nerf.compare.tables import as_latex, as_markdown, make_tables
+from edge_depth_nerf.compare.tables import as_latex, as_markdown, fields_table, make_tables
 from edge_depth_nerf.jobs.runs import command_line, viewer_command
 from edge_depth_nerf.jobs.tasks import Task, do_tasks, this_machine
 from edge_depth_nerf.report.build import Report, write_report
@@ -148,8 +148,9 @@ def write_comparison(output: Path, results: Results, console: Console) -> Report
     """Write tables, figures, plots and pictures of a comparison; give what its page shows."""
     tables = make_tables(results)
     write_rows(output, results)
-    write_text(output / "tables.md", as_markdown(results, tables))
-    write_text(output / "tables.tex", as_latex(results, tables))
+    written = [*tables, fields_table(results)]
+    write_text(output / "tables.md", as_markdown(results, written))
+    write_text(output / "tables.tex", as_latex(results, written))
     with console.status("Plots and pictures"):
         plots = draw_plots(output, results)
         for scene in results.scenes():

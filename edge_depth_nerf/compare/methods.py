@@ -14,11 +14,17 @@ _SOURCE = "pipeline.datamanager.depth_source"
 _LOSS = "pipeline.model.depth_loss"
 _LOSS_SIGMA = "pipeline.model.depth_sigma"
 _EXPOSURE = "pipeline.model.exposure"
-_FINAL = "pipeline.model.depth_loss_final"
-"""nerfstudio's losses keep their weight."""
 _PRIOR_SIGMA = "pipeline.datamanager.prior.sigma_constant_m"
 SIGMA_MODE = "pipeline.datamanager.prior.sigma_mode"
 _KERNEL = "pipeline.datamanager.prior.integration.kernel"
+WITHOUT_EXTRAS: dict[str, Any] = {
+    "pipeline.model.surface_loss_mult": 0.0,
+    "pipeline.datamanager.surface_rays_per_batch": 0,
+    "pipeline.model.sky_loss_mult": 0.0,
+    "pipeline.model.sky_background": False,
+    "pipeline.model.depth_loss_final": 1.0,
+}
+"""No colours at the surface, no sky loss, no colour at infinity, a λ that stays: what any depth loss can have, too."""
 
 
 @dataclass(frozen=True)
@@ -57,32 +63,26 @@ def _edge(
     return Method(name, title, named, needs, sigma, _PRIOR_SIGMA, literal=literal)
 
 
+def _rival(name: MethodName, title: str, loss: str) -> Method:
+    # as nerfstudio has it: on LiDAR alone
+    named = {_LOSS: loss, _SOURCE: "lidar", LAMBDA: 0.01, _LOSS_SIGMA: 0.5, **WITHOUT_EXTRAS}
+    return Method(name, title, named, ("lidar",), sigma_field=_LOSS_SIGMA, rival=True)
+
+
+_NERFACTO = {_LOSS: "none", _SOURCE: "none", **WITHOUT_EXTRAS}
+
 METHODS: dict[MethodName, Method] = {
     method.name: method
     for method in (
-        Method("nerfacto", "nerfacto", {_LOSS: "none"}, rival=True),
+        Method("nerfacto", "nerfacto", _NERFACTO, rival=True),
         Method(
             "nerfacto-embedding",
             "nerfacto, appearance embedding",
-            {_LOSS: "none", _EXPOSURE: "embedding"},
+            {**_NERFACTO, _EXPOSURE: "embedding"},
             rival=True,
         ),
-        Method(
-            "urban-nerf",
-            "UrbanNeRF loss",
-            {_LOSS: "urban-nerf", _SOURCE: "lidar", LAMBDA: 0.01, _LOSS_SIGMA: 0.5, _FINAL: 1.0},
-            ("lidar",),
-            sigma_field=_LOSS_SIGMA,
-            rival=True,
-        ),
-        Method(
-            "ds-nerf",
-            "DS-NeRF loss",
-            {_LOSS: "ds-nerf", _SOURCE: "lidar", LAMBDA: 0.01, _LOSS_SIGMA: 0.5, _FINAL: 1.0},
-            ("lidar",),
-            sigma_field=_LOSS_SIGMA,
-            rival=True,
-        ),
+        _rival("urban-nerf", "UrbanNeRF loss", "urban-nerf"),
+        _rival("ds-nerf", "DS-NeRF loss", "ds-nerf"),
         _edge("edge-lidar", "LiDAR alone", ("lidar",), depth_source="lidar"),
         _edge("edge-mono", "monocular alone", ("mono",), depth_source="mono"),
         _edge("edge-gaussian", "spatial Gaussian", ("lidar", "mono"), overrides={_KERNEL: "spatial-gaussian"}),
@@ -120,6 +120,5 @@ def default_methods(preset: Preset, with_loss: bool = False) -> tuple[MethodName
     return tuple(
         method.name
         for method in METHODS.values()
-        if not (preset == "paper" and (method.literal or _EXPOSURE in method.overrides))
-        and not (with_loss and method.sigma_field is None)
+        if not (preset == "paper" and method.literal) and not (with_loss and method.sigma_field is None)
     )

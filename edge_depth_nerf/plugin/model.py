@@ -60,7 +60,8 @@ class EdgeDepthNerfModelConfig(NerfactoModelConfig):
     depth_loss: Literal["edge", "ds-nerf", "urban-nerf", "none"] = "edge"
     """The loss on the distance prior: Eq. 4, nerfstudio's DS-NeRF or UrbanNeRF loss, or none (plain nerfacto)."""
     depth_loss_mult: float = 0.01
-    """Weight λ of the loss on the distance prior (not published; how it was chosen: docs/ablation.md)."""
+    """Weight λ of the loss on the distance prior (not published; how it was chosen: docs/ablation.md). 0: the prior
+    serves surface and sky alone."""
     depth_sigma: float = 0.5
     """Standard deviation that the DS-NeRF and UrbanNeRF losses assume, metres. (Eq. 4 takes the prior's own.)"""
     depth_loss_levels: Literal["all", "final"] = "all"
@@ -71,13 +72,13 @@ class EdgeDepthNerfModelConfig(NerfactoModelConfig):
     depth_loss_steps: int | None = None
     """Steps in which λ falls. None: those of the whole training, or 30,000 where no trainer says how many."""
     sky_loss_mult: float = 0.01
-    """With the edge loss: weight of what rays into the sky hit, their accumulated weight. 0: the sky is left to
+    """With a depth loss: weight of what rays into the sky hit, their accumulated weight. 0: the sky is left to
     colour."""
     sky_background: bool = True
-    """With the edge loss: what no sample stops is coloured by the field at infinity, where the sky is. False: by the
+    """With a depth loss: what no sample stops is coloured by the field at infinity, where the sky is. False: by the
     last sample, as in nerfacto, from wherever that is."""
     surface_loss_mult: float = 1.0
-    """With the edge loss: weight of the colour error of the field at the prior's distance, for the datamanager's
+    """With a depth loss: weight of the colour error of the field at the prior's distance, for the datamanager's
     `surface_rays_per_batch` further pixels at one sample each."""
     exposure: Literal["gain", "affine", "grid", "embedding", "none"] = "gain"
     """What makes up for a camera's drifting exposure and white balance. gain: a factor for each colour of each training
@@ -201,7 +202,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         self._fused = implementation == "fused"
         if self.config.exposure != "embedding":
             self.config.use_appearance_embedding = False
-        self._has_sky = self.config.depth_loss == "edge" and self.config.sky_background
+        self._has_sky = self.config.depth_loss != "none" and self.config.sky_background
         if self._has_sky:
             # nothing is added to what samples stop; `get_outputs` adds the colour at infinity
             self.config.background_color = "black"
@@ -340,14 +341,14 @@ class EdgeDepthNerfModel(NerfactoModel):
             losses = self._nerfacto_losses(outputs, batch, metrics_dict)
         else:
             losses = super().get_loss_dict(outputs, batch, metrics_dict)
-        if self.training and self.config.depth_loss != "none":
+        if self.training and self.config.depth_loss != "none" and self.config.depth_loss_mult > 0:
             levels = list(zip(outputs["weights_list"], outputs["ray_samples_list"], strict=True))
             if self.config.depth_loss_levels == "final":
                 levels = levels[-1:]
             per_level = [self._depth_loss(weights, samples, outputs, batch) for weights, samples in levels]
             name = "edge_loss" if self.config.depth_loss == "edge" else "depth_loss"
             losses[name] = self._depth_weight() * torch.stack(per_level).mean()
-        if self.training and self.config.depth_loss == "edge":
+        if self.training and self.config.depth_loss != "none":
             losses |= self._sky_and_surface_losses(outputs, batch)
         if self.training and self.config.exposure in ("affine", "grid") and self.exposure is not None:
             losses["exposure_loss"] = self.config.exposure_mult * self.exposure.unevenness()
