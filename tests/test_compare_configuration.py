@@ -71,6 +71,16 @@ ALLOWED = {
         PRIOR + "integration.range_guide",
     },
     "edge": set(),
+    "nerfacto-lidar-extras": {SOURCE, "pipeline.model.depth_loss_mult"},
+    "nerfacto-integrated-extras": {"pipeline.model.depth_loss_mult"},
+    "urban-nerf-integrated": RIVAL - {SOURCE},
+    "urban-nerf-extras": RIVAL - EXTRAS,
+    "urban-nerf-integrated-extras": RIVAL - EXTRAS - {SOURCE},
+    "ds-nerf-integrated": RIVAL - {SOURCE},
+    "ds-nerf-extras": RIVAL - EXTRAS,
+    "ds-nerf-integrated-extras": RIVAL - EXTRAS - {SOURCE},
+    "edge-lidar-plain": {SOURCE, *EXTRAS},
+    "edge-plain": EXTRAS,
 }
 """What each method may have otherwise than `edge`; no method may be missing here."""
 

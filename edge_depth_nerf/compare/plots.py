@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from edge_depth_nerf.base.files import write_bytes
-from edge_depth_nerf.compare.methods import METHODS
+from edge_depth_nerf.compare.methods import METHODS, Loss
 from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.results import Results, RunResult
 from edge_depth_nerf.compare.tables import CLOCKS, clock_metric, curve_metric
@@ -35,6 +35,13 @@ STYLES: dict[MethodName, tuple[str, str, str, str]] = {
     "edge-paper": ("#3a86ff", "#70a9ff", "-.", "X"),
     "edge": ("#d62828", "#ff625c", "-", "o"),
 }
+LOSS_STYLES: dict[Loss, tuple[str, str]] = {
+    "none": ("#888888", "#9aa3ad"),
+    "urban-nerf": ("#b08030", "#d9a94a"),
+    "ds-nerf": ("#444444", "#d5dae0"),
+    "edge": ("#d62828", "#ff625c"),
+}
+"""On white, on dark: of the methods that the grid alone has."""
 BINS = {"by_angle_deg": "angle from the optical axis, degrees", "by_distance_m": "distance, m"}
 PSNR_LABEL = "PSNR, dB"
 _INK = {False: "#1b2026", True: "#d5dae0"}
@@ -93,8 +100,16 @@ def _twice(title: str, draw: Callable[[bool], bytes]) -> Plot:
     return Plot(title, light=drawn[False], dark=drawn[True])
 
 
+def style_of(method: MethodName) -> tuple[str, str, str, str]:
+    """Colour on white, on dark, line and marker; of the grid's cells by loss, extras and prior."""
+    cell = METHODS[method].cell
+    if method in STYLES or cell is None:
+        return STYLES[method]
+    return *LOSS_STYLES[cell.loss], "-" if cell.extras else "--", "D" if cell.prior == "integrated" else "v"
+
+
 def _draw(axis: Axes, method: MethodName, line: Line, dark: bool) -> None:
-    on_white, on_dark, pattern, symbol = STYLES[method]
+    on_white, on_dark, pattern, symbol = style_of(method)
     axis.plot(
         *line,
         color=on_dark if dark else on_white,

@@ -250,9 +250,10 @@ def _settings_table(results: Results) -> MadeTable:
     notes = ["σ in metres, or how the prior's own is found at each pixel."]
     searched_on = results.options.get("tuned_on")
     if searched_on is not None:
-        notes.append(f"Searched on {Path(str(searched_on)).name}.")
-        if searched_on in {run.specification["scene"] for run in results.runs}:
-            notes.append("That drive is one of these tables, too: its figures flatter what was searched.")
+        drives = searched_on if isinstance(searched_on, list) else [searched_on]
+        notes.append(f"Searched on {' and '.join(Path(str(drive)).name for drive in drives)}.")
+        if {run.specification["scene"] for run in results.runs}.intersection(map(str, drives)):
+            notes.append("A drive of these tables is among them: its figures flatter what was searched.")
     return MadeTable("7", "λ and σ", [("", ["λ", "σ", "from"])], rows, notes)
 
 
@@ -350,7 +351,12 @@ def introduction(results: Results) -> list[str]:
 
 def as_markdown(results: Results, tables: Sequence[MadeTable]) -> str:
     """All tables as Markdown."""
-    parts = ["# Comparison", *introduction(results)]
+    return page_of_tables("Comparison", introduction(results), tables)
+
+
+def page_of_tables(title: str, lines: Sequence[str], tables: Sequence[MadeTable]) -> str:
+    """Give a title, paragraphs and tables as Markdown."""
+    parts = [f"# {title}", *lines]
     for table in tables:
         headings = [f"{group} {heading}".strip() for group, heading in table.headings()]
         lines = [f"| | {' | '.join(headings)} |", "|---|" + "---|" * len(headings)]
