@@ -18,7 +18,7 @@ from edge_depth_nerf.compare.configuration import (
     setting_of,
 )
 from edge_depth_nerf.compare.methods import METHODS, WITHOUT_EXTRAS, default_methods
-from edge_depth_nerf.compare.options import Preset
+from edge_depth_nerf.compare.options import MethodName, Preset
 from edge_depth_nerf.compare.protocol import departures
 from edge_depth_nerf.compare.results import Results
 from edge_depth_nerf.compare.specification import OF_A_RUN, RunSpecification
@@ -50,6 +50,7 @@ ALLOWED = {
     "nerfacto": {LOSS, SOURCE, *EXTRAS},
     "nerfacto-embedding": {LOSS, SOURCE, EXPOSURE, *EXTRAS},
     "urban-nerf": RIVAL,
+    "urban-nerf-los": RIVAL,
     "ds-nerf": RIVAL,
     "edge-lidar": {SOURCE},
     "edge-mono": {SOURCE},
@@ -76,6 +77,9 @@ ALLOWED = {
     "urban-nerf-integrated": RIVAL - {SOURCE},
     "urban-nerf-extras": RIVAL - EXTRAS,
     "urban-nerf-integrated-extras": RIVAL - EXTRAS - {SOURCE},
+    "urban-nerf-los-integrated": RIVAL - {SOURCE},
+    "urban-nerf-los-extras": RIVAL - EXTRAS,
+    "urban-nerf-los-integrated-extras": RIVAL - EXTRAS - {SOURCE},
     "ds-nerf-integrated": RIVAL - {SOURCE},
     "ds-nerf-extras": RIVAL - EXTRAS,
     "ds-nerf-integrated-extras": RIVAL - EXTRAS - {SOURCE},
@@ -112,7 +116,9 @@ def test_all_methods_of_the_tables_have_one_exposure(preset):
     assert set(others.values()) == {"gain"} and "edge-paper" in others
 
 
-@pytest.mark.parametrize("method", ["nerfacto", "nerfacto-embedding", "urban-nerf", "ds-nerf", "edge-paper"])
+@pytest.mark.parametrize(
+    "method", ["nerfacto", "nerfacto-embedding", "urban-nerf", "urban-nerf-los", "ds-nerf", "edge-paper"]
+)
 def test_methods_say_which_extras_they_go_without(method):
     """That a model would ignore an extra is no word on it."""
     found = resolved(method)
@@ -125,7 +131,7 @@ def test_methods_say_which_extras_they_go_without(method):
 @pytest.mark.parametrize("preset", ["lite", "paper"])
 def test_the_table_shows_each_field_in_which_methods_differ(preset):
     """Against the configurations themselves, value by value, for each pair of methods."""
-    names = [name for name in METHODS if not (preset == "paper" and name == "edge-paper")]
+    names: list[MethodName] = [name for name in METHODS if not (preset == "paper" and name == "edge-paper")]
     runs, values = [], {}
     for name in names:
         specification = RunSpecification("/scenes/a", "", preset, name, 0, 10)
@@ -160,6 +166,7 @@ def test_each_method_is_what_its_name_says():
     exposures = {method: resolved(method)[EXPOSURE] for method in ALLOWED}
     assert {name for name, exposure in exposures.items() if exposure == "embedding"} == {"nerfacto-embedding"}
     assert loss_and_source("urban-nerf") == ("urban-nerf", "lidar", "edge-aware")
+    assert loss_and_source("urban-nerf-los") == ("urban-nerf-los", "lidar", "edge-aware")
     assert loss_and_source("ds-nerf") == ("ds-nerf", "lidar", "edge-aware")
     assert loss_and_source("edge-lidar") == ("edge", "lidar", "edge-aware")
     assert loss_and_source("edge-mono") == ("edge", "mono", "edge-aware")

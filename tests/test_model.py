@@ -12,12 +12,12 @@ from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.model_components.losses import ds_nerf_depth_loss, urban_radiance_field_depth_loss
 from nerfstudio.models.nerfacto import NerfactoModel
 
-from edge_depth_nerf.method.losses import edge_loss
+from edge_depth_nerf.method.losses import UrbanTerms, edge_loss, urban_nerf_loss
 from edge_depth_nerf.plugin.compat import lpips_not_built
 from edge_depth_nerf.plugin.model import DepthInEvaluation, EdgeDepthNerfModel
 
 METRES_PER_UNIT = 20.0
-LOSSES = ("edge", "ds-nerf", "urban-nerf")
+LOSSES = ("edge", "ds-nerf", "urban-nerf", "urban-nerf-los")
 NO_EXTRAS = {"sky_loss_mult": 0.0, "sky_background": False, "surface_loss_mult": 0.0, "depth_loss_final": 1.0}
 
 
@@ -132,6 +132,22 @@ def test_baselines_are_the_host_own_losses_in_metres(kind):
             total += urban_radiance_field_depth_loss(weights, prior, rendered, middles, sigma)
     assert torch.allclose(losses["depth_loss"], 0.5 * total / 3)
     assert "edge_loss" not in losses
+
+
+def test_urban_nerf_of_its_authors_is_in_metres_and_narrows():
+    terms = UrbanTerms(0.1, 2.0, 0.5, narrowing=4.0)
+    model = build(depth_loss="urban-nerf-los", depth_loss_mult=0.5, depth_loss_final=1.0, depth_sigma=0.3, urban=terms)
+    for step, sigma_m in ((0, 1.2), (15_000, 0.6), (30_000, 0.3)):
+        model._step = step
+        outputs, losses = trained_step(model)
+        total = torch.zeros(())
+        for weights, samples in zip(outputs["weights_list"], outputs["ray_samples_list"], strict=True):
+            starts, ends = (edge[..., 0] * METRES_PER_UNIT for edge in (samples.frustums.starts, samples.frustums.ends))
+            total += urban_nerf_loss(weights[..., 0], starts, ends, batch()["prior_distance_m"][:, 0], sigma_m, terms)
+        assert torch.allclose(losses["depth_loss"], 0.5 * total / 3)
+    losses["depth_loss"].backward()
+    gradients = [p.grad for p in model.field.mlp_base.parameters()]
+    assert any(g is not None and bool(g.abs().sum() > 0) for g in gradients)
 
 
 def test_sigma_of_ds_nerf_is_a_standard_deviation_in_metres():

@@ -27,7 +27,7 @@ WITHOUT_EXTRAS: dict[str, Any] = {
 """No colours at the surface, no sky loss, no colour at infinity, a λ that stays: what any depth loss can have, too."""
 
 
-Loss = Literal["none", "urban-nerf", "ds-nerf", "edge"]
+Loss = Literal["none", "urban-nerf", "urban-nerf-los", "ds-nerf", "edge"]
 PriorName = Literal["lidar", "integrated"]
 
 
@@ -120,6 +120,7 @@ def _name(name: str) -> MethodName:
 LOSS_TITLES: dict[Loss, str] = {
     "none": "no depth loss",
     "urban-nerf": "UrbanNeRF loss",
+    "urban-nerf-los": "UrbanNeRF, line of sight",
     "ds-nerf": "DS-NeRF loss",
     "edge": "edge loss",
 }
@@ -136,6 +137,7 @@ METHODS: dict[MethodName, Method] = {
             rival=True,
         ),
         _rival("urban-nerf", "UrbanNeRF loss", "urban-nerf"),
+        _rival("urban-nerf-los", "UrbanNeRF, line of sight", "urban-nerf-los"),
         _rival("ds-nerf", "DS-NeRF loss", "ds-nerf"),
         _edge("edge-lidar", "LiDAR alone", ("lidar",), depth_source="lidar", cell=Cell("edge", "lidar", True)),
         _edge("edge-mono", "monocular alone", ("mono",), depth_source="mono"),
@@ -147,6 +149,9 @@ METHODS: dict[MethodName, Method] = {
         _of_grid_alone(Cell("urban-nerf", "integrated", False)),
         _of_grid_alone(Cell("urban-nerf", "lidar", True)),
         _of_grid_alone(Cell("urban-nerf", "integrated", True)),
+        _of_grid_alone(Cell("urban-nerf-los", "integrated", False)),
+        _of_grid_alone(Cell("urban-nerf-los", "lidar", True)),
+        _of_grid_alone(Cell("urban-nerf-los", "integrated", True)),
         _of_grid_alone(Cell("ds-nerf", "integrated", False)),
         _of_grid_alone(Cell("ds-nerf", "lidar", True)),
         _of_grid_alone(Cell("ds-nerf", "integrated", True)),

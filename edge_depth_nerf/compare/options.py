@@ -18,6 +18,7 @@ MethodName = Literal[
     "nerfacto",
     "nerfacto-embedding",
     "urban-nerf",
+    "urban-nerf-los",
     "ds-nerf",
     "edge-lidar",
     "edge-mono",
@@ -29,6 +30,9 @@ MethodName = Literal[
     "urban-nerf-integrated",
     "urban-nerf-extras",
     "urban-nerf-integrated-extras",
+    "urban-nerf-los-integrated",
+    "urban-nerf-los-extras",
+    "urban-nerf-los-integrated-extras",
     "ds-nerf-integrated",
     "ds-nerf-extras",
     "ds-nerf-integrated-extras",
@@ -66,8 +70,8 @@ class CompareOptions:
     tuned: Path | None = None
     """λ and σ of the methods: tuned.json of a search, or a file of that form. Not set: the defaults."""
     rivals_implementation: Implementation = "same"
-    """torch: nerfacto, urban-nerf and ds-nerf are computed by nerfstudio's own torch code, with the same results, for
-    figures at equal seconds."""
+    """torch: nerfacto, ds-nerf and both forms of UrbanNeRF are computed by nerfstudio's own torch code, with the same
+    results, for figures at equal seconds."""
     jobs: int | None = None
     """Trainings side by side. Not set: one a core, on a GPU one."""
     cluster: str | None = None

@@ -28,6 +28,7 @@ STYLES: dict[MethodName, tuple[str, str, str, str]] = {
     "nerfacto": ("#888888", "#9aa3ad", "--", "o"),
     "nerfacto-embedding": ("#b5b5b5", "#6f7780", ":", "x"),
     "urban-nerf": ("#b08030", "#d9a94a", "--", "s"),
+    "urban-nerf-los": ("#7a5195", "#b493cc", "--", "d"),
     "ds-nerf": ("#444444", "#d5dae0", "--", "^"),
     "edge-lidar": ("#2a9d8f", "#3cc4b3", ":", "v"),
     "edge-mono": ("#8ab17d", "#a9d39a", ":", "D"),
@@ -38,6 +39,7 @@ STYLES: dict[MethodName, tuple[str, str, str, str]] = {
 LOSS_STYLES: dict[Loss, tuple[str, str]] = {
     "none": ("#888888", "#9aa3ad"),
     "urban-nerf": ("#b08030", "#d9a94a"),
+    "urban-nerf-los": ("#7a5195", "#b493cc"),
     "ds-nerf": ("#444444", "#d5dae0"),
     "edge": ("#d62828", "#ff625c"),
 }

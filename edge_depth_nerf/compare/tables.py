@@ -293,6 +293,7 @@ def make_tables(results: Results) -> list[MadeTable]:
         "nerfacto-embedding",
         "nerfacto",
         "urban-nerf",
+        "urban-nerf-los",
         "ds-nerf",
         "edge-paper",
         "edge",
