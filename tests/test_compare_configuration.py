@@ -143,7 +143,7 @@ def test_the_table_shows_each_field_in_which_methods_differ(preset):
     made = fields_table(Results(runs))
     shown = {row.title: [cell.text() for cell in row.cells] for row in made.rows}
     assert [heading for _, heading in made.headings()] == [METHODS[name].title for name in names]
-    pairs = [
+    pairs: list[tuple[MethodName, MethodName, str]] = [
         (one, other, field)
         for one, other in combinations(names, 2)
         for field in differing(values[one], values[other])

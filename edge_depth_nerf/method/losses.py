@@ -105,9 +105,12 @@ KERNEL_REACH = 3.0
 
 @dataclass(frozen=True)
 class UrbanTerms:
-    """Weights of the terms of UrbanNeRF's loss, beside λ, and how its kernel narrows."""
+    """Weights of the terms of UrbanNeRF's loss, beside λ, and how its kernel narrows.
 
-    expected: float = 1.0
+    In metres an error of ten metres counts 100 and the other terms a few at most, so `expected` weighs a hundredth.
+    """
+
+    expected: float = 0.01
     """Of the squared error of the expected distance, per m²."""
     empty: float = 1.0
     """Of what light ends before the surface, metres."""
