@@ -21,6 +21,7 @@ import tyro
 from edge_depth_nerf import cli
 from edge_depth_nerf.base.files import write_text
 from edge_depth_nerf.method.integration import IntegrationOptions
+from edge_depth_nerf.method.losses import UrbanTerms
 from edge_depth_nerf.method.prior import PriorOptions
 from edge_depth_nerf.plugin.config import make_specifications, read_method_file
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
@@ -211,6 +212,7 @@ def methods() -> str:
         ("The depth prior", "pipeline.datamanager.prior", PriorOptions),
         ("Its integration", "pipeline.datamanager.prior.integration", IntegrationOptions),
         ("The model and its loss", "pipeline.model", EdgeDepthNerfModelConfig),
+        ("UrbanNeRF's loss", "pipeline.model.urban", UrbanTerms),
         ("Poses refined in training", "pipeline.model.camera_optimizer", PoseRefinerConfig),
         ("How it is judged", "pipeline", EdgeDepthPipelineConfig),
         ("The scene", "pipeline.datamanager.dataparser", FisheyeDepthDataParserConfig),
@@ -251,7 +253,13 @@ def presets() -> str:
     declared = read_method_file()
     ours = (
         *(FisheyeDepthDataManagerConfig, PriorOptions, IntegrationOptions),
-        *(EdgeDepthNerfModelConfig, PoseRefinerConfig, EdgeDepthPipelineConfig, FisheyeDepthDataParserConfig),
+        *(
+            EdgeDepthNerfModelConfig,
+            UrbanTerms,
+            PoseRefinerConfig,
+            EdgeDepthPipelineConfig,
+            FisheyeDepthDataParserConfig,
+        ),
     )
     known = {name for cls in ours for name in field_docs(cls)}
     values = {name: declared["presets"][method["preset"]] for name, method in declared["methods"].items()}

@@ -52,7 +52,7 @@ def test_a_search_writes_what_compare_takes(tmp_path, monkeypatch):
     found = command.compare(asked, QUIET)
     assert len(found.runs) == 2 * 4 * 4
     tuned = read_json(output / "tuned.json")
-    assert tuned["scene"] == str(scene) and tuned["seed"] == 7
+    assert tuned["scenes"] == [str(scene)] and tuned["seed"] == 7
     assert tuned["methods"]["ds-nerf"] == {"lambda": 0.1, "sigma_m": 0.5, "psnr": 30.0}
     assert tuned["methods"]["edge"]["lambda"] == 1.0 and tuned["methods"]["edge"]["sigma_m"] == "own"
     ds_nerf, ours = search.grids(found)

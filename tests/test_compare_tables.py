@@ -46,6 +46,9 @@ def test_where_the_weights_come_from(results):
     assert "Searched on street." in made.notes and "flatter" in made.caption
     results.options["tuned_on"] = 7  # a file written by hand
     assert "Searched on 7." in table(results, "7").notes
+    results.options["tuned_on"] = ["/scenes/tuning", "/scenes/turn"]
+    made = table(results, "7")
+    assert "Searched on tuning and turn." in made.notes and "flatter" in made.caption
 
 
 def test_table_1_by_hand(results):

@@ -52,6 +52,8 @@ def test_it_leaves_figures_tables_and_pictures(finished):
     assert all(one > other for one, other in zip(fitted, plain, strict=True))
     text = (asked.output / "tables.md").read_text()
     assert "## Table 1." in text and "## Table 5" in text and "| ours |" in text
+    assert "## Table 8. What the methods differ in" in text and "| pipeline.model.depth_loss | none | edge |" in text
+    assert "| pipeline.model.exposure |" not in text
     assert r"\bottomrule" in (asked.output / "tables.tex").read_text()
     assert read_image(asked.output / "comparison_sample.png").std() > 5
     for name in ("psnr_by_steps", "psnr_by_seconds", "error_by_angle", "error_by_distance"):
@@ -96,7 +98,12 @@ def test_trained_configurations_differ_in_the_named_fields_alone(finished):
     assert different == {
         ("experiment_name: nerfacto_seed-0", "experiment_name: edge_seed-0"),
         ("depth_loss: none", "depth_loss: edge"),
-        ("depth_source: auto", "depth_source: integrated"),
+        ("depth_source: none", "depth_source: integrated"),
+        ("depth_loss_final: 1.0", "depth_loss_final: 0.01"),
+        ("sky_loss_mult: 0.0", "sky_loss_mult: 0.01"),
+        ("sky_background: false", "sky_background: true"),
+        ("surface_loss_mult: 0.0", "surface_loss_mult: 1.0"),
+        ("surface_rays_per_batch: 0", "surface_rays_per_batch: 16384"),
     }
 
 

@@ -20,7 +20,7 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_image, read_json, write_distance_png, write_json, write_mask, write_png
 from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss, proposal_loss
 from edge_depth_nerf.method.integration import IntegrationOptions, integrate_depth, select_prior, sigma_m
-from edge_depth_nerf.method.losses import edge_loss
+from edge_depth_nerf.method.losses import UrbanTerms, edge_loss, urban_nerf_loss
 from edge_depth_nerf.method.prior import PriorOptions
 
 HALVES = [torch.float16, torch.bfloat16]
@@ -66,6 +66,21 @@ def test_the_edge_loss_is_finite(gaussian: Any, divide: bool, dtype: torch.dtype
         (gradient,) = torch.autograd.grad(loss, weights)
         assert math.isfinite(loss.item()), sigma
         # float16 ends at 65,504: a gradient beyond is infinite in it, and the scaler of mixed precision skips the step
+        assert torch.isfinite(gradient).all() or dtype == torch.float16, sigma
+        assert not torch.isnan(gradient).any(), sigma
+
+
+@pytest.mark.parametrize("dtype", [*HALVES, torch.float32])
+@pytest.mark.parametrize("autocast", [None, *HALVES])
+def test_urban_nerfs_loss_is_finite(dtype: torch.dtype, autocast: Any) -> None:
+    edges, weights = samples(dtype)
+    weights.requires_grad_()
+    prior = torch.tensor([2.0, 3.0, 250.0, 1e-3, 4.0, torch.nan, 0.0]).to(dtype)
+    for sigma in (1e-3, 0.3, 300.0):
+        with torch.autocast("cpu", autocast or torch.bfloat16, enabled=autocast is not None):
+            loss = urban_nerf_loss(weights, edges[:, :-1], edges[:, 1:], prior, sigma, UrbanTerms())
+        (gradient,) = torch.autograd.grad(loss, weights)
+        assert math.isfinite(loss.item()), sigma
         assert torch.isfinite(gradient).all() or dtype == torch.float16, sigma
         assert not torch.isnan(gradient).any(), sigma
 
@@ -252,6 +267,10 @@ HOSTILE: dict[str, tuple[Callable[[Path], Any], dict[str, Any]]] = {
     "large weight": (lambda scene: None, {"model__depth_loss_mult": 1e4}),
     "ds-nerf at the limit": (lambda scene: None, {"model__depth_loss": "ds-nerf", "model__depth_sigma": 1e-3}),
     "urban-nerf at the limit": (lambda scene: None, {"model__depth_loss": "urban-nerf", "model__depth_sigma": 1e-3}),
+    "urban-nerf-los at the limit": (
+        lambda scene: None,
+        {"model__depth_loss": "urban-nerf-los", "model__depth_sigma": 1e-3},
+    ),
 }
 
 

@@ -8,7 +8,7 @@ import reference
 import torch
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.method.losses import EPS, Gaussian, edge_loss, sky_loss
+from edge_depth_nerf.method.losses import EPS, Gaussian, UrbanTerms, edge_loss, sky_loss, urban_nerf_loss
 
 GAUSSIANS: tuple[Gaussian, ...] = ("point", "interval")
 FORMS = [(gaussian, norm) for gaussian in GAUSSIANS for norm in (False, True)]
@@ -261,3 +261,109 @@ def test_the_sky_loss_is_the_mean_share_that_is_stopped():
     none = sky_loss(weights, torch.zeros(4, dtype=torch.bool))
     assert float(none) == 0 and none.requires_grad
     assert sky_loss(weights.half(), torch.ones(4, dtype=torch.bool)).dtype == torch.float32
+
+
+def urban_rays(seed: int, dtype: torch.dtype = torch.float64) -> dict:
+    """Random rays, without a σ of each."""
+    rays = random_rays(seed, dtype=dtype)
+    del rays["sigma_m"]
+    return rays
+
+
+TERMS = [UrbanTerms(1.0, 0.0, 0.0), UrbanTerms(0.0, 1.0, 0.0), UrbanTerms(0.0, 0.0, 1.0), UrbanTerms(0.3, 2.0, 0.7)]
+
+
+@pytest.mark.parametrize(("dtype", "rtol"), [(torch.float64, 1e-5), (torch.float32, 1e-3)], ids=str)
+@pytest.mark.parametrize("terms", TERMS, ids=str)
+@pytest.mark.parametrize("sigma_m", [0.05, 0.6, 8.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_urban_nerfs_loss_equals_its_twin(seed, sigma_m, terms, dtype, rtol):
+    rays = urban_rays(seed, dtype)
+    rays["weights"][:, ::5] = 0
+    loss = urban_nerf_loss(**rays, sigma_m=sigma_m, terms=terms)
+    arrays = {name: tensor.numpy().astype(np.float64) for name, tensor in rays.items()}
+    weights = {"expected": terms.expected, "empty": terms.empty, "near": terms.near}
+    twin = reference.urban_nerf_loss(**arrays, sigma_m=sigma_m, **weights)
+    assert loss.dtype == dtype and twin > 0
+    assert float(loss) == pytest.approx(twin, rel=rtol)
+
+
+@pytest.mark.parametrize("terms", TERMS, ids=str)
+def test_urban_nerfs_gradient_equals_finite_differences(terms):
+    rays = {name: tensor[:8, :10] if tensor.ndim == 2 else tensor[:8] for name, tensor in urban_rays(1).items()}
+    weights = (rays.pop("weights") + 0.01).requires_grad_()
+    assert torch.autograd.gradcheck(lambda w: urban_nerf_loss(w, **rays, sigma_m=4.0, terms=terms), (weights,))
+
+
+def urban_ray(weights, edges, prior: float, sigma: float, terms: UrbanTerms) -> float:
+    edges = torch.tensor(edges, dtype=torch.float64)[None]
+    given = torch.tensor(weights, dtype=torch.float64)[None]
+    return float(urban_nerf_loss(given, edges[:, :-1], edges[:, 1:], torch.tensor([prior]).double(), sigma, terms))
+
+
+def test_urban_nerfs_terms_by_hand():
+    # samples [1, 2], [2, 5], [5, 9] m, weights 0.2, 0.3, 0.4; prior 4 m, σ = 1/3 m, so ε = 1 m
+    weights, edges = [0.2, 0.3, 0.4], [1.0, 2.0, 5.0, 9.0]
+    found = [urban_ray(weights, edges, 4.0, 1 / 3, terms) for terms in TERMS[:3]]
+    # expected 0.2 · 1.5 + 0.3 · 3.5 + 0.4 · 7 = 4.15, less 4 m
+    assert found[0] == pytest.approx(0.15**2)
+    # up to 3 m: 0.2² · 1 + 0.1² · 1
+    assert found[1] == pytest.approx(0.05)
+    # 3 to 5 m lie in the second sample: 0.1² · 2 - 2 · 0.1 · 1 + ∫K²; without the cut that is 3 / (2√π) = 0.846284,
+    # cut at 3σ it is times erf(3) / erf(3/√2)² = 0.999978 / 0.994608
+    assert found[2] == pytest.approx(0.02 - 0.2 + 0.846284 * 0.999978 / 0.994608, abs=2e-6)
+
+
+def test_urban_nerfs_loss_is_least_where_light_ends_as_the_kernel_says():
+    edges = np.linspace(1, 9, 801)
+    middles = (edges[:-1] + edges[1:]) / 2
+    losses = {}
+    for at in (4.0, 5.0, 6.0):
+        for width in (0.1, 0.3, 0.9):
+            weights = np.exp(-((middles - at) ** 2) / (2 * width**2))
+            losses[at, width] = urban_ray(weights / weights.sum(), edges.tolist(), 5.0, 0.3, UrbanTerms())
+    assert min(losses, key=lambda key: losses[key]) == (5.0, 0.3)
+    # the kernel itself, but for its cut ends: nothing is left
+    assert losses[5.0, 0.3] == pytest.approx(0, abs=1e-2)
+    assert all(value > -1e-9 for value in losses.values())
+
+
+def test_urban_nerfs_loss_does_not_depend_on_how_a_ray_is_cut_into_samples():
+    """nerfstudio's does: its target grows with no sample's length."""
+    coarse = urban_ray([0.2, 0.3, 0.4], [1.0, 2.0, 5.0, 9.0], 4.2, 0.2, UrbanTerms())
+    fine = urban_ray([0.1, 0.1, 0.1, 0.2, 0.4], [1.0, 1.5, 2.0, 3.0, 5.0, 9.0], 4.2, 0.2, UrbanTerms())
+    assert fine == pytest.approx(coarse, rel=1e-9)
+
+
+def test_urban_nerfs_sigma_narrows_over_the_training():
+    terms = UrbanTerms(narrowing=16.0)
+    assert [terms.sigma_m(0.1, share) for share in (0.0, 0.5, 1.0)] == pytest.approx([1.6, 0.4, 0.1])
+
+
+def test_urban_nerfs_rays_without_a_prior_do_not_count():
+    rays = urban_rays(2)
+    with_prior = {name: tensor[4:] for name, tensor in rays.items()}
+    torch.testing.assert_close(urban_nerf_loss(**with_prior, sigma_m=0.5), urban_nerf_loss(**rays, sigma_m=0.5))
+    none = {name: tensor[:4] for name, tensor in rays.items()}
+    none["weights"].requires_grad_()
+    loss = urban_nerf_loss(**none, sigma_m=0.5)
+    assert loss.item() == 0
+    loss.backward()
+    assert torch.equal(none["weights"].grad, torch.zeros(4, 30, dtype=torch.float64))
+    assert float(urban_nerf_loss(**{name: tensor[:0] for name, tensor in rays.items()}, sigma_m=0.5)) == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"starts_m": torch.ones(12, 29)}, r"urban_nerf_loss: starts_m \(12, 29\) does not fit weights \(12, 30\)"),
+        ({"prior_m": torch.ones(12, 1)}, r"urban_nerf_loss: prior_m \(12, 1\) does not fit"),
+        ({"weights": torch.ones(12, 30, 1)}, r"weights \(12, 30, 1\); expected two dimensions"),
+        ({"sigma_m": 0.0}, "urban_nerf_loss: sigma_m is 0.0; expected a positive number"),
+        ({"sigma_m": math.nan}, "sigma_m is nan"),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+)
+def test_wrong_input_of_urban_nerfs_loss(change, words, unchecked_types):
+    with pytest.raises(InputError, match=words):
+        urban_nerf_loss(**{**urban_rays(7), "sigma_m": 0.5, **change})

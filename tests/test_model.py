@@ -12,11 +12,13 @@ from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.model_components.losses import ds_nerf_depth_loss, urban_radiance_field_depth_loss
 from nerfstudio.models.nerfacto import NerfactoModel
 
-from edge_depth_nerf.method.losses import edge_loss
+from edge_depth_nerf.method.losses import UrbanTerms, edge_loss, urban_nerf_loss
 from edge_depth_nerf.plugin.compat import lpips_not_built
 from edge_depth_nerf.plugin.model import DepthInEvaluation, EdgeDepthNerfModel
 
 METRES_PER_UNIT = 20.0
+LOSSES = ("edge", "ds-nerf", "urban-nerf", "urban-nerf-los")
+NO_EXTRAS = {"sky_loss_mult": 0.0, "sky_background": False, "surface_loss_mult": 0.0, "depth_loss_final": 1.0}
 
 
 def build(**options) -> EdgeDepthNerfModel:
@@ -132,6 +134,22 @@ def test_baselines_are_the_host_own_losses_in_metres(kind):
     assert "edge_loss" not in losses
 
 
+def test_urban_nerf_of_its_authors_is_in_metres_and_narrows():
+    terms = UrbanTerms(0.1, 2.0, 0.5, narrowing=4.0)
+    model = build(depth_loss="urban-nerf-los", depth_loss_mult=0.5, depth_loss_final=1.0, depth_sigma=0.3, urban=terms)
+    for step, sigma_m in ((0, 1.2), (15_000, 0.6), (30_000, 0.3)):
+        model._step = step
+        outputs, losses = trained_step(model)
+        total = torch.zeros(())
+        for weights, samples in zip(outputs["weights_list"], outputs["ray_samples_list"], strict=True):
+            starts, ends = (edge[..., 0] * METRES_PER_UNIT for edge in (samples.frustums.starts, samples.frustums.ends))
+            total += urban_nerf_loss(weights[..., 0], starts, ends, batch()["prior_distance_m"][:, 0], sigma_m, terms)
+        assert torch.allclose(losses["depth_loss"], 0.5 * total / 3)
+    losses["depth_loss"].backward()
+    gradients = [p.grad for p in model.field.mlp_base.parameters()]
+    assert any(g is not None and bool(g.abs().sum() > 0) for g in gradients)
+
+
 def test_sigma_of_ds_nerf_is_a_standard_deviation_in_metres():
     """One sample a ray, one sigma from the prior: it is pulled exp(-1/2) as hard as one at the prior."""
     model = build(depth_loss="ds-nerf", depth_sigma=0.3, depth_loss_mult=1.0)
@@ -153,6 +171,42 @@ def test_without_a_depth_loss_it_is_nerfacto():
     assert set(with_loss) == {*losses, "edge_loss", "sky_loss"}
     for name, value in losses.items():
         assert torch.equal(value, with_loss[name])
+
+
+def step_with_surface(model):
+    """Outputs and losses of a training step that brings further pixels."""
+    model.train()
+    torch.manual_seed(3)
+    with torch.no_grad():
+        for parameter in model.field.parameters():
+            parameter.normal_(0, 0.3)  # a new field has one colour everywhere
+    outputs, supervision = model(rays()), batch() | surface()
+    return outputs, model.get_loss_dict(outputs, supervision, model.get_metrics_dict(outputs, supervision))
+
+
+@pytest.mark.parametrize("kind", LOSSES)
+def test_surface_sky_and_falling_weight_are_options_of_any_depth_loss(kind):
+    name = "edge_loss" if kind == "edge" else "depth_loss"
+    model, plain = build(depth_loss=kind), build(depth_loss=kind, **NO_EXTRAS)
+    outputs, losses = step_with_surface(model)
+    plain_outputs, without = step_with_surface(plain)
+    assert set(losses) - set(without) == {"sky_loss", "surface_loss"} and name in without
+    of_edge = step_with_surface(build())[1]
+    # the same samples: what surface and sky make of them has nothing to do with the depth loss
+    for extra in ("sky_loss", "surface_loss"):
+        assert float(losses[extra].detach()) == pytest.approx(float(of_edge[extra].detach()), rel=1e-5)
+    assert not torch.allclose(outputs["rgb"], plain_outputs["rgb"], atol=1e-2)
+    for each, share in ((model, 0.01), (plain, 1.0)):
+        weight = each._depth_weight()
+        each._step = 30_000
+        assert each._depth_weight() == pytest.approx(share * weight)
+
+
+def test_without_weight_the_prior_serves_surface_and_sky_alone():
+    outputs, losses = step_with_surface(build(depth_loss_mult=0.0))
+    of_edge_outputs, of_edge = step_with_surface(build())
+    assert set(of_edge) - set(losses) == {"edge_loss"} and {"sky_loss", "surface_loss"} < set(losses)
+    assert torch.equal(outputs["rgb"], of_edge_outputs["rgb"])
 
 
 def colours_at(model, bundle: RayBundle, distance_units) -> torch.Tensor:
@@ -278,7 +332,7 @@ def test_a_surface_that_is_not_between_the_planes_says_nothing(distance_m):
     assert float(found["surface_loss"]) != pytest.approx(losses[0], rel=1e-3)
 
 
-@pytest.mark.parametrize("kind", ["edge", "ds-nerf", "urban-nerf"])
+@pytest.mark.parametrize("kind", LOSSES)
 @pytest.mark.parametrize("distance_m", [0.05, 0.199, 51.0, 255.9])
 def test_a_prior_that_is_not_between_the_planes_is_none(kind, distance_m):
     model = build(depth_loss=kind, near_m=0.2, far_m=50.0).train()

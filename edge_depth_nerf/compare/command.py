@@ -7,6 +7,7 @@ import os
 import platform
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, get_args
@@ -22,14 +23,15 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import check_is_folder, read_json_object, write_json, write_png, write_text
 from edge_depth_nerf.base.one_writer import only_writer
 from edge_depth_nerf.base.pictures import DISTANCE, resize, side_by_side, with_colour_bar
-from edge_depth_nerf.compare.methods import METHODS, Setting, default_methods
+from edge_depth_nerf.compare.grid import grid_lines, grid_tables
+from edge_depth_nerf.compare.methods import GRID, METHODS, Setting, default_methods
 from edge_depth_nerf.compare.options import CompareOptions, MethodName
 from edge_depth_nerf.compare.plots import draw_plots
 from edge_depth_nerf.compare.report import first_runs, make_report
 from edge_depth_nerf.compare.results import Results, check_fair, read_results, write_rows
-from edge_depth_nerf.compare.search import show_search, write_search
+from edge_depth_nerf.compare.search import TUNED, grids, show_search, write_search
 from edge_depth_nerf.compare.specification import FIGURES, SPECIFICATION, VIEWS, RunSpecification
-from edge_depth_nerf.compare.tables import as_latex, as_markdown, make_tables
+from edge_depth_nerf.compare.tables import as_latex, as_markdown, fields_table, make_tables, page_of_tables
 from edge_depth_nerf.jobs.runs import command_line, viewer_command
 from edge_depth_nerf.jobs.tasks import Task, do_tasks, this_machine
 from edge_depth_nerf.report.build import Report, write_report
@@ -40,6 +42,9 @@ from edge_depth_nerf.scene.format import LAYERS, layers_of, read_transforms
 
 RECORD = "compare.json"
 RUNS = "runs"
+SEARCH, COMPARISON = "search", "comparison"
+GRID_PAGE = "grid.md"
+"""The two folders of a grid, and its page."""
 LOG = "run.log"
 VIEWS_SHOWN = 3
 MAX_SETTING = 1e6
@@ -49,16 +54,18 @@ LEAST_WIDTH_PX, MOST_WIDTH_PX = 220, 350
 
 
 def compare(options: CompareOptions, console: Console | None = None) -> Results:
-    """Run or finish a comparison, or a search with `--search`.
+    """Run or finish a comparison, a search with `--search`, or both with `--grid`.
 
     Returns:
-        All that the output folder holds.
+        All that the output folder holds; of a grid what was judged.
 
     Raises:
         InputError: options, scenes or the output folder cannot be used, or a run failed (its log is named).
 
     """
     console = console or Console()
+    if options.grid:
+        return compare_grid(options, console)
     with finished_runs(options, console) as results:
         if options.search:
             write_search(options.output, results)
@@ -68,6 +75,63 @@ def compare(options: CompareOptions, console: Console | None = None) -> Results:
             write_report(options.output / REPORT, page)
             show_tables(page.tables, console)
             _show_places(options.output, results, console)
+    return results
+
+
+def compare_grid(options: CompareOptions, console: Console) -> Results:
+    """Search λ and σ of each cell on the tuning drives, compare the cells with what was found, and say what came out.
+
+    Search and comparison are those of `compare`, in two folders of the output folder.
+
+    Returns:
+        The comparison.
+
+    Raises:
+        InputError: options, scenes or the output folder cannot be used, or a run failed (its log is named).
+
+    """
+    options.check()
+    check_is_folder(options.output)
+    cells = options.methods or tuple(GRID.values())
+    others = [name for name in cells if METHODS[name].cell is None]
+    if others:
+        raise InputError(
+            f"--grid --methods {' '.join(others)}: expected cells of the grid, {', '.join(GRID.values())}."
+        )
+    search, comparison = options.output / SEARCH, options.output / COMPARISON
+    if options.output.is_dir() and any(options.output.iterdir()) and not search.is_dir():
+        raise InputError(f"{options.output}: holds other things. Choose a new or empty folder for --output.")
+    # what is to be judged is looked at before a search of hours
+    for scene in options.scenes:
+        check_scene(scene, cells, options.preset)
+    searched = compare(
+        replace(
+            options,
+            grid=False,
+            search=True,
+            scenes=options.tuning,
+            tuning=(),
+            output=search,
+            methods=tuple(name for name in cells if METHODS[name].sigma_field is not None),
+            seeds=options.seeds[:1],
+        ),
+        console,
+    )
+    judged = replace(
+        options,
+        grid=False,
+        tuning=(),
+        lambdas=(),
+        sigmas_m=(),
+        output=comparison,
+        methods=cells,
+        tuned=search / TUNED,
+    )
+    results = compare(judged, console)
+    tables = grid_tables(results, grids(searched))
+    write_text(options.output / GRID_PAGE, page_of_tables("Grid", grid_lines(results, searched), tables))
+    show_tables(tables, console)
+    say(console, f"What prior, loss, extras and the whole are worth: {options.output / GRID_PAGE}")
     return results
 
 
@@ -148,8 +212,9 @@ def write_comparison(output: Path, results: Results, console: Console) -> Report
     """Write tables, figures, plots and pictures of a comparison; give what its page shows."""
     tables = make_tables(results)
     write_rows(output, results)
-    write_text(output / "tables.md", as_markdown(results, tables))
-    write_text(output / "tables.tex", as_latex(results, tables))
+    written = [*tables, fields_table(results)]
+    write_text(output / "tables.md", as_markdown(results, written))
+    write_text(output / "tables.tex", as_latex(results, written))
     with console.status("Plots and pictures"):
         plots = draw_plots(output, results)
         for scene in results.scenes():
@@ -259,7 +324,7 @@ def _record(options: CompareOptions, tuned: dict[str, Setting]) -> dict[str, Any
         "steps": options.steps,
         "rivals_implementation": options.rivals_implementation,
         "tuned": {name: {"lambda": setting.weight, "sigma_m": setting.sigma_m} for name, setting in tuned.items()},
-        "tuned_on": None if options.tuned is None else read_json_object(options.tuned).get("scene"),
+        "tuned_on": None if options.tuned is None else read_json_object(options.tuned).get("scenes"),
     }
     path = options.output / RECORD
     if path.is_file():

@@ -18,12 +18,26 @@ MethodName = Literal[
     "nerfacto",
     "nerfacto-embedding",
     "urban-nerf",
+    "urban-nerf-los",
     "ds-nerf",
     "edge-lidar",
     "edge-mono",
     "edge-gaussian",
     "edge-paper",
     "edge",
+    "nerfacto-lidar-extras",
+    "nerfacto-integrated-extras",
+    "urban-nerf-integrated",
+    "urban-nerf-extras",
+    "urban-nerf-integrated-extras",
+    "urban-nerf-los-integrated",
+    "urban-nerf-los-extras",
+    "urban-nerf-los-integrated-extras",
+    "ds-nerf-integrated",
+    "ds-nerf-extras",
+    "ds-nerf-integrated-extras",
+    "edge-lidar-plain",
+    "edge-plain",
 ]
 Sigma = float | Literal["own"]
 
@@ -44,7 +58,8 @@ class CompareOptions:
     output: Path
     """Folder for the runs, results.csv and results.json, tables.md and tables.tex, pictures and plots."""
     methods: tuple[MethodName, ...] = ()
-    """Which methods. None named: all, with --preset paper without edge-paper, which is edge there."""
+    """Which methods. None named: all but those that only the grid has, with --preset paper without edge-paper, which is
+    edge there; with --grid all of its cells."""
     steps: int | None = None
     """Training steps of each run. Not set: the preset's."""
     seeds: tuple[int, ...] = (0,)
@@ -55,21 +70,26 @@ class CompareOptions:
     tuned: Path | None = None
     """λ and σ of the methods: tuned.json of a search, or a file of that form. Not set: the defaults."""
     rivals_implementation: Implementation = "same"
-    """torch: nerfacto, urban-nerf and ds-nerf are computed by nerfstudio's own torch code, with the same results, for
-    figures at equal seconds."""
+    """torch: nerfacto, ds-nerf and both forms of UrbanNeRF are computed by nerfstudio's own torch code, with the same
+    results, for figures at equal seconds."""
     jobs: int | None = None
     """Trainings side by side. Not set: one a core, on a GPU one."""
     cluster: str | None = None
     """Train on a Dask cluster: local (processes on this machine, one for each GPU or core), or the address of a
     scheduler, such as tcp://10.0.0.1:8786. Needs `pip install edge-depth-nerf[cluster]`; see docs/cluster.md."""
     search: bool = False
-    """Instead of tables: train each method with each λ and σ on one tuning scene and seed, and write the best to
+    """Instead of tables: train each method with each λ and σ on tuning scenes and one seed, and write the best to
     tuned.json."""
+    grid: bool = False
+    """Each loss with each prior, without and with the extras: search λ and σ of each on --tuning, then train and judge
+    all on the scenes, and say what prior, loss, extras and the whole are worth (grid.md)."""
+    tuning: tuple[Path, ...] = ()
+    """With --grid: scene folders to search λ and σ on, of other drives than those that are judged."""
     lambdas: tuple[float, ...] = ()
-    """With --search: the weights λ of the depth loss to try, 4 at least."""
+    """With --search or --grid: the weights λ of the depth loss to try, 4 at least."""
     sigmas_m: tuple[Sigma, ...] = ()
-    """With --search: the standard deviations σ to try, metres, 3 at least; own: the one that the method has by itself
-    (for edge-…: the prior's own at each pixel)."""
+    """With --search or --grid: the standard deviations σ to try, metres, 3 at least; own: the one that the method has
+    by itself (for edge-…: the prior's own at each pixel)."""
 
     def check(self) -> None:
         """Check what can be checked without looking at the disk.
@@ -105,18 +125,25 @@ class CompareOptions:
             "--preset paper --methods edge-paper",
             "edge, which is the literal method in this preset",
         )
-        if not self.search:
+        require(not (self.search and self.grid), "--search with --grid", "one of them: the grid searches first")
+        require(self.grid or not self.tuning, "--tuning without --grid", "both, or --search on the tuning scenes")
+        if not self.search and not self.grid:
             require(
                 not self.lambdas and not self.sigmas_m,
-                "--lambdas or --sigmas-m without --search",
-                "both with --search, or --tuned FILE with what a search found",
+                "--lambdas or --sigmas-m without --search or --grid",
+                "both with one of these, or --tuned FILE with what a search found",
             )
             return
-        require(len(self.scenes) == 1, f"--search with {len(self.scenes)} scenes", "one, which no table uses")
-        require(len(self.seeds) == 1, f"--search with {len(self.seeds)} seeds", "one, which no table uses")
-        require(self.tuned is None, "--search with --tuned", "one of them")
-        without = [name for name in self.methods if name.startswith("nerfacto")]
-        require(not without, f"--search --methods {' '.join(without)}", "methods with a depth loss")
+        require(self.tuned is None, f"--{'grid' if self.grid else 'search'} with --tuned", "one of them")
+        if self.grid:
+            require(self.preset != "paper", "--grid with --preset paper", "lite or full: paper has no extras")
+            require(len(self.tuning) > 0, "--grid without --tuning", "at least one scene that is not judged")
+            tuned_on = {scene.resolve() for scene in self.tuning} & {scene.resolve() for scene in self.scenes}
+            require(not tuned_on, f"--tuning {' '.join(map(str, tuned_on))}", "other drives than those that are judged")
+        else:
+            require(len(self.seeds) == 1, f"--search with {len(self.seeds)} seeds", "one, which no table uses")
+            without = [name for name in self.methods if name.startswith("nerfacto")]
+            require(not without, f"--search --methods {' '.join(without)}", "methods with a depth loss")
         require(
             len(self.lambdas) >= LEAST_LAMBDAS and all(math.isfinite(x) and x > 0 for x in self.lambdas),
             f"--lambdas {' '.join(map(str, self.lambdas))}",

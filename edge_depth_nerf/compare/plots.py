@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from edge_depth_nerf.base.files import write_bytes
-from edge_depth_nerf.compare.methods import METHODS
+from edge_depth_nerf.compare.methods import METHODS, Loss
 from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.results import Results, RunResult
 from edge_depth_nerf.compare.tables import CLOCKS, clock_metric, curve_metric
@@ -28,6 +28,7 @@ STYLES: dict[MethodName, tuple[str, str, str, str]] = {
     "nerfacto": ("#888888", "#9aa3ad", "--", "o"),
     "nerfacto-embedding": ("#b5b5b5", "#6f7780", ":", "x"),
     "urban-nerf": ("#b08030", "#d9a94a", "--", "s"),
+    "urban-nerf-los": ("#7a5195", "#b493cc", "--", "d"),
     "ds-nerf": ("#444444", "#d5dae0", "--", "^"),
     "edge-lidar": ("#2a9d8f", "#3cc4b3", ":", "v"),
     "edge-mono": ("#8ab17d", "#a9d39a", ":", "D"),
@@ -35,6 +36,14 @@ STYLES: dict[MethodName, tuple[str, str, str, str]] = {
     "edge-paper": ("#3a86ff", "#70a9ff", "-.", "X"),
     "edge": ("#d62828", "#ff625c", "-", "o"),
 }
+LOSS_STYLES: dict[Loss, tuple[str, str]] = {
+    "none": ("#888888", "#9aa3ad"),
+    "urban-nerf": ("#b08030", "#d9a94a"),
+    "urban-nerf-los": ("#7a5195", "#b493cc"),
+    "ds-nerf": ("#444444", "#d5dae0"),
+    "edge": ("#d62828", "#ff625c"),
+}
+"""On white, on dark: of the methods that the grid alone has."""
 BINS = {"by_angle_deg": "angle from the optical axis, degrees", "by_distance_m": "distance, m"}
 PSNR_LABEL = "PSNR, dB"
 _INK = {False: "#1b2026", True: "#d5dae0"}
@@ -93,8 +102,16 @@ def _twice(title: str, draw: Callable[[bool], bytes]) -> Plot:
     return Plot(title, light=drawn[False], dark=drawn[True])
 
 
+def style_of(method: MethodName) -> tuple[str, str, str, str]:
+    """Colour on white, on dark, line and marker; of the grid's cells by loss, extras and prior."""
+    cell = METHODS[method].cell
+    if method in STYLES or cell is None:
+        return STYLES[method]
+    return *LOSS_STYLES[cell.loss], "-" if cell.extras else "--", "D" if cell.prior == "integrated" else "v"
+
+
 def _draw(axis: Axes, method: MethodName, line: Line, dark: bool) -> None:
-    on_white, on_dark, pattern, symbol = STYLES[method]
+    on_white, on_dark, pattern, symbol = style_of(method)
     axis.plot(
         *line,
         color=on_dark if dark else on_white,

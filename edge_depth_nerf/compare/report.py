@@ -11,10 +11,10 @@ from edge_depth_nerf.base.files import read_json
 from edge_depth_nerf.compare.methods import METHODS
 from edge_depth_nerf.compare.results import Results, RunResult
 from edge_depth_nerf.compare.specification import OF_A_RUN, VIEWS
-from edge_depth_nerf.compare.tables import introduction
+from edge_depth_nerf.compare.tables import fields_table, introduction
 from edge_depth_nerf.jobs.runs import viewer_command
 from edge_depth_nerf.report.build import Commands, Facts, Plot, Report
-from edge_depth_nerf.report.tables import Cell, MadeTable, Row
+from edge_depth_nerf.report.tables import MadeTable
 from edge_depth_nerf.report.views import make_drives
 
 
@@ -44,7 +44,7 @@ def make_report(results: Results, tables: Sequence[MadeTable], plots: Sequence[P
             *(_of_drive(scene, runs[0]) for scene, runs in first.items()),
             _configuration(results),
         ],
-        settings=[_named_fields(results)],
+        settings=[fields_table(results)],
         commands=[
             Commands("What made this", results.options.get("commands", [])),
             Commands("To look around in what was trained", [viewer_command(path) for path in configs]),
@@ -91,21 +91,8 @@ def _of_drive(scene: str, run: RunResult) -> Facts:
     return Facts(f"Drive {scene}", {name: value for name, value in entries.items() if value})
 
 
-def _named_fields(results: Results) -> MadeTable:
-    """The fields that methods set, and what they came to."""
-    runs = [next(run for run in results.runs if run.method == name) for name in results.methods()]
-    named = sorted({name for run in runs for name in run.content["named"]})
-    rows = [
-        Row(name, [Cell(None, words=run.content["configuration"].get(name, "–").strip("'")) for run in runs])
-        for name in named
-    ]
-    headings = [METHODS[run.method].title for run in runs]
-    note = "The fields of the configuration that methods set. In all others they are the same."
-    return MadeTable("", "What the methods differ in", [("", headings)], rows, [note])
-
-
 def _configuration(results: Results) -> Facts:
-    named = {name for run in results.runs for name in run.content["named"]}
+    different = {row.title for row in fields_table(results).rows}
     shared: Mapping[str, str] = results.runs[0].content["configuration"]
-    entries = {name: value.strip("'") for name, value in sorted(shared.items()) if name not in {*named, *OF_A_RUN}}
+    entries = {name: value.strip("'") for name, value in sorted(shared.items()) if name not in {*different, *OF_A_RUN}}
     return Facts(f"The whole configuration that all share ({len(entries)} fields)", entries, folded=True)

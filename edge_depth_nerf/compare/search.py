@@ -1,7 +1,11 @@
-"""The search of λ and σ: what came out of each pair, and the best of each method."""
+"""The search of λ and σ: what came out of each pair, and the best of each method.
+
+Of several drives the mean counts.
+"""
 
 from __future__ import annotations
 
+import statistics
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +25,7 @@ TUNED = "tuned.json"
 
 @dataclass(frozen=True)
 class Grid:
-    """What came out for a method: PSNR, dB, by λ and σ."""
+    """What came out for a method: PSNR, dB, mean over the drives, by λ and σ."""
 
     method: MethodName
     lambdas: list[float]
@@ -48,7 +52,15 @@ def grids(results: Results) -> list[Grid]:
     found = []
     for method in results.methods():
         runs = [run for run in results.runs if run.method == method]
-        psnr = {(run.specification["weight"], run.specification["sigma_m"]): run.figures[name] for run in runs}
+        figures: dict[tuple[float, float | str], dict[str, float]] = {}
+        for run in runs:
+            pair = (run.specification["weight"], run.specification["sigma_m"])
+            figures.setdefault(pair, {})[run.scene] = run.figures[name]
+        drives = max(len(by_drive) for by_drive in figures.values())
+        # one that not all drives have, as of a search that goes on, is no mean
+        psnr = {
+            pair: statistics.fmean(by_drive.values()) for pair, by_drive in figures.items() if len(by_drive) == drives
+        }
         sigmas = {sigma for _, sigma in psnr}
         found.append(
             Grid(
@@ -66,7 +78,7 @@ def write_search(output: Path, results: Results) -> None:
     run = results.runs[0]
     found = grids(results)
     content: dict[str, Any] = {
-        "scene": run.specification["scene"],
+        "scenes": sorted({each.specification["scene"] for each in results.runs}),
         "seed": run.seed,
         "preset": run.specification["preset"],
         "steps": run.content["steps"],
@@ -78,10 +90,11 @@ def write_search(output: Path, results: Results) -> None:
     }
     write_json(output / TUNED, content)
     against = ", against the truth" if "truth" in content["chosen_by"] else ""
+    against += ", mean over the drives" if len(results.scenes()) > 1 else ""
     parts = [
         "# Search of λ and σ",
-        f"{run.scene}, seed {run.seed}, preset {content['preset']}, {content['steps']} steps each; PSNR in dB of "
-        f"random held-out pixels inside the mask{against}.",
+        f"{', '.join(results.scenes())}, seed {run.seed}, preset {content['preset']}, {content['steps']} steps each; "
+        f"PSNR in dB of random held-out pixels inside the mask{against}.",
     ]
     for grid in found:
         parts.append(f"## {METHODS[grid.method].title}")

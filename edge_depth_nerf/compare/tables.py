@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from edge_depth_nerf.compare.methods import METHODS
 from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.results import Results, RunResult
+from edge_depth_nerf.compare.specification import OF_A_RUN
 from edge_depth_nerf.report.tables import Cell, MadeTable, Metric, Row, mark_best, mean_and_spread
 
 PAPER_AHEAD_DB: dict[str, dict[MethodName, float]] = {
@@ -249,10 +250,36 @@ def _settings_table(results: Results) -> MadeTable:
     notes = ["σ in metres, or how the prior's own is found at each pixel."]
     searched_on = results.options.get("tuned_on")
     if searched_on is not None:
-        notes.append(f"Searched on {Path(str(searched_on)).name}.")
-        if searched_on in {run.specification["scene"] for run in results.runs}:
-            notes.append("That drive is one of these tables, too: its figures flatter what was searched.")
+        drives = searched_on if isinstance(searched_on, list) else [searched_on]
+        notes.append(f"Searched on {' and '.join(Path(str(drive)).name for drive in drives)}.")
+        if {run.specification["scene"] for run in results.runs}.intersection(map(str, drives)):
+            notes.append("A drive of these tables is among them: its figures flatter what was searched.")
     return MadeTable("7", "λ and σ", [("", ["λ", "σ", "from"])], rows, notes)
+
+
+def differing_fields(configurations: Sequence[Mapping[str, str]]) -> list[str]:
+    """The dotted names in which configurations, as `described` gives them, are not all the same, sorted.
+
+    What is a run's own, its seed, scene and folder, is left out.
+    """
+    names = sorted({name for each in configurations for name in each} - {*OF_A_RUN})
+    return [name for name in names if len({each.get(name) for each in configurations}) > 1]
+
+
+def fields_table(results: Results) -> MadeTable:
+    """Each field of the trained configurations in which a method differs from another, and what each method has there.
+
+    It is made from what was trained, not from what the methods name.
+    """
+    runs = [next(run for run in results.runs if run.method == name) for name in results.methods()]
+    configurations = [run.content["configuration"] for run in runs]
+    rows = [
+        Row(name, [Cell(None, words=str(each.get(name, "–")).strip("'")) for each in configurations])
+        for name in differing_fields(configurations)
+    ]
+    headings = [METHODS[run.method].title for run in runs]
+    note = "Of the configurations that were trained; in all other fields they are the same."
+    return MadeTable("8", "What the methods differ in", [("", headings)], rows, [note], on_terminal=False)
 
 
 def make_tables(results: Results) -> list[MadeTable]:
@@ -266,6 +293,7 @@ def make_tables(results: Results) -> list[MadeTable]:
         "nerfacto-embedding",
         "nerfacto",
         "urban-nerf",
+        "urban-nerf-los",
         "ds-nerf",
         "edge-paper",
         "edge",
@@ -324,7 +352,12 @@ def introduction(results: Results) -> list[str]:
 
 def as_markdown(results: Results, tables: Sequence[MadeTable]) -> str:
     """All tables as Markdown."""
-    parts = ["# Comparison", *introduction(results)]
+    return page_of_tables("Comparison", introduction(results), tables)
+
+
+def page_of_tables(title: str, lines: Sequence[str], tables: Sequence[MadeTable]) -> str:
+    """Give a title, paragraphs and tables as Markdown."""
+    parts = [f"# {title}", *lines]
     for table in tables:
         headings = [f"{group} {heading}".strip() for group, heading in table.headings()]
         lines = [f"| | {' | '.join(headings)} |", "|---|" + "---|" * len(headings)]

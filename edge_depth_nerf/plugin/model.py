@@ -39,7 +39,7 @@ from edge_depth_nerf.kernels.fields import CubeContraction, FusedNerfactoField, 
 from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss, proposal_loss
 from edge_depth_nerf.kernels.openmp import let_idle_threads_sleep
 from edge_depth_nerf.kernels.ray_samplers import FusedPDFSampler, edges_of
-from edge_depth_nerf.method.losses import edge_loss, sky_loss
+from edge_depth_nerf.method.losses import URBAN_TERMS, UrbanTerms, edge_loss, sky_loss, urban_nerf_loss
 from edge_depth_nerf.method.metrics import DepthErrors, load_lpips, masked_lpips, masked_psnr, masked_ssim
 from edge_depth_nerf.method.uncertainty import termination_std
 from edge_depth_nerf.plugin.compat import lpips_not_built, total_steps, without_undefined_ray
@@ -61,27 +61,33 @@ class EdgeDepthNerfModelConfig(NerfactoModelConfig):
     """How far along the ray to start sampling, metres (in place of near_plane)."""
     far_m: float = 1000.0
     """How far along the ray to stop sampling, metres (in place of far_plane)."""
-    depth_loss: Literal["edge", "ds-nerf", "urban-nerf", "none"] = "edge"
-    """The loss on the distance prior: Eq. 4, nerfstudio's DS-NeRF or UrbanNeRF loss, or none (plain nerfacto)."""
+    depth_loss: Literal["edge", "ds-nerf", "urban-nerf", "urban-nerf-los", "none"] = "edge"
+    """The loss on the distance prior: Eq. 4, nerfstudio's DS-NeRF or UrbanNeRF loss, UrbanNeRF's as its authors have it
+    (line of sight with a narrowing σ, its terms weighed apart), or none (plain nerfacto)."""
     depth_loss_mult: float = 0.01
-    """Weight λ of the loss on the distance prior (not published; how it was chosen: docs/ablation.md)."""
+    """Weight λ of the loss on the distance prior (not published; how it was chosen: docs/ablation.md). 0: the prior
+    serves surface and sky alone."""
     depth_sigma: float = 0.5
-    """Standard deviation that the DS-NeRF and UrbanNeRF losses assume, metres. (Eq. 4 takes the prior's own.)"""
+    """Standard deviation that the DS-NeRF and UrbanNeRF losses assume, metres; with urban-nerf-los that of the end of
+    the training. (Eq. 4 takes the prior's own.)"""
+    urban: UrbanTerms = URBAN_TERMS
+    """With urban-nerf-los: what its terms weigh, and how its σ narrows."""
     depth_loss_levels: Literal["all", "final"] = "all"
     """Whether the loss acts on the samples of the proposal networks too, or on the final ones alone."""
     depth_loss_final: float = 0.01
     """The share of λ that is left after `depth_loss_steps`; until then it falls exponentially. The prior shapes the
     scene early, and its errors at the outlines of things hold the pictures back late. 1: λ stays."""
     depth_loss_steps: int | None = None
-    """Steps in which λ falls. None: those of the whole training, or 30,000 where no trainer says how many."""
+    """Steps in which λ falls, and with urban-nerf-los σ. None: those of the whole training, or 30,000 where no trainer
+    says how many."""
     sky_loss_mult: float = 0.01
-    """With the edge loss: weight of what rays into the sky hit, their accumulated weight. 0: the sky is left to
+    """With a depth loss: weight of what rays into the sky hit, their accumulated weight. 0: the sky is left to
     colour."""
     sky_background: bool = True
-    """With the edge loss: what no sample stops is coloured by the field at infinity, where the sky is. False: by the
+    """With a depth loss: what no sample stops is coloured by the field at infinity, where the sky is. False: by the
     last sample, as in nerfacto, from wherever that is."""
     surface_loss_mult: float = 1.0
-    """With the edge loss: weight of the colour error of the field at the prior's distance, for the datamanager's
+    """With a depth loss: weight of the colour error of the field at the prior's distance, for the datamanager's
     `surface_rays_per_batch` further pixels at one sample each."""
     exposure: Literal["gain", "affine", "grid", "embedding", "none"] = "gain"
     """What makes up for a camera's drifting exposure and white balance. gain: a factor for each colour of each training
@@ -205,7 +211,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         self._fused = implementation == "fused"
         if self.config.exposure != "embedding":
             self.config.use_appearance_embedding = False
-        self._has_sky = self.config.depth_loss == "edge" and self.config.sky_background
+        self._has_sky = self.config.depth_loss != "none" and self.config.sky_background
         if self._has_sky:
             # nothing is added to what samples stop; `get_outputs` adds the colour at infinity
             self.config.background_color = "black"
@@ -417,14 +423,14 @@ class EdgeDepthNerfModel(NerfactoModel):
             losses = self._nerfacto_losses(outputs, batch, metrics_dict)
         else:
             losses = super().get_loss_dict(outputs, batch, metrics_dict)
-        if self.training and self.config.depth_loss != "none":
+        if self.training and self.config.depth_loss != "none" and self.config.depth_loss_mult > 0:
             levels = list(zip(outputs["weights_list"], outputs["ray_samples_list"], strict=True))
             if self.config.depth_loss_levels == "final":
                 levels = levels[-1:]
             per_level = [self._depth_loss(weights, samples, outputs, batch) for weights, samples in levels]
             name = "edge_loss" if self.config.depth_loss == "edge" else "depth_loss"
             losses[name] = self._depth_weight() * torch.stack(per_level).mean()
-        if self.training and self.config.depth_loss == "edge":
+        if self.training and self.config.depth_loss != "none":
             losses |= self._sky_and_surface_losses(outputs, batch)
         if self.training and self.config.exposure in ("affine", "grid") and self.exposure is not None:
             losses["exposure_loss"] = self.config.exposure_mult * self.exposure.unevenness()
@@ -439,9 +445,12 @@ class EdgeDepthNerfModel(NerfactoModel):
 
     def _depth_weight(self) -> float:
         """λ at this step."""
+        return self.config.depth_loss_mult * self.config.depth_loss_final ** self._share_done()
+
+    def _share_done(self) -> float:
+        """The share of `depth_loss_steps` that is behind."""
         steps = self._training_steps if self.config.depth_loss_steps is None else self.config.depth_loss_steps
-        share = min(1.0, self._step / max(1, steps))
-        return self.config.depth_loss_mult * self.config.depth_loss_final**share
+        return min(1.0, self._step / max(1, steps))
 
     def _sky_and_surface_losses(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
         losses = {}
@@ -509,6 +518,11 @@ class EdgeDepthNerfModel(NerfactoModel):
                 batch["prior_sigma_m"].to(weights)[..., 0],
                 gaussian=self.config.edge_gaussian,
                 divide_by_norm=self.config.edge_divide_by_norm,
+            )
+        if self.config.depth_loss == "urban-nerf-los":
+            narrowed_m = self.config.urban.sigma_m(self.config.depth_sigma, self._share_done())
+            return urban_nerf_loss(
+                weights[..., 0], starts_m[..., 0], ends_m[..., 0], prior_m[..., 0], narrowed_m, self.config.urban
             )
         middles_m = (starts_m + ends_m) / 2
         sigma_m = weights.new_tensor([self.config.depth_sigma])

@@ -64,7 +64,7 @@ class EdgeDepthPipeline(VanillaPipeline):
         assert isinstance(model, EdgeDepthNerfModelConfig) and isinstance(data, FisheyeDepthDataManagerConfig)
         if model.depth_loss == "none":
             config = replace(config, datamanager=replace(data, depth_source="none"))
-        elif model.depth_loss != "edge" or model.surface_loss_mult == 0:
+        elif model.surface_loss_mult == 0:
             config = replace(config, datamanager=replace(data, surface_rays_per_batch=0))
         super().__init__(config, str(device), *args, **kwargs)
         manager = self.datamanager
