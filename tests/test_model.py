@@ -180,7 +180,8 @@ def step_with_surface(model):
     with torch.no_grad():
         for parameter in model.field.parameters():
             parameter.normal_(0, 0.3)  # a new field has one colour everywhere
-    outputs, supervision = model(rays()), batch() | surface()
+    supervision = batch() | surface()
+    outputs = model(rays(), supervision)
     return outputs, model.get_loss_dict(outputs, supervision, model.get_metrics_dict(outputs, supervision))
 
 
@@ -457,3 +458,19 @@ def test_same_parameters_as_nerfacto():
     shapes = [{name: value.shape for name, value in model.state_dict().items()} for model in (ours, host)]
     assert shapes[0] == shapes[1]
     host.load_state_dict(ours.state_dict())
+
+
+def test_levels_that_do_not_learn_are_left_out_and_the_others_pull_as_before():
+    """nerfstudio lets its proposal networks rest in most steps; their levels would give a number, and no gradient."""
+    for rests in (False, True):
+        model = build(depth_loss_mult=1.0).train()
+        if rests:
+            model.proposal_sampler._step, model.proposal_sampler._steps_since_update = 1000, 1
+        torch.manual_seed(3)
+        outputs = model(rays(), batch())
+        *proposals, final = zip(outputs["weights_list"], outputs["ray_samples_list"], strict=True)
+        assert [weights.requires_grad for weights, _ in proposals] == [not rests] * 2
+        losses = model.get_loss_dict(outputs, batch(), model.get_metrics_dict(outputs, batch()))
+        levels = [final] if rests else [*proposals, final]
+        expected = sum(float(model._depth_loss(*level, outputs, batch())) for level in levels) / 3
+        assert float(losses["edge_loss"]) == pytest.approx(expected, rel=1e-5)

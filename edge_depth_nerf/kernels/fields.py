@@ -7,6 +7,7 @@ positions in a box) is left to nerfstudio's.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -112,34 +113,30 @@ class FusedNerfactoField(NerfactoField):
         before, embedding = torch.split(features, [1, self.geo_feat_dim], dim=-1)
         return self.average_init_density * trunc_exp(before.to(inside)) * inside, embedding
 
-    def forward_also_at(
-        self, ray_samples: RaySamples, points: RaySamples
-    ) -> tuple[dict[FieldHeadNames, Tensor], Tensor]:
-        """Evaluate samples along rays and, in the same pass through the hash grid, further points.
+    def forward_together(self, parts: Sequence[RaySamples]) -> list[dict[FieldHeadNames, Tensor]]:
+        """Evaluate several sets of samples in one pass through the hash grid.
 
-        A pass of their own would fill a gradient of the size of the table for them, and add it to the other one.
+        Passes of their own would each fill a gradient of the size of the table, and these would be added.
 
         Args:
-            ray_samples: [rays, samples].
-            points: [points, 1].
+            parts: samples of any shapes, each [rays, samples].
 
         Returns:
-            What `forward` gives for the samples, without normals, and the colours of the points, [points, 3].
+            What `forward` gives for each, without normals.
 
         """
         if not isinstance(self.spatial_distortion, CubeContraction) or self.use_pred_normals:
-            return self.forward(ray_samples), self.forward(points)[FieldHeadNames.RGB][:, 0]
-        parts = [each.frustums.get_positions() for each in (ray_samples, points)]
-        counts = [each[..., 0].numel() for each in parts]
-        places, inside = _unit_cube(self, torch.cat([each.reshape(-1, 3) for each in parts]))
+            return [self.forward(samples) for samples in parts]
+        positions = [samples.frustums.get_positions().reshape(-1, 3) for samples in parts]
+        counts = [len(each) for each in positions]
+        places, inside = _unit_cube(self, torch.cat(positions))
+        of_parts = zip(parts, self.mlp_base(places).split(counts), inside.split(counts), strict=True)
         results = []
-        for samples, *values in zip(
-            (ray_samples, points), self.mlp_base(places).split(counts), inside.split(counts), strict=True
-        ):
+        for samples, *values in of_parts:
             features, valid = (value.view(*samples.frustums.shape, -1) for value in values)
             density, embedding = self._density(features, valid)
             results.append({FieldHeadNames.DENSITY: density, **self.get_outputs(samples, embedding)})
-        return results[0], results[1][FieldHeadNames.RGB][:, 0]
+        return results
 
     def get_outputs(
         self, ray_samples: RaySamples, density_embedding: Tensor | None = None

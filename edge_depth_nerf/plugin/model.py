@@ -350,6 +350,12 @@ class EdgeDepthNerfModel(NerfactoModel):
         at = torch.cat(distances)[:, None, None]
         return every.get_ray_samples(bin_starts=0.99 * at, bin_ends=1.01 * at)
 
+    def _fields(self, parts: list[RaySamples]) -> list[dict[FieldHeadNames, Tensor]]:
+        """The field at several sets of samples."""
+        if isinstance(self.field, FusedNerfactoField):
+            return self.field.forward_together(parts)
+        return [self.field.forward(samples) for samples in parts]
+
     def _rendered(self, rays: RayBundle, batch: dict[str, Any] | None) -> tuple[dict[str, Any], Tensor]:
         """Nerfacto's outputs, and the field's colours at `_places`, [places, 3]."""
         if self.config.predict_normals:
@@ -361,33 +367,31 @@ class EdgeDepthNerfModel(NerfactoModel):
             self.camera_optimizer.apply_to_raybundle(rays)
         samples, weights_list, samples_list = self.proposal_sampler(rays, density_fns=self.density_fns)
         places = self._places(rays, batch)
-        if places is None:
-            found, further = self.field.forward(samples), rays.origins[:0]
-        elif isinstance(self.field, FusedNerfactoField):
-            found, further = self.field.forward_also_at(samples, places)
-        else:
-            found = self.field.forward(samples)
-            further = self.field.forward(places)[FieldHeadNames.RGB][:, 0]
+        found, *others = self._fields([samples, *([] if places is None else [places])])
         if self.config.use_gradient_scaling:
             found = scale_gradients_by_distance_squared(found, samples)
         weights = samples.get_weights(found[FieldHeadNames.DENSITY])
         weights_list.append(weights)
         samples_list.append(samples)
-        with torch.no_grad():
-            depths = [
-                self.renderer_depth(weights=each, ray_samples=its)
-                for each, its in zip(weights_list, samples_list, strict=True)
-            ]
         outputs = {
             "rgb": self.renderer_rgb(rgb=found[FieldHeadNames.RGB], weights=weights),
             "accumulation": self.renderer_accumulation(weights=weights),
-            "depth": depths.pop(),
-            "expected_depth": self.renderer_expected_depth(weights=weights, ray_samples=samples),
-            **{f"prop_depth_{number}": depth for number, depth in enumerate(depths)},
+            **self._depths(weights_list, samples_list),
         }
         if self.training:
             outputs |= {"weights_list": weights_list, "ray_samples_list": samples_list}
-        return outputs, further
+        return outputs, others[0][FieldHeadNames.RGB][:, 0] if others else rays.origins[:0]
+
+    def _depths(self, weights_list: list[Tensor], samples_list: list[RaySamples]) -> dict[str, Any]:
+        """Nerfacto's depths, of the final samples and of those of the proposal networks."""
+        with torch.no_grad():
+            *before, depth = (
+                self.renderer_depth(weights=weights, ray_samples=samples)
+                for weights, samples in zip(weights_list, samples_list, strict=True)
+            )
+        expected = self.renderer_expected_depth(weights=weights_list[-1], ray_samples=samples_list[-1])
+        named = {f"prop_depth_{number}": each for number, each in enumerate(before)}
+        return {"depth": depth, "expected_depth": expected, **named}
 
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
         """Outputs of a whole view; distance and uncertainty also in colours that always mean the same metres."""
@@ -424,12 +428,8 @@ class EdgeDepthNerfModel(NerfactoModel):
         else:
             losses = super().get_loss_dict(outputs, batch, metrics_dict)
         if self.training and self.config.depth_loss != "none" and self.config.depth_loss_mult > 0:
-            levels = list(zip(outputs["weights_list"], outputs["ray_samples_list"], strict=True))
-            if self.config.depth_loss_levels == "final":
-                levels = levels[-1:]
-            per_level = [self._depth_loss(weights, samples, outputs, batch) for weights, samples in levels]
             name = "edge_loss" if self.config.depth_loss == "edge" else "depth_loss"
-            losses[name] = self._depth_weight() * torch.stack(per_level).mean()
+            losses[name] = self._depth_weight() * self._depth_losses(outputs, batch)
         if self.training and self.config.depth_loss != "none":
             losses |= self._sky_and_surface_losses(outputs, batch)
         if self.training and self.config.exposure in ("affine", "grid") and self.exposure is not None:
@@ -497,6 +497,18 @@ class EdgeDepthNerfModel(NerfactoModel):
         }
         self.camera_optimizer.get_loss_dict(losses)
         return losses
+
+    def _depth_losses(self, outputs: dict[str, Any], batch: dict[str, Any]) -> Float[Tensor, ""]:
+        """The loss on the distance prior, mean over the levels of samples.
+
+        While the proposal networks rest their levels would only add a number; the final samples' share stays the same.
+        """
+        levels = list(zip(outputs["weights_list"], outputs["ray_samples_list"], strict=True))
+        if self.config.depth_loss_levels == "final":
+            levels = levels[-1:]
+        learning = [level for level in levels if level[0].requires_grad]
+        per_level = [self._depth_loss(*level, outputs, batch) for level in learning or levels]
+        return torch.stack(per_level).sum() / len(levels)
 
     def _depth_loss(
         self,
