@@ -66,5 +66,5 @@ def test_threads_add_in_one_order(monkeypatch) -> None:
         for share in reversed(shares):
             work(share)
 
-    monkeypatch.setattr(cpu, "_share_out", backwards)
+    monkeypatch.setattr(cpu, "share_out", backwards)
     assert torch.equal(cpu.table_gradient(positions, gradient, scalings, 2 * 64), expected)

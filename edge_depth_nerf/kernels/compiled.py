@@ -17,6 +17,7 @@ TRAINING = (
     "edge_depth_nerf.kernels.hash_grid_numba",
     "edge_depth_nerf.kernels.contraction",
     "edge_depth_nerf.kernels.ray_kernels",
+    "edge_depth_nerf.kernels.table_adam_numba",
     "edge_depth_nerf.kernels.integration_numba",
 )
 """The modules whose kernels a training on the CPU calls."""

@@ -11,6 +11,7 @@ from nerfstudio.field_components.encodings import HashEncoding
 from torch import Tensor, nn
 
 from edge_depth_nerf.kernels.hash_grid import back_end, hash_grid
+from edge_depth_nerf.kernels.table_adam import IN_PLACE
 
 
 class FusedHashEncoding(HashEncoding):
@@ -40,3 +41,4 @@ def use_fused_encodings(module: nn.Module) -> None:
         if type(part) is HashEncoding:
             # the class alone differs; another object would have to be found by all who hold this one
             part.__class__ = FusedHashEncoding
+            setattr(part.hash_table, IN_PLACE, False)  # until an optimiser says that it can do with it

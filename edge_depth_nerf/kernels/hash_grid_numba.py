@@ -189,7 +189,7 @@ def _threads(points: int, levels: int) -> int:
     return max(1, min(torch.get_num_threads(), points * levels // LEAST_SHARE))
 
 
-def _share_out(work: Callable[[Any], None], shares: list[Any]) -> None:
+def share_out(work: Callable[[Any], None], shares: list[Any]) -> None:
     """Call `work` once for each share, all at once, the first one in this thread."""
     waiting = [_pool(os.getpid(), len(shares) - 1).submit(work, share) for share in shares[1:]]
     try:
@@ -199,7 +199,8 @@ def _share_out(work: Callable[[Any], None], shares: list[Any]) -> None:
             future.result()
 
 
-def _stretches(count: int, parts: int) -> list[tuple[int, int]]:
+def stretches(count: int, parts: int) -> list[tuple[int, int]]:
+    """Give where `parts` equal parts of a range begin and end."""
     return [(count * part // parts, count * (part + 1) // parts) for part in range(parts)]
 
 
@@ -215,7 +216,7 @@ def encode(
     points, levels = len(positions), len(scalings)
     encoded = torch.empty(points, levels * table.shape[1])
     arrays = _axes(positions), table.detach().contiguous().numpy(), scalings.numpy(), encoded.numpy()
-    _share_out(lambda part: _encode_points(*arrays, *part), _stretches(points, _threads(points, levels)))
+    share_out(lambda part: _encode_points(*arrays, *part), stretches(points, _threads(points, levels)))
     return encoded
 
 
@@ -225,17 +226,34 @@ def table_gradient(
     scalings: Float[Tensor, "levels"],
     rows: int,
 ) -> Float[Tensor, "rows features"]:
-    """Give the gradient to a table of `rows` rows, from the gradient to the encoded values.
+    """Give the gradient to a table of `rows` rows, from the gradient to the encoded values."""
+    # NumPy asks the system for large pages, torch does not: a third of the time of a table of 64 MB
+    into = torch.from_numpy(np.empty((rows, gradient.shape[1] // len(scalings)), np.float32))
+    _sum_up(positions, gradient, scalings, into, anew=True)
+    return into
+
+
+def add_table_gradient(
+    positions: Float[Tensor, "points 3"],
+    gradient: Float[Tensor, "points encoded"],
+    scalings: Float[Tensor, "levels"],
+    into: Float[Tensor, "rows features"],
+) -> None:
+    """Add the gradient to a table to what `into` holds; contiguous."""
+    _sum_up(positions, gradient, scalings, into, anew=False)
+
+
+def _sum_up(positions: Tensor, gradient: Tensor, scalings: Tensor, into: Tensor, anew: bool) -> None:
+    """Add a table's gradient to `into`, or write it there.
 
     Each thread takes an equal stretch of the levels' points, levels far apart in resolution one after the other (fine
     ones take longer). Where a stretch begins within a level, which another thread begins, it adds into a table of its
     own, and that is added in the end.
     """
     points, levels = len(positions), len(scalings)
-    size, features = rows // levels, gradient.shape[1] // levels
+    size, features = len(into) // levels, into.shape[1]
     axes, given, scaling_of = _axes(positions), gradient.detach().contiguous().numpy(), scalings.numpy()
-    # NumPy asks the system for large pages, torch does not: a third of the time of a table of 64 MB
-    grids = np.empty((levels, size, features), np.float32)
+    grids = into.view(levels, size, features).numpy()
     threads = _threads(points, levels)
     order = [level for thread in range(threads) for level in range(thread, levels, threads)]
     own_grids: dict[tuple[int, int], np.ndarray] = {}
@@ -248,17 +266,17 @@ def table_gradient(
             level = order[place]
             if first == 0:
                 grid = grids[level]
-                grid[:] = 0
+                if anew:
+                    grid[:] = 0
             else:
                 grid = np.zeros((size, features), np.float32)
                 own_grids[level, first] = grid
             _add_to_grid(axes, scaling_of[level], given, level * features, grid, first, last)
 
-    _share_out(work, _stretches(points * levels, threads))
+    share_out(work, stretches(points * levels, threads))
     # in one order, whichever thread was ready first: the same sums each time
     for (level, _), grid in sorted(own_grids.items(), key=lambda item: item[0]):
         grids[level] += grid
-    return torch.from_numpy(grids).view(rows, features)
 
 
 def position_gradient(
@@ -277,5 +295,5 @@ def position_gradient(
         gradient.detach().contiguous().numpy(),
         result.numpy(),
     )
-    _share_out(lambda part: _differentiate_points(*arrays, *part), _stretches(points, _threads(points, levels)))
+    share_out(lambda part: _differentiate_points(*arrays, *part), stretches(points, _threads(points, levels)))
     return result

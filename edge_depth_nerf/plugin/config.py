@@ -21,6 +21,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.kernels.table_adam import TableAdam
 from edge_depth_nerf.plugin.compat import allow_numpy_scalars_in_checkpoints
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModelConfig
@@ -38,6 +39,8 @@ else:
 class FusedAdamConfig(AdamOptimizerConfig):
     """Adam in one pass over each tensor, on the CPU and on CUDA: the same steps, half the time."""
 
+    _target: type = TableAdam
+    """Target class to instantiate."""
     fused: bool = True
     """torch's fused form; without it, its default."""
 
