@@ -183,7 +183,7 @@ def check_extras() -> Iterator[Finding]:
             name,
             "ok" if there else "note",
             version(package) if there else f"not installed; only for {what}",
-            "" if there else f"pip install 'edge-depth-nerf[{extra}]'",
+            "" if there else f"pip install '.[{extra}]'",
         )
     ffmpeg = shutil.which("ffmpeg")
     yield Finding(

@@ -44,13 +44,13 @@ def test_the_name_of_an_extra_is_shown(monkeypatch):
     """Brackets are no markup there."""
 
     def lacking():
-        yield Finding("Thing", "note", "[none]", "pip install 'edge-depth-nerf[hf]'")
+        yield Finding("Thing", "note", "[none]", "pip install '.[hf]'")
 
     console = Console(file=io.StringIO(), width=100)
     monkeypatch.setattr(doctor, "CHECKS", (lacking,))
     assert run_doctor(console) == 0
     assert isinstance(console.file, io.StringIO)
-    assert "[none]" in console.file.getvalue() and "edge-depth-nerf[hf]" in console.file.getvalue()
+    assert "[none]" in console.file.getvalue() and "'.[hf]'" in console.file.getvalue()
 
 
 def test_one_problem_is_enough_for_the_exit_status(monkeypatch):
@@ -77,10 +77,10 @@ def test_missing_libraries_are_findings(monkeypatch):
     monkeypatch.setattr(doctor, "find_spec", lambda name: None if name in hidden else spec(name))
     hidden = {"pycolmap", "kiss_icp", "transformers", "distributed", "tinycudann", "numba"}
     extras = found(doctor.check_extras)
-    assert extras["COLMAP"].state == "note" and "edge-depth-nerf[colmap]" in extras["COLMAP"].remedy
-    assert extras["KISS-ICP"].state == "note" and "edge-depth-nerf[odometry]" in extras["KISS-ICP"].remedy
-    assert extras["transformers"].state == "note" and "edge-depth-nerf[hf]" in extras["transformers"].remedy
-    assert extras["Dask"].state == "note" and "edge-depth-nerf[cluster]" in extras["Dask"].remedy
+    assert extras["COLMAP"].state == "note" and "'.[colmap]'" in extras["COLMAP"].remedy
+    assert extras["KISS-ICP"].state == "note" and "'.[odometry]'" in extras["KISS-ICP"].remedy
+    assert extras["transformers"].state == "note" and "'.[hf]'" in extras["transformers"].remedy
+    assert extras["Dask"].state == "note" and "'.[cluster]'" in extras["Dask"].remedy
     assert found(doctor.check_kernels)["Hash grids"].state == "problem"
     hidden.remove("numba")
     assert found(doctor.check_kernels)["Hash grids"].state == "ok"

@@ -351,7 +351,7 @@ def test_the_kernel_picture_is_of_eq_7(sample_drive):
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory) -> Path:
-    pytest.importorskip("material", reason="pip install edge-depth-nerf[docs]")
+    pytest.importorskip("material", reason="pip install '.[docs]'")
     folder = tmp_path_factory.mktemp("site")
     done = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)],

@@ -346,6 +346,15 @@ def test_a_moment_between_scans_is_a_picture_without_lidar(mine: Path, holdout: 
     assert ("No LiDAR return in 6 pictures" in said) is bool(holdout)
 
 
+def test_a_drive_too_short_to_hold_one_out_is_told_how(mine: Path, capsys) -> None:
+    convert(options(mine, frames=3, holdout_every=8))
+    said = " ".join(capsys.readouterr().out.split())
+    assert "No frame is held out: the drive has 3, too few for --holdout-every 8. --holdout-every 5 holds one" in said
+    shutil.rmtree(mine.parent / "scene")
+    convert(options(mine, frames=3, holdout_every=5))
+    assert "No frame is held out" not in capsys.readouterr().out
+
+
 def test_times_of_the_pictures_reach_the_scene(scene: Path) -> None:
     times = {frame["frame"]: frame["timestamp_s"] for frame in read_json(scene / "transforms.json")["frames"]}
     assert [times[number] - times[0] for number in range(FRAMES)] == pytest.approx(
@@ -536,7 +545,11 @@ LEFT = '[cameras.left]\nimages = "images/left"'
         ('format = "tum"', 'format = "tum"\nrate_hz = 10', r"poses\.rate_hz: unknown key; poses of format tum bring"),
         ('format = "tum"', 'format = "tum2"', r"poses\.format is 'tum2', expected one of 'tum', 'kitti'"),
         ('format = "tum"', 'format = "tum"\nof = "roo"', r"poses\.of is 'roo', expected one of 'vehicle', 'left'"),
-        ('format = "tum"', 'format = "kitti"\nrate_hz = 10', r"poses\.txt, line 2: 8 numbers, expected 12"),
+        (
+            'format = "tum"',
+            'format = "kitti"\nrate_hz = 10',
+            r"poses\.txt, line 2: 8 numbers as TUM's format has, expected 12",
+        ),
         ("[poses]", "[pose]", r"rig\.toml: pose: unknown key; Is poses meant\?"),
         ("[lidars.roof]", "[lidars.left]", "left is the name of a camera and of a scanner"),
         ("[cameras.left]", "[cameras.'a/b']", r"cameras\.a/b: a sensor's name is letters"),

@@ -54,6 +54,7 @@ from edge_depth_nerf.scene.writer import (
     SceneCamera,
     SceneFrame,
     ShiftedView,
+    best_holdout,
     held_out_frames,
     write_scene,
 )
@@ -98,6 +99,11 @@ def content(index: int, rng_seed: int = 0) -> FrameContent:
             pose(index)[:3, 3] + rng.uniform(-20, 20, (40, 3)), rng.integers(0, 256, (40, 3), dtype=np.uint8), rows
         ),
     )
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 5, 20])
+def test_a_short_drive_is_told_how_to_hold_one_out(count: int) -> None:
+    assert sum(held_out_frames(count, best_holdout(count))) >= 1
 
 
 def frames(count: int = 6, load: Callable[[int], FrameContent] | None = None) -> list[SceneFrame]:

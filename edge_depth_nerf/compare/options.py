@@ -76,7 +76,7 @@ class CompareOptions:
     """Trainings side by side. Not set: one a core, on a GPU one."""
     cluster: str | None = None
     """Train on a Dask cluster: local (processes on this machine, one for each GPU or core), or the address of a
-    scheduler, such as tcp://10.0.0.1:8786. Needs `pip install edge-depth-nerf[cluster]`; see docs/cluster.md."""
+    scheduler, such as tcp://10.0.0.1:8786. Needs `pip install '.[cluster]'`; see docs/cluster.md."""
     search: bool = False
     """Instead of tables: train each method with each λ and σ on tuning scenes and one seed, and write the best to
     tuned.json."""

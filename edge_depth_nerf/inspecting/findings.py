@@ -13,6 +13,7 @@ from edge_depth_nerf.inspecting.pose_check import BAD_MEDIAN_PX, bad_steps, pose
 from edge_depth_nerf.masks.ego_files import ego_mask_path, vehicles_unknown
 from edge_depth_nerf.poses.matches import Agreement
 from edge_depth_nerf.scene.reader import SceneFolder
+from edge_depth_nerf.scene.writer import best_holdout
 
 GAP_FACTOR = 10
 """Frames so many times farther apart than usual are a gap."""
@@ -128,7 +129,7 @@ def _split(scene: SceneFolder) -> Iterator[Finding]:
         yield Finding(
             "no_held_out",
             "No frame is held out, so the figures of ns-eval are of pictures that were trained on; process the drive "
-            "with --holdout-every 8.",
+            f"with --holdout-every {best_holdout(len({picture.frame for picture in scene.pictures}))}.",
         )
 
 

@@ -251,8 +251,7 @@ def on_cluster(address: str, tasks: Sequence[Task], reads: Sequence[Path], conso
         from distributed import Client
     except ImportError:
         raise InputError(
-            f"--cluster {address}: needs Dask. Install it here and for the workers: pip install "
-            "'edge-depth-nerf[cluster]'"
+            f"--cluster {address}: needs Dask. Install it here and for the workers: pip install '.[cluster]'"
         ) from None
     with ExitStack() as stack:
         if address == LOCAL:

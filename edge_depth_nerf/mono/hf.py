@@ -79,8 +79,7 @@ def load_ready_network(name: str, output: HfOutput = "auto") -> ReadyNetwork:
         import transformers
     except ImportError as error:
         raise InputError(
-            f"--hf {name}: the transformers library is missing ({error}). Install it with "
-            "`pip install edge-depth-nerf[hf]`."
+            f"--hf {name}: the transformers library is missing ({error}). Install it with `pip install '.[hf]'`."
         ) from None
     folder = Path(name)
     if folder.exists() and not (folder / "config.json").is_file():

@@ -43,7 +43,7 @@ class EstimateDepthOptions:
     hf: str | None = None
     """A ready-made network instead: the folder of a depth network of the transformers library, or its name in Hugging
     Face's cache, such as depth-anything/Depth-Anything-V2-Small-hf. Nothing is downloaded. Needs `pip install
-    edge-depth-nerf[hf]`."""
+    '.[hf]'`."""
     hf_output: HfOutput = "auto"
     """What its maps are: metric (z in metres), relative (depth up to scale and shift), inverse (disparity up to scale
     and shift); auto: as its config tells."""
@@ -66,7 +66,7 @@ class EstimateDepthOptions:
     cluster: str | None = None
     """Work on a Dask cluster: local (processes on this machine, one for each GPU or core), or the address of a
     scheduler, such as tcp://10.0.0.1:8786. The network is trained by one worker, then each scene's maps are a task.
-    Needs `pip install edge-depth-nerf[cluster]`; see docs/cluster.md."""
+    Needs `pip install '.[cluster]'`; see docs/cluster.md."""
 
     def check(self) -> None:
         """Check the ranges.

@@ -105,8 +105,8 @@ class EdgeDepthNerfModelConfig(NerfactoModelConfig):
     """Divide Eq. 4's Gaussian by σ̂·√(2π), so that a wide one does not pull harder than a narrow one."""
     implementation: Literal["auto", "fused", "tcnn", "torch"] = "auto"  # pyright: ignore[reportIncompatibleVariableOverride]
     """What computes fields, samples and losses. fused: kernels of our own (Numba on the CPU; on CUDA the hash grids, by
-    Triton). torch: nerfstudio's, same results and checkpoints as fused, many times slower. tcnn: tiny-cuda-nn, with
-    checkpoints of its own. auto: tcnn on a GPU where it is installed, else fused."""
+    Triton). torch: nerfstudio's, same results and checkpoints as fused, on a CPU many times slower. tcnn:
+    tiny-cuda-nn, with checkpoints of its own. auto: tcnn on a GPU where it is installed, else fused."""
 
 
 INFINITELY_FAR = 1e4

@@ -28,7 +28,7 @@ from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar.projection import transform_points
 from edge_depth_nerf.lidar.trajectory import Trajectory
 
-INSTALL = "pip install edge-depth-nerf[odometry]"
+INSTALL = "pip install '.[odometry]'"
 
 MIN_SWEEPS = 5
 """Fewer say too little of the velocity that the drive starts at."""

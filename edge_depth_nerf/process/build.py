@@ -24,7 +24,7 @@ from torch import Tensor
 from edge_depth_nerf.base.console import say
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, write_json
-from edge_depth_nerf.cameras import Camera
+from edge_depth_nerf.cameras import Camera, CameraFit
 from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar import project_points, transform_points
@@ -51,6 +51,7 @@ from edge_depth_nerf.scene.writer import (
     ProcessReport,
     SceneCamera,
     SceneFrame,
+    best_holdout,
     check_cameras,
     held_out_frames,
     open_scene,
@@ -94,6 +95,12 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
     if recording.skipped:
         say(console, f"Skipped {summarise(recording.skipped)}", "yellow")
     held_out = _held_out(recording, options)
+    if options.holdout_every > 0 and not held_out:
+        moments = len({picture.frame for picture in recording.pictures})
+        notices.append(
+            f"No frame is held out: the drive has {moments}, too few for --holdout-every {options.holdout_every}. "
+            f"--holdout-every {best_holdout(moments)} holds one out to judge by."
+        )
     if options.find_moving:
         recording, more = find_moving(recording, options, held_out, masks, console)
         notices += more
@@ -474,13 +481,18 @@ def _source(recording: Recording, options: ProcessOptions) -> dict[str, Any]:
     }
 
 
+def _fit_words(fit: CameraFit) -> str:
+    if fit.max_px < 5e-4:
+        return "is exactly this one"
+    return f"fits within {fit.rms_px:.4f} px rms, {fit.max_px:.3f} px at most"
+
+
 def _show(report: ProcessReport, console: Console) -> None:
     for name, share in report.mask_share.items():
         fit = report.fits[name]
         say(
             console,
-            f"{name}: nerfstudio's camera fits within {fit.rms_px:.4f} px rms, {fit.max_px:.3f} px at most; the mask "
-            f"keeps {share:.0%} of the picture",
+            f"{name}: nerfstudio's camera {_fit_words(fit)}; the mask keeps {share:.0%} of the picture",
         )
     for notice in report.notices:
         say(console, notice, "yellow")

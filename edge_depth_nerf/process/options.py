@@ -44,11 +44,11 @@ class ProcessOptions:
     """Rays further than this from the optical axis are masked out, in degrees."""
     poses: Literal["recorded", "colmap", "lidar"] = "recorded"
     """recorded: the poses that come with the drive; colmap: found from the pictures, their scale from LiDAR (needs
-    `pip install edge-depth-nerf[colmap]`); lidar: found from the sweeps (needs `pip install
-    edge-depth-nerf[odometry]`)."""
+    `pip install '.[colmap]'`); lidar: found from the sweeps (needs `pip install
+    '.[odometry]'`)."""
     refine_poses: bool = True
     """Refine the poses by the pictures: by features that they share, with the poses held softly, unless that makes
-    them no better. Needs `pip install edge-depth-nerf[colmap]`; without it the poses stay, and you are told."""
+    them no better. Needs `pip install '.[colmap]'`; without it the poses stay, and you are told."""
     sweeps: int = 3
     """Accumulate this many LiDAR sweeps before and after each picture's own. Training never sees a sweep of a moment
     that is held out; a picture that is held out gets its own alone."""
@@ -96,7 +96,7 @@ class ProcessOptions:
     """Leave the sky without monocular distance, instead of a wrong one."""
     cluster: str | None = None
     """Work on a Dask cluster, each scene as a task: local (processes on this machine, one for each GPU or core), or the
-    address of a scheduler, such as tcp://10.0.0.1:8786. Needs `pip install edge-depth-nerf[cluster]`; see
+    address of a scheduler, such as tcp://10.0.0.1:8786. Needs `pip install '.[cluster]'`; see
     docs/cluster.md."""
 
     def ego_mask_of(self, camera: str) -> Path | None:

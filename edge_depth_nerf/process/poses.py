@@ -6,6 +6,7 @@ names the file and the line.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -75,10 +76,11 @@ def read_kitti(path: Path) -> Float64[np.ndarray, "poses 4 4"]:
     """
     poses = []
     for line, values in _number_lines(path):
+        of_tum = " as TUM's format has" if len(values) == 8 else ""
         if len(values) != 12:
             raise InputError(
-                f"{path}, line {line}: {len(values)} numbers, expected 12 (a 3×4 matrix row by row, KITTI's format). "
-                "Check the format that the rig file gives for the poses."
+                f"{path}, line {line}: {len(values)} numbers{of_tum}, expected 12 (a 3×4 matrix row by row, KITTI's "
+                "format). Check the format that the rig file gives for the poses."
             )
         pose = np.eye(4)
         pose[:3] = np.reshape(values, (3, 4))
@@ -194,7 +196,10 @@ def _number(word: str, path: Path, line: int) -> float:
     except ValueError:
         value = np.nan
     if not np.isfinite(value):
-        raise InputError(f"{path}, line {line}: {shown(word)} is not a finite number.")
+        remedy = ""
+        if re.search(r"\d:\d", word):
+            remedy = " Write times as seconds: a date becomes seconds since 1970, a time of day seconds since midnight."
+        raise InputError(f"{path}, line {line}: {shown(word)} is not a finite number.{remedy}")
     return value
 
 

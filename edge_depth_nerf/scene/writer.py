@@ -215,6 +215,11 @@ def ranges(frames: Sequence[int]) -> str:
     return ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in runs)
 
 
+def best_holdout(count: int) -> int:
+    """Give the `holdout_every` that holds out one of `count` moments or more: 8, or less for very short drives."""
+    return max(2, min(8, 2 * count - 1))
+
+
 def held_out_frames(count: int, holdout_every: int) -> list[bool]:
     """Decide which of `count` moments, in order, are held out: the middle one of every `holdout_every`; 0 = none."""
     return [holdout_every > 0 and index % holdout_every == holdout_every // 2 for index in range(count)]

@@ -47,7 +47,7 @@ from edge_depth_nerf.process.recording import Recording
 THETA_MAX_DEG = 85.0
 """Features further from the axis are not used: COLMAP's lenses end at 90°, and calibrations are worst at the rim."""
 
-INSTALL = "pip install edge-depth-nerf[colmap]"
+INSTALL = "pip install '.[colmap]'"
 
 _OLDEST = (4, 2)
 _RECORD = "inputs.json"
