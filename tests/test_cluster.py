@@ -108,7 +108,7 @@ def test_an_address_is_local_or_a_schedulers(given: str) -> None:
 
 def test_without_dask_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(InputError, match=r"pip install 'edge-depth-nerf\[cluster\]'"):
+    with pytest.raises(InputError, match=r"pip install '\.\[cluster\]'"):
         with on_cluster("local", [steps(tmp_path, "a")], [], QUIET):
             pass
 

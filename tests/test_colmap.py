@@ -405,7 +405,7 @@ def pictured(folder: Path, moments: int, size: int = 64) -> Recording:
 
 def test_a_missing_package_is_named_with_the_command(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    with pytest.raises(InputError, match=r"pip install edge-depth-nerf\[colmap\]"):
+    with pytest.raises(InputError, match=r"pip install '\.\[colmap\]'"):
         colmap_poses(recording(12), ProcessOptions(output=tmp_path / "scene"), QUIET)
 
 

@@ -295,7 +295,7 @@ def test_a_vehicle_that_goes_nowhere_has_no_path(motion, message):
 
 def test_a_missing_package_is_named_with_the_command(monkeypatch):
     monkeypatch.setitem(sys.modules, "kiss_icp", None)
-    with pytest.raises(InputError, match=r"pip install edge-depth-nerf\[odometry\]"):
+    with pytest.raises(InputError, match=r"pip install '\.\[odometry\]'"):
         check_sweeps(Recording((), (), (), None, {}))
 
 
