@@ -8,8 +8,13 @@
 Sweeps are kept in the output folder, so that an interrupted run goes on where it stopped. Parallax is that of the true
 point, in the neighbour that tells most; enough is 4 px. Above: of pixels above LiDAR's field, the highest elevation
 that a thousandth of its returns has. `inside` leaves out pixels within 2 px of a jump of the true distance by a tenth,
-where a pixel shows two things. Each scene gets a picture of four of its pictures: RGB, truth, distance, error
-(blue 0, red 30 % and more).
+where a pixel shows two things. A second table gives the share of kept distances that are right to 10 %, and their
+median error, by confidence and by the parallax that was found. Each scene gets a sheet of four of its pictures: RGB,
+truth, distance, error (blue 0, red 30 % and more).
+
+Of scenes that `process` has finished, with LiDAR, monocular maps and maps from motion, the default prior of the
+training pictures is judged too, with motion and without: what share of the pixels has one, how wrong it is in LiDAR's
+field and above it, and how many errors are within one and two sigma.
 """
 
 from __future__ import annotations
@@ -17,6 +22,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import time
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -29,21 +35,22 @@ from rich.table import Table
 
 from edge_depth_nerf.base.files import write_png
 from edge_depth_nerf.kernels import sphere_sweep
-from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
+from edge_depth_nerf.method.integration import INTEGRATED
+from edge_depth_nerf.method.prior import PriorOptions, make_prior, view_of
+from edge_depth_nerf.mono.calibration import find_trust
+from edge_depth_nerf.process.motion import scene_view as view
+from edge_depth_nerf.scene.reader import read_scene
 from edge_depth_nerf.stereo.motion import Motion
 from edge_depth_nerf.stereo.sweep import Geometry, Swept, rays_of
-from edge_depth_nerf.stereo.views import View, view_of, working_factor
+from edge_depth_nerf.stereo.views import View, working_factor
 
 ENOUGH_PX = 4.0
 NEAREST_SHOWN_M, FARTHEST_SHOWN_M = 1.0, 80.0
 WORST_SHOWN = 0.3
 COLUMNS = ("drive", "pixels", "judged", "kept", "of enough", "AbsRel", "median", "< 5 %", "> 20 %", "s a picture")
-
-
-def view(scene: SceneFolder, picture: ScenePicture) -> View:
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = picture.rotation * np.array([1.0, -1.0, -1.0]), picture.position_m
-    return view_of(scene.rgb(picture), scene.usable(picture), picture.lens, pose, scene.theta_max_rad)
+CONFIDENCES = (0.7, 0.8, 0.9, 0.95, 1.01)
+PARALLAXES_PX = (2, 4, 8, 16, 32, 64, 1e4)
+PRIOR_COLUMNS = ("drive", "prior", "pixels", "have one", "AbsRel", "median", "1 sigma", "2 sigma")
 
 
 def parallax_px(seen: View, neighbours: list[View], distance_m: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -75,7 +82,7 @@ def panel(rgb: NDArray, truth_m: NDArray, found_m: NDArray, used: NDArray[np.boo
     return np.concatenate([rgb, depth(truth_m), depth(found_m), coloured(error, both)], 1)
 
 
-def judge(scene_path: Path, output: Path, every: int, console: Console) -> list[tuple[str, ...]]:
+def judge(scene_path: Path, output: Path, every: int) -> tuple[list[tuple[str, ...]], list[tuple[str, ...]]]:
     scene = read_scene(scene_path)
     pictures = [picture for picture in scene.pictures if not picture.held_out]
     positions = np.stack([picture.position_m for picture in pictures])
@@ -124,7 +131,10 @@ def judge(scene_path: Path, output: Path, every: int, console: Console) -> list[
             np.stack(
                 [
                     each[truth_m > 0].astype(np.float32)
-                    for each in (truth_m, found.distance_m, found.confidence, enough, above, beside_jumps(truth_m))
+                    for each in (
+                        *(truth_m, found.distance_m, found.confidence, found.parallax_px),
+                        *(enough, above, beside_jumps(truth_m)),
+                    )
                 ],
                 -1,
             )
@@ -134,7 +144,7 @@ def judge(scene_path: Path, output: Path, every: int, console: Console) -> list[
             panels.append(panel(rgb, truth_m, found.distance_m, seen.used))
     sheet = np.concatenate(panels, 0)
     write_png(output / f"{scene.folder.name}.png", sheet)
-    truth, distance, _, enough, above, edge = np.concatenate(rows).T
+    truth, distance, confidence, parallax, enough, above, edge = np.concatenate(rows).T
     spent = f"{np.mean(seconds):.1f}" if seconds else "-"
     parts = {"all": truth > 0, "inside": edge == 0, "above": above > 0}
     if layer == "lidar":
@@ -154,6 +164,51 @@ def judge(scene_path: Path, output: Path, every: int, console: Console) -> list[
                 *(f"{(error < 0.05).mean():.1%}", f"{(error > 0.2).mean():.1%}", spent),
             )
         )
+    error = np.abs(distance - truth) / truth
+    bins = []
+    for what, values, edges in (("confidence", confidence, CONFIDENCES), ("parallax, px", parallax, PARALLAXES_PX)):
+        for low, high in pairwise(edges):
+            where = (distance > 0) & (values >= low) & (values < high)
+            if where.any():
+                right, median = (error[where] < 0.1).mean(), np.median(error[where])
+                bins.append(
+                    (scene.folder.name, what, f"{low:g}-{high:g}", f"{where.sum():,}", f"{right:.1%}", f"{median:.4f}")
+                )
+    return table, bins
+
+
+def judge_prior(scene_path: Path, every: int) -> list[tuple[str, ...]]:
+    scene = read_scene(scene_path)
+    pictures = [picture for picture in scene.pictures if not picture.held_out][::every]
+    layer = "truth_distance" if scene.has("truth_distance") else "beams"
+    if not all(scene.has(name) for name in ("lidar", "mono", "motion", layer)):
+        return []
+    table = []
+    for motion in (False, True):
+        options = PriorOptions(motion=motion)
+        trust = find_trust(scene, options)
+        rows = []
+        for picture in pictures:
+            maps, view_angles = scene.maps(picture), view_of(picture.lens, picture.up_in_camera)
+            prior = make_prior(maps.distances_m, maps.usable, INTEGRATED, options, trust, view_angles)
+            truth = maps.distances_m[layer]
+            above = ~trust.in_field(view_angles.elevation_rad)
+            where = maps.usable & (truth > 0)
+            rows.append(np.stack([each[where] for each in (truth, prior.distance_m, prior.sigma_m, above)], -1))
+        truth, distance, sigma, above = np.concatenate(rows).T
+        for name, where in (("in the field", above == 0), ("above and below", above > 0)):
+            kept = where & (distance > 0)
+            if not kept.any():
+                continue
+            error = np.abs(distance - truth)[kept]
+            within = [(error <= times * sigma[kept]).mean() for times in (1, 2)]
+            table.append(
+                (
+                    *(scene.folder.name, "with motion" if motion else "without", name),
+                    *(f"{kept.sum() / max(1, where.sum()):.0%}", f"{(error / truth[kept]).mean():.4f}"),
+                    *(f"{np.median(error / truth[kept]):.4f}", f"{within[0]:.1%}", f"{within[1]:.1%}"),
+                )
+            )
     return table
 
 
@@ -166,12 +221,21 @@ def main() -> None:
     torch.set_num_threads(1)
     console = Console(width=120)
     table = Table(*COLUMNS, title="Distances from motion")
+    bins = Table("drive", "by", "from - to", "pixels", "right to 10 %", "median", title="What is kept")
     for scene in arguments.scenes:
-        for row in judge(scene, arguments.output, arguments.every, console):
+        of_scene, by_bins = judge(scene, arguments.output, arguments.every)
+        for row in of_scene:
             table.add_row(*row)
-    console.print(table)
+        for row in by_bins:
+            bins.add_row(*row)
+    console.print(table, bins)
+    priors = Table(*PRIOR_COLUMNS, title="The default prior of training pictures")
+    for scene in arguments.scenes:
+        for row in judge_prior(scene, arguments.every):
+            priors.add_row(*row)
+    console.print(priors)
     with (arguments.output / "table.txt").open("w") as file:
-        Console(file=file, width=120).print(table)
+        Console(file=file, width=120).print(table, bins, priors)
 
 
 if __name__ == "__main__":
