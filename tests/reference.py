@@ -25,10 +25,18 @@ def integrate_depth(
     least_returns=0.0,
     keep_returns=False,
     range_guide="mono",
+    motion_m=None,
+    motion_weight=0.0,
 ):
     """Eq. 5 to 7 for one map: distance, spread, monocular share, each [h, w]."""
     lidar = np.asarray(lidar_m, np.float64)
-    mono = np.asarray(mono_m, np.float64)
+    mono = np.array(mono_m, np.float64)
+    if motion_m is not None:
+        # (1-α) d̂ becomes (1-α) (ρ m + (1-ρ) d̂) where there are both
+        for place, motion in np.ndenumerate(np.asarray(motion_m, np.float64)):
+            has_mono = math.isfinite(mono[place]) and mono[place] > 0
+            if math.isfinite(motion) and motion > 0:
+                mono[place] = motion_weight * motion + (1 - motion_weight) * mono[place] if has_mono else motion
     height, width = mono.shape
     radius = kernel_size // 2
     distance, spread, mono_share = np.zeros((3, height, width))

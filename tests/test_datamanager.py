@@ -17,6 +17,7 @@ from edge_depth_nerf.plugin import datamanager as datamanager_module
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
 from edge_depth_nerf.plugin.dataset import FisheyeDepthDataset
+from edge_depth_nerf.scene.put_maps import write_maps
 from edge_depth_nerf.scene.reader import read_scene
 
 
@@ -324,3 +325,36 @@ def test_pixels_with_a_prior_can_be_drawn_more_often(tmp_path):
     assert shares[1] == pytest.approx(4 * shares[0] / (1 + 3 * shares[0]), rel=0.03)
     with pytest.raises(InputError, match="prior_weight"):
         manager(scene, prior_weight=0.0)
+
+
+def test_what_motion_sees_has_a_prior_and_is_no_sky(tmp_path):
+    scene = write_scene(tmp_path)
+    folder = read_scene(scene)
+    for picture in folder.pictures:
+        path = picture.files["mono"]
+        distance = read_distance_png(path)
+        distance[:8] = 0
+        write_distance_png(path, distance)
+
+    def motion():
+        for picture in folder.pictures:
+            truth = folder.distance_m(picture, "truth_distance")
+            assert truth is not None
+            yield picture.name, truth
+
+    def parts(data):
+        batch = data.next_train(0)[1]
+        upper = batch["indices"][:, 1] < 8
+        return batch["sky"][upper], batch["prior_distance_m"][upper]
+
+    options = {"train_num_rays_per_batch": 4000, "prior": PriorOptions(sigma_mode="combined")}
+    sky, prior = parts(manager(scene, **options))
+    assert sky.any() and not prior.any()
+    write_maps(scene, "motion", motion(), {"kind": "for a test"})
+    data = manager(scene, **options)
+    assert "motion" in data.train_dataset.sources()
+    sky_with, prior_with = parts(data)
+    assert prior_with.all() and not sky_with.any()
+    without = dataclasses.replace(options["prior"], motion=False)
+    sky_without, prior_without = parts(manager(scene, **{**options, "prior": without}))
+    assert sky_without.any() and not prior_without.any()

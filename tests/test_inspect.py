@@ -56,6 +56,7 @@ from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.method.prior import default_source
 from edge_depth_nerf.poses.agreement import compare_paths, write_agreement
 from edge_depth_nerf.poses.matches import Agreement
+from edge_depth_nerf.scene.put_maps import write_maps
 from edge_depth_nerf.scene.reader import read_scene
 
 pytestmark = pytest.mark.slow
@@ -562,6 +563,19 @@ def test_panels_of_what_is_missing_are_left_out(drive, tmp_path, missing, panels
     columns = min(panels, 3)
     rows = -(-panels // 3)
     assert (height, width) == (2 * 28 + rows * (150 + 70 + 14), columns * (200 + 14))
+
+
+def test_distances_from_motion_have_a_panel(drive, tmp_path):
+    (name,) = look(drive, tmp_path / "without", frames=1, size=200)["sheets"]
+    pictures = read_scene(drive).pictures
+    maps = ((each.name, np.full((each.lens.height, each.lens.width), 5, np.float32)) for each in pictures)
+    write_maps(drive, "motion", maps, {"kind": "for a test"})
+    (with_motion,) = look(drive, tmp_path / "with", frames=1, size=200)["sheets"]
+    # six panels in three columns, seven in four
+    width, wider = (
+        read_image(path).shape[1] for path in (tmp_path / "without" / name, tmp_path / "with" / with_motion)
+    )
+    assert (width, wider) == (3 * (200 + 14), 4 * (200 + 14))
 
 
 # ---- other people's scenes -------------------------------------------------------------------------------------

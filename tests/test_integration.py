@@ -21,8 +21,10 @@ from edge_depth_nerf.method.integration import (
     IntegratedDepth,
     IntegrationOptions,
     integrate_depth,
+    join_estimates,
     select_prior,
     sigma_m,
+    weight_of_errors,
 )
 
 
@@ -518,3 +520,45 @@ def test_combined_sigma_wants_mono_only_where_it_counts(unchecked_types):
         sigma_m(integrate_depth(lidar, mono, valid), "magic")  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match="constant_m is 0"):
         sigma_m(integrate_depth(lidar, mono, valid), "constant", constant_m=0.0)
+
+
+def random_motion(seed: int, mono: torch.Tensor) -> torch.Tensor:
+    """Distances from motion near the monocular ones, with holes, broken values, and some where mono has none."""
+    rng = np.random.default_rng([1, seed])
+    near = np.where(np.isfinite(mono) & (mono.numpy() > 0), mono, 20.0) * rng.uniform(0.97, 1.03, mono.shape)
+    near = np.where(rng.random(mono.shape) < 0.3, 0, near)
+    return torch.tensor(np.where(rng.random(mono.shape) < 0.1, rng.choice([-1, np.nan, np.inf], mono.shape), near))
+
+
+@pytest.mark.parametrize(
+    "fields", [{}, {"normalise": "per-source", "least_returns": 4.0, "keep_returns": True}], ids=str
+)
+@pytest.mark.parametrize("weight", [0.0, 0.8, 1.0])
+def test_three_sources_equal_their_twin(fields, weight):
+    lidar, mono, valid = random_maps(11, dtype=torch.float64)
+    motion = random_motion(11, mono)
+    joined = join_estimates(mono, motion, weight)
+    result = integrate_depth(lidar, joined, valid, IntegrationOptions(**fields))
+    twin = reference.integrate_depth(
+        lidar.numpy(), mono.numpy(), valid.numpy(), **fields, motion_m=motion.numpy(), motion_weight=weight
+    )
+    np.testing.assert_allclose(result.distance_m, twin[0], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(result.mono_share, twin[2], rtol=0, atol=1e-9)
+    two = integrate_depth(lidar, mono, valid, IntegrationOptions(**fields))
+    assert (result.distance_m > 0).sum() > (two.distance_m > 0).sum()  # motion fills holes of mono
+    assert not torch.equal(torch.where(two.distance_m > 0, result.distance_m, 0), two.distance_m)
+
+
+def test_without_motion_the_estimate_stays_bit_for_bit():
+    _, mono, _ = random_maps(12)
+    for nothing in (torch.zeros_like(mono), torch.full_like(mono, torch.nan), torch.full_like(mono, -1.0)):
+        assert join_estimates(mono, nothing, 0.9).numpy().tobytes() == mono.numpy().tobytes()
+
+
+def test_the_weight_makes_the_mean_best():
+    assert weight_of_errors(0.02, 0.02) == pytest.approx(0.5)
+    # variances 1 and 9: the mean with 0.9 has the least, 0.9
+    assert weight_of_errors(0.01, 0.03) == pytest.approx(0.9)
+    assert weight_of_errors(0.1, 0.0) == 0.0
+    with pytest.raises(InputError, match="motion_weight"):
+        join_estimates(torch.ones(2, 2), torch.ones(2, 2), 1.2)

@@ -553,7 +553,7 @@ def test_a_new_source_of_depth_reaches_the_prior(tmp_path, monkeypatch):
     maps = torch.stack([torch.from_numpy(read.distance_m(each, "radar")) for each in data.train_dataset.pictures])
     image, row, column = batch["indices"][at].T
     torch.testing.assert_close(batch["prior_distance_m"][at, 0], maps[image, row, column], atol=0.01, rtol=0)
-    with pytest.raises(InputError, match="expected one of auto, integrated, lidar, mono, radar, none"):
+    with pytest.raises(InputError, match="expected one of auto, integrated, lidar, mono, motion, radar, none"):
         FisheyeDepthDataManagerConfig(dataparser=parser, depth_source="sonar").setup(test_mode="val")
 
 

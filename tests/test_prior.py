@@ -8,7 +8,7 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras import KannalaBrandt
 from edge_depth_nerf.method import prior as prior_module
 from edge_depth_nerf.method.alignment import Fit
-from edge_depth_nerf.method.error_model import KNOTS, ErrorModel, Trust
+from edge_depth_nerf.method.error_model import KNOTS, ErrorModel, MotionTrust, Trust
 from edge_depth_nerf.method.integration import IntegrationOptions, integrate_depth
 from edge_depth_nerf.method.prior import PriorCache, PriorOptions, View, make_prior, sky_of, view_of
 
@@ -220,3 +220,93 @@ def test_dark_holes_of_a_map_are_no_sky():
     expected = np.zeros((40, 60), bool)
     expected[sky] = True
     assert np.array_equal(sky_of(mono, None, view, picture, np.ones_like(expected)), expected)
+
+
+# ---- distances from motion -------------------------------------------------------------------------------------
+
+
+def motion_trust(weight: float = 0.9) -> MotionTrust:
+    """Sigma is 3 % of the distance."""
+    flat = {name: [0.0] * len(knots) for name, knots in KNOTS.items()}
+    return MotionTrust(weight, 0.01, 0.03, ErrorModel(float(np.log(0.03)), flat))
+
+
+def field_view(shape):
+    """From 57° above the horizon to 57° below; LiDAR's field, 3° wider, ends in the middle."""
+    elevation = np.broadcast_to(np.linspace(1, -1, shape[0], dtype=np.float32)[:, None], shape).copy()
+    return View(np.zeros(shape, np.float32), elevation), elevation <= np.radians(3)
+
+
+def test_above_lidars_field_there_is_a_prior_where_motion_gives_one():
+    lidar, mono, mask = maps(60, 50)
+    view, in_field = field_view(mask.shape)
+    lidar = np.where(in_field, lidar, 0).astype(np.float32)
+    motion = np.where(np.random.default_rng(6).random(mask.shape) < 0.5, np.float32(7), 0).astype(np.float32)
+    trust = a_trust(field_rad=(-1.0, 0.0), motion=motion_trust())
+    prior = make_prior({**both(lidar, mono), "motion": motion}, mask, "integrated", PriorOptions(), trust, view)
+    np.testing.assert_array_equal((prior.distance_m > 0)[~in_field], (mask & (motion > 0))[~in_field])
+    np.testing.assert_array_equal((prior.distance_m > 0)[in_field], mask[in_field])
+    above = ~in_field & (prior.distance_m > 0)
+    # what mono says there does not count
+    far_up = above & (view.elevation_rad > 0.3)
+    np.testing.assert_allclose(prior.distance_m[far_up], 7, rtol=1e-5)
+    np.testing.assert_allclose(prior.sigma_m[above], 0.03 * prior.distance_m[above], rtol=1e-5)
+    returns = mask & (lidar > 0)
+    np.testing.assert_array_equal(prior.distance_m[returns], lidar[returns])
+    np.testing.assert_allclose(prior.sigma_m[returns], 0.01 * lidar[returns], rtol=1e-5)
+    mono_alone = mask & in_field & ~returns & (motion == 0)
+    np.testing.assert_allclose(prior.sigma_m[mono_alone], 0.1 * prior.distance_m[mono_alone], rtol=1e-5)
+
+
+def test_motion_moves_the_prior_by_its_weight():
+    _, mono, mask = maps(40, 40)
+    mask[:], mono[:] = True, 10
+    nothing, motion = np.zeros_like(mono), np.full_like(mono, 10.5)
+    for weight in (0.0, 0.4, 1.0):
+        trust = a_trust(motion=motion_trust(weight))
+        found = make_prior(
+            *({"lidar": nothing, "mono": mono, "motion": motion}, mask, "integrated", PriorOptions(), trust),
+            level_view(mask.shape),
+        )
+        np.testing.assert_allclose(found.distance_m, 10 + 0.5 * weight, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("options", "trust"),
+    [
+        (PriorOptions(motion=False), a_trust(motion=motion_trust())),
+        (PriorOptions(), a_trust()),  # its error could not be measured
+        (PriorOptions(), a_trust(error_model=None)),
+        (PriorOptions(sigma_mode="combined", motion=False), None),
+    ],
+)
+def test_without_its_part_the_prior_is_that_of_two_sources_bit_for_bit(options, trust):
+    lidar, mono, mask = maps(60, 50)
+    view = field_view(mask.shape)[0] if trust else None
+    motion = np.full_like(mono, 7)
+    two, three = (
+        make_prior(found, mask, "integrated", options, trust, view)
+        for found in (both(lidar, mono), {**both(lidar, mono), "motion": motion})
+    )
+    assert (two.distance_m > 0).any()
+    assert two.distance_m.tobytes() == three.distance_m.tobytes()
+    assert two.sigma_m.tobytes() == three.sigma_m.tobytes()
+
+
+def test_without_a_calibration_motion_counts_by_what_is_usual_of_both():
+    _, mono, mask = maps(40, 40)
+    mask[:], mono[:] = True, 10
+    found = {"lidar": np.zeros_like(mono), "mono": mono, "motion": np.full_like(mono, 10.5)}
+    prior = make_prior(found, mask, "integrated", PriorOptions(sigma_mode="combined"))
+    # 0.1² / (0.1² + 0.03²)
+    np.testing.assert_allclose(prior.distance_m, 10 + 0.5 * 0.917431, rtol=1e-5)
+
+
+def test_motion_alone_is_its_map():
+    _, mono, mask = maps()
+    only = make_prior({"motion": mono}, mask, "motion", PriorOptions())
+    assert np.array_equal(only.distance_m, mono * mask)
+    np.testing.assert_allclose(only.sigma_m[mask], np.sqrt((0.1 * mono[mask]) ** 2 + 0.05**2), rtol=1e-5)
+    assert prior_module.default_source({"motion"}) == "motion"
+    assert prior_module.default_source({"motion", "mono"}) == "mono"
+    assert prior_module.default_source({"motion", "mono", "lidar"}) == "integrated"

@@ -22,6 +22,7 @@ from edge_depth_nerf.method.prior import PriorOptions, View, make_prior
 from edge_depth_nerf.mono import calibration as trust_module
 from edge_depth_nerf.mono.calibration import calibrate_scene, find_trust, held_out_returns, measure_frame
 from edge_depth_nerf.scene.format import TRUST_FILE
+from edge_depth_nerf.scene.put_maps import write_maps
 from edge_depth_nerf.scene.reader import read_scene
 
 
@@ -289,3 +290,65 @@ def test_no_prior_beyond_lidars_field_but_from_a_source_trained_elsewhere(tmp_pa
     assert elsewhere.everywhere
     everywhere = make_prior(both(lidar, mono), mask, "integrated", PriorOptions(), elsewhere, view)
     assert (everywhere.distance_m > 0).sum() == mask.sum() - 1
+
+
+def with_motion(scene, factor):
+    """Give a scene maps from motion: the true distance times a factor."""
+    folder = read_scene(scene)
+    rng = np.random.default_rng(8)
+
+    def made():
+        for picture in folder.pictures:
+            truth = folder.distance_m(picture, "truth_distance")
+            assert truth is not None
+            yield picture.name, (truth * factor * (1 + rng.normal(0, 0.005, truth.shape))).astype(np.float32)
+
+    write_maps(scene, "motion", made(), {"kind": "for a test"}, some_empty=True)
+    return scene
+
+
+def test_motion_counts_by_its_error_beside_monos(tmp_path):
+    rng = np.random.default_rng(9)
+    for name in ("a", "b"):
+        scene = write_scene(tmp_path / name)
+        for frame in range(9):
+            change_map(scene, "mono_file_path", frame, lambda metres: metres * (1 + rng.normal(0, 0.02, metres.shape)))
+    right, wrong = (with_motion(tmp_path / name, factor) for name, factor in (("a", 1.0), ("b", 1.2)))
+    assert not (right / TRUST_FILE).exists()
+    trusted, doubted = calibrate_scene(right), calibrate_scene(wrong)
+    assert trusted.motion is not None and doubted.motion is not None
+    # motion is wrong by half a per cent, or by a fifth; mono by two
+    assert trusted.motion.relative_error == pytest.approx(0.005, rel=0.25)
+    assert doubted.motion.relative_error == pytest.approx(0.105, rel=0.1)
+    assert trusted.motion.mono_relative_error == pytest.approx(0.02, rel=0.25)
+    assert trusted.motion.weight == pytest.approx(16 / 17, abs=0.04)
+    assert doubted.motion.weight < 0.06
+    assert "distances from motion against LiDAR: 95 % within" in trusted.summary()
+    assert read_trust(right / TRUST_FILE) == trusted
+    assert find_trust(read_scene(right), PriorOptions()) == trusted
+    # other files, another calibration
+    assert find_trust(read_scene(right), PriorOptions(motion=False)).motion is None
+
+
+def test_without_motion_a_calibration_says_nothing_of_it(tmp_path):
+    scene = write_scene(tmp_path / "a")
+    trust = calibrate_scene(scene)
+    assert trust.motion is None and "motion" not in read_json(scene / TRUST_FILE)
+    assert "motion" not in trust.summary()
+    same = with_motion(write_scene(tmp_path / "b"), 1.0)
+    assert find_trust(read_scene(same), PriorOptions(motion=False)) == trust
+    empty = with_motion(write_scene(tmp_path / "c"), 0.0)
+    assert calibrate_scene(empty).motion is None
+
+
+def test_a_broken_weight_of_motion_is_named(tmp_path):
+    scene = with_motion(write_scene(tmp_path), 1.0)
+    made = calibrate_scene(scene)
+    content = read_json(scene / TRUST_FILE)
+    del content["sha256"]
+    for broken in (1.5, -0.1, None):
+        content["motion"]["weight"] = broken
+        write_json(scene / TRUST_FILE, content)
+        with pytest.raises(InputError, match=TRUST_FILE):
+            read_trust(scene / TRUST_FILE)
+    assert find_trust(read_scene(scene), PriorOptions()) == made

@@ -57,6 +57,8 @@ def draw_sheet(scene: SceneFolder, figures: PictureFigures, maps: ShownMaps, lon
         panels.append(panel(over, "LiDAR over the picture", colour_bar(DISTANCE, size[0])))
     if maps.mono_m is not None:
         panels.append(distance("monocular distance", maps.mono_m))
+    if (motion_m := maps.distances_m.get("motion")) is not None:
+        panels.append(distance("distance from motion", motion_m))
     if maps.prior is not None:
         panels.append(distance(f"prior ({maps.source})", maps.prior.distance_m))
         has_prior = is_distance(maps.prior.distance_m)

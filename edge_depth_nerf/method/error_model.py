@@ -202,6 +202,20 @@ class FrameAlignment:
 
 
 @dataclass(frozen=True)
+class MotionTrust:
+    """What a drive's training frames say about its distances from motion."""
+
+    weight: float
+    """ρ of `integration.join_estimates`, by the measured errors of both."""
+    relative_error: float
+    """Half of what 95 % of motion's relative errors are within."""
+    mono_relative_error: float
+    """The same of the aligned monocular maps, where motion has a distance, too."""
+    error_model: ErrorModel
+    """Of the prior's pixels without a return that motion has a part in."""
+
+
+@dataclass(frozen=True)
 class Trust:
     """What a drive's training frames say about its prior."""
 
@@ -220,16 +234,27 @@ class Trust:
     """Curve of all frames together, for those with few returns."""
     frames: tuple[FrameAlignment, ...] = field(default=())
     """The training frames it was made from."""
+    motion: MotionTrust | None = None
+    """Of distances from motion; None where the scene has none, or too few to measure: then they take no part."""
 
     def in_field(self, elevation_rad: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
         """Whether each ray points where LiDAR reaches, within the margin."""
         margin = np.radians(FIELD_MARGIN_DEG)
         return (elevation_rad >= self.field_rad[0] - margin) & (elevation_rad <= self.field_rad[1] + margin)
 
-    def sigma_m(self, features: Features) -> NDArray[np.float32]:
-        """σ̂, metres, by the models; there must be an error_model."""
+    def sigma_m(self, features: Features, from_motion: Bool[np.ndarray, "*shape"] | None = None) -> NDArray[np.float32]:
+        """σ̂, metres, by the models; there must be an error_model.
+
+        Args:
+            features: of pixels.
+            from_motion: whether motion has a part in each.
+
+        """
         assert self.error_model is not None
         sigma = self.error_model.sigma_m(features)
+        if self.motion is not None and from_motion is not None:
+            of_motion = {name: values[from_motion] for name, values in features.items()}
+            sigma[from_motion] = self.motion.error_model.sigma_m(of_motion)
         if self.return_model is None:
             return sigma
         at_return = features["nearest_px"] == 0
@@ -254,19 +279,29 @@ class Trust:
                 f"{len(poor)} with fewer returns than an alignment needs, {', '.join(poor[:3])}"
                 f"{' …' if len(poor) > 3 else ''}, take the drive's fit"
             )
+        if self.motion is not None:
+            parts.append(
+                f"distances from motion against LiDAR: 95 % within {2 * self.motion.relative_error:.1%}, monocular "
+                f"ones there within {2 * self.motion.mono_relative_error:.1%}, so motion weighs "
+                f"{self.motion.weight:.0%} of both"
+            )
         if self.error_model is None:
             parts.append("too few LiDAR returns to measure the prior's error: sigma is as under sigma_mode combined")
         if not self.everywhere:
             low, high = np.degrees(self.field_rad)
+            beyond = " (beyond, where motion gives a distance)" if self.motion is not None else ""
             parts.append(
                 f"a prior only between {low - FIELD_MARGIN_DEG:.0f}° and {high + FIELD_MARGIN_DEG:.0f}° of elevation, "
-                "where LiDAR measured and the network could learn"
+                f"where LiDAR measured and the network could learn{beyond}"
             )
         return "; ".join(parts)
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
-        return {"version": _VERSION, **asdict(self)}
+        content = {"version": _VERSION, **asdict(self)}
+        if self.motion is None:
+            del content["motion"]
+        return content
 
     def write(self, path: Path) -> None:
         """Write JSON with its checksum, atomically."""
@@ -304,6 +339,7 @@ def read_trust(path: Path) -> Trust:
             everywhere=bool(content["everywhere"]),
             drive_fit=None if drive_fit is None else _fit(drive_fit),
             frames=tuple(_frame(frame) for frame in content["frames"]),
+            motion=_motion(content.get("motion")),
         )
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise InputError(
@@ -318,6 +354,18 @@ def _number(value: Any) -> float:
     if found is None or abs(found) > _MAX_NUMBER:
         raise ValueError(f"{shown(value)} for a number")
     return found
+
+
+def _motion(content: dict[str, Any] | None) -> MotionTrust | None:
+    if content is None:
+        return None
+    model = _model(content["error_model"])
+    weight = _number(content["weight"])
+    if model is None or not 0 <= weight <= 1:
+        raise ValueError(f"{shown(weight)} for a weight, or no errors")
+    return MotionTrust(
+        weight, _number(content["relative_error"]), _number(content["mono_relative_error"]), error_model=model
+    )
 
 
 def _fit(content: dict[str, Any]) -> Fit:

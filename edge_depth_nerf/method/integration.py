@@ -9,6 +9,14 @@ Eq. 7   g  = exp(-(k² + l²) / 2σ_s²) · exp(-(d̂[i,j] - d̂[i+k,j+l])² / 2
 Eq. 5   d̃ = (1/η) Σ g · (α d 1(d > 0) + (1-α) d̂ 1(d = 0))                       d, d̂ read at [i+k, j+l]
 Eq. 6   η = Σ g · (α 1(d > 0) + (1-α) 1(d = 0))
 
+Distances from motion, m, are a third source. They and the monocular ones share the estimate's part of Eq. 5, by the
+weight ρ that the measured errors of both give:
+
+        (1-α) d̂ 1(d = 0)  becomes  (1-α) (ρ m + (1-ρ) d̂) 1(d = 0)
+
+where a pixel has both, and the one it has elsewhere. This d̂, of both, is also what g compares. Without motion all is as
+it was.
+
 Nothing here is differentiated: the prior is data. CPU tensors are integrated by compiled loops
 (`integration_numba`), CUDA tensors by torch; both compute in float64, which keeps the ratios of weights up to
 37 sigma_depth_m.
@@ -31,7 +39,10 @@ from torch import Tensor
 from edge_depth_nerf.base.errors import InputError
 
 INTEGRATED = "integrated"
-"""The depth source of LiDAR and monocular distance together; every other is the name of one source alone."""
+"""The depth source of LiDAR and monocular distance together, and of that from motion where there is any; every other is
+the name of one source alone."""
+MOTION_RELATIVE_ERROR, MONO_RELATIVE_ERROR = 0.03, 0.1
+"""Standard deviations of estimates as parts of the distance, where nothing was measured."""
 Kernel = Literal["edge-aware", "spatial-gaussian"]
 Normalise = Literal["pooled", "per-source"]
 RangeGuide = Literal["mono", "lidar"]
@@ -130,6 +141,38 @@ def _check_maps(function: str, **maps: Tensor | None) -> None:
 
 def _is_distance(distance_m: Tensor) -> Tensor:
     return torch.isfinite(distance_m) & (distance_m > 0)
+
+
+def join_estimates(
+    mono_m: Float[Tensor, "*batch h w"], motion_m: Float[Tensor, "*batch h w"], motion_weight: float
+) -> Float[Tensor, "*batch h w"]:
+    """Average monocular distances and those from motion, pixel by pixel: the d̂ of three sources.
+
+    Args:
+        mono_m: metres along the ray; 0, or not finite: none.
+        motion_m: the same of motion.
+        motion_weight: ρ, 0 to 1: motion's part where a pixel has both.
+
+    Raises:
+        InputError: the maps differ in shape, or the weight is out of its range.
+
+    """
+    _check_maps("join_estimates", mono_m=mono_m, motion_m=motion_m)
+    _check_number("motion_weight", motion_weight, 0.0, 1.0)
+    has_mono, has_motion = _is_distance(mono_m), _is_distance(motion_m)
+    both = torch.where(has_mono & has_motion, motion_weight * motion_m + (1 - motion_weight) * mono_m, mono_m)
+    return torch.where(has_motion & ~has_mono, motion_m, both)
+
+
+def weight_of_errors(motion_error: float, mono_error: float) -> float:
+    """ρ of `join_estimates` that makes the mean's error least, as far as the errors of both are independent.
+
+    Args:
+        motion_error: relative standard deviation of distances from motion.
+        mono_error: of monocular ones.
+
+    """
+    return mono_error**2 / max(motion_error**2 + mono_error**2, 1e-12)
 
 
 def integrate_depth(
@@ -339,7 +382,7 @@ def sigma_m(
     *,
     mono_m: Float[Tensor, "*batch h w"] | None = None,
     constant_m: float = 1.0,
-    mono_relative_error: float = 0.1,
+    mono_relative_error: float = MONO_RELATIVE_ERROR,
     floor_m: float = 0.05,
 ) -> Float[Tensor, "*batch h w"]:
     """Give σ̂, the standard deviation that Eq. 4 grants the prior, for every pixel.

@@ -29,7 +29,17 @@ from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.masks.sky import regions_like_sky
 from edge_depth_nerf.method.alignment import Align, align
 from edge_depth_nerf.method.error_model import Trust, pixel_features
-from edge_depth_nerf.method.integration import INTEGRATED, IntegrationOptions, SigmaMode, select_prior, sigma_m
+from edge_depth_nerf.method.integration import (
+    INTEGRATED,
+    MONO_RELATIVE_ERROR,
+    MOTION_RELATIVE_ERROR,
+    IntegrationOptions,
+    SigmaMode,
+    join_estimates,
+    select_prior,
+    sigma_m,
+    weight_of_errors,
+)
 
 CACHE_VERSION = 5
 """Part of every key: raised whenever the same inputs give another prior."""
@@ -51,7 +61,7 @@ def default_source(sources: Container[str]) -> str | None:
     """What a prior is made of where nobody says: LiDAR and monocular maps, or what there is of them."""
     if "lidar" in sources:
         return INTEGRATED if "mono" in sources else "lidar"
-    return "mono" if "mono" in sources else None
+    return next((source for source in ("mono", "motion") if source in sources), None)
 
 
 PriorSigma = Literal["calibrated", "constant", "image", "spread", "combined"]
@@ -74,6 +84,9 @@ class PriorOptions:
     others: see `integration.sigma_m`."""
     sigma_constant_m: float = 1.0
     """The standard deviation under sigma_mode constant, metres."""
+    motion: bool = True
+    """Whether distances from motion take part in the prior of LiDAR and monocular ones, where the scene has them. Under
+    sigma_mode calibrated they do as far as their error could be measured."""
     integration: IntegrationOptions = field(
         default_factory=lambda: IntegrationOptions(
             normalise="per-source", least_returns=4.0, keep_returns=True, sigma_depth_growth_per_m=0.005
@@ -157,9 +170,23 @@ class IntegratedFrame:
     spread_m: NDArray[np.float32]
     """Of what was averaged, also where a return was kept."""
     mono_m: NDArray[np.float32]
-    """The aligned monocular map."""
+    """The aligned monocular map, with what motion adds to it."""
     returns: NDArray[np.bool_]
     """The returns that entered."""
+    from_motion: NDArray[np.bool_]
+    """Where motion has a part, but for returns."""
+
+
+@dataclass(frozen=True)
+class MotionMap:
+    """Distances from motion, and how they share the estimate's part with the monocular ones."""
+
+    distance_m: NDArray[np.float32]
+    """H×W, 0 = none."""
+    weight: float
+    """ρ of `integration.join_estimates`."""
+    mono_counts: NDArray[np.bool_]
+    """H×W, True where the monocular map may be trusted: beyond, there is a prior from motion alone."""
 
 
 def integrate_frame(
@@ -169,6 +196,7 @@ def integrate_frame(
     depth_source: str,
     options: PriorOptions,
     trust: Trust | None = None,
+    motion: MotionMap | None = None,
 ) -> IntegratedFrame:
     """Align and integrate a frame under a calibration: the prior whose error `Trust` describes.
 
@@ -179,17 +207,23 @@ def integrate_frame(
         depth_source: integrated, or mono alone.
         options: what is made of them.
         trust: the drive's calibration, for its fit.
+        motion: what is known from motion; for the integrated source.
 
     Raises:
         InputError: the maps differ in size.
 
     """
-    mask = mask & ~(mono_m > FARTHEST_M)
+    anywhere, mask = mask, mask & ~(mono_m > FARTHEST_M)
     returns = mask & np.isfinite(lidar_m) & (lidar_m > 0)
     if depth_source == "mono":
         returns = np.zeros_like(mask)
     else:
         mono_m = align(lidar_m, mono_m, mask, options.align, trust.drive_fit if trust else None).mono_m
+    from_motion = np.zeros_like(mask)
+    if motion is not None:
+        from_motion = anywhere & (motion.distance_m > 0) & ~returns
+        mono_m = _joined(np.where(mask & motion.mono_counts, mono_m, np.float32(0)), motion.distance_m, motion.weight)
+        mask = anywhere
     # the spread is wanted at returns, too, so they are kept afterwards
     integration = dataclasses.replace(options.integration, keep_returns=False)
     lidar, mono, valid = (torch.from_numpy(pixels) for pixels in (lidar_m, mono_m, mask))
@@ -199,7 +233,11 @@ def integrate_frame(
     if options.integration.keep_returns:
         distance = np.where(returns, lidar_m, distance)
     known = np.where(np.isfinite(mono_m), mono_m, 0)
-    return IntegratedFrame(distance, integrated.spread_m.float().numpy(), known, returns)
+    return IntegratedFrame(distance, integrated.spread_m.float().numpy(), known, returns, from_motion)
+
+
+def _joined(mono_m: NDArray[np.float32], motion_m: NDArray[np.float32], motion_weight: float) -> NDArray[np.float32]:
+    return join_estimates(torch.from_numpy(mono_m), torch.from_numpy(motion_m), motion_weight).numpy()
 
 
 def make_prior(
@@ -215,7 +253,7 @@ def make_prior(
     Args:
         maps: H×W distance by source, 0 = none.
         mask: H×W, True where the picture may be used.
-        depth_source: integrated (LiDAR and mono), or the name of a source.
+        depth_source: integrated (LiDAR and mono, and motion where it is given), or the name of a source.
         options: what is made of them.
         trust: the drive's calibration; used for the drive's fit, and under sigma_mode calibrated.
         view: of the picture; under sigma_mode calibrated a trust wants it.
@@ -225,17 +263,27 @@ def make_prior(
 
     """
     lidar_m, mono_m = maps.get("lidar"), maps.get("mono")
+    motion_m = maps.get("motion") if options.motion and depth_source == INTEGRATED else None
     if options.sigma_mode == "calibrated" and depth_source in CALIBRATED and trust is not None and mono_m is not None:
         assert view is not None
-        mask = mask if trust.everywhere else mask & trust.in_field(view.elevation_rad)
+        motion = None
+        if motion_m is not None and trust.motion is not None:
+            counts = np.full_like(mask, True) if trust.everywhere else trust.in_field(view.elevation_rad)
+            motion = MotionMap(motion_m, trust.motion.weight, counts)
+        else:
+            mask = mask if trust.everywhere else mask & trust.in_field(view.elevation_rad)
         if trust.error_model is not None and (lidar_m is not None or depth_source == "mono"):
             lidar_m = np.zeros_like(mono_m) if lidar_m is None else lidar_m
-            frame = integrate_frame(lidar_m, mono_m, mask, depth_source, options, trust)
+            frame = integrate_frame(lidar_m, mono_m, mask, depth_source, options, trust, motion)
             features = pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, frame.returns, view.theta_rad)
-            sigma = trust.sigma_m(features)
+            sigma = trust.sigma_m(features, frame.from_motion)
             return Prior(frame.distance_m, np.where(frame.distance_m > 0, sigma, np.float32(0)))
+        # what could not be measured takes no part
+        motion_m = None
     if depth_source == INTEGRATED and lidar_m is not None and mono_m is not None:
         aligned = align(lidar_m, mono_m, mask, options.align, trust.drive_fit if trust else None).mono_m
+        if motion_m is not None:
+            aligned = _joined(aligned, motion_m, weight_of_errors(MOTION_RELATIVE_ERROR, MONO_RELATIVE_ERROR))
         maps = {**maps, "mono": aligned}
     of_source = {name: torch.from_numpy(pixels) for name, pixels in maps.items() if pixels is not None}
     integrated = select_prior(depth_source, of_source, torch.from_numpy(mask), options.integration)

@@ -3,7 +3,8 @@
 Made from training frames alone. Of each frame some returns are left out, the prior is made of the rest, and compared
 with what was left out: whole blocks of 64 px (of 1400), single returns, and in every second frame LiDAR's lowest and
 highest rows, beyond which a prior is extrapolated. Above a frame's own returns the prior is compared with what the
-returns of the other frames show there. The result is kept beside the scene's maps.
+returns of the other frames show there. How much distances from motion count beside the monocular maps
+follows from the errors of both at the returns that are left out. The result is kept beside the scene's maps.
 """
 
 from __future__ import annotations
@@ -26,15 +27,17 @@ from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.method.alignment import LEAST_RETURNS, align, both, fit_logs
 from edge_depth_nerf.method.error_model import (
     FIELD_MARGIN_DEG,
+    LEAST_JUDGED,
     FrameAlignment,
+    MotionTrust,
     Trust,
     error_of_returns,
     fit_error_model,
     pixel_features,
     read_trust,
 )
-from edge_depth_nerf.method.integration import INTEGRATED
-from edge_depth_nerf.method.prior import CACHE_VERSION, PriorOptions, View, integrate_frame, view_of
+from edge_depth_nerf.method.integration import INTEGRATED, weight_of_errors
+from edge_depth_nerf.method.prior import CACHE_VERSION, MotionMap, PriorOptions, View, integrate_frame, view_of
 from edge_depth_nerf.mono.far_seen import seen_above, static_cloud
 from edge_depth_nerf.scene.format import TRUST_FILE
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
@@ -76,6 +79,8 @@ class MeasuredFrame:
     """Of pixels with LiDAR and mono."""
     mono_m: NDArray[np.float32]
     """The map as it came, at the same pixels."""
+    from_motion: NDArray[np.bool_]
+    """Whether motion has a part in each of the pixels of `relative_error`."""
 
 
 def held_out_returns(
@@ -208,18 +213,25 @@ def _made_of(scene: SceneFolder, pictures: Sequence[ScenePicture], depth_source:
     """Key of the options, of the geometry, and of what is in the files of the pictures that are measured."""
     relevant = {"depth_source": depth_source, **dataclasses.asdict(options)}
     del relevant["sigma_mode"], relevant["sigma_constant_m"]
+    with_motion = _with_motion(scene, depth_source, options)
+    if not with_motion:
+        del relevant["motion"]
     units = [scene.lidar_metres_per_count, scene.lidar_is_z_depth, round(scene.theta_max_rad, 9)]
     digest = hashlib.sha256(json.dumps([CACHE_VERSION, relevant, _trained_on(scene), units], sort_keys=True).encode())
     contents: dict[Path, bytes] = {}
     for picture in pictures:
         pose = picture.rotation.round(9).tolist(), picture.position_m.round(6).tolist()
         digest.update(repr((picture.name, picture.lens, pose)).encode())
-        for layer in ("lidar", "mono", "mask"):
+        for layer in ("lidar", "mono", "mask", *(["motion"] if with_motion else [])):
             path = picture.files.get(layer)
             if path is not None and path not in contents:
                 contents[path] = hashlib.sha256(path.read_bytes()).digest()
             digest.update(layer.encode() + (b"" if path is None else contents[path]))
     return digest.hexdigest()[:16]
+
+
+def _with_motion(scene: SceneFolder, depth_source: str, options: PriorOptions) -> bool:
+    return options.motion and depth_source == INTEGRATED and scene.has("motion")
 
 
 def _trained_on(scene: SceneFolder) -> str:
@@ -253,14 +265,21 @@ def _calibrate(
             "measured. Process the drive again."
         )
 
+    with_motion = _with_motion(scene, depth_source, options)
+    errors = _motion_errors(scene, measurable, options) if with_motion else None
+
     def measure(numbered: tuple[int, ScenePicture]) -> MeasuredFrame:
         number, picture = numbered
         maps = scene.maps(picture)
         assert maps.lidar_m is not None and maps.mono_m is not None
         view = view_of(picture.lens, picture.up_in_camera)
+        motion_m, motion = maps.distances_m.get("motion"), None
+        if errors is not None and motion_m is not None:
+            motion = MotionMap(motion_m, errors.weight, np.ones_like(maps.usable))
         far_seen_m = seen_above(cloud, scene, picture, (picture.lens.width, picture.lens.height))
         return measure_frame(
-            picture.name, number, maps.lidar_m, maps.mono_m, maps.usable, view, options, far_seen_m, depth_source
+            *(picture.name, number, maps.lidar_m, maps.mono_m, maps.usable, view, options, far_seen_m, depth_source),
+            motion=motion,
         )
 
     bars = progress_bars(console or Console(quiet=True), transient=True)
@@ -272,7 +291,41 @@ def _calibrate(
             frames.append(frame)
             progress.advance(task)
     made_of = _made_of(scene, pictures, depth_source, options)
-    return combine(frames, options, made_of, _trained_on(scene) == "elsewhere", depth_source)
+    return combine(frames, options, made_of, _trained_on(scene) == "elsewhere", depth_source, errors)
+
+
+@dataclasses.dataclass(frozen=True)
+class MotionErrors:
+    """Relative errors of two sources where both have a distance: half of what 95 % are within."""
+
+    motion: float
+    mono: float
+
+    @property
+    def weight(self) -> float:
+        """Motion's part of their mean."""
+        return weight_of_errors(self.motion, self.mono)
+
+
+def _motion_errors(scene: SceneFolder, pictures: Sequence[ScenePicture], options: PriorOptions) -> MotionErrors | None:
+    """Measure both sources at the returns that are left out of the monocular maps' alignment; None for too few."""
+    errors: list[NDArray[np.float32]] = []
+    for number, picture in enumerate(pictures):
+        maps = scene.maps(picture)
+        motion_m = maps.distances_m.get("motion")
+        if maps.lidar_m is None or maps.mono_m is None or motion_m is None:
+            continue
+        elevation_rad = view_of(picture.lens, picture.up_in_camera).elevation_rad
+        left_out, _ = held_out_returns(both(maps.lidar_m, maps.mono_m, maps.usable), elevation_rad, number)
+        aligned = align(np.where(left_out, np.float32(0), maps.lidar_m), maps.mono_m, maps.usable, options.align).mono_m
+        judged = _some(left_out & (motion_m > 0) & (aligned > 0), _JUDGED_A_FRAME, np.random.default_rng([9, number]))
+        true_m = maps.lidar_m[judged]
+        errors.append(np.stack([np.abs(found[judged] - true_m) / true_m for found in (motion_m, aligned)]))
+    found = np.concatenate(errors, 1) if errors else np.empty((2, 0))
+    if found.shape[1] < LEAST_JUDGED:
+        return None
+    motion, mono = np.quantile(found, 0.95, axis=1) / 2
+    return MotionErrors(float(motion), float(mono))
 
 
 def measure_frame(
@@ -285,6 +338,7 @@ def measure_frame(
     options: PriorOptions,
     far_seen_m: NDArray[np.float32] | None = None,
     depth_source: str = INTEGRATED,
+    motion: MotionMap | None = None,
 ) -> MeasuredFrame:
     """Leave out some of a frame's returns, make its prior of the rest, and compare.
 
@@ -298,6 +352,7 @@ def measure_frame(
         options: of the prior.
         far_seen_m: H×W distance that the returns of other frames show above this one's, 0 = none.
         depth_source: what the prior is made of: integrated, or mono alone.
+        motion: what is known from motion.
 
     Raises:
         InputError: the maps differ in size.
@@ -310,7 +365,7 @@ def measure_frame(
     # a source alone is not aligned, in the prior either
     mode = "none" if depth_source == "mono" else options.align
     aligned = align(kept_m, mono_m, usable, mode)
-    frame = integrate_frame(kept_m, mono_m, usable, depth_source, options)
+    frame = integrate_frame(kept_m, mono_m, usable, depth_source, options, motion=motion)
     features = pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, frame.returns, view.theta_rad)
     has_prior = frame.distance_m > 0
     measured_m, measured = lidar_m, left_out
@@ -342,6 +397,7 @@ def measure_frame(
         view.elevation_rad[usable & (lidar_m > 0)],
         lidar_m[for_the_drive],
         mono_m[for_the_drive],
+        frame.from_motion[judged],
     )
 
 
@@ -359,6 +415,7 @@ def combine(
     made_of: str,
     everywhere: bool,
     depth_source: str = INTEGRATED,
+    motion_errors: MotionErrors | None = None,
 ) -> Trust:
     """Put the measurements of a drive's frames together.
 
@@ -368,6 +425,7 @@ def combine(
         made_of: key of what they were made of.
         everywhere: whether the monocular maps are to be trusted beyond LiDAR's field of elevation.
         depth_source: what the prior is made of: integrated, or mono alone.
+        motion_errors: by which motion took part in the frames' priors.
 
     """
 
@@ -381,11 +439,24 @@ def combine(
     drive_fit = fit_logs(lidar_m, mono_m) if aligned and len(lidar_m) >= LEAST_RETURNS else None
     names = frames[0].features
     features = {name: pooled(frame.features[name] for frame in frames) for name in names}
+    relative_error = pooled(frame.relative_error for frame in frames)
+    motion = None
+    if motion_errors is not None:
+        from_motion = pooled(frame.from_motion for frame in frames)
+        model = fit_error_model(
+            {name: values[from_motion] for name, values in features.items()}, relative_error[from_motion]
+        )
+        # of few pixels without motion nothing would be known
+        if np.count_nonzero(~from_motion) >= LEAST_JUDGED:
+            features = {name: values[~from_motion] for name, values in features.items()}
+            relative_error = relative_error[~from_motion]
+        if model is not None:
+            motion = MotionTrust(motion_errors.weight, motion_errors.motion, motion_errors.mono, model)
     return_features = {name: pooled(frame.return_features[name] for frame in frames) for name in names}
     alignments = (frame.alignment for frame in frames)
     return Trust(
         made_of=made_of,
-        error_model=fit_error_model(features, pooled(frame.relative_error for frame in frames)),
+        error_model=fit_error_model(features, relative_error),
         return_model=fit_error_model(return_features, pooled(frame.return_error for frame in frames)),
         field_rad=(float(low), float(high)),
         everywhere=everywhere,
@@ -397,4 +468,5 @@ def combine(
             else found
             for found in alignments
         ),
+        motion=motion,
     )

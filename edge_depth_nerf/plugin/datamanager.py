@@ -82,8 +82,9 @@ class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig):
     dataparser: AnnotatedDataParserUnion = field(default_factory=FisheyeDepthDataParserConfig)
     """Specifies the dataparser used to unpack the data."""
     depth_source: str = "auto"
-    """Where the prior comes from. integrated: LiDAR and monocular maps (Eq. 5); lidar, mono (Table 3), or another
-    source that the scene has: it alone. auto: what the scene has. none: no prior."""
+    """Where the prior comes from. integrated: LiDAR and monocular maps (Eq. 5), and maps from motion where the scene
+    has them; lidar, mono (Table 3), motion, or another source that the scene has: it alone. auto: what the scene has.
+    none: no prior."""
     prior: PriorOptions = field(default_factory=PriorOptions)
     """How these maps become a prior."""
     prior_weight: float = 1.0
@@ -335,6 +336,8 @@ class PriorRecipe:
     @property
     def layers(self) -> tuple[str, ...]:
         """The layers that are read: beside the source's own those that say where the sky is."""
+        if self.depth_source == INTEGRATED and self.options.motion:
+            return ("lidar", "mono", "motion")
         return ("lidar", "mono") if self.depth_source in CALIBRATED else (self.depth_source,)
 
 
@@ -364,6 +367,9 @@ def _load(
         view = view_of(picture.lens, picture.up_in_camera) if mono is not None else None
         prior = cache.prior(maps, mask, view if recipe.trust is not None else None)
         sky = None if mono is None or view is None else sky_of(mono, maps.get("lidar"), view, rgb, mask)
+        if sky is not None and (motion := maps.get("motion")) is not None:
+            # what is matched is no sky
+            sky &= ~(motion > 0)
         return PicturePixels(rgb, mask, prior.distance_m, prior.sigma_m, sky)
 
     # OpenCV and torch release the interpreter's lock, so two threads read and integrate side by side; a few pictures

@@ -1,7 +1,8 @@
 """`edge-depth-nerf process`: from a raw drive to a scene that is ready to be trained on.
 
-First the converter writes the scene; then, if it has no monocular maps, a network is trained on its LiDAR and predicts
-them; then it is measured how far the maps can be trusted. Each step that is done is not done again.
+First the converter writes the scene; then distances from motion are found; then, if it has no monocular maps, a
+network is trained on its LiDAR and predicts them; then it is measured how far the maps can be trusted. Each step that
+is done is not done again.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ def process(options: ProcessOptions, console: Console | None = None) -> ProcessR
     _check_network(options)
     with only_writer(options.output, console):
         report = convert(options, console)
+        _add_motion(read_scene(report.scene), options, console)
         _add_mono(read_scene(report.scene), options, console)
         return report
 
@@ -39,6 +41,14 @@ def _check_network(options: ProcessOptions) -> None:
         from edge_depth_nerf.mono.network import load_network
 
         load_network(options.mono_model)
+
+
+def _add_motion(scene: SceneFolder, options: ProcessOptions, console: Console) -> None:
+    """Give the scene distances from motion, if it has none."""
+    if options.motion and not scene.has("motion"):
+        from edge_depth_nerf.process.motion import add_motion
+
+        add_motion(scene, console)
 
 
 def _add_mono(scene: SceneFolder, options: ProcessOptions, console: Console) -> None:

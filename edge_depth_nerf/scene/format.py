@@ -48,6 +48,7 @@ LAYERS: dict[str, Layer] = {
     "mask": Layer("mask_path", "masks/{camera}", "mask", "masks"),
     "lidar": Layer("lidar_file_path", "lidar/{camera}", "distance", "LiDAR maps"),
     "mono": Layer("mono_file_path", "mono/{camera}", "distance", "monocular maps"),
+    "motion": Layer("motion_file_path", "motion/{camera}", "distance", "maps from motion"),
     "beams": Layer("beams_file_path", "beams/{camera}", "distance", "held-out LiDAR beams", True),
     "truth_distance": Layer("truth_distance_file_path", "truth/{camera}/distance", "distance", "true distances", True),
     "truth_rgb": Layer("truth_rgb_file_path", "truth/{camera}/rgb", "picture", "true pictures", True),

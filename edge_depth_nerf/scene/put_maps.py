@@ -31,6 +31,7 @@ def write_maps(
     maps: Iterable[tuple[str, Float[np.ndarray, "h w"]]],
     source: Mapping[str, Any],
     progress: Progress | None = None,
+    some_empty: bool = False,
 ) -> None:
     """Write a map of a source of depth for every frame of a scene, and name them in its transforms.json.
 
@@ -44,6 +45,7 @@ def write_maps(
             order; taken one at a time.
         source: where they come from, as JSON; kept in transforms.json under the layer's name.
         progress: where to show how far it is.
+        some_empty: a map may have no value at all, as one from motion where nothing moved.
 
     Raises:
         FileNotFoundError: no scene there.
@@ -71,7 +73,9 @@ def write_maps(
             if name not in pictures or name in written:
                 fault = "is of no frame of" if name not in pictures else "comes twice for"
                 raise InputError(f"{name}: a {words} {fault} {found.path}. Give one for every file_path in it.")
-            write_distance_png(partial / targets[name], usable_distance(found, pictures[name], metres, words))
+            if not some_empty or metres.any():
+                metres = usable_distance(found, pictures[name], metres, words)
+            write_distance_png(partial / targets[name], metres)
             written.add(name)
             if progress and task is not None:
                 progress.advance(task)

@@ -726,16 +726,15 @@ class _LaterMaps:
 
 
 def _maps_put_in_later(written: Path) -> dict[str, _LaterMaps]:
-    """Find what a transforms.json says of such maps, by layer."""
+    """Find what a transforms.json says of such maps, by layer, in its order."""
     if not written.is_file():
         return {}
     there = read_transforms(written)
     found = {}
-    for name in depth_sources():
-        if name in there:
-            key = LAYERS[name].key
-            of_pictures = {frame["file_path"]: frame[key] for frame in there["frames"] if key in frame}
-            found[name] = _LaterMaps(there[name], of_pictures)
+    for name in filter(depth_sources().__contains__, there):
+        key = LAYERS[name].key
+        of_pictures = {frame["file_path"]: frame[key] for frame in there["frames"] if key in frame}
+        found[name] = _LaterMaps(there[name], of_pictures)
     return found
 
 
@@ -757,6 +756,8 @@ def _kept_later_maps(
                 "Those of the drive's own network are made again; others are to be put in again, by "
                 "`edge-depth-nerf estimate-depth`."
             )
+        if name == "motion":
+            remedy = "They are made again, unless --no-motion is given."
         of_what = "estimated monocular maps" if name == "mono" else f"{LAYERS[name].words} put in later"
         notices.append(
             f"The {of_what} of this scene are left out: one is missing, or pictures or masks are new. {remedy}"

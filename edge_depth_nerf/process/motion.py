@@ -1,0 +1,176 @@
+"""Distances from motion for a scene that is written: `motion/CAMERA/0000000123.png`.
+
+Pictures that are held out take no part, and get an empty map. Sweeps, the long part, are kept in `.cache/motion` until
+all maps are written, so that a run that was stopped goes on where it was.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import io
+import shutil
+import threading
+from collections import OrderedDict
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float32
+from rich.console import Console
+
+from edge_depth_nerf.base.checked_cache import content_of, write_checked
+from edge_depth_nerf.base.console import progress_bars, run_jobs, say
+from edge_depth_nerf.scene.put_maps import write_maps
+from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
+from edge_depth_nerf.stereo.consistency import LEAST_AGREEING, MotionDistance
+from edge_depth_nerf.stereo.motion import Motion
+from edge_depth_nerf.stereo.sweep import Swept
+from edge_depth_nerf.stereo.views import View, view_of, working_factor
+
+VERSION = 1
+"""Of the sweeps that are kept: raised when the same pictures give other ones."""
+FEWEST_PICTURES = 1 + LEAST_AGREEING
+"""Fewer cannot confirm each other."""
+_STANDS = "the vehicle stands or turns on the spot, or no two other pictures see the same"
+_SWEEPS_IN_MEMORY = 48
+_SMOOTH = 0.05
+"""Inverse distances that differ by less than this share are one surface: they are interpolated in larger maps."""
+
+
+def add_motion(scene: SceneFolder, console: Console) -> None:
+    """Find the distances of a scene's training pictures from motion and write them, or say why there are none.
+
+    Raises:
+        InputError: a picture or a mask cannot be used.
+
+    """
+    pictures = [picture for picture in scene.pictures if not picture.held_out]
+    if len(pictures) < FEWEST_PICTURES:
+        say(console, f"No distances from motion: {len(pictures)} pictures for training are too few.", "yellow")
+        return
+    motion = Motion(
+        np.stack([picture.position_m for picture in pictures]), lambda index: scene_view(scene, pictures[index])
+    )
+    with console.status("Looking for neighbours of pictures …"):
+        still = sum(len(motion.neighbours(index)) < LEAST_AGREEING for index in range(len(pictures)))
+    if still == len(pictures):
+        say(console, f"No distances from motion: {_STANDS}, in all pictures for training.", "yellow")
+        return
+    store = _Store(scene.folder / ".cache" / "motion" / _made_of(scene, pictures), motion)
+    run_jobs([partial(store.make, index) for index in range(len(pictures))], "Sweeping pictures", console)
+    numbers = {picture.name: index for index, picture in enumerate(pictures)}
+    shares: list[float] = []
+
+    def maps() -> Iterator[tuple[str, Float32[np.ndarray, "_ _"]]]:
+        for picture in scene.pictures:
+            size = (picture.lens.height, picture.lens.width)
+            if picture.held_out:
+                yield picture.name, np.zeros(size, np.float32)
+                continue
+            found = motion.confirm(numbers[picture.name], store)
+            used = scene_view(scene, picture).used
+            shares.append(float((found.distance_m > 0).sum() / max(1, used.sum())))
+            yield picture.name, enlarged(found, working_factor(picture.lens), size)
+
+    with progress_bars(console) as progress:
+        write_maps(scene.folder, "motion", maps(), {"kind": "sphere sweep"}, progress, some_empty=True)
+    shutil.rmtree(store.folder.parent, ignore_errors=True)
+    said = f"Distances from motion for {np.mean(shares):.0%} of what the masks keep of training pictures"
+    if still:
+        said += f"; none for {still} of {len(shares)}: {_STANDS}"
+    say(console, f"{said}.", "yellow" if still else None)
+
+
+def scene_view(scene: SceneFolder, picture: ScenePicture) -> View:
+    """A scene's picture as the sweep wants it."""
+    pose = np.eye(4)
+    # OpenGL's camera axes to OpenCV's
+    pose[:3, :3], pose[:3, 3] = picture.rotation * np.array([1.0, -1.0, -1.0]), picture.position_m
+    return view_of(scene.rgb(picture), scene.usable(picture), picture.lens, pose, scene.theta_max_rad)
+
+
+def enlarged(found: MotionDistance, factor: int, size: tuple[int, int]) -> Float32[np.ndarray, "_ _"]:
+    """Bring distances to the size of the picture: interpolated on surfaces, else the nearest; 0 = none.
+
+    Args:
+        found: at the working size.
+        factor: by which the picture was averaged down.
+        size: height and width of the picture; what filled no block has none.
+
+    """
+    if factor == 1:
+        return found.distance_m
+    kept = found.distance_m > 0
+    inverse = np.where(kept, 1 / np.where(kept, found.distance_m, 1), np.nan).astype(np.float32)
+    whole = (inverse.shape[1] * factor, inverse.shape[0] * factor)
+    nearest = np.asarray(cv2.resize(inverse, whole, interpolation=cv2.INTER_NEAREST))
+    between = np.asarray(cv2.resize(inverse, whole, interpolation=cv2.INTER_LINEAR))
+    # comparisons with NaN are false
+    inverse = np.where(np.abs(between - nearest) <= _SMOOTH * nearest, between, nearest)
+    result = np.zeros(size, np.float32)
+    result[: whole[1], : whole[0]] = np.nan_to_num(1 / inverse)
+    return result
+
+
+class _Store:
+    """The sweeps of a scene's pictures: on disk, the last ones in memory too."""
+
+    def __init__(self, folder: Path, motion: Motion) -> None:
+        self.folder = folder
+        self._motion = motion
+        self._lock = threading.Lock()
+        self._recent: OrderedDict[int, Swept] = OrderedDict()
+        # of other poses or masks
+        for other in folder.parent.glob("*"):
+            if other != folder:
+                shutil.rmtree(other, ignore_errors=True)
+
+    def make(self, index: int) -> None:
+        """Sweep a picture, unless that is done."""
+        if self._read(index) is None:
+            self._write(index, self._motion.sweep(index))
+
+    def __call__(self, index: int) -> Swept:
+        """The sweep of a picture."""
+        with self._lock:
+            if index in self._recent:
+                self._recent.move_to_end(index)
+                return self._recent[index]
+        swept = self._read(index)
+        if swept is None:
+            swept = self._motion.sweep(index)
+        with self._lock:
+            self._recent[index] = swept
+            while len(self._recent) > _SWEEPS_IN_MEMORY:
+                self._recent.popitem(last=False)
+        return swept
+
+    def _path(self, index: int) -> Path:
+        return self.folder / f"{index:06d}.npz"
+
+    def _read(self, index: int) -> Swept | None:
+        content = content_of(self._path(index), VERSION)
+        if content is None:
+            return None
+        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+            return Swept(**archive)
+
+    def _write(self, index: int, swept: Swept) -> None:
+        archive = io.BytesIO()
+        np.savez(archive, **{field.name: getattr(swept, field.name) for field in dataclasses.fields(Swept)})
+        self.folder.mkdir(parents=True, exist_ok=True)
+        write_checked(self._path(index), VERSION, lambda file: file.write(archive.getbuffer()))
+
+
+def _made_of(scene: SceneFolder, pictures: list[ScenePicture]) -> str:
+    """Key of pictures, masks, lenses and poses."""
+    digest = hashlib.sha256(repr(scene.theta_max_rad).encode())
+    for picture in pictures:
+        files = [picture.files[layer] for layer in ("image", "mask") if layer in picture.files]
+        dated = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in files]
+        pose = picture.rotation.tolist(), picture.position_m.tolist()
+        digest.update(repr((picture.name, dated, picture.lens, pose)).encode())
+    return digest.hexdigest()[:16]

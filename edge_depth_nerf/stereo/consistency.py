@@ -1,0 +1,90 @@
+"""Which of a picture's distances its neighbours confirm, and how far they can be trusted.
+
+A neighbour has distances of its own, found from other pictures. Where it has the same point, both are right or both
+wrong in the same way; where it sees through the point, one is wrong. A distance is kept if several neighbours confirm
+it and fewer see through it, if there is enough parallax, and if it is likely to be right (`confidence`). What is kept
+is the mean of what agrees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32
+
+from edge_depth_nerf.masks.regions import larger
+from edge_depth_nerf.stereo.sweep import Geometry, Swept, padded, rays_of
+from edge_depth_nerf.stereo.views import View
+
+LEAST_PARALLAX_PX = 2.0
+"""Where a point moves less against infinity there is no distance."""
+LEAST_CORRELATION = 0.3
+LEAST_AGREEING = 2
+"""So many neighbours at least confirm a distance."""
+LEAST_CONFIDENCE = 0.7
+SAME_SHARE, SAME_PX = 0.04, 0.5
+"""Inverse distances agree if they differ by less than this share and by this movement together."""
+SMALLEST_PX = 12.0
+"""Smaller regions of what is left are chance."""
+_CONFIDENCE = (-1.0, 3.5, 1.75)
+"""Of a logistic function of 1, the root of the margin, and the agreeing neighbours over `_ALL_AGREE`: fitted to the
+truth of rendered drives, so that it is the share of distances that are right to 10 % (docs/motion.md)."""
+_ALL_AGREE = 8
+
+
+@dataclass(frozen=True, eq=False)
+class MotionDistance:
+    """Distances of a picture from motion; H×W each, 0 where there is none."""
+
+    distance_m: Float32[np.ndarray, "h w"]
+    """Metres along the ray."""
+    confidence: Float32[np.ndarray, "h w"]
+    """How likely the distance is right to 10 %, `LEAST_CONFIDENCE` to 1."""
+    parallax_px: Float32[np.ndarray, "h w"]
+    """How far the point moves against the infinity behind it; see `Swept`."""
+
+
+def worth_asking(swept: Swept) -> Bool[np.ndarray, "h w"]:
+    """Where a sweep may say something, as yet unconfirmed."""
+    return (swept.parallax_px >= LEAST_PARALLAX_PX) & (swept.correlation >= LEAST_CORRELATION)
+
+
+def confirm(
+    view: View, swept: Swept, neighbours: Sequence[View], theirs: Sequence[Float32[np.ndarray, "_ _"]]
+) -> MotionDistance:
+    """Keep of a sweep what the neighbours' own sweeps confirm.
+
+    Args:
+        view: the picture.
+        swept: its sweep.
+        neighbours: pictures with sweeps of their own.
+        theirs: the inverse distances of these, 0 where they are not `worth_asking`.
+
+    """
+    # imported here, because Numba takes half a second to load
+    from edge_depth_nerf.kernels import sphere_sweep
+
+    size = view.grey.shape
+    asked = worth_asking(swept)
+    if len(neighbours) < LEAST_AGREEING or not asked.any():
+        return MotionDistance(*(np.zeros(size, np.float32) for _ in range(3)))
+    inverse_per_m = np.where(asked, swept.inverse_per_m, np.float32(0))
+    unsure = np.float32(SAME_PX) * inverse_per_m / np.maximum(swept.parallax_px, LEAST_PARALLAX_PX)
+    agree, against = np.empty(size, np.uint8), np.empty(size, np.uint8)
+    mean = np.empty(size, np.float32)
+    largest = tuple(max(each.shape[axis] for each in theirs) for axis in (0, 1))
+    sphere_sweep.compare(
+        *(rays_of(view), inverse_per_m, unsure, np.stack([padded(each, largest, 0.0) for each in theirs])),
+        *Geometry.of(view, neighbours).transforms,
+        *(np.float32(SAME_SHARE), agree, against, mean),
+    )
+    constant, of_margin, of_agreeing = _CONFIDENCE
+    odds = constant + of_margin * np.sqrt(np.maximum(swept.margin, 0))
+    odds += of_agreeing * np.minimum(agree, _ALL_AGREE) / _ALL_AGREE
+    confidence = (1 / (1 + np.exp(-odds))).astype(np.float32)
+    kept = asked & (agree >= LEAST_AGREEING) & (agree > against) & (confidence >= LEAST_CONFIDENCE) & (mean > 0)
+    kept = larger(kept, SMALLEST_PX)
+    distance_m = np.where(kept, 1 / np.where(kept, mean, 1), 0).astype(np.float32)
+    return MotionDistance(distance_m, np.where(kept, confidence, 0), np.where(kept, swept.parallax_px, 0))

@@ -1,0 +1,63 @@
+"""Distances of all pictures of a drive: each swept, then confirmed by the sweeps of those it was compared with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+from jaxtyping import Float64
+
+from edge_depth_nerf.stereo.consistency import MotionDistance, confirm, worth_asking
+from edge_depth_nerf.stereo.sweep import Swept, sweep_view
+from edge_depth_nerf.stereo.views import View, choose_neighbours, nearest_views
+
+_KEPT_VIEWS = 96
+"""So many views, half a megabyte each, are kept in memory."""
+
+
+class Motion:
+    """The pictures of a drive that take part: held-out ones are not among them."""
+
+    def __init__(
+        self, positions_m: Float64[np.ndarray, "views 3"], view: Callable[[int], View], most_neighbours: int = 8
+    ) -> None:
+        """Say which pictures there are.
+
+        Args:
+            positions_m: their cameras' centres.
+            view: gives one of them; asked for again when it has been dropped.
+            most_neighbours: each is compared with no more.
+
+        """
+        self._positions_m, self._most = positions_m, most_neighbours
+        self._view = lru_cache(_KEPT_VIEWS)(view)
+        self._neighbours = lru_cache(None)(self._choose)
+
+    def neighbours(self, index: int) -> tuple[int, ...]:
+        """Which pictures a picture is compared with, the best first."""
+        return self._neighbours(index)
+
+    def _choose(self, index: int) -> tuple[int, ...]:
+        near = nearest_views(self._positions_m, index)
+        chosen = choose_neighbours(self._view(index), [self._view(other) for other in near], self._most)
+        return tuple(near[place] for place in chosen)
+
+    def sweep(self, index: int) -> Swept:
+        """What a picture's neighbours say of it; the long part of the work."""
+        return sweep_view(self._view(index), [self._view(other) for other in self.neighbours(index)])
+
+    def confirm(self, index: int, sweeps: Callable[[int], Swept]) -> MotionDistance:
+        """Keep what the neighbours confirm.
+
+        Args:
+            index: which picture.
+            sweeps: gives the sweep of a picture.
+
+        """
+        neighbours = self.neighbours(index)
+        theirs = []
+        for other in neighbours:
+            swept = sweeps(other)
+            theirs.append(np.where(worth_asking(swept), swept.inverse_per_m, np.float32(0)))
+        return confirm(self._view(index), sweeps(index), [self._view(other) for other in neighbours], theirs)
