@@ -70,7 +70,7 @@ def main() -> None:
     torch.manual_seed(100 + rank)
     pipeline.train()
     rays, batch = manager.next_train(0)
-    outputs = pipeline.model(rays)
+    outputs = pipeline.model(rays, batch)
     losses = pipeline.model.get_loss_dict(outputs, batch, pipeline.model.get_metrics_dict(outputs, batch))
     total: Any = sum(losses.values())
     total.backward()
