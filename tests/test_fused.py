@@ -228,7 +228,7 @@ def test_training_goes_as_with_torch(options):
 TABLE = "field.mlp_base.model.0.hash_table"
 
 
-def surface(count: int = 30) -> dict[str, torch.Tensor]:
+def surface(count: int = 30) -> dict[str, RayBundle | torch.Tensor]:
     torch.manual_seed(0)
     return {
         "surface_rays": bundle(count),

@@ -129,7 +129,7 @@ def _split(scene: SceneFolder) -> Iterator[Finding]:
         yield Finding(
             "no_held_out",
             "No frame is held out, so the figures of ns-eval are of pictures that were trained on; process the drive "
-            f"with --holdout-every {best_holdout(len({picture.frame for picture in scene.pictures}))}.",
+            f"with --holdout-every {best_holdout(len({picture.moment for picture in scene.pictures}))}.",
         )
 
 
