@@ -65,6 +65,7 @@ ALLOWED = {
         "pipeline.model.edge_divide_by_norm",
         PRIOR + "align",
         PRIOR + "sigma_mode",
+        PRIOR + "motion",
         PRIOR + "integration.least_returns",
         PRIOR + "integration.sigma_depth_growth_per_m",
         PRIOR + "integration.normalise",

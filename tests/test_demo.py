@@ -105,8 +105,8 @@ def test_its_commands_are_what_a_user_can_type(finished):
     assert all(html.escape(command) in page for command in [*results["commands"], *results["viewer_commands"]])
 
 
-def test_the_two_models_differ_in_the_depth_loss_and_its_source_alone(finished):
-    """And the source says the same of both: auto is integrated where a scene has both kinds of maps."""
+def test_the_two_models_differ_in_what_depth_is_used_for_alone(finished):
+    """nerfacto has no prior, so it has neither the loss nor the extras that use one."""
     options, _ = finished
     texts = [
         next((runs_of(options.output) / f"{name}_seed-0").rglob("config.yml")).read_text().splitlines()
@@ -116,7 +116,12 @@ def test_the_two_models_differ_in_the_depth_loss_and_its_source_alone(finished):
     assert different == {
         ("experiment_name: nerfacto_seed-0", "experiment_name: edge_seed-0"),
         ("depth_loss: none", "depth_loss: edge"),
-        ("depth_source: auto", "depth_source: integrated"),
+        ("depth_source: none", "depth_source: integrated"),
+        ("depth_loss_final: 1.0", "depth_loss_final: 0.01"),
+        ("surface_loss_mult: 0.0", "surface_loss_mult: 1.0"),
+        ("surface_rays_per_batch: 0", "surface_rays_per_batch: 16384"),
+        ("sky_loss_mult: 0.0", "sky_loss_mult: 0.01"),
+        ("sky_background: false", "sky_background: true"),
     }
 
 

@@ -474,5 +474,5 @@ def test_networks_that_cannot_be_used_are_named(networks, tmp_path, monkeypatch,
 
 def test_without_the_library_its_name_is_told(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "transformers", None)
-    with pytest.raises(InputError, match=r"pip install edge-depth-nerf\[hf\]"):
+    with pytest.raises(InputError, match=r"pip install '\.\[hf\]'"):
         load_ready_network(str(tmp_path))
