@@ -61,7 +61,7 @@ class CompareOptions:
     """Which methods. None named: all but those that only the grid has, with --preset paper without edge-paper, which is
     edge there; with --grid all of its cells."""
     steps: int | None = None
-    """Training steps of each run. Not set: the preset's."""
+    """Training steps of each run; the learning rates fall over them. Not set: the preset's."""
     seeds: tuple[int, ...] = (0,)
     """Seeds of the training; each method is trained once with each."""
     preset: Preset = "lite"
