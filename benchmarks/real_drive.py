@@ -6,8 +6,10 @@
 REAL holds kitti360_drive, a recording that `process rig` reads (docs/results.md says which). It is processed at full
 and at half size: every sixth frame is held out with its LiDAR, and a tenth of the LiDAR's beams is held out of all
 sweeps. λ and σ are those that a search on a rendered drive found (tuned.json), for all methods alike; nothing is chosen
-on this drive. Then each method with a depth loss is trained with other λ, one seed, half size: the curves. Writes
-table.md, table.json, lambda.png and views.png. Stopped at any moment, the same command goes on.
+on this drive. Then the rival with the best PSNR is trained once more, for as many steps as ours' processor seconds
+allow, its learning rates falling over these. Last, each method with a depth loss is trained with other λ, one seed,
+half size: the curves. Writes table.md, table.json, lambda.png and views_SCENE.png. Stopped at any moment, the same
+command goes on.
 """
 
 from __future__ import annotations
@@ -31,6 +33,7 @@ from edge_depth_nerf.compare.specification import VIEWS
 
 ROOT = Path(__file__).parents[1]
 TABLE: tuple[MethodName, ...] = ("nerfacto", "urban-nerf", "ds-nerf", "edge-paper", "edge")
+RIVALS: tuple[MethodName, ...] = ("nerfacto", "urban-nerf", "ds-nerf")
 WITH_LAMBDA: tuple[MethodName, ...] = ("urban-nerf", "ds-nerf", "edge")
 LAMBDAS = (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1)
 SIZES = {"half": 2, "full": 1}
@@ -77,22 +80,42 @@ def values(runs: Sequence[RunResult], metric: str) -> list[float]:
     return [run.figures[metric] for run in runs if metric in run.figures]
 
 
-def rows(results: Results, scene: str) -> Iterator[str]:
-    """The table of one size, as Markdown."""
-    runs: dict[MethodName, list[RunResult]] = {method: [] for method in TABLE}
-    for run in results.runs:
-        if run.scene == scene and run.method in runs:
-            runs[run.method].append(run)
-    yield "| " + " | ".join(["method", *(column.title for column in COLUMNS), "processor seconds"]) + " |"
-    yield "|---" * (len(COLUMNS) + 2) + "|"
-    for method, found in runs.items():
-        cells = [METHODS[method].title]
-        for column in COLUMNS:
-            each = values(found, column.metric)
-            spread = f" ± {statistics.stdev(each):{column.form}}" if len(each) > 1 else ""
-            cells.append(f"{statistics.mean(each):{column.form}}{spread}" if each else "–")
-        seconds = values(found, "cpu_seconds")
-        yield "| " + " | ".join([*cells, f"{statistics.mean(seconds):.0f}" if seconds else "–"]) + " |"
+def heading() -> Iterator[str]:
+    """The first lines of a table, as Markdown."""
+    yield "| " + " | ".join(["method", *(column.title for column in COLUMNS), "steps", "processor seconds"]) + " |"
+    yield "|---" * (len(COLUMNS) + 3) + "|"
+
+
+def row(title: str, steps: int, found: Sequence[RunResult]) -> str:
+    """One method of a table, as Markdown: mean and standard deviation of its seeds."""
+    cells = [title]
+    for column in COLUMNS:
+        each = values(found, column.metric)
+        spread = f" ± {statistics.stdev(each):{column.form}}" if len(each) > 1 else ""
+        cells.append(f"{statistics.mean(each):{column.form}}{spread}" if each else "–")
+    seconds = values(found, "cpu_seconds")
+    return "| " + " | ".join([*cells, f"{steps:,}", f"{statistics.mean(seconds):.0f}" if seconds else "–"]) + " |"
+
+
+def of(results: Results, scene: str, method: MethodName) -> list[RunResult]:
+    """The runs of a method on a scene."""
+    return [run for run in results.runs if run.scene == scene and run.method == method]
+
+
+def last_step(runs: Sequence[RunResult]) -> int:
+    """How many steps the runs had."""
+    return int(runs[0].curve[-1]["step"])
+
+
+def best_rival(results: Results, scene: str) -> tuple[MethodName, int] | None:
+    """The rival of the best PSNR, and how many steps it does in ours' processor seconds; None without runs."""
+    ours = of(results, scene, "edge")
+    found: dict[MethodName, list[RunResult]] = {rival: runs for rival in RIVALS if (runs := of(results, scene, rival))}
+    if not ours or not found:
+        return None
+    rival = max(found, key=lambda name: statistics.mean(values(found[name], COLUMNS[0].metric)))
+    ratio = statistics.mean(values(ours, "cpu_seconds")) / statistics.mean(values(found[rival], "cpu_seconds"))
+    return rival, 10 * round(last_step(found[rival]) * ratio / 10)
 
 
 def margins(results: Results, scene: str) -> Iterator[str]:
@@ -107,7 +130,7 @@ def margins(results: Results, scene: str) -> Iterator[str]:
                 for name, each in run.items()
                 if each and column.metric in each.figures
             }
-            rivals = [value for name, value in found.items() if name in ("nerfacto", "urban-nerf", "ds-nerf")]
+            rivals = [value for name, value in found.items() if name in RIVALS]
             if "edge" in found and rivals:
                 leads.append(sign * (found["edge"] - (max(rivals) if sign > 0 else min(rivals))))
         if leads:
@@ -161,6 +184,13 @@ def main() -> None:
     parser.add_argument(
         "--lambdas", nargs="*", type=float, default=list(LAMBDAS), help="of the curves; none: no curves"
     )
+    parser.add_argument(
+        "--equal-seconds",
+        nargs="*",
+        choices=SIZES,
+        default=["half"],
+        help="sizes: the best rival in ours' seconds",
+    )
     parser.add_argument("--curve-steps", type=int, help="of the curves' trainings; the table's, if not set")
     parser.add_argument("--jobs", type=int, default=1, help="trainings at a time")
     options = parser.parse_args()
@@ -182,16 +212,24 @@ def main() -> None:
         common = ("--methods", *TABLE, "--tuned", tuned, "--output", compared, *jobs, *steps)
         command("compare", *scenes.values(), "--seeds", seed, *common)
     results = read_results(compared / RUNS)
+    equal = options.output / "equal_seconds"
+    for size in options.equal_seconds:
+        if size in scenes and (best := best_rival(results, scenes[size].name)):
+            rival, length = best
+            common = ("--methods", rival, "--tuned", tuned, "--steps", length, *jobs)
+            command("compare", scenes[size], "--seeds", *options.seeds, *common, "--output", equal / size)
     parts = ["# A real drive, by all methods\n"]
     for scene in results.scenes():
-        parts += [
-            f"\n## {scene}\n",
-            *rows(results, scene),
-            "",
-            "Ours against the best rival:",
-            "",
-            *margins(results, scene),
-        ]
+        parts += [f"\n## {scene}\n", *heading()]
+        for method in TABLE:
+            if found := of(results, scene, method):
+                parts.append(row(METHODS[method].title, last_step(found), found))
+        parts += ["", "Ours against the best rival, after as many steps:", "", *margins(results, scene)]
+        longer = equal / scene.removeprefix("kitti360_")
+        if longer.is_dir():
+            runs = read_results(longer / RUNS).runs
+            parts += ["", "The best rival after as many processor seconds as ours:", "", *heading()]
+            parts.append(row(METHODS[runs[0].method].title, last_step(runs), runs))
         draw_views(results, scene, options.output / f"views_{scene}.png")
     write_text(options.output / "table.md", "\n".join([*parts, ""]))
     write_json(options.output / "table.json", results.rows())
