@@ -51,6 +51,7 @@ from edge_depth_nerf.inspecting.findings import Finding, find, limited
 from edge_depth_nerf.inspecting.options import InspectOptions
 from edge_depth_nerf.inspecting.pose_check import BAD_MEDIAN_PX
 from edge_depth_nerf.inspecting.pose_plot import pose_check_figure
+from edge_depth_nerf.inspecting.shown_prior import ShownScene
 from edge_depth_nerf.inspecting.top_view import GAP, GREYS, HELD_OUT, PATH, TRAINING, top_view
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.method.prior import default_source
@@ -576,6 +577,27 @@ def test_distances_from_motion_have_a_panel(drive, tmp_path):
         read_image(path).shape[1] for path in (tmp_path / "without" / name, tmp_path / "with" / with_motion)
     )
     assert (width, wider) == (3 * (200 + 14), 4 * (200 + 14))
+
+
+def test_the_sheet_says_what_a_prior_comes_from(drive):
+    """Without a calibration each estimate counts where it is."""
+    scene = read_scene(drive)
+    before = ShownScene(scene).maps(scene.pictures[0])
+    motion_m = np.zeros_like(before.usable, np.float32)
+    motion_m[:, : motion_m.shape[1] // 2] = 5
+    write_maps(drive, "motion", ((each.name, motion_m) for each in scene.pictures), {"kind": "for a test"})
+    scene = read_scene(drive)
+    shown = ShownScene(scene).maps(scene.pictures[0])
+    assert before.origin is not None and shown.origin is not None and shown.prior is not None
+    assert shown.lidar_m is not None and shown.mono_m is not None
+    has_prior, lidar, mono, moved = (
+        each > 0 for each in (shown.prior.distance_m, shown.lidar_m, shown.mono_m, motion_m)
+    )
+    expected = [lidar, ~lidar & mono & ~moved, ~lidar & mono & moved, ~lidar & ~mono & moved]
+    for i, where in enumerate(expected):
+        np.testing.assert_array_equal(shown.origin == i, where & has_prior, err_msg=str(i))
+    assert np.isin([0, 1, 2, 3], shown.origin).all() and {*np.unique(before.origin)} == {-1, 0, 1}
+    np.testing.assert_array_equal(shown.origin == -1, ~has_prior)
 
 
 # ---- other people's scenes -------------------------------------------------------------------------------------
