@@ -18,13 +18,15 @@ import argparse
 import statistics
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edge_depth_nerf.base.files import read_image, read_json, write_json, write_png, write_text
+from edge_depth_nerf.base.pictures import DISTANCE, colour_bar, lay_out, panel
 from edge_depth_nerf.compare.command import RUNS
 from edge_depth_nerf.compare.methods import METHODS
 from edge_depth_nerf.compare.options import MethodName
@@ -38,6 +40,12 @@ WITH_LAMBDA: tuple[MethodName, ...] = ("urban-nerf", "ds-nerf", "edge")
 LAMBDAS = (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1)
 SIZES = {"half": 2, "full": 1}
 HOLDOUT = ("--holdout-every", "6", "--holdout-beams", "10")
+
+
+SHOWN = ("img", "distance")
+"""Judged views that are drawn."""
+SHORT = ("PSNR", "SSIM", "AbsRel", "δ")
+"""Columns of the README."""
 
 
 @dataclass(frozen=True)
@@ -54,10 +62,10 @@ COLUMNS = (
     Column("PSNR", "masked_psnr", ".2f", True),
     Column("fitted PSNR", "affine_masked_psnr", ".2f", True),
     Column("SSIM", "masked_ssim", ".3f", True),
-    Column("AbsRel", "lidar_abs_rel", ".3f", False),
+    Column("AbsRel", "lidar_abs_rel", ".4f", False),
     Column("RMSE, m", "lidar_rmse_m", ".2f", False),
     Column("δ", "lidar_delta_1_25", ".3f", True),
-    Column("beams' AbsRel", "beams_abs_rel", ".3f", False),
+    Column("beams' AbsRel", "beams_abs_rel", ".4f", False),
 )
 
 
@@ -80,21 +88,29 @@ def values(runs: Sequence[RunResult], metric: str) -> list[float]:
     return [run.figures[metric] for run in runs if metric in run.figures]
 
 
-def heading() -> Iterator[str]:
+def heading(columns: Sequence[Column]) -> Iterator[str]:
     """The first lines of a table, as Markdown."""
-    yield "| " + " | ".join(["method", *(column.title for column in COLUMNS), "steps", "processor seconds"]) + " |"
-    yield "|---" * (len(COLUMNS) + 3) + "|"
+    yield "| " + " | ".join(["method", *(column.title for column in columns), "steps", "processor seconds"]) + " |"
+    yield "|---" * (len(columns) + 3) + "|"
 
 
-def row(title: str, steps: int, found: Sequence[RunResult]) -> str:
+def row(title: str, found: Sequence[RunResult], columns: Sequence[Column]) -> str:
     """One method of a table, as Markdown: mean and standard deviation of its seeds."""
     cells = [title]
-    for column in COLUMNS:
+    for column in columns:
         each = values(found, column.metric)
         spread = f" ± {statistics.stdev(each):{column.form}}" if len(each) > 1 else ""
         cells.append(f"{statistics.mean(each):{column.form}}{spread}" if each else "–")
-    seconds = values(found, "cpu_seconds")
-    return "| " + " | ".join([*cells, f"{steps:,}", f"{statistics.mean(seconds):.0f}" if seconds else "–"]) + " |"
+    seconds = f"{statistics.mean(values(found, 'cpu_seconds')):.0f}"
+    return "| " + " | ".join([*cells, f"{last_step(found):,}", seconds]) + " |"
+
+
+def table(results: Results, scene: str, columns: Sequence[Column]) -> Iterator[str]:
+    """All methods on a scene, as Markdown."""
+    yield from heading(columns)
+    for method in TABLE:
+        if found := of(results, scene, method):
+            yield row(METHODS[method].title, found, columns)
 
 
 def of(results: Results, scene: str, method: MethodName) -> list[RunResult]:
@@ -139,6 +155,28 @@ def margins(results: Results, scene: str) -> Iterator[str]:
             yield f"* {column.title}: {mean} on average, ahead with {ahead} of {len(leads)} seeds."
 
 
+def page(results: Results, longer: Mapping[str, Results]) -> str:
+    """All tables, as Markdown.
+
+    Args:
+        results: of as many steps each.
+        longer: of the best rival in ours' seconds, by size.
+
+    """
+    parts = ["# A real drive, by all methods"]
+    for scene in results.scenes():
+        short = [column for column in COLUMNS if column.title in SHORT]
+        parts += ["", f"## {scene}", "", *table(results, scene, COLUMNS)]
+        parts += ["", f"## Short: {scene}", "", *table(results, scene, short)]
+        parts += ["", f"## Ours against the best rival after as many steps: {scene}", "", *margins(results, scene)]
+        size = scene.removeprefix("kitti360_")
+        if size in longer:
+            runs = longer[size].runs
+            parts += ["", f"## The best rival after as many processor seconds as ours: {scene}", "", *heading(COLUMNS)]
+            parts.append(row(METHODS[runs[0].method].title, runs, COLUMNS))
+    return "\n".join([*parts, ""])
+
+
 def draw_lambdas(found: dict[float, Results], path: Path) -> None:
     """Draw picture and depth over λ."""
     import matplotlib.pyplot as plt
@@ -162,16 +200,17 @@ def draw_lambdas(found: dict[float, Results], path: Path) -> None:
 
 
 def draw_views(results: Results, scene: str, path: Path) -> None:
-    """One held-out picture and its distances, by nerfacto, DS-NeRF's loss and ours, one under the other."""
-    shown: list[np.ndarray] = []
+    """One held-out picture and its distances as nerfacto, DS-NeRF's loss and ours render them."""
+    panels: list[NDArray[np.uint8]] = []
     for method in ("nerfacto", "ds-nerf", "edge"):
         run = results.run(scene, method, results.seeds()[0])
         if run is None:
             return
-        shown.append(
-            np.hstack([read_image(run.folder / VIEWS / f"eval_{name}_0001.png") for name in ("img", "distance")])
-        )
-    write_png(path, np.vstack(shown))
+        beside_truth, distance = (read_image(run.folder / VIEWS / f"eval_{name}_0001.png") for name in SHOWN)
+        title, width = METHODS[method].title, beside_truth.shape[1] // 2
+        panels.append(panel(beside_truth[:, width:], title))
+        panels.append(panel(distance, f"{title}: distance", colour_bar(DISTANCE, width)))
+    write_png(path, lay_out(panels, 2, ["A held-out picture, rendered"]))
 
 
 def main() -> None:
@@ -218,20 +257,10 @@ def main() -> None:
             rival, length = best
             common = ("--methods", rival, "--tuned", tuned, "--steps", length, *jobs)
             command("compare", scenes[size], "--seeds", *options.seeds, *common, "--output", equal / size)
-    parts = ["# A real drive, by all methods\n"]
+    longer = {size: read_results(equal / size / RUNS) for size in SIZES if (equal / size).is_dir()}
+    write_text(options.output / "table.md", page(results, longer))
     for scene in results.scenes():
-        parts += [f"\n## {scene}\n", *heading()]
-        for method in TABLE:
-            if found := of(results, scene, method):
-                parts.append(row(METHODS[method].title, last_step(found), found))
-        parts += ["", "Ours against the best rival, after as many steps:", "", *margins(results, scene)]
-        longer = equal / scene.removeprefix("kitti360_")
-        if longer.is_dir():
-            runs = read_results(longer / RUNS).runs
-            parts += ["", "The best rival after as many processor seconds as ours:", "", *heading()]
-            parts.append(row(METHODS[runs[0].method].title, last_step(runs), runs))
         draw_views(results, scene, options.output / f"views_{scene}.png")
-    write_text(options.output / "table.md", "\n".join([*parts, ""]))
     write_json(options.output / "table.json", results.rows())
 
     curves: dict[float, Results] = {}
