@@ -22,6 +22,7 @@ from edge_depth_nerf.kernels import hash_grid_numba as cpu
 from edge_depth_nerf.kernels.fields import CubeContraction
 from edge_depth_nerf.kernels.fused_hash_grid import FusedHashEncoding, use_fused_encodings
 from edge_depth_nerf.kernels.hash_grid import back_end
+from edge_depth_nerf.kernels.table_adam import TableAdam
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
 
 SIZES = {
@@ -417,6 +418,22 @@ def test_a_training_step_is_the_torch_step(options):
     assert models[1].field.follows_positions == bool({"predict_normals", "poses"} & set(options))
     models[0].load_state_dict(models[1].state_dict())
     models[1].load_state_dict(models[0].state_dict())
+
+
+def test_gradients_by_positions_alone_leave_the_tables_be():
+    """Normals ask for them in each step; from the second one on, gradients could be added to the tables in place."""
+    options = {"max_res": 512, "predict_normals": True}
+    models = [build(implementation=implementation, **options) for implementation in ("torch", "fused")]
+    for model in models:
+        # a rate of next to nothing: both stay the same model
+        optimiser = TableAdam(model.parameters(), lr=1e-12, eps=1e-15)
+        step(model)
+        optimiser.step()
+        optimiser.zero_grad()
+        step(model)
+    for ours, of_torch in zip(*(encodings_of(model) for model in reversed(models)), strict=True):
+        assert of_torch.hash_table.grad.any()
+        assert_near(ours.hash_table.grad, of_torch.hash_table.grad, 4e-7 * 512)
 
 
 def test_the_contraction_is_nerfactos():

@@ -224,7 +224,8 @@ class EdgeDepthNerfModel(NerfactoModel):
 
             if not compiled_before():
                 CONSOLE.print("The first steps compile kernels, which takes about a minute, once on this machine.")
-            use_fused_fields(self)
+            # normals differentiate by the positions alone, which would add to the tables' gradients, too
+            use_fused_fields(self, add_in_place=not self.config.predict_normals)
             # bound before the networks were of the fused class
             self.density_fns = [density_fn.__self__.density_fn for density_fn in self.density_fns]
             pdf = self.proposal_sampler.pdf_sampler
@@ -502,11 +503,13 @@ class EdgeDepthNerfModel(NerfactoModel):
         """The loss on the distance prior, mean over the levels of samples.
 
         While the proposal networks rest their levels would only add a number; the final samples' share stays the same.
+        nerfstudio's form of UrbanNeRF's loss holds the final samples' expected distance in every level: all stay.
         """
         levels = list(zip(outputs["weights_list"], outputs["ray_samples_list"], strict=True))
         if self.config.depth_loss_levels == "final":
             levels = levels[-1:]
-        learning = [level for level in levels if level[0].requires_grad]
+        every = self.config.depth_loss == "urban-nerf"
+        learning = [level for level in levels if every or level[0].requires_grad]
         per_level = [self._depth_loss(*level, outputs, batch) for level in learning or levels]
         return torch.stack(per_level).sum() / len(levels)
 
