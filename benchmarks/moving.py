@@ -17,7 +17,6 @@ moves, by the true masks in all three.
 from __future__ import annotations
 
 import argparse
-import subprocess
 import sys
 import tempfile
 import time
@@ -26,6 +25,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from commands import command
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
@@ -151,13 +151,6 @@ def real_table(root: Path, overlays: Path | None, console: Console) -> Table:
     some = sum(share > 0 for share in shares)
     table.add_row(root.name, str(len(shares)), str(some), f"{np.mean(shares):.2%}", f"{np.max(shares):.2%}")
     return table
-
-
-def command(name: str, *words: object) -> None:
-    """Run one of the installed commands."""
-    program = str(Path(sys.executable).with_name(name))
-    if subprocess.run([program, *map(str, words)], check=False, stdout=subprocess.DEVNULL).returncode:
-        sys.exit(f"{name} {' '.join(map(str, words))} failed.")
 
 
 def judge_by(scene: Path, true: Path) -> None:

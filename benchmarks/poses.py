@@ -13,11 +13,10 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
+from commands import command
 from scipy.spatial.transform import Rotation
 
 from edge_depth_nerf.base.files import read_json, write_json, write_text
@@ -36,19 +35,6 @@ ROWS = (
 )
 """Poses of a scene, and whether training moves them."""
 WON_BACK_GOAL, HARM_GOAL_DB = 0.9, 0.1
-
-
-def command(name: str, *words: object) -> None:
-    """Run one of the installed commands."""
-    done = subprocess.run(
-        [str(Path(sys.executable).with_name(name)), *map(str, words)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        check=False,
-    )
-    if done.returncode:
-        sys.exit(f"{name} {' '.join(map(str, words))} failed:\n{done.stdout[-3000:]}")
 
 
 def disturbed_drive(drive: Path, folder: Path, shift_m: float, turn_deg: float) -> Path:

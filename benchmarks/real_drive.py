@@ -16,13 +16,13 @@ from __future__ import annotations
 
 import argparse
 import statistics
-import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from commands import command
 from numpy.typing import NDArray
 
 from edge_depth_nerf.base.files import read_image, read_json, write_json, write_png, write_text
@@ -69,11 +69,9 @@ COLUMNS = (
 )
 
 
-def command(*words: object) -> None:
+def ours(*words: object) -> None:
     """Run one of the project's commands; its output is shown."""
-    program = str(Path(sys.executable).with_name("edge-depth-nerf"))
-    if subprocess.run([program, *map(str, words)], check=False).returncode:
-        sys.exit(f"edge-depth-nerf {' '.join(map(str, words))} failed.")
+    command("edge-depth-nerf", *words, shown=True)
 
 
 def write_tuned(path: Path, weight: float) -> Path:
@@ -244,21 +242,23 @@ def main() -> None:
     compared = options.output / "compared"
     scenes = {size: options.output / f"kitti360_{size}" for size in options.sizes}
     for size, scene in scenes.items():
-        command("process", "rig", "--root", drive, "--output", scene, "--downscale", SIZES[size], *HOLDOUT)
+        ours("process", "rig", "--root", drive, "--output", scene, "--downscale", SIZES[size], *HOLDOUT)
     tuned = ROOT / "benchmarks" / "tuned.json"
     for seed in options.seeds:
         # a seed is whole before the next begins: a stopped benchmark has a table of those it has
         common = ("--methods", *TABLE, "--tuned", tuned, "--output", compared, *jobs, *steps)
-        command("compare", *scenes.values(), "--seeds", seed, *common)
+        ours("compare", *scenes.values(), "--seeds", seed, *common)
     results = read_results(compared / RUNS)
-    equal = options.output / "equal_seconds"
+    longer: dict[str, Path] = {}
     for size in options.equal_seconds:
         if size in scenes and (best := best_rival(results, scenes[size].name)):
             rival, length = best
             common = ("--methods", rival, "--tuned", tuned, "--steps", length, *jobs)
-            command("compare", scenes[size], "--seeds", *options.seeds, *common, "--output", equal / size)
-    longer = {size: read_results(equal / size / RUNS) for size in SIZES if (equal / size).is_dir()}
-    write_text(options.output / "table.md", page(results, longer))
+            longer[size] = options.output / "equal_seconds" / f"{size}_{rival}_{length}"
+            ours("compare", scenes[size], "--seeds", *options.seeds, *common, "--output", longer[size])
+    write_text(
+        options.output / "table.md", page(results, {size: read_results(path / RUNS) for size, path in longer.items()})
+    )
     for scene in results.scenes():
         draw_views(results, scene, options.output / f"views_{scene}.png")
     write_json(options.output / "table.json", results.rows())
@@ -268,7 +268,8 @@ def main() -> None:
         folder = options.output / f"lambda_{weight:g}"
         given = write_tuned(options.output / f"lambda_{weight:g}.json", weight)
         scene = scenes.get("half", next(iter(scenes.values())))
-        command("compare", scene, "--methods", *WITH_LAMBDA, "--tuned", given, "--output", folder, *jobs, *curve_steps)
+        common = ("--tuned", given, "--output", folder, *jobs, *curve_steps)
+        ours("compare", scene, "--methods", *WITH_LAMBDA, *common)
         curves[weight] = read_results(folder / RUNS)
         draw_lambdas(curves, options.output / "lambda.png")
 

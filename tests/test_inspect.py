@@ -572,11 +572,11 @@ def test_distances_from_motion_have_a_panel(drive, tmp_path):
     maps = ((each.name, np.full((each.lens.height, each.lens.width), 5, np.float32)) for each in pictures)
     write_maps(drive, "motion", maps, {"kind": "for a test"})
     (with_motion,) = look(drive, tmp_path / "with", frames=1, size=200)["sheets"]
-    # six panels in three columns, seven in four
-    width, wider = (
-        read_image(path).shape[1] for path in (tmp_path / "without" / name, tmp_path / "with" / with_motion)
-    )
-    assert (width, wider) == (3 * (200 + 14), 4 * (200 + 14))
+    before, after = (read_image(path) for path in (tmp_path / "without" / name, tmp_path / "with" / with_motion))
+    # six panels in three columns; two more, motion and what the prior comes from, in four
+    assert (before.shape[1], after.shape[1]) == (3 * (200 + 14), 4 * (200 + 14))
+    last = after[-(150 + 70) :, -200:]
+    assert before.shape[0] == after.shape[0] and not (last == 255).all()
 
 
 def test_the_sheet_says_what_a_prior_comes_from(drive):

@@ -98,6 +98,11 @@ def compare_grid(options: CompareOptions, console: Console) -> Results:
         raise InputError(
             f"--grid --methods {' '.join(others)}: expected cells of the grid, {', '.join(GRID.values())}."
         )
+    with_loss = tuple(name for name in cells if METHODS[name].sigma_field is not None)
+    if not with_loss:
+        raise InputError(
+            f"--grid --methods {' '.join(cells)}: none of them has a loss on the prior; expected one at least."
+        )
     search, comparison = options.output / SEARCH, options.output / COMPARISON
     if options.output.is_dir() and any(options.output.iterdir()) and not search.is_dir():
         raise InputError(f"{options.output}: holds other things. Choose a new or empty folder for --output.")
@@ -112,7 +117,7 @@ def compare_grid(options: CompareOptions, console: Console) -> Results:
             scenes=options.tuning,
             tuning=(),
             output=search,
-            methods=tuple(name for name in cells if METHODS[name].sigma_field is not None),
+            methods=with_loss,
             seeds=options.seeds[:1],
         ),
         console,
@@ -311,6 +316,12 @@ def open_output(options: CompareOptions, tuned: dict[str, Setting]) -> None:
         write_json(path, wanted)
 
 
+def _tuned_on(path: Path) -> Any:
+    """The scenes that tuned values were searched on; files of a search of one drive have them as `scene`."""
+    content = read_json_object(path)
+    return content.get("scenes", content.get("scene"))
+
+
 def _record(options: CompareOptions, tuned: dict[str, Setting]) -> dict[str, Any]:
     """What the output folder's record is to hold of what all its runs share, beside the commands so far.
 
@@ -324,7 +335,7 @@ def _record(options: CompareOptions, tuned: dict[str, Setting]) -> dict[str, Any
         "steps": options.steps,
         "rivals_implementation": options.rivals_implementation,
         "tuned": {name: {"lambda": setting.weight, "sigma_m": setting.sigma_m} for name, setting in tuned.items()},
-        "tuned_on": None if options.tuned is None else read_json_object(options.tuned).get("scenes"),
+        "tuned_on": None if options.tuned is None else _tuned_on(options.tuned),
     }
     path = options.output / RECORD
     if path.is_file():

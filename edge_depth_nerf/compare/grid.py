@@ -9,7 +9,16 @@ import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from edge_depth_nerf.compare.methods import GRID, LOSS_TITLES, METHODS, Cell, Loss, PriorName
+from edge_depth_nerf.compare.methods import (
+    EXTRAS_TITLES,
+    GRID,
+    LOSS_TITLES,
+    METHODS,
+    PRIOR_TITLES,
+    Cell,
+    Loss,
+    PriorName,
+)
 from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.results import Results
 from edge_depth_nerf.compare.search import Grid
@@ -18,8 +27,6 @@ from edge_depth_nerf.report.tables import Cell as Figure
 from edge_depth_nerf.report.tables import MadeTable, Metric, Row, mark_best, mean_and_spread
 from edge_depth_nerf.scene.format import read_transforms
 
-PRIOR_TITLES: dict[PriorName, str] = {"lidar": "LiDAR", "integrated": "integrated"}
-EXTRAS_TITLES = {False: "without extras", True: "with extras"}
 NOTE = "dB: by how much PSNR is ahead. AbsRel ×: the share of the other's AbsRel that is left; below 1 is better."
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from edge_depth_nerf.method.error_model import Trust, read_trust
 from edge_depth_nerf.method.integration import INTEGRATED
-from edge_depth_nerf.method.prior import Prior, PriorOptions, View, default_source, make_prior, view_of
+from edge_depth_nerf.method.prior import FARTHEST_M, Prior, PriorOptions, View, default_source, make_prior, view_of
 from edge_depth_nerf.mono.calibration import saved_trust
 from edge_depth_nerf.scene.format import TRUST_FILE
 from edge_depth_nerf.scene.reader import PictureMaps, SceneFolder, ScenePicture
@@ -80,7 +80,12 @@ def _origin(maps: PictureMaps, source: str, prior: Prior, trust: Trust | None, v
 
     with_motion = source == "motion" or (source == INTEGRATED and (trust is None or trust.motion is not None))
     moved = has("motion") if with_motion else np.zeros_like(maps.usable)
-    estimated = has("mono") if trust is None or view is None or trust.everywhere else trust.in_field(view.elevation_rad)
+    estimated = has("mono")
+    if trust is not None and view is not None:
+        # beyond, a monocular distance means "far"
+        estimated &= np.nan_to_num(maps.distances_m.get("mono", np.zeros(1))) <= FARTHEST_M
+        if not trust.everywhere:
+            estimated &= trust.in_field(view.elevation_rad)
     points = has("lidar") if source != "mono" else np.zeros_like(maps.usable)
     of_estimates = np.where(moved, np.where(estimated, 2, 3), 1)
     return np.where(prior.distance_m > 0, np.where(points, 0, of_estimates), -1).astype(np.int8)

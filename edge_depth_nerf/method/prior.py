@@ -222,6 +222,8 @@ def integrate_frame(
     from_motion = np.zeros_like(mask)
     if motion is not None:
         from_motion = anywhere & (motion.distance_m > 0) & ~returns
+        # where the monocular map means "far" a return takes no part, with motion or without
+        lidar_m = np.where(mask, lidar_m, np.float32(0))
         mono_m = _joined(np.where(mask & motion.mono_counts, mono_m, np.float32(0)), motion.distance_m, motion.weight)
         mask = anywhere
     # the spread is wanted at returns, too, so they are kept afterwards

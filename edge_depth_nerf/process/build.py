@@ -97,9 +97,10 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
     held_out = _held_out(recording, options)
     if options.holdout_every > 0 and not held_out:
         moments = len({picture.frame for picture in recording.pictures})
+        advice = f"--holdout-every {best_holdout(moments)} holds one out" if moments > 1 else "Take a longer stretch"
         notices.append(
             f"No frame is held out: the drive has {moments}, too few for --holdout-every {options.holdout_every}. "
-            f"--holdout-every {best_holdout(moments)} holds one out to judge by."
+            f"{advice} to judge by."
         )
     if options.find_moving:
         recording, more = find_moving(recording, options, held_out, masks, console)

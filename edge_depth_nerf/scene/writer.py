@@ -216,7 +216,10 @@ def ranges(frames: Sequence[int]) -> str:
 
 
 def best_holdout(count: int) -> int:
-    """Give the `holdout_every` that holds out one of `count` moments or more: 8, or less for very short drives."""
+    """Give the `holdout_every` that holds out one of `count` moments or more: 8, or less for very short drives.
+
+    Of a single moment nothing can be held out.
+    """
     return max(2, min(8, 2 * count - 1))
 
 
