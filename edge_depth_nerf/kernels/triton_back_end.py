@@ -12,6 +12,7 @@ from importlib import import_module
 from types import ModuleType
 
 import torch
+from torch import Tensor
 
 
 @functools.lru_cache
@@ -40,3 +41,14 @@ def working(module: str, device: torch.device, what: str) -> ModuleType | None:
         )
         return None
     return kernels
+
+
+def along_rays(*tensors: Tensor) -> ModuleType | None:
+    """Give the kernels along rays, `ray_triton`, for matrices that have a row a ray; None where they do not serve them.
+
+    They serve float32 on CUDA, and rays whose samples stay on the chip.
+    """
+    if any(each.device.type != "cuda" or each.dtype != torch.float32 for each in tensors):
+        return None
+    kernels = working("ray_triton", tensors[0].device, "form of samples along rays")
+    return kernels if kernels is not None and kernels.fits(*(each.shape[1] for each in tensors)) else None
