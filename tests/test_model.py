@@ -160,7 +160,7 @@ def test_sigma_of_ds_nerf_is_a_standard_deviation_in_metres():
         frustums = Frustums(origins=zero, directions=zero, starts=starts, ends=ends, pixel_area=starts)
         supervision = {"prior_distance_m": torch.full((1, 1), 5.0)}
         weights = torch.full((1, 1, 1), 0.5)
-        pulls.append(float(model._depth_loss(weights, RaySamples(frustums=frustums), {}, supervision)))
+        pulls.append(float(model._edge_losses([(weights, RaySamples(frustums=frustums))], supervision)))
     assert pulls[1] / pulls[0] == pytest.approx(math.exp(-0.5), rel=1e-4)
 
 
@@ -472,5 +472,5 @@ def test_levels_that_do_not_learn_are_left_out_and_the_others_pull_as_before():
         assert [weights.requires_grad for weights, _ in proposals] == [not rests] * 2
         losses = model.get_loss_dict(outputs, batch(), model.get_metrics_dict(outputs, batch()))
         levels = [final] if rests else [*proposals, final]
-        expected = sum(float(model._depth_loss(*level, outputs, batch())) for level in levels) / 3
+        expected = float(model._edge_losses(levels, batch()).sum()) / 3
         assert float(losses["edge_loss"]) == pytest.approx(expected, rel=1e-5)
