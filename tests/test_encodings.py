@@ -23,6 +23,7 @@ from edge_depth_nerf.kernels.fields import CubeContraction
 from edge_depth_nerf.kernels.fused_hash_grid import FusedHashEncoding, use_fused_encodings
 from edge_depth_nerf.kernels.hash_grid import back_end
 from edge_depth_nerf.kernels.table_adam import TableAdam
+from edge_depth_nerf.kernels.triton_back_end import working
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
 
 SIZES = {
@@ -467,10 +468,10 @@ def test_the_choice_of_implementation(monkeypatch):
 def test_other_devices_are_left_to_torch():
     assert back_end(torch.device("mps")) is None
     if not torch.cuda.is_available():
-        back_end.cache_clear()
+        working.cache_clear()
         with pytest.warns(UserWarning, match="fused hash grid does not work on cuda"):
             assert back_end(torch.device("cuda")) is None
-        back_end.cache_clear()
+        working.cache_clear()
 
 
 INTERPRETED = """

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from models import build
-from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.field_components.mlp import MLP
 from nerfstudio.field_components.spatial_distortions import SceneContraction
@@ -18,7 +18,7 @@ from edge_depth_nerf.kernels.contraction import contract
 from edge_depth_nerf.kernels.fields import FusedMLP, FusedNerfactoField, use_fused_fields
 from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss, proposal_loss
 from edge_depth_nerf.kernels.network import network
-from edge_depth_nerf.kernels.ray_samplers import FusedPDFSampler, edges_of
+from edge_depth_nerf.kernels.ray_samplers import FusedPDFSampler, FusedRaySamples, edges_of
 from edge_depth_nerf.plugin.config import FusedAdamConfig
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
 
@@ -142,6 +142,17 @@ def test_samples_lie_where_nerfstudio_puts_them(training, single_jitter):
     for expected, placed in zip(*found, strict=True):
         torch.testing.assert_close(placed, expected, rtol=1e-4, atol=1e-5)
     assert found[1][0].diff().min() >= 0
+
+
+def test_all_samples_of_a_fused_model_have_fused_weights():
+    """On the CPU they are nerfstudio's to the last bit."""
+    model = build().train()
+    outputs = model(bundle())
+    assert [type(samples) for samples in outputs["ray_samples_list"]] == [FusedRaySamples] * 3
+    samples, densities = outputs["ray_samples_list"][0], torch.rand(outputs["weights_list"][0].shape)
+    assert torch.equal(samples.get_weights(densities), RaySamples.get_weights(samples, densities))
+    torch_form = build(implementation="torch").train()(bundle())
+    assert FusedRaySamples not in {type(samples) for samples in torch_form["ray_samples_list"]}
 
 
 def histograms(seed: int = 0, rays: int = 50) -> tuple[torch.Tensor, ...]:

@@ -16,8 +16,6 @@ CUDA tensors by Triton (`cuda`).
 
 from __future__ import annotations
 
-import functools
-import warnings
 from types import ModuleType
 from typing import Any
 
@@ -26,33 +24,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from edge_depth_nerf.kernels.table_adam import CLEARED, IN_PLACE, adds_in_place
+from edge_depth_nerf.kernels.triton_back_end import working
 
 
-@functools.lru_cache
 def back_end(device: torch.device) -> ModuleType | None:
-    """Give the module that works on tensors of this device, None if there is none.
-
-    On CUDA one point is encoded to find out: Triton may be missing, find no C compiler, or not know the GPU.
-    """
-    # imported here, because Numba and Triton take half a second each to load
+    """Give the module that works on tensors of this device, None if there is none."""
     if device.type == "cpu":
+        # imported here, because Numba takes half a second to load
         from edge_depth_nerf.kernels import hash_grid_numba as cpu
 
         return cpu
-    if device.type != "cuda":
-        return None
-    try:
-        from edge_depth_nerf.kernels import hash_grid_triton as cuda
-
-        cuda.encode(*(torch.ones(shape, device=device) for shape in ((1, 3), (2, 2), (1,))))
-    except Exception as error:  # whatever keeps Triton from working here
-        warnings.warn(
-            f"The fused hash grid does not work on {device} ({type(error).__name__}: {error}); "
-            "nerfstudio's torch form takes its place, with the same results but slower.",
-            stacklevel=2,
-        )
-        return None
-    return cuda
+    return working("hash_grid_triton", device, "hash grid")
 
 
 class _HashGrid(torch.autograd.Function):

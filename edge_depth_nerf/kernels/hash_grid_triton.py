@@ -203,3 +203,11 @@ def position_gradient(
                 *given, scalings, result, points, rows // levels, LEVELS=levels, FEATURES=features, POINTS=POINTS
             )
     return result
+
+
+def try_out(device: torch.device) -> None:
+    """Run each kernel once; raises whatever keeps one from working."""
+    x, table, scalings, gradient = (torch.ones(shape, device=device) for shape in ((1, 3), (2, 2), (1,), (1, 2)))
+    encode(x, table, scalings)
+    table_gradient(x, gradient, scalings, len(table))
+    position_gradient(x, table, gradient, scalings)

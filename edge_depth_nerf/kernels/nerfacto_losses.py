@@ -10,6 +10,8 @@ from jaxtyping import Float
 from nerfstudio.model_components.losses import lossfun_outer
 from torch import Tensor
 
+from edge_depth_nerf.kernels.triton_back_end import along_rays
+
 
 def distortion_loss(edges: Float[Tensor, "rays edges"], weights: Float[Tensor, "rays samples"]) -> Float[Tensor, ""]:
     """Compute mip-NeRF 360's distortion loss (its Eq. 15), mean over the rays.
@@ -22,6 +24,9 @@ def distortion_loss(edges: Float[Tensor, "rays edges"], weights: Float[Tensor, "
         weights: rendering weights.
 
     """
+    kernels = along_rays(edges, weights)
+    if kernels is not None and not edges.requires_grad:
+        return kernels.distortion_loss(edges, weights)
     middles = (edges[:, 1:] + edges[:, :-1]) / 2
     # the sums up to and including i: what i itself adds cancels
     before, before_middles = weights.cumsum(dim=-1), (weights * middles).cumsum(dim=-1)
@@ -40,6 +45,9 @@ def proposal_loss(
 
     `weights` are taken as given: the gradient goes to `proposal_weights` alone.
     """
+    kernels = along_rays(edges, weights, proposal_edges, proposal_weights)
+    if kernels is not None:
+        return kernels.bound_loss(edges, weights, proposal_edges, proposal_weights)
     if weights.device.type != "cpu" or weights.dtype != torch.float32:
         return lossfun_outer(edges, weights.detach(), proposal_edges, proposal_weights).mean()
     # imported here, because Numba takes half a second to load

@@ -1,20 +1,34 @@
-"""nerfstudio's placing of samples along rays, in one pass on the CPU.
+"""nerfstudio's placing of samples along rays in one pass, on the CPU and on a GPU, and on a GPU their weights.
 
 Host-facing; the numbers are nerfstudio's to float32's noise, from the same random numbers.
 """
 
 from __future__ import annotations
 
+from types import ModuleType
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.model_components.ray_samplers import PDFSampler
-from torch import Tensor
+from torch import Tensor, nn
+
+from edge_depth_nerf.kernels.triton_back_end import along_rays
+
+
+def _placing(weights: Tensor) -> ModuleType | None:
+    """Give the module whose `place_samples` works on such weights, [rays, samples]."""
+    if weights.device.type == "cpu":
+        # imported here, because Numba takes half a second to load
+        from edge_depth_nerf.kernels import ray_kernels
+
+        return ray_kernels
+    return along_rays(weights)
 
 
 class FusedPDFSampler(PDFSampler):
-    """nerfstudio's `PDFSampler(include_original=False)`; on other devices than the CPU it is left to nerfstudio."""
+    """nerfstudio's `PDFSampler(include_original=False)`; devices without kernels are left to nerfstudio."""
 
     def generate_ray_samples(
         self,
@@ -27,19 +41,17 @@ class FusedPDFSampler(PDFSampler):
         """Place samples by the weights of earlier ones."""
         assert ray_bundle is not None and ray_samples is not None and weights is not None
         count = num_samples or self.num_samples
-        if self.include_original or weights.device.type != "cpu" or weights.ndim != 3 or not count:
+        kernels = None if self.include_original or weights.ndim != 3 else _placing(weights[..., 0])
+        if kernels is None or not count:
             return super().generate_ray_samples(ray_bundle, ray_samples, weights, num_samples, eps)
-        # imported here, because Numba takes half a second to load
-        from edge_depth_nerf.kernels.ray_kernels import place_samples
-
-        places = count + 1
-        wanted = torch.linspace(0, 1 - 1 / places, places).expand(len(weights), -1)
+        places, device = count + 1, weights.device
+        wanted = torch.linspace(0, 1 - 1 / places, places, device=device).expand(len(weights), -1)
         if self.train_stratified and self.training:
-            wanted = wanted + torch.rand(len(weights), 1 if self.single_jitter else places) / places
+            wanted = wanted + torch.rand(len(weights), 1 if self.single_jitter else places, device=device) / places
         else:
             wanted = wanted + 1 / (2 * places)
         edges = edges_of(ray_samples)
-        placed = place_samples(weights[..., 0].float(), edges, wanted, self.histogram_padding, eps)[..., None]
+        placed = kernels.place_samples(weights[..., 0].float(), edges, wanted, self.histogram_padding, eps)[..., None]
         to_euclidean = ray_samples.spacing_to_euclidean_fn
         assert to_euclidean is not None
         distances = to_euclidean(placed[..., 0])[..., None]
@@ -57,3 +69,28 @@ def edges_of(samples: RaySamples) -> Tensor:
     starts: Any = samples.spacing_starts
     ends: Any = samples.spacing_ends
     return torch.cat([starts[..., 0], ends[..., -1:, 0]], dim=-1)
+
+
+class FusedRaySamples(RaySamples):
+    """nerfstudio's `RaySamples`; on a GPU weights come from one kernel."""
+
+    def get_weights(self, densities: Float[Tensor, "*batch samples 1"]) -> Float[Tensor, "*batch samples 1"]:
+        """Rendering weights of the samples."""
+        deltas = self.deltas
+        if deltas is None or deltas.requires_grad or deltas.shape != densities.shape or densities.ndim != 3:
+            return super().get_weights(densities)
+        kernels = along_rays(densities[..., 0], deltas[..., 0])
+        if kernels is None:
+            return super().get_weights(densities)
+        return kernels.weights_from_densities(densities[..., 0], deltas[..., 0])[..., None]
+
+
+def _with_fused_weights(_: nn.Module, __: Any, samples: RaySamples) -> RaySamples:
+    # the class alone differs
+    samples.__class__ = FusedRaySamples
+    return samples
+
+
+def use_fused_weights(sampler: nn.Module) -> None:
+    """Let the samples that a sampler gives compute their weights in the fused form; in place."""
+    sampler.register_forward_hook(_with_fused_weights)

@@ -8,7 +8,7 @@ Half precision is computed in float32, float64 in float64.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.kernels.triton_back_end import working
 
 Gaussian = Literal["point", "interval"]
 
@@ -97,6 +98,66 @@ def edge_loss(
     target = target / math.sqrt(2 * math.pi) if divide_by_norm else target * sigma
     total = -(target * torch.log(weights + EPS)).sum()
     return total / has_prior.sum().clamp(min=1)
+
+
+def edge_losses(
+    levels: Sequence[tuple[Float[Tensor, "rays _"], Float[Tensor, "rays _"], Float[Tensor, "rays _"]]],
+    prior_m: Float[Tensor, "rays"],
+    sigma_m: Float[Tensor, "rays"],
+    *,
+    metres_per_unit: float = 1.0,
+    gaussian: Gaussian = "point",
+    divide_by_norm: bool = False,
+) -> Float[Tensor, "levels"]:
+    """Compute `edge_loss` of several levels of samples of the same rays; on a GPU all in one pass.
+
+    Args:
+        levels: rendering weights of each, and where its samples begin and end, in any unit of length.
+        prior_m: d̃, as in `edge_loss`.
+        sigma_m: σ̂ likewise.
+        metres_per_unit: metres in one unit of the samples' starts and ends.
+        gaussian: as in `edge_loss`.
+        divide_by_norm: as in `edge_loss`.
+
+    Returns:
+        The loss of each level. On a GPU it is differentiable once, and by the weights alone, unless starts, ends or the
+        prior ask for a gradient too.
+
+    Raises:
+        InputError: as in `edge_loss`.
+
+    """
+    weights, starts, ends = zip(*levels, strict=True)
+    every = (*weights, *starts, *ends, prior_m, sigma_m)
+    is_float = all(each.dtype in (torch.float32, torch.float16, torch.bfloat16) for each in every)
+    of_weights_alone = not any(each.requires_grad for each in (*starts, *ends, prior_m, sigma_m))
+    kernels = working("edge_loss_triton", prior_m.device, "edge loss") if is_float and of_weights_alone else None
+    if kernels is None or gaussian not in get_args(Gaussian):
+        per_level = [
+            edge_loss(
+                weight,
+                start * metres_per_unit,
+                end * metres_per_unit,
+                prior_m,
+                sigma_m,
+                gaussian=gaussian,
+                divide_by_norm=divide_by_norm,
+            )
+            for weight, start, end in levels
+        ]
+        return torch.stack(per_level)
+    for weight, start, end in levels:
+        _check_shapes("edge_losses", weight, {"starts": start, "ends": end}, {"prior_m": prior_m, "sigma_m": sigma_m})
+    return kernels.edge_losses(
+        levels,
+        prior_m,
+        sigma_m,
+        metres_per_unit=metres_per_unit,
+        interval=gaussian == "interval",
+        divide_by_norm=divide_by_norm,
+        eps=EPS,
+        narrow=NARROW,
+    )
 
 
 KERNEL_REACH = 3.0

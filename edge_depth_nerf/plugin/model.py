@@ -38,8 +38,8 @@ from edge_depth_nerf.kernels.allocator import keep_freed_memory
 from edge_depth_nerf.kernels.fields import CubeContraction, FusedNerfactoField, use_fused_fields
 from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss, proposal_loss
 from edge_depth_nerf.kernels.openmp import let_idle_threads_sleep
-from edge_depth_nerf.kernels.ray_samplers import FusedPDFSampler, edges_of
-from edge_depth_nerf.method.losses import URBAN_TERMS, UrbanTerms, edge_loss, sky_loss, urban_nerf_loss
+from edge_depth_nerf.kernels.ray_samplers import FusedPDFSampler, edges_of, use_fused_weights
+from edge_depth_nerf.method.losses import URBAN_TERMS, UrbanTerms, edge_losses, sky_loss, urban_nerf_loss
 from edge_depth_nerf.method.metrics import DepthErrors, load_lpips, masked_lpips, masked_psnr, masked_ssim
 from edge_depth_nerf.method.uncertainty import termination_std
 from edge_depth_nerf.plugin.compat import lpips_not_built, total_steps, without_undefined_ray
@@ -232,6 +232,8 @@ class EdgeDepthNerfModel(NerfactoModel):
             self.proposal_sampler.pdf_sampler = FusedPDFSampler(
                 include_original=pdf.include_original, single_jitter=pdf.single_jitter
             )
+            for sampler in (self.proposal_sampler.initial_sampler, self.proposal_sampler.pdf_sampler):
+                use_fused_weights(sampler)
             # nerfacto's field prepares a gradient to the positions at every step, for normals or poses
             if isinstance(self.field, FusedNerfactoField):
                 poses = self.config.camera_optimizer.mode != "off"
@@ -509,9 +511,27 @@ class EdgeDepthNerfModel(NerfactoModel):
         if self.config.depth_loss_levels == "final":
             levels = levels[-1:]
         every = self.config.depth_loss == "urban-nerf"
-        learning = [level for level in levels if every or level[0].requires_grad]
-        per_level = [self._depth_loss(*level, outputs, batch) for level in learning or levels]
-        return torch.stack(per_level).sum() / len(levels)
+        learning = [level for level in levels if every or level[0].requires_grad] or levels
+        if self.config.depth_loss == "edge":
+            per_level = self._edge_losses(learning, batch)
+        else:
+            per_level = torch.stack([self._depth_loss(*level, outputs, batch) for level in learning])
+        return per_level.sum() / len(levels)
+
+    def _edge_losses(self, levels: list[tuple[Tensor, RaySamples]], batch: dict[str, Any]) -> Float[Tensor, "levels"]:
+        prior_m = batch["prior_distance_m"].to(levels[0][0])
+        prior_m = torch.where(self._can_be_met(prior_m), prior_m, 0)
+        return edge_losses(
+            [
+                (weights[..., 0], samples.frustums.starts[..., 0], samples.frustums.ends[..., 0])
+                for weights, samples in levels
+            ],
+            prior_m[..., 0],
+            batch["prior_sigma_m"].to(prior_m)[..., 0],
+            metres_per_unit=self.metres_per_unit,
+            gaussian=self.config.edge_gaussian,
+            divide_by_norm=self.config.edge_divide_by_norm,
+        )
 
     def _depth_loss(
         self,
@@ -524,16 +544,6 @@ class EdgeDepthNerfModel(NerfactoModel):
         ends_m = samples.frustums.ends * self.metres_per_unit
         prior_m = batch["prior_distance_m"].to(weights)
         prior_m = torch.where(self._can_be_met(prior_m), prior_m, 0)
-        if self.config.depth_loss == "edge":
-            return edge_loss(
-                weights[..., 0],
-                starts_m[..., 0],
-                ends_m[..., 0],
-                prior_m[..., 0],
-                batch["prior_sigma_m"].to(weights)[..., 0],
-                gaussian=self.config.edge_gaussian,
-                divide_by_norm=self.config.edge_divide_by_norm,
-            )
         if self.config.depth_loss == "urban-nerf-los":
             narrowed_m = self.config.urban.sigma_m(self.config.depth_sigma, self._share_done())
             return urban_nerf_loss(

@@ -1,0 +1,54 @@
+"""Whether Triton kernels work on a device.
+
+Triton may be missing, find no C compiler, or not know the GPU. A module of kernels says how to find out: its function
+`try_out` calls each of them once on a few numbers.
+"""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from importlib import import_module
+from types import ModuleType
+
+import torch
+from torch import Tensor
+
+
+@functools.lru_cache
+def working(module: str, device: torch.device, what: str) -> ModuleType | None:
+    """Give a module of `edge_depth_nerf.kernels` whose kernels work on a device, None where they do not.
+
+    The first call for a CUDA device runs the kernels and warns where one fails.
+
+    Args:
+        module: its name; it has a function `try_out(device)`.
+        device: of the tensors; without a GPU there is nothing to try.
+        what: what the kernels compute, for the warning.
+
+    """
+    if device.type != "cuda":
+        return None
+    try:
+        # imported here, because Triton takes half a second to load
+        kernels = import_module(f"edge_depth_nerf.kernels.{module}")
+        kernels.try_out(device)
+    except Exception as error:  # whatever keeps Triton from working here
+        warnings.warn(
+            f"The fused {what} does not work on {device} ({type(error).__name__}: {error}); "
+            "nerfstudio's torch form takes its place, with the same results but slower.",
+            stacklevel=2,
+        )
+        return None
+    return kernels
+
+
+def along_rays(*tensors: Tensor) -> ModuleType | None:
+    """Give the kernels along rays, `ray_triton`, for matrices that have a row a ray; None where they do not serve them.
+
+    They serve float32 on CUDA, and rays whose samples stay on the chip.
+    """
+    if any(each.device.type != "cuda" or each.dtype != torch.float32 for each in tensors):
+        return None
+    kernels = working("ray_triton", tensors[0].device, "form of samples along rays")
+    return kernels if kernels is not None and kernels.fits(*(each.shape[1] for each in tensors)) else None

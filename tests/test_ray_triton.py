@@ -1,0 +1,243 @@
+"""The Triton kernels along rays against float64 and the CPU's kernels, in Triton's interpreter; and compiled."""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+from ahead_of_time import ARCHITECTURES, compiled
+from interpreted import assert_near, in_interpreter
+from torch._subclasses.fake_tensor import FakeTensorMode
+
+from edge_depth_nerf.kernels import triton_back_end
+
+SIZES = ((2, 1), (5, 16), (33, 17), (9, 48), (3, 256), (2, 300))
+"""Rays and samples, of which few are multiples of what a program works on."""
+
+
+def histograms(rays: int, samples: int, intervals: int, seed: int = 0) -> tuple[torch.Tensor, ...]:
+    """Edges and weights of samples and of a proposal; some edges are common to both, some intervals have no length."""
+    generator = torch.Generator().manual_seed(seed)
+    outer_edges = torch.rand(rays, intervals + 1, generator=generator).sort(dim=1)[0]
+    edges = torch.rand(rays, samples + 1, generator=generator).sort(dim=1)[0]
+    common = min(samples, intervals) // 2
+    edges[:, : common + 1] = outer_edges[:, : common + 1]
+    edges = edges.sort(dim=1)[0]
+    edges[:, samples // 2] = edges[:, samples // 2 + 1]
+    weights = torch.rand(rays, samples, generator=generator) ** 4
+    outer_weights = torch.rand(rays, intervals, generator=generator) ** 4
+    return (
+        edges,
+        weights / weights.sum(1, keepdim=True),
+        outer_edges,
+        outer_weights / outer_weights.sum(1, keepdim=True),
+    )
+
+
+def torch_weights(densities: torch.Tensor, deltas: torch.Tensor) -> torch.Tensor:
+    """nerfstudio's."""
+    depth = densities * deltas
+    before = torch.cat([torch.zeros_like(depth[:, :1]), depth[:, :-1].cumsum(1)], 1)
+    return torch.nan_to_num((1 - torch.exp(-depth)) * torch.exp(-before))
+
+
+def check_weights() -> None:
+    from edge_depth_nerf.kernels import ray_triton
+
+    for rays, samples in SIZES:
+        densities = 10 ** (4 * torch.rand(rays, samples) - 2)
+        densities[0] = 0
+        densities[-1, samples // 2 :] = 1e9
+        deltas = torch.rand(rays, samples) / samples
+        gradient = torch.randn(rays, samples)
+        found = ray_triton.weights_from_densities(densities.requires_grad_(), deltas)
+        (to_densities,) = torch.autograd.grad(found, densities, gradient)
+        exact = densities.detach().double().requires_grad_()
+        expected = torch_weights(exact, deltas.double())
+        assert_near(found.detach(), expected.detach(), 1e-6)
+        assert_near(to_densities, torch.autograd.grad(expected, exact, gradient.double())[0], 1e-6)
+    for shape in ((0, 5), (5, 0)):
+        empty = torch.empty(shape, requires_grad=True)
+        found = ray_triton.weights_from_densities(empty, torch.empty(shape))
+        assert found.shape == shape and torch.autograd.grad(found.sum(), empty)[0].shape == shape
+
+
+def check_weights_of_what_is_not_finite() -> None:
+    from edge_depth_nerf.kernels import ray_triton
+
+    densities, deltas, gradient = torch.rand(4, 10), torch.rand(4, 10), torch.randn(4, 10)
+    densities[1, 4], densities[2, 3] = float("inf"), float("nan")
+    densities.requires_grad_()
+    found, expected = (form(densities, deltas) for form in (ray_triton.weights_from_densities, torch_weights))
+    assert_near(found.detach(), expected.detach(), 1e-6)
+    assert not found.isnan().any()
+    gradients = [torch.autograd.grad(each, densities, gradient)[0] for each in (found, expected)]
+    assert gradients[1][2].isnan().any() and not gradients[1][[0, 3]].isnan().any()
+    assert_near(gradients[0], gradients[1], 1e-6)
+
+
+def check_places() -> None:
+    from edge_depth_nerf.kernels import ray_kernels, ray_triton
+
+    for rays, samples in SIZES:
+        for places, padding in ((1, 0.01), (17, 0.0), (49, 0.01)):
+            edges, weights, _, _ = histograms(rays, samples, 5)
+            weights[0] = 0
+            weights[-1] = torch.arange(samples) == samples // 3
+            wanted = torch.rand(rays, places).sort(dim=1)[0]
+            wanted[0, 0], wanted[-1, -1] = 0, 1
+            placed = ray_triton.place_samples(weights, edges, wanted, padding, 1e-5)
+            expected = ray_kernels.place_samples(weights, edges, wanted, padding, 1e-5)
+            assert_near(placed, expected, 1e-6)
+            # in the same order, but for rounding
+            assert not bool((placed.diff() < -1e-6).any())
+    assert ray_triton.place_samples(weights[:0], edges[:0], wanted[:0], 0.01, 1e-5).shape == (0, places)
+    weights[1, 3], wanted[:, -1] = float("nan"), 0.5
+    placed = ray_triton.place_samples(weights, edges, wanted, 0.01, 1e-5)
+    assert placed[1].isnan().all() and placed[0].isfinite().all()
+
+
+def exact_bound_loss(edges, weights, outer_edges, outer_weights) -> torch.Tensor:
+    """mip-NeRF 360's Eq. 13 in float64; the outermost intervals stand for what lies beyond them."""
+    begins, ends = outer_edges[:, None, :-1].clone(), outer_edges[:, None, 1:].clone()
+    begins[..., 0], ends[..., -1] = -float("inf"), float("inf")
+    touched = (ends > edges[:, :-1, None]) & (begins <= edges[:, 1:, None])
+    bound = (touched * outer_weights.double()[:, None]).sum(-1)
+    weights = weights.double()
+    return ((weights - bound).clamp(min=0).square() / (weights + 1e-7)).mean()
+
+
+def check_the_proposal_loss() -> None:
+    from edge_depth_nerf.kernels import ray_kernels, ray_triton
+
+    for (rays, samples), intervals in zip(SIZES, (1, 7, 64, 96, 257, 31), strict=True):
+        edges, weights, outer_edges, outer_weights = histograms(rays, samples, intervals)
+        outer_weights.requires_grad_()
+        forms = exact_bound_loss, ray_triton.bound_loss, ray_kernels.bound_loss
+        losses = [form(edges, weights, outer_edges, outer_weights) for form in forms]
+        gradients = [torch.autograd.grad(3 * loss, outer_weights)[0] for loss in losses]
+        # the CPU's takes differences of cumulative sums, which have lost digits
+        for loss, gradient, tolerance in zip(losses[1:], gradients[1:], (1e-6, 5e-3), strict=True):
+            assert float(loss.detach()) == pytest.approx(float(losses[0].detach()), rel=tolerance, abs=1e-12)
+            assert (gradient - gradients[0]).abs().max() <= tolerance * gradients[0].abs().max()
+        assert gradients[0].any() or samples == 1
+        wide = torch.cat([edges, edges], 1).t().contiguous().t()[:, : samples + 1]  # other strides, the same numbers
+        assert torch.equal(ray_triton.bound_loss(wide, weights, outer_edges, outer_weights), losses[1])
+    weights[1] = float("nan")  # of such a ray neither form adds anything
+    losses = [module.bound_loss(edges, weights, outer_edges, outer_weights) for module in (ray_kernels, ray_triton)]
+    assert float(losses[0].detach()) > 0
+    assert float(losses[1].detach()) == pytest.approx(float(losses[0].detach()), rel=1e-5)
+    nothing = ray_triton.bound_loss(edges[:0], weights[:0], outer_edges[:0], outer_weights[:0])
+    assert float(nothing.detach()) == 0 and torch.autograd.grad(nothing, outer_weights)[0].shape == outer_weights.shape
+
+
+def check_the_distortion_loss() -> None:
+    from edge_depth_nerf.kernels import ray_triton
+
+    for rays, samples in SIZES:
+        edges, weights, _, _ = histograms(rays, samples, 5)
+        weights.requires_grad_()
+        found = ray_triton.distortion_loss(edges, weights)
+        (gradient,) = torch.autograd.grad(3 * found, weights)
+        exact, middles = weights.detach().double().requires_grad_(), (edges[:, 1:] + edges[:, :-1]).double() / 2
+        pairs = exact[:, :, None] * exact[:, None] * (middles[:, :, None] - middles[:, None]).abs()
+        expected = (pairs.sum((1, 2)) + (exact.square() * edges.diff().double()).sum(1) / 3).mean()
+        assert float(found.detach()) == pytest.approx(float(expected.detach()), rel=1e-6, abs=1e-9)
+        to_weights = torch.autograd.grad(3 * expected, exact)[0]
+        torch.testing.assert_close(gradient.double(), to_weights, rtol=1e-5, atol=1e-8)
+        assert gradient.any() or samples == 1
+    assert float(ray_triton.distortion_loss(edges[:0], weights[:0]).detach()) == 0
+    with torch.no_grad():
+        weights[0, 0] = float("nan")
+    assert ray_triton.distortion_loss(edges, weights).isnan()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "check",
+    [
+        check_weights,
+        check_weights_of_what_is_not_finite,
+        check_places,
+        check_the_proposal_loss,
+        check_the_distortion_loss,
+    ],
+)
+def test_in_the_interpreter(check):
+    pytest.importorskip("triton")
+    in_interpreter(check)
+
+
+def step(samples: int = 48, intervals: int = 256) -> None:
+    """All kernels along rays."""
+    from edge_depth_nerf.kernels import ray_triton
+
+    edges, weights, outer_edges, outer_weights = (
+        torch.rand(16, each) for each in (samples + 1, samples, intervals + 1, intervals)
+    )
+    ray_triton.weights_from_densities(outer_weights.clone().requires_grad_(), outer_weights).sum().backward()
+    ray_triton.place_samples(outer_weights, outer_edges, edges, 0.01, 1e-5)
+    ray_triton.bound_loss(edges, weights, outer_edges, outer_weights.requires_grad_())
+    ray_triton.distortion_loss(edges, weights.requires_grad_())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("architecture", ARCHITECTURES)
+def test_compiled_without_spills(architecture, tmp_path):
+    pytest.importorskip("triton")
+    kernels = compiled(step, architecture, tmp_path)
+    assert {kernel.name for kernel in kernels} == {
+        "_weight_kernel",
+        "_density_gradient_kernel",
+        "_place_kernel",
+        "_bound_kernel",
+        "_distortion_kernel",
+    }
+    assert {kernel.spilled for kernel in kernels} == {0}
+    assert max(kernel.registers for kernel in kernels) <= 96
+
+
+def module_with(name: str, **contents: Any) -> Any:
+    """A module that is no file."""
+    module = ModuleType(name)
+    vars(module).update(contents)
+    return module
+
+
+def test_a_kernel_that_fails_is_left_to_torch(monkeypatch):
+    """Each kernel is tried before any is used; where one does not work there is one warning, and torch."""
+    tried = []
+
+    def fail(device: torch.device) -> None:
+        tried.append(device.type)
+        raise RuntimeError("no compiler")
+
+    contents = {"whole": {"try_out": lambda _: tried.append("whole")}, "broken": {"try_out": fail}}
+    modules = {f"edge_depth_nerf.kernels.{name}": module_with(name, **each) for name, each in contents.items()}
+    monkeypatch.setattr(triton_back_end, "import_module", modules.__getitem__)
+    triton_back_end.working.cache_clear()
+    device = torch.device("cuda")
+    assert triton_back_end.working("whole", torch.device("cpu"), "sum") is None and not tried
+    assert triton_back_end.working("whole", device, "sum") is modules["edge_depth_nerf.kernels.whole"]
+    with pytest.warns(UserWarning, match="fused sum does not work on cuda .RuntimeError: no compiler"):
+        assert triton_back_end.working("broken", device, "sum") is None
+    assert triton_back_end.working("broken", device, "sum") is None
+    assert tried == ["whole", "cuda"]
+    triton_back_end.working.cache_clear()
+
+
+def test_what_the_kernels_along_rays_serve(monkeypatch):
+    """float32 on CUDA, and rays that stay on the chip."""
+    kernels = module_with("kernels", fits=lambda *samples: max(samples) <= 2048)
+    monkeypatch.setattr(triton_back_end, "working", lambda *_: kernels)
+
+    def served(*columns: int, device: str = "cuda", dtype: torch.dtype = torch.float32) -> bool:
+        with FakeTensorMode():
+            matrices = [torch.empty(4, each, device=device, dtype=dtype) for each in columns]
+        return triton_back_end.along_rays(*matrices) is kernels
+
+    assert served(48, 2048)
+    assert not served(48, 2049)
+    assert not served(48, device="cpu") and not served(48, dtype=torch.float16)
