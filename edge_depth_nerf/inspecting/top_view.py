@@ -31,8 +31,8 @@ VIEWS = ("#008c5a", "#963caa", "#008caa", "#966e00", "#c85078", "#5a5a5a")
 """Viewing directions, by camera."""
 GREYS = ("#e1e1e1", "#cacaca", "#b3b3b3", "#9c9c9c", "#858585", "#6e6e6e")
 """Points, from low to high: the ground stays pale, fronts of houses are lines."""
-_AROUND_PX = (80, 150)
-"""What the axes' numbers, title and legend take."""
+_AROUND_PX = (80, 110)
+"""What the axes' numbers and the title take."""
 _DPI = 100
 _ARROW = {"units": "dots", "scale_units": "dots", "scale": 1 / 18}
 """Arrows of 18 px for a length of 1."""
@@ -87,8 +87,22 @@ def top_view(
         axes.plot(*rings_m.T, "o", markersize=10, markerfacecolor="none", color=INK, label="moment with a sheet")
         for index in _apart(rings_m, 40 * pixel_m):
             _write(axes, str(named[index]), rings_m[index], INK)
-    figure.legend(loc="outside lower left", ncols=max(int(figure.bbox.width / 200), 1), frameon=False)
+    _add_legend(figure)
     return figure
+
+
+def _add_legend(figure: Figure) -> None:
+    """Put the legend below the map, in as many columns as fit, and enlarge the figure by it."""
+    columns = sum(len(axes.get_legend_handles_labels()[1]) for axes in figure.axes)
+    style = {"loc": "outside lower left", "frameon": False, "borderaxespad": 0}
+    legend = figure.legend(ncols=columns, **style)
+    while columns > 1 and legend.get_window_extent().width > figure.bbox.width:
+        columns -= 1
+        legend.remove()
+        legend = figure.legend(ncols=columns, **style)
+    box = legend.get_window_extent()
+    # a camera's name can be wider than the map
+    figure.set_size_inches(max(figure.bbox.width, box.width) / _DPI, (figure.bbox.height + box.height) / _DPI)
 
 
 def _unit(scene: SceneFolder) -> str:
