@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from edge_depth_nerf.base.pictures import INK, drawn
+from edge_depth_nerf.base.pictures import INK, add_legend_below, drawn
 from edge_depth_nerf.inspecting.figures import reference_camera
 from edge_depth_nerf.inspecting.findings import Finding
 from edge_depth_nerf.scene.reader import SceneFolder
@@ -87,22 +87,8 @@ def top_view(
         axes.plot(*rings_m.T, "o", markersize=10, markerfacecolor="none", color=INK, label="moment with a sheet")
         for index in _apart(rings_m, 40 * pixel_m):
             _write(axes, str(named[index]), rings_m[index], INK)
-    _add_legend(figure)
+    add_legend_below(figure, *axes.get_legend_handles_labels(), "outside lower left")
     return figure
-
-
-def _add_legend(figure: Figure) -> None:
-    """Put the legend below the map, in as many columns as fit, and enlarge the figure by it."""
-    columns = sum(len(axes.get_legend_handles_labels()[1]) for axes in figure.axes)
-    style = {"loc": "outside lower left", "frameon": False, "borderaxespad": 0}
-    legend = figure.legend(ncols=columns, **style)
-    while columns > 1 and legend.get_window_extent().width > figure.bbox.width:
-        columns -= 1
-        legend.remove()
-        legend = figure.legend(ncols=columns, **style)
-    box = legend.get_window_extent()
-    # a camera's name can be wider than the map
-    figure.set_size_inches(max(figure.bbox.width, box.width) / _DPI, (figure.bbox.height + box.height) / _DPI)
 
 
 def _unit(scene: SceneFolder) -> str:
