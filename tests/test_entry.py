@@ -218,13 +218,12 @@ def fail(error: BaseException) -> None:
 
 def test_nerfstudio_says_our_errors_plainly(hook, capsys, monkeypatch, tmp_path):
     sys.excepthook(*raised(fail, InputError("scene: has no frames. Make it again.")))
-    said = capsys.readouterr().err
-    assert said.startswith("edge-depth-nerf: scene: has no frames. Make it again.\n") and entry.DEBUG_VARIABLE in said
+    assert capsys.readouterr().err == "\nedge-depth-nerf: scene: has no frames. Make it again.\n"
     # a missing file in our own words
     from edge_depth_nerf.scene.reader import read_scene
 
     sys.excepthook(*raised(read_scene, tmp_path))
-    assert capsys.readouterr().err.startswith(f"edge-depth-nerf: {tmp_path}/transforms.json: no such file.")
+    assert capsys.readouterr().err.startswith(f"\nedge-depth-nerf: {tmp_path}/transforms.json: no such file.")
     sys.excepthook(*raised(fail, KeyboardInterrupt()))
     assert capsys.readouterr().err == "\nStopped.\n"
     assert hook == []
@@ -299,5 +298,10 @@ def test_ns_train_on_what_is_no_scene(tmp_path):
     )
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
-    assert f"edge-depth-nerf: {tmp_path}/nowhere/transforms.json: no such file." in done.stderr
+    assert done.stderr.splitlines()[-1].startswith(
+        f"edge-depth-nerf: {tmp_path}/nowhere/transforms.json: no such file."
+    )
+    # the settings that were changed, not all two hundred
+    assert "edge-depth-nerf-lite: 2000 steps on cpu, scene" in done.stdout and "--vis tensorboard" in done.stdout
+    assert "FusedAdamConfig" not in done.stdout and len(done.stdout.splitlines()) < 10
     assert not (tmp_path / "runs").exists(), "no run was begun"

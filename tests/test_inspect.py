@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -879,6 +880,26 @@ def test_the_top_view_names_moments_with_a_sheet(drive):
     figure = top_view(read_scene(drive), None, [], shown=[1, 9])
     assert [text.get_text() for text in figure.axes[0].texts] == ["1", "9"]
     assert "moment with a sheet" in {text.get_text() for text in figure.legends[0].get_texts()}
+
+
+def test_the_legend_of_six_cameras_is_whole(drive):
+    """Of a drive to the north, whose map is narrow."""
+    scene = read_scene(drive)
+    cameras = [f"images/CAM_{place}" for place in ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "BACK", "BACK_LEFT", "B" * 40)]
+    pictures = [
+        replace(picture, camera=camera, position_m=5 * picture.position_m[[1, 0, 2]])
+        for camera in cameras
+        for picture in scene.pictures
+    ]
+    figure = top_view(replace(scene, pictures=tuple(pictures)), None, [], [])
+    drawn(figure)
+    (legend,), axes = figure.legends, figure.axes[0]
+    assert len(legend.get_texts()) == 6 + 3
+    box, map_box = legend.get_window_extent(), axes.get_tightbbox()
+    assert map_box is not None
+    assert 0 <= box.x0 and box.x1 <= figure.bbox.width and 0 <= box.y0 and box.y1 < map_box.y0
+    (x0, y0), (x1, y1) = axes.transData.transform([(0, 0), (1, 1)])
+    assert x1 - x0 == pytest.approx(y1 - y0, rel=1e-6)
 
 
 def test_the_top_view_marks_gaps(drive):

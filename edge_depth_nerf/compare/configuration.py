@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ from edge_depth_nerf.compare.methods import LAMBDA, METHODS, SIGMA_MODE, Setting
 from edge_depth_nerf.compare.options import MethodName, Preset
 from edge_depth_nerf.compare.specification import RunSpecification
 from edge_depth_nerf.plugin.config import apply_overrides, make_specifications, read_method_file
+from edge_depth_nerf.plugin.settings import flattened
 
 REGISTERED: dict[Preset, str] = {
     "lite": "edge-depth-nerf-lite",
@@ -90,20 +90,6 @@ def setting_of(config: TrainerConfig, name: MethodName) -> tuple[float | None, f
     mode = values[SIGMA_MODE]
     takes_own = SIGMA_MODE in method.sigma and mode != "constant"
     return values[LAMBDA], mode if takes_own else values[method.sigma_field]
-
-
-def flattened(config: Any, prefix: str = "") -> dict[str, Any]:
-    """A configuration as dotted names and values."""
-    if is_dataclass(config) and not isinstance(config, type):
-        children = {entry.name: getattr(config, entry.name) for entry in fields(config)}
-    elif isinstance(config, dict):
-        children = config
-    else:
-        return {prefix: config}
-    found: dict[str, Any] = {}
-    for name, child in children.items():
-        found |= flattened(child, f"{prefix}.{name}" if prefix else str(name))
-    return found
 
 
 def described(config: TrainerConfig) -> dict[str, str]:

@@ -22,7 +22,7 @@ import math
 import struct
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
@@ -30,7 +30,7 @@ from typing import Any, BinaryIO, Literal
 import lzf
 import numpy as np
 import torch
-from jaxtyping import Float64, Shaped
+from jaxtyping import Float64, Shaped, UInt8
 
 from edge_depth_nerf.base.bounds import check_bytes, shown
 from edge_depth_nerf.base.errors import InputError
@@ -145,7 +145,7 @@ def read_scan(path: Path, scan: ScanFormat, moment_s: float = 0.0) -> Sweep:
 
     """
     header = _read_header(path, scan)
-    columns = _read_columns(path, header, scan)
+    columns = _read_columns(path, header, [*scan.needed, scan.name("intensity")], scan)
     points_m = np.stack([columns[scan.name(axis)] for axis in "xyz"], -1)
     intensity = columns.get(scan.name("intensity"), np.zeros(len(points_m)))
     offset_s = None
@@ -154,8 +154,10 @@ def read_scan(path: Path, scan: ScanFormat, moment_s: float = 0.0) -> Sweep:
     return usable_returns(path, torch.from_numpy(points_m), torch.from_numpy(intensity), offset_s)
 
 
-def read_cloud(path: Path) -> Float64[np.ndarray, "points 3"]:
-    """Read the vertices of a .ply file, as they are.
+def read_cloud(
+    path: Path,
+) -> tuple[Float64[np.ndarray, "points 3"], UInt8[np.ndarray, "points 3"] | None]:
+    """Read the vertices of a .ply file, as they are, and their colours (RGB) where it has any.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -164,9 +166,12 @@ def read_cloud(path: Path) -> Float64[np.ndarray, "points 3"]:
     """
     if path.suffix.lower() != ".ply":
         raise InputError(f"{path}: a point cloud of unknown format; expected .ply.")
-    scan = ScanFormat()
-    columns = _read_columns(path, _read_header(path, scan, MAX_CLOUD_POINTS), scan)
-    return np.stack([columns[axis] for axis in "xyz"], -1)
+    scan, colours = ScanFormat(), ("red", "green", "blue")
+    columns = _read_columns(path, _read_header(path, scan, MAX_CLOUD_POINTS), [*scan.needed, *colours], scan)
+    points = np.stack([columns[axis] for axis in "xyz"], -1)
+    if not all(name in columns for name in colours):
+        return points, None
+    return points, np.stack([columns[name] for name in colours], -1).clip(0, 255).astype(np.uint8)
 
 
 # ---- headers ---------------------------------------------------------------------------------------------------
@@ -380,9 +385,10 @@ def _record(path: Path, fields: list) -> np.dtype:
 # ---- points ----------------------------------------------------------------------------------------------------
 
 
-def _read_columns(path: Path, header: _Header, scan: ScanFormat) -> dict[str, Shaped[np.ndarray, "points"]]:
-    """The columns that are used, as float64."""
-    wanted = [*scan.needed, scan.name("intensity")]
+def _read_columns(
+    path: Path, header: _Header, wanted: Sequence[str], scan: ScanFormat
+) -> dict[str, Shaped[np.ndarray, "points"]]:
+    """The columns wanted that there are, as float64."""
     names = [name for name in header.record.names or () if name in wanted]
     if header.encoding == "matrix":
         array = _npy_array(path)

@@ -16,6 +16,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 
 from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.plugin.compat import ignore_deprecations_of_host
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManager, FisheyeDepthDataManagerConfig
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel, EdgeDepthNerfModelConfig
 from edge_depth_nerf.plugin.plain_errors import say_errors_plainly
@@ -43,6 +44,7 @@ class EdgeDepthPipelineConfig(VanillaPipelineConfig):
     def setup(self, **kwargs: Any) -> Any:
         """Build the pipeline; from here on nerfstudio's commands say our errors without a traceback."""
         say_errors_plainly()
+        ignore_deprecations_of_host()
         return super().setup(**kwargs)
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Any
 
-from edge_depth_nerf.base.errors import DEBUG_VARIABLE, PROGRAM, InputError, debugging, of_package
+from edge_depth_nerf.base.errors import PROGRAM, InputError, debugging, of_package
 
 
 class _Hook:
@@ -28,7 +28,8 @@ class _Hook:
         if said is None:
             self.before(kind, error, trace)
         else:
-            sys.stderr.write(f"{PROGRAM}: {said}\n(The traceback: set {DEBUG_VARIABLE}=1.)\n")
+            # apart from the warnings and figures before it
+            sys.stderr.write(f"\n{PROGRAM}: {said}\n")
 
 
 def say_config_slips_plainly() -> None:

@@ -24,10 +24,11 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from edge_depth_nerf.base.errors import STOPPED_STATUS, InputError
 from edge_depth_nerf.base.files import remove_leftovers, write_text
 from edge_depth_nerf.jobs.runs import checkpoints_in, newest_checkpoint
-from edge_depth_nerf.plugin.compat import count_steps_against_all, total_steps
+from edge_depth_nerf.plugin.compat import count_steps_against_all, ignore_deprecations_of_host, total_steps
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig, transforms_path
 from edge_depth_nerf.plugin.pipeline import NotFiniteError
 from edge_depth_nerf.plugin.plain_errors import say_errors_plainly
+from edge_depth_nerf.plugin.settings import changed_settings
 
 FOR_A_GPU = ("edge-depth-nerf", "edge-depth-nerf-paper")
 """Methods of full size."""
@@ -40,6 +41,16 @@ class EdgeDepthTrainerConfig(TrainerConfig):
     _target: type = field(default_factory=lambda: EdgeDepthTrainer)
     """Target class to instantiate."""
 
+    def print_to_terminal(self) -> None:
+        """Say what is trained, and which settings differ from the method's own; config.yml has them all."""
+        from nerfstudio.configs.method_configs import all_methods  # which asks this plugin for its methods
+
+        scene = self.pipeline.datamanager.data
+        lines = [f"{self.method_name}: {self.max_num_iterations} steps on {self.machine.device_type}, scene {scene}"]
+        changed = changed_settings(self, all_methods.get(self.method_name))
+        lines += [f"  --{name.replace('_', '-')} {_word(value)}" for name, value in changed.items()]
+        CONSOLE.print("\n".join(lines), soft_wrap=True, highlight=False, markup=False)
+
     def save_config(self) -> None:
         """Save config.yml as nerfstudio does, but atomically: half of one could not be loaded any more.
 
@@ -48,6 +59,7 @@ class EdgeDepthTrainerConfig(TrainerConfig):
 
         """
         say_errors_plainly()
+        ignore_deprecations_of_host()
         data: Any = self.pipeline.datamanager
         if isinstance(data.dataparser, FisheyeDepthDataParserConfig):
             transforms_path(Path(data.data or data.dataparser.data))
@@ -251,6 +263,11 @@ class _Interruption:
         if not self._busy:
             raise KeyboardInterrupt
         self._asked = True
+
+
+def _word(value: object) -> str:
+    """A setting's value, as it is typed."""
+    return value.__qualname__ if isinstance(value, type) else str(value)
 
 
 def _step_of(checkpoint: Path) -> int:
