@@ -254,7 +254,7 @@ class SceneFolder:
             points = read_cloud(self.points_path)
         except InputError as error:
             raise InputError(
-                f"{error} It cannot be read as a PLY point cloud: make the file again, or take ply_file_path out of "
+                f"{error} It cannot be read as a PLY point cloud: make the file again, or remove ply_file_path from "
                 f"{self.path}."
             ) from None
         return points[np.isfinite(points).all(1)]
