@@ -73,21 +73,18 @@ def paragraphs(markdown: str) -> Iterator[Text]:
 
 def messages(source: str) -> Iterator[Text]:
     """The strings of a module that people read, an f-string's values left out."""
-    tree = ast.parse(source)
-    documentation, parts = set(), set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
-            documentation.add(node.value)
-        if isinstance(node, ast.JoinedStr):
-            texts = [each for each in node.values if isinstance(each, ast.Constant)]
-            parts.update(texts)
-            found = "VALUE".join(str(each.value) for each in texts)
-            if len(found.split()) >= LEAST_WORDS:
-                yield Text(node.lineno, found, False)
-    for node in ast.walk(tree):
-        is_text = isinstance(node, ast.Constant) and isinstance(node.value, str)
-        if is_text and node not in documentation and node not in parts and len(node.value.split()) >= LEAST_WORDS:
-            yield Text(node.lineno, without_code(node.value), False)
+    nodes = [*ast.walk(ast.parse(source))]
+    joined = [node for node in nodes if isinstance(node, ast.JoinedStr)]
+    apart = {node.value for node in nodes if isinstance(node, ast.Expr)}
+    apart.update(part for node in joined for part in node.values)
+    for node in joined:
+        words = "VALUE".join(str(part.value) for part in node.values if isinstance(part, ast.Constant))
+        if len(words.split()) >= LEAST_WORDS:
+            yield Text(node.lineno, without_code(words), False)
+    for node in nodes:
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in apart:
+            if len(node.value.split()) >= LEAST_WORDS:
+                yield Text(node.lineno, without_code(node.value), False)
 
 
 def faults(text: Text, rules: dict[str, Any]) -> Iterator[str]:
