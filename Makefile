@@ -13,7 +13,7 @@ help:
 	@echo "make coverage    all tests, and which lines and branches they run"
 	@echo "make fuzz        a thousand spoilt files for every reader, then a coverage-guided fuzzer (half an hour)"
 	@echo "make audit       known faults of the installed packages (asks the network)"
-	@echo "make lint        ruff, import-linter and pyright"
+	@echo "make lint        ruff, import-linter, the prose rules and pyright"
 	@echo "make docs        the pages as a site (site/)"
 	@echo "make check-dist  build wheel and sdist (dist/), install them into a fresh environment"
 	@echo "make setup       the virtual environment in $(VENV), with the versions of constraints.txt"
@@ -83,6 +83,7 @@ lint: setup
 	$(BIN)/lint-imports --no-cache
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/python docs/check_prose.py
 	$(BIN)/pyright
 
 format: setup

@@ -40,7 +40,7 @@ class Process:
 
 @dataclass
 class Doctor:
-    """Look at what is installed, and say what to do about it. Exit status 1 if something must be mended."""
+    """List what is installed and what is missing, and say how to fix it. Exit status 1 if something must be fixed."""
 
 
 Command = (
@@ -79,8 +79,8 @@ def parse(arguments: list[str]) -> Command:
     return tyro.cli(
         Command,
         prog="edge-depth-nerf",
-        description="Fisheye driving scenes, integrated depth. With --debug, anywhere, errors come with "
-        "tracebacks; --version says which this is.",
+        description="NeRFs of driving scenes from fisheye cameras, LiDAR and monocular "
+        "depth. Add --debug anywhere for tracebacks; --version prints the version.",
         args=arguments,
     )
 

@@ -176,7 +176,7 @@ FOUND: dict[str, tuple[str, str, str | bytes, str]] = {
         "is not of this form",
     ),
     "figures that are none": ("figures", "s/r/figures.json", "[]", "no JSON object"),
-    "aliases that multiply": ("kitti yaml", "a.yaml", "a: &a [x]\n" + "b: [*a,*a]\n" * 9, "is there twice|without"),
+    "aliases that multiply": ("kitti yaml", "a.yaml", "a: &a [x]\n" + "b: [*a,*a]\n" * 9, "occurs twice|without"),
 }
 """What fuzzing and reading the code found, each mended: reader, name of the file, content, message."""
 

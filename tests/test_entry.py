@@ -16,7 +16,7 @@ from edge_depth_nerf.base import files
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.plugin import plain_errors
 
-STOPPED = "\nStopped. The same command takes up where it was.\n"
+STOPPED = "\nStopped. Run the same command again to resume.\n"
 TIMEOUT_S = 120
 
 
@@ -255,7 +255,7 @@ def test_a_slip_in_load_config(hook, capsys, tmp_path):
         ("", "is a folder. --load-config takes a training's config.yml"),
         ("none.yml", "no such file. --load-config takes"),
         ("page.md", "cannot be read (ParserError: "),
-        ("scene.json", "holds something else than a training's configuration. --load-config takes"),
+        ("scene.json", "is not the configuration of a training. --load-config takes"),
     ):
         sys.excepthook(*raised(eval_setup, tmp_path / name))
         assert f"{tmp_path / name}: {what}" in capsys.readouterr().err

@@ -120,7 +120,7 @@ def test_ctrl_c_ends_the_viewer_of_a_complete_training_without_error(trainer, mo
 def test_a_relative_scene_is_said_to_be_relative(trainer, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     trainer.config.pipeline.datamanager.data = Path("elsewhere")
-    with pytest.raises(FileNotFoundError, match=f"looked for in {tmp_path}; paths count from the folder you are in"):
+    with pytest.raises(FileNotFoundError, match=f"searched in {tmp_path}: relative paths start at the current folder"):
         trainer.config.save_config()
 
 

@@ -59,7 +59,7 @@ class LoggedCommands:
             sink.flush()
             with self._lock:
                 if self._stopped:
-                    raise InputError(f"{words[0]}: stopped before it began.")
+                    raise InputError(f"{words[0]}: stopped before it started.")
                 process = self._process = subprocess.Popen(
                     words,
                     env={"OMP_NUM_THREADS": str(threads), "PYTHONUNBUFFERED": "1", **os.environ, **(environment or {})},
@@ -77,7 +77,7 @@ class LoggedCommands:
             status = process.wait()
         if status:
             raise InputError(
-                f"{Path(words[0]).name} ended with status {status}. What it said is in {log}, at last: {last} The "
+                f"{Path(words[0]).name} ended with status {status}. Its log is {log}. The last line is: {last} The "
                 f"command was\n{shlex.join(words)}"
             )
 

@@ -255,14 +255,14 @@ def _calibrate(
     missing = [word for layer, word in (("lidar", "LiDAR"), ("mono", "monocular")) if not scene.has(layer)]
     if missing:
         raise InputError(
-            f"{scene.path}: has no {' and no '.join(missing)} distance maps, so there is nothing to measure the "
-            "monocular maps' error by. Process the drive with its sweeps, and make monocular maps with "
+            f"{scene.path}: has no {' and no '.join(missing)} distance maps, so the error of the monocular maps "
+            "cannot be measured. Process the drive with its sweeps, and make monocular maps with "
             "`edge-depth-nerf estimate-depth`."
         )
     measurable = [p for p in pictures if "lidar" in p.files and "mono" in p.files]
     if not measurable:
         raise InputError(
-            f"{scene.path}: no picture for training has a LiDAR and a monocular map, so the prior's error cannot be "
+            f"{scene.path}: no training picture has both a LiDAR and a monocular map, so the prior's error cannot be "
             "measured. Process the drive again."
         )
 

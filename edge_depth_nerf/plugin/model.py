@@ -58,55 +58,55 @@ class EdgeDepthNerfModelConfig(NerfactoModelConfig):
     _target: type = field(default_factory=lambda: EdgeDepthNerfModel)
     """Target class to instantiate."""
     near_m: float = 0.2
-    """How far along the ray to start sampling, metres (in place of near_plane)."""
+    """Where sampling starts along the ray, metres (replaces near_plane)."""
     far_m: float = 1000.0
-    """How far along the ray to stop sampling, metres (in place of far_plane)."""
+    """Where sampling ends along the ray, metres (replaces far_plane)."""
     depth_loss: Literal["edge", "ds-nerf", "urban-nerf", "urban-nerf-los", "none"] = "edge"
-    """The loss on the distance prior: Eq. 4, nerfstudio's DS-NeRF or UrbanNeRF loss, UrbanNeRF's as its authors have it
-    (line of sight with a narrowing σ, its terms weighed apart), or none (plain nerfacto)."""
+    """The loss on the distance prior: Eq. 4, nerfstudio's DS-NeRF or UrbanNeRF loss, UrbanNeRF's as its authors publish
+    it (line of sight with a narrowing σ, and separate weights), or none (plain nerfacto)."""
     depth_loss_mult: float = 0.01
-    """Weight λ of the loss on the distance prior (not published; how it was chosen: docs/ablation.md). 0: the prior
-    serves surface and sky alone."""
+    """Weight λ of the loss on the distance prior (not published; how it was chosen: docs/ablation.md). 0: the prior is
+    used for surface and sky only."""
     depth_sigma: float = 0.5
-    """Standard deviation that the DS-NeRF and UrbanNeRF losses assume, metres; with urban-nerf-los that of the end of
-    the training. (Eq. 4 takes the prior's own.)"""
+    """Standard deviation of the DS-NeRF and UrbanNeRF losses, metres; with urban-nerf-los its value at the end of
+    training. (Eq. 4 uses the prior's own.)"""
     urban: UrbanTerms = URBAN_TERMS
     """With urban-nerf-los: what its terms weigh, and how its σ narrows."""
     depth_loss_levels: Literal["all", "final"] = "all"
-    """Whether the loss acts on the samples of the proposal networks too, or on the final ones alone."""
+    """Whether the loss applies to the samples of the proposal networks too, or only to the final ones."""
     depth_loss_final: float = 0.01
-    """The share of λ that is left after `depth_loss_steps`; until then it falls exponentially. The prior shapes the
-    scene early, and its errors at the outlines of things hold the pictures back late. 1: λ stays."""
+    """The share of λ that is left after `depth_loss_steps`; until then λ decreases exponentially. Early, the prior
+    shapes the scene; late, its errors at outlines would hold the pictures back. 1: λ is constant."""
     depth_loss_steps: int | None = None
-    """Steps in which λ falls, and with urban-nerf-los σ. None: those of the whole training, or 30,000 where no trainer
-    says how many."""
+    """Steps over which λ decreases, and σ with urban-nerf-los. None: those of the whole training, or 30,000 if no
+    trainer states them."""
     sky_loss_mult: float = 0.01
-    """With a depth loss: weight of what rays into the sky hit, their accumulated weight. 0: the sky is left to
-    colour."""
+    """With a depth loss: weight of the penalty on density along rays into the sky (their accumulated weight). 0: no
+    penalty."""
     sky_background: bool = True
-    """With a depth loss: what no sample stops is coloured by the field at infinity, where the sky is. False: by the
-    last sample, as in nerfacto, from wherever that is."""
+    """With a depth loss: the field at infinity, where the sky is, colours light that no sample stops. False: the last
+    sample does, as in nerfacto, wherever it lies."""
     surface_loss_mult: float = 1.0
     """With a depth loss: weight of the colour error of the field at the prior's distance, for the datamanager's
-    `surface_rays_per_batch` further pixels at one sample each."""
+    `surface_rays_per_batch` additional pixels, with one sample each."""
     exposure: Literal["gain", "affine", "grid", "embedding", "none"] = "gain"
-    """What makes up for a camera's drifting exposure and white balance. gain: a factor for each colour of each training
-    picture, their geometric mean 1, with which views are rendered. affine: a 3×4 map of colours for each picture; grid:
-    a bilateral grid of such maps, for vignetting too; their mean is the identity. embedding: nerfacto's appearance
-    embedding, for views the mean of all pictures'; that of a mean is not the mean of what they make. none: nothing."""
+    """How a camera's drifting exposure and white balance are modelled. gain: a factor per colour and training picture;
+    their geometric mean is 1, and views are rendered with it. affine: a 3×4 map of colours for each picture; grid: a
+    bilateral grid of such maps, for vignetting too; their mean is the identity. embedding: nerfacto's appearance
+    embedding; views use the mean of all pictures, which does not give their mean colour. none: not modelled."""
     camera_optimizer: CameraOptimizerConfig = field(default_factory=PoseRefinerConfig)
     """Poses that training refines."""
     exposure_mult: float = 0.1
-    """With exposure affine or grid: weight of what their maps do beyond the identity, and unevenly."""
+    """With exposure affine or grid: weight of the penalty on maps that differ from the identity or vary."""
     edge_gaussian: Literal["point", "interval"] = "interval"
     """How Eq. 4 weighs a sample: by the Gaussian's value at its middle times its length, or by the Gaussian's mass
     over its interval."""
     edge_divide_by_norm: bool = True
     """Divide Eq. 4's Gaussian by σ̂·√(2π), so that a wide one does not pull harder than a narrow one."""
     implementation: Literal["auto", "fused", "tcnn", "torch"] = "auto"  # pyright: ignore[reportIncompatibleVariableOverride]
-    """What computes fields, samples and losses. fused: kernels of our own (Numba on the CPU; on CUDA the hash grids, by
-    Triton). torch: nerfstudio's, same results and checkpoints as fused, on a CPU many times slower. tcnn:
-    tiny-cuda-nn, with checkpoints of its own. auto: tcnn on a GPU where it is installed, else fused."""
+    """What computes fields, samples and losses. fused: our own kernels (Numba on the CPU; on CUDA Triton for the hash
+    grids). torch: nerfstudio's code, with the same results and checkpoints as fused, but many times slower on a CPU.
+    tcnn: tiny-cuda-nn, whose checkpoints differ. auto: tcnn on a GPU if it is installed, otherwise fused."""
 
 
 INFINITELY_FAR = 1e4
@@ -196,8 +196,8 @@ class EdgeDepthNerfModel(NerfactoModel):
         self.metres_per_unit: float = metadata.get("metres_per_unit", 1.0)
         if self.config.near_m > LARGEST_NEAR_PLANE_M:
             CONSOLE.print(
-                f"[bold yellow]The near plane is at {self.config.near_m:g} m: what is nearer to a camera is not "
-                "rendered. Set --pipeline.model.near-m 0.2 unless that is meant."
+                f"[bold yellow]The near plane is at {self.config.near_m:g} m: nothing nearer to a camera is "
+                "rendered. Set --pipeline.model.near-m 0.2 if you did not intend this."
             )
         implementation = self.config.implementation
         if implementation == "auto":
@@ -223,7 +223,7 @@ class EdgeDepthNerfModel(NerfactoModel):
             )
 
             if not compiled_before():
-                CONSOLE.print("The first steps compile kernels, which takes about a minute, once on this machine.")
+                CONSOLE.print("Compiling kernels for the first steps. This takes about a minute, once on this machine.")
             # normals differentiate by the positions alone, which would add to the tables' gradients, too
             use_fused_fields(self, add_in_place=not self.config.predict_normals)
             # bound before the networks were of the fused class

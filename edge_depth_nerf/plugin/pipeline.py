@@ -38,8 +38,8 @@ class EdgeDepthPipelineConfig(VanillaPipelineConfig):
     _target: type = field(default_factory=lambda: EdgeDepthPipeline)
     """Target class to instantiate."""
     eval_poses: Literal["given", "refined"] = "given"
-    """Poses of judged pictures. refined: fitted to the left half of each picture by `model.camera_optimizer`'s
-    expectations; what is inside the mask is then judged on the right half alone."""
+    """Poses of evaluated pictures. refined: each pose is fitted to the left half of its picture, with the expected
+    errors of `model.camera_optimizer`. Only the right half, inside the mask, is then evaluated."""
 
     def setup(self, **kwargs: Any) -> Any:
         """Build the pipeline; from here on nerfstudio's commands say our errors without a traceback."""
@@ -76,16 +76,15 @@ class EdgeDepthPipeline(VanillaPipeline):
             raise InputError(
                 f"{manager.get_datapath()}: the far plane of {model.far_m:g} m is at "
                 f"{model.far_m / metres_per_unit:.3g} scene units ({metres_per_unit:.3g} m each); beyond "
-                f"{FARTHEST_UNITS:g} the samples along a ray can no longer be told apart. Lower "
+                f"{FARTHEST_UNITS:g} float32 cannot distinguish the samples along a ray. Lower "
                 "--pipeline.model.far-m, or leave --pipeline.datamanager.dataparser.metres-per-unit at its default."
             )
         sampler = manager.train_pixel_sampler
         if model.depth_loss != "none" and sampler is not None and sampler.table.share_with_prior == 0:
             raise InputError(
-                f"{manager.get_datapath()}: no training pixel has a depth prior, so nothing for the depth loss "
-                f"{model.depth_loss!r}. Process the drive with LiDAR, or make monocular maps by "
-                "`edge-depth-nerf estimate-depth`, or train without a prior by "
-                "--pipeline.model.depth-loss none."
+                f"{manager.get_datapath()}: no training pixel has a depth prior, which the depth loss needs: "
+                f"{model.depth_loss!r}. Process the drive with LiDAR, make monocular maps with `edge-depth-nerf "
+                "estimate-depth`, or train without a prior with --pipeline.model.depth-loss none."
             )
         self.drive = DrivePanel(manager)
 
@@ -123,8 +122,8 @@ class EdgeDepthPipeline(VanillaPipeline):
         listed = f"{', '.join(names[:MOST_NAMED])}{' …' if len(names) > MOST_NAMED else ''}"
         return (
             f"Step {step}: {', '.join(odd)}; {rays}, from {len(names)} "
-            f"pictures: {listed}. Look at them with `edge-depth-nerf inspect`; if they are fine, lower the learning "
-            "rate or the weights of the losses, or leave mixed precision off (--mixed-precision False)."
+            f"pictures: {listed}. Check them with `edge-depth-nerf inspect`. If they are fine, lower the learning "
+            "rate or the weights of the losses, or turn mixed precision off (--mixed-precision False)."
         )
 
     def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict[str, Any], dict[str, Any]]:

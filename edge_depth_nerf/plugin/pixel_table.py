@@ -94,7 +94,7 @@ class PixelTable:
 
         """
         if not is_whole(path, TABLE_VERSION):
-            raise InputError(f"{path}: not there, not as it was written, or of another version")
+            raise InputError(f"{path}: missing, changed, or of another version")
         about = read_json_object(_about(path), "pixels", "with_prior")
         self._records: NDArray = np.load(path, mmap_mode="r", allow_pickle=False)
         if about.get("version") != TABLE_VERSION or self._records.dtype != RECORD:
@@ -226,7 +226,7 @@ class PixelTableWriter:
         """
         if not self._pixels:
             raise InputError(
-                f"None of the {self._pictures} pictures has a valid pixel: the masks leave nothing. "
+                f"None of the {self._pictures} pictures has a valid pixel: the masks exclude everything. "
                 "Masks are 255 where a pixel may be used; check that they are not inverted."
             )
 

@@ -66,12 +66,12 @@ def _config_slip(error: BaseException, trace: TracebackType | None) -> str | Non
         kinds = {
             FileNotFoundError: "no such file",
             IsADirectoryError: "is a folder",
-            AssertionError: "holds something else than a training's configuration",
+            AssertionError: "is not the configuration of a training",
         }
         first_line = (str(error).splitlines() or [""])[0]
         what = kinds.get(type(error), f"cannot be read ({type(error).__name__}: {first_line})")
         return (
             f"{found['config_path']}: {what}. --load-config takes a training's config.yml, such as "
-            "outputs/NAME/METHOD/TIME/config.yml; paths count from the folder you are in."
+            "outputs/NAME/METHOD/TIME/config.yml; relative paths start at the current folder."
         )
     return None

@@ -106,7 +106,7 @@ class TableRayGenerator(RayGenerator):
         table = _read(path, int(pixels.sum()))
         if table is None:
             with progress_bars(CONSOLE, transient=True) as progress:
-                task = progress.add_task("Making the table of rays, once …", total=int(pixels.sum()))
+                task = progress.add_task("Making the table of rays (once) …", total=int(pixels.sum()))
                 made = _make(lenses, partial(progress.advance, task))
             try:
                 write_checked(path, TABLE_VERSION, lambda file: np.save(file, made))

@@ -35,7 +35,7 @@ VERSION = 1
 """Of the sweeps that are kept: raised when the same pictures give other ones."""
 FEWEST_PICTURES = 1 + LEAST_AGREEING
 """Fewer cannot confirm each other."""
-_STANDS = "the vehicle stands or turns on the spot, or no two other pictures see the same"
+_STANDS = "the vehicle stands or turns on the spot, or no two other pictures see the same places"
 _SWEEPS_IN_MEMORY = 48
 _SMOOTH = 0.05
 """Inverse distances that differ by less than this share are one surface: they are interpolated in larger maps."""
@@ -50,15 +50,15 @@ def add_motion(scene: SceneFolder, console: Console) -> None:
     """
     pictures = [picture for picture in scene.pictures if not picture.held_out]
     if len(pictures) < FEWEST_PICTURES:
-        say(console, f"No distances from motion: {len(pictures)} pictures for training are too few.", "yellow")
+        say(console, f"No distances from motion: {len(pictures)} training pictures are too few.", "yellow")
         return
     motion = Motion(
         np.stack([picture.position_m for picture in pictures]), lambda index: scene_view(scene, pictures[index])
     )
-    with console.status("Looking for neighbours of pictures …"):
+    with console.status("Searching for neighbours of pictures …"):
         still = sum(len(motion.neighbours(index)) < LEAST_AGREEING for index in range(len(pictures)))
     if still == len(pictures):
-        say(console, f"No distances from motion: {_STANDS}, in all pictures for training.", "yellow")
+        say(console, f"No distances from motion: {_STANDS}, in all training pictures.", "yellow")
         return
     store = SweepStore(scene.folder / ".cache" / "motion", scene, pictures, motion)
     run_jobs([partial(store.make, index) for index in range(len(pictures))], "Sweeping pictures", console)
@@ -79,7 +79,7 @@ def add_motion(scene: SceneFolder, console: Console) -> None:
     with progress_bars(console) as progress:
         write_maps(scene.folder, "motion", maps(), {"kind": "sphere sweep"}, progress, some_empty=True)
     shutil.rmtree(store.folder.parent, ignore_errors=True)
-    said = f"Distances from motion for {np.mean(shares):.0%} of what the masks keep of training pictures"
+    said = f"Distances from motion for {np.mean(shares):.0%} of the pixels inside the masks of training pictures"
     if still:
         said += f"; none for {still} of {len(shares)}: {_STANDS}"
     say(console, f"{said}.", "yellow" if still else None)

@@ -61,8 +61,8 @@ def write_maps(
     targets = {name: _target(layer, picture) for name, picture in pictures.items()}
     if len({*targets.values()}) < len(targets):
         raise InputError(
-            f"{found.path}: two pictures of one camera have the same name but for their ending; their maps would be "
-            "one file. Rename one of them."
+            f"{found.path}: two pictures of one camera have the same name except for their ending, so their maps "
+            "would be one file. Rename one of them."
         )
     partial = found.folder / f".{layer}.partial"
     shutil.rmtree(partial, ignore_errors=True)

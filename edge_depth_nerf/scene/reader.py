@@ -264,7 +264,7 @@ class SceneFolder:
             points, colours = read_cloud(self.points_path)
         except InputError as error:
             raise InputError(
-                f"{error} It cannot be read as a PLY point cloud: make the file again, or take ply_file_path out of "
+                f"{error} It cannot be read as a PLY point cloud: make the file again, or remove ply_file_path from "
                 f"{self.path}."
             ) from None
         known = np.isfinite(points).all(1)
