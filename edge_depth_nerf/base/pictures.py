@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import cv2
 import numpy as np
@@ -285,14 +285,19 @@ def legend(names: Sequence[tuple[str, Colour]], width: int, scale: ColourScale |
     return drawn(figure)
 
 
-def add_legend_below(figure: Figure, handles: Sequence[Artist], names: Sequence[str], place: str) -> None:
+def add_legend_below(
+    figure: Figure,
+    handles: Sequence[Artist],
+    names: Sequence[str],
+    place: Literal["outside lower left", "outside lower center"],
+) -> None:
     """Put a legend below a figure's axes, in as many columns as fit, and enlarge the figure by it.
 
     Args:
         figure: of matplotlib's, with constrained layout.
         handles: what the legend explains.
         names: of each.
-        place: matplotlib's word for it, such as "outside lower center".
+        place: matplotlib's words for it.
 
     """
     for columns in range(len(names), 0, -1):
