@@ -9,8 +9,8 @@ share of the others that it masks out too (lost), with the poses that come with 
 0.1°. Drives in which nothing moves are among them: there all that is masked is lost. Without --drives it synthesises
 them, once. Ends with status 1 if a figure misses its goal.
 
-With --train it measures what the masks are worth instead: the first of these drives is processed without masks, with
-those of `--find-moving` and with the true ones, and each scene is trained. Held-out pictures are judged where nothing
+With --train it measures what the masks are worth instead: a drive with traffic is processed without masks, with those of
+`--find-moving` and with the true ones, and each scene is trained. Held-out pictures are judged where nothing
 moves, by the true masks in all three.
 """
 
@@ -50,6 +50,8 @@ DRIVES: tuple[tuple[SceneName, LayoutName, int, int], ...] = (
 )
 """Scene, layout, width of the pictures and seed of the drives that are made."""
 FRAMES = 40
+TRAINED: tuple[SceneName, int, int, int] = ("traffic", 24, 256, 0)
+"""Scene, frames, width of the pictures and seed of the drive that is trained on."""
 RECALL_GOAL, LOST_GOAL = 0.9, 0.01
 METHOD, SEQUENCE = "edge-depth-nerf-lite", "2013_05_28_drive_0000_sync"
 DISTURBED_M, DISTURBED_DEG = 0.03, 0.1
@@ -167,9 +169,9 @@ def judge_by(scene: Path, true: Path) -> None:
 
 def worth(output: Path, steps: int) -> Table:
     """Train a drive with traffic without masks of what moves, with those that are found, and with the true ones."""
-    scene, layout, size, seed = DRIVES[0]
-    drive = output / f"{scene}_{layout}_{size}_{seed}"
-    made = ("--scene", scene, "--frames", FRAMES, "--size", size, "--seed", seed)
+    scene, frames, size, seed = TRAINED
+    drive = output / f"trained_{scene}_{size}_{seed}"
+    made = ("--scene", scene, "--frames", frames, "--size", size, "--seed", seed)
     command("edge-depth-nerf", "synthesize", "--output", drive, *made)
     words = ("process", "kitti360", "--root", drive, "--sequence", SEQUENCE)
     mono = ("--mono", drive / "simulated_mono" / SEQUENCE)
