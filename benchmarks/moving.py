@@ -9,9 +9,9 @@ share of the others that it masks out too (lost), with the poses that come with 
 0.1°. Drives in which nothing moves are among them: there all that is masked is lost. Without --drives it synthesises
 them, once. Ends with status 1 if a figure misses its goal.
 
-With --train it measures what the masks are worth instead: a drive with traffic is processed without masks, with those of
-`--find-moving` and with the true ones, and each scene is trained. Held-out pictures are judged where nothing
-moves, by the true masks in all three.
+With --train it measures what the masks are worth instead: a drive with traffic is processed without masks, with those
+of `--find-moving` and with the true ones, and each scene is trained. Held-out pictures are judged where nothing moves,
+by the true masks in all three.
 """
 
 from __future__ import annotations
