@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -296,7 +296,9 @@ def add_legend_below(figure: Figure, handles: Sequence[Artist], names: Sequence[
 
     """
     for columns in range(len(names), 0, -1):
-        legend = figure.legend(handles, names, loc=place, ncols=columns, frameon=False, borderaxespad=0)
+        # the stubs know no place outside
+        where: Any = place
+        legend = figure.legend(handles, names, loc=where, ncols=columns, frameon=False, borderaxespad=0)
         box = legend.get_window_extent()
         if box.width <= figure.bbox.width or columns == 1:
             break
