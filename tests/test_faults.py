@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import io
+import os
+import threading
+import time
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -11,7 +15,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from edge_depth_nerf.base import bounds, files
+from edge_depth_nerf.base import bounds, files, one_writer
 from edge_depth_nerf.base.bounds import finite, path_inside, shown, text_lines
 from edge_depth_nerf.base.errors import LONGEST_MESSAGE, InputError
 from edge_depth_nerf.base.files import read_json, read_json_object, read_npz, write_json
@@ -140,6 +144,55 @@ def test_a_folder_that_cannot_be_locked_is_not_waited_for(tmp_path: Path) -> Non
     with only_writer(tmp_path / "file" / "folder", Console(quiet=True)):
         done.append("who writes there tells why it cannot")
     assert done and (tmp_path / "file").is_file()
+
+
+class WindowsLocks:
+    """What msvcrt has, by what Linux has."""
+
+    LK_NBLCK, LK_UNLCK = 2, 0
+
+    @staticmethod
+    def locking(handle: int, mode: int, count: int) -> None:
+        import fcntl
+
+        assert count == 1
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB if mode else fcntl.LOCK_UN)
+        except BlockingIOError:
+            raise PermissionError(errno.EACCES, "Permission denied") from None
+
+
+@pytest.mark.skipif(os.name == "nt", reason="test_killed.py has the real locks")
+def test_windows_locks_a_file_beside_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(one_writer, "fcntl", None)
+    monkeypatch.setattr(one_writer, "msvcrt", WindowsLocks)
+    folder, order, console = tmp_path / "scene", [], Console(record=True, quiet=True)
+    began = threading.Event()
+
+    def first() -> None:
+        with only_writer(folder, console):
+            began.set()
+            assert list(folder.iterdir()) == [] and (tmp_path / ".scene.lock").is_file()
+            time.sleep(0.5)
+            order.append("first")
+            (folder / "a").touch()
+
+    thread = threading.Thread(target=first)
+    thread.start()
+    assert began.wait(10)
+    with only_writer(folder, console), only_writer(folder, console):
+        order.append("second")
+    thread.join()
+    assert order == ["first", "second"]
+    assert [path.name for path in tmp_path.iterdir()] == ["scene"]
+
+
+def test_windows_is_not_asked_whether_a_process_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """There os.kill(number, 0) is Ctrl-C."""
+    monkeypatch.setattr(os, "kill", lambda *_: pytest.fail("killed"))
+    with monkeypatch.context() as windows:
+        windows.setattr(os, "name", "nt")
+        assert files._runs(os.getpid())
 
 
 # ---- transforms.json -------------------------------------------------------------------------------------------

@@ -929,6 +929,7 @@ def test_other_options_or_other_input_are_another_scene(drive: RoomDrive, tmp_pa
     assert tree(tmp_path / "scene") == before
 
 
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGKILL")
 def test_killed_run_is_continued(drive: RoomDrive, tmp_path: Path) -> None:
     """SIGKILL in the middle: what is whole stays, the rest is made, and the result is the same."""
     program = (

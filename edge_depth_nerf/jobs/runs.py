@@ -53,6 +53,8 @@ class LoggedCommands:
         """
         log.parent.mkdir(parents=True, exist_ok=True)
         words = [str(word) for word in command]
+        # Windows' own encoding lacks the letters of progress bars
+        told = {"OMP_NUM_THREADS": str(threads), "PYTHONUNBUFFERED": "1", "PYTHONIOENCODING": "utf-8"}
         last = ""
         with log.open("a", encoding="utf-8") as sink:
             sink.write(f"$ {shlex.join(words)}\n")
@@ -62,11 +64,12 @@ class LoggedCommands:
                     raise InputError(f"{words[0]}: stopped before it started.")
                 process = self._process = subprocess.Popen(
                     words,
-                    env={"OMP_NUM_THREADS": str(threads), "PYTHONUNBUFFERED": "1", **os.environ, **(environment or {})},
+                    env={**told, **os.environ, **(environment or {})},
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE,
                     stderr=subprocess.STDOUT,
-                    text=True,
+                    encoding="utf-8",
+                    errors="replace",
                 )
             assert process.stdout is not None
             for line in process.stdout:
