@@ -1,12 +1,18 @@
 """The hash grid on a GPU: Triton kernels; meaning and shapes as in `hash_grid`, functions as in `cpu`.
 
-Triton comes with torch on Linux, and compiles at the first call for each number of features. Results differ from the
-CPU's by fused multiply-adds, and in the table's gradient by the order of additions, which are atomic.
+Triton comes with torch on Linux, and compiles at the first call for each number of features. In the table's gradient
+results differ from the CPU's by the order of additions, which are atomic. A row's features are added as one block: GPUs
+from sm_90 on take it in one instruction.
+
+There are several forms of the kernels (`Form`), which compute the same. On a GPU the first call of each size measures
+them and keeps the fastest one, unless the environment names one: EDGE_DEPTH_NERF_HASH_GRID=points=128,sums_below=200.
 With TRITON_INTERPRET=1 set before the import the kernels run on CPU tensors.
 """
 
 from __future__ import annotations
 
+from collections.abc import Hashable
+from dataclasses import dataclass
 from typing import no_type_check
 
 import torch
@@ -15,8 +21,31 @@ import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 
-POINTS = 128
-"""Points that one program works on."""
+from edge_depth_nerf.kernels.form_choice import form_for
+from edge_depth_nerf.kernels.triton_launch import launch
+
+VARIABLE = "EDGE_DEPTH_NERF_HASH_GRID"
+"""Environment variable that names a form; what it does not mention is as in `Form`."""
+
+
+@dataclass(frozen=True)
+class Form:
+    """One form of the kernels."""
+
+    points: int = 128
+    """Points that one program works on, one a thread; a power of two of at least 32."""
+    sums_below: float = 0.0
+    """The table's gradient at levels of fewer cells along an axis: what neighbouring points add to the same rows is
+    summed up first, and added once. (At the coarsest level a warp's 32 points lie in one or two cells.)"""
+    level_major: bool = False
+    """Encoded values lie in memory feature after feature, not point after point: neighbouring points are neighbours,
+    and what reads them gets a transposed matrix."""
+
+
+ENCODING = tuple(Form(points, level_major=major) for points in (128, 256) for major in (False, True))
+"""What is measured for encoding."""
+ADDING = Form(128), Form(256), Form(64, sums_below=60.0), Form(64, sums_below=200.0)
+"""What is measured for the table's gradient; sums of more points would not find registers on all GPUs."""
 
 
 @triton.jit
@@ -57,7 +86,8 @@ def _encode_kernel(
     encoded,
     points,
     size,
-    LEVELS: tl.constexpr,
+    point_stride,
+    feature_stride,
     FEATURES: tl.constexpr,
     POINTS: tl.constexpr,
 ):
@@ -75,7 +105,38 @@ def _encode_kernel(
         high_high = tl.load(grid + at7, inside, 0.0) * x + tl.load(grid + at6, inside, 0.0) * (1 - x)
         low = high_low * y + low_low * (1 - y)
         high = high_high * y + low_high * (1 - y)
-        tl.store(encoded + (point * LEVELS + level) * FEATURES + c, high * z + low * (1 - z), inside)
+        place = point * point_stride + (level * FEATURES + c) * feature_stride
+        tl.store(encoded + place, high * z + low * (1 - z), inside)
+
+
+@triton.jit
+@no_type_check
+def _same_cell(positions, point, other, inside, scaling):
+    """Whether two points have the same corners; what is no number has none."""
+    same = inside
+    for axis in tl.static_range(3):
+        here = tl.load(positions + 3 * point + axis, inside, 0.0) * scaling
+        there = tl.load(positions + 3 * other + axis, inside, 0.0) * scaling
+        same = same & (tl.floor(here) == tl.floor(there)) & (tl.ceil(here) == tl.ceil(there))
+    return same
+
+
+@triton.jit
+@no_type_check
+def _add_to_run(start0, a0, a1, a2, a3, a4, a5, a6, a7, start1, b0, b1, b2, b3, b4, b5, b6, b7):
+    """Add what stands before, unless a run starts between."""
+    anew = start1 != 0
+    return (
+        start0 | start1,
+        tl.where(anew, b0, a0 + b0),
+        tl.where(anew, b1, a1 + b1),
+        tl.where(anew, b2, a2 + b2),
+        tl.where(anew, b3, a3 + b3),
+        tl.where(anew, b4, a4 + b4),
+        tl.where(anew, b5, a5 + b5),
+        tl.where(anew, b6, a6 + b6),
+        tl.where(anew, b7, a7 + b7),
+    )
 
 
 @triton.jit
@@ -87,28 +148,48 @@ def _table_gradient_kernel(
     to_table,
     points,
     size,
-    LEVELS: tl.constexpr,
+    point_stride,
+    feature_stride,
+    sums_below,
     FEATURES: tl.constexpr,
+    BLOCK: tl.constexpr,
     POINTS: tl.constexpr,
+    SUMS: tl.constexpr,
 ):
-    point = tl.program_id(0).to(tl.int64) * POINTS + tl.arange(0, POINTS)
+    local = tl.arange(0, POINTS)[:, None]
+    point = tl.program_id(0).to(tl.int64) * POINTS + local
     level = tl.program_id(1).to(tl.int64)
+    feature = tl.arange(0, BLOCK)[None]
     inside = point < points
-    at0, at1, at2, at3, at4, at5, at6, at7, x, y, z = _find_corners(
-        positions, point, inside, tl.load(scalings + level), size, FEATURES
-    )
+    scaling = tl.load(scalings + level)
+    at0, at1, at2, at3, at4, at5, at6, at7, x, y, z = _find_corners(positions, point, inside, scaling, size, FEATURES)
+    has = inside & (feature < FEATURES)
+    g = tl.load(gradient + point * point_stride + (level * FEATURES + feature) * feature_stride, has, 0.0)
     low_low, high_low, low_high, high_high = (1 - y) * (1 - z), y * (1 - z), (1 - y) * z, y * z
-    for c in tl.static_range(FEATURES):
-        grid = to_table + level * size * FEATURES + c
-        g = tl.load(gradient + (point * LEVELS + level) * FEATURES + c, inside, 0.0)
-        tl.atomic_add(grid + at0, g * low_low * (1 - x), inside, sem="relaxed")
-        tl.atomic_add(grid + at1, g * low_low * x, inside, sem="relaxed")
-        tl.atomic_add(grid + at2, g * high_low * (1 - x), inside, sem="relaxed")
-        tl.atomic_add(grid + at3, g * high_low * x, inside, sem="relaxed")
-        tl.atomic_add(grid + at4, g * low_high * (1 - x), inside, sem="relaxed")
-        tl.atomic_add(grid + at5, g * low_high * x, inside, sem="relaxed")
-        tl.atomic_add(grid + at6, g * high_high * (1 - x), inside, sem="relaxed")
-        tl.atomic_add(grid + at7, g * high_high * x, inside, sem="relaxed")
+    g0, g1 = g * low_low * (1 - x), g * low_low * x
+    g2, g3 = g * high_low * (1 - x), g * high_low * x
+    g4, g5 = g * low_high * (1 - x), g * low_high * x
+    g6, g7 = g * high_high * (1 - x), g * high_high * x
+    if SUMS:
+        if scaling < sums_below:
+            continues = (local > 0) & _same_cell(positions, point, point - 1, inside & (local > 0), scaling)
+            follows = (local < POINTS - 1) & (point + 1 < points)
+            follows = _same_cell(positions, point, point + 1, follows, scaling)
+            start = tl.where(continues, 0, 1) + tl.zeros((POINTS, BLOCK), tl.int32)
+            _, g0, g1, g2, g3, g4, g5, g6, g7 = tl.associative_scan(
+                (start, g0, g1, g2, g3, g4, g5, g6, g7), 0, _add_to_run
+            )
+            # the last of a run has its sum
+            has = has & (follows == 0)
+    grid = to_table + level * size * FEATURES + feature
+    tl.atomic_add(grid + at0, g0, has, sem="relaxed")
+    tl.atomic_add(grid + at1, g1, has, sem="relaxed")
+    tl.atomic_add(grid + at2, g2, has, sem="relaxed")
+    tl.atomic_add(grid + at3, g3, has, sem="relaxed")
+    tl.atomic_add(grid + at4, g4, has, sem="relaxed")
+    tl.atomic_add(grid + at5, g5, has, sem="relaxed")
+    tl.atomic_add(grid + at6, g6, has, sem="relaxed")
+    tl.atomic_add(grid + at7, g7, has, sem="relaxed")
 
 
 @triton.jit
@@ -121,6 +202,8 @@ def _position_gradient_kernel(
     to_positions,
     points,
     size,
+    point_stride,
+    feature_stride,
     LEVELS: tl.constexpr,
     FEATURES: tl.constexpr,
     POINTS: tl.constexpr,
@@ -141,7 +224,8 @@ def _position_gradient_kernel(
             v2, v3 = tl.load(grid + at2, inside, 0.0), tl.load(grid + at3, inside, 0.0)
             v4, v5 = tl.load(grid + at4, inside, 0.0), tl.load(grid + at5, inside, 0.0)
             v6, v7 = tl.load(grid + at6, inside, 0.0), tl.load(grid + at7, inside, 0.0)
-            g = tl.load(gradient + (point * LEVELS + level) * FEATURES + c, inside, 0.0) * scaling
+            place = point * point_stride + (level * FEATURES + c) * feature_stride
+            g = tl.load(gradient + place, inside, 0.0) * scaling
             along_x = ((v1 - v0) * (1 - y) + (v3 - v2) * y) * (1 - z) + ((v5 - v4) * (1 - y) + (v7 - v6) * y) * z
             low_low, high_low = v1 * x + v0 * (1 - x), v3 * x + v2 * (1 - x)
             low_high, high_high = v5 * x + v4 * (1 - x), v7 * x + v6 * (1 - x)
@@ -153,19 +237,40 @@ def _position_gradient_kernel(
     tl.store(to_positions + 3 * point + 2, to_z, inside)
 
 
+def _size(positions: Tensor, *others: int) -> tuple[Hashable, ...]:
+    """Numbers of points that need as many binary digits are one size: they differ from step to step."""
+    return positions.device, len(positions).bit_length(), *others
+
+
 def encode(
     positions: Float[Tensor, "points 3"], table: Float[Tensor, "rows features"], scalings: Float[Tensor, "levels"]
 ) -> Float[Tensor, "points encoded"]:
     """Encode points, float32; see `hash_grid`."""
-    (points, _), (rows, features), levels = positions.shape, table.shape, len(scalings)
-    encoded = positions.new_empty(points, levels * features)
-    arrays = positions.detach().contiguous(), table.detach().contiguous(), scalings, encoded
-    if points > 0:
-        with torch.cuda.device_of(positions):
-            _encode_kernel[(triton.cdiv(points, POINTS), levels)](
-                *arrays, points, rows // levels, LEVELS=levels, FEATURES=features, POINTS=POINTS
-            )
-    return encoded
+    positions, table = positions.detach().contiguous(), table.detach().contiguous()
+    points, (rows, features), levels = len(positions), table.shape, len(scalings)
+
+    def run(form: Form) -> Tensor:
+        shape = (levels * features, points) if form.level_major else (points, levels * features)
+        encoded = positions.new_empty(shape)
+        encoded = encoded.t() if form.level_major else encoded
+        launch(
+            _encode_kernel,
+            (triton.cdiv(points, form.points), levels),
+            positions,
+            positions,
+            table,
+            scalings,
+            encoded,
+            points,
+            rows // levels,
+            *encoded.stride(),
+            FEATURES=features,
+            POINTS=form.points,
+            num_warps=form.points // 32,
+        )
+        return encoded
+
+    return run(form_for(VARIABLE, ENCODING, _size(positions, levels, rows, features), run, positions.is_cuda))
 
 
 def table_gradient(
@@ -175,15 +280,34 @@ def table_gradient(
     rows: int,
 ) -> Float[Tensor, "rows features"]:
     """Give the gradient to a table of `rows` rows, from the gradient to the encoded values."""
+    positions, gradient = positions.detach().contiguous(), gradient.detach()
     points, levels = len(positions), len(scalings)
     features = gradient.shape[1] // levels
     result = positions.new_zeros(rows, features)
-    arrays = positions.detach().contiguous(), gradient.detach().contiguous(), scalings, result
-    if points > 0:
-        with torch.cuda.device_of(positions):
-            _table_gradient_kernel[(triton.cdiv(points, POINTS), levels)](
-                *arrays, points, rows // levels, LEVELS=levels, FEATURES=features, POINTS=POINTS
-            )
+
+    def run(form: Form, into: Tensor) -> None:
+        launch(
+            _table_gradient_kernel,
+            (triton.cdiv(points, form.points), levels),
+            positions,
+            positions,
+            gradient,
+            scalings,
+            into,
+            points,
+            rows // levels,
+            *gradient.stride(),
+            float(form.sums_below),
+            FEATURES=features,
+            BLOCK=triton.next_power_of_2(features),
+            POINTS=form.points,
+            num_warps=form.points // 32,
+            SUMS=form.sums_below > 0,
+        )
+
+    # what is measured is added elsewhere
+    size = _size(positions, levels, rows, features)
+    run(form_for(VARIABLE, ADDING, size, lambda form: run(form, torch.empty_like(result)), positions.is_cuda), result)
     return result
 
 
@@ -194,14 +318,25 @@ def position_gradient(
     scalings: Float[Tensor, "levels"],
 ) -> Float[Tensor, "points 3"]:
     """Give the gradient to the positions, from the gradient to the encoded values."""
-    (points, _), (rows, features), levels = positions.shape, table.shape, len(scalings)
-    result = positions.new_empty(points, 3)
-    given = positions.detach().contiguous(), table.detach().contiguous(), gradient.detach().contiguous()
-    if points > 0:
-        with torch.cuda.device_of(positions):
-            _position_gradient_kernel[(triton.cdiv(points, POINTS),)](
-                *given, scalings, result, points, rows // levels, LEVELS=levels, FEATURES=features, POINTS=POINTS
-            )
+    positions, table, gradient = positions.detach().contiguous(), table.detach().contiguous(), gradient.detach()
+    points, (rows, features), levels = len(positions), table.shape, len(scalings)
+    result = torch.empty_like(positions)
+    launch(
+        _position_gradient_kernel,
+        (triton.cdiv(points, Form.points),),
+        positions,
+        positions,
+        table,
+        gradient,
+        scalings,
+        result,
+        points,
+        rows // levels,
+        *gradient.stride(),
+        LEVELS=levels,
+        FEATURES=features,
+        POINTS=Form.points,
+    )
     return result
 
 
