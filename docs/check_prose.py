@@ -1,9 +1,9 @@
 """Check that pages and messages are in plain English: `python docs/check_prose.py`, a part of `make lint`.
 
 The rules are in docs/prose_rules.toml: patterns that must not occur, with the words to use instead, and the longest
-sentence. Code and addresses are left out. In the package's modules, strings of four words
-or more are checked, except docstrings. (docs/options.md is a page, and has the help texts.) vale, the usual
-program for this, is not used: its wheel downloads the program when it first runs.
+sentence. Code and addresses are left out. In the package's modules, strings of four words or more are checked, except
+docstrings; docs/options.md contains the help texts. vale, the usual program for this, is not used, because its wheel
+downloads the program when it first runs.
 """
 
 from __future__ import annotations
@@ -90,10 +90,9 @@ def messages(source: str) -> Iterator[Text]:
 def faults(text: Text, rules: dict[str, Any]) -> Iterator[str]:
     """What the rules have against a text."""
     for rule in rules["rules"]:
-        if ("pages" if text.is_page else "messages") in rule.get("in", ("pages", "messages")):
-            found = re.search(rule["pattern"], text.words, re.IGNORECASE)
-            if found:
-                yield f"“{found[0]}”: write {rule['instead']}"
+        found = re.search(rule["pattern"], text.words, re.IGNORECASE)
+        if found:
+            yield f"“{found[0]}”: write {rule['instead']}"
     most = rules["sentences"]["most_words"]
     for sentence in SENTENCE_END.split(text.words) if text.is_page else ():
         words = sentence.split()
