@@ -32,7 +32,7 @@ from edge_depth_nerf.kernels.table_adam import CLEARED, IN_PLACE, adds_in_place
 def back_end(device: torch.device) -> ModuleType | None:
     """Give the module that works on tensors of this device, None if there is none.
 
-    On CUDA one point is encoded to find out: Triton may be missing, find no C compiler, or not know the GPU.
+    On CUDA each kernel takes one point to find out: Triton may be missing, find no C compiler, or not know the GPU.
     """
     # imported here, because Numba and Triton take half a second each to load
     if device.type == "cpu":
@@ -44,7 +44,12 @@ def back_end(device: torch.device) -> ModuleType | None:
     try:
         from edge_depth_nerf.kernels import hash_grid_triton as cuda
 
-        cuda.encode(*(torch.ones(shape, device=device) for shape in ((1, 3), (2, 2), (1,))))
+        point, table, scalings, gradient = (
+            torch.ones(shape, device=device) for shape in ((1, 3), (2, 2), (1,), (1, 2))
+        )
+        cuda.encode(point, table, scalings)
+        cuda.table_gradient(point, gradient, scalings, len(table))
+        cuda.position_gradient(point, table, gradient, scalings)
     except Exception as error:  # whatever keeps Triton from working here
         warnings.warn(
             f"The fused hash grid does not work on {device} ({type(error).__name__}: {error}); "
