@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import copy
 import multiprocessing
-import os
-import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
@@ -472,41 +470,6 @@ def test_other_devices_are_left_to_torch():
         with pytest.warns(UserWarning, match="fused hash grid does not work on cuda"):
             assert back_end(torch.device("cuda")) is None
         working.cache_clear()
-
-
-INTERPRETED = """
-import torch
-from edge_depth_nerf.kernels import hash_grid_numba as cpu, hash_grid_triton as cuda
-torch.manual_seed(0)
-for levels, features, count in ((3, 2, 300), (2, 4, 5), (1, 1, 128)):
-    x = torch.rand(count, 3)
-    x[:4] = torch.tensor([0.0, 1.0, -1.0, 0.5])[:, None]
-    scalings, table = torch.tensor([16.0, 23.0, 64.0])[:levels], torch.randn(levels * 256, features)
-    gradient = torch.randn(count, levels * features)
-    for name, arguments, tolerance in (
-        ("encode", (x, table, scalings), 1e-6),
-        ("table_gradient", (x, gradient, scalings, len(table)), 1e-5),
-        ("position_gradient", (x, table, gradient, scalings), 1e-5),
-    ):
-        expected, found = (getattr(module, name)(*arguments) for module in (cpu, cuda))
-        assert (found - expected).abs().max() <= tolerance * expected.abs().max(), (name, levels)
-        assert found.shape == expected.shape
-assert cuda.encode(x[:0], table, scalings).shape == (0, 1)
-print("all equal")
-"""
-
-
-@pytest.mark.slow
-def test_triton_kernels_in_its_interpreter():
-    pytest.importorskip("triton")
-    done = subprocess.run(
-        [sys.executable, "-c", INTERPRETED],
-        env={**os.environ, "TRITON_INTERPRET": "1"},
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert done.stdout == "all equal\n", done.stderr
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")

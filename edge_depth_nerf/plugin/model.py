@@ -12,7 +12,6 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal, TypeGuard
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
@@ -26,22 +25,25 @@ from nerfstudio.model_components.losses import (
     scale_gradients_by_distance_squared,
     urban_radiance_field_depth_loss,
 )
-from nerfstudio.model_components.renderers import DepthRenderer
+from nerfstudio.model_components.ray_samplers import UniformLinDispPiecewiseSampler
+from nerfstudio.model_components.renderers import DepthRenderer, RGBRenderer
 from nerfstudio.model_components.scene_colliders import NearFarCollider
 from nerfstudio.models.nerfacto import NerfactoModel, NerfactoModelConfig
 from nerfstudio.utils.external import TCNN_EXISTS
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.pictures import DISTANCE, SIGMA, colour_distance
 from edge_depth_nerf.kernels.allocator import keep_freed_memory
 from edge_depth_nerf.kernels.fields import CubeContraction, FusedNerfactoField, use_fused_fields
 from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss, proposal_loss
 from edge_depth_nerf.kernels.openmp import let_idle_threads_sleep
-from edge_depth_nerf.kernels.ray_samplers import FusedPDFSampler, edges_of, use_fused_weights
+from edge_depth_nerf.kernels.ray_samplers import FirstSampler, FusedPDFSampler, edges_of, use_fused_weights
 from edge_depth_nerf.method.losses import URBAN_TERMS, UrbanTerms, edge_losses, sky_loss, urban_nerf_loss
 from edge_depth_nerf.method.metrics import DepthErrors, load_lpips, masked_lpips, masked_psnr, masked_ssim
 from edge_depth_nerf.method.uncertainty import termination_std
+from edge_depth_nerf.plugin.colours import coloured
 from edge_depth_nerf.plugin.compat import lpips_not_built, total_steps, without_undefined_ray
 from edge_depth_nerf.plugin.exposure import KINDS
 from edge_depth_nerf.plugin.pose_refinement import MOMENTS, PoseRefiner, PoseRefinerConfig
@@ -106,13 +108,48 @@ class EdgeDepthNerfModelConfig(NerfactoModelConfig):
     implementation: Literal["auto", "fused", "tcnn", "torch"] = "auto"  # pyright: ignore[reportIncompatibleVariableOverride]
     """What computes fields, samples and losses. fused: our own kernels (Numba on the CPU; on CUDA Triton for the hash
     grids). torch: nerfstudio's code, with the same results and checkpoints as fused, but many times slower on a CPU.
-    tcnn: tiny-cuda-nn, whose checkpoints differ. auto: tcnn on a GPU if it is installed, otherwise fused."""
+    tcnn: tiny-cuda-nn, whose checkpoints differ. auto: tcnn on a GPU if it is installed, otherwise
+    fused; config.yml keeps which it was."""
+
+
+Implementation = Literal["fused", "tcnn", "torch"]
+
+
+def settled(implementation: Literal["auto", "fused", "tcnn", "torch"], device_type: str) -> Implementation:
+    """Give what `auto` stands for on a device, and any other as it is.
+
+    Raises:
+        InputError: tiny-cuda-nn is asked for and is not installed, or serves no such device.
+
+    """
+    there = TCNN_EXISTS and device_type == "cuda"
+    if implementation == "tcnn" and not there:
+        raise InputError(
+            "--pipeline.model.implementation tcnn needs a GPU and tiny-cuda-nn; here "
+            f"{'there is no GPU' if TCNN_EXISTS else 'tiny-cuda-nn is not installed'}. If a training used it, its "
+            "checkpoints need it too. For a new training, use --pipeline.model.implementation fused."
+        )
+    if implementation == "auto":
+        return "tcnn" if there else "fused"
+    return implementation
 
 
 INFINITELY_FAR = 1e4
 """Scene units: so far that the place in the contracted scene is the direction alone."""
 LEAST_HIT = 0.05
 """Rays that stop less than this share of their light are said to hit nothing."""
+
+
+class NothingBehind(RGBRenderer):
+    """nerfstudio's colours before black, of which it would copy a pixel for each ray to a GPU and add nothing."""
+
+    def __init__(self) -> None:
+        super().__init__(background_color="black")
+
+    def forward(self, rgb: Tensor, weights: Tensor, *args: Any, **kwargs: Any) -> Tensor:
+        """Give the colours, [rays, 3]."""
+        # its word for a background that is added later
+        return super().forward(rgb, weights, *args, **{**kwargs, "background_color": "random"})
 
 
 class DepthInEvaluation(DepthRenderer):
@@ -199,11 +236,9 @@ class EdgeDepthNerfModel(NerfactoModel):
                 f"[bold yellow]The near plane is at {self.config.near_m:g} m: nothing nearer to a camera is "
                 "rendered. Set --pipeline.model.near-m 0.2 if you did not intend this."
             )
-        implementation = self.config.implementation
-        if implementation == "auto":
-            on_gpu = torch.device(self.kwargs.get("device", "cpu")).type == "cuda"
-            implementation = "tcnn" if TCNN_EXISTS and on_gpu else "fused"
-        if torch.device(self.kwargs.get("device", "cpu")).type == "cpu":
+        device_type = torch.device(self.kwargs.get("device", "cpu")).type
+        implementation = settled(self.config.implementation, device_type)
+        if device_type == "cpu":
             keep_freed_memory()
             let_idle_threads_sleep()
         # nerfstudio knows two of them; the model's own configuration says which was built
@@ -226,6 +261,9 @@ class EdgeDepthNerfModel(NerfactoModel):
                 CONSOLE.print("Compiling kernels for the first steps. This takes about a minute, once on this machine.")
             # normals differentiate by the positions alone, which would add to the tables' gradients, too
             use_fused_fields(self, add_in_place=not self.config.predict_normals)
+            if isinstance(self.proposal_sampler.initial_sampler, UniformLinDispPiecewiseSampler):
+                jitter = self.proposal_sampler.initial_sampler.single_jitter
+                self.proposal_sampler.initial_sampler = FirstSampler(single_jitter=jitter)
             # bound before the networks were of the fused class
             self.density_fns = [density_fn.__self__.density_fn for density_fn in self.density_fns]
             pdf = self.proposal_sampler.pdf_sampler
@@ -243,6 +281,8 @@ class EdgeDepthNerfModel(NerfactoModel):
         if not self.config.disable_scene_contraction:
             for network in (self.field, *self.proposal_networks):
                 network.spatial_distortion = CubeContraction(order=float("inf"))
+        if self._has_sky:
+            self.renderer_rgb = NothingBehind()
         self.lpips = LpipsAtFirstUse()
         self.psnr = Psnr()
         self.renderer_depth = DepthInEvaluation(method="median")
@@ -400,9 +440,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         """Outputs of a whole view; distance and uncertainty also in colours that always mean the same metres."""
         outputs = super().get_outputs_for_camera(without_undefined_ray(camera), obb_box)
         for name, scale in (("distance", DISTANCE), ("distance_uncertainty", SIGMA)):
-            metres = outputs[name][..., 0].cpu().numpy()
-            coloured = torch.from_numpy(scale.coloured(metres, np.isfinite(metres)))
-            outputs[f"{name}_coloured"] = coloured.to(outputs[name]) / 255
+            outputs[f"{name}_coloured"] = coloured(outputs[name][..., 0], scale)
         return outputs
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
@@ -465,8 +503,12 @@ class EdgeDepthNerfModel(NerfactoModel):
             colours, sky = outputs["surface_rgb"], batch["surface_sky"][:, 0]
             # no error where the surface is not between the planes; choosing pixels would make a GPU wait
             told = sky | self._can_be_met(batch["surface_distance_m"][:, 0])
+            weight: Any = self.config.surface_loss_mult
+            if "surface_counts" in batch:
+                counts = batch["surface_counts"][:, 0]
+                told, weight = told & counts, weight * (len(counts) / counts.sum().clamp(min=1))
             colours = torch.where(told[:, None], colours, batch["surface_image"])
-            losses["surface_loss"] = self.config.surface_loss_mult * self.rgb_loss(batch["surface_image"], colours)
+            losses["surface_loss"] = weight * self.rgb_loss(batch["surface_image"], colours)
         return losses
 
     def _surface_drawn(self, batch: dict[str, Any]) -> Float[Tensor, "rays"]:

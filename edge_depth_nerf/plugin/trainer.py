@@ -26,6 +26,8 @@ from edge_depth_nerf.base.files import remove_leftovers, write_text
 from edge_depth_nerf.jobs.runs import checkpoints_in, newest_checkpoint
 from edge_depth_nerf.plugin.compat import count_steps_against_all, ignore_deprecations_of_host, total_steps
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig, transforms_path
+from edge_depth_nerf.plugin.grad_scaler import PatientGradScaler
+from edge_depth_nerf.plugin.model import EdgeDepthNerfModelConfig, settled
 from edge_depth_nerf.plugin.pipeline import NotFiniteError
 from edge_depth_nerf.plugin.plain_errors import say_errors_plainly
 from edge_depth_nerf.plugin.settings import changed_settings
@@ -54,6 +56,9 @@ class EdgeDepthTrainerConfig(TrainerConfig):
     def save_config(self) -> None:
         """Save config.yml as nerfstudio does, but atomically: half of one could not be loaded any more.
 
+        An implementation left to `auto` is settled, as another machine may settle it otherwise, and tiny-cuda-nn's
+        checkpoints are not those of the others.
+
         Raises:
             FileNotFoundError: no scene where `--data` says; then nothing is written.
 
@@ -63,6 +68,9 @@ class EdgeDepthTrainerConfig(TrainerConfig):
         data: Any = self.pipeline.datamanager
         if isinstance(data.dataparser, FisheyeDepthDataParserConfig):
             transforms_path(Path(data.data or data.dataparser.data))
+        model = self.pipeline.model
+        if isinstance(model, EdgeDepthNerfModelConfig):
+            model.implementation = settled(model.implementation, self.machine.device_type)
         path = self.get_base_dir() / "config.yml"
         CONSOLE.log(f"Saving config to: {path}")
         write_text(path, yaml.dump(self))
@@ -80,6 +88,7 @@ class EdgeDepthTrainer(Trainer):
     def __init__(self, config: EdgeDepthTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         """Take the configuration; see nerfstudio's Trainer."""
         super().__init__(config, local_rank, world_size)
+        self.grad_scaler = PatientGradScaler(enabled=self.use_grad_scaler and self.device != "cpu")
         self._interruption = _Interruption()
         self._last_step: int | None = None  # that this process has taken
 
