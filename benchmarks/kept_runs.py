@@ -18,6 +18,7 @@ from pathlib import Path
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json_object, write_bytes, write_json
 from edge_depth_nerf.compare.command import RECORD, RUNS
+from edge_depth_nerf.compare.results import Results, RunResult
 from edge_depth_nerf.compare.specification import FIGURES, OF_A_RUN, SPECIFICATION
 
 
@@ -41,6 +42,12 @@ def keep(comparison: Path, file: Path) -> int:
     text = json.dumps({"record": record, "runs": runs}, separators=(",", ":"))
     write_bytes(file, lzma.compress(text.encode(), preset=9 | lzma.PRESET_EXTREME))
     return len(runs)
+
+
+def results_of(file: Path) -> Results:
+    """The runs that `keep` gathered, to make tables of."""
+    runs = json.loads(lzma.decompress(file.read_bytes()))["runs"]
+    return Results([RunResult(Path(name), figures["run"], figures) for name, figures in runs.items()])
 
 
 def lay(file: Path, comparison: Path, scenes: Path) -> int:

@@ -7,7 +7,8 @@ REAL holds kitti360_drive, a recording that `process rig` reads (docs/results.md
 and at half size: every sixth frame is held out with its LiDAR, and a tenth of the LiDAR's beams is held out of all
 sweeps. λ and σ are those that a search on a rendered drive found (tuned.json), for all methods alike; nothing is chosen
 on this drive. Then the rival with the best PSNR is trained once more, for as many steps as ours' processor seconds
-allow, its learning rates falling over these. Last, each method with a depth loss is trained with other λ, one seed,
+allow, its learning rates falling over these. Then, with the first seed, methods that differ from each other in prior,
+loss or extras alone. Last, each method with a depth loss is trained with other λ, one seed,
 half size: the curves. Writes table.md, table.json, lambda.png and views_SCENE.png. Stopped at any moment, the same
 command goes on.
 """
@@ -36,6 +37,15 @@ from edge_depth_nerf.compare.specification import VIEWS
 ROOT = Path(__file__).parents[1]
 TABLE: tuple[MethodName, ...] = ("nerfacto", "urban-nerf", "ds-nerf", "edge-paper", "edge")
 RIVALS: tuple[MethodName, ...] = ("nerfacto", "urban-nerf", "ds-nerf")
+CELLS: dict[MethodName, MethodName | None] = {
+    "nerfacto-integrated-extras": None,
+    "ds-nerf-integrated": "ds-nerf",
+    "ds-nerf-extras": "ds-nerf",
+    "ds-nerf-integrated-extras": "ds-nerf",
+    "edge-plain": "edge",
+    "edge-lidar": "edge-lidar",
+}
+"""Cells of the grid that tell prior, loss and extras apart, and whose λ and σ each takes: those of its loss."""
 WITH_LAMBDA: tuple[MethodName, ...] = ("urban-nerf", "ds-nerf", "edge")
 LAMBDAS = (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1)
 SIZES = {"half": 2, "full": 1}
@@ -78,6 +88,13 @@ def write_tuned(path: Path, weight: float) -> Path:
     """Write the tuned values with another λ for every method that has one."""
     methods = read_json(ROOT / "benchmarks" / "tuned.json")["methods"]
     write_json(path, {"methods": {name: {**methods[name], "lambda": weight} for name in WITH_LAMBDA}})
+    return path
+
+
+def write_cells_tuned(path: Path) -> Path:
+    """Write the tuned values for the cells of the grid."""
+    methods = read_json(ROOT / "benchmarks" / "tuned.json")["methods"]
+    write_json(path, {"methods": {name: methods[of_loss] for name, of_loss in CELLS.items() if of_loss}})
     return path
 
 
@@ -153,12 +170,23 @@ def margins(results: Results, scene: str) -> Iterator[str]:
             yield f"* {column.title}: {mean} on average, ahead with {ahead} of {len(leads)} seeds."
 
 
-def page(results: Results, longer: Mapping[str, Results]) -> str:
+def cells_table(results: Results, cells: Results, scene: str) -> Iterator[str]:
+    """Methods that differ in prior, loss or extras alone, all with the first seed, as Markdown."""
+    yield from heading(COLUMNS)
+    for method in METHODS:
+        if method in CELLS or method in ("nerfacto", "ds-nerf", "edge"):
+            run = (cells if method in CELLS else results).run(scene, method, results.seeds()[0])
+            if run is not None:
+                yield row(METHODS[method].title, [run], COLUMNS)
+
+
+def page(results: Results, longer: Mapping[str, Results], cells: Results) -> str:
     """All tables, as Markdown.
 
     Args:
         results: of as many steps each.
         longer: of the best rival in ours' seconds, by size.
+        cells: of `CELLS`.
 
     """
     parts = ["# A real drive, by all methods"]
@@ -172,6 +200,8 @@ def page(results: Results, longer: Mapping[str, Results]) -> str:
             runs = longer[size].runs
             parts += ["", f"## The best rival after as many processor seconds as ours: {scene}", "", *heading(COLUMNS)]
             parts.append(row(METHODS[runs[0].method].title, runs, COLUMNS))
+        if scene in cells.scenes():
+            parts += ["", f"## One change at a time: {scene}", "", *cells_table(results, cells, scene)]
     return "\n".join([*parts, ""])
 
 
@@ -228,6 +258,9 @@ def main() -> None:
         default=["half"],
         help="sizes: the best rival in ours' seconds",
     )
+    parser.add_argument(
+        "--cells", action=argparse.BooleanOptionalAction, default=True, help="methods that differ in one thing alone"
+    )
     parser.add_argument("--curve-steps", type=int, help="of the curves' trainings; the table's, if not set")
     parser.add_argument("--jobs", type=int, default=1, help="trainings at a time")
     options = parser.parse_args()
@@ -256,9 +289,14 @@ def main() -> None:
             common = ("--methods", rival, "--tuned", tuned, "--steps", length, *jobs)
             longer[size] = options.output / "equal_seconds" / f"{size}_{rival}_{length}"
             ours("compare", scenes[size], "--seeds", *options.seeds, *common, "--output", longer[size])
-    write_text(
-        options.output / "table.md", page(results, {size: read_results(path / RUNS) for size, path in longer.items()})
-    )
+    judged = {size: read_results(path / RUNS) for size, path in longer.items()}
+    cells = options.output / "cells"
+    if options.cells:
+        scene = scenes.get("half", next(iter(scenes.values())))
+        given = write_cells_tuned(options.output / "cells.json")
+        common = ("--tuned", given, "--output", cells, *jobs, *steps)
+        ours("compare", scene, "--methods", *CELLS, "--seeds", options.seeds[0], *common)
+    write_text(options.output / "table.md", page(results, judged, read_results(cells / RUNS)))
     for scene in results.scenes():
         draw_views(results, scene, options.output / f"views_{scene}.png")
     write_json(options.output / "table.json", results.rows())

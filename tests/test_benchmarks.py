@@ -252,14 +252,39 @@ def test_the_real_drives_table_and_margins(benchmark_module, tmp_path):
         for method, of_seeds in psnr.items()
         for seed, value in enumerate(of_seeds)
     ]
-    page = real.page(Results(half), {"half": longer})
+    page = real.page(Results(half), {"half": longer}, Results([]))
     assert page.count("\n## ") == 4 and page.rstrip().splitlines()[-1].startswith("| DS-NeRF loss | 20.20 ± 0.28 |")
+    cells = Results([fake("kitti360_half", "ds-nerf-extras", 0, masked_psnr=20.3, cpu_seconds=110.0)])
+    assert [line.split(" | ")[:2] for line in real.cells_table(Results(half), cells, "kitti360_half")][2:] == [
+        ["| nerfacto", "19.00"],
+        ["| DS-NeRF loss", "20.00"],
+        ["| ours", "20.50"],
+        ["| DS-NeRF loss, LiDAR, with extras", "20.30"],
+    ]
     found = list(real.margins(results, "drive"))
     # by seed: 20.5 against 20.0, 20.3 against 20.4; AbsRel likewise, less is better
     assert found[0] == "* PSNR: +0.20 on average, ahead with 1 of 2 seeds."
     assert found[1].startswith("* AbsRel: +0.000") and "ahead with 1 of 2" in found[1]
     real.draw_lambdas({0.01: results, 0.1: results}, tmp_path / "lambda.png")
     assert (tmp_path / "lambda.png").stat().st_size > 5000
+
+
+def test_the_real_drives_tables_are_those_of_its_runs(benchmark_module):
+    real, kept, pages = (benchmark_module(name) for name in ("real_drive", "kept_runs", "pages"))
+    compared, longer, cells = (
+        kept.results_of(ROOT / "benchmarks" / f"real_drive{part}.json.xz") for part in ("", "_seconds", "_cells")
+    )
+    made = real.page(compared, {"half": longer}, cells)
+    for page, name, heading in (
+        ("README.md", "real: table", "Short: kitti360_half"),
+        ("docs/results.md", "real: table", "kitti360_half"),
+        ("docs/results.md", "real: seconds", "The best rival after as many processor seconds as ours: kitti360_half"),
+        ("docs/results.md", "real: margins", "Ours against the best rival after as many steps: kitti360_half"),
+        ("docs/results.md", "real: cells", "One change at a time: kitti360_half"),
+    ):
+        text = (ROOT / page).read_text(encoding="utf-8")
+        assert f"<!-- {name} -->" in text
+        assert pages.with_part(text, name, pages.under(made, heading)) == text, name
 
 
 def test_disturbed_poses_are_off_by_as_much_as_is_said(benchmark_module, tmp_path):
