@@ -63,6 +63,20 @@ def test_a_name_with_a_slip(monkeypatch, capsys, words, said):
     assert stderr.startswith(f"edge-depth-nerf: {said}")
 
 
+def test_a_wrong_option_is_answered_by_its_own_command(capsys):
+    with pytest.raises(InputError, match=r"--frames: camera-path has no such option\. --seconds sets"):
+        cli.parse(["camera-path", "--load-config", "config.yml", "--frames", "30"])
+    with pytest.raises(SystemExit):
+        cli.parse(["camera-path", "--fram", "30"])
+    said = capsys.readouterr().err
+    assert "--fram" in said and "edge-depth-nerf camera-path --help" in said
+    assert "synthesize" not in said and "demo" not in said
+    with pytest.raises(SystemExit):
+        cli.parse(["process", "rig", "--root", "r", "--output", "o", "--holdout-evry", "3"])
+    said = capsys.readouterr().err
+    assert "--holdout-every" in said and "kitti360" not in said
+
+
 def test_a_bug_is_one_paragraph_that_asks_to_be_reported(monkeypatch, capsys):
     status, said = end_of(monkeypatch, capsys, "doctor", error=KeyError("not\nthere"))
     assert status == 1
