@@ -148,7 +148,7 @@ def test_a_task_that_fails_is_not_done_again_and_names_its_log(tmp_path: Path) -
     others = [steps(tmp_path, name, 60.0) for name in "abcd"]
     tasks = [*others[:1], wrong, *others[1:]]
     with on_cluster("local", tasks, [], QUIET) as place:
-        with pytest.raises(InputError, match=r"status 2\. .*logs/wrong\.log, at last: calib\.txt: is empty"):
+        with pytest.raises(InputError, match=r"status 2\. .*logs/wrong\.log\. The last line is: calib\.txt: is empty"):
             do_tasks(tasks, place, QUIET)
         wait_until(lambda: child_of_worker(".kept") is None, 5.0)
     assert (tmp_path / "logs/wrong.log").read_text().count("$ ") == 1

@@ -61,7 +61,7 @@ def test_one_problem_is_enough_for_the_exit_status(monkeypatch):
     monkeypatch.setattr(doctor, "CHECKS", (broken,))
     assert run_doctor(console) == 1
     assert isinstance(console.file, io.StringIO)
-    assert "1 to mend: Thing" in console.file.getvalue() and "Get it." in console.file.getvalue()
+    assert "1 to fix: Thing" in console.file.getvalue() and "Get it." in console.file.getvalue()
 
 
 @pytest.mark.parametrize(

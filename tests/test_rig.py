@@ -674,7 +674,7 @@ def test_a_scan_of_nan_is_an_error_when_it_is_read(mine: Path) -> None:
     [
         ({"cameras": ("middle",)}, r"--cameras middle: .* no such camera, only left, right, front"),
         ({"first": 9}, "--first 9: reaches frame 9, but the recording has frames 0 to 4"),
-        ({"frames": 9}, "--first 0 --frames 9 --stride 1: reaches moment 8"),
+        ({"frames": 9}, "--first 0 --frames 9 --stride 1: reaches frame 8"),
         ({"stride": 0}, "--stride 0"),
         ({"root": Path("nowhere")}, "nowhere: no such folder"),
         ({"rig": Path("nowhere.toml")}, r"nowhere\.toml: no such file"),

@@ -523,7 +523,7 @@ SKEWED[0, 0] = 1.01
         ({"given": []}, "no frames"),
         ({"given": [*frames(), *frames()]}, "frame 0 of image_02 is given twice"),
         ({"given": [replace(f, held_out=True) for f in frames()]}, "all frames are held out"),
-        ({"given": [replace(f, camera="image_09") for f in frames()]}, "frame 0 of image_09: there is no such camera"),
+        ({"given": [replace(f, camera="image_09") for f in frames()]}, "frame 0 of image_09: no such camera"),
         ({"given": [replace(f, camera_to_world=SKEWED) for f in frames()]}, "frame 0 of image_02.*not a rotation"),
         ({"given": bad({"lidar": None})}, r"frame \d of image_02: has no lidar, but every other frame"),
         ({"given": bad({"mono": None})}, "has no mono"),
@@ -565,7 +565,7 @@ BENT = KannalaBrandt(SIZE, SIZE, 7.0, 7.0, 16.4, 16.1, 0.0652, 0.0189, -0.0042, 
         (
             [SceneCamera("bent", BENT)],
             105.0,
-            r"bent: .*astray; at most 0\.5 px rms can be used\. Give --theta-max-deg 90,",
+            r"bent: .*diverges; at most 0\.5 px rms can be used\. Use --theta-max-deg 90,",
         ),
     ],
 )
