@@ -24,6 +24,7 @@ from torch import Tensor, nn
 
 from edge_depth_nerf.kernels.fused_hash_grid import use_fused_encodings
 from edge_depth_nerf.kernels.network import network
+from edge_depth_nerf.kernels.triton_back_end import of_network
 
 
 class CubeContraction(SceneContraction):
@@ -58,10 +59,12 @@ class FusedMLP(MLP):
 
     def forward(self, in_tensor: Float[Tensor, "*bs in_dim"]) -> Float[Tensor, "*bs out_dim"]:
         """Apply the network."""
-        if not _in_parts(in_tensor) or in_tensor.numel() == 0:
+        kernels = of_network(in_tensor, _parameters(self)[0])
+        if in_tensor.numel() == 0 or (kernels is None and not _in_parts(in_tensor)):
             return super().forward(in_tensor)
         flat = in_tensor.reshape(-1, in_tensor.shape[-1])
-        result = network(flat, *_parameters(self)).view(*in_tensor.shape[:-1], -1)
+        compute = network if kernels is None else kernels.network
+        result = compute(flat, *_parameters(self)).view(*in_tensor.shape[:-1], -1)
         return result if self.out_activation is None else self.out_activation(result)
 
 
