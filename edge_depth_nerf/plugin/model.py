@@ -104,9 +104,10 @@ class EdgeDepthNerfModelConfig(NerfactoModelConfig):
     edge_divide_by_norm: bool = True
     """Divide Eq. 4's Gaussian by σ̂·√(2π), so that a wide one does not pull harder than a narrow one."""
     implementation: Literal["auto", "fused", "tcnn", "torch"] = "auto"  # pyright: ignore[reportIncompatibleVariableOverride]
-    """What computes fields, samples and losses. fused: kernels of our own (Numba on the CPU; on CUDA the hash grids, by
-    Triton). torch: nerfstudio's, same results and checkpoints as fused, on a CPU many times slower. tcnn:
-    tiny-cuda-nn, with checkpoints of its own. auto: tcnn on a GPU where it is installed, else fused."""
+    """What computes fields, samples and losses. fused: kernels of our own (Numba on the CPU; on CUDA, by Triton, hash
+    grids, samples along rays and the edge loss). torch: nerfstudio's, same results and checkpoints as fused, on a CPU
+    many times slower. tcnn: tiny-cuda-nn, with checkpoints of its own. auto: tcnn on a GPU where it is installed, else
+    fused."""
 
 
 INFINITELY_FAR = 1e4
