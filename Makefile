@@ -1,9 +1,11 @@
 # Sets itself up: `make demo` and `make test` need Python 3.10-3.12 and make, nothing else.
 PYTHON ?= python3
 VENV ?= .venv
-BIN := $(VENV)/bin
+# where Windows' Python puts programs
+SCRIPTS := $(if $(filter Windows_NT,$(OS)),Scripts,bin)
+BIN := $(VENV)/$(SCRIPTS)
 
-.PHONY: help setup demo real test test-fast test-pure coverage fuzz audit lint format docs dist check-dist version clean
+.PHONY: help setup demo real test test-fast test-pure coverage fuzz audit lint format docs dist check-dist version notes clean
 help:
 	@echo "make demo        synthesise a drive, train with and without the depth prior, compare (outputs/demo/)"
 	@echo "make real        all methods on a real drive, with three seeds (REAL=its folder; some hours)"
@@ -13,7 +15,7 @@ help:
 	@echo "make coverage    all tests, and which lines and branches they run"
 	@echo "make fuzz        a thousand spoilt files for every reader, then a coverage-guided fuzzer (half an hour)"
 	@echo "make audit       known faults of the installed packages (asks the network)"
-	@echo "make lint        ruff, import-linter and pyright"
+	@echo "make lint        ruff, import-linter, the prose rules and pyright"
 	@echo "make docs        the pages as a site (site/)"
 	@echo "make check-dist  build wheel and sdist (dist/), install them into a fresh environment"
 	@echo "make setup       the virtual environment in $(VENV), with the versions of constraints.txt"
@@ -61,11 +63,11 @@ PURE_TESTS := alignment bad_input camera_fit cameras faults files integration ki
 test-pure:
 	rm -rf $(PURE)
 	$(PYTHON) -m venv $(PURE)
-	$(PURE)/bin/pip install --quiet --disable-pip-version-check 'numpy>=2' torch scipy opencv-contrib-python-headless numba \
+	$(PURE)/$(SCRIPTS)/pip install --quiet --disable-pip-version-check 'numpy>=2' torch scipy opencv-contrib-python-headless numba \
 		jaxtyping 'beartype>=0.18' tyro rich safetensors trimesh embreex Pillow PyYAML pycolmap python-neo-lzf pydantic \
 		'pytest>=8' 'pytest-xdist>=3.7' 'hypothesis>=6'
-	$(PURE)/bin/pip install --quiet --disable-pip-version-check --no-deps -e .
-	$(PURE)/bin/pytest $(PURE_TESTS:%=tests/test_%.py) -k 'not nerfstudio and not all_models and not tuned'
+	$(PURE)/$(SCRIPTS)/pip install --quiet --disable-pip-version-check --no-deps -e .
+	$(PURE)/$(SCRIPTS)/pytest $(PURE_TESTS:%=tests/test_%.py) -k 'not nerfstudio and not all_models and not tuned'
 
 # atheris has wheels for Linux and Python 3.11 or newer; elsewhere the second part is left out.
 fuzz: setup
@@ -83,6 +85,7 @@ lint: setup
 	$(BIN)/lint-imports --no-cache
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/python docs/check_prose.py
 	$(BIN)/pyright
 
 format: setup
@@ -105,16 +108,21 @@ check-dist: dist
 	$(BIN)/twine check --strict dist/*
 	rm -rf $(FRESH)
 	$(PYTHON) -m venv $(FRESH)
-	$(FRESH)/bin/pip install --quiet --disable-pip-version-check dist/*.whl
-	cd build && fresh/bin/edge-depth-nerf --help >/dev/null && fresh/bin/edge-depth-nerf doctor
-	cd build && fresh/bin/ns-train --help | grep edge-depth-nerf-lite >/dev/null
-	cd build && fresh/bin/edge-depth-nerf inspect ../data/sample_drive --frames 1 --output inspection
-	$(FRESH)/bin/pip install --quiet --disable-pip-version-check --no-deps --force-reinstall dist/*.tar.gz
-	cd build && fresh/bin/edge-depth-nerf --help >/dev/null && fresh/bin/edge-depth-nerf doctor
+	$(FRESH)/$(SCRIPTS)/pip install --quiet --disable-pip-version-check dist/*.whl
+	cd build && fresh/$(SCRIPTS)/edge-depth-nerf --help >/dev/null && fresh/$(SCRIPTS)/edge-depth-nerf doctor
+	cd build && fresh/$(SCRIPTS)/ns-train --help | grep edge-depth-nerf-lite >/dev/null
+	cd build && fresh/$(SCRIPTS)/edge-depth-nerf inspect ../data/sample_drive --frames 1 --output inspection
+	$(FRESH)/$(SCRIPTS)/pip install --quiet --disable-pip-version-check --no-deps --force-reinstall dist/*.tar.gz
+	cd build && fresh/$(SCRIPTS)/edge-depth-nerf --help >/dev/null && fresh/$(SCRIPTS)/edge-depth-nerf doctor
 	rm -rf $(FRESH)
 
 version:
 	@$(PYTHON) -c 'import edge_depth_nerf; print(edge_depth_nerf.__version__)'
+
+# The changelog's part on a version, for its release.
+VERSION ?= $(shell $(PYTHON) -c 'import edge_depth_nerf; print(edge_depth_nerf.__version__)')
+notes:
+	@awk '/^## / { found = index($$0, "[$(VERSION)]"); next } found' CHANGELOG.md
 
 clean:
 	rm -rf build dist outputs site *.egg-info .pytest_cache .ruff_cache

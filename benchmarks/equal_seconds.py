@@ -86,7 +86,8 @@ def table(ours: Results, rivals: Results) -> str:
     steps = _mean([run.content["steps"] for run in ours.runs if run.method == "edge"])
     cells = [*(f"**{mean:.2f}**" for mean in last), f"**{_mean(last):.2f}**", "–"]
     lines.append(f"| ours | {' | '.join(cells)} | {steps:.0f} |")
-    return "\n".join([*lines, "", f"After {seconds:.0f} processor seconds of training, those of ours at each drive."])
+    note = f"After {seconds:.0f} processor seconds of training on average: the time of ours on each drive."
+    return "\n".join([*lines, "", note])
 
 
 def _known(ours: Results, run: RunResult) -> list[EqualSeconds]:

@@ -2,11 +2,16 @@
 
     python benchmarks/moving.py --output outputs/moving
     python benchmarks/moving.py --drives drives/traffic --overlays outputs/overlays
+    python benchmarks/moving.py --train --output outputs/moving
 
 Prints, for each drive, the share of the pixels that show what moves that `--find-moving` masks out (recall), and the
 share of the others that it masks out too (lost), with the poses that come with it and with poses disturbed by 3 cm and
 0.1°. Drives in which nothing moves are among them: there all that is masked is lost. Without --drives it synthesises
 them, once. Ends with status 1 if a figure misses its goal.
+
+With --train it measures what the masks are worth instead: a drive with traffic is processed without masks, with those
+of `--find-moving` and with the true ones, and each scene is trained. Held-out pictures are judged where nothing moves,
+by the true masks in all three.
 """
 
 from __future__ import annotations
@@ -20,12 +25,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from commands import command
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from edge_depth_nerf.base.files import read_image, read_mask, write_png
+from edge_depth_nerf.base.files import read_image, read_json, read_mask, write_json, write_png
 from edge_depth_nerf.masks.lens import lens_circle
 from edge_depth_nerf.process.converters import read_drive
 from edge_depth_nerf.process.moving import find_moving
@@ -44,7 +50,10 @@ DRIVES: tuple[tuple[SceneName, LayoutName, int, int], ...] = (
 )
 """Scene, layout, width of the pictures and seed of the drives that are made."""
 FRAMES = 40
+TRAINED: tuple[SceneName, int, int, int] = ("traffic", 24, 256, 0)
+"""Scene, frames, width of the pictures and seed of the drive that is trained on."""
 RECALL_GOAL, LOST_GOAL = 0.9, 0.01
+METHOD, SEQUENCE = "edge-depth-nerf-lite", "2013_05_28_drive_0000_sync"
 DISTURBED_M, DISTURBED_DEG = 0.03, 0.1
 
 Mask = NDArray[np.bool_]
@@ -146,6 +155,56 @@ def real_table(root: Path, overlays: Path | None, console: Console) -> Table:
     return table
 
 
+def judge_by(scene: Path, true: Path) -> None:
+    """Give a scene's held-out pictures the masks of another."""
+    meta, of = read_json(scene / "transforms.json"), read_json(true / "transforms.json")
+    masks = {frame["file_path"]: frame["mask_path"] for frame in of["frames"]}
+    for frame in meta["frames"]:
+        if frame["file_path"] in meta["test_filenames"]:
+            name = Path("judged_masks") / frame["file_path"]
+            write_png(scene / name, read_image(true / masks[frame["file_path"]]))
+            frame["mask_path"] = str(name)
+    write_json(scene / "transforms.json", meta)
+
+
+def worth(output: Path, steps: int) -> Table:
+    """Train a drive with traffic without masks of what moves, with those that are found, and with the true ones."""
+    scene, frames, size, seed = TRAINED
+    drive = output / f"trained_{scene}_{size}_{seed}"
+    made = ("--scene", scene, "--frames", frames, "--size", size, "--seed", seed)
+    command("edge-depth-nerf", "synthesize", "--output", drive, *made)
+    words = ("process", "kitti360", "--root", drive, "--sequence", SEQUENCE)
+    mono = ("--mono", drive / "simulated_mono" / SEQUENCE)
+    given = {
+        "true": ("--frame-masks", drive / "truth" / SEQUENCE / "moving_masks"),
+        "none": (),
+        "found": ("--find-moving",),
+    }
+    scenes = {name: output / f"scene_{name}" for name in given}
+    for name, masks in given.items():
+        if not (scenes[name] / "is_judged_by_true").is_file():
+            command("edge-depth-nerf", *words, *mono, *masks, "--output", scenes[name])
+            if name != "true":
+                judge_by(scenes[name], scenes["true"])
+            (scenes[name] / "is_judged_by_true").touch()
+    columns = ("truth_masked_psnr", "truth_masked_ssim", "truth_abs_rel")
+    table = Table("masks of what moves", *columns, title=f"{drive.name}: held-out pixels where nothing moves")
+    for name in ("none", "found", "true"):
+        folder = output / "runs" / name
+        if not (folder / "figures.json").is_file():
+            command(
+                *("ns-train", METHOD, "--data", scenes[name], "--output-dir", output / "runs"),
+                *("--experiment-name", name, "--timestamp", "run", "--vis", "tensorboard"),
+                *("--max-num-iterations", steps, "--optimizers.fields.scheduler.max-steps", steps),
+                *("--optimizers.proposal_networks.scheduler.max-steps", steps),
+            )
+            config = folder / METHOD / "run" / "config.yml"
+            command("ns-eval", "--load-config", config, "--output-path", folder / "figures.json")
+        found = read_json(folder / "figures.json")["results"]
+        table.add_row(name, *(f"{found[column]:.3f}" for column in columns))
+    return table
+
+
 def main() -> None:
     """Print both tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -153,7 +212,12 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("outputs/moving"), help="where they are made")
     parser.add_argument("--real", type=Path, help="a recorded drive with a rig file")
     parser.add_argument("--overlays", type=Path, help="write pictures: found, too much, missed in green, red, blue")
+    parser.add_argument("--train", action="store_true", help="measure what the masks are worth to a trained model")
+    parser.add_argument("--steps", type=int, default=1000, help="of each training")
     arguments = parser.parse_args()
+    if arguments.train:
+        Console(width=120).print(worth(arguments.output, arguments.steps))
+        return
     roots = arguments.drives or []
     if not roots:
         for scene, layout, size, seed in DRIVES:

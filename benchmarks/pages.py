@@ -1,9 +1,10 @@
-"""Pages whose tables are made: what stands between `<!-- NAME -->` and the next `<!-- end -->` is replaced.
+"""Generated tables of the pages: replaces the text between `<!-- NAME -->` and the next `<!-- end -->`.
 
     python benchmarks/pages.py PAGE NAME=FILE[#HEADING] [NAME=FILE[#HEADING] ...]
 
-puts Markdown that a command wrote (`tables.md`, `search.md`) into a page, its title left out and its headings one level
-further down, or what stands under one heading alone: docs/results.md.
+puts Markdown that a command wrote (`tables.md`, `search.md`) into a page such as docs/results.md. The title is left
+out, headings go one level down, and tables of single drives are folded. With #HEADING, only the text under that heading
+is inserted.
 """
 
 from __future__ import annotations
@@ -34,6 +35,20 @@ def lowered(markdown: str) -> str:
     return "\n".join(f"#{line}" if line.startswith("##") else line for line in lines)
 
 
+def folded(markdown: str) -> str:
+    """Markdown whose sections `### Table 5, DRIVE. …` are folded away, except the average over drives."""
+    first, *sections = re.split(r"^(?=### )", markdown, flags=re.MULTILINE)
+    parts = [first]
+    for section in sections:
+        title, _, content = section.partition("\n")
+        if re.match(r"### Table \d+, (?!average\b)", title):
+            # `markdown` lets MkDocs format what is inside
+            opening = f"<details markdown><summary>{title.removeprefix('### ')}</summary>"
+            section = f"{opening}\n\n{content.strip()}\n\n</details>\n\n"
+        parts.append(section)
+    return "".join(parts)
+
+
 def under(markdown: str, heading: str) -> str:
     """What stands under the first heading that begins with these words, without it.
 
@@ -61,7 +76,7 @@ def main() -> None:
             parser.error(f"{options.page} has no line <!-- {name} -->")
         content = Path(file).read_text(encoding="utf-8")
         try:
-            page = with_part(page, name, under(content, heading) if heading else lowered(content))
+            page = with_part(page, name, under(content, heading) if heading else folded(lowered(content)))
         except InputError as error:
             parser.error(f"{file}: {error}")
     write_text(options.page, page)

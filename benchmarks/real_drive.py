@@ -6,23 +6,27 @@
 REAL holds kitti360_drive, a recording that `process rig` reads (docs/results.md says which). It is processed at full
 and at half size: every sixth frame is held out with its LiDAR, and a tenth of the LiDAR's beams is held out of all
 sweeps. λ and σ are those that a search on a rendered drive found (tuned.json), for all methods alike; nothing is chosen
-on this drive. Then each method with a depth loss is trained with other λ, one seed, half size: the curves. Writes
-table.md, table.json, lambda.png and views.png. Stopped at any moment, the same command goes on.
+on this drive. Then the rival with the best PSNR is trained once more, for as many steps as ours' processor seconds
+allow, its learning rates falling over these. Last, each method with a depth loss is trained with other λ, one seed,
+half size: the curves. Writes table.md, table.json, lambda.png and views_SCENE.png. Stopped at any moment, the same
+command goes on.
 """
 
 from __future__ import annotations
 
 import argparse
 import statistics
-import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from commands import command
+from numpy.typing import NDArray
 
 from edge_depth_nerf.base.files import read_image, read_json, write_json, write_png, write_text
+from edge_depth_nerf.base.pictures import DISTANCE, colour_bar, lay_out, panel
 from edge_depth_nerf.compare.command import RUNS
 from edge_depth_nerf.compare.methods import METHODS
 from edge_depth_nerf.compare.options import MethodName
@@ -31,10 +35,17 @@ from edge_depth_nerf.compare.specification import VIEWS
 
 ROOT = Path(__file__).parents[1]
 TABLE: tuple[MethodName, ...] = ("nerfacto", "urban-nerf", "ds-nerf", "edge-paper", "edge")
+RIVALS: tuple[MethodName, ...] = ("nerfacto", "urban-nerf", "ds-nerf")
 WITH_LAMBDA: tuple[MethodName, ...] = ("urban-nerf", "ds-nerf", "edge")
 LAMBDAS = (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1)
 SIZES = {"half": 2, "full": 1}
 HOLDOUT = ("--holdout-every", "6", "--holdout-beams", "10")
+
+
+SHOWN = ("img", "distance")
+"""Judged views that are drawn."""
+SHORT = ("PSNR", "SSIM", "AbsRel", "δ")
+"""Columns of the README."""
 
 
 @dataclass(frozen=True)
@@ -51,18 +62,16 @@ COLUMNS = (
     Column("PSNR", "masked_psnr", ".2f", True),
     Column("fitted PSNR", "affine_masked_psnr", ".2f", True),
     Column("SSIM", "masked_ssim", ".3f", True),
-    Column("AbsRel", "lidar_abs_rel", ".3f", False),
+    Column("AbsRel", "lidar_abs_rel", ".4f", False),
     Column("RMSE, m", "lidar_rmse_m", ".2f", False),
     Column("δ", "lidar_delta_1_25", ".3f", True),
-    Column("beams' AbsRel", "beams_abs_rel", ".3f", False),
+    Column("beams' AbsRel", "beams_abs_rel", ".4f", False),
 )
 
 
-def command(*words: object) -> None:
+def ours(*words: object) -> None:
     """Run one of the project's commands; its output is shown."""
-    program = str(Path(sys.executable).with_name("edge-depth-nerf"))
-    if subprocess.run([program, *map(str, words)], check=False).returncode:
-        sys.exit(f"edge-depth-nerf {' '.join(map(str, words))} failed.")
+    command("edge-depth-nerf", *words, shown=True)
 
 
 def write_tuned(path: Path, weight: float) -> Path:
@@ -77,22 +86,50 @@ def values(runs: Sequence[RunResult], metric: str) -> list[float]:
     return [run.figures[metric] for run in runs if metric in run.figures]
 
 
-def rows(results: Results, scene: str) -> Iterator[str]:
-    """The table of one size, as Markdown."""
-    runs: dict[MethodName, list[RunResult]] = {method: [] for method in TABLE}
-    for run in results.runs:
-        if run.scene == scene and run.method in runs:
-            runs[run.method].append(run)
-    yield "| " + " | ".join(["method", *(column.title for column in COLUMNS), "processor seconds"]) + " |"
-    yield "|---" * (len(COLUMNS) + 2) + "|"
-    for method, found in runs.items():
-        cells = [METHODS[method].title]
-        for column in COLUMNS:
-            each = values(found, column.metric)
-            spread = f" ± {statistics.stdev(each):{column.form}}" if len(each) > 1 else ""
-            cells.append(f"{statistics.mean(each):{column.form}}{spread}" if each else "–")
-        seconds = values(found, "cpu_seconds")
-        yield "| " + " | ".join([*cells, f"{statistics.mean(seconds):.0f}" if seconds else "–"]) + " |"
+def heading(columns: Sequence[Column]) -> Iterator[str]:
+    """The first lines of a table, as Markdown."""
+    yield "| " + " | ".join(["method", *(column.title for column in columns), "steps", "processor seconds"]) + " |"
+    yield "|---" * (len(columns) + 3) + "|"
+
+
+def row(title: str, found: Sequence[RunResult], columns: Sequence[Column]) -> str:
+    """One method of a table, as Markdown: mean and standard deviation of its seeds."""
+    cells = [title]
+    for column in columns:
+        each = values(found, column.metric)
+        spread = f" ± {statistics.stdev(each):{column.form}}" if len(each) > 1 else ""
+        cells.append(f"{statistics.mean(each):{column.form}}{spread}" if each else "–")
+    seconds = f"{statistics.mean(values(found, 'cpu_seconds')):.0f}"
+    return "| " + " | ".join([*cells, f"{last_step(found):,}", seconds]) + " |"
+
+
+def table(results: Results, scene: str, columns: Sequence[Column]) -> Iterator[str]:
+    """All methods on a scene, as Markdown."""
+    yield from heading(columns)
+    for method in TABLE:
+        if found := of(results, scene, method):
+            yield row(METHODS[method].title, found, columns)
+
+
+def of(results: Results, scene: str, method: MethodName) -> list[RunResult]:
+    """The runs of a method on a scene."""
+    return [run for run in results.runs if run.scene == scene and run.method == method]
+
+
+def last_step(runs: Sequence[RunResult]) -> int:
+    """How many steps the runs had."""
+    return int(runs[0].curve[-1]["step"])
+
+
+def best_rival(results: Results, scene: str) -> tuple[MethodName, int] | None:
+    """The rival of the best PSNR, and how many steps it does in ours' processor seconds; None without runs."""
+    ours = of(results, scene, "edge")
+    found: dict[MethodName, list[RunResult]] = {rival: runs for rival in RIVALS if (runs := of(results, scene, rival))}
+    if not ours or not found:
+        return None
+    rival = max(found, key=lambda name: statistics.mean(values(found[name], COLUMNS[0].metric)))
+    ratio = statistics.mean(values(ours, "cpu_seconds")) / statistics.mean(values(found[rival], "cpu_seconds"))
+    return rival, 10 * round(last_step(found[rival]) * ratio / 10)
 
 
 def margins(results: Results, scene: str) -> Iterator[str]:
@@ -107,13 +144,35 @@ def margins(results: Results, scene: str) -> Iterator[str]:
                 for name, each in run.items()
                 if each and column.metric in each.figures
             }
-            rivals = [value for name, value in found.items() if name in ("nerfacto", "urban-nerf", "ds-nerf")]
+            rivals = [value for name, value in found.items() if name in RIVALS]
             if "edge" in found and rivals:
                 leads.append(sign * (found["edge"] - (max(rivals) if sign > 0 else min(rivals))))
         if leads:
             ahead = sum(lead > 0 for lead in leads)
             mean = f"{statistics.mean(leads):+{column.form}}"
             yield f"* {column.title}: {mean} on average, ahead with {ahead} of {len(leads)} seeds."
+
+
+def page(results: Results, longer: Mapping[str, Results]) -> str:
+    """All tables, as Markdown.
+
+    Args:
+        results: of as many steps each.
+        longer: of the best rival in ours' seconds, by size.
+
+    """
+    parts = ["# A real drive, by all methods"]
+    for scene in results.scenes():
+        short = [column for column in COLUMNS if column.title in SHORT]
+        parts += ["", f"## {scene}", "", *table(results, scene, COLUMNS)]
+        parts += ["", f"## Short: {scene}", "", *table(results, scene, short)]
+        parts += ["", f"## Ours against the best rival after as many steps: {scene}", "", *margins(results, scene)]
+        size = scene.removeprefix("kitti360_")
+        if size in longer:
+            runs = longer[size].runs
+            parts += ["", f"## The best rival after as many processor seconds as ours: {scene}", "", *heading(COLUMNS)]
+            parts.append(row(METHODS[runs[0].method].title, runs, COLUMNS))
+    return "\n".join([*parts, ""])
 
 
 def draw_lambdas(found: dict[float, Results], path: Path) -> None:
@@ -139,16 +198,17 @@ def draw_lambdas(found: dict[float, Results], path: Path) -> None:
 
 
 def draw_views(results: Results, scene: str, path: Path) -> None:
-    """One held-out picture and its distances, by nerfacto, DS-NeRF's loss and ours, one under the other."""
-    shown: list[np.ndarray] = []
+    """One held-out picture and its distances as nerfacto, DS-NeRF's loss and ours render them."""
+    panels: list[NDArray[np.uint8]] = []
     for method in ("nerfacto", "ds-nerf", "edge"):
         run = results.run(scene, method, results.seeds()[0])
         if run is None:
             return
-        shown.append(
-            np.hstack([read_image(run.folder / VIEWS / f"eval_{name}_0001.png") for name in ("img", "distance")])
-        )
-    write_png(path, np.vstack(shown))
+        beside_truth, distance = (read_image(run.folder / VIEWS / f"eval_{name}_0001.png") for name in SHOWN)
+        title, width = METHODS[method].title, beside_truth.shape[1] // 2
+        panels.append(panel(beside_truth[:, width:], title))
+        panels.append(panel(distance, f"{title}: distance", colour_bar(DISTANCE, width)))
+    write_png(path, lay_out(panels, 2, ["A held-out picture, rendered"]))
 
 
 def main() -> None:
@@ -160,6 +220,13 @@ def main() -> None:
     parser.add_argument("--steps", type=int, help="of each training; the preset's, if not set")
     parser.add_argument(
         "--lambdas", nargs="*", type=float, default=list(LAMBDAS), help="of the curves; none: no curves"
+    )
+    parser.add_argument(
+        "--equal-seconds",
+        nargs="*",
+        choices=SIZES,
+        default=["half"],
+        help="sizes: the best rival in ours' seconds",
     )
     parser.add_argument("--curve-steps", type=int, help="of the curves' trainings; the table's, if not set")
     parser.add_argument("--jobs", type=int, default=1, help="trainings at a time")
@@ -175,25 +242,25 @@ def main() -> None:
     compared = options.output / "compared"
     scenes = {size: options.output / f"kitti360_{size}" for size in options.sizes}
     for size, scene in scenes.items():
-        command("process", "rig", "--root", drive, "--output", scene, "--downscale", SIZES[size], *HOLDOUT)
+        ours("process", "rig", "--root", drive, "--output", scene, "--downscale", SIZES[size], *HOLDOUT)
     tuned = ROOT / "benchmarks" / "tuned.json"
     for seed in options.seeds:
         # a seed is whole before the next begins: a stopped benchmark has a table of those it has
         common = ("--methods", *TABLE, "--tuned", tuned, "--output", compared, *jobs, *steps)
-        command("compare", *scenes.values(), "--seeds", seed, *common)
+        ours("compare", *scenes.values(), "--seeds", seed, *common)
     results = read_results(compared / RUNS)
-    parts = ["# A real drive, by all methods\n"]
+    longer: dict[str, Path] = {}
+    for size in options.equal_seconds:
+        if size in scenes and (best := best_rival(results, scenes[size].name)):
+            rival, length = best
+            common = ("--methods", rival, "--tuned", tuned, "--steps", length, *jobs)
+            longer[size] = options.output / "equal_seconds" / f"{size}_{rival}_{length}"
+            ours("compare", scenes[size], "--seeds", *options.seeds, *common, "--output", longer[size])
+    write_text(
+        options.output / "table.md", page(results, {size: read_results(path / RUNS) for size, path in longer.items()})
+    )
     for scene in results.scenes():
-        parts += [
-            f"\n## {scene}\n",
-            *rows(results, scene),
-            "",
-            "Ours against the best rival:",
-            "",
-            *margins(results, scene),
-        ]
         draw_views(results, scene, options.output / f"views_{scene}.png")
-    write_text(options.output / "table.md", "\n".join([*parts, ""]))
     write_json(options.output / "table.json", results.rows())
 
     curves: dict[float, Results] = {}
@@ -201,7 +268,8 @@ def main() -> None:
         folder = options.output / f"lambda_{weight:g}"
         given = write_tuned(options.output / f"lambda_{weight:g}.json", weight)
         scene = scenes.get("half", next(iter(scenes.values())))
-        command("compare", scene, "--methods", *WITH_LAMBDA, "--tuned", given, "--output", folder, *jobs, *curve_steps)
+        common = ("--tuned", given, "--output", folder, *jobs, *curve_steps)
+        ours("compare", scene, "--methods", *WITH_LAMBDA, *common)
         curves[weight] = read_results(folder / RUNS)
         draw_lambdas(curves, options.output / "lambda.png")
 

@@ -10,7 +10,6 @@ there is not made again. The table is also written, as Markdown, to table.md the
 from __future__ import annotations
 
 import argparse
-import subprocess
 import sys
 from functools import partial
 from pathlib import Path
@@ -22,6 +21,7 @@ from rich.table import Table
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 
+from commands import command  # noqa: E402
 from real_scenes import fisheye_frame_scene, stereo_scene  # noqa: E402  # pyright: ignore[reportMissingImports]
 
 from edge_depth_nerf.base.files import read_json, write_text  # noqa: E402
@@ -33,13 +33,6 @@ SCENES = {
 }
 LOSSES = {"nerfacto": "none", "ours": "edge"}
 COLUMNS = ("masked_psnr", "masked_ssim", "lidar_abs_rel", "lidar_rmse_m", "lidar_delta_1_25")
-
-
-def command(name: str, *arguments: object) -> None:
-    words = [str(Path(sys.executable).with_name(name)), *map(str, arguments)]
-    done = subprocess.run(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
-    if done.returncode:
-        sys.exit(f"{name} failed:\n{done.stdout[-3000:]}")
 
 
 def main() -> None:

@@ -15,10 +15,9 @@ file, to have it anew):
     start_up     `edge-depth-nerf --help`, and what the plugin adds to any ns-* command
     preparation  `process` and integration on one core and on all
 
-The drives are made by `edge-depth-nerf synthesize` under `--work` (of 1400 px: some minutes) and stay there. Everything
-else should be still: ratios are taken within rounds, but a busy machine widens them. In the end the tables in
-README.md and docs/speed.md and the curves (docs/speed.svg) are written from the results; `--parts` without a value
-does that alone.
+The drives are made by `edge-depth-nerf synthesize` under `--work` (of 1400 px: some minutes) and stay there. Nothing
+else should run: ratios are taken within rounds, but a busy machine widens their range. At the end the tables in
+docs/speed.md and the curves (docs/speed.svg) are written from the results; `--parts` without a value does only that.
 """
 
 from __future__ import annotations
@@ -293,7 +292,7 @@ def main() -> None:
             results[name] = found
             results.setdefault("seconds", {})[name] = round(time.perf_counter() - started, 1)
             write_json(options.results, results)
-    write_tables(results, [HERE.parent / "README.md", HERE.parent / "docs" / "speed.md"])
+    write_tables(results, [HERE.parent / "docs" / "speed.md"])
     draw(results, HERE.parent / "docs" / "speed.svg")
 
 

@@ -28,7 +28,7 @@ def rows_of(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def summary(results: dict[str, Any]) -> str:
-    """What README has: one line for each thing that is faster."""
+    """The summary: one line for each thing that is faster."""
     rows = []
     for row in results.get("encoding", []):
         low, ratio, high = row["ratio_quartiles"]

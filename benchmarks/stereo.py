@@ -20,7 +20,6 @@ field and above it, and how many errors are within one and two sigma.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import time
 from itertools import pairwise
 from pathlib import Path
@@ -38,6 +37,7 @@ from edge_depth_nerf.kernels import sphere_sweep
 from edge_depth_nerf.method.integration import INTEGRATED
 from edge_depth_nerf.method.prior import PriorOptions, make_prior, view_of
 from edge_depth_nerf.mono.calibration import find_trust
+from edge_depth_nerf.process.motion import SweepStore
 from edge_depth_nerf.process.motion import scene_view as view
 from edge_depth_nerf.scene.reader import read_scene
 from edge_depth_nerf.stereo.motion import Motion
@@ -87,22 +87,14 @@ def judge(scene_path: Path, output: Path, every: int) -> tuple[list[tuple[str, .
     pictures = [picture for picture in scene.pictures if not picture.held_out]
     positions = np.stack([picture.position_m for picture in pictures])
     motion = Motion(positions, lambda index: view(scene, pictures[index]))
-    folder = output / "sweeps" / scene.folder.name
+    store = SweepStore(output / "sweeps" / scene.folder.name, scene, pictures, motion)
     seconds: list[float] = []
 
     def sweep(index: int) -> Swept:
-        path = folder / f"{index:05d}.npz"
-        if not path.is_file():
-            begin = time.process_time()
-            found = motion.sweep(index)
+        begin = time.process_time()
+        if store.make(index):
             seconds.append(time.process_time() - begin)
-            folder.mkdir(parents=True, exist_ok=True)
-            part = path.with_suffix(".part")
-            with part.open("wb") as file:
-                np.savez(file, **dataclasses.asdict(found))
-            part.replace(path)
-        with np.load(path, allow_pickle=False) as archive:
-            return Swept(**archive)
+        return store(index)
 
     rows = []
     panels = []

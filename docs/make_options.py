@@ -34,35 +34,35 @@ PAGE = Path(__file__).with_name("options.md")
 
 HEADER = """# Every option
 
-This page is written by `python docs/make_options.py` from the code itself; a test holds it to that. The commands say
-the same: `edge-depth-nerf COMMAND --help`, `ns-train METHOD --help`.
+`python docs/make_options.py` writes this page from the code; a test checks that it is current. The commands print the
+same: `edge-depth-nerf COMMAND --help`, `ns-train METHOD --help`.
 
 ## The command line
 
-A switch such as `--deskew` is turned off by `--no-deskew`. Several values stand behind one another:
-`--cameras image_02 image_03`. Bare words in capitals are given without a name.
+`--no-deskew` turns off a switch such as `--deskew`. Separate several values by spaces: `--cameras image_02 image_03`.
+Give words in capitals without a name.
 
 """
 
 METHODS_HEADER = """## The methods
 
 What `ns-train edge-depth-nerf`, `edge-depth-nerf-lite` and `edge-depth-nerf-paper` add to nerfstudio's nerfacto, or
-set to another value. Switches take `True` or `False`. Where a method has another default, it is named.
+set to another value. Switches take `True` or `False`. If a method has another default, the table names it.
 
 """
 
-DATAPARSER = """They stand last on the line: `ns-train METHOD --data SCENE … fisheye-depth-data --metres-per-unit 10`.
-Other methods of nerfstudio take them in the same way.
+DATAPARSER = """Put these last on the line: `ns-train METHOD --data SCENE … fisheye-depth-data --metres-per-unit 10`.
+nerfstudio's other methods accept them in the same way.
 
 """
 
 PRESETS = """### What each method sets of nerfstudio's own
 
-From [nerfstudio_method.toml](../nerfstudio_method.toml). – is nerfstudio's default.
+These are from [nerfstudio_method.toml](../nerfstudio_method.toml). – means nerfstudio's default.
 
 """
 
-SHARED = "Of all converters:\n\n"
+SHARED = "Options of all converters:\n\n"
 
 
 # ---- reading dataclasses ---------------------------------------------------------------------------------------
@@ -214,7 +214,7 @@ def methods() -> str:
         ("The model and its loss", "pipeline.model", EdgeDepthNerfModelConfig),
         ("UrbanNeRF's loss", "pipeline.model.urban", UrbanTerms),
         ("Poses refined in training", "pipeline.model.camera_optimizer", PoseRefinerConfig),
-        ("How it is judged", "pipeline", EdgeDepthPipelineConfig),
+        ("Evaluation", "pipeline", EdgeDepthPipelineConfig),
         ("The scene", "pipeline.datamanager.dataparser", FisheyeDepthDataParserConfig),
     )
     places = [place for _, place, _ in groups]

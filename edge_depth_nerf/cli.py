@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Union, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Union, get_args
 
 import tyro
 from rich.console import Console
@@ -40,7 +40,7 @@ class Process:
 
 @dataclass
 class Doctor:
-    """Look at what is installed, and say what to do about it. Exit status 1 if something must be mended."""
+    """List what is installed and what is missing, and say how to fix it. Exit status 1 if something must be fixed."""
 
 
 Command = (
@@ -59,25 +59,50 @@ def parse(arguments: list[str]) -> Command:
     """Read a command line; wrong options and --help end the program.
 
     Raises:
-        InputError: there is no such command.
+        InputError: there is no such command, or one of its options has another name.
 
     """
     _check_name(arguments, Command, "command")
     if arguments[:1] == ["process"]:
         _check_name(arguments[1:], Converter, "converter of `process`")
+    if arguments[:1] == ["camera-path"] and any(word.split("=")[0] == "--frames" for word in arguments):
+        raise InputError(
+            "--frames: camera-path has no such option. --seconds sets how long the film runs, and --fps how many "
+            "pictures it has a second."
+        )
     join_lines_of_option_help()
+    names, options = _named(arguments)
+    if options is not None:
+        # a parser of this command alone: of a wrong option, one of all commands would suggest those of the others
+        found = tyro.cli(options, prog=" ".join(("edge-depth-nerf", *names)), args=arguments[len(names) :])
+        return Process(found) if len(names) == 2 else found
     return tyro.cli(
         Command,
         prog="edge-depth-nerf",
-        description="Fisheye driving scenes, integrated depth. With --debug, anywhere, errors come with "
-        "tracebacks; --version says which this is.",
+        description="NeRFs of driving scenes from fisheye cameras, LiDAR and monocular "
+        "depth. Add --debug anywhere for tracebacks; --version prints the version.",
         args=arguments,
     )
 
 
+def _choices(union: object) -> dict[str, Any]:
+    """Names of subcommands, with their options."""
+    return {name.name: options for options, name in map(get_args, get_args(union))}
+
+
+def _named(arguments: list[str]) -> tuple[list[str], Any]:
+    """The words that name a command, and its options; None where they name none, or not all of it."""
+    names = arguments[:1]
+    options = _choices(Command).get("".join(names))
+    if options is Process:
+        names = arguments[:2]
+        options = _choices(Converter).get("".join(names[1:]))
+    return names, options
+
+
 def _check_name(words: list[str], choices: object, what: str) -> None:
     """Of a name with a slip, tyro would speak of its options."""
-    known = [metadata.name for choice in get_args(choices) for metadata in get_args(choice)[1:]]
+    known = list(_choices(choices))
     if not words or words[0].startswith("-") or words[0] in known:
         return
     close = difflib.get_close_matches(words[0], known, 1, 0.6)

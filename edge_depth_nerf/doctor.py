@@ -60,7 +60,8 @@ def check_python() -> Iterator[Finding]:
         found,
         ""
         if fine
-        else f"Make an environment with Python {wanted}: nerfstudio's dependencies have no wheels for others.",
+        else f"Create an environment with Python {wanted}: nerfstudio's dependencies "
+        "have wheels only for these versions.",
     )
 
 
@@ -83,10 +84,10 @@ def check_torch() -> Iterator[Finding]:
         "problem" if gpu else "note",
         f"CPU, {os.cpu_count()} cores"
         + (f"; torch is built for CUDA {built}" if built else "; torch is built without CUDA"),
-        "There is an NVIDIA driver, but torch finds no GPU: install a torch whose CUDA the driver knows "
-        "(https://pytorch.org/get-started)."
+        "There is an NVIDIA driver, but torch finds no GPU: install a torch with a CUDA version that the driver "
+        "supports (https://pytorch.org/get-started)."
         if gpu
-        else "Train with edge-depth-nerf-lite; the full preset wants a GPU.",
+        else "Train with edge-depth-nerf-lite; the full preset needs a GPU.",
     )
 
 
@@ -165,16 +166,16 @@ def check_lpips() -> Iterator[Finding]:
     yield Finding(
         "LPIPS",
         "ok" if there else "note",
-        str(path) if there else "no weights; the figure is left out",
-        "" if there else f"Put the file of {url} at {path}. Nothing is downloaded by itself.",
+        str(path) if there else "no weights; LPIPS is left out",
+        "" if there else f"Put the file of {url} at {path}. Nothing is downloaded automatically.",
     )
 
 
 def check_extras() -> Iterator[Finding]:
     """Optional libraries and programs."""
     for name, package, extra, what in (
-        ("COLMAP", "pycolmap", "colmap", "poses found from pictures (process --poses colmap)"),
-        ("KISS-ICP", "kiss_icp", "odometry", "poses found from LiDAR (process --poses lidar)"),
+        ("COLMAP", "pycolmap", "colmap", "poses from pictures (process --poses colmap)"),
+        ("KISS-ICP", "kiss_icp", "odometry", "poses from LiDAR (process --poses lidar)"),
         ("transformers", "transformers", "hf", "ready-made depth networks (estimate-depth --hf)"),
         ("Dask", "distributed", "cluster", "many machines (--cluster)"),
     ):
@@ -182,21 +183,21 @@ def check_extras() -> Iterator[Finding]:
         yield Finding(
             name,
             "ok" if there else "note",
-            version(package) if there else f"not installed; only for {what}",
+            version(package) if there else f"not installed; needed only for {what}",
             "" if there else f"pip install '.[{extra}]'",
         )
     ffmpeg = shutil.which("ffmpeg")
     yield Finding(
         "ffmpeg",
         "ok" if ffmpeg else "note",
-        ffmpeg or "not found; only for films (ns-render)",
+        ffmpeg or "not found; needed only for films (ns-render)",
         "" if ffmpeg else "apt-get install ffmpeg",
     )
     usb = ctypes.util.find_library("usb-1.0")
     yield Finding(
         "libusb",
         "ok" if usb or platform.system() != "Linux" else "note",
-        usb or "not found; only for meshes and normals (ns-export)",
+        usb or "not found; needed only for meshes and normals (ns-export)",
         "" if usb else "apt-get install libusb-1.0-0",
     )
 
@@ -210,7 +211,7 @@ def check_room() -> Iterator[Finding]:
             "Free memory",
             "problem" if little else "ok",
             f"{free_gb:.1f} GiB",
-            f"A training takes {LEAST_FREE_MEMORY_GB:g} GiB at least: close other programs." if little else "",
+            f"A training takes {LEAST_FREE_MEMORY_GB:g} GiB or more: close other programs." if little else "",
         )
     disk_gb = shutil.disk_usage(Path.cwd()).free / 2**30
     little = disk_gb < LEAST_FREE_DISK_GB
@@ -218,9 +219,7 @@ def check_room() -> Iterator[Finding]:
         "Free disk",
         "note" if little else "ok",
         f"{disk_gb:.0f} GiB in {Path.cwd()}",
-        "Scenes, tables of pixels and checkpoints lie beside each other: work in a folder with more room."
-        if little
-        else "",
+        "Scenes, tables of pixels and checkpoints need more space: work in a folder with more of it." if little else "",
     )
 
 
@@ -244,7 +243,7 @@ def run_doctor(console: Console | None = None) -> int:
 
     """
     console = console or Console()
-    with console.status("Looking at what is installed …"):
+    with console.status("Checking the installation …"):
         findings = [finding for check in CHECKS for finding in check()]
     table = Table(title=f"edge-depth-nerf {__version__}", show_edge=False, title_justify="left")
     for heading in ("", "", "found", "what to do"):
@@ -255,7 +254,7 @@ def run_doctor(console: Console | None = None) -> int:
     console.print(table)
     problems = [finding.what for finding in findings if finding.state == "problem"]
     if problems:
-        console.print(f"\n[bold red]{len(problems)} to mend: {', '.join(problems)}[/bold red]")
+        console.print(f"\n[bold red]{len(problems)} to fix: {', '.join(problems)}[/bold red]")
     else:
         console.print("\nNothing to mend.")
     return 1 if problems else 0

@@ -56,7 +56,7 @@ def _stopped() -> NoReturn:
 
     # threads may still be writing their last file: whoever does not want to wait for them gets no traceback either
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    sys.stderr.write("\nStopped. The same command takes up where it was.\n")
+    sys.stderr.write("\nStopped. Run the same command again to resume.\n")
     sys.exit(STOPPED_STATUS)
 
 
@@ -67,9 +67,9 @@ def _bug(error: Exception) -> str:
     place = f", in {Path(frames[-1].filename).name}, line {frames[-1].lineno}" if frames else ""
     said = " ".join(str(error).split())
     return (
-        f"a bug in version {__version__}{place}: {type(error).__name__}{': ' if said else ''}{said}. Please report it: "
-        f"give the same command with {DEBUG_OPTION}, and put what it prints and what `{PROGRAM} doctor` says into an "
-        "issue."
+        f"a bug in version {__version__}{place}: {type(error).__name__}{': ' if said else ''}{said}. Please report "
+        f"it: run the same command with {DEBUG_OPTION}, and put its output and that of `{PROGRAM} doctor` "
+        "into an issue."
     )
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+SOFTWARE_WEBGL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 PROGRAMS = ("chromium", "chromium-browser", "google-chrome")
 
 
@@ -24,7 +25,7 @@ def open_browser() -> Iterator[Any]:
     # with --fast, where no program is started, this skips the test; within Playwright nobody would hear of it
     subprocess.run([program, "--version"], stdout=subprocess.DEVNULL, check=True)
     # Chromium's sandbox does not start as root
-    arguments = ["--no-sandbox"] if os.geteuid() == 0 else []
+    arguments = [*SOFTWARE_WEBGL, *(["--no-sandbox"] if hasattr(os, "geteuid") and os.geteuid() == 0 else [])]
     with api.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=program, args=arguments)
         try:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import struct
 import sys
 import time
@@ -49,6 +48,8 @@ def bounded_memory():
     if not sys.platform.startswith("linux"):
         yield
         return
+    import resource  # Windows has none
+
     before = resource.getrlimit(resource.RLIMIT_DATA)
     pages = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmData"))
     resource.setrlimit(resource.RLIMIT_DATA, (int(pages.split()[1]) * 1024 + MOST_BYTES, before[1]))
@@ -176,7 +177,7 @@ FOUND: dict[str, tuple[str, str, str | bytes, str]] = {
         "is not of this form",
     ),
     "figures that are none": ("figures", "s/r/figures.json", "[]", "no JSON object"),
-    "aliases that multiply": ("kitti yaml", "a.yaml", "a: &a [x]\n" + "b: [*a,*a]\n" * 9, "is there twice|without"),
+    "aliases that multiply": ("kitti yaml", "a.yaml", "a: &a [x]\n" + "b: [*a,*a]\n" * 9, "occurs twice|without"),
 }
 """What fuzzing and reading the code found, each mended: reader, name of the file, content, message."""
 

@@ -58,8 +58,8 @@ def test_input_is_checked_before_anything_starts(tmp_path, monkeypatch):
 
     refused(FileNotFoundError, "transforms.json: no such file", tmp_path / "nothing")
     scene, twin = write_scene(tmp_path / "a" / "x"), write_scene(tmp_path / "b" / "x")
-    refused(InputError, "one folder name", scene, twin)
-    refused(InputError, "one folder name", scene, scene)
+    refused(InputError, "folders have the same name", scene, twin)
+    refused(InputError, "folders have the same name", scene, scene)
     bare = write_scene(tmp_path / "bare", lidar=False)
     refused(InputError, r"no LiDAR maps, which the method .*needs", bare, preset="paper")
     refused(InputError, r"no LiDAR maps", bare, methods=("ds-nerf",))
@@ -72,10 +72,10 @@ def test_input_is_checked_before_anything_starts(tmp_path, monkeypatch):
     refused(FileNotFoundError, "no such file", scene, tuned=tuned)
     for content in ([], {"methods": {"nerfacto": {"lambda": 1, "sigma_m": 1}}}, {"methods": {"edge": {"lambda": 0.1}}}):
         write_json(tuned, content)
-        refused(InputError, r"tuned.json: (.*expected \{|holds no JSON object)", scene, tuned=tuned)
+        refused(InputError, r"tuned.json: (.*expected \{|does not contain a JSON object)", scene, tuned=tuned)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").touch()
-    refused(InputError, "holds other things", scene, output=tmp_path / "full")
+    refused(InputError, "contains other files", scene, output=tmp_path / "full")
 
 
 def test_a_folder_keeps_what_its_runs_share(tmp_path, monkeypatch):
@@ -135,10 +135,10 @@ def test_methods_may_be_tuned_after_others(tmp_path):
     }
     open_with(("nerfacto",), ds_nerf=0.1, edge=0.01)
     for tuned in ({"ds_nerf": 0.1, "edge": 0.02}, {"ds_nerf": 0.1}):  # another value; one that is gone
-        with pytest.raises(InputError, match="holds a comparison with tuned"):
+        with pytest.raises(InputError, match="contains a comparison with tuned"):
             open_with(("edge",), **tuned)
     (output / "runs" / "x" / "edge-lidar_seed-0").mkdir()  # trained with the default
-    with pytest.raises(InputError, match="holds a comparison with tuned"):
+    with pytest.raises(InputError, match="contains a comparison with tuned"):
         open_with(("edge-lidar",), ds_nerf=0.1, edge=0.01, edge_lidar=0.01)
 
 

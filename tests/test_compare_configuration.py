@@ -175,6 +175,16 @@ def test_each_method_is_what_its_name_says():
     assert loss_and_source("edge") == loss_and_source("edge-paper") == ("edge", "integrated", "edge-aware")
 
 
+@pytest.mark.parametrize("steps", [1000, 4000])
+def test_learning_rates_fall_over_the_steps_asked_for(steps):
+    """As they do over the preset's: the last step's rate is the preset's last, at any length."""
+    whole, other = resolved("edge", steps=None), resolved("edge", steps=steps)
+    lengths = [name for name in whole if name.endswith((".scheduler.max_steps", ".scheduler.warmup_steps"))]
+    assert len(lengths) == 6 and whole["max_num_iterations"] == 2000
+    assert {name: other[name] for name in lengths} == {name: whole[name] * steps // 2000 for name in lengths}
+    assert {*differing(whole, other)} <= {*lengths, "max_num_iterations"}
+
+
 @pytest.mark.parametrize("preset", ["lite", "full"])
 def test_the_literal_method_is_the_registered_one_in_another_size(preset):
     ours, literal = resolved("edge", preset), resolved("edge-paper", preset)

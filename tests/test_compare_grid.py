@@ -145,7 +145,7 @@ def test_a_part_of_the_grid_has_the_tables_that_it_is_enough_for():
 def test_searches_of_unequal_length_are_said_to_be():
     searches = searched()
     searches[0] = searched(15)[0]
-    assert "unequal length" in grid_tables(judged(), searches)[-1].caption
+    assert "have different sizes" in grid_tables(judged(), searches)[-1].caption
 
 
 @pytest.fixture
@@ -249,7 +249,7 @@ def test_a_grid_searches_every_cell_alike_and_goes_on_where_it_was(tmp_path, mad
     assert "LiDAR: 7 sweeps in each map of street, 7 sweeps in each map of turn." in text
     assert "on tune_a and tune_b" in text and "tune_a" in (grid.output / "comparison" / "tables.md").read_text()
     # a finer search comes too late for what was judged with another
-    with pytest.raises(InputError, match="holds a comparison with tuned"):
+    with pytest.raises(InputError, match="contains a comparison with tuned"):
         command.compare(replace(grid, sigmas_m=(1.5, *SIGMAS_M)), QUIET)
 
 
@@ -273,4 +273,4 @@ def test_a_grid_that_cannot_be(tmp_path, monkeypatch):
     refused("no monocular maps", scenes=(write_scene(tmp_path / "bare", mono=False),))
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").touch()
-    refused("holds other things", output=tmp_path / "full")
+    refused("contains other files", output=tmp_path / "full")

@@ -52,7 +52,10 @@ def test_it_leaves_figures_tables_and_pictures(finished):
     assert all(one > other for one, other in zip(fitted, plain, strict=True))
     text = (asked.output / "tables.md").read_text()
     assert "## Table 1." in text and "## Table 5" in text and "| ours |" in text
-    assert "## Table 8. What the methods differ in" in text and "| pipeline.model.depth_loss | none | edge |" in text
+    assert (
+        "## Table 8. Fields in which the methods differ" in text
+        and "| pipeline.model.depth_loss | none | edge |" in text
+    )
     assert "| pipeline.model.exposure |" not in text
     assert r"\bottomrule" in (asked.output / "tables.tex").read_text()
     assert read_image(asked.output / "comparison_sample.png").std() > 5

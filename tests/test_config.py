@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from nerfstudio.configs.dataparser_configs import all_dataparsers
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.plugins.types import MethodSpecification
@@ -53,6 +54,19 @@ def test_configurations_hold_what_the_file_says(name):
 def test_the_scale_is_chosen_for_the_grid_of_the_model(name):
     pipeline = all_methods[name].pipeline
     assert pipeline.datamanager.dataparser.hash_resolution == pipeline.model.max_res
+
+
+def test_adams_decay_reaches_the_optimiser():
+    """As Instant NGP has it where steps are few, torch's elsewhere."""
+    found = {}
+    for name, specification in config.make_specifications(config.read_method_file()).items():
+        made = specification.config.optimizers["fields"]["optimizer"].setup([torch.nn.Parameter(torch.zeros(1))])
+        found[name] = made.param_groups[0]["betas"]
+    assert found == {
+        "edge-depth-nerf": (0.9, 0.999),
+        "edge-depth-nerf-lite": (0.9, 0.99),
+        "edge-depth-nerf-paper": (0.9, 0.999),
+    }
 
 
 def test_constants_carry_their_source():

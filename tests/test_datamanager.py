@@ -94,6 +94,32 @@ def test_further_pixels_come_for_the_surface_where_the_prior_is_good(tmp_path):
     assert "surface_rays" not in manager(scene, surface_rays_per_batch=0).next_train(0)[1]
 
 
+def test_on_a_gpu_a_batch_is_the_same_with_all_further_pixels_and_which_are_of_use(tmp_path, monkeypatch):
+    scene = write_scene(tmp_path)
+    options = {"train_num_rays_per_batch": 100, "surface_rays_per_batch": 400}
+    data, other = manager(scene, **options), manager(scene, **options)
+    for name in ("train_pixel_sampler", "_surface_sampler"):
+        getattr(other, name)._first = getattr(data, name)._first
+    # half of the pixels are too vague
+    sigma_m = data.train_pixel_sampler.table.batch(0, 1000).prior_sigma_m
+    monkeypatch.setattr(datamanager_module, "SURFACE_SIGMA_SHARE", 0.0)
+    monkeypatch.setattr(datamanager_module, "SURFACE_SIGMA_M", float(sigma_m.median()))
+    for step in range(3):
+        rays, expected = data.next_train(step)
+        found_rays, found = other._next_train_elsewhere(step)
+        counts = found.pop("surface_counts")[:, 0]
+        assert len(counts) == 400 and 0 < counts.sum() < 400
+        pairs = [(rays, found_rays), (expected.pop("surface_rays"), found.pop("surface_rays")[counts])]
+        for one, another in pairs:
+            for name in ("origins", "directions", "pixel_area", "camera_indices"):
+                assert torch.equal(getattr(one, name), getattr(another, name)), name
+            assert torch.equal(one.metadata["place"], another.metadata["place"])
+        assert set(found) == set(expected)
+        for name, value in expected.items():
+            assert torch.equal(found[name][counts] if name.startswith("surface_") else found[name], value), name
+        assert other.pictures_of(torch.tensor([0])) == data.pictures_of(torch.tensor([0]))
+
+
 def test_no_further_pixels_come_where_every_prior_is_vague(tmp_path):
     data = manager(write_scene(tmp_path), prior=PriorOptions(sigma_mode="constant", sigma_constant_m=100.0))
     assert data._surface_sampler is not None

@@ -16,7 +16,7 @@ from edge_depth_nerf.base import files
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.plugin import plain_errors
 
-STOPPED = "\nStopped. The same command takes up where it was.\n"
+STOPPED = "\nStopped. Run the same command again to resume.\n"
 TIMEOUT_S = 120
 
 
@@ -218,13 +218,12 @@ def fail(error: BaseException) -> None:
 
 def test_nerfstudio_says_our_errors_plainly(hook, capsys, monkeypatch, tmp_path):
     sys.excepthook(*raised(fail, InputError("scene: has no frames. Make it again.")))
-    said = capsys.readouterr().err
-    assert said.startswith("edge-depth-nerf: scene: has no frames. Make it again.\n") and entry.DEBUG_VARIABLE in said
+    assert capsys.readouterr().err == "\nedge-depth-nerf: scene: has no frames. Make it again.\n"
     # a missing file in our own words
     from edge_depth_nerf.scene.reader import read_scene
 
     sys.excepthook(*raised(read_scene, tmp_path))
-    assert capsys.readouterr().err.startswith(f"edge-depth-nerf: {tmp_path}/transforms.json: no such file.")
+    assert capsys.readouterr().err.startswith(f"\nedge-depth-nerf: {tmp_path}/transforms.json: no such file.")
     sys.excepthook(*raised(fail, KeyboardInterrupt()))
     assert capsys.readouterr().err == "\nStopped.\n"
     assert hook == []
@@ -256,7 +255,7 @@ def test_a_slip_in_load_config(hook, capsys, tmp_path):
         ("", "is a folder. --load-config takes a training's config.yml"),
         ("none.yml", "no such file. --load-config takes"),
         ("page.md", "cannot be read (ParserError: "),
-        ("scene.json", "holds something else than a training's configuration. --load-config takes"),
+        ("scene.json", "is not the configuration of a training. --load-config takes"),
     ):
         sys.excepthook(*raised(eval_setup, tmp_path / name))
         assert f"{tmp_path / name}: {what}" in capsys.readouterr().err
@@ -299,5 +298,10 @@ def test_ns_train_on_what_is_no_scene(tmp_path):
     )
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
-    assert f"edge-depth-nerf: {tmp_path}/nowhere/transforms.json: no such file." in done.stderr
+    assert done.stderr.splitlines()[-1].startswith(
+        f"edge-depth-nerf: {tmp_path}/nowhere/transforms.json: no such file."
+    )
+    # the settings that were changed, not all two hundred
+    assert "edge-depth-nerf-lite: 2000 steps on cpu, scene" in done.stdout and "--vis tensorboard" in done.stdout
+    assert "FusedAdamConfig" not in done.stdout and len(done.stdout.splitlines()) < 10
     assert not (tmp_path / "runs").exists(), "no run was begun"

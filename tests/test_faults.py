@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import io
+import os
+import threading
+import time
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -11,7 +15,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from edge_depth_nerf.base import bounds, files
+from edge_depth_nerf.base import bounds, files, one_writer
 from edge_depth_nerf.base.bounds import finite, path_inside, shown, text_lines
 from edge_depth_nerf.base.errors import LONGEST_MESSAGE, InputError
 from edge_depth_nerf.base.files import read_json, read_json_object, read_npz, write_json
@@ -98,7 +102,7 @@ def test_json_that_is_to_be_an_object(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="has no 'b'"):
         read_json_object(path, "a", "b")
     write_json(path, [])
-    with pytest.raises(InputError, match="holds no JSON object"):
+    with pytest.raises(InputError, match="does not contain a JSON object"):
         read_json_object(path)
 
 
@@ -120,7 +124,7 @@ def test_arrays_of_an_archive_come_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "compression", "said"),
     [
-        (array_bytes(np.arange(3.0)), zipfile.ZIP_BZIP2, "a is compressed in a way of its own"),
+        (array_bytes(np.arange(3.0)), zipfile.ZIP_BZIP2, "a uses an unsupported compression"),
         (array_bytes(np.array(["words"])), zipfile.ZIP_STORED, "a holds <U5"),
         (array_bytes(np.arange(126.0)), zipfile.ZIP_STORED, r"a has the shape \(126,\) of float64, more than 1000"),
         (array_bytes(np.arange(9.0))[:-8], zipfile.ZIP_STORED, "cannot be read as arrays"),
@@ -142,6 +146,55 @@ def test_a_folder_that_cannot_be_locked_is_not_waited_for(tmp_path: Path) -> Non
     assert done and (tmp_path / "file").is_file()
 
 
+class WindowsLocks:
+    """What msvcrt has, by what Linux has."""
+
+    LK_NBLCK, LK_UNLCK = 2, 0
+
+    @staticmethod
+    def locking(handle: int, mode: int, count: int) -> None:
+        import fcntl
+
+        assert count == 1
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB if mode else fcntl.LOCK_UN)
+        except BlockingIOError:
+            raise PermissionError(errno.EACCES, "Permission denied") from None
+
+
+@pytest.mark.skipif(os.name == "nt", reason="test_killed.py has the real locks")
+def test_windows_locks_a_file_beside_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(one_writer, "fcntl", None)
+    monkeypatch.setattr(one_writer, "msvcrt", WindowsLocks)
+    folder, order, console = tmp_path / "scene", [], Console(record=True, quiet=True)
+    began = threading.Event()
+
+    def first() -> None:
+        with only_writer(folder, console):
+            began.set()
+            assert list(folder.iterdir()) == [] and (tmp_path / ".scene.lock").is_file()
+            time.sleep(0.5)
+            order.append("first")
+            (folder / "a").touch()
+
+    thread = threading.Thread(target=first)
+    thread.start()
+    assert began.wait(10)
+    with only_writer(folder, console), only_writer(folder, console):
+        order.append("second")
+    thread.join()
+    assert order == ["first", "second"]
+    assert [path.name for path in tmp_path.iterdir()] == ["scene"]
+
+
+def test_windows_is_not_asked_whether_a_process_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """There os.kill(number, 0) is Ctrl-C."""
+    monkeypatch.setattr(os, "kill", lambda *_: pytest.fail("killed"))
+    with monkeypatch.context() as windows:
+        windows.setattr(os, "name", "nt")
+        assert files._runs(os.getpid())
+
+
 # ---- transforms.json -------------------------------------------------------------------------------------------
 
 
@@ -161,9 +214,9 @@ VIEW = {"camera": "a", "transform_matrix": POSE, "truth_rgb_file_path": "a", "tr
         ({"frames": transforms()["frames"] * 2}, "frame 1: 'a.png' has a frame already"),
         (transforms({"transform_matrix": POSE[:3]}), "frame 0: transform_matrix must be 4×4 finite numbers"),
         (transforms({"transform_matrix": [[1e9] * 4] * 4}), "transform_matrix holds 1e.09, more than .* in metres"),
-        (transforms({"frame": True}), "frame is True, expected the number of a moment"),
-        (transforms({"frame": 1.5}), "frame is 1.5, expected the number of a moment"),
-        (transforms({"frame": -1}), "frame is -1, expected the number of a moment"),
+        (transforms({"frame": True}), "frame is True, expected a frame number"),
+        (transforms({"frame": 1.5}), "frame is 1.5, expected a frame number"),
+        (transforms({"frame": -1}), "frame is -1, expected a frame number"),
         (transforms({"camera": "../a"}), "frame 0: camera is '../a'"),
         (transforms({"mask_path": "../a"}), "frame 0: mask_path is '../a'"),
         (transforms({"fl_x": "9"}), "frame 0: fl_x is '9', expected a number"),

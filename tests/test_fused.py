@@ -18,7 +18,7 @@ from edge_depth_nerf.kernels.contraction import contract
 from edge_depth_nerf.kernels.fields import FusedMLP, FusedNerfactoField, use_fused_fields
 from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss, proposal_loss
 from edge_depth_nerf.kernels.network import network
-from edge_depth_nerf.kernels.ray_samplers import FusedPDFSampler, FusedRaySamples, edges_of
+from edge_depth_nerf.kernels.ray_samplers import FirstSampler, FusedPDFSampler, FusedRaySamples, edges_of
 from edge_depth_nerf.plugin.config import FusedAdamConfig
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
 
@@ -69,6 +69,11 @@ def test_the_network_in_parts(widths, groups, threads):
         assert float((each - other).abs().max()) <= 1e-5 * float(other.abs().max())
     with torch.no_grad():
         assert torch.equal(network(x, weights, biases), found)
+    # as it is on a GPU
+    by_layer = network_module._layer_by_layer(x, weights, biases)
+    torch.testing.assert_close(by_layer.double(), expected, rtol=1e-5, atol=1e-4)
+    for each, other in zip(torch.autograd.grad(by_layer, leaves, gradient), gradients, strict=True):
+        torch.testing.assert_close(each, other, rtol=1e-4, atol=1e-5 * float(other.abs().max()))
 
 
 def test_the_network_has_no_second_derivative():
@@ -153,6 +158,25 @@ def test_all_samples_of_a_fused_model_have_fused_weights():
     assert torch.equal(samples.get_weights(densities), RaySamples.get_weights(samples, densities))
     torch_form = build(implementation="torch").train()(bundle())
     assert FusedRaySamples not in {type(samples) for samples in torch_form["ray_samples_list"]}
+
+
+@pytest.mark.parametrize("training", [True, False])
+@pytest.mark.parametrize("single_jitter", [True, False])
+def test_the_first_samples_lie_where_nerfstudio_puts_them_on_a_gpu_too(training, single_jitter):
+    rays = bundle()
+    sampler = FirstSampler(single_jitter).train(training)
+    found = []
+    for place in (UniformLinDispPiecewiseSampler(single_jitter=single_jitter).train(training), sampler.placed):
+        torch.manual_seed(2)
+        samples = place(rays, 30)
+        again = samples.spacing_to_euclidean_fn(torch.linspace(0, 1, 7))
+        found.append((edges_of(samples), samples.frustums.starts, samples.frustums.ends, samples.deltas, again))
+    for expected, placed in zip(*found, strict=True):
+        torch.testing.assert_close(placed, expected, rtol=1e-5, atol=1e-5)
+    assert found[0][1].std() > 1
+    # the CPU keeps nerfstudio's own
+    torch.manual_seed(2)
+    assert torch.equal(sampler(rays, 30).frustums.starts, found[0][1])
 
 
 def histograms(seed: int = 0, rays: int = 50) -> tuple[torch.Tensor, ...]:

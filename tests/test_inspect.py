@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -51,6 +52,7 @@ from edge_depth_nerf.inspecting.findings import Finding, find, limited
 from edge_depth_nerf.inspecting.options import InspectOptions
 from edge_depth_nerf.inspecting.pose_check import BAD_MEDIAN_PX
 from edge_depth_nerf.inspecting.pose_plot import pose_check_figure
+from edge_depth_nerf.inspecting.shown_prior import ShownScene
 from edge_depth_nerf.inspecting.top_view import GAP, GREYS, HELD_OUT, PATH, TRAINING, top_view
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.method.prior import default_source
@@ -571,11 +573,32 @@ def test_distances_from_motion_have_a_panel(drive, tmp_path):
     maps = ((each.name, np.full((each.lens.height, each.lens.width), 5, np.float32)) for each in pictures)
     write_maps(drive, "motion", maps, {"kind": "for a test"})
     (with_motion,) = look(drive, tmp_path / "with", frames=1, size=200)["sheets"]
-    # six panels in three columns, seven in four
-    width, wider = (
-        read_image(path).shape[1] for path in (tmp_path / "without" / name, tmp_path / "with" / with_motion)
+    before, after = (read_image(path) for path in (tmp_path / "without" / name, tmp_path / "with" / with_motion))
+    # six panels in three columns; two more, motion and what the prior comes from, in four
+    assert (before.shape[1], after.shape[1]) == (3 * (200 + 14), 4 * (200 + 14))
+    last = after[-(150 + 70) :, -200:]
+    assert before.shape[0] == after.shape[0] and not (last == 255).all()
+
+
+def test_the_sheet_says_what_a_prior_comes_from(drive):
+    """Without a calibration each estimate counts where it is."""
+    scene = read_scene(drive)
+    before = ShownScene(scene).maps(scene.pictures[0])
+    motion_m = np.zeros_like(before.usable, np.float32)
+    motion_m[:, : motion_m.shape[1] // 2] = 5
+    write_maps(drive, "motion", ((each.name, motion_m) for each in scene.pictures), {"kind": "for a test"})
+    scene = read_scene(drive)
+    shown = ShownScene(scene).maps(scene.pictures[0])
+    assert before.origin is not None and shown.origin is not None and shown.prior is not None
+    assert shown.lidar_m is not None and shown.mono_m is not None
+    has_prior, lidar, mono, moved = (
+        each > 0 for each in (shown.prior.distance_m, shown.lidar_m, shown.mono_m, motion_m)
     )
-    assert (width, wider) == (3 * (200 + 14), 4 * (200 + 14))
+    expected = [lidar, ~lidar & mono & ~moved, ~lidar & mono & moved, ~lidar & ~mono & moved]
+    for i, where in enumerate(expected):
+        np.testing.assert_array_equal(shown.origin == i, where & has_prior, err_msg=str(i))
+    assert np.isin([0, 1, 2, 3], shown.origin).all() and {*np.unique(before.origin)} == {-1, 0, 1}
+    np.testing.assert_array_equal(shown.origin == -1, ~has_prior)
 
 
 # ---- other people's scenes -------------------------------------------------------------------------------------
@@ -857,6 +880,26 @@ def test_the_top_view_names_moments_with_a_sheet(drive):
     figure = top_view(read_scene(drive), None, [], shown=[1, 9])
     assert [text.get_text() for text in figure.axes[0].texts] == ["1", "9"]
     assert "moment with a sheet" in {text.get_text() for text in figure.legends[0].get_texts()}
+
+
+def test_the_legend_of_six_cameras_is_whole(drive):
+    """Of a drive to the north, whose map is narrow."""
+    scene = read_scene(drive)
+    cameras = [f"images/CAM_{place}" for place in ("FRONT", "FRONT_LEFT", "FRONT_RIGHT", "BACK", "BACK_LEFT", "B" * 40)]
+    pictures = [
+        replace(picture, camera=camera, position_m=5 * picture.position_m[[1, 0, 2]])
+        for camera in cameras
+        for picture in scene.pictures
+    ]
+    figure = top_view(replace(scene, pictures=tuple(pictures)), None, [], [])
+    drawn(figure)
+    (legend,), axes = figure.legends, figure.axes[0]
+    assert len(legend.get_texts()) == 6 + 3
+    box, map_box = legend.get_window_extent(), axes.get_tightbbox()
+    assert map_box is not None
+    assert 0 <= box.x0 and box.x1 <= figure.bbox.width and 0 <= box.y0 and box.y1 < map_box.y0
+    (x0, y0), (x1, y1) = axes.transData.transform([(0, 0), (1, 1)])
+    assert x1 - x0 == pytest.approx(y1 - y0, rel=1e-6)
 
 
 def test_the_top_view_marks_gaps(drive):

@@ -355,7 +355,9 @@ def test_a_file_that_cannot_be_written_is_named(tmp_path: Path, number: int, mon
     assert contents(tmp_path) == {"a.bin": b"before"}
     said = explain(error.value)
     assert said.startswith(f"{tmp_path / 'a.bin'}: {os.strerror(number)}. ") and "\n" not in said
-    assert {errno.ENOSPC: "free some space", errno.EROFS: "only be read", errno.EACCES: "may not"}[number] in said
+    assert {errno.ENOSPC: "free some space", errno.EROFS: "read-only", errno.EACCES: "has no permission"}[
+        number
+    ] in said
 
 
 def test_a_full_disk_and_then_a_larger_one(room: RoomDrive, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -380,7 +382,7 @@ def test_a_full_disk_and_then_a_larger_one(room: RoomDrive, tmp_path: Path, caps
             entry.main()
         process(options_of(room, tmp_path / "alone"), Console(quiet=True))
         assert contents(disk / "scene") == contents(tmp_path / "alone")
-        # one that can only be read
+        # one that can read-only
         subprocess.run(["mount", "--bind", str(disk), str(disk)], check=True)
         subprocess.run(["mount", "-o", "remount,bind,ro", str(disk)], check=True)
         with pytest.raises((OSError, InputError), match="scene"):

@@ -304,7 +304,9 @@ def test_sweeps_without_a_pose_of_their_own_are_used_by_others(tmp_path: Path) -
 
 def test_one_pose_is_not_enough(drive: RoomDrive, tmp_path: Path) -> None:
     drive.poses_file().write_text(drive.poses_file().read_text().splitlines()[0] + "\n")
-    with pytest.raises(InputError, match=r"poses\.txt: a path needs at least two poses, found 1"):
+    with pytest.raises(
+        InputError, match=r"poses\.txt: a path needs at least two poses for the vehicle's motion, found 1"
+    ):
         process(drive, tmp_path / "scene")
 
 
@@ -539,7 +541,7 @@ def test_an_empty_monocular_map_is_named(sky: bool, drive: RoomDrive, tmp_path: 
         for frame in drive.frames:
             empty = name == "image_03" and frame == 1
             write_distance_png(tmp_path / f"mono/{name}/{frame:010d}.png", np.full((32, 32), 0.0 if empty else 3.0))
-    with pytest.raises(InputError, match=r"image_03/0000000001\.png: its monocular map has no distance anywhere"):
+    with pytest.raises(InputError, match=r"image_03/0000000001\.png: its monocular map contains no distance"):
         process(drive, tmp_path / "scene", mono=tmp_path / "mono", sky=sky)
     assert not (tmp_path / "scene/transforms.json").exists()
 
@@ -764,7 +766,7 @@ BROKEN: dict[str, tuple[Callable[[RoomDrive], Any], str]] = {
     ),
     "poses odd frame": (
         lambda d: d.poses_file().write_text(_pose_line(1).replace("1 ", "1.5 ", 1)),
-        r"poses\.txt, line 1: '1\.5' is not the number of a frame",
+        r"poses\.txt, line 1: '1\.5' is not a frame number",
     ),
     "timestamps cut": (lambda d: drop_line(times(d), 3), r"image_03/timestamps\.txt: ends after line 2, but frame 2"),
     "timestamps odd": (
@@ -805,7 +807,7 @@ def test_wrong_root_or_sequence_says_what_is_there(drive: RoomDrive, tmp_path: P
         FileNotFoundError, match=r"calibration: no such folder; .* holds drive. --root .* is not the data"
     ):
         process(tmp_path, tmp_path / "scene")
-    with pytest.raises(FileNotFoundError, match=f"no such folder; .*data_2d_raw holds {SEQUENCE}. --sequence takes"):
+    with pytest.raises(FileNotFoundError, match=f"no such folder; .*data_2d_raw holds {SEQUENCE}. --sequence needs"):
         process(drive, tmp_path / "scene", sequence="2013_05_28_drive_0007_sync")
 
 
@@ -819,7 +821,7 @@ def test_maps_beside_the_drive_are_checked(drive: RoomDrive, tmp_path: Path, opt
             process(drive, tmp_path / "scene", **given)
         assert not (tmp_path / "scene").exists()
 
-    refuse(f"maps/image_02: no such folder; .*{name} takes a folder with one folder a camera")
+    refuse(f"maps/image_02: no such folder; .*{name} needs a folder with one folder per camera")
     for camera in CAMERAS:
         for frame in drive.frames:
             write_distance_png(tmp_path / f"maps/{camera}/{frame:010d}.png", np.full((32, 32), 4.0))
@@ -871,7 +873,7 @@ def test_truth_is_checked(tmp_path: Path) -> None:
     write_json(truth / "shifted.json", poses)
     refuse(r"shifted\.json: 2 m, image_02, frame 4: expected 4 rows of 4 numbers")
     (truth / "image_03/rgb/0000000003.png").unlink()
-    refuse(r"image_03/rgb/0000000003\.png: no such file; the drive's truth is incomplete")
+    refuse(r"image_03/rgb/0000000003\.png: no such file; the drive's ground truth is incomplete")
 
 
 def test_sweep_without_returns_is_an_error(drive: RoomDrive, tmp_path: Path) -> None:
@@ -890,7 +892,7 @@ def test_scanner_that_sees_nothing_is_an_error(drive: RoomDrive, tmp_path: Path)
     write_mask(tmp_path / "ego.png", np.eye(32) > 0)
     for frame in drive.frames:
         write_points(drive.sweep(frame), np.array([[0.0, 0.0, 50.0]]))
-    with pytest.raises(InputError, match="no LiDAR return lies in any training picture"):
+    with pytest.raises(InputError, match="no LiDAR point lies in any training picture"):
         process(drive, tmp_path / "scene", ego_mask=tmp_path / "ego.png")
 
 
@@ -917,16 +919,17 @@ def test_same_input_same_bytes_and_nothing_done_twice(drive: RoomDrive, tmp_path
 def test_other_options_or_other_input_are_another_scene(drive: RoomDrive, tmp_path: Path) -> None:
     process(drive, tmp_path / "scene")
     before = tree(tmp_path / "scene")
-    with pytest.raises(InputError, match="holds another scene: frames is None there, 2 now"):
+    with pytest.raises(InputError, match="contains another scene: frames is None there, 2 now"):
         process(drive, tmp_path / "scene", frames=2)
     other = write_room_drive(tmp_path / "other/drive", frames=3, beams=400, size=32)
-    with pytest.raises(InputError, match="holds another scene: inputs_sha256"):
+    with pytest.raises(InputError, match="contains another scene: inputs_sha256"):
         process(other, tmp_path / "scene")
     with pytest.raises(InputError, match=r"and no process\.json"):
         process(drive, drive.root)
     assert tree(tmp_path / "scene") == before
 
 
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGKILL")
 def test_killed_run_is_continued(drive: RoomDrive, tmp_path: Path) -> None:
     """SIGKILL in the middle: what is whole stays, the rest is made, and the result is the same."""
     program = (
@@ -1032,7 +1035,7 @@ def test_report_says_how_well_the_cameras_fit(drive: RoomDrive, tmp_path: Path) 
     text = console.export_text()
     for name in CAMERAS:
         assert f"{name}: nerfstudio's camera fits within {report.fits[name].rms_px:.4f} px rms" in text
-    assert "6 pictures for training, 0 held out" in text
+    assert "6 training pictures, 0 held out" in text
     assert "No frame is held out" in text
     assert json.loads((tmp_path / "scene/process.json").read_text())["kind"] == "kitti360"
     assert replace(report, notices=()).scene == tmp_path / "scene"

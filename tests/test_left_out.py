@@ -87,7 +87,7 @@ FAULTS: dict[str, tuple[Callable[[RoomDrive], object], set[tuple[str, int]], str
     "empty monocular map": (
         lambda d: write_distance_png(mono(d, 6), np.zeros((32, 32))),
         {("image_02", 6)},
-        "no distance anywhere",
+        "contains no distance",
     ),
 }
 
@@ -139,13 +139,13 @@ def test_a_fault_of_the_whole_drive_is_an_error(drive: RoomDrive) -> None:
     assert len(run(drive)[0].left_out) == 2
     damage(drive.image("image_02", 3))
     with pytest.raises(
-        InputError, match=r"0000000003\.png: .*3 of this drive's files cannot be used; up to 2 would be left out"
+        InputError, match=r"0000000003\.png: .*3 of this drive's files cannot be used; at most 2 may be left out"
     ):
         run(drive, "more")
     halve(drive.image("image_03", 3))
     halve(drive.image("image_03", 6))
     halve(drive.image("image_03", 8))
-    with pytest.raises(InputError, match="up to 2 would be left out"):
+    with pytest.raises(InputError, match="at most 2 may be left out"):
         run(drive, "many")
     assert not (drive.root.parent / "many").exists()
 

@@ -12,9 +12,10 @@ from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.model_components.losses import ds_nerf_depth_loss, urban_radiance_field_depth_loss
 from nerfstudio.models.nerfacto import NerfactoModel
 
+from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.method.losses import UrbanTerms, edge_loss, urban_nerf_loss
 from edge_depth_nerf.plugin.compat import lpips_not_built
-from edge_depth_nerf.plugin.model import DepthInEvaluation, EdgeDepthNerfModel
+from edge_depth_nerf.plugin.model import DepthInEvaluation, EdgeDepthNerfModel, settled
 
 METRES_PER_UNIT = 20.0
 LOSSES = ("edge", "ds-nerf", "urban-nerf", "urban-nerf-los")
@@ -160,7 +161,7 @@ def test_sigma_of_ds_nerf_is_a_standard_deviation_in_metres():
         frustums = Frustums(origins=zero, directions=zero, starts=starts, ends=ends, pixel_area=starts)
         supervision = {"prior_distance_m": torch.full((1, 1), 5.0)}
         weights = torch.full((1, 1, 1), 0.5)
-        pulls.append(float(model._edge_losses([(weights, RaySamples(frustums=frustums))], supervision)))
+        pulls.append(float(model._depth_loss(weights, RaySamples(frustums=frustums), {}, supervision)))
     assert pulls[1] / pulls[0] == pytest.approx(math.exp(-0.5), rel=1e-4)
 
 
@@ -290,6 +291,33 @@ def test_the_surface_loss_is_the_field_colour_error_at_the_prior():
     assert float(losses["surface_loss"]) == pytest.approx(float(expected), rel=1e-3)
     losses["surface_loss"].backward()
     assert any(p.grad is not None and bool(p.grad.abs().sum() > 0) for p in model.field.mlp_base.parameters())
+
+
+def test_further_pixels_that_do_not_count_change_no_loss():
+    """On a GPU all of them are served, and which are of use; on the CPU these alone."""
+    found = []
+    for counts in (None, torch.tensor([True, False, True, True, False, True])[:, None]):
+        model = build(surface_loss_mult=0.5).train()
+        given = surface()
+        if counts is None:
+            chosen = torch.tensor([0, 2, 3, 5])
+            given = {name: value[chosen] for name, value in given.items()}
+        else:
+            given["surface_counts"] = counts
+        supervision = batch() | given
+        torch.manual_seed(3)
+        outputs = model(rays(), supervision)
+        loss = model.get_loss_dict(outputs, supervision, model.get_metrics_dict(outputs, supervision))["surface_loss"]
+        loss.backward()
+        found.append((loss.detach(), [each.grad for each in model.field.mlp_head.parameters()]))
+    assert float(found[1][0]) == pytest.approx(float(found[0][0]), rel=1e-4) and found[0][0] > 0
+    for one, other in zip(found[0][1], found[1][1], strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-6)
+    nowhere = surface() | {"surface_counts": torch.zeros(6, 1, dtype=torch.bool)}
+    supervision = batch() | nowhere
+    outputs = model(rays(), supervision)
+    losses = model.get_loss_dict(outputs, supervision, model.get_metrics_dict(outputs, supervision))
+    assert losses["surface_loss"] == 0 and losses["surface_loss"].requires_grad
 
 
 def test_the_surface_is_drawn_between_the_planes():
@@ -460,10 +488,14 @@ def test_same_parameters_as_nerfacto():
     host.load_state_dict(ours.state_dict())
 
 
-def test_levels_that_do_not_learn_are_left_out_and_the_others_pull_as_before():
-    """nerfstudio lets its proposal networks rest in most steps; their levels would give a number, and no gradient."""
+@pytest.mark.parametrize("loss", ["edge", "ds-nerf", "urban-nerf", "urban-nerf-los"])
+def test_levels_that_do_not_learn_are_left_out_and_the_others_pull_as_before(loss):
+    """nerfstudio lets its proposal networks rest in most steps; their levels would give a number, and no gradient.
+
+    nerfstudio's form of UrbanNeRF's loss has the final samples' expected distance in them, too.
+    """
     for rests in (False, True):
-        model = build(depth_loss_mult=1.0).train()
+        model = build(depth_loss=loss, depth_loss_mult=1.0).train()
         if rests:
             model.proposal_sampler._step, model.proposal_sampler._steps_since_update = 1000, 1
         torch.manual_seed(3)
@@ -471,6 +503,22 @@ def test_levels_that_do_not_learn_are_left_out_and_the_others_pull_as_before():
         *proposals, final = zip(outputs["weights_list"], outputs["ray_samples_list"], strict=True)
         assert [weights.requires_grad for weights, _ in proposals] == [not rests] * 2
         losses = model.get_loss_dict(outputs, batch(), model.get_metrics_dict(outputs, batch()))
-        levels = [final] if rests else [*proposals, final]
-        expected = float(model._edge_losses(levels, batch()).sum()) / 3
-        assert float(losses["edge_loss"]) == pytest.approx(expected, rel=1e-5)
+        levels = [final] if rests and loss != "urban-nerf" else [*proposals, final]
+        if loss == "edge":
+            expected = float(model._edge_losses(levels, batch()).sum()) / 3
+        else:
+            expected = sum(float(model._depth_loss(*level, outputs, batch())) for level in levels) / 3
+        assert float(losses["edge_loss" if loss == "edge" else "depth_loss"]) == pytest.approx(expected, rel=1e-5)
+
+
+def test_what_auto_stands_for(monkeypatch):
+    module = "edge_depth_nerf.plugin.model.TCNN_EXISTS"
+    monkeypatch.setattr(module, False)
+    assert [settled("auto", "cpu"), settled("auto", "cuda"), settled("torch", "cuda")] == ["fused", "fused", "torch"]
+    with pytest.raises(InputError, match=r"tiny-cuda-nn is not installed.*checkpoints need it too"):
+        settled("tcnn", "cuda")
+    monkeypatch.setattr(module, True)
+    assert [settled("auto", "cpu"), settled("auto", "cuda"), settled("fused", "cuda")] == ["fused", "tcnn", "fused"]
+    assert settled("tcnn", "cuda") == "tcnn"
+    with pytest.raises(InputError, match="there is no GPU"):
+        settled("tcnn", "cpu")

@@ -96,7 +96,7 @@ def test_arrays_may_have_a_channel_and_any_order(scene, tmp_path):
 @pytest.mark.parametrize("metres_per_count", [1 / 256, 0.001])
 def test_pngs_have_their_own_unit(scene, tmp_path, metres_per_count):
     maps = write_maps(scene, tmp_path / "maps", lambda p, distance, c: distance, ".png", metres_per_count)
-    with pytest.raises(InputError, match=r"Say --metres-per-count"):
+    with pytest.raises(InputError, match=r"Give --metres-per-count"):
         take(scene, maps)
     take(scene, maps, metres_per_count=metres_per_count)
     assert error(scene).max() < 4e-3
@@ -176,13 +176,13 @@ def test_frames_with_few_returns_take_the_drives_fit_and_it_is_said(scene, tmp_p
     main()
     assert error(scene).max() < 0.02
     said = " ".join(capsys.readouterr().out.split())
-    assert "2 of 9 pictures have fewer than 50 LiDAR returns to fit to, such as images/0002.png" in said
+    assert "2 of 9 pictures have fewer than 50 LiDAR points to fit to, such as images/0002.png" in said
 
 
 def test_unknown_scale_without_lidar_is_an_error_and_metric_is_none(tmp_path):
     scene = write_scene(tmp_path / "scene", [LENS], frames=3, lidar=False, mono=False)
     maps = write_maps(scene, tmp_path / "maps", lambda p, distance, c: distance)
-    with pytest.raises(InputError, match="no picture for training of images has 50 LiDAR returns"):
+    with pytest.raises(InputError, match="no training picture of images has 50 LiDAR points"):
         take(scene, maps, "relative")
     take(scene, maps)
     assert error(scene).max() < 2e-3
@@ -308,7 +308,7 @@ def test_missing_and_double_maps_are_named(scene, tmp_path):
         ({"hf_output": "metric"}, "--hf-output: for --hf, but the maps come from a network of our own"),
         ({"hf": "x", "maps_kind": "metric"}, "--maps-kind: for --maps, but the maps come from --hf"),
         ({"maps_along": "z", "metres_per_count": 0.1}, "--maps-along, --metres-per-count: for --maps"),
-        ({"maps": Path("m")}, "say what its values are, with --maps-kind"),
+        ({"maps": Path("m")}, "describe its values with --maps-kind"),
         ({"maps": Path("m"), "maps_kind": "metric"}, "--maps-along ray or z"),
         ({"maps": Path("m"), "seconds": 3.0}, "--seconds: for a network of our own, but the maps come from --maps"),
         (
@@ -317,7 +317,7 @@ def test_missing_and_double_maps_are_named(scene, tmp_path):
         ),
         (
             {"maps": Path("m"), "maps_kind": "metric", "maps_along": "z", "scenes": (Path("a"), Path("b"))},
-            "holds the maps of one scene, 2 are given",
+            "contains the maps of one scene, but 2 scenes are given",
         ),
     ],
 )

@@ -250,7 +250,7 @@ def test_maps_of_unknown_scale_need_lidar(tmp_path):
     for entry in meta["frames"]:
         if entry["file_path"] in meta["train_filenames"]:
             write_distance_png(folder / entry["lidar_file_path"], np.zeros((28, 32)))
-    with pytest.raises(InputError, match=r"no picture for training of images has 50 LiDAR returns.*cannot be made"):
+    with pytest.raises(InputError, match=r"no training picture of images has 50 LiDAR points.*cannot be made"):
         FittedMaps(read_scene(folder), "inverse", lambda picture: [])
     FittedMaps(read_scene(folder), "metric", lambda picture: [])
 
@@ -455,7 +455,7 @@ def test_networks_that_cannot_be_used_are_named(networks, tmp_path, monkeypatch,
     write_json(nameless / "config.json", {"model_type": "nothing-known"})
     for name, expected in (
         (str(networks / "trunk"), "misses .* of its network's weights, such as .*head"),
-        (str(networks / "dino"), "dinov2 is no network for depth. Expected one of .*depth_anything"),
+        (str(networks / "dino"), "dinov2 is not a depth network. Expected one of .*depth_anything"),
         (str(truncated), "cannot be loaded as a depth network .*Copy or download"),
         (str(unprepared), "cannot be loaded as a depth network"),
         (str(nameless), "cannot be loaded as a depth network"),

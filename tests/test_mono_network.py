@@ -403,7 +403,7 @@ def test_what_is_kept_for_stopping_are_whole_training_moments(tmp_path):
     for name in ("train", "val", "test"):
         del meta[f"{name}_filenames"]
     write_json(folder / "transforms.json", meta)
-    with pytest.raises(InputError, match="held out for judging"):
+    with pytest.raises(InputError, match=r"which pictures are held out \(train_filenames"):
         training_split(read_scene(folder))
 
 
@@ -436,8 +436,8 @@ def test_a_network_whose_time_was_up_early_is_told_of(small_street):
     report = estimate_depth(EstimateDepthOptions((small_street,), train_steps=100_000, seconds=0.3), console)
     assert report.trained is not None and report.trained.steps < 200
     said = said_to.getvalue()
-    assert f"Trained {report.trained.steps} steps of 100,000, where its time was up, in " in said
-    assert "make poor maps: give it more seconds" in said
+    assert f"Trained {report.trained.steps} steps of 100,000, where the time limit was reached, in " in said
+    assert "make poor maps: increase --seconds" in said
 
 
 def test_weights_know_how_they_were_made_and_predict_other_scenes(small_street, tmp_path, monkeypatch, capsys):
@@ -513,7 +513,7 @@ def test_weights_in_the_scene_that_are_of_no_use_are_made_anew(small_street, con
         architecture = "edge-depth-nerf/u-net-0" if content == "older" else ARCHITECTURE
         save_file({"a": torch.zeros(2)}, path, {"architecture": architecture, "header": "[]"})
     said = said_by(EstimateDepthOptions((small_street,), train_steps=1))
-    assert said.count("trained anew") == 1 and str(path) in said
+    assert said.count("training starts again") == 1 and str(path) in said
     assert load_network(path)[1]["steps"] == 1
 
 
@@ -525,7 +525,7 @@ def test_no_file_of_others_is_overwritten(small_street, tmp_path, quiet):
     ):
         write()
         before = path.read_bytes()
-        with pytest.raises(InputError, match="holds no weights that `estimate-depth` has written"):
+        with pytest.raises(InputError, match="was not written by `estimate-depth`"):
             estimate_depth(EstimateDepthOptions((small_street,), train_steps=1, output=path), quiet)
         assert path.read_bytes() == before
     # what was written by another version of this project may go
@@ -553,7 +553,7 @@ def test_pictures_kept_for_stopping_without_returns(small_street):
     # moment 5 is kept
     write_distance_png(small_street / "lidar" / "0005.png", np.zeros((LENS.height, LENS.width)))
     said = said_by(EstimateDepthOptions((small_street,), train_steps=2))
-    assert "its error is not known" in said
+    assert "its error is unknown" in said
     about = load_network(small_street / WEIGHTS)[1]
     assert about["steps"] == 2 and about["abs_rel"] is None
 

@@ -289,7 +289,7 @@ def test_a_path_from_pictures_is_held_against_lidar(tmp_path, monkeypatch):
 def test_a_vehicle_that_goes_nowhere_has_no_path(motion, message):
     pytest.importorskip("kiss_icp")
     recording, _ = scanned("parking", 8, motion=motion)
-    with pytest.raises(InputError, match=rf"--poses lidar: the vehicle {message}.*take frames of a stretch"):
+    with pytest.raises(InputError, match=rf"--poses lidar: the vehicle {message}.*Use frames of a stretch"):
         lidar_poses(recording, OPTIONS, QUIET)
 
 
@@ -312,7 +312,7 @@ def sweeps_at(times_s: list[float], returns: int = 6000, scanner: str = "roof") 
     ("sweeps", "depth", "message"),
     [
         ([], False, "the recording has no LiDAR sweeps"),
-        ([], True, "depth maps in place of LiDAR sweeps.*--poses colmap"),
+        ([], True, "depth maps instead of LiDAR sweeps.*--poses colmap"),
         (sweeps_at([0.0, 0.1, 0.2, 0.3]), False, "4 sweeps of roof, expected 5 or more"),
         (sweeps_at([0.1 * n for n in range(9)], 900), False, "900 returns a sweep.*expected 5000 or more"),
         (sweeps_at([0.0, 0.1, 0.2, 2.3, 2.4]), False, "no sweep for 2.1 s after lidar/roof_2.bin"),

@@ -207,7 +207,28 @@ def test_the_workflows_cover_every_python():
     text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     supported = re.findall(r"Programming Language :: Python :: (3\.\d+)", text)
     assert ci["jobs"]["tests"]["strategy"]["matrix"]["python"] == supported
-    assert {"lint", "tests", "docs", "distribution", "audit"} == set(ci["jobs"])
+    assert {"lint", "tests", "other-systems", "docs", "distribution", "audit"} == set(ci["jobs"])
+    assert ci["jobs"]["other-systems"]["strategy"]["matrix"]["system"] == ["windows-latest", "macos-latest"]
+
+
+@pytest.mark.parametrize("name", ["ci", "release"])
+def test_the_site_is_kept(name):
+    jobs = yaml.safe_load((ROOT / f".github/workflows/{name}.yml").read_text(encoding="utf-8"))["jobs"]
+    (steps,) = (
+        job["steps"] for job in jobs.values() if any("make docs" in step.get("run", "") for step in job["steps"])
+    )
+    kept = [step["with"] for step in steps if step.get("uses", "").startswith("actions/upload-artifact")]
+    assert {"name": "site", "path": "site/", "if-no-files-found": "error"} in kept
+
+
+def test_a_release_has_its_notes():
+    changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    (version, date), *_ = re.findall(r"^## \[(\d+\.\d+\.\d+)\] - (\d{4}-\d\d-\d\d)$", changelog, re.MULTILINE)
+    command = ["make", "--no-print-directory", "notes", f"VERSION={version}"]
+    notes = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    assert notes.strip() and f"## [{version}] - {date}\n{notes}" in changelog and "\n## " not in notes
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert (str(citation["version"]), str(citation["date-released"])) == (version, date)
 
 
 @pytest.mark.parametrize("name", ["bug", "question", "feature"])

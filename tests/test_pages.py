@@ -24,6 +24,7 @@ import pytest
 import torch
 import tyro
 import yaml
+from browser import open_browser
 from scenes import copy_sample_drive
 
 from edge_depth_nerf import cli
@@ -430,6 +431,22 @@ def test_links_and_pictures_of_the_site_are_there(site):
         for reference in local:
             target = page.parent / reference.partition("#")[0].partition("?")[0]
             assert target.exists(), f"{page.name}: {reference}"
+
+
+def test_pages_opened_as_files_are_searched(site):
+    with open_browser() as browser:
+        for name in ("index.html", "data/index.html"):
+            page = browser.new_context(offline=True).new_page()
+            failed: list[str] = []
+            page.on("requestfailed", lambda request, failed=failed: failed.append(request.url))
+            page.goto((site / name).as_uri())
+            page.get_by_placeholder("Search").first.click()
+            page.keyboard.type("epipolar")
+            found = page.locator(".md-search-result__item a").first
+            found.click()
+            page.wait_for_url(re.compile(r"\.html\?h="))
+            assert "epipolar" in page.locator("article").inner_text(), name
+            assert failed == [], name
 
 
 def test_every_page_is_in_the_navigation():

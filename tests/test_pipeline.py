@@ -2,11 +2,13 @@ from copy import deepcopy
 
 import numpy as np
 import pytest
+import torch
 from models import shrink
 from nerfstudio.configs.method_configs import all_methods
 from scenes import write_scene
 
 from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.plugin.pipeline import NotFiniteError
 
 
 def build(scene, **model):
@@ -42,3 +44,36 @@ def test_depth_errors_are_pooled_and_every_figure_is_finite(tmp_path):
         assert {"masked_psnr", "truth_masked_ssim", "lidar_abs_rel", "truth_delta_1_25"} <= set(metrics)
         assert "lidar_abs_rel_std" not in metrics
         assert np.isfinite([float(value) for value in metrics.values()]).all()
+
+
+def test_a_checkpoint_of_another_implementation_says_what_it_needs(tmp_path):
+    pipeline, _ = build(write_scene(tmp_path))
+    state = pipeline.state_dict()
+    assert any(name.endswith("hash_table") for name in state)
+    pipeline.load_pipeline(state, 0)
+    of_tcnn = {"_model.field.mlp_base.tcnn_encoding.params": torch.zeros(3)}
+    with pytest.raises(InputError, match=r"made with tiny-cuda-nn.*needs a GPU, tiny-cuda-nn"):
+        pipeline.load_pipeline(of_tcnn, 0)
+    pipeline.model.state_dict = lambda: of_tcnn
+    with pytest.raises(InputError, match=r"made without tiny-cuda-nn.*implementation fused"):
+        pipeline.load_pipeline(state, 0)
+
+
+def counted(pipeline, steps, odd):
+    """Let the GPU's count run over some steps, of which `odd` have a loss that is not finite."""
+    for step in steps:
+        _, losses, _ = pipeline.get_train_loss_dict(step)
+        losses["rgb_loss"] = losses["rgb_loss"] * (float("nan") if step in odd else 1.0)
+        pipeline._count_not_finite(step, {"rgb": torch.zeros(64, 3)}, losses)
+
+
+def test_on_a_gpu_several_losses_that_are_not_finite_end_a_training(tmp_path, capsys):
+    pipeline, _ = build(write_scene(tmp_path))
+    counted(pipeline, (1, 2, 50), {1, 50})
+    assert "In 2 of the last 50 steps a loss was not finite" in " ".join(capsys.readouterr().out.split())
+    counted(pipeline, (99, 100), set())  # counted anew
+    assert "not finite" not in capsys.readouterr().out
+    with pytest.raises(NotFiniteError, match=r"all losses are finite\. In 6 of the last 50"):
+        counted(pipeline, (*range(101, 107), 150), set(range(101, 107)))
+    with pytest.raises(NotFiniteError, match=r"rgb_loss is nan.*pictures: .*\.png.*In 6 of the last 50"):
+        counted(pipeline, (*range(195, 200), 200), set(range(195, 201)))

@@ -7,7 +7,7 @@ import torch
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json, write_json
 from edge_depth_nerf.plugin import pixel_table
-from edge_depth_nerf.plugin.pixel_table import RECORD, PicturePixels, PixelTable, PixelTableWriter, to_steps
+from edge_depth_nerf.plugin.pixel_table import RECORD, PicturePixels, PixelTable, PixelTableWriter, decode, to_steps
 
 
 def picture(height, width):
@@ -186,3 +186,21 @@ def test_the_sky_is_known_where_there_is_no_prior(tmp_path):
     assert torch.equal(batch.prior_sigma_m[:, 0] > 0, rows >= 3)
     chosen = batch[batch.sky[:, 0]]
     assert torch.equal(chosen.indices, batch.indices[rows < 3]) and chosen.sky.all()
+
+
+def test_packed_records_are_unpacked_to_the_same_batch(tmp_path):
+    rng = np.random.default_rng(3)
+    records = np.frombuffer(rng.bytes(500 * RECORD.itemsize), RECORD).copy()
+    records["picture"] %= 1 << 31
+    # the sky, a large sigma with a distance, no prior, and the ends of what the fields hold
+    records["distance"][:40], records["sigma"][:20] = 0, 65535
+    records["sigma"][20:40], records["distance"][40:60], records["sigma"][40:80] = 0, 65535, 65535
+    records["picture"][:9], records["row"][:9], records["column"][:9] = [0, 1, 65535, 65536] + [2**31 - 1] * 5, 65535, 0
+    table = table_of(tmp_path / "t.npy", [np.ones((2, 2), bool)])
+    table._records = records
+    expected = table.batch(0, len(records))
+    found = decode(torch.from_numpy(table.records(0, len(records)).view(np.uint8).reshape(-1, RECORD.itemsize).copy()))
+    assert expected.sky.sum() == 20
+    for name in ("indices", "rgb", "prior_distance_m", "prior_sigma_m", "sky"):
+        value, other = getattr(found, name), getattr(expected, name)
+        assert torch.equal(value, other) and value.dtype == other.dtype, name

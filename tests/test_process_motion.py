@@ -13,7 +13,14 @@ from balls import FISHEYE, THETA_MAX_RAD, in_ball, pose
 from drives import SEQUENCE, write_room_drive
 from rich.console import Console
 
-from edge_depth_nerf.base.files import read_distance_png, read_json, write_distance_png, write_json, write_png
+from edge_depth_nerf.base.files import (
+    read_distance_png,
+    read_json,
+    write_distance_png,
+    write_json,
+    write_mask,
+    write_png,
+)
 from edge_depth_nerf.process.command import process
 from edge_depth_nerf.process.motion import add_motion, enlarged
 from edge_depth_nerf.process.options import Kitti360Options
@@ -23,6 +30,12 @@ from edge_depth_nerf.stereo.motion import Motion
 
 STEPS_M = (0.0, 0.3, 0.6, 0.9, 1.2, 1.5)
 HELD_OUT = 3
+MASK = "masks/camera.png"
+
+
+def write_whole_mask(folder: Path) -> None:
+    """The camera's mask, which hides nothing; each run of `process` writes it anew."""
+    write_mask(folder / MASK, np.ones((FISHEYE.height, FISHEYE.width), bool))
 
 
 def write_ball_scene(folder: Path, steps_m: tuple[float, ...] = STEPS_M) -> Path:
@@ -39,11 +52,13 @@ def write_ball_scene(folder: Path, steps_m: tuple[float, ...] = STEPS_M) -> Path
             {
                 "file_path": f"images/{name}",
                 "truth_distance_file_path": f"truth/{name}",
+                "mask_path": MASK,
                 "transform_matrix": (place @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist(),
                 **{"w": FISHEYE.width, "h": FISHEYE.height, "fl_x": FISHEYE.fx, "fl_y": FISHEYE.fy},
                 **{key: getattr(FISHEYE, key) for key in ("cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")},
             }
         )
+    write_whole_mask(folder)
     names = [frame["file_path"] for frame in frames]
     held_out = names[HELD_OUT : HELD_OUT + 1]
     meta = {
@@ -122,10 +137,27 @@ def test_a_run_that_was_stopped_goes_on_where_it_was(
         with pytest.raises(KeyboardInterrupt):
             add(scene)
     assert not read_scene(scene).has("motion")
+    write_whole_mask(scene)
     with monkeypatch.context() as patch:
         patch.setattr(Motion, "sweep", counted)
         add(scene)
     assert swept == [3, 4]
+    np.testing.assert_array_equal(motion_maps(scene), motion_maps(ball))
+
+
+def test_a_damaged_sweep_is_made_anew(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = write_ball_scene(tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(Motion, "confirm", lambda *_: pytest.fail("stopped"))
+        with pytest.raises(pytest.fail.Exception):
+            add(scene)
+    (made,) = (scene / ".cache" / "motion").iterdir()
+    whole = (made / "000001.npz").read_bytes()
+    (made / "000001.npz").write_bytes(whole[:-100])
+    sweep, swept = Motion.sweep, []
+    monkeypatch.setattr(Motion, "sweep", lambda self, index: swept.append(index) or sweep(self, index))
+    add(scene)
+    assert swept == [1]
     np.testing.assert_array_equal(motion_maps(scene), motion_maps(ball))
 
 
@@ -137,7 +169,6 @@ def test_sweeps_of_other_pictures_are_not_taken(ball: Path, tmp_path: Path, monk
             add(scene)
     (made,) = (scene / ".cache" / "motion").iterdir()
     assert len(list(made.iterdir())) == len(STEPS_M) - 1
-    (made / "000001.npz").write_bytes(b"broken")
     (scene / "images" / "0001.png").write_bytes((scene / "images" / "0000.png").read_bytes())
     add(scene)
     assert not np.array_equal(motion_maps(scene)[0], motion_maps(ball)[0])
@@ -145,7 +176,7 @@ def test_sweeps_of_other_pictures_are_not_taken(ball: Path, tmp_path: Path, monk
 
 @pytest.mark.parametrize(
     ("steps_m", "reason"),
-    [((0.5,) * 6, "the vehicle stands"), ((0.0, 0.3, 0.6), "2 pictures for training are too few")],
+    [((0.5,) * 6, "the vehicle stands"), ((0.0, 0.3, 0.6), "2 training pictures are too few")],
 )
 def test_without_motion_it_says_why(steps_m: tuple[float, ...], reason: str, tmp_path: Path) -> None:
     scene = write_ball_scene(tmp_path, steps_m)

@@ -1,5 +1,5 @@
-"""What `process` is given and can do little with is said: broken JPEGs, transforms the wrong way round, a vehicle that
-few pictures show, drives without LiDAR, pictures of any exposure."""
+"""What `process` reports of bad drives: broken JPEGs, inverted transforms, a vehicle that few pictures show, drives
+without LiDAR, pictures of any exposure."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_a_cut_jpeg_is_left_out_and_named(mine: Path, downscale: int) -> None:
         run(mine, output=mine.parent / "strict", strict=True, **changes)
 
 
-# ---- transforms the wrong way round ------------------------------------------------------------------------------
+# ---- inverted transforms -----------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -126,8 +126,8 @@ def test_an_inverse_is_noticed_and_said(recording: Recording, which: str) -> Non
         name: expected if name in concerned else None for name in CAMERAS
     }
     (said,) = agreement_notices(measured)
-    named = re.search(r"with the inverse of .*? \((.*?)\) the pictures agree better", said)
-    assert named is not None and "wrong way round" in said
+    named = re.search(r"With the inverse of .*? \((.*?)\) the pictures agree better", said)
+    assert named is not None and "to_vehicle inverted" in said
     names = {"camera": ", ".join(wrong), "scanner": "roof", "both": "left, right, front and roof"}[expected]
     assert named[1] == names
 
@@ -169,7 +169,7 @@ def test_a_transform_of_other_axes_does_not_fit(recording: Recording) -> None:
 def test_no_fit_is_said_where_the_pictures_could_tell() -> None:
     unfit = Agreement("front", "roof", 0.1, 0.2, 0.1, 0.15, 0.7)
     (said,) = agreement_notices([unfit])
-    assert "no inverse of a transform fits either: front with roof (0.10)" in said
+    assert "no inverse of a transform fits, either: front with roof (0.10)" in said
     # noise has no agreement either way
     assert agreement_notices([replace(unfit, still=0.3)]) == []
 
@@ -181,11 +181,11 @@ def test_process_says_it_before_the_work(mine: Path) -> None:
     matrix = np.array(ast.literal_eval(f"[{given[2]}]"))
     edit(mine, lambda text: rows.sub(lambda match: match[1] + str(np.linalg.inv(matrix).tolist()), text))
     report, said = run(mine)
-    (notice,) = [one for one in report.notices if "wrong way round" in one]
+    (notice,) = [one for one in report.notices if "to_vehicle inverted" in one]
     assert "(left)" in notice and notice in said
     # a scene that is done is not looked at again
     again, _ = run(mine)
-    assert again.written == 0 and not any("wrong way round" in one for one in again.notices)
+    assert again.written == 0 and not any("to_vehicle inverted" in one for one in again.notices)
 
 
 def test_the_real_drive(real_data: Path) -> None:
@@ -215,7 +215,7 @@ def test_the_vehicle_is_found_in_few_pictures_with_lidars_help(mine: Path) -> No
         )
         vehicle, hidden = lens & ~true, lens & ~kept
         assert (vehicle & hidden).sum() > 0.93 * (vehicle | hidden).sum()
-        assert any(one.startswith(f"{name}: the vehicle was found by itself") for one in report.notices)
+        assert any(one.startswith(f"{name}: the vehicle was detected") for one in report.notices)
 
 
 def test_a_vehicle_that_is_not_found_is_said_once_with_the_option(mine: Path) -> None:
@@ -253,7 +253,7 @@ def test_pictures_of_any_exposure_are_taken(mine: Path) -> None:
     with np.errstate(invalid="raise", divide="raise", over="raise"):
         report, _ = run(mine)
     assert report.training + report.held_out == 3 * FRAMES and not report.left_out
-    assert not any("wrong way round" in one or "does not lie" in one for one in report.notices)
+    assert not any("to_vehicle inverted" in one or "do not lie" in one for one in report.notices)
     for name in CAMERAS:
         mask = read_mask(report.scene / f"masks/{name}.png")
         assert mask.mean() > 0.2

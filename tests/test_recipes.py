@@ -49,7 +49,7 @@ def test_lidar_lies_on_the_walls(name: str, tmp_path: Path) -> None:
     options = RigOptions(root=rig_of(name, tmp_path), output=tmp_path / "scene", find_ego=False, sky=False, strict=True)
     report = convert(options, Console(quiet=True))
     assert (report.training, report.held_out) == (10, 2)
-    assert not any("taken as of one moment" in notice for notice in report.notices)
+    assert not any("points of a scan get one time" in notice for notice in report.notices)
     cameras = {frame["camera"] for frame in read_json(report.scene / "transforms.json")["frames"]}
     assert len(cameras) == 2
     for camera, truth in zip(sorted(cameras), ("front", "side"), strict=True):

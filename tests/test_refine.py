@@ -372,7 +372,7 @@ def test_true_poses_stay(colmap: Any, refined: Refined) -> None:
     given = world(rng)
     drive = recorded(given, given.path, shutter_s=0.0)
     kept = refined(drive, given.matches(0.3, rng))
-    assert "stay as they are given: features agree with them as well" in kept.notices[-1]
+    assert "given poses are used unchanged: features agree with them as well" in kept.notices[-1]
     assert kept.trajectory is drive.trajectory
     assert kept.pictures == drive.pictures
 
@@ -393,7 +393,7 @@ def test_few_features_change_nothing(colmap: Any, refined: Refined) -> None:
     rng = np.random.default_rng(10)
     given = world(rng, points=6)
     kept = refined(recorded(given, disturbed(given.path, rng)), given.matches(0.3, rng))
-    assert "could be matched to judge by" in kept.notices[-1]
+    assert "could be matched for the check" in kept.notices[-1]
     none = refined(recorded(given, given.path), [])
     assert "only 0 features" in none.notices[-1]
 

@@ -32,8 +32,10 @@ from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.report import views
 from edge_depth_nerf.report.build import Commands, Facts, Plot, Report, build_report, write_report
 from edge_depth_nerf.report.compared_views import DISTANCE_KEYS, ComparedView, compared_views, held_out_frames
+from edge_depth_nerf.report.points import ShownPoints, show_points
 from edge_depth_nerf.report.tables import Cell, MadeTable, Row
 from edge_depth_nerf.report.views import KINDS, Drive, ShownView, encode, make_drives, show_view, spread
+from edge_depth_nerf.scene.reader import read_scene
 
 NASTY = "</script><script>window.hacked = 1</script><img src=x onerror='window.hacked=1'> & \"quotes\" {{ 1 }} $x$"
 
@@ -146,8 +148,8 @@ def test_pictures_are_small():
     assert len(encode(noise[:300, :300], 10**6)) > 50_000  # where there is room, nothing is lost
     # three drives, eight methods: their views and the true ones, as text
     shown_views = views.views_of_a_drive(3 * 8)
-    assert shown_views >= 4 and 3 * shown_views * (8 * 4 + 2) * allowance * 4 / 3 < 24e6
-    assert views.views_of_a_drive(2) == 6 and views.views_of_a_drive(1000) == 1
+    assert shown_views >= 10 and 3 * shown_views * (8 * 4 + 2) * allowance * 4 / 3 < 24e6
+    assert views.views_of_a_drive(2) == 125 and views.views_of_a_drive(1000) == 1
 
 
 def test_some_views_spread_over_the_drive():
@@ -170,11 +172,55 @@ def test_drives_are_read_from_what_runs_left(tmp_path):
     (drive,) = make_drives({"x": (scene, {"one": tmp_path / "one", "two": tmp_path / "two"})}, console)
     frames = held_out_frames(scene)
     assert [view.title for view in drive.views] == [frame["file_path"] for frame in frames]
-    assert f"{len(frames)} of {len(frames)} held-out views" in drive.note and "without noise" in drive.note
+    assert f"All {len(frames)} held-out views" in drive.note and "without noise" in drive.note
+    assert drive.points is None
     for view in drive.views:
         one, two = (float(view.figures[name]["PSNR, dB"]) for name in ("one", "two"))
         assert one > two + 5
         assert (view.figures["one"]["δ<1.25, 2-40 m"], view.figures["two"]["δ<1.25, 2-40 m"]) == ("1.000", "0.000")
+
+
+# --- points -----------------------------------------------------------------------------------------------------------
+
+
+def test_points_come_back_from_their_steps(tmp_path):
+    scene = write_scene(tmp_path, ply_file_path="points.ply")
+    generator = np.random.default_rng(0)
+    points_m = generator.uniform((-30, -20, -2), (30, 20, 8), (500, 3))
+    points_m[:20, 0] += 200  # further from all cameras than is shown
+    rgb = generator.integers(0, 256, points_m.shape)
+    write_cloud(scene, points_m, rgb)
+    found = show_points(read_scene(scene))
+    assert found is not None
+    data = found.data()
+    steps = np.frombuffer(base64.b64decode(str(data["steps"])), "<u2").reshape(-1, 3)
+    places_m = np.array(data["low"]) + steps * np.array(data["step"])
+    nearest = np.abs(places_m[:, None] - points_m[None]).max(-1)
+    assert sorted(nearest.argmin(1)) == list(range(20, 500)) and nearest.min(1).max() < 60 / 65535
+    assert np.array_equal(np.frombuffer(base64.b64decode(str(data["colours"])), np.uint8).reshape(-1, 3),
+                          rgb[nearest.argmin(1)])  # fmt: skip
+    assert len(found.training_m) == 8 and len(found.held_out_m) == 1 and [len(path) for path in found.paths_m] == [9]
+    assert np.allclose(found.held_out_m[0], found.paths_m[0][4])
+    few = show_points(read_scene(scene), 100)
+    assert few is not None and len(few.steps) == len(few.colours) == 100
+
+
+def test_points_without_colours_are_coloured_by_height(tmp_path):
+    scene = write_scene(tmp_path, ply_file_path="points.ply")
+    write_cloud(scene, np.array([[1.0, 0, height] for height in np.linspace(-3, 3, 50)]))
+    found = show_points(read_scene(scene))
+    assert found is not None
+    low, high = (found.colours[found.steps[:, 2].argsort()[place]].astype(int) for place in (0, -1))
+    assert low[2] > low[0] and high[0] > high[2]
+
+
+def test_a_broken_cloud_costs_the_view_in_3d_alone(tmp_path, capsys):
+    scene = write_scene(tmp_path / "x", ply_file_path="points.ply")
+    (scene / "points.ply").write_text("no cloud")
+    write_rendered(scene, tmp_path / "one", 0.9)
+    (drive,) = make_drives({"x": (scene, {"one": tmp_path / "one"})}, Console(width=500))
+    assert drive.points is None and drive.views
+    assert "report.html has no points of this drive." in capsys.readouterr().out
 
 
 # --- commands ---------------------------------------------------------------------------------------------------------
@@ -245,8 +291,29 @@ def small_plot() -> Plot:
     return plot_bins("A plot", bins, "distance, m", [("psnr", "PSNR, dB")], logarithmic_x=True)
 
 
+def write_cloud(folder: Path, points_m: np.ndarray, rgb: np.ndarray | None = None) -> None:
+    """A point cloud of a scene, as text."""
+    names = ["float x", "float y", "float z", *([] if rgb is None else ["uchar red", "uchar green", "uchar blue"])]
+    header = ["ply", "format ascii 1.0", f"element vertex {len(points_m)}", *(f"property {name}" for name in names)]
+    rows = points_m if rgb is None else np.hstack([points_m, rgb])
+    lines = [" ".join(f"{value:.6g}" for value in row) for row in rows]
+    (folder / "points.ply").write_text("\n".join([*header, "end_header", *lines, ""]))
+
+
 @pytest.fixture(scope="module")
-def report() -> Report:
+def cloud(tmp_path_factory) -> ShownPoints:
+    """A wall of red points ahead of the cameras."""
+    scene = write_scene(tmp_path_factory.mktemp("scene"), ply_file_path="points.ply")
+    across, up = (axis.ravel() for axis in np.meshgrid(np.linspace(-8, 8, 60), np.linspace(-4, 4, 60)))
+    points_m = np.stack([np.full(across.size, 9.0), across, up], -1)
+    write_cloud(scene, points_m, np.tile([220, 20, 20], (len(points_m), 1)))
+    found = show_points(read_scene(scene))
+    assert found is not None
+    return found
+
+
+@pytest.fixture(scope="module")
+def report(cloud) -> Report:
     cells = [Cell(20.0 + 0.01 * place, 0.5, best=place == 3) for place in range(12)]
     rows = [Row("first", cells), Row(NASTY, [Cell(None, words=NASTY), *cells[1:]])]
     tables = [
@@ -258,7 +325,7 @@ def report() -> Report:
         lead=NASTY,
         methods=["first", NASTY],
         drives=[
-            Drive("street", [shown_view(number) for number in range(3)], "3 of 10 views."),
+            Drive("street", [shown_view(number) for number in range(3)], "3 of 10 views.", cloud),
             Drive(NASTY, [shown_view(5, distances=False)], NASTY),
         ],
         notes=[NASTY],
@@ -305,7 +372,7 @@ def test_text_is_escaped(report):
     assert "<script>window.hacked" not in text and "onerror='" not in re.sub(r'"[^"]*"', "", text)
     assert [attributes for tag, attributes in page.tags if tag == "script"] == [
         {"type": "application/json", "id": "data"},
-        {},
+        *[{}] * 3,
     ]
     assert not [name for _, attributes in page.tags for name in attributes if name.startswith("on") or name == "style"]
     # and it is all there, as text
@@ -327,7 +394,9 @@ def test_the_page_loads_nothing(report):
     ]
     assert loads and all(re.match(r"data:(,$|image/(svg\+xml|webp|png);base64,)", each) for each in loads)
     assert not re.search(r"url\(|@import", page.texts["style"][0])
-    assert not re.search(r"fetch|XMLHttp|WebSocket|import\(|eval|innerHTML", page.texts["script"][1])
+    assert len(page.texts["script"]) == 4
+    for script in page.texts["script"][1:]:
+        assert not re.search(r"fetch|XMLHttp|WebSocket|import\(|eval|innerHTML", script)
     # no address but those in the pictures' own namespaces
     assert "http" not in re.sub(r"data:image/[^\"]*", "", text).replace("http-equiv", "")
 
@@ -338,9 +407,9 @@ def test_only_its_own_script_and_style_count(report):
     parts = dict(part.strip().split(" ", 1) for part in policy.split(";"))
     assert parts["default-src"] == parts["base-uri"] == parts["form-action"] == "'none'"
     assert parts["img-src"] == "data:"
-    for name, content in (("script-src", page.texts["script"][1]), ("style-src", page.texts["style"][0])):
-        digest = base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()
-        assert parts[name] == f"'sha256-{digest}'"
+    for name, contents in (("script-src", page.texts["script"][1:]), ("style-src", page.texts["style"])):
+        digests = [base64.b64encode(hashlib.sha256(content.encode()).digest()).decode() for content in contents]
+        assert digests and parts[name].split(" ") == [f"'sha256-{digest}'" for digest in digests]
 
 
 def test_plots_are_svg_in_two_colours():
@@ -542,6 +611,80 @@ def test_methods_kinds_and_drives_switch(opened):
     assert page.locator(".drive-note").inner_text() == NASTY
     # sides that the drive has are kept
     assert page.get_by_label("Left", exact=True).locator("option:checked").inner_text() == "first"
+
+
+def test_an_error_names_what_stands_beside_it(opened):
+    page = opened()
+    tags = page.locator(".tag")
+    assert tags.all_inner_texts() == ["truth", NASTY]
+    page.get_by_role("radio", name="Distance error").check(force=True)
+    assert tags.all_inner_texts() == ["truth: distance", f"{NASTY}: distance error"]
+    assert page.locator(".scale").evaluate_all("(all) => all.map((each) => each.firstChild.textContent)") == [
+        *("Distance", "Distance error"),
+    ]
+    assert page.locator(".ticks").all_inner_texts()[0].endswith("60 m")
+    page.get_by_label("Left", exact=True).select_option(label="first")
+    assert tags.all_inner_texts() == ["first", NASTY] and page.locator(".legend").count() == 1
+
+
+def space(page: Any) -> np.ndarray:
+    shot = page.locator(".space canvas").screenshot()
+    return cv2.imdecode(np.frombuffer(shot, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)
+
+
+def red(picture: np.ndarray) -> np.ndarray:
+    return (picture[..., 0] > 150) & (picture[..., 1:].max(-1) < 80)
+
+
+def test_points_are_seen_in_3d(opened, cloud):
+    page = opened()
+    canvas = page.locator(".space canvas")
+    assert canvas.get_attribute("data-points") is None  # nothing is drawn before it is seen
+    canvas.scroll_into_view_if_needed()
+    page.locator(".space canvas[data-points]").wait_for()
+    assert canvas.get_attribute("data-points") == str(len(cloud.steps))
+    page.wait_for_timeout(500)
+    first = space(page)
+    assert red(first).sum() > 500  # the wall
+
+    box = canvas.bounding_box()
+    middle = (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.move(*middle)
+    page.mouse.down()
+    page.mouse.move(middle[0] + 150, middle[1], steps=5)
+    page.mouse.up()
+    page.wait_for_timeout(2500)
+    dragged = space(page)
+    assert (red(first) != red(dragged)).sum() > 300
+    page.keyboard.press("ArrowLeft")  # it has the focus now
+    for _ in range(4):
+        page.keyboard.press("+")
+    page.wait_for_timeout(500)
+    assert (red(dragged) != red(space(page))).sum() > 300
+    page.get_by_role("button", name="First view").click()
+    page.wait_for_timeout(500)
+    assert (red(first) != red(space(page))).sum() < 100
+
+    # another drive has no points
+    page.get_by_label("Drive", exact=True).select_option(index=1)
+    assert not page.locator("#points").is_visible()
+
+
+def test_tables_and_plots_fit_a_phone(opened):
+    page = opened(390, 844)
+    tables = page.locator(".tall")
+    assert tables.count() == 2 and tables.first.is_visible()
+    wide = page.locator(".or-tall .scroll")
+    assert wide.count() == 2 and not any(each.is_visible() for each in wide.all())
+    listed = tables.first.locator("tbody").first.locator("tr")
+    assert listed.all_inner_texts()[:2] == ["street: PSNR ↑", "first\t20.00 ± 0.50"]
+    boxes = [each.bounding_box() for each in [tables.first, *page.locator(".plot img").all()]]
+    assert len(boxes) == 2 and all(box["x"] >= 0 and box["x"] + box["width"] <= 390 for box in boxes)
+    # a plot is slid nowhere, and not shrunk until nobody can read it
+    assert page.locator(".plot .scroll").evaluate("(each) => each.scrollWidth <= each.clientWidth")
+    assert page.locator(".plot img").evaluate("(image) => image.clientWidth / image.naturalWidth") > 0.7
+    desk = opened()
+    assert not any(each.is_visible() for each in desk.locator(".tall").all())
 
 
 @pytest.mark.parametrize("width", [320, 360, 600, 900])

@@ -343,7 +343,7 @@ def test_a_moment_between_scans_is_a_picture_without_lidar(mine: Path, holdout: 
     }
     without = {number for number, has in has_return.items() if not has}
     assert without == ({1, 3} if holdout else set())
-    assert ("No LiDAR return in 6 pictures" in said) is bool(holdout)
+    assert ("No LiDAR point in 6 pictures" in said) is bool(holdout)
 
 
 def test_a_drive_too_short_to_hold_one_out_is_told_how(mine: Path, capsys) -> None:
@@ -518,7 +518,7 @@ LEFT = '[cameras.left]\nimages = "images/left"'
         ('time_unit = "ns"', 'time_unit = "minutes"', r"lidars\.roof\.time_unit is 'minutes'"),
         ("timestamp =", "time_stamp =", r"lidars\.roof\.time_stamp: unknown key; Is timestamp meant"),
         ('timestamp = "start"', "", r"lidars\.roof\.timestamp is missing; expected one of 'start', 'middle', 'end'"),
-        ("turn_s = 0.1", "", r"lidars\.roof\.turn_s is missing; timestamp says nothing without it"),
+        ("turn_s = 0.1", "", r"lidars\.roof\.turn_s is missing; timestamp needs it"),
         (
             "turn_s = 0.1",
             'turn_s = 0.1\ndirection = "clockwise"',
@@ -551,10 +551,10 @@ LEFT = '[cameras.left]\nimages = "images/left"'
             r"poses\.txt, line 2: 8 numbers as TUM's format has, expected 12",
         ),
         ("[poses]", "[pose]", r"rig\.toml: pose: unknown key; Is poses meant\?"),
-        ("[lidars.roof]", "[lidars.left]", "left is the name of a camera and of a scanner"),
+        ("[lidars.roof]", "[lidars.left]", "left is the name of both a camera and a scanner"),
         ("[cameras.left]", "[cameras.'a/b']", r"cameras\.a/b: a sensor's name is letters"),
         ("[poses]", "[poses", r"rig\.toml: not valid TOML \(.*line 1"),
-        ('"images/left"', '"images/lift"', r"images/lift: no such folder; the rig file names it"),
+        ('"images/left"', '"images/lift"', r"images/lift: no such folder; it is named in the rig file"),
         ('"images/left"', '"images/left/*.jpeg"', r"\*\.jpeg: no file has such a name"),
         (
             'scans = "lidar"',
@@ -569,7 +569,7 @@ LEFT = '[cameras.left]\nimages = "images/left"'
         (
             'turn_s = 0.1\ntimestamp = "start"\n' + TIMES,
             'corrected_to = "middle"',
-            r"lidars\.roof\.turn_s is missing; corrected_to = 'middle' says nothing without it",
+            r"lidars\.roof\.turn_s is missing; corrected_to = 'middle' needs it",
         ),
         ('timestamp = "start"', 'timestamp = "start"\npoints_in = "world"', r"points_in is 'world', expected one of"),
         ('column = "t"', 'column = "time"', r"\.pcd: has no column time, only x, y, z, intensity, t"),
@@ -614,9 +614,9 @@ def spoil_scan(content: Callable[[bytes], bytes]) -> Callable[[Path], None]:
         ),
         (
             lambda root: (root / "poses.txt").write_text("5 0 0 0 0 0 0 1\n"),
-            r"poses\.txt: 1 pose, expected two at least",
+            r"poses\.txt: 1 pose, expected at least two",
         ),
-        (lambda root: (root / "poses.txt").write_text("# nothing\n"), r"poses\.txt: 0 poses, expected two at least"),
+        (lambda root: (root / "poses.txt").write_text("# nothing\n"), r"poses\.txt: 0 poses, expected at least two"),
         (lambda root: (root / "poses.txt").unlink(), r"poses\.txt: no such file"),
         (
             lambda root: (root / "times_left.txt").write_text("1\n2\n"),
@@ -673,7 +673,7 @@ def test_a_scan_of_nan_is_an_error_when_it_is_read(mine: Path) -> None:
     ("changes", "message"),
     [
         ({"cameras": ("middle",)}, r"--cameras middle: .* no such camera, only left, right, front"),
-        ({"first": 9}, "--first 9: reaches moment 9, but the recording has moments 0 to 4"),
+        ({"first": 9}, "--first 9: reaches frame 9, but the recording has frames 0 to 4"),
         ({"frames": 9}, "--first 0 --frames 9 --stride 1: reaches moment 8"),
         ({"stride": 0}, "--stride 0"),
         ({"root": Path("nowhere")}, "nowhere: no such folder"),

@@ -184,7 +184,7 @@ def test_an_archive_says_what_it_lacks(tmp_path: Path) -> None:
 def test_tables_want_pyarrow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.feather").write_bytes(b"ARROW1 and so on")
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(InputError, match=r"a\.feather: .* pyarrow, which is not installed\. `pip install pyarrow`"):
+    with pytest.raises(InputError, match=r"a\.feather: .* pyarrow, which is not installed\. Run `pip install pyarrow`"):
         check_scan(tmp_path / "a.feather", ScanFormat())
 
 
@@ -247,7 +247,7 @@ BROKEN = {
     "no column": (lambda f: saved(f / "a.npy", records()[["x", "y", "t"]]), r"has no column z, only x, y, t"),
     "cut .npy": (
         lambda f: named(f, "b.npy", saved(f / "a.npy", np.ones((9, 4))).read_bytes()[:-8]),
-        r"b\.npy: 408 bytes, but its header promises 416: truncated",
+        r"b\.npy: 408 bytes, but its header declares 416: truncated",
     ),
     "no ply": (lambda f: named(f, "a.ply", b"solid\n"), r"a\.ply: does not begin with 'ply'"),
     "ply of faces": (

@@ -395,7 +395,7 @@ def test_one_point_of_each_cube(seed: int, voxel_m: float) -> None:
 def test_cloud_without_points_is_an_error(tmp_path: Path) -> None:
     nothing = PointCloud(np.empty((0, 3)), np.empty((0, 3), np.uint8), np.empty((0, 2), np.int64))
     given = [replace(f, content=replace(content(f.frame), cloud=nothing)) for f in frames()]
-    with pytest.raises(InputError, match="no LiDAR return lies in any training picture"):
+    with pytest.raises(InputError, match="no LiDAR point lies in any training picture"):
         write(tmp_path / "scene", given=given)
     assert not (tmp_path / "scene/transforms.json").exists()
 
@@ -480,7 +480,7 @@ def test_folder_with_another_scene_is_left_alone(tmp_path: Path) -> None:
     before = tree(tmp_path / "scene")
     with pytest.raises(InputError, match=r"downscale is 1 there, 2 now.*another --output, or delete"):
         write(tmp_path / "scene", source={"kind": "test", "downscale": 2})
-    with pytest.raises(InputError, match="holds another scene"):
+    with pytest.raises(InputError, match="contains another scene"):
         write(tmp_path / "scene", source={"kind": "other", "more": None})
     assert tree(tmp_path / "scene") == before
 
@@ -525,7 +525,7 @@ SKEWED[0, 0] = 1.01
         ({"given": [replace(f, held_out=True) for f in frames()]}, "all frames are held out"),
         ({"given": [replace(f, camera="image_09") for f in frames()]}, "frame 0 of image_09: there is no such camera"),
         ({"given": [replace(f, camera_to_world=SKEWED) for f in frames()]}, "frame 0 of image_02.*not a rotation"),
-        ({"given": bad({"lidar": None})}, r"frame \d of image_02: has no lidar, but every frame"),
+        ({"given": bad({"lidar": None})}, r"frame \d of image_02: has no lidar, but every other frame"),
         ({"given": bad({"mono": None})}, "has no mono"),
         ({"given": bad({"cloud": None})}, "has no cloud"),
         ({"given": bad({"lidar": HALF})}, "its LiDAR map: 16×32 pixels, expected 32×32"),
@@ -560,7 +560,7 @@ BENT = KannalaBrandt(SIZE, SIZE, 7.0, 7.0, 16.4, 16.1, 0.0652, 0.0189, -0.0042, 
         (
             [SceneCamera("wide", WIDE), SceneCamera("round", POLYNOMIAL)],
             95.0,
-            r"wide: .* PINHOLE.*pinhole cameras alone",
+            r"wide: .* PINHOLE.*pinhole cameras only",
         ),
         (
             [SceneCamera("bent", BENT)],

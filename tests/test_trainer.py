@@ -8,12 +8,14 @@ from pathlib import Path
 
 import pytest
 import torch
+import yaml
 from nerfstudio.pipelines.base_pipeline import Pipeline
 from nerfstudio.utils import writer
 from scenes import write_scene
 from trainings import trainer_of
 
 from edge_depth_nerf.jobs.runs import newest_checkpoint
+from edge_depth_nerf.plugin.grad_scaler import PatientGradScaler
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
 from edge_depth_nerf.plugin.trainer import EdgeDepthTrainer
 
@@ -120,7 +122,7 @@ def test_ctrl_c_ends_the_viewer_of_a_complete_training_without_error(trainer, mo
 def test_a_relative_scene_is_said_to_be_relative(trainer, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     trainer.config.pipeline.datamanager.data = Path("elsewhere")
-    with pytest.raises(FileNotFoundError, match=f"looked for in {tmp_path}; paths count from the folder you are in"):
+    with pytest.raises(FileNotFoundError, match=f"searched in {tmp_path}: relative paths start at the current folder"):
         trainer.config.save_config()
 
 
@@ -151,3 +153,40 @@ def test_ctrl_c_while_it_is_set_up(trainer, monkeypatch, capsys):
     with pytest.raises(SystemExit) as ended:
         trainer.setup()
     assert ended.value.code == 130 and "Stopped before the first step." in capsys.readouterr().out
+
+
+def test_a_checkpoint_of_the_full_preset_on_a_cpu_is_taken_up_on_a_gpu_and_back(trainer, tmp_path, monkeypatch):
+    """What mixed precision keeps is nothing on a CPU; a scaler of a GPU begins anew, and its state harms no CPU."""
+    trainer.train()
+    monkeypatch.setattr("torch.cuda.amp.common.amp_definitely_not_available", lambda: False)
+    scalers = []
+
+    def loaded(scaler: PatientGradScaler, number: int) -> None:
+        """Take the checkpoint up as a trainer with this scaler does, and save it again."""
+        newest = newest_checkpoint(trainer.checkpoint_dir)
+        assert newest is not None
+        scalers.append(torch.load(newest)["scalers"])
+        again = trainer_of(trainer.config.data, tmp_path / str(number))
+        again.grad_scaler = scaler
+        again.config.load_dir = newest.parent
+        again._load_checkpoint()
+        again.checkpoint_dir = trainer.checkpoint_dir
+        again.save_checkpoint(STEPS + number)
+
+    loaded(PatientGradScaler(enabled=True), 1)
+    loaded(PatientGradScaler(enabled=False), 2)
+    assert scalers[0] == {} and scalers[1]["scale"] == 2.0**16
+
+
+def test_the_configuration_that_is_saved_says_what_auto_stood_for(trainer, monkeypatch):
+    assert trainer.config.pipeline.model.implementation == "auto"
+    trainer.config.save_config()
+    saved = yaml.load((trainer.base_dir / "config.yml").read_text(), Loader=yaml.Loader)
+    assert saved.pipeline.model.implementation == "fused"
+    # on a GPU that had tiny-cuda-nn
+    monkeypatch.setattr("edge_depth_nerf.plugin.model.TCNN_EXISTS", True)
+    trainer.config.machine.device_type = "cuda"
+    trainer.config.pipeline.model.implementation = "auto"
+    trainer.config.save_config()
+    saved = yaml.load((trainer.base_dir / "config.yml").read_text(), Loader=yaml.Loader)
+    assert saved.pipeline.model.implementation == "tcnn"

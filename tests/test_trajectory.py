@@ -76,7 +76,7 @@ def test_gaps_and_ends() -> None:
 
 
 def test_one_pose_is_no_path() -> None:
-    with pytest.raises(InputError, match="at least two poses, found 1"):
+    with pytest.raises(InputError, match="at least two poses for the vehicle's motion, found 1"):
         Trajectory(TIMES[:1], random_poses(6)[:1])
 
 

@@ -11,13 +11,16 @@ from collections.abc import Callable, Iterator
 from copy import deepcopy
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 import torch
+from browser import SOFTWARE_WEBGL
 from models import shrink
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.configs.method_configs import all_methods
+from nerfstudio.viewer.render_state_machine import RenderAction, RenderStateMachine
 from nerfstudio.viewer.utils import CameraState, get_camera, parse_object
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
 from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerElement
@@ -28,13 +31,13 @@ from edge_depth_nerf.base.files import as_people_count
 from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.base.pictures import SIGMA, colour_distance
 from edge_depth_nerf.cameras import KannalaBrandt
+from edge_depth_nerf.plugin.coarse_to_fine import CoarseToFine
 from edge_depth_nerf.plugin.viewer import AZIMUTHS, RINGS, DriveLayers, lens_cap, rim_rad
 
 pytestmark = pytest.mark.slow
 
 METHOD = "edge-depth-nerf-lite"
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-SOFTWARE_WEBGL = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 TIMEOUT_S = 120
 
 
@@ -230,12 +233,12 @@ def test_colours_of_clouds(pipeline):
     assert np.array_equal(lidar.colours("sigma"), lidar.colours("height"))
 
 
-def test_nerfstudio_finds_the_switches(pipeline):
-    found = parse_object(pipeline, ViewerElement, "Custom Elements")
-    assert [element.name for path, element in found if path.startswith("Custom Elements/drive/")] == [
-        *("Lenses", "Path", "LiDAR points", "Depth prior", "Colour of points"),
+def test_nerfstudio_finds_the_layers(pipeline):
+    assert parse_object(pipeline, ViewerControl, "Custom Elements") == [
+        ("Custom Elements/drive/layers", pipeline.drive.layers)
     ]
-    assert len(parse_object(pipeline, ViewerControl, "Custom Elements")) == 1
+    # they stand in a folder of their own, and not a second time among its elements
+    assert not [path for path, _ in parse_object(pipeline, ViewerElement, "Custom Elements") if "/drive/" in path]
     # nothing of it is in a checkpoint
     assert not [name for name in pipeline.state_dict() if "drive" in name]
 
@@ -252,6 +255,69 @@ def test_nothing_is_made_without_a_viewer(scene, monkeypatch):
     for name in ("_lidar", "_prior", "_draw_lenses", "_draw_path"):
         monkeypatch.setattr(DriveLayers, name, lambda *_: pytest.fail("made"))
     pipeline_of(scene)
+
+
+# ---- from coarse to fine ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def machine() -> CoarseToFine:
+    """Of a browser that is 1.5 times as wide as high; nothing is rendered."""
+    viewer: Any = SimpleNamespace(
+        control_panel=SimpleNamespace(max_res=512),
+        step=59,
+        stats_markdown=SimpleNamespace(content="Step: 0  \nResolution: 0x0px"),
+        make_stats_markdown=lambda step, res: f"Step: {step}  \nResolution: {res}",
+    )
+    return CoarseToFine(viewer, cast(Any, None))
+
+
+def test_a_resting_browser_gets_finer_pictures_in_steps(machine):
+    states = [machine.state]
+    for _ in range(4):
+        states.append(machine.transitions[states[-1]]["static"])
+    assert states == ["low_static", "middle", "high", "high", "high"]
+    assert machine.transitions["middle"]["move"] == machine.transitions["high"]["move"] == "low_move"
+
+
+@pytest.mark.parametrize(
+    ("rays_per_s", "heights"),
+    # the least heights; seconds times speed = height² · 1.5; the panel's largest side
+    [(1e3, [60, 100, 160, 341]), (2e4, [60, 115, 200, 341]), (1e7, [341, 341, 341, 341])],
+)
+def test_the_steps_take_what_the_machine_can(machine, rays_per_s, heights):
+    machine._rays_per_s = rays_per_s
+    sizes = []
+    for machine.state in ("low_move", "low_static", "middle", "high"):
+        sizes.append(machine._calculate_image_res(1.5))
+    assert [height for height, _ in sizes] == heights
+    assert all(abs(width - 1.5 * height) <= 1.5 and width <= 512 for height, width in sizes)
+
+
+def test_small_pictures_are_enlarged_smoothly(machine, monkeypatch):
+    sent = []
+    monkeypatch.setattr(RenderStateMachine, "_send_output_to_viewer", lambda _, outputs, static: sent.append(outputs))
+    ramp = torch.linspace(0, 1, 40)[None, :, None].expand(30, 40, 3)
+    machine._send_output_to_viewer({"rgb": ramp, "gl_z_buf_depth": ramp[..., :1].double()})
+    (outputs,) = sent
+    assert outputs["rgb"].shape == (512, 683, 3) and outputs["gl_z_buf_depth"].shape == (512, 683, 1)
+    assert outputs["gl_z_buf_depth"].dtype == torch.float64
+    assert float(outputs["rgb"].diff(dim=1).max()) < 1 / 40 / 10  # no squares
+    # what was rendered, and the step of the model, also where nothing is trained
+    assert machine.viewer.stats_markdown.content == "Step: 59  \nResolution: 40x30px"
+    machine._send_output_to_viewer({"rgb": torch.zeros(512, 600, 3)})
+    assert sent[1]["rgb"].shape == (512, 600, 3)
+
+
+def test_a_movement_ends_a_fine_picture_and_no_other(machine):
+    move = RenderAction("move", cast(Any, None))
+    for machine.state, machine._is_rendering in (("low_move", True), ("middle", False), ("high", False)):
+        machine.action(move)
+        assert not machine.interrupt_render_flag
+    for machine.state in ("low_static", "middle", "high"):
+        machine._is_rendering, machine.next_action = True, None
+        machine.action(move)
+        assert machine.interrupt_render_flag, machine.state
 
 
 # ---- the viewer itself, during a training ---------------------------------------------------------------------------
@@ -378,7 +444,7 @@ def browser():
         pytest.skip("no Chromium on this machine (Debian: apt-get install chromium)")
     sync_api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed (pip install playwright)")
     with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE_WEBGL)
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *SOFTWARE_WEBGL])
         yield browser
         browser.close()
 
@@ -439,6 +505,28 @@ def test_the_page_shows_the_scene(page, training):
     for label in ("Lenses", "Path", "LiDAR points", "Depth prior"):
         assert page.get_by_label(label).count() == 1, label
     until(lambda: "distance_coloured" in training.viewer.control_panel._output_render.options)
+
+
+@pytest.mark.slow
+def test_a_browser_begins_at_a_training_camera(browser, page, training):
+    server = training.viewer.viser_server
+    known = set(server.get_clients())
+    other = browser.new_page(viewport={"width": 500, "height": 400})
+    other.goto(f"http://127.0.0.1:{server.get_port()}")
+    until(lambda: bool(set(server.get_clients()) - known), lambda seconds: other.wait_for_timeout(1000 * seconds))
+    (number,) = set(server.get_clients()) - known
+    dataset = training.trainer.pipeline.datamanager.train_dataset
+    pose = dataset.cameras.camera_to_worlds[5].double().numpy()  # of eleven of the first camera
+    assert dataset.image_filenames[5].parent == dataset.image_filenames[0].parent
+    camera = server.get_clients()[number].camera
+    assert np.allclose(camera.position, pose[:, 3] * VISER_NERFSTUDIO_SCALE_RATIO, atol=1e-5)
+    state = training.viewer.get_camera_state(server.get_clients()[number])
+    assert np.allclose(state.c2w, pose, atol=1e-5)
+    assert isinstance(training.viewer.render_statemachines[number], CoarseToFine)
+    shown = f"Step: {training.viewer.step}"
+    assert training.viewer.step > 5 and shown in training.viewer.stats_markdown.content
+    other.get_by_text(shown).wait_for()
+    other.close()
 
 
 @pytest.mark.slow

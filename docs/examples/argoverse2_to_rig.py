@@ -4,8 +4,8 @@
     python argoverse2_to_rig.py LOG OUTPUT      # such as /data/av2/sensor/train/01bb304d-7bd8-35f8-bbef-7086b688e35e
     edge-depth-nerf process rig --root OUTPUT --output scenes/av2
 
-Pictures are undistorted. The returns of both scanners are in one file, in the vehicle's frame, corrected for its motion
-to the moment in the file's name, at which the turn begins. Poses of one time come more than once.
+Pictures are undistorted. The points of both scanners are in one file, in the vehicle's frame, corrected for its motion
+to the time in the file's name, when the turn begins. Poses of one time come more than once.
 """
 
 from __future__ import annotations

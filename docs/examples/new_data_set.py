@@ -1,8 +1,8 @@
-"""A converter of one's own: reads a drive in its own layout into a Recording, and writes the scene.
+"""Your own converter: it reads a drive in its own layout into a Recording, and writes the scene.
 
 DRIVE/pictures/000000.png …   one camera, a Kannala-Brandt lens whose calibration is known
 DRIVE/scans/000000.npy …      points × 3, float32, metres in the scanner's frame
-DRIVE/poses.txt               a line a frame: x y heading (metres, radians), 10 a second
+DRIVE/poses.txt               one line per frame: x y heading (metres, radians), 10 per second
 """
 
 from __future__ import annotations

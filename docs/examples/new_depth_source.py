@@ -3,7 +3,7 @@
     python new_depth_source.py SCENE
 
 The line that declares the layer is all that reader, writer, checks and DataManager need: they take what there is from
-one table. In the radar's place stand the LiDAR's returns here, thinned to a tenth and in steps of 0.2 m.
+one table. Here LiDAR points, thinned to a tenth and in steps of 0.2 m, stand in for the radar's.
 """
 
 from __future__ import annotations

@@ -91,7 +91,9 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def _runs(process: int) -> bool:
-    """Whether there is a process of this number."""
+    """Whether there is a process of this number; on Windows every number counts, as asking would be Ctrl-C there."""
+    if os.name == "nt":
+        return True
     try:
         os.kill(process, 0)
     except ProcessLookupError:
@@ -107,15 +109,15 @@ def explain(error: Exception) -> str:
         errno.ENOSPC: "The disk is full: free some space there, or choose another one",
         errno.EDQUOT: "Your share of the disk is used up: free some space there, or choose another disk",
         errno.EFBIG: "Files may not grow so large there: see `ulimit -f`, or choose another disk",
-        errno.EROFS: "The disk can only be read: choose another folder",
-        errno.EACCES: "This user may not do that there: see who owns the folder, or choose another one",
-        errno.EPERM: "This user may not do that there: see who owns the folder, or choose another one",
+        errno.EROFS: "The disk is read-only: choose another folder",
+        errno.EACCES: "This user has no permission there: check who owns the folder, or choose another one",
+        errno.EPERM: "This user has no permission there: check who owns the folder, or choose another one",
     }
     remedy = remedies.get(error.errno or 0) if isinstance(error, OSError) else None
     if not isinstance(error, OSError) or remedy is None:
         return str(error)
     where = f"{error.filename}: " if error.filename else ""
-    return f"{where}{error.strerror}. {remedy}; what is done is kept, and the same command takes up where it was."
+    return f"{where}{error.strerror}. {remedy}; finished work is kept. Run the same command again to resume."
 
 
 def as_people_count(path: Path) -> list[tuple[int, str]]:
@@ -157,7 +159,7 @@ def read_json(path: Path) -> Any:
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not valid JSON ({error}). Mend or re-create the file.") from None
+        raise InputError(f"{path}: not valid JSON ({error}). Repair or re-create the file.") from None
 
 
 def read_json_object(path: Path, *keys: str) -> dict[str, Any]:
@@ -170,7 +172,7 @@ def read_json_object(path: Path, *keys: str) -> dict[str, Any]:
     """
     content = read_json(path)
     if not isinstance(content, dict):
-        raise InputError(f"{path}: holds no JSON object. Delete or re-create the file.")
+        raise InputError(f"{path}: does not contain a JSON object. Delete or re-create the file.")
     if missing := [key for key in keys if key not in content]:
         raise InputError(f"{path}: has no {missing[0]!r}. Delete or re-create the file.")
     return content
@@ -261,7 +263,7 @@ def check_is_folder(output: Path) -> None:
 
     """
     if output.exists() and not output.is_dir():
-        raise InputError(f"{output}: is a file; --output takes a folder.")
+        raise InputError(f"{output}: is a file; --output needs a folder.")
 
 
 def read_mask(path: Path) -> NDArray[np.bool_]:
@@ -379,7 +381,7 @@ def read_npz(path: Path, names: Iterable[str], most_bytes: int) -> dict[str, NDA
             for name in names:
                 entry = archive.getinfo(f"{name}.npy")
                 if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                    raise ValueError(f"{name} is compressed in a way of its own")
+                    raise ValueError(f"{name} uses an unsupported compression")
                 with archive.open(entry) as member:
                     shape, fortran, kind = read_array_header(member, f"{path}: {name}")
                     count = math.prod(shape)

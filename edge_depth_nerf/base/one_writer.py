@@ -15,8 +15,12 @@ from edge_depth_nerf.base.console import say
 
 try:
     import fcntl
-except ImportError:  # Windows has no such locks
+except ImportError:  # Windows
     fcntl = None
+try:
+    import msvcrt
+except ImportError:  # everywhere else
+    msvcrt = None
 
 POLL_S = 0.2
 _held: set[tuple[Path, int]] = set()
@@ -27,12 +31,13 @@ _held: set[tuple[Path, int]] = set()
 def only_writer(folder: Path, console: Console) -> Iterator[None]:
     """Hold a folder while it is written to, or wait until nobody else does.
 
-    The folder itself is locked, so nothing is left behind, and the system lets go of it when a process is killed. One
-    that is not there is made, and taken away again if nothing was written to it. A thread may hold a folder twice.
-    Where there are no such locks (some network disks, Windows) nothing is waited for.
+    The folder itself is locked, so nothing is left behind; on Windows, which locks no folders, a file beside it is. The
+    system lets go of either when a process is killed. A folder that is not there is made, and taken away again if
+    nothing was written to it. A thread may hold a folder twice. Where there are no locks (some network disks) nothing
+    is waited for.
     """
     key = (folder.resolve(), threading.get_ident())
-    if fcntl is None or key in _held:
+    if key in _held:
         yield
         return
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
@@ -52,20 +57,20 @@ def only_writer(folder: Path, console: Console) -> Iterator[None]:
                 path.rmdir()
             except OSError:
                 break  # something is in it
-        os.close(handle)
+        _unlock(folder, handle)
 
 
 def _locked(folder: Path, console: Console) -> int:
     """Lock a folder; give what is to be closed."""
-    assert fcntl is not None
     said = False
     while True:
         folder.mkdir(parents=True, exist_ok=True)
-        handle = os.open(folder, os.O_RDONLY)
+        place = _lock_of(folder)
+        handle = os.open(place, os.O_RDONLY if fcntl is not None else os.O_RDWR | os.O_CREAT)
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # whoever held it may have taken an empty folder away
-            if os.path.samestat(os.fstat(handle), os.stat(folder)):
+            _try_lock(handle)
+            # whoever held it may have taken it away
+            if os.path.samestat(os.fstat(handle), os.stat(place)):
                 return handle
         except FileNotFoundError:
             pass
@@ -78,3 +83,41 @@ def _locked(folder: Path, console: Console) -> int:
             os.close(handle)
             raise
         os.close(handle)
+
+
+def _lock_of(folder: Path) -> Path:
+    """What is locked: the folder, or on Windows a file beside it."""
+    if fcntl is not None:
+        return folder
+    whole = folder.resolve()
+    return whole.with_name(f".{whole.name}.lock")
+
+
+def _try_lock(handle: int) -> None:
+    """Lock what was opened.
+
+    Raises:
+        BlockingIOError: somebody else holds it.
+        OSError: it cannot be locked.
+
+    """
+    if fcntl is not None:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return
+    assert msvcrt is not None
+    try:
+        msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)  # pyright: ignore[reportAttributeAccessIssue]
+    except PermissionError as error:
+        raise BlockingIOError from error
+
+
+def _unlock(folder: Path, handle: int) -> None:
+    """Let go of what `_locked` gave."""
+    if msvcrt is not None:
+        msvcrt.locking(handle, msvcrt.LK_UNLCK, 1)  # pyright: ignore[reportAttributeAccessIssue]
+    os.close(handle)
+    if fcntl is None:
+        try:
+            _lock_of(folder).unlink(missing_ok=True)
+        except OSError:
+            pass  # whoever waits for it has it open, and removes it

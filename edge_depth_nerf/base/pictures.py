@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.figure import Figure
 
 NEAREST_M, FARTHEST_M = 1.0, 60.0
@@ -282,6 +283,35 @@ def legend(names: Sequence[tuple[str, Colour]], width: int, scale: ColourScale |
         bar.minorticks_off()
         bar.outline.set_visible(False)
     return drawn(figure)
+
+
+def add_legend_below(
+    figure: Figure,
+    handles: Sequence[Artist],
+    names: Sequence[str],
+    place: Literal["outside lower left", "outside lower center"],
+) -> None:
+    """Put a legend below a figure's axes, in as many columns as fit, and enlarge the figure by it.
+
+    Args:
+        figure: of matplotlib's, with constrained layout.
+        handles: what the legend explains.
+        names: of each.
+        place: matplotlib's words for it.
+
+    """
+    for columns in range(len(names), 0, -1):
+        legend = figure.legend(handles, names, loc=place, ncols=columns, frameon=False, borderaxespad=0)
+        box = legend.get_window_extent()
+        if box.width <= figure.bbox.width or columns == 1:
+            break
+        legend.remove()
+    else:
+        return
+    # a single name can be wider than the axes
+    figure.set_size_inches(
+        max(figure.bbox.width, box.width) / figure.dpi, (figure.bbox.height + box.height) / figure.dpi
+    )
 
 
 def panel(picture: NDArray[np.uint8], title: str, legend: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:

@@ -21,7 +21,9 @@ from edge_depth_nerf.cameras.models import Camera
 from edge_depth_nerf.cameras.rays import rays
 
 WRONG_PX = 0.01
-"""The polynomials are as long as it takes to be right to this."""
+"""The polynomials are as long as it takes to be right to this; the longest are right to 0.02 px."""
+_FURTHEST_RAD = math.radians(150.0)
+"""Beyond, sine over sine grows too steep for them; nothing is projected there."""
 _LONGEST = 24
 _COSINES = 2048
 _NEAR_AXIS_RAD = 1e-4
@@ -49,13 +51,14 @@ def projection_series(camera: Camera, theta_max_rad: float = math.pi) -> Project
 
     Args:
         camera: the lens, at the size of the picture.
-        theta_max_rad: angle from the axis beyond which nothing is projected; π leaves the lens model's own.
+        theta_max_rad: angle from the axis beyond which nothing is projected; π leaves the lens model's own, and
+            150° at most.
 
     """
     seen = rays(camera, theta_max_rad)
     furthest = math.acos(max(-1.0, min(1.0, float(seen.cos_theta[seen.within].min())))) if seen.within.any() else 0.0
     # a pixel beyond the outermost centres
-    limit = min(camera.theta_max_rad, theta_max_rad, math.pi - _NEAR_AXIS_RAD)
+    limit = min(camera.theta_max_rad, theta_max_rad, _FURTHEST_RAD)
     least = math.cos(min(max(furthest, _NEAR_AXIS_RAD) + 1.0 / min(camera.fx, camera.fy), limit))
     t = torch.cos(torch.linspace(math.pi, 0.0, _COSINES, dtype=torch.float64))
     theta = torch.acos((least + (t + 1.0) / 2.0 * (1.0 - least)).clamp(-1.0, 1.0)).clamp(min=_NEAR_AXIS_RAD)

@@ -98,9 +98,14 @@ def compare_grid(options: CompareOptions, console: Console) -> Results:
         raise InputError(
             f"--grid --methods {' '.join(others)}: expected cells of the grid, {', '.join(GRID.values())}."
         )
+    with_loss = tuple(name for name in cells if METHODS[name].sigma_field is not None)
+    if not with_loss:
+        raise InputError(
+            f"--grid --methods {' '.join(cells)}: none of them has a loss on the prior; expected one at least."
+        )
     search, comparison = options.output / SEARCH, options.output / COMPARISON
     if options.output.is_dir() and any(options.output.iterdir()) and not search.is_dir():
-        raise InputError(f"{options.output}: holds other things. Choose a new or empty folder for --output.")
+        raise InputError(f"{options.output}: contains other files. Choose a new or empty folder for --output.")
     # what is to be judged is looked at before a search of hours
     for scene in options.scenes:
         check_scene(scene, cells, options.preset)
@@ -112,7 +117,7 @@ def compare_grid(options: CompareOptions, console: Console) -> Results:
             scenes=options.tuning,
             tuning=(),
             output=search,
-            methods=tuple(name for name in cells if METHODS[name].sigma_field is not None),
+            methods=with_loss,
             seeds=options.seeds[:1],
         ),
         console,
@@ -160,8 +165,8 @@ def _opened_runs(options: CompareOptions, tuned: dict[str, Setting]) -> list[Run
     scenes = {scene.resolve().name: scene.resolve() for scene in options.scenes}
     if len(scenes) < len(options.scenes):
         raise InputError(
-            f"scenes {', '.join(map(str, options.scenes))}: two have one folder name, which is what the tables call "
-            "them. Rename one, or give each scene once."
+            f"scenes {', '.join(map(str, options.scenes))}: two folders have the same name, which the tables use. "
+            "Rename one, or give each scene once."
         )
     digests = {name: check_scene(folder, methods, options.preset) for name, folder in scenes.items()}
     open_output(options, tuned)
@@ -245,15 +250,15 @@ def check_scene(folder: Path, methods: Sequence[MethodName], preset: str) -> str
     frames, held_out = meta["frames"], meta.get("test_filenames") or []
     if not held_out or set(held_out) & set(meta.get("train_filenames", [])):
         raise InputError(
-            f"{path}: found {len(held_out)} pictures under test_filenames that are not trained on, too; expected at "
-            "least one to judge by. Process the drive with --holdout-every 2 or more."
+            f"{path}: found {len(held_out)} pictures under test_filenames that are not training pictures; expected "
+            "at least one for evaluation. Process the drive with --holdout-every 2 or more."
         )
     has = layers_of(frames[0])
     for name in methods:
         missing = [source for source in METHODS[name].needs if source not in has]
         if missing:
             remedy = {
-                "lidar": "process the drive with its LiDAR",
+                "lidar": "process the drive with LiDAR",
                 "mono": "make them by `edge-depth-nerf estimate-depth`",
             }
             remedies = " and ".join(remedy[source] for source in missing).capitalize()
@@ -311,6 +316,12 @@ def open_output(options: CompareOptions, tuned: dict[str, Setting]) -> None:
         write_json(path, wanted)
 
 
+def _tuned_on(path: Path) -> Any:
+    """The scenes that tuned values were searched on; files of a search of one drive have them as `scene`."""
+    content = read_json_object(path)
+    return content.get("scenes", content.get("scene"))
+
+
 def _record(options: CompareOptions, tuned: dict[str, Setting]) -> dict[str, Any]:
     """What the output folder's record is to hold of what all its runs share, beside the commands so far.
 
@@ -324,7 +335,7 @@ def _record(options: CompareOptions, tuned: dict[str, Setting]) -> dict[str, Any
         "steps": options.steps,
         "rivals_implementation": options.rivals_implementation,
         "tuned": {name: {"lambda": setting.weight, "sigma_m": setting.sigma_m} for name, setting in tuned.items()},
-        "tuned_on": None if options.tuned is None else read_json_object(options.tuned).get("scenes"),
+        "tuned_on": None if options.tuned is None else _tuned_on(options.tuned),
     }
     path = options.output / RECORD
     if path.is_file():
@@ -337,12 +348,12 @@ def _record(options: CompareOptions, tuned: dict[str, Setting]) -> dict[str, Any
         if different:
             name = different[0]
             raise InputError(
-                f"{path}: this folder holds a comparison with {name} {found.get(name)}, not {record[name]}. Choose "
+                f"{path}: this folder contains a comparison with {name} {found.get(name)}, not {record[name]}. Choose "
                 "another --output."
             )
         return found
     if options.output.is_dir() and any(options.output.iterdir()):
-        raise InputError(f"{options.output}: holds other things. Choose a new or empty folder for --output.")
+        raise InputError(f"{options.output}: contains other files. Choose a new or empty folder for --output.")
     return record
 
 
@@ -379,7 +390,7 @@ class Run:
             if different:
                 name = different[0]
                 raise InputError(
-                    f"{path}: this run was begun with {name} {found.get(name)}, not {wanted[name]}. Choose another "
+                    f"{path}: this run was started with {name} {found.get(name)}, not {wanted[name]}. Choose another "
                     f"--output, or remove {self.folder}."
                 )
             return
@@ -451,12 +462,12 @@ def show_tables(tables: Sequence[MadeTable], console: Console) -> None:
 
 
 def _show_places(output: Path, results: Results, console: Console) -> None:
-    say(console, f"To look at, in a browser: {output / REPORT}")
+    say(console, f"Open in a browser: {output / REPORT}")
     say(console, f"Tables: {output / 'tables.md'}, {output / 'tables.tex'}; all figures: {output / 'results.csv'}")
     there = [(scene, runs) for scene in results.scenes() if (runs := first_runs(results, scene))]
     for scene, runs in there[:1]:
-        more = "" if len(results.runs) == len(runs) else f" (on {scene}; for all others see {REPORT})"
-        say(console, f"To look around in what was trained{more}:")
+        more = "" if len(results.runs) == len(runs) else f" (on {scene}; see {REPORT} for the others)"
+        say(console, f"View the trained scenes{more}:")
         for run in runs:
             if run.config:
                 say(console, f"  {viewer_command(run.config)}")

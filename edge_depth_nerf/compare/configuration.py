@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ from edge_depth_nerf.compare.methods import LAMBDA, METHODS, SIGMA_MODE, Setting
 from edge_depth_nerf.compare.options import MethodName, Preset
 from edge_depth_nerf.compare.specification import RunSpecification
 from edge_depth_nerf.plugin.config import apply_overrides, make_specifications, read_method_file
+from edge_depth_nerf.plugin.settings import flattened
 
 REGISTERED: dict[Preset, str] = {
     "lite": "edge-depth-nerf-lite",
@@ -37,6 +37,20 @@ def literal_form() -> dict[str, Any]:
     return {name: value for name, value in presets["paper"].items() if presets["full"].get(name) != value}
 
 
+def _schedules_over(config: TrainerConfig, steps: int) -> dict[str, int]:
+    """The lengths of the learning rates' schedules, in steps: the preset's, stretched as the training is.
+
+    A short training would end at a high learning rate otherwise, and a long one stand still at the lowest.
+    """
+    stretch = steps / config.max_num_iterations
+    return {
+        f"optimizers.{group}.scheduler.{name}": max(round(getattr(optimiser["scheduler"], name) * stretch), least)
+        for group, optimiser in config.optimizers.items()
+        if optimiser["scheduler"] is not None
+        for name, least in (("max_steps", 1), ("warmup_steps", 0))
+    }
+
+
 def configuration(run: RunSpecification, folder: Path | None = None) -> tuple[TrainerConfig, set[str]]:
     """Resolve the configuration of a run.
 
@@ -54,7 +68,7 @@ def configuration(run: RunSpecification, folder: Path | None = None) -> tuple[Tr
         **COMMON,
         "machine.seed": run.seed,
         "pipeline.datamanager.data": Path(run.scene),
-        **({} if run.steps is None else {"max_num_iterations": run.steps}),
+        **({} if run.steps is None else {"max_num_iterations": run.steps, **_schedules_over(config, run.steps)}),
         **({} if folder is None else {"output_dir": folder.parent, "experiment_name": folder.name}),
     }
     named = {
@@ -76,20 +90,6 @@ def setting_of(config: TrainerConfig, name: MethodName) -> tuple[float | None, f
     mode = values[SIGMA_MODE]
     takes_own = SIGMA_MODE in method.sigma and mode != "constant"
     return values[LAMBDA], mode if takes_own else values[method.sigma_field]
-
-
-def flattened(config: Any, prefix: str = "") -> dict[str, Any]:
-    """A configuration as dotted names and values."""
-    if is_dataclass(config) and not isinstance(config, type):
-        children = {entry.name: getattr(config, entry.name) for entry in fields(config)}
-    elif isinstance(config, dict):
-        children = config
-    else:
-        return {prefix: config}
-    found: dict[str, Any] = {}
-    for name, child in children.items():
-        found |= flattened(child, f"{prefix}.{name}" if prefix else str(name))
-    return found
 
 
 def described(config: TrainerConfig) -> dict[str, str]:

@@ -9,7 +9,16 @@ import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from edge_depth_nerf.compare.methods import GRID, LOSS_TITLES, METHODS, Cell, Loss, PriorName
+from edge_depth_nerf.compare.methods import (
+    EXTRAS_TITLES,
+    GRID,
+    LOSS_TITLES,
+    METHODS,
+    PRIOR_TITLES,
+    Cell,
+    Loss,
+    PriorName,
+)
 from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.results import Results
 from edge_depth_nerf.compare.search import Grid
@@ -18,9 +27,7 @@ from edge_depth_nerf.report.tables import Cell as Figure
 from edge_depth_nerf.report.tables import MadeTable, Metric, Row, mark_best, mean_and_spread
 from edge_depth_nerf.scene.format import read_transforms
 
-PRIOR_TITLES: dict[PriorName, str] = {"lidar": "LiDAR", "integrated": "integrated"}
-EXTRAS_TITLES = {False: "without extras", True: "with extras"}
-NOTE = "dB: by how much PSNR is ahead. AbsRel ×: the share of the other's AbsRel that is left; below 1 is better."
+NOTE = "dB: the gain in PSNR. AbsRel ×: AbsRel divided by the other's; below 1 is better."
 
 
 class _Judged:
@@ -166,10 +173,10 @@ def _cells_table(judged: _Judged, searches: Sequence[Grid]) -> MadeTable:
     better = [metric.best for _ in judged.columns for metric in (judged.psnr, judged.abs_rel)]
     mark_best(rows, [*better, 0, 0, 0])
     groups = [(name, [judged.psnr.heading, judged.abs_rel.heading]) for name, _ in judged.columns]
-    notes = ["σ in metres. * at an end of what was tried: more may be beyond."]
+    notes = ["σ in metres. * at an end of the range: values beyond may be better."]
     budgets = {len(grid.psnr) for grid in searches}
     if len(budgets) > 1:
-        notes.append("The searches are of unequal length, so these cells are no fair comparison.")
+        notes.append("The searches have different sizes, so this comparison of cells is not fair.")
     return MadeTable("G5", "All cells", [*groups, ("", ["λ", "σ", "tried"])], rows, notes)
 
 
@@ -203,7 +210,7 @@ def grid_lines(results: Results, searched: Results) -> list[str]:
         *introduction(results),
         *_sweeps_lines({run.scene: Path(run.specification["scene"]) for run in results.runs}),
         f"λ and σ of each cell: the best mean PSNR of random held-out pixels on {' and '.join(searched.scenes())}, "
-        f"which no table has; seed {run.seed}, {run.content['steps']} steps each.",
-        "Extras: colours at the surface, a sky loss, a sky colour at infinity, a λ that falls. Where the sky is, "
-        "monocular maps say: with LiDAR alone there is no sky loss.",
+        f"which no table uses; seed {run.seed}, {run.content['steps']} steps each.",
+        "Extras: colours at the surface, a sky loss, a sky colour at infinity, a decreasing λ. Monocular maps show "
+        "where the sky is, so there is no sky loss with LiDAR alone.",
     ]

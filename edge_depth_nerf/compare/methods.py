@@ -70,7 +70,9 @@ class Method:
 
 _NERFACTO = {_LOSS: "none", _SOURCE: "none", **WITHOUT_EXTRAS}
 _NEEDS: dict[PriorName, tuple[str, ...]] = {"lidar": ("lidar",), "integrated": ("lidar", "mono")}
-_PRIOR_WORDS: dict[PriorName, str] = {"lidar": "LiDAR", "integrated": "integrated"}
+PRIOR_TITLES: dict[PriorName, str] = {"lidar": "LiDAR", "integrated": "integrated"}
+EXTRAS_TITLES = {False: "without extras", True: "with extras"}
+"""What the grid calls priors and extras."""
 
 
 def _edge(
@@ -98,7 +100,7 @@ def _of_grid_alone(cell: Cell) -> Method:
     """A cell of the grid that is none of the paper's rows."""
     assert cell.prior is not None
     prior, extras = cell.prior, cell.extras
-    words = f"{_PRIOR_WORDS[prior]}, {'with' if extras else 'without'} extras"
+    words = f"{PRIOR_TITLES[prior]}, {EXTRAS_TITLES[extras]}"
     if cell.loss == "none":
         # the prior serves the extras alone
         named = {_LOSS: "edge", LAMBDA: 0.0, _SOURCE: prior}

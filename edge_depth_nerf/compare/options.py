@@ -47,33 +47,33 @@ LEAST_LAMBDAS, LEAST_SIGMAS = 4, 3
 
 @dataclass(frozen=True, kw_only=True)
 class CompareOptions:
-    """Train each method on each scene with one configuration, judge all alike, and make the paper's tables.
+    """Train each method on each scene with one configuration, evaluate all alike, and make the paper's tables.
 
-    Stopped at any moment, the same command takes up where it was. The folder takes more scenes, methods and seeds
-    later; its tables are of all that it holds.
+    You can stop at any time; run the same command again to resume. You can add scenes, methods and seeds to the folder
+    later; the tables include everything in it.
     """
 
     scenes: tyro.conf.Positional[tuple[Path, ...]]
-    """Scene folders, as `edge-depth-nerf process` writes them; the tables call a drive by its folder's name."""
+    """Scene folders written by `edge-depth-nerf process`; the tables use their names."""
     output: Path
     """Folder for the runs, results.csv and results.json, tables.md and tables.tex, pictures and plots."""
     methods: tuple[MethodName, ...] = ()
-    """Which methods. None named: all but those that only the grid has, with --preset paper without edge-paper, which is
-    edge there; with --grid all of its cells."""
+    """Which methods. Not set: all except those of the grid; with --preset paper also without edge-paper, which equals
+    edge there; with --grid all its cells."""
     steps: int | None = None
-    """Training steps of each run. Not set: the preset's."""
+    """Training steps of each run; the learning rates fall over them. Not set: the preset's."""
     seeds: tuple[int, ...] = (0,)
     """Seeds of the training; each method is trained once with each."""
     preset: Preset = "lite"
-    """The configuration that all methods share. lite: a laptop's CPU; full: a GPU; paper: full size, and what edge-…
-    stands for is the literal method."""
+    """The configuration that all methods share. lite: a laptop's CPU; full: a GPU; paper: full size, and edge-… is the
+    literal method."""
     tuned: Path | None = None
     """λ and σ of the methods: tuned.json of a search, or a file of that form. Not set: the defaults."""
     rivals_implementation: Implementation = "same"
-    """torch: nerfacto, ds-nerf and both forms of UrbanNeRF are computed by nerfstudio's own torch code, with the same
-    results, for figures at equal seconds."""
+    """torch: nerfacto, ds-nerf and both forms of UrbanNeRF run in nerfstudio's own torch code, with the same results,
+    to compare at equal seconds."""
     jobs: int | None = None
-    """Trainings side by side. Not set: one a core, on a GPU one."""
+    """Parallel trainings. Not set: one per core; on a GPU, one."""
     cluster: str | None = None
     """Train on a Dask cluster: local (processes on this machine, one for each GPU or core), or the address of a
     scheduler, such as tcp://10.0.0.1:8786. Needs `pip install '.[cluster]'`; see docs/cluster.md."""
@@ -81,15 +81,15 @@ class CompareOptions:
     """Instead of tables: train each method with each λ and σ on tuning scenes and one seed, and write the best to
     tuned.json."""
     grid: bool = False
-    """Each loss with each prior, without and with the extras: search λ and σ of each on --tuning, then train and judge
-    all on the scenes, and say what prior, loss, extras and the whole are worth (grid.md)."""
+    """Each loss with each prior, without and with the extras: search λ and σ of each on --tuning, then train and
+    evaluate all on the scenes, and report what prior, loss, extras and the whole are worth (grid.md)."""
     tuning: tuple[Path, ...] = ()
-    """With --grid: scene folders to search λ and σ on, of other drives than those that are judged."""
+    """With --grid: scene folders to search λ and σ on, of other drives than the evaluated ones."""
     lambdas: tuple[float, ...] = ()
     """With --search or --grid: the weights λ of the depth loss to try, 4 at least."""
     sigmas_m: tuple[Sigma, ...] = ()
-    """With --search or --grid: the standard deviations σ to try, metres, 3 at least; own: the one that the method has
-    by itself (for edge-…: the prior's own at each pixel)."""
+    """With --search or --grid: the standard deviations σ to try, metres, 3 at least; own: the method's own σ (for
+    edge-…: the prior's σ at each pixel)."""
 
     def check(self) -> None:
         """Check what can be checked without looking at the disk.
@@ -110,7 +110,7 @@ class CompareOptions:
         require(
             self.jobs is None or self.cluster is None,
             "--jobs with --cluster",
-            "one of them: a cluster trains as many side by side as it has workers",
+            "one of them: a cluster runs one training per worker",
         )
         require(len(self.seeds) > 0 and min(self.seeds) >= 0, f"--seeds {self.seeds}", "at least one, each 0 or more")
         for name, values in (

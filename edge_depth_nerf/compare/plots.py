@@ -1,6 +1,7 @@
-"""Plots of a comparison: PSNR against steps and seconds, errors by angle and by distance.
+"""Plots of a comparison: PSNR and AbsRel against steps and seconds, errors by angle and by distance.
 
-Each is drawn twice, on white and for a dark page, as SVG.
+Each is drawn twice, on white and for a dark page, as SVG. A file has a column for each drive; on the page each drive
+has a plot of its own, which fits a phone.
 """
 
 from __future__ import annotations
@@ -14,9 +15,10 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogFormatter, LogLocator, NullFormatter
 
 from edge_depth_nerf.base.files import write_bytes
+from edge_depth_nerf.base.pictures import add_legend_below
 from edge_depth_nerf.compare.methods import METHODS, Loss
 from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.results import Results, RunResult
@@ -46,6 +48,8 @@ LOSS_STYLES: dict[Loss, tuple[str, str]] = {
 """On white, on dark: of the methods that the grid alone has."""
 BINS = {"by_angle_deg": "angle from the optical axis, degrees", "by_distance_m": "distance, m"}
 PSNR_LABEL = "PSNR, dB"
+DISTANCE_ERRORS = ("truth_abs_rel", "lidar_abs_rel")
+"""Of a curve's points: the better one first."""
 _INK = {False: "#1b2026", True: "#d5dae0"}
 _PAPER = {False: "#ffffff", True: "#161b22"}
 
@@ -57,7 +61,7 @@ Line = tuple[Sequence[float], Sequence[float]]
 
 def _axes(titles: Sequence[str], rows: int) -> tuple[Figure, np.ndarray]:
     # no pyplot: it would look for a display
-    figure = Figure(figsize=(max(6.0, 4.6 * len(titles)), 3.6 * rows + 0.9), layout="constrained")
+    figure = Figure(figsize=(4.8 * len(titles), 3.2 * rows + 0.3), layout="constrained")
     axes = figure.subplots(rows, len(titles), squeeze=False)
     for axis, title in zip(axes[0], titles, strict=True):
         # a drive may be called $x$
@@ -80,10 +84,16 @@ def _logarithmic(axis: Axes) -> None:
     axis.xaxis.set_minor_formatter(NullFormatter())
 
 
+def _logarithmic_errors(axis: Axes) -> None:
+    """Let y be logarithmic, with plain numbers."""
+    axis.set_yscale("log")
+    axis.yaxis.set_major_formatter(LogFormatter())
+    axis.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.5)))
+
+
 def _finished(figure: Figure, axes: np.ndarray) -> bytes:
     handles = dict(pair for axis in axes.flat for pair in _labelled(axis))
-    columns = 3 if axes.shape[1] == 1 else 4
-    figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=columns, frameon=False)
+    add_legend_below(figure, list(handles.values()), list(handles), "outside lower center")
     content = io.BytesIO()
     # the same bytes for the same figures
     figure.savefig(content, format="svg", metadata={"Date": None})
@@ -97,7 +107,8 @@ def _twice(title: str, draw: Callable[[bool], bytes]) -> Plot:
             ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), _INK[dark]
         )
         paper = dict.fromkeys(("figure.facecolor", "axes.facecolor", "savefig.facecolor"), _PAPER[dark])
-        with matplotlib.rc_context({**ink, **paper, "svg.hashsalt": title}):
+        # letters as letters: a third of the bytes that they take as outlines
+        with matplotlib.rc_context({**ink, **paper, "svg.hashsalt": title, "svg.fonttype": "none"}):
             drawn[dark] = draw(dark)
     return Plot(title, light=drawn[False], dark=drawn[True])
 
@@ -134,18 +145,28 @@ def _runs(results: Results, scene: str) -> dict[MethodName, list[RunResult]]:
     return found
 
 
-def _curves(results: Results, title: str, key: str, label: str) -> Plot:
-    name = curve_metric(results)
+def _curves(results: Results, scenes: Sequence[str], title: str, key: str, label: str) -> Plot:
+    """Plot how far held-out pixels are right in the course of the training, a column for each drive."""
+    rows = [(curve_metric(results), "PSNR of held-out pixels, dB")]
+    known = (name for name in DISTANCE_ERRORS if all(name in run.curve[-1] for run in results.runs))
+    rows += [(name, "AbsRel of held-out pixels") for name in [*known][:1]]
 
     def draw(dark: bool) -> bytes:
-        figure, axes = _axes(results.scenes(), 1)
-        for axis, scene in zip(axes[0], results.scenes(), strict=True):
+        figure, axes = _axes(scenes, len(rows))
+        for column, scene in enumerate(scenes):
             for method, runs in _runs(results, scene).items():
-                x, y = (np.mean([[point[one] for point in run.curve] for run in runs], axis=0) for one in (key, name))
-                _draw(axis, method, (x.tolist(), y.tolist()), dark)
-            axis.set_xlabel(label)
+                for row, (name, _) in enumerate(rows):
+                    values = ([[point[one] for point in run.curve] for run in runs] for one in (key, name))
+                    x, y = (np.mean(of_runs, axis=0).tolist() for of_runs in values)
+                    _draw(axes[row, column], method, (x, y), dark)
+            axes[-1, column].set_xlabel(label)
+        for axis in axes.flat:
             _logarithmic(axis)
-        axes[0, 0].set_ylabel("PSNR of held-out pixels, dB")
+        for row, (name, words) in enumerate(rows):
+            axes[row, 0].set_ylabel(words)
+            if name in DISTANCE_ERRORS:
+                for axis in axes[row]:
+                    _logarithmic_errors(axis)
         return _finished(figure, axes)
 
     return _twice(title, draw)
@@ -180,7 +201,7 @@ def plot_bins(
                         y = np.mean([[entry[name] for entry in one] for one in kept], axis=0)
                         _draw(axes[row, column], method, (x, y.tolist()), dark)
                 if name == "abs_rel":
-                    axes[row, column].set_yscale("log")
+                    _logarithmic_errors(axes[row, column])
                 if logarithmic_x:
                     _logarithmic(axes[row, column])
             axes[-1, column].set_xlabel(label)
@@ -191,9 +212,9 @@ def plot_bins(
     return _twice(title, draw)
 
 
-def _binned(results: Results, title: str, key: str) -> Plot:
+def _binned(results: Results, scenes: Sequence[str], title: str, key: str) -> Plot:
     bins: dict[str, dict[MethodName, list[Bins]]] = {}
-    for scene in results.scenes():
+    for scene in scenes:
         runs_of = _runs(results, scene)
         bins[scene] = {method: [run.content.get(key, []) for run in runs] for method, runs in runs_of.items()}
     return plot_bins(
@@ -202,14 +223,25 @@ def _binned(results: Results, title: str, key: str) -> Plot:
 
 
 def draw_plots(output: Path, results: Results) -> list[Plot]:
-    """Draw psnr_by_steps, psnr_by_seconds, error_by_angle and error_by_distance, a column for each drive."""
-    clock = clock_metric(results)
-    plots = {
-        "psnr_by_steps": _curves(results, "PSNR by steps", "step", "steps"),
-        "psnr_by_seconds": _curves(results, "PSNR by time", clock, f"{CLOCKS[clock].lower()} of training"),
-        "error_by_angle": _binned(results, "Errors by the angle from the optical axis", "by_angle_deg"),
-        "error_by_distance": _binned(results, "Errors by distance", "by_distance_m"),
+    """Draw psnr_by_steps, psnr_by_seconds, error_by_angle and error_by_distance.
+
+    Returns:
+        For the page: each plot of each drive.
+
+    """
+    clock, scenes = clock_metric(results), results.scenes()
+    kinds: dict[str, Callable[[Sequence[str], str], Plot]] = {
+        "psnr_by_steps": lambda of, more: _curves(results, of, f"Training curves by steps{more}", "step", "steps"),
+        "psnr_by_seconds": lambda of, more: _curves(
+            results, of, f"Training curves by time{more}", clock, f"{CLOCKS[clock].lower()} of training"
+        ),
+        "error_by_angle": lambda of, more: _binned(
+            results, of, f"Errors by the angle from the optical axis{more}", "by_angle_deg"
+        ),
+        "error_by_distance": lambda of, more: _binned(results, of, f"Errors by distance{more}", "by_distance_m"),
     }
-    for name, plot in plots.items():
-        write_bytes(output / f"{name}.svg", plot.light)
-    return list(plots.values())
+    for_the_page = []
+    for name, plot in kinds.items():
+        write_bytes(output / f"{name}.svg", plot(scenes, "").light)
+        for_the_page += [plot([scene], f": {scene}" if len(scenes) > 1 else "") for scene in scenes]
+    return for_the_page

@@ -32,7 +32,8 @@ def make_report(results: Results, tables: Sequence[MadeTable], plots: Sequence[P
     configs = [run.config for runs in first.values() for run in runs if run.config]
     return Report(
         title=f"Comparison on {' and '.join(scenes) if len(scenes) < 3 else f'{len(scenes)} drives'}",
-        lead=f"{', '.join(methods)}: trained alike but for what each method names, judged alike on held-out views.",
+        lead=f"{', '.join(methods)}: trained with the same configuration except for "
+        "each method's own fields, and evaluated alike on held-out views.",
         methods=methods,
         drives=make_drives(drives, console),
         notes=introduction(results),
@@ -47,7 +48,7 @@ def make_report(results: Results, tables: Sequence[MadeTable], plots: Sequence[P
         settings=[fields_table(results)],
         commands=[
             Commands("What made this", results.options.get("commands", [])),
-            Commands("To look around in what was trained", [viewer_command(path) for path in configs]),
+            Commands("View the trained scenes", [viewer_command(path) for path in configs]),
         ],
     )
 
@@ -95,4 +96,4 @@ def _configuration(results: Results) -> Facts:
     different = {row.title for row in fields_table(results).rows}
     shared: Mapping[str, str] = results.runs[0].content["configuration"]
     entries = {name: value.strip("'") for name, value in sorted(shared.items()) if name not in {*different, *OF_A_RUN}}
-    return Facts(f"The whole configuration that all share ({len(entries)} fields)", entries, folded=True)
+    return Facts(f"The common configuration ({len(entries)} fields)", entries, folded=True)

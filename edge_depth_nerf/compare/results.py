@@ -139,7 +139,9 @@ def _check_run(content: dict[str, Any], path: Path) -> None:
         and all(_is_figures(figures) for figures in (content["figures"], *curve))
     )
     if not fine:
-        raise InputError(f"{path}: is not of this form's runs. Remove its folder, and the same command trains it anew.")
+        raise InputError(
+            f"{path}: is not a run of this version. Remove its folder; the same command then trains it again."
+        )
 
 
 def _floats(figures: dict[str, Any]) -> dict[str, float]:
@@ -171,8 +173,9 @@ def check_fair(results: Results) -> None:
                 name = unnamed[0]
                 raise InputError(
                     f"{run.folder}: its {name} is {ours.get(name)}, that of {other.folder} is {theirs.get(name)}. "
-                    "Compared runs differ in what their methods name alone; one was trained by another version of "
-                    "this program. Remove its folder, and the same command trains it anew."
+                    "Compared runs may differ only in the fields that their methods set; one was trained "
+                    "by another version of this program. Remove its folder; the same command then trains "
+                    "it again."
                 )
 
 

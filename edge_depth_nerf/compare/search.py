@@ -89,7 +89,7 @@ def write_search(output: Path, results: Results) -> None:
         },
     }
     write_json(output / TUNED, content)
-    against = ", against the truth" if "truth" in content["chosen_by"] else ""
+    against = ", against the ground truth" if "truth" in content["chosen_by"] else ""
     against += ", mean over the drives" if len(results.scenes()) > 1 else ""
     parts = [
         "# Search of λ and σ",
@@ -123,7 +123,7 @@ def _cells(grid: Grid, weight: float, mark: str) -> list[str]:
 
 def _advice(grid: Grid) -> str:
     best = " and ".join(grid.at_the_edge)
-    return f"The best {best} is at an end of what was tried: the same command takes more values."
+    return f"The best {best} is at an end of the range. Add values with the same command."
 
 
 def show_search(output: Path, results: Results, console: Console) -> None:
@@ -135,4 +135,4 @@ def show_search(output: Path, results: Results, console: Console) -> None:
         console.print(table)
         if grid.at_the_edge:
             say(console, _advice(grid))
-    say(console, f"The best of each: {output / TUNED}; `edge-depth-nerf compare … --tuned {output / TUNED}` takes it.")
+    say(console, f"The best of each: {output / TUNED}; `edge-depth-nerf compare … --tuned {output / TUNED}` uses it.")

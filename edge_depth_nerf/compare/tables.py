@@ -26,14 +26,14 @@ KITTI360, JBNU = "kitti360", "jbnu-depth360"
 """The kinds of source whose drives make Tables 1 and 2; all others come to Table 1."""
 
 AVERAGES = (
-    "The paper's averages do not follow from its rows; the differences are those that it states for the averages."
+    "The paper's averages do not follow from its rows. The differences shown are those that it states for its averages."
 )
 TEXT = "Some figures of the paper differ between its text and its tables."
 INTEGRATED = "In the paper the integrated depth is ahead of both sources."
 EDGE_AWARE = "In the paper the edge-aware kernel is ahead."
 SAME_ROW = (
-    "The paper's row of LiDAR alone (Table 3) is its row of DS-NeRF (Table 1), another loss; here both are trained: "
-    "Table 3 differs in the source of depth alone."
+    "The paper's row of LiDAR alone (Table 3) is its row of DS-NeRF (Table 1), which has another loss. Here both are "
+    "trained: Table 3 differs only in the source of depth."
 )
 
 
@@ -182,7 +182,7 @@ def _table(
 def _geometry_table(results: Results, where: str, scenes: Sequence[str]) -> MadeTable:
     """Pictures after a colour fit, distances, and views beside the path."""
     truth = "truth_" if psnr_metric(results) is TRUE_PSNR else ""
-    reference, known = ("truth", "the truth") if truth else ("lidar", "the held-out LiDAR")
+    reference, known = ("truth", "the ground truth") if truth else ("lidar", "the held-out LiDAR")
     metrics = [
         psnr_metric(results),
         Metric(f"{truth}affine_masked_psnr", "fitted ↑", ".2f"),
@@ -197,7 +197,9 @@ def _geometry_table(results: Results, where: str, scenes: Sequence[str]) -> Made
     notes = ["Fitted: PSNR after an affine fit of each view's colours."]
     if truth:
         notes.append("Recorded: PSNR against the recorded picture.")
-    notes.append(f"AbsRel, RMSE, δ: rendered median distance against {known}, 1-60 m, pooled over pixels, without sky.")
+    notes.append(
+        f"AbsRel, RMSE, δ: rendered median distance against {known}, 1-60 m, over all pixels together, without sky."
+    )
     if any(metric.name.startswith("shifted_") for metric in metrics):
         notes.append("Beside: PSNR of views moved sideways.")
     columns = [_column(metric) for metric in metrics]
@@ -221,15 +223,16 @@ def _time_table(results: Results, where: str, scenes: Sequence[str]) -> MadeTabl
         return math.inf if steps is None else steps
 
     columns = [
-        _Column("s a step", ".3f", lambda run: run.curve[-1][clock] / run.content["steps"], 0),
+        _Column("s per step", ".3f", lambda run: run.curve[-1][clock] / run.content["steps"], 0),
         _Column("seconds", ".0f", lambda run: run.curve[-1][clock], 0),
-        _Column("PSNR at ours' seconds ↑", ".2f", at_our_seconds),
-        _Column("PSNR in the end ↑", ".2f", lambda run: run.curve[-1][name]),
-        _Column("steps to nerfacto's end ↓", ".0f", to_nerfacto, -1),
+        _Column("PSNR at our seconds ↑", ".2f", at_our_seconds),
+        _Column("final PSNR ↑", ".2f", lambda run: run.curve[-1][name]),
+        _Column("steps to nerfacto's final PSNR ↓", ".0f", to_nerfacto, -1),
     ]
     note = (
-        f"{CLOCKS[clock]} of training, without judging, saving and the making of priors; PSNR of random held-out "
-        "pixels. A method that has ended by ours' seconds keeps its last PSNR."
+        f"{CLOCKS[clock]} of training, without evaluation, saving and making priors. PSNR is of random held-out "
+        "pixels. "
+        "A method that ends before ours keeps its last PSNR."
     )
     return _table(results, f"6, {where}", "Time", scenes, columns, note)
 
@@ -247,13 +250,13 @@ def _settings_table(results: Results) -> MadeTable:
         weight, sigma = (", ".join(sorted(values)) for values in zip(*found, strict=True))
         searched = "–" if METHODS[method].sigma_field is None else "searched" if method in tuned else "default"
         rows.append(Row(METHODS[method].title, [Cell(None, words=text) for text in (weight, sigma, searched)]))
-    notes = ["σ in metres, or how the prior's own is found at each pixel."]
+    notes = ["σ in metres, or the mode that gives the prior's own σ at each pixel."]
     searched_on = results.options.get("tuned_on")
     if searched_on is not None:
         drives = searched_on if isinstance(searched_on, list) else [searched_on]
         notes.append(f"Searched on {' and '.join(Path(str(drive)).name for drive in drives)}.")
         if {run.specification["scene"] for run in results.runs}.intersection(map(str, drives)):
-            notes.append("A drive of these tables is among them: its figures flatter what was searched.")
+            notes.append("These tables include a drive of the search: its figures flatter the searched values.")
     return MadeTable("7", "λ and σ", [("", ["λ", "σ", "from"])], rows, notes)
 
 
@@ -278,8 +281,8 @@ def fields_table(results: Results) -> MadeTable:
         for name in differing_fields(configurations)
     ]
     headings = [METHODS[run.method].title for run in runs]
-    note = "Of the configurations that were trained; in all other fields they are the same."
-    return MadeTable("8", "What the methods differ in", [("", headings)], rows, [note], on_terminal=False)
+    note = "From the trained configurations. All other fields are equal."
+    return MadeTable("8", "Fields in which the methods differ", [("", headings)], rows, [note], on_terminal=False)
 
 
 def make_tables(results: Results) -> list[MadeTable]:
@@ -333,7 +336,7 @@ def introduction(results: Results) -> list[str]:
     ]
     against = "the picture without noise and exposure drift" if psnr_metric(results) is TRUE_PSNR else "the picture"
     lines = [
-        f"Preset {results.options.get('preset')}, {' and '.join(map(str, steps))} steps a run; drives "
+        f"Preset {results.options.get('preset')}, {' and '.join(map(str, steps))} steps per run; drives "
         f"{', '.join(results.scenes())}.",
         "Seeds: " + "; ".join(seeds) + ".",
         f"Means over held-out views, PSNR in dB, inside the mask, against {against}; ± the standard deviation over "
@@ -341,12 +344,12 @@ def introduction(results: Results) -> list[str]:
         "Versions: " + ", ".join(f"{name} {number}" for name, number in results.versions.items()) + ".",
     ]
     if not any(name.endswith("lpips") for run in results.runs for name in run.figures):
-        lines.append("LPIPS is left out: its weights were not on this machine.")
+        lines.append("LPIPS is missing: its weights were not on this machine.")
     if any(run.specification["implementation"] == "torch" for run in results.runs):
         lines.append("nerfacto, UrbanNeRF and DS-NeRF ran in nerfstudio's own torch code.")
     departures = sorted({text for run in results.runs for text in run.content.get("departures", [])})
     if departures:
-        lines.append("Other than in the paper: " + "; ".join(departures) + ".")
+        lines.append("Departures from the paper: " + "; ".join(departures) + ".")
     return lines
 
 

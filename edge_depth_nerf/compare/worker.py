@@ -101,8 +101,8 @@ class MeasuredTrainer(EdgeDepthTrainer):
                 self.curve = [point for point in measured["curve"] if point["step"] <= self._start_step]
             except (AttributeError, KeyError, TypeError, ValueError) as error:
                 raise InputError(
-                    f"{self.progress_path}: does not go with the checkpoint of step {self._start_step} ({error!r}). "
-                    "Remove the run's folder, and the same command trains it anew."
+                    f"{self.progress_path}: does not match the checkpoint of step {self._start_step} ({error!r}). "
+                    "Remove the run's folder; the same command then trains it again."
                 ) from None
         self.callbacks.append(
             TrainingCallback(
@@ -144,8 +144,8 @@ def read_specification(path: Path) -> RunSpecification:
     if wrong:
         name = min(wrong)
         raise InputError(
-            f"{path}: {name} is {shown(content.get(name))}, which no run has. Remove its folder, and the same command "
-            "trains it anew."
+            f"{path}: {name} is {shown(content.get(name))}, which is not valid for a run. Remove its folder; the "
+            "same command then trains it again."
         )
     return RunSpecification(**content)
 

@@ -102,7 +102,7 @@ def run_demo(options: DemoOptions, console: Console | None = None) -> dict[str, 
     record = output / RECORD
     if record.is_file() and read_json(record) != recorded:
         raise InputError(
-            f"{record}: this folder holds a demo of other options ({read_json(record)}). "
+            f"{record}: this folder contains a demo with other options ({read_json(record)}). "
             "Choose another --output, or remove the folder."
         )
     finished, compared = output / RESULTS, stages.comparison.output
@@ -113,9 +113,9 @@ def run_demo(options: DemoOptions, console: Console | None = None) -> dict[str, 
         write_json(record, recorded)
         results = _make(options, stages, recorded, console)
         write_json(finished, results)
-    say(console, f"To look at, in a browser: {output / REPORT}")
+    say(console, f"Open in a browser: {output / REPORT}")
     say(console, f"Picture: {output / PICTURE}; figures: {finished}; tables: {compared / 'tables.md'}")
-    say(console, "To look around in what was trained:")
+    say(console, "View the trained scenes:")
     for command in results["viewer_commands"]:
         say(console, f"  {command}")
     return results
@@ -158,8 +158,9 @@ def _page(page: Report, results: dict[str, Any]) -> Report:
     return replace(
         page,
         title=f"Demo: nerfacto and ours on a rendered {options['scene']}",
-        lead="The same model trained twice on one drive, without depth and with the edge loss on LiDAR and monocular "
-        "depth integrated: {scene}, {frames} moments, {size} px, {steps} steps each.".format(**options),
+        lead="The same model trained twice on one drive: without depth, and with "
+        "the edge loss on integrated LiDAR and monocular depth. {scene}, {frames} frames, {size} px, "
+        "{steps} steps each.".format(**options),
         facts=[
             Facts("Demo", {name.replace("_", " ").capitalize(): str(value) for name, value in options.items()}),
             *page.facts,
@@ -169,8 +170,8 @@ def _page(page: Report, results: dict[str, Any]) -> Report:
             ),
         ],
         commands=[
-            Commands("What made this: the first alone, or the others one after another", results["commands"]),
-            Commands("To look around in what was trained", results["viewer_commands"]),
+            Commands("Commands that produce this: the first one alone, or the others in order", results["commands"]),
+            Commands("View the trained scenes", results["viewer_commands"]),
         ],
     )
 

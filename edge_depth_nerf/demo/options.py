@@ -9,9 +9,9 @@ from typing import Literal
 
 @dataclass
 class DemoOptions:
-    """Synthesise a drive, process it with a depth network of its own, and compare nerfacto and ours on it.
+    """Synthesise a drive, process it, train a depth network on it, and compare nerfacto and ours.
 
-    Stopped at any moment, the same command takes up where it was.
+    You can stop at any time; run the same command again to resume.
     """
 
     output: Path = Path("outputs/demo")
@@ -19,11 +19,11 @@ class DemoOptions:
     scene: Literal["street", "parking", "turn"] = "street"
     """What the drive passes."""
     frames: int = 40
-    """Moments of the drive; two pictures each."""
+    """Frames of the drive, with two pictures each."""
     size: int = 256
     """Width and height of the pictures, px."""
     mono_seconds: float = 90.0
-    """Seconds that the monocular depth network is trained for."""
+    """Seconds of training of the monocular depth network."""
     steps: int = 800
     """Training steps of each model."""
     seed: int = 0

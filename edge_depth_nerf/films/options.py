@@ -29,7 +29,7 @@ class CameraPathOptions:
     load_config: Path | None = None
     """The training's config.yml: it knows the scene, and which coordinates the model was trained in."""
     kind: Kind = "replay"
-    """replay: along the drive as it was; lane-shift: eased to one side of it and back; orbit: around a point before
+    """replay: along the recorded path; lane-shift: eased to one side of it and back; orbit: around a point before
     the vehicle, looking at it, as wide as LiDAR found nothing in the way."""
     camera: FilmCamera = "fisheye"
     """fisheye: equidistant, without the distortion of the drive's own lens; perspective: a pinhole; equirectangular:

@@ -126,10 +126,13 @@ def _split(scene: SceneFolder) -> Iterator[Finding]:
             "moment it is of; give train_filenames and test_filenames in transforms.json to judge by whole moments.",
         )
     elif not any(picture.held_out for picture in scene.pictures):
+        moments = len({picture.moment for picture in scene.pictures})
+        advice = (
+            f"process the drive with --holdout-every {best_holdout(moments)}" if moments > 1 else "take more frames"
+        )
         yield Finding(
             "no_held_out",
-            "No frame is held out, so the figures of ns-eval are of pictures that were trained on; process the drive "
-            f"with --holdout-every {best_holdout(len({picture.moment for picture in scene.pictures}))}.",
+            f"No frame is held out, so the figures of ns-eval are of pictures that were trained on; {advice}.",
         )
 
 

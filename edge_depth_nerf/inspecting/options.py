@@ -21,7 +21,7 @@ class InspectOptions:
     output: Path | None = None
     """Folder for the pictures and summary.json. Not set: SCENE_inspection beside the scene."""
     frames: int = 4
-    """How many moments get a sheet per camera, spread over the drive."""
+    """How many frames get a sheet per camera, spread over the drive."""
     size: int = 640
     """Longer side of each picture in a sheet, px."""
 

@@ -21,13 +21,16 @@ from edge_depth_nerf.base.pictures import (
     tinted,
 )
 from edge_depth_nerf.inspecting.figures import PictureFigures
-from edge_depth_nerf.inspecting.shown_prior import ShownMaps
+from edge_depth_nerf.inspecting.shown_prior import ORIGINS, ShownMaps
 from edge_depth_nerf.scene.reader import SceneFolder
 
 HIDDEN_RGB = (205, 50, 60)
 """Tint of what the mask hides."""
 NO_PRIOR_RGB = (60, 110, 230)
 """Tint, hatched, of usable pixels without a prior."""
+
+ORIGIN_RGB: tuple[Colour, ...] = ((20, 20, 20), (150, 150, 150), (240, 170, 40), (220, 60, 40))
+"""Of each of `ORIGINS`."""
 
 
 def draw_sheet(scene: SceneFolder, figures: PictureFigures, maps: ShownMaps, longer_side_px: int) -> NDArray[np.uint8]:
@@ -58,11 +61,14 @@ def draw_sheet(scene: SceneFolder, figures: PictureFigures, maps: ShownMaps, lon
     if maps.mono_m is not None:
         panels.append(distance("monocular distance", maps.mono_m))
     if (motion_m := maps.distances_m.get("motion")) is not None:
-        panels.append(distance("distance from motion", motion_m))
+        none = " (held out: none)" if figures.picture.held_out else ""
+        panels.append(distance(f"distance from motion{none}", motion_m))
     if maps.prior is not None:
         panels.append(distance(f"prior ({maps.source})", maps.prior.distance_m))
         has_prior = is_distance(maps.prior.distance_m)
         panels.append(coloured("sigma of the prior", maps.prior.sigma_m, has_prior, SIGMA))
+        if motion_m is not None and maps.origin is not None:
+            panels.append(_origin_panel(maps.origin, size))
     if "mask" in figures.picture.files or maps.prior is not None:
         panels.append(_mask_panel(maps, size))
     if maps.truth_m is not None:
@@ -83,6 +89,15 @@ def _mask_panel(maps: ShownMaps, size: tuple[int, int]) -> NDArray[np.uint8]:
         picture = tinted(picture, resize(without, size), NO_PRIOR_RGB, hatched=True)
         names.append(("used, without prior", NO_PRIOR_RGB))
     return panel(picture, "mask", legend(names, size[0]))
+
+
+def _origin_panel(origin: NDArray[np.int8], size: tuple[int, int]) -> NDArray[np.uint8]:
+    colours = np.array([*ORIGIN_RGB, (255, 255, 255)], np.uint8)
+    found = np.count_nonzero(origin >= 0)
+    names = [
+        (f"{name} {np.count_nonzero(origin == i) / max(found, 1):.0%}", ORIGIN_RGB[i]) for i, name in enumerate(ORIGINS)
+    ]
+    return panel(colours[resize(origin, size)], "what the prior comes from", legend(names, size[0]))
 
 
 def _heading(scene: SceneFolder, figures: PictureFigures) -> list[str]:

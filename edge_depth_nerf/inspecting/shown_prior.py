@@ -5,11 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
+from numpy.typing import NDArray
+
 from edge_depth_nerf.method.error_model import Trust, read_trust
-from edge_depth_nerf.method.prior import Prior, PriorOptions, default_source, make_prior, view_of
+from edge_depth_nerf.method.integration import INTEGRATED
+from edge_depth_nerf.method.prior import FARTHEST_M, Prior, PriorOptions, View, default_source, make_prior, view_of
 from edge_depth_nerf.mono.calibration import saved_trust
 from edge_depth_nerf.scene.format import TRUST_FILE
 from edge_depth_nerf.scene.reader import PictureMaps, SceneFolder, ScenePicture
+
+ORIGINS = ("LiDAR", "monocular", "both", "motion")
+"""What is known at a pixel with a prior: a LiDAR point; without one a monocular distance, one from motion as well, or
+that from motion alone."""
 
 
 @dataclass(frozen=True)
@@ -20,6 +28,8 @@ class ShownMaps(PictureMaps):
     """What the prior is made of; None with neither LiDAR nor monocular distance."""
     prior: Prior | None
     """None without a source."""
+    origin: NDArray[np.int8] | None
+    """H×W, what the prior comes from: an index of `ORIGINS`, -1 without a prior. None without a source."""
 
 
 class ShownScene:
@@ -53,8 +63,29 @@ class ShownScene:
         """
         maps = self.scene.maps(picture)
         source = default_source(picture.files)
-        prior = None
+        prior = origin = None
         if source:
             view = view_of(picture.lens, picture.up_in_camera) if self.trust else None
             prior = make_prior(maps.distances_m, maps.usable, source, PriorOptions(), self.trust, view)
-        return ShownMaps(**vars(maps), source=source, prior=prior)
+            origin = _origin(maps, source, prior, self.trust, view)
+        return ShownMaps(**vars(maps), source=source, prior=prior, origin=origin)
+
+
+def _origin(maps: PictureMaps, source: str, prior: Prior, trust: Trust | None, view: View | None) -> NDArray[np.int8]:
+    """Say for each pixel what its prior comes from, by the rules of `make_prior`."""
+
+    def has(name: str) -> NDArray[np.bool_]:
+        found = maps.distances_m.get(name)
+        return np.zeros_like(maps.usable) if found is None else np.nan_to_num(found) > 0
+
+    with_motion = source == "motion" or (source == INTEGRATED and (trust is None or trust.motion is not None))
+    moved = has("motion") if with_motion else np.zeros_like(maps.usable)
+    estimated = has("mono")
+    if trust is not None and view is not None:
+        # beyond, a monocular distance means "far"
+        estimated &= np.nan_to_num(maps.distances_m.get("mono", np.zeros(1))) <= FARTHEST_M
+        if not trust.everywhere:
+            estimated &= trust.in_field(view.elevation_rad)
+    points = has("lidar") if source != "mono" else np.zeros_like(maps.usable)
+    of_estimates = np.where(moved, np.where(estimated, 2, 3), 1)
+    return np.where(prior.distance_m > 0, np.where(points, 0, of_estimates), -1).astype(np.int8)

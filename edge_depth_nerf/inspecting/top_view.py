@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from edge_depth_nerf.base.pictures import INK, drawn
+from edge_depth_nerf.base.pictures import INK, add_legend_below, drawn
 from edge_depth_nerf.inspecting.figures import reference_camera
 from edge_depth_nerf.inspecting.findings import Finding
 from edge_depth_nerf.scene.reader import SceneFolder
@@ -31,8 +31,8 @@ VIEWS = ("#008c5a", "#963caa", "#008caa", "#966e00", "#c85078", "#5a5a5a")
 """Viewing directions, by camera."""
 GREYS = ("#e1e1e1", "#cacaca", "#b3b3b3", "#9c9c9c", "#858585", "#6e6e6e")
 """Points, from low to high: the ground stays pale, fronts of houses are lines."""
-_AROUND_PX = (80, 150)
-"""What the axes' numbers, title and legend take."""
+_AROUND_PX = (80, 110)
+"""What the axes' numbers and the title take."""
 _DPI = 100
 _ARROW = {"units": "dots", "scale_units": "dots", "scale": 1 / 18}
 """Arrows of 18 px for a length of 1."""
@@ -87,7 +87,7 @@ def top_view(
         axes.plot(*rings_m.T, "o", markersize=10, markerfacecolor="none", color=INK, label="moment with a sheet")
         for index in _apart(rings_m, 40 * pixel_m):
             _write(axes, str(named[index]), rings_m[index], INK)
-    figure.legend(loc="outside lower left", ncols=max(int(figure.bbox.width / 200), 1), frameon=False)
+    add_legend_below(figure, *axes.get_legend_handles_labels(), "outside lower left")
     return figure
 
 

@@ -129,15 +129,15 @@ def _check_version(worker: str, name: str, found: str, wanted: str) -> None:
 
     if told_apart(found) != told_apart(wanted):
         raise InputError(
-            f"worker {worker}: has {name} {found}, this machine {wanted}. The same is needed on all, or their results "
-            "differ: give the workers the environment of this machine, and start them anew."
+            f"worker {worker}: has {name} {found}, this machine {wanted}. All machines need the same version, or "
+            "their results differ: give the workers this machine's environment, and restart them."
         )
 
 
 def _not_shared(worker: str, folder: Path) -> str:
     return (
-        f"worker {worker}: does not see {folder} as this machine does. Expected storage that all machines share, under "
-        "one path; data do not travel. Mount it there on the worker, or give a folder that is shared."
+        f"worker {worker}: does not have {folder} as this machine does. Expected storage that all machines share, "
+        "under one path: data are not sent to workers. Mount it on the worker, or give a shared folder."
     )
 
 
@@ -183,7 +183,7 @@ class Cluster:
         if said["begins"]:
             self._begun[said["key"]] += 1
             if self._begun[said["key"]] > 1:
-                say(self._console, f"{task.title}: its worker was lost; goes on on {said['machine']}.", "yellow")
+                say(self._console, f"{task.title}: worker lost; continuing on {said['machine']}.", "yellow")
         tell(said["share"])
 
     def _end(self, task: Task, done: Any, ended: Future[None]) -> None:
@@ -204,16 +204,17 @@ class Cluster:
             lost = f"{_count(count, 'worker')} {'was' if count == 1 else 'were'}"
             ended.set_exception(
                 InputError(
-                    f"{task.title}: {lost} lost while doing it. What it said is in {task.log}; what the workers said, "
-                    "in their own logs: often it is memory that ends. What is done is kept, and the same command takes "
-                    "up where it was."
+                    f"{task.title}: {lost} lost while running it. Its log is {task.log}. The workers' logs may show "
+                    "the reason; often it is too little memory. Finished work is kept. Run the same command again "
+                    "to resume."
                 )
             )
         except BaseException as error:  # whatever a worker or a lost scheduler makes of it
             ended.set_exception(
                 InputError(
-                    f"{task.title}: the cluster did not end it ({type(error).__name__}: {error}). Look whether "
-                    "scheduler and workers still run; what is done is kept, and the same command takes up where it was."
+                    f"{task.title}: the cluster did not finish it ({type(error).__name__}: {error}). Check whether "
+                    "scheduler and workers still run; finished work is kept. Run the same command again "
+                    "to resume."
                 )
             )
         else:
@@ -226,8 +227,9 @@ def _wait_for(path: Path, machine: str) -> None:
     while not path.exists():
         if time.monotonic() > until:
             raise InputError(
-                f"{path}: was made on {machine}, but is not here after {SEEN_WITHIN_S:g} s. Expected storage that all "
-                "machines share, under one path: mount it on that machine, or take it out of the cluster."
+                f"{path}: was made on {machine}, but did not appear here within {SEEN_WITHIN_S:g} s. Expected "
+                "storage that all machines share, under one path: mount it on that machine, or remove the "
+                "machine from the cluster."
             )
         time.sleep(0.1)
 
@@ -261,8 +263,9 @@ def on_cluster(address: str, tasks: Sequence[Task], reads: Sequence[Path], conso
                 client = Client(address, timeout=CONNECT_S, set_as_default=False)
             except (OSError, TimeoutError, ValueError, TypeError) as error:
                 raise InputError(
-                    f"--cluster {address}: no scheduler answers ({_first_line(error)}). Start one by `dask scheduler` "
-                    "where this machine reaches it; for tls:// Dask's own settings name the keys (docs/cluster.md)."
+                    f"--cluster {address}: no scheduler answers ({_first_line(error)}). Start one with `dask "
+                    "scheduler` where this machine can reach it; for tls://, Dask's own settings name the "
+                    "keys (docs/cluster.md)."
                 ) from None
             stack.enter_context(client)
         _await_workers(client, address, console)
@@ -291,13 +294,13 @@ def _first_line(error: Exception) -> str:
 
 def _await_workers(client: Any, address: str, console: Console) -> None:
     if not client.scheduler_info(n_workers=-1)["workers"]:
-        say(console, f"Cluster {address}: no worker yet; waiting for one, {WAIT_FOR_WORKERS_S:g} s at most.", "yellow")
+        say(console, f"Cluster {address}: no worker yet; waiting up to {WAIT_FOR_WORKERS_S:g} s at most.", "yellow")
     try:
         client.wait_for_workers(1, timeout=WAIT_FOR_WORKERS_S)
     except TimeoutError:
         raise InputError(
-            f"--cluster {address}: the scheduler has no worker, after {WAIT_FOR_WORKERS_S:g} s. Start some with `dask "
-            f"worker {address} --nthreads 1`, on machines with a GPU with --resources 'GPU=1'."
+            f"--cluster {address}: the scheduler has no worker after {WAIT_FOR_WORKERS_S:g} s. Start some with `dask "
+            f"worker {address} --nthreads 1`, and with --resources 'GPU=1' on machines with a GPU."
         ) from None
 
 
@@ -344,9 +347,9 @@ def _look_at(
     for address, worker in workers.items():
         if worker["nthreads"] != 1:
             raise InputError(
-                f"worker {machines.get(address, '')} ({address}): has {worker['nthreads']} threads, so Dask would give "
-                "it as many tasks at once. Expected one: a task is a process, which uses several cores by itself. "
-                "Start it with --nthreads 1."
+                f"worker {machines.get(address, '')} ({address}): has {worker['nthreads']} threads, so Dask would "
+                "give it that many tasks at once. Expected one: a task is a process that uses several "
+                "cores. Start it with --nthreads 1."
             )
     for where, found in ask(platform.python_version):
         _check_version(where, "Python", str(found), platform.python_version())
@@ -363,8 +366,8 @@ def _look_at(
     for where, may in ask(os.access, str(witness.parent), os.W_OK):
         if may is not True:
             raise InputError(
-                f"worker {where}: may not write to {witness.parent}. Expected the user of this machine, or one who "
-                "may: start the worker as that user, or let others write there."
+                f"worker {where}: has no permission to write to {witness.parent}. Start the worker as the user of "
+                "this machine, or give its user permission to write there."
             )
     return machines
 

@@ -53,20 +53,23 @@ class LoggedCommands:
         """
         log.parent.mkdir(parents=True, exist_ok=True)
         words = [str(word) for word in command]
+        # Windows' own encoding lacks the letters of progress bars
+        told = {"OMP_NUM_THREADS": str(threads), "PYTHONUNBUFFERED": "1", "PYTHONIOENCODING": "utf-8"}
         last = ""
         with log.open("a", encoding="utf-8") as sink:
             sink.write(f"$ {shlex.join(words)}\n")
             sink.flush()
             with self._lock:
                 if self._stopped:
-                    raise InputError(f"{words[0]}: stopped before it began.")
+                    raise InputError(f"{words[0]}: stopped before it started.")
                 process = self._process = subprocess.Popen(
                     words,
-                    env={"OMP_NUM_THREADS": str(threads), "PYTHONUNBUFFERED": "1", **os.environ, **(environment or {})},
+                    env={**told, **os.environ, **(environment or {})},
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE,
                     stderr=subprocess.STDOUT,
-                    text=True,
+                    encoding="utf-8",
+                    errors="replace",
                 )
             assert process.stdout is not None
             for line in process.stdout:
@@ -77,7 +80,7 @@ class LoggedCommands:
             status = process.wait()
         if status:
             raise InputError(
-                f"{Path(words[0]).name} ended with status {status}. What it said is in {log}, at last: {last} The "
+                f"{Path(words[0]).name} ended with status {status}. Its log is {log}. The last line is: {last} The "
                 f"command was\n{shlex.join(words)}"
             )
 

@@ -143,7 +143,7 @@ def this_machine(jobs: int | None, count: int, console: Console) -> Iterator[Thi
     # the same for the last task, which is alone: what its seconds are compared with had no more
     threads = max(1, cores // jobs)
     jobs = min(jobs, count)
-    say(console, f"Runs to do: {count}; side by side: {jobs}; threads of each: {threads}.")
+    say(console, f"Runs to do: {count}; in parallel: {jobs}; threads of each: {threads}.")
     with ThreadPoolExecutor(jobs) as pool:
         yield ThisMachine(pool, threads)
 

@@ -40,8 +40,18 @@ class CubeContraction(SceneContraction):
 
 
 def _in_parts(x: Tensor) -> bool:
-    """Whether `network` is for it."""
+    """Whether `network` takes it in parts."""
     return x.device.type == "cpu" and x.dtype == torch.float32 and not torch.is_autocast_enabled("cpu")
+
+
+def _by_network(x: Tensor) -> bool:
+    """Whether `network` is for it, which takes once a ray what the samples of a ray share."""
+    return x.device.type == "cuda" or _in_parts(x)
+
+
+def _one_a_ray(directions: Tensor) -> bool:
+    """Whether all samples of a ray have one direction."""
+    return directions.ndim == 3 and (directions.shape[1] == 1 or directions.stride(1) == 0)
 
 
 def _is_plain(mlp: MLP) -> bool:
@@ -133,31 +143,46 @@ class FusedNerfactoField(NerfactoField):
         positions = [samples.frustums.get_positions().reshape(-1, 3) for samples in parts]
         counts = [len(each) for each in positions]
         places, inside = _unit_cube(self, torch.cat(positions))
-        of_parts = zip(parts, self.mlp_base(places).split(counts), inside.split(counts), strict=True)
+        encoded = self._encoded_directions(parts)
+        of_parts = zip(parts, self.mlp_base(places).split(counts), inside.split(counts), encoded, strict=True)
         results = []
-        for samples, *values in of_parts:
-            features, valid = (value.view(*samples.frustums.shape, -1) for value in values)
+        for samples, features, valid, of_rays in of_parts:
+            features, valid = (value.view(*samples.frustums.shape, -1) for value in (features, valid))
             density, embedding = self._density(features, valid)
-            results.append({FieldHeadNames.DENSITY: density, **self.get_outputs(samples, embedding)})
+            colours = self.get_outputs(samples, embedding, of_rays)
+            results.append({FieldHeadNames.DENSITY: density, **colours})
         return results
 
+    def _encoded_directions(self, parts: Sequence[RaySamples]) -> Sequence[Tensor | None]:
+        """The directions of the rays of each part, encoded together; None where samples have their own."""
+        directions = [samples.frustums.directions for samples in parts]
+        if not all(map(_one_a_ray, directions)):
+            return [None] * len(parts)
+        every = torch.cat([each[:, 0] for each in directions])
+        return self.direction_encoding(get_normalized_directions(every)).split([len(each) for each in directions])
+
     def get_outputs(
-        self, ray_samples: RaySamples, density_embedding: Tensor | None = None
+        self,
+        ray_samples: RaySamples,
+        density_embedding: Tensor | None = None,
+        encoded: Float[Tensor, "rays encoded"] | None = None,
     ) -> dict[FieldHeadNames, Tensor]:
-        """Colours of samples."""
+        """Colours of samples; `encoded`: their rays' directions, where they are encoded already."""
         directions, cameras = ray_samples.frustums.directions, ray_samples.camera_indices
         assert density_embedding is not None
         more_heads = self.use_transient_embedding or self.use_semantics or self.use_pred_normals
-        one_direction_a_ray = directions.ndim == 3 and (directions.shape[1] == 1 or directions.stride(1) == 0)
-        plain = isinstance(self.mlp_head, FusedMLP) and _in_parts(density_embedding)
-        if more_heads or cameras is None or not one_direction_a_ray or not plain:
+        plain = isinstance(self.mlp_head, FusedMLP) and _by_network(density_embedding)
+        if more_heads or cameras is None or not _one_a_ray(directions) or not plain:
             return super().get_outputs(ray_samples, density_embedding)
-        encoded = self.direction_encoding(get_normalized_directions(directions[:, 0]))
+        of_rays = encoded
+        if of_rays is None:
+            of_rays = self.direction_encoding(get_normalized_directions(directions[:, 0]))
+            assert of_rays is not None
         weights, biases = _parameters(self.mlp_head)
         of_direction, of_features, of_appearance = torch.split(
-            weights[0], [encoded.shape[1], self.geo_feat_dim, self.appearance_embedding_dim], dim=1
+            weights[0], [of_rays.shape[1], self.geo_feat_dim, self.appearance_embedding_dim], dim=1
         )
-        shared = torch.addmm(biases[0], encoded, of_direction.t())
+        shared = torch.addmm(biases[0], of_rays, of_direction.t())
         if self.embedding_appearance is not None:
             if self.training:
                 shared = torch.addmm(shared, self.embedding_appearance(cameras[:, 0, 0]), of_appearance.t())
@@ -168,7 +193,8 @@ class FusedNerfactoField(NerfactoField):
             [of_features, *weights[1:]],
             [shared, *biases[1:]],
         )
-        return {FieldHeadNames.RGB: torch.sigmoid(colours).view(directions.shape)}
+        # float32 also where autocast had it otherwise, as nerfstudio's
+        return {FieldHeadNames.RGB: torch.sigmoid(colours).view(directions.shape).to(directions)}
 
 
 FUSED: dict[type[nn.Module], type[nn.Module]] = {
@@ -178,12 +204,17 @@ FUSED: dict[type[nn.Module], type[nn.Module]] = {
 }
 
 
-def use_fused_fields(module: nn.Module) -> None:
+def use_fused_fields(module: nn.Module, add_in_place: bool = True) -> None:
     """Let all fields, networks and hash encodings below `module` compute in fused forms.
 
     In place; parameters stay the same objects.
+
+    Args:
+        module: whose parts change.
+        add_in_place: as for `use_fused_encodings`.
+
     """
-    use_fused_encodings(module)
+    use_fused_encodings(module, add_in_place)
     for part in module.modules():
         if type(part) in FUSED and not (isinstance(part, MLP) and not _is_plain(part)):
             # the class alone differs; another object would have to be found by all who hold this one

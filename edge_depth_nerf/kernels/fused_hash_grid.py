@@ -35,10 +35,18 @@ class FusedHashEncoding(HashEncoding):
         return encoded.view(*in_tensor.shape[:-1], self.get_out_dim())
 
 
-def use_fused_encodings(module: nn.Module) -> None:
-    """Let all hash encodings below `module` compute in the fused form; in place, parameters stay the same objects."""
+def use_fused_encodings(module: nn.Module, add_in_place: bool = True) -> None:
+    """Let all hash encodings below `module` compute in the fused form; in place, parameters stay the same objects.
+
+    Args:
+        module: whose encodings change.
+        add_in_place: whether an optimiser may have the gradients of their tables added in place. Not where, within a
+            step, `torch.autograd.grad` asks for the gradient by positions: backward cannot tell that from a step's own.
+
+    """
     for part in module.modules():
         if type(part) is HashEncoding:
             # the class alone differs; another object would have to be found by all who hold this one
             part.__class__ = FusedHashEncoding
-            setattr(part.hash_table, IN_PLACE, False)  # until an optimiser says that it can do with it
+            if add_in_place:
+                setattr(part.hash_table, IN_PLACE, False)  # until an optimiser says that it can do with it

@@ -28,7 +28,10 @@ from edge_depth_nerf.kernels.triton_back_end import working
 
 
 def back_end(device: torch.device) -> ModuleType | None:
-    """Give the module that works on tensors of this device, None if there is none."""
+    """Give the module that works on tensors of this device, None if there is none.
+
+    On CUDA each kernel takes one point to find out: Triton may be missing, find no C compiler, or not know the GPU.
+    """
     if device.type == "cpu":
         # imported here, because Numba takes half a second to load
         from edge_depth_nerf.kernels import hash_grid_numba as cpu

@@ -1,4 +1,4 @@
-"""A small network on the CPU, layer by layer for a part of the points at a time, so that the part stays in the cache.
+"""A small network; on the CPU for a part of the points at a time, so that the part stays in the cache.
 
 y = W_n relu(… relu(W_1 x + b_1) …) + b_n. torch takes all points through one layer after the other: each layer is
 written to memory and read again, and its ReLU makes a second copy. Here a part of the points passes all layers, the
@@ -16,8 +16,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
+
+from edge_depth_nerf.kernels.triton_back_end import of_network
 
 PART = 2048
 """So many points at a time: 512 kB in a layer of 64."""
@@ -107,13 +110,24 @@ class _Gradients(torch.autograd.Function):
         )
 
 
+def _layer_by_layer(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tensor:
+    """Apply a network by torch's own products."""
+    shared = biases[0].view(-1, biases[0].shape[-1])
+    groups = len(shared)
+    x = F.linear(x, weights[0]).view(groups, -1, len(weights[0]))
+    x = (x + shared[:, None]).flatten(0, 1)
+    for weight, bias in zip(weights[1:], biases[1:], strict=True):
+        x = F.linear(x.relu_(), weight, bias)
+    return x
+
+
 def network(
     x: Float[Tensor, "points in"], weights: Sequence[Tensor], biases: Sequence[Tensor]
 ) -> Float[Tensor, "points out"]:
     """Apply a network to points, differentiable once by all it is given.
 
     Args:
-        x: on the CPU, float32.
+        x: float32; on a GPU, where torch's products take all points at once, whatever autocast makes of it.
         weights: of each layer, [out, in].
         biases: of each layer, [out]; the first may be [groups, out] for equal groups of neighbouring points.
 
@@ -121,6 +135,9 @@ def network(
         The last layer, without activation.
 
     """
+    if x.device.type != "cpu":
+        kernels = of_network(x, weights)
+        return (_layer_by_layer if kernels is None else kernels.network)(x, weights, biases)
     rows = [bias.view(-1, bias.shape[-1]) for bias in biases]
     parameters = [each for pair in zip(weights, rows, strict=True) for each in pair]
     result = _Network.apply(x, torch.is_grad_enabled(), *parameters)

@@ -1,4 +1,4 @@
-"""nerfstudio's placing of samples along rays in one pass, on the CPU and on a GPU, and on a GPU their weights.
+"""nerfstudio's placing of samples along rays: in one pass, without a copy from the host, and on a GPU their weights.
 
 Host-facing; the numbers are nerfstudio's to float32's noise, from the same random numbers.
 """
@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.rays import RayBundle, RaySamples
-from nerfstudio.model_components.ray_samplers import PDFSampler
+from nerfstudio.model_components.ray_samplers import PDFSampler, UniformLinDispPiecewiseSampler
 from torch import Tensor, nn
 
 from edge_depth_nerf.kernels.triton_back_end import along_rays
@@ -25,6 +25,59 @@ def _placing(weights: Tensor) -> ModuleType | None:
 
         return ray_kernels
     return along_rays(weights)
+
+
+class FirstSampler(UniformLinDispPiecewiseSampler):
+    """nerfstudio's first sampler, which makes its constants anew in each step and copies them from the host.
+
+    On the CPU it is left to nerfstudio.
+    """
+
+    def __init__(self, single_jitter: bool) -> None:
+        super().__init__(single_jitter=single_jitter)
+        self._intervals: dict[tuple[int, torch.device], tuple[Tensor, Tensor]] = {}
+
+    def generate_ray_samples(self, ray_bundle: RayBundle | None = None, num_samples: int | None = None) -> RaySamples:
+        """Place samples, in training anywhere within their intervals."""
+        assert ray_bundle is not None
+        count = num_samples or self.num_samples
+        if ray_bundle.origins.device.type == "cpu" or not count:
+            return super().generate_ray_samples(ray_bundle, num_samples)
+        return self.placed(ray_bundle, count)
+
+    def placed(self, ray_bundle: RayBundle, count: int) -> RaySamples:
+        """Place so many samples, on any device."""
+        assert ray_bundle.nears is not None and ray_bundle.fars is not None
+        device = ray_bundle.origins.device
+        lower, lengths = self._between(count, device)
+        first, last = self.spacing_fn(ray_bundle.nears), self.spacing_fn(ray_bundle.fars)
+        if self.train_stratified and self.training:
+            drawn = torch.rand(len(ray_bundle), 1 if self.single_jitter else count + 1, device=device)
+            edges = torch.addcmul(lower, lengths, drawn)
+        else:
+            edges = torch.linspace(0, 1, count + 1, device=device)[None]
+
+        def to_euclidean(places: Tensor) -> Tensor:
+            return self.spacing_fn_inv(torch.lerp(first, last, places))
+
+        distances, edges = to_euclidean(edges)[..., None], edges[..., None]
+        return ray_bundle.get_ray_samples(
+            bin_starts=distances[:, :-1],
+            bin_ends=distances[:, 1:],
+            spacing_starts=edges[:, :-1],
+            spacing_ends=edges[:, 1:],
+            spacing_to_euclidean_fn=to_euclidean,
+        )
+
+    def _between(self, count: int, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Where each edge may lie: the middles beside its even place, the lower one and how far it is to the upper."""
+        key = count, device
+        if key not in self._intervals:
+            even = torch.linspace(0, 1, count + 1)
+            middles = (even[1:] + even[:-1]) / 2
+            lower, upper = torch.cat([even[:1], middles]), torch.cat([middles, even[-1:]])
+            self._intervals[key] = lower[None].to(device), (upper - lower)[None].to(device)
+        return self._intervals[key]
 
 
 class FusedPDFSampler(PDFSampler):

@@ -22,7 +22,7 @@ import math
 import struct
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
@@ -30,7 +30,7 @@ from typing import Any, BinaryIO, Literal
 import lzf
 import numpy as np
 import torch
-from jaxtyping import Float64, Shaped
+from jaxtyping import Float64, Shaped, UInt8
 
 from edge_depth_nerf.base.bounds import check_bytes, shown
 from edge_depth_nerf.base.errors import InputError
@@ -50,7 +50,7 @@ _MAX_TEXT_BYTES = 1 << 27
 _MAX_LZF_RATIO = 100
 """LZF makes at most 264 bytes of three."""
 _MAX_HEADER_BYTES = 1 << 16
-_AGAIN = "Copy or export the file again, or delete it so that its moment is skipped."
+_AGAIN = "Copy or export the file again, or delete it so that its frame is skipped."
 
 _PLY_TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -145,7 +145,7 @@ def read_scan(path: Path, scan: ScanFormat, moment_s: float = 0.0) -> Sweep:
 
     """
     header = _read_header(path, scan)
-    columns = _read_columns(path, header, scan)
+    columns = _read_columns(path, header, [*scan.needed, scan.name("intensity")], scan)
     points_m = np.stack([columns[scan.name(axis)] for axis in "xyz"], -1)
     intensity = columns.get(scan.name("intensity"), np.zeros(len(points_m)))
     offset_s = None
@@ -154,8 +154,10 @@ def read_scan(path: Path, scan: ScanFormat, moment_s: float = 0.0) -> Sweep:
     return usable_returns(path, torch.from_numpy(points_m), torch.from_numpy(intensity), offset_s)
 
 
-def read_cloud(path: Path) -> Float64[np.ndarray, "points 3"]:
-    """Read the vertices of a .ply file, as they are.
+def read_cloud(
+    path: Path,
+) -> tuple[Float64[np.ndarray, "points 3"], UInt8[np.ndarray, "points 3"] | None]:
+    """Read the vertices of a .ply file, as they are, and their colours (RGB) where it has any.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -164,9 +166,12 @@ def read_cloud(path: Path) -> Float64[np.ndarray, "points 3"]:
     """
     if path.suffix.lower() != ".ply":
         raise InputError(f"{path}: a point cloud of unknown format; expected .ply.")
-    scan = ScanFormat()
-    columns = _read_columns(path, _read_header(path, scan, MAX_CLOUD_POINTS), scan)
-    return np.stack([columns[axis] for axis in "xyz"], -1)
+    scan, colours = ScanFormat(), ("red", "green", "blue")
+    columns = _read_columns(path, _read_header(path, scan, MAX_CLOUD_POINTS), [*scan.needed, *colours], scan)
+    points = np.stack([columns[axis] for axis in "xyz"], -1)
+    if not all(name in columns for name in colours):
+        return points, None
+    return points, np.stack([columns[name] for name in colours], -1).clip(0, 255).astype(np.uint8)
 
 
 # ---- headers ---------------------------------------------------------------------------------------------------
@@ -191,25 +196,25 @@ def _read_header(path: Path, scan: ScanFormat, most: int = MAX_POINTS) -> _Heade
     names = header.record.names or ()
     if missing := [name for name in scan.needed if name not in names]:
         raise InputError(
-            f"{path}: has no column {', '.join(missing)}, only {', '.join(names)}. Say in the rig file what x, y, z, "
-            "intensity and time are called."
+            f"{path}: has no column {', '.join(missing)}, only {', '.join(names)}. Name the columns of x, y, z, "
+            "intensity and time in the rig file."
         )
     if header.count == 0:
         raise InputError(f"{path}: a scan without points. {_AGAIN}")
     if header.count > most:
         raise InputError(
-            f"{path}: {shown(header.count)} points, expected at most {most}: one scan a file, not a whole map."
+            f"{path}: {shown(header.count)} points, expected at most {most}: one scan per file, not a whole map."
         )
     if header.encoding == "text" and size > _MAX_TEXT_BYTES:
         raise InputError(f"{path}: {size} bytes of text, expected at most {_MAX_TEXT_BYTES}. Export it as binary.")
     if header.encoding == "records" and header.offset + header.count * header.record.itemsize > size:
         raise InputError(
             f"{path}: {size} bytes, but {header.count} points of {header.record.itemsize} bytes from byte "
-            f"{header.offset} on are promised: the file is truncated. {_AGAIN}"
+            f"{header.offset} on are declared: the file is truncated. {_AGAIN}"
         )
     # a value and a line end, or space, take two bytes at least
     if header.encoding == "text" and header.offset + header.count * 2 * len(names) - 1 > size:
-        raise InputError(f"{path}: {size} bytes cannot hold the {header.count} lines promised. {_AGAIN}")
+        raise InputError(f"{path}: {size} bytes cannot hold the declared {header.count} lines. {_AGAIN}")
     return header
 
 
@@ -218,7 +223,7 @@ def _bin_header(path: Path, size: int, scan: ScanFormat) -> _Header:
     if size % record.itemsize:
         raise InputError(
             f"{path}: {size} bytes, expected a multiple of {record.itemsize} ({', '.join(scan.columns)} as "
-            f"{scan.dtype}). The file is truncated, or has other columns than the rig file says."
+            f"{scan.dtype}). The file is truncated, or its columns differ from the rig file's."
         )
     return _Header(record, size // record.itemsize, "records")
 
@@ -228,7 +233,7 @@ def _npy_array(path: Path) -> np.ndarray:
         shape, _, kind = read_array_header(file, str(path))
         promised, size = file.tell() + math.prod(shape) * kind.itemsize, file.seek(0, 2)
     if promised > size:
-        raise InputError(f"{path}: {size} bytes, but its header promises {shown(promised)}: truncated. {_AGAIN}")
+        raise InputError(f"{path}: {size} bytes, but its header declares {shown(promised)}: truncated. {_AGAIN}")
     try:
         # mapped: nothing is allocated
         return np.load(path, mmap_mode="r", allow_pickle=False)
@@ -250,7 +255,7 @@ def _array_header(path: Path, shape: tuple[int, ...], kind: np.dtype, scan: Scan
     structured = "a structured array, or " if encoding == "matrix" else ""
     raise InputError(
         f"{path}: an array of {kind} and shape {shape}; expected {structured}points × {len(scan.columns)} numbers "
-        f"({', '.join(scan.columns)}). Say in the rig file which columns it has."
+        f"({', '.join(scan.columns)}). State its columns in the rig file."
     )
 
 
@@ -265,7 +270,8 @@ def _npz_name(path: Path, scan: ScanFormat) -> str:
     if len(wanted) != 1 or wanted[0] not in names:
         asked = f"no array {scan.array!r}" if scan.array is not None else f"{len(names)} arrays"
         raise InputError(
-            f"{path}: {asked}; it holds {shown(names)}. Name the one of the points in the rig file, as array = 'data'."
+            f"{path}: {asked}; it holds {shown(names)}. Name the array with the points in the rig file, as array = "
+            "'data'."
         )
     return wanted[0]
 
@@ -288,8 +294,8 @@ def _feather_table(path: Path, columns: list[str] | None = None) -> Any:
         from pyarrow import ArrowException, feather  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise InputError(
-            f"{path}: .feather scans are read by pyarrow, which is not installed. `pip install pyarrow`, or convert "
-            "the scans to .npz."
+            f"{path}: reading .feather scans needs pyarrow, which is not installed. Run `pip install pyarrow`, or "
+            "convert the scans to .npz."
         ) from None
     try:
         return feather.read_table(path, columns=columns, memory_map=True)
@@ -380,9 +386,10 @@ def _record(path: Path, fields: list) -> np.dtype:
 # ---- points ----------------------------------------------------------------------------------------------------
 
 
-def _read_columns(path: Path, header: _Header, scan: ScanFormat) -> dict[str, Shaped[np.ndarray, "points"]]:
-    """The columns that are used, as float64."""
-    wanted = [*scan.needed, scan.name("intensity")]
+def _read_columns(
+    path: Path, header: _Header, wanted: Sequence[str], scan: ScanFormat
+) -> dict[str, Shaped[np.ndarray, "points"]]:
+    """The columns wanted that there are, as float64."""
     names = [name for name in header.record.names or () if name in wanted]
     if header.encoding == "matrix":
         array = _npy_array(path)
@@ -424,7 +431,7 @@ def _text_columns(path: Path, header: _Header, names: list[str]) -> dict[str, np
         except ValueError as error:
             raise InputError(f"{path}: a line of its points cannot be read ({error}). {_AGAIN}") from None
     if len(values) != header.count:
-        raise InputError(f"{path}: {len(values)} lines of points, {header.count} are promised: truncated. {_AGAIN}")
+        raise InputError(f"{path}: {len(values)} lines of points, but {header.count} are declared: truncated. {_AGAIN}")
     return {name: values[:, number] for number, name in enumerate(names)}
 
 

@@ -49,9 +49,7 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         if len(self.times_s) < 2:
-            raise InputError(
-                f"a path needs at least two poses, found {len(self.times_s)}: the vehicle's motion comes from them."
-            )
+            raise InputError(f"a path needs at least two poses for the vehicle's motion, found {len(self.times_s)}.")
         if not (np.diff(self.times_s) > 0).all():
             first = int(np.argmax(~(np.diff(self.times_s) > 0)))
             raise InputError(

@@ -148,12 +148,12 @@ def find_ego(
     taken, offered = _take_moving(pictures, lens.shape, factor, small_lens)
     if offered < fewest:
         return NoEgo(
-            f"{offered} pictures are too few (held-out ones do not count), at least {fewest} are needed.",
+            f"{offered} pictures are too few (held-out ones do not count); at least {fewest} are needed.",
             could_tell=False,
         )
     if len(taken) < fewest:
         return NoEgo(
-            f"The vehicle stands: only {len(taken)} of {offered} pictures show something new, at least "
+            f"The vehicle stands still: only {len(taken)} of {offered} pictures show something new; at least "
             f"{fewest} are needed.",
             could_tell=False,
         )
@@ -168,11 +168,12 @@ def find_ego(
         if certainty >= _CLEAR:
             break
     if not vehicle.any():
-        return NoEgo("Nothing at the lower rim of the pictures stays the same while the vehicle moves.")
+        return NoEgo("No region at the lower border of the pictures stays the same while the vehicle moves.")
     if certainty < _MIN_CERTAINTY:
         return NoEgo(
-            "What stays the same at the lower rim of the pictures has no clear outline: only along "
-            f"{certainty:.0%} of it there is an edge beyond which things change. It may be smooth road."
+            "The region at the lower border of the pictures that stays the same has no clear outline: there is an "
+            "edge along only "
+            f"{certainty:.0%} of it. It may be smooth road."
         )
     ego = enlarge(dilated(vehicle, _GROWN * max(small_lens.shape)), factor, (lens.shape[0], lens.shape[1]))
     ego = from_nearest(ego, lens)[0]

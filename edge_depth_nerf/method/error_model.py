@@ -270,28 +270,31 @@ class Trust:
                 np.median([getattr(f, name) for f in judged]) for name in ("held_out_before", "held_out_after")
             )
             parts.append(
-                f"monocular maps against LiDAR left out of their alignment: mean relative error {before:.3f} before, "
+                "monocular maps compared with LiDAR points left out of their alignment: mean relative error "
+                f"{before:.3f} before, "
                 f"{after:.3f} after (median of {len(judged)} training pictures)"
             )
         poor = [f.frame for f in self.frames if f.fit_of == "drive"]
         if poor:
             parts.append(
-                f"{len(poor)} with fewer returns than an alignment needs, {', '.join(poor[:3])}"
-                f"{' …' if len(poor) > 3 else ''}, take the drive's fit"
+                f"{len(poor)} with fewer LiDAR points than an alignment needs, {', '.join(poor[:3])}"
+                f"{' …' if len(poor) > 3 else ''}, use the drive's fit"
             )
         if self.motion is not None:
             parts.append(
-                f"distances from motion against LiDAR: 95 % within {2 * self.motion.relative_error:.1%}, monocular "
+                f"distances from motion compared with LiDAR: 95 % within {2 * self.motion.relative_error:.1%}, "
+                "monocular "
                 f"ones there within {2 * self.motion.mono_relative_error:.1%}, so motion weighs "
                 f"{self.motion.weight:.0%} of both"
             )
         if self.error_model is None:
-            parts.append("too few LiDAR returns to measure the prior's error: sigma is as under sigma_mode combined")
+            parts.append("too few LiDAR points to measure the prior's error: sigma is that of sigma_mode combined")
         if not self.everywhere:
             low, high = np.degrees(self.field_rad)
             beyond = " (beyond, where motion gives a distance)" if self.motion is not None else ""
             parts.append(
-                f"a prior only between {low - FIELD_MARGIN_DEG:.0f}° and {high + FIELD_MARGIN_DEG:.0f}° of elevation, "
+                f"there is a prior only between {low - FIELD_MARGIN_DEG:.0f}° and {high + FIELD_MARGIN_DEG:.0f}° of "
+                "elevation, "
                 f"where LiDAR measured and the network could learn{beyond}"
             )
         return "; ".join(parts)
@@ -343,7 +346,7 @@ def read_trust(path: Path) -> Trust:
         )
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise InputError(
-            f"{path}: is no calibration of this version's form ({error!r}). Delete it: it is made anew from the "
+            f"{path}: is not a calibration of this version ({error!r}). Delete it: it is then made again from the "
             "scene's maps."
         ) from error
 

@@ -14,8 +14,8 @@ weight ρ that the measured errors of both give:
 
         (1-α) d̂ 1(d = 0)  becomes  (1-α) (ρ m + (1-ρ) d̂) 1(d = 0)
 
-where a pixel has both, and the one it has elsewhere. This d̂, of both, is also what g compares. Without motion all is as
-it was.
+where a pixel has both, and the one it has elsewhere. This d̂, of both, is also what g compares. Without motion all is
+as it was.
 
 Nothing here is differentiated: the prior is data. CPU tensors are integrated by compiled loops
 (`integration_numba`), CUDA tensors by torch; both compute in float64, which keeps the ratios of weights up to
@@ -84,7 +84,7 @@ class IntegrationOptions:
     """
 
     alpha: float = 0.7
-    """Weight of a LiDAR return against 1 - alpha of a monocular value, 0 to 1 (Eq. 5)."""
+    """Weight of a LiDAR point; a monocular value has 1 - alpha. 0 to 1 (Eq. 5)."""
     kernel_size: int = 9
     """Width of the square window in pixels, odd (Eq. 7)."""
     sigma_space_px: float = 3.0
@@ -92,19 +92,21 @@ class IntegrationOptions:
     sigma_depth_m: float = 1.0
     """Standard deviation of the kernel over distance, metres (Eq. 7)."""
     sigma_depth_growth_per_m: float = 0.0
-    """That standard deviation is at least so much times the square of the distance at the centre: neighbouring pixels
-    of the ground lie apart by the square of their distance over the camera's height. 0: Eq. 7."""
+    """The standard deviation over distance is at least this factor times the square of the distance at the centre,
+    because the distances of neighbouring ground pixels differ by the square of their distance over the camera's height.
+    0: Eq. 7."""
     kernel: Kernel = "edge-aware"
     """edge-aware: Eq. 7. spatial-gaussian: Eq. 7 without its distance factor (the rival of Table 4)."""
     normalise: Normalise = "pooled"
-    """pooled: Eq. 5, each pixel of the window counts. per-source: alpha weighs the two sources, not their counts."""
+    """pooled: Eq. 5, each pixel of the window counts. per-source: alpha weights the two sources, whatever their
+    counts."""
     least_returns: float = 0.0
-    """per-source: where the returns of a window together weigh less in space than so many at its centre, LiDAR's share
-    is that much smaller. 0: a single return has the whole share, as far as the window reaches, and makes a square."""
+    """per-source: where the LiDAR points of a window together weigh less than this many points at its centre, LiDAR's
+    weight is reduced in proportion. 0: a single point has LiDAR's whole weight in its window, and makes a square."""
     keep_returns: bool = False
-    """Keep a return as it is (d̃ = d, spread 0, monocular share 0) instead of averaging it with its window."""
+    """Keep a LiDAR point's distance (d̃ = d, spread 0, monocular share 0) instead of averaging it with its window."""
     range_guide: RangeGuide = "mono"
-    """What the window's d̂ is compared with: d̂ at the centre (Eq. 7), or LiDAR at the centre where it has a return
+    """What the window's d̂ is compared with: d̂ at the centre (Eq. 7), or a LiDAR point at the centre if there is one
     (the paper's prose)."""
 
     def __post_init__(self) -> None:
@@ -363,8 +365,8 @@ def select_prior(
     found = {name: pixels for name, pixels in maps.items() if name in needed and pixels is not None}
     if missing := [name for name in needed if name not in found]:
         raise InputError(
-            f"depth_source {depth_source!r} needs {' and '.join(missing)} distance maps, and there are none; "
-            "add them to the scene, or choose the depth_source that the scene has."
+            f"depth_source {depth_source!r} needs {' and '.join(missing)} distance maps, which the scene does not "
+            "have; add them, or choose a depth_source that the scene has."
         )
     if depth_source == INTEGRATED:
         return integrate_depth(found["lidar"], found["mono"], valid, options)

@@ -172,13 +172,13 @@ class UrbanTerms:
     """
 
     expected: float = 0.01
-    """Of the squared error of the expected distance, per m²."""
+    """Weight of the squared error of the expected distance, per m²."""
     empty: float = 1.0
-    """Of what light ends before the surface, metres."""
+    """Weight of the light that ends before the surface, metres."""
     near: float = 1.0
-    """Of how light ends at the surface, metres."""
+    """Weight of how light ends at the surface, metres."""
     narrowing: float = 10.0
-    """By so much σ is wider at the start of a training than at its end; it falls exponentially."""
+    """Ratio of σ at the start of training to σ at its end; it decreases exponentially."""
 
     def sigma_m(self, last_m: float, share: float) -> float:
         """σ, metres, after a share of the training, 0 to 1; `last_m` is that of the end."""

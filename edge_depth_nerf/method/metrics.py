@@ -43,7 +43,7 @@ def _check_pictures(function: str, pred: Tensor, target: Tensor, mask: Tensor) -
             "expected (h, w, 3) twice and (h, w)."
         )
     if not mask.any():
-        raise InputError(f"{function}: the mask {tuple(mask.shape)} keeps no pixel; there is nothing to judge.")
+        raise InputError(f"{function}: the mask {tuple(mask.shape)} keeps no pixel; there is nothing to evaluate.")
 
 
 def _blacked_out(picture: Tensor, mask: Tensor) -> Tensor:
@@ -149,7 +149,7 @@ def load_lpips() -> torch.nn.Module | None:
     """
     path, url = lpips_weights()
     if not path.is_file():
-        _say_once(f"LPIPS is left out: no AlexNet weights at {path}. To have it, put the file of {url} there.")
+        _say_once(f"LPIPS is left out: no AlexNet weights at {path}. To get LPIPS, put the file of {url} there.")
         return None
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 

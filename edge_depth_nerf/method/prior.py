@@ -77,16 +77,17 @@ class PriorOptions:
     """
 
     align: Align = "local"
-    """How the monocular map is fitted to the frame's LiDAR before both are integrated; mono alone stays as it is."""
+    """How the monocular map is fitted to the frame's LiDAR before both are integrated. Without LiDAR it is not
+    changed."""
     sigma_mode: PriorSigma = "calibrated"
-    """calibrated: by the errors that the drive's training frames show at LiDAR returns left out (see
-    `mono.error_model`), and no prior where nothing is known of the error; without a calibration as combined. The
-    others: see `integration.sigma_m`."""
+    """calibrated: from the errors of the drive's training frames at left-out LiDAR points (see `mono.error_model`),
+    with no prior where the error is unknown; combined if there is no calibration. For the others see
+    `integration.sigma_m`."""
     sigma_constant_m: float = 1.0
     """The standard deviation under sigma_mode constant, metres."""
     motion: bool = True
-    """Whether distances from motion take part in the prior of LiDAR and monocular ones, where the scene has them. Under
-    sigma_mode calibrated they do as far as their error could be measured."""
+    """Whether the prior also uses distances from motion, if the scene has them. With sigma_mode calibrated, they are
+    used only if their error could be measured."""
     integration: IntegrationOptions = field(
         default_factory=lambda: IntegrationOptions(
             normalise="per-source", least_returns=4.0, keep_returns=True, sigma_depth_growth_per_m=0.005
@@ -222,6 +223,8 @@ def integrate_frame(
     from_motion = np.zeros_like(mask)
     if motion is not None:
         from_motion = anywhere & (motion.distance_m > 0) & ~returns
+        # where the monocular map means "far" a return takes no part, with motion or without
+        lidar_m = np.where(mask, lidar_m, np.float32(0))
         mono_m = _joined(np.where(mask & motion.mono_counts, mono_m, np.float32(0)), motion.distance_m, motion.weight)
         mask = anywhere
     # the spread is wanted at returns, too, so they are kept afterwards

@@ -14,6 +14,7 @@ import hashlib
 import json
 from collections.abc import Collection, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -254,19 +255,19 @@ def _calibrate(
     missing = [word for layer, word in (("lidar", "LiDAR"), ("mono", "monocular")) if not scene.has(layer)]
     if missing:
         raise InputError(
-            f"{scene.path}: has no {' and no '.join(missing)} distance maps, so there is nothing to measure the "
-            "monocular maps' error by. Process the drive with its sweeps, and make monocular maps with "
+            f"{scene.path}: has no {' and no '.join(missing)} distance maps, so the error of the monocular maps "
+            "cannot be measured. Process the drive with its sweeps, and make monocular maps with "
             "`edge-depth-nerf estimate-depth`."
         )
     measurable = [p for p in pictures if "lidar" in p.files and "mono" in p.files]
     if not measurable:
         raise InputError(
-            f"{scene.path}: no picture for training has a LiDAR and a monocular map, so the prior's error cannot be "
+            f"{scene.path}: no training picture has both a LiDAR and a monocular map, so the prior's error cannot be "
             "measured. Process the drive again."
         )
 
     with_motion = _with_motion(scene, depth_source, options)
-    errors = _motion_errors(scene, measurable, options) if with_motion else None
+    errors: MotionErrors | None = None
 
     def measure(numbered: tuple[int, ScenePicture]) -> MeasuredFrame:
         number, picture = numbered
@@ -284,8 +285,14 @@ def _calibrate(
 
     bars = progress_bars(console or Console(quiet=True), transient=True)
     with bars as progress, ThreadPoolExecutor(2) as pool:
-        task = progress.add_task("Measuring the prior's error…", total=4 * len(measurable))
+        task = progress.add_task("Measuring the prior's error…", total=(4 + with_motion) * len(measurable))
         cloud = static_cloud(scene, measurable, lambda: progress.advance(task))
+        if with_motion:
+            found = []
+            for each in pool.map(partial(_errors_of_both, scene, options), enumerate(measurable)):
+                found.append(each)
+                progress.advance(task)
+            errors = _motion_errors(found)
         frames = []
         for frame in pool.map(measure, enumerate(measurable)):
             frames.append(frame)
@@ -307,21 +314,26 @@ class MotionErrors:
         return weight_of_errors(self.motion, self.mono)
 
 
-def _motion_errors(scene: SceneFolder, pictures: Sequence[ScenePicture], options: PriorOptions) -> MotionErrors | None:
-    """Measure both sources at the returns that are left out of the monocular maps' alignment; None for too few."""
-    errors: list[NDArray[np.float32]] = []
-    for number, picture in enumerate(pictures):
-        maps = scene.maps(picture)
-        motion_m = maps.distances_m.get("motion")
-        if maps.lidar_m is None or maps.mono_m is None or motion_m is None:
-            continue
-        elevation_rad = view_of(picture.lens, picture.up_in_camera).elevation_rad
-        left_out, _ = held_out_returns(both(maps.lidar_m, maps.mono_m, maps.usable), elevation_rad, number)
-        aligned = align(np.where(left_out, np.float32(0), maps.lidar_m), maps.mono_m, maps.usable, options.align).mono_m
-        judged = _some(left_out & (motion_m > 0) & (aligned > 0), _JUDGED_A_FRAME, np.random.default_rng([9, number]))
-        true_m = maps.lidar_m[judged]
-        errors.append(np.stack([np.abs(found[judged] - true_m) / true_m for found in (motion_m, aligned)]))
-    found = np.concatenate(errors, 1) if errors else np.empty((2, 0))
+def _errors_of_both(
+    scene: SceneFolder, options: PriorOptions, numbered: tuple[int, ScenePicture]
+) -> NDArray[np.float32]:
+    """2×N: relative errors of motion and of the monocular map, at returns left out of the latter's alignment."""
+    number, picture = numbered
+    maps = scene.maps(picture)
+    motion_m = maps.distances_m.get("motion")
+    if maps.lidar_m is None or maps.mono_m is None or motion_m is None:
+        return np.empty((2, 0), np.float32)
+    elevation_rad = view_of(picture.lens, picture.up_in_camera).elevation_rad
+    left_out, _ = held_out_returns(both(maps.lidar_m, maps.mono_m, maps.usable), elevation_rad, number)
+    aligned = align(np.where(left_out, np.float32(0), maps.lidar_m), maps.mono_m, maps.usable, options.align).mono_m
+    judged = _some(left_out & (motion_m > 0) & (aligned > 0), _JUDGED_A_FRAME, np.random.default_rng([9, number]))
+    true_m = maps.lidar_m[judged]
+    return np.stack([np.abs(found[judged] - true_m) / true_m for found in (motion_m, aligned)])
+
+
+def _motion_errors(of_frames: Sequence[NDArray[np.float32]]) -> MotionErrors | None:
+    """Errors of both sources over all frames; None where too little was judged."""
+    found = np.concatenate(of_frames, 1)
     if found.shape[1] < LEAST_JUDGED:
         return None
     motion, mono = np.quantile(found, 0.95, axis=1) / 2

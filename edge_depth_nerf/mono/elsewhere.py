@@ -81,9 +81,9 @@ class FittedMaps:
             yield picture, self._blended(picture, layers, lines)
         if waiting and not self.scene.split_known:
             raise InputError(
-                f"{self.scene.path}: {waiting[0].name} has fewer than {LEAST_RETURNS} LiDAR returns, so its map needs "
-                "the fit of pictures for training; but the scene does not say which these are. Add train_filenames, "
-                "val_filenames and test_filenames, or take a source of metric maps."
+                f"{self.scene.path}: {waiting[0].name} has fewer than {LEAST_RETURNS} LiDAR points, so its map "
+                "needs the fit of training pictures; but the scene does not say which these are. Add "
+                "train_filenames, val_filenames and test_filenames, or use a source of metric maps."
             )
         of_drive: dict[str, list[Line]] = {}
         for picture in waiting:
@@ -98,9 +98,9 @@ class FittedMaps:
 
     def _no_lidar(self, camera: str) -> InputError:
         return InputError(
-            f"{self.scene.path}: no picture for training of {camera} has {LEAST_RETURNS} LiDAR returns where its map "
-            f"has values, so {self.kind} maps, of unknown scale, cannot be made metric. Process the drive with its "
-            "sweeps, or take a source of metric maps."
+            f"{self.scene.path}: no training picture of {camera} has {LEAST_RETURNS} LiDAR points where its map has "
+            f"values, so {self.kind} maps, of unknown scale, cannot be made metric. Process the drive with "
+            "its sweeps, or use a source of metric maps."
         )
 
     def _seen(self, picture: ScenePicture) -> tuple[Sequence[Layer], Samples]:

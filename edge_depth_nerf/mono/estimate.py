@@ -126,7 +126,7 @@ def estimate_depth(options: EstimateDepthOptions, console: Console | None = None
     ready = load_ready_network(options.hf, options.hf_output) if options.hf is not None else None
     scenes = [read_scene(path) for path in options.scenes]
     if len({scene.path.resolve() for scene in scenes}) < len(scenes):
-        raise InputError("a scene is given twice. Name each scene once.")
+        raise InputError("the scene is given twice. Name each scene once.")
     with ExitStack() as stack:
         # in one order, lest two wait for each other
         for folder in sorted(scene.folder.resolve() for scene in scenes):
@@ -233,7 +233,7 @@ def _write_fitted(every: Sequence[FittedMaps], source: dict[str, Any], console: 
         if few := fitted.by_the_drive:
             console.print(
                 f"{fitted.scene.folder}: {len(few)} of {len(fitted.scene.pictures)} pictures have fewer than "
-                f"{LEAST_RETURNS} LiDAR returns to fit to, such as {few[0]}; they took the drive's fit",
+                f"{LEAST_RETURNS} LiDAR points to fit to, such as {few[0]}; they use the drive's fit",
                 soft_wrap=True,
             )
 
@@ -329,7 +329,7 @@ def _gather(
     """Read the pictures and LiDAR of scenes.
 
     Raises:
-        InputError: no LiDAR return lies in any training picture.
+        InputError: no LiDAR point lies in any training picture.
 
     """
     split = _thinned([training_split(scene) for scene in scenes], settings.working_px, console)
@@ -356,13 +356,13 @@ def _gather(
     assert examples is not None
     if not examples.lidar_m.any():
         raise InputError(
-            f"{scenes[0].path}: no LiDAR return lies inside the masks of the training pictures, nothing to train "
-            "on. Check the LiDAR maps with `edge-depth-nerf inspect`."
+            f"{scenes[0].path}: no LiDAR point lies inside the masks of the training pictures, so there is nothing "
+            "to train on. Check the LiDAR maps with `edge-depth-nerf inspect`."
         )
     if kept is not None and not kept.lidar_m.any():
         console.print(
-            f"No LiDAR return lies inside the masks of the {len(kept)} pictures kept for stopping: training takes "
-            "all its steps, and its error is not known",
+            f"No LiDAR point lies inside the masks of the {len(kept)} pictures set aside for early stopping: "
+            "training takes all its steps, and its error is unknown",
             soft_wrap=True,
         )
         kept = None
@@ -375,19 +375,19 @@ def _gather(
 
 def _say_trained(trained: Trained, training: TrainingOptions, material: _Material, console: Console) -> None:
     short = not trained.stopped_early and trained.steps < training.steps
-    early = ", where it stopped by itself" if trained.stopped_early else ""
+    early = ", where it stopped early" if trained.stopped_early else ""
     if short:
-        early = f" of {training.steps:,}, where its time was up,"
+        early = f" of {training.steps:,}, where the time limit was reached,"
     judged = ""
     if material.kept is not None:
-        judged = f"; error on the {len(material.kept)} pictures kept for stopping: {trained.abs_rel:.1%}"
+        judged = f"; error on the {len(material.kept)} pictures set aside for early stopping: {trained.abs_rel:.1%}"
     console.print(
         f"Trained {trained.steps} steps{early} in {trained.seconds:.0f} s on {len(material.examples)} pictures{judged}",
         soft_wrap=True,
     )
     if short and trained.steps < _FEW_STEPS:
         console.print(
-            f"Fewer than {_FEW_STEPS} steps make poor maps: give it more seconds, or a machine that does nothing else.",
+            f"Fewer than {_FEW_STEPS} steps make poor maps: increase --seconds, or use a machine without other work.",
             style="yellow",
             soft_wrap=True,
         )
@@ -410,20 +410,20 @@ def _weights_of_before(
     """
     if options.model is not None and weights.resolve() == options.model.resolve():
         raise InputError(
-            f"{weights}: training would start from these weights and be written over them, and go on from there each "
-            "time. Name another file with --output."
+            f"{weights}: training would start from these weights and overwrite them, and so continue from its own "
+            "result each time. Name another file with --output."
         )
     if not weights.exists():
         return None, {}
     if weights.resolve() != scenes_own.resolve() and not is_ours(weights):
         raise InputError(
-            f"--output {weights}: is there already, and holds no weights that `estimate-depth` has written. Name "
-            "another file, or remove this one."
+            f"--output {weights}: exists already, and was not written by `estimate-depth`. Name another file, or "
+            "remove this one."
         )
     try:
         return load_network(weights)
     except InputError:
-        console.print(f"{weights} is broken or of another version: it is trained anew", soft_wrap=True, markup=False)
+        console.print(f"{weights} is broken or of another version: training starts again", soft_wrap=True, markup=False)
         return None, {}
 
 
@@ -451,8 +451,9 @@ def training_split(scene: SceneFolder) -> Split:
         )
     if not scene.split_known:
         raise InputError(
-            f"{scene.path}: does not say which pictures are held out for judging (train_filenames, val_filenames, "
-            "test_filenames). Add them, lest the network sees what the scene is judged by."
+            f"{scene.path}: does not say which pictures are held out (train_filenames, val_filenames, "
+            "test_filenames). Add them, so that the network never sees pictures that are used for "
+            "evaluation."
         )
     allowed = [picture for picture in scene.pictures if not picture.held_out]
     moments = sorted({picture.moment for picture in allowed})

@@ -43,7 +43,7 @@ class MapFiles:
         values = np.where(np.isfinite(values) & (values > 0), values, np.float32(np.nan))
         if np.isnan(values).all():
             raise InputError(
-                f"{path}: holds no positive number, only zeros, negative numbers, NaN or infinity: no map of anything. "
+                f"{path}: contains no positive number, only zeros, negative numbers, NaN or infinity. "
                 "Make it again, or leave the frame out of the scene."
             )
         size = (picture.lens.width, picture.lens.height)
@@ -87,12 +87,13 @@ def find_maps(scene: SceneFolder, folder: Path, kind: Kind, along: Along, metres
     has_png = any(path.suffix == ".png" for path in found.values())
     if has_png and kind == "metric" and metres_per_count is None:
         raise InputError(
-            f"{folder}: holds PNGs, whose counts may be anything. Say --metres-per-count, such as 0.00390625 (1/256 m, "
+            f"{folder}: contains PNGs, whose unit is unknown. Give --metres-per-count, such as 0.00390625 (1/256 m, "
             "as in this project and KITTI) or 0.001."
         )
     if not has_png and metres_per_count is not None:
         raise InputError(
-            f"--metres-per-count {metres_per_count:g}: is for PNGs, {folder} holds .npy, which are in metres."
+            f"--metres-per-count {metres_per_count:g}: is for PNGs, but {folder} contains .npy files, which are in "
+            "metres."
         )
     return MapFiles(found, kind, along, metres_per_count or 1 / DISTANCE_STEPS_PER_METRE)
 
@@ -108,7 +109,7 @@ def _find(folder: Path, picture: ScenePicture) -> Path:
             "under its camera's and its own name."
         )
     if len(there) > 1:
-        raise InputError(f"{there[0]}: there is {there[1].name} as well. Leave one map for each picture.")
+        raise InputError(f"{there[0]}: {there[1].name} exists as well. Keep one map for each picture.")
     return there[0]
 
 

@@ -69,7 +69,7 @@ def load_ready_network(name: str, output: HfOutput = "auto") -> ReadyNetwork:
 
     Args:
         name: a folder that save_pretrained or a download made, or such as depth-anything/Depth-Anything-V2-Small-hf.
-        output: what its maps are; auto: as its config tells.
+        output: what its maps are; auto: as its config states.
 
     Raises:
         InputError: it is not there, is no depth network, or misses some of its weights.
@@ -85,14 +85,14 @@ def load_ready_network(name: str, output: HfOutput = "auto") -> ReadyNetwork:
     if folder.exists() and not (folder / "config.json").is_file():
         raise InputError(
             f"{name}: has no config.json. --hf takes the folder of a network as the transformers library saves it "
-            "(config.json, preprocessor_config.json, model.safetensors); a network of this project is taken by --model."
+            "(config.json, preprocessor_config.json, model.safetensors); for a network of this project, use --model."
         )
     local: dict[str, Any] = {"local_files_only": True, "trust_remote_code": False}
     config = _load(name, lambda: transformers.AutoConfig.from_pretrained(name, **local))
     if type(config) not in transformers.MODEL_FOR_DEPTH_ESTIMATION_MAPPING:
         known = sorted({known.model_type for known in transformers.MODEL_FOR_DEPTH_ESTIMATION_MAPPING})
         raise InputError(
-            f"{name}: {config.model_type} is no network for depth. Expected one of {', '.join(known)}, such as "
+            f"{name}: {config.model_type} is not a depth network. Expected one of {', '.join(known)}, such as "
             "depth-anything/Depth-Anything-V2-Small-hf."
         )
     kind = _kind(name, config, output)
@@ -143,7 +143,8 @@ def _kind(name: str, config: Any, output: HfOutput) -> Kind:
     if declared == "relative" or config.model_type in _INVERSE_TYPES:
         return "inverse"
     raise InputError(
-        f"{name}: its config ({config.model_type}) does not tell what its maps are. Say --hf-output metric (metres), "
+        f"{name}: its config ({config.model_type}) does not state the unit of its maps. Give --hf-output metric "
+        "(metres), "
         "relative (depth up to scale and shift) or inverse (disparity up to scale and shift)."
     )
 

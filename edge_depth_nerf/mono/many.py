@@ -37,7 +37,7 @@ def estimate_on_cluster(options: EstimateDepthOptions, console: Console | None =
         load_ready_network(options.hf, options.hf_output)
     scenes = [read_scene(path) for path in options.scenes]
     if len({scene.path.resolve() for scene in scenes}) < len(scenes):
-        raise InputError("a scene is given twice. Name each scene once.")
+        raise InputError("the scene is given twice. Name each scene once.")
     folders = [scene.folder.absolute() for scene in scenes]
     here = replace(options, cluster=None)
     if options.hf is not None and Path(options.hf).is_dir():

@@ -20,33 +20,35 @@ TrainedOn = Literal["scene", "elsewhere"]
 
 @dataclass(frozen=True)
 class EstimateDepthOptions:
-    """Write monocular distance maps into scenes: of a network trained on their own LiDAR, of another, or from files.
+    """Write monocular distance maps into scenes: from a network trained on their LiDAR, another network, or files.
 
-    Held-out pictures are never trained on. Stopped at any moment, the same command takes up where it was.
+    Held-out pictures are never used for training. You can stop at any time; run the same command again to resume.
     """
 
     scenes: tyro.conf.Positional[tuple[Path, ...]]
-    """Scene folders, as `edge-depth-nerf process` writes them; one network is trained on all of them."""
+    """Scene folders written by `edge-depth-nerf process`; one network is trained on all of them."""
     model: Path | None = None
-    """Weights to begin with. Without --train-steps they predict as they are, and the scenes need no LiDAR."""
+    """Weights to start from. Without --train-steps they are used without further training, and the scenes need no
+    LiDAR."""
     train_steps: int | None = None
     """Steps of training. Not set: the preset's number, or none with --model."""
     seconds: float | None = None
-    """Seconds of training at most. What was trained so far is used, at a learning rate that ends in time."""
+    """Maximum seconds of training. The learning rate decreases so that it ends in time, and the result so far is
+    used."""
     preset: Preset = "lite"
     """lite: minutes on a laptop's CPU; full: a larger network on larger pictures, for a GPU."""
     output: Path | None = None
     """Where the trained weights go. Not set: mono_network.safetensors in the first scene."""
     seed: int = 0
-    """Of the first weights and of the order of pictures; on one thread the same seed gives the same weights, unless
-    --seconds ends the training."""
+    """Seed of the initial weights and of the order of pictures. On one thread, the same seed gives the same weights,
+    unless --seconds ends the training."""
     hf: str | None = None
     """A ready-made network instead: the folder of a depth network of the transformers library, or its name in Hugging
     Face's cache, such as depth-anything/Depth-Anything-V2-Small-hf. Nothing is downloaded. Needs `pip install
     '.[hf]'`."""
     hf_output: HfOutput = "auto"
     """What its maps are: metric (z in metres), relative (depth up to scale and shift), inverse (disparity up to scale
-    and shift); auto: as its config tells."""
+    and shift); auto: as its config states."""
     maps: Path | None = None
     """Maps of another tool instead: a folder with CAMERA/FRAME.npy (floating point) or .png (16 bit, 0 = none), in the
     pictures' sizes; one for every picture of the one scene."""
@@ -54,15 +56,15 @@ class EstimateDepthOptions:
     """What they are: metric (metres), relative (depth up to scale and shift), inverse (one over depth, up to scale and
     shift). The last two are fitted to LiDAR."""
     maps_along: Along | None = None
-    """Whether they count along the ray (distance) or along the optical axis (z)."""
+    """Whether they are measured along the ray (distance) or along the optical axis (z)."""
     metres_per_count: float | None = None
     """Of PNGs with metric maps, such as 0.00390625 (1/256)."""
     maps_trained_on: TrainedOn | None = None
-    """What their maker has seen: scene, if it was trained on LiDAR alone and knows nothing beyond a scanner's field of
-    elevation, where no prior is made then. Not set: elsewhere."""
+    """What their network was trained on. scene: on LiDAR only, so that it knows nothing beyond the scanner's field of
+    elevation; there is then no prior there. Not set: elsewhere."""
 
     predict: bool = True
-    """Write maps; off to train a network and leave it at that, for `--model` later."""
+    """Write maps. Off: only train a network, for `--model` later."""
     cluster: str | None = None
     """Work on a Dask cluster: local (processes on this machine, one for each GPU or core), or the address of a
     scheduler, such as tcp://10.0.0.1:8786. The network is trained by one worker, then each scene's maps are a task.
@@ -88,7 +90,7 @@ class EstimateDepthOptions:
         check_address(self.cluster)
         self._check_sources()
         if not self.predict and (self.hf is not None or self.maps is not None or not self.trains):
-            raise InputError("--no-predict: expected a training, for there is nothing else to do. Leave it out.")
+            raise InputError("--no-predict: without training, there is nothing to do. Leave it out.")
 
     def _check_sources(self) -> None:
         """Check that one source of maps is chosen, and that all options belong to it."""
@@ -105,15 +107,17 @@ class EstimateDepthOptions:
             given = [name for name, value in options.items() if value is not None]
             if owner != source and given:
                 raise InputError(
-                    f"{', '.join(given)}: for {owner}, but the maps come from {source}. Leave out the one or the other."
+                    f"{', '.join(given)}: for {owner}, but the maps come from {source}. Leave out one of them."
                 )
         if self.maps is None:
             return
         if len(self.scenes) > 1:
-            raise InputError(f"--maps {self.maps}: holds the maps of one scene, {len(self.scenes)} are given.")
+            raise InputError(
+                f"--maps {self.maps}: contains the maps of one scene, but {len(self.scenes)} scenes are given."
+            )
         if self.maps_kind is None or self.maps_along is None:
             raise InputError(
-                f"--maps {self.maps}: say what its values are, with --maps-kind metric, relative or inverse, and "
+                f"--maps {self.maps}: describe its values with --maps-kind metric, relative or inverse, and "
                 "--maps-along ray or z."
             )
         if self.metres_per_count is not None and not 0 < self.metres_per_count < 1000:

@@ -98,6 +98,18 @@ def quiet_host() -> Iterator[None]:
             CONSOLE.quiet = before
 
 
+def ignore_deprecations_of_host() -> None:
+    """Keep back what torch warns nerfstudio's developers of, from here on: ten lines that hide what concerns users.
+
+    What the host's imports warn of comes before a plugin is asked for anything, so it stays.
+
+    Works around: https://github.com/nerfstudio-project/nerfstudio/issues/3528.
+    Ends with: a nerfstudio that uses torch.amp, and indexes with tuples.
+    """
+    warnings.filterwarnings("ignore", category=FutureWarning, module=r"nerfstudio\.")
+    warnings.filterwarnings("ignore", message="Using a non-tuple sequence", category=UserWarning, module="nerfstudio")
+
+
 def total_steps(trainer: Trainer) -> int:
     """All steps of a training, those before it was taken up again too; its `max_num_iterations` are those to come.
 

@@ -43,6 +43,8 @@ class FusedAdamConfig(AdamOptimizerConfig):
     """Target class to instantiate."""
     fused: bool = True
     """torch's fused form; without it, its default."""
+    betas: tuple[float, float] = (0.9, 0.999)
+    """Decay a step of the gradients' running mean, and of that of their squares."""
 
 
 METHOD_FILE = "nerfstudio_method.toml"

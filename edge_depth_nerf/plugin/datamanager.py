@@ -60,8 +60,10 @@ from edge_depth_nerf.plugin.pixel_table import (
     PixelBatch,
     PixelTable,
     PixelTableWriter,
+    decode,
 )
 from edge_depth_nerf.plugin.ray_table import PLACE, TableRayGenerator
+from edge_depth_nerf.plugin.upload import Stretch, Uploads
 from edge_depth_nerf.scene.format import LAYERS, depth_sources
 
 KEPT_TABLES = 8
@@ -154,19 +156,25 @@ class TablePixelSampler:
 
     def sample(self, step: int = 0) -> PixelBatch:
         """Read the next batch; at a later step of training, the one that belongs there."""
+        stretch = self.draw(step)
+        return self.table.batch(stretch.start, stretch.count)
+
+    def draw(self, step: int = 0) -> Stretch:
+        """Say which records are the next batch."""
         # a training that is taken up again goes on where it was; the exporter always says 0
         self._drawn = max(self._drawn, step * self.num_rays_per_batch)
         start = self._first + self._drawn * self._world_size + self._rank * self.num_rays_per_batch
-        batch = self.table.batch(start, self.num_rays_per_batch)
         self._drawn += self.num_rays_per_batch
-        return batch
+        return Stretch(self.table, start, self.num_rays_per_batch, self.num_rays_per_batch * self._world_size)
 
 
 class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
     """DataManager of fisheye scenes.
 
     A batch holds image (n×3), indices (n×3: picture, row, column), prior_distance_m and prior_sigma_m (n×1, metres,
-    0 = no prior), and sky (n×1, bool: known to show the sky).
+    0 = no prior), and sky (n×1, bool: known to show the sky). The same of further pixels is named surface_…, and
+    surface_rays are their rays. On the CPU these are the pixels of use. Elsewhere their number is always the same, as a
+    GPU would have to be waited for to know it, and surface_counts (n×1, bool) says which are of use.
     """
 
     config: FisheyeDepthDataManagerConfig
@@ -188,6 +196,7 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
             table = self._table(self.train_dataset, "Integrating depth", with_prior=True)
             self.train_ray_generator = self._ray_generator(self.train_dataset)
         self.train_pixel_sampler = TablePixelSampler(table, self.config.train_num_rays_per_batch, self.device)
+        self._uploads = Uploads(self.device)
         self._surface_sampler = None
         if self.config.surface_rays_per_batch > 0 and table.share_with_prior > 0:
             self._surface_sampler = TablePixelSampler(table, self.config.surface_rays_per_batch, self.device)
@@ -211,23 +220,40 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         """Rays of the next training batch and what supervises them; surface_…: further pixels of use, if any."""
         self.train_count += 1
         assert self.train_pixel_sampler is not None
+        if torch.device(self.device).type != "cpu":
+            return self._next_train_elsewhere(step)
         pixels = self.train_pixel_sampler.sample(step)
         self.trained_on = pixels.indices
         rays, batch = self._serve(pixels, self.train_ray_generator)
         if self._surface_sampler is not None:
             further = self._surface_sampler.sample(step)
-            vague = further.prior_sigma_m > SURFACE_SIGMA_M + SURFACE_SIGMA_SHARE * further.prior_distance_m
-            chosen = (further.sky | (further.prior_distance_m > 0) & ~vague)[:, 0]
+            chosen = _of_use(further)[:, 0]
             # the mean over no pixels would be no number
             if chosen.any():
                 batch["surface_rays"], surface = self._serve(further[chosen], self.train_ray_generator)
-                names = {"prior_distance_m": "distance_m", "prior_sigma_m": "sigma_m"}
-                batch |= {f"surface_{names.get(name, name)}": value for name, value in surface.items()}
+                batch |= _of_surface(surface)
         return rays, batch
+
+    def _next_train_elsewhere(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
+        """Give the same on another device, of one copy, with all of the further pixels."""
+        assert self.train_pixel_sampler is not None
+        samplers = [sampler for sampler in (self.train_pixel_sampler, self._surface_sampler) if sampler is not None]
+        stretches = [sampler.draw(step) for sampler in samplers]
+        pixels = decode(self._uploads.upload(stretches))
+        every, values = self._serve(pixels, self.train_ray_generator)
+        count = stretches[0].count
+        self.trained_on = pixels.indices[:count]
+        batch = {name: value[:count] for name, value in values.items()}
+        if self._surface_sampler is not None:
+            batch["surface_rays"] = every[count:]
+            batch |= _of_surface({name: value[count:] for name, value in values.items()})
+            batch["surface_counts"] = _of_use(pixels[count:])
+        return every[:count], batch
 
     def pictures_of(self, rays: Tensor | None = None) -> list[str]:
         """Names of the pictures that the last training batch is from; of some of its rays, where these are said."""
-        chosen = self.trained_on[:, 0] if rays is None else self.trained_on[rays.cpu(), 0]
+        pictures = self.trained_on[:, 0].cpu()
+        chosen = pictures if rays is None else pictures[rays.cpu()]
         return [str(self.train_dataset.image_filenames[image_idx]) for image_idx in chosen.unique().tolist()]
 
     def next_eval(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
@@ -240,9 +266,13 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         """The table of rays where the cameras allow one, else nerfstudio's generator."""
         cameras = dataset.cameras.to(self.device)
         if TableRayGenerator.suits(cameras):
-            return TableRayGenerator(cameras, self._cache_dir() / "rays")
-        # its grid of pixels has to lie where the indices do
-        return RayGenerator(cameras).to(self.device)
+            generator = TableRayGenerator(cameras, self._cache_dir() / "rays")
+        else:
+            # its grid of pixels has to lie where the indices do
+            generator = RayGenerator(cameras).to(self.device)
+        sizes = torch.cat([cameras.width, cameras.height], dim=-1)
+        generator.register_buffer("sizes", sizes, persistent=False)
+        return generator
 
     def _cache_dir(self) -> Path:
         data = Path(self.config.dataparser.data)
@@ -251,7 +281,7 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
     def _serve(self, batch: PixelBatch, generator: RayGenerator) -> tuple[RayBundle, dict[str, Any]]:
         indices = batch.indices.to(self.device)
         rays = generator(indices)
-        sizes = torch.cat([generator.cameras.width, generator.cameras.height], dim=-1)
+        sizes: Any = generator.sizes
         rays.metadata[PLACE] = (indices[:, 1:].flip(-1) + 0.5) / sizes[indices[:, 0]]
         return rays, {
             "image": batch.rgb.to(self.device),
@@ -320,6 +350,18 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         if cache is not None:
             cache.remove_old(len(dataset))
         return PixelTable(path)
+
+
+def _of_use(pixels: PixelBatch) -> Tensor:
+    """Whether a surface is known: the sky, or a prior that is not too vague, [n, 1]."""
+    vague = pixels.prior_sigma_m > SURFACE_SIGMA_M + SURFACE_SIGMA_SHARE * pixels.prior_distance_m
+    return pixels.sky | (pixels.prior_distance_m > 0) & ~vague
+
+
+def _of_surface(values: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The names that a batch has for what belongs to further pixels."""
+    names = {"prior_distance_m": "distance_m", "prior_sigma_m": "sigma_m"}
+    return {f"surface_{names.get(name, name)}": value for name, value in values.items()}
 
 
 @dataclass(frozen=True)

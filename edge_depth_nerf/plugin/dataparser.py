@@ -31,22 +31,22 @@ class FisheyeDepthDataParserConfig(NerfstudioDataParserConfig):
     _target: type = field(default_factory=lambda: FisheyeDepth)
     """Target class to instantiate."""
     metres_per_unit: float | None = None
-    """Metres that one scene unit stands for. Not set: half of the drive's extent, at least 10 m, at most what keeps
-    the finest hash cell at 0.25 m."""
+    """Metres per scene unit. Not set: half of the drive's extent, at least 10 m, and small enough to keep the finest
+    hash cell at 0.25 m."""
     hash_resolution: int = 2048
     """Cells of the finest hash-grid level along one axis, for the choice above (the model's max_res)."""
     depth_unit_scale_factor: float | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
     """Metres per count of the files under depth_file_path. Not set: what transforms.json says, else nerfstudio's
     0.001."""
     depth_kind: DepthKind = "auto"
-    """What the files under depth_file_path hold. auto: distance along the ray in scenes of this project and in
+    """What the files under depth_file_path contain. auto: distance along the ray in scenes of this project and in
     fisheye scenes, z_depth (nerfstudio's convention) in other people's pinhole scenes."""
     downscale_factor: int | None = 1
     """How much to downscale images; other than 1 needs nerfstudio's images_K folders (not in our scenes)."""
     orientation_method: Literal["pca", "up", "vertical", "none"] = "none"
     """The method to use for orientation; the drive's own axes by default."""
     auto_scale_poses: bool = False
-    """nerfstudio's scaling of all poses into +-1. Kept off: the scale is metres_per_unit."""
+    """nerfstudio's scaling of all poses into +-1. Must be off: metres_per_unit sets the scale."""
     eval_mode: Literal["fraction", "filename", "interval", "all"] = "interval"
     """How a scene without split files is divided. Interval holds out every eval_interval-th picture."""
 
@@ -111,8 +111,9 @@ def check_split(meta: dict[str, Any], path: Path) -> None:
         shared = sorted(moments[0] & moments[1], key=str)
         if shared:
             raise InputError(
-                f"{path}: frame {shared[0]} is in train_filenames and in {split}_filenames. All cameras of a moment "
-                "share one LiDAR sweep, so a moment is either trained on or held out. Process the drive again."
+                f"{path}: frame {shared[0]} is in train_filenames and in {split}_filenames. All cameras of a frame "
+                "share one LiDAR sweep, so a frame is either for training or held out. Process the drive "
+                "again."
             )
 
 
@@ -125,8 +126,8 @@ def transforms_path(data: Path) -> Path:
     path = data if data.suffix == ".json" else data / "transforms.json"
     if not path.is_file():
         relative = (
-            f" It was looked for in {Path.cwd()}; paths count from the folder you are in, those that a config.yml "
-            "keeps of its training, too."
+            f" It was searched in {Path.cwd()}: relative paths start at the current folder, including those in a "
+            "config.yml."
         )
         raise FileNotFoundError(
             f"{path}: no such file. --data takes a scene folder with a transforms.json; `edge-depth-nerf process` "
@@ -195,7 +196,7 @@ class FisheyeDepth(Nerfstudio):
             )
         if self.config.auto_scale_poses:
             raise InputError(
-                "auto_scale_poses would lose the metres that near plane, prior and loss are in. "
+                "auto_scale_poses would lose the metric scale that near plane, prior and loss need. "
                 "Set the scale with fisheye-depth-data --metres-per-unit M instead."
             )
 

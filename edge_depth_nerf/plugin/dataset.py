@@ -43,8 +43,8 @@ class FisheyeDepthDataset(InputDataset):
             )
         if "scene" not in self.metadata:
             raise InputError(
-                "this method reads scenes with the parser fisheye-depth-data; leave the other parser away (ours reads "
-                "nerfstudio's own scenes, too)."
+                "this method reads scenes with the parser fisheye-depth-data; leave out the other parser (ours "
+                "also reads nerfstudio's own scenes)."
             )
         # not for the model, which gets what is left of the metadata
         self.scene, self.pictures = self.metadata.pop("scene"), self.metadata.pop("pictures")

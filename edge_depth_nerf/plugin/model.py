@@ -12,7 +12,6 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal, TypeGuard
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
@@ -26,22 +25,25 @@ from nerfstudio.model_components.losses import (
     scale_gradients_by_distance_squared,
     urban_radiance_field_depth_loss,
 )
-from nerfstudio.model_components.renderers import DepthRenderer
+from nerfstudio.model_components.ray_samplers import UniformLinDispPiecewiseSampler
+from nerfstudio.model_components.renderers import DepthRenderer, RGBRenderer
 from nerfstudio.model_components.scene_colliders import NearFarCollider
 from nerfstudio.models.nerfacto import NerfactoModel, NerfactoModelConfig
 from nerfstudio.utils.external import TCNN_EXISTS
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.pictures import DISTANCE, SIGMA, colour_distance
 from edge_depth_nerf.kernels.allocator import keep_freed_memory
 from edge_depth_nerf.kernels.fields import CubeContraction, FusedNerfactoField, use_fused_fields
 from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss, proposal_loss
 from edge_depth_nerf.kernels.openmp import let_idle_threads_sleep
-from edge_depth_nerf.kernels.ray_samplers import FusedPDFSampler, edges_of, use_fused_weights
+from edge_depth_nerf.kernels.ray_samplers import FirstSampler, FusedPDFSampler, edges_of, use_fused_weights
 from edge_depth_nerf.method.losses import URBAN_TERMS, UrbanTerms, edge_losses, sky_loss, urban_nerf_loss
 from edge_depth_nerf.method.metrics import DepthErrors, load_lpips, masked_lpips, masked_psnr, masked_ssim
 from edge_depth_nerf.method.uncertainty import termination_std
+from edge_depth_nerf.plugin.colours import coloured
 from edge_depth_nerf.plugin.compat import lpips_not_built, total_steps, without_undefined_ray
 from edge_depth_nerf.plugin.exposure import KINDS
 from edge_depth_nerf.plugin.pose_refinement import MOMENTS, PoseRefiner, PoseRefinerConfig
@@ -58,62 +60,96 @@ class EdgeDepthNerfModelConfig(NerfactoModelConfig):
     _target: type = field(default_factory=lambda: EdgeDepthNerfModel)
     """Target class to instantiate."""
     near_m: float = 0.2
-    """How far along the ray to start sampling, metres (in place of near_plane)."""
+    """Where sampling starts along the ray, metres (replaces near_plane)."""
     far_m: float = 1000.0
-    """How far along the ray to stop sampling, metres (in place of far_plane)."""
+    """Where sampling ends along the ray, metres (replaces far_plane)."""
     depth_loss: Literal["edge", "ds-nerf", "urban-nerf", "urban-nerf-los", "none"] = "edge"
-    """The loss on the distance prior: Eq. 4, nerfstudio's DS-NeRF or UrbanNeRF loss, UrbanNeRF's as its authors have it
-    (line of sight with a narrowing σ, its terms weighed apart), or none (plain nerfacto)."""
+    """The loss on the distance prior: Eq. 4, nerfstudio's DS-NeRF or UrbanNeRF loss, UrbanNeRF's as its authors publish
+    it (line of sight with a narrowing σ, and separate weights), or none (plain nerfacto)."""
     depth_loss_mult: float = 0.01
-    """Weight λ of the loss on the distance prior (not published; how it was chosen: docs/ablation.md). 0: the prior
-    serves surface and sky alone."""
+    """Weight λ of the loss on the distance prior (not published; how it was chosen: docs/ablation.md). 0: the prior is
+    used for surface and sky only."""
     depth_sigma: float = 0.5
-    """Standard deviation that the DS-NeRF and UrbanNeRF losses assume, metres; with urban-nerf-los that of the end of
-    the training. (Eq. 4 takes the prior's own.)"""
+    """Standard deviation of the DS-NeRF and UrbanNeRF losses, metres; with urban-nerf-los its value at the end of
+    training. (Eq. 4 uses the prior's own.)"""
     urban: UrbanTerms = URBAN_TERMS
     """With urban-nerf-los: what its terms weigh, and how its σ narrows."""
     depth_loss_levels: Literal["all", "final"] = "all"
-    """Whether the loss acts on the samples of the proposal networks too, or on the final ones alone."""
+    """Whether the loss applies to the samples of the proposal networks too, or only to the final ones."""
     depth_loss_final: float = 0.01
-    """The share of λ that is left after `depth_loss_steps`; until then it falls exponentially. The prior shapes the
-    scene early, and its errors at the outlines of things hold the pictures back late. 1: λ stays."""
+    """The share of λ that is left after `depth_loss_steps`; until then λ decreases exponentially. Early, the prior
+    shapes the scene; late, its errors at outlines would hold the pictures back. 1: λ is constant."""
     depth_loss_steps: int | None = None
-    """Steps in which λ falls, and with urban-nerf-los σ. None: those of the whole training, or 30,000 where no trainer
-    says how many."""
+    """Steps over which λ decreases, and σ with urban-nerf-los. None: those of the whole training, or 30,000 if no
+    trainer states them."""
     sky_loss_mult: float = 0.01
-    """With a depth loss: weight of what rays into the sky hit, their accumulated weight. 0: the sky is left to
-    colour."""
+    """With a depth loss: weight of the penalty on density along rays into the sky (their accumulated weight). 0: no
+    penalty."""
     sky_background: bool = True
-    """With a depth loss: what no sample stops is coloured by the field at infinity, where the sky is. False: by the
-    last sample, as in nerfacto, from wherever that is."""
+    """With a depth loss: the field at infinity, where the sky is, colours light that no sample stops. False: the last
+    sample does, as in nerfacto, wherever it lies."""
     surface_loss_mult: float = 1.0
     """With a depth loss: weight of the colour error of the field at the prior's distance, for the datamanager's
-    `surface_rays_per_batch` further pixels at one sample each."""
+    `surface_rays_per_batch` additional pixels, with one sample each."""
     exposure: Literal["gain", "affine", "grid", "embedding", "none"] = "gain"
-    """What makes up for a camera's drifting exposure and white balance. gain: a factor for each colour of each training
-    picture, their geometric mean 1, with which views are rendered. affine: a 3×4 map of colours for each picture; grid:
-    a bilateral grid of such maps, for vignetting too; their mean is the identity. embedding: nerfacto's appearance
-    embedding, for views the mean of all pictures'; that of a mean is not the mean of what they make. none: nothing."""
+    """How a camera's drifting exposure and white balance are modelled. gain: a factor per colour and training picture;
+    their geometric mean is 1, and views are rendered with it. affine: a 3×4 map of colours for each picture; grid: a
+    bilateral grid of such maps, for vignetting too; their mean is the identity. embedding: nerfacto's appearance
+    embedding; views use the mean of all pictures, which does not give their mean colour. none: not modelled."""
     camera_optimizer: CameraOptimizerConfig = field(default_factory=PoseRefinerConfig)
     """Poses that training refines."""
     exposure_mult: float = 0.1
-    """With exposure affine or grid: weight of what their maps do beyond the identity, and unevenly."""
+    """With exposure affine or grid: weight of the penalty on maps that differ from the identity or vary."""
     edge_gaussian: Literal["point", "interval"] = "interval"
     """How Eq. 4 weighs a sample: by the Gaussian's value at its middle times its length, or by the Gaussian's mass
     over its interval."""
     edge_divide_by_norm: bool = True
     """Divide Eq. 4's Gaussian by σ̂·√(2π), so that a wide one does not pull harder than a narrow one."""
     implementation: Literal["auto", "fused", "tcnn", "torch"] = "auto"  # pyright: ignore[reportIncompatibleVariableOverride]
-    """What computes fields, samples and losses. fused: kernels of our own (Numba on the CPU; on CUDA, by Triton, hash
-    grids, samples along rays and the edge loss). torch: nerfstudio's, same results and checkpoints as fused, on a CPU
-    many times slower. tcnn: tiny-cuda-nn, with checkpoints of its own. auto: tcnn on a GPU where it is installed, else
-    fused."""
+    """What computes fields, samples and losses. fused: our own kernels (Numba on the CPU; on CUDA Triton for hash
+    grids, samples along rays and the edge loss). torch: nerfstudio's code, with the same results and checkpoints as
+    fused, but many times slower on a CPU. tcnn: tiny-cuda-nn, whose checkpoints differ. auto: tcnn on a GPU if it is
+    installed, otherwise fused; config.yml keeps which it was."""
+
+
+Implementation = Literal["fused", "tcnn", "torch"]
+
+
+def settled(implementation: Literal["auto", "fused", "tcnn", "torch"], device_type: str) -> Implementation:
+    """Give what `auto` stands for on a device, and any other as it is.
+
+    Raises:
+        InputError: tiny-cuda-nn is asked for and is not installed, or serves no such device.
+
+    """
+    there = TCNN_EXISTS and device_type == "cuda"
+    if implementation == "tcnn" and not there:
+        raise InputError(
+            "--pipeline.model.implementation tcnn needs a GPU and tiny-cuda-nn; here "
+            f"{'there is no GPU' if TCNN_EXISTS else 'tiny-cuda-nn is not installed'}. If a training used it, its "
+            "checkpoints need it too. For a new training, use --pipeline.model.implementation fused."
+        )
+    if implementation == "auto":
+        return "tcnn" if there else "fused"
+    return implementation
 
 
 INFINITELY_FAR = 1e4
 """Scene units: so far that the place in the contracted scene is the direction alone."""
 LEAST_HIT = 0.05
 """Rays that stop less than this share of their light are said to hit nothing."""
+
+
+class NothingBehind(RGBRenderer):
+    """nerfstudio's colours before black, of which it would copy a pixel for each ray to a GPU and add nothing."""
+
+    def __init__(self) -> None:
+        super().__init__(background_color="black")
+
+    def forward(self, rgb: Tensor, weights: Tensor, *args: Any, **kwargs: Any) -> Tensor:
+        """Give the colours, [rays, 3]."""
+        # its word for a background that is added later
+        return super().forward(rgb, weights, *args, **{**kwargs, "background_color": "random"})
 
 
 class DepthInEvaluation(DepthRenderer):
@@ -197,14 +233,12 @@ class EdgeDepthNerfModel(NerfactoModel):
         self.metres_per_unit: float = metadata.get("metres_per_unit", 1.0)
         if self.config.near_m > LARGEST_NEAR_PLANE_M:
             CONSOLE.print(
-                f"[bold yellow]The near plane is at {self.config.near_m:g} m: what is nearer to a camera is not "
-                "rendered. Set --pipeline.model.near-m 0.2 unless that is meant."
+                f"[bold yellow]The near plane is at {self.config.near_m:g} m: nothing nearer to a camera is "
+                "rendered. Set --pipeline.model.near-m 0.2 if you did not intend this."
             )
-        implementation = self.config.implementation
-        if implementation == "auto":
-            on_gpu = torch.device(self.kwargs.get("device", "cpu")).type == "cuda"
-            implementation = "tcnn" if TCNN_EXISTS and on_gpu else "fused"
-        if torch.device(self.kwargs.get("device", "cpu")).type == "cpu":
+        device_type = torch.device(self.kwargs.get("device", "cpu")).type
+        implementation = settled(self.config.implementation, device_type)
+        if device_type == "cpu":
             keep_freed_memory()
             let_idle_threads_sleep()
         # nerfstudio knows two of them; the model's own configuration says which was built
@@ -224,8 +258,12 @@ class EdgeDepthNerfModel(NerfactoModel):
             )
 
             if not compiled_before():
-                CONSOLE.print("The first steps compile kernels, which takes about a minute, once on this machine.")
-            use_fused_fields(self)
+                CONSOLE.print("Compiling kernels for the first steps. This takes about a minute, once on this machine.")
+            # normals differentiate by the positions alone, which would add to the tables' gradients, too
+            use_fused_fields(self, add_in_place=not self.config.predict_normals)
+            if isinstance(self.proposal_sampler.initial_sampler, UniformLinDispPiecewiseSampler):
+                jitter = self.proposal_sampler.initial_sampler.single_jitter
+                self.proposal_sampler.initial_sampler = FirstSampler(single_jitter=jitter)
             # bound before the networks were of the fused class
             self.density_fns = [density_fn.__self__.density_fn for density_fn in self.density_fns]
             pdf = self.proposal_sampler.pdf_sampler
@@ -243,6 +281,8 @@ class EdgeDepthNerfModel(NerfactoModel):
         if not self.config.disable_scene_contraction:
             for network in (self.field, *self.proposal_networks):
                 network.spatial_distortion = CubeContraction(order=float("inf"))
+        if self._has_sky:
+            self.renderer_rgb = NothingBehind()
         self.lpips = LpipsAtFirstUse()
         self.psnr = Psnr()
         self.renderer_depth = DepthInEvaluation(method="median")
@@ -400,9 +440,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         """Outputs of a whole view; distance and uncertainty also in colours that always mean the same metres."""
         outputs = super().get_outputs_for_camera(without_undefined_ray(camera), obb_box)
         for name, scale in (("distance", DISTANCE), ("distance_uncertainty", SIGMA)):
-            metres = outputs[name][..., 0].cpu().numpy()
-            coloured = torch.from_numpy(scale.coloured(metres, np.isfinite(metres)))
-            outputs[f"{name}_coloured"] = coloured.to(outputs[name]) / 255
+            outputs[f"{name}_coloured"] = coloured(outputs[name][..., 0], scale)
         return outputs
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
@@ -465,8 +503,12 @@ class EdgeDepthNerfModel(NerfactoModel):
             colours, sky = outputs["surface_rgb"], batch["surface_sky"][:, 0]
             # no error where the surface is not between the planes; choosing pixels would make a GPU wait
             told = sky | self._can_be_met(batch["surface_distance_m"][:, 0])
+            weight: Any = self.config.surface_loss_mult
+            if "surface_counts" in batch:
+                counts = batch["surface_counts"][:, 0]
+                told, weight = told & counts, weight * (len(counts) / counts.sum().clamp(min=1))
             colours = torch.where(told[:, None], colours, batch["surface_image"])
-            losses["surface_loss"] = self.config.surface_loss_mult * self.rgb_loss(batch["surface_image"], colours)
+            losses["surface_loss"] = weight * self.rgb_loss(batch["surface_image"], colours)
         return losses
 
     def _surface_drawn(self, batch: dict[str, Any]) -> Float[Tensor, "rays"]:
@@ -505,11 +547,13 @@ class EdgeDepthNerfModel(NerfactoModel):
         """The loss on the distance prior, mean over the levels of samples.
 
         While the proposal networks rest their levels would only add a number; the final samples' share stays the same.
+        nerfstudio's form of UrbanNeRF's loss holds the final samples' expected distance in every level: all stay.
         """
         levels = list(zip(outputs["weights_list"], outputs["ray_samples_list"], strict=True))
         if self.config.depth_loss_levels == "final":
             levels = levels[-1:]
-        learning = [level for level in levels if level[0].requires_grad] or levels
+        every = self.config.depth_loss == "urban-nerf"
+        learning = [level for level in levels if every or level[0].requires_grad] or levels
         if self.config.depth_loss == "edge":
             per_level = self._edge_losses(learning, batch)
         else:

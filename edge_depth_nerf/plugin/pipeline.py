@@ -14,8 +14,10 @@ from typing import Any, Literal
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.utils.rich_utils import CONSOLE
 
 from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.plugin.compat import ignore_deprecations_of_host
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManager, FisheyeDepthDataManagerConfig
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel, EdgeDepthNerfModelConfig
 from edge_depth_nerf.plugin.plain_errors import say_errors_plainly
@@ -25,7 +27,9 @@ from edge_depth_nerf.plugin.viewer import DrivePanel
 FARTHEST_UNITS = 1e6
 """nerfstudio's sampler turns a distance x beyond 1 into 1 - 1/(2x): float32 has no such number below 1 from 2^23 on."""
 STEPS_PER_CHECK = 50
-"""On a GPU the losses are looked at once in so many steps; NaN in a parameter stays, so it is found then."""
+"""On a GPU steps whose loss is not finite are counted, and the count is looked at once in so many steps."""
+MOST_NOT_FINITE = 5
+"""So many of them may be: the scaler of mixed precision skips such a step. NaN in a parameter stays, and makes more."""
 MOST_NAMED = 5
 """An error names so many pictures."""
 
@@ -37,12 +41,13 @@ class EdgeDepthPipelineConfig(VanillaPipelineConfig):
     _target: type = field(default_factory=lambda: EdgeDepthPipeline)
     """Target class to instantiate."""
     eval_poses: Literal["given", "refined"] = "given"
-    """Poses of judged pictures. refined: fitted to the left half of each picture by `model.camera_optimizer`'s
-    expectations; what is inside the mask is then judged on the right half alone."""
+    """Poses of evaluated pictures. refined: each pose is fitted to the left half of its picture, with the expected
+    errors of `model.camera_optimizer`. Only the right half, inside the mask, is then evaluated."""
 
     def setup(self, **kwargs: Any) -> Any:
         """Build the pipeline; from here on nerfstudio's commands say our errors without a traceback."""
         say_errors_plainly()
+        ignore_deprecations_of_host()
         return super().setup(**kwargs)
 
 
@@ -74,25 +79,46 @@ class EdgeDepthPipeline(VanillaPipeline):
             raise InputError(
                 f"{manager.get_datapath()}: the far plane of {model.far_m:g} m is at "
                 f"{model.far_m / metres_per_unit:.3g} scene units ({metres_per_unit:.3g} m each); beyond "
-                f"{FARTHEST_UNITS:g} the samples along a ray can no longer be told apart. Lower "
+                f"{FARTHEST_UNITS:g} float32 cannot distinguish the samples along a ray. Lower "
                 "--pipeline.model.far-m, or leave --pipeline.datamanager.dataparser.metres-per-unit at its default."
             )
         sampler = manager.train_pixel_sampler
         if model.depth_loss != "none" and sampler is not None and sampler.table.share_with_prior == 0:
             raise InputError(
-                f"{manager.get_datapath()}: no training pixel has a depth prior, so nothing for the depth loss "
-                f"{model.depth_loss!r}. Process the drive with LiDAR, or make monocular maps by "
-                "`edge-depth-nerf estimate-depth`, or train without a prior by "
-                "--pipeline.model.depth-loss none."
+                f"{manager.get_datapath()}: no training pixel has a depth prior, which the depth loss needs: "
+                f"{model.depth_loss!r}. Process the drive with LiDAR, make monocular maps with `edge-depth-nerf "
+                "estimate-depth`, or train without a prior with --pipeline.model.depth-loss none."
             )
         self.drive = DrivePanel(manager)
+        self._odd_steps: torch.Tensor | None = None
+
+    def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
+        """Load a checkpoint as nerfstudio does.
+
+        Raises:
+            InputError: it is of another implementation; nerfstudio would load what fits, and say nothing of the rest.
+
+        """
+        # tiny-cuda-nn keeps table and network in one parameter
+        tables = [any(key.endswith(".hash_table") for key in keys) for keys in (loaded_state, self.model.state_dict())]
+        if tables[0] and not tables[1]:
+            raise InputError(
+                "This checkpoint was made without tiny-cuda-nn, which the model uses here. Choose "
+                "--pipeline.model.implementation fused (in a config.yml: implementation: fused)."
+            )
+        if tables[1] and not tables[0]:
+            raise InputError(
+                "This checkpoint was made with tiny-cuda-nn: to be loaded it needs a GPU, tiny-cuda-nn, and "
+                "--pipeline.model.implementation tcnn (in a config.yml: implementation: tcnn)."
+            )
+        super().load_pipeline(loaded_state, step)
 
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Any], dict[str, Any]]:
         """Outputs, losses and metrics of the next batch, as nerfstudio gives them.
 
         Raises:
             NotFiniteError: a loss is not finite; before the step is taken. On a GPU, which would have to be waited for,
-                this is looked at in some steps only.
+                such steps are counted, and several end the training.
 
         """
         rays, batch = self.datamanager.next_train(step)
@@ -100,10 +126,35 @@ class EdgeDepthPipeline(VanillaPipeline):
         outputs = self._model(rays, batch)
         metrics = self.model.get_metrics_dict(outputs, batch)
         losses = self.model.get_loss_dict(outputs, batch, metrics)
-        if str(self.device) == "cpu" or step % STEPS_PER_CHECK == 0:
+        if torch.device(self.device).type == "cpu":
             if not all(bool(loss.detach().isfinite()) for loss in losses.values()):
                 raise NotFiniteError(self._not_finite(step, outputs, losses))
+        else:
+            self._count_not_finite(step, outputs, losses)
         return outputs, losses, metrics
+
+    def _count_not_finite(self, step: int, outputs: dict[str, Any], losses: dict[str, Any]) -> None:
+        """Count this step, if a loss is not finite, where the losses are; now and then look at the count.
+
+        Raises:
+            NotFiniteError: there were several since the last look.
+
+        """
+        total = torch.stack([loss.detach() for loss in losses.values()]).sum()
+        # what is not finite, less itself, is NaN
+        odd = total - total != 0
+        self._odd_steps = odd.long() if self._odd_steps is None else self._odd_steps + odd
+        if step % STEPS_PER_CHECK:
+            return
+        count, self._odd_steps = int(self._odd_steps), None
+        if count > MOST_NOT_FINITE:
+            found = self._not_finite(step, outputs, losses) if bool(odd) else f"Step {step}: all losses are finite."
+            raise NotFiniteError(f"{found} In {count} of the last {STEPS_PER_CHECK} steps a loss was not finite.")
+        if count:
+            CONSOLE.print(
+                f"[yellow]In {count} of the last {STEPS_PER_CHECK} steps a loss was not finite; mixed precision skips "
+                "them."
+            )
 
     def _not_finite(self, step: int, outputs: dict[str, Any], losses: dict[str, Any]) -> str:
         """Say which losses are not finite, and in which pictures."""
@@ -121,8 +172,8 @@ class EdgeDepthPipeline(VanillaPipeline):
         listed = f"{', '.join(names[:MOST_NAMED])}{' …' if len(names) > MOST_NAMED else ''}"
         return (
             f"Step {step}: {', '.join(odd)}; {rays}, from {len(names)} "
-            f"pictures: {listed}. Look at them with `edge-depth-nerf inspect`; if they are fine, lower the learning "
-            "rate or the weights of the losses, or leave mixed precision off (--mixed-precision False)."
+            f"pictures: {listed}. Check them with `edge-depth-nerf inspect`. If they are fine, lower the learning "
+            "rate or the weights of the losses, or turn mixed precision off (--mixed-precision False)."
         )
 
     def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict[str, Any], dict[str, Any]]:

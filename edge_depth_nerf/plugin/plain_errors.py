@@ -8,7 +8,7 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Any
 
-from edge_depth_nerf.base.errors import DEBUG_VARIABLE, PROGRAM, InputError, debugging, of_package
+from edge_depth_nerf.base.errors import PROGRAM, InputError, debugging, of_package
 
 
 class _Hook:
@@ -28,7 +28,8 @@ class _Hook:
         if said is None:
             self.before(kind, error, trace)
         else:
-            sys.stderr.write(f"{PROGRAM}: {said}\n(The traceback: set {DEBUG_VARIABLE}=1.)\n")
+            # apart from the warnings and figures before it
+            sys.stderr.write(f"\n{PROGRAM}: {said}\n")
 
 
 def say_config_slips_plainly() -> None:
@@ -65,12 +66,12 @@ def _config_slip(error: BaseException, trace: TracebackType | None) -> str | Non
         kinds = {
             FileNotFoundError: "no such file",
             IsADirectoryError: "is a folder",
-            AssertionError: "holds something else than a training's configuration",
+            AssertionError: "is not the configuration of a training",
         }
         first_line = (str(error).splitlines() or [""])[0]
         what = kinds.get(type(error), f"cannot be read ({type(error).__name__}: {first_line})")
         return (
             f"{found['config_path']}: {what}. --load-config takes a training's config.yml, such as "
-            "outputs/NAME/METHOD/TIME/config.yml; paths count from the folder you are in."
+            "outputs/NAME/METHOD/TIME/config.yml; relative paths start at the current folder."
         )
     return None

@@ -34,7 +34,7 @@ class PoseRefinerConfig(CameraOptimizerConfig):
     _target: type = field(default_factory=lambda: PoseRefiner)
     """Target class to instantiate."""
     mode: Literal["off", "SO3xR3"] = "off"  # pyright: ignore[reportIncompatibleVariableOverride]
-    """SO3xR3: poses are refined in training, those of held-out pictures stay. off: all stay."""
+    """SO3xR3: poses are refined in training, except those of held-out pictures. off: no pose is refined."""
     sigma_m: float = 0.03
     """Expected error of the given positions: standard deviation in metres."""
     sigma_deg: float = 0.1
@@ -48,24 +48,22 @@ class PoseRefiner(CameraOptimizer):
 
     config: PoseRefinerConfig
     moment: Int[Tensor, "pictures"]
+    sigmas: Float[Tensor, "6"]
+    """What one means of an adjustment: scene units of translation, radians of rotation."""
 
     def __init__(self, config: PoseRefinerConfig, num_cameras: int, device: torch.device | str, **kwargs: Any) -> None:
         super().__init__(config, num_cameras, device, **kwargs)
         self.register_buffer("moment", torch.arange(num_cameras), persistent=False)
-        self.metres_per_unit = 1.0
+        self.register_buffer("sigmas", _sigmas(config, 1.0, torch.empty(0)), persistent=False)
 
     def settle(self, moments: list[int], metres_per_unit: float) -> None:
         """Say which pictures share a moment and how long the scene's unit is; before any step."""
         _, moment = torch.unique(torch.tensor(moments), return_inverse=True)
         self.moment = moment.to(self.moment)
-        self.metres_per_unit = metres_per_unit
+        self.sigmas = _sigmas(self.config, metres_per_unit, self.sigmas)
         if self.config.mode != "off":
             rows = self.pose_adjustment.new_zeros(int(moment.max()) + 1, 6)
             self.pose_adjustment = torch.nn.Parameter(rows)
-
-    def sigmas(self) -> Float[Tensor, "6"]:
-        """What one means of an adjustment: scene units of translation, radians of rotation."""
-        return _sigmas(self.config, self.metres_per_unit, self.pose_adjustment)
 
     def forward(self, indices: Int[Tensor, "rays"]) -> Float[Tensor, "rays 3 4"]:
         """What is to be done to the rays of pictures, in the world: a turn about the camera, and a shift."""
@@ -73,7 +71,7 @@ class PoseRefiner(CameraOptimizer):
             # the viewer asks also then
             return super().forward(indices)
         centred = self.pose_adjustment - self.pose_adjustment.mean(dim=0)
-        return exp_map_SO3xR3(centred * self.sigmas())[self.moment[indices]]
+        return exp_map_SO3xR3(centred * self.sigmas)[self.moment[indices]]
 
     def apply_to_raybundle(self, raybundle: RayBundle) -> None:
         """Move rays, in place."""

@@ -93,8 +93,10 @@ class TableRayGenerator(RayGenerator):
     """nerfstudio's `RayGenerator`, for cameras that share a few lenses; rays differ by float32's noise at most."""
 
     table: Tensor
-    lens: Tensor
     first: Tensor
+    """Where the rays of each camera's lens begin."""
+    poses: Tensor
+    widths: Tensor
 
     def __init__(self, cameras: Cameras, folder: Path) -> None:
         """Make the table, or find it in `folder`; where that cannot be written the table stays in memory."""
@@ -106,7 +108,7 @@ class TableRayGenerator(RayGenerator):
         table = _read(path, int(pixels.sum()))
         if table is None:
             with progress_bars(CONSOLE, transient=True) as progress:
-                task = progress.add_task("Making the table of rays, once …", total=int(pixels.sum()))
+                task = progress.add_task("Making the table of rays (once) …", total=int(pixels.sum()))
                 made = _make(lenses, partial(progress.advance, task))
             try:
                 write_checked(path, TABLE_VERSION, lambda file: np.save(file, made))
@@ -119,10 +121,13 @@ class TableRayGenerator(RayGenerator):
             if table is None:
                 table = torch.from_numpy(made)
         first = torch.cumsum(pixels, 0) - pixels
-        for name, value in (("table", table), ("lens", lens), ("first", first)):
+        for name, value in (
+            ("table", table),
+            ("first", first[lens]),
+            ("poses", cameras.camera_to_worlds.detach()),
+            ("widths", cameras.width[:, 0]),
+        ):
             self.register_buffer(name, value.to(cameras.device), persistent=False)
-        self.poses = cameras.camera_to_worlds.detach()
-        self.widths = cameras.width[:, 0]
 
     @staticmethod
     def suits(cameras: Cameras) -> bool:
@@ -138,7 +143,7 @@ class TableRayGenerator(RayGenerator):
     def forward(self, ray_indices: Int[Tensor, "num_rays 3"]) -> RayBundle:
         """Rays of pixels, given by picture, row and column."""
         picture, row, column = ray_indices.unbind(-1)
-        ray = self.table[self.first[self.lens[picture]] + row * self.widths[picture] + column]
+        ray = self.table[self.first[picture] + row * self.widths[picture] + column]
         pose = self.poses[picture]
         return RayBundle(
             origins=pose[:, :3, 3],

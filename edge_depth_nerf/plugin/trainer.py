@@ -24,10 +24,13 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from edge_depth_nerf.base.errors import STOPPED_STATUS, InputError
 from edge_depth_nerf.base.files import remove_leftovers, write_text
 from edge_depth_nerf.jobs.runs import checkpoints_in, newest_checkpoint
-from edge_depth_nerf.plugin.compat import count_steps_against_all, total_steps
+from edge_depth_nerf.plugin.compat import count_steps_against_all, ignore_deprecations_of_host, total_steps
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig, transforms_path
+from edge_depth_nerf.plugin.grad_scaler import PatientGradScaler
+from edge_depth_nerf.plugin.model import EdgeDepthNerfModelConfig, settled
 from edge_depth_nerf.plugin.pipeline import NotFiniteError
 from edge_depth_nerf.plugin.plain_errors import say_errors_plainly
+from edge_depth_nerf.plugin.settings import changed_settings
 
 FOR_A_GPU = ("edge-depth-nerf", "edge-depth-nerf-paper")
 """Methods of full size."""
@@ -40,17 +43,34 @@ class EdgeDepthTrainerConfig(TrainerConfig):
     _target: type = field(default_factory=lambda: EdgeDepthTrainer)
     """Target class to instantiate."""
 
+    def print_to_terminal(self) -> None:
+        """Say what is trained, and which settings differ from the method's own; config.yml has them all."""
+        from nerfstudio.configs.method_configs import all_methods  # which asks this plugin for its methods
+
+        scene = self.pipeline.datamanager.data
+        lines = [f"{self.method_name}: {self.max_num_iterations} steps on {self.machine.device_type}, scene {scene}"]
+        changed = changed_settings(self, all_methods.get(self.method_name))
+        lines += [f"  --{name.replace('_', '-')} {_word(value)}" for name, value in changed.items()]
+        CONSOLE.print("\n".join(lines), soft_wrap=True, highlight=False, markup=False)
+
     def save_config(self) -> None:
         """Save config.yml as nerfstudio does, but atomically: half of one could not be loaded any more.
+
+        An implementation left to `auto` is settled, as another machine may settle it otherwise, and tiny-cuda-nn's
+        checkpoints are not those of the others.
 
         Raises:
             FileNotFoundError: no scene where `--data` says; then nothing is written.
 
         """
         say_errors_plainly()
+        ignore_deprecations_of_host()
         data: Any = self.pipeline.datamanager
         if isinstance(data.dataparser, FisheyeDepthDataParserConfig):
             transforms_path(Path(data.data or data.dataparser.data))
+        model = self.pipeline.model
+        if isinstance(model, EdgeDepthNerfModelConfig):
+            model.implementation = settled(model.implementation, self.machine.device_type)
         path = self.get_base_dir() / "config.yml"
         CONSOLE.log(f"Saving config to: {path}")
         write_text(path, yaml.dump(self))
@@ -68,6 +88,7 @@ class EdgeDepthTrainer(Trainer):
     def __init__(self, config: EdgeDepthTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         """Take the configuration; see nerfstudio's Trainer."""
         super().__init__(config, local_rank, world_size)
+        self.grad_scaler = PatientGradScaler(enabled=self.use_grad_scaler and self.device != "cpu")
         self._interruption = _Interruption()
         self._last_step: int | None = None  # that this process has taken
 
@@ -251,6 +272,11 @@ class _Interruption:
         if not self._busy:
             raise KeyboardInterrupt
         self._asked = True
+
+
+def _word(value: object) -> str:
+    """A setting's value, as it is typed."""
+    return value.__qualname__ if isinstance(value, type) else str(value)
 
 
 def _step_of(checkpoint: Path) -> int:

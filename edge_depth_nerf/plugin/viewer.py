@@ -1,6 +1,6 @@
 """What nerfstudio's viewer shows of a drive besides the rendering: LiDAR, the prior, the path, the lenses.
 
-Host-facing, through nerfstudio's own hooks: it finds the panel's switches and its `ViewerControl` in the pipeline. A
+Host-facing, through nerfstudio's own hooks: it finds the `ViewerControl` that installs the switches in the pipeline. A
 layer is made in a thread of its own when it is first switched on, and hidden, not removed, when it is switched off, so
 neither a training nor a command without a viewer waits for it.
 """
@@ -32,6 +32,7 @@ from edge_depth_nerf.base.files import as_people_count
 from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.base.pictures import DISTANCE, SIGMA
 from edge_depth_nerf.cameras import Camera
+from edge_depth_nerf.plugin.coarse_to_fine import render_coarse_to_fine
 
 if TYPE_CHECKING:
     from nerfstudio.viewer.viewer import Viewer
@@ -62,6 +63,8 @@ THETA_STEPS = 720
 """The rim is found within theta_max / THETA_STEPS."""
 PATH_COLOURS = ((230, 120, 20), (40, 160, 220), (120, 190, 60), (200, 80, 180), (230, 200, 40), (120, 120, 220))
 """One for each camera, over and over."""
+FOLDER = "Layers of the drive"
+"""Heading of the switches in the panel."""
 COLOURS = ("height", "picture", "sigma")
 """What the colour of a point can stand for."""
 
@@ -166,6 +169,11 @@ def _glb(camera: Camera, theta_max_rad: float, picture: NDArray[np.uint8], radiu
     return data.getvalue()
 
 
+def _viser_rotation(pose: Float64[np.ndarray, "3 4"]) -> viser.transforms.SO3:
+    """The rotation of one of nerfstudio's cameras, which look along -z; viser's look along z."""
+    return viser.transforms.SO3.from_matrix(pose[:, :3] * (1.0, -1.0, -1.0))
+
+
 class DriveLayers(ViewerControl):
     """Draws the layers; nerfstudio calls `_setup` once its viewer stands."""
 
@@ -175,12 +183,12 @@ class DriveLayers(ViewerControl):
         has_prior = sampler is not None and sampler.table.share_with_prior > 0
         has_lidar = "lidar" in manager.train_dataset.sources()
         self.switches = {
+            "lidar": self._switch("LiDAR points", "lidar", False, "Returns of the training pictures", has_lidar),
+            "prior": self._switch("Depth prior", "prior", False, "What the loss draws the density to", has_prior),
             "lenses": self._switch(
                 "Lenses", "lenses", True, "What each camera sees, in place of nerfstudio's pyramids"
             ),
             "path": self._switch("Path", "path", True, "A line through the places of each camera"),
-            "lidar": self._switch("LiDAR points", "lidar", False, "Returns of the training pictures", has_lidar),
-            "prior": self._switch("Depth prior", "prior", False, "What the loss draws the density to", has_prior),
         }
         self.meaning = ViewerDropdown(
             "Colour of points",
@@ -200,12 +208,37 @@ class DriveLayers(ViewerControl):
     def _setup(self, viewer: Viewer) -> None:
         """Take hold of the viewer, and draw what is on from the beginning."""
         super()._setup(viewer)
+        self._install(viewer)
+        viewer.viser_server.on_client_connect(self._welcome)
         # made before nerfstudio's frusta, it decides over all of them
         self._host_frusta = viewer.viser_server.scene.add_frame(HOST_FRUSTA, show_axes=False)
         viewer.hide_images.on_click(lambda _: self._hide_lenses(True))
         viewer.show_images.on_click(lambda _: self._hide_lenses(False))
         for layer in self.switches:
             self._update(layer)
+
+    def _install(self, viewer: Viewer) -> None:
+        """Put the layers' switches above the panel's tabs, where they are seen at once."""
+        gui = viewer.viser_server.gui
+        with gui.add_folder(FOLDER, order=viewer.stats_markdown.order + 0.5):
+            for element in (*self.switches.values(), self.meaning):
+                element.install(viewer.viser_server)
+        labels = ", ".join(switch.name for switch in self.switches.values() if not switch.disabled)
+        CONSOLE.print(f"The viewer's panel switches these layers on and off: {labels}.")
+
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        """Let a browser begin at a training camera: the middle one of the drive's first camera."""
+        dataset = self.manager.train_dataset
+        folder = dataset.image_filenames[0].parent
+        of_camera = [index for index, file in enumerate(dataset.image_filenames) if file.parent == folder]
+        index = of_camera[len(of_camera) // 2]
+        pose = dataset.cameras.camera_to_worlds[index].double().cpu().numpy()
+        with client.atomic():
+            client.camera.position = pose[:, 3] * VISER_NERFSTUDIO_SCALE_RATIO
+            client.camera.wxyz = _viser_rotation(pose).wxyz
+        self.viewer.current_camera_idx = index
+        self.viewer.update_step(self.viewer.step)
+        render_coarse_to_fine(self.viewer, client)
 
     def _hide_lenses(self, hidden: bool) -> None:
         self._hidden = hidden
@@ -252,12 +285,10 @@ class DriveLayers(ViewerControl):
         radius = self._units(LENS_RADIUS_M) * self.viewer.config.camera_frustum_scale / HOST_FRUSTUM_SCALE
         for index in spread_over(len(dataset), MOST_LENSES):
             pose = dataset.cameras.camera_to_worlds[index].double().cpu().numpy()
-            # nerfstudio's camera looks along -z, viser's along z
-            rotation = viser.transforms.SO3.from_matrix(pose[:, :3] * (1.0, -1.0, -1.0))
             lens = self.viser_server.scene.add_glb(
                 f"{node}/{index:05d}",
                 _glb(dataset.camera(index), limit_rad, dataset.rgb(index), radius),
-                wxyz=rotation.wxyz,
+                wxyz=_viser_rotation(pose).wxyz,
                 position=pose[:, 3] * VISER_NERFSTUDIO_SCALE_RATIO,
             )
             lens.on_click(self._go_there(index))
@@ -360,6 +391,3 @@ class DrivePanel(torch.nn.Module):
     def __init__(self, manager: FisheyeDepthDataManager) -> None:
         super().__init__()
         self.layers = DriveLayers(manager)
-        # it shows them in the order of their names
-        for number, element in enumerate((*self.layers.switches.values(), self.layers.meaning)):
-            setattr(self, f"element_{number}", element)

@@ -54,7 +54,7 @@ def read_agreement(scene: Path, first: Trajectory | None = None) -> PathAgreemen
     content = read_json(path)
     names = [field.name for field in fields(PathAgreement)]
     if not isinstance(content, dict) or not all(isinstance(content.get(name), float) for name in names):
-        raise InputError(f"{path}: expected {', '.join(names)} as numbers. Delete it; `process` writes it anew.")
+        raise InputError(f"{path}: expected {', '.join(names)} as numbers. Delete it; `process` then writes it again.")
     if first is not None and content.get("poses_sha256") != _sum(first):
         return None
     return PathAgreement(**{name: content[name] for name in names})

@@ -108,8 +108,9 @@ def odometry(sweeps: Sequence[TimedSweep], advance: Callable[[], object] = lambd
     kiss = import_kiss_icp()
     if len(sweeps) < MIN_SWEEPS:
         raise InputError(
-            f"--poses lidar: {len(sweeps)} sweep{'' if len(sweeps) == 1 else 's'}, expected {MIN_SWEEPS} or more one "
-            "after another: the path comes from what sweeps have in common. Take more frames, or --poses colmap."
+            f"--poses lidar: {len(sweeps)} sweep{'' if len(sweeps) == 1 else 's'}, expected {MIN_SWEEPS} or more "
+            "consecutive ones: the path is computed from their overlap. Take more frames, or --poses "
+            "colmap."
         )
     some = sweeps[:_SEED_SWEEPS]
     start = None

@@ -287,8 +287,8 @@ def agreement_notices(found: Sequence[Agreement]) -> list[str]:
     """Say which transforms seem to be wrong; nothing for those that fit."""
     notices = []
     for which, whose, fix in (
-        ("camera", "{cameras}", "the transform of that camera to the vehicle"),
-        ("scanner", "{scanners}", "the transform of that scanner to the vehicle"),
+        ("camera", "{cameras}", "that camera's transform to the vehicle"),
+        ("scanner", "{scanners}", "that scanner's transform to the vehicle"),
         ("both", "{cameras} and {scanners}", "each of these transforms to the vehicle"),
     ):
         wrong = [one for one in found if one.better == which]
@@ -303,14 +303,16 @@ def agreement_notices(found: Sequence[Agreement]) -> list[str]:
                 scanners=", ".join(dict.fromkeys(one.scanner for one in wrong)),
             )
             notices.append(
-                f"LiDAR does not lie on what the pictures show: with the inverse of {fix} ({names}) the pictures agree "
-                f"better at its returns (correlation {figures}). Is to_vehicle given the wrong way round?"
+                f"LiDAR points do not lie on the objects in the pictures. With the inverse of {fix} ({names}) the "
+                f"pictures agree better at the LiDAR points (correlation {figures}). Is to_vehicle "
+                "inverted?"
             )
     unfit = [one for one in found if one.better is None and not one.fits]
     if unfit:
         named = ", ".join(f"{one.camera} with {one.scanner} ({one.given:.2f})" for one in unfit)
         notices.append(
-            f"LiDAR does not lie on what the pictures show, and no inverse of a transform fits either: {named}; 1 is "
-            "agreement of the pictures at its returns. Check to_vehicle, the clocks and the poses."
+            "LiDAR points do not lie on the objects in the pictures, and no inverse of a transform fits, either: "
+            f"{named}; 1 means that the pictures agree at the LiDAR points. Check to_vehicle, the clocks "
+            "and the poses."
         )
     return notices

@@ -97,9 +97,10 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
     held_out = _held_out(recording, options)
     if options.holdout_every > 0 and not held_out:
         moments = len({picture.frame for picture in recording.pictures})
+        advice = f"--holdout-every {best_holdout(moments)} holds one out" if moments > 1 else "Take a longer stretch"
         notices.append(
             f"No frame is held out: the drive has {moments}, too few for --holdout-every {options.holdout_every}. "
-            f"--holdout-every {best_holdout(moments)} holds one out to judge by."
+            f"{advice} for evaluation."
         )
     if options.find_moving:
         recording, more = find_moving(recording, options, held_out, masks, console)
@@ -149,7 +150,7 @@ def _disagreements(
     for recorded in recording.cameras:
         lens = lens_circle(recorded.camera, options.theta_max_deg)
         usable[recorded.name] = lens & masks[recorded.name] if recorded.name in masks else lens
-    with console.status("Holding LiDAR against the pictures"):
+    with console.status("Comparing LiDAR with the pictures"):
         return agreement_notices(agreements(recording, usable))
 
 
@@ -176,14 +177,14 @@ def _posed(recording: Recording, options: ProcessOptions, console: Console) -> t
     elif options.poses == "lidar":
         notices = features_say(recording, options, console)
     if recording.trajectory is None:
-        raise InputError("the recording has no poses. Give them, or find them: --poses lidar, --poses colmap.")
+        raise InputError("the recording has no poses. Give them, or compute them: --poses lidar, --poses colmap.")
     if options.refine_poses:
         from edge_depth_nerf.process.colmap.refine import check_refining, refine_poses
 
         try:
             check_refining(recording, options)
         except InputError as error:
-            notices.append(f"The poses stay as they are given. {error}")
+            notices.append(f"The given poses are used unchanged. {error}")
         else:
             recording = refine_poses(recording, options, console)
     return recording, notices
@@ -378,8 +379,9 @@ class _Builder:
         whole = read_distance_png(picture.mono)
         if not whole.any():
             raise InputError(
-                f"{picture.mono}: its monocular map has no distance anywhere. Expected 16-bit counts of 1/256 m along "
-                "the ray; a network gives every picture a depth, so its export has failed: make the map again."
+                f"{picture.mono}: its monocular map contains no distance. Expected 16-bit counts of 1/256 m along "
+                "the ray. Networks give every picture a depth, so its export has failed: make the map "
+                "again."
             )
         if not self._options.sky:
             return load_distance(picture.mono, factor)
@@ -398,20 +400,20 @@ class _Builder:
         found = self._store.notices()
         if "lidar" not in self.layers:
             prior = (
-                "the prior is monocular alone, and nothing checks its scale"
+                "the prior is made of monocular maps only, and nothing checks their scale"
                 if "mono" in self.layers
-                else ("no ray has a prior, and training is plain nerfacto")
+                else ("no ray has a prior, and training equals plain nerfacto")
             )
             found.append(
-                f"The drive has neither LiDAR nor depth maps: {prior}. Name its scans or depth maps where the drive is "
-                "described, or bring monocular maps of true scale by --mono."
+                f"The drive has neither LiDAR nor depth maps: {prior}. Name its scans or depth maps in the "
+                "description of the drive, or give metric monocular maps with --mono."
             )
         if self._coverage:
             shares = ", ".join(f"{np.mean(shares):.1%} of {name}" for name, shares in sorted(self._coverage.items()))
-            found.append(f"LiDAR covers, of what the masks keep, {shares}.")
+            found.append(f"LiDAR covers this share of the pixels inside the masks: {shares}.")
         if self._without:
             found.append(
-                f"No LiDAR return in {len(self._without)} pictures: frames {', '.join(sorted(self._without)[:10])}"
+                f"No LiDAR point in {len(self._without)} pictures: frames {', '.join(sorted(self._without)[:10])}"
                 f"{' …' if len(self._without) > 10 else ''}."
             )
         return found
@@ -483,7 +485,7 @@ def _source(recording: Recording, options: ProcessOptions) -> dict[str, Any]:
 
 def _fit_words(fit: CameraFit) -> str:
     if fit.max_px < 5e-4:
-        return "is exactly this one"
+        return "is exact"
     return f"fits within {fit.rms_px:.4f} px rms, {fit.max_px:.3f} px at most"
 
 
@@ -492,7 +494,7 @@ def _show(report: ProcessReport, console: Console) -> None:
         fit = report.fits[name]
         say(
             console,
-            f"{name}: nerfstudio's camera {_fit_words(fit)}; the mask keeps {share:.0%} of the picture",
+            f"{name}: the camera model for nerfstudio {_fit_words(fit)}; the mask keeps {share:.0%} of the picture",
         )
     for notice in report.notices:
         say(console, notice, "yellow")
@@ -500,7 +502,7 @@ def _show(report: ProcessReport, console: Console) -> None:
         say(console, f"Left out: {item.key}. {item.fault}", "yellow")
     if report.left_out:
         count = len(report.left_out)
-        more = f", {count - MOST_LISTED} of them not listed here" if count > MOST_LISTED else ""
+        more = f", {count - MOST_LISTED} of them are not listed" if count > MOST_LISTED else ""
         say(console, f"{count} broken or missing files{more}; with --strict the first one is an error.", "yellow")
     done = "" if report.written else "; all of them were there"
-    say(console, f"{report.scene}: {report.training} pictures for training, {report.held_out} held out{done}")
+    say(console, f"{report.scene}: {report.training} training pictures, {report.held_out} held out{done}")

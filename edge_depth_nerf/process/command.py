@@ -59,7 +59,7 @@ def _add_mono(scene: SceneFolder, options: ProcessOptions, console: Console) -> 
         if not isinstance(source, dict) or source.get("weights") != options.mono_model.name:
             say(
                 console,
-                f"{scene.folder}: has monocular maps already, they stay. For those of {options.mono_model}: "
+                f"{scene.folder}: has monocular maps already, which are kept. For those of {options.mono_model}: "
                 "`edge-depth-nerf estimate-depth SCENE --model …`.",
                 "yellow",
             )
@@ -76,8 +76,7 @@ def _add_mono(scene: SceneFolder, options: ProcessOptions, console: Console) -> 
             return
         say(
             console,
-            "No LiDAR, so no network of the drive's own can be trained. Bring monocular maps with --mono, or weights "
-            "with --mono-model.",
+            "There is no LiDAR to train a network on. Give monocular maps with --mono, or weights with --mono-model.",
             "yellow",
         )
     if scene.has("mono") and lidar:

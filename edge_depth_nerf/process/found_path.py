@@ -39,7 +39,7 @@ def with_path(
             continue
         vehicle_to_world = trajectory.at(np.array([picture.time_s]))[0]
         kept.append(dataclasses.replace(picture, camera_to_world=vehicle_to_world @ to_vehicle[picture.camera]))
-    beside = ("The drive's true views from beside the path are left out: they are of another world.",)
+    beside = ("The drive's true views beside the path are left out, because they belong to other poses.",)
     return dataclasses.replace(
         recording,
         pictures=tuple(kept),

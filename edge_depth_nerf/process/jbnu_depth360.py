@@ -36,7 +36,7 @@ def read_jbnu_depth360(options: JbnuDepth360Options) -> Recording:
     """
     options.check()
     for folder in ("image", "bin"):
-        require_folder(options.root / folder, "--root takes a sequence's folder, such as 230329/test_1")
+        require_folder(options.root / folder, "--root takes a sequence's folder such as 230329/test_1")
     rig = read_rig(options.calibration, options.calibration.parent, _fill_in)
     if len(rig.lidars) != 1:
         raise InputError(f"{rig.path}: {len(rig.lidars)} scanners in [lidars]; the data set has one.")

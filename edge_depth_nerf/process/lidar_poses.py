@@ -69,7 +69,7 @@ def lidar_poses(recording: Recording, options: ProcessOptions, console: Console)
     if not posed.pictures:
         raise InputError(
             f"--poses lidar: none of the {len(recording.pictures)} pictures was taken between the sweeps of "
-            f"{sweeps[0].scanner}. Check the times of pictures and sweeps."
+            f"{sweeps[0].scanner}. Check the times of pictures and sweeps"
         )
     return dataclasses.replace(posed, notices=(*posed.notices, *_notices(sweeps, trajectory)))
 
@@ -84,10 +84,10 @@ def check_sweeps(recording: Recording) -> list[RecordedSweep]:
     import_kiss_icp()
     if not recording.sweeps:
         maps = any(picture.depth for picture in recording.pictures)
-        found = "depth maps in place of LiDAR sweeps" if maps else "no LiDAR sweeps"
+        found = "depth maps instead of LiDAR sweeps" if maps else "no LiDAR sweeps"
         raise InputError(
-            f"--poses lidar: the recording has {found}; the path is found from sweeps. Give scans ([lidars] in a rig "
-            "file), or find the path from the pictures (--poses colmap)."
+            f"--poses lidar: the recording has {found}; the path is computed from sweeps. Give scans ([lidars] in a "
+            "rig file), or compute the path from the pictures (--poses colmap)."
         )
     scanners: dict[str, list[RecordedSweep]] = defaultdict(list)
     for sweep in recording.sweeps:
@@ -97,22 +97,22 @@ def check_sweeps(recording: Recording) -> list[RecordedSweep]:
     sweeps = sorted(scanners[name], key=lambda sweep: sweep.time_s)
     if len(sweeps) < MIN_SWEEPS:
         raise InputError(
-            f"--poses lidar: {len(sweeps)} sweep{'' if len(sweeps) == 1 else 's'} of {name}, expected {MIN_SWEEPS} or "
-            "more one after another: the path comes from what sweeps have in common. Take more frames (--frames), or "
-            "find the path from the pictures (--poses colmap)."
+            f"--poses lidar: {len(sweeps)} sweep{'' if len(sweeps) == 1 else 's'} of {name}, expected {MIN_SWEEPS} "
+            "or more consecutive ones: the path is computed from their overlap. Take more frames "
+            "(--frames), or compute the path from the pictures (--poses colmap)."
         )
     if returns[name] < _FEW_RETURNS:
         raise InputError(
             f"--poses lidar: {sweeps[0].path.parent}: {returns[name]:.0f} returns a sweep (median), expected "
-            f"{_FEW_RETURNS} or more: fewer do not say how the vehicle rolls and pitches. Use --poses colmap."
+            f"{_FEW_RETURNS} or more: roll and pitch cannot be computed from fewer. Use --poses colmap."
         )
     times = np.array([sweep.time_s for sweep in sweeps])
     widest = int(np.diff(times).argmax())
     if times[widest + 1] - times[widest] > MAX_POSE_GAP_S:
         raise InputError(
             f"--poses lidar: no sweep for {times[widest + 1] - times[widest]:.1f} s after {sweeps[widest].path}; "
-            f"sweeps more than {MAX_POSE_GAP_S:g} s apart have too little in common. Take the frames before or after "
-            "alone (--first, --frames), or find the path from the pictures (--poses colmap)."
+            f"sweeps more than {MAX_POSE_GAP_S:g} s apart overlap too little. Use only the frames before or after "
+            "(--first, --frames), or compute the path from the pictures (--poses colmap)."
         )
     return sweeps
 
@@ -170,15 +170,16 @@ def _check_path(trajectory: Trajectory) -> None:
     if reach_m < _MIN_WAY_M:
         what = f"turns on the spot, by {math.degrees(turned):.0f}°" if turned > _TURNED_RAD else "stands still"
         raise InputError(
-            f"--poses lidar: the vehicle {what}: it stays within {reach_m:.2f} m of where it begins. Pictures from one "
-            "place do not say how far away anything is; take frames of a stretch where it drives (--first, --frames)."
+            f"--poses lidar: the vehicle {what}: it stays within {reach_m:.2f} m of its start. Pictures from one "
+            "place cannot give distances. Use frames of a stretch where it drives (--first, --frames)."
         )
     if found := find_break(trajectory):
         first, last = trajectory.times_s[[found.first, found.last]]
         raise InputError(
-            f"--poses lidar: the path breaks between {first:.2f} and {last:.2f} s: {found.what}. LiDAR's surroundings "
-            "say too little there (an open field, a tunnel, a scanner of few rings), or the sweeps' times are wrong. "
-            "Check turn_s, direction and times, take the frames before or after alone, or use --poses colmap."
+            f"--poses lidar: the path breaks between {first:.2f} and {last:.2f} s: {found.what}. The surroundings "
+            "have too little structure there (an open field, a tunnel, a scanner with few rings), or the "
+            "sweeps' times are wrong. Check turn_s, direction and times, use only the frames before or "
+            "after, or use --poses colmap."
         )
 
 
@@ -192,7 +193,7 @@ def _notices(sweeps: Sequence[RecordedSweep], trajectory: Trajectory) -> list[st
     ]
     if sweeps[0].timing is None and sweeps[0].read().offset_s is None:
         notices.append(
-            f"The sweeps of {sweeps[0].scanner} have no times, so they are taken as corrected for the vehicle's motion "
-            "already. If they are raw, give turn_s and direction, or point_times: the vehicle moves during a turn."
+            f"The sweeps of {sweeps[0].scanner} have no times, so they count as already corrected for the vehicle's "
+            "motion. If they are raw, give turn_s and direction, or point_times."
         )
     return notices

@@ -52,7 +52,8 @@ def cut(options: ProcessOptions, console: Console) -> list[ProcessOptions]:
     """
     if (options.output / "transforms.json").exists():
         raise InputError(
-            f"{options.output}: is a scene, which --frames-per-scene would put others into. Choose another --output."
+            f"{options.output}: is a scene; --frames-per-scene would write other scenes into it. Choose another "
+            "--output."
         )
     with console.status("Reading the drive …"):
         frames = usable_frames(options)
@@ -72,7 +73,7 @@ def cut(options: ProcessOptions, console: Console) -> list[ProcessOptions]:
                 cluster=None,
             )
         )
-    say(console, f"{len(frames)} frames that can be used, cut into {count} scenes.")
+    say(console, f"{len(frames)} usable frames, split into {count} scenes.")
     return parts
 
 
@@ -100,4 +101,4 @@ def _on_cluster(parts: list[ProcessOptions], cluster: str, console: Console) -> 
     root: Path = vars(parts[0])["root"]  # which the options of each converter have
     with on_cluster(cluster, tasks, [root.absolute()], console) as place:
         do_tasks(tasks, place, console)
-    say(console, f"Scenes: {', '.join(task.title for task in tasks)}. What was said of each is in the log beside it.")
+    say(console, f"Scenes: {', '.join(task.title for task in tasks)}. Each one's log is beside it.")

@@ -23,6 +23,7 @@ from rich.console import Console
 
 from edge_depth_nerf.base.checked_cache import content_of, write_checked
 from edge_depth_nerf.base.console import progress_bars, run_jobs, say
+from edge_depth_nerf.cameras.transforms import opencv_to_opengl
 from edge_depth_nerf.scene.put_maps import write_maps
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
 from edge_depth_nerf.stereo.consistency import LEAST_AGREEING, MotionDistance
@@ -34,7 +35,7 @@ VERSION = 1
 """Of the sweeps that are kept: raised when the same pictures give other ones."""
 FEWEST_PICTURES = 1 + LEAST_AGREEING
 """Fewer cannot confirm each other."""
-_STANDS = "the vehicle stands or turns on the spot, or no two other pictures see the same"
+_STANDS = "the vehicle stands or turns on the spot, or no two other pictures see the same places"
 _SWEEPS_IN_MEMORY = 48
 _SMOOTH = 0.05
 """Inverse distances that differ by less than this share are one surface: they are interpolated in larger maps."""
@@ -49,17 +50,17 @@ def add_motion(scene: SceneFolder, console: Console) -> None:
     """
     pictures = [picture for picture in scene.pictures if not picture.held_out]
     if len(pictures) < FEWEST_PICTURES:
-        say(console, f"No distances from motion: {len(pictures)} pictures for training are too few.", "yellow")
+        say(console, f"No distances from motion: {len(pictures)} training pictures are too few.", "yellow")
         return
     motion = Motion(
         np.stack([picture.position_m for picture in pictures]), lambda index: scene_view(scene, pictures[index])
     )
-    with console.status("Looking for neighbours of pictures …"):
+    with console.status("Searching for neighbours of pictures …"):
         still = sum(len(motion.neighbours(index)) < LEAST_AGREEING for index in range(len(pictures)))
     if still == len(pictures):
-        say(console, f"No distances from motion: {_STANDS}, in all pictures for training.", "yellow")
+        say(console, f"No distances from motion: {_STANDS}, in all training pictures.", "yellow")
         return
-    store = _Store(scene.folder / ".cache" / "motion" / _made_of(scene, pictures), motion)
+    store = SweepStore(scene.folder / ".cache" / "motion", scene, pictures, motion)
     run_jobs([partial(store.make, index) for index in range(len(pictures))], "Sweeping pictures", console)
     numbers = {picture.name: index for index, picture in enumerate(pictures)}
     shares: list[float] = []
@@ -71,14 +72,14 @@ def add_motion(scene: SceneFolder, console: Console) -> None:
                 yield picture.name, np.zeros(size, np.float32)
                 continue
             found = motion.confirm(numbers[picture.name], store)
-            used = scene_view(scene, picture).used
+            used = motion.view(numbers[picture.name]).used
             shares.append(float((found.distance_m > 0).sum() / max(1, used.sum())))
             yield picture.name, enlarged(found, working_factor(picture.lens), size)
 
     with progress_bars(console) as progress:
         write_maps(scene.folder, "motion", maps(), {"kind": "sphere sweep"}, progress, some_empty=True)
     shutil.rmtree(store.folder.parent, ignore_errors=True)
-    said = f"Distances from motion for {np.mean(shares):.0%} of what the masks keep of training pictures"
+    said = f"Distances from motion for {np.mean(shares):.0%} of the pixels inside the masks of training pictures"
     if still:
         said += f"; none for {still} of {len(shares)}: {_STANDS}"
     say(console, f"{said}.", "yellow" if still else None)
@@ -87,8 +88,9 @@ def add_motion(scene: SceneFolder, console: Console) -> None:
 def scene_view(scene: SceneFolder, picture: ScenePicture) -> View:
     """A scene's picture as the sweep wants it."""
     pose = np.eye(4)
-    # OpenGL's camera axes to OpenCV's
-    pose[:3, :3], pose[:3, 3] = picture.rotation * np.array([1.0, -1.0, -1.0]), picture.position_m
+    pose[:3, :3], pose[:3, 3] = picture.rotation, picture.position_m
+    # its own inverse: back to OpenCV's axes
+    pose = opencv_to_opengl(pose)
     return view_of(scene.rgb(picture), scene.usable(picture), picture.lens, pose, scene.theta_max_rad)
 
 
@@ -115,23 +117,33 @@ def enlarged(found: MotionDistance, factor: int, size: tuple[int, int]) -> Float
     return result
 
 
-class _Store:
+class SweepStore:
     """The sweeps of a scene's pictures: on disk, the last ones in memory too."""
 
-    def __init__(self, folder: Path, motion: Motion) -> None:
-        self.folder = folder
+    def __init__(self, root: Path, scene: SceneFolder, pictures: list[ScenePicture], motion: Motion) -> None:
+        """Say whose sweeps they are.
+
+        Args:
+            root: gets a folder for these pictures, masks, lenses and poses; those of others are removed.
+            scene: whose pictures they are.
+            pictures: those that take part, in `motion`'s order.
+            motion: makes them.
+
+        """
+        self.folder = root / _made_of(scene, pictures)
         self._motion = motion
         self._lock = threading.Lock()
         self._recent: OrderedDict[int, Swept] = OrderedDict()
-        # of other poses or masks
-        for other in folder.parent.glob("*"):
-            if other != folder:
+        for other in root.glob("*"):
+            if other != self.folder:
                 shutil.rmtree(other, ignore_errors=True)
 
-    def make(self, index: int) -> None:
-        """Sweep a picture, unless that is done."""
-        if self._read(index) is None:
-            self._write(index, self._motion.sweep(index))
+    def make(self, index: int) -> bool:
+        """Sweep a picture, unless that is done; whether it had to be."""
+        if self._read(index) is not None:
+            return False
+        self._write(index, self._motion.sweep(index))
+        return True
 
     def __call__(self, index: int) -> Swept:
         """The sweep of a picture."""
@@ -166,11 +178,14 @@ class _Store:
 
 
 def _made_of(scene: SceneFolder, pictures: list[ScenePicture]) -> str:
-    """Key of pictures, masks, lenses and poses."""
+    """Key of pictures, masks, lenses and poses: by what is in the files, since each run writes masks anew."""
     digest = hashlib.sha256(repr(scene.theta_max_rad).encode())
+    contents: dict[Path, str] = {}
     for picture in pictures:
         files = [picture.files[layer] for layer in ("image", "mask") if layer in picture.files]
-        dated = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in files]
+        for path in files:
+            if path not in contents:
+                contents[path] = hashlib.sha256(path.read_bytes()).hexdigest()
         pose = picture.rotation.tolist(), picture.position_m.tolist()
-        digest.update(repr((picture.name, dated, picture.lens, pose)).encode())
+        digest.update(repr((picture.name, [contents[path] for path in files], picture.lens, pose)).encode())
     return digest.hexdigest()[:16]

@@ -93,8 +93,8 @@ def find_moving(
     assert recording.trajectory is not None
     if not recording.sweeps:
         raise InputError(
-            "--find-moving: the drive has no LiDAR sweeps, and what moves is found by what they saw through. Leave it "
-            "out, or give masks with --frame-masks."
+            "--find-moving: the drive has no LiDAR sweeps, which it needs. Leave it out, or give masks with "
+            "--frame-masks."
         )
     paths = {id(picture): moving_mask_path(options.output, picture) for picture in recording.pictures}
     missing = [picture for picture in recording.pictures if not paths[id(picture)].is_file()]
@@ -117,9 +117,9 @@ def find_moving(
     pictures = tuple(replace(picture, moving_mask=paths[id(picture)]) for picture in recording.pictures)
     shares = [1 - float(read_mask(path).mean()) for path in paths.values()]
     notice = (
-        f"What moves was found in {sum(share > 0 for share in shares)} of {len(shares)} pictures and hides "
-        f"{np.mean(shares):.1%} of them. Look at {options.output / MOVING_MASKS}: what you correct there counts when "
-        "the drive is processed again."
+        f"Moving objects were found in {sum(share > 0 for share in shares)} of {len(shares)} pictures and hides "
+        f"{np.mean(shares):.1%} of them. Look at {options.output / MOVING_MASKS}: correct them there and process "
+        "the drive again."
     )
     return replace(recording, pictures=pictures), [notice]
 

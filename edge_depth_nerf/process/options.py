@@ -20,83 +20,82 @@ class ProcessOptions:
     """What every converter can be told."""
 
     output: Path
-    """The scene folder to write. A run that was interrupted is continued by the same command."""
+    """The scene folder to write. Run the same command again to resume an interrupted run."""
     first: int = 0
     """Number of the first frame."""
     frames: int | None = None
-    """How many frames to look at: first, first + stride, and so on. Not set: to the end of the drive. Those without
-    pose, picture or sweep are listed and skipped."""
+    """How many frames to consider: first, first + stride, and so on. Not set: to the end of the drive. Frames without
+    pose, picture or sweep are skipped and listed."""
     stride: int = 1
     """Take every stride-th frame."""
     frames_per_scene: int | None = None
-    """Cut a long drive into scenes of so many frames at most, one after another, as equal as can be: 000, 001 and so
-    on in the output folder. Frames that cannot be used do not count. Not set: one scene."""
+    """Split a long drive into consecutive scenes of at most this many frames, of similar length: 000, 001 and so on in
+    the output folder. Unusable frames do not count. Not set: one scene."""
     downscale: int = 1
-    """Average blocks of this many pixels by this many into one. What does not fill a block, at the right and at the
-    bottom, is cut off."""
+    """Average blocks of this many pixels by this many into one. Incomplete blocks at the right and at the bottom are
+    cut off."""
     holdout_every: int = 8
-    """One frame of so many is held out of training, for all cameras at once: with 8 the fifth, the 13th, the 21st …;
-    0 holds out none."""
+    """Hold out one frame in this many, for all cameras: with 8 the fifth, the 13th, the 21st …; 0 holds out none."""
     holdout_beams: int = 0
-    """One band of elevation of so many, each 0.4° high (a beam or two of a scanner), is held out of every sweep: no
-    prior or network sees it, training views are judged by it. 0 holds out none."""
+    """Hold out one band of elevation in this many from every sweep. A band is 0.4° high (a beam or two of a scanner).
+    No prior or network sees it; training views are evaluated with it. 0 holds out none."""
     theta_max_deg: float = 95.0
-    """Rays further than this from the optical axis are masked out, in degrees."""
+    """Mask out rays farther than this from the optical axis, in degrees."""
     poses: Literal["recorded", "colmap", "lidar"] = "recorded"
-    """recorded: the poses that come with the drive; colmap: found from the pictures, their scale from LiDAR (needs
-    `pip install '.[colmap]'`); lidar: found from the sweeps (needs `pip install
-    '.[odometry]'`)."""
+    """recorded: the poses that come with the drive; colmap: computed from the pictures, with LiDAR's scale (needs `pip
+    install '.[colmap]'`); lidar: computed from the sweeps (needs `pip install '.[odometry]'`)."""
     refine_poses: bool = True
-    """Refine the poses by the pictures: by features that they share, with the poses held softly, unless that makes
-    them no better. Needs `pip install '.[colmap]'`; without it the poses stay, and you are told."""
+    """Refine the poses with features that pictures share; the given poses are soft constraints, and are kept if
+    refining does not improve them. Needs `pip install '.[colmap]'`; without it the poses are kept, and this is
+    reported."""
     sweeps: int = 3
-    """Accumulate this many LiDAR sweeps before and after each picture's own. Training never sees a sweep of a moment
-    that is held out; a picture that is held out gets its own alone."""
+    """Accumulate this many LiDAR sweeps before and after each picture's own. Training never sees a sweep of a held-out
+    frame; a held-out picture uses only its own sweep."""
     deskew: bool = True
     """Move each point by the vehicle's pose at the time it was measured; off to compare."""
     occlusion: bool = True
     """Remove points that a nearer surface hides from the camera; off to compare."""
     ego_mask: Path | None = None
-    """What of the picture is never used, such as the vehicle itself (255 = use the pixel, 0 = ignore it): a PNG for
-    all cameras, or a folder with a PNG named after each camera. In the size of the raw pictures."""
+    """Mask of pixels that are never used, such as the vehicle itself (255 = use the pixel, 0 = ignore it): a PNG for
+    all cameras, or a folder with a PNG named after each camera, in the size of the raw pictures."""
     find_ego: bool = True
-    """Where no mask is given, find the vehicle as what never changes while it moves; the masks found are written to
-    ego_masks/ in the scene, to be corrected and given as --ego-mask."""
+    """If no mask is given, detect the vehicle as the pixels that never change while it moves. The masks are written to
+    ego_masks/ in the scene; you can correct them there, or give them as --ego-mask."""
     frame_masks: Path | None = None
-    """Masks of single frames, such as moving things: a folder with CAMERA/0000000123.png (255 = use the pixel). In
-    the size of the raw pictures; one for every frame taken."""
+    """Masks of single pictures, such as of moving objects: a folder with CAMERA/0000000123.png (255 = use the pixel).
+    In the size of the raw pictures; one for every frame used."""
     find_moving: bool = False
-    """Find things that move by what LiDAR's sweeps of other moments saw through, and mask them out of the pictures;
-    the masks are written to moving_masks/ in the scene, to be corrected there or given as --frame-masks."""
+    """Find moving objects with the help of LiDAR sweeps from other times, and mask them out of the pictures. The masks
+    are written to moving_masks/ in the scene; you can correct them there, or give them as --frame-masks."""
     moving_classes: tuple[str, ...] = (
         *("person", "rider", "car", "truck", "bus", "caravan", "trailer", "train", "motorcycle", "bicycle"),
         "unknown vehicle",
     )
-    """Classes that are masked out where the drive brings KITTI-360's semantics; none to keep all."""
+    """Classes to mask out if the drive has KITTI-360's semantics; none keeps all."""
     motion: bool = True
     """Find distances by comparing each training picture with its neighbours, also above LiDAR's field, where the
-    vehicle moves; off to save the time: some two seconds a picture of 350×350 px and core."""
+    vehicle moves; off saves time: about two seconds per picture of 350×350 px on one core."""
     mono: Path | None = None
     """Monocular distance maps: a folder with CAMERA/0000000123.png, 16 bit, 1/256 m along the ray, 0 = none. In the
-    size of the raw pictures; one for every frame taken. `estimate-depth --maps` takes other forms. Not set: a network
-    of the drive's own makes them."""
+    size of the raw pictures; one for every frame used. `estimate-depth --maps` accepts other formats. Not set: a
+    network trained on the drive makes them."""
     mono_trained_on: Literal["scene", "elsewhere"] = "elsewhere"
-    """What the maker of the maps that are brought has seen: scene, if it was trained on LiDAR alone and knows nothing
-    beyond a scanner's field of elevation, where no prior is made then."""
+    """What the network of the given maps was trained on. scene: on LiDAR only, so that it knows nothing beyond the
+    scanner's field of elevation; there is then no prior there."""
     estimate_depth: bool = True
-    """Where no monocular maps are given, train a network on the drive's LiDAR, as `edge-depth-nerf estimate-depth`
-    does; off to leave the scene without, or to bring maps of other networks by that command."""
+    """If no monocular maps are given, train a network on the drive's LiDAR, as `edge-depth-nerf estimate-depth` does.
+    Off: the scene gets no maps; you can add those of other networks with that command."""
     mono_model: Path | None = None
-    """Weights that `estimate-depth` trained on other drives: they predict as they are, nothing is trained."""
+    """Weights that `estimate-depth` trained on other drives. They are used without further training."""
     mono_preset: Literal["lite", "full"] = "lite"
     """Size of the drive's own network; lite: some minutes on a laptop's CPU; full: for a GPU."""
     mono_seconds: float | None = None
-    """The drive's own network is trained for so many seconds at most. Not set: all steps of its preset."""
+    """Train the drive's network for at most this many seconds. Not set: all steps of its preset."""
     strict: bool = False
-    """Stop at the first picture, sweep or map that is broken or missing. Otherwise up to a tenth of them are left out
-    of the scene and named at the end."""
+    """Stop at the first broken or missing picture, sweep or map. Otherwise up to a tenth of them are left out of the
+    scene and named at the end."""
     sky: bool = True
-    """Leave the sky without monocular distance, instead of a wrong one."""
+    """Give the sky no monocular distance, instead of a wrong one."""
     cluster: str | None = None
     """Work on a Dask cluster, each scene as a task: local (processes on this machine, one for each GPU or core), or the
     address of a scheduler, such as tcp://10.0.0.1:8786. Needs `pip install '.[cluster]'`; see
@@ -119,7 +118,7 @@ class ProcessOptions:
             if not fine:
                 raise InputError(f"--{option} {found}: expected {expected}.")
 
-        require(self.first >= 0, "first", self.first, "the number of a frame, 0 or more")
+        require(self.first >= 0, "first", self.first, "a frame number, 0 or more")
         require(self.frames is None or self.frames > 0, "frames", self.frames, "1 or more")
         require(self.stride > 0, "stride", self.stride, "1 or more")
         scene = self.frames_per_scene
@@ -153,24 +152,24 @@ class Kitti360Options(ProcessOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class RigOptions(ProcessOptions):
-    """Turn a recording of your own into a scene folder. docs/rig.md says how it is described."""
+    """Turn your own recording into a scene folder. docs/rig.md says how to describe it."""
 
     root: Path
-    """The recording's folder; paths in the rig file count from it."""
+    """The recording's folder; paths in the rig file are relative to it."""
     rig: Path | None = None
     """The file that describes cameras, scanners and poses. Not set: rig.toml or rig.json in the recording's folder."""
     cameras: tuple[str, ...] = ()
-    """Which of its cameras; none named: all."""
+    """Which of its cameras. Not set: all."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class JbnuDepth360Options(ProcessOptions):
-    """Turn a sequence of JBNU-Depth360 into a scene folder. docs/jbnu_depth360.md says what is to be handed in."""
+    """Turn a sequence of JBNU-Depth360 into a scene folder. docs/jbnu_depth360.md says what you have to provide."""
 
     root: Path
     """The sequence's folder: the one that holds image and bin."""
     calibration: Path
-    """TOML or JSON with cameras, scanner and poses, which the data set does not publish; paths in it count from its own
-    folder, those of pictures and scans from the sequence's."""
+    """TOML or JSON with cameras, scanner and poses, which the data set does not publish. Paths in it are relative to
+    its own folder; those of pictures and scans are relative to the sequence's folder."""
     cameras: tuple[str, ...] = ()
-    """Which of its cameras; none named: all."""
+    """Which of its cameras. Not set: all."""

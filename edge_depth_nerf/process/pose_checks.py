@@ -57,9 +57,9 @@ def features_say(recording: Recording, options: ProcessOptions, console: Console
         except (InputError, FileNotFoundError) as error:
             if options.strict:
                 raise
-            return [f"The poses are not held against features of the pictures: {error}"]
+            return [f"The poses are not compared with features of the pictures: {error}"]
     if not found:
-        return ["Too few features match between successive pictures to say how good the poses are."]
+        return ["Too few features match between successive pictures to check the poses."]
     worst = max(found, key=lambda pair: pair.median_px)
     median_px = float(np.median([pair.median_px for pair in found]))
     said = [
@@ -69,8 +69,8 @@ def features_say(recording: Recording, options: ProcessOptions, console: Console
     ]
     if median_px > _WARN_PX:
         said.append(
-            "That is far: check the calibration between LiDAR and cameras, and the times of pictures and sweeps, or "
-            "find the poses from the pictures (--poses colmap)."
+            "This is far: check the calibration between LiDAR and cameras, and the times of pictures and sweeps, "
+            "or compute the poses from the pictures (--poses colmap)."
         )
     return said
 
@@ -104,7 +104,7 @@ def lidar_says(recording: Recording, scene: Path, console: Console) -> list[str]
     said = [f"LiDAR odometry's path of the same drive lies {found.text()}; it is {abs(found.scale - 1):.2%} {longer}."]
     if found.max_m > _WARN_APART_M + _WARN_APART * found.length_m:
         said.append(
-            "That is much: one of the two is wrong. Make the scene with --poses lidar as well, and see which path the "
-            "maps of `edge-depth-nerf inspect` lie better with."
+            "This is much: one of the two is wrong. Make the scene with --poses lidar as well, and check with "
+            "`edge-depth-nerf inspect` with which path the LiDAR points fit the pictures better."
         )
     return said

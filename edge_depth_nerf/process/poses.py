@@ -43,7 +43,7 @@ def read_tum(path: Path) -> tuple[Float64[np.ndarray, "poses"], Float64[np.ndarr
         if len(values) != 8:
             raise InputError(
                 f"{path}, line {line}: {len(values)} numbers, expected 8 (time x y z qx qy qz qw, TUM's format). "
-                "Check the format that the rig file gives for the poses."
+                "Check poses.format in the rig file."
             )
         if abs(values[0]) > MAX_TIME_S:
             raise InputError(f"{path}, line {line}: its time {values[0]:g} is no time in seconds.")
@@ -80,7 +80,7 @@ def read_kitti(path: Path) -> Float64[np.ndarray, "poses 4 4"]:
         if len(values) != 12:
             raise InputError(
                 f"{path}, line {line}: {len(values)} numbers{of_tum}, expected 12 (a 3×4 matrix row by row, KITTI's "
-                "format). Check the format that the rig file gives for the poses."
+                "format). Check poses.format in the rig file."
             )
         pose = np.eye(4)
         pose[:3] = np.reshape(values, (3, 4))
@@ -137,7 +137,7 @@ def read_times(path: Path) -> list[tuple[str | None, float]]:
         found.append((words[0] if len(words) == 2 else None, _number(words[-1], path, line)))
         if (found[0][0] is None) != (found[-1][0] is None):
             raise InputError(
-                f"{path}, line {line}: some lines have a file's name and some have none; one or the other."
+                f"{path}, line {line}: some lines have a file's name and some have none; use one form for all lines."
             )
     return found
 

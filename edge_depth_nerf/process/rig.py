@@ -118,7 +118,7 @@ def recording_of_rig(rig: Rig, root: Path, options: RigOptions | JbnuDepth360Opt
     if options.poses == "recorded":
         if rig.poses is None:
             raise InputError(
-                f"{rig.path}: has no table [poses]. Give poses (docs/rig.md), or have them found: --poses lidar, "
+                f"{rig.path}: has no table [poses]. Give poses (docs/rig.md), or compute them: --poses lidar, "
                 "--poses colmap."
             )
         path, camera_poses = _path(rig, rig.poses, cameras, files)
@@ -127,7 +127,7 @@ def recording_of_rig(rig: Rig, root: Path, options: RigOptions | JbnuDepth360Opt
 
     kept, skipped = _usable(_moments(files), options, path, camera_poses, scans)
     if not kept:
-        raise InputError(f"{root}: none of the moments asked for can be used: {summarise(skipped)}.")
+        raise InputError(f"{root}: none of the chosen frames can be used: {summarise(skipped)}.")
 
     by_name = {camera.name: camera for camera in cameras}
     companions = _Companions(rig.path, root, cameras, options)
@@ -152,7 +152,7 @@ def recording_of_rig(rig: Rig, root: Path, options: RigOptions | JbnuDepth360Opt
         skipped=tuple(skipped),
         left_out=tolerance.left_out,
         notices=tuple(
-            f"{lidar.name}: neither turn_s nor point_times is given; its scans are taken as of one moment."
+            f"{lidar.name}: neither turn_s nor point_times is given; all points of a scan get one time."
             for lidar in rig.lidars
             if lidar.timing is None and lidar.format.times is None and lidar.corrected_to is None
         ),
@@ -186,7 +186,7 @@ def _files(root: Path, given: str, suffixes: tuple[str, ...]) -> list[Path]:
         try:
             found = [file for file in folder.glob(str(Path(*parts[wild[0] :]))) if file.is_file()]
         except ValueError as error:
-            raise InputError(f"{path}: is no pattern of files ({error}); the rig file names it.") from None
+            raise InputError(f"{path}: is not a valid pattern of files ({error}); it is in the rig file.") from None
         what = "no file has such a name"
     elif path.is_dir():
         present = [file for file in path.iterdir() if file.is_file() and not file.name.startswith(".")]
@@ -197,7 +197,7 @@ def _files(root: Path, given: str, suffixes: tuple[str, ...]) -> list[Path]:
             )
         what = "nothing in it"
     else:
-        raise FileNotFoundError(f"{path}: no such folder; the rig file names it.")
+        raise FileNotFoundError(f"{path}: no such folder; it is named in the rig file.")
     if not found:
         raise FileNotFoundError(f"{path}: {what}; expected {', '.join(suffixes)} files.")
     return sorted(found, key=as_people_count)
@@ -206,7 +206,9 @@ def _files(root: Path, given: str, suffixes: tuple[str, ...]) -> list[Path]:
 def _number_in(path: Path) -> float:
     numbers = re.findall(r"[0-9]+(?:\.[0-9]+)?", path.stem)
     if not numbers:
-        raise InputError(f"{path}: no number in its name, which the rig file takes its time from. Give a times_file.")
+        raise InputError(
+            f"{path}: no number in its name, but the rig file says that its time is there. Give a times_file."
+        )
     return float(numbers[-1])
 
 
@@ -224,7 +226,7 @@ def _timed(files: list[Path], clock: Clock) -> list[_Timed]:
     for before, after in pairwise(timed):
         if before.time_s == after.time_s:
             raise InputError(
-                f"{after.path} and {before.path.name} have the same time, {after.time_s:.6f} s; mend the times."
+                f"{after.path} and {before.path.name} have the same time, {after.time_s:.6f} s; correct the times."
             )
     return timed
 
@@ -236,7 +238,7 @@ def _times_of_file(path: Path, files: list[Path]) -> list[float]:
         found = [by_name.get(file.name, by_name.get(file.stem)) for file in files]
         for file, time in zip(files, found, strict=True):
             if time is None:
-                raise InputError(f"{path}: has no time for {file.name}. Add a line, or take the file away.")
+                raise InputError(f"{path}: has no time for {file.name}. Add a line, or remove the file.")
         return [time for time in found if time is not None]
     if len(lines) != len(files):
         raise InputError(
@@ -280,8 +282,8 @@ def _select(moments: list[dict[str, _Timed]], options: RigOptions | JbnuDepth360
     if end > last:
         asked = "" if options.frames is None else f" --frames {options.frames} --stride {options.stride}"
         raise InputError(
-            f"--first {options.first}{asked}: reaches moment {end}, but the recording has moments 0 to {last}. Begin "
-            "earlier, ask for fewer, or leave out --first and --frames to take all."
+            f"--first {options.first}{asked}: reaches frame {end}, but the recording has frames 0 to {last}. Start "
+            "earlier, use fewer, or leave out --first and --frames to use all."
         )
     return range(options.first, end + 1, options.stride)
 
@@ -338,8 +340,8 @@ def _path(
         times, sensor_to_world = _pose_list(poses)
     if len(times) < 2:
         raise InputError(
-            f"{poses.file}: {len(times)} pose{'' if len(times) == 1 else 's'}, expected two at least: the vehicle's "
-            "motion comes from them."
+            f"{poses.file}: {len(times)} pose{'' if len(times) == 1 else 's'}, expected at least two, for the "
+            "vehicle's motion."
         )
     upright = _upright(poses.up)
 
@@ -503,8 +505,7 @@ class _Companions:
             lacking = [camera.name for camera in cameras if getattr(camera, key) is None]
             if 0 < len(lacking) < len(cameras):
                 raise InputError(
-                    f"{rig}: cameras.{lacking[0]}.{key} is missing; give it for every camera that is taken, or for "
-                    "none."
+                    f"{rig}: cameras.{lacking[0]}.{key} is missing; give it for every camera that is used, or for none."
                 )
         self._found = {
             (camera.name, what): {path.stem: path for path in _files(root, given, (".png",))}
@@ -577,7 +578,7 @@ class _Companions:
         if not path.is_file():
             raise FileNotFoundError(
                 f"{path}: no such file; --{option.replace('_', '-')} needs one for every picture taken, named after "
-                "the moment's number."
+                "the frame's number."
             )
         return path
 

@@ -348,20 +348,18 @@ class RigLidar(_Sensor):
         assert self.clock
         without_turn = sorted({"direction", "start_azimuth_deg", "timestamp"} & self.model_fields_set)
         if self.turn_s is None and without_turn:
-            raise InputError(f".turn_s is missing; {without_turn[-1]} says nothing without it.")
+            raise InputError(f".turn_s is missing; {without_turn[-1]} needs it.")
         if self.turn_s is not None and self.timestamp is None:
             raise InputError(".timestamp is missing; expected one of 'start', 'middle', 'end'.")
         if self.corrected_to is not None:
             if wrong := sorted({"direction", "start_azimuth_deg", "point_times"} & self.model_fields_set):
                 raise InputError(
-                    f".{wrong[0]}: points that are corrected already (corrected_to) need no times; take one away."
+                    f".{wrong[0]}: points that are corrected already (corrected_to) need no times; remove one."
                 )
             if self.corrected_to != "timestamp" and self.turn_s is None:
-                raise InputError(f".turn_s is missing; corrected_to = {self.corrected_to!r} says nothing without it.")
+                raise InputError(f".turn_s is missing; corrected_to = {self.corrected_to!r} needs it.")
         if self.timing is not None and self.point_times is not None:
-            raise InputError(
-                ".direction: points with times of their own (point_times) need no direction; take one away."
-            )
+            raise InputError(".direction: points with times of their own (point_times) need no direction; remove one.")
         return self
 
 
@@ -424,7 +422,7 @@ def read_rig(path: Path, root: Path, prepare: Callable[[dict[str, Any]], None] |
         raise
     except (ValueError, RecursionError) as error:
         raise InputError(
-            f"{path}: not valid {suffixes} ({error}). Mend the file; docs/rig.md has an example."
+            f"{path}: not valid {suffixes} ({error}). Repair the file; docs/rig.md has an example."
         ) from error
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected tables [cameras.NAME], [lidars.NAME] and [poses].")
@@ -457,11 +455,11 @@ def _rig(whole: _Whole, path: Path) -> Rig:
     if not cameras:
         raise InputError(f"{path}: has no camera; expected a table [cameras.NAME] for each (docs/rig.md).")
     if twice := {name for name in names if names.count(name) > 1}:
-        raise InputError(f"{path}: {min(twice)} is the name of a camera and of a scanner; give them different names.")
+        raise InputError(f"{path}: {min(twice)} is the name of both a camera and a scanner; use different names.")
     if lidars and (both := [camera.name for camera in cameras if camera.depth]):
         raise InputError(
             f"{path}: cameras.{both[0]}.depth and [lidars.{lidars[0].name}]: depth maps take the place of LiDAR; give "
-            "one or the other."
+            "use one form for all lines."
         )
     with_depth = [camera.name for camera in cameras if camera.depth]
     if with_depth and len(with_depth) < len(cameras):

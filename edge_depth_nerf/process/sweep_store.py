@@ -249,7 +249,7 @@ class SweepStore:
         not_finite, out_of_range = np.sum([*self._left_out.values(), (0, 0)], axis=0)
         found = {"NaN or infinite": not_finite, "zero, nearer than 0.5 m or beyond 255 m": out_of_range}
         return [
-            f"{count} LiDAR points left out of {len(self._left_out)} sweeps: {why}."
+            f"{count} LiDAR points were left out of {len(self._left_out)} sweeps: {why}."
             for why, count in found.items()
             if count
         ]

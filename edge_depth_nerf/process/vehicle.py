@@ -47,10 +47,10 @@ _RETURNS_PICTURES = 3
 _INNER = 0.01
 """So far inside the outline, as a share of the picture's longer side: scanner and camera do not see quite the same."""
 
-_LOOK = "Look at {}: what you correct there counts when the drive is processed again."
+_LOOK = "Check {}; if you correct it there, process the drive again."
 _PAINT = (
-    "What is seen of it is trained on as if it stood in the world: process more of the drive, or give its mask by "
-    "--ego-mask (255 = use the pixel, 0 = the vehicle), or paint it black in {} and process again."
+    "Its visible parts are trained on as if they were in the world: process more of the drive, or give its mask "
+    "with --ego-mask (255 = use the pixel, 0 = the vehicle), or paint it black in {} and process again."
 )
 
 
@@ -100,7 +100,7 @@ def find_vehicle(
                 mask, found = _find_mask(recording, recorded, pictures, options, console)
                 keep_ego_mask(options.output, recorded.name, mask, isinstance(found, EgoMask) or found.could_tell)
                 if isinstance(found, EgoMask):
-                    said = f"the vehicle was found by itself and hides {found.share:.1%} of the lens."
+                    said = f"the vehicle was detected and hides {found.share:.1%} of the lens."
                     notices.append(f"{recorded.name}: {said} {_LOOK.format(path)}")
                 elif found.could_tell:
                     notices.append(f"{recorded.name}: {_NOT_FOUND} {found.reason.rstrip('.')}. {_LOOK.format(path)}")
@@ -131,7 +131,7 @@ def _find_mask(
     if not options.strict:
         # those that cannot be read are told of when their turn comes
         spread = [picture for picture in spread if _readable(picture.path)]
-    with console.status("Looking for the vehicle in the pictures"):
+    with console.status("Searching for the vehicle in the pictures"):
         rim = dark_rim(read_image(picture.path) for picture in spread[:: max(len(spread) // _RIM_PICTURES, 1)])
         mask = np.ones((camera.height, camera.width), bool) if rim is None else rim
         lens = lens_circle(camera, options.theta_max_deg) & mask

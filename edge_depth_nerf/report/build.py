@@ -68,20 +68,22 @@ class Report:
 def build_report(report: Report) -> str:
     """Build the page."""
     folder = files("edge_depth_nerf.report")
-    script, style, template = (
-        folder.joinpath(name).read_text(encoding="utf-8") for name in ("script.js", "style.css", "template.html.j2")
-    )
+    style, template = (folder.joinpath(name).read_text(encoding="utf-8") for name in ("style.css", "template.html.j2"))
+    # the library and the view in 3D only where there are points
+    in_3d = ["ogl.min.js", "points.js"] if any(drive.points for drive in report.drives) else []
+    scripts = [folder.joinpath(name).read_text(encoding="utf-8") for name in (*in_3d, "script.js")]
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.globals["svg"] = lambda content: data_uri(content, "image/svg+xml")
     # only what stands here runs and styles, whatever a text might smuggle in
     policy = (
         "default-src 'none'; base-uri 'none'; form-action 'none'; img-src data:; "
-        f"script-src '{_digest(script)}'; style-src '{_digest(style)}'"
+        f"script-src {' '.join(map(_digest, scripts))}; style-src {_digest(style)}"
     )
     return environment.from_string(template).render(
         report=report,
         policy=policy,
-        script=script,
+        scripts=scripts,
+        in_3d=bool(in_3d),
         style=style,
         data=_pictures(report),
     )
@@ -93,7 +95,7 @@ def write_report(path: Path, report: Report) -> None:
 
 
 def _digest(text: str) -> str:
-    return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
 def _pictures(report: Report) -> dict[str, object]:
@@ -116,6 +118,7 @@ def _pictures(report: Report) -> dict[str, object]:
             {
                 "title": drive.title,
                 "note": drive.note,
+                "points": None if drive.points is None else drive.points.data(),
                 "methods": [name for name in report.methods if all(name in view.rendered for view in drive.views)],
                 "views": [
                     {

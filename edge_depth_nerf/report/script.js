@@ -27,7 +27,7 @@
   function pictureOf(name) {
     const shown = view();
     if (name === TRUTH) {
-      return shown.truth[OF_TRUTH[state.kind] || state.kind] || shown.truth.colour;
+      return shown.truth[shownKind(name).key] || shown.truth.colour;
     }
     return shown.rendered[name.slice(1)][state.kind];
   }
@@ -47,19 +47,36 @@
     );
   }
 
-  function drawLegend() {
-    const legend = find(".legend");
-    const scale = kind().legend;
-    legend.hidden = !scale;
-    if (scale) {
-      find(".scale img").src = scale.bar;
-      const ticks = find(".ticks");
-      ticks.replaceChildren();
-      scale.ticks.forEach(([place, label], index) => {
-        const last = index === scale.ticks.length - 1;
-        make("span", last ? `${label} ${scale.unit}` : label, ticks).style.left = `${100 * place}%`;
+  // which kind a side shows: the truth has no error, so its colours or distances stand beside one
+  function shownKind(name) {
+    const key = name === TRUTH ? OF_TRUTH[state.kind] || state.kind : state.kind;
+    return data.kinds.find((each) => each.key === key);
+  }
+
+  function drawLegends() {
+    const legends = find(".legends");
+    legends.replaceChildren();
+    const kinds = [...new Set([shownKind(state.left), shownKind(state.right)])];
+    for (const { title, legend } of kinds.filter((each) => each.legend)) {
+      const box = make("div", "", legends);
+      box.className = "legend";
+      const scale = make("div", kinds.length > 1 ? title : "", box);
+      scale.className = "scale";
+      const bar = document.createElement("img");
+      bar.alt = "";
+      bar.draggable = false;
+      bar.src = legend.bar;
+      scale.append(bar);
+      const ticks = make("div", "", scale);
+      ticks.className = "ticks";
+      legend.ticks.forEach(([place, label], index) => {
+        const last = index === legend.ticks.length - 1;
+        make("span", last ? `${label} ${legend.unit}` : label, ticks).style.left = `${100 * place}%`;
       });
-      legend.style.setProperty("--none", scale.none);
+      const none = make("span", "none", box);
+      none.className = "none";
+      none.prepend(document.createElement("i"));
+      box.style.setProperty("--none", legend.none);
     }
     find(".explanation").textContent = kind().explanation;
   }
@@ -102,15 +119,16 @@
       ["right", ".over", ".tag.right"],
     ]) {
       const name = state[side];
-      const ofTruth = name === TRUTH ? OF_TRUTH[state.kind] || state.kind : state.kind;
+      const what = shownKind(name).title.toLowerCase();
       const image = find(picture);
       image.src = pictureOf(name);
-      image.alt = `${side}: ${titleOf(name)}, ${ofTruth.replace("-", " ")} of ${shown.title}`;
-      find(tag).textContent = titleOf(name);
+      image.alt = `${side}: ${titleOf(name)}, ${what} of ${shown.title}`;
+      const differ = shownKind(state.left) !== shownKind(state.right);
+      find(tag).textContent = differ ? `${titleOf(name)}: ${what}` : titleOf(name);
       sides[side].value = name;
     }
     slide(Number(wipe.value));
-    drawLegend();
+    drawLegends();
     drawFigures();
   }
 
@@ -154,6 +172,9 @@
       label.append(radio, image);
     });
     find(".drive-note").textContent = drive().note;
+    if (find("#points")) {
+      pointsView.open(drive().points);
+    }
     draw();
   }
 

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from edge_depth_nerf.base.console import run_jobs
+from edge_depth_nerf.base.console import run_jobs, say
+from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.base.pictures import (
     COLOUR_ERROR,
@@ -33,17 +34,17 @@ from edge_depth_nerf.base.pictures import (
 from edge_depth_nerf.masks.regions import from_nearest
 from edge_depth_nerf.method.metrics import LEAST_SQUARED_ERROR
 from edge_depth_nerf.report.compared_views import ComparedView, compared_view, held_out_frames
+from edge_depth_nerf.report.points import MOST_POINTS, ShownPoints, show_points
+from edge_depth_nerf.scene.reader import read_scene
 
 REPORT = "report.html"
 """The page's name beside the other results."""
-MOST_VIEWS = 6
-"""Of a drive."""
-MOST_PICTURES = 400
-"""Of all drives and methods; with more of these there are fewer views."""
+MOST_PICTURES = 1000
+"""Of all drives and methods; only with more of them are held-out views left out."""
 MOST_WIDTH_PX = 640
 PICTURES_BYTES = 16_000_000
 """Of all encoded pictures; a third more in the page, as text."""
-WEBP_QUALITIES = ((1.0, 85), (1.0, 70), (1.0, 50), (0.7, 50), (0.5, 50))
+WEBP_QUALITIES = ((1.0, 85), (1.0, 70), (1.0, 50), (0.7, 50), (0.5, 50), (0.5, 30), (0.35, 30))
 """Share of the size and quality: the first at which a picture is small enough, else the last."""
 ERROR_RANGE_M = (2.0, 40.0)
 """True distances for which errors are shown."""
@@ -109,11 +110,13 @@ class Drive:
     views: Sequence[ShownView]
     note: str
     """Which views these are, and what the truth is."""
+    points: ShownPoints | None = None
+    """What LiDAR saw, in 3D, where the scene has points."""
 
 
 def views_of_a_drive(runs: int) -> int:
     """How many views of each drive are shown at most, with so many runs over all drives."""
-    return min(max(MOST_PICTURES // (len(KINDS) * max(runs, 1)), 1), MOST_VIEWS)
+    return max(MOST_PICTURES // (len(KINDS) * max(runs, 1)), 1)
 
 
 def make_drives(drives: Mapping[str, tuple[Path, Mapping[str, Path]]], console: Console) -> list[Drive]:
@@ -137,14 +140,33 @@ def make_drives(drives: Mapping[str, tuple[Path, Mapping[str, Path]]], console: 
     jobs = [partial(make, title, index) for title in drives for index in chosen[title]]
     made = iter(run_jobs(jobs, f"Pictures for {REPORT}", console))
     return [
-        Drive(title, [next(made) for _ in chosen[title]], _note(frames[title], len(chosen[title]))) for title in drives
+        Drive(
+            title,
+            [next(made) for _ in chosen[title]],
+            _note(frames[title], len(chosen[title])),
+            _points(scene, MOST_POINTS // len(drives), console),
+        )
+        for title, (scene, _) in drives.items()
     ]
+
+
+def _points(scene: Path, most: int, console: Console) -> ShownPoints | None:
+    """The drive's points; a cloud that cannot be read costs the page its view in 3D alone."""
+    try:
+        return show_points(read_scene(scene), most)
+    except (InputError, OSError) as error:
+        say(console, f"{REPORT} has no points of this drive. {error}", "yellow")
+        return None
 
 
 def _note(frames: Sequence[Mapping[str, object]], shown: int) -> str:
     """Say which views of a drive are shown, and what counts as their truth."""
     known = {key for frame in frames for key in frame}
-    parts = [f"{shown} of {len(frames)} held-out views, spread over the drive."]
+    parts = [
+        f"All {shown} held-out views."
+        if shown == len(frames)
+        else f"{shown} of {len(frames)} held-out views, spread over the drive."
+    ]
     if "truth_rgb_file_path" in known:
         parts.append("The truth is the picture without noise and exposure drift.")
     if "truth_distance_file_path" in known:

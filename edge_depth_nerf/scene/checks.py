@@ -64,8 +64,9 @@ def read_camera_mask(path: Path, camera: Camera) -> NDArray[np.bool_]:
 def size_error(path: Path, width: int, height: int, camera: Camera) -> str:
     """Say that a file is not of its camera's size."""
     return (
-        f"{path}: {width}×{height} pixels, but its camera's calibration says {camera.width}×{camera.height}. Pictures, "
-        "masks and maps are to have the size of the raw pictures; --downscale then reduces them together."
+        f"{path}: {width}×{height} pixels, but its camera's calibration says {camera.width}×{camera.height}. "
+        "Pictures, masks and maps must have the size of the raw pictures; --downscale then reduces them "
+        "together."
     )
 
 
@@ -143,7 +144,7 @@ class Tolerance:
             self._found[frame, camera, str(error)] = LeftOut(frame, camera, str(error))
             if len(self._found) > self._most:
                 raise InputError(
-                    f"{error} {len(self._found)} of this drive's files cannot be used; up to {self._most} would be "
+                    f"{error} {len(self._found)} of this drive's files cannot be used; at most {self._most} may be "
                     "left out."
                 ) from error
 

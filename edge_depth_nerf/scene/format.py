@@ -120,7 +120,7 @@ def read_transforms(path: Path) -> dict[str, Any]:
         where = f"{path}: frame {number}"
         _check_frame(frame, where, path.parent)
         if frame["file_path"] in names:
-            raise InputError(f"{where}: {shown(frame['file_path'])} has a frame already; expected one a picture.")
+            raise InputError(f"{where}: {shown(frame['file_path'])} has a frame already; expected one per picture.")
         names.add(frame["file_path"])
     _check_scene(meta, path)
     return meta
@@ -135,7 +135,7 @@ def number_of(value: Any, where: str) -> float:
     """
     found = finite(value)
     if found is None:
-        raise InputError(f"{where} is {shown(value)}, expected a number. Mend the file, or process the drive again.")
+        raise InputError(f"{where} is {shown(value)}, expected a number. Repair the file, or process the drive again.")
     return found
 
 
@@ -155,7 +155,7 @@ def _matrix(value: Any, where: str, rows: int) -> Float64[np.ndarray, "rows 4"]:
     if len(numbers) != rows or any(len(row) != 4 or None in row for row in numbers):
         raise InputError(
             f"{where} must be {rows}×4 finite numbers, found {shown(value)}. Every frame needs a pose; process the "
-            "drive again, or mend the file."
+            "drive again, or repair the file."
         )
     matrix = np.array(numbers, dtype=np.float64)
     if np.abs(matrix).max() > MAX_LENGTH_M:
@@ -174,7 +174,7 @@ def _check_frame(frame: Mapping[str, Any], where: str, folder: Path) -> None:
         pose_of(frame, where)
     moment = frame.get("frame", 0)
     if isinstance(moment, bool) or not isinstance(moment, int) or not 0 <= moment < 10**10:
-        raise InputError(f"{where}: frame is {shown(moment)}, expected the number of a moment. Mend the file.")
+        raise InputError(f"{where}: frame is {shown(moment)}, expected a frame number. Repair the file.")
     if "camera" in frame:
         # maps lie in folders of cameras' names
         path_inside(folder, frame["camera"], f"{where}: camera")
@@ -189,7 +189,7 @@ def _check_numbers(entry: Mapping[str, Any], where: str) -> None:
 def _check_size(entry: Mapping[str, Any], where: str) -> None:
     sides = [number_of(entry[key], f"{where}: {key}") for key in ("w", "h") if key in entry]
     if any(side % 1 or not 1 <= side < 2**31 for side in sides):
-        raise InputError(f"{where}: w and h are {sides}, expected whole numbers of pixels. Mend the file.")
+        raise InputError(f"{where}: w and h are {sides}, expected whole numbers of pixels. Repair the file.")
     if len(sides) == 2:
         check_pixels(int(sides[0]), int(sides[1]), where)
 
@@ -198,7 +198,7 @@ def _check_distortion(entry: Mapping[str, Any], where: str) -> None:
     """Another way of nerfstudio's to write k1 to p2."""
     given = entry.get("distortion_params", [0.0] * 6)
     if not isinstance(given, list) or len(given) != 6 or any(finite(value) is None for value in given):
-        raise InputError(f"{where}: distortion_params is {shown(given)}, expected 6 numbers. Mend the file.")
+        raise InputError(f"{where}: distortion_params is {shown(given)}, expected 6 numbers. Repair the file.")
 
 
 def _check_scene(meta: Mapping[str, Any], path: Path) -> None:
@@ -211,13 +211,13 @@ def _check_scene(meta: Mapping[str, Any], path: Path) -> None:
     if "orientation_override" in meta and meta["orientation_override"] not in _ORIENTATIONS:
         raise InputError(
             f"{path}: orientation_override is {shown(meta['orientation_override'])}, expected one of "
-            f"{', '.join(_ORIENTATIONS)}. Mend the file."
+            f"{', '.join(_ORIENTATIONS)}. Repair the file."
         )
     if "applied_transform" in meta:
         rows = 4 if isinstance(meta["applied_transform"], list) and len(meta["applied_transform"]) == 4 else 3
         _matrix(meta["applied_transform"], f"{path}: applied_transform", rows)
     if meta.get("applied_scale") == 0:
-        raise InputError(f"{path}: applied_scale is 0, expected a number above. Mend the file.")
+        raise InputError(f"{path}: applied_scale is 0, expected a number above. Repair the file.")
     if meta.get("ply_file_path") is not None:
         path_inside(path.parent, meta["ply_file_path"], f"{path}: ply_file_path")
     for split in ("train", "val", "test"):

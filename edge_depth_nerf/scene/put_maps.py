@@ -61,8 +61,8 @@ def write_maps(
     targets = {name: _target(layer, picture) for name, picture in pictures.items()}
     if len({*targets.values()}) < len(targets):
         raise InputError(
-            f"{found.path}: two pictures of one camera have the same name but for their ending; their maps would be "
-            "one file. Rename one of them."
+            f"{found.path}: two pictures of one camera have the same name except for their ending, so their maps "
+            "would be one file. Rename one of them."
         )
     partial = found.folder / f".{layer}.partial"
     shutil.rmtree(partial, ignore_errors=True)
@@ -73,8 +73,7 @@ def write_maps(
             if name not in pictures or name in written:
                 fault = "is of no frame of" if name not in pictures else "comes twice for"
                 raise InputError(f"{name}: a {words} {fault} {found.path}. Give one for every file_path in it.")
-            if not some_empty or metres.any():
-                metres = usable_distance(found, pictures[name], metres, words)
+            metres = usable_distance(found, pictures[name], metres, words, some_empty)
             write_distance_png(partial / targets[name], metres)
             written.add(name)
             if progress and task is not None:
@@ -103,9 +102,20 @@ def write_maps(
 
 
 def usable_distance(
-    scene: SceneFolder, picture: ScenePicture, metres: Float[np.ndarray, "h w"], words: str = "monocular map"
+    scene: SceneFolder,
+    picture: ScenePicture,
+    metres: Float[np.ndarray, "h w"],
+    words: str = "monocular map",
+    may_be_empty: bool = False,
 ) -> Float[np.ndarray, "h w"]:
     """Leave out of a map what is no distance to anything, or outside the lens and the mask.
+
+    Args:
+        scene: whose picture it is.
+        picture: what it is a map of.
+        metres: along the ray.
+        words: what the map is called in errors.
+        may_be_empty: whether nothing may be left.
 
     Raises:
         InputError: the map has another size than its camera, or nothing is left.
@@ -120,7 +130,7 @@ def usable_distance(
     usable = scene.usable(picture)
     # comparisons with NaN are false
     kept = usable & (metres > 0) & (metres <= FARTHEST_M)
-    if usable.any() and not kept.any():
+    if usable.any() and not kept.any() and not may_be_empty:
         raise InputError(
             f"{picture.name}: its {words} has no distance between 0 and {FARTHEST_M:g} m anywhere in the mask. "
             "Expected metres along the ray."

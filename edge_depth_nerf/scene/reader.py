@@ -242,7 +242,17 @@ class SceneFolder:
         return pixels
 
     def points_m(self) -> Float64[np.ndarray, "points 3"] | None:
-        """Read the point cloud, if there is one.
+        """Read the points of the point cloud, if there is one.
+
+        Raises:
+            InputError: it cannot be read.
+
+        """
+        cloud = self.cloud()
+        return None if cloud is None else cloud[0]
+
+    def cloud(self) -> tuple[Float64[np.ndarray, "points 3"], UInt8[np.ndarray, "points 3"] | None] | None:
+        """Read the point cloud, if there is one: points in the scene (metres), and their colours where it has any.
 
         Raises:
             InputError: it cannot be read.
@@ -251,13 +261,14 @@ class SceneFolder:
         if self.points_path is None:
             return None
         try:
-            points = read_cloud(self.points_path)
+            points, colours = read_cloud(self.points_path)
         except InputError as error:
             raise InputError(
-                f"{error} It cannot be read as a PLY point cloud: make the file again, or take ply_file_path out of "
+                f"{error} It cannot be read as a PLY point cloud: make the file again, or remove ply_file_path from "
                 f"{self.path}."
             ) from None
-        return points[np.isfinite(points).all(1)]
+        known = np.isfinite(points).all(1)
+        return points[known], None if colours is None else colours[known]
 
 
 def read_scene(scene: Path) -> SceneFolder:

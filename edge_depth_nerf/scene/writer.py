@@ -216,7 +216,10 @@ def ranges(frames: Sequence[int]) -> str:
 
 
 def best_holdout(count: int) -> int:
-    """Give the `holdout_every` that holds out one of `count` moments or more: 8, or less for very short drives."""
+    """Give the `holdout_every` that holds out one of `count` moments or more: 8, or less for very short drives.
+
+    Of a single moment nothing can be held out.
+    """
     return max(2, min(8, 2 * count - 1))
 
 
@@ -298,7 +301,7 @@ def write_scene(
 
     held_out = sum(frame.held_out for frame in frames)
     if not held_out:
-        notices.append("No frame is held out: evaluation runs on the training frames and says little.")
+        notices.append("No frame is held out: evaluation runs on the training frames and means little.")
     return ProcessReport(
         scene=output,
         training=len(frames) - held_out,
@@ -324,7 +327,7 @@ def _write_cloud(output: Path, frames: Sequence[SceneFrame]) -> None:
     parts = [output / _cloud_path(frame) for frame in frames if not frame.held_out]
     if not merge_parts(parts, output / POINTS):
         raise InputError(
-            f"{output}: no LiDAR return lies in any training picture. Check the calibration from the scanner to "
+            f"{output}: no LiDAR point lies in any training picture. Check the calibration from the scanner to "
             "the cameras, and the masks (255 = use the pixel)."
         )
 
@@ -368,7 +371,7 @@ def _check(
     for item in (*frames, *shifted):
         where = f"frame {item.frame} of {item.camera}"
         if item.camera not in by_name:
-            raise InputError(f"{where}: there is no such camera, only {', '.join(by_name)}.")
+            raise InputError(f"{where}: no such camera; there are {', '.join(by_name)}.")
         check_rigid(item.camera_to_world, f"{where}: camera_to_world")
     twice = [key for key, count in Counter((frame.camera, frame.frame) for frame in frames).items() if count > 1]
     if twice:
@@ -379,7 +382,7 @@ def _check_split(frames: Sequence[SceneFrame]) -> None:
     if not frames:
         raise InputError("no frames to make a scene of.")
     if all(frame.held_out for frame in frames):
-        raise InputError("all frames are held out; none is left for training.")
+        raise InputError("all frames are held out; no frame is left for training.")
 
 
 def _size_error(what: str, found: tuple[int, ...], expected: tuple[int, int]) -> str:
@@ -411,14 +414,15 @@ def open_scene(output: Path, source: Mapping[str, Any]) -> None:
             key = differing[0]
             others = f" (also: {', '.join(differing[1:])})" if differing[1:] else ""
             raise InputError(
-                f"{output}: holds another scene: {key} is {there.get(key)!r} there, {record.get(key)!r} now{others}. "
+                f"{output}: contains another scene: {key} is {there.get(key)!r} there, {record.get(key)!r} "
+                f"now{others}. "
                 "Give another --output, or delete that folder first."
             )
         return
     if output.is_dir() and (foreign := sorted(entry.name for entry in output.iterdir())):
         raise InputError(
-            f"{output}: holds {', '.join(foreign[:5])}{' …' if len(foreign) > 5 else ''} and no {RECORD}: it was not "
-            "begun by this command. Give another --output, or empty that folder first."
+            f"{output}: holds {', '.join(foreign[:5])}{' …' if len(foreign) > 5 else ''} and no {RECORD}: this "
+            "command did not create it. Give another --output, or empty that folder first."
         )
     try:
         output.mkdir(parents=True, exist_ok=True)
@@ -463,17 +467,17 @@ def _scene_camera(camera: SceneCamera, theta_max_rad: float, fisheye: bool) -> C
             return fit
         off = f"by {fit.rms_px:.2f} px rms up to {math.degrees(fit.theta_max_rad):.0f}°"
         if math.isinf(fit.rms_px):
-            off = f"without bound from {math.degrees(wrong_rad):.1f}° on, where nerfstudio's iteration goes astray"
+            off = f"without bound from {math.degrees(wrong_rad):.1f}° on, where nerfstudio's iteration diverges"
         fault = (
             f"nerfstudio's {'fisheye' if fisheye else 'pinhole'} camera differs from this {original.model} camera {off}"
         )
     remedy = "Check its calibration."
     if (usable_deg := _usable_deg(original, theta_max_rad, fisheye)) is not None:
-        remedy = f"Give --theta-max-deg {usable_deg}, up to which it can."
+        remedy = f"Use --theta-max-deg {usable_deg}, up to which it fits."
         if isinstance(original, Pinhole) and fisheye:
             remedy += (
-                " Or limit this camera alone, by theta_max_deg in a rig file. Or make a scene of the pinhole cameras "
-                "alone, where they stay as they are."
+                " Or limit only this camera, with theta_max_deg in a rig file. Or make a scene of the pinhole "
+                "cameras only, where they stay unchanged."
             )
     raise InputError(
         f"camera {camera.name}: {fault.rstrip('.')}; at most {MAX_FIT_RMS_PX} px rms can be used. {remedy}"
@@ -648,7 +652,9 @@ def _write_frame(
     size = (camera_mask.shape[0], camera_mask.shape[1])
     for layer in files:
         if getattr(content, layer) is None:
-            raise InputError(f"{where}: has no {layer}, but every frame of this scene has. Give it for all or none.")
+            raise InputError(
+                f"{where}: has no {layer}, but every other frame of this scene has one. Give it for all or none."
+            )
 
     _write_picture(files["image"], content.image, size, f"{where}: the picture")
     mask = camera_mask
@@ -672,7 +678,7 @@ def _write_frame(
         _write_picture(files["truth_rgb"], content.truth_rgb, size, f"{where}: its true picture")
     if CLOUD in layers and not frame.held_out:
         if content.cloud is None:
-            raise InputError(f"{where}: has no cloud, but every training frame of this scene has.")
+            raise InputError(f"{where}: has no cloud, but every other training frame of this scene has one.")
         write_part(output / _cloud_path(frame), content.cloud, mask, offset)
 
 
@@ -750,17 +756,17 @@ def _kept_later_maps(
         if fresh and all(file is not None and (output / file).is_file() for file in files):
             kept[name] = later
             continue
-        remedy = "Put them in again."
+        remedy = "Add them again."
         if name == "mono":
             remedy = (
-                "Those of the drive's own network are made again; others are to be put in again, by "
-                "`edge-depth-nerf estimate-depth`."
+                "Those of the drive's own network are made again. Add others again with `edge-depth-nerf "
+                "estimate-depth`."
             )
         if name == "motion":
             remedy = "They are made again, unless --no-motion is given."
         of_what = "estimated monocular maps" if name == "mono" else f"{LAYERS[name].words} put in later"
         notices.append(
-            f"The {of_what} of this scene are left out: one is missing, or pictures or masks are new. {remedy}"
+            f"The {of_what} of this scene are removed: one is missing, or pictures or masks are new. {remedy}"
         )
         if name in layers:
             # in their places belong the drive's

@@ -19,19 +19,17 @@ _KEPT_VIEWS = 96
 class Motion:
     """The pictures of a drive that take part: held-out ones are not among them."""
 
-    def __init__(
-        self, positions_m: Float64[np.ndarray, "views 3"], view: Callable[[int], View], most_neighbours: int = 8
-    ) -> None:
+    def __init__(self, positions_m: Float64[np.ndarray, "views 3"], view: Callable[[int], View]) -> None:
         """Say which pictures there are.
 
         Args:
             positions_m: their cameras' centres.
             view: gives one of them; asked for again when it has been dropped.
-            most_neighbours: each is compared with no more.
 
         """
-        self._positions_m, self._most = positions_m, most_neighbours
-        self._view = lru_cache(_KEPT_VIEWS)(view)
+        self._positions_m = positions_m
+        self.view = lru_cache(_KEPT_VIEWS)(view)
+        """Gives one of the pictures, from memory if it was asked for lately."""
         self._neighbours = lru_cache(None)(self._choose)
 
     def neighbours(self, index: int) -> tuple[int, ...]:
@@ -40,12 +38,12 @@ class Motion:
 
     def _choose(self, index: int) -> tuple[int, ...]:
         near = nearest_views(self._positions_m, index)
-        chosen = choose_neighbours(self._view(index), [self._view(other) for other in near], self._most)
+        chosen = choose_neighbours(self.view(index), [self.view(other) for other in near])
         return tuple(near[place] for place in chosen)
 
     def sweep(self, index: int) -> Swept:
         """What a picture's neighbours say of it; the long part of the work."""
-        return sweep_view(self._view(index), [self._view(other) for other in self.neighbours(index)])
+        return sweep_view(self.view(index), [self.view(other) for other in self.neighbours(index)])
 
     def confirm(self, index: int, sweeps: Callable[[int], Swept]) -> MotionDistance:
         """Keep what the neighbours confirm.
@@ -60,4 +58,4 @@ class Motion:
         for other in neighbours:
             swept = sweeps(other)
             theirs.append(np.where(worth_asking(swept), swept.inverse_per_m, np.float32(0)))
-        return confirm(self._view(index), sweeps(index), [self._view(other) for other in neighbours], theirs)
+        return confirm(self.view(index), sweeps(index), [self.view(other) for other in neighbours], theirs)

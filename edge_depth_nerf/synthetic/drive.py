@@ -85,8 +85,8 @@ def _manifest(options: SynthesizeOptions) -> dict[str, Any]:
         "kind": "synthetic drive",
         "version": VERSION,
         "options": fields,
-        "note": "Ray-traced, not recorded. simulated_mono/ is made from the true distances with a depth network's "
-        "faults; it is no network's estimate.",
+        "note": "Ray-traced, not recorded. simulated_mono/ is made from the true "
+        "distances with a depth network's typical errors; it is not a network's estimate.",
     }
 
 
@@ -111,7 +111,7 @@ def _open_folder(options: SynthesizeOptions) -> None:
                 if old.get(name) != new.get(name)
             ]
             raise InputError(
-                f"{folder}: holds a drive of other options ({'; '.join(changed) or 'made by another version'}). "
+                f"{folder}: contains a drive with other options ({'; '.join(changed) or 'made by another version'}). "
                 "Choose another --output, or the same options to continue it."
             )
         # what an interrupted run was about to write
@@ -121,7 +121,7 @@ def _open_folder(options: SynthesizeOptions) -> None:
     elif folder.is_dir() and any(folder.iterdir()):
         names = sorted(entry.name for entry in folder.iterdir())
         raise InputError(
-            f"{folder}: holds something that is not a synthetic drive ({', '.join(names[:5])}"
+            f"{folder}: contains something that is not a synthetic drive ({', '.join(names[:5])}"
             f"{', ...' if len(names) > 5 else ''}). Choose a new or empty folder as --output."
         )
     write_json(path, manifest)

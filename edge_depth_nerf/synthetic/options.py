@@ -35,10 +35,11 @@ _SPEED_MAX_M_S = 40.0
 
 @dataclass(frozen=True)
 class SynthesizeOptions:
-    """A drive with fisheye pictures, LiDAR sweeps, poses and their truth, in KITTI-360's raw layout or another one."""
+    """A drive with fisheye pictures, LiDAR sweeps, poses and ground truth, in KITTI-360's raw layout or another."""
 
     output: Path
-    """Folder to write the drive to; new, empty, or an unfinished drive of the same options, which is continued."""
+    """Folder to write the drive to. It must be new, empty, or an unfinished drive with the same options, which is then
+    continued."""
     scene: SceneName = "street"
     """street: houses, trees, parked cars; parking: an underground car park; turn: 90 degrees at a junction;
     traffic: the street with cars that pass, one that stops and starts again, a bus, people on foot and a cyclist."""
@@ -53,14 +54,14 @@ class SynthesizeOptions:
     speed_m_s: float | None = None
     """Mean speed of the car in m/s; none = the scene's own (street 8, parking 4, turn 6, traffic 6)."""
     sequence: str = "2013_05_28_drive_0000_sync"
-    """Name of the sequence in the folders (KITTI-360's layout alone)."""
+    """Name of the sequence in the folders (only in KITTI-360's layout)."""
     layout: LayoutName = "kitti-360"
     """kitti-360: two fisheyes, Velodyne; jbnu-depth360: four 183 degree fisheyes, Ouster; rig: two fisheyes to 110
-    degrees, a pinhole and a scanner, described by a rig.toml. --size is the width; other pictures are not square."""
+    degrees, a pinhole and a scanner, described by a rig.toml. --size is the width; not all pictures are square."""
 
     camera: CameraName = "plain"
-    """plain: exposure drifts by 10 %. automatic: exposure by 40 % and white balance by 10 %, as bright as what is seen
-    asks for; noise grows with the gain, and lenses darken towards their rim."""
+    """plain: exposure drifts by 10 %. automatic: exposure varies by 40 % and white balance by 10 %, depending on the
+    brightness of the view; noise grows with the gain, and lenses darken towards their rim."""
 
     @property
     def has_movers(self) -> bool:

@@ -177,7 +177,7 @@ def check_folder(folder: Path) -> None:
     """
     if folder.is_dir() and any(folder.iterdir()) and not (folder / _RECORD).is_file():
         raise InputError(
-            f"{folder}: COLMAP's features and models are to go there, but it holds other files. Move them away, or "
+            f"{folder}: this folder is for COLMAP's features and models, but contains other files. Move them, or "
             "choose another --output."
         )
 
@@ -482,7 +482,7 @@ class _Run:
             except Exception as error:  # COLMAP raises whatever its readers meet
                 raise InputError(
                     f"{folder}: cannot be read as a COLMAP model of these pictures ({type(error).__name__}: {error}). "
-                    f"Delete {models}; the same command makes it anew."
+                    f"Delete {models}; the same command then makes it again."
                 ) from error
         return sorted(found, key=lambda model: -len(model.camera_to_model))
 

@@ -91,14 +91,14 @@ def check_colmap(recording: Recording, options: ProcessOptions) -> None:
     found = len(recording.pictures)
     if found < _MIN_PICTURES:
         raise InputError(
-            f"--poses colmap: {found} picture{'' if found == 1 else 's'}, expected {_MIN_PICTURES} or more: poses come "
-            "from what several pictures have in common. Take more frames."
+            f"--poses colmap: {found} picture{'' if found == 1 else 's'}, expected {_MIN_PICTURES} or more: poses "
+            "are computed from the overlap of several pictures. Use more frames."
         )
     with_lidar = {sweep.frame for sweep in recording.sweeps}
     if not any(picture.depth is not None or picture.frame in with_lidar for picture in recording.pictures):
         raise InputError(
-            "--poses colmap: none of the pictures has a LiDAR sweep or a depth map, which COLMAP's scale is found "
-            "from. Take frames with LiDAR, or use the poses of the recording (--poses recorded)."
+            "--poses colmap: none of the pictures has a LiDAR sweep or a depth map, which COLMAP's scale is "
+            "computed from. Use frames with LiDAR, or the poses of the recording (--poses recorded)."
         )
 
 
@@ -129,10 +129,10 @@ def _check_path(path: MetricPath, scale: Scale) -> None:
     else:
         return
     raise InputError(
-        f"--poses colmap: COLMAP's path breaks between frames {where[0]} and {where[1]}: {why}. Find the path from "
-        "LiDAR (--poses lidar); or give COLMAP more to go by: frames closer together (--stride 1), all cameras, the "
-        "lens as it was calibrated, masks of what moves (--frame-masks); or take the frames before or after the break "
-        "alone (--first, --frames)."
+        f"--poses colmap: COLMAP's path breaks between frames {where[0]} and {where[1]}: {why}. Compute the path "
+        "from LiDAR (--poses lidar). Or give COLMAP more information: frames closer together (--stride "
+        "1), all cameras, the right lens calibration, masks of moving objects (--frame-masks). Or use "
+        "only the frames before or after the break (--first, --frames)."
     )
 
 
@@ -142,7 +142,7 @@ def _notices(recording: Recording, models: list[ColmapModel], path: MetricPath, 
     total = len(recording.pictures)
     notices = [
         f"COLMAP registered {len(registered)} of {total} pictures"
-        + (f", {posed - len(registered)} more have their pose through the rig" if posed > len(registered) else "")
+        + (f", {posed - len(registered)} more get their pose from the rig" if posed > len(registered) else "")
         + f": {sum(model.points for model in members)} points, mean reprojection error "
         f"{max(model.error_px for model in members):.2f} px"
         + (f", {len(members)} models joined by the rig" if len(members) > 1 else "")
@@ -161,12 +161,12 @@ def _notices(recording: Recording, models: list[ColmapModel], path: MetricPath, 
     left = len(models) - len(members)
     if left:
         notices.append(
-            f"{left} more of COLMAP's models could not be joined with the largest (too few moments in common, or too "
-            "few points with LiDAR beside them); what only they hold counts as not registered."
+            f"{left} more of COLMAP's models could not be joined with the largest (too few frames in common, or too "
+            "few points with LiDAR next to them). Pictures in these models only count as not registered."
         )
     if path.disagreement_m > _WARN_APART_M:
         notices.append(
-            "The cameras do not agree on where the vehicle is: check where the calibration puts them on it, and the "
+            "The cameras disagree on the vehicle's position: check their mounting in the calibration, and the "
             "times of the pictures."
         )
     if scale.spread > _WARN_SPREAD:

@@ -135,7 +135,7 @@ def refine_poses(recording: Recording, options: ProcessOptions, console: Console
     times = moment_times(recording)
     moments, times_s = list(times), np.array(list(times.values()))
     if len(moments) < 2 or not (np.diff(times_s) > 0).all():
-        return _kept(recording, "the pictures are not of two moments or more, one after another")
+        return _kept(recording, "the pictures are not of two or more consecutive frames")
     given = trajectory.at(times_s)
     shots = _shots(recording, moments, given)
 
@@ -152,12 +152,12 @@ def refine_poses(recording: Recording, options: ProcessOptions, console: Console
             found = refine(pycolmap, shots, matches, given, reshoot=reshoot)
         write_json(options.output / REFINED_POSES, {"digest": digest, **found.to_dict()})
     if found.judges < _LEAST_JUDGES:
-        return _kept(recording, f"only {found.judges} features could be matched to judge by")
+        return _kept(recording, f"only {found.judges} features could be matched for the check")
     distances = f"{found.before_px:.2f} px before, {found.after_px:.2f} px after"
     if not found.after_px <= (1 - LEAST_GAIN) * found.before_px:
-        return _kept(recording, f"features agree with them as well as with refined ones ({distances})")
+        return _kept(recording, f"features agree with them as well as with the refined ones ({distances})")
     if found.supported.sum() < 2:
-        return _kept(recording, "the pictures of too few moments show features")
+        return _kept(recording, "the pictures of too few frames show features")
     refined, change = _moved(recording, times_s, moments, given, found.vehicle_to_world, found.supported)
     cosine = ((np.trace(change[:, :3, :3], axis1=1, axis2=2) - 1) / 2).clip(-1, 1)
     furthest_m = float(np.linalg.norm(change[:, :3, 3], axis=-1).max())
@@ -165,12 +165,12 @@ def refine_poses(recording: Recording, options: ProcessOptions, console: Console
     if furthest_m > FURTHEST_M or furthest_deg > FURTHEST_DEG:
         return _kept(
             recording,
-            f"refining would move them by up to {furthest_m:.2f} m and {furthest_deg:.1f}°, too far to be trusted; if "
-            "they are that far off, find them anew with --poses colmap",
+            f"refining would move them by up to {furthest_m:.2f} m and {furthest_deg:.1f}°, too far to be trusted. "
+            "If they are wrong by that much, use --poses colmap",
         )
     notice = (
         f"Poses refined by {found.points} points that the pictures share: median distance of matched features to "
-        f"their epipolar lines {distances} ({found.judges} matches that took no part); moved by up to "
+        f"their epipolar lines {distances} ({found.judges} matches were left out for this check); moved by up to "
         f"{100 * furthest_m:.0f} cm and {furthest_deg:.2f}°."
     )
     return dataclasses.replace(refined, notices=(*recording.notices, notice))
@@ -193,7 +193,7 @@ def _lenses(recording: Recording, options: ProcessOptions) -> dict[str, ColmapLe
 
 
 def _kept(recording: Recording, why: str) -> Recording:
-    return dataclasses.replace(recording, notices=(*recording.notices, f"The poses stay as they are given: {why}."))
+    return dataclasses.replace(recording, notices=(*recording.notices, f"The given poses are used unchanged: {why}."))
 
 
 def _digest(

@@ -297,11 +297,11 @@ def _together(along: Mapping[int, Float64[np.ndarray, "_"]]) -> Float64[np.ndarr
 
 
 def _too_few(pairs: int, recording: Recording) -> InputError:
-    source = "a depth map's value" if not recording.sweeps else "a LiDAR return"
+    source = "a depth map's value" if not recording.sweeps else "a LiDAR point"
     return InputError(
-        f"--poses colmap: only {pairs} of COLMAP's points have {source} beside them, expected {MIN_PAIRS} or more: the "
-        "scale cannot be found. Take more frames, or frames whose sweeps and pictures see the same, and check that "
-        "the calibration of LiDAR and cameras is that of this recording."
+        f"--poses colmap: only {pairs} of COLMAP's points have {source} next to them, expected {MIN_PAIRS} or more: "
+        "the scale cannot be computed. Use more frames, or frames whose sweeps and pictures overlap, and "
+        "check that the calibration of LiDAR and cameras belongs to this recording."
     )
 
 

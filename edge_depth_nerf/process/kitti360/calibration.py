@@ -82,8 +82,8 @@ def read_mei_camera(path: Path) -> MEI:
     def text(key: str) -> tuple[int, str]:
         if key not in values:
             raise InputError(
-                f"{path}: ends after line {lines} without {key}; expected a MEI camera's parameters. "
-                f"The file is truncated or of another camera. {_DOWNLOAD}"
+                f"{path}: ends after line {lines} without {key}; expected a MEI camera's parameters. The file is "
+                f"truncated or for another camera. {_DOWNLOAD}"
             )
         return values[key]
 
@@ -137,7 +137,7 @@ def read_cam_to_pose(path: Path) -> dict[str, Transform]:
         if not colon:
             raise InputError(f"{path}, line {number}: expected 'image_00: ' and 12 numbers. {_DOWNLOAD}")
         if name.strip() in transforms:
-            raise InputError(f"{path}, line {number}: {shown(name.strip())} is there twice. {_DOWNLOAD}")
+            raise InputError(f"{path}, line {number}: {shown(name.strip())} occurs twice. {_DOWNLOAD}")
         transforms[name.strip()] = _transform(rest, path, number)
     return transforms
 
@@ -169,7 +169,7 @@ def read_poses(path: Path) -> dict[int, Transform]:
         first, rest = (*line.split(maxsplit=1), "")[:2]
         frame = _number(first, path, number)
         if frame != int(frame) or not 0 <= frame < _MAX_FRAME:
-            raise InputError(f"{path}, line {number}: {shown(first)} is not the number of a frame. {_DOWNLOAD}")
+            raise InputError(f"{path}, line {number}: {shown(first)} is not a frame number. {_DOWNLOAD}")
         if int(frame) in poses:
             raise InputError(f"{path}, line {number}: frame {int(frame)} has a pose already. {_DOWNLOAD}")
         poses[int(frame)] = _transform(rest, path, number)
@@ -234,7 +234,7 @@ def _read_yaml(path: Path) -> tuple[dict[str, tuple[int, str]], int]:
             continue
         name = f"{group}.{key}" if key in _MEI_FIELDS.get(group, ()) else key
         if name in values:
-            raise InputError(f"{path}, line {last}: {shown(name)} is there twice. {_DOWNLOAD}")
+            raise InputError(f"{path}, line {last}: {shown(name)} occurs twice. {_DOWNLOAD}")
         values[name] = last, value
         if len(values) > _MAX_YAML_VALUES:
             raise InputError(f"{path}: more than {_MAX_YAML_VALUES} values; expected a MEI camera's. {_DOWNLOAD}")

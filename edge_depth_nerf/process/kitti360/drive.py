@@ -62,14 +62,14 @@ class Kitti360Drive:
         for folder in ("calibration", *of_sequence):
             require_folder(root / folder, f"--root {root} is not the data set's folder, or a download is missing")
         for folder in of_sequence:
-            require_folder(root / folder / sequence, "--sequence takes the name of one of these")
+            require_folder(root / folder / sequence, "--sequence needs one of these names")
         for name in options.cameras:
             require_folder(self.image_folder(name), f"the pictures of {name} belong there; or leave out that camera")
         require_folder(self.sweeps, "the LiDAR sweeps belong there")
         for option, folder in (("--mono", options.mono), ("--frame-masks", options.frame_masks)):
             if folder is not None:
                 for name in options.cameras:
-                    require_folder(folder / name, f"{option} takes a folder with one folder a camera in it")
+                    require_folder(folder / name, f"{option} needs a folder with one folder per camera")
 
     def image_folder(self, camera: str) -> Path:
         """Where the pictures of a camera lie."""
@@ -104,8 +104,8 @@ class Kitti360Drive:
             asked = "" if options.frames is None else f" --frames {options.frames} --stride {options.stride}"
             raise InputError(
                 f"--first {options.first}{asked}: reaches frame {last}, but the pictures of {options.sequence} are of "
-                f"frames {min(present)} to {end}. Begin earlier, ask for fewer, or leave "
-                "out --first and --frames to take all."
+                f"frames {min(present)} to {end}. Start earlier, use fewer, or leave out --first and --frames to "
+                "use all."
             )
         kept, skipped = [], []
         for frame in range(options.first, last + 1, options.stride):
@@ -174,8 +174,8 @@ class Kitti360Drive:
         for path in (files.truth_distance, files.truth_rgb):
             if path is not None and not path.is_file():
                 raise FileNotFoundError(
-                    f"{path}: no such file; the drive's truth is incomplete. Synthesise the drive again, or move "
-                    f"{self.truth} away to go on without it."
+                    f"{path}: no such file; the drive's ground truth is incomplete. Synthesise the drive again, or "
+                    f"move {self.truth} away to continue without it."
                 )
         for path in (files.mask, files.truth_rgb):
             if path is not None:

@@ -1,0 +1,121 @@
+"""Check that pages and messages are in plain English: `python docs/check_prose.py`, a part of `make lint`.
+
+The rules are in docs/prose_rules.toml: patterns that must not occur, with the words to use instead, and the longest
+sentence. Code and addresses are left out. In the package's modules, strings of four words or more are checked, except
+docstrings; docs/options.md contains the help texts. vale, the usual program for this, is not used, because its wheel
+downloads the program when it first runs.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib  # pyright: ignore[reportMissingImports]
+
+ROOT = Path(__file__).resolve().parents[1]
+RULES = Path(__file__).with_name("prose_rules.toml")
+PAGES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "data/README.md", "docs/*.md")
+MODULES = "edge_depth_nerf/**/*.py"
+LEAST_WORDS = 4
+"""Strings of a module with fewer words are names and keys, not messages."""
+LIST_ITEM = re.compile(r" *(?:[-*]|\d+\.) +")
+SENTENCE_END = re.compile(r"[.!?:;][)\"*]*\s+")
+OFF, ON = "<!-- prose: off -->", "<!-- prose: on -->"
+"""Lines between these comments are examples of what not to write."""
+
+
+@dataclass(frozen=True)
+class Text:
+    """A paragraph of a page, or a message."""
+
+    line: int
+    words: str
+    is_page: bool
+
+
+def without_code(line: str) -> str:
+    """A line of Markdown without what is code, an address or a comment."""
+    line = re.sub(r"`[^`]*`", "CODE", line)
+    line = re.sub(r"<!--.*?-->|<[^>]+>", "", line)
+    return re.sub(r"\]\([^)]*\)", "]", line)
+
+
+def paragraphs(markdown: str) -> Iterator[Text]:
+    """Paragraphs, list items, headings and cells of tables, each on one line, without code."""
+    fenced = quoted = is_off = False
+    begin, held = 0, ""
+    for number, line in enumerate([*markdown.splitlines(), ""], 1):
+        if line.strip() in (OFF, ON):
+            is_off = line.strip() == OFF
+        line = "" if is_off else line
+        if line.lstrip().startswith("```"):
+            fenced = not fenced
+        quoted = line.startswith("    ") and not held
+        is_row = line.lstrip().startswith("|")
+        ends = fenced or quoted or is_row or not line.strip() or LIST_ITEM.match(line) or line.startswith(("#", "```"))
+        if ends and held:
+            yield Text(begin, without_code(held), True)
+            held = ""
+        if is_row and not fenced:
+            yield from (Text(number, without_code(cell.strip()), True) for cell in line.split("|") if cell.strip())
+        elif line.strip() and not fenced and not quoted and not line.lstrip().startswith("```"):
+            begin, held = (begin, f"{held} {line.strip()}") if held else (number, line.strip())
+
+
+def messages(source: str) -> Iterator[Text]:
+    """The strings of a module that people read, an f-string's values left out."""
+    nodes = [*ast.walk(ast.parse(source))]
+    joined = [node for node in nodes if isinstance(node, ast.JoinedStr)]
+    apart = {node.value for node in nodes if isinstance(node, ast.Expr)}
+    apart.update(part for node in joined for part in node.values)
+    for node in joined:
+        words = "VALUE".join(str(part.value) for part in node.values if isinstance(part, ast.Constant))
+        if len(words.split()) >= LEAST_WORDS:
+            yield Text(node.lineno, without_code(words), False)
+    for node in nodes:
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in apart:
+            if len(node.value.split()) >= LEAST_WORDS:
+                yield Text(node.lineno, without_code(node.value), False)
+
+
+def faults(text: Text, rules: dict[str, Any]) -> Iterator[str]:
+    """What the rules have against a text."""
+    for rule in rules["rules"]:
+        found = re.search(rule["pattern"], text.words, re.IGNORECASE)
+        if found:
+            yield f"“{found[0]}”: write {rule['instead']}"
+    most = rules["sentences"]["most_words"]
+    for sentence in SENTENCE_END.split(text.words) if text.is_page else ():
+        words = sentence.split()
+        if len(words) > most:
+            yield f"a sentence of {len(words)} words, more than {most}: “{' '.join(words[:8])} …”"
+
+
+def main(root: Path = ROOT) -> int:
+    """Print what is wrong; how many faults there are."""
+    rules = tomllib.loads(RULES.read_text(encoding="utf-8"))
+    found = 0
+    for pattern in (*PAGES, MODULES):
+        for path in sorted(root.glob(pattern)):
+            if any(path.relative_to(root).match(each) for each in rules["unchecked"]):
+                continue
+            content = path.read_text(encoding="utf-8")
+            for text in paragraphs(content) if path.suffix == ".md" else messages(content):
+                for fault in faults(text, rules):
+                    print(f"{path.relative_to(root)}:{text.line}: {fault}")
+                    found += 1
+    print(f"{found} faults" if found else "The prose is plain.")
+    return found
+
+
+if __name__ == "__main__":
+    sys.exit(min(main(), 1))

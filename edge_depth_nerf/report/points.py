@@ -1,0 +1,104 @@
+"""A drive's LiDAR points and cameras, as small as the page's view in 3D needs them."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, UInt8, UInt16
+from scipy.spatial import KDTree
+
+from edge_depth_nerf.base.pictures import DISTANCE
+from edge_depth_nerf.scene.reader import SceneFolder
+
+MOST_POINTS = 40_000
+"""Of all drives of a page; each takes 12 bytes in it."""
+NEAR_M = 40.0
+"""Points further from all cameras are left out, of scenes whose lengths are metres."""
+STEPS = 65535
+"""Into so many steps each axis is divided."""
+
+
+@dataclass(frozen=True, eq=False)
+class ShownPoints:
+    """Points and cameras in the scene's metres: x and y level, z up."""
+
+    low_m: Float64[np.ndarray, "3"]
+    """The lowest corner of the points."""
+    step_m: Float64[np.ndarray, "3"]
+    """What one step along each axis is."""
+    steps: UInt16[np.ndarray, "points 3"]
+    """Places of the points from there on."""
+    colours: UInt8[np.ndarray, "points 3"]
+    """RGB: of the pictures, or by height where the scene's cloud has none."""
+    paths_m: list[Float64[np.ndarray, "pictures 3"]]
+    """Places of each camera's pictures, in order."""
+    training_m: Float64[np.ndarray, "trained 3"]
+    """Places of the pictures trained on."""
+    held_out_m: Float64[np.ndarray, "held 3"]
+    """Places of the held-out pictures."""
+    forward: Float64[np.ndarray, "3"]
+    """Where the vehicle went at first, or the first camera looks if it stood."""
+
+    def data(self) -> dict[str, object]:
+        """What the page's script reads."""
+        return {
+            "low": self.low_m.tolist(),
+            "step": self.step_m.tolist(),
+            "steps": base64.b64encode(self.steps.astype("<u2").tobytes()).decode(),
+            "colours": base64.b64encode(self.colours.tobytes()).decode(),
+            "paths": [np.round(path, 2).tolist() for path in self.paths_m],
+            "training": np.round(self.training_m, 2).tolist(),
+            "heldOut": np.round(self.held_out_m, 2).tolist(),
+            "forward": np.round(self.forward, 3).tolist(),
+        }
+
+
+def show_points(scene: SceneFolder, most: int = MOST_POINTS) -> ShownPoints | None:
+    """Choose the points of a scene that are shown, at random; None for a scene without any.
+
+    Args:
+        scene: its cameras and its point cloud.
+        most: how many points at most.
+
+    Raises:
+        InputError: the point cloud cannot be read.
+
+    """
+    cloud = scene.cloud()
+    if cloud is None:
+        return None
+    points_m, colours = cloud
+    cameras = [np.array([picture.position_m for picture in pictures]) for pictures in scene.cameras().values()]
+    if scene.own:
+        near = KDTree(np.concatenate(cameras)).query(points_m, distance_upper_bound=NEAR_M)[0] <= NEAR_M
+        points_m, colours = points_m[near], None if colours is None else colours[near]
+    if not len(points_m):
+        return None
+    chosen = np.random.default_rng(0).permutation(len(points_m))[:most]
+    points_m = points_m[chosen]
+    if colours is None:
+        low, high = np.percentile(points_m[:, 2], (2, 98))
+        place = np.clip((points_m[:, 2] - low) / max(high - low, 1e-6), 0, 1)
+        shown = DISTANCE.colours[np.rint(255 * (1 - place)).astype(int)]
+    else:
+        shown = colours[chosen]
+    low_m = points_m.min(0)
+    step_m = np.maximum((points_m.max(0) - low_m) / STEPS, 1e-9)
+    places_m = np.array([picture.position_m for picture in scene.pictures])
+    held_out = np.array([picture.held_out for picture in scene.pictures])
+    first = next(iter(scene.cameras().values()))
+    forward = cameras[0][-1] - cameras[0][0]
+    if np.linalg.norm(forward[:2]) < 0.1:
+        forward = first[0].looks_along
+    return ShownPoints(
+        low_m=low_m,
+        step_m=step_m,
+        steps=np.rint((points_m - low_m) / step_m).clip(0, STEPS).astype(np.uint16),
+        colours=np.ascontiguousarray(shown),
+        paths_m=cameras,
+        training_m=places_m[~held_out],
+        held_out_m=places_m[held_out],
+        forward=forward / np.linalg.norm(forward),
+    )

@@ -1,0 +1,73 @@
+"""The prose rules: pages and messages pass, and riddles of former pages do not."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def prose() -> ModuleType:
+    specification = importlib.util.spec_from_file_location("check_prose", ROOT / "docs/check_prose.py")
+    assert specification and specification.loader
+    module = importlib.util.module_from_spec(specification)
+    sys.modules["check_prose"] = module  # dataclasses look themselves up there
+    specification.loader.exec_module(module)
+    return module
+
+
+def test_pages_and_messages_are_plain(prose, capsys):
+    assert prose.main() == 0, capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "riddle",
+    [
+        "Whoever has a nerfstudio scene already trains on it as it is.",
+        "Stopped with Ctrl-C, the same command goes on.",
+        "Not searched for features: what lies further than 85° from a lens's axis.",
+        "Much less, or none, means that a clock is wrong; as much does not mean that they are right.",
+        "On a rendered street one in a thousand of its returns is wrong.",
+        "It is held to the real geometry by LiDAR.",
+        "With neither, a scan is taken as of one moment, and you are told so.",
+        "Without them the figure is left out, and said so.",
+        "Trained, it waits for you to look.",
+    ],
+)
+def test_a_riddle_in_a_page_is_refused(prose, tmp_path, capsys, riddle):
+    (tmp_path / "docs").mkdir()
+    page = tmp_path / "docs/page.md"
+    page.write_text(f"# Title\n\nThis sentence is plain. {riddle}\n", encoding="utf-8")
+    assert prose.main(tmp_path) > 0
+    assert "docs/page.md:3: " in capsys.readouterr().out
+    page.write_text("# Title\n\nThis sentence is plain.\n", encoding="utf-8")
+    assert prose.main(tmp_path) == 0
+
+
+def test_a_riddle_in_a_message_is_refused(prose, tmp_path, capsys):
+    module = tmp_path / "edge_depth_nerf/jobs/worker.py"
+    module.parent.mkdir(parents=True)
+    module.write_text(
+        '"""A moment in a docstring."""\n\nNAME = "moment"\nprint(f"{NAME}: its worker goes on on {NAME}")\n'
+    )
+    assert prose.main(tmp_path) == 1
+    assert "edge_depth_nerf/jobs/worker.py:4: “goes on on”" in capsys.readouterr().out
+
+
+def test_code_examples_and_long_lists_are_left_alone(prose, tmp_path, capsys):
+    page = tmp_path / "README.md"
+    page.write_text(
+        "Call `find_moments()`:\n\n    print(moment)\n\n```python\nmoment = 1\n```\n\n[it](moment.md)\n\n"
+        f"<!-- prose: off -->\nA moment.\n<!-- prose: on -->\n\n| {' | '.join(['a word'] * 40)} |\n",
+        encoding="utf-8",
+    )
+    assert prose.main(tmp_path) == 0
+    page.write_text("A " + "very " * 40 + "long sentence.\n", encoding="utf-8")
+    assert prose.main(tmp_path) == 1
+    assert "README.md:1: a sentence of 43 words" in capsys.readouterr().out
