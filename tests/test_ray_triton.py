@@ -244,9 +244,16 @@ def test_what_the_kernels_along_rays_serve(monkeypatch):
 
 
 def check_that_trying_out_runs_each_kernel() -> None:
-    from edge_depth_nerf.kernels import edge_loss_triton, hash_grid_triton, network_triton, ray_triton, triton_launch
+    from edge_depth_nerf.kernels import (
+        contraction_triton,
+        edge_loss_triton,
+        hash_grid_triton,
+        network_triton,
+        ray_triton,
+        triton_launch,
+    )
 
-    modules = edge_loss_triton, hash_grid_triton, network_triton, ray_triton
+    modules = contraction_triton, edge_loss_triton, hash_grid_triton, network_triton, ray_triton
     for module in modules:
         launched = set()
 
