@@ -241,3 +241,32 @@ def test_what_the_kernels_along_rays_serve(monkeypatch):
     assert served(48, 2048)
     assert not served(48, 2049)
     assert not served(48, device="cpu") and not served(48, dtype=torch.float16)
+
+
+def check_that_trying_out_runs_each_kernel() -> None:
+    from edge_depth_nerf.kernels import (
+        contraction_triton,
+        edge_loss_triton,
+        hash_grid_triton,
+        network_triton,
+        ray_triton,
+        triton_launch,
+    )
+
+    modules = contraction_triton, edge_loss_triton, hash_grid_triton, network_triton, ray_triton
+    for module in modules:
+        launched = set()
+
+        def launch(kernel: Any, *given: Any, launched: set[str] = launched, **constants: Any) -> None:
+            launched.add(kernel.__name__)
+            triton_launch.launch(kernel, *given, **constants)
+
+        module.launch = launch
+        module.try_out(torch.device("cpu"))
+        assert launched == {name for name in vars(module) if name.endswith("_kernel")}
+
+
+@pytest.mark.slow
+def test_trying_out_runs_each_kernel():
+    pytest.importorskip("triton")
+    in_interpreter(check_that_trying_out_runs_each_kernel)

@@ -222,7 +222,7 @@ def edge_losses(
 
 def try_out(device: torch.device) -> None:
     """Run each kernel once; raises whatever keeps it from working."""
-    edges = torch.tensor([[1.0, 2.0, 3.0]], device=device)
+    edges = torch.arange(1.0, 4.0, device=device)[None]
     weights = torch.full((1, 2), 0.5, device=device, requires_grad=True)
     one = torch.ones(1, device=device)
     edge_losses(

@@ -8,6 +8,7 @@ positions in a box) is left to nerfstudio's.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import ModuleType
 from typing import Any
 
 import torch
@@ -24,6 +25,7 @@ from torch import Tensor, nn
 
 from edge_depth_nerf.kernels.fused_hash_grid import use_fused_encodings
 from edge_depth_nerf.kernels.network import network
+from edge_depth_nerf.kernels.triton_back_end import of_network, working
 
 
 class CubeContraction(SceneContraction):
@@ -68,21 +70,33 @@ class FusedMLP(MLP):
 
     def forward(self, in_tensor: Float[Tensor, "*bs in_dim"]) -> Float[Tensor, "*bs out_dim"]:
         """Apply the network."""
-        if not _in_parts(in_tensor) or in_tensor.numel() == 0:
+        kernels = of_network(in_tensor, _parameters(self)[0])
+        if in_tensor.numel() == 0 or (kernels is None and not _in_parts(in_tensor)):
             return super().forward(in_tensor)
         flat = in_tensor.reshape(-1, in_tensor.shape[-1])
-        result = network(flat, *_parameters(self)).view(*in_tensor.shape[:-1], -1)
+        compute = network if kernels is None else kernels.network
+        result = compute(flat, *_parameters(self)).view(*in_tensor.shape[:-1], -1)
         return result if self.out_activation is None else self.out_activation(result)
+
+
+def _contraction(device: torch.device) -> ModuleType | None:
+    """Give the module that contracts positions on a device."""
+    if device.type == "cpu":
+        # imported here, because Numba takes half a second to load
+        from edge_depth_nerf.kernels import contraction
+
+        return contraction
+    return working("contraction_triton", device, "contraction")
 
 
 def _unit_cube(field: Any, positions: Float[Tensor, "*bs 3"]) -> tuple[Tensor, Tensor]:
     """Positions in scene units to 0..1, flat, and 1 for those strictly inside (else 0), of shape [*bs, 1]."""
     flat = positions.reshape(-1, 3)
-    if flat.device.type == "cpu" and flat.dtype == torch.float32 and not flat.requires_grad:
-        # imported here, because Numba takes half a second to load
-        from edge_depth_nerf.kernels.contraction import contract
-
-        places, inside = contract(flat)
+    kernels = None
+    if flat.dtype == torch.float32 and not flat.requires_grad:
+        kernels = _contraction(flat.device)
+    if kernels is not None:
+        places, inside = kernels.contract(flat)
     else:
         places = (field.spatial_distortion(flat) + 2) / 4
         inside = ((places > 0) & (places < 1)).all(dim=-1).to(flat)

@@ -20,6 +20,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from edge_depth_nerf.kernels.triton_back_end import of_network
+
 PART = 2048
 """So many points at a time: 512 kB in a layer of 64."""
 
@@ -134,7 +136,8 @@ def network(
 
     """
     if x.device.type != "cpu":
-        return _layer_by_layer(x, weights, biases)
+        kernels = of_network(x, weights)
+        return (_layer_by_layer if kernels is None else kernels.network)(x, weights, biases)
     rows = [bias.view(-1, bias.shape[-1]) for bias in biases]
     parameters = [each for pair in zip(weights, rows, strict=True) for each in pair]
     result = _Network.apply(x, torch.is_grad_enabled(), *parameters)

@@ -387,7 +387,7 @@ def distortion_loss(edges: Float[Tensor, "rays edges"], weights: Float[Tensor, "
 
 def try_out(device: torch.device) -> None:
     """Run each kernel once; raises whatever keeps one from working."""
-    edges = torch.tensor([[0.0, 0.5, 1.0]], device=device)
+    edges = torch.linspace(0, 1, 3, device=device)[None]
     densities = torch.ones((1, 2), device=device, requires_grad=True)
     weights = weights_from_densities(densities, edges.diff())
     place_samples(weights, edges, torch.full((1, 1), 0.5, device=device), 0.01, 1e-5)

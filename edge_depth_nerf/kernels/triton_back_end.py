@@ -7,7 +7,9 @@ Triton may be missing, find no C compiler, or not know the GPU. A module of kern
 from __future__ import annotations
 
 import functools
+import os
 import warnings
+from collections.abc import Sequence
 from importlib import import_module
 from types import ModuleType
 
@@ -52,3 +54,20 @@ def along_rays(*tensors: Tensor) -> ModuleType | None:
         return None
     kernels = working("ray_triton", tensors[0].device, "form of samples along rays")
     return kernels if kernels is not None and kernels.fits(*(each.shape[1] for each in tensors)) else None
+
+
+NETWORK = "EDGE_DEPTH_NERF_NETWORK"
+"""Environment variable that turns on the kernels of networks, with the value `triton`; no GPU has compared them yet."""
+
+
+def of_network(x: Tensor, weights: Sequence[Tensor]) -> ModuleType | None:
+    """Give the kernels of networks, `network_triton`; None where they are not asked for, or do not serve this network.
+
+    They serve what autocast would compute in float16 on CUDA, where nobody asks for a gradient.
+    """
+    if os.environ.get(NETWORK) != "triton" or x.device.type != "cuda" or torch.is_grad_enabled():
+        return None
+    if not torch.is_autocast_enabled("cuda") or torch.get_autocast_dtype("cuda") != torch.float16:
+        return None
+    kernels = working("network_triton", x.device, "network")
+    return kernels if kernels is not None and kernels.fits(weights) else None

@@ -106,10 +106,10 @@ class EdgeDepthNerfModelConfig(NerfactoModelConfig):
     edge_divide_by_norm: bool = True
     """Divide Eq. 4's Gaussian by σ̂·√(2π), so that a wide one does not pull harder than a narrow one."""
     implementation: Literal["auto", "fused", "tcnn", "torch"] = "auto"  # pyright: ignore[reportIncompatibleVariableOverride]
-    """What computes fields, samples and losses. fused: our own kernels (Numba on the CPU; on CUDA Triton for the hash
-    grids). torch: nerfstudio's code, with the same results and checkpoints as fused, but many times slower on a CPU.
-    tcnn: tiny-cuda-nn, whose checkpoints differ. auto: tcnn on a GPU if it is installed, otherwise
-    fused; config.yml keeps which it was."""
+    """What computes fields, samples and losses. fused: our own kernels (Numba on the CPU; on CUDA Triton for hash
+    grids, samples along rays and the edge loss). torch: nerfstudio's code, with the same results and checkpoints as
+    fused, but many times slower on a CPU. tcnn: tiny-cuda-nn, whose checkpoints differ. auto: tcnn on a GPU if it is
+    installed, otherwise fused; config.yml keeps which it was."""
 
 
 Implementation = Literal["fused", "tcnn", "torch"]

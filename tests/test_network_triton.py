@@ -1,0 +1,111 @@
+"""The network's Triton kernels against torch, in Triton's interpreter; and compiled."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+import torch
+from ahead_of_time import ARCHITECTURES, compiled
+from interpreted import assert_near, in_interpreter
+from torch._subclasses.fake_tensor import FakeTensorMode
+
+from edge_depth_nerf.kernels import triton_back_end
+
+WIDTHS = ((32, 64, 16), (15, 64, 64, 3), (10, 16, 1))
+"""nerfacto's two networks of the field (without what a ray's points share), and a proposal network."""
+
+
+def layers(widths: tuple[int, ...], groups: int = 0) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+    weights = [torch.randn(out, width) / width**0.5 for width, out in itertools.pairwise(widths)]
+    biases = [torch.randn(len(weight)) for weight in weights]
+    if groups:
+        biases[0] = torch.randn(groups, widths[1])
+    return weights, biases
+
+
+def straight(x: torch.Tensor, weights: list[torch.Tensor], biases: list[torch.Tensor], half: bool) -> torch.Tensor:
+    """The network in float64; `half` rounds what enters a product to float16, as autocast does."""
+    for number, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+        rows = bias.repeat_interleave(len(x) // len(bias), 0) if bias.ndim == 2 else bias
+        x, weight = (each.half().double() if half else each.double() for each in (x, weight))
+        x = x @ weight.T + rows
+        x = x.clamp(min=0) if number < len(weights) - 1 else x
+    return x
+
+
+def check_values() -> None:
+    """Points that are no multiple of a program's, several programs, groups that begin within one."""
+    from edge_depth_nerf.kernels import network_triton
+
+    for widths, (points, groups) in zip(WIDTHS, ((1, 0), (310, 31), (64 * 5 + 7, 0)), strict=True):
+        torch.manual_seed(points)
+        weights, biases = layers(widths, groups)
+        x = torch.randn(points, widths[0] + 3)[:, 2:-1]
+        found = network_triton.network(x, weights, biases)
+        assert_near(found, straight(x, weights, biases, half=True), 5e-4)
+        assert_near(found, straight(x, weights, biases, half=False), 5e-3)
+
+
+def check_half_precision_empty_and_not_finite() -> None:
+    from edge_depth_nerf.kernels import network_triton
+
+    weights, biases = layers((10, 16, 1))
+    x = torch.randn(70, 10)
+    whole = network_triton.network(x, weights, biases)
+    assert torch.equal(network_triton.network(x.half(), weights, biases), whole)
+    x[5, 3], x[66, 0] = float("nan"), float("inf")
+    found = network_triton.network(x, weights, biases)
+    usable = x.isfinite().all(1)
+    # each point is its own
+    assert torch.equal(found[usable], whole[usable]) and found.dtype == torch.float32
+    assert network_triton.network(x[:0], weights, biases).shape == (0, 1)
+
+
+def check_what_it_serves() -> None:
+    from edge_depth_nerf.kernels import network_triton
+
+    served = [network_triton.fits(layers(widths)[0]) for widths in (*WIDTHS, (4, 2), (8, 64, 32, 3), (128, 64, 3))]
+    assert served == [True, True, True, False, False, False]
+
+
+@pytest.mark.slow
+def test_in_the_interpreter():
+    pytest.importorskip("triton")
+    in_interpreter(check_values, check_half_precision_empty_and_not_finite, check_what_it_serves)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("architecture", ARCHITECTURES)
+def test_compiled_without_spills(architecture, tmp_path):
+    kernels = pytest.importorskip("edge_depth_nerf.kernels.network_triton")
+
+    def step():
+        for widths, groups in zip(WIDTHS, (0, 4, 0), strict=True):
+            kernels.network(torch.rand(64, widths[0]), *layers(widths, groups))
+
+    found = compiled(step, architecture, tmp_path)
+    assert [kernel.name.split()[0] for kernel in found] == ["_forward_kernel"] * 3
+    assert {kernel.spilled for kernel in found} == {0}
+    # tensor cores do the products
+    assert all(any("MMA" in name for name in kernel.instructions) for kernel in found)
+
+
+def test_it_is_off_unless_it_is_asked_for(monkeypatch):
+    """And serves what autocast would compute in float16 on CUDA."""
+    asked = []
+    monkeypatch.setattr(triton_back_end, "working", lambda *given: asked.append(given))
+    weights, _ = layers((32, 64, 16))
+    with FakeTensorMode():
+        x = torch.empty(4, 32, device="cuda")
+    monkeypatch.setattr(torch, "get_autocast_dtype", lambda _: torch.float16)
+    ways = ((None, True, True, 0), ("torch", True, True, 0), ("triton", False, True, 0), ("triton", True, False, 0))
+    for chosen, half, without_gradient, expected in (*ways, ("triton", True, True, 1)):
+        monkeypatch.setenv(triton_back_end.NETWORK, chosen or "")
+        monkeypatch.setattr(torch, "is_autocast_enabled", lambda _, half=half: half)
+        with torch.set_grad_enabled(not without_gradient):
+            assert triton_back_end.of_network(x, weights) is None
+        assert len(asked) == expected
+    with torch.no_grad():
+        assert triton_back_end.of_network(torch.empty(4, 32), weights) is None
+    assert [module for module, *_ in asked] == ["network_triton"]
