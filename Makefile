@@ -5,10 +5,11 @@ VENV ?= .venv
 SCRIPTS := $(if $(filter Windows_NT,$(OS)),Scripts,bin)
 BIN := $(VENV)/$(SCRIPTS)
 
-.PHONY: help setup demo real test test-fast test-pure coverage fuzz audit lint format docs dist check-dist version notes clean
+.PHONY: help setup demo real gpu test test-fast test-pure coverage fuzz audit lint format docs dist check-dist version notes clean
 help:
 	@echo "make demo        synthesise a drive, train with and without the depth prior, compare (outputs/demo/)"
 	@echo "make real        all methods on a real drive, with three seeds (REAL=its folder; some hours)"
+	@echo "make gpu         what a GPU makes of it: tests, kernels, steps, a training (outputs/gpu/report.md; ten minutes)"
 	@echo "make test-fast   tests of what needs no nerfstudio and a smoke run of the plugin, in a minute and a half"
 	@echo "make test        run all tests, in a quarter of an hour"
 	@echo "make test-pure   tests of the modules that need no nerfstudio, under NumPy 2"
@@ -36,6 +37,10 @@ demo: setup
 real: setup
 	@test -n "$(REAL)" || { echo "Give the folder with the real drive: make real REAL=FOLDER"; exit 2; }
 	$(BIN)/python benchmarks/real_drive.py --real "$(REAL)" --output outputs/real_drive
+
+# In parts of at most three minutes; called again it does what is missing. GPU=--fake goes the same way without a GPU.
+gpu: setup
+	$(BIN)/python benchmarks/gpu.py $(GPU)
 
 # In a folder of their own, which is removed if they pass; of those that fail it can be looked at.
 in_a_folder = folder=$$(mktemp -d) && if $(BIN)/pytest --basetemp=$$folder/tests $(1); then rm -rf $$folder; else \

@@ -8,8 +8,10 @@ is taken between neighbouring runs, so that what else the machine does hits both
 repeats. Wall time is the median; CPU time counts all threads. "with positions" has the gradient to the positions
 besides the table's. Backward's results are compared before it is timed: largest difference by the largest value.
 
-On CUDA (Triton) events on the device are timed, and the traffic that cannot be avoided (positions, features or their
-gradient once, eight corners a level, read, or read and written) is set against the time: GB/s.
+On CUDA (Triton) the sizes are those of the full preset's step, as smaller ones time the host's launches, and each form
+is timed by `triton.testing.do_bench`, which repeats it and empties the device's cache in between. The traffic that
+cannot be avoided (positions, features or their gradient once, eight corners a level, read, or read and written) is set
+against the time: GB/s.
 """
 
 from __future__ import annotations
@@ -37,6 +39,12 @@ SIZES = {
     "proposal": (5, 17, 65536, 128),
     "field, nerfacto": (16, 19, 49152, 2048),
 }
+SIZES_ON_CUDA = {
+    "field, full": (16, 19, 4096 * 48 + 4096 + 16384, 2048),
+    "proposal 0, full": (5, 17, 4096 * 256, 128),
+    "proposal 1, full": (5, 17, 4096 * 96, 256),
+}
+"""A step of the full preset: 4,096 rays, in the field with the sky behind them and 16,384 surface pixels."""
 
 
 def make_points(count: int, *, along_rays: bool) -> Tensor:
@@ -49,32 +57,49 @@ def make_points(count: int, *, along_rays: bool) -> Tensor:
     return (starts + places * (ends - starts)).view(-1, 3)
 
 
-def clock(work: Callable[[], object], device: str) -> tuple[float, float]:
-    """Seconds of wall (on CUDA: of the device) and of CPU."""
-    start_cpu = time.process_time()
-    if device == "cpu":
-        start = time.perf_counter()
-        work()
-        return time.perf_counter() - start, time.process_time() - start_cpu
-    first, last = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-    first.record()
+def clock(work: Callable[[], object]) -> tuple[float, float]:
+    """Seconds of wall and of CPU."""
+    start, start_cpu = time.perf_counter(), time.process_time()
     work()
-    last.record()
-    torch.cuda.synchronize()
-    return first.elapsed_time(last) / 1000, time.process_time() - start_cpu
+    return time.perf_counter() - start, time.process_time() - start_cpu
+
+
+def on_the_device(encoding: HashEncoding, x: Tensor, gradient: Tensor) -> dict[str, tuple[float, float]]:
+    """Clock the parts of one step on CUDA, launched over and over; the host's seconds are not the form's."""
+    from triton.testing import do_bench
+
+    encoded = encoding(x)
+    milliseconds = {
+        "forward": do_bench(lambda: encoding(x), return_mode="median"),
+        "backward": do_bench(
+            lambda: encoded.backward(gradient, retain_graph=True),
+            grad_to_none=[encoding.hash_table, x],
+            return_mode="median",
+        ),
+    }
+    times = {part: (taken / 1e3, 0.0) for part, taken in milliseconds.items()}
+    return {**times, "both": (sum(milliseconds.values()) / 1e3, 0.0)}
+
+
+def moved_bytes(points: int, features: int) -> dict[str, int]:
+    """What the parts of a step cannot but read and write; `features` of all levels together, float32."""
+    corners, once = 8 * points * features * 4, 4 * points * (3 + features)
+    return {"forward": once + corners, "backward": once + 2 * corners, "both": 2 * once + 3 * corners}
 
 
 def one_run(
     encoding: HashEncoding, x: Tensor, gradient: Tensor, device: str, pause_s: float
 ) -> dict[str, tuple[float, float]]:
     """Clock the parts of one step."""
+    if device != "cpu":
+        return on_the_device(encoding, x, gradient)
     encoded = [torch.empty(0)]
     time.sleep(pause_s)
 
     def forward() -> None:
         encoded[0] = encoding(x)
 
-    times = {"forward": clock(forward, device), "backward": clock(lambda: encoded[0].backward(gradient), device)}
+    times = {"forward": clock(forward), "backward": clock(lambda: encoded[0].backward(gradient))}
     encoding.hash_table.grad = None
     x.grad = None
     wall, cpu = zip(*times.values(), strict=True)
@@ -105,7 +130,7 @@ def measure(
     size: str, device: str, threads: int, repeat: int, *, along_rays: bool, of_positions: bool, pause_s: float = PAUSE_S
 ) -> list[dict]:
     """Run the two forms in turn; a dictionary for forward, backward and both."""
-    levels, log2_rows, count, finest = SIZES[size]
+    levels, log2_rows, count, finest = (SIZES | SIZES_ON_CUDA)[size]
     torch.manual_seed(0)
     torch.set_num_threads(threads)
     host = HashEncoding(num_levels=levels, log2_hashmap_size=log2_rows, max_res=finest, implementation="torch").to(
@@ -123,10 +148,7 @@ def measure(
         torch_cpu, fused_cpu = ([pair[form][part][1] for pair in runs] for form in (0, 1))
         ratios = quartiles([a / b for a, b in zip(torch_wall, fused_wall, strict=True)])
         seconds = statistics.median(fused_wall)
-        features = host.get_out_dim()
-        corners = 8 * levels * count * 2 * 4
-        once = 4 * count * (3 + features)
-        moved = {"forward": once + corners, "backward": once + 2 * corners, "both": 2 * once + 3 * corners}[part]
+        moved = moved_bytes(count, host.get_out_dim())[part]
         rows.append(
             {
                 "size": size,
@@ -170,14 +192,14 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|---|")
     rows = []
     for device in arguments.device:
-        for size in SIZES:
+        for size in SIZES if device == "cpu" else SIZES_ON_CUDA:
             for threads in arguments.threads if device == "cpu" else [1]:
                 for along_rays, of_positions in ((True, False), (True, True), (False, False)):
                     found = measure(
                         size,
                         device,
                         threads,
-                        arguments.repeat,
+                        arguments.repeat if device == "cpu" else 3,
                         along_rays=along_rays,
                         of_positions=of_positions,
                         pause_s=arguments.pause,

@@ -258,7 +258,7 @@ class temporary:
 def parts(work: Path) -> dict[str, Callable[[], Any]]:
     """What is measured, by name."""
     sample = HERE.parent / "data" / "sample_drive"
-    every = [*speed.HOST, *speed.OURS]
+    every = speed.ON_EVERY_MACHINE
     return {
         "encoding": encodings,
         "lite": lambda: speed.race(speed.configurations("lite", sample, every), 5, 10, 1 << 16),

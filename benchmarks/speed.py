@@ -4,7 +4,8 @@
 
 Four trainers with the same sizes (levels, table, samples, rays, chunk; pose refinement off) on the same scene:
 nerfstudio's nerfacto and depth-nerfacto with its own DataManager and its torch implementation, and ours with the torch
-implementation and with the one that `auto` takes. (nerfstudio's nerfacto would read ahead in other processes, which
+implementation and with its fused kernels. On a GPU also, if asked for, nerfacto and ours with tiny-cuda-nn, and
+splatfacto, whose step is a picture. (nerfstudio's nerfacto would read ahead in other processes, which
 two cores do not have; VanillaDataManager, its other one, is used for both.) Each round, every trainer makes the same
 number of whole training iterations (batch, forward, losses, backward, optimisers, schedulers) in turn, at steps spread
 over the whole schedule, since proposal networks are trained less often later. A held-out view, or as many of its rows
@@ -47,8 +48,14 @@ from edge_depth_nerf.plugin import config as ours
 from edge_depth_nerf.plugin.compat import lpips_not_built
 
 PRESETS: dict[str, Any] = {"lite": ours.edge_depth_nerf_lite, "full": ours.edge_depth_nerf}
-HOST = {"nerfacto": NerfactoModelConfig, "depth-nerfacto": DepthNerfactoModelConfig}
-OURS = {"ours, torch": "torch", "ours": "auto"}
+HOST = {
+    "nerfacto": (NerfactoModelConfig, "torch"),
+    "depth-nerfacto": (DepthNerfactoModelConfig, "torch"),
+    "nerfacto, tiny-cuda-nn": (NerfactoModelConfig, "tcnn"),
+}
+OURS = {"ours, torch": "torch", "ours": "fused", "ours, tiny-cuda-nn": "tcnn"}
+SPLATS = "splatfacto"
+ON_EVERY_MACHINE = ("nerfacto", "depth-nerfacto", "ours, torch", "ours")
 REFERENCE = "nerfacto"
 
 
@@ -153,16 +160,22 @@ def configurations(
             found[name] = copy.deepcopy(base)
             found[name].pipeline.model.implementation = OURS[name]
             continue
+        if name == SPLATS:
+            found[name] = config = copy.deepcopy(method_configs[SPLATS])
+            config.pipeline.datamanager.dataparser = NerfstudioDataParserConfig(data=scene, load_3D_points=True)
+            config.max_num_iterations = base.max_num_iterations
+            continue
         config: Any = copy.deepcopy(method_configs["depth-nerfacto"])
         shared = {
             field.name: copy.deepcopy(getattr(base.pipeline.model, field.name))
             for field in dataclasses.fields(NerfactoModelConfig)
             if field.name not in ("_target", "implementation")
         }
-        config.pipeline.model = HOST[name](**shared, implementation="torch")
+        model, implementation = HOST[name]
+        config.pipeline.model = model(**shared, implementation=implementation)
         data = config.pipeline.datamanager
         data.dataparser = NerfstudioDataParserConfig(data=scene, depth_unit_scale_factor=1 / 256)
-        if name == "nerfacto":
+        if model is NerfactoModelConfig:
             data._target = VanillaDataManager[InputDataset]
         data.train_num_rays_per_batch = base.pipeline.datamanager.train_num_rays_per_batch
         config.mixed_precision = base.mixed_precision
@@ -180,8 +193,16 @@ def seconds(work: Callable[[], Any]) -> float:
     return time.perf_counter() - started
 
 
-def race(configs: dict[str, Any], rounds: int, steps: int, view_rays: int = 0) -> dict[str, Any]:
+def race(
+    configs: dict[str, Any],
+    rounds: int,
+    steps: int,
+    view_rays: int = 0,
+    contestant_of: Callable[[TrainerConfig], Contestant] = Contestant,
+) -> dict[str, Any]:
     """Let trainers of these configurations take turns.
+
+    On a GPU the allocator and what is compiled settle in tens of steps; on a CPU three are enough.
 
     Returns:
         Of each: rays_per_second (median), seconds of a step and of the rows of a view in each round, and the
@@ -194,10 +215,10 @@ def race(configs: dict[str, Any], rounds: int, steps: int, view_rays: int = 0) -
     contestants = {}
     for name, config in configs.items():  # one after the other: the first writes what all find in the cache
         CONSOLE.print(f"Building {name}")
-        contestants[name] = Contestant(config)
+        contestants[name] = contestant_of(config)
         contestants[name].wait()
     for contestant in contestants.values():  # kernels are compiled, memory is there
-        contestant.ask("iterate", range(3))
+        contestant.ask("iterate", range(50 if torch.cuda.is_available() else 3))
     for number in range(rounds):
         chosen = spread[number * steps : (number + 1) * steps]
         for contestant in contestants.values():
@@ -251,7 +272,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", type=Path, default=Path("data/sample_drive"))
     parser.add_argument("--preset", nargs="+", default=["lite"], choices=list(PRESETS))
-    parser.add_argument("--contestants", nargs="+", default=[*HOST, *OURS], choices=[*HOST, *OURS])
+    parser.add_argument("--contestants", nargs="+", default=ON_EVERY_MACHINE, choices=[*HOST, *OURS, SPLATS])
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--steps", type=int, default=10)
     parser.add_argument("--view-rays", type=int, default=1 << 16, help="at most so many are rendered; 0 for none")

@@ -1,0 +1,359 @@
+"""The parts of `benchmarks/gpu.py`: what each measures on a GPU, as a dictionary for JSON.
+
+Each runs with `Settings` that say whether it is meant: without a GPU (`fake`) sizes are tiny, everything is on the CPU,
+and the figures mean nothing; what runs is the same code.
+"""
+
+from __future__ import annotations
+
+import copy
+import importlib.util
+import math
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+
+HERE = Path(__file__).resolve().parent
+TESTS = HERE.parent / "tests"
+TRAINED_STEPS = 500
+EQUAL_STEPS = 40
+"""So many steps are made on the CPU as well: each takes about a second."""
+PROFILED_STEPS = 20
+LAUNCHES = ("cudaLaunchKernel", "cudaLaunchKernelExC", "cuLaunchKernel", "cuLaunchKernelEx", "cudaGraphLaunch")
+WAITS = ("cudaStreamSynchronize", "cudaDeviceSynchronize", "cudaEventSynchronize", "cudaMemcpy")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a part is to measure."""
+
+    scene: Path
+    folder: Path
+    """For what is written on the way."""
+    fake: bool = False
+
+    @property
+    def device(self) -> str:
+        """Where it runs."""
+        return "cpu" if self.fake else "cuda"
+
+    def adjust(self, config: Any) -> None:
+        """Keep the scene as it is; make what is trained tiny, where it is not meant."""
+        config.pipeline.datamanager.cache_dir = self.folder / "cache"
+        if self.fake:
+            shrink(config)
+
+
+@dataclass(frozen=True)
+class Part:
+    """A measurement with a limit of its own."""
+
+    run: Callable[[Settings], dict[str, Any]]
+    limit_s: int
+
+
+def synchronise() -> None:
+    """Wait for a GPU, where there is one."""
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+
+
+def milliseconds(work: Callable[[], object], settings: Settings) -> float:
+    """Median of many runs on the device, whose cache is emptied in between."""
+    if settings.fake:
+        started = time.perf_counter()
+        work()
+        return 1e3 * (time.perf_counter() - started)
+    from triton.testing import do_bench
+
+    return float(do_bench(work, return_mode="median"))
+
+
+# ---- the device and its kernels -----------------------------------------------------------------------------------
+
+
+def device(settings: Settings) -> dict[str, Any]:
+    """What it is, and how many bytes a second it copies."""
+    import triton
+    from speed import machine
+
+    x = torch.empty(1 << (16 if settings.fake else 28), device=settings.device)
+    taken_ms = milliseconds(lambda: x.clone(), settings)
+    about: dict[str, Any] = {**machine(), "triton": triton.__version__, "cuda": torch.version.cuda}
+    if not settings.fake:
+        properties = torch.cuda.get_device_properties(0)
+        about |= {
+            "memory_gb": properties.total_memory / 1e9,
+            "capability": f"{properties.major}.{properties.minor}",
+            "multiprocessors": properties.multi_processor_count,
+        }
+    return {**about, "copied_gb_s": 2 * x.numel() * x.element_size() / taken_ms / 1e6}
+
+
+def gpu_tests(settings: Settings) -> dict[str, Any]:
+    """The tests that a machine without a GPU skips, by number."""
+    files = [TESTS / "test_grad_scaler.py"]
+    if not settings.fake:
+        marked = "cuda.is_available"
+        files = [path for path in sorted(TESTS.glob("test_*.py")) if marked in path.read_text(encoding="utf-8")]
+    command = [sys.executable, "-m", "pytest", *map(str, files), "-n", "0", "-p", "no:cacheprovider"]
+    command += [f"--basetemp={settings.folder / 'tests'}"]
+    command += [] if settings.fake else ["-k", "gpu or cuda or triton"]
+    done = subprocess.run(command, cwd=HERE.parent, capture_output=True, text=True)
+    last = done.stdout.strip().rpartition("\n")[2]
+    counts = {what: int(number) for number, what in re.findall(r"(\d+) (passed|failed|skipped|error)", last)}
+    return {"counts": counts, "said": done.stdout[-4000:] if done.returncode else ""}
+
+
+def kernels(settings: Settings) -> dict[str, Any]:
+    """The hash grid's kernels: beside the CPU's numbers, and timed at the sizes of a full step."""
+    from encoding import SIZES, SIZES_ON_CUDA, make_points, moved_bytes
+    from nerfstudio.field_components.encodings import HashEncoding
+
+    from edge_depth_nerf.kernels import hash_grid_numba as on_cpu
+    from edge_depth_nerf.kernels.hash_grid import back_end
+
+    work = back_end(torch.device(settings.device))
+    if work is None:
+        raise RuntimeError("Triton's kernels do not work on this GPU; the warning above says why")
+    rows = []
+    for name, (levels, log2_rows, count, finest) in (SIZES if settings.fake else SIZES_ON_CUDA).items():
+        if settings.fake:
+            count, log2_rows = 320, 8
+        torch.manual_seed(0)
+        grid = HashEncoding(num_levels=levels, log2_hashmap_size=log2_rows, max_res=finest, implementation="torch")
+        table, scalings, features = grid.hash_table.detach(), grid.scalings.float(), grid.get_out_dim()
+        moved = moved_bytes(count, features)
+        for along_rays in (True, False):
+            x, gradient = make_points(count, along_rays=along_rays), torch.randn(count, features)
+            calls: dict[str, tuple[Sequence[Any], int]] = {
+                "encode": ((x, table, scalings), moved["forward"]),
+                "table_gradient": ((x, gradient, scalings, len(table)), moved["backward"]),
+                "position_gradient": ((x, table, gradient, scalings), moved["forward"]),
+            }
+            for kernel, (arguments, size) in calls.items():
+                there = [each.to(settings.device) if isinstance(each, torch.Tensor) else each for each in arguments]
+                expected, found = getattr(on_cpu, kernel)(*arguments), getattr(work, kernel)(*there).cpu()
+                off = float((found - expected).abs().max() / expected.abs().max())
+                taken_ms = milliseconds(lambda k=kernel, a=there: getattr(work, k)(*a), settings)
+                rows.append(
+                    {
+                        "size": name,
+                        "points": count,
+                        "along_rays": along_rays,
+                        "kernel": kernel,
+                        "ms": taken_ms,
+                        "gb_s": size / taken_ms / 1e6,
+                        "off_the_cpu": off,
+                    }
+                )
+    return {"rows": rows}
+
+
+def counts(settings: Settings) -> dict[str, Any]:
+    """What a step would ask for, counted on fake tensors, as the tests do."""
+    import gpu_counts
+
+    if reason := gpu_counts.why_not():
+        return {"left_out": reason}
+    cases = ["lite"] if settings.fake else ["full", "full, proposals rest", "full, torch"]
+    return gpu_counts.in_a_process(cases, settings.scene, settings.folder / "counts")
+
+
+# ---- steps --------------------------------------------------------------------------------------------------------
+
+
+def configuration(settings: Settings) -> Any:
+    """The full preset on the scene."""
+    from edge_depth_nerf.plugin import config as methods
+
+    config: Any = copy.deepcopy(methods.edge_depth_nerf.config)
+    config.pipeline.datamanager.data = config.pipeline.datamanager.dataparser.data = settings.scene
+    config.machine.device_type, config.vis = settings.device, "tensorboard"
+    settings.adjust(config)
+    return config
+
+
+def shrink(config: Any) -> None:
+    """Make what is trained tiny."""
+    model, data = config.pipeline.model, config.pipeline.datamanager
+    model.num_levels, model.log2_hashmap_size = 2, 8
+    model.proposal_net_args_list = [{**each, "log2_hashmap_size": 8} for each in model.proposal_net_args_list]
+    model.num_proposal_samples_per_ray, model.num_nerf_samples_per_ray = (8, 8), 8
+    data.train_num_rays_per_batch, data.eval_num_rays_per_batch = 64, 64
+    if hasattr(data, "surface_rays_per_batch"):
+        data.surface_rays_per_batch = 64
+
+
+class Here:
+    """A contestant of `speed.race` in this process, which leaves its folder to tensorboard's thread."""
+
+    def __init__(self, config: Any, folder: Path) -> None:
+        from speed import Runner
+
+        self._runner = Runner(config, folder)
+        self.step_s: list[float] = []
+        self.render_s: list[float] = []
+        self.rendered_px = (0, 0)
+
+    def wait(self) -> None:
+        """It is ready."""
+
+    def ask(self, name: str, argument: Any) -> Any:
+        """Let it do one thing."""
+        return getattr(self._runner, name)(argument)
+
+    def stop(self) -> None:
+        """Forget it."""
+        del self._runner
+
+
+def raced(settings: Settings, names: Sequence[str]) -> dict[str, Any]:
+    """Milliseconds of a step of several trainers, in turn."""
+    import speed
+
+    rounds, steps = (1, 1) if settings.fake else (5, 100)
+    every = list(dict.fromkeys((speed.REFERENCE, *names)))
+    configs = speed.configurations("full", settings.scene, every, settings.adjust)
+    of: Any = partial(Here, folder=settings.folder / "race") if settings.fake else speed.Contestant
+    found = speed.race(configs, rounds, steps, contestant_of=of)
+    return {
+        name: {
+            "rays_per_second": None if name == speed.SPLATS else result["rays_per_second"],
+            "step_ms": [1e3 * each for each in result["step_s"]],
+            "ratio_to_nerfacto": result["step_ratio"],
+        }
+        for name, result in found.items()
+    }
+
+
+def our_steps(settings: Settings) -> dict[str, Any]:
+    """Ours, fused and in torch, beside nerfstudio's nerfacto."""
+    return raced(settings, ["ours"] if settings.fake else ["ours", "ours, torch"])
+
+
+def other_steps(settings: Settings) -> dict[str, Any]:
+    """depth-nerfacto; tiny-cuda-nn's nerfacto and ours where it is installed, splatfacto where gsplat works."""
+    from nerfstudio.utils.external import TCNN_EXISTS
+
+    names = ["depth-nerfacto"]
+    left_out = {}
+    if TCNN_EXISTS and not settings.fake:
+        names += ["nerfacto, tiny-cuda-nn", "ours, tiny-cuda-nn"]
+    else:
+        left_out["tiny-cuda-nn"] = "not installed"
+    found = {} if settings.fake else raced(settings, names)
+    if settings.fake or importlib.util.find_spec("gsplat") is None:
+        left_out["splatfacto"] = "gsplat is not installed, or there is no GPU"
+    else:
+        try:  # gsplat compiles at its first call
+            found |= {name: each for name, each in raced(settings, ["splatfacto"]).items() if name == "splatfacto"}
+        except Exception as error:
+            left_out["splatfacto"] = f"{type(error).__name__}: {error}"[:500]
+    return {**found, "left_out": left_out}
+
+
+def profile(settings: Settings) -> dict[str, Any]:
+    """Launches and waiting as the driver sees them, seconds of host and device, memory; of a step of ours."""
+    from speed import Runner
+    from torch.profiler import ProfilerActivity
+
+    runner = Runner(configuration(settings), settings.folder / "profile")
+    first = 20_000
+    steps = range(first, first + (1 if settings.fake else PROFILED_STEPS))
+    runner.iterate(steps)
+    started = time.perf_counter()
+    for step in steps:
+        runner._iterate(step)
+    host_s = time.perf_counter() - started
+    synchronise()
+    both_s = time.perf_counter() - started
+    activities = [ProfilerActivity.CPU] + [ProfilerActivity.CUDA] * (not settings.fake)
+    with torch.profiler.profile(activities=activities) as profiler:
+        for step in steps:
+            runner._iterate(step)
+        synchronise()
+    events = profiler.key_averages()
+
+    def calls(names: Sequence[str]) -> float:
+        return sum(event.count for event in events if event.key in names) / len(steps)
+
+    on_device = [event for event in events if event.device_type == torch.autograd.DeviceType.CUDA]
+    on_device.sort(key=lambda event: -event.self_device_time_total)
+    memory = {}
+    if not settings.fake:
+        memory = {"allocated_gb": torch.cuda.max_memory_allocated() / 1e9}
+        memory["reserved_gb"] = torch.cuda.max_memory_reserved() / 1e9
+    return {
+        "steps": len(steps),
+        "host_ms": 1e3 * host_s / len(steps),
+        "step_ms": 1e3 * both_s / len(steps),
+        "device_ms": sum(event.self_device_time_total for event in on_device) / len(steps) / 1e3,
+        "launches": calls(LAUNCHES),
+        "copies": calls(("cudaMemcpyAsync", "cudaMemcpy")),
+        # the profiler waits once itself, at the end
+        "waits": max(0.0, calls(WAITS) - 1 / len(steps)),
+        **memory,
+        "slowest": [
+            {"kernel": event.key[:120], "ms": event.self_device_time_total / len(steps) / 1e3, "calls": event.count}
+            for event in on_device[:15]
+        ],
+    }
+
+
+# ---- trainings ----------------------------------------------------------------------------------------------------
+
+
+def trained(settings: Settings, steps: int, device_type: str) -> dict[str, Any]:
+    """Train as `ns-train` does once it has read its arguments, and judge as `ns-eval` does."""
+    from nerfstudio.scripts.train import main
+    from nerfstudio.utils.eval_utils import eval_setup
+
+    config = configuration(settings)
+    config.machine.device_type, config.max_num_iterations = device_type, steps
+    config.output_dir, config.experiment_name = settings.folder / "trained", f"{device_type}_{steps}"
+    config.timestamp = f"{time.time():.0f}"
+    config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = 0
+    started = time.perf_counter()
+    main(config)
+    synchronise()
+    taken_s = time.perf_counter() - started
+    _, pipeline, _, _ = eval_setup(config.get_base_dir() / "config.yml")
+    with torch.no_grad():
+        figures = pipeline.get_average_eval_image_metrics()
+    kept = {name: float(value) for name, value in figures.items() if math.isfinite(float(value))}
+    return {"steps": steps, "seconds_with_start": taken_s, "figures": kept}
+
+
+def training(settings: Settings) -> dict[str, Any]:
+    """A training of some hundred steps, from start to figures."""
+    return trained(settings, 2 if settings.fake else TRAINED_STEPS, settings.device)
+
+
+def beside_the_cpu(settings: Settings) -> dict[str, Any]:
+    """The same steps on GPU and CPU, from the same seed: figures that should agree."""
+    if settings.fake:
+        return {"left_out": "there is no GPU"}
+    return {kind: trained(settings, EQUAL_STEPS, kind) for kind in ("cuda", "cpu")}
+
+
+PARTS = {
+    "device": Part(device, 60),
+    "counts": Part(counts, 120),
+    "tests": Part(gpu_tests, 180),
+    "kernels": Part(kernels, 120),
+    "our steps": Part(our_steps, 180),
+    "other steps": Part(other_steps, 180),
+    "profile": Part(profile, 120),
+    "training": Part(training, 180),
+    "beside the CPU": Part(beside_the_cpu, 180),
+}
+"""In the order of what is missed most if time runs out."""
