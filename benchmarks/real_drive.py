@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from edge_depth_nerf.base.files import read_image, read_json, write_json, write_png, write_text
 from edge_depth_nerf.base.pictures import DISTANCE, colour_bar, lay_out, panel
 from edge_depth_nerf.compare.command import RUNS
-from edge_depth_nerf.compare.methods import METHODS
+from edge_depth_nerf.compare.methods import EXTRAS_TITLES, GRID, LOSS_TITLES, METHODS, PRIOR_TITLES
 from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.results import Results, RunResult, read_results
 from edge_depth_nerf.compare.specification import VIEWS
@@ -173,11 +173,11 @@ def margins(results: Results, scene: str) -> Iterator[str]:
 def cells_table(results: Results, cells: Results, scene: str) -> Iterator[str]:
     """Methods that differ in prior, loss or extras alone, all with the first seed, as Markdown."""
     yield from heading(COLUMNS)
-    for method in METHODS:
-        if method in CELLS or method in ("nerfacto", "ds-nerf", "edge"):
-            run = (cells if method in CELLS else results).run(scene, method, results.seeds()[0])
-            if run is not None:
-                yield row(METHODS[method].title, [run], COLUMNS)
+    for cell, method in sorted(GRID.items(), key=lambda item: (item[0].extras, item[0].prior or "", item[0].loss)):
+        run = (cells if method in CELLS else results).run(scene, method, results.seeds()[0])
+        if run is not None:
+            prior = [PRIOR_TITLES[cell.prior]] if cell.prior else []
+            yield row(", ".join([LOSS_TITLES[cell.loss], *prior, EXTRAS_TITLES[cell.extras]]), [run], COLUMNS)
 
 
 def page(results: Results, longer: Mapping[str, Results], cells: Results) -> str:

@@ -256,9 +256,9 @@ def test_the_real_drives_table_and_margins(benchmark_module, tmp_path):
     assert page.count("\n## ") == 4 and page.rstrip().splitlines()[-1].startswith("| DS-NeRF loss | 20.20 ± 0.28 |")
     cells = Results([fake("kitti360_half", "ds-nerf-extras", 0, masked_psnr=20.3, cpu_seconds=110.0)])
     assert [line.split(" | ")[:2] for line in real.cells_table(Results(half), cells, "kitti360_half")][2:] == [
-        ["| nerfacto", "19.00"],
-        ["| DS-NeRF loss", "20.00"],
-        ["| ours", "20.50"],
+        ["| no depth loss, without extras", "19.00"],
+        ["| DS-NeRF loss, LiDAR, without extras", "20.00"],
+        ["| edge loss, integrated, with extras", "20.50"],
         ["| DS-NeRF loss, LiDAR, with extras", "20.30"],
     ]
     found = list(real.margins(results, "drive"))
