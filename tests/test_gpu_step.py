@@ -16,8 +16,8 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parent.parent
 
 MOST_KERNELS = {
-    "full": 641,
-    "full, proposals rest": 566,
+    "full": 593,
+    "full, proposals rest": 518,
     "full, poses": 1001,
     "lite": 560,
     "paper": 483,
