@@ -253,7 +253,7 @@ def check_that_trying_out_runs_each_kernel() -> None:
         triton_launch,
     )
 
-    modules = contraction_triton, edge_loss_triton, hash_grid_triton, network_triton, ray_triton
+    modules: tuple[Any, ...] = contraction_triton, edge_loss_triton, hash_grid_triton, network_triton, ray_triton
     for module in modules:
         launched = set()
 
