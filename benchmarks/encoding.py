@@ -24,6 +24,7 @@ import statistics
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 from nerfstudio.field_components.encodings import HashEncoding
@@ -69,7 +70,7 @@ def on_the_device(encoding: HashEncoding, x: Tensor, gradient: Tensor) -> dict[s
     from triton.testing import do_bench
 
     encoded = encoding(x)
-    milliseconds = {
+    milliseconds: dict[str, Any] = {
         "forward": do_bench(lambda: encoding(x), return_mode="median"),
         "backward": do_bench(
             lambda: encoded.backward(gradient, retain_graph=True),

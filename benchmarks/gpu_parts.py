@@ -74,7 +74,8 @@ def milliseconds(work: Callable[[], object], settings: Settings) -> float:
         return 1e3 * (time.perf_counter() - started)
     from triton.testing import do_bench
 
-    return float(do_bench(work, return_mode="median"))
+    taken: Any = do_bench(work, return_mode="median")
+    return float(taken)
 
 
 # ---- the device and its kernels -----------------------------------------------------------------------------------
@@ -328,7 +329,7 @@ def trained(settings: Settings, steps: int, device_type: str) -> dict[str, Any]:
     taken_s = time.perf_counter() - started
     _, pipeline, _, _ = eval_setup(config.get_base_dir() / "config.yml")
     with torch.no_grad():
-        figures = pipeline.get_average_eval_image_metrics()
+        figures: Any = pipeline.get_average_eval_image_metrics()
     kept = {name: float(value) for name, value in figures.items() if math.isfinite(float(value))}
     return {"steps": steps, "seconds_with_start": taken_s, "figures": kept}
 

@@ -96,8 +96,7 @@ def test_further_pixels_come_for_the_surface_where_the_prior_is_good(tmp_path):
 
 def test_on_a_gpu_a_batch_is_the_same_with_all_further_pixels_and_which_are_of_use(tmp_path, monkeypatch):
     scene = write_scene(tmp_path)
-    options = {"train_num_rays_per_batch": 100, "surface_rays_per_batch": 400}
-    data, other = manager(scene, **options), manager(scene, **options)
+    data, other = (manager(scene, train_num_rays_per_batch=100, surface_rays_per_batch=400) for _ in range(2))
     for name in ("train_pixel_sampler", "_surface_sampler"):
         getattr(other, name)._first = getattr(data, name)._first
     # half of the pixels are too vague

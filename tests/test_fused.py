@@ -169,6 +169,7 @@ def test_the_first_samples_lie_where_nerfstudio_puts_them_on_a_gpu_too(training,
     for place in (UniformLinDispPiecewiseSampler(single_jitter=single_jitter).train(training), sampler.placed):
         torch.manual_seed(2)
         samples = place(rays, 30)
+        assert samples.spacing_to_euclidean_fn is not None
         again = samples.spacing_to_euclidean_fn(torch.linspace(0, 1, 7))
         found.append((edges_of(samples), samples.frustums.starts, samples.frustums.ends, samples.deltas, again))
     for expected, placed in zip(*found, strict=True):
