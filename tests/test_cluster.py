@@ -266,7 +266,7 @@ def test_a_training_has_a_gpu_for_itself(tmp_path: Path, monkeypatch: pytest.Mon
                 with pytest.raises(InputError, match=pattern), on_cluster(address, tasks, [tmp_path], QUIET):
                     pass
 
-            with pytest.raises(InputError, match=r"worker \S+ \(tcp://.*\): does not see /nowhere/at/all.*shared"):
+            with pytest.raises(InputError, match=r"worker \S+ \(tcp://.*\): does not have /nowhere/at/all.*shared"):
                 with on_cluster(address, tasks, [Path("/nowhere/at/all")], QUIET):
                     pass
             other = tmp_path / "other" / "torch-9.9.dist-info"

@@ -74,7 +74,7 @@ def test_it_leaves_figures_and_a_picture(finished):
     # one of distances, of three pictures 220 px wide
     assert picture.shape == (34 + 6 * 226 - 6 + 40, 3 * 226 - 6, 3), "with the scale of distances below"
     page = (options.output / "report.html").read_text(encoding="utf-8")
-    assert "<h1>Demo: nerfacto and ours on a rendered street</h1>" in page and "13 moments, 64 px, 8 steps each" in page
+    assert "<h1>Demo: nerfacto and ours on a rendered street</h1>" in page and "13 frames, 64 px, 8 steps each" in page
     assert "Table 1</i> Rivals" in page and "All 4 held-out views" in page
     for name, form in SHOWN.items():
         assert f">{results['figures']['ours'][name]:{form}}</td>" in page
