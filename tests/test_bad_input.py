@@ -174,9 +174,9 @@ FOUND: dict[str, tuple[str, str, str | bytes, str]] = {
         "s/r/figures.json",
         '{"run": {"scene": "s", "preset": "lite", "method": ["x"], "seed": 0}, "named": [], "configuration": {}, '
         '"figures": {}, "curve": [], "steps": 1}',
-        "is not of this form",
+        "is not a run of this version",
     ),
-    "figures that are none": ("figures", "s/r/figures.json", "[]", "no JSON object"),
+    "figures that are none": ("figures", "s/r/figures.json", "[]", "does not contain a JSON object"),
     "aliases that multiply": ("kitti yaml", "a.yaml", "a: &a [x]\n" + "b: [*a,*a]\n" * 9, "occurs twice|without"),
 }
 """What fuzzing and reading the code found, each mended: reader, name of the file, content, message."""

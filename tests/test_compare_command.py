@@ -111,7 +111,7 @@ def test_a_folder_keeps_what_its_runs_share(tmp_path, monkeypatch):
             command.compare(replace(first, steps=6), QUIET)
     meta = read_json(scene / "transforms.json")
     write_json(scene / "transforms.json", {**meta, "processed": "anew"})
-    with pytest.raises(InputError, match="begun with scene_sha256"):
+    with pytest.raises(InputError, match="started with scene_sha256"):
         command.compare(first, QUIET)
 
 

@@ -79,7 +79,7 @@ def test_the_page_shows_what_is_there(finished):
         assert f"Table {made.label}</i> {html.escape(made.title)}</span>" in page
         for row in made.rows:
             assert all(f">{html.escape(cell.text())}</td>" in page for cell in row.cells)
-    assert "2 of 2 held-out views" in page and page.count('"distance-error": "data:image/webp') == 2 * 2
+    assert "All 2 held-out views." in page and page.count('"distance-error": "data:image/webp') == 2 * 2
     assert page.count("data:image/svg+xml;base64,") == 2 * 4
     (command_line,) = results.options["commands"]
     assert command_line.startswith("edge-depth-nerf compare /") and f"<code>{command_line}</code>" in page

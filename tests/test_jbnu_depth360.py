@@ -155,7 +155,7 @@ def test_what_stands_in_the_file_is_taken(published: Path) -> None:
         (lambda root: (root.parents[1] / "calibration.toml").unlink(), r"calibration\.toml: no such file"),
         (
             lambda root: (root.parents[1] / "poses.txt").write_text("1 0 0 0 0 0 0 1"),
-            r"poses\.txt: 1 pose, expected two",
+            r"poses\.txt: 1 pose, expected at least two",
         ),
         (
             lambda root: (root.parents[1] / "calibration.toml").write_text("cameras = 3"),

@@ -568,8 +568,8 @@ def test_points_that_are_none_are_counted(drive: RoomDrive, tmp_path: Path) -> N
     write_points(drive.sweep(1), points)
     report = process(drive, tmp_path / "scene")
     # once a sweep, though both cameras read it
-    assert any(notice.startswith("5 LiDAR points left out of 3 sweeps: NaN") for notice in report.notices)
-    assert any(notice.startswith("7 LiDAR points left out of 3 sweeps: zero") for notice in report.notices)
+    assert any(notice.startswith("5 LiDAR points were left out of 3 sweeps: NaN") for notice in report.notices)
+    assert any(notice.startswith("7 LiDAR points were left out of 3 sweeps: zero") for notice in report.notices)
 
 
 # ---- choosing frames -------------------------------------------------------------------------------------------
@@ -1034,7 +1034,7 @@ def test_report_says_how_well_the_cameras_fit(drive: RoomDrive, tmp_path: Path) 
     report = process(drive, tmp_path / "scene", console=console)
     text = console.export_text()
     for name in CAMERAS:
-        assert f"{name}: nerfstudio's camera fits within {report.fits[name].rms_px:.4f} px rms" in text
+        assert f"{name}: the camera model for nerfstudio fits within {report.fits[name].rms_px:.4f} px rms" in text
     assert "6 training pictures, 0 held out" in text
     assert "No frame is held out" in text
     assert json.loads((tmp_path / "scene/process.json").read_text())["kind"] == "kitti360"

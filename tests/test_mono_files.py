@@ -215,7 +215,7 @@ def test_a_map_without_a_distance_is_named_and_nothing_is_written(scene, tmp_pat
     np.save(maps / "images/0005.npy", np.full((44, 48), fill))
     before = (scene / "transforms.json").read_bytes()
     name = "0005" if which == "one" else "0000"
-    with pytest.raises(InputError, match=rf"{name}.npy: holds no positive number, only zeros, negative .*NaN"):
+    with pytest.raises(InputError, match=rf"{name}.npy: contains no positive number, only zeros, negative .*NaN"):
         take(scene, maps)
     assert (scene / "transforms.json").read_bytes() == before
     assert not list(scene.glob("mono*")) and not list(scene.glob(".mono*"))
@@ -288,7 +288,7 @@ def test_broken_pngs_are_named_before_any_work(scene, tmp_path):
 def test_missing_and_double_maps_are_named(scene, tmp_path):
     maps = write_maps(scene, tmp_path / "maps", lambda p, d, c: d)
     write_distance_png(maps / "images/0001.png", np.ones((44, 48)))
-    with pytest.raises(InputError, match=r"0001.npy: there is 0001.png as well"):
+    with pytest.raises(InputError, match=r"0001.npy: 0001.png exists as well"):
         take(scene, maps)
     (maps / "images/0001.png").unlink()
     (maps / "images/0001.npy").unlink()

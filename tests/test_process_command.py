@@ -196,7 +196,7 @@ def test_maps_put_in_over_those_of_the_drive_stay_with_their_source(tmp_path: Pa
     assert read_json(scene / "transforms.json")["mono"] == {"trained_on": "elsewhere"}
     # one file renewed: all are the drive's again, none is mixed in
     next(mono.rglob("0000000002.png")).touch()
-    assert "are left out" in run(options)
+    assert "of this scene are removed" in run(options)
     assert distances(scene) == {9.0} and "mono" not in read_json(scene / "transforms.json")
 
 
@@ -221,11 +221,11 @@ def test_a_map_that_is_lost_is_made_again(room: RoomDrive, tmp_path: Path) -> No
     run(options_of(room, scene))
     next((scene / "mono").rglob("*.png")).unlink()
     said = run(options_of(room, scene))
-    assert "are left out" in said and "is trained already" in said
+    assert "of this scene are removed" in said and "is trained already" in said
     assert read_scene(scene).has("mono") and (scene / TRUST_FILE).is_file()
 
 
 def test_other_weights_for_a_scene_that_has_maps(room: RoomDrive, tmp_path: Path) -> None:
     run(options_of(room, tmp_path / "scene"))
     other = (tmp_path / "scene" / WEIGHTS).rename(tmp_path / "other.safetensors")
-    assert "they stay" in run(options_of(room, tmp_path / "scene", mono_model=other))
+    assert "which are kept" in run(options_of(room, tmp_path / "scene", mono_model=other))

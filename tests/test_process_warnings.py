@@ -237,7 +237,7 @@ def test_neither_lidar_nor_depth_is_said(mine: Path, drive: Path, mono: bool) ->
         edit(mine, lambda text: re.sub(r"\[cameras\.(\w+)\]\n", r'[cameras.\1]\nmono = "mono/\1"\n', text))
     report, said = run(mine)
     (notice,) = [one for one in report.notices if "neither LiDAR nor depth maps" in one]
-    assert ("monocular alone" if mono else "plain nerfacto") in notice and notice in said
+    assert ("monocular maps only" if mono else "plain nerfacto") in notice and notice in said
 
 
 # ---- exposure ----------------------------------------------------------------------------------------------------

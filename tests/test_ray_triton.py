@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from types import ModuleType
 from typing import Any
 
@@ -215,12 +216,13 @@ def test_a_kernel_that_fails_is_left_to_torch(monkeypatch):
         raise RuntimeError("no compiler")
 
     contents = {"whole": {"try_out": lambda _: tried.append("whole")}, "broken": {"try_out": fail}}
-    modules = {f"edge_depth_nerf.kernels.{name}": module_with(name, **each) for name, each in contents.items()}
-    monkeypatch.setattr(triton_back_end, "import_module", modules.__getitem__)
+    modules = {name: module_with(name, **each) for name, each in contents.items()}
+    for name in modules:
+        monkeypatch.setitem(triton_back_end.MODULES, name, partial(modules.__getitem__, name))
     triton_back_end.working.cache_clear()
     device = torch.device("cuda")
     assert triton_back_end.working("whole", torch.device("cpu"), "sum") is None and not tried
-    assert triton_back_end.working("whole", device, "sum") is modules["edge_depth_nerf.kernels.whole"]
+    assert triton_back_end.working("whole", device, "sum") is modules["whole"]
     with pytest.warns(UserWarning, match="fused sum does not work on cuda .RuntimeError: no compiler"):
         assert triton_back_end.working("broken", device, "sum") is None
     assert triton_back_end.working("broken", device, "sum") is None

@@ -666,7 +666,7 @@ def test_a_scan_of_nan_is_an_error_when_it_is_read(mine: Path) -> None:
     # some NaN among the points are left out and counted
     path.write_bytes(head + b"DATA binary\n" + nothing * 7 + points[7 * len(nothing) :])
     report = convert(options(mine, sweeps=0), Console(quiet=True))
-    assert any(notice.startswith("7 LiDAR points left out") for notice in report.notices)
+    assert any(notice.startswith("7 LiDAR points were left out") for notice in report.notices)
 
 
 @pytest.mark.parametrize(

@@ -266,7 +266,7 @@ BROKEN = {
         lambda f: ply(f / "a.ply", "binary_little_endian", b"", MAX_POINTS + 1),
         "5000001 points, expected at most 5000000",
     ),
-    "big promise": (lambda f: ply(f / "a.ply", "ascii", lines(), MAX_POINTS), "cannot hold the 5000000 lines"),
+    "big promise": (lambda f: ply(f / "a.ply", "ascii", lines(), MAX_POINTS), "cannot hold the declared 5000000 lines"),
     "negative": (lambda f: pcd(f / "a.pcd", "binary", b"", points=-3), "negative count"),
     "pcd without z": (lambda f: pcd(f / "a.pcd", "ascii", lines(), "x y h intensity t"), "has no column z"),
     "pcd of another kind": (

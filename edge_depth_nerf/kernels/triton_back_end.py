@@ -9,12 +9,22 @@ from __future__ import annotations
 import functools
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from types import ModuleType
 
 import torch
 from torch import Tensor
+
+MODULES: dict[str, Callable[[], ModuleType]] = {
+    # imported when they are asked for, because Triton takes half a second to load
+    "contraction_triton": lambda: import_module("edge_depth_nerf.kernels.contraction_triton"),
+    "edge_loss_triton": lambda: import_module("edge_depth_nerf.kernels.edge_loss_triton"),
+    "hash_grid_triton": lambda: import_module("edge_depth_nerf.kernels.hash_grid_triton"),
+    "network_triton": lambda: import_module("edge_depth_nerf.kernels.network_triton"),
+    "ray_triton": lambda: import_module("edge_depth_nerf.kernels.ray_triton"),
+}
+"""The modules of kernels by their names."""
 
 
 @functools.lru_cache
@@ -32,8 +42,7 @@ def working(module: str, device: torch.device, what: str) -> ModuleType | None:
     if device.type != "cuda":
         return None
     try:
-        # imported here, because Triton takes half a second to load
-        kernels = import_module(f"edge_depth_nerf.kernels.{module}")
+        kernels = MODULES[module]()
         kernels.try_out(device)
     except Exception as error:  # whatever keeps Triton from working here
         warnings.warn(
