@@ -26,7 +26,7 @@ def inputs(levels: int, features: int, count: int) -> tuple[torch.Tensor, ...]:
         : count - count // 2
     ]
     x[3 * count // 4 :] = 0
-    scalings = torch.tensor([4.0, 16.0, 23.0, 64.0, 300.0])[:levels]
+    scalings = torch.tensor([4.0, 16.0, 23.0, 64.0, 2000.0])[:levels]
     return x, torch.randn(levels * 256, features), scalings, torch.randn(count, levels * features)
 
 

@@ -145,13 +145,19 @@ def test_a_run_that_was_stopped_goes_on_where_it_was(
     np.testing.assert_array_equal(motion_maps(scene), motion_maps(ball))
 
 
-def test_a_damaged_sweep_is_made_anew(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = write_ball_scene(tmp_path)
+def stopped_after_its_sweeps(scene: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of the sweeps of a run that was stopped before it confirmed any."""
     with monkeypatch.context() as patch:
         patch.setattr(Motion, "confirm", lambda *_: pytest.fail("stopped"))
         with pytest.raises(pytest.fail.Exception):
             add(scene)
     (made,) = (scene / ".cache" / "motion").iterdir()
+    return made
+
+
+def test_a_damaged_sweep_is_made_anew(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = write_ball_scene(tmp_path)
+    made = stopped_after_its_sweeps(scene, monkeypatch)
     whole = (made / "000001.npz").read_bytes()
     (made / "000001.npz").write_bytes(whole[:-100])
     sweep, swept = Motion.sweep, []
@@ -163,11 +169,7 @@ def test_a_damaged_sweep_is_made_anew(ball: Path, tmp_path: Path, monkeypatch: p
 
 def test_sweeps_of_other_pictures_are_not_taken(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = write_ball_scene(tmp_path)
-    with monkeypatch.context() as patch:
-        patch.setattr(Motion, "confirm", lambda *_: pytest.fail("stopped"))
-        with pytest.raises(pytest.fail.Exception):
-            add(scene)
-    (made,) = (scene / ".cache" / "motion").iterdir()
+    made = stopped_after_its_sweeps(scene, monkeypatch)
     assert len(list(made.iterdir())) == len(STEPS_M) - 1
     (scene / "images" / "0001.png").write_bytes((scene / "images" / "0000.png").read_bytes())
     add(scene)
