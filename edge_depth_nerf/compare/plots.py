@@ -19,7 +19,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from edge_depth_nerf.base.files import write_bytes
 from edge_depth_nerf.base.pictures import add_legend_below
-from edge_depth_nerf.compare.methods import METHODS, Loss
+from edge_depth_nerf.compare.methods import METHODS
 from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.results import Results, RunResult
 from edge_depth_nerf.compare.tables import CLOCKS, clock_metric, curve_metric
@@ -38,14 +38,6 @@ STYLES: dict[MethodName, tuple[str, str, str, str]] = {
     "edge-paper": ("#3a86ff", "#70a9ff", "-.", "X"),
     "edge": ("#d62828", "#ff625c", "-", "o"),
 }
-LOSS_STYLES: dict[Loss, tuple[str, str]] = {
-    "none": ("#888888", "#9aa3ad"),
-    "urban-nerf": ("#b08030", "#d9a94a"),
-    "urban-nerf-los": ("#7a5195", "#b493cc"),
-    "ds-nerf": ("#444444", "#d5dae0"),
-    "edge": ("#d62828", "#ff625c"),
-}
-"""On white, on dark: of the methods that the grid alone has."""
 BINS = {"by_angle_deg": "angle from the optical axis, degrees", "by_distance_m": "distance, m"}
 PSNR_LABEL = "PSNR, dB"
 DISTANCE_ERRORS = ("truth_abs_rel", "lidar_abs_rel")
@@ -119,7 +111,11 @@ def style_of(method: MethodName) -> tuple[str, str, str, str]:
     cell = METHODS[method].cell
     if method in STYLES or cell is None:
         return STYLES[method]
-    return *LOSS_STYLES[cell.loss], "-" if cell.extras else "--", "D" if cell.prior == "integrated" else "v"
+    return (
+        *STYLES["nerfacto" if cell.loss == "none" else cell.loss][:2],
+        "-" if cell.extras else "--",
+        "D" if cell.prior == "integrated" else "v",
+    )
 
 
 def _draw(axis: Axes, method: MethodName, line: Line, dark: bool) -> None:
