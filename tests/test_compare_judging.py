@@ -22,7 +22,8 @@ def test_judging_leaves_no_trace_in_a_training(tmp_path):
     pipeline.datamanager.train_pixel_sampler.set_num_rays_per_batch(32)
     start = deepcopy(pipeline.state_dict())
     chosen = choose_pixels(pipeline.datamanager.eval_dataset)
-    ends, figures = [], []
+    trained_on = choose_pixels(pipeline.datamanager.train_dataset)
+    ends, figures, of_trained = [], [], []
     for judged in (False, True):
         pipeline.load_state_dict(start)
         pipeline.datamanager.train_pixel_sampler._drawn = pipeline.datamanager._surface_sampler._drawn = 0
@@ -40,11 +41,24 @@ def test_judging_leaves_no_trace_in_a_training(tmp_path):
             optimisers.optimizer_step_all()
             if judged and step in (11, 12, 13):
                 figures.append(judge_pixels(pipeline, chosen))
+                of_trained.append(judge_pixels(pipeline, trained_on, trained_on=True))
                 assert pipeline.model.training
         ends.append(deepcopy(pipeline.state_dict()))
     assert all(torch.equal(ends[0][name], ends[1][name]) for name in ends[0])
     assert {"psnr", "truth_psnr", "lidar_abs_rel", "truth_abs_rel"} <= set(figures[0])
     assert figures[0] != figures[-1]
+    assert of_trained[0]["psnr"] != figures[0]["psnr"] and of_trained[0] != of_trained[-1]
+
+
+def test_pixels_of_a_few_views_are_spread_evenly(tmp_path):
+    pipeline, _ = build(write_scene(tmp_path))
+    dataset = pipeline.datamanager.train_dataset
+    every = [int(view.indices[0, 0]) for view in choose_pixels(dataset, per_view=2)]
+    assert every == [*range(len(dataset))]
+    few = choose_pixels(dataset, most=6, most_views=2)
+    chosen = [int(view.indices[0, 0]) for view in few]
+    assert len(few) == 2 and [len(view.indices) for view in few] == [3, 3]
+    assert chosen == [len(dataset) // 4, 3 * len(dataset) // 4]
 
 
 def test_the_pixels_are_always_the_same_and_inside_the_mask(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import html
 import json
+import math
 import re
 import shutil
 import subprocess
@@ -66,6 +67,7 @@ def test_it_leaves_figures_tables_and_pictures(finished):
         assert all(any(f"stroke: {colour}" in style for style in styles) for colour in ("#888888", "#d62828"))
     for run in results.runs:
         assert [point["step"] for point in run.curve][-1] == 12
+        assert all(math.isfinite(point["trained_psnr"]) for point in run.curve)
         seconds = [point["seconds"] for point in run.curve]
         assert seconds == sorted(seconds) and seconds[0] > 0
         assert sum(entry["pixels"] for entry in run.content["by_angle_deg"]) > 1000

@@ -29,6 +29,8 @@ from edge_depth_nerf.scene.format import read_transforms
 PIXELS_PER_VIEW = 3000
 MOST_PIXELS = 20_000
 """Over all views; so many take about a second on one core."""
+MOST_TRAINED_VIEWS, MOST_TRAINED_PIXELS = 10, 10_000
+"""Of training pictures, whose PSNR says how much has been learned at all."""
 COLOURS = {"psnr": "image", "truth_psnr": "truth_rgb"}
 DISTANCES = {"lidar": "lidar_distance_m", "truth": "truth_distance_m"}
 
@@ -64,7 +66,7 @@ class JudgedView:
 
 @dataclass(frozen=True, eq=False)
 class ChosenPixels:
-    """Some pixels of a held-out view with what they are judged by."""
+    """Some pixels of a view with what they are judged by."""
 
     indices: Tensor
     """n×3: picture, row, column."""
@@ -73,13 +75,25 @@ class ChosenPixels:
 
 
 def choose_pixels(
-    dataset: FisheyeDepthDataset, per_view: int = PIXELS_PER_VIEW, most: int = MOST_PIXELS
+    dataset: FisheyeDepthDataset,
+    per_view: int = PIXELS_PER_VIEW,
+    most: int = MOST_PIXELS,
+    most_views: int | None = None,
 ) -> list[ChosenPixels]:
-    """Choose random pixels inside the mask of every held-out view; always the same ones."""
+    """Choose random pixels inside the masks of a split's views; always the same ones.
+
+    Args:
+        dataset: the split.
+        per_view: at most so many of a view.
+        most: at most so many of all.
+        most_views: at most so many views, spread evenly; None: every view.
+
+    """
     generator = torch.Generator().manual_seed(0)
-    per_view = max(1, min(per_view, most // len(dataset)))
+    count = len(dataset) if most_views is None else min(len(dataset), most_views)
+    per_view = max(1, min(per_view, most // count))
     chosen = []
-    for view in range(len(dataset)):
+    for view in (len(dataset) * (2 * number + 1) // (2 * count) for number in range(count)):
         item = dataset[view]
         at = item["mask"][..., 0].nonzero()
         at = at[torch.randperm(len(at), generator=generator)[:per_view]]
@@ -120,23 +134,32 @@ def judge_beams(pipeline: Any, most: int = MOST_PIXELS) -> dict[str, float]:
     return errors.compute("beams_")
 
 
-def judge_pixels(pipeline: Any, chosen: list[ChosenPixels]) -> dict[str, float]:
-    """Judge the pixels of all views.
+def judge_pixels(pipeline: Any, chosen: list[ChosenPixels], trained_on: bool = False) -> dict[str, float]:
+    """Judge chosen pixels.
+
+    Args:
+        pipeline: that trains, or has trained.
+        chosen: the pixels.
+        trained_on: whether they are of training pictures, not of held-out ones. Their poses are those that training
+            has now; the colours are neutral, without the pictures' exposures.
 
     Returns:
         psnr and, where it is known, truth_psnr against the picture without noise: means over views, dB; and the
         depth errors against LiDAR and truth, pooled over pixels.
 
     """
-    model = pipeline.model
+    model, manager = pipeline.model, pipeline.datamanager
+    generator = manager.train_ray_generator if trained_on else manager.eval_ray_generator
     psnr: dict[str, list[float]] = {name: [] for name in COLOURS}
     errors = {name: DepthErrors() for name in DISTANCES}
     with evaluated(model):
         for view in chosen:
-            parts = [
-                model(pipeline.datamanager.eval_ray_generator(part.to(model.device)))
-                for part in view.indices.split(model.config.eval_num_rays_per_chunk)
-            ]
+            parts = []
+            for part in view.indices.split(model.config.eval_num_rays_per_chunk):
+                rays = generator(part.to(model.device))
+                if trained_on:
+                    model.camera_optimizer.apply_to_raybundle(rays)
+                parts.append(model(rays))
             rgb = torch.cat([part["rgb"] for part in parts]).cpu().clamp(0, 1)
             distance_m = torch.cat([part["depth"][:, 0] for part in parts]).cpu() * model.metres_per_unit
             for name, key in COLOURS.items():

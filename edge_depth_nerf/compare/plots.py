@@ -143,8 +143,11 @@ def _runs(results: Results, scene: str) -> dict[MethodName, list[RunResult]]:
 
 
 def _curves(results: Results, scenes: Sequence[str], title: str, key: str, label: str) -> Plot:
-    """Plot how far held-out pixels are right in the course of the training, a column for each drive."""
+    """Plot how far held-out and trained-on pixels are right in the course of the training, a column for each drive."""
     rows = [(curve_metric(results), "PSNR of held-out pixels, dB")]
+    # runs of versions before 0.1 have none
+    if all(f"trained_{rows[0][0]}" in run.curve[-1] for run in results.runs):
+        rows.append((f"trained_{rows[0][0]}", "PSNR of trained-on pixels, dB"))
     known = (name for name in DISTANCE_ERRORS if all(name in run.curve[-1] for run in results.runs))
     rows += [(name, "AbsRel of held-out pixels") for name in [*known][:1]]
 

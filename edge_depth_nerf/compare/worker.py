@@ -25,7 +25,16 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import explain, read_json_object, write_json
 from edge_depth_nerf.base.one_writer import only_writer
 from edge_depth_nerf.compare.configuration import configuration, described, setting_of
-from edge_depth_nerf.compare.judging import ViewJudge, choose_pixels, judge_beams, judge_pixels, shifted_views
+from edge_depth_nerf.compare.judging import (
+    COLOURS,
+    MOST_TRAINED_PIXELS,
+    MOST_TRAINED_VIEWS,
+    ViewJudge,
+    choose_pixels,
+    judge_beams,
+    judge_pixels,
+    shifted_views,
+)
 from edge_depth_nerf.compare.protocol import departures
 from edge_depth_nerf.compare.specification import FIGURES, PROGRESS, SPECIFICATION, VIEWS, RunSpecification
 from edge_depth_nerf.jobs.runs import end_with_parent, steps_done
@@ -90,7 +99,9 @@ class MeasuredTrainer(EdgeDepthTrainer):
     def setup(self, test_mode: Literal["test", "val", "inference"] = "test") -> None:
         """Set up as nerfstudio does, and go on from what was measured before."""
         super().setup(test_mode)
-        self._pixels = choose_pixels(self.pipeline.datamanager.eval_dataset)  # pyright: ignore[reportArgumentType]
+        manager: Any = self.pipeline.datamanager
+        self._pixels = choose_pixels(manager.eval_dataset)
+        self._trained_on = choose_pixels(manager.train_dataset, most=MOST_TRAINED_PIXELS, most_views=MOST_TRAINED_VIEWS)
         if self._start_step:
             measured = read_json_object(self.progress_path, "times", "curve")
             try:
@@ -127,6 +138,8 @@ class MeasuredTrainer(EdgeDepthTrainer):
         if steps in self._judged_at:
             with self.clock.stopped():
                 figures = judge_pixels(self.pipeline, self._pixels)
+                trained_on = judge_pixels(self.pipeline, self._trained_on, trained_on=True)
+                figures |= {f"trained_{name}": value for name, value in trained_on.items() if name in COLOURS}
                 self.curve.append({"step": float(steps), **self.clock.passed, **figures})
         self.on_step(steps)
 
