@@ -1,6 +1,6 @@
 """The figures of all runs of a comparison in one small file, and a comparison's folder made of it again.
 
-    python benchmarks/kept_runs.py keep comparison benchmarks/comparison.json.xz
+    python benchmarks/kept_runs.py keep benchmarks/comparison.json.xz comparison
     python benchmarks/kept_runs.py lay benchmarks/comparison.json.xz comparison --scenes scenes
 
 What was laid out is in the tables of the next `edge-depth-nerf compare … --output comparison`, which does not train it
@@ -22,23 +22,29 @@ from edge_depth_nerf.compare.results import Results, RunResult
 from edge_depth_nerf.compare.specification import FIGURES, OF_A_RUN, SPECIFICATION
 
 
-def keep(comparison: Path, file: Path) -> int:
+def keep(file: Path, *comparisons: Path) -> int:
     """Gather the figures of all finished runs; the scenes' folders are left out, their names stay.
+
+    What was gathered of several comparisons can make tables, but cannot be laid out.
 
     Returns:
         How many.
 
     """
     runs = {}
-    for path in sorted(comparison.glob(f"{RUNS}/*/*/{FIGURES}")):
-        figures = read_json_object(path)
-        figures["run"]["scene"] = Path(figures["run"]["scene"]).name
-        # paths of this machine are among them
-        for name in OF_A_RUN:
-            figures["configuration"].pop(name, None)
-        runs[path.parent.relative_to(comparison / RUNS).as_posix()] = figures
+    for comparison in comparisons:
+        for path in sorted(comparison.glob(f"{RUNS}/*/*/{FIGURES}")):
+            figures = read_json_object(path)
+            figures["run"]["scene"] = Path(figures["run"]["scene"]).name
+            # paths of this machine are among them
+            for name in OF_A_RUN:
+                figures["configuration"].pop(name, None)
+            key = path.parent.relative_to(comparison / RUNS).as_posix()
+            runs[key if len(comparisons) == 1 else f"{comparison.name}/{key}"] = figures
+    record_path = comparisons[0] / RECORD
     # benchmarks/equal_seconds.py leaves none
-    record = {**read_json_object(comparison / RECORD), "commands": []} if (comparison / RECORD).exists() else None
+    of_one = len(comparisons) == 1 and record_path.exists()
+    record = {**read_json_object(record_path), "commands": []} if of_one else None
     text = json.dumps({"record": record, "runs": runs}, separators=(",", ":"))
     write_bytes(file, lzma.compress(text.encode(), preset=9 | lzma.PRESET_EXTREME))
     return len(runs)
@@ -89,15 +95,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
     keeping = commands.add_parser("keep")
-    keeping.add_argument("comparison", type=Path)
     keeping.add_argument("file", type=Path)
+    keeping.add_argument("comparisons", type=Path, nargs="+")
     laying = commands.add_parser("lay")
     laying.add_argument("file", type=Path)
     laying.add_argument("comparison", type=Path)
     laying.add_argument("--scenes", type=Path, default=Path("scenes"))
     options = parser.parse_args()
     if options.command == "keep":
-        print(f"{keep(options.comparison, options.file)} runs, {options.file.stat().st_size / 1024:.0f} KiB")
+        print(f"{keep(options.file, *options.comparisons)} runs, {options.file.stat().st_size / 1024:.0f} KiB")
     else:
         print(f"{lay(options.file, options.comparison, options.scenes)} runs")
 

@@ -9,7 +9,7 @@ sweeps. λ and σ are those that a search on a rendered drive found (tuned.json)
 on this drive. Then the rival with the best PSNR is trained once more, for as many steps as ours' processor seconds
 allow, its learning rates falling over these. Then, with the first seed, methods that differ from each other in prior,
 loss or extras alone. Last, each method with a depth loss is trained with other λ, one seed,
-half size: the curves. Writes table.md, table.json, lambda.png and views_SCENE.png. Stopped at any moment, the same
+half size: the curves. Writes table.md, table.json, lambda.svg and views_SCENE.png. Stopped at any moment, the same
 command goes on.
 """
 
@@ -77,6 +77,8 @@ COLUMNS = (
     Column("δ", "lidar_delta_1_25", ".3f", True),
     Column("beams' AbsRel", "beams_abs_rel", ".4f", False),
 )
+OVER_LAMBDA = (COLUMNS[0], COLUMNS[3])
+"""Picture and depth."""
 
 
 def ours(*words: object) -> None:
@@ -180,13 +182,27 @@ def cells_table(results: Results, cells: Results, scene: str) -> Iterator[str]:
             yield row(", ".join([LOSS_TITLES[cell.loss], *prior, EXTRAS_TITLES[cell.extras]]), [run], COLUMNS)
 
 
-def page(results: Results, longer: Mapping[str, Results], cells: Results) -> str:
+def lambda_table(curves: Sequence[RunResult]) -> Iterator[str]:
+    """PSNR and AbsRel of each method by λ, as Markdown."""
+    methods = [method for method in WITH_LAMBDA if any(run.method == method for run in curves)]
+    yield "| λ | " + " | ".join(METHODS[method].title for method in methods) + " |"
+    yield "|---" * (len(methods) + 1) + "|"
+    for weight in sorted({run.content["lambda"] for run in curves}):
+        cells = [f"{weight:g}"]
+        for method in methods:
+            found = [run.figures for run in curves if run.method == method and run.content["lambda"] == weight]
+            cells += [", ".join(f"{figures[each.metric]:{each.form}}" for each in OVER_LAMBDA) for figures in found]
+        yield "| " + " | ".join(cells) + " |"
+
+
+def page(results: Results, longer: Mapping[str, Results], cells: Results, curves: Sequence[RunResult] = ()) -> str:
     """All tables, as Markdown.
 
     Args:
         results: of as many steps each.
         longer: of the best rival in ours' seconds, by size.
         cells: of `CELLS`.
+        curves: with other λ.
 
     """
     parts = ["# A real drive, by all methods"]
@@ -202,22 +218,23 @@ def page(results: Results, longer: Mapping[str, Results], cells: Results) -> str
             parts.append(row(METHODS[runs[0].method].title, runs, COLUMNS))
         if scene in cells.scenes():
             parts += ["", f"## One change at a time: {scene}", "", *cells_table(results, cells, scene)]
+    if curves:
+        parts += ["", f"## PSNR and AbsRel over λ: {curves[0].scene}", "", *lambda_table(curves)]
     return "\n".join([*parts, ""])
 
 
-def draw_lambdas(found: dict[float, Results], path: Path) -> None:
+def draw_lambdas(curves: Sequence[RunResult], path: Path) -> None:
     """Draw picture and depth over λ."""
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
-    for axis, column in zip(axes, (COLUMNS[0], COLUMNS[3]), strict=True):
+    for axis, column in zip(axes, OVER_LAMBDA, strict=True):
         for method in WITH_LAMBDA:
             points = sorted(
-                (weight, run.figures[column.metric])
-                for weight, results in found.items()
-                for run in results.runs
-                if run.method == method
+                (run.content["lambda"], run.figures[column.metric]) for run in curves if run.method == method
             )
+            if not points:
+                continue
             axis.plot(*zip(*points, strict=True), marker="o", label=METHODS[method].title)
         axis.set(xscale="log", xlabel="λ", ylabel=column.title)
         axis.grid(alpha=0.3)
@@ -296,20 +313,22 @@ def main() -> None:
         given = write_cells_tuned(options.output / "cells.json")
         common = ("--tuned", given, "--output", cells, *jobs, *steps)
         ours("compare", scene, "--methods", *CELLS, "--seeds", options.seeds[0], *common)
-    write_text(options.output / "table.md", page(results, judged, read_results(cells / RUNS)))
+    of_cells = read_results(cells / RUNS)
+    write_text(options.output / "table.md", page(results, judged, of_cells))
     for scene in results.scenes():
         draw_views(results, scene, options.output / f"views_{scene}.png")
     write_json(options.output / "table.json", results.rows())
 
-    curves: dict[float, Results] = {}
+    curves: list[RunResult] = []
     for weight in options.lambdas:
         folder = options.output / f"lambda_{weight:g}"
         given = write_tuned(options.output / f"lambda_{weight:g}.json", weight)
         scene = scenes.get("half", next(iter(scenes.values())))
         common = ("--tuned", given, "--output", folder, *jobs, *curve_steps)
         ours("compare", scene, "--methods", *WITH_LAMBDA, *common)
-        curves[weight] = read_results(folder / RUNS)
-        draw_lambdas(curves, options.output / "lambda.png")
+        curves += read_results(folder / RUNS).runs
+        draw_lambdas(curves, options.output / "lambda.svg")
+        write_text(options.output / "table.md", page(results, judged, of_cells, curves))
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import importlib
 import json
@@ -112,7 +113,7 @@ def test_kept_runs_are_laid_out_again(benchmark_module, tmp_path):
     )
     write_json(folder / "compare.json", {"steps": 20, "commands": [f"edge-depth-nerf compare {scene}"]})
     file = tmp_path / "kept.json.xz"
-    assert kept.keep(folder, file) == 1
+    assert kept.keep(file, folder) == 1
     assert str(tmp_path) not in lzma.decompress(file.read_bytes()).decode()
 
     moved = tmp_path / "there"
@@ -133,7 +134,7 @@ def test_kept_runs_are_laid_out_again(benchmark_module, tmp_path):
     assert read_json(again / "runs/street/edge_seed-1/figures.json") == {"mine": 1}
     # without the record of a comparison
     (folder / "compare.json").unlink()
-    kept.keep(folder, file)
+    kept.keep(file, folder)
     assert kept.lay(file, tmp_path / "second", moved) == 1
     assert not (tmp_path / "second" / "compare.json").exists()
     # another scene is none
@@ -265,8 +266,20 @@ def test_the_real_drives_table_and_margins(benchmark_module, tmp_path):
     # by seed: 20.5 against 20.0, 20.3 against 20.4; AbsRel likewise, less is better
     assert found[0] == "* PSNR: +0.20 on average, ahead with 1 of 2 seeds."
     assert found[1].startswith("* AbsRel: +0.000") and "ahead with 1 of 2" in found[1]
-    real.draw_lambdas({0.01: results, 0.1: results}, tmp_path / "lambda.png")
-    assert (tmp_path / "lambda.png").stat().st_size > 5000
+    curves = [
+        dataclasses.replace(run, content={**run.content, "lambda": weight})
+        for weight in (0.1, 0.01)
+        for run in [
+            fake("kitti360_half", "edge", 0, masked_psnr=20 + weight, lidar_abs_rel=0.02),
+            fake("kitti360_half", "ds-nerf", 0, masked_psnr=19.0, lidar_abs_rel=0.03),
+        ]
+    ]
+    assert list(real.lambda_table(curves))[2:] == [
+        "| 0.01 | 19.00, 0.0300 | 20.01, 0.0200 |",
+        "| 0.1 | 19.00, 0.0300 | 20.10, 0.0200 |",
+    ]
+    real.draw_lambdas(curves, tmp_path / "lambda.svg")
+    assert (tmp_path / "lambda.svg").stat().st_size > 5000
 
 
 def test_the_real_drives_tables_are_those_of_its_runs(benchmark_module):
