@@ -54,11 +54,12 @@ def disturbed_drive(drive: Path, folder: Path, shift_m: float, turn_deg: float) 
     return folder
 
 
-def process(drive: Path, scene: Path, refine: bool = False) -> None:
+def process(drive: Path, scene: Path, downscale: int, refine: bool = False) -> None:
     """Make a scene of a drive, with its simulated monocular maps."""
     words = ("process", "kitti360", "--root", drive, "--sequence", SEQUENCE, "--output", scene)
     mono = drive / "simulated_mono" / SEQUENCE
-    command("edge-depth-nerf", *words, "--mono", mono, "--refine-poses" if refine else "--no-refine-poses")
+    refining = "--refine-poses" if refine else "--no-refine-poses"
+    command("edge-depth-nerf", *words, "--mono", mono, "--downscale", downscale, refining)
 
 
 def with_true_held_out(scene: Path, true: Path) -> None:
@@ -95,7 +96,8 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("outputs/poses"))
     parser.add_argument("--scene", default="street")
     parser.add_argument("--frames", type=int, default=24)
-    parser.add_argument("--size", type=int, default=350)
+    parser.add_argument("--size", type=int, default=700, help="of the recorded pictures, which poses are refined by")
+    parser.add_argument("--downscale", type=int, default=2, help="of the pictures that are trained on")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=int, default=2000)
     parser.add_argument("--shift-m", type=float, default=0.03)
@@ -110,10 +112,10 @@ def main() -> None:
         shutil.rmtree(other, ignore_errors=True)
         disturbed_drive(drive, other, options.shift_m, options.turn_deg)
         (other / "is_whole").touch()
-    process(drive, scenes["true"])
-    process(other, scenes["refined"], refine=True)
+    process(drive, scenes["true"], options.downscale)
+    process(other, scenes["refined"], options.downscale, refine=True)
     if not (scenes["disturbed"] / "held_out_is_true").is_file():
-        process(other, scenes["disturbed"])
+        process(other, scenes["disturbed"], options.downscale)
         with_true_held_out(scenes["disturbed"], scenes["true"])
         (scenes["disturbed"] / "held_out_is_true").touch()
     found: dict[tuple[str, str], dict[str, float]] = {}
