@@ -396,7 +396,7 @@ def test_the_last_whole_checkpoint_is_taken_up(short: Any, tmp_path: Path) -> No
         assert torch.equal(tensor, saved[name]), name
     for path in folder.glob("*.ckpt"):
         path.write_bytes(b"")
-    with pytest.raises(InputError, match=r"found 4 checkpoints, none of them whole; --load-dir takes"):
+    with pytest.raises(InputError, match=r"found 4 checkpoints, none of them complete; --load-dir takes"):
         trainer_of(short.config.data, tmp_path / "runs", load_dir=folder)
     with pytest.raises(InputError, match="found no checkpoint"):
         trainer_of(short.config.data, tmp_path / "runs", load_dir=tmp_path / "nowhere")
