@@ -16,6 +16,8 @@ from rich.console import Console
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json, write_bytes, write_json
+from edge_depth_nerf.demo.options import DemoOptions
+from edge_depth_nerf.jobs.runs import command_line
 from edge_depth_nerf.report.build import Commands, Facts, Report, build_report
 from edge_depth_nerf.report.views import Drive, ShownView, make_drives
 
@@ -64,7 +66,7 @@ def store(demo: Path, folder: Path = FOLDER) -> None:
         "note": drive.note,
         "options": {name.replace("_", " "): str(value) for name, value in options.items()},
         "versions": results["versions"],
-        "command": results["commands"][0],
+        "command": command_line(["edge-depth-nerf", "demo"], DemoOptions(**options)),
         "views": views,
     }
     write_json(folder / CONTENT, content)
