@@ -420,7 +420,8 @@ def test_the_site_needs_no_network(site):
     assert len(pages) > 15
     for page in pages:
         found = References(page)
-        assert len(found.loads) > 3, page
+        # the slider page contains all that it shows
+        assert len(found.loads) > 3 or page.name == "slider.html", page
         assert not [each for each in found.loads if is_elsewhere(each)], page
         assert not re.search(r"(url\(|@import)\s*['\"]?\s*(https?:)?//", found.styles), page
         # Material fetches its program for diagrams where there are any
@@ -439,8 +440,8 @@ def test_what_loads_elsewhere_is_noticed(tmp_path):
 
 
 def test_links_and_pictures_of_the_site_are_there(site):
-    # the links of 404.html are from the server's root
-    pages = [page for page in site.rglob("*.html") if page.name != "404.html"]
+    # the links of 404.html are from the server's root; the slider page has none
+    pages = [page for page in site.rglob("*.html") if page.name not in ("404.html", "slider.html")]
     assert len(pages) > 10
     for page in pages:
         found = References(page)
