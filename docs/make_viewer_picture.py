@@ -63,8 +63,9 @@ def take_picture(load_config: Path, output: Path) -> None:
             browser = playwright.chromium.launch(executable_path=chromium, args=ARGUMENTS)
             # where WebGL is slow, the page goes down to a fifth of the screen's resolution
             page = browser.new_page(viewport={"width": SIZE_PX[0], "height": SIZE_PX[1]}, device_scale_factor=3)
+            page.set_default_timeout(TIMEOUT_S * 1000)  # drawing by software keeps the page busy
             page.goto(f"http://127.0.0.1:{settings.websocket_port}")
-            page.wait_for_selector("text=Output type", timeout=TIMEOUT_S * 1000)
+            page.wait_for_selector("text=Output type")
             page.get_by_label("LiDAR points").click()
             page.mouse.move(10, 300)
             look_along_the_drive(viewer, dataset)
