@@ -3,8 +3,8 @@
 python docs/make_viewer_picture.py --load-config outputs/sample_drive/edge-depth-nerf-lite/DATE/config.yml
 
 The scene is copied without its `.cache`, so that what earlier trainings left there is not seen. It needs Chromium and
-Playwright (`pip install playwright`). What is seen depends on the training; the picture in the repository is of 300
-steps on the sample drive.
+Playwright (`pip install playwright`). What is seen depends on the training; the picture in the repository is of
+the demo behind docs/slider/ (12 frames, 400 steps).
 """
 
 from __future__ import annotations
@@ -63,8 +63,9 @@ def take_picture(load_config: Path, output: Path) -> None:
             browser = playwright.chromium.launch(executable_path=chromium, args=ARGUMENTS)
             # where WebGL is slow, the page goes down to a fifth of the screen's resolution
             page = browser.new_page(viewport={"width": SIZE_PX[0], "height": SIZE_PX[1]}, device_scale_factor=3)
+            page.set_default_timeout(TIMEOUT_S * 1000)  # drawing by software keeps the page busy
             page.goto(f"http://127.0.0.1:{settings.websocket_port}")
-            page.wait_for_selector("text=Output type", timeout=TIMEOUT_S * 1000)
+            page.wait_for_selector("text=Output type")
             page.get_by_label("LiDAR points").click()
             page.mouse.move(10, 300)
             look_along_the_drive(viewer, dataset)
@@ -92,7 +93,7 @@ def look_along_the_drive(viewer: Viewer, dataset: InputDataset) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Take the picture of docs/viewer.md.")
-    parser.add_argument("--load-config", type=Path, required=True, help="config.yml of a training of the sample drive")
+    parser.add_argument("--load-config", type=Path, required=True, help="config.yml of a training")
     parser.add_argument("--output", type=Path, default=ROOT / "docs" / "viewer.jpg", help="the picture")
     given = parser.parse_args()
     take_picture(given.load_config, given.output)

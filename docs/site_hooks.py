@@ -2,10 +2,13 @@
 
 In the site docs/ is the repository's root: `../data/README.md` in a page of docs/ becomes `data/README.md`, and what is
 linked is put there. So every link works in the repository and in the site.
+
+slider.html is a page of its own, made of the pictures in docs/slider/ (see slider_page.py).
 """
 
 from __future__ import annotations
 
+import importlib.util
 import re
 from pathlib import Path
 
@@ -16,6 +19,8 @@ from mkdocs.structure.pages import Page
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = ("data/README.md", "CONTRIBUTING.md", "CHANGELOG.md")
 """Pages of the site that lie elsewhere in the repository."""
+SLIDER = "slider.html"
+"""The page of pictures, beside results.html."""
 LINK = re.compile(r"(\]\()(?!https?:|mailto:|#)([^)#\s]+)")
 
 
@@ -52,7 +57,17 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         wanted |= dict.fromkeys(linked_files(page, (ROOT / page).read_text(encoding="utf-8")))
     for name in wanted:
         files.append(File.generated(config, name, abs_src_path=str(ROOT / name)))
+    files.append(File.generated(config, SLIDER, content=_slider_page()))
     return files
+
+
+def _slider_page() -> str:
+    """Build the page with docs/slider_page.py, which is no module of a package."""
+    specification = importlib.util.spec_from_file_location("slider_page", ROOT / "docs/slider_page.py")
+    assert specification and specification.loader
+    module = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(module)
+    return module.page()
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:

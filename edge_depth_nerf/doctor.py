@@ -256,7 +256,7 @@ def run_doctor(console: Console | None = None) -> int:
     if problems:
         console.print(f"\n[bold red]{len(problems)} to fix: {', '.join(problems)}[/bold red]")
     else:
-        console.print("\nNothing to mend.")
+        console.print("\nNothing to fix.")
     return 1 if problems else 0
 
 

@@ -372,7 +372,7 @@ def test_a_scene_that_changed_since_the_training_is_refused(trained, scene, tmp_
     outputs.save_dataparser_transform(tmp_path / "dataparser_transforms.json")
     write_camera_path(options, Console(quiet=True))
     other = write_scene(tmp_path / "other")
-    with pytest.raises(InputError, match="changed since the training"):
+    with pytest.raises(InputError, match="changed after the training"):
         write_camera_path(replace(options, scene=other), Console(quiet=True))
 
 
@@ -395,7 +395,7 @@ def test_a_dataparser_whose_transform_does_not_tell_is_refused(scene, tmp_path, 
         return outputs
 
     monkeypatch.setattr(FisheyeDepth, "_generate_dataparser_outputs", shifted)
-    with pytest.raises(InputError, match="cannot be placed"):
+    with pytest.raises(InputError, match="no path can be computed"):
         film(scene, tmp_path)
 
 
@@ -418,7 +418,7 @@ def test_a_camera_that_is_not_there(scene, tmp_path):
     ("options", "message"),
     [
         ({"scene": None}, "--load-config"),
-        ({"load_config": Path("c.yml"), "metres_per_unit": 3.0}, "Leave one of the two away"),
+        ({"load_config": Path("c.yml"), "metres_per_unit": 3.0}, "Leave out one of the two"),
         ({"width": 33}, "--width 33: expected an even number"),
         ({"height": 8}, "--height 8"),
         ({"camera": "equirectangular", "fov_deg": 90.0}, "whole sphere"),

@@ -25,7 +25,7 @@ def test_the_command_is_content_with_this_environment():
     program = Path(sys.executable).with_name("edge-depth-nerf")
     done = subprocess.run([program, "doctor"], capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "Nothing to mend" in done.stdout
+    assert "Nothing to fix" in done.stdout
     for what in (
         "Python",
         "PyTorch",

@@ -351,7 +351,7 @@ def test_no_checkpoint_with_a_parameter_that_is_not_finite(short: Any) -> None:
         whole = table.view(-1)[7].item()
         table.view(-1)[7] = math.inf
         try:
-            with pytest.raises(InputError, match=r"no longer finite after step 9.*step-000000003\.ckpt, is kept"):
+            with pytest.raises(InputError, match=r"not finite after step 9.*step-000000003\.ckpt, is kept"):
                 short.save_checkpoint(9)
         finally:
             table.view(-1)[7] = whole
@@ -396,7 +396,7 @@ def test_the_last_whole_checkpoint_is_taken_up(short: Any, tmp_path: Path) -> No
         assert torch.equal(tensor, saved[name]), name
     for path in folder.glob("*.ckpt"):
         path.write_bytes(b"")
-    with pytest.raises(InputError, match=r"found 4 checkpoints, none of them whole; --load-dir takes"):
+    with pytest.raises(InputError, match=r"found 4 checkpoints, none of them complete; --load-dir takes"):
         trainer_of(short.config.data, tmp_path / "runs", load_dir=folder)
     with pytest.raises(InputError, match="found no checkpoint"):
         trainer_of(short.config.data, tmp_path / "runs", load_dir=tmp_path / "nowhere")

@@ -138,10 +138,10 @@ def agreements(medians_px: Sequence[float]) -> list[Agreement]:
 @pytest.mark.parametrize(
     ("medians_px", "refined", "frames", "words"),
     [
-        ([0.6] * 9 + [math.nan], False, (), "lie 0.60 px from where the poses have their epipolar lines (median"),
-        ([0.2] * 9 + [1.3], False, (9, 10), "From frame 9 to 10 of left features lie 1.3 px"),
+        ([0.6] * 9 + [math.nan], False, (), "are 0.60 px from their epipolar lines (median"),
+        ([0.2] * 9 + [1.3], False, (9, 10), "From frame 9 to 10 of left features are 1.3 px"),
         ([0.2] * 8 + [2.0, 1.3], False, (8, 9, 10), "and at 1 more steps"),
-        ([0.6] * 9, True, (), "find them anew with --poses lidar or --poses colmap, and check the lens"),
+        ([0.6] * 9, True, (), "find new poses with --poses lidar or --poses colmap, and check the lens"),
     ],
 )
 def test_poses_that_disagree_with_the_pictures(drive, medians_px, refined, frames, words):
@@ -405,7 +405,7 @@ def one_without_mono(meta):
 
 
 POSES_AND_LISTS = [
-    (shift_from(5, 4.8), "gap", ("left",), (4, 5), "Frames 4 and 5 lie 5.3 m apart, 11 times the usual 0.5 m"),
+    (shift_from(5, 4.8), "gap", ("left",), (4, 5), "Frames 4 and 5 are 5.3 m apart, 11 times the usual 0.5 m"),
     (turn_from(9, 30), "turn", ("left",), (8, 9), "From frame 8 to 9 the camera turns by 30 degrees"),
     (late, "timestamps", ("left",), (7,), "do not increase at frame 7"),
     (badly_fitted, "fit", ("left",), (), "0.20 px rms"),
@@ -416,7 +416,7 @@ POSES_AND_LISTS = [
     (without("mono_file_path", "lidar_file_path", "frame"), "no_prior", (), (), "plain nerfacto"),
     (without("mask_path"), "no_mask", (), (), "--ego-mask"),
     (without("ply_file_path"), "no_points", (), (), "ply_file_path"),
-    (one_without_mono, "incomplete", (), (), "mono_file_path is given for 11 of 12 frames"),
+    (one_without_mono, "incomplete", (), (), "mono_file_path is given for 11 of 12 pictures"),
 ]
 
 
@@ -473,13 +473,13 @@ def other_shape(mono):
 
 
 CONTENTS = [
-    ("lidar", (6,), sparse, "lidar", (6,), "frame 6 of left where 50.00% is usual"),
-    ("images", (2, 3), lambda picture: picture // 3, "dark", (2, 3), "frames 2, 3 of left is dark, mean grey 33"),
+    ("lidar", (6,), sparse, "lidar", (6,), "frame 6 of left; 50.00% is usual"),
+    ("images", (2, 3), lambda picture: picture // 3, "dark", (2, 3), "frames 2, 3 of left is dark: mean grey 33"),
     ("images", (8,), lambda picture: picture * 2 + 30, "bright", (8,), "frame 8 of left is bright"),
     ("mono", tuple(range(12)), lambda mono: mono * 1.5, "mono_scale", (), "1.57 times LiDAR's in left"),
     ("mono", tuple(range(12)), other_shape, "mono_shape", (), "differ by 40% in left"),
     ("mono", (1,), lambda mono: mono / 2, "mono_scale", (1,), "0.52 times LiDAR's in frame 1 of left"),
-    ("lidar", tuple(range(12)), np.zeros_like, "lidar", (), "hold no return"),
+    ("lidar", tuple(range(12)), np.zeros_like, "lidar", (), "maps of left are empty"),
 ]
 
 
@@ -879,7 +879,7 @@ def test_the_top_view_is_to_scale(drive):
 def test_the_top_view_names_moments_with_a_sheet(drive):
     figure = top_view(read_scene(drive), None, [], shown=[1, 9])
     assert [text.get_text() for text in figure.axes[0].texts] == ["1", "9"]
-    assert "moment with a sheet" in {text.get_text() for text in figure.legends[0].get_texts()}
+    assert "frame with a sheet" in {text.get_text() for text in figure.legends[0].get_texts()}
 
 
 def test_the_legend_of_six_cameras_is_whole(drive):

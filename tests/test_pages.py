@@ -306,6 +306,23 @@ def test_the_pictures_are_current(tmp_path):
     assert sum(path.stat().st_size for path in committed) < 1 << 20
 
 
+def test_the_chart_is_of_the_table(tmp_path):
+    chart = load("make_chart")
+    page = (DOCS / "results.md").read_text(encoding="utf-8")
+    found = chart.results(page)
+    assert [one.title for one in found][-1] == "ours" and len(found) == 6
+    committed = (DOCS / chart.CHART).read_text(encoding="utf-8")
+    table = page.partition("<!-- real: table -->")[2].partition("<!-- end -->")[0]
+    figures = re.findall(r"^\| [^|]+ \| (\d\d\.\d\d) ± ", table, re.MULTILINE)
+    assert len(figures) == 5 and not [psnr for psnr in figures if f">{psnr}<" not in committed]
+    chart.draw(found, tmp_path / chart.CHART)
+    made = (tmp_path / chart.CHART).read_text(encoding="utf-8")
+    texts = [re.findall(r"<text[^>]*>([^<]+)</text>", svg) for svg in (made, committed)]
+    assert texts[0] == texts[1], "run python docs/make_chart.py"
+    with pytest.raises(InputError, match="has no rows"):
+        chart.results(page.replace("<!-- real: table -->", ""))
+
+
 def test_the_pictures_do_not_depend_on_what_trainings_left(sample_drive, tmp_path, monkeypatch):
     """A calibration in .cache does not stand in for one that the repository's sample drive lacks."""
     module, scene = load("make_pictures"), copy_sample_drive(tmp_path / "sample_drive")
@@ -403,7 +420,8 @@ def test_the_site_needs_no_network(site):
     assert len(pages) > 15
     for page in pages:
         found = References(page)
-        assert len(found.loads) > 3, page
+        # the slider page contains all that it shows
+        assert len(found.loads) > 3 or page.name == "slider.html", page
         assert not [each for each in found.loads if is_elsewhere(each)], page
         assert not re.search(r"(url\(|@import)\s*['\"]?\s*(https?:)?//", found.styles), page
         # Material fetches its program for diagrams where there are any
@@ -422,8 +440,8 @@ def test_what_loads_elsewhere_is_noticed(tmp_path):
 
 
 def test_links_and_pictures_of_the_site_are_there(site):
-    # the links of 404.html are from the server's root
-    pages = [page for page in site.rglob("*.html") if page.name != "404.html"]
+    # the links of 404.html are from the server's root; the slider page has none
+    pages = [page for page in site.rglob("*.html") if page.name not in ("404.html", "slider.html")]
     assert len(pages) > 10
     for page in pages:
         found = References(page)
@@ -448,6 +466,20 @@ def test_pages_opened_as_files_are_searched(site):
             page.wait_for_url(re.compile(r"\.html\?h="))
             assert "epipolar" in page.locator("article").inner_text(), name
             assert failed == [], name
+
+
+def test_the_slider_page_shows_both_methods_without_a_network(site):
+    text = (site / "slider.html").read_text(encoding="utf-8")
+    assert len(text) < 3_000_000 and not (site / "slider").exists()
+    assert 'href="slider.html"' in (site / "results.html").read_text(encoding="utf-8")
+    with open_browser() as browser:
+        page = browser.new_context(offline=True).new_page()
+        page.goto((site / "slider.html").as_uri())
+        page.get_by_text("Distance", exact=True).click()
+        assert page.locator(".stage .tag").all_inner_texts() == ["ground truth", "ours"]
+        page.get_by_label("Left", exact=True).select_option(label="nerfacto")
+        assert page.locator(".stage .tag").all_inner_texts() == ["nerfacto", "ours"]
+        assert page.locator(".stage img.over").evaluate("image => image.naturalWidth") > 100
 
 
 def test_every_page_is_in_the_navigation():

@@ -220,7 +220,7 @@ def test_a_broken_cloud_costs_the_view_in_3d_alone(tmp_path, capsys):
     write_rendered(scene, tmp_path / "one", 0.9)
     (drive,) = make_drives({"x": (scene, {"one": tmp_path / "one"})}, Console(width=500))
     assert drive.points is None and drive.views
-    assert "report.html has no points of this drive." in capsys.readouterr().out
+    assert "report.html does not show the points of this drive." in capsys.readouterr().out
 
 
 # --- commands ---------------------------------------------------------------------------------------------------------
@@ -505,12 +505,12 @@ def test_it_opens_with_truth_and_the_last_method(opened):
     assert page.title().startswith(NASTY[:20])
     assert page.evaluate("window.hacked") is None
     assert colour_of(pixel(page, 0.25)) == "red" and colour_of(pixel(page, 0.75)) == "blue"
-    assert slider(page).get_attribute("aria-valuetext").startswith("50 % truth, 50 % <")
+    assert slider(page).get_attribute("aria-valuetext").startswith("50 % ground truth, 50 % <")
     assert page.locator(".stage img.over").get_attribute("alt").startswith(f"right: {NASTY}, colour of images/0.png")
     for heading in ("Pictures", "Tables", "Plots", "Settings and versions", "Commands"):
         assert page.get_by_role("heading", name=heading, exact=True).is_visible()
     assert page.get_by_role("table").count() == 3  # with that of the view's figures; one is folded
-    page.get_by_text("Each drive by itself").click()
+    page.get_by_text("Tables of single drives").click()
     assert page.get_by_role("table").count() == 4
     assert page.locator(".plot img").evaluate("(image) => image.complete && image.naturalWidth > 300")
 
@@ -592,11 +592,11 @@ def test_methods_kinds_and_drives_switch(opened):
     page = opened()
     page.get_by_label("Left", exact=True).select_option(label="first")
     assert colour_of(pixel(page, 0.25)) == "green" and colour_of(pixel(page, 0.75)) == "blue"
-    page.get_by_label("Right", exact=True).select_option(label="truth")
+    page.get_by_label("Right", exact=True).select_option(label="ground truth")
     assert colour_of(pixel(page, 0.75)) == "red"
     page.get_by_role("radio", name="Colour error").check(force=True)
     # the truth has no error: its colours stand beside it
-    assert page.locator(".stage img.over").get_attribute("alt") == "right: truth, colour of images/0.png"
+    assert page.locator(".stage img.over").get_attribute("alt") == "right: ground truth, colour of images/0.png"
     assert page.locator(".stage img.under").get_attribute("alt") == "left: first, colour error of images/0.png"
     assert "percent of the whole range" in page.locator(".explanation").inner_text()
     ticks = page.locator(".ticks span").all_inner_texts()
@@ -616,9 +616,9 @@ def test_methods_kinds_and_drives_switch(opened):
 def test_an_error_names_what_stands_beside_it(opened):
     page = opened()
     tags = page.locator(".tag")
-    assert tags.all_inner_texts() == ["truth", NASTY]
+    assert tags.all_inner_texts() == ["ground truth", NASTY]
     page.get_by_role("radio", name="Distance error").check(force=True)
-    assert tags.all_inner_texts() == ["truth: distance", f"{NASTY}: distance error"]
+    assert tags.all_inner_texts() == ["ground truth: distance", f"{NASTY}: distance error"]
     assert page.locator(".scale").evaluate_all("(all) => all.map((each) => each.firstChild.textContent)") == [
         *("Distance", "Distance error"),
     ]

@@ -57,7 +57,7 @@ def test_ctrl_c_finishes_the_step_saves_it_and_says_how_to_go_on(trainer, tmp_pa
     newest = newest_checkpoint(trainer.checkpoint_dir)
     assert newest is not None and newest.name == "step-000000003.ckpt"
     said = capsys.readouterr().out
-    assert "Stopped after step 3, which is saved." in said and "Traceback" not in said
+    assert "Stopped after step 3; its checkpoint is saved." in said and "Traceback" not in said
     assert f"--load-dir {trainer.checkpoint_dir} --max-num-iterations {STEPS - 4}" in said
     again = trainer_of(trainer.config.data, tmp_path / "again", load_dir=newest.parent, max_num_iterations=STEPS - 4)
     expected = parameters(trainer.pipeline)
@@ -89,7 +89,7 @@ def test_ctrl_c_in_the_last_step_leaves_nothing_to_go_on_with(trainer, monkeypat
     with pytest.raises(SystemExit):
         trainer.train()
     said = capsys.readouterr().out
-    assert f"Stopped after step {STEPS - 1}, which is saved.\n" in said and "--load-dir" not in said
+    assert f"Stopped after step {STEPS - 1}; its checkpoint is saved.\n" in said and "--load-dir" not in said
 
 
 def test_ctrl_c_while_a_checkpoint_is_written_leaves_it_whole(trainer, monkeypatch):

@@ -159,7 +159,7 @@ def _page(page: Report, results: dict[str, Any]) -> Report:
         page,
         title=f"Demo: nerfacto and ours on a rendered {options['scene']}",
         lead="The same model trained twice on one drive: without depth, and with "
-        "the edge loss on integrated LiDAR and monocular depth. {scene}, {frames} frames, {size} px, "
+        "the edge loss on integrated LiDAR and monocular depth. The drive: {scene}, {frames} frames, {size} px, "
         "{steps} steps each.".format(**options),
         facts=[
             Facts("Demo", {name.replace("_", " ").capitalize(): str(value) for name, value in options.items()}),

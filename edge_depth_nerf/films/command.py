@@ -1,6 +1,6 @@
 """`edge-depth-nerf camera-path`: a path file for `ns-render camera-path`, in the trained model's coordinates.
 
-nerfstudio's own dataparser, with the training's own settings, says where a scene lies in the model's coordinates.
+The scene's place in the model's coordinates comes from nerfstudio's own dataparser, with the training's settings.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from edge_depth_nerf.plugin.compat import quiet_host
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
 
 DEFAULT_RATE_HZ = 10.0
-"""Of drives whose scene knows no times."""
+"""Used for scenes without times."""
 ORBIT_SECONDS = 6.0
 LARGEST_FILM_FRAMES = 100_000
 SAVED_TRANSFORM = "dataparser_transforms.json"
-"""Beside config.yml: where the scene lay when it was trained on."""
+"""A file beside config.yml. It contains the scene's transform at the time of the training."""
 SAME_PLACE = 1e-3
-"""Scene units by which a camera's place may differ between the path and the training."""
+"""Largest difference of a camera's position between the path and the training, in scene units."""
 KEYFRAMES = 12
-"""So many poses are keyframes, from which nerfstudio's viewer draws the path when it loads the file."""
+"""Number of keyframes. nerfstudio's viewer draws the path through them when it loads the file."""
 
 
 @dataclass(frozen=True)
@@ -47,21 +47,21 @@ class FilmLens:
     width: int
     height: int
     focal_px: float
-    """Pixels per unit of tan(angle) (perspective) or per radian (fisheye); of no meaning for the whole sphere."""
+    """Pixels per unit of tan(angle) (perspective) or per radian (fisheye). Unused for the whole sphere."""
 
     @property
     def fov_deg(self) -> float:
-        """What path files call fov: nerfstudio takes height / 2 / tan(fov / 2) as the focal length, of any camera."""
+        """What path files call fov: nerfstudio computes every focal length as height / 2 / tan(fov / 2)."""
         return math.degrees(2 * math.atan(self.height / 2 / self.focal_px))
 
 
 @dataclass(frozen=True)
 class SceneToModel:
-    """Where a scene lies in the coordinates that its model was trained in."""
+    """Transform from a scene to the coordinates that its model was trained in."""
 
     rotation: Float64[np.ndarray, "3 3"]
     shift_m: Float64[np.ndarray, "3"]
-    """After the turn, before the scale."""
+    """Added after the rotation and before the scaling."""
     units_per_metre: float
 
     def poses(self, camera_to_scene: Float64[np.ndarray, "n 4 4"]) -> Float64[np.ndarray, "n 4 4"]:
@@ -73,17 +73,17 @@ class SceneToModel:
 
 
 def write_camera_path(options: CameraPathOptions, console: Console | None = None) -> Path:
-    """Write a path file, and say how a film is made of it.
+    """Write a path file, and print the command that renders the film.
 
     Args:
-        options: which scene and training, which way, which camera.
-        console: where it is said.
+        options: the scene and training, the kind of path, the camera.
+        console: for messages.
 
     Returns:
         The file.
 
     Raises:
-        FileNotFoundError: no scene, or no config.yml there.
+        FileNotFoundError: there is no scene, or no config.yml, at the given path.
         InputError: an option, the scene or the training cannot be used.
 
     """
@@ -92,12 +92,12 @@ def write_camera_path(options: CameraPathOptions, console: Console | None = None
     if shutil.which("ffmpeg") is None:
         say(
             console,
-            "ns-render needs ffmpeg, which is not on this machine: install it before you render (apt-get install "
-            "ffmpeg, brew install ffmpeg).",
+            "ns-render needs ffmpeg, which is not installed here. Install it before you render: apt-get install "
+            "ffmpeg, or brew install ffmpeg.",
             style="yellow",
         )
     scene = None if options.scene is None else read_scene(options.scene)
-    with console.status("Asking nerfstudio where the scene lies in the model's coordinates …"), quiet_host():
+    with console.status("Reading the scene's place in the model's coordinates from nerfstudio …"), quiet_host():
         scene, to_model = _placed(scene, options)
 
     pictures = _followed(scene, options.follow)
@@ -116,7 +116,7 @@ def write_camera_path(options: CameraPathOptions, console: Console | None = None
     else:
         points_m = scene.points_m()
         poses, radius_m = orbit(drive, frames, options.ahead_m, options.radius_m, points_m)
-        seen = "the scene has no LiDAR points" if points_m is None else "kept clear of LiDAR's returns"
+        seen = "the scene has no LiDAR points" if points_m is None else "it keeps clear of the LiDAR points"
         where = f"Around a point {options.ahead_m:g} m ahead of the drive's middle, radius {radius_m:.2f} m ({seen})"
 
     beside = options.load_config.parent if options.load_config else scene.folder
@@ -131,10 +131,10 @@ def write_camera_path(options: CameraPathOptions, console: Console | None = None
 
 
 def film_lens(lens: KannalaBrandt | Pinhole, options: CameraPathOptions) -> FilmLens:
-    """Choose the film's size and focal length, where options leave them open, by the drive's own lens.
+    """Return the film's size and focal length: from the options, or else from the drive's own lens.
 
     Raises:
-        InputError: a size that follows from the other is out of range.
+        InputError: a computed width or height is out of range.
 
     """
     aspect = {"fisheye": lens.width / lens.height, "perspective": 16 / 9, "equirectangular": 2.0}[options.camera]
@@ -159,7 +159,7 @@ def film_lens(lens: KannalaBrandt | Pinhole, options: CameraPathOptions) -> Film
 def path_file(
     camera_to_model: Float64[np.ndarray, "n 4 4"], lens: FilmLens, options: CameraPathOptions, fps: float
 ) -> dict[str, Any]:
-    """What nerfstudio reads: the film's poses and lens, and some of the poses as keyframes for its viewer."""
+    """Return the path file's content: the film's poses and lens, and keyframes for nerfstudio's viewer."""
     frames = len(camera_to_model)
     seconds = frames / fps
     aspect = lens.width / lens.height
@@ -192,7 +192,7 @@ def _even(length: float) -> int:
 
 def _frames(drive: Drive, options: CameraPathOptions, fps: float) -> int:
     seconds = options.seconds or (ORBIT_SECONDS if options.kind == "orbit" else None)
-    # as long as the drive: its first picture and its last are both in the film
+    # the film is as long as the drive, with its first and its last picture
     frames = round(drive.duration_s * fps) + 1 if seconds is None else round(seconds * fps)
     if not 2 <= frames <= LARGEST_FILM_FRAMES:
         raise InputError(
@@ -227,7 +227,7 @@ def _poses(pictures: tuple[ScenePicture, ...]) -> Float64[np.ndarray, "n 4 4"]:
 
 
 def _placed(scene: SceneFolder | None, options: CameraPathOptions) -> tuple[SceneFolder, SceneToModel]:
-    """The scene, and where the training's own dataparser puts it."""
+    """Return the scene, and its place in the model's coordinates by the training's own dataparser."""
     if options.load_config is None:
         assert scene is not None
         from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
@@ -240,7 +240,7 @@ def _placed(scene: SceneFolder | None, options: CameraPathOptions) -> tuple[Scen
     outputs = dataparser.setup().get_dataparser_outputs(split="train")
     if options.load_config is not None:
         _check_unchanged(outputs, options.load_config.parent / SAVED_TRANSFORM, scene)
-    # both lead from the coordinates before transforms.json, which are nerfstudio's own to change
+    # both start from the coordinates before transforms.json, which nerfstudio may have changed
     applied = np.vstack((scene.meta.get("applied_transform", np.eye(4)[:3]), [0, 0, 0, 1])).astype(np.float64)
     transform = outputs.dataparser_transform.numpy().astype(np.float64) @ np.linalg.inv(applied)
     scale = float(outputs.dataparser_scale) / float(scene.meta.get("applied_scale", 1.0))
@@ -251,14 +251,15 @@ def _placed(scene: SceneFolder | None, options: CameraPathOptions) -> tuple[Scen
     furthest = max(float(np.linalg.norm(ours - place, axis=1).min()) for place in trained)
     if furthest > SAME_PLACE * max(1.0, float(np.abs(trained).max())):
         raise InputError(
-            f"{scene.path}: the training's dataparser puts the cameras {furthest:.3g} scene units away from where its "
-            "own transform puts them, so a path cannot be placed. Train with fisheye-depth-data or nerfstudio-data."
+            f"{scene.path}: the training's dataparser places the cameras {furthest:.3g} scene units away from where "
+            "its own transform places them, so no path can be computed. Train with fisheye-depth-data or "
+            "nerfstudio-data."
         )
     return scene, to_model
 
 
 def _check_unchanged(outputs: Any, saved: Path, scene: SceneFolder) -> None:
-    """Compare where the scene lies now with what the training wrote down.
+    """Compare the scene's place with the one that the training saved.
 
     Raises:
         InputError: they differ.
@@ -274,6 +275,6 @@ def _check_unchanged(outputs: Any, saved: Path, scene: SceneFolder) -> None:
         raise InputError(f"{saved}: expected a matrix under transform and a number under scale. Train again.") from None
     if now.shape != then.shape or not np.allclose(now, then, rtol=1e-4, atol=1e-4):
         raise InputError(
-            f"{scene.path}: lies elsewhere in the model's coordinates than {saved} says: it is another scene, or was "
-            "changed since the training. Give the scene that the model was trained on, or train again."
+            f"{scene.path}: its place in the model's coordinates differs from {saved}. It is another scene, or it was "
+            "changed after the training. Give the scene that the model was trained on, or train again."
         )

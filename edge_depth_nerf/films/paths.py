@@ -1,7 +1,7 @@
-"""Where a film's camera stands and looks: the drive again, beside it, or around a point.
+"""The poses of a film's camera: along the drive, beside it, or around a point.
 
 Frames: the scene (metres) and a camera with OpenGL's axes (x right, y up, z backward); transforms are 4×4, float64.
-Times are seconds of one clock. The vehicle is known by one camera that is fixed to it.
+Times are seconds of one clock. The vehicle's motion is that of one camera, which is fixed to it.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from edge_depth_nerf.base.errors import InputError
 
 EASE = 0.25
-"""Share of a shifted film in which the camera moves aside, and again in which it comes back."""
+"""Share of a shifted film in which the camera moves aside. It moves back during the same share at the end."""
 Z_IS_UP_WITHIN_DEG = 25.0
-"""The scene's z is taken as up if the cameras agree with it to this."""
+"""The scene's z is used as up if it is within this angle of the cameras' mean up."""
 LEAST_RADIUS_M = 1.0
-"""So far beside the way the vehicle itself has been."""
+"""The vehicle itself occupied the space within this distance of the path."""
 CLEARANCE_M = 1.0
-"""An orbit keeps this far from what LiDAR saw."""
+"""An orbit keeps this distance from LiDAR points."""
 OBSTACLE_BAND_M = 1.0
-"""Returns at most this far above and below the camera are in an orbit's way: not the road, not the trees' crowns."""
+"""Only points within this height above and below the camera block an orbit: not the road, and not the treetops."""
 STRAY_RETURNS = 4
-"""So many returns nearer than the others do not make an obstacle."""
+"""This many nearest points are ignored as outliers."""
 
 Poses = Float64[np.ndarray, "poses 4 4"]
 Direction = Float64[np.ndarray, "3"]
@@ -35,7 +35,7 @@ Direction = Float64[np.ndarray, "3"]
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """The way of one camera through a scene.
+    """The path of one camera through a scene.
 
     Raises:
         InputError: fewer than two poses, or times that do not increase.
@@ -57,26 +57,26 @@ class Drive:
         if not (np.diff(self.times_s) > 0).all():
             first = int(np.argmax(~(np.diff(self.times_s) > 0)))
             raise InputError(
-                f"the times of a drive must increase, but picture {first + 2} is of {self.times_s[first + 1]:.6f} s, "
-                f"the one before of {self.times_s[first]:.6f} s."
+                f"the times of a drive must increase, but picture {first + 2} is at {self.times_s[first + 1]:.6f} s "
+                f"and the one before it at {self.times_s[first]:.6f} s."
             )
 
     @property
     def duration_s(self) -> float:
-        """From the first picture to the last."""
+        """Time from the first picture to the last."""
         return float(self.times_s[-1] - self.times_s[0])
 
     @property
     def frame_rate_hz(self) -> float:
-        """Pictures a second, by the median of the times between them."""
+        """Pictures per second, from the median time between two pictures."""
         return float(1 / np.median(np.diff(self.times_s)))
 
     @cached_property
     def vehicle_in_camera(self) -> Float64[np.ndarray, "3 3"]:
         """Unit vectors forward, left and up of the vehicle, as columns, in the camera's axes.
 
-        One for the whole drive: the camera is fixed to the vehicle. Forward is the mean direction in which the camera
-        moved, so that a vehicle which stands, or drives backward for a while, still has one.
+        They are the same for the whole drive, because the camera is fixed to the vehicle. Forward is the mean direction
+        of the camera's motion, so it is known even if the vehicle stands or reverses for a while.
 
         Raises:
             InputError: the camera does not move.
@@ -91,8 +91,7 @@ class Drive:
         length = np.linalg.norm(forward)
         if not length > 1e-3 * max(1.0, float(np.abs(position).max())):
             raise InputError(
-                "the drive's camera does not move, so there is no forward and no side. Take --kind replay --look "
-                "camera."
+                "the drive's camera does not move, so its direction is unknown. Use --kind replay --look camera."
             )
         forward /= length
         return np.stack((forward, np.cross(up, forward), up), axis=1)
@@ -105,14 +104,14 @@ class Drive:
     def at(self, times_s: Float64[np.ndarray, "times"]) -> Float64[np.ndarray, "times 4 4"]:
         """The camera's poses at some times within the drive.
 
-        Exactly those of the drive at its own times, and smooth (twice differentiable) between them.
+        At the drive's own times they are exactly its poses. Between them they are smooth (twice differentiable).
         """
         position, rotation = self._splines
         return _poses(rotation(times_s).as_matrix(), position(times_s))
 
 
 def up_of(rotations: Float64[np.ndarray, "poses 3 3"]) -> Direction:
-    """Which way is up in a scene: z, where its cameras do not contradict, else what is up for them on average.
+    """The up direction of a scene: z if the cameras agree with it, else the mean up of the cameras.
 
     Args:
         rotations: camera to scene (OpenGL's axes), of all cameras.
@@ -121,19 +120,19 @@ def up_of(rotations: Float64[np.ndarray, "poses 3 3"]) -> Direction:
     mean = rotations[:, :, 1].mean(axis=0)
     z = np.array([0.0, 0.0, 1.0])
     length = float(np.linalg.norm(mean))
-    # cameras that look down all around, or that lie on their side, do not tell
+    # cameras that look down in all directions, or lie on their side, have no mean up
     if length < 0.1 or mean @ z >= length * np.cos(np.radians(Z_IS_UP_WITHIN_DEG)):
         return z
     return mean / length
 
 
 def replay(drive: Drive, times_s: Float64[np.ndarray, "times"], forward: bool) -> Float64[np.ndarray, "times 4 4"]:
-    """The drive again.
+    """Poses along the recorded path.
 
     Args:
-        drive: the camera's way.
-        times_s: when the film's pictures are taken.
-        forward: look where the vehicle goes, not where the drive's camera looked.
+        drive: the camera's path.
+        times_s: the times of the film's pictures.
+        forward: look in the direction of travel, not in that of the drive's camera.
 
     Returns:
         Camera to scene.
@@ -149,13 +148,13 @@ def replay(drive: Drive, times_s: Float64[np.ndarray, "times"], forward: bool) -
 def lane_shift(
     drive: Drive, times_s: Float64[np.ndarray, "times"], forward: bool, shift_m: float
 ) -> Float64[np.ndarray, "times 4 4"]:
-    """The drive again, from beside its way: eased out over the film's first quarter, back over its last.
+    """Poses beside the recorded path: moving aside in the film's first quarter, and back in its last.
 
     Args:
-        drive: the camera's way.
-        times_s: when the film's pictures are taken.
-        forward: as of `replay`.
-        shift_m: how far to the vehicle's left at most; negative to the right.
+        drive: the camera's path.
+        times_s: the times of the film's pictures.
+        forward: as in `replay`.
+        shift_m: the largest offset to the vehicle's left; negative to the right.
 
     Returns:
         Camera to scene.
@@ -171,18 +170,18 @@ def lane_shift(
 def orbit(
     drive: Drive, frames: int, ahead_m: float, largest_radius_m: float, points_m: Float[np.ndarray, "points 3"] | None
 ) -> tuple[Poses, float]:
-    """Once around a point of the drive's way, level, looking at it.
+    """Poses on a level circle around a point of the drive's path, looking at the point.
 
-    The point lies on the way, so that the vehicle has been there, some metres further on than the drive's middle. The
-    circle begins behind it and goes counter-clockwise, seen from above. It is as wide as LiDAR found nothing within
-    it, at most as asked; without LiDAR's points it stays where the vehicle itself has been.
+    The point is on the path, some metres after its middle, so the vehicle has been there. The circle starts behind the
+    point and runs counter-clockwise, seen from above. It is as wide as requested, unless LiDAR points lie within it.
+    Without LiDAR points it stays where the vehicle itself has been.
 
     Args:
-        drive: the camera's way.
-        frames: pictures of the film; the one after the last would be the first.
-        ahead_m: how far from the middle of the way to the point, along it.
-        largest_radius_m: of the circle.
-        points_m: what LiDAR saw, in the scene.
+        drive: the camera's path.
+        frames: number of the film's pictures; one more would repeat the first.
+        ahead_m: distance from the middle of the path to the point, along the path.
+        largest_radius_m: the largest radius of the circle.
+        points_m: LiDAR points in the scene.
 
     Returns:
         Camera to scene, and the circle's radius in metres.
@@ -212,7 +211,7 @@ def orbit(
 
 
 def _free_radius_m(centre: Direction, up: Direction, points_m: Float[np.ndarray, "points 3"] | None) -> float:
-    """How far LiDAR saw nothing around a point, level with it; 0 if that is not known."""
+    """Return the level distance from a point to the nearest LiDAR points; 0 if that is unknown."""
     if points_m is None:
         return 0.0
     offset = points_m - centre
@@ -225,7 +224,7 @@ def _free_radius_m(centre: Direction, up: Direction, points_m: Float[np.ndarray,
 
 
 def _ease(share: np.ndarray) -> np.ndarray:
-    """From 0 at 0 to 1 at 1, starting and ending without speed."""
+    """Rise from 0 at 0 to 1 at 1, with zero speed at both ends."""
     share = np.clip(share, 0, 1)
     return share**2 * (3 - 2 * share)
 

@@ -1,8 +1,8 @@
-"""What a training's config.yml says of its dataparser, read without building what the file names.
+"""Reads the dataparser's settings from a training's config.yml, without executing anything in the file.
 
 nerfstudio's own commands load that file with yaml.Loader, which builds any class and calls any function that it names
-(PyYAML's python tags). Here the file is parsed into nodes, nothing more; from these the settings of a dataparser that
-is known are taken, each checked against its type.
+(PyYAML's python tags). This module only parses the file into nodes. It then takes the settings of a known dataparser
+from them, and checks each against its type.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from edge_depth_nerf.base.bounds import finite, read_text, shown
 from edge_depth_nerf.base.errors import InputError
 
 MAX_CONFIG_BYTES = 1 << 15
-"""No config.yml is larger: nerfstudio's have some 10 kB. The parser takes up to a third of a second for that much."""
+"""Larger files are refused. nerfstudio writes about 10 kB; the parser needs up to a third of a second for the limit."""
 MAX_DEPTH = 40
-"""No config.yml is nested deeper: nerfstudio's are some 10 deep. The parser's time grows with the depth's square."""
+"""Deeper nesting is refused. nerfstudio's files are about 10 deep; the parser's time grows with the depth's square."""
 MAX_NODES = 5000
-"""No config.yml has more names, values and lists: nerfstudio's have some 500. Short ones fill a file with many."""
+"""Files with more names, values and lists are refused. nerfstudio's have about 500."""
 _PYTHON = "tag:yaml.org,2002:python/"
 _HINT = "--load-config takes the config.yml that ns-train wrote"
 
@@ -34,7 +34,7 @@ def read_dataparser(path: Path) -> Any:
 
     Raises:
         FileNotFoundError: there is no such file.
-        InputError: no YAML, no training's settings, or those of another dataparser.
+        InputError: the file is not YAML, is not a training's config.yml, or has another dataparser.
 
     """
     from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
@@ -54,13 +54,13 @@ def read_dataparser(path: Path) -> Any:
         raise InputError(f"{path}: cannot be read ({' '.join(str(error).split())}). {_HINT}.") from None
     manager = _child(_child(root, "pipeline"), "datamanager")
     if manager is None or not re.fullmatch(rf"{_PYTHON}object:[\w.]*TrainerConfig", root.tag):
-        raise InputError(f"{path}: is no training's settings. {_HINT}.")
+        raise InputError(f"{path}: this is not the config.yml of a training. {_HINT}.")
     node = _child(manager, "dataparser")
     name = node.tag.removeprefix(f"{_PYTHON}object:") if node is not None else "none"
     if name not in known:
         raise InputError(
             f"{path}: its dataparser is {shown(name)}, expected one of {', '.join(known)}. Train with "
-            "fisheye-depth-data or nerfstudio-data, or give the scene in place of --load-config."
+            "fisheye-depth-data or nerfstudio-data, or give the scene instead of --load-config."
         )
     settings = {}
     hints = get_type_hints(known[name])
@@ -70,14 +70,14 @@ def read_dataparser(path: Path) -> Any:
             continue
         value = _value(found)
         if not _fits(value, hints[field.name]):
-            raise InputError(f"{path}: dataparser.{field.name} is {shown(value)}, which it cannot be. {_HINT}.")
+            raise InputError(f"{path}: dataparser.{field.name} is {shown(value)}, which is not a valid value. {_HINT}.")
         settings[field.name] = value
     data = _value(_child(manager, "data"))
     return known[name](**{**settings, **({"data": data} if isinstance(data, Path) else {})})
 
 
 def _compose(text: str) -> Any:
-    """A YAML document as nodes; with more than `MAX_NODES`, or `MAX_DEPTH` deep, it is not read to its end."""
+    """Parse a YAML document into nodes. Stop at more than `MAX_NODES` nodes or `MAX_DEPTH` levels."""
     import yaml
 
     class Shallow(yaml.SafeLoader):
@@ -97,18 +97,18 @@ def _compose(text: str) -> Any:
 
 
 def _child(node: Any, key: str) -> Any:
-    """The node under a key of a mapping; None where there is none."""
+    """Return the node under a key of a mapping, or None."""
     if node is None or node.id != "mapping":
         return None
     return next((value for name, value in node.value if name.id == "scalar" and name.value == key), None)
 
 
 class _Unknown:
-    """Stands for what is neither a plain value nor a path."""
+    """Stands for a value that is neither plain nor a path."""
 
 
 def _value(node: Any) -> Any:
-    """A plain value, a path or a list of plain values."""
+    """Convert a node to a plain value, a path or a list of plain values."""
     from yaml.constructor import ConstructorError, SafeConstructor
 
     if node is None:
@@ -128,7 +128,7 @@ def _value(node: Any) -> Any:
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Whether a value is of a dataparser's declared type."""
+    """Whether a value has the declared type."""
     origin, inner = get_origin(hint), get_args(hint)
     if origin is Literal:
         return isinstance(value, str) and value in inner

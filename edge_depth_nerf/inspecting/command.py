@@ -1,4 +1,4 @@
-"""`edge-depth-nerf inspect`: writes the pictures and summary.json, prints the figures and what to mend."""
+"""`edge-depth-nerf inspect`: writes pictures and summary.json, prints figures and warnings."""
 
 from __future__ import annotations
 
@@ -40,22 +40,22 @@ TOP_VIEW = "top_view.png"
 POSES = "poses.png"
 CAMERAS_IN_A_TABLE = 4
 """More would not fit a terminal."""
-CAPTION = "mean (least to most); coverage of the pixels used; distances: median (5 to 95 %)"
+CAPTION = "mean (smallest to largest); coverage: of the pixels used; distances: median (5 to 95 %)"
 
 
 def inspect_scene(options: InspectOptions, console: Console | None = None) -> dict[str, Any]:
-    """Look at a scene: sheets of some frames, a view from above, figures, warnings.
+    """Inspect a scene: draw sheets of some frames and a view from above, print figures and warnings.
 
     Args:
-        options: which scene, where to, how much.
-        console: where progress, figures and warnings are shown.
+        options: the scene, the output folder, the number of frames.
+        console: for progress, figures and warnings.
 
     Returns:
         The content of summary.json.
 
     Raises:
-        FileNotFoundError: no scene there.
-        InputError: the scene, a file of it, an option or the output folder cannot be used.
+        FileNotFoundError: there is no scene.
+        InputError: the scene, one of its files, an option or the output folder cannot be used.
 
     """
     options.check()
@@ -73,7 +73,7 @@ def inspect_scene(options: InspectOptions, console: Console | None = None) -> di
     shown_scene = ShownScene(scene)
     sheet_of = {name: output / sheet for name, sheet in sheets.items()}
     jobs = [partial(_look_at, shown_scene, picture, sheet_of.get(picture.name), options) for picture in chosen]
-    figures = run_jobs(jobs, "Looking at the pictures", console)
+    figures = run_jobs(jobs, "Inspecting the pictures", console)
 
     agreements = check_poses(scene, console)
     findings = find(scene, figures, agreements)
@@ -121,7 +121,7 @@ def _sample(measured: int, pictures: int) -> str:
 
 
 def _open_output(output: Path) -> None:
-    """Make the folder; sheets of an earlier look are removed, so that none of another scene stays among the new."""
+    """Create the folder. Remove the sheets of an earlier inspection, which may be of another scene."""
     check_is_folder(output)
     try:
         output.mkdir(parents=True, exist_ok=True)
@@ -139,7 +139,7 @@ def _sheet_name(picture: ScenePicture) -> str:
 
 
 def _look_at(shown: ShownScene, picture: ScenePicture, sheet: Path | None, options: InspectOptions) -> PictureFigures:
-    """Measure one picture, and draw its sheet if it is to be shown."""
+    """Measure one picture, and draw its sheet if it has one."""
     maps = shown.maps(picture)
     figures = measure(picture, maps)
     if sheet is not None:
@@ -155,7 +155,7 @@ def _number(value: float | int | None, form: str, unit: str = "") -> str:
 
 
 def _spread(values: dict[str, float] | None, form: str) -> str:
-    """Mean, with the smallest and largest in brackets."""
+    """Format a mean, with the smallest and largest value in brackets."""
     return "–" if values is None else "{mean:{0}} ({min:{0}} to {max:{0}})".format(form, **values)
 
 
@@ -164,7 +164,7 @@ def _quantiles(values: dict[str, float] | None) -> str:
 
 
 def _epipolar(values: dict[str, Any] | None) -> str:
-    """Median over the steps, with the smallest and largest in brackets."""
+    """Format a median over the steps, with the smallest and largest value in brackets."""
     return "–" if values is None else "{median_px:.2f} ({min_px:.2f} to {max_px:.2f})".format(**values)
 
 
@@ -174,20 +174,20 @@ def _show(summary: dict[str, Any], console: Console) -> None:
     split = "no split given"
     if summary["held_out"] is not None:
         split = f"{summary['training']} for training, {summary['held_out']} held out"
-    drive.add_row("pictures", f"{summary['pictures']} at {summary['moments']} moments: {split}")
+    drive.add_row("pictures", f"{summary['pictures']} in {summary['moments']} frames: {split}")
     drive.add_row("path", f"{path['length_m']:.1f} {unit} ({path['camera']})")
     drive.add_row("spacing", f"{path['spacing_median_m']:.2f} {unit} (median), {path['spacing_max_m']:.2f} at most")
     if path["duration_s"] is not None:
         speeds = (_number(path[key], ".1f", " m/s") for key in ("speed_mean_mps", "speed_max_mps"))
         drive.add_row("time", "{:.1f} s; {} on average, {} at most".format(path["duration_s"], *speeds))
     if summary["paths_agree"] is not None:
-        drive.add_row("by LiDAR odometry", summary["paths_agree"]["text"])
+        drive.add_row("LiDAR odometry", summary["paths_agree"]["text"])
     drive.add_row("points.ply", _number(summary["points"], ",", " points"))
     if (found := summary["epipolar"]) is not None:
         drive.add_row(
             "poses",
-            f"features {found['median_px']:.2f} px from their epipolar lines (median; {found['min_px']:.2f} to "
-            f"{found['max_px']:.2f} over {found['steps']} steps), at the scene's size",
+            f"features are {found['median_px']:.2f} px from their epipolar lines (median; {found['min_px']:.2f} to "
+            f"{found['max_px']:.2f} px over {found['steps']} steps)",
         )
     console.print(drive)
 
@@ -223,16 +223,16 @@ def _rows(cameras: Sequence[dict[str, Any]]) -> list[tuple[str, list[str]]]:
         "size, px": lambda c: "{}×{}".format(*c["size_px"]) + ("" if c["one_lens"] else ", varies"),
         "fit rms / max, px": fit,
         "to epipolar lines, px": lambda c: _epipolar(c["epipolar"]),
-        "used up to": lambda c: _number(c["angle_limit_deg"], ".0f", "°"),
-        "used of the picture": lambda c: _spread(c["used_share"], ".0%"),
+        "largest angle off-axis": lambda c: _number(c["angle_limit_deg"], ".0f", "°"),
+        "pixels used": lambda c: _spread(c["used_share"], ".0%"),
         "LiDAR coverage": lambda c: _spread(c["lidar_coverage"], ".1%"),
         "mono coverage": lambda c: _spread(c["mono_coverage"], ".0%"),
-        "rays with a prior": lambda c: _spread(c["prior_share"], ".0%"),
-        "without (sky, …)": lambda c: _number(c["no_prior_share"], ".0%"),
+        "pixels with a prior": lambda c: _spread(c["prior_share"], ".0%"),
+        "without a prior (sky, …)": lambda c: _number(c["no_prior_share"], ".0%"),
         "LiDAR distance": lambda c: _quantiles(c["lidar_distance_m"]),
         "prior distance": lambda c: _quantiles(c["prior_distance_m"]),
         "sigma, median": lambda c: _number(c["sigma_median_m"], ".2f", " m"),
         "mono / LiDAR, AbsRel": mono,
-        "prior against truth, AbsRel": lambda c: _number(c["prior_against_truth_abs_rel"], ".3f"),
+        "prior / ground truth, AbsRel": lambda c: _number(c["prior_against_truth_abs_rel"], ".3f"),
     }
     return [(label, [cell(camera) for camera in cameras]) for label, cell in rows.items()]

@@ -1,8 +1,8 @@
-"""The figures of a scene: its path, its timing, and what its maps hold.
+"""The figures of a scene: its path, its timing, and the content of its maps.
 
-The path is exact, from all poses. What the maps hold is measured on pictures spread evenly over the drive, at most
-`MEASURED_PICTURES`, so that a long drive takes no longer than a short one; of each picture a few thousand values are
-kept for medians. Shares are 0 to 1. A figure that the scene cannot give is None.
+The path is exact, from all poses. The maps are measured on at most `MEASURED_PICTURES` pictures, spread evenly over the
+drive, so a long drive takes no longer than a short one. A few thousand values of each picture are kept for medians.
+Shares are 0 to 1. A figure is None if the scene lacks what it needs.
 """
 
 from __future__ import annotations
@@ -23,31 +23,31 @@ from edge_depth_nerf.inspecting.shown_prior import ShownMaps
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
 
 MEASURED_PICTURES = 64
-"""Maps of so many pictures are measured, unless more are to be shown."""
+"""The maps of this many pictures are measured, or of more if more are shown."""
 KEPT_VALUES = 5000
-"""So many values of a map are kept for medians over the drive."""
+"""This many values of a map are kept for medians over the drive."""
 STANDING_M = 0.05
-"""Steps below this are the jitter of a vehicle that stands; the usual spacing is taken of the others."""
+"""Shorter steps are the jitter of a standing vehicle. The usual spacing is computed from the others."""
 
 
 @dataclass(frozen=True)
 class PictureFigures:
-    """What the maps of one picture hold."""
+    """Figures of one picture's maps."""
 
     picture: ScenePicture
-    """Which."""
+    """The picture."""
     used_share: float
-    """Share of the picture that the mask leaves, within the lens."""
+    """Share of the picture that is inside the lens and the mask."""
     hidden_share: float
     """Share of the lens that the mask hides."""
     brightness: float
     """Mean grey inside the mask, 0 to 255."""
     lidar_coverage: float | None
-    """Share of the usable pixels with a return."""
+    """Share of the usable pixels with a LiDAR point."""
     mono_coverage: float | None
     """Share of the usable pixels with a monocular distance."""
     prior_share: float | None
-    """Share of the usable pixels with a prior; the rest is sky, or out of both sources' reach."""
+    """Share of the usable pixels with a prior. The others show sky, or are out of reach of all sources."""
     lidar_m: NDArray[np.float32]
     """Some LiDAR distances."""
     prior_m: NDArray[np.float32]
@@ -60,7 +60,7 @@ class PictureFigures:
     """The prior's distance over the true one, at some of the pixels that have both."""
 
     def to_dict(self) -> dict[str, Any]:
-        """The picture's own figures, as JSON."""
+        """Return the picture's figures as JSON."""
         return {
             "file_path": self.picture.name,
             "camera": self.picture.camera,
@@ -75,7 +75,7 @@ class PictureFigures:
 
 
 def measure(picture: ScenePicture, maps: ShownMaps) -> PictureFigures:
-    """Take the figures of one picture."""
+    """Measure one picture."""
     usable = maps.usable
     count = max(int(usable.sum()), 1)
 
@@ -119,7 +119,7 @@ def measure(picture: ScenePicture, maps: ShownMaps) -> PictureFigures:
 
 
 def measured_moments(scene: SceneFolder, shown: int) -> tuple[list[int], list[int]]:
-    """Choose which moments are measured, and which of them are shown, both spread evenly over the drive."""
+    """Choose the frames to measure, and those of them to show. Both are spread evenly over the drive."""
     moments = scene.moments()
     wanted = max(MEASURED_PICTURES // len(scene.cameras()), shown, 1)
     measured = [moments[index] for index in spread_over(len(moments), wanted)]
@@ -129,22 +129,22 @@ def measured_moments(scene: SceneFolder, shown: int) -> tuple[list[int], list[in
 
 @dataclass(frozen=True)
 class Step:
-    """From one picture of a camera to its next."""
+    """The step from one picture of a camera to its next."""
 
     before: ScenePicture
     """The earlier picture."""
     after: ScenePicture
     """The later picture."""
     length_m: float
-    """Distance between their cameras."""
+    """Distance between the two camera positions."""
     turn_deg: float
-    """Angle between their rotations."""
+    """Angle between the two rotations."""
     seconds: float | None
-    """Time between them, where both have a timestamp."""
+    """Time between the two pictures, if both have a timestamp."""
 
 
 def steps(pictures: Sequence[ScenePicture]) -> list[Step]:
-    """List the steps of one camera; `pictures` in order of their moments."""
+    """List the steps of one camera; `pictures` are in order of their frames."""
     found = []
     for before, after in pairwise(pictures):
         cosine = (np.trace(before.rotation.T @ after.rotation) - 1) / 2
@@ -162,20 +162,20 @@ def steps(pictures: Sequence[ScenePicture]) -> list[Step]:
 
 
 def usual_length_m(found: Sequence[Step], own: bool) -> float:
-    """Median length of the steps on which the vehicle moved; 0 without any."""
+    """Return the median length of the steps in which the vehicle moved; 0 if there are none."""
     least_m = STANDING_M if own else 0.0
     moved = [step.length_m for step in found if step.length_m > least_m]
     return float(np.median(moved)) if moved else 0.0
 
 
 def reference_camera(scene: SceneFolder) -> str:
-    """The camera whose path stands for the vehicle's: the one with the most pictures."""
+    """Return the camera whose path represents the vehicle's: the one with the most pictures."""
     cameras = scene.cameras()
     return max(cameras, key=lambda name: len(cameras[name]))
 
 
 def path_figures(scene: SceneFolder) -> dict[str, Any]:
-    """Length, spacing, duration and speed of the drive, as JSON."""
+    """Return length, spacing, duration and speed of the drive as JSON."""
     name = reference_camera(scene)
     pictures = scene.cameras()[name]
     found = steps(pictures)
@@ -195,7 +195,7 @@ def path_figures(scene: SceneFolder) -> dict[str, Any]:
 
 
 def map_figures(measured: Sequence[PictureFigures]) -> dict[str, Any]:
-    """What the maps of some pictures hold together, as JSON."""
+    """Return the figures of several pictures together as JSON."""
 
     def spread(values: Sequence[float | None]) -> dict[str, Any] | None:
         known = [value for value in values if value is not None]
@@ -236,7 +236,7 @@ def map_figures(measured: Sequence[PictureFigures]) -> dict[str, Any]:
 
 
 def camera_figures(scene: SceneFolder, name: str, measured: Sequence[PictureFigures]) -> dict[str, Any]:
-    """One camera: its lens, its fit, and what its maps hold, as JSON."""
+    """Return the figures of one camera as JSON: its lens, its fit, its maps."""
     pictures = scene.cameras()[name]
     lens = pictures[0].lens
     fit = recorded(scene, "camera_fits", name)
@@ -257,14 +257,14 @@ def camera_figures(scene: SceneFolder, name: str, measured: Sequence[PictureFigu
 
 
 def recorded(scene: SceneFolder, table: str, camera: str) -> dict[str, Any]:
-    """What transforms.json says of a camera in one of its tables; nothing in other people's scenes."""
+    """Return a camera's entry in a table of transforms.json; empty in scenes of other makers."""
     found = scene.meta.get(table)
     found = found.get(camera) if isinstance(found, dict) else None
     return found if isinstance(found, dict) else {}
 
 
 def _rounded(value: SupportsFloat | None) -> float | None:
-    """Keep six digits: more would only differ between machines."""
+    """Keep six digits; further ones differ between machines."""
     return None if value is None else float(f"{float(value):.6g}")
 
 

@@ -1,4 +1,4 @@
-"""What is wrong with a scene, or may be: each finding one sentence that names the frame and what to do."""
+"""Faults and possible faults of a scene. Each finding names the frame and says what to do."""
 
 from __future__ import annotations
 
@@ -16,45 +16,45 @@ from edge_depth_nerf.scene.reader import SceneFolder
 from edge_depth_nerf.scene.writer import best_holdout
 
 GAP_FACTOR = 10
-"""Frames so many times farther apart than usual are a gap."""
+"""Frames are a gap if they are this many times farther apart than usual."""
 LARGEST_TURN_DEG = 20.0
-"""A turn between two frames is a jump above this, and above ten times the usual one."""
+"""A turn between two frames is a jump if it is above this and above ten times the usual one."""
 LITTLE_LIDAR = 0.25
-"""A frame with less than this part of the usual LiDAR coverage has little."""
+"""Coverage below this share of the usual LiDAR coverage is reported."""
 LARGEST_HIDDEN_SHARE = 0.5
-"""A mask that hides more of the lens than this is worth a look."""
+"""A mask that hides more of the lens than this is reported."""
 BRIGHTNESS_FACTOR = 2.0
-"""A picture so many times darker or brighter than usual is worth a look."""
+"""A picture this many times darker or brighter than usual is reported."""
 LARGEST_FIT_RMS_PX = 0.1
-"""A fit worse than this shifts what training sees against LiDAR."""
+"""A fit worse than this shifts the pictures against LiDAR."""
 LARGEST_SCALE_FACTOR = 1.25
-"""Monocular distance that is off by more than this against LiDAR is not aligned to it."""
+"""Monocular distance that differs from LiDAR by more than this factor is not aligned to it."""
 LARGEST_SHAPE_ERROR = 0.2
-"""Where monocular and LiDAR distance differ by more than this whatever the scale, they are not of the same things. On
-rendered drives it is 0.04-0.07, with one camera's transform inverted 0.31."""
+"""Monocular and LiDAR distances that differ by more than this, at the best scale, show different things. On rendered
+drives they differ by 0.04 to 0.07; with one camera's transform inverted, by 0.31."""
 _NAMED = 5
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing to mend or to know."""
+    """One thing to fix or to know."""
 
     kind: str
     """A word for it, such as gap."""
     text: str
-    """One sentence."""
+    """What is wrong, and what to do."""
     cameras: tuple[str, ...] = ()
-    """The cameras concerned; none for all."""
+    """The cameras concerned; empty for all."""
     frames: tuple[int, ...] = ()
-    """The moments concerned; none for all."""
+    """The frames concerned; empty for all."""
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON."""
+        """Return it as JSON."""
         return asdict(self)
 
 
 def find(scene: SceneFolder, measured: Sequence[PictureFigures], agreements: Sequence[Agreement] = ()) -> list[Finding]:
-    """Look for everything that this module knows; the gravest first."""
+    """Run all checks of this module; the most serious findings come first."""
     return [
         *_layers(scene),
         *_split(scene),
@@ -71,7 +71,7 @@ def find(scene: SceneFolder, measured: Sequence[PictureFigures], agreements: Seq
 
 
 def _frames(numbers: Iterable[int]) -> str:
-    """Name some frames, the first few in full."""
+    """Name some frames: the first few, and the number of the others."""
     listed = sorted(set(numbers))
     some = ", ".join(map(str, listed[:_NAMED]))
     more = f" and {len(listed) - _NAMED} more" if len(listed) > _NAMED else ""
@@ -83,38 +83,38 @@ def _layers(scene: SceneFolder) -> Iterator[Finding]:
     if not has_lidar and not has_mono:
         yield Finding(
             "no_prior",
-            "The scene has neither LiDAR nor monocular maps, so no ray has a prior and training is plain nerfacto; "
-            "process the drive with its sweeps, or with --mono.",
+            "The scene has neither LiDAR nor monocular maps, so there is no prior and training is plain nerfacto. "
+            "Process the drive with its sweeps, or with --mono.",
         )
     elif not has_lidar:
         yield Finding(
             "no_lidar",
-            "The scene has no LiDAR maps, so the prior is monocular alone and its scale is not checked; process the "
-            "drive with its sweeps.",
+            "The scene has no LiDAR maps, so the prior is from monocular maps alone and its scale is not checked. "
+            "Process the drive with its sweeps.",
         )
     elif not has_mono:
         yield Finding(
             "no_mono",
-            "The scene has no monocular maps, so only pixels with a return have a prior; make them, or finish those "
-            "that were begun, with `edge-depth-nerf estimate-depth`, or process the drive with --mono.",
+            "The scene has no monocular maps, or not all of them, so only pixels with a LiDAR point have a prior. Run "
+            "`edge-depth-nerf estimate-depth`, or process the drive with --mono.",
         )
     if not scene.has("mask"):
         yield Finding(
             "no_mask",
-            "The scene has no masks, so the vehicle itself and moving things are trained on; give --ego-mask when you "
-            "process the drive, or mask_path in transforms.json.",
+            "The scene has no masks, so training includes the vehicle itself and moving things. Process the drive with "
+            "--ego-mask, or add mask_path to transforms.json.",
         )
     for key, count in scene.incomplete.items():
         yield Finding(
             "incomplete",
-            f"{key} is given for {count} of {len(scene.pictures)} frames, which training refuses; give it for every "
-            "frame or for none.",
+            f"{key} is given for {count} of {len(scene.pictures)} pictures, which training refuses. Give it for every "
+            "picture or for none.",
         )
     if scene.points_path is None:
         yield Finding(
             "no_points",
-            "The scene names no point cloud (ply_file_path), so the top view shows the poses alone; process the drive "
-            "again if you want one.",
+            "The scene names no point cloud (ply_file_path), so the top view shows only the poses. Process the drive "
+            "again if you want a point cloud.",
         )
 
 
@@ -122,8 +122,8 @@ def _split(scene: SceneFolder) -> Iterator[Finding]:
     if not scene.split_known:
         yield Finding(
             "no_split",
-            "The scene does not say which pictures are held out, so ns-train takes every eighth picture, whatever "
-            "moment it is of; give train_filenames and test_filenames in transforms.json to judge by whole moments.",
+            "The scene does not list its held-out pictures, so ns-train holds out every eighth picture, not whole "
+            "frames. Add train_filenames and test_filenames to transforms.json to hold out whole frames.",
         )
     elif not any(picture.held_out for picture in scene.pictures):
         moments = len({picture.moment for picture in scene.pictures})
@@ -132,7 +132,7 @@ def _split(scene: SceneFolder) -> Iterator[Finding]:
         )
         yield Finding(
             "no_held_out",
-            f"No frame is held out, so the figures of ns-eval are of pictures that were trained on; {advice}.",
+            f"No frame is held out, so ns-eval would use training pictures. Remedy: {advice}.",
         )
 
 
@@ -154,9 +154,9 @@ def _path(scene: SceneFolder) -> Iterator[Finding]:
         step, usual_m = max(seen, key=lambda item: item[0].length_m)
         yield Finding(
             "gap",
-            f"Frames {before} and {after} lie {step.length_m:.3g} {unit} apart, {step.length_m / usual_m:.0f} times "
-            f"the usual {usual_m:.2g} {unit}; look for poses that are missing or wrong there, or make two scenes of "
-            "the drive with --first and --frames.",
+            f"Frames {before} and {after} are {step.length_m:.3g} {unit} apart, {step.length_m / usual_m:.0f} times "
+            f"the usual {usual_m:.2g} {unit}. Check for missing or wrong poses there, or make two scenes of the drive "
+            "with --first and --frames.",
             tuple(step.before.camera for step, _ in seen),
             (before, after),
         )
@@ -164,8 +164,8 @@ def _path(scene: SceneFolder) -> Iterator[Finding]:
         step, usual_deg = max(seen, key=lambda item: item[0].turn_deg)
         yield Finding(
             "turn",
-            f"From frame {before} to {after} the camera turns by {step.turn_deg:.0f} degrees where {usual_deg:.1f} are "
-            "usual; check both poses, and leave the frame out whose pose is wrong.",
+            f"From frame {before} to {after} the camera turns by {step.turn_deg:.0f} degrees; {usual_deg:.1f} are "
+            "usual. Check both poses, and leave out the frame whose pose is wrong.",
             tuple(step.before.camera for step, _ in seen),
             (before, after),
         )
@@ -175,9 +175,9 @@ def _poses(scene: SceneFolder, agreements: Sequence[Agreement]) -> Iterator[Find
     source = scene.meta.get("source")
     refined = isinstance(source, dict) and source.get("refine_poses") is True
     remedy = (
-        "find them anew with --poses lidar or --poses colmap, and check the lens and the times of the pictures"
+        "find new poses with --poses lidar or --poses colmap, and check the lens and the times of the pictures"
         if refined
-        else "process the drive with --refine-poses (needs pycolmap), or find them anew with --poses lidar or "
+        else "process the drive with --refine-poses (needs pycolmap), or find new poses with --poses lidar or "
         "--poses colmap"
     )
     for name in scene.cameras():
@@ -185,8 +185,8 @@ def _poses(scene: SceneFolder, agreements: Sequence[Agreement]) -> Iterator[Find
         if figures is not None and figures["median_px"] > BAD_MEDIAN_PX:
             yield Finding(
                 "poses",
-                f"Features of {name} lie {figures['median_px']:.2f} px from where the poses have their epipolar lines "
-                f"(median, at the scene's size; 0.1 to 0.2 are usual); {remedy}.",
+                f"Features of {name} are {figures['median_px']:.2f} px from their epipolar lines (median; 0.1 to 0.2 "
+                f"px are usual), so the poses are inaccurate. Remedy: {remedy}.",
                 (name,),
             )
         elif figures is not None and bad:
@@ -195,8 +195,8 @@ def _poses(scene: SceneFolder, agreements: Sequence[Agreement]) -> Iterator[Find
                 "poses",
                 f"From frame {worst.first} to {worst.second} of {name}"
                 + (f" and at {len(bad) - 1} more steps" if len(bad) > 1 else "")
-                + f" features lie {worst.median_px:.1f} px from where the poses have their epipolar lines, where "
-                f"{figures['median_px']:.2f} px are usual; {remedy}.",
+                + f" features are {worst.median_px:.1f} px from their epipolar lines; {figures['median_px']:.2f} px "
+                f"are usual. Remedy: {remedy}.",
                 (name,),
                 tuple(sorted({moment for one in bad for moment in (one.first, one.second)})),
             )
@@ -208,8 +208,8 @@ def _timestamps(scene: SceneFolder) -> Iterator[Finding]:
         if wrong:
             yield Finding(
                 "timestamps",
-                f"The timestamps of {name} do not increase at {_frames(wrong)}; mend the recording's timestamps, by "
-                "which sweeps are de-skewed and poses are found.",
+                f"The timestamps of {name} do not increase at {_frames(wrong)}. Correct the recording's timestamps; "
+                "sweeps are de-skewed and poses are interpolated with them.",
                 (name,),
                 tuple(wrong),
             )
@@ -221,7 +221,7 @@ def _fits(scene: SceneFolder) -> Iterator[Finding]:
         if isinstance(rms_px, (int, float)) and rms_px > LARGEST_FIT_RMS_PX:
             yield Finding(
                 "fit",
-                f"The fisheye camera that stands for {name} is off by {rms_px:.2f} px rms; check its calibration, or "
+                f"The fisheye model fitted to {name} has an error of {rms_px:.2f} px rms. Check the calibration, or "
                 "process the drive with a smaller --theta-max-deg.",
                 (name,),
             )
@@ -240,9 +240,8 @@ def _vehicles(scene: SceneFolder) -> Iterator[Finding]:
         if name in cameras:
             yield Finding(
                 "vehicle",
-                f"The vehicle itself was not found in the pictures of {name}, too few or all alike, so what is seen of "
-                f"it is trained on; paint it black in {ego_mask_path(scene.path.parent, name)} and process the drive "
-                "again.",
+                f"The vehicle itself was not found in the pictures of {name}: they are too few or too similar. If it "
+                f"is visible, paint it black in {ego_mask_path(scene.path.parent, name)} and process the drive again.",
                 (name,),
             )
 
@@ -255,7 +254,7 @@ def _masks(measured: Sequence[PictureFigures]) -> Iterator[Finding]:
         which = f"The mask of {name}" if len(hidden) == len(figures) else f"The mask of {_frames(hidden)} of {name}"
         yield Finding(
             "mask",
-            f"{which} hides {max(hidden.values()):.0%} of the lens; see whether it is meant so (255 = use the pixel, "
+            f"{which} hides {max(hidden.values()):.0%} of the lens. Check that this is intended (255 = use the pixel, "
             "0 = ignore it).",
             (name,),
             () if len(hidden) == len(figures) else tuple(hidden),
@@ -263,22 +262,22 @@ def _masks(measured: Sequence[PictureFigures]) -> Iterator[Finding]:
 
 
 def _outliers(measured: Sequence[PictureFigures]) -> Iterator[Finding]:
-    """Pictures with far less LiDAR, or far darker or brighter, than the others of their camera."""
+    """Find pictures with far less LiDAR, or far darker or brighter, than the others of their camera."""
     for name, figures in _by_camera(measured).items():
         coverage = {one.picture.moment: one.lidar_coverage for one in figures if one.lidar_coverage is not None}
         usual = float(np.median(list(coverage.values()))) if coverage else 0.0
         if coverage and usual == 0:
             yield Finding(
                 "lidar",
-                f"Most LiDAR maps of {name} hold no return; check the calibration from the scanner to this camera.",
+                f"Most LiDAR maps of {name} are empty. Check the calibration from the scanner to this camera.",
                 (name,),
             )
         little = [moment for moment, share in coverage.items() if share < LITTLE_LIDAR * usual]
         if little:
             yield Finding(
                 "lidar",
-                f"LiDAR covers {min(coverage[moment] for moment in little):.2%} of {_frames(little)} of {name} where "
-                f"{usual:.2%} is usual; see whether the sweep is whole and the pose right.",
+                f"LiDAR covers {min(coverage[moment] for moment in little):.2%} of {_frames(little)} of {name}; "
+                f"{usual:.2%} is usual. Check that the sweep is complete and the pose is right.",
                 (name,),
                 tuple(little),
             )
@@ -292,8 +291,8 @@ def _outliers(measured: Sequence[PictureFigures]) -> Iterator[Finding]:
             if moments:
                 yield Finding(
                     word,
-                    f"The picture of {_frames(moments)} of {name} is {word}, mean grey {brightness[moments[0]]:.0f} "
-                    f"where {usual:.0f} is usual; look at it, and leave it out if it is badly exposed.",
+                    f"The picture of {_frames(moments)} of {name} is {word}: mean grey {brightness[moments[0]]:.0f}, "
+                    f"{usual:.0f} is usual. Leave it out if it is badly exposed.",
                     (name,),
                     tuple(moments),
                 )
@@ -315,33 +314,32 @@ def _mono_scale(measured: Sequence[PictureFigures]) -> Iterator[Finding]:
         which = name if every else f"{_frames(wrong)} of {name}"
         yield Finding(
             "mono_scale",
-            f"Monocular distance is {ratio:.2f} times LiDAR's in {which} (median); align the maps to LiDAR before "
-            "training, or see whether they hold metres along the ray in steps of 1/256 m.",
+            f"Monocular distance is {ratio:.2f} times LiDAR's in {which} (median). Check that the maps contain metres "
+            "along the ray in steps of 1/256 m, or align them to LiDAR.",
             (name,),
             () if every else tuple(wrong),
         )
 
 
 def _mono_shape(measured: Sequence[PictureFigures]) -> Iterator[Finding]:
-    """What a wrong transform looks like: LiDAR may cover as much of the pictures, but not with what they show."""
+    """Find wrong transforms: LiDAR covers the pictures as usual, but with other objects than they show."""
     for name, figures in _by_camera(measured).items():
         ratios = [one.mono_over_lidar for one in figures if len(one.mono_over_lidar)]
         if not ratios:
             continue
-        # whatever scale each map has
+        # the scale of each map does not matter
         off = float(np.median(np.concatenate([np.abs(ratio / np.median(ratio) - 1) for ratio in ratios])))
         if off > LARGEST_SHAPE_ERROR:
             yield Finding(
                 "mono_shape",
-                f"Monocular distance and LiDAR's differ by {off:.0%} in {name} (median, with each map's scale set "
-                "right). See in the sheets whether LiDAR lies on the things it hit: if not, a transform or a clock is "
-                "wrong.",
+                f"Monocular and LiDAR distances differ by {off:.0%} in {name} (median, after each map was scaled). "
+                "Check in the sheets that LiDAR points are on their objects. If not, a transform or a clock is wrong.",
                 (name,),
             )
 
 
 def limited(findings: Sequence[Finding], of_a_kind: int = _NAMED) -> list[str]:
-    """Give the sentences to print; of many of one kind only the first."""
+    """Return the sentences to print: of each kind at most the first few."""
     counts: dict[str, int] = {}
     lines = []
     for finding in findings:

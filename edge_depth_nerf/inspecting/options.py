@@ -14,14 +14,14 @@ LARGEST_PANEL_PX = 4000
 
 @dataclass(frozen=True)
 class InspectOptions:
-    """Look at a scene before training on it: sheets of its maps, a top view, figures and warnings."""
+    """Inspect a scene before training: sheets of its maps, a top view, figures and warnings."""
 
     scene: tyro.conf.Positional[Path]
-    """The scene folder, or its transforms.json; other nerfstudio scenes are shown with what they have."""
+    """The scene folder, or its transforms.json. Scenes of other makers work, too."""
     output: Path | None = None
     """Folder for the pictures and summary.json. Not set: SCENE_inspection beside the scene."""
     frames: int = 4
-    """How many frames get a sheet per camera, spread over the drive."""
+    """Number of frames that get a sheet per camera, spread over the drive."""
     size: int = 640
     """Longer side of each picture in a sheet, px."""
 
@@ -33,6 +33,6 @@ class InspectOptions:
 
         """
         if self.frames < 1:
-            raise InputError(f"--frames {self.frames}: expected 1 or more moments to show.")
+            raise InputError(f"--frames {self.frames}: expected 1 or more frames.")
         if not 64 <= self.size <= LARGEST_PANEL_PX:
             raise InputError(f"--size {self.size}: expected 64 to {LARGEST_PANEL_PX} px for the pictures of a sheet.")

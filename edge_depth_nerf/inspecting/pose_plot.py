@@ -1,4 +1,4 @@
-"""The poses along the drive: how far features lie from their epipolar lines, step by step."""
+"""Plots the poses' errors along the drive: distances of features from their epipolar lines, step by step."""
 
 from __future__ import annotations
 
@@ -40,6 +40,6 @@ def pose_check_figure(scene: SceneFolder, agreements: Sequence[Agreement]) -> Fi
     axes.legend(frameon=False, ncols=6)
     name = scene.path.parent.resolve().name
     figure.suptitle(
-        f"{name}: how far features matched with the next frame lie from their epipolar lines", parse_math=False
+        f"{name}: distance of matched features from their epipolar lines, each frame and the next", parse_math=False
     )
     return figure

@@ -1,4 +1,4 @@
-"""A sheet of one picture: the picture and its maps side by side, each with its legend."""
+"""Draws a sheet of one picture: the picture and its maps side by side, each with its legend."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ from edge_depth_nerf.inspecting.shown_prior import ORIGINS, ShownMaps
 from edge_depth_nerf.scene.reader import SceneFolder
 
 HIDDEN_RGB = (205, 50, 60)
-"""Tint of what the mask hides."""
+"""Tint of pixels that the mask hides."""
 NO_PRIOR_RGB = (60, 110, 230)
 """Tint, hatched, of usable pixels without a prior."""
 
 ORIGIN_RGB: tuple[Colour, ...] = ((20, 20, 20), (150, 150, 150), (240, 170, 40), (220, 60, 40))
-"""Of each of `ORIGINS`."""
+"""Colour of each of `ORIGINS`."""
 
 
 def draw_sheet(scene: SceneFolder, figures: PictureFigures, maps: ShownMaps, longer_side_px: int) -> NDArray[np.uint8]:
-    """Draw the sheet of one picture; panels of maps that it does not have are left out.
+    """Draw the sheet of one picture. Panels of missing maps are left out.
 
     Args:
-        scene: whose picture it is.
-        figures: of this picture, for the heading.
-        maps: its maps.
-        longer_side_px: of each panel's picture.
+        scene: the picture's scene.
+        figures: the picture's figures, for the heading.
+        maps: the picture's maps.
+        longer_side_px: longer side of each panel's picture.
 
     """
     height, width = maps.usable.shape
@@ -76,7 +76,7 @@ def draw_sheet(scene: SceneFolder, figures: PictureFigures, maps: ShownMaps, lon
         if maps.prior is not None:
             both = is_distance(maps.prior.distance_m) & is_distance(maps.truth_m)
             error = 100 * (maps.prior.distance_m / np.where(both, maps.truth_m, 1) - 1)
-            panels.append(coloured("prior against truth", error, both, RELATIVE_ERROR))
+            panels.append(coloured("prior / ground truth", error, both, RELATIVE_ERROR))
     columns = 4 if len(panels) > 6 else min(len(panels), 3)
     return lay_out(panels, columns, _heading(scene, figures))
 
@@ -97,7 +97,7 @@ def _origin_panel(origin: NDArray[np.int8], size: tuple[int, int]) -> NDArray[np
     names = [
         (f"{name} {np.count_nonzero(origin == i) / max(found, 1):.0%}", ORIGIN_RGB[i]) for i, name in enumerate(ORIGINS)
     ]
-    return panel(colours[resize(origin, size)], "what the prior comes from", legend(names, size[0]))
+    return panel(colours[resize(origin, size)], "source of the prior", legend(names, size[0]))
 
 
 def _heading(scene: SceneFolder, figures: PictureFigures) -> list[str]:
@@ -114,7 +114,7 @@ def _heading(scene: SceneFolder, figures: PictureFigures) -> list[str]:
     if len(figures.sigma_m):
         facts.append(f"sigma {np.median(figures.sigma_m):.2g} m (median)")
     if len(figures.prior_over_truth):
-        facts.append(f"prior against truth: AbsRel {np.abs(figures.prior_over_truth - 1).mean():.3f}")
+        facts.append(f"prior / ground truth: AbsRel {np.abs(figures.prior_over_truth - 1).mean():.3f}")
     return [
         f"{picture.camera}, frame {picture.moment} ({split})",
         f"{picture.lens.width}×{picture.lens.height} px; " + "; ".join(facts),

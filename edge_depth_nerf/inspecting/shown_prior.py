@@ -1,4 +1,4 @@
-"""The prior of a scene's pictures for show: as training makes it by default."""
+"""Computes the prior of a scene's pictures for display, with training's defaults."""
 
 from __future__ import annotations
 
@@ -16,33 +16,30 @@ from edge_depth_nerf.scene.format import TRUST_FILE
 from edge_depth_nerf.scene.reader import PictureMaps, SceneFolder, ScenePicture
 
 ORIGINS = ("LiDAR", "monocular", "both", "motion")
-"""What is known at a pixel with a prior: a LiDAR point; without one a monocular distance, one from motion as well, or
-that from motion alone."""
+"""Sources of a pixel's prior. LiDAR: a LiDAR point. Without one: a monocular distance, one from motion, or both."""
 
 
 @dataclass(frozen=True)
 class ShownMaps(PictureMaps):
-    """All that one picture has, with the prior that training makes of it."""
+    """All maps of one picture, with the prior that training makes of them."""
 
     source: str | None
-    """What the prior is made of; None with neither LiDAR nor monocular distance."""
+    """The prior's depth source; None without any."""
     prior: Prior | None
     """None without a source."""
     origin: NDArray[np.int8] | None
-    """H×W, what the prior comes from: an index of `ORIGINS`, -1 without a prior. None without a source."""
+    """H×W, the source of each pixel's prior: an index of `ORIGINS`, -1 without a prior. None without a source."""
 
 
 class ShownScene:
-    """A scene whose pictures come with their priors."""
+    """A scene with the priors of its pictures."""
 
     def __init__(self, scene: SceneFolder) -> None:
         self.scene = scene
 
     @cached_property
     def trust(self) -> Trust | None:
-        """The calibration beside the maps, if it was made of them as they are.
-
-        Without one, sigma is as under sigma_mode combined.
+        """The calibration beside the maps, if it matches them; else None, and sigma_mode is combined.
 
         Raises:
             InputError: the file is broken.
@@ -55,10 +52,10 @@ class ShownScene:
         return saved_trust(self.scene, PriorOptions())
 
     def maps(self, picture: ScenePicture) -> ShownMaps:
-        """Read all that a picture has, and make its prior.
+        """Read all maps of a picture, and compute its prior.
 
         Raises:
-            InputError: a file cannot be decoded, or has another size than the camera.
+            InputError: a file cannot be decoded, or its size differs from the camera's.
 
         """
         maps = self.scene.maps(picture)
@@ -72,7 +69,7 @@ class ShownScene:
 
 
 def _origin(maps: PictureMaps, source: str, prior: Prior, trust: Trust | None, view: View | None) -> NDArray[np.int8]:
-    """Say for each pixel what its prior comes from, by the rules of `make_prior`."""
+    """Return the source of each pixel's prior, by the rules of `make_prior`."""
 
     def has(name: str) -> NDArray[np.bool_]:
         found = maps.distances_m.get(name)
@@ -82,7 +79,7 @@ def _origin(maps: PictureMaps, source: str, prior: Prior, trust: Trust | None, v
     moved = has("motion") if with_motion else np.zeros_like(maps.usable)
     estimated = has("mono")
     if trust is not None and view is not None:
-        # beyond, a monocular distance means "far"
+        # larger monocular distances only mean "far"
         estimated &= np.nan_to_num(maps.distances_m.get("mono", np.zeros(1))) <= FARTHEST_M
         if not trust.everywhere:
             estimated &= trust.in_field(view.elevation_rad)

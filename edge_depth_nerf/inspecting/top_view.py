@@ -1,7 +1,7 @@
-"""The drive from above: points, path, cameras, gaps.
+"""Draws the drive from above: points, path, cameras, gaps.
 
-The scene's x runs to the right, its y upwards, its z towards the viewer. Lengths are the scene's, metres in scenes of
-this project.
+The scene's x runs to the right, its y upwards, its z towards the viewer. Lengths are in the scene's unit, which is
+metres in scenes of this project.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from edge_depth_nerf.inspecting.findings import Finding
 from edge_depth_nerf.scene.reader import SceneFolder
 
 LARGEST_PX = (1600, 1100)
-"""Width and height that the map may take."""
+"""Largest width and height of the map."""
 LEAST_PX = 420
-"""Each side of the map is at least so long, for the legend's sake."""
+"""Least length of each side, so that the legend fits."""
 MARGIN_M = 12.0
-"""What is shown around the path, at least, in scenes whose lengths are metres."""
+"""Least margin around the path, in scenes whose lengths are metres."""
 PATH, TRAINING, HELD_OUT, GAP = "#7896c8", "#1450be", "#eb7d00", "#d21428"
 VIEWS = ("#008c5a", "#963caa", "#008caa", "#966e00", "#c85078", "#5a5a5a")
-"""Viewing directions, by camera."""
+"""Colours of the viewing directions, by camera."""
 GREYS = ("#e1e1e1", "#cacaca", "#b3b3b3", "#9c9c9c", "#858585", "#6e6e6e")
-"""Points, from low to high: the ground stays pale, fronts of houses are lines."""
+"""Colours of points, from low to high: the ground is pale, and house fronts become lines."""
 _AROUND_PX = (80, 110)
-"""What the axes' numbers and the title take."""
+"""Space for the axes' numbers and the title."""
 _DPI = 100
 _ARROW = {"units": "dots", "scale_units": "dots", "scale": 1 / 18}
 """Arrows of 18 px for a length of 1."""
@@ -46,8 +46,8 @@ def draw_top_view(
     Args:
         scene: its poses.
         points_m: N×3 points in the scene; higher ones are drawn darker.
-        findings: of these, the gaps are marked.
-        shown: moments that have a sheet; they are numbered beside the path.
+        findings: the gaps among them are marked.
+        shown: frames that have a sheet; their numbers are beside the path.
 
     """
     return drawn(top_view(scene, points_m, findings, shown))
@@ -56,7 +56,7 @@ def draw_top_view(
 def top_view(
     scene: SceneFolder, points_m: NDArray[np.float64] | None, findings: Sequence[Finding], shown: Sequence[int]
 ) -> Figure:
-    """Make the figure of `draw_top_view`; its one pair of axes counts the scene's lengths."""
+    """Make the figure of `draw_top_view`. Its axes are in the scene's unit."""
     figure, axes, pixel_m = _empty_map(scene)
     if points_m is not None:
         _add_points(axes, points_m)
@@ -70,7 +70,7 @@ def top_view(
             ends_m = np.array([at_m[moment] for moment in step])
             axes.plot(*ends_m.T[:2], color=GAP, linewidth=3, zorder=0.9)
             _write(axes, f"{np.linalg.norm(np.diff(ends_m, axis=0)):.3g} {_unit(scene)}", ends_m.mean(0)[:2], GAP)
-    # no heads on those that are drawn close to each other
+    # viewing directions have no arrow heads, because they are close to each other
     bare = {"width": 1.4, "headwidth": 0, "headlength": 0, "headaxislength": 0}
     for number, (name, pictures) in enumerate(scene.cameras().items()):
         from_m = np.array([picture.position_m[:2] for picture in pictures])
@@ -84,7 +84,7 @@ def top_view(
     _add_dots(axes, path_m[held_out], 10.0, pixel_m, HELD_OUT, "held out")
     if named := sorted({*shown} & at_m.keys()):
         rings_m = np.array([at_m[moment][:2] for moment in named])
-        axes.plot(*rings_m.T, "o", markersize=10, markerfacecolor="none", color=INK, label="moment with a sheet")
+        axes.plot(*rings_m.T, "o", markersize=10, markerfacecolor="none", color=INK, label="frame with a sheet")
         for index in _apart(rings_m, 40 * pixel_m):
             _write(axes, str(named[index]), rings_m[index], INK)
     add_legend_below(figure, *axes.get_legend_handles_labels(), "outside lower left")
@@ -96,7 +96,7 @@ def _unit(scene: SceneFolder) -> str:
 
 
 def _empty_map(scene: SceneFolder) -> tuple[Figure, Axes, float]:
-    """Axes on which the path fits with a margin, and what one pixel of them stands for."""
+    """Return axes that the path fits with a margin, and the length of one of their pixels."""
     positions_m = np.array([picture.position_m[:2] for picture in scene.pictures])
     low, high = positions_m.min(0), positions_m.max(0)
     extent = float((high - low).max())
@@ -115,13 +115,13 @@ def _empty_map(scene: SceneFolder) -> tuple[Figure, Axes, float]:
     axes.set_xlabel(f"x{' (east)' if mapped else ''}, {_unit(scene)}")
     axes.set_ylabel(f"y{' (north)' if mapped else ''}, {_unit(scene)}")
     name = scene.path.parent.resolve().name
-    title = f"{name} from above: {len(scene.moments())} moments, path of {reference_camera(scene)}"
+    title = f"{name} from above: {len(scene.moments())} frames, path of {reference_camera(scene)}"
     figure.suptitle(title, parse_math=False)
     return figure, axes, pixel_m
 
 
 def _write(axes: Axes, text: str, at_m: NDArray[np.float64], colour: str) -> None:
-    """Write beside a place, legibly over lines."""
+    """Write beside a position, readable on top of lines."""
     rim = [withStroke(linewidth=3, foreground="white")]
     axes.annotate(text, tuple(at_m), (7, 7), textcoords="offset points", color=colour, path_effects=rim)
 
@@ -141,7 +141,7 @@ def _add_points(axes: Axes, points_m: NDArray[np.float64]) -> None:
 
 
 def _apart(places_m: NDArray[np.float64], least_m: float) -> list[int]:
-    """Which places to keep so that each is so far from the one kept before."""
+    """Return indices of positions that are at least this far from the one kept before."""
     kept: list[int] = []
     for index, place_m in enumerate(places_m):
         if not kept or np.linalg.norm(place_m - places_m[kept[-1]]) >= least_m:
@@ -152,7 +152,7 @@ def _apart(places_m: NDArray[np.float64], least_m: float) -> list[int]:
 def _add_dots(
     axes: Axes, places_m: NDArray[np.float64], largest_px: float, pixel_m: float, colour: str, label: str
 ) -> None:
-    """Draw a dot at each place, smaller and fewer where they would touch."""
+    """Draw a dot at each position; smaller and fewer ones where they would touch."""
     if not len(places_m):
         return
     steps_px = np.linalg.norm(np.diff(places_m, axis=0), axis=1) / pixel_m
@@ -162,7 +162,7 @@ def _add_dots(
 
 
 def _add_travel(axes: Axes, path_m: NDArray[np.float64], pixel_m: float) -> None:
-    """Draw arrow heads on the path, in the direction of travel, some 90 px apart."""
+    """Draw arrow heads on the path, in the direction of travel, about 90 px apart."""
     path_m = path_m[_apart(path_m, 10 * pixel_m)]
     steps_m = np.diff(path_m, axis=0)
     lengths_m = np.linalg.norm(steps_m, axis=1)

@@ -1,7 +1,7 @@
-"""How the viewer's picture gets sharp on a CPU: in steps that a machine's speed allows, and smooth at each.
+"""Renders the viewer's picture coarse to fine, in sizes that the machine's speed allows, and smooth in each.
 
-nerfstudio renders once for a thirtieth of a second, which on a CPU is a mosaic of 38×30 pixels, and then as large as it
-may, which takes half a minute there.
+nerfstudio itself renders twice: first for a thirtieth of a second, which on a CPU gives a mosaic of 38×30 pixels, then
+in full size, which takes half a minute on a CPU.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ if TYPE_CHECKING:
     from nerfstudio.viewer.viewer import Viewer
 
 BUDGETS: dict[str, tuple[float, int]] = {"low_move": (0.15, 60), "low_static": (1.0, 100), "middle": (3.0, 160)}
-"""Of the steps before the last: seconds that one may take, and the height in px that it has in any case."""
+"""For each step before the last: its largest time in seconds, and its least height in px."""
 FIRST_RAYS_PER_S = 10_000.0
-"""Taken for the machine's speed before anything was rendered."""
+"""Assumed speed of the machine before the first rendering."""
 SHOWN_PX = 512
-"""Smaller pictures are enlarged to this height, lest the browser draw their pixels as squares."""
+"""Smaller pictures are enlarged to this height. Otherwise the browser draws their pixels as squares."""
 
 
 class CoarseToFine(RenderStateMachine):
-    """Decides what a browser is sent: a rough picture while it moves, then three finer ones."""
+    """Chooses what a browser receives: a coarse picture while the camera moves, then three finer ones."""
 
     def __init__(self, viewer: Viewer, client: viser.ClientHandle) -> None:
         """Render for one browser; nothing is rendered before `start`."""
@@ -39,9 +39,9 @@ class CoarseToFine(RenderStateMachine):
         self._is_rendering = False
 
     def action(self, action: RenderAction) -> None:
-        """Take note of what happened; a movement ends a finer picture that is being rendered."""
+        """Record an event. A movement stops the rendering of a finer picture."""
         super().action(action)
-        # nerfstudio's own flag would also end a rendering that has not begun
+        # nerfstudio's own flag would also stop a rendering that has not started
         asked = self.next_action
         self.interrupt_render_flag = (
             self._is_rendering
@@ -77,7 +77,7 @@ class CoarseToFine(RenderStateMachine):
             size = (SHOWN_PX, round(SHOWN_PX * width / height))
             outputs = {name: _enlarged(values, size) for name, values in outputs.items()}
         super()._send_output_to_viewer(outputs, static_render)
-        # the size that was rendered, and the step that the model is of: nerfstudio tells of it during trainings alone
+        # the rendered size and the model's step; nerfstudio itself updates them only during a training
         self.viewer.stats_markdown.content = self.viewer.make_stats_markdown(self.viewer.step, f"{width}x{height}px")
 
 
@@ -89,9 +89,9 @@ def _enlarged(values: Any, size: tuple[int, int]) -> Any:
 
 
 def render_coarse_to_fine(viewer: Viewer, client: viser.ClientHandle) -> None:
-    """Let a browser that has just come be served by `CoarseToFine`."""
+    """Serve a new browser with `CoarseToFine`."""
     before = viewer.render_statemachines[client.client_id]
-    # what has nothing to do does not look at its flag before it has rendered once, unless its picture is done
+    # an idle machine checks its flag only after a rendering, or if its picture is complete
     before.state, before.running = "high", False
     machine = CoarseToFine(viewer, client)
     viewer.render_statemachines[client.client_id] = machine

@@ -1,11 +1,12 @@
 """Serves training rays with colour and depth prior.
 
-Host-facing. The prior of each training frame is integrated once, in `setup_train` (ns-render and the viewer's
-thumbnails never wait for it), from that frame's own maps: a sweep of a held-out moment is in no training frame. How
-far it is trusted is measured on training frames alone (`mono.trust`), once, if the scene does not bring it.
-Batches are read from a table of all valid pixels of all training pictures (see `pixel_table`), so that scenes of one
-picture, of mixed sizes, with masks or without all work; nerfstudio's own pixel sampler fails on some of these. The
-table is kept on disk: the next training of the same scene with the same prior reads no picture at all.
+Host-facing. `setup_train` integrates the prior of each training picture once, so ns-render and the viewer's thumbnails
+never wait for it. The prior uses the frame's own maps: no training frame contains a sweep of a held-out frame. The
+prior's calibration (`mono.calibration`) is measured on training frames alone, unless the scene has one.
+
+Batches are read from a table of all valid pixels of all training pictures (see `pixel_table`). This works for scenes of
+one picture, of mixed sizes, with and without masks; nerfstudio's own pixel sampler fails on some of these. The table is
+kept on disk, so the next training of the same scene with the same prior reads no picture.
 """
 
 from __future__ import annotations
@@ -67,12 +68,12 @@ from edge_depth_nerf.plugin.upload import Stretch, Uploads
 from edge_depth_nerf.scene.format import LAYERS, depth_sources
 
 KEPT_TABLES = 8
-"""So many tables of pixels are kept of a scene, those used last; one of 300 pictures of 1400×1400 px takes 6 GB."""
+"""This many tables of pixels are kept per scene, the last used ones. 300 pictures of 1400×1400 px take 6 GB."""
 
 
 SURFACE_SIGMA_M = 0.1
 SURFACE_SIGMA_SHARE = 0.15
-"""A prior whose sigma is above these metres plus this share of its distance is too vague for a surface."""
+"""A prior is too vague for a surface if its sigma exceeds these metres plus this share of its distance."""
 
 
 @dataclass
@@ -84,31 +85,31 @@ class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig):
     dataparser: AnnotatedDataParserUnion = field(default_factory=FisheyeDepthDataParserConfig)
     """Specifies the dataparser used to unpack the data."""
     depth_source: str = "auto"
-    """Where the prior comes from. integrated: LiDAR and monocular maps (Eq. 5), and maps from motion where the scene
-    has them; lidar, mono (Table 3), motion, or another source that the scene has: it alone. auto: what the scene has.
-    none: no prior."""
+    """The prior's source. integrated: LiDAR and monocular maps (Eq. 5), and maps from motion if the scene has them.
+    lidar, mono (Table 3), motion or another source of the scene: this source alone. auto: what the scene has. none:
+    no prior."""
     prior: PriorOptions = field(default_factory=PriorOptions)
-    """How these maps become a prior."""
+    """How the prior is computed from these maps."""
     prior_weight: float = 1.0
-    """How often a pixel with a prior is drawn, against one without."""
+    """How often a pixel with a prior is drawn, relative to one without."""
     surface_rays_per_batch: int = 16384
-    """So many further pixels come with each training batch, less those whose prior is vague: their colour is compared
-    with the field's at the prior's distance, at one sample a ray. 0: none."""
+    """Number of additional pixels in each training batch; those with a vague prior are dropped. Their colour is
+    compared with the field's at the prior's distance, with one sample per ray. 0: none."""
     cache_dir: Path | None = None
-    """Where integrated priors and tables of training pixels are kept. Not set: .cache/ in the scene folder."""
+    """Folder for integrated priors and tables of training pixels. Not set: .cache/ in the scene folder."""
 
     def __post_init__(self) -> None:
         if not 0.01 <= self.prior_weight <= 100:
             raise InputError(f"prior_weight is {self.prior_weight:g}; expected 0.01 to 100.")
 
     def source_of_prior(self, sources: Collection[str]) -> str | None:
-        """The depth source with `auto` settled by what the scene has; None for no prior.
+        """Return the depth source; `auto` becomes what the scene has. None: no prior.
 
         Args:
             sources: the layers that all pictures have.
 
         Raises:
-            InputError: the depth source asked for is none, or is not in the scene.
+            InputError: the depth source is unknown, or is not in the scene.
 
         """
         if self.depth_source == "none":
@@ -131,16 +132,16 @@ class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig):
 
 
 class TablePixelSampler:
-    """What nerfstudio calls a pixel sampler; its exporter sets `num_rays_per_batch`.
+    """A pixel sampler of nerfstudio's interface; its exporter sets `num_rays_per_batch`.
 
-    Of several processes that train together (torch.distributed) each reads a part of every batch: all begin at one
-    place, and what the first reads the others leave out.
+    Processes that train together (torch.distributed) each read a part of every batch. All start at the same record,
+    and no two read the same records.
     """
 
     def __init__(self, table: PixelTable, num_rays_per_batch: int, device: torch.device | str = "cpu"):
         self.table = table
         self.num_rays_per_batch = num_rays_per_batch
-        # another seed begins elsewhere
+        # another seed starts at another record
         first = torch.randint(len(table), ())
         self._rank, self._world_size = 0, 1
         if dist.is_available() and dist.is_initialized():
@@ -155,13 +156,13 @@ class TablePixelSampler:
         self.num_rays_per_batch = num_rays_per_batch
 
     def sample(self, step: int = 0) -> PixelBatch:
-        """Read the next batch; at a later step of training, the one that belongs there."""
+        """Read the next batch; at a later step of the training, the batch of that step."""
         stretch = self.draw(step)
         return self.table.batch(stretch.start, stretch.count)
 
     def draw(self, step: int = 0) -> Stretch:
-        """Say which records are the next batch."""
-        # a training that is taken up again goes on where it was; the exporter always says 0
+        """Return which records are the next batch."""
+        # a resumed training continues at its record; the exporter always passes 0
         self._drawn = max(self._drawn, step * self.num_rays_per_batch)
         start = self._first + self._drawn * self._world_size + self._rank * self.num_rays_per_batch
         self._drawn += self.num_rays_per_batch
@@ -171,10 +172,10 @@ class TablePixelSampler:
 class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
     """DataManager of fisheye scenes.
 
-    A batch holds image (n×3), indices (n×3: picture, row, column), prior_distance_m and prior_sigma_m (n×1, metres,
-    0 = no prior), and sky (n×1, bool: known to show the sky). The same of further pixels is named surface_…, and
-    surface_rays are their rays. On the CPU these are the pixels of use. Elsewhere their number is always the same, as a
-    GPU would have to be waited for to know it, and surface_counts (n×1, bool) says which are of use.
+    A batch contains image (n×3), indices (n×3: picture, row, column), prior_distance_m and prior_sigma_m (n×1, metres,
+    0 = no prior), and sky (n×1, bool: shows the sky). For the additional pixels, these names start with surface_, and
+    surface_rays are their rays. On the CPU the batch only has the useful additional pixels. On a GPU it always has all
+    of them, because counting them would wait for the GPU; surface_counts (n×1, bool) marks the useful ones.
     """
 
     config: FisheyeDepthDataManagerConfig
@@ -190,8 +191,8 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         super().__init__(config, *args, **kwargs)
 
     def setup_train(self) -> None:
-        """Integrate the prior of every training frame and write the table of training pixels, or find it."""
-        # of several processes that train on a scene the first makes what they share
+        """Integrate the prior of each training picture and write the table of their pixels, or open an existing one."""
+        # if several processes train on a scene, the first one makes what they share
         with only_writer(self._cache_dir(), CONSOLE):
             table = self._table(self.train_dataset, "Integrating depth", with_prior=True)
             self.train_ray_generator = self._ray_generator(self.train_dataset)
@@ -206,7 +207,7 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         )
 
     def setup_eval(self) -> None:
-        """Write or find the table of held-out pixels (no prior) and prepare the loaders of whole views."""
+        """Write or open the table of held-out pixels (no prior), and prepare the loaders of whole views."""
         with only_writer(self._cache_dir(), CONSOLE):
             table = self._table(self.eval_dataset, "Reading held-out pictures", with_prior=False)
             self.eval_ray_generator = self._ray_generator(self.eval_dataset)
@@ -217,7 +218,7 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         self.eval_dataloader = RandIndicesEvalDataloader(input_dataset=self.eval_dataset, device=self.device)
 
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
-        """Rays of the next training batch and what supervises them; surface_…: further pixels of use, if any."""
+        """Return the rays of the next training batch and their supervision; surface_…: additional pixels, if any."""
         self.train_count += 1
         assert self.train_pixel_sampler is not None
         if torch.device(self.device).type != "cpu":
@@ -228,14 +229,14 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         if self._surface_sampler is not None:
             further = self._surface_sampler.sample(step)
             chosen = _of_use(further)[:, 0]
-            # the mean over no pixels would be no number
+            # the mean over no pixels would be NaN
             if chosen.any():
                 batch["surface_rays"], surface = self._serve(further[chosen], self.train_ray_generator)
                 batch |= _of_surface(surface)
         return rays, batch
 
     def _next_train_elsewhere(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
-        """Give the same on another device, of one copy, with all of the further pixels."""
+        """Return the same on another device, with one copy to it and all additional pixels."""
         assert self.train_pixel_sampler is not None
         samplers = [sampler for sampler in (self.train_pixel_sampler, self._surface_sampler) if sampler is not None]
         stretches = [sampler.draw(step) for sampler in samplers]
@@ -251,24 +252,24 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         return every[:count], batch
 
     def pictures_of(self, rays: Tensor | None = None) -> list[str]:
-        """Names of the pictures that the last training batch is from; of some of its rays, where these are said."""
+        """Return the names of the pictures of the last training batch, or of some of its rays."""
         pictures = self.trained_on[:, 0].cpu()
         chosen = pictures if rays is None else pictures[rays.cpu()]
         return [str(self.train_dataset.image_filenames[image_idx]) for image_idx in chosen.unique().tolist()]
 
     def next_eval(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
-        """Rays of a batch of held-out pixels and their colours."""
+        """Return the rays of a batch of held-out pixels, and their colours."""
         self.eval_count += 1
         assert self.eval_pixel_sampler is not None
         return self._serve(self.eval_pixel_sampler.sample(), self.eval_ray_generator)
 
     def _ray_generator(self, dataset: FisheyeDepthDataset) -> RayGenerator:
-        """The table of rays where the cameras allow one, else nerfstudio's generator."""
+        """Return the table of rays if the cameras allow one, else nerfstudio's generator."""
         cameras = dataset.cameras.to(self.device)
         if TableRayGenerator.suits(cameras):
             generator = TableRayGenerator(cameras, self._cache_dir() / "rays")
         else:
-            # its grid of pixels has to lie where the indices do
+            # its grid of pixels must be on the device of the indices
             generator = RayGenerator(cameras).to(self.device)
         sizes = torch.cat([cameras.width, cameras.height], dim=-1)
         generator.register_buffer("sizes", sizes, persistent=False)
@@ -292,7 +293,7 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         }
 
     def _recipe(self, dataset: FisheyeDepthDataset) -> PriorRecipe | None:
-        """What the prior of a split's pictures is made of and how; None without any."""
+        """Return how the prior of a split's pictures is made; None without a prior."""
         options, scene = self.config.prior, dataset.scene
         sources = dataset.sources()
         source = self.config.source_of_prior(sources)
@@ -306,14 +307,13 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
             trust = field_of_source(scene)
         elif self.config.depth_source == "auto" and "mono" not in sources:
             CONSOLE.log(
-                f"[yellow]Depth prior: LiDAR alone, for the scene has no monocular maps. `edge-depth-nerf "
-                f"estimate-depth {escape(str(self.config.dataparser.data))}` makes them, or finishes those that were "
-                "begun.",
+                f"[yellow]Depth prior: LiDAR alone, because the scene has no monocular maps, or not all of them. To "
+                f"make them, run `edge-depth-nerf estimate-depth {escape(str(self.config.dataparser.data))}`.",
             )
         return PriorRecipe(source, options, trust)
 
     def _table(self, dataset: FisheyeDepthDataset, description: str, with_prior: bool) -> PixelTable:
-        """The table of a split's pixels: the one on disk, if it was made of the same things, or a new one."""
+        """Return the table of a split's pixels: the one on disk if it matches, else a new one."""
         cache_dir = self._cache_dir()
         recipe = self._recipe(dataset) if with_prior else None
         weight = self.config.prior_weight if recipe else 1.0
@@ -323,9 +323,9 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
             used(path)
             return table
         except (OSError, ValueError, KeyError, InputError):
-            pass  # not there, or not whole: made now
+            pass  # absent or incomplete: it is made now
         if not _writable(path.parent):
-            # a scene that cannot be written: the table lives as long as this object
+            # the scene folder is read-only: the table is deleted with this object
             self._temporary.append(tempfile.TemporaryDirectory(prefix="edge-depth-nerf-"))
             path = Path(self._temporary[-1].name) / path.name
         cache = None
@@ -342,8 +342,8 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
             if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
                 raise
             raise InputError(
-                f"{path.parent}: the table of pixels cannot be written ({os.strerror(error.errno)}); it takes up to "
-                f"{most * RECORD.itemsize / 1e9:.2g} GB. Free some space there, or choose another place by "
+                f"{path.parent}: the table of pixels cannot be written ({os.strerror(error.errno)}); it needs up to "
+                f"{most * RECORD.itemsize / 1e9:.2g} GB. Free some space there, or choose another folder with "
                 "--pipeline.datamanager.cache-dir."
             ) from error
         _remove_old(path.parent)
@@ -353,31 +353,31 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
 
 
 def _of_use(pixels: PixelBatch) -> Tensor:
-    """Whether a surface is known: the sky, or a prior that is not too vague, [n, 1]."""
+    """Whether a pixel's surface is known: it is sky, or its prior is not too vague, [n, 1]."""
     vague = pixels.prior_sigma_m > SURFACE_SIGMA_M + SURFACE_SIGMA_SHARE * pixels.prior_distance_m
     return pixels.sky | (pixels.prior_distance_m > 0) & ~vague
 
 
 def _of_surface(values: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The names that a batch has for what belongs to further pixels."""
+    """Rename a batch's entries to those of additional pixels."""
     names = {"prior_distance_m": "distance_m", "prior_sigma_m": "sigma_m"}
     return {f"surface_{names.get(name, name)}": value for name, value in values.items()}
 
 
 @dataclass(frozen=True)
 class PriorRecipe:
-    """What a prior is made of, and how."""
+    """The source and options of a prior."""
 
     depth_source: str
     """integrated, or the name of a source."""
     options: PriorOptions
-    """How its maps become a prior."""
+    """How the prior is computed from its maps."""
     trust: Trust | None
-    """The drive's calibration, where it has a part."""
+    """The drive's calibration, if the source uses one."""
 
     @property
     def layers(self) -> tuple[str, ...]:
-        """The layers that are read: beside the source's own those that say where the sky is."""
+        """The layers that are read: the source's own, and those that show where the sky is."""
         if self.depth_source == INTEGRATED and self.options.motion:
             return ("lidar", "mono", "motion")
         return ("lidar", "mono") if self.depth_source in CALIBRATED else (self.depth_source,)
@@ -386,10 +386,10 @@ class PriorRecipe:
 def _load(
     dataset: FisheyeDepthDataset, recipe: PriorRecipe | None, cache: PriorCache | None, whole_windows: bool
 ) -> Iterator[PicturePixels]:
-    """Colours, mask, prior and its sigma, and the sky of each picture.
+    """Yield colours, mask, prior with sigma, and sky of each picture.
 
     Raises:
-        InputError: a file cannot be used, or, with `whole_windows`, a mask leaves too little to be judged by.
+        InputError: a file cannot be used. With `whole_windows`, also: a mask leaves too few pixels for evaluation.
 
     """
 
@@ -399,8 +399,8 @@ def _load(
         if whole_windows and not has_whole_window(torch.from_numpy(mask)):
             raise InputError(
                 f"{dataset.mask_key(image_idx)[0] or dataset.image_filenames[image_idx]}: the mask of the held-out "
-                f"picture {dataset.image_filenames[image_idx].name} keeps too little to judge by (not one window "
-                "of SSIM, 11×11 px). Mend the mask (255 = use the pixel), or do not hold that picture out."
+                f"picture {dataset.image_filenames[image_idx].name} leaves too few pixels for evaluation (no window "
+                "of SSIM, 11×11 px). Correct the mask (255 = use the pixel), or do not hold out this picture."
             )
         if recipe is None or cache is None:
             return PicturePixels(rgb, mask)
@@ -410,12 +410,12 @@ def _load(
         prior = cache.prior(maps, mask, view if recipe.trust is not None else None)
         sky = None if mono is None or view is None else sky_of(mono, maps.get("lidar"), view, rgb, mask)
         if sky is not None and (motion := maps.get("motion")) is not None:
-            # what is matched is no sky
+            # a pixel that was matched between pictures is not sky
             sky &= ~(motion > 0)
         return PicturePixels(rgb, mask, prior.distance_m, prior.sigma_m, sky)
 
-    # OpenCV and torch release the interpreter's lock, so two threads read and integrate side by side; a few pictures
-    # ahead, not all that the disk can bring
+    # OpenCV and torch release the interpreter's lock, so two threads read and integrate at the same time. They are only
+    # a few pictures ahead, which limits memory.
     with ThreadPoolExecutor(max_workers=2) as pool:
         waiting = deque(pool.submit(load, image_idx) for image_idx in range(min(3, len(dataset))))
         for ahead in range(len(dataset)):
@@ -426,7 +426,7 @@ def _load(
 
 
 def _table_key(dataset: FisheyeDepthDataset, recipe: PriorRecipe | None, weight: float) -> str:
-    """What a table was made of: the files by name, size and date, the cameras, and what the prior is made by."""
+    """Return a hash of all that a table depends on: files by name, size and date, cameras, the prior's settings."""
     layers = ["image", "mask", *(recipe.layers if recipe else ())]
     files = [picture.files[layer] for layer in layers for picture in dataset.pictures if layer in picture.files]
     stats = [(str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in files]
@@ -453,7 +453,7 @@ def _writable(folder: Path) -> bool:
 
 
 def _remove_old(folder: Path) -> None:
-    """Keep the tables that were used last."""
+    """Remove all tables but those used last."""
     keep_last(folder, "*.npy", KEPT_TABLES)
     for about in folder.glob("[!.]*.json"):
         if not about.with_suffix(".npy").exists():

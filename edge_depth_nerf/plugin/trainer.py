@@ -1,4 +1,4 @@
-"""Trains so that a run stopped at any moment can be taken up again, and stops itself where numbers are not finite."""
+"""A trainer whose runs can be stopped and resumed at any time, and that stops at numbers that are not finite."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ from edge_depth_nerf.plugin.plain_errors import say_errors_plainly
 from edge_depth_nerf.plugin.settings import changed_settings
 
 FOR_A_GPU = ("edge-depth-nerf", "edge-depth-nerf-paper")
-"""Methods of full size."""
+"""Methods with full-size models."""
 
 
 @dataclass
 class EdgeDepthTrainerConfig(TrainerConfig):
-    """nerfstudio's trainer with checkpoints that are whole, and with finite numbers."""
+    """nerfstudio's trainer with atomic checkpoints and a check for finite numbers."""
 
     _target: type = field(default_factory=lambda: EdgeDepthTrainer)
     """Target class to instantiate."""
 
     def print_to_terminal(self) -> None:
-        """Say what is trained, and which settings differ from the method's own; config.yml has them all."""
-        from nerfstudio.configs.method_configs import all_methods  # which asks this plugin for its methods
+        """Print what is trained, and the settings that differ from the method's own; config.yml has all of them."""
+        from nerfstudio.configs.method_configs import all_methods  # imports this plugin's methods
 
         scene = self.pipeline.datamanager.data
         lines = [f"{self.method_name}: {self.max_num_iterations} steps on {self.machine.device_type}, scene {scene}"]
@@ -54,13 +54,13 @@ class EdgeDepthTrainerConfig(TrainerConfig):
         CONSOLE.print("\n".join(lines), soft_wrap=True, highlight=False, markup=False)
 
     def save_config(self) -> None:
-        """Save config.yml as nerfstudio does, but atomically: half of one could not be loaded any more.
+        """Save config.yml as nerfstudio does, but atomically: half a file could not be loaded.
 
-        An implementation left to `auto` is settled, as another machine may settle it otherwise, and tiny-cuda-nn's
-        checkpoints are not those of the others.
+        The implementation `auto` is replaced by the chosen one. Another machine might choose differently, and
+        tiny-cuda-nn cannot load the checkpoints of the others.
 
         Raises:
-            FileNotFoundError: no scene where `--data` says; then nothing is written.
+            FileNotFoundError: there is no scene at `--data`; then nothing is written.
 
         """
         say_errors_plainly()
@@ -78,25 +78,25 @@ class EdgeDepthTrainerConfig(TrainerConfig):
 
 
 class EdgeDepthTrainer(Trainer):
-    """nerfstudio's trainer with checkpoints that are whole, and with finite numbers.
+    """nerfstudio's trainer with atomic checkpoints and a check for finite numbers.
 
-    Ctrl-C ends it after the step it is at, with a checkpoint of that step and a line on how to go on.
+    Ctrl-C ends it after the current step, with a checkpoint of that step and a line on how to resume.
     """
 
     config: EdgeDepthTrainerConfig  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __init__(self, config: EdgeDepthTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
-        """Take the configuration; see nerfstudio's Trainer."""
+        """Initialise it as nerfstudio's Trainer."""
         super().__init__(config, local_rank, world_size)
         self.grad_scaler = PatientGradScaler(enabled=self.use_grad_scaler and self.device != "cpu")
         self._interruption = _Interruption()
-        self._last_step: int | None = None  # that this process has taken
+        self._last_step: int | None = None  # of this process
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Set up as nerfstudio does; Ctrl-C ends it with one line."""
         if self.device == "cpu" and self.config.method_name in FOR_A_GPU and test_mode == "val":
             CONSOLE.print(
-                f"[yellow]{self.config.method_name} is meant for a GPU, and there is none: expect hours, where "
+                f"[yellow]{self.config.method_name} is meant for a GPU, but this training uses the CPU: expect hours. "
                 "edge-depth-nerf-lite takes minutes."
             )
         try:
@@ -110,12 +110,12 @@ class EdgeDepthTrainer(Trainer):
         """Train as nerfstudio does.
 
         Raises:
-            SystemExit: after Ctrl-C, with status 130 and a checkpoint of the last step. Where the training was done and
-                only its viewer was up, Ctrl-C is how one ends it, and no error.
+            SystemExit: after Ctrl-C, with status 130 and a checkpoint of the last step. After a completed training
+                Ctrl-C only closes the viewer, and is no error.
 
         """
         if self.world_size > 1 or threading.current_thread() is not threading.main_thread():
-            super().train()  # nerfstudio ends the processes of its ranks; signals reach the main thread alone
+            super().train()  # nerfstudio ends the processes of its ranks; only the main thread receives signals
             return
         try:
             with self._interruption.watched():
@@ -130,12 +130,12 @@ class EdgeDepthTrainer(Trainer):
         else:
             self.save_checkpoint(self._last_step)
             remaining = total_steps(self) - self._last_step - 1
-            goes_on = (
-                " The same command goes on from there with --load-dir "
+            how_to_resume = (
+                " To resume, add this to the same command: --load-dir "
                 f"{shlex.quote(str(self.checkpoint_dir))} --max-num-iterations {remaining}"
             )
             CONSOLE.print(
-                f"\nStopped after step {self._last_step}, which is saved.{goes_on if remaining else ''}",
+                f"\nStopped after step {self._last_step}; its checkpoint is saved.{how_to_resume if remaining else ''}",
                 soft_wrap=True,
                 highlight=False,
                 markup=False,
@@ -146,7 +146,7 @@ class EdgeDepthTrainer(Trainer):
         """Do a step as nerfstudio does.
 
         Raises:
-            InputError: a loss was not finite; it says in which pictures, and which checkpoint was kept.
+            InputError: a loss was not finite. The message names the pictures and the last checkpoint.
 
         """
         try:
@@ -159,20 +159,20 @@ class EdgeDepthTrainer(Trainer):
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
-        """Save into a folder beside the checkpoints, then move the whole file there.
+        """Save into a folder beside the checkpoints, then move the complete file into theirs.
 
-        nerfstudio writes in place: a kill in that moment leaves half a file as the newest checkpoint. The folder
-        lies outside, since resuming parses every name in the checkpoint folder.
+        nerfstudio writes directly into the checkpoint folder, so a kill while writing leaves half a file as the newest
+        checkpoint. Ours is outside, because resuming parses every name in the checkpoint folder.
 
         Raises:
-            InputError: a parameter is not finite, or the file cannot be written; the checkpoint before is kept.
+            InputError: a parameter is not finite, or the file cannot be written. The checkpoint before is kept.
 
         """
         for name, parameter in self.pipeline.model.named_parameters():
             # a sum is not finite if one of its terms is not
             if not torch.isfinite(parameter.detach().sum(dtype=torch.float64)):
                 raise InputError(
-                    f"The parameter {name} is no longer finite after step {step}: a gradient was not. {self._kept()}"
+                    f"The parameter {name} is not finite after step {step}, because a gradient was not. {self._kept()}"
                 )
         with self._interruption.put_off():
             self._save_whole(step)
@@ -191,7 +191,7 @@ class EdgeDepthTrainer(Trainer):
             (written,) = partial.iterdir()
             os.replace(written, folder / written.name)
         except (OSError, RuntimeError) as error:
-            # torch says no more than that it failed
+            # torch does not name the reason
             raise InputError(
                 f"{folder}: the checkpoint of step {step} cannot be written ({error}). Is the disk full? {self._kept()}"
             ) from error
@@ -203,7 +203,7 @@ class EdgeDepthTrainer(Trainer):
                     checkpoint.unlink()
 
     def _load_checkpoint(self) -> None:
-        """Load a checkpoint as nerfstudio does; of `load_dir` the newest that is whole.
+        """Load a checkpoint as nerfstudio does: the newest complete one of `load_dir`.
 
         Raises:
             InputError: there is none.
@@ -216,13 +216,13 @@ class EdgeDepthTrainer(Trainer):
         newest = newest_checkpoint(folder)
         every = checkpoints_in(folder)
         if newest is None:
-            found = f"{len(every)} checkpoints, none of them whole" if every else "no checkpoint"
+            found = f"{len(every)} checkpoints, none of them complete" if every else "no checkpoint"
             raise InputError(
-                f"{folder}: found {found}; --load-dir takes the folder nerfstudio_models of a training. Leave it out "
-                "to begin from the start."
+                f"{folder}: found {found}; --load-dir takes the folder nerfstudio_models of a training. To start a "
+                "new training, leave it out."
             )
         if newest != every[-1]:
-            CONSOLE.print(f"[bold yellow]{every[-1]} is not whole; going on from {newest.name}.")
+            CONSOLE.print(f"[bold yellow]{every[-1]} is incomplete; resuming from {newest.name}.")
         given = self.config
         self.config = dataclasses.replace(given, load_step=_step_of(newest))
         try:
@@ -231,17 +231,17 @@ class EdgeDepthTrainer(Trainer):
             self.config = given
 
     def _kept(self) -> str:
-        """Say what can be gone on from."""
+        """Return a sentence on how to resume."""
         newest = newest_checkpoint(self.checkpoint_dir)
         if newest is None and self.config.load_dir is not None:
             newest = newest_checkpoint(self.config.load_dir)
         if newest is None:
-            return "No checkpoint was saved before."
-        return f"The last checkpoint, {newest}, is kept; --load-dir {newest.parent} goes on from it."
+            return "No checkpoint was saved so far."
+        return f"The last checkpoint, {newest}, is kept; resume with --load-dir {newest.parent}."
 
 
 class _Interruption:
-    """Ctrl-C, kept back while what must be whole is done: a step, a checkpoint."""
+    """Delays Ctrl-C until a step or a checkpoint is complete."""
 
     def __init__(self) -> None:
         self._busy = False
@@ -249,7 +249,7 @@ class _Interruption:
 
     @contextmanager
     def watched(self) -> Iterator[None]:
-        """Answer Ctrl-C here, and as before afterwards."""
+        """Handle Ctrl-C here, and restore the former handler afterwards."""
         before = signal.signal(signal.SIGINT, self._on_signal)
         try:
             yield
@@ -258,7 +258,7 @@ class _Interruption:
 
     @contextmanager
     def put_off(self) -> Iterator[None]:
-        """Raise KeyboardInterrupt after what is done here, if it was asked for meanwhile."""
+        """Raise KeyboardInterrupt after the block, if Ctrl-C was pressed during it."""
         self._busy = True
         try:
             yield
@@ -275,7 +275,7 @@ class _Interruption:
 
 
 def _word(value: object) -> str:
-    """A setting's value, as it is typed."""
+    """Return a setting's value as one types it."""
     return value.__qualname__ if isinstance(value, type) else str(value)
 
 

@@ -1,8 +1,8 @@
-"""What nerfstudio's viewer shows of a drive besides the rendering: LiDAR, the prior, the path, the lenses.
+"""Additional layers in nerfstudio's viewer: LiDAR points, the prior, the path, the lenses.
 
-Host-facing, through nerfstudio's own hooks: it finds the `ViewerControl` that installs the switches in the pipeline. A
-layer is made in a thread of its own when it is first switched on, and hidden, not removed, when it is switched off, so
-neither a training nor a command without a viewer waits for it.
+Host-facing, through nerfstudio's own hooks: nerfstudio finds the `ViewerControl` in the pipeline, and the control
+installs the switches. A layer is made in a thread of its own when it is first switched on. Switching it off hides it.
+So neither a training nor a command without a viewer waits for it.
 """
 
 from __future__ import annotations
@@ -40,17 +40,17 @@ if TYPE_CHECKING:
     from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManager
 
 ROOT = "/drive"
-"""The viewer's scene node above all of ours."""
+"""Parent of all our scene nodes in the viewer."""
 HOST_FRUSTA = "/cameras"
-"""nerfstudio's node above its own frusta."""
+"""Parent of nerfstudio's own frusta."""
 MOST_POINTS = 200_000
-"""Of a cloud; each takes 15 bytes on the way to the browser."""
+"""Most points of a cloud. The browser receives 15 bytes for each."""
 MOST_LENSES = 256
-"""So many lenses are drawn, spread over the drive."""
+"""Most lenses that are drawn, spread over the drive."""
 LENS_RADIUS_M = 0.3
 """Radius of a lens's cap at nerfstudio's default --viewer.camera-frustum-scale."""
 HOST_FRUSTUM_SCALE = 0.1
-"""That default."""
+"""nerfstudio's default --viewer.camera-frustum-scale."""
 POINT_SIZE_M = 0.06
 """Side of a point of a cloud."""
 THUMBNAIL_PX = 128
@@ -60,13 +60,13 @@ AZIMUTHS, RINGS = 48, 10
 SPOKES = 6
 """Lines from a lens's centre to its rim."""
 THETA_STEPS = 720
-"""The rim is found within theta_max / THETA_STEPS."""
+"""Accuracy of the rim: theta_max / THETA_STEPS."""
 PATH_COLOURS = ((230, 120, 20), (40, 160, 220), (120, 190, 60), (200, 80, 180), (230, 200, 40), (120, 120, 220))
-"""One for each camera, over and over."""
+"""One per camera; repeated if there are more."""
 FOLDER = "Layers of the drive"
 """Heading of the switches in the panel."""
 COLOURS = ("height", "picture", "sigma")
-"""What the colour of a point can stand for."""
+"""What a point's colour can show."""
 
 
 @dataclass(frozen=True)
@@ -75,14 +75,14 @@ class Cloud:
 
     points: Float[np.ndarray, "n 3"]
     rgb: UInt8[np.ndarray, "n 3"]
-    """Of the pictures that they are seen in."""
+    """The points' colours in the pictures."""
     height_m: Float[np.ndarray, "n"]
-    """Along the drive's vertical."""
+    """Height above the scene's origin."""
     sigma_m: Float[np.ndarray, "n"] | None
     """Standard deviation of the prior; LiDAR has none."""
 
     def colours(self, meaning: str) -> UInt8[np.ndarray, "n 3"]:
-        """Colours of the points: of the picture, or by a quantity; by height where there is no sigma."""
+        """Return the points' colours: from the picture, or by sigma or height. Without sigma, by height."""
         if meaning == "picture":
             return self.rgb
         if meaning == "sigma" and self.sigma_m is not None:
@@ -95,9 +95,9 @@ class Cloud:
 
 
 def rim_rad(camera: Camera, theta_max_rad: float) -> Float64[np.ndarray, "azimuths"]:
-    """The angle from the axis up to which a lens sees, for each azimuth (from x to y, evenly spaced).
+    """Return the largest angle off-axis that a lens sees, for each azimuth (from x to y, evenly spaced).
 
-    The picture ends there, or the lens model's validity, or `theta_max_rad`.
+    It is limited by the picture's border, the lens model's validity, and `theta_max_rad`.
     """
     theta = torch.linspace(0, min(theta_max_rad, camera.theta_max_rad), THETA_STEPS + 1, dtype=torch.float64)
     azimuth = _azimuths()
@@ -109,10 +109,10 @@ def rim_rad(camera: Camera, theta_max_rad: float) -> Float64[np.ndarray, "azimut
 def lens_cap(
     camera: Camera, theta_max_rad: float
 ) -> tuple[Float64[np.ndarray, "vertices 3"], Float64[np.ndarray, "vertices 2"], Int[np.ndarray, "faces 3"]]:
-    """The part of the unit sphere that a lens sees, in its frame (OpenCV), as a mesh.
+    """Return the part of the unit sphere that a lens sees as a mesh, in the lens's frame (OpenCV).
 
     Returns:
-        Corners, ring by ring from the axis to the rim; the pixel (x, y) that each is seen at; triangles.
+        Corners, ring by ring from the axis to the rim; the pixel (x, y) of each; triangles.
 
     """
     ring = torch.linspace(0, 1, RINGS + 1, dtype=torch.float64)
@@ -135,9 +135,9 @@ def _directions(theta: Float64[Tensor, "*#shape"], azimuth: Float64[Tensor, "*#s
 
 
 def _glb(camera: Camera, theta_max_rad: float, picture: NDArray[np.uint8], radius: float) -> bytes:
-    """A lens as a file for the browser: the picture on its cap, and lines from its centre to the rim."""
+    """Return a lens as a glTF file for the browser: a cap with the picture, and lines from the centre to the rim."""
     from PIL import Image
-    from trimesh import Scene, Trimesh, load_path  # half a second, which every command of nerfstudio would wait for
+    from trimesh import Scene, Trimesh, load_path  # takes half a second, too long for all commands
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
 
@@ -145,10 +145,10 @@ def _glb(camera: Camera, theta_max_rad: float, picture: NDArray[np.uint8], radiu
     corners = corners * radius
     scale = THUMBNAIL_PX / max(camera.width, camera.height)
     size = (max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
-    # as a JPEG, which is a tenth of what trimesh would write
+    # a JPEG has a tenth of the size that trimesh would write
     small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
     thumbnail = Image.open(BytesIO(cv2.imencode(".jpg", small[..., ::-1])[1].tobytes()))
-    # as a light: the browser's lamps would shade it
+    # emissive, because the browser's lamps would shade it
     material = PBRMaterial(
         baseColorFactor=[0, 0, 0, 255],
         emissiveTexture=thumbnail,
@@ -170,12 +170,12 @@ def _glb(camera: Camera, theta_max_rad: float, picture: NDArray[np.uint8], radiu
 
 
 def _viser_rotation(pose: Float64[np.ndarray, "3 4"]) -> viser.transforms.SO3:
-    """The rotation of one of nerfstudio's cameras, which look along -z; viser's look along z."""
+    """Convert the rotation of a nerfstudio camera, which looks along -z, to viser's, which looks along z."""
     return viser.transforms.SO3.from_matrix(pose[:, :3] * (1.0, -1.0, -1.0))
 
 
 class DriveLayers(ViewerControl):
-    """Draws the layers; nerfstudio calls `_setup` once its viewer stands."""
+    """Draws the layers. nerfstudio calls `_setup` when its viewer is ready."""
 
     def __init__(self, manager: FisheyeDepthDataManager) -> None:
         self.manager = manager
@@ -183,34 +183,34 @@ class DriveLayers(ViewerControl):
         has_prior = sampler is not None and sampler.table.share_with_prior > 0
         has_lidar = "lidar" in manager.train_dataset.sources()
         self.switches = {
-            "lidar": self._switch("LiDAR points", "lidar", False, "Returns of the training pictures", has_lidar),
-            "prior": self._switch("Depth prior", "prior", False, "What the loss draws the density to", has_prior),
-            "lenses": self._switch(
-                "Lenses", "lenses", True, "What each camera sees, in place of nerfstudio's pyramids"
+            "lidar": self._switch("LiDAR points", "lidar", False, "LiDAR points of the training pictures", has_lidar),
+            "prior": self._switch(
+                "Depth prior", "prior", False, "The distances that supervise the training", has_prior
             ),
-            "path": self._switch("Path", "path", True, "A line through the places of each camera"),
+            "lenses": self._switch("Lenses", "lenses", True, "What each camera sees; replaces nerfstudio's pyramids"),
+            "path": self._switch("Path", "path", True, "A line through the positions of each camera"),
         }
         self.meaning = ViewerDropdown(
             "Colour of points",
             COLOURS[0],
             list(COLOURS),
             cb_hook=lambda _: self._recolour(),
-            hint="Sigma of the prior: dark is sure (0.05 m), bright is unsure (20 m)",
+            hint="Sigma of the prior: dark is certain (0.05 m), bright is uncertain (20 m)",
         )
         self._frames: dict[str, viser.FrameHandle] = {}
         self._clouds: dict[str, Cloud] = {}
         self._hidden = False
 
     def _switch(self, label: str, layer: str, shown: bool, hint: str, available: bool = True) -> ViewerCheckbox:
-        hint = hint if available else "There is none in this training"
+        hint = hint if available else "This training has none"
         return ViewerCheckbox(label, shown, disabled=not available, cb_hook=lambda _: self._update(layer), hint=hint)
 
     def _setup(self, viewer: Viewer) -> None:
-        """Take hold of the viewer, and draw what is on from the beginning."""
+        """Install the panel, and draw the layers that are on at the start."""
         super()._setup(viewer)
         self._install(viewer)
         viewer.viser_server.on_client_connect(self._welcome)
-        # made before nerfstudio's frusta, it decides over all of them
+        # created before nerfstudio's frusta, this parent shows or hides all of them
         self._host_frusta = viewer.viser_server.scene.add_frame(HOST_FRUSTA, show_axes=False)
         viewer.hide_images.on_click(lambda _: self._hide_lenses(True))
         viewer.show_images.on_click(lambda _: self._hide_lenses(False))
@@ -218,7 +218,7 @@ class DriveLayers(ViewerControl):
             self._update(layer)
 
     def _install(self, viewer: Viewer) -> None:
-        """Put the layers' switches above the panel's tabs, where they are seen at once."""
+        """Put the layers' switches above the panel's tabs, where they are visible at once."""
         gui = viewer.viser_server.gui
         with gui.add_folder(FOLDER, order=viewer.stats_markdown.order + 0.5):
             for element in (*self.switches.values(), self.meaning):
@@ -227,7 +227,7 @@ class DriveLayers(ViewerControl):
         CONSOLE.print(f"The viewer's panel switches these layers on and off: {labels}.")
 
     def _welcome(self, client: viser.ClientHandle) -> None:
-        """Let a browser begin at a training camera: the middle one of the drive's first camera."""
+        """Start a browser at a training picture: the middle one of the drive's first camera."""
         dataset = self.manager.train_dataset
         folder = dataset.image_filenames[0].parent
         of_camera = [index for index, file in enumerate(dataset.image_filenames) if file.parent == folder]
@@ -245,7 +245,7 @@ class DriveLayers(ViewerControl):
         self._update("lenses")
 
     def _update(self, layer: str) -> None:
-        """Make a layer's nodes be seen or not, as its switch says."""
+        """Show or hide a layer's nodes, according to its switch."""
         shown = bool(self.switches[layer].value)
         if layer == "lenses":
             self._host_frusta.visible = not shown
@@ -269,7 +269,7 @@ class DriveLayers(ViewerControl):
                 self._clouds[layer] = self._lidar() if layer == "lidar" else self._prior()
                 self._draw_cloud(layer)
         except (InputError, OSError) as error:
-            CONSOLE.print(f"The viewer cannot show this layer. {error}", style="yellow", markup=False)
+            CONSOLE.print(f"The viewer cannot show this layer ({layer}). {error}", style="yellow", markup=False)
             self.switches[layer].value = False
             return
         finally:
@@ -294,7 +294,7 @@ class DriveLayers(ViewerControl):
             lens.on_click(self._go_there(index))
 
     def _go_there(self, index: int) -> Callable[[viser.SceneNodePointerEvent[viser.GlbHandle]], None]:
-        """As on nerfstudio's own frusta: a click takes the browser to the camera."""
+        """Return a handler that moves the browser to the camera, as a click on nerfstudio's own frusta does."""
 
         def on_click(event: viser.SceneNodePointerEvent[viser.GlbHandle]) -> None:
             with event.client.atomic():
@@ -305,7 +305,7 @@ class DriveLayers(ViewerControl):
         return on_click
 
     def _draw_path(self, node: str) -> None:
-        """One line for each folder of pictures, held-out ones included."""
+        """Draw one line for each folder of pictures, with the held-out ones."""
         places: dict[Path, list[tuple[Path, NDArray]]] = {}
         for dataset in (self.manager.train_dataset, self.manager.eval_dataset):
             positions = dataset.cameras.camera_to_worlds[:, :3, 3].cpu().numpy()
@@ -326,7 +326,7 @@ class DriveLayers(ViewerControl):
     # ---- clouds -------------------------------------------------------------------------------------------------
 
     def _lidar(self) -> Cloud:
-        """Returns of the training pictures, a share of each."""
+        """Collect LiDAR points of the training pictures, a share of each picture."""
         dataset = self.manager.train_dataset
         rng = np.random.default_rng(0)
         pixels, distances, colours = [], [], []
@@ -342,7 +342,7 @@ class DriveLayers(ViewerControl):
         return self._cloud(np.concatenate(pixels), np.concatenate(distances), np.concatenate(colours), None)
 
     def _prior(self) -> Cloud:
-        """Of the table that the training reads, whose order is random, the first pixels with a prior."""
+        """Collect the first pixels with a prior from the training's table, whose order is random."""
         assert self.manager.train_pixel_sampler is not None
         table = self.manager.train_pixel_sampler.table
         batch = table.batch(0, min(len(table), round(MOST_POINTS / table.share_with_prior)))
@@ -358,7 +358,7 @@ class DriveLayers(ViewerControl):
         rgb: UInt8[np.ndarray, "n 3"],
         sigma_m: Float[np.ndarray, "n"] | None,
     ) -> Cloud:
-        """Put pixels (picture, row, column) at a distance into the scene."""
+        """Convert pixels (picture, row, column) with distances to points in the scene."""
         metadata = self.manager.train_dataset.metadata
         rays = self.manager.train_ray_generator(torch.from_numpy(pixels).to(self.manager.device))
         along = torch.from_numpy(distance_m)[:, None] / metadata["metres_per_unit"]
@@ -381,12 +381,12 @@ class DriveLayers(ViewerControl):
             self._draw_cloud(layer)
 
     def _units(self, length_m: float) -> float:
-        """A length in the units that the browser draws in."""
+        """Convert a length to the browser's units."""
         return length_m / self.manager.train_dataset.metadata["metres_per_unit"] * VISER_NERFSTUDIO_SCALE_RATIO
 
 
 class DrivePanel(torch.nn.Module):
-    """Where nerfstudio finds what belongs into its viewer: it looks through the pipeline's modules."""
+    """A module that contains the layers: nerfstudio searches the pipeline's modules for viewer controls."""
 
     def __init__(self, manager: FisheyeDepthDataManager) -> None:
         super().__init__()

@@ -1,1 +1,1 @@
-"""report.html: one page that needs no network: pictures, tables, plots, settings and commands of a comparison."""
+"""report.html: pictures, tables, plots, settings and commands of a comparison, in one page without network."""

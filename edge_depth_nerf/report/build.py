@@ -1,4 +1,4 @@
-"""Builds report.html: text in, one page out. It loads nothing, runs its own script alone, and holds all it shows."""
+"""Builds report.html. The page contains all that it shows, loads nothing, and runs only its own scripts."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from edge_depth_nerf.report.views import KINDS, Drive, data_uri, legend
 
 @dataclass(frozen=True)
 class Plot:
-    """A plot, drawn twice."""
+    """A plot in two colour schemes."""
 
     title: str
     light: bytes
-    """SVG, on white."""
+    """SVG for a light page."""
     dark: bytes
-    """SVG, for a dark page."""
+    """SVG for a dark page."""
 
 
 @dataclass(frozen=True)
@@ -34,12 +34,12 @@ class Facts:
     title: str
     entries: Mapping[str, str]
     folded: bool = False
-    """Whether they are hidden at first."""
+    """Whether they are hidden until the reader opens them."""
 
 
 @dataclass(frozen=True)
 class Commands:
-    """What was typed, or can be."""
+    """Commands that were typed, or that the reader can type."""
 
     title: str
     lines: Sequence[str]
@@ -47,7 +47,7 @@ class Commands:
 
 @dataclass(frozen=True)
 class Report:
-    """All that the page shows. Texts are plain; the page escapes them."""
+    """The content of the page. Texts are plain; the page escapes them."""
 
     title: str
     lead: str
@@ -58,23 +58,23 @@ class Report:
     facts: Sequence[Facts]
     commands: Sequence[Commands]
     methods: Sequence[str]
-    """Of the pictures; the last one is shown first."""
+    """The methods that have pictures; the page starts with the last one."""
     notes: Sequence[str] = field(default_factory=tuple)
-    """How the tables are to be read."""
+    """Notes on reading the tables."""
     settings: Sequence[MadeTable] = field(default_factory=tuple)
-    """Settings that are tables."""
+    """Settings in the form of tables."""
 
 
 def build_report(report: Report) -> str:
     """Build the page."""
     folder = files("edge_depth_nerf.report")
     style, template = (folder.joinpath(name).read_text(encoding="utf-8") for name in ("style.css", "template.html.j2"))
-    # the library and the view in 3D only where there are points
+    # the library and the view in 3D are only needed for points
     in_3d = ["ogl.min.js", "points.js"] if any(drive.points for drive in report.drives) else []
     scripts = [folder.joinpath(name).read_text(encoding="utf-8") for name in (*in_3d, "script.js")]
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.globals["svg"] = lambda content: data_uri(content, "image/svg+xml")
-    # only what stands here runs and styles, whatever a text might smuggle in
+    # only these scripts and this style are allowed, even if a text contains others
     policy = (
         "default-src 'none'; base-uri 'none'; form-action 'none'; img-src data:; "
         f"script-src {' '.join(map(_digest, scripts))}; style-src {_digest(style)}"
@@ -90,7 +90,7 @@ def build_report(report: Report) -> str:
 
 
 def write_report(path: Path, report: Report) -> None:
-    """Write the page, whole or not at all."""
+    """Write the page, complete or not at all."""
     write_text(path, build_report(report))
 
 
@@ -99,7 +99,7 @@ def _digest(text: str) -> str:
 
 
 def _pictures(report: Report) -> dict[str, object]:
-    """What the page's script reads: kinds, methods, and each drive's views."""
+    """Return the data for the page's script: kinds, methods, and each drive's views."""
 
     def addresses(pictures: Mapping[str, bytes]) -> dict[str, str]:
         return {kind: data_uri(content, "image/webp") for kind, content in pictures.items()}

@@ -1,4 +1,4 @@
-"""Held-out views of a scene beside what trained models made of them, as `ns-eval` wrote it."""
+"""Held-out views of a scene, with the renderings of trained models that `ns-eval` wrote."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from edge_depth_nerf.base.pictures import colour_distance
 from edge_depth_nerf.scene.format import LAYERS, read_transforms
 
 DISTANCE_KEYS = (LAYERS["truth_distance"].key, LAYERS["lidar"].key)
-"""What a view's distances are shown by, the better one first."""
+"""Sources of a view's distances, the better one first."""
 
 
 def held_out_frames(scene: Path) -> list[dict[str, Any]]:
-    """The held-out frames of a scene's transforms.json, in the order in which they are judged."""
+    """Return the held-out frames of a scene's transforms.json, in the order of the evaluation."""
     transforms = read_transforms(scene / "transforms.json")
     names = set(transforms.get("test_filenames", ()))
     frames = [frame for frame in transforms["frames"] if frame["file_path"] in names]
@@ -29,27 +29,27 @@ def held_out_frames(scene: Path) -> list[dict[str, Any]]:
 
 @dataclass(frozen=True, eq=False)
 class ComparedView:
-    """A held-out view: what is known of it, and what each run made of it. Pictures are H×W×3 uint8, maps H×W."""
+    """A held-out view: its ground truth, and each run's rendering. Pictures are H×W×3 uint8, maps H×W."""
 
     name: str
-    """Its file in the scene."""
+    """Its file name in the scene."""
     rgb: NDArray[np.uint8]
     """The recorded picture."""
     clean_rgb: NDArray[np.uint8] | None
-    """The same without noise and exposure drift, where that is known."""
+    """The same without noise and exposure drift, if known."""
     mask: NDArray[np.bool_]
-    """True = judge the pixel."""
+    """True = the pixel is evaluated."""
     distance_m: NDArray[np.float32]
     """Metres along the ray, 0 = unknown."""
     distance_key: str | None
-    """Which of `DISTANCE_KEYS` that is; None without any."""
+    """The one of `DISTANCE_KEYS` that it is from; None without any."""
     colours: dict[str, NDArray[np.uint8]]
-    """What each run rendered, black outside the mask."""
+    """Each run's rendered picture, black outside the mask."""
     distances: dict[str, NDArray[np.uint8]]
-    """The median distances that it rendered, in the colours of `colour_distance`."""
+    """Each run's rendered median distances, in the colours of `colour_distance`."""
 
     def rows(self) -> tuple[list[NDArray[np.uint8]], list[NDArray[np.uint8]]]:
-        """Its colours, then its distances: the recorded ones first, then each run's."""
+        """Return colours and distances: the recorded ones first, then each run's."""
         known = colour_distance(self.distance_m, self.mask)
         return [self.rgb, *self.colours.values()], [known, *self.distances.values()]
 
@@ -60,8 +60,8 @@ def compared_view(scene: Path, frame: Mapping[str, Any], index: int, views_of: M
     Args:
         scene: the scene folder.
         frame: one of its `held_out_frames`.
-        index: its place among these.
-        views_of: for each run the folder of its judged views, as `ns-eval --render-output-path` writes them.
+        index: its index among these.
+        views_of: for each run the folder of its rendered views, as `ns-eval --render-output-path` writes them.
 
     """
     rgb = read_image(scene / frame["file_path"])
@@ -70,7 +70,7 @@ def compared_view(scene: Path, frame: Mapping[str, Any], index: int, views_of: M
     clean = frame.get(LAYERS["truth_rgb"].key)
     colours, distances = {}, {}
     for name, folder in views_of.items():
-        # nerfstudio saves truth and rendering side by side
+        # nerfstudio saves ground truth and rendering side by side
         rendered = read_image(folder / f"eval_img_{index:04d}.png")[:, rgb.shape[1] :]
         colours[name] = np.where(mask[..., None], rendered, 0).astype(np.uint8)
         distances[name] = read_image(folder / f"eval_distance_{index:04d}.png")
@@ -87,12 +87,12 @@ def compared_view(scene: Path, frame: Mapping[str, Any], index: int, views_of: M
 
 
 def compared_views(scene: Path, views_of: Mapping[str, Path], most: int | None = None) -> Iterator[ComparedView]:
-    """Read some held-out views, spread over the drive, or all.
+    """Read held-out views: all, or some that are spread over the drive.
 
     Args:
         scene: the scene folder.
-        views_of: for each run the folder of its judged views.
-        most: how many views at most; None: all.
+        views_of: for each run the folder of its rendered views.
+        most: the largest number of views; None: all.
 
     """
     frames = held_out_frames(scene)

@@ -1,5 +1,5 @@
 "use strict";
-// LiDAR's points and the cameras in 3D; the script of the pictures calls `pointsView.open` with a drive's points
+// LiDAR points and cameras in 3D; the script of the pictures calls `pointsView.open` with a drive's points
 const pointsView = (() => {
   const section = document.querySelector("#points");
   const canvas = section.querySelector("canvas");
@@ -7,7 +7,7 @@ const pointsView = (() => {
   const HELD_OUT = [235, 125, 0];
   const SETTLED_MS = 1500;
   const TURN = Math.PI / 36;
-  // nothing is asked of the graphics before somebody looks
+  // nothing is drawn before the section is visible
   let state = null;
   let shown = null;
   let seen = false;
@@ -50,7 +50,7 @@ const pointsView = (() => {
     renderer.gl.clearColor(0.09, 0.1, 0.11, 1);
     const camera = new ogl.Camera(renderer.gl, { fov: 55, near: 0.1, far: 2000 });
     const orbit = new ogl.Orbit(camera, { element: canvas, ease: 0.5, inertia: 0.6, rotateSpeed: 0.3 });
-    // a page that is scrolled over it goes on being scrolled
+    // scrolling the page across it must not zoom
     orbit.enabled = false;
     canvas.addEventListener("pointerdown", () => (orbit.enabled = true));
     canvas.addEventListener("focus", () => (orbit.enabled = true));

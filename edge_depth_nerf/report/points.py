@@ -1,4 +1,4 @@
-"""A drive's LiDAR points and cameras, as small as the page's view in 3D needs them."""
+"""A drive's LiDAR points and cameras in a small form for the page's view in 3D."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from edge_depth_nerf.base.pictures import DISTANCE
 from edge_depth_nerf.scene.reader import SceneFolder
 
 MOST_POINTS = 40_000
-"""Of all drives of a page; each takes 12 bytes in it."""
+"""Most points of a page, over all its drives. The page has 12 bytes for each."""
 NEAR_M = 40.0
-"""Points further from all cameras are left out, of scenes whose lengths are metres."""
+"""Points farther than this from all cameras are left out, in scenes whose lengths are metres."""
 STEPS = 65535
-"""Into so many steps each axis is divided."""
+"""Number of steps that each axis is divided into."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,22 +27,22 @@ class ShownPoints:
     low_m: Float64[np.ndarray, "3"]
     """The lowest corner of the points."""
     step_m: Float64[np.ndarray, "3"]
-    """What one step along each axis is."""
+    """Length of one step along each axis."""
     steps: UInt16[np.ndarray, "points 3"]
-    """Places of the points from there on."""
+    """Positions of the points, in steps from the lowest corner."""
     colours: UInt8[np.ndarray, "points 3"]
-    """RGB: of the pictures, or by height where the scene's cloud has none."""
+    """RGB from the pictures, or by height if the scene's cloud has no colours."""
     paths_m: list[Float64[np.ndarray, "pictures 3"]]
-    """Places of each camera's pictures, in order."""
+    """Positions of each camera's pictures, in order."""
     training_m: Float64[np.ndarray, "trained 3"]
-    """Places of the pictures trained on."""
+    """Positions of the training pictures."""
     held_out_m: Float64[np.ndarray, "held 3"]
-    """Places of the held-out pictures."""
+    """Positions of the held-out pictures."""
     forward: Float64[np.ndarray, "3"]
-    """Where the vehicle went at first, or the first camera looks if it stood."""
+    """Direction from the first camera's first position to its last, or its viewing direction if it did not move."""
 
     def data(self) -> dict[str, object]:
-        """What the page's script reads."""
+        """Return the data for the page's script."""
         return {
             "low": self.low_m.tolist(),
             "step": self.step_m.tolist(),
@@ -56,11 +56,11 @@ class ShownPoints:
 
 
 def show_points(scene: SceneFolder, most: int = MOST_POINTS) -> ShownPoints | None:
-    """Choose the points of a scene that are shown, at random; None for a scene without any.
+    """Choose points of a scene at random; None for a scene without points.
 
     Args:
-        scene: its cameras and its point cloud.
-        most: how many points at most.
+        scene: the scene, with its cameras and its point cloud.
+        most: the largest number of points.
 
     Raises:
         InputError: the point cloud cannot be read.

@@ -8,14 +8,14 @@
   const sides = { left: find("select[name=left]"), right: find("select[name=right]") };
   const driveChoice = find("select[name=drive]");
   const TRUTH = "truth";
-  // what of the truth stands beside an error
+  // which picture of the ground truth is shown beside an error
   const OF_TRUTH = { "colour-error": "colour", "distance-error": "distance" };
   const state = { drive: 0, view: 0, kind: "colour", left: TRUTH, right: "" };
 
   const drive = () => data.drives[state.drive];
   const view = () => drive().views[state.view];
   const kind = () => data.kinds.find((each) => each.key === state.kind);
-  const titleOf = (name) => (name === TRUTH ? "truth" : name.slice(1));
+  const titleOf = (name) => (name === TRUTH ? "ground truth" : name.slice(1));
 
   function make(tag, text, parent) {
     const element = document.createElement(tag);
@@ -32,7 +32,7 @@
     return shown.rendered[name.slice(1)][state.kind];
   }
 
-  // a kind that a view lacks: no distances are known there
+  // a view without known distances lacks some kinds
   function there(key) {
     return drive().methods.every((name) => view().rendered[name][key]);
   }
@@ -47,7 +47,7 @@
     );
   }
 
-  // which kind a side shows: the truth has no error, so its colours or distances stand beside one
+  // the kind that a side shows: the ground truth has no error, so its colours or distances are shown beside one
   function shownKind(name) {
     const key = name === TRUTH ? OF_TRUTH[state.kind] || state.kind : state.kind;
     return data.kinds.find((each) => each.key === key);
@@ -142,7 +142,7 @@
   function openDrive(index) {
     state.drive = index;
     state.view = 0;
-    // a mark before each, lest a method's title be "truth"
+    // a mark before each, because a method's title may be "truth"
     const names = [TRUTH, ...drive().methods.map((name) => `:${name}`)];
     for (const side of ["left", "right"]) {
       fillSelect(sides[side], names);

@@ -1,4 +1,4 @@
-"""Tables of figures, as the page, the terminal, Markdown and LaTeX show them.
+"""Tables of figures, for the page, the terminal, Markdown and LaTeX.
 
 A cell is a mean over seeds with its sample standard deviation.
 """
@@ -15,11 +15,11 @@ class Metric:
     """A column."""
 
     name: str
-    """In the figures of a run."""
+    """Its name in the figures of a run."""
     heading: str
     form: str
     best: int = 1
-    """1: more is better; -1: less is; 0: neither."""
+    """1: larger is better; -1: smaller is better; 0: neither."""
 
 
 @dataclass
@@ -31,12 +31,12 @@ class Cell:
     """Sample standard deviation; None for a single seed."""
     form: str = ".2f"
     words: str | None = None
-    """Instead of a figure."""
+    """A text instead of a figure."""
     best: bool = False
     """Whether it is the best of its column."""
 
     def text(self) -> str:
-        """As it is read."""
+        """Return the text of the cell."""
         if self.words is not None:
             return self.words
         if self.mean is None:
@@ -66,23 +66,23 @@ class MadeTable:
 
     @property
     def caption(self) -> str:
-        """All notes."""
+        """All notes in one text."""
         return " ".join(self.notes)
 
     def headings(self) -> list[tuple[str, str]]:
-        """Group and heading of each column."""
+        """Return the group and heading of each column."""
         return [(group, heading) for group, headings in self.groups for heading in headings]
 
 
 def mean_and_spread(values: Sequence[float]) -> tuple[float | None, float | None]:
-    """Mean and sample standard deviation; None where there is too little for them."""
+    """Return mean and sample standard deviation; None if there are too few values."""
     if not values:
         return None, None
     return statistics.fmean(values), statistics.stdev(values) if len(values) > 1 else None
 
 
 def mark_best(rows: Sequence[Row], better: Sequence[int]) -> None:
-    """Mark the best cells of each column; `better` says of each whether more (1), less (-1) or neither (0) is."""
+    """Mark the best cells of each column; `better` is 1 if larger is better, -1 if smaller is, and 0 for neither."""
     for column, sign in enumerate(better):
         cells = [row.cells[column] for row in rows if row.cells[column].mean is not None]
         if sign and len(cells) > 1:

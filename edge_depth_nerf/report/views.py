@@ -1,7 +1,7 @@
-"""The report's pictures: colours, distances and the errors of both, of some held-out views.
+"""The report's pictures of held-out views: colours, distances, and the errors of both.
 
-Distances are read back from the saved pictures' colours, which end at 60 m. Errors are therefore shown where the true
-distance is 2 to 40 m: there, what lies beyond either end is wrong by more than the scale of errors shows anyway.
+Rendered distances are read from the colours of saved pictures, which end at 60 m. Errors are therefore shown only where
+the true distance is 2 to 40 m. There, a distance beyond the colours' range has an error beyond the error scale, too.
 """
 
 from __future__ import annotations
@@ -38,48 +38,48 @@ from edge_depth_nerf.report.points import MOST_POINTS, ShownPoints, show_points
 from edge_depth_nerf.scene.reader import read_scene
 
 REPORT = "report.html"
-"""The page's name beside the other results."""
+"""File name of the page."""
 MOST_PICTURES = 1000
-"""Of all drives and methods; only with more of them are held-out views left out."""
+"""Most pictures of a page, over all drives and methods. With more, some held-out views are left out."""
 MOST_WIDTH_PX = 640
 PICTURES_BYTES = 16_000_000
-"""Of all encoded pictures; a third more in the page, as text."""
+"""Size of all encoded pictures. As text in the page they take a third more."""
 WEBP_QUALITIES = ((1.0, 85), (1.0, 70), (1.0, 50), (0.7, 50), (0.5, 50), (0.5, 30), (0.35, 30))
-"""Share of the size and quality: the first at which a picture is small enough, else the last."""
+"""Share of the size, and quality. The first that makes a picture small enough is used, else the last."""
 ERROR_RANGE_M = (2.0, 40.0)
-"""True distances for which errors are shown."""
+"""Range of true distances in which errors are shown."""
 WITHIN = 1.25
-"""Ratio to the true distance up to which a rendered one counts as right."""
+"""Largest ratio to the true distance that counts as right."""
 SPREAD_PX = 1.6
-"""Radius that a LiDAR return is shown with."""
+"""Radius of a LiDAR point in a picture."""
 DIMMED = 0.35
 """Brightness of the true picture outside the mask."""
 
 
 @dataclass(frozen=True)
 class KindShown:
-    """What a kind of picture is."""
+    """A kind of picture."""
 
     key: str
     title: str
     explanation: str
     scale: ColourScale | None = None
-    """What its colours stand for."""
+    """The meaning of its colours."""
 
 
 KINDS = (
-    KindShown("colour", "Colour", "What was rendered, inside the mask."),
-    KindShown("distance", "Distance", "Median distance along the ray.", DISTANCE),
+    KindShown("colour", "Colour", "The rendered picture, inside the mask."),
+    KindShown("distance", "Distance", "Rendered median distance along the ray.", DISTANCE),
     KindShown(
         "colour-error",
         "Colour error",
-        "Mean difference of red, green and blue from the truth, in percent of the whole range.",
+        "Mean difference of red, green and blue from the ground truth, in percent of the whole range.",
         COLOUR_ERROR,
     ),
     KindShown(
         "distance-error",
         "Distance error",
-        "Rendered against true distance, where that is {:g} to {:g} m: too near is blue, too far is red.".format(
+        "Rendered against true distance, for true ones of {:g} to {:g} m. Too near is blue, too far is red.".format(
             *ERROR_RANGE_M
         ),
         RELATIVE_ERROR,
@@ -89,17 +89,17 @@ KINDS = (
 
 @dataclass(frozen=True)
 class ShownView:
-    """A held-out view as the page shows it; pictures are encoded (WebP)."""
+    """A held-out view with encoded pictures (WebP)."""
 
     title: str
     width: int
     height: int
     truth: dict[str, bytes]
-    """Colours and, where any are known, distances."""
+    """Colours, and distances if any are known."""
     rendered: dict[str, dict[str, bytes]]
-    """By method, all kinds that there are."""
+    """All kinds of pictures, by method."""
     figures: dict[str, dict[str, str]]
-    """By method, figures of this view by name."""
+    """Figures of this view by name, by method."""
 
 
 @dataclass(frozen=True)
@@ -109,13 +109,13 @@ class Drive:
     title: str
     views: Sequence[ShownView]
     note: str
-    """Which views these are, and what the truth is."""
+    """Which views these are, and what their ground truth is."""
     points: ShownPoints | None = None
-    """What LiDAR saw, in 3D, where the scene has points."""
+    """LiDAR points in 3D, if the scene has any."""
 
 
 def views_of_a_drive(runs: int) -> int:
-    """How many views of each drive are shown at most, with so many runs over all drives."""
+    """Return the largest number of views per drive, from the number of runs over all drives."""
     return max(MOST_PICTURES // (len(KINDS) * max(runs, 1)), 1)
 
 
@@ -123,8 +123,8 @@ def make_drives(drives: Mapping[str, tuple[Path, Mapping[str, Path]]], console: 
     """Make the pictures of all drives, with progress.
 
     Args:
-        drives: by title the scene folder and, by method, the folder of its judged views.
-        console: where the progress is shown.
+        drives: by title, the scene folder and the folders of rendered views by method.
+        console: for progress.
 
     """
     runs = sum(len(views_of) for _, views_of in drives.values())
@@ -151,16 +151,16 @@ def make_drives(drives: Mapping[str, tuple[Path, Mapping[str, Path]]], console: 
 
 
 def _points(scene: Path, most: int, console: Console) -> ShownPoints | None:
-    """The drive's points; a cloud that cannot be read costs the page its view in 3D alone."""
+    """Return the drive's points. If they cannot be read, the page only lacks its view in 3D."""
     try:
         return show_points(read_scene(scene), most)
     except (InputError, OSError) as error:
-        say(console, f"{REPORT} has no points of this drive. {error}", "yellow")
+        say(console, f"{REPORT} does not show the points of this drive. {error}", "yellow")
         return None
 
 
 def _note(frames: Sequence[Mapping[str, object]], shown: int) -> str:
-    """Say which views of a drive are shown, and what counts as their truth."""
+    """Return a text on which views are shown, and what their ground truth is."""
     known = {key for frame in frames for key in frame}
     parts = [
         f"All {shown} held-out views."
@@ -168,16 +168,18 @@ def _note(frames: Sequence[Mapping[str, object]], shown: int) -> str:
         else f"{shown} of {len(frames)} held-out views, spread over the drive."
     ]
     if "truth_rgb_file_path" in known:
-        parts.append("The truth is the picture without noise and exposure drift.")
+        parts.append("The ground truth is the picture without noise and exposure drift.")
     if "truth_distance_file_path" in known:
-        parts.append("True distances are the renderer's.")
+        parts.append("The true distances are the renderer's.")
     elif "lidar_file_path" in known:
-        parts.append("True distances are LiDAR's returns, drawn larger.")
-    return " ".join([*parts, "Outside the mask (lens, vehicle) nothing is judged; the truth is dimmed there."])
+        parts.append("The true distances are LiDAR points, drawn larger.")
+    return " ".join(
+        [*parts, "Pixels outside the mask (lens, vehicle) are not evaluated; they are dark in the ground truth."]
+    )
 
 
 def show_view(view: ComparedView, allowance: int) -> ShownView:
-    """Make all pictures and figures of a view."""
+    """Make the pictures and figures of a view."""
     height, width = view.mask.shape
     shown = min(width, MOST_WIDTH_PX)
     size = (shown, max(round(height * shown / width), 1))
@@ -224,15 +226,15 @@ def show_view(view: ComparedView, allowance: int) -> ShownView:
 def spread(
     values: NDArray[np.float32], known: NDArray[np.bool_], radius: float
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Give pixels around known ones the value of the nearest, so that single pixels can be seen.
+    """Give pixels around known ones the nearest value, so that single pixels are visible.
 
     Args:
         values: H×W.
-        known: H×W, where they count.
-        radius: how far, px; 0: nothing is changed.
+        known: H×W, True where a value is known.
+        radius: px; 0 changes nothing.
 
     Returns:
-        Values and where they count now.
+        The values, and where they are known now.
 
     """
     if radius <= 0 or not known.any():
@@ -242,7 +244,7 @@ def spread(
 
 
 def encode(pixels: NDArray[np.uint8], allowance: int) -> bytes:
-    """Encode H×W×3 RGB as WebP, coarser and smaller where it would exceed some bytes."""
+    """Encode H×W×3 RGB as WebP. Reduce quality and size if it would exceed `allowance` bytes."""
     encoded = np.zeros(0, np.uint8)
     for share, quality in WEBP_QUALITIES:
         size = (max(round(pixels.shape[1] * share), 1), max(round(pixels.shape[0] * share), 1))
@@ -258,12 +260,12 @@ def encode(pixels: NDArray[np.uint8], allowance: int) -> bytes:
 
 
 def data_uri(content: bytes, media_type: str) -> str:
-    """Write bytes as an address that holds them."""
+    """Return bytes as a data URI."""
     return f"data:{media_type};base64,{base64.b64encode(content).decode()}"
 
 
 def legend(scale: ColourScale) -> dict[str, object]:
-    """What the page draws the legend of a scale from: a bar of its colours, ticks, and the colour of no value."""
+    """Return the data of a scale's legend: a bar of its colours, ticks, and the colour of missing values."""
     ok, bar = cv2.imencode(".png", np.ascontiguousarray(scale.colours[None, :, ::-1]))
     assert ok
     places = scale.position(np.array(scale.ticks, float))
