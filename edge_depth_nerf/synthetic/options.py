@@ -10,12 +10,18 @@ from typing import Literal
 
 from edge_depth_nerf.base.errors import InputError
 
-SceneName = Literal["street", "parking", "turn", "traffic"]
+SceneName = Literal["street", "parking", "turn", "traffic", "roundabout"]
 
-SCENES: tuple[SceneName, ...] = ("street", "parking", "turn", "traffic")
+SCENES: tuple[SceneName, ...] = ("street", "parking", "turn", "traffic", "roundabout")
 """The scenes that can be synthesised."""
 
-DEFAULT_SPEED_M_S: dict[SceneName, float] = {"street": 8.0, "parking": 4.0, "turn": 6.0, "traffic": 6.0}
+DEFAULT_SPEED_M_S: dict[SceneName, float] = {
+    "street": 8.0,
+    "parking": 4.0,
+    "turn": 6.0,
+    "traffic": 6.0,
+    "roundabout": 5.0,
+}
 """How fast the car drives in each scene unless told otherwise; a frame is 0.1 s."""
 
 LayoutName = Literal["kitti-360", "jbnu-depth360", "rig"]
@@ -42,7 +48,8 @@ class SynthesizeOptions:
     continued."""
     scene: SceneName = "street"
     """street: houses, trees, parked cars; parking: an underground car park; turn: 90 degrees at a junction;
-    traffic: the street with cars that pass, one that stops and starts again, a bus, people on foot and a cyclist."""
+    traffic: the street with cars that pass, one that stops and starts again, a bus, people on foot and a cyclist;
+    roundabout: around an island with trees."""
     frames: int = 40
     """Number of frames, 0.1 s apart, each with two pictures and one LiDAR sweep."""
     size: int = 350
@@ -52,7 +59,7 @@ class SynthesizeOptions:
     moving: int = 0
     """Number of other cars that drive through the scene; their masks are written as truth/<sequence>/moving_masks."""
     speed_m_s: float | None = None
-    """Mean speed of the car in m/s; none = the scene's own (street 8, parking 4, turn 6, traffic 6)."""
+    """Mean speed of the car in m/s; none = the scene's own (street 8, parking 4, turn 6, traffic 6, roundabout 5)."""
     sequence: str = "2013_05_28_drive_0000_sync"
     """Name of the sequence in the folders (only in KITTI-360's layout)."""
     layout: LayoutName = "kitti-360"
