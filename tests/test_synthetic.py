@@ -256,6 +256,7 @@ def test_a_folder_with_something_else_is_refused_untouched(parking, tmp_path):
         ({"moving": 9}, "--moving 9"),
         ({"speed_m_s": 0.0}, "--speed-m-s 0"),
         ({"speed_m_s": float("nan")}, "--speed-m-s nan"),
+        ({"body": "red"}, "--body red.*grey, ground"),
         ({"camera": "phone"}, "--camera phone.*plain, automatic"),
         ({"scene": "moon"}, "--scene moon.*street, parking, turn"),
         ({"sequence": "../up"}, "--sequence"),
@@ -514,6 +515,25 @@ def test_an_automatic_camera_exposes_balances_and_darkens_towards_the_rim(street
     balance = np.array(gains)[:, [0, 2]] / np.array(gains)[:, 1:2]
     assert np.abs(balance - 1).max() > 0.005
     assert np.ptp(np.array(gains)[:, 1]) > 0.01
+
+
+def test_a_body_of_the_grounds_colour_hides_as_much_and_has_no_clear_edge(parking, tmp_path):
+    options, grey = parking
+    root = synthesize_drive(dataclasses.replace(options, output=tmp_path / "drive", body="ground", frames=1))
+    assert read_json(root / "drive.json")["options"]["body"] == "ground"
+    assert "body" not in read_json(grey / "drive.json")["options"]
+    for camera in rig.CAMERAS:
+        ego, with_fittings = (read_mask(each / "truth" / "masks" / f"{camera}_ego.png") for each in (root, grey))
+        assert (with_fittings & ~ego).sum() < 0.05 * (~with_fittings).sum()
+        assert 0.7 * (~with_fittings).sum() < (~ego).sum()
+        lens = read_mask(root / "truth" / "masks" / f"{camera}_lens.png")
+        differences = []
+        for each, mask in ((root, ego), (grey, with_fittings)):
+            seen = read_image(truth(each, camera, "rgb", 0)).astype(float).mean(-1)
+            own = lens & ~mask
+            beside = lens & mask & (cv2.dilate(own.astype(np.uint8), np.ones((7, 7))) > 0)
+            differences.append(abs(np.median(seen[own]) - np.median(seen[beside])))
+        assert differences[0] < 0.7 * differences[1]
 
 
 def test_shifted_views_are_exactly_sideways(street):

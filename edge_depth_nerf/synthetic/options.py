@@ -34,6 +34,11 @@ CameraName = Literal["plain", "automatic"]
 CAMERAS: tuple[CameraName, ...] = ("plain", "automatic")
 """How the cameras of a drive can expose."""
 
+BodyName = Literal["grey", "ground"]
+
+BODIES: tuple[BodyName, ...] = ("grey", "ground")
+"""What the recording car can look like."""
+
 _SIZE_RANGE_PX = (32, 4096)
 _MOVING_MAX = 8
 _SPEED_MAX_M_S = 40.0
@@ -70,6 +75,10 @@ class SynthesizeOptions:
     """plain: exposure drifts by 10 %. automatic: exposure varies by 40 % and white balance by 10 %, depending on the
     brightness of the view; noise grows with the gain, and lenses darken towards their rim."""
 
+    body: BodyName = "grey"
+    """Of the recording car. grey: grey paint, with bars, a box and cables on the roof. ground: without these, in matt
+    paint of the ground's colour, so that there is no clear outline in the pictures."""
+
     @property
     def has_movers(self) -> bool:
         """Whether anything but the recording car moves."""
@@ -93,6 +102,8 @@ class SynthesizeOptions:
             raise InputError(f"--layout {self.layout}: no such layout, expected one of {', '.join(LAYOUTS)}.")
         if self.camera not in CAMERAS:
             raise InputError(f"--camera {self.camera}: no such camera, expected one of {', '.join(CAMERAS)}.")
+        if self.body not in BODIES:
+            raise InputError(f"--body {self.body}: no such body, expected one of {', '.join(BODIES)}.")
         if self.frames < 1:
             raise InputError(f"--frames {self.frames}: expected at least 1.")
         if not _SIZE_RANGE_PX[0] <= self.size <= _SIZE_RANGE_PX[1]:

@@ -28,6 +28,9 @@ HOUSE_Y_M = 8.7
 KERB_HEIGHT_M = 0.12
 
 _ASPHALT: Colour = (0.115, 0.113, 0.11)
+_CONCRETE: Colour = (0.23, 0.23, 0.225)
+_CONCRETE_UNDER_LAMPS: Colour = (0.31, 0.31, 0.303)
+"""Paint that is as bright in a car park's ambient light as its ground under the lamps."""
 _PAVING: Colour = (0.27, 0.255, 0.235)
 _KERB: Colour = (0.36, 0.35, 0.33)
 _GRASS: Colour = (0.085, 0.125, 0.04)
@@ -66,6 +69,8 @@ class SceneModel:
     contacts: list[NDArray[np.float64]]
     """Convex outlines (N×2) of what stands on the ground and keeps light from it."""
     drive: Drive
+    ground: Colour
+    """Paint that is as bright as what is driven on, in the sun or, indoors, without the lamps' light."""
 
 
 class _Site:
@@ -304,7 +309,8 @@ def _driven_through(
     movers = _movers(options, drive, oncoming, -start_m, np.random.default_rng([options.seed, 3]))
     if options.scene == "traffic":
         movers += traffic(drive, options.frames * FRAME_INTERVAL_S, np.random.default_rng([options.seed, 4]))
-    return SceneModel(site.mesh.build(), movers, lighting, site.contacts, drive)
+    ground = _CONCRETE_UNDER_LAMPS if options.scene == "parking" else _ASPHALT
+    return SceneModel(site.mesh.build(), movers, lighting, site.contacts, drive, ground)
 
 
 def _street(options: SynthesizeOptions) -> SceneModel:
@@ -622,7 +628,7 @@ def _parking(options: SynthesizeOptions) -> SceneModel:
     site = _Site()
     mesh = site.mesh
     whole = (x0, x1), (wall_right, wall_left)
-    mesh.add_rectangle(*whole, 0.0, Material.CONCRETE, (0.23, 0.23, 0.225))
+    mesh.add_rectangle(*whole, 0.0, Material.CONCRETE, _CONCRETE)
     mesh.add_rectangle(*whole, _CEILING_M, Material.CONCRETE, (0.42, 0.41, 0.39))
     corners = [np.array(corner) for corner in _rectangle(*whole)]
     for a, b in zip(corners, [*corners[1:], corners[0]], strict=True):
