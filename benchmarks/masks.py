@@ -5,7 +5,8 @@
 
 Prints tables: the lens circle from the dark rim, the vehicle found from the pictures (of few frames, and under light
 that changes), the sky with and without monocular maps, and what can be said of the real frame. Without --drives it
-synthesises four small drives, once. Ends with status 1 if a figure misses its goal.
+synthesises five small drives, once; in one of them the vehicle has the ground's colour. Ends with status 1 if a figure
+misses its goal.
 """
 
 from __future__ import annotations
@@ -31,12 +32,18 @@ from edge_depth_nerf.masks.lens import dark_rim, lens_circle
 from edge_depth_nerf.masks.sky import find_sky
 from edge_depth_nerf.process.kitti360.calibration import read_cam_to_pose, read_mei_camera, read_poses
 from edge_depth_nerf.synthetic.drive import synthesize_drive
-from edge_depth_nerf.synthetic.options import SceneName, SynthesizeOptions
+from edge_depth_nerf.synthetic.options import BodyName, SceneName, SynthesizeOptions
 
 ROOT = Path(__file__).parents[1]
 CAMERAS = ("image_02", "image_03")
-SMALL_DRIVES: tuple[tuple[SceneName, int], ...] = (("street", 0), ("turn", 0), ("parking", 0), ("turn", 7))
-"""Scenes and seeds of the drives that are made, 24 frames of 350 pixels each."""
+SMALL_DRIVES: tuple[tuple[SceneName, int, BodyName], ...] = (
+    ("street", 0, "grey"),
+    ("turn", 0, "grey"),
+    ("parking", 0, "grey"),
+    ("turn", 7, "grey"),
+    ("parking", 1, "ground"),
+)
+"""Scenes, seeds and vehicles of the drives that are made, 24 frames of 350 pixels each."""
 LENS_DEG = 97.0
 """The generator's lens circle."""
 EGO_GOAL, SKY_GOAL = 0.95, 0.98
@@ -304,9 +311,9 @@ def main() -> None:
         drives = [Drive(root) for root in options.drives]
     else:
         drives = []
-        for scene, seed in SMALL_DRIVES:
-            root = options.output / f"{scene}_{seed}"
-            synthesize_drive(SynthesizeOptions(output=root, scene=scene, frames=24, size=350, seed=seed))
+        for scene, seed, body in SMALL_DRIVES:
+            root = options.output / (f"{scene}_{seed}" if body == "grey" else f"{scene}_{seed}_{body}")
+            synthesize_drive(SynthesizeOptions(output=root, scene=scene, frames=24, size=350, seed=seed, body=body))
             drives.append(Drive(root))
     console = Console(width=150)
     console.print(lens_table(drives))

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -39,7 +40,7 @@ from edge_depth_nerf.method.prior import PriorOptions, make_prior, view_of
 from edge_depth_nerf.mono.calibration import find_trust
 from edge_depth_nerf.process.motion import SweepStore
 from edge_depth_nerf.process.motion import scene_view as view
-from edge_depth_nerf.scene.reader import read_scene
+from edge_depth_nerf.scene.reader import SceneFolder, read_scene
 from edge_depth_nerf.stereo.motion import Motion
 from edge_depth_nerf.stereo.sweep import Geometry, Swept, rays_of
 from edge_depth_nerf.stereo.views import View, working_factor
@@ -169,38 +170,64 @@ def judge(scene_path: Path, output: Path, every: int) -> tuple[list[tuple[str, .
     return table, bins
 
 
+def prior_pixels(scene: SceneFolder, options: PriorOptions, every: int = 1) -> NDArray[np.float64]:
+    """Each used pixel of the training pictures that is no sky: the true distance, the prior's, its sigma (metres), and
+    whether it lies outside LiDAR's field; 4×N."""
+    trust, rows = find_trust(scene, options), []
+    layer = true_layer(scene)
+    for picture in [picture for picture in scene.pictures if not picture.held_out][::every]:
+        maps, view_angles = scene.maps(picture), view_of(picture.lens, picture.up_in_camera)
+        prior = make_prior(maps.distances_m, maps.usable, INTEGRATED, options, trust, view_angles)
+        truth = maps.distances_m[layer]
+        outside = ~trust.in_field(view_angles.elevation_rad)
+        where = maps.usable & (truth > 0)
+        rows.append(np.stack([each[where] for each in (truth, prior.distance_m, prior.sigma_m, outside)], -1))
+    return np.concatenate(rows).T
+
+
+def true_layer(scene: SceneFolder) -> str:
+    return "truth_distance" if scene.has("truth_distance") else "beams"
+
+
+@dataclass(frozen=True)
+class PriorFigures:
+    """How good a prior is on some pixels: shares of 0-1."""
+
+    have_one: float
+    abs_rel: float
+    median: float
+    within_1: float
+    """Of the priors, how many have an error of one sigma at most."""
+    within_2: float
+
+
+def prior_figures(pixels: NDArray[np.float64]) -> PriorFigures | None:
+    """Of pixels that `prior_pixels` gives; None if none has a prior."""
+    truth, distance, sigma, _ = pixels[:, pixels[1] > 0]
+    if not len(truth):
+        return None
+    error = np.abs(distance - truth)
+    within = [float((error <= times * sigma).mean()) for times in (1, 2)]
+    relative = error / truth
+    return PriorFigures(len(truth) / pixels.shape[1], float(relative.mean()), float(np.median(relative)), *within)
+
+
 def judge_prior(scene_path: Path, every: int) -> list[tuple[str, ...]]:
     scene = read_scene(scene_path)
-    pictures = [picture for picture in scene.pictures if not picture.held_out][::every]
-    layer = "truth_distance" if scene.has("truth_distance") else "beams"
-    if not all(scene.has(name) for name in ("lidar", "mono", "motion", layer)):
+    if not all(scene.has(name) for name in ("lidar", "mono", "motion", true_layer(scene))):
         return []
     table = []
     for motion in (False, True):
-        options = PriorOptions(motion=motion)
-        trust = find_trust(scene, options)
-        rows = []
-        for picture in pictures:
-            maps, view_angles = scene.maps(picture), view_of(picture.lens, picture.up_in_camera)
-            prior = make_prior(maps.distances_m, maps.usable, INTEGRATED, options, trust, view_angles)
-            truth = maps.distances_m[layer]
-            above = ~trust.in_field(view_angles.elevation_rad)
-            where = maps.usable & (truth > 0)
-            rows.append(np.stack([each[where] for each in (truth, prior.distance_m, prior.sigma_m, above)], -1))
-        truth, distance, sigma, above = np.concatenate(rows).T
-        for name, where in (("in the field", above == 0), ("above and below", above > 0)):
-            kept = where & (distance > 0)
-            if not kept.any():
-                continue
-            error = np.abs(distance - truth)[kept]
-            within = [(error <= times * sigma[kept]).mean() for times in (1, 2)]
-            table.append(
-                (
-                    *(scene.folder.name, "with motion" if motion else "without", name),
-                    *(f"{kept.sum() / max(1, where.sum()):.0%}", f"{(error / truth[kept]).mean():.4f}"),
-                    *(f"{np.median(error / truth[kept]):.4f}", f"{within[0]:.1%}", f"{within[1]:.1%}"),
+        pixels = prior_pixels(scene, PriorOptions(motion=motion), every)
+        for name, outside in (("in the field", False), ("above and below", True)):
+            if found := prior_figures(pixels[:, pixels[3] == outside]):
+                table.append(
+                    (
+                        *(scene.folder.name, "with motion" if motion else "without", name),
+                        *(f"{found.have_one:.0%}", f"{found.abs_rel:.4f}", f"{found.median:.4f}"),
+                        *(f"{found.within_1:.1%}", f"{found.within_2:.1%}"),
+                    )
                 )
-            )
     return table
 
 

@@ -225,6 +225,32 @@ def test_road_without_texture_is_not_taken_for_the_vehicle() -> None:
     assert "smooth road" in found.reason
 
 
+@pytest.mark.parametrize("textured", [True, False])
+def test_paint_like_the_road_is_told_from_it_by_its_own_texture(textured: bool) -> None:
+    """As bright as the road, so that there is no edge between them; without any texture nothing tells them apart."""
+    world = SlidingWorld(vehicle_shape())
+    rng = np.random.default_rng(3)
+    texture = cv2.GaussianBlur(rng.normal(size=(SIZE, SIZE)), (0, 0), 1.5)
+    world.paint = 90 + (3.0 if textured else 0.0) * texture / texture.std()
+    found = ego.find_ego([world.picture(11 * number, number) for number in range(24)], world.lens)
+    if textured:
+        assert isinstance(found, ego.EgoMask)
+        assert iou(~found.keep & world.lens, vehicle_shape() & world.lens) > 0.95
+        assert found.certainty > 0.9
+    else:
+        assert isinstance(found, ego.NoEgo)
+        assert "no clear outline" in found.reason
+
+
+def test_smooth_road_before_rough_road_is_not_taken_for_the_vehicle() -> None:
+    """What is near passes too fast to show texture: it stays the same, and what lies beyond clearly changes."""
+    bare = SlidingWorld(None)
+    bare.world[vehicle_shape().any(1).argmax() + 20 :] = 90
+    found = ego.find_ego(bare.drive(30), bare.lens)
+    assert isinstance(found, ego.NoEgo)
+    assert "smooth road" in found.reason
+
+
 def test_a_stop_does_not_count() -> None:
     world = SlidingWorld(vehicle_shape())
     stop = [world.picture(0, k) for k in range(20)]

@@ -15,11 +15,11 @@ from edge_depth_nerf.base.files import read_distance_png, read_image, read_json,
 from edge_depth_nerf.synthetic import layout as layout_module
 from edge_depth_nerf.synthetic import lidar, rig
 from edge_depth_nerf.synthetic.drive import WORLD_ORIGIN_M, synthesize_drive
-from edge_depth_nerf.synthetic.materials import Noise
-from edge_depth_nerf.synthetic.motion import Drive, Route
+from edge_depth_nerf.synthetic.materials import Material, Noise
+from edge_depth_nerf.synthetic.motion import Drive, Route, Turn, WindingRoute
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 from edge_depth_nerf.synthetic.render import Caster, World
-from edge_depth_nerf.synthetic.scenes import _movers, build_scene
+from edge_depth_nerf.synthetic.scenes import ISLAND_M, _movers, build_scene, roundabout_route
 from edge_depth_nerf.synthetic.simulated_mono import simulated_estimate
 from edge_depth_nerf.synthetic.traffic import traffic
 
@@ -51,6 +51,16 @@ def parking(tmp_path_factory):
     output = tmp_path_factory.mktemp("parking") / "drive"
     options = SynthesizeOptions(output, "parking", frames=2, size=64, moving=2, seed=3)
     return options, synthesize_drive(options)
+
+
+@pytest.fixture(scope="module")
+def roundabout(tmp_path_factory):
+    """The scene of a short drive around a roundabout, rays in it, and the drive."""
+    options = SynthesizeOptions(tmp_path_factory.mktemp("roundabout") / "drive", "roundabout", frames=2, size=SIZE)
+    model = build_scene(options)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(layout_module, "build_scene", lambda _: model)
+        return model, Caster(model.static), synthesize_drive(options)
 
 
 @pytest.fixture(scope="module")
@@ -246,6 +256,7 @@ def test_a_folder_with_something_else_is_refused_untouched(parking, tmp_path):
         ({"moving": 9}, "--moving 9"),
         ({"speed_m_s": 0.0}, "--speed-m-s 0"),
         ({"speed_m_s": float("nan")}, "--speed-m-s nan"),
+        ({"body": "red"}, "--body red.*grey, ground"),
         ({"camera": "phone"}, "--camera phone.*plain, automatic"),
         ({"scene": "moon"}, "--scene moon.*street, parking, turn"),
         ({"sequence": "../up"}, "--sequence"),
@@ -506,6 +517,25 @@ def test_an_automatic_camera_exposes_balances_and_darkens_towards_the_rim(street
     assert np.ptp(np.array(gains)[:, 1]) > 0.01
 
 
+def test_a_body_of_the_grounds_colour_hides_as_much_and_has_no_clear_edge(parking, tmp_path):
+    options, grey = parking
+    root = synthesize_drive(dataclasses.replace(options, output=tmp_path / "drive", body="ground", frames=1))
+    assert read_json(root / "drive.json")["options"]["body"] == "ground"
+    assert "body" not in read_json(grey / "drive.json")["options"]
+    for camera in rig.CAMERAS:
+        ego, with_fittings = (read_mask(each / "truth" / "masks" / f"{camera}_ego.png") for each in (root, grey))
+        assert (with_fittings & ~ego).sum() < 0.05 * (~with_fittings).sum()
+        assert 0.7 * (~with_fittings).sum() < (~ego).sum()
+        lens = read_mask(root / "truth" / "masks" / f"{camera}_lens.png")
+        differences = []
+        for each, mask in ((root, ego), (grey, with_fittings)):
+            seen = read_image(truth(each, camera, "rgb", 0)).astype(float).mean(-1)
+            own = lens & ~mask
+            beside = lens & mask & (cv2.dilate(own.astype(np.uint8), np.ones((7, 7))) > 0)
+            differences.append(abs(np.median(seen[own]) - np.median(seen[beside])))
+        assert differences[0] < 0.7 * differences[1]
+
+
 def test_shifted_views_are_exactly_sideways(street):
     _, root = street
     pose = poses_of(root)[4]
@@ -579,6 +609,22 @@ def test_movers_drive_and_meet_the_car(scene):
             assert 2.0 < apart.min() < 4.5, "it comes past on the other lane during the drive"
         else:
             assert 7 < apart.min() < 11, "it drives ahead"
+
+
+def test_cars_on_a_roundabout_drive_behind_and_ahead():
+    options = SynthesizeOptions(Path(), "roundabout", frames=20, moving=4)
+    route, _ = roundabout_route()
+    drive = Drive.random(route, 30.0, options.mean_speed_m_s, np.random.default_rng(0))
+    movers = _movers(options, drive, None, 0.0, np.random.default_rng(1))
+    times = np.arange(20) * 0.1
+    own, heading = route.at(30.0 + 5.0 * times)
+    ahead = np.stack((np.cos(heading), np.sin(heading)), -1)
+    sides = []
+    for mover in movers:
+        apart = mover.at(times)[0] - own
+        assert np.linalg.norm(apart, axis=1).min() > 6.0
+        sides.append(np.sign(np.sum(apart * ahead, axis=1)[0]))
+    assert sides == [-1, 1, -1, 1]
 
 
 @pytest.mark.parametrize("frames", [10, 40, 80])
@@ -675,6 +721,93 @@ def test_route_has_unit_speed_and_turns_by_its_angle():
     direction = np.diff(place, axis=0) / step
     middle = (heading[1:] + heading[:-1]) / 2
     np.testing.assert_allclose(direction, np.stack((np.cos(middle), np.sin(middle)), -1), atol=2e-3)
+
+
+def test_winding_route_has_unit_speed_and_all_of_its_turns():
+    turns = (Turn(-0.6, 9.0, 4.0), Turn(2.0, 7.0), Turn(-0.4, 12.0, 3.0))
+    route = WindingRoute((1.0, -2.0), 0.3, turns)
+    # each turn takes its angle at the radius, and 3 m to ease in and out
+    lengths = [4.0 + 0.6 * 9 + 3, 2.0 * 7 + 3, 3.0 + 0.4 * 12 + 3]
+    np.testing.assert_allclose(route.ends_m, np.cumsum(lengths), rtol=1e-12)
+    s = np.linspace(-5, 50, 5501)
+    place, heading = route.at(s)
+    step = s[1] - s[0]
+    np.testing.assert_allclose(np.linalg.norm(np.diff(place, axis=0), axis=1), step, rtol=1e-3)
+    assert np.abs(np.diff(heading)).max() < step / 6.9
+    np.testing.assert_allclose(place[500], (1.0, -2.0), atol=1e-9)
+    for end, turned in zip(route.ends_m, np.cumsum([-0.6, 2.0, -0.4]), strict=True):
+        assert route.at(np.array([end]))[1][0] == pytest.approx(0.3 + turned, abs=1e-6)
+
+
+def test_roundabout_is_driven_around_its_island_and_left_by_the_road_to_the_left():
+    route, centre = roundabout_route()
+    begin, end = route.ends_m[:2]
+    place, heading = route.at(np.arange(begin + 3, end - 3, 0.1))
+    # the curve is eased in and out; between, it is a circle
+    np.testing.assert_allclose(np.linalg.norm(place - centre, axis=1), 10.25, atol=0.02)
+    assert np.degrees(heading[-1] - heading[0]) > 140
+    first, last = route.at(np.array([0.0, route.ends_m[2] + 5.0]))[0]
+    # on the right-hand side of roads whose middle lines meet in the island's centre
+    assert centre[1] == pytest.approx(0, abs=1e-6)
+    assert first[1] == -1.75
+    assert last[0] - centre[0] == pytest.approx(1.75, abs=0.01)
+    assert last[1] > 15
+
+
+def test_nothing_stands_in_the_way_around_the_roundabout(roundabout):
+    model, caster, _ = roundabout
+    _, centre = roundabout_route()
+    assert np.hypot(*(model.drive.pose_to_world(np.array([0.1]))[0, :2, 3] - centre)) == pytest.approx(10.25, abs=0.15)
+    drive = dataclasses.replace(model.drive, start_m=0.0)
+    poses = drive.pose_to_world(np.arange(0, 15, 0.1))
+    # the vehicle's sides: its body is 4.77 m × 1.82 m, the pose's origin 1.375 m behind and 0.30 m left of its middle
+    x, left, right = np.array([-1.0, 3.76]), -0.62, 1.21
+    for side in (left, right):
+        for height in (0.05, 0.3, 1.0, 1.7):
+            rear, front = (
+                poses[:, :3, 3] + at * poses[:, :3, 0] + side * poses[:, :3, 1] + (height - 0.93) * np.array((0, 0, 1))
+                for at in x
+            )
+            reach = np.linalg.norm(front - rear, axis=1).astype(np.float32)
+            directions = ((front - rear) / reach[:, None]).astype(np.float32)
+            hit = caster.blocked(rear.astype(np.float32), directions, reach)
+            assert len(hit) == 150 and not hit.any(), (side, height, np.flatnonzero(hit))
+
+
+def test_trees_stand_on_the_island(roundabout):
+    model, caster, _ = roundabout
+    _, centre = roundabout_route()
+    # from 3.2 m over the road, all around the island, towards its middle
+    angles = np.linspace(0, 2 * np.pi, 180, endpoint=False)
+    outward = np.column_stack((np.cos(angles), np.sin(angles), np.zeros(180)))
+    origins = np.array((*centre, 3.2)) + 10.0 * outward
+    distance, triangle, _ = caster.first_hits(origins.astype(np.float32), -outward.astype(np.float32))
+    assert np.all(triangle >= 0)
+    on_island = distance < 10.0 + ISLAND_M
+    plants = np.isin(model.static.material[triangle], (Material.LEAF, Material.BARK))
+    assert np.mean(on_island & plants) > 0.5
+    # and there are many small leaves
+    corners = model.static.corners[model.static.material == Material.LEAF]
+    near = np.linalg.norm(corners.mean(1)[:, :2] - centre, axis=1) < ISLAND_M
+    assert near.sum() > 50_000
+
+
+def test_roundabout_pictures_sweeps_and_distances_agree(roundabout):
+    _, _, root = roundabout
+    for camera in rig.CAMERAS:
+        distance = read_distance_png(truth(root, camera, "distance", 1))
+        to_camera = velo_to_camera(camera)
+        points = points_of(root, 1)[:, :3] @ to_camera[:3, :3].T + to_camera[:3, 3]
+        share, in_front, count = agreement(points, camera, distance)
+        assert count > 10_000
+        # leaves are smaller than a pixel
+        assert share > 0.88
+        assert in_front < 0.03
+        keep = read_mask(root / "truth" / "masks" / f"{camera}.png")
+        sky = keep & (distance == 0)
+        upper, lower = sky[: SIZE // 2], sky[int(0.6 * SIZE) :]
+        assert 0.2 < upper[keep[: SIZE // 2]].mean() < 0.9
+        assert not lower.any(), "the road's end is not the sky"
 
 
 def test_turn_drives_straight_turns_and_drives_on():

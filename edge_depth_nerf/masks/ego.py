@@ -5,7 +5,8 @@ change either. What tells is contrast, a pixel's brightness against its surround
 it, on the vehicle it stays the same to the noise of the pictures, and over passing asphalt it does not, however
 faint. It is judged first against all that surrounds a pixel, then against the vehicle found so far, which makes the
 outline sharp. Of what stays the same only what reaches the lower rim of the lens (or of the picture) is the vehicle;
-a sky that never changes is not. Pictures are taken to stand upright.
+a sky that never changes is not. Smooth road stays the same as well: what is found must have an edge along its outline
+that stays, or a texture at it that is the same in two halves of the pictures. Pictures are taken to stand upright.
 
 Lengths are shares of the picture's longer side, so the size of the pictures does not matter. A picture is used at
 `WORKING_PX` or less, and only if things have moved since the last one that was: a stop at a traffic light does not
@@ -71,6 +72,12 @@ _LIGHT_CHANGE = 0.35
 """Share by which the light on a part of the vehicle may vary (one standard deviation); more is something passing."""
 _LASTING_EDGE = 0.04
 """Mean contrast of an edge that stays; it must also be more than its changes."""
+_REPEATED = 0.005
+"""Contrast of a texture that is the same in all pictures: more than rounding and compression leave on smooth road."""
+_REPEATED_POOL = 1 / 40
+"""Side of the square in which pictures are compared for it."""
+_ALIKE = 0.5
+"""Correlation of such a texture between one half of the pictures and the other."""
 _LIT_LEVELS = 24.0
 """Darker surroundings show noise, not texture."""
 _TEXTURE = 0.1
@@ -106,8 +113,8 @@ class EgoMask:
     share: float
     """Of the lens that the vehicle covers, 0-1."""
     certainty: float
-    """Share of the vehicle's outline that is an edge which stays, or beyond which things clearly change, whichever is
-    less, 0-1; above 0.9 as a rule."""
+    """Share of the vehicle's outline that has an edge or a texture which stays, or beyond which things clearly change,
+    whichever is less, 0-1; above 0.9 as a rule."""
     pictures: int
     """How many pictures it was found from."""
 
@@ -172,8 +179,7 @@ def find_ego(
     if certainty < _MIN_CERTAINTY:
         return NoEgo(
             "The region at the lower border of the pictures that stays the same has no clear outline: there is an "
-            "edge along only "
-            f"{certainty:.0%} of it. It may be smooth road."
+            f"edge or a texture that stays along only {certainty:.0%} of it. It may be smooth road."
         )
     ego = enlarge(dilated(vehicle, _GROWN * max(small_lens.shape)), factor, (lens.shape[0], lens.shape[1]))
     ego = from_nearest(ego, lens)[0]
@@ -244,10 +250,27 @@ def _find(
     beyond = lens & dilated(vehicle, 3 * _POOL * side) & ~dilated(vehicle, _POOL * side)
     if not (outline.any() and beyond.any()):
         return vehicle, 0.0
-    edged = dilated(lens & lasting, _POOL * side)[outline].mean()
+    # paint like the road behind it has no edge there, but a texture that stays, which smooth road has not
+    repeated = vehicle & _repeated(over_time, lens, noise_levels, len(stack))
+    edged = dilated((lens & lasting) | repeated, _POOL * side)[outline].mean()
     # pooled with what is clipped: three quarters of the way is clear
     changing = (change[beyond] > 0.75 * _CLEARLY_CHANGED).mean()
     return vehicle, float(min(edged, changing))
+
+
+def _repeated(
+    over_time: _OverTime, lens: Bool[np.ndarray, "h w"], noise_levels: float, count: int
+) -> Bool[np.ndarray, "h w"]:
+    """Where one half of the pictures has the same texture at the same pixels as the other, and more than noise."""
+    side = 2 * round(_REPEATED_POOL * max(lens.shape) / 2) + 1
+    # at the rim the surroundings lie to one side: there a vignette looks like texture
+    inner = eroded(lens, 3 * _SURROUNDINGS * max(lens.shape))
+    shown = inner.astype(np.float32)
+    one, other = (half * shown for half in over_time.halves)
+    weight = np.maximum(cv2.blur(shown, (side, side)), 1e-6)
+    common, power = (np.asarray(cv2.blur(each, (side, side))) for each in (one * other, (one**2 + other**2) / 2))
+    noise = 2 * noise_levels**2 * over_time.inverse_light / count
+    return inner & (common > _ALIKE * power) & (common > weight * np.maximum(noise, _REPEATED**2))
 
 
 def _white_patches(over_time: _OverTime, lens: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
@@ -262,6 +285,8 @@ class _OverTime:
     """What became of each pixel's contrast over the pictures."""
 
     mean: Float32[np.ndarray, "h w"]
+    halves: tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]
+    """Means over every other picture, and over those between."""
     variance: Float32[np.ndarray, "h w"]
     inverse_light: Float32[np.ndarray, "h w"]
     """Mean square of 1/brightness around: times the variance of the noise, it is that of the contrast."""
@@ -275,19 +300,22 @@ def _over_time(
     stack: Float16[np.ndarray, "n h w"], lens: Bool[np.ndarray, "h w"], reference: Bool[np.ndarray, "h w"]
 ) -> _OverTime:
     count = len(stack)
-    contrast_sum, contrast_square_sum, inverse_sum, log_sum, log_square_sum = (np.zeros(lens.shape) for _ in range(5))
+    contrast_square_sum, inverse_sum, log_sum, log_square_sum = (np.zeros(lens.shape) for _ in range(4))
+    sums = np.zeros((2, *lens.shape))
     saturated = np.zeros(lens.shape, np.float32)
-    for half in stack:
+    for number, half in enumerate(stack):
         contrast, light = _contrast(half.astype(np.float32), lens, reference)
-        contrast_sum += contrast
+        sums[number % 2] += contrast
         contrast_square_sum += np.square(contrast, dtype=np.float64)
         inverse_sum += np.square(1 / light)
         log_light = np.log(light)
         log_sum += log_light
         log_square_sum += np.square(log_light, dtype=np.float64)
         saturated += half > _SATURATED_LEVEL
+    contrast_sum = sums[0] + sums[1]
     return _OverTime(
         mean=(contrast_sum / count).astype(np.float32),
+        halves=((sums[0] / (count - count // 2)).astype(np.float32), (sums[1] / (count // 2)).astype(np.float32)),
         variance=np.maximum((contrast_square_sum - contrast_sum**2 / count) / (count - 1), 0).astype(np.float32),
         inverse_light=(inverse_sum / count).astype(np.float32),
         light_variance=np.maximum(log_square_sum / count - np.square(log_sum / count), 0).astype(np.float32),

@@ -6,6 +6,7 @@ headings in radians, counter-clockwise from world x.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,10 +73,50 @@ class Route:
 
 
 @dataclass(frozen=True)
+class Turn:
+    """A turn of a `WindingRoute`."""
+
+    angle_rad: Real
+    """Signed: positive to the left."""
+    radius_m: Real
+    """Its smallest radius."""
+    straight_m: Real = 0.0
+    """Length of the straight stretch before it."""
+
+
+class WindingRoute:
+    """A path on the ground with several turns, one behind the other, as smooth as a `Route`."""
+
+    def __init__(self, start: tuple[float | int, float | int], heading_rad: float, turns: Sequence[Turn]) -> None:
+        """Lay out the route from where its arc length is 0; behind the last turn it is straight."""
+        self._legs: list[Route] = []
+        self.ends_m: list[float] = []
+        """Arc lengths where the turns end."""
+        place, heading, passed = start, heading_rad, 0.0
+        for turn in turns:
+            leg = Route(place, heading, float(turn.angle_rad), float(turn.straight_m), float(turn.radius_m))
+            length = float(turn.straight_m) + leg.turn_length_m
+            places, headings = leg.at(np.array([length]))
+            place, heading, passed = (float(places[0, 0]), float(places[0, 1])), float(headings[0]), passed + length
+            self._legs.append(leg)
+            self.ends_m.append(passed)
+
+    def at(self, s_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Positions (N×2) and headings (N) at N arc lengths, which may lie before the start."""
+        s = np.asarray(s_m, np.float64)
+        leg_of = np.searchsorted(self.ends_m[:-1], s)
+        position, heading = np.empty((*s.shape, 2)), np.empty(s.shape)
+        for number, (leg, begin) in enumerate(zip(self._legs, (0.0, *self.ends_m), strict=False)):
+            own = leg_of == number
+            position[own], heading[own] = leg.at(s[own] - begin)
+        return position, heading
+
+
+@dataclass(frozen=True)
 class Drive:
     """The recording car's motion: along a route at an uneven speed, swaying, pitching and rolling a little."""
 
-    route: Route
+    route: Route | WindingRoute
     start_m: float
     """Arc length at time 0."""
     speed_m_s: float
@@ -84,7 +125,7 @@ class Drive:
     """Five phases in radians: speed, sway, pitch, roll, bounce."""
 
     @staticmethod
-    def random(route: Route, start_m: float, speed_m_s: float, rng: Generator) -> Drive:
+    def random(route: Route | WindingRoute, start_m: float, speed_m_s: float, rng: Generator) -> Drive:
         """A drive whose disturbances have random phases."""
         return Drive(route, start_m, speed_m_s, rng.uniform(0, 2 * np.pi, 5))
 
@@ -119,7 +160,7 @@ class Mover:
     """A car, a person or another thing that moves along a route at one speed, and may stand for a while."""
 
     geometry: Geometry
-    route: Route
+    route: Route | WindingRoute
     start_m: Real
     """Arc length at time 0."""
     speed_m_s: Real

@@ -10,12 +10,18 @@ from typing import Literal
 
 from edge_depth_nerf.base.errors import InputError
 
-SceneName = Literal["street", "parking", "turn", "traffic"]
+SceneName = Literal["street", "parking", "turn", "traffic", "roundabout"]
 
-SCENES: tuple[SceneName, ...] = ("street", "parking", "turn", "traffic")
+SCENES: tuple[SceneName, ...] = ("street", "parking", "turn", "traffic", "roundabout")
 """The scenes that can be synthesised."""
 
-DEFAULT_SPEED_M_S: dict[SceneName, float] = {"street": 8.0, "parking": 4.0, "turn": 6.0, "traffic": 6.0}
+DEFAULT_SPEED_M_S: dict[SceneName, float] = {
+    "street": 8.0,
+    "parking": 4.0,
+    "turn": 6.0,
+    "traffic": 6.0,
+    "roundabout": 5.0,
+}
 """How fast the car drives in each scene unless told otherwise; a frame is 0.1 s."""
 
 LayoutName = Literal["kitti-360", "jbnu-depth360", "rig"]
@@ -27,6 +33,11 @@ CameraName = Literal["plain", "automatic"]
 
 CAMERAS: tuple[CameraName, ...] = ("plain", "automatic")
 """How the cameras of a drive can expose."""
+
+BodyName = Literal["grey", "ground"]
+
+BODIES: tuple[BodyName, ...] = ("grey", "ground")
+"""What the recording car can look like."""
 
 _SIZE_RANGE_PX = (32, 4096)
 _MOVING_MAX = 8
@@ -42,7 +53,8 @@ class SynthesizeOptions:
     continued."""
     scene: SceneName = "street"
     """street: houses, trees, parked cars; parking: an underground car park; turn: 90 degrees at a junction;
-    traffic: the street with cars that pass, one that stops and starts again, a bus, people on foot and a cyclist."""
+    traffic: the street with cars that pass, one that stops and starts again, a bus, people on foot and a cyclist;
+    roundabout: around an island with trees."""
     frames: int = 40
     """Number of frames, 0.1 s apart, each with two pictures and one LiDAR sweep."""
     size: int = 350
@@ -52,7 +64,7 @@ class SynthesizeOptions:
     moving: int = 0
     """Number of other cars that drive through the scene; their masks are written as truth/<sequence>/moving_masks."""
     speed_m_s: float | None = None
-    """Mean speed of the car in m/s; none = the scene's own (street 8, parking 4, turn 6, traffic 6)."""
+    """Mean speed of the car in m/s; none = the scene's own (street 8, parking 4, turn 6, traffic 6, roundabout 5)."""
     sequence: str = "2013_05_28_drive_0000_sync"
     """Name of the sequence in the folders (only in KITTI-360's layout)."""
     layout: LayoutName = "kitti-360"
@@ -62,6 +74,10 @@ class SynthesizeOptions:
     camera: CameraName = "plain"
     """plain: exposure drifts by 10 %. automatic: exposure varies by 40 % and white balance by 10 %, depending on the
     brightness of the view; noise grows with the gain, and lenses darken towards their rim."""
+
+    body: BodyName = "grey"
+    """Of the recording car. grey: grey paint, with bars, a box and cables on the roof. ground: without these, in matt
+    paint of the ground's colour, so that there is no clear outline in the pictures."""
 
     @property
     def has_movers(self) -> bool:
@@ -86,6 +102,8 @@ class SynthesizeOptions:
             raise InputError(f"--layout {self.layout}: no such layout, expected one of {', '.join(LAYOUTS)}.")
         if self.camera not in CAMERAS:
             raise InputError(f"--camera {self.camera}: no such camera, expected one of {', '.join(CAMERAS)}.")
+        if self.body not in BODIES:
+            raise InputError(f"--body {self.body}: no such body, expected one of {', '.join(BODIES)}.")
         if self.frames < 1:
             raise InputError(f"--frames {self.frames}: expected at least 1.")
         if not _SIZE_RANGE_PX[0] <= self.size <= _SIZE_RANGE_PX[1]:

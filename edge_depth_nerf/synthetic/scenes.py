@@ -1,4 +1,4 @@
-"""The scenes: a street, the same with traffic, an underground car park, a turn at a junction.
+"""The scenes: a street, the same with traffic, an underground car park, a turn at a junction, a roundabout.
 
 World frame: x along the first stretch of road, y left of it, z up, the road at z = 0, metres. Everything stands
 still and looks the same in every frame, but for what moves.
@@ -12,11 +12,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
+from scipy.optimize import root_scalar
 
 from edge_depth_nerf.synthetic import objects
 from edge_depth_nerf.synthetic.geometry import Colour, Geometry, MeshBuilder, Pair, Real, Triple, placement
 from edge_depth_nerf.synthetic.materials import Material
-from edge_depth_nerf.synthetic.motion import FRAME_INTERVAL_S, Drive, Mover, Route
+from edge_depth_nerf.synthetic.motion import FRAME_INTERVAL_S, Drive, Mover, Route, Turn, WindingRoute
 from edge_depth_nerf.synthetic.options import SceneName, SynthesizeOptions
 from edge_depth_nerf.synthetic.traffic import traffic
 
@@ -27,6 +28,9 @@ HOUSE_Y_M = 8.7
 KERB_HEIGHT_M = 0.12
 
 _ASPHALT: Colour = (0.115, 0.113, 0.11)
+_CONCRETE: Colour = (0.23, 0.23, 0.225)
+_CONCRETE_UNDER_LAMPS: Colour = (0.31, 0.31, 0.303)
+"""Paint that is as bright in a car park's ambient light as its ground under the lamps."""
 _PAVING: Colour = (0.27, 0.255, 0.235)
 _KERB: Colour = (0.36, 0.35, 0.33)
 _GRASS: Colour = (0.085, 0.125, 0.04)
@@ -65,6 +69,8 @@ class SceneModel:
     contacts: list[NDArray[np.float64]]
     """Convex outlines (N×2) of what stands on the ground and keeps light from it."""
     drive: Drive
+    ground: Colour
+    """Paint that is as bright as what is driven on, in the sun or, indoors, without the lamps' light."""
 
 
 class _Site:
@@ -263,11 +269,12 @@ _DAYLIGHT = Lighting(
 
 
 def _movers(
-    options: SynthesizeOptions, own: Drive, oncoming: Route, oncoming_zero_m: Real, rng: Generator
+    options: SynthesizeOptions, own: Drive, oncoming: Route | None, oncoming_zero_m: Real, rng: Generator
 ) -> list[Mover]:
     """Cars that drive: by turns towards the recording car, meeting it during the drive, and ahead of it.
 
-    `oncoming_zero_m` is the arc length of the oncoming route where the recording car starts beside it.
+    `oncoming_zero_m` is the arc length of the oncoming route where the recording car starts beside it. Without such a
+    route, cars drive by turns behind the recording car and ahead of it.
     """
     movers = []
     speed = options.mean_speed_m_s
@@ -277,27 +284,33 @@ def _movers(
         kind = str(rng.choice(["hatchback", "saloon", "estate"]))
         colour = objects.CAR_COLOURS[int(rng.integers(len(objects.CAR_COLOURS)))]
         geometry = objects.car(kind, colour)
-        if number % 2 == 0:
+        if number % 2 == 0 and oncoming is not None:
             meets_s = duration * (number // 2 + 0.5) / towards
             its_speed = speed * rng.uniform(0.9, 1.1)
             # both have the same place beside the road at the moment of meeting
             start = oncoming_zero_m - speed * meets_s - its_speed * meets_s
             movers.append(Mover(geometry, oncoming, start, its_speed))
         else:
-            ahead = 9.0 + 9.0 * (number // 2)
+            ahead = (9.0 + 9.0 * (number // 2)) * (1 if number % 2 else -1)
             movers.append(Mover(geometry, own.route, own.start_m + ahead, speed))
     return movers
 
 
 def _driven_through(
-    options: SynthesizeOptions, site: _Site, lighting: Lighting, route: Route, oncoming: Route, start_m: Real = 0.0
+    options: SynthesizeOptions,
+    site: _Site,
+    lighting: Lighting,
+    route: Route | WindingRoute,
+    oncoming: Route | None,
+    start_m: Real = 0.0,
 ) -> SceneModel:
     """The scene with the recording car on its route, from an arc length on, and the cars that drive."""
     drive = Drive.random(route, start_m, options.mean_speed_m_s, np.random.default_rng([options.seed, 2]))
     movers = _movers(options, drive, oncoming, -start_m, np.random.default_rng([options.seed, 3]))
     if options.scene == "traffic":
         movers += traffic(drive, options.frames * FRAME_INTERVAL_S, np.random.default_rng([options.seed, 4]))
-    return SceneModel(site.mesh.build(), movers, lighting, site.contacts, drive)
+    ground = _CONCRETE_UNDER_LAMPS if options.scene == "parking" else _ASPHALT
+    return SceneModel(site.mesh.build(), movers, lighting, site.contacts, drive, ground)
 
 
 def _street(options: SynthesizeOptions) -> SceneModel:
@@ -336,9 +349,8 @@ def _traffic_light(site: _Site, x: Real, y: Real, yaw_rad: Real) -> None:
     site.put(mesh.build(), placement(x, y, KERB_HEIGHT_M, yaw_rad), _rectangle((-0.1, 0.1), (-0.1, 0.1)))
 
 
-def _crossing(mesh: MeshBuilder) -> None:
-    """Zebra stripes and a stop line across the arm that leaves the origin along x."""
-    near = KERB_Y_M + _CORNER_M + 0.3
+def _crossing(mesh: MeshBuilder, near: Real) -> None:
+    """Zebra stripes from x = `near` on, and a stop line, across the arm that leaves the origin along x."""
     for y in np.arange(-KERB_Y_M + 0.35, KERB_Y_M - 0.5, 1.0):
         mesh.add_rectangle((near, near + 3.0), (y, y + 0.5), 0.003, Material.MARKING, _LINE)
     mesh.add_rectangle((near + 3.7, near + 4.15), (0.1, LANE_M), 0.003, Material.MARKING, _LINE)
@@ -381,7 +393,7 @@ def _turn(options: SynthesizeOptions) -> SceneModel:
                     np.concatenate((arc, [(reach + 60, KERB_Y_M), (reach + 60, reach + 60), (KERB_Y_M, reach + 60)])),
                 )
             _traffic_light(local, inner + 3.4, side * (KERB_Y_M + 0.35), np.pi if side > 0 else 0.0)
-        _crossing(local.mesh)
+        _crossing(local.mesh, inner + 0.3)
         _road_details(local.mesh, (inner + 4.5, reach), rng)
         far = _Site()
         _houses(far, (-30.0, 26.0), rng, corner_first=False)
@@ -390,6 +402,184 @@ def _turn(options: SynthesizeOptions) -> SceneModel:
         local.put(back, placement(reach + 25, -reach, 0, np.pi / 2))
         site.put_site(local, placement(centre_x, 0, 0, arm * np.pi / 2))
     return _driven_through(options, site, _DAYLIGHT, route, Route((0.0, 1.75), np.pi), start)
+
+
+ISLAND_M = 7.5
+"""Radius of a roundabout's island."""
+_RING_M = 10.25
+"""Radius that is driven around it."""
+_RING_KERB_M = 13.0
+_ENTRY_RADIUS_M = 12.0
+_FLARE_M = 8.0
+"""Radius of the kerb where a road meets the roundabout."""
+_APPROACH_M = 12.0
+"""Straight stretch before the first turn."""
+
+
+def roundabout_route() -> tuple[WindingRoute, NDArray[np.float64]]:
+    """The way into a roundabout along x, around its island, and out to the left; and the island's centre, x and y."""
+
+    def laid_out(entry_rad: float) -> tuple[WindingRoute, NDArray[np.float64]]:
+        entry = Turn(-entry_rad, _ENTRY_RADIUS_M, _APPROACH_M)
+        around = Turn(np.pi / 2 + 2 * entry_rad, _RING_M)
+        route = WindingRoute((0.0, -1.75), 0.0, (entry, around, Turn(-entry_rad, _ENTRY_RADIUS_M)))
+        place, heading = route.at(np.array([(route.ends_m[0] + route.ends_m[1]) / 2]))
+        return route, place[0] + _RING_M * np.array((-np.sin(heading[0]), np.cos(heading[0])))
+
+    # a sharper entry moves the ring to the right; the roads' middle lines meet in the island's centre
+    entry_rad = root_scalar(lambda angle: laid_out(angle)[1][1], bracket=(0.4, 1.4)).root
+    return laid_out(float(entry_rad))
+
+
+def _island(rng: Generator) -> _Site:
+    """A roundabout's island about the origin: a kerb, a strip of paving, a mound of grass with trees and shrubs."""
+    site = _Site()
+    around = np.linspace(0, 2 * np.pi, 73)[:-1]
+    circle = np.column_stack((np.cos(around), np.sin(around)))
+    _block(site.mesh, ISLAND_M * circle)
+    rings = [
+        np.column_stack((radius * circle, np.full(len(circle), KERB_HEIGHT_M + height)))
+        for radius, height in ((6.2, 0.0), (5.6, 0.12), (4.4, 0.32), (2.8, 0.48), (1.2, 0.55), (0.05, 0.56))
+    ]
+    site.mesh.add_loft(np.array(rings), Material.GRASS, _GRASS, closed=False)
+    small = _rectangle((-0.14, 0.14), (-0.14, 0.14))
+    first, trees = rng.uniform(0, 2 * np.pi), int(rng.integers(5, 7))
+    for number in range(trees):
+        # one in the middle, the others around it
+        angle = first + 2 * np.pi * number / (trees - 1) + rng.normal(0, 0.12)
+        away = 0.0 if number == 0 else rng.uniform(3.4, 4.4)
+        where = placement(away * np.cos(angle), away * np.sin(angle), KERB_HEIGHT_M + 0.25, rng.uniform(0, 6.28))
+        site.put(objects.tree(rng.uniform(6.0, 9.5), rng, leaves=12000), where, small)
+    for number in range(7):
+        angle, length = first + 0.4 + 2 * np.pi * number / 7 + rng.normal(0, 0.08), rng.uniform(1.2, 2.6)
+        shrub = objects.hedge(length, rng.uniform(0.5, 0.9), rng)
+        # along the rim
+        start = 5.1 * np.array((np.cos(angle), np.sin(angle))) + length / 2 * np.array((np.sin(angle), -np.cos(angle)))
+        where = placement(start[0], start[1], KERB_HEIGHT_M + 0.12, angle + np.pi / 2)
+        site.put(shrub, where, _rectangle((0, length), (-0.3, 0.3)))
+    return site
+
+
+def _chevrons(site: _Site, distance_m: Real, angle_rad: Real) -> None:
+    """A board with stripes on the island that faces away from the origin, towards those who come in."""
+    mesh = MeshBuilder()
+    for y in (-0.8, 0.8):
+        mesh.add_rod((-0.06, y, 0), (-0.06, y, 1.1), 0.03, Material.METAL, (0.3, 0.31, 0.32), 8)
+    mesh.add_box((0, 0, 0.85), (0.05, 2.0, 0.5), Material.PAINTED, (0.7, 0.7, 0.68))
+    for y in np.arange(-0.8, 0.6, 0.5):
+        for edge in (0.6, 1.1):
+            stripe = [(0.027, y, edge), (0.027, y + 0.25, edge), (0.027, y + 0.37, 0.85), (0.027, y + 0.12, 0.85)]
+            mesh.add_polygon(stripe, Material.PAINTED, (0.5, 0.02, 0.02))
+    where = placement(distance_m * np.cos(angle_rad), distance_m * np.sin(angle_rad), KERB_HEIGHT_M, angle_rad)
+    site.put(mesh.build(), where, _rectangle((-0.1, 0.1), (-1.0, 1.0)))
+
+
+def _ring_corner(reach: Real, rng: Generator) -> _Site:
+    """What lies between two arms of a roundabout, along x and y: pavement with a kerb, a house, trees, furniture."""
+    site = _Site()
+    # the kerb's arcs about points from which they touch the road's kerb and the ring
+    along = np.sqrt((_RING_KERB_M + _FLARE_M) ** 2 - (KERB_Y_M + _FLARE_M) ** 2)
+    touch = np.arctan2(KERB_Y_M + _FLARE_M, along)
+    bend = np.linspace(1.5 * np.pi, np.pi + touch, 9)
+    flare = (along, KERB_Y_M + _FLARE_M) + _FLARE_M * np.column_stack((np.cos(bend), np.sin(bend)))
+    ring = np.linspace(touch, np.pi / 2 - touch, 7)[1:-1]
+    arc = _RING_KERB_M * np.column_stack((np.cos(ring), np.sin(ring)))
+    kerb = np.concatenate(([(reach + 60, KERB_Y_M)], flare, arc, flare[::-1, ::-1], [(KERB_Y_M, reach + 60)]))
+    _pavement(site.mesh, kerb[::-1], (reach + 60, reach + 60))
+    width = rng.uniform(9, 11)
+    outward, sideways = np.array((np.sqrt(0.5), np.sqrt(0.5))), np.array((np.sqrt(0.5), -np.sqrt(0.5)))
+
+    def put(thing: Geometry, out: Real, side: Real, half: Pair) -> None:
+        """Put a thing at a distance from the centre; its y axis points away from there."""
+        x, y = out * outward + side * sideways
+        outline = _rectangle((-half[0], half[0]), (-half[1], half[1]))
+        site.put(thing, placement(x, y, KERB_HEIGHT_M, -np.pi / 4), outline)
+
+    corner = 19.0 * outward - width / 2 * sideways
+    house = placement(corner[0], corner[1], KERB_HEIGHT_M, -np.pi / 4)
+    site.put(objects.house(width, 10.0, rng, rng.random() < 0.5), house, _rectangle((0, width), (0, 10.0)))
+    for side in (-1, 1):
+        put(objects.tree(rng.uniform(6.0, 9.0), rng), 16.6, side * rng.uniform(3.2, 4.2), (0.14, 0.14))
+        garden = objects.tree(rng.uniform(5, 8), rng, leaves=5000)
+        put(garden, rng.uniform(24.0, 26.0), side * rng.uniform(8.0, 8.8), (0.14, 0.14))
+        length = rng.uniform(3.0, 4.0)
+        hedge = objects.hedge(length, rng.uniform(0.9, 1.5), rng)
+        x, y = (20.0, 9.6) if side > 0 else (9.6, 20.0 + length)
+        yaw = 0.0 if side > 0 else -np.pi / 2
+        site.put(hedge, placement(x, y, KERB_HEIGHT_M, yaw), _rectangle((0, length), (-0.3, 0.3)))
+    # its arm reaches over the road
+    put(objects.street_lamp(), 13.6, 0.0, (0.1, 0.1))
+    put(objects.billboard((0.06, 0.25, 0.1)), 18.6, 0.5 * width - 1.6, (1.8, 0.1)) if rng.random() < 0.4 else None
+    for step in range(int(rng.integers(2, 5))):
+        put(objects.bollard(), 14.0, 1.2 + 1.2 * step, (0.06, 0.06))
+    put(objects.cabinet(), 18.4, -rng.uniform(1.0, 3.0), (0.45, 0.17))
+    return site
+
+
+def _pavement(mesh: MeshBuilder, kerb: NDArray[np.float64], far: Pair) -> None:
+    """Raised pavement with a kerb along a line (N×2) that has it on its right; `far` sees all of the line."""
+    low, high = (np.column_stack((kerb, np.full(len(kerb), z))) for z in (0.0, KERB_HEIGHT_M))
+    edge = np.diff(kerb, axis=0)
+    inward = np.stack((edge[:, 1], -edge[:, 0]), -1) / np.linalg.norm(edge, axis=1, keepdims=True)
+    joint = np.concatenate((inward[:1], inward[:-1] + inward[1:], inward[-1:]))
+    inner = kerb + 0.16 * joint / np.sum(joint * np.concatenate((inward[:1], inward)), axis=1, keepdims=True)
+    for i in range(len(edge)):
+        mesh.add_polygon([low[i], low[i + 1], high[i + 1], high[i]], Material.STONE, _KERB)
+        mesh.add_ground_polygon([far, kerb[i], kerb[i + 1]], KERB_HEIGHT_M, Material.PAVING, _PAVING)
+        strip = [kerb[i], kerb[i + 1], inner[i + 1], inner[i]]
+        mesh.add_ground_polygon(strip, KERB_HEIGHT_M + 0.002, Material.STONE, _KERB)
+
+
+def _ring_arm(reach: Real, rng: Generator) -> _Site:
+    """A road that leaves a roundabout along x, with what stands on both of its sides."""
+    site, begin = _Site(), 27.0
+    mesh = site.mesh
+    for side in (1, -1):
+        row = _street_side((begin, reach), 1.0, np.pi if side > 0 else 0.0, rng)
+        site.put_site(row, placement(0, 0, mirror_y=side < 0))
+    # an island between those who come and those who leave
+    _block(mesh, np.array([(14.8, -0.55), (18.2, -0.3), (18.2, 0.3), (14.8, 0.55)]))
+    small = _rectangle((-0.14, 0.14), (-0.14, 0.14))
+    site.put(objects.road_sign(2), placement(17.8, 0.0, KERB_HEIGHT_M, np.pi), small)
+    site.put(objects.bollard(), placement(15.2, 0.0, KERB_HEIGHT_M), small)
+    site.put(objects.road_sign(1), placement(19.5, KERB_Y_M + 0.35, KERB_HEIGHT_M, np.pi), small)
+    _crossing(mesh, 19.0)
+    _road_details(mesh, (begin - 2.0, reach), rng)
+    # where those who come in give way: short bars across the mouth
+    for angle in np.arange(0.07, 0.6, 0.06):
+        bar = [(r, a) for r, a in ((13.1, angle), (13.5, angle), (13.5, angle + 0.03), (13.1, angle + 0.03))]
+        corners = [(r * np.cos(a), r * np.sin(a)) for r, a in bar]
+        mesh.add_ground_polygon(corners, 0.003, Material.MARKING, _LINE)
+    far = _Site()
+    _houses(far, (-30.0, 26.0), rng, corner_first=False)
+    site.put_site(far, placement(reach + 15, 0, 0, -np.pi / 2))
+    site.put(objects.thicket(2 * reach, 12.0, rng), placement(reach + 25, -reach, 0, np.pi / 2))
+    return site
+
+
+def _roundabout(options: SynthesizeOptions) -> SceneModel:
+    rng = np.random.default_rng([options.seed, 1])
+    length = options.mean_speed_m_s * options.frames * FRAME_INTERVAL_S
+    route, centre = roundabout_route()
+    # a drive too short for all of it has its middle beside the island
+    start = max(0.0, (route.ends_m[0] + route.ends_m[1] - length) / 2)
+    reach = max(65.0, length + 45.0)
+    site = _Site()
+    mesh = site.mesh
+    mesh.add_rectangle((-260, 320), (-320, 260), -0.01, Material.GRASS, _GRASS)
+    middle = _Site()
+    for half_x, half_y, z in ((reach + 60, KERB_Y_M, 0.0), (KERB_Y_M, reach + 60, -0.001)):
+        middle.mesh.add_rectangle((-half_x, half_x), (-half_y, half_y), z, Material.ASPHALT, _ASPHALT)
+    middle.mesh.add_disc((0, 0, 0.0007), (0, 0, 1), 24.0, Material.ASPHALT, _ASPHALT, 48)
+    middle.put_site(_island(rng), np.eye(4))
+    for arm in range(4):
+        turned = placement(0, 0, 0, arm * np.pi / 2)
+        middle.put_site(_ring_arm(reach, rng), turned)
+        middle.put_site(_ring_corner(reach, rng), turned)
+        # the first thing that those who come in by this arm see of the island
+        _chevrons(middle, ISLAND_M - 0.6, arm * np.pi / 2 + 0.2)
+    site.put_site(middle, placement(centre[0], centre[1]))
+    return _driven_through(options, site, _DAYLIGHT, route, None, start)
 
 
 _CEILING_M = 2.6
@@ -438,7 +628,7 @@ def _parking(options: SynthesizeOptions) -> SceneModel:
     site = _Site()
     mesh = site.mesh
     whole = (x0, x1), (wall_right, wall_left)
-    mesh.add_rectangle(*whole, 0.0, Material.CONCRETE, (0.23, 0.23, 0.225))
+    mesh.add_rectangle(*whole, 0.0, Material.CONCRETE, _CONCRETE)
     mesh.add_rectangle(*whole, _CEILING_M, Material.CONCRETE, (0.42, 0.41, 0.39))
     corners = [np.array(corner) for corner in _rectangle(*whole)]
     for a, b in zip(corners, [*corners[1:], corners[0]], strict=True):
@@ -502,7 +692,13 @@ def _parking(options: SynthesizeOptions) -> SceneModel:
     return _driven_through(options, site, lighting, Route((0.0, -1.1)), Route((0.0, 1.6), np.pi))
 
 
-_BUILDERS = {"street": _street, "traffic": _street, "turn": _turn, "parking": _parking}
+_BUILDERS = {
+    "street": _street,
+    "traffic": _street,
+    "turn": _turn,
+    "parking": _parking,
+    "roundabout": _roundabout,
+}
 
 
 def build_scene(options: SynthesizeOptions) -> SceneModel:
