@@ -94,9 +94,9 @@ NETWORK = "EDGE_DEPTH_NERF_NETWORK"
 def of_network(x: Tensor, weights: Sequence[Tensor]) -> ModuleType | None:
     """Give the kernels of networks, `network_triton`; None where they are not asked for, or do not serve this network.
 
-    They serve what autocast would compute in float16 on CUDA, where nobody asks for a gradient.
+    They serve what autocast would compute in float16 on CUDA.
     """
-    if os.environ.get(NETWORK) != "triton" or x.device.type != "cuda" or torch.is_grad_enabled():
+    if os.environ.get(NETWORK) != "triton" or x.device.type != "cuda":
         return None
     if not torch.is_autocast_enabled("cuda") or torch.get_autocast_dtype("cuda") != torch.float16:
         return None
