@@ -108,9 +108,9 @@ class EdgeDepthNerfModelConfig(NerfactoModelConfig):
     """Divide Eq. 4's Gaussian by σ̂·√(2π), so that a wide one does not pull harder than a narrow one."""
     implementation: Literal["auto", "fused", "tcnn", "torch"] = "auto"  # pyright: ignore[reportIncompatibleVariableOverride]
     """What computes fields, samples and losses. fused: our own kernels (Numba on the CPU; on CUDA Triton for hash
-    grids, samples along rays, densities, directions and the edge loss). torch: nerfstudio's code, with the same results and checkpoints as
-    fused, but many times slower on a CPU. tcnn: tiny-cuda-nn, whose checkpoints differ. auto: tcnn on a GPU if it is
-    installed, otherwise fused; config.yml keeps which it was."""
+    grids, samples along rays, densities, directions and the edge loss). torch: nerfstudio's code, with the same
+    results and checkpoints as fused, but many times slower on a CPU. tcnn: tiny-cuda-nn, whose checkpoints differ.
+    auto: tcnn on a GPU if it is installed, otherwise fused; config.yml keeps which it was."""
 
 
 Implementation = Literal["fused", "tcnn", "torch"]
