@@ -173,6 +173,10 @@ def fused(samples: RaySamples) -> RaySamples:
     return samples
 
 
+def _given_fused(_: nn.Module, __: Any, samples: RaySamples) -> RaySamples:
+    return fused(samples)
+
+
 def use_fused_samples(sampler: nn.Module) -> None:
     """Let the samples that a sampler gives compute in the fused form; in place."""
-    sampler.register_forward_hook(lambda _, __, samples: fused(samples))
+    sampler.register_forward_hook(_given_fused)
