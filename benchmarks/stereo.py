@@ -14,7 +14,9 @@ truth, distance, error (blue 0, red 30 % and more).
 
 Of scenes that `process` has finished, with LiDAR, monocular maps and maps from motion, the default prior of the
 training pictures is judged too, with motion and without: what share of the pixels has one, how wrong it is in LiDAR's
-field and above it, and how many errors are within one and two sigma.
+field and beyond it, and how many errors are within one and two sigma; beyond it also by whether a pixel has a distance
+from motion. The share of the sky that has a prior is printed too, which is to be none. --only-prior judges the prior
+alone.
 """
 
 from __future__ import annotations
@@ -185,10 +187,21 @@ def judge_prior(scene_path: Path, every: int) -> list[tuple[str, ...]]:
             prior = make_prior(maps.distances_m, maps.usable, INTEGRATED, options, trust, view_angles)
             truth = maps.distances_m[layer]
             above = ~trust.in_field(view_angles.elevation_rad)
-            where = maps.usable & (truth > 0)
-            rows.append(np.stack([each[where] for each in (truth, prior.distance_m, prior.sigma_m, above)], -1))
-        truth, distance, sigma, above = np.concatenate(rows).T
-        for name, where in (("in the field", above == 0), ("above and below", above > 0)):
+            matched = maps.distances_m["motion"] > 0
+            of_pixels = (truth, prior.distance_m, prior.sigma_m, above, matched)
+            rows.append(np.stack([each[maps.usable] for each in of_pixels], -1))
+        truth, distance, sigma, above, matched = np.concatenate(rows).T
+        if layer == "truth_distance" and (truth == 0).any():
+            share = (distance[truth == 0] > 0).mean()
+            table.append((scene.folder.name, "with motion" if motion else "without", "sky", f"{share:.1%}", *4 * "-"))
+        there = truth > 0
+        for name, where in {
+            "all": there,
+            "in the field": there & (above == 0),
+            "beyond": there & (above > 0),
+            "beyond, matched": there & (above > 0) & (matched > 0),
+            "beyond, not matched": there & (above > 0) & (matched == 0),
+        }.items():
             kept = where & (distance > 0)
             if not kept.any():
                 continue
@@ -209,23 +222,26 @@ def main() -> None:
     parser.add_argument("scenes", nargs="+", type=Path, help="scene folders written by `process`")
     parser.add_argument("--output", type=Path, default=Path("outputs/stereo"), help="sweeps, tables and pictures")
     parser.add_argument("--every", type=int, default=1, help="judge every so many-th training picture")
+    parser.add_argument("--only-prior", action="store_true", help="judge the prior alone, which takes seconds")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     console = Console(width=120)
     table = Table(*COLUMNS, title="Distances from motion")
     bins = Table("drive", "by", "from - to", "pixels", "right to 10 %", "median", title="What is kept")
-    for scene in arguments.scenes:
+    for scene in [] if arguments.only_prior else arguments.scenes:
         of_scene, by_bins = judge(scene, arguments.output, arguments.every)
         for row in of_scene:
             table.add_row(*row)
         for row in by_bins:
             bins.add_row(*row)
-    console.print(table, bins)
+    if not arguments.only_prior:
+        console.print(table, bins)
     priors = Table(*PRIOR_COLUMNS, title="The default prior of training pictures")
     for scene in arguments.scenes:
         for row in judge_prior(scene, arguments.every):
             priors.add_row(*row)
     console.print(priors)
+    arguments.output.mkdir(parents=True, exist_ok=True)
     with (arguments.output / "table.txt").open("w") as file:
         Console(file=file, width=120).print(table, bins, priors)
 
