@@ -36,9 +36,9 @@ from edge_depth_nerf.base.files import read_json, write_json
 from edge_depth_nerf.method.alignment import Fit
 
 KNOTS: dict[str, tuple[float, ...]] = {
-    "distance_m": (1, 2, 4, 8, 16, 32, 64, 128),
-    "theta_deg": (0, 30, 60, 90),
-    "nearest_px": (0, 1, 2, 4, 8, 16, 32, 64),
+    "distance_m": (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0),
+    "theta_deg": (0.0, 30.0, 60.0, 90.0),
+    "nearest_px": (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0),
     "spread": (0.001, 0.003, 0.01, 0.03, 0.1, 0.3),
     "step": (0.003, 0.01, 0.03, 0.1, 0.3, 1.0),
 }
@@ -46,7 +46,7 @@ KNOTS: dict[str, tuple[float, ...]] = {
 MOTION_KNOTS: dict[str, tuple[float, ...]] = {
     "distance_m": KNOTS["distance_m"],
     "by_matching": (0.02, 0.03, 0.04, 0.06, 0.08, 0.12),
-    "rim_px": (0, 1, 2, 4, 8),
+    "rim_px": (0.0, 1.0, 2.0, 4.0, 8.0),
     "spread": KNOTS["spread"],
     "step": KNOTS["step"],
 }
@@ -158,8 +158,16 @@ def _log_scale(scaled_error: NDArray) -> float:
     return float(np.log(max(np.quantile(scaled_error, 0.95) / 2, 1e-6)))
 
 
+def _log_middle_scale(scaled_error: NDArray) -> float:
+    """Mean of that and of the logarithm of what 68.3 % are within: between one sigma and two."""
+    return 0.5 * (_log_scale(scaled_error) + float(np.log(max(np.quantile(scaled_error, 0.683), 1e-6))))
+
+
 def fit_error_model(
-    features: Features, relative_error: Float[np.ndarray, "n"], knots_of: Mapping[str, tuple[float, ...]] = KNOTS
+    features: Features,
+    relative_error: Float[np.ndarray, "n"],
+    knots_of: Mapping[str, tuple[float, ...]] = KNOTS,
+    middle: bool = False,
 ) -> ErrorModel | None:
     """Fit the factors to errors; None for fewer than LEAST_JUDGED.
 
@@ -170,6 +178,8 @@ def fit_error_model(
         features: of the pixels, n each.
         relative_error: |d̃ - d| / d̃.
         knots_of: which features, and where their factors are kept.
+        middle: fit one sigma and two alike, where tails are so heavy that 95 % within two would leave too many within
+            one.
 
     """
     if len(relative_error) < LEAST_JUDGED:
@@ -178,7 +188,8 @@ def fit_error_model(
     for name, knots in knots_of.items():
         scaled = _scaled(name, np.array(knots))
         bins[name] = np.searchsorted((scaled[1:] + scaled[:-1]) / 2, _scaled(name, features[name]))
-    log_base = _log_scale(relative_error)
+    log_scale = _log_middle_scale if middle else _log_scale
+    log_base = log_scale(relative_error)
     log_factors = {name: np.zeros(len(knots)) for name, knots in knots_of.items()}
 
     def log_sigma() -> NDArray[np.float64]:
@@ -188,13 +199,13 @@ def fit_error_model(
         for name, factors in log_factors.items():
             scaled_error = relative_error / np.exp(log_sigma())
             found = {
-                knot: _log_scale(scaled_error[bins[name] == knot])
+                knot: log_scale(scaled_error[bins[name] == knot])
                 for knot in range(len(factors))
                 if np.count_nonzero(bins[name] == knot) >= LEAST_IN_BIN
             }
             if found:
                 factors += np.interp(np.arange(len(factors)), list(found), list(found.values()))
-        log_base += _log_scale(relative_error / np.exp(log_sigma()))
+        log_base += log_scale(relative_error / np.exp(log_sigma()))
     if "nearest_px" in bins and not (bins["nearest_px"] == 0).any():
         log_factors["nearest_px"][0] = log_factors["nearest_px"][1] - 0.5 * np.log(2)
     return ErrorModel(log_base, {name: factors.tolist() for name, factors in log_factors.items()})
@@ -253,12 +264,23 @@ class BeyondField:
     the network nor the prior saw."""
     reach_rad: tuple[float, float]
     """Elevations between which these were: least and largest."""
+    reach_px: float
+    """How far at most they were from the nearest pixel with a return or a distance from motion."""
 
-    def network_reaches(self, elevation_rad: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-        """Whether the monocular map's error is known for rays of these elevations."""
+    def network_reaches(
+        self, elevation_rad: Float[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]
+    ) -> Bool[np.ndarray, "h w"]:
+        """Where the monocular map's error is known.
+
+        Args:
+            elevation_rad: of each ray.
+            known: pixels with a return or a distance from motion.
+
+        """
         if self.network_model is None:
             return np.zeros(elevation_rad.shape, bool)
-        return (elevation_rad >= self.reach_rad[0]) & (elevation_rad <= self.reach_rad[1])
+        near = cv2.distanceTransform((~known).astype(np.uint8), cv2.DIST_L2, 5) <= self.reach_px
+        return near & (elevation_rad >= self.reach_rad[0]) & (elevation_rad <= self.reach_rad[1])
 
 
 @dataclass(frozen=True)
@@ -353,13 +375,25 @@ class Trust:
             parts.append("too few LiDAR points to measure the prior's error: sigma is that of sigma_mode combined")
         if not self.everywhere:
             low, high = np.degrees(self.field_rad)
-            beyond = " (beyond, where motion gives a distance)" if self.motion is not None else ""
             parts.append(
                 f"there is a prior only between {low - FIELD_MARGIN_DEG:.0f}° and {high + FIELD_MARGIN_DEG:.0f}° of "
                 "elevation, "
-                f"where LiDAR measured and the network could learn{beyond}"
+                f"where LiDAR measured and the network could learn{self._beyond_said()}"
             )
         return "; ".join(parts)
+
+    def _beyond_said(self) -> str:
+        """Where else there is a prior."""
+        if self.motion is None:
+            return ""
+        beyond = self.motion.beyond
+        if beyond is None or beyond.network_model is None:
+            return " (beyond, where motion gives a distance)"
+        low, high = np.degrees(beyond.reach_rad)
+        return (
+            " (beyond, where motion gives a distance, and near such pixels, where the network learned from it: between "
+            f"{low:.0f}° and {high:.0f}°)"
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -442,6 +476,7 @@ def _beyond(content: dict[str, Any]) -> BeyondField:
         motion_model=_model(content["motion_model"], MOTION_KNOTS),
         network_model=_model(content["network_model"]),
         reach_rad=(_number(low), _number(high)),
+        reach_px=_number(content["reach_px"]),
     )
 
 

@@ -280,13 +280,16 @@ def _joined(mono_m: NDArray[np.float32], motion_m: NDArray[np.float32], motion_w
     return join_estimates(torch.from_numpy(mono_m), torch.from_numpy(motion_m), motion_weight).numpy()
 
 
-def motion_map(motion_m: NDArray[np.float32], trust: Trust, view: View) -> MotionMap:
+def motion_map(
+    motion_m: NDArray[np.float32], trust: Trust, view: View, lidar_m: NDArray[np.float32] | None
+) -> MotionMap:
     """How a picture's distances from motion take part under a calibration that measured them.
 
     Args:
         motion_m: H×W, 0 = none.
         trust: the drive's calibration, with what it says of motion.
         view: of the picture.
+        lidar_m: its LiDAR, 0 = no return; None without.
 
     """
     assert trust.motion is not None
@@ -296,7 +299,8 @@ def motion_map(motion_m: NDArray[np.float32], trust: Trust, view: View) -> Motio
         return MotionMap(motion_m, trust.motion.weight, counts, np.zeros_like(in_field))
     if beyond.motion_model is None:
         motion_m = np.where(in_field, motion_m, np.float32(0))
-    counts = in_field | trust.everywhere | beyond.network_reaches(view.elevation_rad)
+    known = motion_m > 0 if lidar_m is None else (motion_m > 0) | (np.nan_to_num(lidar_m) > 0)
+    counts = in_field | trust.everywhere | beyond.network_reaches(view.elevation_rad, known)
     return MotionMap(motion_m, trust.motion.weight, counts, ~in_field)
 
 
@@ -334,7 +338,7 @@ def make_prior(
         assert view is not None
         motion, motion_sigma_m = None, np.zeros(mask.shape, np.float32)
         if motion_m is not None and trust.motion is not None:
-            motion = motion_map(motion_m, trust, view)
+            motion = motion_map(motion_m, trust, view, lidar_m)
             motion_sigma_m = motion_sigma(motion_m, maps.get("motion_sigma"))
         else:
             mask = mask if trust.everywhere else mask & trust.in_field(view.elevation_rad)

@@ -9,7 +9,8 @@ follows from the errors of both at the returns that are left out. The result is 
 Beyond LiDAR's field there is nothing but motion to compare with. Motion's own error is measured in the field, where
 LiDAR is, as a function of what is known of it: a prior is made of motion alone and compared with the returns. The
 monocular map's error is measured beyond the field, on distances from motion in places that neither the network nor the
-prior saw (`mono.motion_seen`).
+prior saw (`mono.motion_seen`). It is used where motion has none, at outlines and far ahead, where a network is worse
+than elsewhere: by how much is measured in the field, at returns with and without a distance from motion.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -33,11 +34,10 @@ from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.method.alignment import LEAST_RETURNS, align, both, fit_logs
 from edge_depth_nerf.method.error_model import (
     FIELD_MARGIN_DEG,
-    KNOTS,
     LEAST_JUDGED,
     MOTION_KNOTS,
     BeyondField,
-    ErrorModel,
+    Features,
     FrameAlignment,
     MotionTrust,
     Trust,
@@ -75,6 +75,8 @@ HELD_OUT_ROWS = (0.1, 0.95)
 """In every second frame returns below and above these quantiles of their elevation are left out."""
 FIELD_QUANTILES = (0.001, 0.999)
 """LiDAR's field of elevation, but for stray returns."""
+REACH_QUANTILE = 0.95
+"""Of how far left-out distances from motion lie from the nearest that is known: beyond, nothing is measured."""
 _JUDGED_A_FRAME = 5_000
 _FOR_THE_DRIVE_A_FRAME = 2_000
 """So many returns of a frame enter; more tell nothing new."""
@@ -92,6 +94,12 @@ class MeasuredBeyond:
     """Of pixels beyond LiDAR's field, with a distance from motion that was left out."""
     network_error: NDArray[np.float32]
     """|d̃ - d| / d̃ there, of a prior made without it."""
+    field_features: dict[str, NDArray[np.float32]]
+    """Of pixels with a left-out return."""
+    field_error: NDArray[np.float32]
+    """|d̃ - d| / d̃ there, of a prior made without motion."""
+    field_matched: NDArray[np.bool_]
+    """Which of them motion has a distance of."""
     elevation_rad: NDArray[np.float32]
     """Of all distances from motion, above the horizon."""
 
@@ -517,11 +525,20 @@ def measure_beyond(
     of_network = beyond_features(network, view)
     held_out = _some(usable & left_out & motion.alone & (network.distance_m > 0), _JUDGED_A_FRAME, rng)
     found_m, true_m = network.distance_m[held_out], motion.distance_m[held_out]
+
+    # as in `measure_frame`, but of two sources
+    fewer, _ = held_out_returns(both(lidar_m, mono_m, usable), view.elevation_rad, number)
+    of_two = integrate_frame(np.where(fewer, np.float32(0), lidar_m), mono_m, usable, INTEGRATED, options)
+    of_field = pixel_features(of_two.distance_m, of_two.spread_m, of_two.mono_m, of_two.returns, view.theta_rad)
+    tried = _some(fewer & (of_two.distance_m > 0), _JUDGED_A_FRAME, rng)
     return MeasuredBeyond(
         {name: values[judged] for name, values in of_motion.items()},
         motion_error,
         {name: values[held_out] for name, values in of_network.items()},
         np.abs(found_m - true_m) / found_m,
+        {name: values[tried] for name, values in of_field.items()},
+        np.abs(of_two.distance_m[tried] - lidar_m[tried]) / of_two.distance_m[tried],
+        motion.distance_m[tried] > 0,
         view.elevation_rad[usable & (motion.distance_m > 0)],
     )
 
@@ -602,10 +619,31 @@ def _combine_beyond(frames: Sequence[MeasuredBeyond]) -> BeyondField | None:
     if not frames:
         return None
 
-    def fitted(of: str, knots: Mapping[str, tuple[float, ...]]) -> ErrorModel | None:
-        features = [getattr(frame, f"{of}_features") for frame in frames]
-        pooled = {name: np.concatenate([each[name] for each in features]) for name in knots}
-        return fit_error_model(pooled, np.concatenate([getattr(frame, f"{of}_error") for frame in frames]), knots)
+    def pooled(name: str) -> NDArray:
+        return np.concatenate([getattr(frame, name) for frame in frames])
 
-    reach_rad = _field_rad([frame.elevation_rad for frame in frames])
-    return BeyondField(fitted("motion", MOTION_KNOTS), fitted("network", KNOTS), reach_rad)
+    def features(name: str) -> dict[str, NDArray[np.float32]]:
+        every = [getattr(frame, name) for frame in frames]
+        return {feature: np.concatenate([each[feature] for each in every]) for feature in every[0]}
+
+    motion_model = fit_error_model(features("motion_features"), pooled("motion_error"), MOTION_KNOTS, middle=True)
+    of_network = features("network_features")
+    network_model = fit_error_model(of_network, pooled("network_error"))
+    reach_px = 0.0
+    if network_model is not None:
+        reach_px = float(np.quantile(of_network["nearest_px"], REACH_QUANTILE))
+        worse = _unmatched_factor(features("field_features"), pooled("field_error"), pooled("field_matched"))
+        network_model = dataclasses.replace(network_model, log_base=network_model.log_base + np.log(worse))
+    return BeyondField(motion_model, network_model, _field_rad([frame.elevation_rad for frame in frames]), reach_px)
+
+
+def _unmatched_factor(features: Features, relative_error: NDArray[np.float32], matched: NDArray[np.bool_]) -> float:
+    """How much more a prior without motion is wrong where motion has no distance, all other features alike; 1 or more.
+
+    Not known for few: 1.
+    """
+    model = fit_error_model({name: values[matched] for name, values in features.items()}, relative_error[matched])
+    if model is None or np.count_nonzero(~matched) < LEAST_JUDGED:
+        return 1.0
+    sigma = np.exp(model.log_sigma({name: values[~matched] for name, values in features.items()}))
+    return max(1.0, float(np.quantile(relative_error[~matched] / sigma, 0.95)) / 2)
