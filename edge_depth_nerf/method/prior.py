@@ -234,14 +234,22 @@ def integrate_frame(
         mask = anywhere
     # the spread is wanted at returns, too, so they are kept afterwards
     integration = dataclasses.replace(options.integration, keep_returns=False)
-    lidar, mono, valid = (torch.from_numpy(pixels) for pixels in (lidar_m, mono_m, mask))
-    integrated = select_prior(depth_source, {"lidar": lidar, "mono": mono}, valid, integration)
-    distance = integrated.distance_m.float().numpy()
+
+    def integrated(lidar_m: NDArray[np.float32], mono_m: NDArray[np.float32]) -> tuple[NDArray, NDArray]:
+        lidar, mono, valid = (torch.from_numpy(pixels) for pixels in (lidar_m, mono_m, mask))
+        found = select_prior(depth_source, {"lidar": lidar, "mono": mono}, valid, integration)
+        return found.distance_m.float().numpy(), found.spread_m.float().numpy()
+
+    distance, spread = integrated(lidar_m, mono_m)
+    if motion is not None and (alone := motion.alone & from_motion).any():
+        # a monocular map that is worse takes no part in the windows of these pixels, either
+        by_motion = integrated(np.zeros_like(mono_m), np.where(motion.alone, motion.distance_m, np.float32(0)))
+        distance, spread = (np.where(alone, *both) for both in zip(by_motion, (distance, spread), strict=True))
     returns &= distance > 0
     if options.integration.keep_returns:
         distance = np.where(returns, lidar_m, distance)
     known = np.where(np.isfinite(mono_m), mono_m, 0)
-    return IntegratedFrame(distance, integrated.spread_m.float().numpy(), known, returns, from_motion)
+    return IntegratedFrame(distance, spread, known, returns, from_motion)
 
 
 def _measured(lidar_m: NDArray[np.float32], motion: MotionMap) -> NDArray[np.float32]:
