@@ -182,10 +182,12 @@ def test_sigma_of_the_network_beyond_the_field_is_its_own():
     _, maps, view, beyond = beyond_frames(0.15, seed=1)
     one, two = covered(trust, maps, view, beyond)
     assert one == pytest.approx(0.68, abs=0.12) and two == pytest.approx(0.95, abs=0.05)
-    # that of a network that is three times as wrong there is too small, and it shows
-    _, worse, _, _ = beyond_frames(0.45, seed=1)
-    one, two = covered(trust, worse, view, beyond)
-    assert one < 0.45 and two < 0.75
+    # that of the field, where the network is right to 2 %, is too small, and it shows
+    assert trust.motion is not None and trust.motion.beyond is not None
+    of_field = dataclasses.replace(trust.motion.beyond, network_model=trust.error_model)
+    extrapolated = dataclasses.replace(trust, motion=dataclasses.replace(trust.motion, beyond=of_field))
+    one, two = covered(extrapolated, maps, view, beyond)
+    assert one < 0.5 and two < 0.8
 
 
 def test_without_a_measurement_beyond_there_is_no_prior():

@@ -75,6 +75,8 @@ HELD_OUT_ROWS = (0.1, 0.95)
 """In every second frame returns below and above these quantiles of their elevation are left out."""
 FIELD_QUANTILES = (0.001, 0.999)
 """LiDAR's field of elevation, but for stray returns."""
+_BEYOND_VERSION = 1
+"""Part of the key of calibrations with motion: raised when they measure otherwise beyond LiDAR's field."""
 REACH_QUANTILE = 0.95
 """Of how far left-out distances from motion lie from the nearest that is known: beyond, nothing is measured."""
 _JUDGED_A_FRAME = 5_000
@@ -261,7 +263,9 @@ def _made_of(scene: SceneFolder, pictures: Sequence[ScenePicture], depth_source:
     relevant = {"depth_source": depth_source, **dataclasses.asdict(options)}
     del relevant["sigma_mode"], relevant["sigma_constant_m"]
     with_motion = _with_motion(scene, depth_source, options)
-    if not with_motion:
+    if with_motion:
+        relevant["beyond"] = _BEYOND_VERSION
+    else:
         del relevant["motion"]
     units = [scene.lidar_metres_per_count, scene.lidar_is_z_depth, round(scene.theta_max_rad, 9)]
     digest = hashlib.sha256(json.dumps([CACHE_VERSION, relevant, _trained_on(scene), units], sort_keys=True).encode())
