@@ -107,10 +107,12 @@ def test_the_loss_counts_by_weight():
     for e, v, w in zip(error, valid, weight, strict=True):
         mean, square = (np.average(values[v], weights=w[v]) for values in (e, e**2))
         expected.append(np.sqrt(square - 0.5 * mean**2 + 1e-6))
-    tensors = [torch.from_numpy(values) for values in (error, valid)]
-    assert float(scale_invariant_loss(*tensors, 0.5, torch.from_numpy(weight))) == pytest.approx(np.mean(expected))
-    whole = scale_invariant_loss(*tensors, 0.5, torch.ones(2, 6, 5))
-    assert float(whole) == float(scale_invariant_loss(*tensors, 0.5))
+    log_error, measured = torch.from_numpy(error), torch.from_numpy(valid)
+    assert float(scale_invariant_loss(log_error, measured, 0.5, torch.from_numpy(weight))) == pytest.approx(
+        np.mean(expected)
+    )
+    whole = scale_invariant_loss(log_error, measured, 0.5, torch.ones(2, 6, 5))
+    assert float(whole) == float(scale_invariant_loss(log_error, measured, 0.5))
 
 
 def test_sigma_falls_with_parallax_and_confidence():
@@ -193,11 +195,13 @@ def test_sigma_of_the_network_beyond_the_field_is_its_own():
 def test_without_a_measurement_beyond_there_is_no_prior():
     frames, maps, view, beyond = beyond_frames(0.1)
     whole = combine(frames, PriorOptions(), "key", False, motion_errors=MotionErrors(0.01, 0.02))
-    assert whole.motion is not None and whole.motion.beyond is not None
+    motion = whole.motion
+    assert motion is not None and motion.beyond is not None
+    beyond_field = motion.beyond
 
     def has_prior(**changes) -> np.ndarray:
-        changed = dataclasses.replace(whole.motion.beyond, **{"reach_px": 1e3, **changes})
-        trust = dataclasses.replace(whole, motion=dataclasses.replace(whole.motion, beyond=changed))
+        changed = dataclasses.replace(beyond_field, **{"reach_px": 1e3, **changes})
+        trust = dataclasses.replace(whole, motion=dataclasses.replace(motion, beyond=changed))
         prior = make_prior(maps[0][1], np.ones(SIZE, bool), "integrated", PriorOptions(), trust, view)
         np.testing.assert_array_equal(prior.distance_m > 0, prior.sigma_m > 0)
         return prior.distance_m > 0
