@@ -173,8 +173,8 @@ def judge(scene_path: Path, output: Path, every: int) -> tuple[list[tuple[str, .
 
 
 def prior_pixels(scene: SceneFolder, options: PriorOptions, every: int = 1) -> NDArray[np.float64]:
-    """Each used pixel of the training pictures: the true distance (0: none is known, or it is sky), the prior's, its sigma
-    (metres), whether it lies outside LiDAR's field, and whether motion has a distance there; 5×N."""
+    """Each used pixel of the training pictures: the true distance (0: none is known, or it is sky), the prior's and its
+    sigma (metres), whether it lies outside LiDAR's field, and whether motion has a distance there; 5×N."""
     trust, rows = find_trust(scene, options), []
     layer = true_layer(scene)
     for picture in [picture for picture in scene.pictures if not picture.held_out][::every]:
@@ -225,7 +225,7 @@ def judge_prior(scene_path: Path, every: int) -> list[tuple[str, ...]]:
         pixels = prior_pixels(scene, PriorOptions(motion=motion), every)
         truth, distance, _, outside, matched = pixels
         source = "with motion" if motion else "without"
-        if layer == "truth_distance" and (truth == 0).any():
+        if true_layer(scene) == "truth_distance" and (truth == 0).any():
             share = (distance[truth == 0] > 0).mean()
             table.append((scene.folder.name, source, "sky", f"{share:.1%}", *4 * "-"))
         for name, where in {
