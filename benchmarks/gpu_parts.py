@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import importlib.util
+import itertools
 import math
 import re
 import subprocess
@@ -159,6 +160,83 @@ def kernels(settings: Settings) -> dict[str, Any]:
     return {"rows": rows}
 
 
+def samples_and_networks(settings: Settings) -> dict[str, Any]:
+    """Triton's kernels for samples, densities, directions and networks beside torch's, at the sizes of a full step."""
+    import torch.nn.functional as F
+    from nerfstudio.field_components.activations import trunc_exp
+    from nerfstudio.utils.math import components_from_spherical_harmonics
+
+    from edge_depth_nerf.kernels.network import _layer_by_layer
+
+    torch.manual_seed(0)
+    rays, samples = (16, 8) if settings.fake else (4096, 256)
+    count = rays * samples
+    near, far = (torch.full((rays, 1), value, device=settings.device) for value in (0.01, 50.0))
+    edges = torch.rand(rays, samples + 1, device=settings.device).sort(dim=1)[0]
+    directions = F.normalize(torch.randn(rays, 3, device=settings.device), dim=1)
+    before = torch.randn(count, device=settings.device, requires_grad=True)
+    inside = torch.ones(count, device=settings.device)
+
+    def spaced(distance: torch.Tensor) -> torch.Tensor:
+        return torch.where(distance < 1, distance / 2, 1 - 1 / (2 * distance))
+
+    def distances() -> torch.Tensor:
+        x = torch.lerp(spaced(near), spaced(far), edges)
+        return torch.where(x < 0.5, 2 * x, 1 / (2 - 2 * x))
+
+    def middles() -> torch.Tensor:
+        starts, ends = edges[:, :-1, None], edges[:, 1:, None]
+        return directions[:, None] + directions[:, None] * (starts + ends) / 2
+
+    def followed(found: torch.Tensor, *given: torch.Tensor) -> torch.Tensor:
+        """The gradients of the sum, in one row."""
+        return torch.cat([each.flatten().float() for each in torch.autograd.grad(found.sum(), given)])
+
+    of_torch: dict[str, Callable[[], torch.Tensor]] = {
+        "distances": distances,
+        "positions": middles,
+        "densities": lambda: followed(0.01 * trunc_exp(before) * inside, before),
+        "directions": lambda: components_from_spherical_harmonics(4, (directions + 1) / 2),
+    }
+    of_triton = of_torch
+    if not settings.fake:
+        from edge_depth_nerf.kernels import network_triton, pointwise_triton
+
+        of_triton = {
+            "distances": lambda: pointwise_triton.distances(edges, near, far),
+            "positions": lambda: pointwise_triton.middles(directions, directions, edges[:, :-1], edges[:, 1:]),
+            "densities": lambda: followed(pointwise_triton.density(before, inside, 0.01), before),
+            "directions": lambda: pointwise_triton.harmonics(directions, torch.float32),
+        }
+    for widths, points in (((10, 16, 1), count), ((32, 64, 16), count // 5), ((15, 64, 64, 3), count // 5)):
+        pairs = list(itertools.pairwise(widths))
+        weights = [torch.randn(out, width, device=settings.device).requires_grad_() for width, out in pairs]
+        biases = [torch.randn(out, device=settings.device).requires_grad_() for _, out in pairs]
+        x = torch.randn(points, widths[0], device=settings.device).requires_grad_()
+
+        def step(network: Any, x: Any = x, weights: Any = weights, biases: Any = biases) -> torch.Tensor:
+            with torch.autocast(settings.device, enabled=not settings.fake, dtype=torch.float16):
+                found = network(x, weights, biases)
+            return followed(found, x, *weights, *biases)
+
+        name = f"network of {'-'.join(map(str, widths))}, forward and backward"
+        of_torch[name] = partial(step, _layer_by_layer)
+        if not settings.fake:
+            of_triton[name] = partial(step, network_triton.network)
+    rows = []
+    for name, expected in of_torch.items():
+        found, beside = of_triton[name]().double(), expected().double()
+        rows.append(
+            {
+                "what": name,
+                "triton_ms": milliseconds(of_triton[name], settings),
+                "torch_ms": milliseconds(expected, settings),
+                "off_torch": float((found - beside).norm() / beside.norm()),
+            }
+        )
+    return {"rows": rows}
+
+
 def counts(settings: Settings) -> dict[str, Any]:
     """What a step would ask for, counted on fake tensors, as the tests do."""
     import gpu_counts
@@ -237,8 +315,10 @@ def raced(settings: Settings, names: Sequence[str]) -> dict[str, Any]:
 
 
 def our_steps(settings: Settings) -> dict[str, Any]:
-    """Ours, fused and in torch, beside nerfstudio's nerfacto."""
-    return raced(settings, ["ours"] if settings.fake else ["ours", "ours, torch"])
+    """Ours, fused (launched one by one, and as CUDA graphs) and in torch, beside nerfstudio's nerfacto."""
+    import speed
+
+    return raced(settings, ["ours"] if settings.fake else ["ours", speed.GRAPHS, "ours, torch"])
 
 
 def other_steps(settings: Settings) -> dict[str, Any]:
@@ -351,6 +431,7 @@ PARTS = {
     "counts": Part(counts, 120),
     "tests": Part(gpu_tests, 180),
     "kernels": Part(kernels, 120),
+    "samples and networks": Part(samples_and_networks, 120),
     "our steps": Part(our_steps, 180),
     "other steps": Part(other_steps, 180),
     "profile": Part(profile, 120),

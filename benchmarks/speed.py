@@ -53,7 +53,8 @@ HOST = {
     "depth-nerfacto": (DepthNerfactoModelConfig, "torch"),
     "nerfacto, tiny-cuda-nn": (NerfactoModelConfig, "tcnn"),
 }
-OURS = {"ours, torch": "torch", "ours": "fused", "ours, tiny-cuda-nn": "tcnn"}
+GRAPHS = "ours, CUDA graphs"
+OURS = {"ours, torch": "torch", "ours": "fused", GRAPHS: "fused", "ours, tiny-cuda-nn": "tcnn"}
 SPLATS = "splatfacto"
 ON_EVERY_MACHINE = ("nerfacto", "depth-nerfacto", "ours, torch", "ours")
 REFERENCE = "nerfacto"
@@ -159,6 +160,7 @@ def configurations(
         if name in OURS:
             found[name] = copy.deepcopy(base)
             found[name].pipeline.model.implementation = OURS[name]
+            found[name].cuda_graphs = name == GRAPHS
             continue
         if name == SPLATS:
             found[name] = config = copy.deepcopy(method_configs[SPLATS])

@@ -29,6 +29,7 @@ from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModelConfig
 from edge_depth_nerf.plugin.pipeline import EdgeDepthPipelineConfig
 from edge_depth_nerf.plugin.pose_refinement import PoseRefinerConfig
+from edge_depth_nerf.plugin.trainer import EdgeDepthTrainerConfig
 
 PAGE = Path(__file__).with_name("options.md")
 
@@ -208,6 +209,7 @@ def methods() -> str:
     """The section of what our methods add to nerfstudio."""
     configs = {name: made.config for name, made in make_specifications(read_method_file()).items()}
     groups = (
+        ("The training", "", EdgeDepthTrainerConfig),
         ("The training data", "pipeline.datamanager", FisheyeDepthDataManagerConfig),
         ("The depth prior", "pipeline.datamanager.prior", PriorOptions),
         ("Its integration", "pipeline.datamanager.prior.integration", IntegrationOptions),
@@ -227,15 +229,16 @@ def methods() -> str:
         rows = []
         for entry in dataclasses.fields(cls):
             # a group of options has a table of its own
-            if entry.name not in docs or entry.name == "_target" or f"{place}.{entry.name}" in places:
+            full = f"{place}.{entry.name}".removeprefix(".")
+            if entry.name not in docs or entry.name == "_target" or full in places:
                 continue
-            values = {name: at(config, f"{place}.{entry.name}") for name, config in configs.items()}
+            values = {name: at(config, full) for name, config in configs.items()}
             first = next(iter(values.values()))
             default = shown(first)
             for name, value in values.items():
                 if value != first:
                     default += f"; {name.removeprefix('edge-depth-nerf-')}: {shown(value)}"
-            option = f"`--{dashed(entry.name)}`" if is_parser else f"`--{dashed(place)}.{dashed(entry.name)}`"
+            option = f"`--{dashed(entry.name)}`" if is_parser else f"`--{dashed(full)}`"
             rows.append((option, kind_of(hints[entry.name]), default, cell(docs[entry.name])))
         text += table(rows, ("option", "values", "default", "what"))
     return text + presets()

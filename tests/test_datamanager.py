@@ -105,7 +105,7 @@ def test_on_a_gpu_a_batch_is_the_same_with_all_further_pixels_and_which_are_of_u
     monkeypatch.setattr(datamanager_module, "SURFACE_SIGMA_M", float(sigma_m.median()))
     for step in range(3):
         rays, expected = data.next_train(step)
-        found_rays, found = other._next_train_elsewhere(step)
+        found_rays, found = other.batch_of(other.upload(step))
         counts = found.pop("surface_counts")[:, 0]
         assert len(counts) == 400 and 0 < counts.sum() < 400
         pairs = [(rays, found_rays), (expected.pop("surface_rays"), found.pop("surface_rays")[counts])]

@@ -42,6 +42,8 @@ def test_every_part_runs_to_its_end_without_a_gpu(gpu, sample_drive, tmp_path, c
     assert found["device"]["copied_gb_s"] > 0
     assert found["tests"]["counts"]["passed"] > 0 and not found["tests"]["said"]
     assert {row["kernel"] for row in found["kernels"]["rows"]} == {"encode", "table_gradient", "position_gradient"}
+    beside_torch = found["samples and networks"]["rows"]
+    assert len(beside_torch) == 7 and all(row["off_torch"] == 0 and row["torch_ms"] > 0 for row in beside_torch)
     assert set(found["our steps"]) == {"nerfacto", "ours"} and found["our steps"]["ours"]["step_ms"][0] > 0
     assert found["profile"]["launches"] == 0 and found["profile"]["step_ms"] > 0
     assert "masked_psnr" in found["training"]["figures"]

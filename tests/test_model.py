@@ -258,8 +258,10 @@ def test_views_have_the_geometric_mean_of_the_pictures_gains():
     bundle = replace(rays(), camera_indices=(torch.arange(16) % 3)[:, None])
     colours = torch.rand(16, 3)
     expected = colours * torch.tensor([[-0.2, 0, 0.1], [0, 0, -0.1], [0.2, 0, 0]]).exp()[torch.arange(16) % 3]
-    assert torch.allclose(model.train()._exposed(colours, bundle), expected)
-    assert torch.equal(model.eval()._exposed(colours, bundle), colours)
+    bundles = [bundle[:10], bundle[10:]]
+    exposed = model.train()._exposed([colours[:10], colours[10:]], bundles)
+    assert torch.allclose(torch.cat([*exposed]), expected)
+    assert torch.equal(model.eval()._exposed([colours], [bundle])[0], colours)
     # they are learned, and kept with the rest
     assert any(parameter is gains.log_gains for parameter in model.get_param_groups()["fields"])
     torch.stack(list(trained_step(model)[1].values())).sum().backward()

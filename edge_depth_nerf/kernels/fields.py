@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from nerfstudio.cameras.rays import RaySamples
 from nerfstudio.field_components.activations import trunc_exp
+from nerfstudio.field_components.encodings import SHEncoding
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.field_components.mlp import MLP
 from nerfstudio.field_components.spatial_distortions import SceneContraction
@@ -25,7 +26,7 @@ from torch import Tensor, nn
 
 from edge_depth_nerf.kernels.fused_hash_grid import use_fused_encodings
 from edge_depth_nerf.kernels.network import network
-from edge_depth_nerf.kernels.triton_back_end import of_network, working
+from edge_depth_nerf.kernels.triton_back_end import by_number, made_by_autocast, of_network, working
 
 
 class CubeContraction(SceneContraction):
@@ -104,6 +105,14 @@ def _unit_cube(field: Any, positions: Float[Tensor, "*bs 3"]) -> tuple[Tensor, T
     return places, inside.view(*positions.shape[:-1], 1)
 
 
+def _densities(before: Float[Tensor, "*bs 1"], inside: Float[Tensor, "*bs 1"], scale: float) -> Float[Tensor, "*bs 1"]:
+    """Densities from a network's outputs; 0 where a point is not inside."""
+    kernels = by_number(inside)
+    if kernels is None:
+        return scale * trunc_exp(before.to(inside)) * inside
+    return kernels.density(before.reshape(-1), inside.reshape(-1), scale).view(inside.shape)
+
+
 class FusedDensityField(HashMLPDensityField):
     """nerfstudio's proposal network."""
 
@@ -112,8 +121,8 @@ class FusedDensityField(HashMLPDensityField):
         if not isinstance(self.spatial_distortion, CubeContraction) or self.use_linear or positions.requires_grad:
             return super().density_fn(positions, times)
         places, inside = _unit_cube(self, positions)
-        before = self.mlp_base(places).view(*positions.shape[:-1], 1).to(positions)
-        return self.average_init_density * trunc_exp(before) * inside
+        before = self.mlp_base(places).view(*positions.shape[:-1], 1)
+        return _densities(before, inside, self.average_init_density)
 
 
 class FusedNerfactoField(NerfactoField):
@@ -135,7 +144,7 @@ class FusedNerfactoField(NerfactoField):
     def _density(self, features: Tensor, inside: Tensor) -> tuple[Tensor, Tensor]:
         """Density and what colours are made of, from the first network's outputs."""
         before, embedding = torch.split(features, [1, self.geo_feat_dim], dim=-1)
-        return self.average_init_density * trunc_exp(before.to(inside)) * inside, embedding
+        return _densities(before, inside, self.average_init_density), embedding
 
     def forward_together(self, parts: Sequence[RaySamples]) -> list[dict[FieldHeadNames, Tensor]]:
         """Evaluate several sets of samples in one pass through the hash grid.
@@ -146,7 +155,7 @@ class FusedNerfactoField(NerfactoField):
             parts: samples of any shapes, each [rays, samples].
 
         Returns:
-            What `forward` gives for each, without normals.
+            What `forward` gives for each, without normals; densities of the first alone.
 
         """
         if not isinstance(self.spatial_distortion, CubeContraction) or self.use_pred_normals:
@@ -159,9 +168,11 @@ class FusedNerfactoField(NerfactoField):
         results = []
         for samples, features, valid, of_rays in of_parts:
             features, valid = (value.view(*samples.frustums.shape, -1) for value in (features, valid))
-            density, embedding = self._density(features, valid)
-            colours = self.get_outputs(samples, embedding, of_rays)
-            results.append({FieldHeadNames.DENSITY: density, **colours})
+            if not results:
+                density, embedding = self._density(features, valid)
+                results.append({FieldHeadNames.DENSITY: density, **self.get_outputs(samples, embedding, of_rays)})
+            else:
+                results.append(self.get_outputs(samples, features[..., 1:], of_rays))
         return results
 
     def _encoded_directions(self, parts: Sequence[RaySamples]) -> Sequence[Tensor | None]:
@@ -170,7 +181,17 @@ class FusedNerfactoField(NerfactoField):
         if not all(map(_one_a_ray, directions)):
             return [None] * len(parts)
         every = torch.cat([each[:, 0] for each in directions])
-        return self.direction_encoding(get_normalized_directions(every)).split([len(each) for each in directions])
+        return self._encoded(every).split([len(each) for each in directions])
+
+    def _encoded(self, directions: Float[Tensor, "rays 3"]) -> Float[Tensor, "rays encoded"]:
+        """Directions in spherical harmonics, without a gradient, as nerfstudio has them."""
+        encoding = self.direction_encoding
+        kernels = None
+        if isinstance(encoding, SHEncoding) and encoding.tcnn_encoding is None:
+            kernels = by_number(directions.detach())
+        if kernels is None or encoding.get_out_dim() != kernels.HARMONICS:
+            return encoding(get_normalized_directions(directions))
+        return kernels.harmonics(directions, made_by_autocast(directions.device))
 
     def get_outputs(
         self,
@@ -187,8 +208,7 @@ class FusedNerfactoField(NerfactoField):
             return super().get_outputs(ray_samples, density_embedding)
         of_rays = encoded
         if of_rays is None:
-            of_rays = self.direction_encoding(get_normalized_directions(directions[:, 0]))
-            assert of_rays is not None
+            of_rays = self._encoded(directions[:, 0])
         weights, biases = _parameters(self.mlp_head)
         of_direction, of_features, of_appearance = torch.split(
             weights[0], [of_rays.shape[1], self.geo_feat_dim, self.appearance_embedding_dim], dim=1

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from edge_depth_nerf.kernels.hash_grid import back_end, hash_grid
 from edge_depth_nerf.kernels.table_adam import IN_PLACE
+from edge_depth_nerf.kernels.triton_back_end import made_by_autocast
 
 
 class FusedHashEncoding(HashEncoding):
@@ -31,7 +32,8 @@ class FusedHashEncoding(HashEncoding):
             return super().forward(in_tensor)
         # moved once, not at each call
         self.scalings = self.scalings.to(in_tensor.device, torch.float32)
-        encoded = hash_grid(in_tensor.reshape(-1, 3).float(), self.hash_table, self.scalings, work)
+        dtype = made_by_autocast(in_tensor.device)
+        encoded = hash_grid(in_tensor.reshape(-1, 3).float(), self.hash_table, self.scalings, work, dtype)
         return encoded.view(*in_tensor.shape[:-1], self.get_out_dim())
 
 

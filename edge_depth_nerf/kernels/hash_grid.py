@@ -16,6 +16,7 @@ CUDA tensors by Triton (`cuda`).
 
 from __future__ import annotations
 
+from functools import partial
 from types import ModuleType
 from typing import Any
 
@@ -42,12 +43,15 @@ def back_end(device: torch.device) -> ModuleType | None:
 
 class _HashGrid(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, positions: Tensor, table: Tensor, scalings: Tensor, work: ModuleType) -> Tensor:
+    def forward(
+        ctx: Any, positions: Tensor, table: Tensor, scalings: Tensor, work: ModuleType, dtype: torch.dtype
+    ) -> Tensor:
         # without a gradient to the positions the table is not needed again
         ctx.save_for_backward(positions, table if ctx.needs_input_grad[0] else None, scalings)
         ctx.work, ctx.rows = work, len(table)
         ctx.table = table if hasattr(table, IN_PLACE) else None
-        return work.encode(positions, table, scalings)
+        encode = work.encode if dtype == torch.float32 else partial(work.encode, dtype=dtype)
+        return encode(positions, table, scalings)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
@@ -58,7 +62,7 @@ class _HashGrid(torch.autograd.Function):
                 ctx.work.add_table_gradient(positions, gradients[0], scalings, ctx.table.grad)
                 rows = None
             setattr(ctx.table, CLEARED, False)
-        return *_Gradients.apply(gradients[0], positions, table, scalings, rows, ctx.work), None, None
+        return *_Gradients.apply(gradients[0], positions, table, scalings, rows, ctx.work), None, None, None
 
 
 class _Gradients(torch.autograd.Function):
@@ -92,6 +96,7 @@ def hash_grid(
     table: Float[Tensor, "rows features"],
     scalings: Float[Tensor, "levels"],
     work: ModuleType,
+    dtype: torch.dtype = torch.float32,
 ) -> Float[Tensor, "points encoded"]:
     """Encode points, differentiable once by positions and table.
 
@@ -100,11 +105,12 @@ def hash_grid(
         table: float32, all levels one after the other, each with the same power of two of rows.
         scalings: float32, cells along an axis of the unit cube, for each level.
         work: the back end, from `back_end`.
+        dtype: of what is given; the CPU has float32 alone.
 
     Returns:
         The features of each point, level after level.
 
     """
-    encoded = _HashGrid.apply(positions, table, scalings, work)
+    encoded = _HashGrid.apply(positions, table, scalings, work, dtype)
     assert isinstance(encoded, Tensor)
     return encoded

@@ -106,7 +106,8 @@ def _encode_kernel(
         low = high_low * y + low_low * (1 - y)
         high = high_high * y + low_high * (1 - y)
         place = point * point_stride + (level * FEATURES + c) * feature_stride
-        tl.store(encoded + place, high * z + low * (1 - z), inside)
+        value = high * z + low * (1 - z)
+        tl.store(encoded + place, value.to(encoded.dtype.element_ty), inside)
 
 
 @triton.jit
@@ -165,6 +166,7 @@ def _table_gradient_kernel(
     at0, at1, at2, at3, at4, at5, at6, at7, x, y, z = _find_corners(positions, point, inside, scaling, size, FEATURES)
     has = inside & (feature < FEATURES)
     g = tl.load(gradient + point * point_stride + (level * FEATURES + feature) * feature_stride, has, 0.0)
+    g = g.to(tl.float32)
     low_low, high_low, low_high, high_high = (1 - y) * (1 - z), y * (1 - z), (1 - y) * z, y * z
     g0, g1 = g * low_low * (1 - x), g * low_low * x
     g2, g3 = g * high_low * (1 - x), g * high_low * x
@@ -225,7 +227,7 @@ def _position_gradient_kernel(
             v4, v5 = tl.load(grid + at4, inside, 0.0), tl.load(grid + at5, inside, 0.0)
             v6, v7 = tl.load(grid + at6, inside, 0.0), tl.load(grid + at7, inside, 0.0)
             place = point * point_stride + (level * FEATURES + c) * feature_stride
-            g = tl.load(gradient + place, inside, 0.0) * scaling
+            g = tl.load(gradient + place, inside, 0.0).to(tl.float32) * scaling
             along_x = ((v1 - v0) * (1 - y) + (v3 - v2) * y) * (1 - z) + ((v5 - v4) * (1 - y) + (v7 - v6) * y) * z
             low_low, high_low = v1 * x + v0 * (1 - x), v3 * x + v2 * (1 - x)
             low_high, high_high = v5 * x + v4 * (1 - x), v7 * x + v6 * (1 - x)
@@ -243,15 +245,18 @@ def _size(positions: Tensor, *others: int) -> tuple[Hashable, ...]:
 
 
 def encode(
-    positions: Float[Tensor, "points 3"], table: Float[Tensor, "rows features"], scalings: Float[Tensor, "levels"]
+    positions: Float[Tensor, "points 3"],
+    table: Float[Tensor, "rows features"],
+    scalings: Float[Tensor, "levels"],
+    dtype: torch.dtype = torch.float32,
 ) -> Float[Tensor, "points encoded"]:
-    """Encode points, float32; see `hash_grid`."""
+    """Encode points in float32; see `hash_grid`. What is given may be rounded to another type at the end."""
     positions, table = positions.detach().contiguous(), table.detach().contiguous()
     points, (rows, features), levels = len(positions), table.shape, len(scalings)
 
     def run(form: Form) -> Tensor:
         shape = (levels * features, points) if form.level_major else (points, levels * features)
-        encoded = positions.new_empty(shape)
+        encoded = positions.new_empty(shape, dtype=dtype)
         encoded = encoded.t() if form.level_major else encoded
         launch(
             _encode_kernel,
@@ -270,7 +275,7 @@ def encode(
         )
         return encoded
 
-    return run(form_for(VARIABLE, ENCODING, _size(positions, levels, rows, features), run, positions.is_cuda))
+    return run(form_for(VARIABLE, ENCODING, (dtype, *_size(positions, levels, rows, features)), run, positions.is_cuda))
 
 
 def table_gradient(

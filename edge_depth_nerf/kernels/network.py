@@ -115,10 +115,11 @@ def _layer_by_layer(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tenso
     shared = biases[0].view(-1, biases[0].shape[-1])
     groups = len(shared)
     x = F.linear(x, weights[0]).view(groups, -1, len(weights[0]))
-    x = (x + shared[:, None]).flatten(0, 1)
+    x = x + shared[:, None]
     for weight, bias in zip(weights[1:], biases[1:], strict=True):
-        x = F.linear(x.relu_(), weight, bias)
-    return x
+        # in place before it is flattened: backward would copy what is changed through another view
+        x = F.linear(x.relu_().view(-1, x.shape[-1]), weight, bias)
+    return x.view(-1, x.shape[-1])
 
 
 def network(

@@ -1,8 +1,8 @@
-"""A small network on a GPU in one kernel, without gradients; meaning and arguments as `network.network`.
+"""A small network on a GPU in one kernel, and its backward in another; meaning and arguments as `network.network`.
 
-For views, and for proposal networks while they rest. Products are of float16 with sums of float32, as in torch under
-autocast, and what lies between the layers stays on the chip. Training is left to torch: a backward kernel that holds
-the weights' gradients on the chip found too few registers (three layers of 64).
+Products are of float16 with sums of float32, as in torch under autocast, and what lies between the layers stays on the
+chip. Backward computes the hidden layers again and writes them beside their gradients, in float16; torch multiplies
+these to the weights' gradients, as these do not find room on the chip (three layers of 64).
 
 Networks have two or three layers, at most `WIDEST` wide. No GPU has run this: it is off unless the environment says
 EDGE_DEPTH_NERF_NETWORK=triton. With TRITON_INTERPRET=1 set before the import it runs on CPU tensors.
@@ -11,7 +11,7 @@ EDGE_DEPTH_NERF_NETWORK=triton. With TRITON_INTERPRET=1 set before the import it
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import no_type_check
+from typing import Any, no_type_check
 
 import torch
 import triton
@@ -108,11 +108,125 @@ def _forward_kernel(
     tl.store(result + point[:, None] * out + column, y, inside[:, None] & (column < out))
 
 
-@torch.no_grad()
+@triton.jit
+@no_type_check
+def _store(pointer, values, point, inside, width, WIDTH: tl.constexpr):
+    """Store a row for each point."""
+    column = tl.arange(0, WIDTH)[None]
+    has = inside[:, None] & (column < width)
+    tl.store(pointer + point[:, None] * width + column, values.to(pointer.dtype.element_ty), has)
+
+
+@triton.jit
+@no_type_check
+def _backward_kernel(
+    xs,
+    weight0,
+    bias0,
+    weight1,
+    bias1,
+    weight2,
+    gradient,
+    hidden0,
+    hidden1,
+    to_hidden0,
+    to_hidden1,
+    to_x,
+    points,
+    stride,
+    group,
+    width,
+    hidden,
+    out,
+    LAYERS: tl.constexpr,
+    WIDTH: tl.constexpr,
+    HIDDEN: tl.constexpr,
+    OUT: tl.constexpr,
+    POINTS: tl.constexpr,
+):
+    point = tl.program_id(0).to(tl.int64) * POINTS + tl.arange(0, POINTS)
+    inside = point < points
+    w0 = _matrix(weight0, hidden, width, HIDDEN, WIDTH)
+    x = _points(xs, point, inside, stride, width, WIDTH)
+    h0 = _first_layer(x, w0, bias0, point, inside, group, hidden, HIDDEN)
+    _store(hidden0, h0, point, inside, hidden, HIDDEN)
+    g = _points(gradient, point, inside, out, out, OUT)
+    d = tl.dot(g, _matrix(weight2, out, hidden, OUT, HIDDEN))
+    if LAYERS == 3:
+        w1 = _matrix(weight1, hidden, hidden, HIDDEN, HIDDEN)
+        h1 = tl.maximum(tl.dot(h0, tl.trans(w1)) + _bias(bias1, hidden, HIDDEN), 0.0).to(tl.float16)
+        _store(hidden1, h1, point, inside, hidden, HIDDEN)
+        d1 = tl.where(h1 > 0, d, 0.0).to(tl.float16)
+        _store(to_hidden1, d1, point, inside, hidden, HIDDEN)
+        d = tl.dot(d1, w1)
+    d0 = tl.where(h0 > 0, d, 0.0).to(tl.float16)
+    _store(to_hidden0, d0, point, inside, hidden, HIDDEN)
+    _store(to_x, tl.dot(d0, w0), point, inside, width, WIDTH)
+
+
+class _Network(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, *parameters: Tensor) -> Tensor:
+        ctx.save_for_backward(x, *parameters)
+        return _forward(x, parameters[::2], parameters[1::2])
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, ...]:
+        x, *parameters = ctx.saved_tensors
+        with torch.autocast(x.device.type, enabled=False):
+            return _backward(x, parameters[::2], parameters[1::2], gradients[0])
+
+
+def _backward(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], gradient: Tensor) -> tuple[Tensor, ...]:
+    """Give the gradients to x, then to weight and bias of each layer."""
+    (hidden, width), out, points = weights[0].shape, len(weights[-1]), len(x)
+    x, gradient = x if x.stride(1) == 1 else x.contiguous(), gradient.contiguous()
+    groups = len(biases[0].view(-1, hidden))
+    group = max(1, points // groups)
+    layers = [(weight.contiguous(), bias.contiguous()) for weight, bias in zip(weights, biases, strict=True)]
+    between = [torch.empty(points, hidden, dtype=torch.float16, device=x.device) for _ in weights[:-1]]
+    to_between = [torch.empty_like(each) for each in between]
+    to_x = torch.empty(points, width, dtype=x.dtype, device=x.device)
+    launch(
+        _backward_kernel,
+        (triton.cdiv(points, POINTS),),
+        x,
+        x,
+        *layers[0],
+        *layers[-2],  # of two layers the one between is not read
+        layers[-1][0],
+        gradient,
+        between[0],
+        between[-1],
+        to_between[0],
+        to_between[-1],
+        to_x,
+        points,
+        x.stride(0),
+        group,
+        width,
+        hidden,
+        out,
+        LAYERS=len(weights),
+        WIDTH=_block(width),
+        HIDDEN=_block(hidden),
+        OUT=_block(out),
+        POINTS=POINTS,
+    )
+    inputs, slopes = [x.half(), *between], [*to_between, gradient.half()]
+    found = [to_x]
+    for number, (slope, values) in enumerate(zip(slopes, inputs, strict=True)):
+        rows = slope.view(groups, group, -1) if number == 0 and points > 0 else slope[None]
+        to_bias = rows.sum(1, dtype=torch.float32) if points > 0 else torch.zeros_like(biases[number])
+        found += [slope.t().mm(values).to(weights[number]), to_bias.view(biases[number].shape)]
+    return tuple(found)
+
+
 def network(
     x: Float[Tensor, "points in"], weights: Sequence[Tensor], biases: Sequence[Tensor]
 ) -> Float[Tensor, "points out"]:
-    """Apply a network to points, without a gradient; see `network.network`.
+    """Apply a network to points, differentiable once by all it is given; see `network.network`.
 
     Args:
         x: half precision or float32.
@@ -123,6 +237,16 @@ def network(
         The last layer, without activation, float32.
 
     """
+    parameters = [each for pair in zip(weights, biases, strict=True) for each in pair]
+    if not (torch.is_grad_enabled() and any(each.requires_grad for each in (x, *parameters))):
+        return _forward(x, weights, biases)
+    found = _Network.apply(x, *parameters)
+    assert isinstance(found, Tensor)
+    return found
+
+
+@torch.no_grad()
+def _forward(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tensor:
     x = x if x.stride(1) == 1 else x.contiguous()
     layers = [(weight.contiguous(), bias.contiguous()) for weight, bias in zip(weights, biases, strict=True)]
     (hidden, width), out, groups = weights[0].shape, len(weights[-1]), biases[0].view(-1, len(weights[0])).shape[0]
@@ -154,5 +278,5 @@ def network(
 def try_out(device: torch.device) -> None:
     """Run each kernel once; raises whatever keeps one from working."""
     for layers in (2, 3):
-        square, row = torch.ones(16, 16, device=device), torch.ones(16, device=device)
-        network(square[:1], [square] * layers, [row] * layers)
+        square = torch.ones(16, 16, device=device, requires_grad=True)
+        network(square[:1], [square] * layers, [square[0]] * layers).sum().backward()

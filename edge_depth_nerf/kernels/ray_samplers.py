@@ -10,11 +10,11 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
-from nerfstudio.cameras.rays import RayBundle, RaySamples
+from nerfstudio.cameras.rays import Frustums, RayBundle, RaySamples
 from nerfstudio.model_components.ray_samplers import PDFSampler, UniformLinDispPiecewiseSampler
 from torch import Tensor, nn
 
-from edge_depth_nerf.kernels.triton_back_end import along_rays
+from edge_depth_nerf.kernels.triton_back_end import along_rays, by_number
 
 
 def _placing(weights: Tensor) -> ModuleType | None:
@@ -50,15 +50,18 @@ class FirstSampler(UniformLinDispPiecewiseSampler):
         assert ray_bundle.nears is not None and ray_bundle.fars is not None
         device = ray_bundle.origins.device
         lower, lengths = self._between(count, device)
-        first, last = self.spacing_fn(ray_bundle.nears), self.spacing_fn(ray_bundle.fars)
+        nears, fars = ray_bundle.nears, ray_bundle.fars
         if self.train_stratified and self.training:
             drawn = torch.rand(len(ray_bundle), 1 if self.single_jitter else count + 1, device=device)
             edges = torch.addcmul(lower, lengths, drawn)
         else:
-            edges = torch.linspace(0, 1, count + 1, device=device)[None]
+            edges = torch.linspace(0, 1, count + 1, device=device).expand(len(ray_bundle), -1)
 
         def to_euclidean(places: Tensor) -> Tensor:
-            return self.spacing_fn_inv(torch.lerp(first, last, places))
+            kernels = by_number(places, nears, fars)
+            if kernels is not None and places.ndim == 2 and len(places) == len(nears):
+                return kernels.distances(places, nears, fars)
+            return self.spacing_fn_inv(torch.lerp(self.spacing_fn(nears), self.spacing_fn(fars), places))
 
         distances, edges = to_euclidean(edges)[..., None], edges[..., None]
         return ray_bundle.get_ray_samples(
@@ -100,7 +103,8 @@ class FusedPDFSampler(PDFSampler):
         places, device = count + 1, weights.device
         wanted = torch.linspace(0, 1 - 1 / places, places, device=device).expand(len(weights), -1)
         if self.train_stratified and self.training:
-            wanted = wanted + torch.rand(len(weights), 1 if self.single_jitter else places, device=device) / places
+            drawn = torch.rand(len(weights), 1 if self.single_jitter else places, device=device)
+            wanted = torch.add(wanted, drawn, alpha=1 / places)
         else:
             wanted = wanted + 1 / (2 * places)
         edges = edges_of(ray_samples)
@@ -121,6 +125,15 @@ def edges_of(samples: RaySamples) -> Tensor:
     """Where a ray's samples begin and the last one ends, in the spacing of 0..1, [rays, samples + 1]."""
     starts: Any = samples.spacing_starts
     ends: Any = samples.spacing_ends
+    rays, count = starts.shape[:2]
+    step = starts.stride(1)
+    if (
+        starts.untyped_storage()._cdata == ends.untyped_storage()._cdata
+        and starts.stride() == ends.stride()
+        and ends.storage_offset() == starts.storage_offset() + step
+    ):
+        # both are views of the edges
+        return starts.as_strided((rays, count + 1), (starts.stride(0), step))
     return torch.cat([starts[..., 0], ends[..., -1:, 0]], dim=-1)
 
 
@@ -132,18 +145,38 @@ class FusedRaySamples(RaySamples):
         deltas = self.deltas
         if deltas is None or deltas.requires_grad or deltas.shape != densities.shape or densities.ndim != 3:
             return super().get_weights(densities)
-        kernels = along_rays(densities[..., 0], deltas[..., 0])
+        # squeezed, not indexed: backward of an index fills zeros and copies
+        densities_of_rays, deltas_of_rays = densities.squeeze(-1), deltas.squeeze(-1)
+        kernels = along_rays(densities_of_rays, deltas_of_rays)
         if kernels is None:
             return super().get_weights(densities)
-        return kernels.weights_from_densities(densities[..., 0], deltas[..., 0])[..., None]
+        return kernels.weights_from_densities(densities_of_rays, deltas_of_rays)[..., None]
 
 
-def _with_fused_weights(_: nn.Module, __: Any, samples: RaySamples) -> RaySamples:
-    # the class alone differs
-    samples.__class__ = FusedRaySamples
+class FusedFrustums(Frustums):
+    """nerfstudio's `Frustums`; on a GPU positions without a gradient come from one kernel."""
+
+    def get_positions(self) -> Float[Tensor, "*batch 3"]:
+        """Positions in the middle of the samples."""
+        given = self.origins, self.directions, self.starts, self.ends
+        of_rays = self.origins.ndim == 3 and all(each.stride(1) == 0 for each in given[:2])
+        kernels = by_number(*given) if of_rays and self.offsets is None else None
+        if kernels is None:
+            return super().get_positions()
+        return kernels.middles(self.origins[:, 0], self.directions[:, 0], self.starts[..., 0], self.ends[..., 0])
+
+
+def fused(samples: RaySamples) -> RaySamples:
+    """Let samples compute weights and positions in the fused form; in place."""
+    # the classes alone differ
+    samples.__class__, samples.frustums.__class__ = FusedRaySamples, FusedFrustums
     return samples
 
 
-def use_fused_weights(sampler: nn.Module) -> None:
-    """Let the samples that a sampler gives compute their weights in the fused form; in place."""
-    sampler.register_forward_hook(_with_fused_weights)
+def _given_fused(_: nn.Module, __: Any, samples: RaySamples) -> RaySamples:
+    return fused(samples)
+
+
+def use_fused_samples(sampler: nn.Module) -> None:
+    """Let the samples that a sampler gives compute in the fused form; in place."""
+    sampler.register_forward_hook(_given_fused)

@@ -22,6 +22,7 @@ MODULES: dict[str, Callable[[], ModuleType]] = {
     "edge_loss_triton": lambda: import_module("edge_depth_nerf.kernels.edge_loss_triton"),
     "hash_grid_triton": lambda: import_module("edge_depth_nerf.kernels.hash_grid_triton"),
     "network_triton": lambda: import_module("edge_depth_nerf.kernels.network_triton"),
+    "pointwise_triton": lambda: import_module("edge_depth_nerf.kernels.pointwise_triton"),
     "ray_triton": lambda: import_module("edge_depth_nerf.kernels.ray_triton"),
 }
 """The modules of kernels by their names."""
@@ -65,6 +66,27 @@ def along_rays(*tensors: Tensor) -> ModuleType | None:
     return kernels if kernels is not None and kernels.fits(*(each.shape[1] for each in tensors)) else None
 
 
+def by_number(*tensors: Tensor) -> ModuleType | None:
+    """Give the kernels `pointwise_triton` for what is computed number by number; None where they do not serve it.
+
+    They serve float32 on CUDA where nobody asks for a gradient to these tensors.
+    """
+    followed = torch.is_grad_enabled() and any(each.requires_grad for each in tensors)
+    if followed or any(each.device.type != "cuda" or each.dtype != torch.float32 for each in tensors):
+        return None
+    return working("pointwise_triton", tensors[0].device, "arithmetic of samples")
+
+
+def made_by_autocast(device: torch.device) -> torch.dtype:
+    """Give the type that autocast makes of what enters a product on a GPU; float32 without it, and on the CPU.
+
+    What is kept in that type to begin with is neither copied nor cast, and the products are the same.
+    """
+    if device.type == "cuda" and torch.is_autocast_enabled("cuda"):
+        return torch.get_autocast_dtype("cuda")
+    return torch.float32
+
+
 NETWORK = "EDGE_DEPTH_NERF_NETWORK"
 """Environment variable that turns on the kernels of networks, with the value `triton`; no GPU has compared them yet."""
 
@@ -72,9 +94,9 @@ NETWORK = "EDGE_DEPTH_NERF_NETWORK"
 def of_network(x: Tensor, weights: Sequence[Tensor]) -> ModuleType | None:
     """Give the kernels of networks, `network_triton`; None where they are not asked for, or do not serve this network.
 
-    They serve what autocast would compute in float16 on CUDA, where nobody asks for a gradient.
+    They serve what autocast would compute in float16 on CUDA.
     """
-    if os.environ.get(NETWORK) != "triton" or x.device.type != "cuda" or torch.is_grad_enabled():
+    if os.environ.get(NETWORK) != "triton" or x.device.type != "cuda":
         return None
     if not torch.is_autocast_enabled("cuda") or torch.get_autocast_dtype("cuda") != torch.float16:
         return None

@@ -270,8 +270,8 @@ def sky_loss(weights: Float[Tensor, "rays samples"], sky: Bool[Tensor, "rays"]) 
         0 where all of them reach the background, 1 where none does; 0, still connected to `weights`, without such rays.
 
     """
-    hit = torch.where(sky[:, None], weights.to(torch.promote_types(weights.dtype, torch.float32)), 0)
-    return hit.sum() / sky.sum().clamp(min=1)
+    hit = weights.sum(dim=1, dtype=torch.promote_types(weights.dtype, torch.float32))
+    return hit.masked_fill(~sky, 0).sum() / sky.sum().clamp(min=1)
 
 
 def _check_shapes(

@@ -26,6 +26,7 @@ from typing import Any
 
 import torch
 import torch.distributed as dist
+from jaxtyping import UInt8
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
@@ -219,10 +220,10 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
 
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
         """Return the rays of the next training batch and their supervision; surface_…: additional pixels, if any."""
-        self.train_count += 1
         assert self.train_pixel_sampler is not None
         if torch.device(self.device).type != "cpu":
-            return self._next_train_elsewhere(step)
+            return self.batch_of(self.upload(step))
+        self.train_count += 1
         pixels = self.train_pixel_sampler.sample(step)
         self.trained_on = pixels.indices
         rays, batch = self._serve(pixels, self.train_ray_generator)
@@ -235,14 +236,18 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
                 batch |= _of_surface(surface)
         return rays, batch
 
-    def _next_train_elsewhere(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
-        """Return the same on another device, with one copy to it and all additional pixels."""
-        assert self.train_pixel_sampler is not None
+    def upload(self, step: int) -> UInt8[Tensor, "n 15"]:
+        """Copy the packed records of the next training batch and all additional pixels to the device, at once."""
+        self.train_count += 1
         samplers = [sampler for sampler in (self.train_pixel_sampler, self._surface_sampler) if sampler is not None]
-        stretches = [sampler.draw(step) for sampler in samplers]
-        pixels = decode(self._uploads.upload(stretches))
+        return self._uploads.upload([sampler.draw(step) for sampler in samplers])
+
+    def batch_of(self, packed: UInt8[Tensor, "n 15"]) -> tuple[RayBundle, dict[str, Any]]:
+        """Return the rays of an uploaded batch and their supervision, like `next_train`, with all additional pixels."""
+        assert self.train_pixel_sampler is not None
+        pixels = decode(packed)
         every, values = self._serve(pixels, self.train_ray_generator)
-        count = stretches[0].count
+        count = self.train_pixel_sampler.num_rays_per_batch
         self.trained_on = pixels.indices[:count]
         batch = {name: value[:count] for name, value in values.items()}
         if self._surface_sampler is not None:

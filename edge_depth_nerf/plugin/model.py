@@ -7,7 +7,8 @@ scene.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal, TypeGuard
@@ -39,7 +40,7 @@ from edge_depth_nerf.kernels.allocator import keep_freed_memory
 from edge_depth_nerf.kernels.fields import CubeContraction, FusedNerfactoField, use_fused_fields
 from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss, proposal_loss
 from edge_depth_nerf.kernels.openmp import let_idle_threads_sleep
-from edge_depth_nerf.kernels.ray_samplers import FirstSampler, FusedPDFSampler, edges_of, use_fused_weights
+from edge_depth_nerf.kernels.ray_samplers import FirstSampler, FusedPDFSampler, edges_of, fused, use_fused_samples
 from edge_depth_nerf.method.losses import URBAN_TERMS, UrbanTerms, edge_losses, sky_loss, urban_nerf_loss
 from edge_depth_nerf.method.metrics import DepthErrors, load_lpips, masked_lpips, masked_psnr, masked_ssim
 from edge_depth_nerf.method.uncertainty import termination_std
@@ -107,9 +108,9 @@ class EdgeDepthNerfModelConfig(NerfactoModelConfig):
     """Divide Eq. 4's Gaussian by σ̂·√(2π), so that a wide one does not pull harder than a narrow one."""
     implementation: Literal["auto", "fused", "tcnn", "torch"] = "auto"  # pyright: ignore[reportIncompatibleVariableOverride]
     """What computes fields, samples and losses. fused: our own kernels (Numba on the CPU; on CUDA Triton for hash
-    grids, samples along rays and the edge loss). torch: nerfstudio's code, with the same results and checkpoints as
-    fused, but many times slower on a CPU. tcnn: tiny-cuda-nn, whose checkpoints differ. auto: tcnn on a GPU if it is
-    installed, otherwise fused; config.yml keeps which it was."""
+    grids, samples along rays, densities, directions and the edge loss). torch: nerfstudio's code, with the same
+    results and checkpoints as fused, but many times slower on a CPU. tcnn: tiny-cuda-nn, whose checkpoints differ.
+    auto: tcnn on a GPU if it is installed, otherwise fused; config.yml keeps which it was."""
 
 
 Implementation = Literal["fused", "tcnn", "torch"]
@@ -271,7 +272,7 @@ class EdgeDepthNerfModel(NerfactoModel):
                 include_original=pdf.include_original, single_jitter=pdf.single_jitter
             )
             for sampler in (self.proposal_sampler.initial_sampler, self.proposal_sampler.pdf_sampler):
-                use_fused_weights(sampler)
+                use_fused_samples(sampler)
             # nerfacto's field prepares a gradient to the positions at every step, for normals or poses
             if isinstance(self.field, FusedNerfactoField):
                 poses = self.config.camera_optimizer.mode != "off"
@@ -297,6 +298,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         self.exposure = None if maps is None else maps(self.num_train_data)
         self._step = 0
         self._training_steps = 30_000
+        self._scheduled_weight: Tensor | None = None
         self.reset_depth_errors()
 
     def _refine_poses(self, metadata: dict[str, Any]) -> None:
@@ -329,12 +331,17 @@ class EdgeDepthNerfModel(NerfactoModel):
             groups["fields"].extend(self.exposure.parameters())
         return groups
 
-    def _exposed(self, colours: Float[Tensor, "rays 3"], rays: RayBundle) -> Float[Tensor, "rays 3"]:
-        """Colours as the training pictures that the rays are from have them; as they are at evaluation."""
+    def _exposed(self, colours: list[Tensor], bundles: list[RayBundle]) -> Sequence[Tensor]:
+        """Colours of several bundles, each [rays, 3], as the training pictures that the rays are from have them.
+
+        As they are at evaluation.
+        """
         if not self.training or self.exposure is None:
             return colours
-        assert rays.camera_indices is not None
-        return self.exposure(colours, rays.camera_indices[:, 0], rays.metadata.get(PLACE))
+        pictures = torch.cat([rays.camera_indices[:, 0] for rays in bundles if rays.camera_indices is not None])
+        places = [rays.metadata[PLACE] for rays in bundles if PLACE in rays.metadata]
+        exposed = self.exposure(torch.cat(colours), pictures, torch.cat(places) if places else None)
+        return exposed.split([len(each) for each in colours])
 
     def forward(self, ray_bundle: RayBundle, batch: dict[str, Any] | None = None) -> dict[str, Any]:
         """Outputs of a batch of rays.
@@ -360,8 +367,10 @@ class EdgeDepthNerfModel(NerfactoModel):
             behind, further = further[: len(ray_bundle)], further[len(ray_bundle) :]
             outputs["rgb"] = outputs["rgb"] + (1 - outputs["accumulation"]) * behind
         if self._has_surface(batch):
-            outputs["surface_rgb"] = self._exposed(further, batch["surface_rays"])
-        outputs["rgb"] = self._exposed(outputs["rgb"], ray_bundle)
+            bundles = [ray_bundle, batch["surface_rays"]]
+            outputs["rgb"], outputs["surface_rgb"] = self._exposed([outputs["rgb"], further], bundles)
+        else:
+            (outputs["rgb"],) = self._exposed([outputs["rgb"]], [ray_bundle])
         if not self.training:
             outputs["expected_depth"], std = outputs["expected_depth"].split(1, dim=-1)
             outputs["distance"] = outputs["depth"] * self.metres_per_unit
@@ -391,7 +400,8 @@ class EdgeDepthNerfModel(NerfactoModel):
         )
         every = RayBundle(origins, directions, areas, pictures)
         at = torch.cat(distances)[:, None, None]
-        return every.get_ray_samples(bin_starts=0.99 * at, bin_ends=1.01 * at)
+        samples = every.get_ray_samples(bin_starts=0.99 * at, bin_ends=1.01 * at)
+        return fused(samples) if self._fused else samples
 
     def _fields(self, parts: list[RaySamples]) -> list[dict[FieldHeadNames, Tensor]]:
         """The field at several sets of samples."""
@@ -423,7 +433,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         }
         if self.training:
             outputs |= {"weights_list": weights_list, "ray_samples_list": samples_list}
-        return outputs, others[0][FieldHeadNames.RGB][:, 0] if others else rays.origins[:0]
+        return outputs, others[0][FieldHeadNames.RGB].squeeze(1) if others else rays.origins[:0]
 
     def _depths(self, weights_list: list[Tensor], samples_list: list[RaySamples]) -> dict[str, Any]:
         """Nerfacto's depths, of the final samples and of those of the proposal networks."""
@@ -450,7 +460,7 @@ class EdgeDepthNerfModel(NerfactoModel):
             metrics = {
                 "psnr": self.psnr(rendered, self.renderer_rgb.blend_background(batch["image"].to(self.device))),
                 "distortion": distortion_loss(
-                    edges_of(outputs["ray_samples_list"][-1]), outputs["weights_list"][-1][..., 0]
+                    edges_of(outputs["ray_samples_list"][-1]), outputs["weights_list"][-1].squeeze(-1)
                 ),
             }
             self.camera_optimizer.get_metrics_dict(metrics)
@@ -484,8 +494,30 @@ class EdgeDepthNerfModel(NerfactoModel):
         """
         return (prior_m >= self.config.near_m) & (prior_m <= self.config.far_m) & (prior_m > 0)
 
-    def _depth_weight(self) -> float:
+    def schedule(self) -> tuple[float, float]:
+        """What differs between steps: λ, and the exponent by which the sampler's weights are annealed."""
+        return float(self._depth_weight()), float(self.proposal_sampler._anneal)
+
+    @contextmanager
+    def scheduled_by(self, numbers: Float[Tensor, "2"]) -> Iterator[None]:
+        """Take what `schedule` gives from a tensor, where it can change without the host."""
+        sampler: Any = self.proposal_sampler
+        before = sampler._anneal
+        self._scheduled_weight, sampler._anneal = numbers[0], numbers[1]
+        try:
+            yield
+        finally:
+            self._scheduled_weight, sampler._anneal = None, before
+
+    def updates_proposals(self) -> bool:
+        """Whether the next step trains the proposal networks, as nerfstudio's sampler decides it."""
+        sampler = self.proposal_sampler
+        return sampler._steps_since_update > sampler.update_sched(sampler._step) or sampler._step < 10
+
+    def _depth_weight(self) -> float | Tensor:
         """λ at this step."""
+        if self._scheduled_weight is not None:
+            return self._scheduled_weight
         return self.config.depth_loss_mult * self.config.depth_loss_final ** self._share_done()
 
     def _share_done(self) -> float:
@@ -497,8 +529,10 @@ class EdgeDepthNerfModel(NerfactoModel):
         losses = {}
         if self.config.sky_loss_mult > 0:
             sky = batch["sky"][:, 0].to(self.device)
-            per_level = [sky_loss(weights[..., 0], sky) for weights in outputs["weights_list"]]
-            losses["sky_loss"] = self.config.sky_loss_mult * torch.stack(per_level).mean()
+            # the mean over the levels, of all their weights in one row
+            every = torch.cat([weights.squeeze(-1) for weights in outputs["weights_list"]], dim=1)
+            share = self.config.sky_loss_mult / len(outputs["weights_list"])
+            losses["sky_loss"] = share * sky_loss(every, sky)
         if "surface_rgb" in outputs:
             colours, sky = outputs["surface_rgb"], batch["surface_sky"][:, 0]
             # no error where the surface is not between the planes; choosing pixels would make a GPU wait
@@ -531,7 +565,7 @@ class EdgeDepthNerfModel(NerfactoModel):
             outputs["rgb"], outputs["accumulation"], batch["image"].to(self.device)
         )
         *proposals, final = (
-            (edges_of(samples), weights[..., 0])
+            (edges_of(samples), weights.squeeze(-1))
             for samples, weights in zip(outputs["ray_samples_list"], outputs["weights_list"], strict=True)
         )
         bounds = [proposal_loss(final[0], final[1].detach(), *proposal) for proposal in proposals]
@@ -565,7 +599,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         prior_m = torch.where(self._can_be_met(prior_m), prior_m, 0)
         return edge_losses(
             [
-                (weights[..., 0], samples.frustums.starts[..., 0], samples.frustums.ends[..., 0])
+                (weights.squeeze(-1), samples.frustums.starts[..., 0], samples.frustums.ends[..., 0])
                 for weights, samples in levels
             ],
             prior_m[..., 0],
@@ -589,7 +623,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         if self.config.depth_loss == "urban-nerf-los":
             narrowed_m = self.config.urban.sigma_m(self.config.depth_sigma, self._share_done())
             return urban_nerf_loss(
-                weights[..., 0], starts_m[..., 0], ends_m[..., 0], prior_m[..., 0], narrowed_m, self.config.urban
+                weights.squeeze(-1), starts_m[..., 0], ends_m[..., 0], prior_m[..., 0], narrowed_m, self.config.urban
             )
         middles_m = (starts_m + ends_m) / 2
         sigma_m = weights.new_tensor([self.config.depth_sigma])

@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
@@ -22,6 +23,7 @@ from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManager, FisheyeD
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel, EdgeDepthNerfModelConfig
 from edge_depth_nerf.plugin.plain_errors import say_errors_plainly
 from edge_depth_nerf.plugin.pose_refinement import PoseRefinerConfig, fit_pose, halves
+from edge_depth_nerf.plugin.step_graphs import Step, StepGraphs
 from edge_depth_nerf.plugin.viewer import DrivePanel
 
 FARTHEST_UNITS = 1e6
@@ -91,6 +93,7 @@ class EdgeDepthPipeline(VanillaPipeline):
             )
         self.drive = DrivePanel(manager)
         self._odd_steps: torch.Tensor | None = None
+        self.graphs: StepGraphs | None = None
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load a checkpoint as nerfstudio does.
@@ -121,16 +124,27 @@ class EdgeDepthPipeline(VanillaPipeline):
                 such steps are counted, and several end the training.
 
         """
-        rays, batch = self.datamanager.next_train(step)
-        # the wrapped model, where several processes train; nerfstudio gives it the rays alone
-        outputs = self._model(rays, batch)
-        metrics = self.model.get_metrics_dict(outputs, batch)
-        losses = self.model.get_loss_dict(outputs, batch, metrics)
+        manager = self.datamanager
+        assert isinstance(manager, FisheyeDepthDataManager)
+        if self.graphs is None:
+            found = self._computed(*manager.next_train(step))
+        else:
+            packed = manager.upload(step)
+            found = self.graphs.replayed(packed, step) or self._computed(*manager.batch_of(packed))
+        outputs, losses, _ = found
         if torch.device(self.device).type == "cpu":
             if not all(bool(loss.detach().isfinite()) for loss in losses.values()):
                 raise NotFiniteError(self._not_finite(step, outputs, losses))
         else:
             self._count_not_finite(step, outputs, losses)
+        return found
+
+    def _computed(self, rays: RayBundle, batch: dict[str, Any]) -> Step:
+        """Outputs, losses and metrics of a batch."""
+        # the wrapped model, where several processes train; nerfstudio gives it the rays alone
+        outputs = self._model(rays, batch)
+        metrics = self.model.get_metrics_dict(outputs, batch)
+        losses: Any = self.model.get_loss_dict(outputs, batch, metrics)
         return outputs, losses, metrics
 
     def _count_not_finite(self, step: int, outputs: dict[str, Any], losses: dict[str, Any]) -> None:

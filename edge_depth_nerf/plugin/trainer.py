@@ -31,6 +31,7 @@ from edge_depth_nerf.plugin.model import EdgeDepthNerfModelConfig, settled
 from edge_depth_nerf.plugin.pipeline import NotFiniteError
 from edge_depth_nerf.plugin.plain_errors import say_errors_plainly
 from edge_depth_nerf.plugin.settings import changed_settings
+from edge_depth_nerf.plugin.step_graphs import GpuCapture, StepGraphs, why_not
 
 FOR_A_GPU = ("edge-depth-nerf", "edge-depth-nerf-paper")
 """Methods with full-size models."""
@@ -42,6 +43,9 @@ class EdgeDepthTrainerConfig(TrainerConfig):
 
     _target: type = field(default_factory=lambda: EdgeDepthTrainer)
     """Target class to instantiate."""
+    cuda_graphs: bool = False
+    """On a GPU, launch the kernels of a step as one, by CUDA graphs. No GPU has tried this yet. Where it is not
+    possible, a line says why, and training continues without."""
 
     def print_to_terminal(self) -> None:
         """Print what is trained, and the settings that differ from the method's own; config.yml has all of them."""
@@ -102,9 +106,20 @@ class EdgeDepthTrainer(Trainer):
         try:
             super().setup(test_mode)
             count_steps_against_all(self)
+            if self.config.cuda_graphs and test_mode == "val":
+                self._use_graphs()
         except KeyboardInterrupt:
             CONSOLE.print("\nStopped before the first step.")
             raise SystemExit(STOPPED_STATUS) from None
+
+    def _use_graphs(self) -> None:
+        accumulates = any(steps > 1 for steps in self.gradient_accumulation_steps.values())
+        pipeline: Any = self.pipeline
+        reason = why_not(pipeline.model, self.device, self.world_size, accumulates)
+        if reason is None:
+            pipeline.graphs = StepGraphs(pipeline, self.grad_scaler.scale, GpuCapture())
+        else:
+            CONSOLE.print(f"[yellow]Training goes without CUDA graphs: {reason}.")
 
     def train(self) -> None:
         """Train as nerfstudio does.
