@@ -14,7 +14,9 @@ truth, distance, error (blue 0, red 30 % and more).
 
 Of scenes that `process` has finished, with LiDAR, monocular maps and maps from motion, the default prior of the
 training pictures is judged too, with motion and without: what share of the pixels has one, how wrong it is in LiDAR's
-field and above it, and how many errors are within one and two sigma.
+field and beyond it, and how many errors are within one and two sigma; beyond it also by whether a pixel has a distance
+from motion. The share of the sky that has a prior is printed too, which is to be none. --only-prior judges the prior
+alone.
 """
 
 from __future__ import annotations
@@ -171,8 +173,8 @@ def judge(scene_path: Path, output: Path, every: int) -> tuple[list[tuple[str, .
 
 
 def prior_pixels(scene: SceneFolder, options: PriorOptions, every: int = 1) -> NDArray[np.float64]:
-    """Each used pixel of the training pictures that is no sky: the true distance, the prior's, its sigma (metres), and
-    whether it lies outside LiDAR's field; 4×N."""
+    """Each used pixel of the training pictures: the true distance (0: none is known, or it is sky), the prior's and its
+    sigma (metres), whether it lies outside LiDAR's field, and whether motion has a distance there; 5×N."""
     trust, rows = find_trust(scene, options), []
     layer = true_layer(scene)
     for picture in [picture for picture in scene.pictures if not picture.held_out][::every]:
@@ -180,8 +182,9 @@ def prior_pixels(scene: SceneFolder, options: PriorOptions, every: int = 1) -> N
         prior = make_prior(maps.distances_m, maps.usable, INTEGRATED, options, trust, view_angles)
         truth = maps.distances_m[layer]
         outside = ~trust.in_field(view_angles.elevation_rad)
-        where = maps.usable & (truth > 0)
-        rows.append(np.stack([each[where] for each in (truth, prior.distance_m, prior.sigma_m, outside)], -1))
+        matched = maps.distances_m.get("motion", np.zeros_like(truth)) > 0
+        of_pixels = (truth, prior.distance_m, prior.sigma_m, outside, matched)
+        rows.append(np.stack([each[maps.usable] for each in of_pixels], -1))
     return np.concatenate(rows).T
 
 
@@ -202,8 +205,9 @@ class PriorFigures:
 
 
 def prior_figures(pixels: NDArray[np.float64]) -> PriorFigures | None:
-    """Of pixels that `prior_pixels` gives; None if none has a prior."""
-    truth, distance, sigma, _ = pixels[:, pixels[1] > 0]
+    """Of those pixels that `prior_pixels` gives whose truth is known; None if none has a prior."""
+    pixels = pixels[:, pixels[0] > 0]
+    truth, distance, sigma, *_ = pixels[:, pixels[1] > 0]
     if not len(truth):
         return None
     error = np.abs(distance - truth)
@@ -219,11 +223,22 @@ def judge_prior(scene_path: Path, every: int) -> list[tuple[str, ...]]:
     table = []
     for motion in (False, True):
         pixels = prior_pixels(scene, PriorOptions(motion=motion), every)
-        for name, outside in (("in the field", False), ("above and below", True)):
-            if found := prior_figures(pixels[:, pixels[3] == outside]):
+        truth, distance, _, outside, matched = pixels
+        source = "with motion" if motion else "without"
+        if true_layer(scene) == "truth_distance" and (truth == 0).any():
+            share = (distance[truth == 0] > 0).mean()
+            table.append((scene.folder.name, source, "sky", f"{share:.1%}", *4 * "-"))
+        for name, where in {
+            "all": truth > 0,
+            "in the field": outside == 0,
+            "beyond": outside > 0,
+            "beyond, matched": (outside > 0) & (matched > 0),
+            "beyond, not matched": (outside > 0) & (matched == 0),
+        }.items():
+            if found := prior_figures(pixels[:, where]):
                 table.append(
                     (
-                        *(scene.folder.name, "with motion" if motion else "without", name),
+                        *(scene.folder.name, source, name),
                         *(f"{found.have_one:.0%}", f"{found.abs_rel:.4f}", f"{found.median:.4f}"),
                         *(f"{found.within_1:.1%}", f"{found.within_2:.1%}"),
                     )
@@ -236,23 +251,26 @@ def main() -> None:
     parser.add_argument("scenes", nargs="+", type=Path, help="scene folders written by `process`")
     parser.add_argument("--output", type=Path, default=Path("outputs/stereo"), help="sweeps, tables and pictures")
     parser.add_argument("--every", type=int, default=1, help="judge every so many-th training picture")
+    parser.add_argument("--only-prior", action="store_true", help="judge the prior alone, which takes seconds")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     console = Console(width=120)
     table = Table(*COLUMNS, title="Distances from motion")
     bins = Table("drive", "by", "from - to", "pixels", "right to 10 %", "median", title="What is kept")
-    for scene in arguments.scenes:
+    for scene in [] if arguments.only_prior else arguments.scenes:
         of_scene, by_bins = judge(scene, arguments.output, arguments.every)
         for row in of_scene:
             table.add_row(*row)
         for row in by_bins:
             bins.add_row(*row)
-    console.print(table, bins)
+    if not arguments.only_prior:
+        console.print(table, bins)
     priors = Table(*PRIOR_COLUMNS, title="The default prior of training pictures")
     for scene in arguments.scenes:
         for row in judge_prior(scene, arguments.every):
             priors.add_row(*row)
     console.print(priors)
+    arguments.output.mkdir(parents=True, exist_ok=True)
     with (arguments.output / "table.txt").open("w") as file:
         Console(file=file, width=120).print(table, bins, priors)
 

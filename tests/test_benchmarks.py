@@ -284,16 +284,19 @@ def test_the_real_drives_table_and_margins(benchmark_module, tmp_path):
 
 def test_the_real_drives_tables_are_those_of_its_runs(benchmark_module):
     real, kept, pages = (benchmark_module(name) for name in ("real_drive", "kept_runs", "pages"))
-    compared, longer, cells = (
-        kept.results_of(ROOT / "benchmarks" / f"real_drive{part}.json.xz") for part in ("", "_seconds", "_cells")
+    compared, longer, cells, full, curves = (
+        kept.results_of(ROOT / "benchmarks" / f"real_drive{part}.json.xz")
+        for part in ("", "_seconds", "_cells", "_full", "_lambda")
     )
-    made = real.page(compared, {"half": longer}, cells)
+    made = real.page(Results([*compared.runs, *full.runs]), {"half": longer}, cells, curves.runs)
     for page, name, heading in (
         ("README.md", "real: table", "Short: kitti360_half"),
         ("docs/results.md", "real: table", "kitti360_half"),
         ("docs/results.md", "real: seconds", "The best rival after as many processor seconds as ours: kitti360_half"),
         ("docs/results.md", "real: margins", "Ours against the best rival after as many steps: kitti360_half"),
         ("docs/results.md", "real: cells", "One change at a time: kitti360_half"),
+        ("docs/results.md", "real: full", "kitti360_full"),
+        ("docs/results.md", "real: lambda", "PSNR and AbsRel over λ: kitti360_half"),
     ):
         text = (ROOT / page).read_text(encoding="utf-8")
         assert f"<!-- {name} -->" in text

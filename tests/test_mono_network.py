@@ -261,7 +261,7 @@ def test_the_presets_cut_what_is_said(preset, sides_px):
     settings = NetworkSettings(values.channels, values.working_px, HEIGHT_M, 5.0)
     side = values.working_px
     flat = torch.ones(1, side, side)
-    plain = Batch(torch.zeros(1, 3, side, side), torch.zeros(1, 5, side, side), flat, flat > 0, flat)
+    plain = Batch(torch.zeros(1, 3, side, side), torch.zeros(1, 5, side, side), flat, flat > 0, flat, flat)
     shapes = {
         augmented(plain, values.training, settings.multiple_px, np.random.default_rng(seed)).usable.shape[1:]
         for seed in range(24)

@@ -105,6 +105,12 @@ def test_training_pictures_get_right_maps_and_held_out_ones_none(ball: Path) -> 
         assert truth is not None
         assert kept.sum() > 0.4 * (truth > 0).sum()
         assert np.median(np.abs(found - truth)[kept] / truth[kept]) < 0.02
+        sigma_m = scene.distance_m(picture, "motion_sigma")
+        assert sigma_m is not None
+        np.testing.assert_array_equal(sigma_m > 0, kept)
+        # by parallax and confidence: no better than 1 %, no worse than what is wrong
+        assert 0.009 < (sigma_m / np.where(kept, found, 1))[kept].min()
+        assert (sigma_m / np.where(kept, found, 1))[kept].max() < 0.2
     # what it was made by is not kept
     assert not (ball / ".cache" / "motion").exists()
 

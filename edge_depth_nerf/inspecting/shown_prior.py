@@ -81,7 +81,9 @@ def _origin(maps: PictureMaps, source: str, prior: Prior, trust: Trust | None, v
     if trust is not None and view is not None:
         # larger monocular distances only mean "far"
         estimated &= np.nan_to_num(maps.distances_m.get("mono", np.zeros(1))) <= FARTHEST_M
-        if not trust.everywhere:
+        alone = trust.motion is not None and trust.motion.beyond is not None
+        if not trust.everywhere or alone:
+            # beyond, motion counts alone where it has a distance
             estimated &= trust.in_field(view.elevation_rad)
     points = has("lidar") if source != "mono" else np.zeros_like(maps.usable)
     of_estimates = np.where(moved, np.where(estimated, 2, 3), 1)

@@ -36,14 +36,25 @@ from edge_depth_nerf.base.files import read_json, write_json
 from edge_depth_nerf.method.alignment import Fit
 
 KNOTS: dict[str, tuple[float, ...]] = {
-    "distance_m": (1, 2, 4, 8, 16, 32, 64, 128),
-    "theta_deg": (0, 30, 60, 90),
-    "nearest_px": (0, 1, 2, 4, 8, 16, 32, 64),
+    "distance_m": (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0),
+    "theta_deg": (0.0, 30.0, 60.0, 90.0),
+    "nearest_px": (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0),
     "spread": (0.001, 0.003, 0.01, 0.03, 0.1, 0.3),
     "step": (0.003, 0.01, 0.03, 0.1, 0.3, 1.0),
 }
 """Where each feature's factor is kept; between them it is interpolated, beyond them it stays."""
-_LOGARITHMIC = ("distance_m", "spread", "step")
+MOTION_KNOTS: dict[str, tuple[float, ...]] = {
+    "distance_m": KNOTS["distance_m"],
+    "by_matching": (0.02, 0.03, 0.04, 0.06, 0.08, 0.12),
+    "rim_px": (0.0, 1.0, 2.0, 4.0, 8.0),
+    "spread": KNOTS["spread"],
+    "step": KNOTS["step"],
+}
+"""The same of a prior that motion alone gives."""
+_ALL_KNOTS = {**KNOTS, **MOTION_KNOTS}
+_LOGARITHMIC = ("distance_m", "spread", "step", "by_matching")
+RIM_STEP = 0.1
+"""Neighbours in a map from motion whose logarithms differ by more are of two surfaces."""
 
 LEAST_JUDGED = 300
 """With fewer errors there is no error model."""
@@ -91,6 +102,34 @@ def pixel_features(
     }
 
 
+def motion_features(
+    features: Features, motion_m: Float[np.ndarray, "h w"], sigma_m: Float[np.ndarray, "h w"]
+) -> dict[str, NDArray[np.float32]]:
+    """The features of pixels whose prior is from motion alone, H×W each.
+
+    by_matching   the distance's standard deviation by parallax and confidence, as a part of it
+    rim_px        pixels to the nearest jump of the map, or to the nearest pixel without distance: matching by windows
+                  puts outlines some pixels off
+
+    Args:
+        features: from `pixel_features`.
+        motion_m: distances from motion, 0 = none.
+        sigma_m: their standard deviation.
+
+    """
+    known = (motion_m > 0).astype(np.uint8)
+    logs = np.log(np.where(motion_m > 0, motion_m, 1)).astype(np.float32)
+    kernel = np.ones((3, 3), np.uint8)
+    whole = cv2.erode(known, kernel, borderValue=(1,)) & (
+        (cv2.dilate(logs, kernel) - cv2.erode(logs, kernel)) < RIM_STEP
+    )
+    return {
+        **{name: features[name] for name in ("distance_m", "spread", "step")},
+        "by_matching": sigma_m / np.maximum(motion_m, np.float32(1e-3)),
+        "rim_px": np.asarray(cv2.distanceTransform(whole.astype(np.uint8), cv2.DIST_L2, 5), np.float32),
+    }
+
+
 def _scaled(name: str, values: NDArray) -> NDArray:
     return np.log(np.maximum(values, 1e-6)) if name in _LOGARITHMIC else np.asarray(values)
 
@@ -107,7 +146,7 @@ class ErrorModel:
         """Logarithm of σ̂ / d̃."""
         total = np.float64(self.log_base)
         for name, factors in self.log_factors.items():
-            total = total + np.interp(_scaled(name, features[name]), _scaled(name, np.array(KNOTS[name])), factors)
+            total = total + np.interp(_scaled(name, features[name]), _scaled(name, np.array(_ALL_KNOTS[name])), factors)
         return np.asarray(total)
 
     def sigma_m(self, features: Features) -> NDArray[np.float32]:
@@ -121,7 +160,17 @@ def _log_scale(scaled_error: NDArray) -> float:
     return float(np.log(max(np.quantile(scaled_error, 0.95) / 2, 1e-6)))
 
 
-def fit_error_model(features: Features, relative_error: Float[np.ndarray, "n"]) -> ErrorModel | None:
+def _log_middle_scale(scaled_error: NDArray) -> float:
+    """Mean of that and of the logarithm of what 68.3 % are within: between one sigma and two."""
+    return 0.5 * (_log_scale(scaled_error) + float(np.log(max(np.quantile(scaled_error, 0.683), 1e-6))))
+
+
+def fit_error_model(
+    features: Features,
+    relative_error: Float[np.ndarray, "n"],
+    knots_of: Mapping[str, tuple[float, ...]] = KNOTS,
+    middle: bool = False,
+) -> ErrorModel | None:
     """Fit the factors to errors; None for fewer than LEAST_JUDGED.
 
     Without any pixel at a return the factor there is that of the next pixel over √2: a held-out error is made of two,
@@ -130,15 +179,20 @@ def fit_error_model(features: Features, relative_error: Float[np.ndarray, "n"]) 
     Args:
         features: of the pixels, n each.
         relative_error: |d̃ - d| / d̃.
+        knots_of: which features, and where their factors are kept.
+        middle: fit one sigma and two alike, where tails are so heavy that 95 % within two would leave too many within
+            one.
 
     """
     if len(relative_error) < LEAST_JUDGED:
         return None
     bins = {}
-    for name, knots in KNOTS.items():
+    for name, knots in knots_of.items():
         scaled = _scaled(name, np.array(knots))
         bins[name] = np.searchsorted((scaled[1:] + scaled[:-1]) / 2, _scaled(name, features[name]))
-    log_base, log_factors = _log_scale(relative_error), {name: np.zeros(len(knots)) for name, knots in KNOTS.items()}
+    log_scale = _log_middle_scale if middle else _log_scale
+    log_base = log_scale(relative_error)
+    log_factors = {name: np.zeros(len(knots)) for name, knots in knots_of.items()}
 
     def log_sigma() -> NDArray[np.float64]:
         return ErrorModel(log_base, {name: list(f) for name, f in log_factors.items()}).log_sigma(features)
@@ -147,14 +201,14 @@ def fit_error_model(features: Features, relative_error: Float[np.ndarray, "n"]) 
         for name, factors in log_factors.items():
             scaled_error = relative_error / np.exp(log_sigma())
             found = {
-                knot: _log_scale(scaled_error[bins[name] == knot])
+                knot: log_scale(scaled_error[bins[name] == knot])
                 for knot in range(len(factors))
                 if np.count_nonzero(bins[name] == knot) >= LEAST_IN_BIN
             }
             if found:
                 factors += np.interp(np.arange(len(factors)), list(found), list(found.values()))
-        log_base += _log_scale(relative_error / np.exp(log_sigma()))
-    if not (bins["nearest_px"] == 0).any():
+        log_base += log_scale(relative_error / np.exp(log_sigma()))
+    if "nearest_px" in bins and not (bins["nearest_px"] == 0).any():
         log_factors["nearest_px"][0] = log_factors["nearest_px"][1] - 0.5 * np.log(2)
     return ErrorModel(log_base, {name: factors.tolist() for name, factors in log_factors.items()})
 
@@ -202,6 +256,36 @@ class FrameAlignment:
 
 
 @dataclass(frozen=True)
+class BeyondField:
+    """What is known of the prior where LiDAR does not reach. What is None could not be measured: no prior there."""
+
+    motion_model: ErrorModel | None
+    """Of pixels whose distance is from motion alone: measured against LiDAR where both are (`MOTION_KNOTS`)."""
+    network_model: ErrorModel | None
+    """Of pixels without one, whose distance is the monocular map's: measured on distances from motion that neither
+    the network nor the prior saw."""
+    reach_rad: tuple[float, float]
+    """Elevations between which these were: least and largest."""
+    reach_px: float
+    """How far at most they were from the nearest pixel with a return or a distance from motion."""
+
+    def network_reaches(
+        self, elevation_rad: Float[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]
+    ) -> Bool[np.ndarray, "h w"]:
+        """Where the monocular map's error is known.
+
+        Args:
+            elevation_rad: of each ray.
+            known: pixels with a return or a distance from motion.
+
+        """
+        if self.network_model is None:
+            return np.zeros(elevation_rad.shape, bool)
+        near = cv2.distanceTransform((~known).astype(np.uint8), cv2.DIST_L2, 5) <= self.reach_px
+        return near & (elevation_rad >= self.reach_rad[0]) & (elevation_rad <= self.reach_rad[1])
+
+
+@dataclass(frozen=True)
 class MotionTrust:
     """What a drive's training frames say about its distances from motion."""
 
@@ -212,7 +296,9 @@ class MotionTrust:
     mono_relative_error: float
     """The same of the aligned monocular maps, where motion has a distance, too."""
     error_model: ErrorModel
-    """Of the prior's pixels without a return that motion has a part in."""
+    """Of the prior's pixels without a return that motion has a part in, in LiDAR's field."""
+    beyond: BeyondField | None = None
+    """None in calibrations of before."""
 
 
 @dataclass(frozen=True)
@@ -291,13 +377,25 @@ class Trust:
             parts.append("too few LiDAR points to measure the prior's error: sigma is that of sigma_mode combined")
         if not self.everywhere:
             low, high = np.degrees(self.field_rad)
-            beyond = " (beyond, where motion gives a distance)" if self.motion is not None else ""
             parts.append(
                 f"there is a prior only between {low - FIELD_MARGIN_DEG:.0f}° and {high + FIELD_MARGIN_DEG:.0f}° of "
                 "elevation, "
-                f"where LiDAR measured and the network could learn{beyond}"
+                f"where LiDAR measured and the network could learn{self._beyond_said()}"
             )
         return "; ".join(parts)
+
+    def _beyond_said(self) -> str:
+        """Where else there is a prior."""
+        if self.motion is None:
+            return ""
+        beyond = self.motion.beyond
+        if beyond is None or beyond.network_model is None:
+            return " (beyond, where motion gives a distance)"
+        low, high = np.degrees(beyond.reach_rad)
+        return (
+            " (beyond, where motion gives a distance, and near such pixels, where the network learned from it: between "
+            f"{low:.0f}° and {high:.0f}°)"
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -366,8 +464,21 @@ def _motion(content: dict[str, Any] | None) -> MotionTrust | None:
     weight = _number(content["weight"])
     if model is None or not 0 <= weight <= 1:
         raise ValueError(f"{shown(weight)} for a weight, or no errors")
+    beyond = content.get("beyond")
     return MotionTrust(
-        weight, _number(content["relative_error"]), _number(content["mono_relative_error"]), error_model=model
+        *(weight, _number(content["relative_error"]), _number(content["mono_relative_error"])),
+        error_model=model,
+        beyond=None if beyond is None else _beyond(beyond),
+    )
+
+
+def _beyond(content: dict[str, Any]) -> BeyondField:
+    low, high = content["reach_rad"]
+    return BeyondField(
+        motion_model=_model(content["motion_model"], MOTION_KNOTS),
+        network_model=_model(content["network_model"]),
+        reach_rad=(_number(low), _number(high)),
+        reach_px=_number(content["reach_px"]),
     )
 
 
@@ -388,11 +499,11 @@ def _frame(content: dict[str, Any]) -> FrameAlignment:
     )
 
 
-def _model(content: dict[str, Any] | None) -> ErrorModel | None:
+def _model(content: dict[str, Any] | None, knots: Mapping[str, tuple[float, ...]] = KNOTS) -> ErrorModel | None:
     if content is None:
         return None
     factors = {name: [_number(value) for value in values] for name, values in content["log_factors"].items()}
     model = ErrorModel(_number(content["log_base"]), factors)
-    if {name: len(factors) for name, factors in model.log_factors.items()} != {n: len(k) for n, k in KNOTS.items()}:
+    if {name: len(factors) for name, factors in model.log_factors.items()} != {n: len(k) for n, k in knots.items()}:
         raise ValueError("other features")
     return model

@@ -28,7 +28,7 @@ from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.masks.sky import regions_like_sky
 from edge_depth_nerf.method.alignment import Align, align
-from edge_depth_nerf.method.error_model import Trust, pixel_features
+from edge_depth_nerf.method.error_model import Trust, motion_features, pixel_features
 from edge_depth_nerf.method.integration import (
     INTEGRATED,
     MONO_RELATIVE_ERROR,
@@ -188,6 +188,9 @@ class MotionMap:
     """ρ of `integration.join_estimates`."""
     mono_counts: NDArray[np.bool_]
     """H×W, True where the monocular map may be trusted: beyond, there is a prior from motion alone."""
+    alone: NDArray[np.bool_]
+    """H×W, True where motion counts alone if it has a distance: beyond LiDAR's field. There the monocular map is fitted
+    to it, as to LiDAR's returns in the field."""
 
 
 def integrate_frame(
@@ -219,28 +222,100 @@ def integrate_frame(
     if depth_source == "mono":
         returns = np.zeros_like(mask)
     else:
-        mono_m = align(lidar_m, mono_m, mask, options.align, trust.drive_fit if trust else None).mono_m
+        fitted_to_m = lidar_m if motion is None else _measured(lidar_m, motion)
+        mono_m = align(fitted_to_m, mono_m, mask, options.align, trust.drive_fit if trust else None).mono_m
     from_motion = np.zeros_like(mask)
     if motion is not None:
         from_motion = anywhere & (motion.distance_m > 0) & ~returns
         # where the monocular map means "far" a return takes no part, with motion or without
         lidar_m = np.where(mask, lidar_m, np.float32(0))
-        mono_m = _joined(np.where(mask & motion.mono_counts, mono_m, np.float32(0)), motion.distance_m, motion.weight)
+        mono_counts = mask & motion.mono_counts & ~(motion.alone & (motion.distance_m > 0))
+        mono_m = _joined(np.where(mono_counts, mono_m, np.float32(0)), motion.distance_m, motion.weight)
         mask = anywhere
     # the spread is wanted at returns, too, so they are kept afterwards
     integration = dataclasses.replace(options.integration, keep_returns=False)
-    lidar, mono, valid = (torch.from_numpy(pixels) for pixels in (lidar_m, mono_m, mask))
-    integrated = select_prior(depth_source, {"lidar": lidar, "mono": mono}, valid, integration)
-    distance = integrated.distance_m.float().numpy()
+
+    def integrated(lidar_m: NDArray[np.float32], mono_m: NDArray[np.float32]) -> tuple[NDArray, NDArray]:
+        lidar, mono, valid = (torch.from_numpy(pixels) for pixels in (lidar_m, mono_m, mask))
+        found = select_prior(depth_source, {"lidar": lidar, "mono": mono}, valid, integration)
+        return found.distance_m.float().numpy(), found.spread_m.float().numpy()
+
+    distance, spread = integrated(lidar_m, mono_m)
+    if motion is not None and (alone := motion.alone & from_motion).any():
+        # a monocular map that is worse takes no part in the windows of these pixels, either
+        by_motion = integrated(np.zeros_like(mono_m), np.where(motion.alone, motion.distance_m, np.float32(0)))
+        distance, spread = (np.where(alone, *both) for both in zip(by_motion, (distance, spread), strict=True))
     returns &= distance > 0
     if options.integration.keep_returns:
         distance = np.where(returns, lidar_m, distance)
     known = np.where(np.isfinite(mono_m), mono_m, 0)
-    return IntegratedFrame(distance, integrated.spread_m.float().numpy(), known, returns, from_motion)
+    return IntegratedFrame(distance, spread, known, returns, from_motion)
+
+
+def _measured(lidar_m: NDArray[np.float32], motion: MotionMap) -> NDArray[np.float32]:
+    """What a monocular map is fitted to: LiDAR, and beyond its field motion."""
+    return np.where(np.nan_to_num(lidar_m) > 0, lidar_m, np.where(motion.alone, motion.distance_m, np.float32(0)))
+
+
+def sigma_of(
+    frame: IntegratedFrame, trust: Trust, view: View, motion: MotionMap | None, motion_sigma_m: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """σ̂ of a frame's prior, metres: by the model of LiDAR's field in it, by those of `BeyondField` beyond."""
+    features = pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, frame.returns, view.theta_rad)
+    sigma_m = trust.sigma_m(features, frame.from_motion)
+    beyond = trust.motion.beyond if trust.motion is not None else None
+    if motion is None or beyond is None:
+        return sigma_m
+    outside = motion.alone & ~frame.returns
+    if beyond.network_model is not None:
+        where = outside & ~frame.from_motion
+        of_network = beyond_features(frame, view)
+        sigma_m[where] = beyond.network_model.sigma_m({name: values[where] for name, values in of_network.items()})
+    if beyond.motion_model is not None:
+        where = outside & frame.from_motion
+        of_motion = motion_features(features, motion.distance_m, motion_sigma_m)
+        sigma_m[where] = beyond.motion_model.sigma_m({name: values[where] for name, values in of_motion.items()})
+    return sigma_m
+
+
+def beyond_features(frame: IntegratedFrame, view: View) -> dict[str, NDArray[np.float32]]:
+    """Features of a frame's pixels beyond LiDAR's field: the nearest known pixel may be one from motion."""
+    known = frame.returns | frame.from_motion
+    return pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, known, view.theta_rad)
 
 
 def _joined(mono_m: NDArray[np.float32], motion_m: NDArray[np.float32], motion_weight: float) -> NDArray[np.float32]:
     return join_estimates(torch.from_numpy(mono_m), torch.from_numpy(motion_m), motion_weight).numpy()
+
+
+def motion_map(
+    motion_m: NDArray[np.float32], trust: Trust, view: View, lidar_m: NDArray[np.float32] | None
+) -> MotionMap:
+    """How a picture's distances from motion take part under a calibration that measured them.
+
+    Args:
+        motion_m: H×W, 0 = none.
+        trust: the drive's calibration, with what it says of motion.
+        view: of the picture.
+        lidar_m: its LiDAR, 0 = no return; None without.
+
+    """
+    assert trust.motion is not None
+    in_field, beyond = trust.in_field(view.elevation_rad), trust.motion.beyond
+    if beyond is None:
+        counts = np.full_like(in_field, True) if trust.everywhere else in_field
+        return MotionMap(motion_m, trust.motion.weight, counts, np.zeros_like(in_field))
+    if beyond.motion_model is None:
+        motion_m = np.where(in_field, motion_m, np.float32(0))
+    known = motion_m > 0 if lidar_m is None else (motion_m > 0) | (np.nan_to_num(lidar_m) > 0)
+    counts = in_field | trust.everywhere | beyond.network_reaches(view.elevation_rad, known)
+    return MotionMap(motion_m, trust.motion.weight, counts, ~in_field)
+
+
+def motion_sigma(motion_m: NDArray[np.float32], sigma_m: NDArray[np.float32] | None) -> NDArray[np.float32]:
+    """Standard deviation of distances from motion: as they came, or a usual share where nothing came with them."""
+    usual_m = np.float32(MOTION_RELATIVE_ERROR) * motion_m
+    return usual_m if sigma_m is None else np.where(sigma_m > 0, sigma_m, usual_m)
 
 
 def make_prior(
@@ -269,17 +344,16 @@ def make_prior(
     motion_m = maps.get("motion") if options.motion and depth_source == INTEGRATED else None
     if options.sigma_mode == "calibrated" and depth_source in CALIBRATED and trust is not None and mono_m is not None:
         assert view is not None
-        motion = None
+        motion, motion_sigma_m = None, np.zeros(mask.shape, np.float32)
         if motion_m is not None and trust.motion is not None:
-            counts = np.full_like(mask, True) if trust.everywhere else trust.in_field(view.elevation_rad)
-            motion = MotionMap(motion_m, trust.motion.weight, counts)
+            motion = motion_map(motion_m, trust, view, lidar_m)
+            motion_sigma_m = motion_sigma(motion_m, maps.get("motion_sigma"))
         else:
             mask = mask if trust.everywhere else mask & trust.in_field(view.elevation_rad)
         if trust.error_model is not None and (lidar_m is not None or depth_source == "mono"):
             lidar_m = np.zeros_like(mono_m) if lidar_m is None else lidar_m
             frame = integrate_frame(lidar_m, mono_m, mask, depth_source, options, trust, motion)
-            features = pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, frame.returns, view.theta_rad)
-            sigma = trust.sigma_m(features, frame.from_motion)
+            sigma = sigma_of(frame, trust, view, motion, motion_sigma_m)
             return Prior(frame.distance_m, np.where(frame.distance_m > 0, sigma, np.float32(0)))
         # what could not be measured takes no part
         motion_m = None

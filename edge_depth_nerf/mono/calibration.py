@@ -5,6 +5,12 @@ with what was left out: whole blocks of 64 px (of 1400), single returns, and in 
 highest rows, beyond which a prior is extrapolated. Above a frame's own returns the prior is compared with what the
 returns of the other frames show there. How much distances from motion count beside the monocular maps
 follows from the errors of both at the returns that are left out. The result is kept beside the scene's maps.
+
+Beyond LiDAR's field there is nothing but motion to compare with. Motion's own error is measured in the field, where
+LiDAR is, as a function of what is known of it: a prior is made of motion alone and compared with the returns. The
+monocular map's error is measured beyond the field, on distances from motion in places that neither the network nor the
+prior saw (`mono.motion_seen`). It is used where motion has none, at outlines and far ahead, where a network is worse
+than elsewhere: by how much is measured in the field, at returns with and without a distance from motion.
 """
 
 from __future__ import annotations
@@ -29,17 +35,31 @@ from edge_depth_nerf.method.alignment import LEAST_RETURNS, align, both, fit_log
 from edge_depth_nerf.method.error_model import (
     FIELD_MARGIN_DEG,
     LEAST_JUDGED,
+    MOTION_KNOTS,
+    BeyondField,
+    Features,
     FrameAlignment,
     MotionTrust,
     Trust,
     error_of_returns,
     fit_error_model,
+    motion_features,
     pixel_features,
     read_trust,
 )
 from edge_depth_nerf.method.integration import INTEGRATED, weight_of_errors
-from edge_depth_nerf.method.prior import CACHE_VERSION, MotionMap, PriorOptions, View, integrate_frame, view_of
+from edge_depth_nerf.method.prior import (
+    CACHE_VERSION,
+    MotionMap,
+    PriorOptions,
+    View,
+    beyond_features,
+    integrate_frame,
+    motion_sigma,
+    view_of,
+)
 from edge_depth_nerf.mono.far_seen import seen_above, static_cloud
+from edge_depth_nerf.mono.motion_seen import left_out_pixels
 from edge_depth_nerf.scene.format import TRUST_FILE
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
 
@@ -55,9 +75,35 @@ HELD_OUT_ROWS = (0.1, 0.95)
 """In every second frame returns below and above these quantiles of their elevation are left out."""
 FIELD_QUANTILES = (0.001, 0.999)
 """LiDAR's field of elevation, but for stray returns."""
+_BEYOND_VERSION = 1
+"""Part of the key of calibrations with motion: raised when they measure otherwise beyond LiDAR's field."""
+REACH_QUANTILE = 0.95
+"""Of how far left-out distances from motion lie from the nearest that is known: beyond, nothing is measured."""
 _JUDGED_A_FRAME = 5_000
 _FOR_THE_DRIVE_A_FRAME = 2_000
 """So many returns of a frame enter; more tell nothing new."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MeasuredBeyond:
+    """One training frame's part in `BeyondField`."""
+
+    motion_features: dict[str, NDArray[np.float32]]
+    """Of pixels with a return and a distance from motion."""
+    motion_error: NDArray[np.float32]
+    """|d̃ - d| / d̃ there, of a prior made of motion alone."""
+    network_features: dict[str, NDArray[np.float32]]
+    """Of pixels beyond LiDAR's field, with a distance from motion that was left out."""
+    network_error: NDArray[np.float32]
+    """|d̃ - d| / d̃ there, of a prior made without it."""
+    field_features: dict[str, NDArray[np.float32]]
+    """Of pixels with a left-out return."""
+    field_error: NDArray[np.float32]
+    """|d̃ - d| / d̃ there, of a prior made without motion."""
+    field_matched: NDArray[np.bool_]
+    """Which of them motion has a distance of."""
+    elevation_rad: NDArray[np.float32]
+    """Of all distances from motion, above the horizon."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,6 +128,8 @@ class MeasuredFrame:
     """The map as it came, at the same pixels."""
     from_motion: NDArray[np.bool_]
     """Whether motion has a part in each of the pixels of `relative_error`."""
+    beyond: MeasuredBeyond | None = None
+    """Where LiDAR does not reach; None without motion."""
 
 
 def held_out_returns(
@@ -215,7 +263,9 @@ def _made_of(scene: SceneFolder, pictures: Sequence[ScenePicture], depth_source:
     relevant = {"depth_source": depth_source, **dataclasses.asdict(options)}
     del relevant["sigma_mode"], relevant["sigma_constant_m"]
     with_motion = _with_motion(scene, depth_source, options)
-    if not with_motion:
+    if with_motion:
+        relevant["beyond"] = _BEYOND_VERSION
+    else:
         del relevant["motion"]
     units = [scene.lidar_metres_per_count, scene.lidar_is_z_depth, round(scene.theta_max_rad, 9)]
     digest = hashlib.sha256(json.dumps([CACHE_VERSION, relevant, _trained_on(scene), units], sort_keys=True).encode())
@@ -223,7 +273,7 @@ def _made_of(scene: SceneFolder, pictures: Sequence[ScenePicture], depth_source:
     for picture in pictures:
         pose = picture.rotation.round(9).tolist(), picture.position_m.round(6).tolist()
         digest.update(repr((picture.name, picture.lens, pose)).encode())
-        for layer in ("lidar", "mono", "mask", *(["motion"] if with_motion else [])):
+        for layer in ("lidar", "mono", "mask", *(["motion", "motion_sigma"] if with_motion else [])):
             path = picture.files.get(layer)
             if path is not None and path not in contents:
                 contents[path] = hashlib.sha256(path.read_bytes()).digest()
@@ -268,6 +318,7 @@ def _calibrate(
 
     with_motion = _with_motion(scene, depth_source, options)
     errors: MotionErrors | None = None
+    field_rad = (0.0, 0.0)
 
     def measure(numbered: tuple[int, ScenePicture]) -> MeasuredFrame:
         number, picture = numbered
@@ -276,12 +327,20 @@ def _calibrate(
         view = view_of(picture.lens, picture.up_in_camera)
         motion_m, motion = maps.distances_m.get("motion"), None
         if errors is not None and motion_m is not None:
-            motion = MotionMap(motion_m, errors.weight, np.ones_like(maps.usable))
+            motion = MotionMap(motion_m, errors.weight, np.ones_like(maps.usable), ~_within(field_rad, view))
         far_seen_m = seen_above(cloud, scene, picture, (picture.lens.width, picture.lens.height))
-        return measure_frame(
+        measured = measure_frame(
             *(picture.name, number, maps.lidar_m, maps.mono_m, maps.usable, view, options, far_seen_m, depth_source),
             motion=motion,
         )
+        if motion is None:
+            return measured
+        left_out = left_out_pixels(scene, picture, motion.distance_m)
+        sigma_m = motion_sigma(motion.distance_m, maps.distances_m.get("motion_sigma"))
+        beyond = measure_beyond(
+            *(number, maps.lidar_m, maps.mono_m, maps.usable, view, options), motion, sigma_m, left_out
+        )
+        return dataclasses.replace(measured, beyond=beyond)
 
     bars = progress_bars(console or Console(quiet=True), transient=True)
     with bars as progress, ThreadPoolExecutor(2) as pool:
@@ -292,7 +351,8 @@ def _calibrate(
             for each in pool.map(partial(_errors_of_both, scene, options), enumerate(measurable)):
                 found.append(each)
                 progress.advance(task)
-            errors = _motion_errors(found)
+            errors = _motion_errors([errors_of_both for errors_of_both, _ in found])
+            field_rad = _field_rad([elevation_rad for _, elevation_rad in found])
         frames = []
         for frame in pool.map(measure, enumerate(measurable)):
             frames.append(frame)
@@ -314,21 +374,37 @@ class MotionErrors:
         return weight_of_errors(self.motion, self.mono)
 
 
+def _within(field_rad: tuple[float, float], view: View) -> NDArray[np.bool_]:
+    """Rays in LiDAR's field, within its margin: as `Trust.in_field`."""
+    return Trust("", None, None, field_rad, everywhere=False, drive_fit=None).in_field(view.elevation_rad)
+
+
+def _field_rad(elevations_rad: Sequence[NDArray[np.float32]]) -> tuple[float, float]:
+    """LiDAR's field by the elevations of all returns."""
+    every = np.concatenate(elevations_rad)
+    low, high = np.quantile(every, FIELD_QUANTILES) if len(every) else (0.0, 0.0)
+    return float(low), float(high)
+
+
 def _errors_of_both(
     scene: SceneFolder, options: PriorOptions, numbered: tuple[int, ScenePicture]
-) -> NDArray[np.float32]:
-    """2×N: relative errors of motion and of the monocular map, at returns left out of the latter's alignment."""
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """2×N: relative errors of motion and of the monocular map, at returns left out of the latter's alignment.
+
+    And the elevation of every return.
+    """
     number, picture = numbered
     maps = scene.maps(picture)
     motion_m = maps.distances_m.get("motion")
     if maps.lidar_m is None or maps.mono_m is None or motion_m is None:
-        return np.empty((2, 0), np.float32)
+        return np.empty((2, 0), np.float32), np.empty(0, np.float32)
     elevation_rad = view_of(picture.lens, picture.up_in_camera).elevation_rad
     left_out, _ = held_out_returns(both(maps.lidar_m, maps.mono_m, maps.usable), elevation_rad, number)
     aligned = align(np.where(left_out, np.float32(0), maps.lidar_m), maps.mono_m, maps.usable, options.align).mono_m
     judged = _some(left_out & (motion_m > 0) & (aligned > 0), _JUDGED_A_FRAME, np.random.default_rng([9, number]))
     true_m = maps.lidar_m[judged]
-    return np.stack([np.abs(found[judged] - true_m) / true_m for found in (motion_m, aligned)])
+    errors = np.stack([np.abs(found[judged] - true_m) / true_m for found in (motion_m, aligned)])
+    return errors, elevation_rad[maps.usable & (maps.lidar_m > 0)]
 
 
 def _motion_errors(of_frames: Sequence[NDArray[np.float32]]) -> MotionErrors | None:
@@ -413,6 +489,64 @@ def measure_frame(
     )
 
 
+def measure_beyond(
+    number: int,
+    lidar_m: NDArray[np.float32],
+    mono_m: NDArray[np.float32],
+    usable: NDArray[np.bool_],
+    view: View,
+    options: PriorOptions,
+    motion: MotionMap,
+    motion_sigma_m: NDArray[np.float32],
+    left_out: NDArray[np.bool_],
+) -> MeasuredBeyond:
+    """Measure a frame's prior as it is where LiDAR does not reach: that of motion alone, and that of the network.
+
+    Args:
+        number: of the frame in the calibration: decides which pixels are judged.
+        lidar_m: H×W LiDAR distance, 0 = no return.
+        mono_m: H×W monocular distance as it came, 0 = none.
+        usable: H×W, True where the picture may be used.
+        view: the angles of its rays.
+        options: of the prior.
+        motion: distances from motion; beyond LiDAR's field they count alone.
+        motion_sigma_m: their standard deviation by parallax and confidence.
+        left_out: where they lie in places that the network was not taught.
+
+    """
+    rng = np.random.default_rng([10, number])
+    none = np.zeros_like(lidar_m)
+    nowhere, everywhere = np.zeros_like(usable), np.ones_like(usable)
+    by_motion = dataclasses.replace(motion, mono_counts=nowhere, alone=everywhere)
+    frame = integrate_frame(none, none, usable, INTEGRATED, options, motion=by_motion)
+    features = pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, frame.returns, view.theta_rad)
+    of_motion = motion_features(features, motion.distance_m, motion_sigma_m)
+    judged = _some(usable & (lidar_m > 0) & frame.from_motion, _JUDGED_A_FRAME, rng)
+    motion_error = np.abs(frame.distance_m[judged] - lidar_m[judged]) / frame.distance_m[judged]
+
+    seen = dataclasses.replace(motion, distance_m=np.where(left_out, np.float32(0), motion.distance_m))
+    network = integrate_frame(lidar_m, mono_m, usable, INTEGRATED, options, motion=seen)
+    of_network = beyond_features(network, view)
+    held_out = _some(usable & left_out & motion.alone & (network.distance_m > 0), _JUDGED_A_FRAME, rng)
+    found_m, true_m = network.distance_m[held_out], motion.distance_m[held_out]
+
+    # as in `measure_frame`, but of two sources
+    fewer, _ = held_out_returns(both(lidar_m, mono_m, usable), view.elevation_rad, number)
+    of_two = integrate_frame(np.where(fewer, np.float32(0), lidar_m), mono_m, usable, INTEGRATED, options)
+    of_field = pixel_features(of_two.distance_m, of_two.spread_m, of_two.mono_m, of_two.returns, view.theta_rad)
+    tried = _some(fewer & (of_two.distance_m > 0), _JUDGED_A_FRAME, rng)
+    return MeasuredBeyond(
+        {name: values[judged] for name, values in of_motion.items()},
+        motion_error,
+        {name: values[held_out] for name, values in of_network.items()},
+        np.abs(found_m - true_m) / found_m,
+        {name: values[tried] for name, values in of_field.items()},
+        np.abs(of_two.distance_m[tried] - lidar_m[tried]) / of_two.distance_m[tried],
+        motion.distance_m[tried] > 0,
+        view.elevation_rad[usable & (motion.distance_m > 0)],
+    )
+
+
 def _some(pixels: NDArray[np.bool_], most: int, rng: np.random.Generator) -> tuple[NDArray[np.intp], ...]:
     """Rows and columns of True pixels, at most so many, drawn evenly."""
     where = np.flatnonzero(pixels)
@@ -444,8 +578,7 @@ def combine(
     def pooled(values: Iterable[NDArray]) -> NDArray:
         return np.concatenate(list(values))
 
-    elevations = pooled(frame.elevation_rad for frame in frames)
-    low, high = np.quantile(elevations, FIELD_QUANTILES) if len(elevations) else (0.0, 0.0)
+    field_rad = _field_rad([frame.elevation_rad for frame in frames])
     lidar_m, mono_m = pooled(frame.lidar_m for frame in frames), pooled(frame.mono_m for frame in frames)
     aligned = options.align != "none" and depth_source == INTEGRATED
     drive_fit = fit_logs(lidar_m, mono_m) if aligned and len(lidar_m) >= LEAST_RETURNS else None
@@ -463,14 +596,15 @@ def combine(
             features = {name: values[~from_motion] for name, values in features.items()}
             relative_error = relative_error[~from_motion]
         if model is not None:
-            motion = MotionTrust(motion_errors.weight, motion_errors.motion, motion_errors.mono, model)
+            beyond = _combine_beyond([frame.beyond for frame in frames if frame.beyond is not None])
+            motion = MotionTrust(motion_errors.weight, motion_errors.motion, motion_errors.mono, model, beyond)
     return_features = {name: pooled(frame.return_features[name] for frame in frames) for name in names}
     alignments = (frame.alignment for frame in frames)
     return Trust(
         made_of=made_of,
         error_model=fit_error_model(features, relative_error),
         return_model=fit_error_model(return_features, pooled(frame.return_error for frame in frames)),
-        field_rad=(float(low), float(high)),
+        field_rad=field_rad,
         everywhere=everywhere,
         drive_fit=drive_fit,
         frames=tuple(
@@ -482,3 +616,38 @@ def combine(
         ),
         motion=motion,
     )
+
+
+def _combine_beyond(frames: Sequence[MeasuredBeyond]) -> BeyondField | None:
+    """Put the frames' measurements beyond LiDAR's field together; None without any."""
+    if not frames:
+        return None
+
+    def pooled(name: str) -> NDArray:
+        return np.concatenate([getattr(frame, name) for frame in frames])
+
+    def features(name: str) -> dict[str, NDArray[np.float32]]:
+        every = [getattr(frame, name) for frame in frames]
+        return {feature: np.concatenate([each[feature] for each in every]) for feature in every[0]}
+
+    motion_model = fit_error_model(features("motion_features"), pooled("motion_error"), MOTION_KNOTS, middle=True)
+    of_network = features("network_features")
+    network_model = fit_error_model(of_network, pooled("network_error"))
+    reach_px = 0.0
+    if network_model is not None:
+        reach_px = float(np.quantile(of_network["nearest_px"], REACH_QUANTILE))
+        worse = _unmatched_factor(features("field_features"), pooled("field_error"), pooled("field_matched"))
+        network_model = dataclasses.replace(network_model, log_base=network_model.log_base + np.log(worse))
+    return BeyondField(motion_model, network_model, _field_rad([frame.elevation_rad for frame in frames]), reach_px)
+
+
+def _unmatched_factor(features: Features, relative_error: NDArray[np.float32], matched: NDArray[np.bool_]) -> float:
+    """How much more a prior without motion is wrong where motion has no distance, all other features alike; 1 or more.
+
+    Not known for few: 1.
+    """
+    model = fit_error_model({name: values[matched] for name, values in features.items()}, relative_error[matched])
+    if model is None or np.count_nonzero(~matched) < LEAST_JUDGED:
+        return 1.0
+    sigma = np.exp(model.log_sigma({name: values[~matched] for name, values in features.items()}))
+    return max(1.0, float(np.quantile(relative_error[~matched] / sigma, 0.95)) / 2)

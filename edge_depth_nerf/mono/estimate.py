@@ -46,6 +46,7 @@ from edge_depth_nerf.mono.examples import (
 from edge_depth_nerf.mono.far_seen import field_deg, seen_above, static_cloud
 from edge_depth_nerf.mono.files import find_maps
 from edge_depth_nerf.mono.hf import ReadyNetwork, load_ready_network, view_layers
+from edge_depth_nerf.mono.motion_seen import taught_by_motion
 from edge_depth_nerf.mono.network import (
     ARCHITECTURE,
     DepthNetwork,
@@ -73,6 +74,8 @@ _FEW_STEPS = 200
 """Less makes poor maps: on a rendered street the error is 27 % after 42 steps, 4 % after 1,000."""
 _HEIGHT_PICTURES = 20
 """The camera's height is taken from so many pictures of each camera."""
+_OUTLINE_SHARE = 3 / 350
+"""How far off matching puts outlines, as a share of the picture's longer side."""
 _EYE_LEVEL_M = 1.6
 """Height of a camera that nothing is known of."""
 
@@ -332,7 +335,8 @@ def _gather(
         InputError: no LiDAR point lies in any training picture.
 
     """
-    split = _thinned([training_split(scene) for scene in scenes], settings.working_px, console)
+    weighted = any(scene.has("motion") for scene in scenes)
+    split = _thinned([training_split(scene) for scene in scenes], settings.working_px, weighted, console)
     training = [pictures for pictures, _ in split]
     heights = [camera_heights_m(scene, settings) for scene in scenes]
     task = progress.add_task("Gathering LiDAR", total=4 * sum(map(len, training)))
@@ -344,15 +348,18 @@ def _gather(
         far_seen.append(functools.partial(seen_above, cloud, scene))
     task = progress.add_task("Reading pictures", total=sum(len(pictures) for both in split for pictures in both))
 
-    def load(chosen: list[list[ScenePicture]], more: list[Any] | None) -> Examples | None:
+    def load(
+        chosen: list[list[ScenePicture]], more: list[Any] | None = None, by_motion: list[Any] | None = None
+    ) -> Examples | None:
         if not any(chosen):
             return None
         size = settings.working_px, settings.multiple_px
-        return load_examples(scenes, chosen, heights, *size, lambda: progress.advance(task), more)
+        return load_examples(scenes, chosen, heights, *size, lambda: progress.advance(task), more, by_motion)
 
-    examples = load(training, far_seen)
+    of_motion = [functools.partial(taught_by_motion, scene) if scene.has("motion") else None for scene in scenes]
+    examples = load(training, far_seen, of_motion)
     # what stops the training is what these pictures measured themselves
-    kept = load([pictures for _, pictures in split], None)
+    kept = load([pictures for _, pictures in split])
     assert examples is not None
     if not examples.lidar_m.any():
         raise InputError(
@@ -464,10 +471,10 @@ def training_split(scene: SceneFolder) -> Split:
     )
 
 
-def _thinned(split: list[Split], working_px: int, console: Console) -> list[Split]:
+def _thinned(split: list[Split], working_px: int, weighted: bool, console: Console) -> list[Split]:
     """Take every k-th picture where all would not fit in memory."""
     pictures = [picture for both in split for pictures in both for picture in pictures]
-    most = LARGEST_SET_BYTES // bytes_a_picture(pictures, working_px)
+    most = LARGEST_SET_BYTES // bytes_a_picture(pictures, working_px, weighted)
     step = -(-len(pictures) // most)
     if step > 1:
         console.print(f"{len(pictures)} pictures would not fit in memory: every {step}th is used", soft_wrap=True)
@@ -520,6 +527,9 @@ def without_sky(
 ) -> Float32[np.ndarray, "h w"]:
     """Look for the sky in a picture, and leave it out of its map.
 
+    What has a return is no sky, nor is what motion matched. Matching puts outlines some pixels off, so that beside
+    one a distance does not say that there is no sky around.
+
     Args:
         scene: of the picture.
         picture: one of the scene's.
@@ -529,8 +539,15 @@ def without_sky(
     """
     usable = view_of(picture, scene.theta_max_rad, max(metres.shape)).usable
     lidar_m = scene.lidar_m(picture)
+    matched_m = scene.distance_m(picture, "motion")
+    if matched_m is not None:
+        radius_px = max(1, round(_OUTLINE_SHARE * max(metres.shape)))
+        inside = cv2.erode((matched_m > 0).astype(np.uint8), np.ones((2 * radius_px + 1,) * 2, np.uint8)) > 0
+        lidar_m = np.where((lidar_m == 0) & inside, matched_m, lidar_m)
     rgb = read_image(picture.files["image"])
     sky = find_sky(rgb, usable, picture.up_in_camera, picture.lens, lidar_m, known_m)
+    if matched_m is not None:
+        sky &= matched_m == 0
     return np.where(sky, 0, metres)
 
 

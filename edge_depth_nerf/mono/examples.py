@@ -26,6 +26,8 @@ from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
 
 FarSeen = Callable[[ScenePicture, tuple[int, int]], NDArray[np.float32]]
 """Gives for a picture, at (width, height), distances along the ray, 0 = none."""
+Taught = Callable[[ScenePicture], tuple[NDArray[np.float32], NDArray[np.float32]] | None]
+"""Gives for a picture, at its own size, distances along the ray and their weights, 0 = none; or nothing."""
 LARGEST_SET_BYTES = 8 << 30
 """More pictures than fit in this are thinned evenly."""
 _GROUND_SINE = -math.sin(math.radians(12.0))
@@ -58,6 +60,8 @@ class Examples:
     """Which of them, by picture."""
     up_in_camera: Float32[np.ndarray, "n 3"]
     camera_height_m: Float32[np.ndarray, "n"]
+    weight: Float32[np.ndarray, "n h w"] | None = None
+    """How much each distance of `lidar_m` counts, 0 to 1: those from motion less than returns. None: all alike."""
 
     def __len__(self) -> int:
         return len(self.rgb)
@@ -66,7 +70,9 @@ class Examples:
         """What tells one set from another."""
         digest = hashlib.sha256()
         for field in dataclasses.fields(self):
-            values: np.ndarray = getattr(self, field.name)
+            values: np.ndarray | None = getattr(self, field.name)
+            if values is None:
+                continue
             digest.update(f"{field.name}{values.dtype}{values.shape}".encode())
             digest.update(np.ascontiguousarray(values).data)
         return digest.hexdigest()[:32]
@@ -116,6 +122,7 @@ def load_examples(
     multiple_px: int,
     advance: Callable[[], None] = lambda: None,
     far_seen: Sequence[FarSeen] | None = None,
+    by_motion: Sequence[Taught | None] | None = None,
 ) -> Examples:
     """Read pictures into memory.
 
@@ -127,6 +134,8 @@ def load_examples(
         multiple_px: what both sides of the arrays are multiples of.
         advance: called after each picture.
         far_seen: of each scene, what gives more distances of a picture where it has no return; see `mono.far_seen`.
+        by_motion: of each scene, what gives distances from motion, for where there is still none; None for a scene
+            without. See `mono.motion_seen`.
 
     Raises:
         InputError: a file cannot be decoded, or has another size than its camera.
@@ -138,6 +147,7 @@ def load_examples(
     rgb = np.zeros((count, height, width, 3), np.uint8)
     lidar_m = np.zeros((count, height, width), np.float32)
     usable = np.zeros((count, height, width), bool)
+    weight = np.ones((count, height, width), np.float32) if by_motion and any(by_motion) else None
     ups, heights, lenses = np.zeros((count, 3), np.float32), np.zeros(count, np.float32), np.zeros(count, np.int64)
     rays_of: dict[object, tuple[int, np.ndarray]] = {}
     index = 0
@@ -152,6 +162,9 @@ def load_examples(
                 # at twice the size it is told better what is hidden
                 twice = working_size(picture.lens.width, picture.lens.height, 2 * working_px)
                 known_m = np.where(known_m > 0, known_m, _reduced(far_seen[number](picture, twice), view))
+            of_motion = by_motion[number] if by_motion is not None else None
+            if of_motion is not None and weight is not None and (found := of_motion(picture)) is not None:
+                known_m, weight[part] = _with_motion(known_m, *(_reduced(values, view) for values in found))
             lidar_m[part] = known_m
             usable[part] = view.usable
             key = (picture.lens, scene.theta_max_rad)
@@ -163,13 +176,21 @@ def load_examples(
             ups[index], heights[index] = view.up_in_camera, height_m[picture.camera]
             index += 1
             advance()
-    return Examples(rgb, lidar_m, usable, np.stack([padded for _, padded in rays_of.values()]), lenses, ups, heights)
+    all_rays = np.stack([padded for _, padded in rays_of.values()])
+    return Examples(rgb, lidar_m, usable, all_rays, lenses, ups, heights, weight)
 
 
-def bytes_a_picture(pictures: Sequence[ScenePicture], working_px: int) -> int:
-    """Memory that one picture takes at most."""
+def _with_motion(
+    known_m: Float32[np.ndarray, "h w"], motion_m: Float32[np.ndarray, "h w"], weight: Float32[np.ndarray, "h w"]
+) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+    """Distances from motion where LiDAR has none, and the weights of all."""
+    return np.where(known_m > 0, known_m, motion_m), np.where(known_m > 0, np.float32(1), weight)
+
+
+def bytes_a_picture(pictures: Sequence[ScenePicture], working_px: int, weighted: bool = False) -> int:
+    """Memory that one picture takes at most, with or without weights of its distances."""
     largest = max(np.prod(working_size(p.lens.width, p.lens.height, working_px)) for p in pictures)
-    return int(largest) * (3 + 4 + 1)
+    return int(largest) * (3 + 4 + 1 + 4 * weighted)
 
 
 def small_picture(picture: ScenePicture, size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:

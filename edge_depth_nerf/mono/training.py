@@ -92,6 +92,8 @@ class Batch:
     usable: Bool[Tensor, "n h w"]
     lidar_m: Float[Tensor, "n h w"]
     """0 = no return."""
+    weight: Float[Tensor, "n h w"]
+    """Of each distance, 0 to 1."""
 
     def each(self, change: Callable[[Tensor], Tensor]) -> Batch:
         """All of it changed in the same way."""
@@ -99,7 +101,10 @@ class Batch:
 
 
 def scale_invariant_loss(
-    log_error: Float[Tensor, "n h w"], valid: Bool[Tensor, "n h w"], balance: float
+    log_error: Float[Tensor, "n h w"],
+    valid: Bool[Tensor, "n h w"],
+    balance: float,
+    weight: Float[Tensor, "n h w"] | float = 1.0,
 ) -> Float[Tensor, ""]:
     """Scale-invariant log loss (Eigen et al., NIPS 2014, Eq. 4): mean(e²) - balance·mean(e)², over pictures.
 
@@ -109,12 +114,14 @@ def scale_invariant_loss(
         log_error: log(predicted / measured distance).
         valid: where there is a measurement; pictures without any count for nothing.
         balance: 0 = plain squared log error, 1 = a picture's scale does not matter.
+        weight: how much each measurement counts in the means.
 
     """
-    counts = valid.sum((1, 2))
+    weight = valid * weight
+    counts = weight.sum((1, 2))
     error = torch.where(valid, log_error, 0.0)
-    mean = error.sum((1, 2)) / counts.clamp(min=1)
-    square = error.square().sum((1, 2)) / counts.clamp(min=1)
+    mean = (weight * error).sum((1, 2)) / counts.clamp(min=1)
+    square = (weight * error.square()).sum((1, 2)) / counts.clamp(min=1)
     # the root's slope at 0 is infinite
     loss = (square - balance * mean.square() + 1e-6).sqrt()
     measured = counts > 0
@@ -162,6 +169,9 @@ def make_batch(examples: Examples, indices: np.ndarray, settings: NetworkSetting
         log_room=log_room,
         usable=on_device(examples.usable[indices]),
         lidar_m=on_device(examples.lidar_m[indices]),
+        weight=on_device(
+            np.ones_like(examples.lidar_m[indices]) if examples.weight is None else examples.weight[indices]
+        ),
     )
 
 
@@ -342,7 +352,7 @@ def _step(
     log_ratio = network(batch.rgb, batch.geometry, batch.usable)
     valid = (batch.lidar_m > 0) & batch.usable
     log_error = log_ratio + batch.log_room - batch.lidar_m.clamp(min=1e-3).log()
-    loss = scale_invariant_loss(log_error, valid, options.balance)
+    loss = scale_invariant_loss(log_error, valid, options.balance, batch.weight)
     loss = loss + options.smoothness * smoothness_loss(log_ratio, batch.rgb, batch.usable)
     optimizer.zero_grad(set_to_none=True)
     loss.backward()

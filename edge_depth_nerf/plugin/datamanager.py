@@ -384,7 +384,7 @@ class PriorRecipe:
     def layers(self) -> tuple[str, ...]:
         """The layers that are read: the source's own, and those that show where the sky is."""
         if self.depth_source == INTEGRATED and self.options.motion:
-            return ("lidar", "mono", "motion")
+            return ("lidar", "mono", "motion", "motion_sigma")
         return ("lidar", "mono") if self.depth_source in CALIBRATED else (self.depth_source,)
 
 
@@ -410,6 +410,9 @@ def _load(
         if recipe is None or cache is None:
             return PicturePixels(rgb, mask)
         maps = {layer: dataset.distance_m(image_idx, layer) for layer in recipe.layers}
+        if maps.get("motion_sigma") is None:
+            # a scene without keeps the priors that it has
+            maps.pop("motion_sigma", None)
         picture, mono = dataset.pictures[image_idx], maps.get("mono")
         view = view_of(picture.lens, picture.up_in_camera) if mono is not None else None
         prior = cache.prior(maps, mask, view if recipe.trust is not None else None)

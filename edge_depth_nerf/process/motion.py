@@ -1,5 +1,7 @@
 """Distances from motion for a scene that is written: `motion/CAMERA/0000000123.png`.
 
+Their standard deviations by parallax and confidence go to `motion_sigma/`.
+
 Pictures that are held out take no part, and get an empty map. Sweeps, the long part, are kept in `.cache/motion` until
 all maps are written, so that a run that was stopped goes on where it was.
 """
@@ -23,6 +25,7 @@ from rich.console import Console
 
 from edge_depth_nerf.base.checked_cache import content_of, write_checked
 from edge_depth_nerf.base.console import progress_bars, run_jobs, say
+from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE
 from edge_depth_nerf.cameras.transforms import opencv_to_opengl
 from edge_depth_nerf.scene.put_maps import write_maps
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
@@ -65,19 +68,26 @@ def add_motion(scene: SceneFolder, console: Console) -> None:
     numbers = {picture.name: index for index, picture in enumerate(pictures)}
     shares: list[float] = []
 
-    def maps() -> Iterator[tuple[str, Float32[np.ndarray, "_ _"]]]:
+    def maps(sigma: bool) -> Iterator[tuple[str, Float32[np.ndarray, "_ _"]]]:
         for picture in scene.pictures:
             size = (picture.lens.height, picture.lens.width)
             if picture.held_out:
                 yield picture.name, np.zeros(size, np.float32)
                 continue
             found = motion.confirm(numbers[picture.name], store)
+            factor = working_factor(picture.lens)
+            if sigma:
+                yield picture.name, enlarged_sigma(found, factor, size)
+                continue
             used = motion.view(numbers[picture.name]).used
             shares.append(float((found.distance_m > 0).sum() / max(1, used.sum())))
-            yield picture.name, enlarged(found, working_factor(picture.lens), size)
+            yield picture.name, enlarged(found, factor, size)
 
+    source = {"kind": "sphere sweep"}
     with progress_bars(console) as progress:
-        write_maps(scene.folder, "motion", maps(), {"kind": "sphere sweep"}, progress, some_empty=True)
+        # a scene that has the distances has these too
+        write_maps(scene.folder, "motion_sigma", maps(sigma=True), source, progress, some_empty=True)
+        write_maps(scene.folder, "motion", maps(sigma=False), source, progress, some_empty=True)
     shutil.rmtree(store.folder.parent, ignore_errors=True)
     said = f"Distances from motion for {np.mean(shares):.0%} of the pixels inside the masks of training pictures"
     if still:
@@ -115,6 +125,18 @@ def enlarged(found: MotionDistance, factor: int, size: tuple[int, int]) -> Float
     result = np.zeros(size, np.float32)
     result[: whole[1], : whole[0]] = np.nan_to_num(1 / inverse)
     return result
+
+
+def enlarged_sigma(found: MotionDistance, factor: int, size: tuple[int, int]) -> Float32[np.ndarray, "_ _"]:
+    """Bring the distances' standard deviations to the size of the picture: the nearest; 0 = none."""
+    sigma_m = found.sigma_m
+    if factor > 1:
+        whole = (sigma_m.shape[1] * factor, sigma_m.shape[0] * factor)
+        sigma_m = np.asarray(cv2.resize(sigma_m, whole, interpolation=cv2.INTER_NEAREST))
+    result = np.zeros(size, np.float32)
+    result[: sigma_m.shape[0], : sigma_m.shape[1]] = sigma_m
+    # a file has steps, the least of which still says that there is one
+    return np.where(result > 0, np.maximum(result, np.float32(1 / DISTANCE_STEPS_PER_METRE)), result)
 
 
 class SweepStore:

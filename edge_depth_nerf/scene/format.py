@@ -24,7 +24,7 @@ POINTS = "points.ply"
 TRUST_FILE = "mono_trust.json"
 """The calibration of the prior, beside the maps that it was measured on."""
 
-LayerKind = Literal["picture", "mask", "distance"]
+LayerKind = Literal["picture", "mask", "distance", "sigma"]
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,8 @@ class Layer:
     folder: str
     """Where `process` and `write_maps` put the files."""
     kind: LayerKind
-    """picture: RGB. mask: 255 = use. distance: metres along the ray, 0 = none."""
+    """picture: RGB. mask: 255 = use. distance: metres along the ray, 0 = none. sigma: standard deviation of another
+    layer's distances, metres, 0 = none."""
     words: str
     """What messages call it."""
     is_truth: bool = False
@@ -49,6 +50,7 @@ LAYERS: dict[str, Layer] = {
     "lidar": Layer("lidar_file_path", "lidar/{camera}", "distance", "LiDAR maps"),
     "mono": Layer("mono_file_path", "mono/{camera}", "distance", "monocular maps"),
     "motion": Layer("motion_file_path", "motion/{camera}", "distance", "maps from motion"),
+    "motion_sigma": Layer("motion_sigma_file_path", "motion_sigma/{camera}", "sigma", "errors of maps from motion"),
     "beams": Layer("beams_file_path", "beams/{camera}", "distance", "held-out LiDAR beams", True),
     "truth_distance": Layer("truth_distance_file_path", "truth/{camera}/distance", "distance", "true distances", True),
     "truth_rgb": Layer("truth_rgb_file_path", "truth/{camera}/rgb", "picture", "true pictures", True),
@@ -64,6 +66,11 @@ DepthKind = Literal["auto", "distance", "z_depth"]
 def depth_sources() -> list[str]:
     """The layers that a prior can be made of."""
     return [name for name, layer in LAYERS.items() if layer.kind == "distance" and not layer.is_truth]
+
+
+def later_layers() -> list[str]:
+    """The layers that can be put into a scene that exists: sources of depth, and what is known of their errors."""
+    return [name for name, layer in LAYERS.items() if layer.kind in ("distance", "sigma") and not layer.is_truth]
 
 
 def path_keys() -> list[str]:

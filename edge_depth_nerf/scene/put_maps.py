@@ -18,7 +18,7 @@ from rich.progress import Progress
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import write_distance_png, write_json
-from edge_depth_nerf.scene.format import LAYERS, TRUST_FILE, depth_sources, read_transforms
+from edge_depth_nerf.scene.format import LAYERS, TRUST_FILE, later_layers, read_transforms
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
 
 FARTHEST_M = 200.0
@@ -40,7 +40,7 @@ def write_maps(
 
     Args:
         scene: the folder, or its transforms.json.
-        layer: which source of depth: one of `scene.format.depth_sources()`.
+        layer: which source of depth, or what is known of its errors: one of `scene.format.later_layers()`.
         maps: `file_path` of a frame in transforms.json, and its H×W metres along the ray. One for every frame, in any
             order; taken one at a time.
         source: where they come from, as JSON; kept in transforms.json under the layer's name.
@@ -53,8 +53,8 @@ def write_maps(
             without a map.
 
     """
-    if layer not in depth_sources():
-        raise InputError(f"{layer!r} is no source of depth; expected one of {', '.join(depth_sources())}.")
+    if layer not in later_layers():
+        raise InputError(f"{layer!r} is no source of depth; expected one of {', '.join(later_layers())}.")
     words = "monocular map" if layer == "mono" else f"{layer} map"
     found = read_scene(scene)
     pictures = {picture.name: picture for picture in found.pictures}

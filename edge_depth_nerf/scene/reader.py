@@ -39,6 +39,7 @@ from edge_depth_nerf.scene.format import (
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 FISHEYE_MODEL = "OPENCV_FISHEYE"
+_IN_METRES = ("distance", "sigma")
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,8 @@ class PictureMaps:
     usable: Bool[np.ndarray, "h w"]
     """The mask within the lens: what training draws rays from."""
     distances_m: dict[str, Float32[np.ndarray, "h w"]]
-    """Of each distance layer that the picture has: LiDAR, monocular, true distance."""
+    """Of each distance layer that the picture has: LiDAR, monocular, true distance; and of the standard deviation of
+    those from motion."""
 
     @property
     def lidar_m(self) -> Float32[np.ndarray, "h w"] | None:
@@ -226,7 +228,7 @@ class SceneFolder:
         """
         rgb = self.rgb(picture)
         usable = self.usable(picture)
-        found = {layer: self.distance_m(picture, layer) for layer in picture.files if LAYERS[layer].kind == "distance"}
+        found = {layer: self.distance_m(picture, layer) for layer in picture.files if LAYERS[layer].kind in _IN_METRES}
         distances_m = {layer: metres for layer, metres in found.items() if metres is not None}
         return PictureMaps(rgb, self.rays(picture).within, usable, distances_m)
 

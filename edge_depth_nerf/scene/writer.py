@@ -63,7 +63,7 @@ from edge_depth_nerf.scene.format import (
     LAYERS,
     POINTS,
     TRANSFORMS,
-    depth_sources,
+    later_layers,
     read_transforms,
 )
 from edge_depth_nerf.scene.points import PointCloud, merge_parts, write_part
@@ -737,7 +737,7 @@ def _maps_put_in_later(written: Path) -> dict[str, _LaterMaps]:
         return {}
     there = read_transforms(written)
     found = {}
-    for name in filter(depth_sources().__contains__, there):
+    for name in filter(later_layers().__contains__, there):
         key = LAYERS[name].key
         of_pictures = {frame["file_path"]: frame[key] for frame in there["frames"] if key in frame}
         found[name] = _LaterMaps(there[name], of_pictures)
@@ -762,7 +762,7 @@ def _kept_later_maps(
                 "Those of the drive's own network are made again. Add others again with `edge-depth-nerf "
                 "estimate-depth`."
             )
-        if name == "motion":
+        if name in ("motion", "motion_sigma"):
             remedy = "They are made again, unless --no-motion is given."
         of_what = "estimated monocular maps" if name == "mono" else f"{LAYERS[name].words} put in later"
         notices.append(

@@ -32,6 +32,12 @@ _CONFIDENCE = (-1.0, 3.5, 1.75)
 """Of a logistic function of 1, the root of the margin, and the agreeing neighbours over `_ALL_AGREE`: fitted to the
 truth of rendered drives, so that it is the share of distances that are right to 10 % (docs/motion.md)."""
 _ALL_AGREE = 8
+_MATCH_PX = 0.15
+"""How exactly a point is found in the neighbours: standard deviation of what is right."""
+_LEAST_ERROR = 0.01
+"""Of lenses and poses, as a share of the distance."""
+_WRONG_ERROR = 0.2
+"""Of a distance that is not right, as a share of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +50,17 @@ class MotionDistance:
     """How likely the distance is right to 10 %, `LEAST_CONFIDENCE` to 1."""
     parallax_px: Float32[np.ndarray, "h w"]
     """How far the point moves against the infinity behind it; see `Swept`."""
+
+    @property
+    def sigma_m(self) -> Float32[np.ndarray, "h w"]:
+        """Standard deviation by parallax and confidence, metres, 0 where there is none.
+
+        That of a mixture: with the confidence's probability a distance is as exact as its parallax allows, else it is
+        wrong. What it amounts to on a drive is measured against LiDAR (`mono.calibration`).
+        """
+        of_right = (_MATCH_PX / np.maximum(self.parallax_px, LEAST_PARALLAX_PX)) ** 2 + _LEAST_ERROR**2
+        variance = self.confidence * of_right + (1 - self.confidence) * _WRONG_ERROR**2
+        return (self.distance_m * np.sqrt(variance)).astype(np.float32)
 
 
 def worth_asking(swept: Swept) -> Bool[np.ndarray, "h w"]:
