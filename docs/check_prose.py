@@ -96,14 +96,13 @@ def docstrings(source: str) -> Iterator[Text]:
                 yield Text(node.lineno + text.line - 1, text.words)
 
 
-def texts(path: Path, *, with_docstrings: bool = True) -> Iterator[Text]:
+def texts(path: Path) -> Iterator[Text]:
     """Everything that people read in a page or module."""
     content = path.read_text(encoding="utf-8")
     if path.suffix == ".md":
         yield from paragraphs(content)
     else:
-        if with_docstrings:
-            yield from docstrings(content)
+        yield from docstrings(content)
         yield from messages(content)
 
 
@@ -126,8 +125,7 @@ def main(root: Path = ROOT) -> int:
     found = 0
     for pattern in (*PAGES, MODULES):
         for path in sorted(root.glob(pattern)):
-            unchecked = path.relative_to(root).as_posix() in rules["docstrings"]["unchecked"]
-            for text in texts(path, with_docstrings=not unchecked):
+            for text in texts(path):
                 for fault in faults(text, rules):
                     print(f"{path.relative_to(root)}:{text.line}: {fault}")
                     found += 1
