@@ -1,14 +1,15 @@
-"""Check that pages and messages are in plain English: `python docs/check_prose.py`, a part of `make lint`.
+"""Check that pages, messages and docstrings are in plain English: `python docs/check_prose.py`; `make lint` runs it.
 
 The rules are in docs/prose_rules.toml: patterns that must not occur, with the words to use instead, and the longest
-sentence. Code and addresses are left out. In the package's modules, strings of four words or more are checked, except
-docstrings; docs/options.md contains the help texts. vale, the usual program for this, is not used, because its wheel
-downloads the program when it first runs.
+sentence. Code and addresses are left out. In the package's modules, docstrings are checked like pages, and other
+strings of four words or more are checked as messages; docs/options.md contains the help texts. vale, the usual program
+for this, is not used, because its wheel downloads the program when it first runs.
 """
 
 from __future__ import annotations
 
 import ast
+import inspect
 import re
 import sys
 from collections.abc import Iterator
@@ -35,11 +36,11 @@ OFF, ON = "<!-- prose: off -->", "<!-- prose: on -->"
 
 @dataclass(frozen=True)
 class Text:
-    """A paragraph of a page, or a message."""
+    """A paragraph of a page or docstring, or a message."""
 
     line: int
     words: str
-    is_page: bool
+    is_message: bool = False
 
 
 def without_code(line: str) -> str:
@@ -63,10 +64,10 @@ def paragraphs(markdown: str) -> Iterator[Text]:
         is_row = line.lstrip().startswith("|")
         ends = fenced or quoted or is_row or not line.strip() or LIST_ITEM.match(line) or line.startswith(("#", "```"))
         if ends and held:
-            yield Text(begin, without_code(held), True)
+            yield Text(begin, without_code(held))
             held = ""
         if is_row and not fenced:
-            yield from (Text(number, without_code(cell.strip()), True) for cell in line.split("|") if cell.strip())
+            yield from (Text(number, without_code(cell.strip())) for cell in line.split("|") if cell.strip())
         elif line.strip() and not fenced and not quoted and not line.lstrip().startswith("```"):
             begin, held = (begin, f"{held} {line.strip()}") if held else (number, line.strip())
 
@@ -80,11 +81,29 @@ def messages(source: str) -> Iterator[Text]:
     for node in joined:
         words = "VALUE".join(str(part.value) for part in node.values if isinstance(part, ast.Constant))
         if len(words.split()) >= LEAST_WORDS:
-            yield Text(node.lineno, without_code(words), False)
+            yield Text(node.lineno, without_code(words), is_message=True)
     for node in nodes:
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in apart:
             if len(node.value.split()) >= LEAST_WORDS:
-                yield Text(node.lineno, without_code(node.value), False)
+                yield Text(node.lineno, without_code(node.value), is_message=True)
+
+
+def docstrings(source: str) -> Iterator[Text]:
+    """The paragraphs of a module's docstrings, those of attributes included."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            for text in paragraphs(inspect.cleandoc(node.value.value)):
+                yield Text(node.lineno + text.line - 1, text.words)
+
+
+def texts(path: Path) -> Iterator[Text]:
+    """Everything that people read in a page or module."""
+    content = path.read_text(encoding="utf-8")
+    if path.suffix == ".md":
+        yield from paragraphs(content)
+    else:
+        yield from docstrings(content)
+        yield from messages(content)
 
 
 def faults(text: Text, rules: dict[str, Any]) -> Iterator[str]:
@@ -94,7 +113,7 @@ def faults(text: Text, rules: dict[str, Any]) -> Iterator[str]:
         if found:
             yield f"“{found[0]}”: write {rule['instead']}"
     most = rules["sentences"]["most_words"]
-    for sentence in SENTENCE_END.split(text.words) if text.is_page else ():
+    for sentence in SENTENCE_END.split(text.words) if not text.is_message else ():
         words = sentence.split()
         if len(words) > most:
             yield f"a sentence of {len(words)} words, more than {most}: “{' '.join(words[:8])} …”"
@@ -106,8 +125,7 @@ def main(root: Path = ROOT) -> int:
     found = 0
     for pattern in (*PAGES, MODULES):
         for path in sorted(root.glob(pattern)):
-            content = path.read_text(encoding="utf-8")
-            for text in paragraphs(content) if path.suffix == ".md" else messages(content):
+            for text in texts(path):
                 for fault in faults(text, rules):
                     print(f"{path.relative_to(root)}:{text.line}: {fault}")
                     found += 1

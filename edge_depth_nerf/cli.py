@@ -121,7 +121,7 @@ def run(command: Command) -> None:
     """Carry out a command.
 
     Raises:
-        InputError, OSError: what the user can mend.
+        InputError, OSError: what the user can fix.
 
     """
     if isinstance(command, SynthesizeOptions):

@@ -1,6 +1,6 @@
 """How commands end early: one line or one paragraph on stderr, an exit status, and a traceback only if asked for.
 
-Imports next to nothing, so that Ctrl-C is answered from the first moment on.
+It imports next to nothing, so that Ctrl-C works immediately.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ BUG_STATUS, INPUT_STATUS, PIPE_STATUS = 1, 2, 141
 def main() -> None:
     """Entry point of `edge-depth-nerf`.
 
-    Exit status: 0; 1 for a bug; 2 for what the user can mend (also of options); 130 after Ctrl-C; 141 when
-    whoever reads the output has gone.
+    Exit status: 0; 1 for a bug; 2 for what the user can fix (wrong options included); 130 after Ctrl-C; 141 when the
+    reader of the output has gone.
     """
     try:
         # before OpenMP is loaded, and for the commands that this one starts; why: openmp.py

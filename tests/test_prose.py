@@ -1,4 +1,4 @@
-"""The prose rules: pages and messages pass, and riddles of former pages do not."""
+"""The prose rules: pages, messages and docstrings pass, and riddles of former pages do not."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def prose() -> ModuleType:
     return module
 
 
-def test_pages_and_messages_are_plain(prose, capsys):
+def test_pages_messages_and_docstrings_are_plain(prose, capsys):
     assert prose.main() == 0, capsys.readouterr().out
 
 
@@ -53,11 +53,50 @@ def test_a_riddle_in_a_page_is_refused(prose, tmp_path, capsys, riddle):
 def test_a_riddle_in_a_message_is_refused(prose, tmp_path, capsys):
     module = tmp_path / "edge_depth_nerf/jobs/worker.py"
     module.parent.mkdir(parents=True)
-    module.write_text(
-        '"""A moment in a docstring."""\n\nNAME = "moment"\nprint(f"{NAME}: its worker goes on on {NAME}")\n'
-    )
+    module.write_text('"""A docstring."""\n\nNAME = "moment"\nprint(f"{NAME}: its worker goes on on {NAME}")\n')
     assert prose.main(tmp_path) == 1
     assert "edge_depth_nerf/jobs/worker.py:4: “goes on on”" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("where", "line"),
+    [
+        ('"""DOCSTRING"""\n', 1),
+        ('class Sweep:\n    """A sweep.\n\n    DOCSTRING\n    """\n', 4),
+        ('class Sweep:\n    @property\n    def time_s(self):\n        """DOCSTRING"""\n', 4),
+        ('class Sweep:\n    time_s: float\n    """DOCSTRING"""\n', 3),
+        ('TIME_S = 0.1\n"""A time.\n\nDOCSTRING\n"""\n', 4),
+        ('def read():\n    """Read.\n\n    Args:\n        time_s: DOCSTRING\n    """\n', 4),
+    ],
+    ids=["module", "class", "function", "attribute", "constant", "argument"],
+)
+def test_a_riddle_in_a_docstring_is_refused(prose, tmp_path, capsys, where, line):
+    module = tmp_path / "edge_depth_nerf/lidar/sweeps.py"
+    module.parent.mkdir(parents=True)
+    module.write_text(where.replace("DOCSTRING", "The sweep's own moment."))
+    assert prose.main(tmp_path) == 1
+    assert f"edge_depth_nerf/lidar/sweeps.py:{line}: “moment”" in capsys.readouterr().out
+    module.write_text(where.replace("DOCSTRING", "The sweep's own time."))
+    assert prose.main(tmp_path) == 0
+
+
+def test_a_long_sentence_in_a_docstring_is_refused(prose, tmp_path, capsys):
+    module = tmp_path / "edge_depth_nerf/module.py"
+    module.parent.mkdir(parents=True)
+    module.write_text(f'"""A module.\n\nA {"very " * 40}long sentence.\n"""\n')
+    assert prose.main(tmp_path) == 1
+    assert "edge_depth_nerf/module.py:3: a sentence of 43 words" in capsys.readouterr().out
+
+
+def test_code_and_headings_of_a_docstring_are_left_alone(prose, tmp_path):
+    module = tmp_path / "edge_depth_nerf/module.py"
+    module.parent.mkdir(parents=True)
+    module.write_text(
+        '"""Reads `moment`.\n\n    print(moment)\n\nIt is plain.\n"""\n\n\ndef read(moment):\n'
+        '    """Read what `moment_s` holds; the function returns it.\n\n'
+        '    Args:\n        moment_s: a time.\n\n    Returns:\n        Seconds.\n    """\n'
+    )
+    assert prose.main(tmp_path) == 0
 
 
 def test_code_examples_and_long_lists_are_left_alone(prose, tmp_path, capsys):

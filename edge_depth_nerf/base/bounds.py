@@ -27,7 +27,7 @@ MAX_LINE_CHARACTERS = 1 << 16
 MAX_JSON_BYTES = 100_000_000
 """No JSON file is larger: transforms.json of 40,000 pictures."""
 MAX_JSON_VALUES = 8_000_000
-"""No JSON file holds more numbers, texts, lists and objects; one takes up to a hundred bytes of memory."""
+"""No JSON file holds more numbers, texts, lists and objects; each needs up to a hundred bytes of memory."""
 MAX_LENGTH_M = 1e8
 """No length is larger: coordinates of the whole earth still pass."""
 MAX_TIME_S = 1e11
@@ -39,7 +39,7 @@ _MAX_NAME_BYTES = 255
 def path_inside(folder: Path, name: object, where: str) -> Path:
     """Resolve a path that a file gives, which may not lead out of `folder`.
 
-    Links that lie in the folder are followed: they were put there by whoever made the folder, not by the file.
+    Links in the folder are followed: the folder's owner put them there, not the file.
 
     Args:
         folder: what the path is relative to.

@@ -1,9 +1,8 @@
-"""Files that can be made anew: with a version and a checksum in their last bytes, few enough, and harmless to share.
+"""Files that can be made again: they end with a version and a checksum, stay few, and are safe to share.
 
-A file that was cut, changed or written by another version is not there for who reads it, and is made again. The
-checksum stands behind the content, so that NumPy maps the file into memory as if it were not there. Several processes
-may read, write and clean one folder at once: files appear whole, and one that is removed stays readable for who has it
-open.
+A file that was cut, changed or written by another version counts as missing and is made again. The checksum stands
+behind the content, so that NumPy maps the file into memory as if it were not there. Several processes may read, write
+and clean one folder at once: files appear whole, and a removed file stays readable for processes that have opened it.
 """
 
 from __future__ import annotations
@@ -53,7 +52,7 @@ def write_checked(path: Path, version: int, write: Callable[[_Summed], object]) 
 
 
 def is_whole(path: Path, version: int) -> bool:
-    """Whether a file is there, of this version, and as it was written; reads all of it, about 1 GB a second."""
+    """Whether a file exists, is of this version and is unchanged; reads all of it, about 1 GB a second."""
     try:
         with path.open("rb") as file:
             left = os.fstat(file.fileno()).st_size - _SEAL.size

@@ -25,7 +25,7 @@ Result = TypeVar("Result")
 
 
 def say(console: Console, text: str, style: str | None = None) -> None:
-    """Print a line as it is: paths and brackets are not markup, and the terminal wraps it."""
+    """Print a line unchanged: paths and brackets are not markup, and the terminal wraps it."""
     console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
 
 

@@ -1,4 +1,4 @@
-"""The one error for input that a user can mend.
+"""The one error for input that a user can fix.
 
 Its message names the file (and line, frame or field), what was found, what was expected and what to do.
 The command line prints it as one paragraph; a missing file may also be a plain `FileNotFoundError`. Here stands, too,
@@ -21,7 +21,7 @@ LONGEST_MESSAGE = 4000
 
 
 class InputError(ValueError):
-    """Data or options from outside that cannot be used as they are.
+    """Data or options from outside that cannot be used.
 
     Messages quote files that may hold anything: what a terminal would take as an order is written as its code.
     """

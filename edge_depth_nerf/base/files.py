@@ -76,7 +76,7 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
 def remove_leftovers(folder: Path) -> None:
     """Remove what `write_atomically` leaves in a folder and those below when its process is killed.
 
-    What another process is writing at this moment stays.
+    Files that another process is still writing stay.
     """
     for path in folder.rglob(".*"):
         named = _TEMPORARY.fullmatch(path.name)
@@ -104,7 +104,7 @@ def _runs(process: int) -> bool:
 
 
 def explain(error: Exception) -> str:
-    """What to tell of an error that the user can mend: one paragraph, with what to do about a disk or a folder."""
+    """The message for an error that the user can fix: one paragraph, with what to do about a disk or a folder."""
     remedies = {
         errno.ENOSPC: "The disk is full: free some space there, or choose another one",
         errno.EDQUOT: "Your share of the disk is used up: free some space there, or choose another disk",

@@ -234,7 +234,7 @@ def text_bar(
     """Write a line of text on white, smaller where it would be wider.
 
     Args:
-        text: the line, as it is ($ is no formula).
+        text: the line, drawn unchanged ($ starts no formula).
         width: of what is made, px.
         height: of what is made, px.
         size: of the letters, points.

@@ -74,7 +74,7 @@ def read_png_header(path: Path) -> PngHeader:
 
 
 def read_png_bytes(path: Path) -> bytes:
-    """Read a whole PNG as it is; Pillow checks each of its blocks against its checksum.
+    """Read a whole PNG unchanged; Pillow checks each of its blocks against its checksum.
 
     Raises:
         FileNotFoundError: there is no such file.

@@ -79,7 +79,7 @@ class Distortion:
 
         Args:
             distorted: finite coordinates in the distorted plane.
-            radius_max: x is looked for within |x| <= radius_max, at most this distortion's own.
+            radius_max: the function searches for x within |x| <= radius_max, at most this distortion's own.
             tolerance: by how much `distorted` may be off by earlier rounding, in the plane's unit; it decides
                 which points just beyond the rim still count as on it.
 

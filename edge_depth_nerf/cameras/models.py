@@ -219,7 +219,7 @@ class MEI(Camera):
     def theta_max_rad(self) -> float:
         """For ξ > 1 the angle arccos(-1/ξ), beyond which the plane's radius shrinks again; else where Z = -ξ.
 
-        Less, where the distortion folds before, or `theta_limit_rad` says so.
+        It is less where the distortion folds before that angle, or where `theta_limit_rad` is less.
         """
         return min(self._theta_of_model, self.theta_limit_rad)
 
@@ -341,7 +341,7 @@ class Pinhole(Camera):
 
     @cached_property
     def theta_max_rad(self) -> float:
-        """90°, which no ray reaches; less, where the distortion folds before, or `theta_limit_rad` says so."""
+        """90°, which no ray reaches; less where the distortion folds before, or where `theta_limit_rad` is less."""
         return math.atan(self._radius_max)
 
     @cached_property

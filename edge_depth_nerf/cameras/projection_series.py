@@ -27,16 +27,16 @@ _FURTHEST_RAD = math.radians(150.0)
 _LONGEST = 24
 _COSINES = 2048
 _NEAR_AXIS_RAD = 1e-4
-"""In place of the axis itself, where sine over sine has no value."""
+"""Used instead of the axis itself, where sine over sine has no value."""
 
 
 @dataclass(frozen=True, eq=False)
 class ProjectionSeries:
     """What a compiled loop needs to project into a picture.
 
-    With c the cosine of a unit ray's angle from the axis and t = (c - `numbers[6]`) · `numbers[7]` - 1, from -1 where
-    the picture ends to 1 on the axis, row 0 of `factors` gives what takes x and y of the ray to the distorted plane
-    without its tangential terms, and row 1 what takes them to the undistorted one.
+    Let c be the cosine of a unit ray's angle from the axis, and t = (c - `numbers[6]`) · `numbers[7]` - 1, which is -1
+    where the picture ends and 1 on the axis. Row 0 of `factors` gives the factor that takes x and y of the ray to the
+    distorted plane without its tangential terms. Row 1 gives the factor that takes them to the undistorted plane.
     """
 
     factors: Float32[np.ndarray, "2 length"]

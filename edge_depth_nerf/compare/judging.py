@@ -111,8 +111,8 @@ def judge_beams(pipeline: Any, most: int = MOST_PIXELS) -> dict[str, float]:
     """Judge training views by the LiDAR beams that were held out of everything (`process --holdout-beams`).
 
     Returns:
-        The depth errors beams_abs_rel and so on, pooled over random returns of all training views, rendered from the
-        poses that training ended with; nothing for a scene without such beams.
+        The depth errors beams_abs_rel and so on, pooled over random LiDAR points of all training views, rendered from
+        the poses that training ended with; nothing for a scene without such beams.
 
     """
     model, manager = pipeline.model, pipeline.datamanager
@@ -230,7 +230,7 @@ class ViewJudge:
 
         Returns:
             The figures of `ns-eval` and, under affine_… and truth_affine_…, those after a colour fit; and the bins
-            by_angle_deg and by_distance_m, against the truth where it is known, else against picture and LiDAR.
+            by_angle_deg and by_distance_m, against ground truth where it is known, else against picture and LiDAR.
 
         """
         dataset = self.pipeline.datamanager.eval_dataset
@@ -258,7 +258,7 @@ class ViewJudge:
         return figures, {"by_angle_deg": by_angle.compute(), "by_distance_m": by_distance.compute()}
 
     def shifted(self, views: dict[str, list[Callable[[], JudgedView]]]) -> dict[str, float]:
-        """Judge views from beside the path against their truth, inside the mask; shifted_1m_masked_psnr and so on."""
+        """Evaluate views beside the path against their ground truth, inside the mask: shifted_1m_masked_psnr etc."""
         figures: dict[str, float] = {}
         kept = ("masked_", "affine_", "truth_")
         for metres, chosen in views.items():

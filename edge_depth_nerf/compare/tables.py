@@ -70,7 +70,7 @@ def ahead(results: Results, scenes: Sequence[str], method: MethodName, metric: s
 
 
 def psnr_metric(results: Results) -> Metric:
-    """PSNR against the truth where all drives have it, else against the pictures."""
+    """PSNR against ground truth where all drives have it, else against the pictures."""
     return TRUE_PSNR if all(TRUE_PSNR.name in run.figures for run in results.runs) else PSNR
 
 
@@ -140,7 +140,7 @@ def steps_to(curve: Sequence[dict[str, float]], psnr: float, name: str) -> float
 
 
 def curve_metric(results: Results) -> str:
-    """The PSNR of the random pixels that all curves have: against the truth, if it is known."""
+    """The PSNR of the random pixels that all curves have: against ground truth, if it is known."""
     return "truth_psnr" if all("truth_psnr" in run.curve[-1] for run in results.runs) else "psnr"
 
 

@@ -1,7 +1,7 @@
 """Trains and judges one run: `python -m edge_depth_nerf.compare.worker FOLDER`, with a run.json in the folder.
 
-A process of its own, so that a run that dies takes no other with it, and one process for both, as nerfstudio takes long
-to start. Killed at any moment, it goes on at its last checkpoint.
+It is a process of its own, so that a run that dies stops no other run. One process does both, because nerfstudio takes
+long to start. The process can be killed at any time; it resumes from its last checkpoint.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class Clock:
 class MeasuredTrainer(EdgeDepthTrainer):
     """Counts the seconds of training, and stops the clock while it judges the random pixels.
 
-    What was measured is kept with the checkpoints, so that a training that is taken up again goes on with it.
+    Measurements are kept with the checkpoints, so that a resumed training continues them.
     """
 
     def __init__(self, config: Any, progress: Path, total_steps: int) -> None:
@@ -97,7 +97,7 @@ class MeasuredTrainer(EdgeDepthTrainer):
         self._judged_at = {max(1, round(share * total_steps)) for share in CURVE}
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "test") -> None:
-        """Set up as nerfstudio does, and go on from what was measured before."""
+        """Set up as nerfstudio does, and continue the measurements made before."""
         super().setup(test_mode)
         manager: Any = self.pipeline.datamanager
         self._pixels = choose_pixels(manager.eval_dataset)
@@ -173,7 +173,7 @@ def _is(value: Any, hint: Any) -> bool:
 
 
 def do_run(folder: Path) -> None:
-    """Train and judge what run.json of a folder says, as far as it is not done; figures.json is written last."""
+    """Train and evaluate what a folder's run.json describes and is not done yet; figures.json is written last."""
     run = read_specification(folder / SPECIFICATION)
     config, named = configuration(run, folder)
     resolved = described(config)

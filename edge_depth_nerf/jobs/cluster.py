@@ -2,7 +2,7 @@
 
 A worker starts a process for each task and waits for it; the process dies with its worker. Data stay on storage that
 all machines share: what travels are paths, versions and shares of work. Dask does a lost worker's tasks again
-elsewhere, and they take up what they find on disk.
+elsewhere, and they continue from what they find on disk.
 """
 
 from __future__ import annotations
@@ -373,7 +373,7 @@ def _look_at(
 
 
 def _threads(client: Any, machines: Mapping[str, str]) -> int:
-    """Cores that each worker has for itself, of those who have least: the same for all tasks, or times differ."""
+    """Cores that each worker has for itself, at the smallest worker: the same for all tasks, or times differ."""
     given = os.environ.get(THREAD_VARIABLES[0], "")
     if given.isdecimal() and int(given) > 0:
         return int(given)
@@ -393,7 +393,7 @@ def _threads(client: Any, machines: Mapping[str, str]) -> int:
 def _local(count: int) -> Iterator[Any]:
     """A cluster of processes on this machine, at most `count`: one for each GPU, or else for each core.
 
-    It listens on the loopback alone, and speaks TLS with keys that nobody else has: whoever reaches a scheduler can
+    It listens on the loopback alone, and speaks TLS with keys that nobody else has: anyone who reaches a scheduler can
     run programs as its user, and on a machine of several users all of them reach the loopback.
     """
     import dask.config

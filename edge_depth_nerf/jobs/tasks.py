@@ -1,7 +1,7 @@
 """Commands in processes of their own, side by side: in threads of this machine, or on the workers of a cluster.
 
-A task tells how far it is by lines that begin with `WORK`. What it made is on disk, and a task that is done again takes
-up what is there; so nothing but paths and small values goes to it, and nothing but its end comes back.
+A task reports its progress in lines that begin with `WORK`. Its results are on disk, and a task that is done again
+continues from them. So a task gets only paths and small values, and only its end comes back.
 """
 
 from __future__ import annotations

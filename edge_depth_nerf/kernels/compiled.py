@@ -26,7 +26,7 @@ _folders: set[Path] = set()
 
 
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Compile a function without Python's lock; on disk if there is a folder for it, else anew in each process.
+    """Compile a function without Python's lock; on disk if there is a folder for it, else once in each process.
 
     Put `no_type_check` below it: the tests' type checker would wrap what Numba has to read. `options` are njit's.
     """

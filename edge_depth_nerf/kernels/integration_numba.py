@@ -129,7 +129,7 @@ def integrate_rows(
     """Integrate the rows `rows_from` up to `rows_to` of one map. Calls for different rows may run at once.
 
     Args:
-        lidar: [h, w], C order, metres; what is not finite and positive is no return.
+        lidar: [h, w], C order, metres; what is not finite and positive is no LiDAR point.
         mono: the same for the estimates.
         valid: [h, w] bool.
         distance: [h, w], C order; gets d̃ in the given rows, 0 where there is no prior.
@@ -142,8 +142,8 @@ def integrate_rows(
         alpha: LiDAR's share.
         per_source: divide each source's weights by the sum of its spatial weights.
         least_returns: but LiDAR's by no less than this.
-        keep_returns: a return is its own prior.
-        lidar_guides: compare with LiDAR where the centre has a return.
+        keep_returns: a LiDAR point is its own prior.
+        lidar_guides: compare with LiDAR where the centre has a LiDAR point.
         rows_from: first row.
         rows_to: row after the last.
     """

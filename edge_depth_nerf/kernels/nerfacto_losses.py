@@ -17,7 +17,7 @@ def distortion_loss(edges: Float[Tensor, "rays edges"], weights: Float[Tensor, "
     """Compute mip-NeRF 360's distortion loss (its Eq. 15), mean over the rays.
 
     Σ_ij w_i w_j |m_i - m_j| + 1/3 Σ_i w_i² Δ_i, with middles m and lengths Δ of the samples. As the middles ascend, the
-    double sum is 2 Σ_i w_i (m_i Σ_j<i w_j - Σ_j<i w_j m_j): two cumulative sums in place of samples² terms.
+    double sum is 2 Σ_i w_i (m_i Σ_j<i w_j - Σ_j<i w_j m_j): two cumulative sums instead of samples² terms.
 
     Args:
         edges: of the samples, ascending, in the spacing of 0..1.

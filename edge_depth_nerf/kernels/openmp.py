@@ -6,8 +6,9 @@ take the cores from those that work: a step takes a sixth longer, and five times
 (docs/speed.md).
 
 `OMP_WAIT_POLICY=passive` lets them sleep, but is read when the library is loaded; in `ns-train` that is before this
-package is. The library also gives the turning up, but for a moment, once it has made more threads than there are cores
-(`gomp_throttled_spin_count_var`, libgomp's config/linux/wait.h). So some are made that sleep for ever.
+package is. The library also lets threads turn only briefly before they sleep, once it has created more threads than
+there are cores (`gomp_throttled_spin_count_var`, libgomp's config/linux/wait.h). So some threads are created that sleep
+forever.
 """
 
 from __future__ import annotations

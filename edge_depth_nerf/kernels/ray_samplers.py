@@ -28,7 +28,7 @@ def _placing(weights: Tensor) -> ModuleType | None:
 
 
 class FirstSampler(UniformLinDispPiecewiseSampler):
-    """nerfstudio's first sampler, which makes its constants anew in each step and copies them from the host.
+    """nerfstudio's first sampler, which makes its constants again in each step and copies them from the host.
 
     On the CPU it is left to nerfstudio.
     """

@@ -94,7 +94,7 @@ def _sample_row(picture, u, v, out):
 @_compiled
 @no_type_check
 def _sum_windows_along(reference, other, first, second, cross):
-    """Sum a row, its square and its product with another over the width of windows; the ends stay as they are."""
+    """Sum a row, its square and its product with another over the width of windows; the ends stay unchanged."""
     for j in range(RADIUS_PX, len(reference) - RADIUS_PX):
         a = b = c = _ZERO
         for k in range(-RADIUS_PX, RADIUS_PX + 1):

@@ -1,6 +1,6 @@
 """Adam for hash tables on the CPU, whose gradients are added in place.
 
-A table of 50 MB has a gradient of 50 MB. torch makes it anew in each step: it is filled with zeros, added to, read by
+A table of 50 MB has a gradient of 50 MB. torch makes it again in each step: it is filled with zeros, added to, read by
 Adam and dropped. Here one array stays: backward adds to it (`hash_grid`), and Adam clears each number after reading it.
 The steps are those of torch's Adam, and so is what checkpoints hold.
 

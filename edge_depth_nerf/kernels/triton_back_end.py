@@ -92,7 +92,7 @@ NETWORK = "EDGE_DEPTH_NERF_NETWORK"
 
 
 def of_network(x: Tensor, weights: Sequence[Tensor]) -> ModuleType | None:
-    """Give the kernels of networks, `network_triton`; None where they are not asked for, or do not serve this network.
+    """Give the kernels of networks, `network_triton`; None where not requested, or for an unsupported network.
 
     They serve what autocast would compute in float16 on CUDA.
     """

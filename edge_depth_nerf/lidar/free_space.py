@@ -1,7 +1,7 @@
 """What a sweep saw through: points of other sweeps that lie where this one's beams went on.
 
-A thing that moves is measured where it was. A sweep of another moment, whose beams passed there and ended further
-away, shows that it has gone, or had not yet come.
+A moving thing is measured where it was. If the beams of a sweep at another time passed that place and ended further
+away, the thing has gone, or had not yet come.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from edge_depth_nerf.lidar.projection import transform_points
 from edge_depth_nerf.lidar.world import WorldSweep
 
 _CELL_SPACINGS = 1.1
-"""Size of a direction's cell in spacings of the returns, so that few cells stay empty."""
+"""Size of a direction's cell in spacings of the LiDAR points, so that few cells stay empty."""
 _MARGIN = 1.05
 _MARGIN_M = 0.3
 """A beam passed a point if it ended further away by this ratio and by this length."""
@@ -38,7 +38,7 @@ class FreeSpace:
 
     @staticmethod
     def of(sweep: WorldSweep) -> FreeSpace:
-        """Sort a sweep's returns by direction."""
+        """Sort a sweep's points by direction."""
         world_to_scanner = torch.from_numpy(sweep.world_to_scanner)
         cell_rad = _CELL_SPACINGS * sweep.spacing_rad
         lowest, highest = sweep.elevation_rad
@@ -87,7 +87,7 @@ def _cells(
 
 
 def _least_around(shortest_m: Float32[Tensor, "rows columns"]) -> Float32[np.ndarray, "rows columns"]:
-    """Take the least of each cell and its neighbours; 0 for a cell without any return of its own."""
+    """Take the least of each cell and its neighbours; 0 for a cell without a LiDAR point of its own."""
     image = shortest_m.numpy()
     wrapped = np.concatenate((image[:, -1:], image, image[:, :1]), axis=1)
     least = cv2.erode(wrapped, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)[:, 1:-1]

@@ -1,13 +1,14 @@
 """Things that move, found in sweeps: what was there for one stretch of a drive, and gone before or after.
 
-1. *Judged.* Each return that stands above the ground is looked at by all sweeps near by, of any moment of the drive:
-   they see through its place, or meet something there. Of what moves one sees first nothing, then for one stretch
-   the thing, then nothing again. Of what holds still, a crown of leaves above all, hits and passes come mixed.
-2. *Gathered.* Returns that moved hang together as things, and take with them returns beside them of which nothing is
-   known, such as those of a car's roof behind which there is only sky.
+1. *Judged.* Each LiDAR point above the ground is checked against all sweeps near by, of any time of the drive: they see
+   through its place, or meet something there. At a moving thing's place, sweeps meet nothing at first, then the thing
+   for one stretch, then nothing again. At a still thing's place, hits and passes are mixed, above all in a crown of
+   leaves.
+2. *Gathered.* Points that moved are joined to things. Unknown points beside them are added, such as those of a car's
+   roof with only sky behind it.
 3. *Followed.* A thing of one sweep is the thing of the next that lies where its speed takes it. Where the evidence
-   ends, as at the end of a drive, it is looked for at the place that its speed tells. What stays where it is, or is
-   seen in few sweeps, is not believed.
+   ends, as at the end of a drive, the thing is searched for at the place that its speed predicts. Things that stay
+   where they are, or are seen in few sweeps, are dropped.
 
 Positions are metres in the world, z up; times are seconds.
 """
@@ -30,25 +31,25 @@ from edge_depth_nerf.lidar.free_space import FreeSpace
 from edge_depth_nerf.lidar.world import WorldSweep
 
 FARTHEST_M = 60.0
-"""Returns beyond this are not judged: beams are too far apart there."""
+"""LiDAR points beyond this are not judged: beams are too far apart there."""
 _ABOVE_GROUND_M = 0.3
 """What lies lower is ground, or the foot of something."""
 _GROUND_CELL_M = 1.0
 _GROUND_RANK = 3
-"""The so many-th lowest return of a cell is its ground: strays lie below it."""
+"""The so many-th lowest LiDAR point of a cell is its ground: strays lie below it."""
 
 _MIN_SCORE = 2.0
-"""A return moved if so many more sweeps saw through its place, outside one stretch, than met something there."""
+"""A LiDAR point moved if, outside one stretch, so many more sweeps saw through its place than met something there."""
 _HELD_MET = 3
 """A place where so many sweeps met something, and no stretch explains it, seems to hold still."""
 _LASTING_MET, _LASTING_S = 2, 1.0
-"""It does so for certain if so many of them are of moments this far off: what moves hides its own place for as long as
-it takes to leave it."""
+"""It certainly holds still if so many of them are this far off in time: a moving thing hides its own place for as long
+as it takes to leave it."""
 _VOTE_M = 0.5
 """Neighbours within this have a say."""
 _MIN_VOTES = 3
 _JOIN_M = 0.4
-"""Unknown returns within this of what moved belong to it."""
+"""Unknown points within this of what moved belong to it."""
 _JOIN_ROUNDS = 3
 _APART_M = 0.9
 """What lies further apart is two things."""
@@ -65,7 +66,7 @@ _SPEED_SWEEPS = 2
 _COASTED = 8
 """A thing is followed for so many sweeps without evidence."""
 _COAST_SHARE = 0.3
-"""So many returns of what is expected must be there."""
+"""This share of the expected LiDAR points must be there."""
 
 
 # ---- the ground ------------------------------------------------------------------------------------------------
@@ -73,14 +74,14 @@ _COAST_SHARE = 0.3
 
 @dataclass(frozen=True)
 class Lowest:
-    """The lowest returns of a sweep, by cells of the ground plan."""
+    """The lowest LiDAR points of a sweep, by cells of the ground plan."""
 
     cells: Int[np.ndarray, "cells 2"]
     height_m: Float[np.ndarray, "cells"]
 
     @staticmethod
     def of(points_m: Float[np.ndarray, "points 3"]) -> Lowest:
-        """Take the `_GROUND_RANK`-th lowest of each cell; cells with fewer returns say nothing."""
+        """Take the `_GROUND_RANK`-th lowest of each cell; cells with fewer points say nothing."""
         cells, height_m, first, count = _by_cell(_cell_of(points_m), points_m[:, 2])
         enough = count >= _GROUND_RANK
         chosen = first[enough] + _GROUND_RANK - 1
@@ -130,12 +131,12 @@ def _by_cell(
 
 @dataclass(frozen=True)
 class Loose:
-    """Returns of a sweep that stand above the ground and are not known to hold still."""
+    """LiDAR points of a sweep that stand above the ground and are not known to hold still."""
 
     time_s: float
-    """The sweep's own moment."""
+    """The sweep's own time."""
     rows: Int[np.ndarray, "n"]
-    """Which returns of the sweep they are."""
+    """Which points of the sweep they are."""
     points_m: Float[np.ndarray, "n 3"]
     """World."""
     moved: Bool[np.ndarray, "n"]
@@ -147,10 +148,10 @@ class Loose:
 def one_stretch(
     seen_through: Bool[np.ndarray, "sweeps n"], met: Bool[np.ndarray, "sweeps n"], own: int
 ) -> Float[np.ndarray, "n"]:
-    """How well one stretch of presence explains what sweeps of other moments saw at the places of a sweep's returns.
+    """How well one stretch of presence explains what sweeps of other times saw at the places of a sweep's points.
 
-    Outside of the stretch a sweep that saw through counts for it and one that met something against it; within it one
-    that saw through counts against it. The best stretch that contains the sweep's own moment is taken.
+    Outside the stretch, a sweep that saw through counts for it, and one that met something counts against it. Within
+    the stretch, one that saw through counts against it. The best stretch that contains the sweep's own time is taken.
 
     Args:
         seen_through: by each of the others, in order of time.
@@ -178,13 +179,13 @@ def loose_returns(
     ground: Ground,
     others: Sequence[tuple[float, FreeSpace]],
 ) -> Loose:
-    """Find the returns of a sweep that moved, and those of which nothing is known.
+    """Find the LiDAR points of a sweep that moved, and those of which nothing is known.
 
     Args:
         sweep: the sweep.
-        time_s: its moment.
+        time_s: its time.
         ground: of the drive.
-        others: moments and free space of sweeps near by, in order of time, without this one.
+        others: times and free space of sweeps near by, in order of time, without this one.
 
     """
     in_reach = sweep.points_m - torch.from_numpy(np.linalg.inv(sweep.world_to_scanner)[:3, 3])
@@ -240,12 +241,12 @@ def _neighbours(cells: Int[np.ndarray, "cells 3"], reach: float) -> csr_matrix:
 
 @dataclass(frozen=True)
 class Thing:
-    """Returns of one sweep that move together."""
+    """LiDAR points of one sweep that move together."""
 
     time_s: float
-    """The sweep's moment."""
+    """The sweep's time."""
     rows: Int[np.ndarray, "n"]
-    """Which of the sweep's returns they are."""
+    """Which of the sweep's points they are."""
     points_m: Float[np.ndarray, "n 3"]
     """World."""
     velocity_m_s: Float[np.ndarray, "2"] = field(default_factory=lambda: np.zeros(2))
@@ -259,7 +260,7 @@ class Thing:
 
 
 def things_of(loose: Loose) -> list[Thing]:
-    """Gather what hangs together, with the unknown returns beside it."""
+    """Gather what hangs together, with the unknown points beside it."""
     if not loose.moved.any():
         return []
     chosen = loose.moved.copy()
@@ -386,7 +387,7 @@ def _coasted(track: Mapping[int, Thing], ordered: Sequence[Loose]) -> dict[int, 
 
 
 def expected_at(thing: Thing, loose: Loose) -> Thing | None:
-    """Look for a thing where its speed takes it, in a sweep of another moment."""
+    """Search for a thing where its speed takes it, in a sweep of another time."""
     shift = np.r_[(loose.time_s - thing.time_s) * thing.velocity_m_s, 0.0]
     expected = thing.points_m + shift
     low, high = expected.min(0) - _JOIN_M, expected.max(0) + _JOIN_M

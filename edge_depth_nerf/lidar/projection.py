@@ -1,17 +1,17 @@
 """Projecting points into a camera: a sparse map of distances along the ray.
 
-Points are metres in the camera's frame (x right, y down, z forward). A camera says itself which rays it can see,
-so points beside and behind it count as far as its model reaches; there is no test of z. A map has the picture's
-size; distance is Euclidean metres from the camera's centre, 0 = no return.
+Points are metres in the camera's frame (x right, y down, z forward). A camera decides itself which rays it can see, so
+points beside and behind it count as far as its model reaches; there is no test of z. A map has the picture's size;
+distance is Euclidean metres from the camera's centre, 0 = no LiDAR point.
 
-Hidden points. The scanner sits elsewhere than the camera and sees what the camera cannot. Each return stands for a
-patch of surface as wide as the returns are apart, and so hides what lies behind within as many pixels of its own:
-the nearer the surface is to the camera, the more. A road seen at a flat angle also has nearer returns beside each
-return; so what is said to be hidden must lie behind steeply: further behind than `_FLATTEST` allows for the
-distance in the picture. All of it is done in the picture's own pixels, with the lens's own scale at each angle.
+Hidden points. The scanner sits elsewhere than the camera and sees what the camera cannot. Each LiDAR point stands for a
+patch of surface as wide as the distance to its neighbours. So it hides what lies behind it within as many pixels of its
+own: the nearer the surface is to the camera, the more. A road seen at a flat angle also has nearer points beside each
+point. So a hidden point must lie steeply behind: further behind than `_FLATTEST` allows for the distance in the
+picture. All of it is done in the picture's own pixels, with the lens's own scale at each angle.
 
-Where several returns fall into one pixel the nearest surface wins; of its returns the one measured nearest in time,
-and then the one nearest to the pixel's centre. The nearest return itself would lie at the near edge of the pixel's
+Where several points fall into one pixel, the nearest surface wins. Of its points, the one measured nearest in time
+wins, and then the one nearest to the pixel's centre. The nearest point itself would lie at the near edge of the pixel's
 patch of road: on a synthesised street at 256×256 px it is 0.8 % too near in the median, the chosen one 0.1 %.
 """
 
@@ -30,14 +30,14 @@ from torch import Tensor
 from edge_depth_nerf.cameras import Camera
 
 _SAME_SURFACE = 1.1
-"""Returns of one pixel whose distances differ by less than this ratio are taken to lie on one surface."""
+"""Points of one pixel whose distances differ by less than this ratio are taken to lie on one surface."""
 _BEHIND = 0.04
 """A point is only called hidden if it is further away than what hides it by more than this part of its distance."""
 _FLATTEST = 0.06
-"""Slope, as sideways over along the ray, of the flattest surface whose own returns must not hide each other: a road
-from 2 m above it, 33 m away."""
+"""Slope, as sideways over along the ray, of the flattest surface whose own points must not hide each other: a road from
+2 m above it, 33 m away."""
 _REACHES_PX = (1, 2, 3, 5, 8, 12, 18)
-"""How far around itself a return may hide what is behind."""
+"""How far around itself a LiDAR point may hide what is behind."""
 
 
 @dataclass(frozen=True)

@@ -132,16 +132,16 @@ def check_scan(path: Path, scan: ScanFormat) -> None:
 
 
 def read_scan(path: Path, scan: ScanFormat, moment_s: float = 0.0) -> Sweep:
-    """Read a scan and leave out what is no return.
+    """Read a scan and leave out what is not a measured point.
 
     Args:
         path: the file.
         scan: what its columns mean.
-        moment_s: the scan's own moment on the clock that its points' times count on; `offset_s` is counted from it.
+        moment_s: the scan's own time, on the clock of its points' times; `offset_s` is counted from it.
 
     Raises:
         FileNotFoundError: there is no such file.
-        InputError: of an unknown format, broken, without a column needed, or without a single usable return.
+        InputError: of an unknown format, broken, without a column needed, or without a single usable point.
 
     """
     header = _read_header(path, scan)
@@ -157,7 +157,7 @@ def read_scan(path: Path, scan: ScanFormat, moment_s: float = 0.0) -> Sweep:
 def read_cloud(
     path: Path,
 ) -> tuple[Float64[np.ndarray, "points 3"], UInt8[np.ndarray, "points 3"] | None]:
-    """Read the vertices of a .ply file, as they are, and their colours (RGB) where it has any.
+    """Read the vertices of a .ply file unchanged, and their colours (RGB) where it has any.
 
     Raises:
         FileNotFoundError: there is no such file.

@@ -1,4 +1,4 @@
-"""Reading LiDAR sweeps in KITTI's layout: float32 x, y, z, reflectance, little-endian, one return after another.
+"""Reading LiDAR sweeps in KITTI's layout: float32 x, y, z, reflectance, little-endian, one point after another.
 
 Coordinates are metres in the scanner's frame (x forward, y left, z up), as recorded: the vehicle moves during a
 turn, and nothing is corrected for that here.
@@ -19,7 +19,7 @@ from edge_depth_nerf.base.bounds import check_bytes
 from edge_depth_nerf.base.errors import InputError
 
 MIN_RANGE_M = 0.5
-"""Nearer than this a scanner measures nothing: such a point stands for "no return", or lies on its housing."""
+"""Nearer than this a scanner measures nothing: such a point stands for a missing echo, or lies on its housing."""
 MAX_RANGE_M = 255.0
 """Beyond this a distance map cannot hold the value; no scanner on a car measures so far."""
 MAX_POINTS = 5_000_000
@@ -29,7 +29,7 @@ _BYTES_PER_POINT = 16
 
 @dataclass(frozen=True)
 class SweepTiming:
-    """When a turning scanner measures which direction: at its reference azimuth at the sweep's own moment."""
+    """When a turning scanner measures which direction; it measures its reference azimuth at the sweep's own time."""
 
     turn_s: float
     """Duration of a turn."""
@@ -39,7 +39,7 @@ class SweepTiming:
     """Counter-clockwise from x. Half a turn from it the sweep begins and ends."""
 
     def offsets_s(self, points_m: Float[Tensor, "returns 3"]) -> Float[Tensor, "returns"]:
-        """When each return was measured, from the sweep's own moment: -turn_s/2 to turn_s/2."""
+        """When each point was measured, counted from the sweep's own time: -turn_s/2 to turn_s/2."""
         azimuth = torch.atan2(points_m[:, 1], points_m[:, 0]) - self.reference_azimuth_rad
         turns = torch.remainder(azimuth / (2 * math.pi) + 0.5, 1.0) - 0.5
         return turns * (-self.turn_s if self.clockwise else self.turn_s)
@@ -47,18 +47,18 @@ class SweepTiming:
 
 @dataclass(frozen=True)
 class Sweep:
-    """The usable returns of one turn of the scanner."""
+    """The usable points of one turn of the scanner."""
 
     points_m: Float[Tensor, "returns 3"]
     """Scanner frame, float64, in the file's order."""
     reflectance: Float[Tensor, "returns"]
     """0 to 1."""
     not_finite: int
-    """How many returns were left out because a coordinate is NaN or infinite."""
+    """How many points were left out because a coordinate is NaN or infinite."""
     out_of_range: int
-    """How many returns were left out because they lie nearer than 0.5 m (zeros among them) or beyond 255 m."""
+    """How many points were left out because they lie nearer than 0.5 m (zeros among them) or beyond 255 m."""
     offset_s: Float[Tensor, "returns"] | None = None
-    """When each return was measured, from the sweep's own moment, where the file says so; float64."""
+    """When each point was measured, counted from the sweep's own time, if the file gives it; float64."""
 
 
 BEAM_RAD = math.radians(0.4)
@@ -81,7 +81,7 @@ def without_beams(sweep: Sweep, one_of: int) -> tuple[Sweep, Sweep]:
 
 
 def check_sweep_size(path: Path) -> None:
-    """Check that the file holds whole returns, and any, without reading it.
+    """Check that the file holds whole points, and at least one, without reading it.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -97,11 +97,11 @@ def check_sweep_size(path: Path) -> None:
 
 
 def read_sweep(path: Path) -> Sweep:
-    """Read a sweep and leave out what is no return.
+    """Read a sweep and leave out what is not a measured point.
 
     Raises:
         FileNotFoundError: there is no such file.
-        InputError: the file is truncated, or nothing in it is a usable return.
+        InputError: the file is truncated, or nothing in it is a usable point.
 
     """
     check_sweep_size(path)
@@ -115,7 +115,7 @@ def usable_returns(
     reflectance: Float[Tensor, "points"],
     offset_s: Float[Tensor, "points"] | None = None,
 ) -> Sweep:
-    """Leave out and count what is no return: NaN and infinity, zeros, what is too near or too far.
+    """Leave out and count what is not a measured point: NaN and infinity, zeros, what is too near or too far.
 
     Raises:
         InputError: nothing is left; names `path`.

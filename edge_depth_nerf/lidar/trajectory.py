@@ -1,9 +1,9 @@
-"""The vehicle's path: poses at some moments, and between them the screw motion from one to the next.
+"""The vehicle's path: poses at some times, and between them the screw motion from one to the next.
 
 Frames: vehicle (as the recording has it) and world; transforms are 4×4, float64, metres; times are seconds of one
 clock. Between two poses the vehicle is taken to turn and advance evenly: T(s) = T0 · exp(s · log(T0⁻¹·T1)), the
-geodesic of SE(3), 0 <= s <= 1. A pose that is missing is thus bridged; before the first and after the last pose the
-nearest motion goes on.
+geodesic of SE(3), 0 <= s <= 1. So a missing pose is bridged. Before the first and after the last pose, the nearest
+motion continues.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
-"""From a sweep as it was recorded to points in the world.
+"""From a recorded sweep to points in the world.
 
-A scanner turns while the vehicle drives: at 10 m/s its points are up to half a metre off if they are taken as
-measured at one moment. So each point is moved by the vehicle's pose at the point's own time, which the file gives or
-the point's azimuth tells.
+A scanner turns while the vehicle drives: at 10 m/s its points are up to half a metre off if they are taken as measured
+all at once. So each point is moved by the vehicle's pose at the point's own time. The file gives this time, or it
+follows from the point's azimuth.
 
-A camera that sits above the scanner looks over the upper edge of the scanner's field: what it sees there behind a
-tree that the scanner meets at that edge, no return of the tree hides. So what reaches the edge is taken to go on
-above it, as far as the camera looks over.
+A camera above the scanner looks over the upper edge of the scanner's field. If a tree reaches that edge, no LiDAR point
+of the tree hides what the camera sees behind its upper part. So what reaches the edge is taken to continue above it, as
+far as the camera looks over.
 """
 
 from __future__ import annotations
@@ -24,33 +24,33 @@ from edge_depth_nerf.lidar.sweeps import Sweep, SweepTiming
 from edge_depth_nerf.lidar.trajectory import Trajectory
 
 _SPACING = 1.4
-"""How much further apart than evenly spread the returns are where they are sparse: scanners have fewer beams than
+"""How much further apart than evenly spread the LiDAR points are where they are sparse: scanners have fewer beams than
 firings (0.43° by 0.2° for KITTI-360's)."""
 
 _STRAY = 1e-3
-"""Share of returns that may lie beyond the scanner's field; one beam of 64 has 16 times as many."""
+"""Share of points that may lie beyond the scanner's field; one beam of 64 has 16 times as many."""
 _TOP_RAD = math.radians(0.6)
-"""Returns within this of the highest one are of the highest beam or two."""
+"""Points within this of the highest one are of the highest beam or two."""
 _STEPS_UP = 6
 """Points on the way up from each of those."""
 
 
 @dataclass(frozen=True)
 class WorldSweep:
-    """A sweep's returns in the world."""
+    """A sweep's points in the world."""
 
     points_m: Float[Tensor, "returns 3"]
     """World, float64."""
     spacing_m: Float[Tensor, "returns"]
-    """How far apart neighbouring returns are where each return was measured, across its beam; float32."""
+    """How far apart neighbouring points are where each point was measured, across its beam; float32."""
     spacing_rad: float
     """The same as an angle at the scanner."""
     world_to_scanner: Float64[np.ndarray, "4 4"]
-    """At the sweep's own moment."""
+    """At the sweep's own time."""
     elevation_rad: tuple[float, float]
-    """Lowest and highest direction of the returns, from the scanner's horizontal plane."""
+    """Lowest and highest direction of the points, from the scanner's horizontal plane."""
     offset_s: Float[Tensor, "returns"]
-    """When each was measured, from the sweep's own moment; 0 where that is not known or not asked for."""
+    """When each was measured, counted from the sweep's own time; 0 where that is unknown or not requested."""
 
 
 def sweep_in_world(
@@ -66,11 +66,11 @@ def sweep_in_world(
 
     Args:
         sweep: as recorded, in the scanner's frame.
-        time_s: its own moment, on the trajectory's clock.
+        time_s: its own time, on the trajectory's clock.
         scanner_to_vehicle: where the scanner sits.
         trajectory: where the vehicle is.
         timing: when which azimuth is measured; times from the file come first. None and no times = all at once.
-        deskew: False takes all points as measured at the sweep's own moment.
+        deskew: False takes all points as measured at the sweep's own time.
 
     """
     offset_s = torch.zeros(len(sweep.points_m), dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""The vehicle's own masks in a scene: `ego_masks/CAMERA.png`, as they were found and as people correct them."""
+"""The vehicle's own masks in a scene: `ego_masks/CAMERA.png`, as found or as corrected by users."""
 
 from __future__ import annotations
 

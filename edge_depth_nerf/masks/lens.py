@@ -14,10 +14,10 @@ from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.masks.regions import block_mean
 
 WORKING_PX = 700
-"""The dark rim is looked for in pictures that are averaged down until the longer side is no longer than this."""
+"""Pictures are averaged down until the longer side is no longer than this; then the dark rim is searched for."""
 
 _ANGLES = 720
-"""Number of directions from the picture's middle in which the rim is looked for."""
+"""Number of directions from the picture's middle in which the rim is searched for."""
 _DARK_LEVELS = 40.0
 """What is not lit by the lens is darker than this in every picture, glare included."""
 _LIT_LEVELS = 80.0

@@ -1,9 +1,9 @@
-"""Moving things in a picture: from the places of LiDAR's returns on them to all that the picture shows of them.
+"""Moving things in a picture: from the places of LiDAR points on them to all that the picture shows of them.
 
-Returns on a thing lie some pixels apart, miss its outline, and end at the upper edge of the scanner's field. What
-lies between them is the thing's; how far it goes beyond them the picture tells: the outline is put where colour
-changes most between the thing's returns and those of what holds still (watershed). Above the scanner's field the roof
-is the height along which the picture has an edge.
+LiDAR points on a thing lie some pixels apart, miss its outline, and end at the upper edge of the scanner's field. What
+lies between them is the thing's; how far it goes beyond them the picture tells: the outline is put where colour changes
+most between the thing's LiDAR points and those of what holds still (watershed). Above the scanner's field the roof is
+the height along which the picture has an edge.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ WORKING_PX = 700
 """Pictures are averaged down until the longer side is no longer than this."""
 _FREE_REACH = 0.5
 _FREE_PX = 1.0
-"""A return stands for half the way to the next one; the outline may lie beyond that by so many times the way between
-two, and so many pixels."""
+"""A LiDAR point stands for half the way to the next one; the outline may lie beyond that by so many times the way
+between two, and so many pixels."""
 _STRONG_EDGE, _WEAK_EDGE = 6.0, 2.5
 """Steepest change from one pixel to the next, in grey levels, that counts; and the least mean along an edge."""
 _STANDS_OUT = 1.2
@@ -40,13 +40,13 @@ def grow_moving(
     reach_px: Float[np.ndarray, "n"],
     still: Bool[np.ndarray, "h w"],
 ) -> Bool[np.ndarray, "h w"]:
-    """Grow the returns on moving things to the things' outlines.
+    """Grow the LiDAR points on moving things to the things' outlines.
 
     Args:
         picture: RGB.
-        returns_px: where returns on moving things are seen, column and row.
-        reach_px: how far apart returns are there.
-        still: pixels with a return on what holds still, and those that are not used.
+        returns_px: where LiDAR points on moving things are seen, column and row.
+        reach_px: how far apart LiDAR points are there.
+        still: pixels with a LiDAR point on a still thing, and those that are not used.
 
     Returns:
         True = a thing that moves.

@@ -5,9 +5,9 @@ the horizon, is far by all that is known, is brighter than the ground, never red
 smooth bright part that is high up or reaches the picture's upper rim. In doubt a pixel is not sky: a prior that is kept
 can be weighed down later, one that was removed is lost.
 
-It is looked for in three steps. First whole smooth regions are judged: those that go on below the horizon, hold LiDAR
-returns, or are whiter than a bluer sky beside them are house fronts and vans. Then those that are left grow to
-all that hangs together with them and is alike. Last come the small holes close by, as between twigs.
+The search has three steps. First, whole smooth regions are judged: those that continue below the horizon, contain LiDAR
+points, or are whiter than a bluer sky beside them are house fronts and vans. Then the remaining regions grow to all
+that is connected with them and alike. Last come the small holes close by, as between twigs.
 """
 
 from __future__ import annotations
@@ -77,8 +77,8 @@ _ROUNDS = 3
 _MOST_BELOW = 0.25
 """A region goes on below the horizon if so much lies there, as a share of what lies above."""
 _MOST_RETURNS = 0.3
-"""Returns in a region, as a share of those to be expected: the sky has none, but for where it runs into a car's roof
-or twigs."""
+"""LiDAR points in a region, as a share of those to be expected: the sky has none, but for where it runs into a car's
+roof or twigs."""
 _FEWEST_RETURNS = 8
 _NARROWEST = 1 / 60
 """Radius of the disc, as a share of the longer side, that fills most of a grey or white sky."""
@@ -121,7 +121,7 @@ def find_sky(
         mask: True = use: inside the lens, not the vehicle.
         up_in_camera: unit vector away from the ground, in the camera's frame.
         camera: of the picture, at its size. Its rays are worked out once and remembered.
-        lidar_m: distance of LiDAR's returns in metres, 0 = none. A return is no sky, however far.
+        lidar_m: distance of LiDAR points in metres, 0 = none. A pixel with one is no sky, however far it is.
         mono_m: monocular distance in metres, 0 = none; None without.
 
     Returns:
@@ -282,7 +282,7 @@ def _upper_rim(blocks: _Blocks) -> Bool[np.ndarray, "h w"]:
 
 
 def _surfaces(blocks: _Blocks) -> Bool[np.ndarray, "h w"]:
-    """Smooth bright regions that a surface makes: they go on below the horizon, or hold as many returns as others."""
+    """Smooth bright regions of a surface: they continue below the horizon, or have as many LiDAR points as others."""
     labels, sizes = components(blocks.like_sky & blocks.smooth)
 
     def sums(values: Shaped[np.ndarray, "h w"]) -> Float[np.ndarray, "n"]:

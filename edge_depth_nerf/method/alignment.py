@@ -2,12 +2,11 @@
 
 Pure. Maps are H×W metres along the ray, 0 = none. The curve is a line in logarithms, log d = scale + exponent · log m,
 fitted robustly (it measures better than a line in inverse distance: docs/prior.md); beyond the distances that have
-returns it goes on as a factor. What it leaves, log d - log m, is
-carried from the returns over the picture on a pyramid of coarse grids over column, row and log m, so that it crosses
-no edge of the monocular map. A cell's value is the mean of its returns, drawn by an imagined return to the value of
-the coarser cell around it; the coarsest is drawn to 0 the same way, so the correction vanishes where there are no
-returns. The frame's own returns alone decide: nothing of another frame enters, except the drive's fit where a frame
-has too few of them.
+LiDAR points it continues as a factor. Its residual, log d - log m, is spread from the LiDAR points over the picture on
+a pyramid of coarse grids over column, row and log m, so that it crosses no edge of the monocular map. A cell's value is
+the mean over its LiDAR points. An imagined point draws it to the value of the coarser cell around it; the coarsest is
+drawn to 0 the same way, so the correction vanishes where there are no LiDAR points. Only the frame's own LiDAR points
+decide: nothing of another frame is used, except the drive's fit where a frame has too few of them.
 """
 
 from __future__ import annotations
@@ -26,11 +25,11 @@ from edge_depth_nerf.base.errors import InputError
 Align = Literal["none", "global", "local"]
 
 LEAST_RETURNS = 50
-"""With fewer returns a frame takes the drive's fit."""
+"""With fewer LiDAR points a frame takes the drive's fit."""
 EXPONENT_RANGE = (0.5, 2.0)
 """The exponent stays within: beyond, the map has nothing to do with the distances."""
 BEYOND_SHARE = 0.005
-"""This share of the returns, at either end, does not count where the curve's range is taken."""
+"""This share of the LiDAR points, at either end, is left out of the curve's range."""
 OUTLIER_SCALE = 8.0
 """A residual of so many robust standard deviations counts a quarter (the weight is 1 / (1 + u²)²)."""
 
@@ -41,17 +40,17 @@ FINEST_CELL_LOG = 0.07
 LEVELS = 6
 """Grids of the pyramid; each has cells of twice the side of the one below, the coarsest of a fifth of the picture."""
 IMAGINED_RETURNS = 0.2
-"""So many returns with the coarser cell's value are added to each cell."""
+"""So many imagined LiDAR points with the coarser cell's value are added to each cell."""
 JUDGING_RETURNS = 0.5
-"""The same where outliers are looked for: a return alone in its cell is judged by those around."""
+"""The same in the search for outliers: a LiDAR point alone in its cell is judged by those around."""
 
 
 @dataclass(frozen=True)
 class Fit:
-    """d = exp(log_scale) · m ** exponent where it was fitted; beyond, d/m stays as it is at the end of that range.
+    """d = exp(log_scale) · m ** exponent where it was fitted; beyond, d/m keeps its value at the end of that range.
 
-    A floor just before the camera has no returns: an exponent carried on to a tenth of the least fitted distance would
-    be a guess.
+    A floor just before the camera has no LiDAR points: an exponent continued to a tenth of the least fitted distance
+    would be a guess.
     """
 
     log_scale: float = 0.0
@@ -82,7 +81,7 @@ class Aligned:
     fit: Fit
     """The picture's curve, before the local correction."""
     fit_of: Literal["none", "frame", "drive"]
-    """Whose returns made it. drive: the frame has fewer than LEAST_RETURNS; there is no local correction then."""
+    """Whose LiDAR points made it. drive: the frame has fewer than LEAST_RETURNS; there is no local correction then."""
     returns: int
     """Pixels that have both LiDAR and mono."""
 
@@ -107,7 +106,7 @@ def fit_logs(lidar_m: Float[np.ndarray, "n"], mono_m: Float[np.ndarray, "n"]) ->
     """Fit scale and exponent, robust against outliers (iteratively reweighted least squares, Geman-McClure weights).
 
     Args:
-        lidar_m: distances of returns, all positive, at least one.
+        lidar_m: distances of LiDAR points, all positive, at least one.
         mono_m: the map at the same pixels, all positive.
 
     """
@@ -139,11 +138,11 @@ def align(
     """Fit a frame's monocular map to its LiDAR.
 
     Args:
-        lidar_m: LiDAR distance, 0 = no return.
+        lidar_m: LiDAR distance, 0 = no LiDAR point.
         mono_m: monocular distance, 0 = none.
         valid: True where the picture may be used.
-        mode: none leaves the map as it is; global fits scale and exponent; local corrects what they leave.
-        drive_fit: what a frame with fewer than LEAST_RETURNS takes; None leaves its map as it is.
+        mode: none leaves the map unchanged; global fits scale and exponent; local corrects what they leave.
+        drive_fit: used for a frame with fewer than LEAST_RETURNS LiDAR points; None leaves its map unchanged.
 
     Raises:
         InputError: the maps differ in size, or the mode is unknown.

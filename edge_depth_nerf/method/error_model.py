@@ -1,19 +1,19 @@
-"""How far a prior is trusted: its error at returns that it was not made of, as a function of what is known of a pixel.
+"""How far a prior is trusted: its error at LiDAR points that it was not made of, as a function of a pixel's features.
 
 Pure. The relative error |d̃ - d| / d̃ is described by a product of factors, one for each feature of the pixel, each a
 curve through its values at a few knots:
 
 distance_m    d̃
 theta_deg     angle of the ray from the optical axis
-nearest_px    distance in the picture from the nearest return that the prior was made of; 0 at a return
+nearest_px    distance in the picture from the nearest LiDAR point that the prior was made of; 0 at a point
 spread        spread of what Eq. 5 averaged, as a part of d̃
 step          largest less least log of the aligned monocular map over 3×3 pixels: an edge is near
 
 σ̂ = d̃ · base · Π factor. The factors are fitted in turn so that in every bin around a knot 95 % of the errors are
 within 2 σ̂. (Errors have heavy tails: with 68 % within 1 σ̂ instead, fewer than 90 % are within 2.)
 
-One such model is of pixels without a return, from held-out returns. Another is of pixels that keep theirs: no return is
-held out there, but returns can be held against their neighbours.
+One such model is of pixels without a LiDAR point, from held-out points. Another is of pixels that keep theirs: no point
+is held out there, but points can be compared with their neighbours.
 """
 
 from __future__ import annotations
@@ -82,9 +82,9 @@ def pixel_features(
 
     Args:
         distance_m: d̃, 0 = none.
-        spread_m: of what was averaged into it, whether or not a return was kept.
+        spread_m: of what was averaged into it, whether or not a LiDAR point was kept.
         mono_m: the aligned monocular map, 0 = none.
-        returns: the returns that the prior was made of.
+        returns: the LiDAR points that the prior was made of.
         theta_rad: angle of each ray from the optical axis.
 
     """
@@ -173,8 +173,8 @@ def fit_error_model(
 ) -> ErrorModel | None:
     """Fit the factors to errors; None for fewer than LEAST_JUDGED.
 
-    Without any pixel at a return the factor there is that of the next pixel over √2: a held-out error is made of two,
-    that of the prior and that of the held-out return, and at a return only the latter is left.
+    Without any pixel at a LiDAR point the factor there is that of the next pixel over √2: a held-out error consists of
+    two, that of the prior and that of the held-out point, and at a point only the latter is left.
 
     Args:
         features: of the pixels, n each.
@@ -216,13 +216,14 @@ def fit_error_model(
 def error_of_returns(
     lidar_m: Float[np.ndarray, "h w"], returns: Bool[np.ndarray, "h w"]
 ) -> tuple[Bool[np.ndarray, "h w"], NDArray[np.float32]]:
-    """How far returns lie from a line through their two neighbours, in the row or the column, whichever is worse.
+    """How far LiDAR points lie from a line through their two neighbours, in the row or the column, whichever is worse.
 
     On a plane inverse distance is linear in the picture, nearly so for a fisheye over three pixels. What is left is the
-    noise of three returns, that of one after division by √1.5, with what poses, sweeps of other moments and edges add.
+    noise of three LiDAR points, that of one after division by √1.5, with what poses, sweeps of other frames and edges
+    add.
 
     Returns:
-        Which returns have neighbours, and their relative errors (0 elsewhere).
+        Which LiDAR points have neighbours, and their relative errors (0 elsewhere).
 
     """
     inverse = np.where(returns, 1 / np.where(returns, lidar_m, 1), 0).astype(np.float32)
@@ -250,7 +251,7 @@ class FrameAlignment:
     fit: Fit
     """The picture's curve."""
     held_out_before: float | None
-    """Mean relative error of the map as it came, at returns left out of the alignment; None if none was."""
+    """Mean relative error of the map as it came, at LiDAR points held out of the alignment; None if none was."""
     held_out_after: float | None
     """The same of the aligned map."""
 
@@ -267,7 +268,7 @@ class BeyondField:
     reach_rad: tuple[float, float]
     """Elevations between which these were: least and largest."""
     reach_px: float
-    """How far at most they were from the nearest pixel with a return or a distance from motion."""
+    """How far at most they were from the nearest pixel with a LiDAR point or a distance from motion."""
 
     def network_reaches(
         self, elevation_rad: Float[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]
@@ -276,7 +277,7 @@ class BeyondField:
 
         Args:
             elevation_rad: of each ray.
-            known: pixels with a return or a distance from motion.
+            known: pixels with a LiDAR point or a distance from motion.
 
         """
         if self.network_model is None:
@@ -296,7 +297,7 @@ class MotionTrust:
     mono_relative_error: float
     """The same of the aligned monocular maps, where motion has a distance, too."""
     error_model: ErrorModel
-    """Of the prior's pixels without a return that motion has a part in, in LiDAR's field."""
+    """Of the prior's pixels without a LiDAR point that motion has a part in, in LiDAR's field."""
     beyond: BeyondField | None = None
     """None in calibrations of before."""
 
@@ -308,16 +309,16 @@ class Trust:
     made_of: str
     """Key of the files and options it was made from."""
     error_model: ErrorModel | None
-    """Of pixels without a return; None where too few returns could be held out."""
+    """Of pixels without a LiDAR point; None where too few points could be held out."""
     return_model: ErrorModel | None
-    """Of pixels that keep their return; None where error_model says it, too."""
+    """Of pixels that keep their LiDAR point; None where error_model states it, too."""
     field_rad: tuple[float, float]
     """Elevations above the horizon that LiDAR reached, least and largest."""
     everywhere: bool
     """Whether the source of the monocular maps was trained elsewhere: then there is a prior beyond LiDAR's field, too,
     of a sigma that nothing there was measured by."""
     drive_fit: Fit | None
-    """Curve of all frames together, for those with few returns."""
+    """Curve of all frames together, for those with few LiDAR points."""
     frames: tuple[FrameAlignment, ...] = field(default=())
     """The training frames it was made from."""
     motion: MotionTrust | None = None

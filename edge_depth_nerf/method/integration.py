@@ -1,9 +1,9 @@
 """The depth prior: LiDAR and monocular distance integrated into one dense map, and how far each pixel is trusted.
 
-All maps are H×W, metres along the ray, any leading batch dimensions; maps of a batch do not mix. `lidar_m` is
-D (0 = no return), `mono_m` D̂ (0 = no estimate), `valid` the pixels that may be used at all (True = use).
-A pixel outside `valid`, or whose d̂ is not a finite positive number, gives no weight and gets none; outside the
-picture there is nothing. Where the prior is 0 there is none. A return that is not finite or not positive is none.
+All maps are H×W, metres along the ray, any leading batch dimensions; maps of a batch do not mix. `lidar_m` is D (0 = no
+LiDAR point), `mono_m` D̂ (0 = no estimate), `valid` the pixels that may be used at all (True = use). A pixel outside
+`valid`, or whose d̂ is not a finite positive number, gives no weight and gets none; outside the picture there is
+nothing. Where the prior is 0 there is none. A LiDAR distance that is not finite or not positive counts as none.
 
 Eq. 7   g  = exp(-(k² + l²) / 2σ_s²) · exp(-(d̂[i,j] - d̂[i+k,j+l])² / 2σ_d²),   k, l in -r .. r, kernel 2r + 1
 Eq. 5   d̃ = (1/η) Σ g · (α d 1(d > 0) + (1-α) d̂ 1(d = 0))                       d, d̂ read at [i+k, j+l]
@@ -14,8 +14,8 @@ weight ρ that the measured errors of both give:
 
         (1-α) d̂ 1(d = 0)  becomes  (1-α) (ρ m + (1-ρ) d̂) 1(d = 0)
 
-where a pixel has both, and the one it has elsewhere. This d̂, of both, is also what g compares. Without motion all is
-as it was.
+where a pixel has both, and the one it has elsewhere. This d̂, of both, is also what g compares. Without motion nothing
+changes.
 
 Nothing here is differentiated: the prior is data. CPU tensors are integrated by compiled loops
 (`integration_numba`), CUDA tensors by torch; both compute in float64, which keeps the ratios of weights up to
@@ -188,13 +188,13 @@ def integrate_depth(
     `spread_m` is the weighted standard deviation of the very values that were averaged, from sums of their
     differences to the centre's d̂ (so that 80 m do not swallow 8 cm).
 
-    normalise "per-source" first divides each source's weights by the sum of its spatial weights alone, then lets
-    alpha weigh the two: how many pixels a source has in the window no longer counts, how well they agree with the
-    centre still does. (Were each source divided by its whole weight, a lone return behind an edge would get the
-    full alpha, and the edges would be gone.) A source that is alone in the window gets all.
+    normalise "per-source" first divides each source's weights by the sum of its spatial weights alone, then lets alpha
+    weigh the two: how many pixels a source has in the window no longer counts, how well they agree with the centre
+    still does. (Were each source divided by its whole weight, a lone LiDAR point behind an edge would get the full
+    alpha, and the edges would be gone.) A source that is alone in the window gets all.
 
     Args:
-        lidar_m: D, metres along the ray, 0 = no return.
+        lidar_m: D, metres along the ray, 0 = no LiDAR point.
         mono_m: D̂, metres along the ray, 0 = no estimate.
         valid: True where the pixel may be used.
         options: the defaults are the paper's.
@@ -348,12 +348,12 @@ def select_prior(
 ) -> IntegratedDepth:
     """Give the prior made of LiDAR and monocular distance (`integrate_depth`) or of one source alone (Table 3).
 
-    LiDAR alone is D where it has a return, spread 0 and monocular share 0; any other source alone is an estimate: its
+    LiDAR alone is D where it has a point, spread 0 and monocular share 0; any other source alone is an estimate: its
     map, spread 0 and share 1.
 
     Args:
         depth_source: integrated, or the name of a source.
-        maps: distance in metres by source, 0 = none; those that are not asked for may be missing or None.
+        maps: distance in metres by source, 0 = none; those that are not needed may be missing or None.
         valid: where the picture may be used.
         options: of the integration.
 

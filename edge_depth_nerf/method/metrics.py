@@ -144,8 +144,8 @@ def lpips_weights() -> tuple[Path, str]:
 def load_lpips() -> torch.nn.Module | None:
     """Build LPIPS (AlexNet, as nerfstudio has it) if AlexNet's weights lie in torch.hub's folder.
 
-    Nothing is ever downloaded, and no figure comes from random weights: without the file the answer is None, and
-    the log says so once; likewise for a file that cannot be read. The module takes pictures `[1, 3, h, w]` in 0 to 1.
+    Nothing is ever downloaded, and no figure comes from random weights: without the file the answer is None, and the
+    log reports it once; likewise for a file that cannot be read. The module takes pictures `[1, 3, h, w]` in 0 to 1.
     """
     path, url = lpips_weights()
     if not path.is_file():

@@ -1,8 +1,8 @@
 """The depth prior of a frame: aligned, integrated once, kept on disk.
 
-Maps are H×W metres along the ray, 0 = no prior. A cached prior carries a key of everything it was made of (the
-maps, the mask, the options, the calibration, the version of this format); a file that is not whole or does not fit
-is made anew.
+Maps are H×W metres along the ray, 0 = no prior. A cached prior carries a key of everything it was made of (the maps,
+the mask, the options, the calibration, the version of this format); a file that is not whole or does not fit is made
+again.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ LOWEST_SKY_DEG = 2.0
 """Nearer to the horizon a missing monocular distance may be the end of the world's hills as well as sky."""
 
 CALIBRATED = (INTEGRATED, "mono")
-"""The sources whose error is measured against LiDAR returns left out."""
+"""The sources whose error is measured against held-out LiDAR points."""
 
 
 def default_source(sources: Container[str]) -> str | None:
@@ -152,7 +152,7 @@ def sky_of(
     picture: UInt8[np.ndarray, "h w 3"],
     mask: Bool[np.ndarray, "h w"],
 ) -> Bool[np.ndarray, "h w"]:
-    """Where a monocular map says that nothing is there: no distance, above the horizon, bright, and no LiDAR return.
+    """Where a monocular map says that nothing is there: no distance, above the horizon, bright, and no LiDAR point.
 
     `process` and `estimate-depth` take the sky out of the maps; maps of one's own may lack a distance elsewhere, too.
     """
@@ -169,13 +169,13 @@ class IntegratedFrame:
 
     distance_m: NDArray[np.float32]
     spread_m: NDArray[np.float32]
-    """Of what was averaged, also where a return was kept."""
+    """Of what was averaged, also where a LiDAR point was kept."""
     mono_m: NDArray[np.float32]
     """The aligned monocular map, with what motion adds to it."""
     returns: NDArray[np.bool_]
-    """The returns that entered."""
+    """The LiDAR points that entered."""
     from_motion: NDArray[np.bool_]
-    """Where motion has a part, but for returns."""
+    """Where motion has a part, except at LiDAR points."""
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,7 @@ class MotionMap:
     """H×W, True where the monocular map may be trusted: beyond, there is a prior from motion alone."""
     alone: NDArray[np.bool_]
     """H×W, True where motion counts alone if it has a distance: beyond LiDAR's field. There the monocular map is fitted
-    to it, as to LiDAR's returns in the field."""
+    to it, as to LiDAR points in the field."""
 
 
 def integrate_frame(
@@ -205,7 +205,7 @@ def integrate_frame(
     """Align and integrate a frame under a calibration: the prior whose error `Trust` describes.
 
     Args:
-        lidar_m: H×W LiDAR distance, 0 = no return.
+        lidar_m: H×W LiDAR distance, 0 = no LiDAR point.
         mono_m: H×W monocular distance, 0 = none.
         mask: H×W, True where the picture may be used.
         depth_source: integrated, or mono alone.
@@ -297,7 +297,7 @@ def motion_map(
         motion_m: H×W, 0 = none.
         trust: the drive's calibration, with what it says of motion.
         view: of the picture.
-        lidar_m: its LiDAR, 0 = no return; None without.
+        lidar_m: its LiDAR, 0 = no LiDAR point; None without.
 
     """
     assert trust.motion is not None

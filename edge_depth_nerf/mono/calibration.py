@@ -1,16 +1,16 @@
 """A drive's calibration of trust: how well its monocular maps fit LiDAR, and how wrong its priors are.
 
-Made from training frames alone. Of each frame some returns are left out, the prior is made of the rest, and compared
-with what was left out: whole blocks of 64 px (of 1400), single returns, and in every second frame LiDAR's lowest and
-highest rows, beyond which a prior is extrapolated. Above a frame's own returns the prior is compared with what the
-returns of the other frames show there. How much distances from motion count beside the monocular maps
-follows from the errors of both at the returns that are left out. The result is kept beside the scene's maps.
+It is made only from training frames. In each frame some LiDAR points are held out, the prior is made of the rest, and
+compared with the held-out points: whole blocks of 64 px (of 1400), single points, and in every second frame LiDAR's
+lowest and highest rows, beyond which a prior is extrapolated. Above a frame's own LiDAR points the prior is compared
+with what the points of the other frames show there. The weight of distances from motion beside the monocular maps
+follows from the errors of both at the held-out points. The result is kept beside the scene's maps.
 
 Beyond LiDAR's field there is nothing but motion to compare with. Motion's own error is measured in the field, where
-LiDAR is, as a function of what is known of it: a prior is made of motion alone and compared with the returns. The
+LiDAR is, as a function of what is known of it: a prior is made of motion alone and compared with the LiDAR points. The
 monocular map's error is measured beyond the field, on distances from motion in places that neither the network nor the
 prior saw (`mono.motion_seen`). It is used where motion has none, at outlines and far ahead, where a network is worse
-than elsewhere: by how much is measured in the field, at returns with and without a distance from motion.
+than elsewhere: by how much is measured in the field, at LiDAR points with and without a distance from motion.
 """
 
 from __future__ import annotations
@@ -70,18 +70,18 @@ MOST_FRAMES = 100
 HELD_OUT_BLOCK_SHARE = 64 / 1400
 """Side of the blocks that are left out, as a share of the picture's width."""
 HELD_OUT_PART = 0.1
-"""So much of the blocks, and of the single returns, is left out."""
+"""So much of the blocks, and of the single LiDAR points, is held out."""
 HELD_OUT_ROWS = (0.1, 0.95)
-"""In every second frame returns below and above these quantiles of their elevation are left out."""
+"""In every second frame LiDAR points below and above these quantiles of their elevation are held out."""
 FIELD_QUANTILES = (0.001, 0.999)
-"""LiDAR's field of elevation, but for stray returns."""
+"""LiDAR's field of elevation, except for stray points."""
 _BEYOND_VERSION = 1
 """Part of the key of calibrations with motion: raised when they measure otherwise beyond LiDAR's field."""
 REACH_QUANTILE = 0.95
 """Of how far left-out distances from motion lie from the nearest that is known: beyond, nothing is measured."""
 _JUDGED_A_FRAME = 5_000
 _FOR_THE_DRIVE_A_FRAME = 2_000
-"""So many returns of a frame enter; more tell nothing new."""
+"""So many LiDAR points of a frame are used; more tell nothing new."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,7 +89,7 @@ class MeasuredBeyond:
     """One training frame's part in `BeyondField`."""
 
     motion_features: dict[str, NDArray[np.float32]]
-    """Of pixels with a return and a distance from motion."""
+    """Of pixels with a LiDAR point and a distance from motion."""
     motion_error: NDArray[np.float32]
     """|d̃ - d| / d̃ there, of a prior made of motion alone."""
     network_features: dict[str, NDArray[np.float32]]
@@ -97,7 +97,7 @@ class MeasuredBeyond:
     network_error: NDArray[np.float32]
     """|d̃ - d| / d̃ there, of a prior made without it."""
     field_features: dict[str, NDArray[np.float32]]
-    """Of pixels with a left-out return."""
+    """Of pixels with a held-out LiDAR point."""
     field_error: NDArray[np.float32]
     """|d̃ - d| / d̃ there, of a prior made without motion."""
     field_matched: NDArray[np.bool_]
@@ -113,15 +113,15 @@ class MeasuredFrame:
     alignment: FrameAlignment
     """How well its map was fitted."""
     features: dict[str, NDArray[np.float32]]
-    """Of the pixels of left-out returns, and of those that other frames' returns show."""
+    """Of the pixels of held-out LiDAR points, and of those that other frames' points show."""
     relative_error: NDArray[np.float32]
     """|d̃ - d| / d̃ there."""
     return_features: dict[str, NDArray[np.float32]]
-    """Of pixels that keep their return."""
+    """Of pixels that keep their LiDAR point."""
     return_error: NDArray[np.float32]
-    """Relative error of these returns against their neighbours."""
+    """Relative error of these LiDAR points against their neighbours."""
     elevation_rad: NDArray[np.float32]
-    """Of all returns, above the horizon."""
+    """Of all LiDAR points, above the horizon."""
     lidar_m: NDArray[np.float32]
     """Of pixels with LiDAR and mono."""
     mono_m: NDArray[np.float32]
@@ -135,10 +135,10 @@ class MeasuredFrame:
 def held_out_returns(
     returns: NDArray[np.bool_], elevation_rad: NDArray[np.float32], number: int
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which of a frame's returns to leave out, and which of these lie in whole blocks.
+    """Which of a frame's LiDAR points to hold out, and which of these lie in whole blocks.
 
     Args:
-        returns: H×W, True at a return.
+        returns: H×W, True at a LiDAR point.
         elevation_rad: H×W, of each ray.
         number: of the frame in the calibration; seeds the choice.
 
@@ -181,7 +181,7 @@ def saved_trust(
     training_images: Collection[Path] | None = None,
     depth_source: str = INTEGRATED,
 ) -> Trust | None:
-    """The scene's calibration, if one is there that was made of the files as they are and for these options."""
+    """The scene's calibration, if there is one made of the present files and for these options."""
     made_of = _made_of(scene, _chosen(scene, training_images), depth_source, options)
     for path in (scene.folder / TRUST_FILE, _cached(scene, cache, made_of)):
         try:
@@ -286,7 +286,7 @@ def _with_motion(scene: SceneFolder, depth_source: str, options: PriorOptions) -
 
 
 def _trained_on(scene: SceneFolder) -> str:
-    """Where the maps' source was trained: elsewhere only if it says so."""
+    """Where the maps' source was trained: elsewhere only if the source states it."""
     later, drive = scene.meta.get("mono"), scene.meta.get("source")
     if isinstance(later, dict):
         found = later.get("trained_on")
@@ -380,7 +380,7 @@ def _within(field_rad: tuple[float, float], view: View) -> NDArray[np.bool_]:
 
 
 def _field_rad(elevations_rad: Sequence[NDArray[np.float32]]) -> tuple[float, float]:
-    """LiDAR's field by the elevations of all returns."""
+    """LiDAR's field by the elevations of all LiDAR points."""
     every = np.concatenate(elevations_rad)
     low, high = np.quantile(every, FIELD_QUANTILES) if len(every) else (0.0, 0.0)
     return float(low), float(high)
@@ -389,9 +389,9 @@ def _field_rad(elevations_rad: Sequence[NDArray[np.float32]]) -> tuple[float, fl
 def _errors_of_both(
     scene: SceneFolder, options: PriorOptions, numbered: tuple[int, ScenePicture]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """2×N: relative errors of motion and of the monocular map, at returns left out of the latter's alignment.
+    """2×N: relative errors of motion and of the monocular map, at LiDAR points held out of the latter's alignment.
 
-    And the elevation of every return.
+    And the elevation of every LiDAR point.
     """
     number, picture = numbered
     maps = scene.maps(picture)
@@ -428,17 +428,17 @@ def measure_frame(
     depth_source: str = INTEGRATED,
     motion: MotionMap | None = None,
 ) -> MeasuredFrame:
-    """Leave out some of a frame's returns, make its prior of the rest, and compare.
+    """Hold out some of a frame's LiDAR points, make its prior of the rest, and compare.
 
     Args:
         name: of the frame, for the report.
         number: of the frame in the calibration: decides what is left out.
-        lidar_m: H×W LiDAR distance, 0 = no return.
+        lidar_m: H×W LiDAR distance, 0 = no LiDAR point.
         mono_m: H×W monocular distance as it came, 0 = none.
         usable: H×W, True where the picture may be used.
         view: the angles of its rays.
         options: of the prior.
-        far_seen_m: H×W distance that the returns of other frames show above this one's, 0 = none.
+        far_seen_m: H×W distance that the LiDAR points of other frames show above this one's, 0 = none.
         depth_source: what the prior is made of: integrated, or mono alone.
         motion: what is known from motion.
 
@@ -500,11 +500,11 @@ def measure_beyond(
     motion_sigma_m: NDArray[np.float32],
     left_out: NDArray[np.bool_],
 ) -> MeasuredBeyond:
-    """Measure a frame's prior as it is where LiDAR does not reach: that of motion alone, and that of the network.
+    """Measure a frame's prior in the form used where LiDAR does not reach: from motion alone, and from the network.
 
     Args:
         number: of the frame in the calibration: decides which pixels are judged.
-        lidar_m: H×W LiDAR distance, 0 = no return.
+        lidar_m: H×W LiDAR distance, 0 = no LiDAR point.
         mono_m: H×W monocular distance as it came, 0 = none.
         usable: H×W, True where the picture may be used.
         view: the angles of its rays.

@@ -1,8 +1,8 @@
 """Monocular maps of a source that this project did not train, made metric: by ready-made networks, or by file.
 
-Metric maps stay as they are, but that views of one picture are brought to agree. Others are fitted to LiDAR: each
-picture to its own returns, for a map of unknown scale has another scale in every picture. One with too few returns
-takes scale and shift of the drive, from pictures for training. So nothing of a held-out picture enters another one.
+Metric maps stay unchanged, except that views of one picture are made to agree. Others are fitted to LiDAR: each picture
+to its own LiDAR points, because a map of unknown scale has another scale in every picture. A picture with too few
+points takes scale and shift of the drive, from training pictures. So nothing of a held-out picture enters another one.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
 
 _SAMPLES = 3000
 _SAMPLES_FOR_THE_DRIVE = 300
-"""Returns of a picture, and so many other pixels."""
+"""LiDAR points of a picture, and so many other pixels."""
 
 
 @dataclass
@@ -59,7 +59,7 @@ class FittedMaps:
                 raise self._no_lidar(camera)
 
     def __iter__(self) -> Iterator[tuple[ScenePicture, Float32[np.ndarray, "h w"]]]:
-        """Give H×W metres along the ray of all pictures; those with few returns come last."""
+        """Give H×W metres along the ray of all pictures; those with few LiDAR points come last."""
         waiting: list[ScenePicture] = []
         drive: dict[str, list[Samples]] = {}
         for picture in self.scene.pictures:

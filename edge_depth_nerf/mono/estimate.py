@@ -2,8 +2,8 @@
 
 They come from a network trained on the scenes' own LiDAR, from a ready-made one, or from files of another tool.
 
-Held-out pictures, which scenes keep for judging, are predicted and nothing else: they are neither trained on nor used
-to stop. For stopping, one moment of eight of those to be trained on is kept aside, with all its cameras.
+Held-out pictures, which scenes keep for the evaluation, are only predicted: they are neither trained on nor used to
+stop. For stopping, one of eight training frames is kept aside, with all its cameras.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ Split = tuple[list[ScenePicture], list[ScenePicture]]
 WEIGHTS = "mono_network.safetensors"
 """The weights' file in a scene."""
 KEEP_EVERY = 8
-"""One training moment of so many is kept for stopping."""
+"""One training frame of so many is kept for stopping."""
 _FEW_STEPS = 200
 """Less makes poor maps: on a rendered street the error is 27 % after 42 steps, 4 % after 1,000."""
 _HEIGHT_PICTURES = 20
@@ -445,7 +445,7 @@ def _key(scene: SceneFolder) -> str:
 
 
 def training_split(scene: SceneFolder) -> Split:
-    """Divide a scene's training pictures, whole moments each: to train on, and to stop by.
+    """Divide a scene's training pictures by whole frames: to train on, and to stop by.
 
     Raises:
         InputError: it has no LiDAR, or does not say what is held out.
@@ -508,7 +508,7 @@ def _one_thread() -> Iterator[None]:
 def predicted_maps(network: DepthNetwork, scene: SceneFolder) -> Iterator[tuple[str, Float32[np.ndarray, "h w"]]]:
     """Predict all pictures of a scene, one after another: file_path and H×W metres along the ray, 0 in the sky.
 
-    The network never learns of the sky, where LiDAR has no returns; so it is looked for in the picture.
+    The network never learns about the sky, where LiDAR has no points; so the sky is found in the picture.
     """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     # as it was trained: weights in another order in memory round otherwise
@@ -527,8 +527,8 @@ def without_sky(
 ) -> Float32[np.ndarray, "h w"]:
     """Look for the sky in a picture, and leave it out of its map.
 
-    What has a return is no sky, nor is what motion matched. Matching puts outlines some pixels off, so that beside
-    one a distance does not say that there is no sky around.
+    A pixel with a LiDAR point is no sky, nor is one that motion matched. Matching puts outlines some pixels off, so a
+    distance beside an outline does not prove that there is no sky around.
 
     Args:
         scene: of the picture.

@@ -31,9 +31,9 @@ Taught = Callable[[ScenePicture], tuple[NDArray[np.float32], NDArray[np.float32]
 LARGEST_SET_BYTES = 8 << 30
 """More pictures than fit in this are thinned evenly."""
 _GROUND_SINE = -math.sin(math.radians(12.0))
-"""Returns below this elevation are mostly of the ground."""
+"""LiDAR points below this elevation are mostly of the ground."""
 _GROUND_QUANTILE = 0.8
-"""Of how far returns lie below the camera: kerbs and parked cars lie less deep, nothing much deeper."""
+"""Of how far LiDAR points lie below the camera: kerbs and parked cars lie less deep, nothing much deeper."""
 _MIN_GROUND_RETURNS = 100
 
 
@@ -61,7 +61,7 @@ class Examples:
     up_in_camera: Float32[np.ndarray, "n 3"]
     camera_height_m: Float32[np.ndarray, "n"]
     weight: Float32[np.ndarray, "n h w"] | None = None
-    """How much each distance of `lidar_m` counts, 0 to 1: those from motion less than returns. None: all alike."""
+    """How much each distance of `lidar_m` counts, 0 to 1: those from motion less than LiDAR points. None: all alike."""
 
     def __len__(self) -> int:
         return len(self.rgb)
@@ -133,7 +133,8 @@ def load_examples(
         working_px: longer side at the network.
         multiple_px: what both sides of the arrays are multiples of.
         advance: called after each picture.
-        far_seen: of each scene, what gives more distances of a picture where it has no return; see `mono.far_seen`.
+        far_seen: of each scene, what gives more distances of a picture where it has no LiDAR point; see
+            `mono.far_seen`.
         by_motion: of each scene, what gives distances from motion, for where there is still none; None for a scene
             without. See `mono.motion_seen`.
 
@@ -201,7 +202,7 @@ def small_picture(picture: ScenePicture, size: tuple[int, int]) -> UInt8[np.ndar
 
 
 def small_lidar(scene: SceneFolder, picture: ScenePicture, view: View) -> Float32[np.ndarray, "h w"]:
-    """LiDAR at the network's size: of the returns in a pixel the one nearest to its centre."""
+    """LiDAR at the network's size: of the LiDAR points in a pixel the one nearest to its centre."""
     return _reduced(scene.lidar_m(picture), view)
 
 
@@ -238,10 +239,10 @@ def check_size(pixels: np.ndarray, picture: ScenePicture, layer: str) -> None:
 
 
 def camera_height_m(scene: SceneFolder, pictures: Sequence[ScenePicture], working_px: int) -> float | None:
-    """Height of the cameras above the ground, from some pictures' returns below the horizon.
+    """Height of the cameras above the ground, from some pictures' LiDAR points below the horizon.
 
     Returns:
-        Metres; None where too few returns lie there.
+        Metres; None where too few LiDAR points lie there.
 
     """
     depths = []
@@ -257,10 +258,10 @@ def camera_height_m(scene: SceneFolder, pictures: Sequence[ScenePicture], workin
 
 
 def room_radius_m(examples: Examples) -> float:
-    """Horizontal distance of the room's wall: the geometric mean over returns near and above the horizon.
+    """Horizontal distance of the room's wall: the geometric mean over LiDAR points near and above the horizon.
 
     Returns:
-        Metres; 20 where there are no such returns.
+        Metres; 20 where there are no such LiDAR points.
 
     """
     logs = []

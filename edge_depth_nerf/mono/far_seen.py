@@ -1,9 +1,9 @@
-"""What LiDAR saw from elsewhere: the returns of other moments, as a picture sees them above its own LiDAR's reach.
+"""What LiDAR saw from elsewhere: the points of other frames, as a picture sees them above its own LiDAR's reach.
 
 A scanner's field ends some degrees above the horizon, a fisheye's does not. But what stands high up before a picture
-was in the scanner's field when the vehicle was farther away. So the returns of all training moments are put together
-as points in the world, what moved is taken out, and the rest is projected into each picture, above its own returns
-alone: within their field these are denser, and what they do not show is mostly hidden.
+was in the scanner's field when the vehicle was farther away. So the LiDAR points of all training frames are put
+together in the world, what moved is removed, and the rest is projected into each picture, only above its own points:
+within their field these are denser, and what they do not show is mostly hidden.
 
 A picture is concerned with points within `REACH_M` of it alone. They are found by squares of the ground plane, so that
 the work grows with the length of the drive.
@@ -30,14 +30,14 @@ from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
 VOXEL_M = 0.05
 """The cloud holds one point of each cube of this size."""
 SPACING_RAD = 0.0075
-"""How far apart returns lie, seen from where they were measured: 0.43°, that of a scanner of 64 beams."""
+"""How far apart LiDAR points lie, seen from where they were measured: 0.43°, that of a scanner of 64 beams."""
 FIELD_QUANTILE = 0.99
-"""Above this quantile of its own returns' elevation a picture has next to none of its own."""
+"""Above this quantile of its own LiDAR points' elevation a picture has next to none of its own."""
 REACH_M = 86.0
 """Horizontally: what is judged ends at 60 m; and farther off than this the ground, too, is so little below a camera
 1.7 m up that `_BELOW_SINE` lets it through."""
 ELEVATION_QUANTILES = (0.001, 0.999)
-"""Between these of its returns' elevations lies a scanner's field, but for strays."""
+"""Between these quantiles of its points' elevations lies a scanner's field, except for strays."""
 _ELEVATION_STEP_DEG = 0.01
 _BELOW_SINE = 0.02
 """Points so little below hide what is above."""
@@ -79,19 +79,19 @@ class Cloud:
 
 @dataclass(frozen=True)
 class _Field:
-    """What a picture's own returns reach."""
+    """What a picture's own LiDAR points reach."""
 
     top_sine: float
-    """Sine of their highest elevation, but for a few; 1 without returns."""
+    """Sine of their highest elevation, except for a few; 1 without LiDAR points."""
     reach_m: Float32[np.ndarray, "azimuths"]
-    """How far off, horizontally, the picture can see above them, by azimuth. What a return at the upper edge belongs
-    to may go on above it, as a house does, and hide what is behind."""
+    """How far off, horizontally, the picture can see above them, by azimuth. The thing that a LiDAR point at the upper
+    edge belongs to may continue above it, as a house does, and hide what is behind."""
 
 
 def static_cloud(
     scene: SceneFolder, pictures: Sequence[ScenePicture], advance: Callable[[], None] = lambda: None
 ) -> Cloud:
-    """Put the returns of some pictures together, as far as they are above any of these pictures' own.
+    """Put the LiDAR points of some pictures together, if they are above any of these pictures' own.
 
     What more of the pictures see through than see has moved, and is left out.
 
@@ -139,7 +139,7 @@ def static_cloud(
 def seen_above(
     cloud: Cloud, scene: SceneFolder, picture: ScenePicture, size: tuple[int, int]
 ) -> Float32[np.ndarray, "h w"]:
-    """Project what a cloud has within reach into a picture, above its own returns, without what is or may be hidden.
+    """Project what a cloud has within reach into a picture, above its own points, without what is or may be hidden.
 
     Args:
         cloud: from `static_cloud`.
@@ -164,7 +164,7 @@ def seen_above(
 def field_deg(
     scene: SceneFolder, pictures: Sequence[ScenePicture], advance: Callable[[], None] = lambda: None
 ) -> tuple[float, float] | None:
-    """Elevations between which nearly all of some pictures' own returns lie, within the masks.
+    """Elevations between which nearly all of some pictures' own LiDAR points lie, within the masks.
 
     Args:
         scene: the scene.
@@ -172,7 +172,7 @@ def field_deg(
         advance: called after each picture.
 
     Returns:
-        Degrees above the world's horizon, to 0.01°: the `ELEVATION_QUANTILES`; None without returns.
+        Degrees above the world's horizon, to 0.01°: the `ELEVATION_QUANTILES`; None without LiDAR points.
 
     Raises:
         InputError: a file cannot be decoded, or has another size than its camera.
@@ -220,7 +220,7 @@ def _azimuth(picture: ScenePicture, rays: Float32[np.ndarray, "*shape 3"]) -> ND
 
 
 def _is_above(picture: ScenePicture, points_m: Float64[np.ndarray, "n 3"], top_sine: float) -> Bool[np.ndarray, "n"]:
-    """Whether points lie above a picture's returns, or so little below that they hide what does."""
+    """Whether points lie above a picture's own LiDAR points, or so little below that they hide what does."""
     from_camera = points_m - picture.position_m
     return from_camera[:, 2] > (top_sine - _BELOW_SINE) * np.linalg.norm(from_camera, axis=1)
 
@@ -268,7 +268,7 @@ def _to_camera(picture: ScenePicture, points_m: Float64[np.ndarray, "n 3"]) -> F
 def _votes(
     picture: ScenePicture, points_m: Float64[np.ndarray, "n 3"], lidar_m: Float32[np.ndarray, "h w"]
 ) -> Int32[np.ndarray, "n"]:
-    """1 for each point that the picture's own returns confirm, -1 for each that they saw through, else 0."""
+    """1 for each point that the picture's own LiDAR points confirm, -1 for each that they saw through, else 0."""
     in_camera = torch.from_numpy(_to_camera(picture, points_m))
     pixels, valid = picture.lens.project(in_camera)
     seen = (valid & picture.lens.inside(pixels)).numpy()

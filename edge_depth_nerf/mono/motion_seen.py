@@ -1,9 +1,9 @@
 """What distances from motion teach the depth network, and which of them are left out to judge it by.
 
-Where no LiDAR return ever fell, neither of a picture's own nor of others seen from afar, consistent distances from
-motion are what is known. They count the less the less exact they are. Some places in the world are left out of all
-pictures' training: there the network's error is measured (`mono.calibration`). They are left out by place, not by
-picture, because the same wall is seen from many of them.
+Where no LiDAR point ever fell, neither a picture's own nor one of others seen from afar, only consistent distances from
+motion are known. They count less the less exact they are. Some places in the world are left out of all pictures'
+training: there the network's error is measured (`mono.calibration`). They are left out by place, not by picture,
+because the same wall is seen from many of them.
 
 Lengths are metres, distances along the ray, 0 = none.
 """
@@ -58,7 +58,7 @@ def left_out_pixels(
 def taught_by_motion(
     scene: SceneFolder, picture: ScenePicture
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]] | None:
-    """A picture's distances from motion without those in the places left out, and their weight beside a return's 1.
+    """A picture's distances from motion without those in left-out places, and their weight beside a LiDAR point's 1.
 
     Returns:
         Both at the picture's size, 0 = none; None if the picture has no map.

@@ -7,9 +7,9 @@ relative    depth up to scale and shift
 inverse     one over depth (disparity) up to scale and shift
 
 distance = z / cosine, the cosine of the ray to the axis that z counts along; 1 for maps of distance along the ray. Each
-view of a picture has its own scale and shift. They are found together: views that see the same pixel shall say the same
-distance, and at LiDAR's returns LiDAR's. Errors are differences of log distance, so that near and far count alike;
-their sum, with weights that leave outliers out, is made least by Gauss and Newton's method, from a start by linear
+view of a picture has its own scale and shift. They are found together: views that see the same pixel shall have the
+same distance there, and LiDAR's distance at LiDAR points. Errors are differences of log distance, so that near and far
+count alike. The Gauss-Newton method minimises their sum, with weights that leave outliers out, from a start by linear
 equations.
 """
 
@@ -37,7 +37,7 @@ KIND_SAID: dict[Kind, str] = {
 ANCHOR_WEIGHT = 0.1
 """What views say already counts so much, where there is no LiDAR; that they agree counts 1."""
 WRONG_WAY = -0.5
-"""A rank correlation to LiDAR below this: the map runs against the kind it is said to be of."""
+"""A rank correlation to LiDAR below this: the map runs against its given kind."""
 _LINEAR_ROUNDS = 5
 _ROUNDS = 8
 _robust = partial(robust_weights, least_spread=1e-4)
@@ -72,7 +72,7 @@ class Samples:
     weight: Float[np.ndarray, "views pixels"]
     """How well a view sees the pixel, more than 0 where it does."""
     lidar_m: Float[np.ndarray, "pixels"]
-    """Distance, 0 = no return."""
+    """Distance, 0 = no LiDAR point."""
 
     @staticmethod
     def joined(parts: Sequence[Samples]) -> Samples:
@@ -82,7 +82,7 @@ class Samples:
 
     @property
     def returns(self) -> int:
-        """How many returns some view has a value for."""
+        """How many LiDAR points some view has a value for."""
         return int((self.seen.any(0) & (self.lidar_m > 0)).sum())
 
     @property
@@ -116,11 +116,11 @@ class Layer:
 def take_samples(
     layers: Sequence[Layer], lidar_m: Float[np.ndarray, "h w"], usable: Bool[np.ndarray, "h w"], most: int
 ) -> Samples:
-    """Read the layers at returns, and at other pixels: at most so many of each, drawn evenly.
+    """Read the layers at LiDAR points, and at other pixels: at most so many of each, drawn evenly.
 
     Args:
         layers: of one picture.
-        lidar_m: its LiDAR distance, 0 = no return.
+        lidar_m: its LiDAR distance, 0 = no LiDAR point.
         usable: True where the picture may be used.
         most: number of pixels of each sort.
 

@@ -1,8 +1,8 @@
 """Training of the monocular network on LiDAR: losses, augmentation, the loop with its checkpoints.
 
 Augmentation keeps the lens's geometry true: whatever moves a pixel moves its ray with it, and a mirrored picture gets
-mirrored rays. Distances along rays change in none of it. A step's randomness comes from the seed and the step's number
-alone, so that a training that was killed goes on as if nothing had been.
+mirrored rays. Distances along rays change in none of it. A step's randomness comes only from the seed and the step's
+number, so that a killed training resumes as if it had not been interrupted.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class Batch:
     log_room: Float[Tensor, "n h w"]
     usable: Bool[Tensor, "n h w"]
     lidar_m: Float[Tensor, "n h w"]
-    """0 = no return."""
+    """0 = no LiDAR point."""
     weight: Float[Tensor, "n h w"]
     """Of each distance, 0 to 1."""
 
@@ -108,7 +108,7 @@ def scale_invariant_loss(
 ) -> Float[Tensor, ""]:
     """Scale-invariant log loss (Eigen et al., NIPS 2014, Eq. 4): mean(e²) - balance·mean(e)², over pictures.
 
-    Its square root is taken, so that a few wrong returns do not rule it.
+    Its square root is taken, so that a few wrong LiDAR points do not dominate it.
 
     Args:
         log_error: log(predicted / measured distance).
@@ -154,7 +154,7 @@ def smoothness_loss(
 
 
 def make_batch(examples: Examples, indices: np.ndarray, settings: NetworkSettings, device: torch.device) -> Batch:
-    """Put some examples together, as they are."""
+    """Put some examples together, unchanged."""
 
     def on_device(values: np.ndarray) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(values)).to(device)
@@ -255,15 +255,15 @@ def train(
     device: torch.device | None = None,
     report: Callable[[float, float], None] = lambda share, abs_rel: None,
 ) -> Trained:
-    """Train a network, or go on with a training that was interrupted.
+    """Train a network, or resume an interrupted training.
 
     Args:
         examples: what is trained on.
-        kept: pictures kept for stopping, with returns; None to take the last weights.
+        kept: pictures kept for stopping, with LiDAR points; None to take the last weights.
         settings: the network's.
         options: how.
         start: weights to begin with, of the same settings.
-        checkpoint: file for what a killed training goes on from; one of another training is replaced.
+        checkpoint: file that a killed training resumes from; one of another training is replaced.
         checkpoint_seconds: how often it is written.
         device: where; the GPU if there is one.
         report: called after each step with the share done and the least error so far, infinite before the first look.
@@ -362,7 +362,7 @@ def _step(
 
 @torch.no_grad()
 def abs_rel(network: DepthNetwork, examples: Examples, settings: NetworkSettings, device: torch.device) -> float:
-    """Mean of |predicted - measured| / measured over all returns of the examples."""
+    """Mean of |predicted - measured| / measured over all LiDAR points of the examples."""
     total, count = 0.0, 0
     for first in range(0, len(examples), 4):
         batch = make_batch(examples, np.arange(first, min(first + 4, len(examples))), settings, device)
@@ -419,7 +419,7 @@ def _resume(
 
 
 def as_json(value: Any) -> Any:
-    """As it comes back from a file: tuples become lists."""
+    """As read back from a file: tuples become lists."""
     if isinstance(value, dict):
         return {key: as_json(entry) for key, entry in value.items()}
     return [as_json(entry) for entry in value] if isinstance(value, (list, tuple)) else value

@@ -41,8 +41,8 @@ def allow_numpy_scalars_in_checkpoints() -> None:
 def lpips_not_built() -> Iterator[None]:
     """Keep nerfacto from building LPIPS, which downloads AlexNet's weights at start and enters the state dict.
 
-    nerfacto's `populate_modules` imports the class at that moment, so the name in torchmetrics is swapped for
-    the duration.
+    nerfacto's `populate_modules` imports the class when it is called, so the name in torchmetrics is swapped for the
+    duration.
 
     Works around: https://github.com/nerfstudio-project/nerfstudio/issues/2415.
     Ends with: a nerfstudio that builds its metrics at first use.
@@ -111,7 +111,7 @@ def ignore_deprecations_of_host() -> None:
 
 
 def total_steps(trainer: Trainer) -> int:
-    """All steps of a training, those before it was taken up again too; its `max_num_iterations` are those to come.
+    """All steps of a training, those before it was resumed included; its `max_num_iterations` are those to come.
 
     Works around: https://github.com/nerfstudio-project/nerfstudio/issues/3096.
     Ends with: a nerfstudio that has its pull request 3526, where `max_num_iterations` are all steps.
@@ -120,7 +120,7 @@ def total_steps(trainer: Trainer) -> int:
 
 
 def count_steps_against_all(trainer: Trainer) -> None:
-    """Let what nerfstudio prints of a training that was taken up again end at 100 %.
+    """Let nerfstudio's printed progress of a resumed training end at 100 %.
 
     Works around: https://github.com/nerfstudio-project/nerfstudio/issues/1304.
     Ends with: a nerfstudio that has its pull request 3526.
@@ -135,7 +135,7 @@ def join_lines_of_option_help() -> None:
     """Let tyro wrap an option's help by itself: docstrings keep the line breaks and indentation of the source.
 
     tyro 1.0 joins such lines only where they are not indented, which those of a class always are; it prints words left
-    alone on a line. For our own command; nerfstudio's help is as it is.
+    alone on a line. For our own command; nerfstudio's help is unchanged.
 
     The issue is of the same code, which joins too much of a class's docstring and too little of a field's.
 

@@ -1,7 +1,7 @@
 """The methods that nerfstudio registers, made from nerfstudio_method.toml.
 
-An override is a dotted name in the configuration and a value. Names and types are checked against the
-configuration itself; all that is wrong is said in one error.
+An override is a dotted name in the configuration and a value. Names and types are checked against the configuration
+itself; one error reports all that is wrong.
 """
 
 from __future__ import annotations

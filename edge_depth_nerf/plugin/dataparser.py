@@ -89,11 +89,11 @@ def check_meta(meta: dict[str, Any], path: Path) -> list[dict[str, Any]]:
 def check_split(meta: dict[str, Any], path: Path) -> None:
     """Check the lists of training and held-out pictures.
 
-    A moment is either trained on or held out, with all its cameras: they share one LiDAR sweep. (A scene with nothing
+    A frame is either trained on or held out, with all its cameras: they share one LiDAR sweep. (A scene with nothing
     held out has the same pictures in both lists.)
 
     Raises:
-        InputError: a name that is no frame's, or a moment that is in both.
+        InputError: a name that is no picture's, or a frame that is in both.
     """
     by_name = {frame["file_path"]: frame for frame in meta["frames"]}
     lists = {split: meta[f"{split}_filenames"] for split in ("train", "val", "test") if f"{split}_filenames" in meta}
@@ -146,7 +146,7 @@ class FisheyeDepth(Nerfstudio):
 
         Raises:
             FileNotFoundError: no scene there, or a file it names is missing.
-            InputError: the scene cannot be used as it is.
+            InputError: the scene cannot be used.
 
         """
         path = transforms_path(Path(self.config.data))

@@ -27,7 +27,7 @@ JUDGED_DISTANCES = ("lidar", "truth_distance")
 
 
 class FisheyeDepthDataset(InputDataset):
-    """Adds to nerfstudio's dataset: the validity mask, held-out LiDAR and, where it is known, the truth."""
+    """Adds to nerfstudio's dataset: the validity mask, held-out LiDAR and, where it is known, ground truth."""
 
     scene: SceneFolder
     """Where the pictures are from."""

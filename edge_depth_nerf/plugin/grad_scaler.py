@@ -23,7 +23,7 @@ class PatientGradScaler(torch.amp.GradScaler):
         self._updates = 0
 
     def get_scale(self) -> float:
-        """The scale as it was last seen."""
+        """The scale when it was last read."""
         return self._seen
 
     def update(self, new_scale: Any = None) -> None:
@@ -34,12 +34,12 @@ class PatientGradScaler(torch.amp.GradScaler):
             self._seen = super().get_scale()
 
     def state_dict(self) -> dict[str, Any]:
-        """What a checkpoint keeps, the scale of this moment with it."""
+        """What a checkpoint keeps, the present scale included."""
         self._seen = super().get_scale()
         return super().state_dict()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take up a checkpoint's state; that of a training on a CPU is empty, and the scale begins anew."""
+        """Restore a checkpoint's state; that of a training on a CPU is empty, and the scale starts again."""
         if state_dict:
             super().load_state_dict(state_dict)
             self._seen = super().get_scale()

@@ -117,7 +117,7 @@ Implementation = Literal["fused", "tcnn", "torch"]
 
 
 def settled(implementation: Literal["auto", "fused", "tcnn", "torch"], device_type: str) -> Implementation:
-    """Give what `auto` stands for on a device, and any other as it is.
+    """Give what `auto` stands for on a device, and any other value unchanged.
 
     Raises:
         InputError: tiny-cuda-nn is asked for and is not installed, or serves no such device.
@@ -138,7 +138,7 @@ def settled(implementation: Literal["auto", "fused", "tcnn", "torch"], device_ty
 INFINITELY_FAR = 1e4
 """Scene units: so far that the place in the contracted scene is the direction alone."""
 LEAST_HIT = 0.05
-"""Rays that stop less than this share of their light are said to hit nothing."""
+"""Rays that stop less than this share of their light count as hitting nothing."""
 
 
 class NothingBehind(RGBRenderer):
@@ -197,7 +197,7 @@ class Psnr(torch.nn.Module):
 class LpipsAtFirstUse:
     """LPIPS as nerfacto calls it, kept outside the module tree and so outside checkpoints.
 
-    Without AlexNet's weights on disk it says so once and gives NaN, which the model leaves out of its figures.
+    Without AlexNet's weights on disk it reports this once and gives NaN, which the model leaves out of its figures.
     """
 
     def __init__(self) -> None:
@@ -334,7 +334,7 @@ class EdgeDepthNerfModel(NerfactoModel):
     def _exposed(self, colours: list[Tensor], bundles: list[RayBundle]) -> Sequence[Tensor]:
         """Colours of several bundles, each [rays, 3], as the training pictures that the rays are from have them.
 
-        As they are at evaluation.
+        At evaluation they are unchanged.
         """
         if not self.training or self.exposure is None:
             return colours
@@ -634,7 +634,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         return urban_radiance_field_depth_loss(weights, prior_m, expected_m, middles_m, sigma_m)
 
     def reset_depth_errors(self) -> None:
-        """Start pooling depth errors anew."""
+        """Start pooling depth errors again."""
         self._depth_errors = {"lidar": DepthErrors(), "truth": DepthErrors()}
 
     def pooled_depth_errors(self) -> dict[str, float]:

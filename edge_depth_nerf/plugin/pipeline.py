@@ -29,7 +29,7 @@ from edge_depth_nerf.plugin.viewer import DrivePanel
 FARTHEST_UNITS = 1e6
 """nerfstudio's sampler turns a distance x beyond 1 into 1 - 1/(2x): float32 has no such number below 1 from 2^23 on."""
 STEPS_PER_CHECK = 50
-"""On a GPU steps whose loss is not finite are counted, and the count is looked at once in so many steps."""
+"""On a GPU steps whose loss is not finite are counted, and the count is read once in so many steps."""
 MOST_NOT_FINITE = 5
 """So many of them may be: the scaler of mixed precision skips such a step. NaN in a parameter stays, and makes more."""
 MOST_NAMED = 5

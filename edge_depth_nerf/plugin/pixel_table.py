@@ -108,7 +108,7 @@ class PixelTable:
     """All valid pixels of some pictures, in a random order, memory-mapped."""
 
     def __init__(self, path: Path):
-        """Open a table that `PixelTableWriter` wrote; all of it is read once, to see whether it is as it was written.
+        """Open a table that `PixelTableWriter` wrote; all of it is read once, to check that it is unchanged.
 
         Raises:
             InputError, OSError, ValueError: it is not there, of another version, or not whole.
@@ -136,7 +136,7 @@ class PixelTable:
         return self._with_prior / len(self)
 
     def records(self, start: int, count: int) -> NDArray:
-        """Give `count` records from number `start` on, as they lie in the file; the first comes after the last."""
+        """Give `count` records from number `start` on, in the file's order; the first comes after the last."""
         first = start % len(self)
         records = self._records[first : first + count]
         if len(records) < count:
@@ -244,7 +244,7 @@ class PixelTableWriter:
             file.write(part.tobytes())
 
     def finish(self) -> None:
-        """Put the pixels into their order and the file in its place.
+        """Put the pixels into their order and the file into its final path.
 
         Raises:
             InputError: no valid pixel in any picture.

@@ -39,7 +39,7 @@ def say_config_slips_plainly() -> None:
 
 
 def say_errors_plainly() -> None:
-    """Make nerfstudio's commands say our errors as ours are said; all other exceptions stay with who had them."""
+    """Make nerfstudio's commands print our errors as our commands do; earlier hooks handle all other exceptions."""
     say_config_slips_plainly()
     assert isinstance(sys.excepthook, _Hook)
     sys.excepthook.ours = True

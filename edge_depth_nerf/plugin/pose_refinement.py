@@ -1,9 +1,9 @@
-"""Camera poses that training mends, held to the given ones.
+"""Camera poses that training corrects; a cost keeps them near the given ones.
 
 Host-facing: nerfstudio's camera optimiser in other units. Its own learns scene units and radians for each picture, at
 the fields' learning rate and with next to nothing that holds them. Here an adjustment is the vehicle's, shared by the
-pictures of a moment; it counts in the standard deviations that are expected of the given poses, and each moment pays
-for what it takes. The drive's mean adjustment is held at zero: it would move the scene, not mend it.
+pictures of a frame. Its unit is the standard deviation that is expected of the given poses, and each frame pays for its
+adjustment. The drive's mean adjustment is kept at zero: it would move the scene, not correct it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
 MOMENTS = "moments"
-"""Metadata of the training dataset: the number of the moment of each picture."""
+"""Metadata of the training dataset: the number of each picture's frame."""
 FIT_STEPS, FIT_RAYS, FIT_LEARNING_RATE = 150, 1024, 0.05
 """How the pose of a held-out picture is fitted."""
 _FIT_PIXELS = 32_768
@@ -44,7 +44,7 @@ class PoseRefinerConfig(CameraOptimizerConfig):
 
 
 class PoseRefiner(CameraOptimizer):
-    """Adjusts the vehicle's pose at each moment."""
+    """Adjusts the vehicle's pose at each frame."""
 
     config: PoseRefinerConfig
     moment: Int[Tensor, "pictures"]
@@ -57,7 +57,7 @@ class PoseRefiner(CameraOptimizer):
         self.register_buffer("sigmas", _sigmas(config, 1.0, torch.empty(0)), persistent=False)
 
     def settle(self, moments: list[int], metres_per_unit: float) -> None:
-        """Say which pictures share a moment and how long the scene's unit is; before any step."""
+        """Set which pictures share a frame and how long the scene's unit is; before any step."""
         _, moment = torch.unique(torch.tensor(moments), return_inverse=True)
         self.moment = moment.to(self.moment)
         self.sigmas = _sigmas(self.config, metres_per_unit, self.sigmas)
@@ -110,7 +110,7 @@ def _move(rays: RayBundle, correction: Float[Tensor, "rays 3 4"]) -> None:
 def fit_pose(
     model: Any, camera: Cameras, image: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"], config: PoseRefinerConfig
 ) -> Cameras:
-    """Fit the pose of a picture to what a model shows, held to the given pose.
+    """Fit the pose of a picture to what a model shows, with a cost for leaving the given pose.
 
     Args:
         model: an EdgeDepthNerfModel in evaluation; nothing of it is changed.

@@ -1,4 +1,4 @@
-"""Training rays read from a table of each lens, in place of nerfstudio's undistortion of every batch.
+"""Training rays read from a table of each lens, instead of nerfstudio's undistortion of every batch.
 
 Host-facing. nerfstudio inverts a lens's polynomial by ten iterations for each pixel of each batch, and twice more for
 its neighbours. The table holds what comes out, made once by nerfstudio's own `generate_rays` from a camera that is not
@@ -51,7 +51,7 @@ def _lenses(cameras: Cameras) -> tuple[Float[Tensor, "lenses 13"], Int[Tensor, "
 
 
 def _make(lenses: Tensor, advance: Callable[[int], object]) -> np.ndarray:
-    """The table of some lenses, one after the other, each row by row; `advance` is told of pixels that are done."""
+    """The table of some lenses, one after the other, each row by row; `advance` gets the number of finished pixels."""
     parts = []
     for lens in lenses.float():
         width, height = int(lens[0]), int(lens[1])

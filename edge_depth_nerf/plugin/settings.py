@@ -6,7 +6,7 @@ from dataclasses import fields, is_dataclass
 from typing import Any
 
 SAID_ANYWAY = ("data", "pipeline.datamanager.data", "timestamp", "experiment_name", "max_num_iterations")
-"""Settings that each training has of its own, or that are said beside the changed ones."""
+"""Settings that each training has of its own, or that are printed beside the changed ones."""
 
 
 def flattened(config: Any, prefix: str = "") -> dict[str, Any]:

@@ -4,7 +4,7 @@ Host-facing. **No GPU has run this; it is off unless it is asked for** (`--cuda-
 launch the kernels of a step than a fast GPU to run them. A graph is recorded once and launched as a whole. There are
 two, as there are two kinds of steps: proposal networks are updated, or rest.
 
-Recorded are decoding, rays, forward, losses and backward. Optimisers, the scaler and schedulers stay as they are. A
+The graph records decoding, rays, forward, losses and backward. Optimisers, the scaler and schedulers stay unchanged. A
 graph reads where it read when it was recorded, so everything that differs between steps is put there before: the packed
 batch, λ, and how far the sampler's weights are annealed. All shapes are the same at each step. What a graph has not
 seen (other rays, parameters or options) ends this, with one line that says why, and training continues without.
@@ -134,7 +134,7 @@ class StepGraphs:
         """Take a step with a batch by a graph, but for the optimisers.
 
         Args:
-            packed: the batch as it was uploaded.
+            packed: the uploaded batch.
             step: its number, for what is printed.
 
         Returns:
@@ -188,7 +188,7 @@ class StepGraphs:
         return recorded.outputs, dict(zip(recorded.names, losses.unbind(), strict=True)), recorded.metrics
 
     def _state(self, packed: Tensor) -> tuple[Any, ...]:
-        """What must stay as it was when a step was recorded."""
+        """What must not change after a step was recorded."""
         pipeline = self._pipeline
         return (
             packed.shape,

@@ -1,6 +1,6 @@
 """Batches on their way to a GPU: read ahead, packed, from pinned memory, so that neither host nor device waits.
 
-Host-facing. The records of a batch are 15 bytes a pixel; they are copied as they lie in the file and unpacked on the
+Host-facing. The records of a batch are 15 bytes a pixel; they are copied unchanged from the file and unpacked on the
 device. While a step is computed, a thread reads those of the next.
 """
 
@@ -52,8 +52,8 @@ def read(stretches: Sequence[Stretch]) -> UInt8[np.ndarray, "n 15"]:
 class Uploads:
     """Copies batches to a device, the next already read.
 
-    What is read ahead is what follows in the tables; where something else is asked for (another number of rays, a
-    training that is taken up again), that is read instead. So batches are the same with a thread as without one.
+    What is read ahead is what follows in the tables; where something else is requested (another number of rays, a
+    resumed training), that is read instead. So batches are the same with a thread as without one.
     """
 
     def __init__(self, device: torch.device | str) -> None:

@@ -68,11 +68,11 @@ def compare_paths(first: Trajectory, second: Trajectory) -> PathAgreement | None
     """Lay a path over another by a rotation and a shift (Kabsch, Acta Crystallographica 1976).
 
     Args:
-        first: its own moments count.
-        second: of the same vehicle's frame; asked where it was at those moments.
+        first: its own times count.
+        second: of the same vehicle's frame; asked where it was at those times.
 
     Returns:
-        None if the two have fewer than three moments in common.
+        None if the two have fewer than three times in common.
 
     """
     common = np.array([second.outside_s(time) == 0 for time in first.times_s.tolist()])

@@ -1,10 +1,10 @@
 """Features matched between pictures of known lenses, and how far each lies from its epipolar curve, in pixels.
 
 Two poses and a ray span the epipolar plane. A ray of the other picture that sees the same point lies in it; through a
-fisheye the plane is seen as a curve. How far a feature at pixel p with ray d(p) lies from that curve is, to first
-order (Sampson's distance of one picture, Hartley & Zisserman, Multiple View Geometry, 11.4.3), |n·d| / |Jᵀn|, with the
-plane's normal n and J = ∂d/∂p. This holds for every lens. Measured are the errors of a turn, and of the direction of a
-shift; the length of a shift leaves no trace.
+fisheye the plane is seen as a curve. Let n be the plane's normal, d(p) the ray of a feature at pixel p, and J = ∂d/∂p.
+To first order, the feature's distance from that curve is |n·d| / |Jᵀn| (Sampson's distance of one picture, Hartley &
+Zisserman, Multiple View Geometry, 11.4.3). This holds for every lens. It measures the errors of a turn, and of the
+direction of a shift; the length of a shift leaves no trace.
 
 Features are OpenCV's SIFT, compared by Hellinger's distance (Arandjelović & Zisserman, CVPR 2012), mutually nearest and
 clearly nearer than the second. Pixels have their centres at +0.5, camera axes are OpenCV's, transforms 4×4 in metres.
@@ -27,7 +27,7 @@ from edge_depth_nerf.cameras.transforms import Transform
 MOST_FEATURES = 3000
 """Of a picture, those of the most contrast."""
 LARGEST_SIDE_PX = 1400
-"""Larger pictures are made smaller before features are looked for."""
+"""Larger pictures are made smaller before the search for features."""
 RATIO = 0.8
 """A match must be nearer than this part of the second nearest (Lowe, IJCV 2004)."""
 LEAST_BASELINE_M = 0.05
@@ -41,7 +41,7 @@ LEAST_MATCHES = 20
 _BORDER_PX = 4
 """Features nearer to the edge of a mask look at what is masked."""
 MEASURED_MOMENTS = 100
-"""So many moments of each camera, spread over the drive, are looked at."""
+"""So many frames of each camera, spread over the drive, are used."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class PosedPicture:
     camera: str
     """Name of its camera."""
     moment: int
-    """Number of its moment."""
+    """Number of its frame."""
     lens: Camera
     """At the picture's size."""
     camera_to_world: Transform
@@ -274,9 +274,9 @@ class Agreement:
     camera: str
     """Name of the camera."""
     first: int
-    """The earlier moment."""
+    """The earlier frame."""
     second: int
-    """The later moment."""
+    """The later frame."""
     matches: int
     """How many matched features have an epipolar curve."""
     median_px: float
@@ -296,12 +296,12 @@ def agreement(camera: str, first: int, second: int, distances_px: Float64[np.nda
 def successive(
     pictures: Sequence[PosedPicture], apart: Sequence[int] = (1, 2), most: int = MEASURED_MOMENTS
 ) -> list[tuple[int, int]]:
-    """Pairs of pictures of one camera, so many moments apart, between which the vehicle moved; in order.
+    """Pairs of pictures of one camera, so many frames apart, between which the vehicle moved; in order.
 
     Args:
         pictures: some pictures.
         apart: 1 is the next picture of the camera.
-        most: pairs begin at so many moments of each camera, spread over the drive.
+        most: pairs begin at so many frames of each camera, spread over the drive.
 
     """
     pairs = []
@@ -325,11 +325,11 @@ def along_drive(
 
     Args:
         pictures: of any cameras, in any order.
-        apart: how many moments lie between the two pictures of a pair; 1 is the next.
-        most: so many moments of each camera, spread over the drive, are looked at.
+        apart: how many frames lie between the two pictures of a pair; 1 is the next.
+        most: so many frames of each camera, spread over the drive, are used.
 
     Returns:
-        One for each pair between whose pictures the vehicle moved by 5 cm or more, by camera and moment.
+        One for each pair between whose pictures the vehicle moved by 5 cm or more, by camera and frame.
 
     Raises:
         InputError: a picture or its mask cannot be read.

@@ -9,8 +9,8 @@ known, and its first steps are wrong by decimetres. So:
 3. Each sweep is corrected by the path that was found, and laid on a map of its neighbours before *and* after it. This
    leaves no sweep to a sparse map, and evens out what single steps are wrong by.
 
-Poses are those of the sweeps' own moments, whatever part of the turn these are: points are corrected here, by their
-own times. Frames: vehicle; world, which is the vehicle's frame at the first sweep. Metres, seconds.
+Poses are those of the sweeps' own times, whatever part of the turn these are: points are corrected here, by their own
+times. Frames: vehicle; world, which is the vehicle's frame at the first sweep. Metres, seconds.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ MIN_SWEEPS = 5
 """Fewer say too little of the velocity that the drive starts at."""
 _OLDEST = (1, 2)
 RANGE_M = (2.0, 100.0)
-"""Nearer to the scanner lies the vehicle itself; further away returns are too far apart."""
+"""Nearer to the scanner lies the vehicle itself; further away LiDAR points are too far apart."""
 _VOXEL_M = 1.0
 """KISS-ICP's own choice for this reach: of cubes of half the size one point each is kept, of 1.5 of it one is laid."""
 _SETTLED = 1e-4
@@ -60,9 +60,9 @@ class TimedSweep:
     """A sweep that is ready to be read."""
 
     time_s: float
-    """Its own moment, which its pose is to be of."""
+    """Its own time, which its pose is to be of."""
     read: Callable[[], tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n"]]]
-    """Points in the vehicle's frame, as recorded, and when each was measured, counted from the sweep's moment.
+    """Points in the vehicle's frame, as recorded, and when each was measured, counted from the sweep's time.
 
     Those that are to be used: of `RANGE_M` from the scanner.
     """
@@ -99,7 +99,7 @@ def odometry(sweeps: Sequence[TimedSweep], advance: Callable[[], object] = lambd
         advance: called for each sweep that is done, `steps_of(len(sweeps))` times.
 
     Returns:
-        The vehicle's poses at the sweeps' own moments. The first is the identity.
+        The vehicle's poses at the sweeps' own times. The first is the identity.
 
     Raises:
         InputError: KISS-ICP is missing, or there are fewer than five sweeps.
@@ -193,7 +193,7 @@ def _last_step(sweeps: Sequence[TimedSweep], poses: Sequence[Transform] | np.nda
 
 
 def _in_vehicle(sweep: TimedSweep, path: Trajectory | None) -> Float64[np.ndarray, "n 3"]:
-    """The points as if measured at the sweep's own moment."""
+    """The points as if measured at the sweep's own time."""
     points, offset_s = sweep.read()
     if path is None or not offset_s.any():
         return points

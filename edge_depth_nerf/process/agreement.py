@@ -1,12 +1,12 @@
 """Whether LiDAR lies on what the pictures show: what a transform that is given the wrong way round looks like.
 
-Returns of a scan are projected into two pictures of one camera between which the vehicle has moved. Where scanner and
-camera sit as they are said to, both pictures have the same contrast at a return: brightness against its surroundings,
-in which exposure cancels. Its correlation over all returns is measured with the transforms as they are given, with the
-camera's inverted, with the scanner's inverted, and with both. On rendered drives of all layouts and on a real one it is
-0.79 to 0.96 with the right ones, and 0.89 at most with one of them inverted. Coverage alone tells nothing: with an
-inverted transform LiDAR covers a tenth to a third of the pictures, too. Edges of LiDAR held against the pictures' edges
-tell less: their agreement is one to two standard deviations above that of shifted ones.
+A scan's LiDAR points are projected into two pictures of one camera between which the vehicle has moved. If the
+transforms of scanner and camera are right, both pictures have the same contrast at a point: brightness against its
+surroundings, in which exposure cancels. Its correlation over all points is measured with the given transforms, with the
+camera's inverted, with the scanner's inverted, and with both inverted. On rendered drives of all layouts and on a real
+one it is 0.79 to 0.96 with the right ones, and 0.89 at most with one of them inverted. Coverage alone proves nothing:
+with an inverted transform LiDAR covers a tenth to a third of the pictures, too. A comparison of LiDAR's edges with the
+pictures' edges shows less: their agreement is one to two standard deviations above that of shifted ones.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _MOVED_M = 0.5
 _APART_S = 0.2
 """A scan further in time from a picture does not belong to it."""
 _MOST_RETURNS = 40_000
-"""Of a scan so many returns are looked at."""
+"""So many points of a scan are used."""
 _SURROUNDINGS_PX = 4.0
 """Scale of what contrast is measured against."""
 _DARK_LEVELS = 8.0
@@ -49,9 +49,9 @@ _DARK_LEVELS = 8.0
 _STRONGEST = 0.5
 """Contrast, as a logarithm, is limited to this."""
 _FEWEST = 400
-"""Fewer returns seen in both pictures say nothing."""
+"""Fewer LiDAR points seen in both pictures say nothing."""
 _FAINTEST = 0.02
-"""Pictures with less contrast at the returns (root mean square) say nothing."""
+"""Pictures with less contrast at the LiDAR points (root mean square) say nothing."""
 _LESS_DOUBT = 0.6
 """An inverse fits clearly better if its correlation lacks this share, or less, of what the given one lacks to 1 …"""
 _FITS = 0.6
@@ -62,12 +62,12 @@ _NO_FIT = 0.3
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well a scanner's returns agree with a camera's pictures; correlations, at most 1."""
+    """How well a scanner's points agree with a camera's pictures; correlations, at most 1."""
 
     camera: str
     scanner: str
     given: float
-    """With both transforms as they are given."""
+    """With both transforms as given."""
     camera_inverted: float
     scanner_inverted: float
     both_inverted: float
@@ -105,12 +105,12 @@ class _Sums:
 
     @property
     def tells(self) -> bool:
-        """Whether there are enough returns, on things with contrast."""
+        """Whether there are enough LiDAR points, on things with contrast."""
         return self.count >= _FEWEST and min(self.first, self.second) > self.count * _FAINTEST**2
 
     @property
     def correlation(self) -> float:
-        """Without the means: contrast has none. 0 without returns."""
+        """Without the means: contrast has none. 0 without LiDAR points."""
         return self.products / max(math.sqrt(self.first * self.second), 1e-9)
 
 
@@ -134,7 +134,7 @@ class _Pair:
 
 
 def agreements(recording: Recording, usable: Mapping[str, Bool[np.ndarray, "h w"]]) -> list[Agreement]:
-    """Hold each scanner's returns against each camera's pictures, a few of them.
+    """Compare each scanner's points with each camera's pictures, a few of them.
 
     Args:
         recording: with the vehicle's path. Files that cannot be read are passed over.
@@ -256,7 +256,7 @@ def _seen_twice(
     usable: Bool[np.ndarray, "h w"],
     contrasts: tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]],
 ) -> tuple[Float32[np.ndarray, "returns"], ...]:
-    """Contrast at returns that both see: in the first, in the second, in the second where the first has them."""
+    """Contrast at LiDAR points that both see: in the first, in the second, in the second where the first has them."""
     visible = project_points(in_first.float(), camera, spacing_m=spacing_m).point_index
     points = in_first[visible[visible >= 0]]
     in_second = transform_points(torch.from_numpy(first_to_second), points)

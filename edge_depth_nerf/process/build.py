@@ -191,7 +191,7 @@ def _posed(recording: Recording, options: ProcessOptions, console: Console) -> t
 
 
 def _held_out(recording: Recording, options: ProcessOptions) -> set[int]:
-    """Numbers of the moments that are kept from training."""
+    """Numbers of the frames that are kept from training."""
     moments = sorted({picture.frame for picture in recording.pictures})
     held_out = held_out_frames(len(moments), options.holdout_every)
     return {frame for frame, out in zip(moments, held_out, strict=True) if out}
@@ -351,7 +351,7 @@ class _Builder:
         return distance_m, _cloud(index, in_camera, camera_to_world, image)
 
     def _beams(self, picture: RecordedPicture, full: Camera) -> Float[np.ndarray, "h w"]:
-        """The returns that are held out of everything, as far as nothing hides them."""
+        """The LiDAR points that are held out of everything, as far as nothing hides them."""
         camera_to_world = self.pose(picture)
         around = self._store.around(picture.frame, picture.time_s, camera_to_world)
         beams = self._store.beams(picture.frame, picture.time_s)

@@ -45,7 +45,7 @@ def name_of(options: ProcessOptions) -> str:
 
 
 def read_drive(options: ProcessOptions) -> Recording:
-    """Say what a drive consists of; every file is looked at, nothing large is read.
+    """Say what a drive consists of; every file is checked, nothing large is read.
 
     Raises:
         FileNotFoundError: a folder or file of the drive is missing.

@@ -5,7 +5,7 @@ A sequence, 230329/test_1 and so on, as published:
     image/000000.png                 pictures of the front camera
     bin/000000.bin                   scans; a scan's number is that of its picture
 
-Calibration and poses are not published: they are handed in as a rig file, docs/jbnu_depth360.md says how. What the
+Calibration and poses are not published: users provide them as a rig file, as docs/jbnu_depth360.md describes. What the
 data set is known, or taken, to have stands in `_fill_in` and may be left out there. All else is as for any rig.
 """
 
@@ -21,7 +21,7 @@ from edge_depth_nerf.process.rig_file import read_rig
 from edge_depth_nerf.scene.checks import require_folder
 
 RATE_HZ = 10.0
-"""Pictures and scans a second; the data set has numbers in place of times."""
+"""Pictures and scans a second; the data set has numbers instead of times."""
 SCANNER = "ouster"
 """The scanner's name, if the rig file has none."""
 

@@ -1,7 +1,7 @@
 """Poses by LiDAR odometry: the vehicle's path from the sweeps of one scanner.
 
-Of several scanners the one with the most returns in all is followed; the others are placed by its path. Every sweep of
-the stretch is used, those between the moments taken, too.
+Of several scanners, the one with the most LiDAR points in all is followed; the others are placed by its path. Every
+sweep of the stretch is used, those between the chosen frames included.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _MIN_WAY_M = 1.0
 """A vehicle that stays within so much of where it begins has no path."""
 _TURNED_RAD = math.radians(20)
 _LOOKED_AT = 5
-"""So many sweeps of each scanner say how many returns it has."""
+"""The number of a scanner's LiDAR points is counted in so many of its sweeps."""
 _FEW_RETURNS = 5000
 """Fewer a sweep say too little of the vehicle's roll and pitch; a scanner of 16 rings has some 25,000."""
 

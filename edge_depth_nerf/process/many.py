@@ -78,7 +78,7 @@ def cut(options: ProcessOptions, console: Console) -> list[ProcessOptions]:
 
 
 def usable_frames(options: ProcessOptions) -> list[int]:
-    """Numbers of the frames that a drive's scene would have, in order; every file is looked at.
+    """Numbers of the frames that a drive's scene would have, in order; every file is checked.
 
     Raises:
         FileNotFoundError: a file of the drive is missing.

@@ -2,8 +2,8 @@
 
 Their standard deviations by parallax and confidence go to `motion_sigma/`.
 
-Pictures that are held out take no part, and get an empty map. Sweeps, the long part, are kept in `.cache/motion` until
-all maps are written, so that a run that was stopped goes on where it was.
+Held-out pictures take no part, and get an empty map. Sweeps, the long part, are kept in `.cache/motion` until all maps
+are written, so that a stopped run resumes where it stopped.
 """
 
 from __future__ import annotations
@@ -200,7 +200,7 @@ class SweepStore:
 
 
 def _made_of(scene: SceneFolder, pictures: list[ScenePicture]) -> str:
-    """Key of pictures, masks, lenses and poses: by what is in the files, since each run writes masks anew."""
+    """Key of pictures, masks, lenses and poses: by what is in the files, since each run writes masks again."""
     digest = hashlib.sha256(repr(scene.theta_max_rad).encode())
     contents: dict[Path, str] = {}
     for picture in pictures:

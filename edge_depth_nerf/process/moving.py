@@ -1,8 +1,8 @@
 """Masks of what moves, found by LiDAR: `moving_masks/CAMERA/0000000123.png` in the scene, 255 = use the pixel.
 
-They have the size of the raw pictures, so that the folder can be given as --frame-masks. A mask that is there already
-stays as it is: it may have been corrected. What is found for pictures of training knows nothing of sweeps of moments
-that are held out. A picture that is held out gets a mask from its own sweep: it decides which pixels are judged.
+They have the size of the raw pictures, so that the folder can be given as --frame-masks. An existing mask stays
+unchanged: it may have been corrected. Masks of training pictures use nothing from the sweeps of held-out frames. A
+held-out picture gets a mask from its own sweep: it decides which pixels are judged.
 """
 
 from __future__ import annotations
@@ -48,15 +48,16 @@ MOVING_MASKS = "moving_masks"
 """Folder of the scene with the masks of what moves."""
 
 _FOOT_M = (0.06, 0.3)
-"""Returns between these heights above the ground are left out where things are looked for, and are feet and wheels."""
+"""LiDAR points between these heights above the ground are left out of the search for things; they are feet and
+wheels."""
 _FOOT_AWAY_M = 0.25
 """Of those, the ones within this of a thing, across the ground, are its own."""
 _BODY_ENDS_M = 0.25
 """What the scanner's lowest beams meet goes on down to this above the ground."""
 _EDGE_RAD = 0.015
-"""Returns within this of the highest or lowest direction are at the edge of the scanner's field."""
+"""LiDAR points within this of the highest or lowest direction are at the edge of the scanner's field."""
 _TALLEST_M = 3.5
-"""Above the scanner's field a thing is looked for up to this height above the ground: that of a bus."""
+"""Above the scanner's field a thing is searched for up to this height above the ground: that of a bus."""
 _LONG_M = 2.5
 """Only what is longer than this may be higher than the field: people are not."""
 _STEP_M = 0.1
@@ -79,7 +80,7 @@ def find_moving(
     Args:
         recording: with a trajectory.
         options: the converter's.
-        held_out: numbers of the moments that training must not see.
+        held_out: numbers of the frames that training must not see.
         ego: the vehicle's masks, by camera, in the size of the raw pictures.
         console: where progress is shown.
 
@@ -165,7 +166,7 @@ class _ScannersThings:
         return [*expected, *_not_alone(things_of(loose), expected)]
 
     def seen_from(self, frame: int, time_s: float) -> tuple[WorldSweep, list[Thing], int] | None:
-        """The sweep of a picture's moment and what moves in it; None without one that the picture may know."""
+        """The sweep of a picture's frame and what moves in it; None without one that the picture may use."""
         index = self.scanner.own(frame, time_s)
         if index is None or index not in self._things:
             return None
@@ -178,7 +179,7 @@ class _ScannersThings:
 
 
 def _not_alone(things: Sequence[Thing], expected: Sequence[Thing]) -> list[Thing]:
-    """Those that share returns with what was expected: their speed is known."""
+    """Those that share LiDAR points with what was expected: their speed is known."""
     result = []
     for thing in things:
         for other in expected:
@@ -281,10 +282,10 @@ def _heights(height_m: NDArray[np.float64]) -> Iterator[NDArray[np.bool_]]:
 def _at_moment(
     sweep: WorldSweep, things: Sequence[Thing], late_s: float, ground: Ground
 ) -> tuple[_Returns, list[_Returns], NDArray[np.int64]]:
-    """Where things are some time after a sweep's moment.
+    """Where things are some time after a sweep's time.
 
     Returns:
-        Their points; of each long thing those at the upper edge of the scanner's field; rows of their returns.
+        Their points; of each long thing those at the upper edge of the scanner's field; rows of their LiDAR points.
 
     """
     moving, cut_off, rows = [_Returns.none()], [], [np.zeros(0, np.int64)]
@@ -307,7 +308,7 @@ def _at_moment(
 
 
 def _feet(sweep: WorldSweep, thing: Thing, ground: Ground) -> NDArray[np.int64]:
-    """Rows of the returns just above the ground that are a thing's."""
+    """Rows of the LiDAR points just above the ground that are a thing's."""
     points = sweep.points_m.numpy()
     low, high = thing.points_m.min(0) - _FOOT_AWAY_M, thing.points_m.max(0) + _FOOT_AWAY_M
     near = np.flatnonzero(np.all((points[:, :2] > low[:2]) & (points[:, :2] < high[:2]), axis=1))
@@ -318,7 +319,7 @@ def _feet(sweep: WorldSweep, thing: Thing, ground: Ground) -> NDArray[np.int64]:
 
 
 def _elevation(sweep: WorldSweep, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Elevations of some of a sweep's returns, as its scanner sees them."""
+    """Elevations of some of a sweep's points, as its scanner sees them."""
     in_scanner = transform_points(torch.from_numpy(sweep.world_to_scanner), sweep.points_m[rows])
     return torch.atan2(in_scanner[:, 2], in_scanner[:, :2].norm(dim=-1)).numpy()
 

@@ -30,7 +30,7 @@ def features_say(recording: Recording, options: ProcessOptions, console: Console
     Args:
         recording: with the poses of its pictures, and the masks of its cameras.
         options: theta_max_deg, and the masks that are not in the recording.
-        console: where it is said that this takes a while.
+        console: where a message reports that this takes a while.
 
     Raises:
         InputError: under `strict`, a picture or a mask cannot be read.

@@ -93,7 +93,7 @@ def read_nerfstudio(path: Path) -> dict[str, Transform]:
     """Read the frames of a nerfstudio transforms.json.
 
     Returns:
-        Camera-to-world poses with OpenCV's camera axes, by file_path without its suffix, as it is written there.
+        Camera-to-world poses with OpenCV's camera axes, by file_path without its suffix, as written there.
 
     Raises:
         FileNotFoundError: there is no such file.

@@ -1,9 +1,9 @@
 """A recorded drive as every converter hands it on: sensors, pictures, sweeps, the vehicle's path.
 
-Each converter (kitti360, jbnu_depth360, rig) reads its own layout into a `Recording`, checking every file by size
-and header; `build.process_recording` makes the scene folder of it. Frames: camera (x right, y down, z forward),
-scanner and vehicle as the recording has them, world with z up. Transforms are 4×4, metres, named a_to_b. Times are
-seconds of one clock for pictures, sweeps and poses. A moment is what all cameras see at once; its number is `frame`.
+Each converter (kitti360, jbnu_depth360, rig) reads its own layout into a `Recording`, checking every file by size and
+header; `build.process_recording` makes the scene folder of it. Frames: camera (x right, y down, z forward), scanner and
+vehicle as the recording has them, world with z up. Transforms are 4×4, metres, named a_to_b. Times are seconds of one
+clock for pictures, sweeps and poses. A frame is what all cameras see at once; its number is `frame`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from edge_depth_nerf.scene.writer import ShiftedView, Skipped
 
 @dataclass(frozen=True)
 class DepthFile:
-    """A dense or sparse map from another sensor, in place of LiDAR."""
+    """A dense or sparse map from another sensor, instead of LiDAR."""
 
     path: Path
     """16-bit PNG, 0 = none."""
@@ -56,7 +56,7 @@ class RecordedPicture:
     camera: str
     """Name of its camera."""
     frame: int
-    """Number of its moment; the pictures of one moment are held out together."""
+    """Number of its frame; the pictures of one frame are held out together."""
     path: Path
     """8-bit picture."""
     time_s: float
@@ -66,11 +66,11 @@ class RecordedPicture:
     timestamp_s: float | None = None
     """Seconds of the recording's own clock (KITTI-360's: since 1970) for transforms.json; None = not known."""
     depth: DepthFile | None = None
-    """A depth map in place of sweeps."""
+    """A depth map instead of sweeps."""
     mask: Path | None = None
     """This picture's own mask, 255 = use."""
     moving_mask: Path | None = None
-    """What moves in this picture, as it was found, 255 = use; beside the mask that is given."""
+    """The mask found of what moves in this picture, 255 = use; beside the given mask."""
     semantics: Path | None = None
     """KITTI-360's label ids, 8-bit PNG."""
     mono: Path | None = None
@@ -95,9 +95,9 @@ class RecordedSweep:
     path: Path
     """Its file."""
     time_s: float
-    """The moment that its points' times are counted from."""
+    """The time that its points' times are counted from."""
     frame: int | None
-    """Number of the moment it belongs to (held out with it); None = between the moments taken."""
+    """Number of the frame it belongs to (held out with it); None = between the chosen frames."""
     scanner: str
     """Name of the scanner: the sweeps before and after are of the same one."""
     to_vehicle: Transform
@@ -116,7 +116,7 @@ class Recording:
     pictures: tuple[RecordedPicture, ...]
     """Those that are to be in the scene, in order of frames."""
     sweeps: tuple[RecordedSweep, ...]
-    """All that may be used, those around the pictures' moments included; empty with depth maps in their place."""
+    """All that may be used, those around the pictures' frames included; empty with depth maps instead."""
     trajectory: Trajectory | None
     """None if poses are still to be found."""
     source: dict[str, Any]

@@ -1,8 +1,8 @@
 """Anyone's recording, described by a rig file, as a recording to make a scene of. docs/rig.md is its manual.
 
-Files of a sensor are taken in the order of their names, numbers in them counting as numbers, and get their times
-as the rig file says. Pictures of different cameras less than half a frame apart form a moment; moments are numbered
-from 0 in order of time. A scan belongs to the nearest moment, if that is at most half a turn away.
+Files of a sensor are taken in the order of their names, numbers in them counting as numbers, and get their times as the
+rig file says. Pictures of different cameras less than half a picture interval apart form a frame; frames are numbered
+from 0 in order of time. A scan belongs to the nearest frame, if that is at most half a turn away.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def recording_of_rig(rig: Rig, root: Path, options: RigOptions | JbnuDepth360Opt
     Args:
         rig: what the file says.
         root: the recording's folder.
-        options: which cameras and moments.
+        options: which cameras and frames.
         source: what the scene says that it is made of.
 
     Raises:
@@ -252,7 +252,7 @@ def _times_of_file(path: Path, files: list[Path]) -> list[float]:
 
 
 def _time(pictures: dict[str, _Timed]) -> float:
-    """When a moment was: the middle of its pictures."""
+    """When a frame was taken: the middle of its pictures' times."""
     times = [picture.time_s for picture in pictures.values()]
     return (min(times) + max(times)) / 2
 
@@ -295,7 +295,7 @@ def _usable(
     camera_poses: dict[Path, Transform],
     scans: Sequence[_Scans],
 ) -> tuple[dict[int, dict[str, _Timed]], list[Skipped]]:
-    """The moments asked for, by number, without those and those of their pictures that cannot be used; and these."""
+    """The requested frames, by number, without frames and pictures that cannot be used; and the latter."""
     kept: dict[int, dict[str, _Timed]] = {}
     skipped: list[Skipped] = []
     for frame in _select(moments, options):
@@ -311,7 +311,7 @@ def _usable(
 
 
 def _unusable(pictures: dict[str, _Timed], path: Trajectory | None, scans: Sequence[_Scans]) -> str | None:
-    """Why a moment cannot be used, if it cannot."""
+    """Why a frame cannot be used, if it cannot."""
     time_s = _time(pictures)
     if path is not None:
         slack_s = min(0.1, 0.5 * _interval(path.times_s.tolist()))
@@ -441,7 +441,7 @@ def _check_clocks(rig: Rig, files: dict[str, list[_Timed]], scans: Sequence[_Sca
 def _sweeps(
     scans: Sequence[_Scans], moments_s: dict[int, float], path: Trajectory | None, reach: int, tolerance: Tolerance
 ) -> list[RecordedSweep]:
-    """The scans that the moments taken can use, checked by their headers, each with the moment it belongs to."""
+    """The scans that the chosen frames can use, checked by their headers, each with the frame it belongs to."""
     frames, times_s = np.array(list(moments_s)), np.array(list(moments_s.values()))
     found = []
     for scanner in scans:
@@ -492,7 +492,7 @@ def _read(path: Path, lidar: RigLidar, counted_from_s: float) -> Sweep:
 class _Companions:
     """Finds the maps that come with pictures, and checks them by their headers.
 
-    They have the name of the picture's file where the rig file names a folder, and the moment's number where an option
+    They have the name of the picture's file where the rig file names a folder, and the frame's number where an option
     does.
     """
 

@@ -207,7 +207,7 @@ class _Sensor(_Timed):
 
 
 class DepthMaps(_Table):
-    """Depth maps that come with a camera's pictures, in place of LiDAR."""
+    """Depth maps that come with a camera's pictures, instead of LiDAR."""
 
     files: Files
     kind: Literal["z_depth", "distance"]
@@ -300,7 +300,7 @@ class RigLidar(_Sensor):
     points_in: Literal["scanner", "vehicle"] = "scanner"
     """The frame of its points."""
     corrected_to: Literal["timestamp", "start", "middle", "end"] | None = None
-    """The moment at which the vehicle is taken to have been where its points say; None = they are as measured."""
+    """The time of the vehicle's pose that the points were corrected to; None = they are uncorrected."""
     point_times: _PointTimes | None = None
     turn_s: Annotated[float, Field(gt=1e-9, le=1e5, description="a number above 1e-09, at most 100000")] | None = None
     """How long a scan takes; None = from one to the next."""
@@ -327,7 +327,7 @@ class RigLidar(_Sensor):
 
     @property
     def to_pose_s(self) -> float:
-        """From a scan's timestamp to the moment of the pose that its points belong to: its middle, or another one."""
+        """From a scan's timestamp to the time of the pose that its points belong to: its middle, or another one."""
         if self.corrected_to in (None, "middle"):
             return self.to_middle_s
         if self.corrected_to == "timestamp":

@@ -1,12 +1,12 @@
 """The sweeps around each picture, in the world: read once, kept while they are needed.
 
-A picture of moment f gets the sweep of its own moment and, of the same scanner, those of up to K sweeps before and
-after. A picture for training never gets anything from a sweep of a moment that is held out, not even the evidence
-that a point has moved; a picture that is held out gets the sweep of its own moment alone.
+A picture of frame f gets the sweep of its own frame and, of the same scanner, up to K sweeps before and after. A
+training picture never gets anything from the sweep of a held-out frame, not even the evidence that a point has moved. A
+held-out picture gets only the sweep of its own frame.
 
-Of the sweeps of other moments are left out: points that another sweep saw through, so that a passing car leaves no
-trail, and points above the field of the picture's own sweep, where nothing nearer could have been measured that
-hides them.
+Two kinds of points are left out of the sweeps of other frames. Points that another sweep saw through are left out, so
+that a passing car leaves no trail. Points above the field of the picture's own sweep are left out, because nothing
+nearer that hides them could have been measured there.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class Surroundings:
     only_hides: Bool[Tensor, "points"]
     """Points that were not measured: they hide others and are not to be chosen."""
     moved: Bool[Tensor, "points"]
-    """Points of the picture's own sweep that others saw through: there at its moment, and no part of what lasts."""
+    """Points of the picture's own sweep that others saw through: there at its time, and no part of what lasts."""
 
 
 class Scanner:
@@ -179,7 +179,7 @@ class Scanner:
         return passed
 
     def own(self, frame: int, time_s: float) -> int | None:
-        """The sweep of a picture's moment: the one that belongs to it, else the nearest in time, within a turn."""
+        """The sweep of a picture's frame: the one that belongs to it, else the nearest in time, within a turn."""
         if of_frame := self._of_frame.get(frame):
             return min(of_frame, key=lambda index: abs(self.times_s[index] - time_s))
         after = int(np.searchsorted(self.times_s, time_s))
@@ -204,8 +204,8 @@ class SweepStore:
         trajectory: the vehicle's path.
         reach: how many sweeps before and after a picture are taken.
         deskew: whether each point is moved by the pose of its own time.
-        held_out: numbers of the moments that training must not see.
-        strict: a sweep that cannot be read is an error; otherwise only for the pictures of its own moment.
+        held_out: numbers of the frames that training must not see.
+        strict: a sweep that cannot be read is an error; otherwise only for the pictures of its own frame.
         holdout_beams: one band of elevation of so many is kept out of all that is given but `beams`; 0: none.
 
     """
@@ -269,7 +269,7 @@ class SweepStore:
         return window + sorted(scanner.around(own), key=lambda index: abs(scanner.times_s[index] - time_s))
 
     def beams(self, frame: int, time_s: float) -> Float[Tensor, "points 3"]:
-        """What is held out of the sweeps of a picture's own moment, in the world, float64."""
+        """What is held out of the sweeps of a picture's own frame, in the world, float64."""
         found = [torch.empty(0, 3, dtype=torch.float64)]
         for scanner in self.scanners:
             own = scanner.own(frame, time_s)
@@ -282,7 +282,7 @@ class SweepStore:
         """Gather the points around a picture.
 
         Args:
-            frame: number of its moment.
+            frame: number of its frame.
             time_s: when it was taken.
             viewpoint_in_world: the camera's pose, camera to world.
             hide: also give the points that only hide others.

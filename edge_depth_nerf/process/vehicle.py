@@ -1,10 +1,10 @@
 """The vehicle's own masks: those that are given, and those that are found in the pictures.
 
-Of fewer than `MIN_PICTURES` pictures what stays the same says too little: smooth road does, too. There a mask is
-believed if its outline is clear and the drive's LiDAR agrees: a scanner on the roof has next to no returns on its own
-vehicle, and many on the road. On rendered drives, five to nine pictures: the vehicle has 5 to 10 % of the returns a
-pixel that lie around it, road that was taken for it 21 % and more, and of a front camera or a scanner that looks past
-the bonnet nothing can be told this way.
+In fewer than `MIN_PICTURES` pictures, what stays the same proves too little: smooth road stays the same, too. Then a
+mask is used only if its outline is clear and the drive's LiDAR agrees: a scanner on the roof measures almost no points
+on its own vehicle, and many on the road. On rendered drives of five to nine pictures, LiDAR points per pixel are 5 to
+10 % of those around on the vehicle, and 21 % and more on road that was mistaken for it. For a front camera, or a
+scanner that looks past the bonnet, this check cannot decide.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from edge_depth_nerf.process.recording import RecordedCamera, RecordedPicture, R
 from edge_depth_nerf.scene.checks import read_camera_mask
 
 _PICTURES = 60
-"""The vehicle is looked for in so many pictures of a camera, spread over the drive."""
+"""The vehicle is searched for in so many pictures of a camera, spread over the drive."""
 _RIM_PICTURES = 4
 """The lens's dark rim in so many: what stays dark in different places."""
 _FEWEST = 5
@@ -41,9 +41,9 @@ _FEWEST = 5
 _FEW_CERTAINTY = 0.9
 """Its outline must be so clear then."""
 _FEW_RETURNS = 0.15
-"""And it may have so many returns a pixel, as a share of what lies around it."""
+"""And it may have so many LiDAR points a pixel, as a share of what lies around it."""
 _RETURNS_PICTURES = 3
-"""The returns of so many pictures are counted."""
+"""The LiDAR points of so many pictures are counted."""
 _INNER = 0.01
 """So far inside the outline, as a share of the picture's longer side: scanner and camera do not see quite the same."""
 
@@ -156,7 +156,7 @@ def _readable(picture: Path) -> bool:
 def _returns(
     recording: Recording, recorded: RecordedCamera, pictures: Sequence[RecordedPicture]
 ) -> Float32[np.ndarray, "h w"]:
-    """How many returns of their own moments' sweeps fall into each pixel of some pictures."""
+    """How many LiDAR points of their own frames' sweeps fall into each pixel of some pictures."""
     camera = recorded.camera
     counts = np.zeros((camera.height, camera.width), np.float32)
     frames = [pictures[index].frame for index in np.linspace(0, len(pictures) - 1, _RETURNS_PICTURES).astype(int)]
@@ -178,7 +178,7 @@ def _returns(
 def _has_few(
     returns: Float32[np.ndarray, "h w"], vehicle: Bool[np.ndarray, "h w"], around: Bool[np.ndarray, "h w"]
 ) -> bool:
-    """Whether the vehicle has far fewer returns a pixel than the lower half of what lies around it."""
+    """Whether the vehicle has far fewer LiDAR points a pixel than the lower half of what lies around it."""
     inner = eroded(vehicle, _INNER * max(vehicle.shape))
     rows = np.flatnonzero((vehicle | around).any(1))
     below = around.copy()

@@ -97,7 +97,7 @@ class LeftOut:
     """A picture or a sweep that cannot be used."""
 
     frame: int | None
-    """Number of its moment; None = between the moments taken."""
+    """Number of its frame; None = between the chosen frames."""
     camera: str
     """Name of the camera, or of the scanner."""
     fault: str

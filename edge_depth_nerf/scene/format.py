@@ -1,8 +1,9 @@
 """transforms.json: what tells this project's scenes from other people's, and the checks that every reader needs.
 
-Light: both readers import it, and so does whoever reads the file for something else. Written out, unlike rig files:
-paths, sizes and what other frames have take most of the lines and of the time (two thirds go into paths), and a schema
-would hold none of them; keys of nerfstudio's that nobody here reads must pass.
+This module is light: both readers import it, and so does all other code that reads the file. The checks are written
+out, unlike those of rig files. Paths, sizes and comparisons with other frames take most of the lines and of the time
+(two thirds of it for paths), and a schema would cover none of them. Keys of nerfstudio that nothing here reads must
+pass.
 """
 
 from __future__ import annotations
@@ -55,8 +56,8 @@ LAYERS: dict[str, Layer] = {
     "truth_distance": Layer("truth_distance_file_path", "truth/{camera}/distance", "distance", "true distances", True),
     "truth_rgb": Layer("truth_rgb_file_path", "truth/{camera}/rgb", "picture", "true pictures", True),
 }
-"""The one table of what a scene holds. A distance layer that is not the truth is a source of depth: a prior can be made
-of it (`--pipeline.datamanager.depth-source`). A new source is a line here; see docs/extending.md."""
+"""The one table of what a scene holds. A distance layer that is not ground truth is a source of depth: a prior can be
+made of it (`--pipeline.datamanager.depth-source`). A new source is a line here; see docs/extending.md."""
 DEPTH_KEY = "depth_file_path"
 """nerfstudio's own key of a depth map; counts as LiDAR where there is no other. What its files hold (unit, distance or
 z-depth) the scene says, or `--depth-unit-scale-factor` and `--depth-kind`."""
@@ -87,7 +88,7 @@ INTRINSICS = ("fl_x", "fl_y", "cx", "cy")
 """Keys of a frame, or of the whole scene, that are numbers of pixels."""
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _MAX_FRAMES = 1_000_000
-"""Also an upper bound of the numbers of moments."""
+"""Also an upper bound of frame numbers."""
 _NUMBERS = (*INTRINSICS, *DISTORTION, "timestamp_s")
 _SCENE_NUMBERS = ("theta_max_deg", "depth_unit_scale_factor", "applied_scale", "fisheye_crop_radius")
 _MAY_BE_NULL = ("timestamp_s", "fisheye_crop_radius")

@@ -1,8 +1,8 @@
 """Maps of a source of depth put into a scene that exists: whole, or not at all.
 
 The maps are first written beside the scene's own: a run that is killed, or fails on its last map, leaves the scene with
-the maps it had. When all are there transforms.json drops the old ones, they are moved in, and it names them: a run that
-is killed in that moment leaves a scene without maps of that source.
+the maps it had. When all are there, transforms.json drops the old ones, the new ones are moved in, and it names them. A
+run that is killed during this step leaves a scene without maps of that source.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A scene folder on disk: its pictures with their lenses, poses, maps and moments.
+"""A scene folder on disk: its pictures with their lenses, poses, maps and frame numbers.
 
 Reads this project's scenes and other people's nerfstudio scenes, without nerfstudio, whose import takes longer than
 most commands. A map that is missing is no error here, a file that is named and missing is one. Maps are H×W,
@@ -129,7 +129,7 @@ class SceneFolder:
     lidar_is_z_depth: bool
     """Whether they hold the coordinate along the axis, as in other people's pinhole scenes."""
     pictures: tuple[ScenePicture, ...]
-    """By camera, then by moment."""
+    """By camera, then by frame."""
     split_known: bool
     """Whether transforms.json says which pictures are for training."""
     incomplete: dict[str, int]
@@ -147,12 +147,12 @@ class SceneFolder:
         return self.path.parent
 
     def cameras(self) -> dict[str, tuple[ScenePicture, ...]]:
-        """The pictures of each camera, in order of their moments."""
+        """The pictures of each camera, in order of their frames."""
         names = dict.fromkeys(picture.camera for picture in self.pictures)
         return {name: tuple(picture for picture in self.pictures if picture.camera == name) for name in names}
 
     def moments(self) -> list[int]:
-        """All moments that any camera has, in order."""
+        """The numbers of all frames that any camera has, in order."""
         return sorted({picture.moment for picture in self.pictures})
 
     def has(self, layer: str) -> bool:
@@ -164,7 +164,7 @@ class SceneFolder:
         return rays(picture.lens, self.theta_max_rad)
 
     def rgb(self, picture: ScenePicture, layer: str = "image") -> UInt8[np.ndarray, "h w 3"]:
-        """Read a picture, as it was recorded or in another layer of pictures.
+        """Read a picture, the recorded one or one of another layer of pictures.
 
         Raises:
             InputError: it cannot be decoded, or has another size than the camera.
@@ -367,7 +367,7 @@ def _picture(
 
 
 def _held_out(meta: dict[str, Any]) -> tuple[set[str], bool]:
-    """Names that are kept from training, and whether the scene says so at all."""
+    """Names that are kept from training, and whether the scene has a split at all."""
     lists: dict[str, set[str]] = {}
     for split in ("train", "val", "test"):
         names = meta.get(f"{split}_filenames")
@@ -384,7 +384,7 @@ def _camera_name(frame: dict[str, Any]) -> str:
 
 
 def _moments(frames: list[dict[str, Any]]) -> dict[str, int]:
-    """The moment of each picture: as the frames say, else their order within their camera."""
+    """The frame number of each picture: the given one, else its order within its camera."""
     if all(isinstance(frame.get("frame"), int) for frame in frames):
         return {frame["file_path"]: frame["frame"] for frame in frames}
     ordered: dict[str, list[str]] = {}

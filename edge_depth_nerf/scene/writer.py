@@ -84,14 +84,14 @@ Picture = Path | NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class FrameContent:
-    """The maps of one frame, at the scene's size: arrays, or files, which are copied as they are."""
+    """The maps of one frame, at the scene's size: arrays, or files, which are copied unchanged."""
 
     image: Picture
     """H×W×3 RGB."""
     mask: NDArray[np.bool_] | None = None
     """This frame's own mask, True = use; the camera's mask is applied as well."""
     lidar: DistanceMap | None = None
-    """LiDAR distance in metres, 0 = no return; what the mask hides is removed."""
+    """LiDAR distance in metres, 0 = no LiDAR point; what the mask hides is removed."""
     mono: DistanceMap | None = None
     """Monocular distance in metres, 0 = none."""
     beams: DistanceMap | None = None
@@ -111,7 +111,7 @@ class SceneCamera:
     name: str
     """Such as image_02; the name of its folders."""
     original: Camera
-    """As it was calibrated, at the scene's size."""
+    """The calibrated camera, at the scene's size."""
     mask: NDArray[np.bool_] | None = None
     """What of its pictures may be used, True = use; the lens circle is applied as well."""
 
@@ -123,7 +123,7 @@ class SceneFrame:
     camera: str
     """Name of its camera."""
     frame: int
-    """Number of its moment."""
+    """Number of its frame."""
     camera_to_world: Transform
     """OpenCV's camera axes, the recording's world, metres."""
     content: FrameContent | Callable[[], FrameContent]
@@ -131,7 +131,7 @@ class SceneFrame:
     timestamp_s: float | None = None
     """Seconds of the recording's own clock."""
     held_out: bool = False
-    """Whether it is kept from training. All cameras of a moment should agree."""
+    """Whether it is kept from training. All cameras of a frame should agree."""
     inputs: tuple[Path, ...] = ()
     """Files that a loaded content comes from: if one is newer than what was written, it is written again."""
 
@@ -150,7 +150,7 @@ class ShiftedView:
     camera: str
     """Name of the camera."""
     frame: int
-    """Number of the moment."""
+    """Number of the frame."""
     camera_to_world: Transform
     """OpenCV's camera axes, the recording's world, metres."""
     content: Callable[[], tuple[Picture, DistanceMap]]
@@ -164,7 +164,7 @@ class Skipped:
     """Something that was asked for and cannot be taken."""
 
     frame: int
-    """Number of the moment."""
+    """Number of the frame."""
     camera: str | None
     """The camera, or None for all."""
     reason: str
@@ -216,15 +216,15 @@ def ranges(frames: Sequence[int]) -> str:
 
 
 def best_holdout(count: int) -> int:
-    """Give the `holdout_every` that holds out one of `count` moments or more: 8, or less for very short drives.
+    """Give the `holdout_every` that holds out one of `count` frames or more: 8, or less for very short drives.
 
-    Of a single moment nothing can be held out.
+    Of a single frame nothing can be held out.
     """
     return max(2, min(8, 2 * count - 1))
 
 
 def held_out_frames(count: int, holdout_every: int) -> list[bool]:
-    """Decide which of `count` moments, in order, are held out: the middle one of every `holdout_every`; 0 = none."""
+    """Decide which of `count` frames, in order, are held out: the middle one of every `holdout_every`; 0 = none."""
     return [holdout_every > 0 and index % holdout_every == holdout_every // 2 for index in range(count)]
 
 

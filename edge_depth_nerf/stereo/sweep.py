@@ -1,4 +1,4 @@
-"""The sphere sweep: distances of one picture from its neighbours, on fisheye pictures as they are.
+"""The sphere sweep: distances of one picture from its neighbours, on original fisheye pictures.
 
 Hypotheses are inverse distances along the picture's own rays, so that each is a sphere about its camera. Under each one
 the neighbours are seen from the picture, and the correlation of small windows, which exposure does not change, says how
@@ -24,7 +24,7 @@ from edge_depth_nerf.cameras.projection_series import projection_series
 from edge_depth_nerf.stereo.views import View
 
 NEAREST_M = 0.4
-"""Nothing is looked for nearer than this."""
+"""The sweep does not search nearer than this."""
 STEP_PX = 1.0
 """Hypotheses lie so far apart in the neighbour where they do most, for most pixels."""
 STEP_SHARE = 0.04
@@ -42,7 +42,7 @@ _LARGE_PENALTY = 1.0
 _EDGE_LEVELS = 30.0
 """The change of brightness that halves it."""
 _APART = 3
-"""The next best hypothesis is looked for farther from the best than this."""
+"""The next best hypothesis is searched for farther than this from the best."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Writing a synthetic drive in KITTI-360's raw layout, with the truth beside it.
+"""Writing a synthetic drive in KITTI-360's raw layout, with the ground truth beside it.
 
 Under the output folder, with SEQ the sequence, k = 2 (left), 3 (right) and ten-digit frame numbers:
 

@@ -51,7 +51,7 @@ class MountedCamera:
     lens_theta_deg: float = LENS_THETA_DEG
     """Half of the lens's field of view."""
     delay_s: float = 0.0
-    """How long after the frame's moment it fires."""
+    """How long after the frame's time it fires."""
 
 
 class DriveLayout(ABC):
@@ -96,7 +96,7 @@ class DriveLayout(ABC):
         """A map of a picture: its truth_distance, truth_rgb or mono."""
 
     def true_points(self, frame: int) -> Path | None:
-        """A scan without noise, moved to the frame's moment; None where the layout has none."""
+        """A scan without noise, moved to the frame's time; None where the layout has none."""
         return None
 
     def moving_mask(self, name: str, frame: int) -> Path | None:

@@ -1,8 +1,8 @@
-"""A Velodyne HDL-64E on the moving car: one sweep a frame, each firing from the pose of its own moment.
+"""A Velodyne HDL-64E on the moving car: one sweep a frame, each firing from the pose of its own time.
 
-Frames: velodyne (x forward, y left, z up), world (z up); metres, seconds. 64 beams from +2° to -24.8°; 0.2° of
-azimuth between firings, clockwise seen from above. A sweep begins and ends facing backwards; at the frame's moment
-the laser faces forwards. A firing at azimuth a (counter-clockwise from x) happens at -a/360° of a turn after it.
+Frames: velodyne (x forward, y left, z up), world (z up); metres, seconds. 64 beams from +2° to -24.8°; 0.2° of azimuth
+between firings, clockwise seen from above. A sweep begins and ends facing backwards; at the frame's time the laser
+faces forwards. A firing at azimuth a (counter-clockwise from x) happens at -a/360° of a turn after it.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Scanner:
 
     @property
     def offset_s(self) -> NDArray[np.float64]:
-        """When each firing happens, from the moment that the laser faces forwards."""
+        """When each firing happens, counted from the time that the laser faces forwards."""
         return -self.azimuth_rad / (2 * np.pi) * FRAME_INTERVAL_S
 
 
@@ -46,25 +46,25 @@ HDL_64E = Scanner.turning(2.0, -24.8, 64, 1800, VELO_TO_POSE)
 """KITTI-360's scanner."""
 
 RANGE_M = (0.9, 80.0)
-"""Nearest and farthest return."""
+"""Nearest and farthest point."""
 
 RANGE_NOISE_M = 0.02
 """Standard deviation of the range."""
 
 DROPOUT = 0.05
-"""Share of returns that are lost."""
+"""Share of LiDAR points that are lost."""
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """N returns in the order of firing, beam by beam."""
+    """N points in the order of firing, beam by beam."""
 
     raw: NDArray[np.float32]
-    """N×4: x, y, z in the scanner's frame of the firing's own moment, with range noise; reflectance in 0-1."""
+    """N×4: x, y, z in the scanner's frame at the firing's own time, with range noise; reflectance in 0-1."""
     offset_s: NDArray[np.float64]
-    """N: when each was measured, from the sweep's moment."""
+    """N: when each was measured, counted from the sweep's time."""
     deskewed: NDArray[np.float32]
-    """N×4: the same returns without noise, in the scanner's frame of the sweep's moment; reflectance.
+    """N×4: the same points without noise, in the scanner's frame at the sweep's time; reflectance.
 
     Only the recording car's own motion is taken out: a car that drives stays where each firing met it.
     """

@@ -1,4 +1,4 @@
-"""Where things are at any moment: routes on the ground, what moves along them, and the recording car's own motion.
+"""Where things are at any time: routes on the ground, what moves along them, and the recording car's own motion.
 
 Frames: world (x, y horizontal, z up, metres), pose = vehicle (x forward, y right, z down). Times in seconds;
 headings in radians, counter-clockwise from world x.

@@ -142,7 +142,7 @@ class _RigFileLayout(DriveLayout):
         write_text(self.last_file, self.description())
 
     def write_times(self) -> None:
-        """Write when the pictures were taken, where the layout says so."""
+        """Write when the pictures were taken, if the layout has it."""
 
 
 class _Rig(_RigFileLayout):

@@ -54,7 +54,7 @@ def _torso(mesh: MeshBuilder, low: Triple, high: Triple, colour: Colour) -> None
 
 
 def pedestrian(rng: Generator) -> Geometry:
-    """Somebody of 1.6 to 1.9 m in mid-stride; the limbs stay as they are."""
+    """Somebody of 1.6 to 1.9 m in mid-stride; the limbs do not move."""
     mesh, tall = MeshBuilder(), float(rng.uniform(1.6, 1.9)) / 1.75
     top, trousers = _clothes(rng), _clothes(rng)
     for side in (-1, 1):
@@ -70,7 +70,7 @@ def pedestrian(rng: Generator) -> Geometry:
 
 
 def cyclist(rng: Generator) -> Geometry:
-    """Somebody on a bicycle, 1.7 m long; wheels and legs stay as they are."""
+    """Somebody on a bicycle, 1.7 m long; wheels and legs do not move."""
     mesh = MeshBuilder()
     top, trousers, frame = _clothes(rng), _clothes(rng), _clothes(rng)
     for x in (-0.53, 0.53):

@@ -1,10 +1,10 @@
 """Bundle adjustment by pycolmap: the vehicle's poses and points, with the given poses held softly.
 
-The rig of each moment is rigid, and lenses are fixed. COLMAP's own priors hold the positions of single cameras alone
-and nothing of a turn. So each moment has six cameras more, at the vehicle's origin, which look along its axes, each at
+The rig of each frame is rigid, and lenses are fixed. COLMAP's own priors hold only the positions of single cameras and
+nothing of a turn. So each frame has six more cameras at the vehicle's origin, which look along its axes. Each looks at
 a fixed point of the world that lies, by the given pose, in the middle of its picture. A vehicle that turns by θ or
-shifts by t moves them out of it by f·θ and f·t / ρ, ρ their distance: with f and ρ chosen, in units of the standard
-deviations. The same robust loss applies to features and poses.
+shifts by t moves these points out of the middle by f·θ and f·t / ρ, where ρ is their distance. f and ρ are chosen so
+that this is in units of the standard deviations. The same robust loss applies to features and poses.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ class Softness:
 
 @dataclass(frozen=True)
 class Shot:
-    """A picture on the rig of its moment."""
+    """A picture on the rig of its frame."""
 
     lens: Camera
     """At the picture's size."""
     moment: int
-    """Index of the moment."""
+    """Index of the frame."""
     to_vehicle: Transform
-    """From its camera to the vehicle as it is at the moment."""
+    """From its camera to the vehicle's pose at the frame's time."""
 
 
 def adjust_bundle(
@@ -73,7 +73,7 @@ def adjust_bundle(
         softness: how softly.
 
     Returns:
-        Vehicle to world, of each moment.
+        Vehicle to world, of each frame.
 
     """
     # COLMAP works best near the origin
@@ -198,7 +198,7 @@ class _Bundle:
         colmap.create_default_bundle_adjuster(options, self.config, self.model).solve()
 
     def vehicle_to_world(self) -> Float64[np.ndarray, "moments 4 4"]:
-        """The poses as they are now."""
+        """The present poses."""
         poses = np.tile(np.eye(4), (self.moments, 1, 1))
         for moment in range(self.moments):
             poses[moment, :3] = self.model.frame(moment + 1).rig_from_world.matrix()

@@ -1,6 +1,6 @@
 """COLMAP itself: from a recording's pictures to models of camera poses and sparse points, each of its own scale.
 
-Works in a folder of its own, so that a run that was interrupted goes on where it stopped:
+It works in a folder of its own, so that an interrupted run resumes where it stopped:
 
     inputs.json      what the folder was made from; with other inputs it is emptied
     pictures/        links to the pictures, named CAMERA/0000000123.png
@@ -10,10 +10,10 @@ Works in a folder of its own, so that a run that was interrupted goes on where i
     models/0, 1, …   COLMAP's models in its own format, which its viewer and other tools read
     models.json      their checksum
 
-Lenses are known and stay as they are. The pictures are matched in the order they were taken. The rig is not given to
-COLMAP: where its cameras share no view, as KITTI-360's left and right fisheye, COLMAP starts from a pair of moments
-whose scale cannot be seen in a straight drive, and paths come out wrong by 3 to 50 % of their length (synthetic
-drives, COLMAP 4.2). Without it, the cameras that share no view become a model each, and `colmap_scale` joins them.
+Lenses are known and stay fixed. The pictures are matched in the order they were taken. COLMAP does not get the rig.
+With a rig whose cameras share no view, such as KITTI-360's left and right fisheye, COLMAP starts from a pair of frames.
+In a straight drive their scale cannot be seen, and paths come out wrong by 3 to 50 % of their length (synthetic drives,
+COLMAP 4.2). Without the rig, the cameras that share no view become a model each, and `colmap_scale` joins them.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ _MODELS_SUM = "models.json"
 _VERSION = 2
 """Of what is done with the inputs; raised when results change."""
 _NEIGHBOURS = (1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 20)
-"""How many moments apart the pictures that are matched are: densely near, and further for a vehicle that is slow."""
+"""How many frames apart the matched pictures are: densely near, and further for a slow vehicle."""
 _SHARED_VIEW_DEG = 30.0
 """Cameras whose pictures overlap by at least this much are matched with each other."""
 _CHUNK_PICTURES = 16
@@ -186,7 +186,7 @@ def find_models(recording: Recording, options: ProcessOptions, folder: Path, con
     """Let COLMAP find the pictures' poses.
 
     Args:
-        recording: with at least three pictures; the order of its pictures is that of their moments.
+        recording: with at least three pictures; its pictures are in the order of their frames.
         options: theta_max_deg and the masks that are not in the recording.
         folder: the folder to work in, ours alone.
         console: where the progress is shown.
@@ -398,7 +398,7 @@ class _Run:
         return pairs
 
     def map(self) -> None:
-        """Find poses and points, lenses as they are; by the number of points that gives more pictures their pose."""
+        """Find poses and points with fixed lenses; by the number of points that gives more pictures their pose."""
         kept, most = self.folder / "models.kept", -1
         shutil.rmtree(kept, ignore_errors=True)
         for pose_points in _POSE_POINTS:
@@ -459,7 +459,7 @@ class _Run:
         return unfinished
 
     def has_models(self) -> bool:
-        """Whether models are there, as they were written: COLMAP's reader ends the whole process at a damaged one."""
+        """Whether models exist and are unchanged: COLMAP's reader ends the whole process at a damaged one."""
         record = self.folder / _MODELS_SUM
         if not (self.models.is_dir() and record.is_file()):
             return False

@@ -38,8 +38,8 @@ def colmap_poses(recording: Recording, options: ProcessOptions, console: Console
     """Find the poses of a recording's pictures.
 
     Args:
-        recording: its trajectory and its pictures' poses, if any, are not used; its rig, lenses, masks, and the
-            sweeps or depth maps of its moments are.
+        recording: its trajectory and its pictures' poses, if any, are not used; its rig, lenses, masks, and the sweeps
+            or depth maps of its frames are.
         options: output, beside which COLMAP works in the folder `.NAME.colmap`, and theta_max_deg.
         console: where the progress is shown.
 
@@ -103,7 +103,7 @@ def check_colmap(recording: Recording, options: ProcessOptions) -> None:
 
 
 def _spans(recording: Recording, model: ColmapModel) -> bool:
-    """Whether some camera of a model was found at two moments or more."""
+    """Whether some camera of a model was found at two frames or more."""
     seen = [recording.pictures[index].camera for index in model.camera_to_model]
     return any(seen.count(camera.name) > 1 for camera in recording.cameras)
 
@@ -112,7 +112,7 @@ def _check_path(path: MetricPath, scale: Scale) -> None:
     """Whether the path hangs together: its scale, and its steps.
 
     Raises:
-        InputError: it does not; names the moments.
+        InputError: it does not; names the frames.
 
     """
     frames, found = list(path.moments), scale.broken

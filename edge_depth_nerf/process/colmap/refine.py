@@ -2,7 +2,7 @@
 
 The given path, of LiDAR odometry, a file or COLMAP, is held softly (`bundle.Softness`): features decide from step to
 step, where they are good to hundredths of a degree; scale and drift, of which they know little, stay the given path's.
-All cameras of a moment move with the vehicle as one.
+All cameras of a frame move with the vehicle as one.
 
 A fifth of the tracks takes no part. By them the path is judged before and after: unless their features come nearer to
 their epipolar curves, and nothing has moved further than the given poses can be off, the given path stays.
@@ -66,7 +66,7 @@ REFINED_POSES = "refined_poses.json"
 _VERSION = 2
 """Of what is done with the inputs; raised when results change."""
 _APART = (1, 2, 3, 5, 8)
-"""So many moments lie between the pictures of one camera that are matched; 1 is the next."""
+"""So many frames lie between the matched pictures of one camera; 1 is the next."""
 _ACROSS = (0, 1, 2)
 """Between those of two cameras whose views overlap."""
 _MOST_FEATURES = 2500
@@ -77,7 +77,7 @@ _ROUNDS_DEG = (0.6, 0.2, 0.1, 0.1)
 _ROUNDS_LEAST_PX = (3.0, 1.5, 1.0, 1.0)
 """Features are found to some tenths of a pixel, however coarse the picture."""
 _LEAST_SIGHTS = 30
-"""A moment whose pictures see fewer points moves as the moments around it do."""
+"""A frame whose pictures see fewer points moves as the frames around it do."""
 _LEAST_JUDGES = 100
 """So many matches that took no part tell whether a path is better."""
 _JUDGING_SHARE = 5
@@ -89,9 +89,9 @@ class Refinement:
     """What became of the given poses."""
 
     vehicle_to_world: Float64[np.ndarray, "moments 4 4"]
-    """Of each moment, refined."""
+    """Of each frame, refined."""
     supported: Bool[np.ndarray, "moments"]
-    """Which moments were moved by features; the others move as those around them do."""
+    """Which frames were moved by features; the others move as those around them do."""
     points: int
     """Points in the bundle."""
     before_px: float
@@ -122,8 +122,8 @@ def refine_poses(recording: Recording, options: ProcessOptions, console: Console
         console: where the progress is shown.
 
     Returns:
-        The recording with the refined path, pictures' and shifted views' poses moved with it; or as it was, if that
-        would not be better. A notice says which.
+        The recording with the refined path, pictures' and shifted views' poses moved with it; or unchanged, if that
+        would not be better. A notice reports which.
 
     Raises:
         InputError: pycolmap is missing or too old, the recording has no path; with --strict, a picture is broken.
@@ -140,7 +140,7 @@ def refine_poses(recording: Recording, options: ProcessOptions, console: Console
     shots = _shots(recording, moments, given)
 
     def reshoot(refined: Float64[np.ndarray, "moments 4 4"], supported: Bool[np.ndarray, "moments"]) -> list[Shot]:
-        """The pictures on the rig, by the path as it is now."""
+        """The pictures on the rig, by the present path."""
         moved, change = _moved(recording, times_s, moments, given, refined, supported)
         return _shots(moved, moments, given @ change)
 
@@ -245,7 +245,7 @@ def _read_refinement(path: Path, digest: str) -> Refinement | None:
 
 
 def _shots(recording: Recording, moments: Sequence[int], given: Float64[np.ndarray, "moments 4 4"]) -> list[Shot]:
-    """The pictures on the rig of their moment: with what the vehicle moved between the moment and the picture."""
+    """The pictures on the rig of their frame: with the vehicle's motion between the frame's time and the picture's."""
     number = {frame: index for index, frame in enumerate(moments)}
     lenses = {camera.name: camera.camera for camera in recording.cameras}
     to_vehicle = np.linalg.inv(given)
@@ -292,7 +292,7 @@ def _match(
 
 
 def _read(picture: RecordedPicture, lens: Camera, strict: bool) -> np.ndarray:
-    """A picture; one that is broken is black, and is told of when its turn comes."""
+    """A picture; a broken one is black, and is reported when its turn comes."""
     try:
         rgb = read_image(picture.path)
         if rgb.shape[:2] == (lens.height, lens.width):
@@ -345,10 +345,10 @@ def refine(
         pycolmap: the module.
         shots: the pictures.
         matches: what pairs of them have in common; they count `shots`.
-        given: vehicle to world of each moment.
+        given: vehicle to world of each frame.
         softness: how softly these are held.
-        reshoot: from refined poses, and which moments features moved, to the pictures on the rig: cameras that fire at
-            other times than the moment's stand where the path has the vehicle then. None = they stay.
+        reshoot: from refined poses, and which frames features moved, to the pictures on the rig: cameras that fire at
+            other times than the frame's stand where the path has the vehicle then. None = they stay.
 
     """
     groups = features_joined(matches)
@@ -420,10 +420,10 @@ def _moved(
     refined: Float64[np.ndarray, "moments 4 4"],
     supported: Bool[np.ndarray, "moments"],
 ) -> tuple[Recording, Float64[np.ndarray, "moments 4 4"]]:
-    """Move the path, and all that lies on it; also how each moment moved, in the vehicle's frame.
+    """Move the path, and all that lies on it; also how each frame moved, in the vehicle's coordinates.
 
-    A change goes over into that of the next moment evenly; before the first moment and after the last it stays. A
-    picture with a pose of its own moves with its moment.
+    A change passes evenly into that of the next frame; before the first frame and after the last it stays. A picture
+    with a pose of its own moves with its frame.
     """
     trajectory = recording.trajectory
     assert trajectory is not None

@@ -1,9 +1,9 @@
 """From COLMAP's models to the vehicle's path in metres: scale from LiDAR, and models joined by the rig.
 
-A model gives the vehicle's pose wherever one of its pictures is registered, because the rig says where the cameras
-sit on the vehicle; models with moments in common can thus be laid over one another, also where their cameras share no
-view. The unit of a model is found where LiDAR sees what its points are: the median of LiDAR's distance over the
-model's, over all features with returns right beside them.
+A model gives the vehicle's pose wherever one of its pictures is registered, because the rig defines where the cameras
+sit on the vehicle. So models with common frames can be aligned, even if their cameras share no view. The unit of a
+model is found where LiDAR sees the model's points: it is the median of LiDAR's distance over the model's, over all
+features with LiDAR points right beside them.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from edge_depth_nerf.process.recording import RecordedPicture, RecordedSweep, Re
 MIN_PAIRS = 30
 """Fewer features than this with LiDAR beside them give no scale."""
 MIN_COMMON_MOMENTS = 3
-"""Models with fewer moments in common are not joined."""
+"""Models with fewer frames in common are not joined."""
 
 _WINDOW_PAIRS = 100
 """A window along the path is as long as it takes for so many features with LiDAR."""
@@ -44,11 +44,11 @@ _STEADY = 1.15
 _DOUBTS = 3.0
 """So many standard errors of both windows are explained."""
 _MOMENTS = 40
-"""LiDAR of at most so many moments, spread over the drive, is looked at."""
+"""LiDAR of at most so many frames, spread over the drive, is used."""
 _WINDOW_RAD = math.radians(0.4)
-"""Returns this near to a feature's ray count; the rings of a 64-beam scanner are 0.42° apart."""
+"""LiDAR points this near to a feature's ray count; the rings of a 64-beam scanner are 0.42° apart."""
 _AGREE = 0.03
-"""Returns in the window that differ by more than this share see an edge, or past it."""
+"""LiDAR points in the window that differ by more than this share see an edge, or past it."""
 _NEIGHBOURS = 8
 _ROUNDS = 4
 _SETTLED = 5e-4
@@ -60,9 +60,9 @@ class ScaleBreak:
     """Where a reconstruction changes its scale."""
 
     first: int
-    """Number of the last moment before the place where it changes most."""
+    """Number of the last frame before the place where it changes most."""
     last: int
-    """Number of the first moment after it."""
+    """Number of the first frame after it."""
     before: float
     """Metres per unit before it."""
     after: float
@@ -92,7 +92,7 @@ class MetricPath:
     """The vehicle's path in metres, in the world of the first model."""
 
     moments: dict[int, Transform]
-    """Vehicle to world, by number of moment."""
+    """Vehicle to world, by number of frame."""
     trajectory: Trajectory
     """The same over time."""
     members: tuple[ColmapModel, ...]
@@ -100,11 +100,11 @@ class MetricPath:
     scales: tuple[float, ...]
     """Metres per unit of each of them."""
     disagreement_m: float
-    """Median distance between where the cameras of one moment put the vehicle, from their mean; NaN for one camera."""
+    """Median distance of where the cameras of one frame put the vehicle, from their mean; NaN for one camera."""
 
 
 def moment_times(recording: Recording) -> dict[int, float]:
-    """When each moment was: the median of its pictures' times."""
+    """When each frame was taken: the median of its pictures' times."""
     times = defaultdict(list)
     for picture in recording.pictures:
         times[picture.frame].append(picture.time_s)
@@ -116,11 +116,11 @@ def join_models(recording: Recording, models: Sequence[ColmapModel], scales: Arr
 
     Args:
         recording: whose pictures and rig the models are of.
-        models: that with the most moments comes first.
+        models: that with the most frames comes first.
         scales: metres per unit of each. Those of joined models are made to agree with the first's.
 
     Raises:
-        InputError: the first model has fewer than two moments.
+        InputError: the first model has fewer than two frames.
 
     """
     times = moment_times(recording)
@@ -165,7 +165,7 @@ def join_models(recording: Recording, models: Sequence[ColmapModel], scales: Arr
 def _vehicle_poses(
     recording: Recording, model: ColmapModel, scale: float, times: Mapping[int, float]
 ) -> dict[int, list[Transform]]:
-    """Where each camera of a model puts the vehicle at the moments it is registered at, in metres."""
+    """Where each camera of a model puts the vehicle at the frames it is registered at, in metres."""
     found = defaultdict(list)
     for camera in recording.cameras:
         indices = [i for i in model.camera_to_model if recording.pictures[i].camera == camera.name]
@@ -195,7 +195,7 @@ def _mean_pose(poses: Sequence[Transform]) -> Transform:
 def _similarity(
     moved: Mapping[int, Transform], target: Mapping[int, Transform], factor: float | None = None
 ) -> tuple[float, Transform]:
-    """The factor (unless given) and the rigid transform that take some poses to others of the same moments.
+    """The factor (unless given) and the rigid transform that take some poses to others of the same frames.
 
     The turn is the mean of the poses' own, so that a straight path is no special case.
     """
@@ -213,11 +213,11 @@ def _similarity(
 
 
 def metric_path(recording: Recording, models: Sequence[ColmapModel]) -> tuple[MetricPath, Scale]:
-    """Find the scale from LiDAR, or from the depth maps in its place, and the path in metres.
+    """Find the scale from LiDAR, or from the depth maps instead, and the path in metres.
 
     Args:
-        recording: with the sweeps, or the depth maps, of the pictures' moments.
-        models: that with the most moments comes first.
+        recording: with the sweeps, or the depth maps, of the pictures' frames.
+        models: that with the most frames comes first.
 
     Returns:
         The path; and the scale as metres per unit of the first model, with its spread.
@@ -257,10 +257,10 @@ def find_scale_break(along: Mapping[int, Float64[np.ndarray, "_"]]) -> ScaleBrea
     """Find where the scale changes along the path, window by window.
 
     Args:
-        along: by number of moment, in order, LiDAR's distances over the reconstruction's.
+        along: by number of frame, in order, LiDAR's distances over the reconstruction's.
 
     Returns:
-        Where it changes most, if it is nowhere near one scale; None if it is, or too few moments have LiDAR.
+        Where it changes most, if it is nowhere near one scale; None if it is, or too few frames have LiDAR.
 
     """
     frames = [frame for frame, found in along.items() if len(found)]
@@ -308,14 +308,14 @@ def _too_few(pairs: int, recording: Recording) -> InputError:
 def _ratios(
     recording: Recording, models: Sequence[ColmapModel], scales: Sequence[float], trajectory: Trajectory | None
 ) -> dict[int, Float64[np.ndarray, "_"]]:
-    """LiDAR's distance over the models' scaled ones, by number of moment, for every feature with returns beside it.
+    """LiDAR's distance over the models' scaled ones, by number of frame, for every feature with LiDAR points beside it.
 
     Args:
         recording: whose sweeps are used.
         models: some models.
         scales: of each.
-        trajectory: the vehicle's path in metres, to de-skew by; None = as if each sweep were taken all at once, at
-            the moment of the picture.
+        trajectory: the vehicle's path in metres, to de-skew by; None = as if each sweep were taken all at once, at the
+            picture's time.
 
     """
     registered: dict[int, list[tuple[int, int]]] = defaultdict(list)
@@ -378,7 +378,7 @@ def _depth_points(picture: RecordedPicture, camera: Camera) -> Float64[np.ndarra
 def _beside(
     rays: Float64[np.ndarray, "features 3"], returns: Float64[np.ndarray, "returns 3"]
 ) -> Float64[np.ndarray, "features"]:
-    """LiDAR's distance along some rays, from the returns beside each; NaN where there are none that agree."""
+    """LiDAR's distance along some rays, from the LiDAR points beside each; NaN where there are none that agree."""
     distance = np.linalg.norm(returns, axis=-1)
     away = distance > 0
     returns, distance = returns[away], distance[away]

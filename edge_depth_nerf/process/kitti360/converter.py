@@ -9,9 +9,9 @@ Read from the data set's folder, for each frame number f:
     data_poses/SEQUENCE/poses.txt
     truth/SEQUENCE/…                                 what only synthesised drives have
 
-Frames: scanner → vehicle by inv(cam_0→velo) and cam_0→pose; camera → vehicle by cam→pose. cam0_to_world.txt is of
-the rectified camera 0 and not used. The cameras fire when the laser faces forward, so frame f's picture and sweep
-share their moment; the scanner turns clockwise, once a frame. Everything is checked by sizes and headers.
+Frames: scanner → vehicle by inv(cam_0→velo) and cam_0→pose; camera → vehicle by cam→pose. cam0_to_world.txt is of the
+rectified camera 0 and not used. The cameras fire when the laser faces forward, so frame f's picture and sweep share
+their time; the scanner turns clockwise, once a frame. Everything is checked by sizes and headers.
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ def _trajectory(poses: dict[int, np.ndarray], clock: _Clock, path: Path) -> Traj
 
 
 def _near(numbers: np.ndarray, moments: np.ndarray, reach: int, between: bool) -> np.ndarray:
-    """Those numbers that are at most so far from a moment, or also all between the first moment and the last."""
+    """Those numbers that are at most so far from a frame, or also all between the first frame and the last."""
     after = np.searchsorted(moments, numbers).clip(max=len(moments) - 1)
     before = (after - 1).clip(min=0)
     apart = np.minimum(np.abs(moments[after] - numbers), np.abs(moments[before] - numbers))
