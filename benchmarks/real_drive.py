@@ -191,7 +191,8 @@ def lambda_table(curves: Sequence[RunResult]) -> Iterator[str]:
         cells = [f"{weight:g}"]
         for method in methods:
             found = [run.figures for run in curves if run.method == method and run.content["lambda"] == weight]
-            cells += [", ".join(f"{figures[each.metric]:{each.form}}" for each in OVER_LAMBDA) for figures in found]
+            each_seed = [", ".join(f"{figures[each.metric]:{each.form}}" for each in OVER_LAMBDA) for figures in found]
+            cells.append("; ".join(each_seed) or "–")
         yield "| " + " | ".join(cells) + " |"
 
 

@@ -274,6 +274,8 @@ def test_the_real_drives_table_and_margins(benchmark_module, tmp_path):
             fake("kitti360_half", "ds-nerf", 0, masked_psnr=19.0, lidar_abs_rel=0.03),
         ]
     ]
+    alone = dataclasses.replace(curves[-1], content={**curves[-1].content, "lambda": 0.3})
+    assert list(real.lambda_table([*curves, alone]))[-1] == "| 0.3 | 19.00, 0.0300 | – |"
     assert list(real.lambda_table(curves))[2:] == [
         "| 0.01 | 19.00, 0.0300 | 20.01, 0.0200 |",
         "| 0.1 | 19.00, 0.0300 | 20.10, 0.0200 |",
