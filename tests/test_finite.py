@@ -338,7 +338,7 @@ def test_training_stops_with_the_pictures_name(short: Any) -> None:
         poses[:] = whole
     said = str(error.value)
     assert said.startswith("Step 4: ") and "rgb_loss is nan" in said and f"from 1 pictures: {short.config.data}" in said
-    assert name in said and "step-000000003.ckpt, is kept; --load-dir" in said and "\n" not in said
+    assert name in said and "step-000000003.ckpt, is kept; resume with --load-dir" in said and "\n" not in said
     # the step was not taken
     assert all(torch.equal(before[name], parameter) for name, parameter in short.pipeline.model.named_parameters())
     assert math.isfinite(short.train_iteration(5)[0])

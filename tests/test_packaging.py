@@ -157,7 +157,8 @@ def test_pages_link_to_what_exists(page):
     links = re.findall(r"\]\((?!http)([^)#]+)\)", text)
     assert page != "README.md" or len(links) > 3
     for link in links:
-        assert ((ROOT / page).parent / link).exists(), link
+        # the site's own page of pictures, which `make docs` writes
+        assert link == "slider.html" or ((ROOT / page).parent / link).exists(), link
 
 
 def test_the_citation_is_of_this_version():

@@ -794,6 +794,7 @@ def test_trees_stand_on_the_island(roundabout):
 
 def test_roundabout_pictures_sweeps_and_distances_agree(roundabout):
     _, _, root = roundabout
+    assert len(rig.CAMERAS) == 2
     for camera in rig.CAMERAS:
         distance = read_distance_png(truth(root, camera, "distance", 1))
         to_camera = velo_to_camera(camera)

@@ -23,8 +23,9 @@ from edge_depth_nerf.kernels.triton_launch import launch
 
 WIDEST = 64
 """Numbers in a layer that stay on the chip."""
-POINTS = 64
-"""Points that a program works on."""
+POINTS, BACKWARD_POINTS, BACKWARD_WARPS = 64, 128, 8
+"""Points that a program works on. With fewer points or warps, backward needs more registers than sm_80 and sm_89
+have."""
 
 
 def fits(weights: Sequence[Tensor]) -> bool:
@@ -190,7 +191,7 @@ def _backward(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], gr
     to_x = torch.empty(points, width, dtype=x.dtype, device=x.device)
     launch(
         _backward_kernel,
-        (triton.cdiv(points, POINTS),),
+        (triton.cdiv(points, BACKWARD_POINTS),),
         x,
         x,
         *layers[0],
@@ -212,7 +213,8 @@ def _backward(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], gr
         WIDTH=_block(width),
         HIDDEN=_block(hidden),
         OUT=_block(out),
-        POINTS=POINTS,
+        POINTS=BACKWARD_POINTS,
+        num_warps=BACKWARD_WARPS,
     )
     inputs, slopes = [x.half(), *between], [*to_between, gradient.half()]
     found = [to_x]
