@@ -184,7 +184,7 @@ def cells_table(results: Results, cells: Results, scene: str) -> Iterator[str]:
 
 def lambda_table(curves: Sequence[RunResult]) -> Iterator[str]:
     """PSNR and AbsRel of each method by λ, as Markdown."""
-    methods = [method for method in WITH_LAMBDA if any(run.method == method for run in curves)]
+    methods: list[MethodName] = [method for method in WITH_LAMBDA if any(run.method == method for run in curves)]
     yield "| λ | " + " | ".join(METHODS[method].title for method in methods) + " |"
     yield "|---" * (len(methods) + 1) + "|"
     for weight in sorted({run.content["lambda"] for run in curves}):

@@ -52,13 +52,15 @@ def trainer_in(folder: Path, name: str, **changes: Any) -> EdgeDepthTrainer:
         if hasattr(parameter, IN_PLACE):
             delattr(parameter, IN_PLACE)  # of the CPU alone
     # both kinds of steps, from the first graph on
-    trainer.pipeline.model.proposal_sampler.update_sched = lambda step: 2
+    sampler: Any = trainer.pipeline.model.proposal_sampler
+    sampler.update_sched = lambda step: 2
     return trainer
 
 
 def with_graphs(trainer: EdgeDepthTrainer) -> RunAgain:
-    capture, pipeline = RunAgain(), trainer.pipeline
-    pipeline.graphs = StepGraphs(pipeline, trainer.grad_scaler.scale, capture)  # pyright: ignore[reportAttributeAccessIssue]
+    capture = RunAgain()
+    pipeline: Any = trainer.pipeline
+    pipeline.graphs = StepGraphs(pipeline, trainer.grad_scaler.scale, capture)
     return capture
 
 
@@ -113,10 +115,12 @@ def test_what_was_not_recorded_is_computed_and_reported_once(folder, change, cap
     trainer = trainer_in(folder, "run")
     capture = with_graphs(trainer)
     losses_of(trainer, range(EAGER_STEPS + 4))
-    replays, model = capture.replays, trainer.pipeline.model
+    replays = capture.replays
+    pipeline: Any = trainer.pipeline
+    model = pipeline.model
     assert replays == 4
     if change == "rays":
-        trainer.pipeline.datamanager.train_pixel_sampler.num_rays_per_batch = 48
+        pipeline.datamanager.train_pixel_sampler.num_rays_per_batch = 48
     elif change == "options":
         model.config.sky_loss_mult = 0.0
     else:
@@ -136,7 +140,8 @@ def test_an_error_while_recording_loses_no_batch(folder, capsys):
         work()
         raise RuntimeError("operation not permitted when stream is capturing")
 
-    trainer.pipeline.graphs._capture = fails  # pyright: ignore[reportAttributeAccessIssue]
+    pipeline: Any = trainer.pipeline
+    pipeline.graphs._capture = fails
     steps = range(EAGER_STEPS + 2)
     seen = []
     for each in (computed, trainer):

@@ -120,9 +120,8 @@ def motion_features(
     known = (motion_m > 0).astype(np.uint8)
     logs = np.log(np.where(motion_m > 0, motion_m, 1)).astype(np.float32)
     kernel = np.ones((3, 3), np.uint8)
-    whole = cv2.erode(known, kernel, borderValue=(1,)) & (
-        (cv2.dilate(logs, kernel) - cv2.erode(logs, kernel)) < RIM_STEP
-    )
+    jump = np.asarray(cv2.dilate(logs, kernel) - cv2.erode(logs, kernel))
+    whole = (np.asarray(cv2.erode(known, kernel, borderValue=(1,))) > 0) & (jump < RIM_STEP)
     return {
         **{name: features[name] for name in ("distance_m", "spread", "step")},
         "by_matching": sigma_m / np.maximum(motion_m, np.float32(1e-3)),
