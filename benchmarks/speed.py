@@ -1,6 +1,7 @@
 """Training steps and rendering beside nerfstudio's own classes, in one run.
 
     python benchmarks/speed.py [--scene data/sample_drive] [--preset lite full] [--rounds 5] [--steps 10] [--json FILE]
+                               [--beside CHECKOUT]
 
 Four trainers with the same sizes (levels, table, samples, rays, chunk; pose refinement off) on the same scene:
 nerfstudio's nerfacto and depth-nerfacto with its own DataManager and its torch implementation, and ours with the torch
@@ -11,7 +12,8 @@ number of whole training iterations (batch, forward, losses, backward, optimiser
 over the whole schedule, since proposal networks are trained less often later. A held-out view, or as many of its rows
 as `--view-rays` allows, is rendered by each in turn, too. Ratios are taken within a round: what else the machine does
 hits all of them. Median and range over the rounds. Each trainer has a process of its own, which sleeps while it is
-another's turn.
+another's turn. With `--beside` one more is the code of another checkout (`git worktree add`), with the configuration of
+this one: whether a change made a step faster or slower is read in one run.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ import multiprocessing
 import os
 import platform
 import statistics
+import sys
 import tempfile
 import time
 import warnings
@@ -44,6 +47,7 @@ from nerfstudio.models.nerfacto import NerfactoModelConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.table import Table
 
+import edge_depth_nerf
 from edge_depth_nerf.plugin import config as ours
 from edge_depth_nerf.plugin.compat import lpips_not_built
 
@@ -54,7 +58,8 @@ HOST = {
     "nerfacto, tiny-cuda-nn": (NerfactoModelConfig, "tcnn"),
 }
 GRAPHS = "ours, CUDA graphs"
-OURS = {"ours, torch": "torch", "ours": "fused", GRAPHS: "fused", "ours, tiny-cuda-nn": "tcnn"}
+BESIDE = "ours, other checkout"
+OURS = {"ours, torch": "torch", "ours": "fused", BESIDE: "fused", GRAPHS: "fused", "ours, tiny-cuda-nn": "tcnn"}
 SPLATS = "splatfacto"
 ON_EVERY_MACHINE = ("nerfacto", "depth-nerfacto", "ours, torch", "ours")
 REFERENCE = "nerfacto"
@@ -108,9 +113,11 @@ class Runner:
         return taken, (rows, width)
 
 
-def serve(pipe: Connection, config: TrainerConfig) -> None:
+def serve(pipe: Connection, config: TrainerConfig, checkout: Path | None) -> None:
     """A contestant's process: it does what it is asked, one thing after the other."""
     warnings.simplefilter("ignore")
+    if checkout is not None and not Path(edge_depth_nerf.__file__).is_relative_to(checkout):
+        sys.exit(f"{checkout}: expected its edge_depth_nerf to be imported, found {edge_depth_nerf.__file__}.")
     with tempfile.TemporaryDirectory() as folder:
         runner = Runner(config, Path(folder))
         pipe.send("ready")
@@ -120,13 +127,17 @@ def serve(pipe: Connection, config: TrainerConfig) -> None:
 
 
 class Contestant:
-    """A trainer in a process of its own, and the seconds it took in each round."""
+    """A trainer in a process of its own, of this or another checkout, and the seconds it took in each round."""
 
-    def __init__(self, config: TrainerConfig) -> None:
+    def __init__(self, config: TrainerConfig, checkout: Path | None = None) -> None:
         context = multiprocessing.get_context("spawn")
         self._pipe, other = context.Pipe()
-        self._process = context.Process(target=serve, args=(other, config), daemon=True)
+        self._process = context.Process(target=serve, args=(other, config, checkout), daemon=True)
+        paths = list(sys.path)
+        if checkout is not None:
+            sys.path.insert(0, str(checkout))  # a spawned process imports from where its parent does
         self._process.start()
+        sys.path[:] = paths
         other.close()
         self.step_s: list[float] = []
         self.render_s: list[float] = []
@@ -201,6 +212,7 @@ def race(
     steps: int,
     view_rays: int = 0,
     contestant_of: Callable[[TrainerConfig], Contestant] = Contestant,
+    beside: Path | None = None,
 ) -> dict[str, Any]:
     """Let trainers of these configurations take turns.
 
@@ -217,7 +229,7 @@ def race(
     contestants = {}
     for name, config in configs.items():  # one after the other: the first writes what all find in the cache
         CONSOLE.print(f"Building {name}")
-        contestants[name] = contestant_of(config)
+        contestants[name] = Contestant(config, beside.resolve()) if name == BESIDE and beside else contestant_of(config)
         contestants[name].wait()
     for contestant in contestants.values():  # kernels are compiled, memory is there
         contestant.ask("iterate", range(50 if torch.cuda.is_available() else 3))
@@ -274,17 +286,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", type=Path, default=Path("data/sample_drive"))
     parser.add_argument("--preset", nargs="+", default=["lite"], choices=list(PRESETS))
-    parser.add_argument("--contestants", nargs="+", default=ON_EVERY_MACHINE, choices=[*HOST, *OURS, SPLATS])
+    choices = [*HOST, *OURS, SPLATS]
+    choices.remove(BESIDE)
+    parser.add_argument("--contestants", nargs="+", default=ON_EVERY_MACHINE, choices=choices)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--steps", type=int, default=10)
     parser.add_argument("--view-rays", type=int, default=1 << 16, help="at most so many are rendered; 0 for none")
+    parser.add_argument("--beside", type=Path, metavar="CHECKOUT", help="compare with the code there, too")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     results: dict[str, Any] = {"machine": machine()}
-    names = list(dict.fromkeys([REFERENCE, *options.contestants]))
+    names = list(dict.fromkeys([REFERENCE, *options.contestants, *([BESIDE] if options.beside else [])]))
     for preset in options.preset:
         configs = configurations(preset, options.scene, names)
-        results[preset] = race(configs, options.rounds, options.steps, options.view_rays)
+        results[preset] = race(configs, options.rounds, options.steps, options.view_rays, beside=options.beside)
         table = Table(
             "", "rays/s", "s a step", "× nerfacto", "s a view", "× nerfacto", title=f"{preset}, {options.scene}"
         )
