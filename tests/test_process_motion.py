@@ -151,6 +151,27 @@ def test_a_run_that_was_stopped_goes_on_where_it_was(
     np.testing.assert_array_equal(motion_maps(scene), motion_maps(ball))
 
 
+def test_each_picture_is_confirmed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two layers are made of it, and a run that was stopped while it wrote them does not confirm anew."""
+    scene = write_ball_scene(tmp_path)
+    confirm, confirmed = Motion.confirm, []
+
+    def counted(self: Motion, index: int, sweeps: Any) -> MotionDistance:
+        confirmed.append(index)
+        return confirm(self, index, sweeps)
+
+    def stopped(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Motion, "confirm", counted)
+    with monkeypatch.context() as patch:
+        patch.setattr("edge_depth_nerf.process.motion.write_maps", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            add(scene)
+    add(scene)
+    assert sorted(confirmed) == [0, 1, 2, 3, 4]
+
+
 def stopped_after_its_sweeps(scene: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder of the sweeps of a run that was stopped before it confirmed any."""
     with monkeypatch.context() as patch:

@@ -2,8 +2,8 @@
 
 Their standard deviations by parallax and confidence go to `motion_sigma/`.
 
-Held-out pictures take no part, and get an empty map. Sweeps, the long part, are kept in `.cache/motion` until all maps
-are written, so that a stopped run resumes where it stopped.
+Held-out pictures take no part, and get an empty map. Sweeps and what is confirmed of them are kept in `.cache/motion`
+until all maps are written, so that a stopped run resumes where it stopped.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from collections import OrderedDict
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -35,11 +36,12 @@ from edge_depth_nerf.stereo.sweep import Swept
 from edge_depth_nerf.stereo.views import View, view_of, working_factor
 
 VERSION = 1
-"""Of the sweeps that are kept: raised when the same pictures give other ones."""
+"""Of what is kept: raised when the same pictures give something else."""
 FEWEST_PICTURES = 1 + LEAST_AGREEING
 """Fewer cannot confirm each other."""
 _STANDS = "the vehicle stands or turns on the spot, or no two other pictures see the same places"
 _SWEEPS_IN_MEMORY = 48
+Maps = TypeVar("Maps", Swept, MotionDistance)
 _SMOOTH = 0.05
 """Inverse distances that differ by less than this share are one surface: they are interpolated in larger maps."""
 
@@ -65,6 +67,7 @@ def add_motion(scene: SceneFolder, console: Console) -> None:
         return
     store = SweepStore(scene.folder / ".cache" / "motion", scene, pictures, motion)
     run_jobs([partial(store.make, index) for index in range(len(pictures))], "Sweeping pictures", console)
+    run_jobs([partial(store.confirmed, index) for index in range(len(pictures))], "Confirming distances", console)
     numbers = {picture.name: index for index, picture in enumerate(pictures)}
     shares: list[float] = []
 
@@ -74,7 +77,7 @@ def add_motion(scene: SceneFolder, console: Console) -> None:
             if picture.held_out:
                 yield picture.name, np.zeros(size, np.float32)
                 continue
-            found = motion.confirm(numbers[picture.name], store)
+            found = store.confirmed(numbers[picture.name])
             factor = working_factor(picture.lens)
             if sigma:
                 yield picture.name, enlarged_sigma(found, factor, size)
@@ -140,7 +143,7 @@ def enlarged_sigma(found: MotionDistance, factor: int, size: tuple[int, int]) ->
 
 
 class SweepStore:
-    """The sweeps of a scene's pictures: on disk, the last ones in memory too."""
+    """The sweeps of a scene's pictures and what is confirmed of them: on disk, the last sweeps in memory too."""
 
     def __init__(self, root: Path, scene: SceneFolder, pictures: list[ScenePicture], motion: Motion) -> None:
         """Say whose sweeps they are.
@@ -162,9 +165,10 @@ class SweepStore:
 
     def make(self, index: int) -> bool:
         """Sweep a picture, unless that is done; whether it had to be."""
-        if self._read(index) is not None:
+        path = self._path(index)
+        if _read(path, Swept) is not None:
             return False
-        self._write(index, self._motion.sweep(index))
+        _write(path, self._motion.sweep(index))
         return True
 
     def __call__(self, index: int) -> Swept:
@@ -173,7 +177,7 @@ class SweepStore:
             if index in self._recent:
                 self._recent.move_to_end(index)
                 return self._recent[index]
-        swept = self._read(index)
+        swept = _read(self._path(index), Swept)
         if swept is None:
             swept = self._motion.sweep(index)
         with self._lock:
@@ -182,21 +186,34 @@ class SweepStore:
                 self._recent.popitem(last=False)
         return swept
 
+    def confirmed(self, index: int) -> MotionDistance:
+        """What neighbours confirm of a picture's sweep; kept."""
+        path = self._path(index).with_suffix(".confirmed.npz")
+        found = _read(path, MotionDistance)
+        if found is None:
+            found = self._motion.confirm(index, self)
+            _write(path, found)
+        return found
+
     def _path(self, index: int) -> Path:
         return self.folder / f"{index:06d}.npz"
 
-    def _read(self, index: int) -> Swept | None:
-        content = content_of(self._path(index), VERSION)
-        if content is None:
-            return None
-        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-            return Swept(**archive)
 
-    def _write(self, index: int, swept: Swept) -> None:
-        archive = io.BytesIO()
-        np.savez(archive, **{field.name: getattr(swept, field.name) for field in dataclasses.fields(Swept)})
-        self.folder.mkdir(parents=True, exist_ok=True)
-        write_checked(self._path(index), VERSION, lambda file: file.write(archive.getbuffer()))
+def _read(path: Path, kind: type[Maps]) -> Maps | None:
+    """Maps of a picture, if they are kept."""
+    content = content_of(path, VERSION)
+    if content is None:
+        return None
+    with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+        return kind(**archive)
+
+
+def _write(path: Path, maps: Swept | MotionDistance) -> None:
+    """Keep maps of a picture."""
+    archive = io.BytesIO()
+    np.savez(archive, **{field.name: getattr(maps, field.name) for field in dataclasses.fields(maps)})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_checked(path, VERSION, lambda file: file.write(archive.getbuffer()))
 
 
 def _made_of(scene: SceneFolder, pictures: list[ScenePicture]) -> str:
