@@ -16,15 +16,15 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parent.parent
 
 MOST_KERNELS = {
+    "full, a view": 198,
     "full": 397,
     "full, proposals rest": 348,
     "full, poses": 841,
     "lite": 331,
     "paper": 289,
-    "full, a view": 198,
 }
 """Today's counts: to be lowered when fewer are needed, never raised."""
-MOST_GIGABYTES = {"full": 2.6, "full, proposals rest": 2.1, "full, poses": 3.0, "lite": 1.0, "paper": 2.4}
+MOST_GIGABYTES = {"full, a view": 11.4, "full": 2.6, "full, proposals rest": 2.1, "full, poses": 3.0, "lite": 1.0, "paper": 2.4}
 """Of torch's operations; to be lowered likewise."""
 
 

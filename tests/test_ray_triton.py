@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from functools import partial
 from types import ModuleType
 from typing import Any
@@ -227,6 +228,41 @@ def test_a_kernel_that_fails_is_left_to_torch(monkeypatch):
         assert triton_back_end.working("broken", device, "sum") is None
     assert triton_back_end.working("broken", device, "sum") is None
     assert tried == ["whole", "cuda"]
+    triton_back_end.working.cache_clear()
+
+
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_a_rendering_may_be_the_first_that_needs_the_kernels(monkeypatch, mode):
+    """Without gradients, and traced by the viewer, which raises an error to end a picture."""
+
+    class Interrupted(Exception):
+        pass
+
+    def traced(*_: Any) -> Any:
+        if asked:
+            raise Interrupted
+        return traced
+
+    def try_out(device: torch.device) -> None:
+        asked.append(device)
+        x = torch.ones(1, requires_grad=True)
+        (2 * x).backward()
+        slopes.append(x.grad)
+
+    asked, slopes = [], []
+    module = module_with("module", try_out=try_out)
+    monkeypatch.setitem(triton_back_end.MODULES, "module", lambda: module)
+    before = sys.gettrace()
+    with mode():
+        sys.settrace(traced)
+        try:
+            found = triton_back_end.working("module", torch.device("cuda"), "sum")
+        except Interrupted:
+            found = None  # after the trial, where it is a rendering that ends
+        finally:
+            sys.settrace(before)
+    assert [float(slope) for slope in slopes] == [2.0]
+    assert (found or triton_back_end.working("module", torch.device("cuda"), "sum")) is module
     triton_back_end.working.cache_clear()
 
 

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import functools
 import os
+import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from types import ModuleType
 
@@ -28,6 +30,22 @@ MODULES: dict[str, Callable[[], ModuleType]] = {
 """The modules of kernels by their names."""
 
 
+@contextmanager
+def undisturbed() -> Iterator[None]:
+    """Let kernels be tried out and measured in the same way, whoever is the first to need them.
+
+    That may be a rendering: without gradients, and in a browser's thread, where nerfstudio traces each line of Python
+    and raises an error to end a picture that is no longer wanted. It would look like the kernel's.
+    """
+    trace = sys.gettrace()
+    sys.settrace(None)
+    try:
+        with torch.inference_mode(False), torch.enable_grad():
+            yield
+    finally:
+        sys.settrace(trace)
+
+
 @functools.lru_cache
 def working(module: str, device: torch.device, what: str) -> ModuleType | None:
     """Give a module of `edge_depth_nerf.kernels` whose kernels work on a device, None where they do not.
@@ -42,17 +60,21 @@ def working(module: str, device: torch.device, what: str) -> ModuleType | None:
     """
     if device.type != "cuda":
         return None
-    try:
-        kernels = MODULES[module]()
-        kernels.try_out(device)
-    except Exception as error:  # whatever keeps Triton from working here
-        warnings.warn(
-            f"The fused {what} does not work on {device} ({type(error).__name__}: {error}); "
-            "nerfstudio's torch form takes its place, with the same results but slower.",
-            stacklevel=2,
-        )
-        return None
-    return kernels
+    failure = None
+    with undisturbed():
+        try:
+            kernels = MODULES[module]()
+            kernels.try_out(device)
+        except Exception as error:  # whatever keeps Triton from working here
+            failure = error
+    if failure is None:
+        return kernels
+    warnings.warn(
+        f"The fused {what} does not work on {device} ({type(failure).__name__}: {failure}); "
+        "nerfstudio's torch form takes its place, with the same results but slower.",
+        stacklevel=2,
+    )
+    return None
 
 
 def along_rays(*tensors: Tensor) -> ModuleType | None:
