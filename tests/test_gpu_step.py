@@ -5,11 +5,16 @@ from __future__ import annotations
 import importlib
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
+from nerfstudio.cameras.rays import Frustums, RaySamples
 from torch._subclasses.fake_tensor import FakeTensorMode
+
+from edge_depth_nerf.plugin.exposure import KINDS
+from edge_depth_nerf.plugin.model import EdgeDepthNerfModel, EdgeDepthNerfModelConfig
 
 pytestmark = pytest.mark.slow
 
@@ -24,7 +29,14 @@ MOST_KERNELS = {
     "paper": 289,
 }
 """Today's counts: to be lowered when fewer are needed, never raised."""
-MOST_GIGABYTES = {"full, a view": 11.4, "full": 2.6, "full, proposals rest": 2.1, "full, poses": 3.0, "lite": 1.0, "paper": 2.4}
+MOST_GIGABYTES = {
+    "full, a view": 11.4,
+    "full": 2.6,
+    "full, proposals rest": 2.1,
+    "full, poses": 3.0,
+    "lite": 1.0,
+    "paper": 2.4,
+}
 """Of torch's operations; to be lowered likewise."""
 
 
@@ -98,6 +110,29 @@ def test_the_counter_counts(gpu_counts):
         assert counter.counts.uploads == [20]
         with pytest.raises(Exception, match="same device"):
             torch.add(x, torch.ones(5))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_maps_of_colours_copy_nothing_from_the_host(gpu_counts, kind):
+    counter = gpu_counts.Counter()
+    with FakeTensorMode(), torch.device("cuda"):
+        maps, colours, picture, place = KINDS[kind](3), torch.rand(7, 3), torch.zeros(7).long(), torch.rand(7, 2)
+        with counter:
+            maps(colours, picture, place).sum()
+    assert counter.counts.parts["other"].kernels > 0 and not counter.counts.synchronisations
+
+
+def test_the_rival_losses_copy_nothing_from_the_host(gpu_counts):
+    counter = gpu_counts.Counter()
+    config = EdgeDepthNerfModelConfig(depth_loss="ds-nerf")
+    with FakeTensorMode(), torch.device("cuda"):
+        lengths = torch.rand(7, 5, 1)
+        along = lengths.expand(7, 5, 3)
+        samples = RaySamples(Frustums(along, along, starts=lengths, ends=lengths, pixel_area=lengths))
+        model: Any = SimpleNamespace(config=config, metres_per_unit=2.0, _can_be_met=lambda prior_m: prior_m > 0)
+        with counter:
+            EdgeDepthNerfModel._depth_loss(model, lengths, samples, {}, {"prior_distance_m": torch.rand(7, 1)})
+    assert counter.counts.parts["other"].kernels > 0 and not counter.counts.synchronisations
 
 
 def test_a_kernel_of_triton_is_given_tensors_of_the_gpu(gpu_counts):

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import pytest
 import torch
 from ahead_of_time import ARCHITECTURES, compiled
-from interpreted import assert_near, in_interpreter
+from interpreted import NEEDS_A_GPU, assert_near, in_interpreter, on_a_gpu
 
 from edge_depth_nerf.kernels import form_choice, hash_grid_numba
 from edge_depth_nerf.kernels.form_choice import form_for
@@ -96,6 +96,11 @@ def check_what_is_not_finite() -> None:
 def test_in_the_interpreter(check):
     pytest.importorskip("triton")
     in_interpreter(check)
+
+
+@NEEDS_A_GPU
+def test_the_same_on_a_gpu():
+    on_a_gpu(check_encoding, check_the_tables_gradient, check_what_is_not_finite)
 
 
 @pytest.mark.slow

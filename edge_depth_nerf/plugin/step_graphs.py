@@ -53,7 +53,8 @@ class GpuCapture:
                 work()
         torch.cuda.current_stream().wait_stream(stream)
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, pool=self._pool):
+        # the viewer's thread may use the GPU meanwhile, on its own stream
+        with torch.cuda.graph(graph, pool=self._pool, capture_error_mode="thread_local"):
             found = work()
         return found, graph.replay
 
