@@ -75,6 +75,16 @@ def test_a_batch_is_one_upload_of_packed_records(counts, case, rays):
     assert counts[case]["uploads"] == [15 * rays]
 
 
+def test_the_field_is_asked_once_and_directions_once_a_ray(counts):
+    """Two proposal networks and the field; at rest the former get no gradient."""
+    for case, gradients in (("full", 3), ("full, proposals rest", 1), ("lite", 3)):
+        names = counts[case]["names"]
+        assert (names["triton:_encode_kernel"], names["triton:_table_gradient_kernel"]) == (3, gradients), case
+        assert names["triton:_harmonics_kernel"] == 1, case
+        # the edge loss: all levels in one launch each
+        assert [names[f"triton:_{each}_kernel"] for each in ("share", "sum", "scale")] == [1, 1, 1], case
+
+
 def test_all_parameters_get_a_gradient_but_those_of_proposals_at_rest(counts):
     for case in ("full", "full, poses", "lite", "paper"):
         # nerfstudio's parameter that tells the device
@@ -82,6 +92,18 @@ def test_all_parameters_get_a_gradient_but_those_of_proposals_at_rest(counts):
     resting = counts["full, proposals rest"]["without_gradient"]
     assert len(resting) > 1
     assert all(name == "device_indicator_param" or name.startswith("proposal_networks") for name in resting)
+
+
+def test_the_page_says_what_is_counted(counts):
+    names = {"full, proposal networks at rest": "full, proposals rest", "full, poses refined": "full, poses"}
+    text = (ROOT / "docs" / "speed.md").read_text(encoding="utf-8").partition("| | kernels before |")[2]
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.split("\n\n")[0].splitlines()[2:]]
+    assert {names.get(row[0], row[0]) for row in rows} == set(MOST_KERNELS)
+    for name, _, kernels, _, gigabytes, uploads, _, waits in rows:
+        found = counts[names.get(name, name)]
+        expected = [found["kernels"], len(found["uploads"]), len(found["synchronisations"])]
+        assert [int(kernels), int(uploads), int(waits)] == expected, name
+        assert gigabytes == f"{found['gigabytes']:.1f}", name
 
 
 def test_the_counter_counts(gpu_counts):

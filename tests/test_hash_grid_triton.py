@@ -127,6 +127,9 @@ def test_each_form_compiles_without_spills(architecture, features, tmp_path, mon
     ]
     assert {kernel.spilled for kernel in found} == {0}
     assert max(kernel.registers for kernel in found) <= 32 * features
+    # a product and a sum are two roundings, as in torch: a point's cell must not depend on the compiler
+    instructions = {name for kernel in found for name in kernel.instructions}
+    assert "FMUL" in instructions and not any(name.startswith("FFMA") for name in instructions)
     additions = {
         sum(count for name, count in kernel.instructions.items() if name.startswith("RED"))
         for kernel in found

@@ -32,10 +32,10 @@ MODULES: dict[str, Callable[[], ModuleType]] = {
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Let kernels be tried out and measured in the same way, whoever is the first to need them.
+    """Enable gradients and stop tracing, to try out and measure kernels.
 
-    That may be a rendering: without gradients, and in a browser's thread, where nerfstudio traces each line of Python
-    and raises an error to end a picture that is no longer wanted. It would look like the kernel's.
+    The first caller may be a rendering. It has no gradients, which `try_out` needs. In the viewer's thread nerfstudio
+    also traces each line of Python, and ends a picture by an error there. It would look like an error of the kernel.
     """
     trace = sys.gettrace()
     sys.settrace(None)

@@ -131,6 +131,11 @@ class StepGraphs:
         self._seen: tuple[Any, ...] = ()
         self._packed = self._schedule = self._start = torch.empty(0)
 
+    @property
+    def recorded(self) -> int:
+        """How many kinds of steps are replayed; 0 before the first recording, and once something has ended this."""
+        return len(self._recorded)
+
     def replayed(self, packed: Tensor, step: int) -> Step | None:
         """Take a step with a batch by a graph, but for the optimisers.
 
