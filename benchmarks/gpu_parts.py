@@ -10,6 +10,7 @@ import copy
 import importlib.util
 import itertools
 import math
+import os
 import re
 import subprocess
 import sys
@@ -100,15 +101,17 @@ def device(settings: Settings) -> dict[str, Any]:
     return {**about, "copied_gb_s": 2 * x.numel() * x.element_size() / taken_ms / 1e6}
 
 
+def tests_of_a_gpu() -> list[Path]:
+    """The files that have such tests."""
+    return [path for path in sorted(TESTS.glob("test_*.py")) if "_on_a_gpu(" in path.read_text(encoding="utf-8")]
+
+
 def gpu_tests(settings: Settings) -> dict[str, Any]:
-    """The tests that a machine without a GPU skips, by number."""
-    files = [TESTS / "test_grad_scaler.py"]
-    if not settings.fake:
-        marked = "cuda.is_available"
-        files = [path for path in sorted(TESTS.glob("test_*.py")) if marked in path.read_text(encoding="utf-8")]
-    command = [sys.executable, "-m", "pytest", *map(str, files), "-n", "0", "-p", "no:cacheprovider"]
-    command += [f"--basetemp={settings.folder / 'tests'}"]
-    command += [] if settings.fake else ["-k", "gpu or cuda or triton"]
+    """The tests that a machine without a GPU skips, by number: their names end with `on_a_gpu`."""
+    files = [TESTS / "test_grad_scaler.py"] if settings.fake else tests_of_a_gpu()
+    command = [sys.executable, "-m", "pytest", *map(str, files), "-p", "no:cacheprovider"]
+    command += [f"--basetemp={settings.folder / 'tests'}", *(["-n", "0"] if settings.fake else ["-n", "4"])]
+    command += [] if settings.fake else ["-k", "on_a_gpu"]
     done = subprocess.run(command, cwd=HERE.parent, capture_output=True, text=True)
     last = done.stdout.strip().rpartition("\n")[2]
     counts = {what: int(number) for number, what in re.findall(r"(\d+) (passed|failed|skipped|error)", last)}
@@ -160,25 +163,48 @@ def kernels(settings: Settings) -> dict[str, Any]:
     return {"rows": rows}
 
 
-def samples_and_networks(settings: Settings) -> dict[str, Any]:
-    """Triton's kernels for samples, densities, directions and networks beside torch's, at the sizes of a full step."""
+Pair = tuple[Callable[[], torch.Tensor], Callable[[], torch.Tensor]]
+"""The same work by Triton's kernels and by torch."""
+
+
+def has_kernels(settings: Settings) -> bool:
+    """Whether Triton's kernels run: on a GPU, or interpreted; else torch's form stands for them."""
+    return not settings.fake or os.environ.get("TRITON_INTERPRET") == "1"
+
+
+def followed(found: torch.Tensor, *given: torch.Tensor) -> torch.Tensor:
+    """The sum and its gradients, in one row."""
+    return torch.cat(
+        [found.sum().view(1), *(each.flatten().float() for each in torch.autograd.grad(found.sum(), given))]
+    )
+
+
+def spaced(distance: torch.Tensor) -> torch.Tensor:
+    """nerfstudio's piecewise spacing."""
+    return torch.where(distance < 1, distance / 2, 1 - 1 / (2 * distance))
+
+
+def sorted_edges(rays: int, samples: int, settings: Settings) -> torch.Tensor:
+    """Edges of samples anywhere in 0..1."""
+    return torch.rand(rays, samples + 1, device=settings.device).sort(dim=1)[0]
+
+
+def work_by_number(rays: int, samples: int, settings: Settings) -> dict[str, Pair]:
+    """Places, positions, densities and directions."""
     import torch.nn.functional as F
     from nerfstudio.field_components.activations import trunc_exp
     from nerfstudio.utils.math import components_from_spherical_harmonics
 
-    from edge_depth_nerf.kernels.network import _layer_by_layer
+    from edge_depth_nerf.kernels import contraction_triton, pointwise_triton
+    from edge_depth_nerf.kernels.fields import CubeContraction
 
-    torch.manual_seed(0)
-    rays, samples = (16, 8) if settings.fake else (4096, 256)
     count = rays * samples
     near, far = (torch.full((rays, 1), value, device=settings.device) for value in (0.01, 50.0))
-    edges = torch.rand(rays, samples + 1, device=settings.device).sort(dim=1)[0]
+    edges = sorted_edges(rays, samples, settings)
     directions = F.normalize(torch.randn(rays, 3, device=settings.device), dim=1)
     before = torch.randn(count, device=settings.device, requires_grad=True)
-    inside = torch.ones(count, device=settings.device)
-
-    def spaced(distance: torch.Tensor) -> torch.Tensor:
-        return torch.where(distance < 1, distance / 2, 1 - 1 / (2 * distance))
+    inside, anywhere = torch.ones(count, device=settings.device), 3 * torch.randn(count, 3, device=settings.device)
+    contraction = CubeContraction(order=float("inf"))
 
     def distances() -> torch.Tensor:
         x = torch.lerp(spaced(near), spaced(far), edges)
@@ -188,49 +214,133 @@ def samples_and_networks(settings: Settings) -> dict[str, Any]:
         starts, ends = edges[:, :-1, None], edges[:, 1:, None]
         return directions[:, None] + directions[:, None] * (starts + ends) / 2
 
-    def followed(found: torch.Tensor, *given: torch.Tensor) -> torch.Tensor:
-        """The gradients of the sum, in one row."""
-        return torch.cat([each.flatten().float() for each in torch.autograd.grad(found.sum(), given)])
-
-    of_torch: dict[str, Callable[[], torch.Tensor]] = {
-        "distances": distances,
-        "positions": middles,
-        "densities": lambda: followed(0.01 * trunc_exp(before) * inside, before),
-        "directions": lambda: components_from_spherical_harmonics(4, (directions + 1) / 2),
+    return {
+        "contraction": (
+            lambda: contraction_triton.contract(anywhere)[0],
+            lambda: (contraction(anywhere) + 2) / 4,
+        ),
+        "distances": (lambda: pointwise_triton.distances(edges, near, far), distances),
+        "positions": (
+            lambda: pointwise_triton.middles(directions, directions, edges[:, :-1], edges[:, 1:]),
+            middles,
+        ),
+        "densities": (
+            lambda: followed(pointwise_triton.density(before, inside, 0.01), before),
+            lambda: followed(0.01 * trunc_exp(before) * inside, before),
+        ),
+        "directions": (
+            lambda: pointwise_triton.harmonics(directions, torch.float32),
+            lambda: components_from_spherical_harmonics(4, (directions + 1) / 2),
+        ),
     }
-    of_triton = of_torch
-    if not settings.fake:
-        from edge_depth_nerf.kernels import network_triton, pointwise_triton
 
-        of_triton = {
-            "distances": lambda: pointwise_triton.distances(edges, near, far),
-            "positions": lambda: pointwise_triton.middles(directions, directions, edges[:, :-1], edges[:, 1:]),
-            "densities": lambda: followed(pointwise_triton.density(before, inside, 0.01), before),
-            "directions": lambda: pointwise_triton.harmonics(directions, torch.float32),
-        }
-    for widths, points in (((10, 16, 1), count), ((32, 64, 16), count // 5), ((15, 64, 64, 3), count // 5)):
+
+def work_along_rays(rays: int, samples: int, settings: Settings) -> dict[str, Pair]:
+    """Weights, placing samples and the losses on samples, with their gradients."""
+    from nerfstudio.model_components.losses import lossfun_distortion, lossfun_outer
+
+    from edge_depth_nerf.kernels import edge_loss_triton, ray_triton
+    from edge_depth_nerf.method.losses import EPS, NARROW, edge_loss
+
+    final = max(2, samples // 5)
+    densities = (5 * torch.rand(rays, samples, device=settings.device)).requires_grad_()
+    outer_edges, edges = (sorted_edges(rays, each, settings) for each in (samples, final))
+    outer, weights = (
+        torch.rand(rays, each, device=settings.device).pow(4).div(each).requires_grad_() for each in (samples, final)
+    )
+    prior, sigma = 0.1 + torch.rand(rays, device=settings.device), torch.full((rays,), 0.2, device=settings.device)
+    wanted = torch.linspace(0.01, 0.99, final, device=settings.device).expand(rays, -1).contiguous()
+    levels = [(outer, outer_edges[:, :-1], outer_edges[:, 1:]), (weights, edges[:, :-1], edges[:, 1:])]
+    deltas = outer_edges.diff()
+
+    def torch_weights() -> torch.Tensor:
+        depth = densities * deltas
+        before = depth.cumsum(1) - depth
+        return followed((1 - torch.exp(-depth)) * torch.exp(-before) * wanted[:, :1], densities)
+
+    def placed() -> torch.Tensor:
+        share = outer.detach() + 0.01
+        cumulative = torch.nn.functional.pad((share / share.sum(1, keepdim=True)).cumsum(1), (1, 0))
+        above = torch.searchsorted(cumulative, wanted, side="right").clamp(1, samples)
+        low, high = (cumulative.gather(1, each) for each in (above - 1, above))
+        start, end = (outer_edges.gather(1, each) for each in (above - 1, above))
+        return start + (wanted - low) / (high - low) * (end - start)
+
+    def by_triton() -> torch.Tensor:
+        found = edge_loss_triton.edge_losses(
+            levels,
+            prior,
+            sigma,
+            metres_per_unit=1.0,
+            interval=True,
+            divide_by_norm=True,
+            eps=EPS,
+            narrow=NARROW,
+        )
+        return followed(found, outer, weights)
+
+    def by_torch() -> torch.Tensor:
+        each = [edge_loss(*level, prior, sigma, gaussian="interval", divide_by_norm=True) for level in levels]
+        return followed(torch.stack(each), outer, weights)
+
+    return {
+        "weights": (
+            lambda: followed(ray_triton.weights_from_densities(densities, deltas) * wanted[:, :1], densities),
+            torch_weights,
+        ),
+        "placing samples": (lambda: ray_triton.place_samples(outer, outer_edges, wanted, 0.01, 1e-5), placed),
+        "proposal loss": (
+            lambda: followed(ray_triton.bound_loss(edges, weights.detach(), outer_edges, outer), outer),
+            lambda: followed(lossfun_outer(edges, weights.detach(), outer_edges, outer).mean(), outer),
+        ),
+        "distortion loss": (
+            lambda: followed(ray_triton.distortion_loss(edges, weights), weights),
+            lambda: followed(lossfun_distortion(edges, weights).mean(), weights),
+        ),
+        "edge loss": (by_triton, by_torch),
+    }
+
+
+def work_of_networks(points: int, settings: Settings) -> dict[str, Pair]:
+    """nerfacto's networks, forward and backward; of a proposal network five times the points."""
+    from edge_depth_nerf.kernels import network_triton
+    from edge_depth_nerf.kernels.network import _layer_by_layer
+
+    found: dict[str, Pair] = {}
+    for widths, count in (((10, 16, 1), 5 * points), ((32, 64, 16), points), ((15, 64, 64, 3), points)):
         pairs = list(itertools.pairwise(widths))
         weights = [torch.randn(out, width, device=settings.device).requires_grad_() for width, out in pairs]
         biases = [torch.randn(out, device=settings.device).requires_grad_() for _, out in pairs]
-        x = torch.randn(points, widths[0], device=settings.device).requires_grad_()
+        x = torch.randn(count, widths[0], device=settings.device).requires_grad_()
 
         def step(network: Any, x: Any = x, weights: Any = weights, biases: Any = biases) -> torch.Tensor:
             with torch.autocast(settings.device, enabled=not settings.fake, dtype=torch.float16):
-                found = network(x, weights, biases)
-            return followed(found, x, *weights, *biases)
+                result = network(x, weights, biases)
+            return followed(result, x, *weights, *biases)
 
         name = f"network of {'-'.join(map(str, widths))}, forward and backward"
-        of_torch[name] = partial(step, _layer_by_layer)
-        if not settings.fake:
-            of_triton[name] = partial(step, network_triton.network)
+        found[name] = partial(step, network_triton.network), partial(step, _layer_by_layer)
+    return found
+
+
+def samples_and_networks(settings: Settings) -> dict[str, Any]:
+    """Triton's kernels for samples, losses and networks beside torch's, at the sizes of a full step."""
+    torch.manual_seed(0)
+    rays, samples = (16, 8) if settings.fake else (4096, 256)
+    pairs = {
+        **work_by_number(rays, samples, settings),
+        **work_along_rays(rays, samples, settings),
+        **work_of_networks(rays * samples // 5, settings),
+    }
     rows = []
-    for name, expected in of_torch.items():
-        found, beside = of_triton[name]().double(), expected().double()
+    for name, (by_triton, by_torch) in pairs.items():
+        work = by_triton if has_kernels(settings) else by_torch
+        found, beside = work().double(), by_torch().double()
         rows.append(
             {
                 "what": name,
-                "triton_ms": milliseconds(of_triton[name], settings),
-                "torch_ms": milliseconds(expected, settings),
+                "triton_ms": milliseconds(work, settings),
+                "torch_ms": milliseconds(by_torch, settings),
                 "off_torch": float((found - beside).norm() / beside.norm()),
             }
         )
@@ -309,16 +419,31 @@ def raced(settings: Settings, names: Sequence[str]) -> dict[str, Any]:
             "rays_per_second": None if name == speed.SPLATS else result["rays_per_second"],
             "step_ms": [1e3 * each for each in result["step_s"]],
             "ratio_to_nerfacto": result["step_ratio"],
+            "graphs": result["graphs"],
         }
         for name, result in found.items()
     }
+
+
+def beside_others(settings: Settings, name: str) -> dict[str, Any]:
+    """Race a trainer that may fail on its own, so that it ends no other; `left_out` says why it has no figures."""
+    try:
+        found = raced(settings, [name])[name]
+    except Exception as error:
+        return {"left_out": {name: f"{type(error).__name__}: {error}"[:500]}}
+    if found["graphs"] == 0:
+        return {"left_out": {name: "no graph was recorded; the log says why"}}
+    return {name: found}
 
 
 def our_steps(settings: Settings) -> dict[str, Any]:
     """Ours, fused (launched one by one, and as CUDA graphs) and in torch, beside nerfstudio's nerfacto."""
     import speed
 
-    return raced(settings, ["ours"] if settings.fake else ["ours", speed.GRAPHS, "ours, torch"])
+    found = raced(settings, ["ours"] if settings.fake else ["ours", "ours, torch"])
+    if settings.fake:
+        return {**found, "left_out": {speed.GRAPHS: "there is no GPU"}}
+    return found | beside_others(settings, speed.GRAPHS)
 
 
 def other_steps(settings: Settings) -> dict[str, Any]:
@@ -335,10 +460,8 @@ def other_steps(settings: Settings) -> dict[str, Any]:
     if settings.fake or importlib.util.find_spec("gsplat") is None:
         left_out["splatfacto"] = "gsplat is not installed, or there is no GPU"
     else:
-        try:  # gsplat compiles at its first call
-            found |= {name: each for name, each in raced(settings, ["splatfacto"]).items() if name == "splatfacto"}
-        except Exception as error:
-            left_out["splatfacto"] = f"{type(error).__name__}: {error}"[:500]
+        splats = beside_others(settings, "splatfacto")  # gsplat compiles at its first call
+        found, left_out = {**found, **splats}, {**left_out, **splats.get("left_out", {})}
     return {**found, "left_out": left_out}
 
 

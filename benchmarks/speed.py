@@ -92,6 +92,13 @@ class Runner:
         for callback in self.trainer.callbacks:
             callback.run_callback_at_location(step, location=TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
 
+    def graphs(self, _: None) -> int | None:
+        """How many CUDA graphs its steps are replayed from; None where none are asked for."""
+        if not getattr(self.trainer.config, "cuda_graphs", False):
+            return None
+        graphs = self.trainer.pipeline.graphs
+        return 0 if graphs is None else graphs.recorded
+
     def render(self, most_rays: int) -> tuple[float, tuple[int, int]]:
         """Seconds of rendering rows from the middle of the first held-out view, and their height and width."""
         pipeline: Any = self.trainer.pipeline
@@ -241,6 +248,7 @@ def race(
             taken, contestant.rendered_px = contestant.ask("render", view_rays)
             contestant.render_s.append(taken)
         CONSOLE.print(f"Round {number + 1} of {rounds}")
+    graphs = {name: contestant.ask("graphs", None) for name, contestant in contestants.items()}
     for contestant in contestants.values():
         contestant.stop()
     reference = contestants[REFERENCE]
@@ -249,6 +257,7 @@ def race(
             "rays_per_second": rays / statistics.median(contestant.step_s),
             "step_s": contestant.step_s,
             "step_ratio": [a / b for a, b in zip(reference.step_s, contestant.step_s, strict=True)],
+            "graphs": graphs[name],
             "rendered_px": contestant.rendered_px,
             "render_s": contestant.render_s,
             "render_ratio": [a / b for a, b in zip(reference.render_s, contestant.render_s, strict=True)],
@@ -296,7 +305,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     results: dict[str, Any] = {"machine": machine()}
-    names = list(dict.fromkeys([REFERENCE, *options.contestants, *([BESIDE] if options.beside else [])]))
+    names: list[str] = list(dict.fromkeys([REFERENCE, *options.contestants, *([BESIDE] if options.beside else [])]))
     for preset in options.preset:
         configs = configurations(preset, options.scene, names)
         results[preset] = race(configs, options.rounds, options.steps, options.view_rays, beside=options.beside)

@@ -1,4 +1,4 @@
-"""Functions run in a process of their own, whose Triton kernels are interpreted and take CPU tensors.
+"""Functions run in a process of their own, whose Triton kernels take CPU tensors: interpreted, or on a GPU.
 
 The variable TRITON_INTERPRET has to be set before Triton is imported.
 """
@@ -8,21 +8,39 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+import pytest
 import torch
 
 DONE = "the checks have run"
+NEEDS_A_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+slack = 1.0
+"""Tolerances are multiplied by this."""
 
 
 def in_interpreter(*checks: Callable[[], None]) -> None:
     """Run functions of a module of tests, one after the other; raises what they raise."""
+    _in_a_process(checks, [], {"TRITON_INTERPRET": "1"})
+
+
+def moved_in_interpreter(*checks: Callable[[], None]) -> None:
+    """As `in_interpreter`, the memory of all tensors copied at each launch as `on_a_gpu` does it."""
+    _in_a_process(checks, ["import launched; launched.launch_on('cpu')"], {"TRITON_INTERPRET": "1"})
+
+
+def on_a_gpu(*checks: Callable[[], None]) -> None:
+    """As `in_interpreter`, but kernels are compiled, and run on the GPU; all else stays on the CPU."""
+    _in_a_process(checks, ["import launched; launched.launch_on('cuda')"], {"TRITON_INTERPRET": "0"})
+
+
+def _in_a_process(checks: Sequence[Callable[[], None]], before: Sequence[str], variables: Mapping[str, str]) -> None:
     calls = [f"import {check.__module__}; {check.__module__}.{check.__name__}()" for check in checks]
     path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
     done = subprocess.run(
-        [sys.executable, "-c", "\n".join([*calls, f"print({DONE!r})"])],
-        env={**os.environ, "PYTHONPATH": path, "TRITON_INTERPRET": "1"},
+        [sys.executable, "-c", "\n".join([*before, *calls, f"print({DONE!r})"])],
+        env={**os.environ, "PYTHONPATH": path, **variables},
         capture_output=True,
         text=True,
         timeout=240,
@@ -39,4 +57,4 @@ def assert_near(found: torch.Tensor, expected: torch.Tensor, tolerance: float) -
     difference = (found.double() - expected)[~is_nan].abs().max()
     largest = expected[~is_nan].abs().max()
     assert largest > 0
-    assert difference <= tolerance * largest, (float(difference), float(largest))
+    assert difference <= slack * tolerance * largest, (float(difference), float(largest))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from ahead_of_time import ARCHITECTURES, compiled
-from interpreted import in_interpreter
+from interpreted import NEEDS_A_GPU, in_interpreter, on_a_gpu
 
 
 def check_places() -> None:
@@ -26,6 +26,11 @@ def check_places() -> None:
 def test_in_the_interpreter():
     pytest.importorskip("triton")
     in_interpreter(check_places)
+
+
+@NEEDS_A_GPU
+def test_the_same_on_a_gpu():
+    on_a_gpu(check_places)
 
 
 @pytest.mark.slow

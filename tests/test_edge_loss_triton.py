@@ -7,7 +7,7 @@ import pytest
 import reference
 import torch
 from ahead_of_time import ARCHITECTURES, compiled
-from interpreted import assert_near, in_interpreter
+from interpreted import NEEDS_A_GPU, assert_near, in_interpreter, on_a_gpu
 
 from edge_depth_nerf.method import losses
 from edge_depth_nerf.method.losses import EPS, NARROW, Gaussian, edge_loss, edge_losses
@@ -114,6 +114,11 @@ def test_in_the_interpreter():
     in_interpreter(
         check_values_and_gradients, check_nothing_to_look_at, check_what_is_not_finite, check_a_level_that_rests
     )
+
+
+@NEEDS_A_GPU
+def test_the_same_on_a_gpu():
+    on_a_gpu(check_values_and_gradients, check_nothing_to_look_at, check_what_is_not_finite, check_a_level_that_rests)
 
 
 @pytest.mark.slow

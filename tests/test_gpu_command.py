@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from interpreted import in_interpreter
 
 from edge_depth_nerf.base.files import read_json, write_json
 
@@ -43,8 +44,8 @@ def test_every_part_runs_to_its_end_without_a_gpu(gpu, sample_drive, tmp_path, c
     assert found["tests"]["counts"]["passed"] > 0 and not found["tests"]["said"]
     assert {row["kernel"] for row in found["kernels"]["rows"]} == {"encode", "table_gradient", "position_gradient"}
     beside_torch = found["samples and networks"]["rows"]
-    assert len(beside_torch) == 7 and all(row["off_torch"] == 0 and row["torch_ms"] > 0 for row in beside_torch)
-    assert set(found["our steps"]) == {"nerfacto", "ours"} and found["our steps"]["ours"]["step_ms"][0] > 0
+    assert len(beside_torch) == 13 and all(row["off_torch"] == 0 and row["torch_ms"] > 0 for row in beside_torch)
+    assert set(found["our steps"]) == {"nerfacto", "ours", "left_out"} and found["our steps"]["ours"]["step_ms"][0] > 0
     assert found["profile"]["launches"] == 0 and found["profile"]["step_ms"] > 0
     assert "masked_psnr" in found["training"]["figures"]
     page = (tmp_path / "report.md").read_text()
@@ -69,6 +70,50 @@ def test_a_part_that_fails_or_takes_too_long_says_so_and_ends_no_other(gpu, tmp_
     monkeypatch.setattr(subprocess, "Popen", lambda command, **given: start(["sleep", "30"], **given))
     options = gpu.argparse.Namespace(output=tmp_path, scene=tmp_path)
     assert gpu.in_a_process("device", options) == {"failed": "not done after 0.2 s"}
+
+
+def check_the_work_that_is_timed() -> None:
+    sys.path.insert(0, str(ROOT / "benchmarks"))
+    gpu_parts: Any = importlib.import_module("gpu_parts")
+    settings = gpu_parts.Settings(Path(), Path(), fake=True)
+    assert gpu_parts.has_kernels(settings)
+    off = {row["what"]: row["off_torch"] for row in gpu_parts.samples_and_networks(settings)["rows"]}
+    assert len(off) == 13
+    for what, found in off.items():
+        # networks round to float16
+        assert found < (5e-2 if what.startswith("network") else 1e-5), (what, found)
+
+
+def test_the_kernels_that_are_timed_do_the_work_of_torch():
+    pytest.importorskip("triton")
+    in_interpreter(check_the_work_that_is_timed)
+
+
+def test_the_tests_of_a_gpu_are_found(gpu):
+    parts = importlib.import_module("gpu_parts")
+    found = {path.name for path in parts.tests_of_a_gpu()}
+    needing = {
+        path.name
+        for path in (ROOT / "tests").glob("test_*.py")
+        if "@NEEDS_A_GPU" in (text := path.read_text(encoding="utf-8")) or "skipif(not torch.cuda" in text
+    } - {Path(__file__).name}
+    assert found >= needing and len(needing) > 6
+
+
+def test_a_trainer_that_fails_ends_no_other(gpu, monkeypatch):
+    parts = importlib.import_module("gpu_parts")
+    settings = parts.Settings(ROOT, ROOT)
+
+    def raced(_: Any, names: list[str]) -> dict[str, Any]:
+        if names == ["breaks"]:
+            raise EOFError
+        return {"nerfacto": {"graphs": None}, names[0]: {"graphs": {"waits": 0, "graphs": 2}.get(names[0])}}
+
+    monkeypatch.setattr(parts, "raced", raced)
+    assert parts.beside_others(settings, "breaks") == {"left_out": {"breaks": "EOFError: "}}
+    assert list(parts.beside_others(settings, "waits")) == ["left_out"]
+    assert parts.beside_others(settings, "graphs") == {"graphs": {"graphs": 2}}
+    assert parts.beside_others(settings, "splatfacto") == {"splatfacto": {"graphs": None}}
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")

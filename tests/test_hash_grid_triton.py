@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import pytest
 import torch
 from ahead_of_time import ARCHITECTURES, compiled
-from interpreted import assert_near, in_interpreter
+from interpreted import NEEDS_A_GPU, assert_near, in_interpreter, on_a_gpu
 
 from edge_depth_nerf.kernels import form_choice, hash_grid_numba
 from edge_depth_nerf.kernels.form_choice import form_for
@@ -98,6 +98,11 @@ def test_in_the_interpreter(check):
     in_interpreter(check)
 
 
+@NEEDS_A_GPU
+def test_the_same_on_a_gpu():
+    on_a_gpu(check_encoding, check_the_tables_gradient, check_what_is_not_finite)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
 @pytest.mark.parametrize("features", [2, 4])
@@ -122,6 +127,9 @@ def test_each_form_compiles_without_spills(architecture, features, tmp_path, mon
     ]
     assert {kernel.spilled for kernel in found} == {0}
     assert max(kernel.registers for kernel in found) <= 32 * features
+    # a product and a sum are two roundings, as in torch: a point's cell must not depend on the compiler
+    instructions = {name for kernel in found for name in kernel.instructions}
+    assert "FMUL" in instructions and not any(name.startswith("FFMA") for name in instructions)
     additions = {
         sum(count for name, count in kernel.instructions.items() if name.startswith("RED"))
         for kernel in found

@@ -420,7 +420,7 @@ def test_half_precision_and_gradients_do_not_matter():
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 @pytest.mark.parametrize("normalise", ["pooled", "per-source"])
-def test_cuda_equals_cpu(normalise):
+def test_equals_the_cpu_on_a_gpu(normalise):
     lidar, mono, valid = random_maps(10)
     options = IntegrationOptions(normalise=normalise)
     there = integrate_depth(lidar.cuda(), mono.cuda(), valid.cuda(), options)

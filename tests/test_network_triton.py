@@ -7,7 +7,7 @@ import itertools
 import pytest
 import torch
 from ahead_of_time import ARCHITECTURES, compiled
-from interpreted import assert_near, in_interpreter
+from interpreted import NEEDS_A_GPU, assert_near, in_interpreter, on_a_gpu
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from edge_depth_nerf.kernels import triton_back_end
@@ -99,6 +99,11 @@ def check_what_it_serves() -> None:
 def test_in_the_interpreter():
     pytest.importorskip("triton")
     in_interpreter(check_values, check_gradients, check_half_precision_empty_and_not_finite, check_what_it_serves)
+
+
+@NEEDS_A_GPU
+def test_the_same_on_a_gpu():
+    on_a_gpu(check_values, check_gradients, check_half_precision_empty_and_not_finite)
 
 
 @pytest.mark.slow

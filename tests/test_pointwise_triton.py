@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from ahead_of_time import ARCHITECTURES, compiled
-from interpreted import assert_near, in_interpreter
+from interpreted import NEEDS_A_GPU, assert_near, in_interpreter, moved_in_interpreter, on_a_gpu
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from edge_depth_nerf.kernels import triton_back_end
@@ -101,6 +101,17 @@ def check_harmonics() -> None:
 def test_in_the_interpreter():
     pytest.importorskip("triton")
     in_interpreter(check_distances, check_positions, check_densities, check_harmonics)
+
+
+@NEEDS_A_GPU
+def test_the_same_on_a_gpu():
+    on_a_gpu(check_distances, check_positions, check_densities, check_harmonics)
+
+
+@pytest.mark.slow
+def test_memory_goes_there_and_back_as_it_lies():
+    pytest.importorskip("triton")
+    moved_in_interpreter(check_positions, check_densities)
 
 
 @pytest.mark.slow

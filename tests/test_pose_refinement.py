@@ -111,7 +111,8 @@ def looking_along_x(position, yaw_deg: float) -> torch.Tensor:
     return pose
 
 
-def test_a_pictures_pose_is_found_again_also_when_its_exposure_differs():
+def fits_a_pictures_pose(device: str) -> None:
+    """The picture is on the CPU, as nerfstudio's loader leaves it."""
     true, given = looking_along_x([0.0, 0.0, 0.0], 0.0), looking_along_x([0.0, 0.01, -0.008], 0.15)
     model = PaintedWall()
     picture = 0.9 * model(camera(true).generate_rays(0).flatten())["rgb"].view(60, 80, 3)
@@ -119,6 +120,7 @@ def test_a_pictures_pose_is_found_again_also_when_its_exposure_differs():
     mask[:, 60:] = False
     config = PoseRefinerConfig(mode="SO3xR3", sigma_m=0.05, sigma_deg=0.2, prior_mult=1e-6)
     before = camera(given)
+    model.device, mask = torch.device(device), mask.to(device)
     fitted = fit_pose(model, before, picture, mask, config)
     assert torch.equal(before.camera_to_worlds[0], given[:3])
 
@@ -130,6 +132,15 @@ def test_a_pictures_pose_is_found_again_also_when_its_exposure_differs():
     # all but the given pose is forgotten where it costs more than it gains
     strict = fit_pose(model, before, picture, mask, PoseRefinerConfig(mode="SO3xR3", sigma_m=0.05, prior_mult=1e6))
     torch.testing.assert_close(strict.camera_to_worlds, before.camera_to_worlds, atol=2e-3, rtol=0)
+
+
+def test_a_pictures_pose_is_found_again_also_when_its_exposure_differs():
+    fits_a_pictures_pose("cpu")
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_a_pictures_pose_is_found_again_on_a_gpu():
+    fits_a_pictures_pose("cuda")
 
 
 def test_halves_are_columns_with_as_many_pixels():

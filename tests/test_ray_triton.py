@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import sys
 from functools import partial
 from types import ModuleType
 from typing import Any
 
+import interpreted
 import pytest
 import torch
 from ahead_of_time import ARCHITECTURES, compiled
-from interpreted import assert_near, in_interpreter
+from interpreted import NEEDS_A_GPU, assert_near, in_interpreter, on_a_gpu
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from edge_depth_nerf.kernels import triton_back_end
@@ -120,12 +122,15 @@ def check_the_proposal_loss() -> None:
         losses = [form(edges, weights, outer_edges, outer_weights) for form in forms]
         gradients = [torch.autograd.grad(3 * loss, outer_weights)[0] for loss in losses]
         # the CPU's takes differences of cumulative sums, which have lost digits
-        for loss, gradient, tolerance in zip(losses[1:], gradients[1:], (1e-6, 5e-3), strict=True):
+        for loss, gradient, tolerance in zip(losses[1:], gradients[1:], (1e-6 * interpreted.slack, 5e-3), strict=True):
             assert float(loss.detach()) == pytest.approx(float(losses[0].detach()), rel=tolerance, abs=1e-12)
             assert (gradient - gradients[0]).abs().max() <= tolerance * gradients[0].abs().max()
         assert gradients[0].any() or samples == 1
         wide = torch.cat([edges, edges], 1).t().contiguous().t()[:, : samples + 1]  # other strides, the same numbers
         assert torch.equal(ray_triton.bound_loss(wide, weights, outer_edges, outer_weights), losses[1])
+        column_major = outer_weights.detach().t().contiguous().t().requires_grad_()
+        loss = ray_triton.bound_loss(edges, weights, outer_edges, column_major)
+        assert torch.equal(torch.autograd.grad(3 * loss, column_major)[0], gradients[1])
     weights[1] = float("nan")  # of such a ray neither form adds anything
     losses = [module.bound_loss(edges, weights, outer_edges, outer_weights) for module in (ray_kernels, ray_triton)]
     assert float(losses[0].detach()) > 0
@@ -149,6 +154,9 @@ def check_the_distortion_loss() -> None:
         to_weights = torch.autograd.grad(3 * expected, exact)[0]
         torch.testing.assert_close(gradient.double(), to_weights, rtol=1e-5, atol=1e-8)
         assert gradient.any() or samples == 1
+        column_major = weights.detach().t().contiguous().t().requires_grad_()
+        loss = ray_triton.distortion_loss(edges, column_major)
+        assert torch.equal(torch.autograd.grad(3 * loss, column_major)[0], gradient)
     assert float(ray_triton.distortion_loss(edges[:0], weights[:0]).detach()) == 0
     with torch.no_grad():
         weights[0, 0] = float("nan")
@@ -182,6 +190,17 @@ def step(samples: int = 48, intervals: int = 256) -> None:
     ray_triton.place_samples(outer_weights, outer_edges, edges, 0.01, 1e-5)
     ray_triton.bound_loss(edges, weights, outer_edges, outer_weights.requires_grad_())
     ray_triton.distortion_loss(edges, weights.requires_grad_())
+
+
+@NEEDS_A_GPU
+def test_the_same_on_a_gpu():
+    on_a_gpu(
+        check_weights,
+        check_weights_of_what_is_not_finite,
+        check_places,
+        check_the_proposal_loss,
+        check_the_distortion_loss,
+    )
 
 
 @pytest.mark.slow
@@ -230,6 +249,41 @@ def test_a_kernel_that_fails_is_left_to_torch(monkeypatch):
     triton_back_end.working.cache_clear()
 
 
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_a_rendering_may_be_the_first_that_needs_the_kernels(monkeypatch, mode):
+    """Without gradients, and traced by the viewer, which raises an error to end a picture."""
+
+    class Interrupted(Exception):
+        pass
+
+    def traced(*_: Any) -> Any:
+        if asked:
+            raise Interrupted
+        return traced
+
+    def try_out(device: torch.device) -> None:
+        asked.append(device)
+        x = torch.ones(1, requires_grad=True)
+        (2 * x).backward()
+        slopes.append(x.grad)
+
+    asked, slopes = [], []
+    module = module_with("module", try_out=try_out)
+    monkeypatch.setitem(triton_back_end.MODULES, "module", lambda: module)
+    before = sys.gettrace()
+    with mode():
+        sys.settrace(traced)
+        try:
+            found = triton_back_end.working("module", torch.device("cuda"), "sum")
+        except Interrupted:
+            found = None  # after the trial, where it is a rendering that ends
+        finally:
+            sys.settrace(before)
+    assert [float(slope) for slope in slopes] == [2.0]
+    assert (found or triton_back_end.working("module", torch.device("cuda"), "sum")) is module
+    triton_back_end.working.cache_clear()
+
+
 def test_what_the_kernels_along_rays_serve(monkeypatch):
     """float32 on CUDA, and rays that stay on the chip."""
     kernels = module_with("kernels", fits=lambda *samples: max(samples) <= 2048)
@@ -246,16 +300,10 @@ def test_what_the_kernels_along_rays_serve(monkeypatch):
 
 
 def check_that_trying_out_runs_each_kernel() -> None:
-    from edge_depth_nerf.kernels import (
-        contraction_triton,
-        edge_loss_triton,
-        hash_grid_triton,
-        network_triton,
-        ray_triton,
-        triton_launch,
-    )
+    from edge_depth_nerf.kernels import triton_launch
 
-    modules: tuple[Any, ...] = contraction_triton, edge_loss_triton, hash_grid_triton, network_triton, ray_triton
+    modules: list[Any] = [load() for load in triton_back_end.MODULES.values()]
+    assert "pointwise_triton" in triton_back_end.MODULES
     for module in modules:
         launched = set()
 

@@ -91,6 +91,7 @@ def test_replayed_steps_are_those_that_are_computed(folder):
     capture = with_graphs(replayed)
     expected, found = (losses_of(trainer, range(STEPS)) for trainer in (computed, replayed))
     assert (capture.recorded, capture.replays) == (2, STEPS - EAGER_STEPS)
+    assert replayed.pipeline.graphs.recorded == 2  # pyright: ignore[reportAttributeAccessIssue]
     assert len({each["edge_loss"] for each in found}) == STEPS
     for one, another in zip(expected, found, strict=True):
         assert set(one) == set(another)
@@ -128,6 +129,7 @@ def test_what_was_not_recorded_is_computed_and_reported_once(folder, change, cap
     found = losses_of(trainer, range(EAGER_STEPS + 4, EAGER_STEPS + 7))
     assert capture.replays == replays
     assert ("sky_loss" in found[-1]) == (change != "options")
+    assert pipeline.graphs.recorded == 0
     said = " ".join(capsys.readouterr().out.split())
     assert said.count("continues without CUDA graphs") == 1 and "have changed" in said
 

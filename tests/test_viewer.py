@@ -25,6 +25,7 @@ from nerfstudio.viewer.utils import CameraState, get_camera, parse_object
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
 from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerElement
 from scenes import RADIUS_M, copy_sample_drive, fisheye, pinhole, write_scene
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import as_people_count
@@ -307,6 +308,21 @@ def test_small_pictures_are_enlarged_smoothly(machine, monkeypatch):
     assert machine.viewer.stats_markdown.content == "Step: 59  \nResolution: 40x30px"
     machine._send_output_to_viewer({"rgb": torch.zeros(512, 600, 3)})
     assert sent[1]["rgb"].shape == (512, 600, 3)
+
+
+def test_the_speed_of_a_gpu_counts_what_was_only_asked_for(machine, monkeypatch):
+    with FakeTensorMode():
+        outputs = {"rgb": torch.empty(20, 30, 3, device="cuda")}
+    waited_for = []
+
+    def wait(device: torch.device) -> None:
+        waited_for.append(device.type)
+        time.sleep(0.05)
+
+    monkeypatch.setattr(RenderStateMachine, "_render_img", lambda *_: outputs)
+    monkeypatch.setattr(torch.cuda, "synchronize", wait)
+    assert machine._render_img(None) is outputs
+    assert waited_for == ["cuda"] and 0 < machine._rays_per_s <= 600 / 0.05
 
 
 def test_a_movement_ends_a_fine_picture_and_no_other(machine):

@@ -9,6 +9,8 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import fields
 from typing import Any, TypeVar
 
+from edge_depth_nerf.kernels.triton_back_end import undisturbed
+
 Form = TypeVar("Form")
 
 _fastest: dict[tuple[Hashable, ...], Any] = {}
@@ -46,7 +48,8 @@ def form_for(
     key = variable, tuple(forms), *size
     if key not in _fastest:
         measure = seconds or _on_the_device
-        _fastest[key] = min(forms, key=lambda form: _took(measure, run, form))
+        with undisturbed():
+            _fastest[key] = min(forms, key=lambda form: _took(measure, run, form))
     return _fastest[key]
 
 

@@ -222,11 +222,12 @@ def _position_gradient_kernel(
         )
         for c in tl.static_range(FEATURES):
             grid = table + tl.cast(level, tl.int64) * size * FEATURES + c
+            feature = tl.cast(level, tl.int64) * FEATURES + c
             v0, v1 = tl.load(grid + at0, inside, 0.0), tl.load(grid + at1, inside, 0.0)
             v2, v3 = tl.load(grid + at2, inside, 0.0), tl.load(grid + at3, inside, 0.0)
             v4, v5 = tl.load(grid + at4, inside, 0.0), tl.load(grid + at5, inside, 0.0)
             v6, v7 = tl.load(grid + at6, inside, 0.0), tl.load(grid + at7, inside, 0.0)
-            place = point * point_stride + (level * FEATURES + c) * feature_stride
+            place = point * point_stride + feature * feature_stride
             g = tl.load(gradient + place, inside, 0.0).to(tl.float32) * scaling
             along_x = ((v1 - v0) * (1 - y) + (v3 - v2) * y) * (1 - z) + ((v5 - v4) * (1 - y) + (v7 - v6) * y) * z
             low_low, high_low = v1 * x + v0 * (1 - x), v3 * x + v2 * (1 - x)

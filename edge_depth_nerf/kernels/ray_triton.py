@@ -257,7 +257,7 @@ class _BoundLoss(torch.autograd.Function):
     def forward(ctx: Any, edges: Tensor, weights: Tensor, outer_edges: Tensor, outer_weights: Tensor) -> Tensor:
         (rays, samples), intervals = weights.shape, outer_weights.shape[1]
         follow = ctx.needs_input_grad[3]
-        losses, slopes = weights.new_empty(rays), torch.empty_like(outer_weights)
+        losses, slopes = weights.new_empty(rays), outer_weights.new_empty(outer_weights.shape)
         edges, stride = rows_of(edges)
         outer_edges, outer_stride = rows_of(outer_edges)
         launch(
@@ -343,7 +343,7 @@ class _DistortionLoss(torch.autograd.Function):
     def forward(ctx: Any, edges: Tensor, weights: Tensor) -> Tensor:
         rays, samples = weights.shape
         follow = ctx.needs_input_grad[1]
-        losses, slopes = weights.new_empty(rays), torch.empty_like(weights)
+        losses, slopes = weights.new_empty(rays), weights.new_empty(weights.shape)
         edges, stride = rows_of(edges)
         launch(
             _distortion_kernel,

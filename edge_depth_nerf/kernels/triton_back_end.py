@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import functools
 import os
+import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from types import ModuleType
 
@@ -28,6 +30,22 @@ MODULES: dict[str, Callable[[], ModuleType]] = {
 """The modules of kernels by their names."""
 
 
+@contextmanager
+def undisturbed() -> Iterator[None]:
+    """Enable gradients and stop tracing, to try out and measure kernels.
+
+    The first caller may be a rendering. It has no gradients, which `try_out` needs. In the viewer's thread nerfstudio
+    also traces each line of Python, and ends a picture by an error there. It would look like an error of the kernel.
+    """
+    trace = sys.gettrace()
+    sys.settrace(None)
+    try:
+        with torch.inference_mode(False), torch.enable_grad():
+            yield
+    finally:
+        sys.settrace(trace)
+
+
 @functools.lru_cache
 def working(module: str, device: torch.device, what: str) -> ModuleType | None:
     """Give a module of `edge_depth_nerf.kernels` whose kernels work on a device, None where they do not.
@@ -42,17 +60,21 @@ def working(module: str, device: torch.device, what: str) -> ModuleType | None:
     """
     if device.type != "cuda":
         return None
-    try:
-        kernels = MODULES[module]()
-        kernels.try_out(device)
-    except Exception as error:  # whatever keeps Triton from working here
-        warnings.warn(
-            f"The fused {what} does not work on {device} ({type(error).__name__}: {error}); "
-            "nerfstudio's torch form takes its place, with the same results but slower.",
-            stacklevel=2,
-        )
-        return None
-    return kernels
+    failure = None
+    with undisturbed():
+        try:
+            kernels = MODULES[module]()
+            kernels.try_out(device)
+        except Exception as error:  # whatever keeps Triton from working here
+            failure = error
+    if failure is None:
+        return kernels
+    warnings.warn(
+        f"The fused {what} does not work on {device} ({type(failure).__name__}: {failure}); "
+        "nerfstudio's torch form takes its place, with the same results but slower.",
+        stacklevel=2,
+    )
+    return None
 
 
 def along_rays(*tensors: Tensor) -> ModuleType | None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Any
 
+import torch
 import torch.nn.functional as F
 from nerfstudio.viewer.render_state_machine import RenderAction, RenderStateMachine
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
@@ -55,6 +56,8 @@ class CoarseToFine(RenderStateMachine):
         self._is_rendering = True
         try:
             outputs = super()._render_img(camera_state)
+            if outputs["rgb"].is_cuda:
+                torch.cuda.synchronize(outputs["rgb"].device)  # until here it was only asked for
         finally:
             self._is_rendering = False
         rays = outputs["rgb"].shape[0] * outputs["rgb"].shape[1]

@@ -72,9 +72,13 @@ class BilateralGrids(nn.Module):
     A grid of `GRID_SHAPE` for each picture; between its corners maps are interpolated linearly.
     """
 
+    luma: Float[Tensor, "3"]
+
     def __init__(self, pictures: int) -> None:
         super().__init__()
         self.slow_offsets = nn.Parameter(torch.zeros(pictures, _CHANNELS, *GRID_SHAPE))
+        # made at each step it would be copied to a GPU, which waits for that
+        self.register_buffer("luma", torch.tensor(_LUMA), persistent=False)
 
     @property
     def offsets(self) -> Float[Tensor, "pictures channels depth rows columns"]:
@@ -90,7 +94,7 @@ class BilateralGrids(nn.Module):
         offsets = self.offsets
         # all pictures' grids one behind the other: one call for rays of many pictures, no cell between two of them
         volume = offsets.movedim(1, 0).flatten(1, 2)[None]
-        brightness = (colours * colours.new_tensor(_LUMA)).sum(dim=-1).clamp(0, 1)
+        brightness = (colours * self.luma).sum(dim=-1).clamp(0, 1)
         layers = len(offsets) * depth
         behind = (picture * depth + brightness * (depth - 1)) / max(1, layers - 1)
         at = 2 * torch.cat([place, behind[:, None]], dim=-1) - 1

@@ -254,12 +254,15 @@ class EdgeDepthNerfModel(NerfactoModel):
         with lpips_not_built():
             super().populate_modules()
         if implementation == "fused":
-            from edge_depth_nerf.kernels.compiled import (
-                compiled_before,  # imports Numba, which other commands do without
-            )
+            if device_type == "cpu":
+                from edge_depth_nerf.kernels.compiled import (
+                    compiled_before,  # imports Numba, which other commands do without
+                )
 
-            if not compiled_before():
-                CONSOLE.print("Compiling kernels for the first steps. This takes about a minute, once on this machine.")
+                if not compiled_before():
+                    CONSOLE.print(
+                        "Compiling kernels for the first steps. This takes about a minute, once on this machine."
+                    )
             # normals differentiate by the positions alone, which would add to the tables' gradients, too
             use_fused_fields(self, add_in_place=not self.config.predict_normals)
             if isinstance(self.proposal_sampler.initial_sampler, UniformLinDispPiecewiseSampler):
@@ -626,7 +629,8 @@ class EdgeDepthNerfModel(NerfactoModel):
                 weights.squeeze(-1), starts_m[..., 0], ends_m[..., 0], prior_m[..., 0], narrowed_m, self.config.urban
             )
         middles_m = (starts_m + ends_m) / 2
-        sigma_m = weights.new_tensor([self.config.depth_sigma])
+        # filled, not copied: a GPU would wait for that
+        sigma_m = weights.new_full((1,), self.config.depth_sigma)
         if self.config.depth_loss == "ds-nerf":
             # nerfstudio divides by 2σ where a Gaussian has 2σ², so what it calls sigma is a variance
             return ds_nerf_depth_loss(weights, prior_m, middles_m, ends_m - starts_m, sigma_m.square())

@@ -123,7 +123,8 @@ def fit_pose(
         A camera with the pose that fits best. A gain for each colour is fitted beside it, and forgotten.
 
     """
-    at = mask.nonzero()
+    # nerfstudio's loader leaves the picture on the CPU, and puts all else on the model's device
+    at = mask.nonzero().to(image.device)
     generator = torch.Generator().manual_seed(0)
     at = at[torch.randperm(len(at), generator=generator)[:_FIT_PIXELS]]
     target = image[at[:, 0], at[:, 1]].to(model.device)

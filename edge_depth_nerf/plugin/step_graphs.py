@@ -53,7 +53,8 @@ class GpuCapture:
                 work()
         torch.cuda.current_stream().wait_stream(stream)
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, pool=self._pool):
+        # the viewer's thread may use the GPU meanwhile, on its own stream
+        with torch.cuda.graph(graph, pool=self._pool, capture_error_mode="thread_local"):
             found = work()
         return found, graph.replay
 
@@ -129,6 +130,11 @@ class StepGraphs:
         self._eager_steps = 0
         self._seen: tuple[Any, ...] = ()
         self._packed = self._schedule = self._start = torch.empty(0)
+
+    @property
+    def recorded(self) -> int:
+        """How many kinds of steps are replayed; 0 before the first recording, and once something has ended this."""
+        return len(self._recorded)
 
     def replayed(self, packed: Tensor, step: int) -> Step | None:
         """Take a step with a batch by a graph, but for the optimisers.
