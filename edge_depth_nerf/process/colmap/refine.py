@@ -170,8 +170,8 @@ def refine_poses(recording: Recording, options: ProcessOptions, console: Console
         )
     notice = (
         f"Poses refined by {found.points} points that the pictures share. The poses moved by up to "
-        f"{100 * furthest_m:.0f} cm and {furthest_deg:.2f}°. Check with {found.judges} other matches: the median distance "
-        f"of features to their epipolar lines is {distances}."
+        f"{100 * furthest_m:.0f} cm and {furthest_deg:.2f}°. Check with {found.judges} other matches: the median "
+        f"distance of features to their epipolar lines is {distances}."
     )
     return dataclasses.replace(refined, notices=(*recording.notices, notice))
 
