@@ -430,7 +430,7 @@ def picture_name(scene: str) -> str:
 
 
 def _draw_comparison(output: Path, results: Results, scene: str) -> None:
-    """Draw some held-out views, a row of colours and one of distances each: ground truth, then each method's first seed."""
+    """Draw some held-out views, a row of colours and one of distances each: ground truth, then first seeds."""
     chosen = first_runs(results, scene)
     if not chosen:
         return
