@@ -23,6 +23,7 @@ help:
 
 # OpenCV comes in several wheels that overwrite each other; the one with contrib and without a window goes last.
 $(VENV)/.installed: pyproject.toml constraints.txt
+	@echo "Installing into $(VENV): some minutes, 9 GB. pip prints nothing while it works, except warnings of other packages."
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt --no-deps --force-reinstall opencv-contrib-python-headless

@@ -25,6 +25,8 @@ FOLDER = Path(__file__).resolve().parent / "slider"
 CONTENT = "content.json"
 MOST_BYTES = 2_000_000
 """Largest size of the folder."""
+LINKS = {"← Results": "results.html", "Home": "index.html"}
+"""The way back: pages of the site beside this one."""
 
 
 def store(demo: Path, folder: Path = FOLDER) -> None:
@@ -106,6 +108,7 @@ def page(folder: Path = FOLDER) -> str:
             facts=[Facts("Drive and training", options), Facts("Versions", content["versions"])],
             commands=[Commands("The command that makes these pictures", [content["command"]])],
             methods=list(content["views"][0]["rendered"]),
+            links=LINKS,
         )
     )
 

@@ -440,8 +440,8 @@ def test_what_loads_elsewhere_is_noticed(tmp_path):
 
 
 def test_links_and_pictures_of_the_site_are_there(site):
-    # the links of 404.html are from the server's root; the slider page has none
-    pages = [page for page in site.rglob("*.html") if page.name not in ("404.html", "slider.html")]
+    # the links of 404.html are from the server's root
+    pages = [page for page in site.rglob("*.html") if page.name != "404.html"]
     assert len(pages) > 10
     for page in pages:
         found = References(page)
@@ -480,6 +480,11 @@ def test_the_slider_page_shows_both_methods_without_a_network(site):
         page.get_by_label("Left", exact=True).select_option(label="nerfacto")
         assert page.locator(".stage .tag").all_inner_texts() == ["nerfacto", "ours"]
         assert page.locator(".stage img.over").evaluate("image => image.naturalWidth") > 100
+        page.get_by_role("link", name="Results").click()
+        page.wait_for_url(re.compile(r"/results\.html$"))
+        page.go_back()
+        page.get_by_role("link", name="Home").click()
+        page.wait_for_url(re.compile(r"/index\.html$"))
 
 
 def test_every_page_is_in_the_navigation():

@@ -127,7 +127,7 @@ def test_maps_that_are_given_are_calibrated(room: RoomDrive, tmp_path: Path) -> 
             write_distance_png(tmp_path / f"mono/{camera}/{frame:010d}.png", np.full((64, 64), 4.0))
     said = run(options_of(room, tmp_path / "scene", mono=tmp_path / "mono"))
     assert read_trust(tmp_path / "scene" / TRUST_FILE).error_model is not None
-    assert not (tmp_path / "scene" / WEIGHTS).exists() and "Monocular maps compared with LiDAR" in said
+    assert not (tmp_path / "scene" / WEIGHTS).exists() and "Error of the monocular maps" in said
 
 
 def test_weights_of_another_drive_predict_without_training(room: RoomDrive, tmp_path: Path) -> None:

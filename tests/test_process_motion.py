@@ -89,7 +89,7 @@ def motion_maps(scene: Path) -> list[np.ndarray]:
 @pytest.fixture(scope="module")
 def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
     scene = write_ball_scene(tmp_path_factory.mktemp("ball"))
-    assert "Distances from motion for" in add(scene)
+    assert "Motion gives distances for" in add(scene)
     return scene
 
 
@@ -230,7 +230,7 @@ def test_process_finds_motion_once_unless_told_not_to(tmp_path: Path) -> None:
 
     assert "from motion" not in run(motion=False)
     assert not read_scene(tmp_path / "scene").has("motion")
-    assert "Distances from motion for" in run()
+    assert "Motion gives distances for" in run()
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "scene" / "motion").rglob("*.png")}
     assert len(before) == 12
     assert "from motion" not in run()
@@ -238,7 +238,7 @@ def test_process_finds_motion_once_unless_told_not_to(tmp_path: Path) -> None:
     # other pictures, other maps
     next(drive.root.rglob("image_02/**/0000000002.png")).touch()
     said = run()
-    assert "They are made again, unless --no-motion is given." in said and "Distances from motion for" in said
+    assert "They are made again, unless --no-motion is given." in said and "Motion gives distances for" in said
     assert len(read_json(tmp_path / "scene" / "transforms.json")["motion"]) == 1
 
 

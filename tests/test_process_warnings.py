@@ -221,7 +221,7 @@ def test_the_vehicle_is_found_in_few_pictures_with_lidars_help(mine: Path) -> No
 def test_a_vehicle_that_is_not_found_is_said_once_with_the_option(mine: Path) -> None:
     edit(mine, without_masks)
     report, said = run(mine, frames=4)
-    (notice,) = [one for one in report.notices if "own mask was not found" in one]
+    (notice,) = [one for one in report.notices if "nothing is masked as the vehicle" in one]
     assert notice.startswith("left, right, front: ") and "too few" in notice
     assert said.count("--ego-mask") == 1 and all(f"ego_masks/{name}.png" in notice for name in CAMERAS)
 

@@ -349,10 +349,21 @@ def test_a_moment_between_scans_is_a_picture_without_lidar(mine: Path, holdout: 
 def test_a_drive_too_short_to_hold_one_out_is_told_how(mine: Path, capsys) -> None:
     convert(options(mine, frames=3, holdout_every=8))
     said = " ".join(capsys.readouterr().out.split())
-    assert "No frame is held out: the drive has 3, too few for --holdout-every 8. --holdout-every 5 holds one" in said
+    assert said.count("No frame is held out") == 1
+    assert "3 frames are too few for --holdout-every 8: use --holdout-every 5." in said
     shutil.rmtree(mine.parent / "scene")
     convert(options(mine, frames=3, holdout_every=5))
     assert "No frame is held out" not in capsys.readouterr().out
+    shutil.rmtree(mine.parent / "scene")
+    convert(options(mine, frames=3, holdout_every=0))
+    said = " ".join(capsys.readouterr().out.split())
+    assert said.count("No frame is held out") == 1
+    assert "Use --holdout-every 5 to hold frames out." in said
+    shutil.rmtree(mine.parent / "scene")
+    convert(options(mine, frames=1, holdout_every=8))
+    said = " ".join(capsys.readouterr().out.split())
+    assert said.count("No frame is held out") == 1
+    assert "take a longer stretch" in said
 
 
 def test_times_of_the_pictures_reach_the_scene(scene: Path) -> None:

@@ -295,11 +295,11 @@ def test_principal_point_keeps_off_pixel_centres(tmp_path: Path) -> None:
         assert (frame["cx"], frame["cy"]) == (expected, cy)
 
 
-def test_without_held_out_frames_it_says_so(tmp_path: Path) -> None:
+def test_without_held_out_frames_it_evaluates_on_the_training_frames(tmp_path: Path) -> None:
     report = write(tmp_path / "scene", given=frames(1))
     meta = read_json(tmp_path / "scene/transforms.json")
     assert meta["train_filenames"] == meta["val_filenames"] == ["images/image_02/0000000000.png"]
-    assert any("No frame is held out" in notice for notice in report.notices)
+    assert (report.training, report.held_out) == (1, 0)
 
 
 def test_shifted_views_and_truth(tmp_path: Path) -> None:

@@ -179,7 +179,7 @@ def test_a_scene_is_calibrated_and_the_file_read_again(tmp_path):
         assert frame.held_out_after is not None and frame.held_out_after < 0.01
     assert trust.drive_fit is not None
     assert trust.drive_fit.apply(np.array([[11.0]], np.float32))[0, 0] == pytest.approx(10, rel=0.02)
-    assert "0.100 before" in trust.summary()
+    assert "10.0% before" in trust.summary()
 
 
 @pytest.mark.parametrize("key", ["lidar_file_path", "mono_file_path"])
@@ -205,7 +205,7 @@ def test_few_returns_are_named(tmp_path):
     trust = calibrate_scene(scene)
     (poor,) = [frame for frame in trust.frames if frame.fit_of == "drive"]
     assert poor.frame == "images/0002.png" and poor.returns < 50 and poor.fit == trust.drive_fit
-    assert "images/0002.png, use the drive's fit" in trust.summary()
+    assert "use that of the whole drive: images/0002.png." in trust.summary()
 
 
 def test_a_calibration_is_found_until_its_files_change(tmp_path, monkeypatch):
@@ -257,7 +257,7 @@ def test_maps_of_zeros_give_no_model_but_no_error(tmp_path):
         change_map(scene, "mono_file_path", frame, lambda metres: metres * 0)
     trust = calibrate_scene(scene)
     assert trust.error_model is None and trust.drive_fit is None
-    assert "too few LiDAR points" in trust.summary()
+    assert "LiDAR points are too few" in trust.summary()
 
 
 def test_no_prior_beyond_lidars_field_but_from_a_source_trained_elsewhere(tmp_path):
@@ -323,7 +323,7 @@ def test_motion_counts_by_its_error_beside_monos(tmp_path):
     assert trusted.motion.mono_relative_error == pytest.approx(0.02, rel=0.25)
     assert trusted.motion.weight == pytest.approx(16 / 17, abs=0.04)
     assert doubted.motion.weight < 0.06
-    assert "distances from motion compared with LiDAR: 95 % within" in trusted.summary()
+    assert "95 % of the distances from motion are within" in trusted.summary()
     assert read_trust(right / TRUST_FILE) == trusted
     assert find_trust(read_scene(right), PriorOptions()) == trusted
     # other files, another calibration

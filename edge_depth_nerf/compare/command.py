@@ -430,14 +430,14 @@ def picture_name(scene: str) -> str:
 
 
 def _draw_comparison(output: Path, results: Results, scene: str) -> None:
-    """Draw some held-out views, a row of colours and one of distances each: truth, then the methods' first seeds."""
+    """Draw some held-out views, a row of colours and one of distances each: ground truth, then first seeds."""
     chosen = first_runs(results, scene)
     if not chosen:
         return
     views_of = {METHODS[run.method].title: run.folder / VIEWS for run in chosen}
     views = compared_views(Path(chosen[0].specification["scene"]), views_of, VIEWS_SHOWN)
     rows = [[_shown(picture) for picture in row] for view in views for row in view.rows()]
-    sheet = side_by_side(rows, ["truth", *views_of])
+    sheet = side_by_side(rows, ["ground truth", *views_of])
     write_png(output / picture_name(scene), with_colour_bar(sheet, DISTANCE))
 
 

@@ -32,7 +32,7 @@ def pose_check_figure(scene: SceneFolder, agreements: Sequence[Agreement]) -> Fi
         medians = [one.median_px for one in known]
         colour = VIEWS[number % len(VIEWS)]
         axes.plot(middles, medians, "o-", markersize=3.5, linewidth=1, color=colour, label=name)
-    axes.axhline(BAD_MEDIAN_PX, color=GAP, linewidth=1, linestyle="--")
+    axes.axhline(BAD_MEDIAN_PX, color=GAP, linewidth=1, linestyle="--", label=f"above {BAD_MEDIAN_PX} px: warning")
     axes.set_ylim(bottom=0)
     axes.set_xlabel("frame")
     axes.set_ylabel("px (median)")

@@ -348,7 +348,7 @@ class Trust:
         return sigma
 
     def summary(self) -> str:
-        """One paragraph for the user."""
+        """Some sentences for the user."""
         judged = [f for f in self.frames if f.held_out_before is not None and f.held_out_after is not None]
         parts = []
         if judged:
@@ -356,33 +356,30 @@ class Trust:
                 np.median([getattr(f, name) for f in judged]) for name in ("held_out_before", "held_out_after")
             )
             parts.append(
-                "monocular maps compared with LiDAR points left out of their alignment: mean relative error "
-                f"{before:.3f} before, "
-                f"{after:.3f} after (median of {len(judged)} training pictures)"
+                f"Error of the monocular maps, at LiDAR points left out of their alignment: {before:.1%} before it, "
+                f"{after:.1%} after it (mean relative error, median of {len(judged)} training pictures)."
             )
         poor = [f.frame for f in self.frames if f.fit_of == "drive"]
         if poor:
             parts.append(
-                f"{len(poor)} with fewer LiDAR points than an alignment needs, {', '.join(poor[:3])}"
-                f"{' …' if len(poor) > 3 else ''}, use the drive's fit"
+                f"{len(poor)} maps have too few LiDAR points for an alignment of their own and use that of the whole "
+                f"drive: {', '.join(poor[:3])}{' …' if len(poor) > 3 else '.'}"
             )
         if self.motion is not None:
             parts.append(
-                f"distances from motion compared with LiDAR: 95 % within {2 * self.motion.relative_error:.1%}, "
-                "monocular "
-                f"ones there within {2 * self.motion.mono_relative_error:.1%}, so motion weighs "
-                f"{self.motion.weight:.0%} of both"
+                f"95 % of the distances from motion are within {2 * self.motion.relative_error:.1%} of LiDAR's, and "
+                f"95 % of the monocular distances there within {2 * self.motion.mono_relative_error:.1%}. Where both "
+                f"are known, motion has {self.motion.weight:.0%} of the weight."
             )
         if self.error_model is None:
-            parts.append("too few LiDAR points to measure the prior's error: sigma is that of sigma_mode combined")
+            parts.append("LiDAR points are too few to measure the prior's error: sigma is that of sigma_mode combined.")
         if not self.everywhere:
             low, high = np.degrees(self.field_rad)
             parts.append(
-                f"there is a prior only between {low - FIELD_MARGIN_DEG:.0f}° and {high + FIELD_MARGIN_DEG:.0f}° of "
-                "elevation, "
-                f"where LiDAR measured and the network could learn{self._beyond_said()}"
+                f"The prior covers elevations from {low - FIELD_MARGIN_DEG:.0f}° to {high + FIELD_MARGIN_DEG:.0f}°, "
+                f"where LiDAR measured.{self._beyond_said()}"
             )
-        return "; ".join(parts)
+        return " ".join(parts)
 
     def _beyond_said(self) -> str:
         """Where else there is a prior."""
@@ -390,11 +387,11 @@ class Trust:
             return ""
         beyond = self.motion.beyond
         if beyond is None or beyond.network_model is None:
-            return " (beyond, where motion gives a distance)"
+            return " Beyond, it covers pixels with a distance from motion."
         low, high = np.degrees(beyond.reach_rad)
         return (
-            " (beyond, where motion gives a distance, and near such pixels, where the network learned from it: between "
-            f"{low:.0f}° and {high:.0f}°)"
+            " Beyond, it covers pixels with a distance from motion, and pixels near these from "
+            f"{low:.0f}° to {high:.0f}°, where the network learned from motion."
         )
 
     def to_dict(self) -> dict[str, Any]:

@@ -307,7 +307,7 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         trust: Trust | None = None
         if source in CALIBRATED and {"lidar", "mono"} <= sources and options.wants_trust(source):
             trust = find_trust(scene, options, self._cache_dir(), dataset.image_filenames, CONSOLE, source)
-            CONSOLE.log(f"Depth prior: {trust.summary()}.")
+            CONSOLE.log(f"Depth prior: {trust.summary()}")
         elif source == "mono" and options.sigma_mode == "calibrated":
             trust = field_of_source(scene)
         elif self.config.depth_source == "auto" and "mono" not in sources:

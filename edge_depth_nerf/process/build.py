@@ -95,13 +95,6 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
     if recording.skipped:
         say(console, f"Skipped {summarise(recording.skipped)}", "yellow")
     held_out = _held_out(recording, options)
-    if options.holdout_every > 0 and not held_out:
-        moments = len({picture.frame for picture in recording.pictures})
-        advice = f"--holdout-every {best_holdout(moments)} holds one out" if moments > 1 else "Take a longer stretch"
-        notices.append(
-            f"No frame is held out: the drive has {moments}, too few for --holdout-every {options.holdout_every}. "
-            f"{advice} for evaluation."
-        )
     if options.find_moving:
         recording, more = find_moving(recording, options, held_out, masks, console)
         notices += more
@@ -130,6 +123,8 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
         strict=options.strict,
         console=console,
     )
+    if not report.held_out:
+        notices.append(_none_held_out(len({picture.frame for picture in recording.pictures}), options.holdout_every))
     report = dataclasses.replace(
         report,
         skipped=recording.skipped,
@@ -140,10 +135,23 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
     return report
 
 
+def _none_held_out(frames: int, holdout_every: int) -> str:
+    """Say that a drive of so many frames has no held-out one, and what to do."""
+    text = "No frame is held out, so evaluation runs on the training pictures and means little."
+    best = best_holdout(frames)
+    if frames == 1:
+        return f"{text} The drive has only one frame: take a longer stretch."
+    if not holdout_every:
+        return f"{text} Use --holdout-every {best} to hold frames out."
+    if any(held_out_frames(frames, holdout_every)):
+        return f"{text} All held-out frames were left out because of broken or missing files."
+    return f"{text} {frames} frames are too few for --holdout-every {holdout_every}: use --holdout-every {best}."
+
+
 def _disagreements(
     recording: Recording, masks: dict[str, NDArray[np.bool_]], options: ProcessOptions, console: Console
 ) -> list[str]:
-    """What speaks against the transforms that are given; of a scene that is done it has been said."""
+    """Warn where LiDAR and the pictures contradict the given transforms. A complete scene was checked before."""
     if (options.output / TRANSFORMS).is_file():
         return []
     usable = {}

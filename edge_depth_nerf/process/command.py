@@ -85,5 +85,4 @@ def _add_mono(scene: SceneFolder, options: ProcessOptions, console: Console) -> 
 
         if saved_trust(scene, PriorOptions()) is None:
             trust = calibrate_scene(scene.path, console=console)
-            summary = trust.summary()
-            say(console, summary[0].upper() + summary[1:])
+            say(console, trust.summary())

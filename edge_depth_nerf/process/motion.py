@@ -92,7 +92,7 @@ def add_motion(scene: SceneFolder, console: Console) -> None:
         write_maps(scene.folder, "motion_sigma", maps(sigma=True), source, progress, some_empty=True)
         write_maps(scene.folder, "motion", maps(sigma=False), source, progress, some_empty=True)
     shutil.rmtree(store.folder.parent, ignore_errors=True)
-    said = f"Distances from motion for {np.mean(shares):.0%} of the pixels inside the masks of training pictures"
+    said = f"Motion gives distances for {np.mean(shares):.0%} of the pixels inside the masks of training pictures"
     if still:
         said += f"; none for {still} of {len(shares)}: {_STANDS}"
     say(console, f"{said}.", "yellow" if still else None)

@@ -48,9 +48,12 @@ _INNER = 0.01
 """So far inside the outline, as a share of the picture's longer side: scanner and camera do not see quite the same."""
 
 _LOOK = "Check {}; if you correct it there, process the drive again."
+_UNSEEN = (
+    "That is right if the camera does not see the vehicle. Otherwise paint the vehicle black in {} and process again."
+)
 _PAINT = (
-    "Its visible parts are trained on as if they were in the world: process more of the drive, or give its mask "
-    "with --ego-mask (255 = use the pixel, 0 = the vehicle), or paint it black in {} and process again."
+    "Visible parts of the vehicle spoil the training: process more of the drive, or give its mask with --ego-mask "
+    "(255 = use the pixel, 0 = the vehicle), or paint it black in {} and process again."
 )
 
 
@@ -103,7 +106,7 @@ def find_vehicle(
                     said = f"the vehicle was detected and hides {found.share:.1%} of the lens."
                     notices.append(f"{recorded.name}: {said} {_LOOK.format(path)}")
                 elif found.could_tell:
-                    notices.append(f"{recorded.name}: {_NOT_FOUND} {found.reason.rstrip('.')}. {_LOOK.format(path)}")
+                    notices.append(f"{recorded.name}: {_NOT_FOUND} {found.reason} {_UNSEEN.format(path)}")
                 else:
                     not_found[found.reason].append(path)
             masks[recorded.name] = read_camera_mask(path, recorded.camera)
@@ -115,7 +118,7 @@ def find_vehicle(
     return dataclasses.replace(recording, cameras=tuple(cameras)), notices
 
 
-_NOT_FOUND = "the vehicle's own mask was not found:"
+_NOT_FOUND = "nothing is masked as the vehicle."
 
 
 def _find_mask(

@@ -63,6 +63,8 @@ class Report:
     """Notes on reading the tables."""
     settings: Sequence[MadeTable] = field(default_factory=tuple)
     """Settings in the form of tables."""
+    links: Mapping[str, str] = field(default_factory=dict)
+    """Other pages beside this one: their titles, with their addresses."""
 
 
 def build_report(report: Report) -> str:

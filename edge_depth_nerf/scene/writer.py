@@ -300,8 +300,6 @@ def write_scene(
     shutil.rmtree(output / _PARTIAL, ignore_errors=True)
 
     held_out = sum(frame.held_out for frame in frames)
-    if not held_out:
-        notices.append("No frame is held out: evaluation runs on the training frames and means little.")
     return ProcessReport(
         scene=output,
         training=len(frames) - held_out,

@@ -169,9 +169,9 @@ def refine_poses(recording: Recording, options: ProcessOptions, console: Console
             "If they are wrong by that much, use --poses colmap",
         )
     notice = (
-        f"Poses refined by {found.points} points that the pictures share: median distance of matched features to "
-        f"their epipolar lines {distances} ({found.judges} matches were left out for this check); moved by up to "
-        f"{100 * furthest_m:.0f} cm and {furthest_deg:.2f}°."
+        f"Poses refined by {found.points} points that the pictures share. The poses moved by up to "
+        f"{100 * furthest_m:.0f} cm and {furthest_deg:.2f}°. Check with {found.judges} other matches: the median "
+        f"distance of features to their epipolar lines is {distances}."
     )
     return dataclasses.replace(refined, notices=(*recording.notices, notice))
 
