@@ -347,7 +347,7 @@ def test_vehicle_mask_is_found_corrected_and_kept(tmp_path: Path) -> None:
     report = process(drive, tmp_path / "scene")
     assert report.written >= 3, "that camera's pictures"
     assert vehicles_unknown(tmp_path / "scene") == ["image_03"]
-    assert ["image_03: the vehicle's own" in notice for notice in report.notices].count(True) == 1
+    assert ["image_03: nothing is masked" in notice for notice in report.notices].count(True) == 1
     assert not read_mask(tmp_path / "scene/masks/image_02.png")[24:].any()
     after = read_distance_png(tmp_path / "scene/lidar/image_02/0000000000.png")
     assert not after[24:].any() and after[:24].any()

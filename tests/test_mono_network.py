@@ -450,7 +450,7 @@ def test_weights_know_how_they_were_made_and_predict_other_scenes(small_street, 
         metadata = file.metadata()
     header = json.loads(metadata["header"])
     assert metadata["architecture"] == ARCHITECTURE
-    assert header["settings"]["working_px"] == 192 and header["settings"]["channels"] == [16, 32, 64, 96, 128]
+    assert header["settings"]["working_px"] == 192 and header["settings"]["channels"] == [16, 24, 48, 96, 128]
     assert header["settings"]["camera_height_m"] == pytest.approx(HEIGHT_M, abs=0.1)
     assert header["settings"]["room_radius_m"] == pytest.approx(6.0, abs=3.0)
     assert header["about"]["preset"] == "lite" and header["about"]["scenes"] == ["street"]

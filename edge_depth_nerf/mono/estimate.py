@@ -93,7 +93,7 @@ class PresetValues:
 
 
 PRESETS: dict[Preset, PresetValues] = {
-    "lite": PresetValues((16, 32, 64, 96, 128), 192, TrainingOptions(steps=1000)),
+    "lite": PresetValues((16, 24, 48, 96, 128), 192, TrainingOptions(steps=1000)),
     "full": PresetValues(
         (32, 64, 128, 256, 384, 512),
         512,

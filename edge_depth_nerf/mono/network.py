@@ -95,10 +95,10 @@ class DepthNetwork(nn.Module):
         """
         seen = usable[:, None].to(picture.dtype)
         features = torch.cat(((picture - 0.5) * 4.0 * seen, geometry, seen), 1)
-        features = self.encoder[0](F.relu(self.stem(features)))
+        features = self.encoder[0](self.stem(features).relu_())
         skipped = [features]
         for down, encode in zip(self.down, list(self.encoder)[1:], strict=True):
-            features = encode(F.relu(down(features)))
+            features = encode(down(features).relu_())
             skipped.append(features)
         for level in range(len(self.decoder) - 1, -1, -1):
             finer = skipped[level]
@@ -116,8 +116,8 @@ class _Residual(nn.Module):
         self.second_norm = nn.GroupNorm(_GROUPS, channels)
 
     def forward(self, features: Tensor) -> Tensor:
-        inner = self.second(F.relu(self.first_norm(self.first(features))))
-        return F.relu(features + self.second_norm(inner))
+        inner = self.second(self.first_norm(self.first(features)).relu_())
+        return self.second_norm(inner).add_(features).relu_()
 
 
 def log_room_distance(

@@ -55,7 +55,7 @@ def write_maps(
     """
     if layer not in later_layers():
         raise InputError(f"{layer!r} is no source of depth; expected one of {', '.join(later_layers())}.")
-    words = "monocular map" if layer == "mono" else f"{layer} map"
+    words = "monocular map" if layer == "mono" else f"{layer.replace('_', ' ')} map"
     found = read_scene(scene)
     pictures = {picture.name: picture for picture in found.pictures}
     targets = {name: _target(layer, picture) for name, picture in pictures.items()}
@@ -66,7 +66,7 @@ def write_maps(
         )
     partial = found.folder / f".{layer}.partial"
     shutil.rmtree(partial, ignore_errors=True)
-    task = progress.add_task(f"Writing maps of {found.folder.name}", total=len(pictures)) if progress else None
+    task = progress.add_task(f"Writing {words}s of {found.folder.name}", total=len(pictures)) if progress else None
     written: set[str] = set()
     try:
         for name, metres in maps:
