@@ -301,6 +301,13 @@ def work_along_rays(rays: int, samples: int, settings: Settings) -> dict[str, Pa
     }
 
 
+def layers(widths: Sequence[int], settings: Settings) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+    """Weights and biases of a network, by chance."""
+    pairs = list(itertools.pairwise(widths))
+    weights = [torch.randn(out, width, device=settings.device).requires_grad_() for width, out in pairs]
+    return weights, [torch.randn(out, device=settings.device).requires_grad_() for out in widths[1:]]
+
+
 def work_of_networks(points: int, settings: Settings) -> dict[str, Pair]:
     """nerfacto's networks, forward and backward; of a proposal network five times the points."""
     from edge_depth_nerf.kernels import network_triton
@@ -308,9 +315,7 @@ def work_of_networks(points: int, settings: Settings) -> dict[str, Pair]:
 
     found: dict[str, Pair] = {}
     for widths, count in (((10, 16, 1), 5 * points), ((32, 64, 16), points), ((15, 64, 64, 3), points)):
-        pairs = list(itertools.pairwise(widths))
-        weights = [torch.randn(out, width, device=settings.device).requires_grad_() for width, out in pairs]
-        biases = [torch.randn(out, device=settings.device).requires_grad_() for _, out in pairs]
+        weights, biases = layers(widths, settings)
         x = torch.randn(count, widths[0], device=settings.device).requires_grad_()
 
         def step(network: Any, x: Any = x, weights: Any = weights, biases: Any = biases) -> torch.Tensor:
@@ -323,6 +328,29 @@ def work_of_networks(points: int, settings: Settings) -> dict[str, Pair]:
     return found
 
 
+def work_at_rest(points: int, settings: Settings) -> dict[str, Pair]:
+    """A proposal network with its hash grid, without gradients."""
+    from nerfstudio.field_components.encodings import HashEncoding
+
+    from edge_depth_nerf.kernels import network_triton
+    from edge_depth_nerf.kernels.network import _layer_by_layer
+
+    encoding = HashEncoding(5, 16, 256, 17, hash_init_scale=1.0, implementation="torch").to(settings.device)
+    table, scalings = encoding.hash_table.detach(), encoding.scalings.float().to(settings.device)
+    weights, biases = layers((10, 16, 1), settings)
+    places = torch.rand(points, 3, device=settings.device)
+
+    @torch.no_grad()
+    def by_torch() -> torch.Tensor:
+        with torch.autocast(settings.device, enabled=not settings.fake, dtype=torch.float16):
+            return _layer_by_layer(encoding(places), weights, biases)
+
+    def by_triton() -> torch.Tensor:
+        return network_triton.encoded_network(places, table, scalings, weights, biases)
+
+    return {"network of 10-16-1 with its hash grid, forward": (by_triton, by_torch)}
+
+
 def samples_and_networks(settings: Settings) -> dict[str, Any]:
     """Triton's kernels for samples, losses and networks beside torch's, at the sizes of a full step."""
     torch.manual_seed(0)
@@ -331,6 +359,7 @@ def samples_and_networks(settings: Settings) -> dict[str, Any]:
         **work_by_number(rays, samples, settings),
         **work_along_rays(rays, samples, settings),
         **work_of_networks(rays * samples // 5, settings),
+        **work_at_rest(rays * samples, settings),
     }
     rows = []
     for name, (by_triton, by_torch) in pairs.items():

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
@@ -11,6 +13,7 @@ from interpreted import NEEDS_A_GPU, assert_near, in_interpreter, on_a_gpu
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from edge_depth_nerf.kernels import triton_back_end
+from edge_depth_nerf.kernels.fields import use_fused_fields
 
 WIDTHS = ((32, 64, 16), (15, 64, 64, 3), (10, 16, 1))
 """nerfacto's two networks of the field (without what a ray's points share), and a proposal network."""
@@ -88,6 +91,28 @@ def check_half_precision_empty_and_not_finite() -> None:
     assert network_triton.network(x[:0], weights, biases).shape == (0, 1)
 
 
+def check_encoding_before_it() -> None:
+    """Two kernels, one after the other, give the same; a point that is no number spoils no other."""
+    from edge_depth_nerf.kernels import hash_grid_triton, network_triton
+
+    for widths, features, points in (((10, 16, 1), 2, 1), ((32, 64, 16), 4, 131), ((5, 24, 24, 3), 1, 64)):
+        torch.manual_seed(points)
+        levels = widths[0] // features
+        table, scalings = torch.randn(levels << 7, features), 16.0 * 1.5 ** torch.arange(levels)
+        weights, biases = layers(widths)
+        places = torch.rand(points, 3)
+        found = network_triton.encoded_network(places, table, scalings, weights, biases)
+        x = hash_grid_triton.encode(places, table, scalings)
+        assert found.shape == (points, widths[-1]) and x.abs().max() > 0.1
+        assert_near(found, straight(x, weights, biases, half=True), 5e-4)
+        places[points // 2, 1] = float("nan")
+        usable = places.isfinite().all(1)
+        assert usable.sum() == points - 1
+        spoilt = network_triton.encoded_network(places, table, scalings, weights, biases)
+        assert torch.equal(spoilt[usable], found[usable])
+        assert network_triton.encoded_network(places[:0], table, scalings, weights, biases).shape == (0, widths[-1])
+
+
 def check_what_it_serves() -> None:
     from edge_depth_nerf.kernels import network_triton
 
@@ -98,12 +123,18 @@ def check_what_it_serves() -> None:
 @pytest.mark.slow
 def test_in_the_interpreter():
     pytest.importorskip("triton")
-    in_interpreter(check_values, check_gradients, check_half_precision_empty_and_not_finite, check_what_it_serves)
+    in_interpreter(
+        check_values,
+        check_gradients,
+        check_half_precision_empty_and_not_finite,
+        check_encoding_before_it,
+        check_what_it_serves,
+    )
 
 
 @NEEDS_A_GPU
 def test_the_same_on_a_gpu():
-    on_a_gpu(check_values, check_gradients, check_half_precision_empty_and_not_finite)
+    on_a_gpu(check_values, check_gradients, check_half_precision_empty_and_not_finite, check_encoding_before_it)
 
 
 @pytest.mark.slow
@@ -115,9 +146,14 @@ def test_compiled_without_spills(architecture, tmp_path):
         for widths, groups in zip(WIDTHS, (0, 4, 0), strict=True):
             x = torch.rand(64, widths[0], requires_grad=True)
             kernels.network(x, *layers(widths, groups)).sum().backward()
+        for widths in WIDTHS[::2]:
+            levels = widths[0] // 2
+            grid = torch.rand(64, 3), torch.rand(levels << 7, 2), torch.rand(levels)
+            kernels.encoded_network(*grid, *layers(widths))
 
     found = compiled(step, architecture, tmp_path)
-    assert [kernel.name.split()[0] for kernel in found] == ["_forward_kernel", "_backward_kernel"] * 3
+    names = [kernel.name.split()[0] for kernel in found]
+    assert names == ["_forward_kernel", "_backward_kernel"] * 3 + ["_encoded_kernel"] * 2
     assert {kernel.spilled for kernel in found} == {0}
     # tensor cores do the products
     assert all(any("MMA" in name for name in kernel.instructions) for kernel in found)
@@ -138,3 +174,34 @@ def test_it_is_off_unless_it_is_asked_for(monkeypatch):
         assert len(asked) == expected
     assert triton_back_end.of_network(torch.empty(4, 32), weights) is None
     assert [module for module, *_ in asked] == ["network_triton"]
+
+
+@pytest.mark.parametrize("chosen", ["triton", "triton+encoding"])
+def test_the_encoding_joins_the_network_where_no_gradient_is_followed(chosen, monkeypatch):
+    from nerfstudio.field_components.encodings import HashEncoding
+    from nerfstudio.field_components.mlp import MLP
+
+    torch.manual_seed(0)
+    encoding, mlp = (
+        HashEncoding(5, 16, 64, 8, implementation="torch"),
+        MLP(10, 2, 16, 1, out_activation=torch.nn.Tanh()),
+    )
+    base = torch.nn.Sequential(encoding, mlp)
+    places = torch.rand(7, 2, 3)
+    expected = base(places)
+    use_fused_fields(base)
+    called = []
+
+    def joined(*given: Any) -> torch.Tensor:
+        called.append([tuple(each.shape) for each in given[:3]])
+        return mlp.layers[1](mlp.layers[0](encoding(given[0])).relu())
+
+    stand_in = ModuleType("stand_in")
+    monkeypatch.setattr(stand_in, "encoded_network", joined, raising=False)
+    monkeypatch.setenv(triton_back_end.NETWORK, chosen)
+    monkeypatch.setattr(triton_back_end, "of_network", lambda *_: stand_in)
+    torch.testing.assert_close(base(places), expected)
+    assert not called
+    with torch.no_grad():
+        torch.testing.assert_close(base(places), expected)
+    assert called == ([[(14, 3), (5 << 8, 2), (5,)]] if chosen == "triton+encoding" else [])

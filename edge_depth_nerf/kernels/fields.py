@@ -24,9 +24,9 @@ from nerfstudio.fields.density_fields import HashMLPDensityField
 from nerfstudio.fields.nerfacto_field import NerfactoField
 from torch import Tensor, nn
 
-from edge_depth_nerf.kernels.fused_hash_grid import use_fused_encodings
+from edge_depth_nerf.kernels.fused_hash_grid import FusedHashEncoding, use_fused_encodings
 from edge_depth_nerf.kernels.network import network
-from edge_depth_nerf.kernels.triton_back_end import by_number, made_by_autocast, of_network, working
+from edge_depth_nerf.kernels.triton_back_end import by_number, made_by_autocast, of_encoded_network, of_network, working
 
 
 class CubeContraction(SceneContraction):
@@ -78,6 +78,23 @@ class FusedMLP(MLP):
         compute = network if kernels is None else kernels.network
         result = compute(flat, *_parameters(self)).view(*in_tensor.shape[:-1], -1)
         return result if self.out_activation is None else self.out_activation(result)
+
+
+class FusedEncodedMLP(nn.Sequential):
+    """A hash encoding and the network behind it: one after the other, or in one kernel."""
+
+    def forward(self, input: Float[Tensor, "*bs 3"]) -> Float[Tensor, "*bs out_dim"]:
+        """Encode positions in 0..1 and apply the network."""
+        encoding, mlp = self
+        assert isinstance(encoding, FusedHashEncoding) and isinstance(mlp, FusedMLP)
+        weights, biases = _parameters(mlp)
+        table = encoding.hash_table
+        kernels = of_encoded_network(input, weights) if table.dtype == torch.float32 else None
+        if kernels is None or input.numel() == 0:
+            return super().forward(input)
+        flat, scalings = input.reshape(-1, 3), encoding.scalings.to(input.device, torch.float32)
+        result = kernels.encoded_network(flat, table, scalings, weights, biases).view(*input.shape[:-1], -1)
+        return result if mlp.out_activation is None else mlp.out_activation(result)
 
 
 def _contraction(device: torch.device) -> ModuleType | None:
@@ -250,3 +267,6 @@ def use_fused_fields(module: nn.Module, add_in_place: bool = True) -> None:
         if type(part) in FUSED and not (isinstance(part, MLP) and not _is_plain(part)):
             # the class alone differs; another object would have to be found by all who hold this one
             part.__class__ = FUSED[type(part)]  # pyright: ignore[reportAttributeAccessIssue]
+    for part in module.modules():
+        if type(part) is nn.Sequential and [type(each) for each in part] == [FusedHashEncoding, FusedMLP]:
+            part.__class__ = FusedEncodedMLP

@@ -60,7 +60,7 @@ def _corner_pair(scaled, prime: tl.constexpr):
 
 @triton.jit
 @no_type_check
-def _find_corners(positions, point, inside, scaling, size, FEATURES: tl.constexpr):
+def find_corners(positions, point, inside, scaling, size, FEATURES: tl.constexpr):
     """Give where the features of a point's eight corners begin in a level's grid, and the place between them."""
     x0, x1, x = _corner_pair(tl.load(positions + 3 * point, inside, 0.0) * scaling, 1)
     y0, y1, y = _corner_pair(tl.load(positions + 3 * point + 1, inside, 0.0) * scaling, 2654435761)
@@ -75,6 +75,19 @@ def _find_corners(positions, point, inside, scaling, size, FEATURES: tl.constexp
     at6 = ((x0 ^ y1 ^ z1) & mask).to(tl.int64) * FEATURES
     at7 = ((x1 ^ y1 ^ z1) & mask).to(tl.int64) * FEATURES
     return at0, at1, at2, at3, at4, at5, at6, at7, x, y, z
+
+
+@triton.jit
+@no_type_check
+def interpolated(grid, inside, at0, at1, at2, at3, at4, at5, at6, at7, x, y, z):
+    """Give one feature of points from its values at their corners, on x, then y, then z."""
+    low_low = tl.load(grid + at1, inside, 0.0) * x + tl.load(grid + at0, inside, 0.0) * (1 - x)
+    high_low = tl.load(grid + at3, inside, 0.0) * x + tl.load(grid + at2, inside, 0.0) * (1 - x)
+    low_high = tl.load(grid + at5, inside, 0.0) * x + tl.load(grid + at4, inside, 0.0) * (1 - x)
+    high_high = tl.load(grid + at7, inside, 0.0) * x + tl.load(grid + at6, inside, 0.0) * (1 - x)
+    low = high_low * y + low_low * (1 - y)
+    high = high_high * y + low_high * (1 - y)
+    return high * z + low * (1 - z)
 
 
 @triton.jit
@@ -94,19 +107,13 @@ def _encode_kernel(
     point = tl.program_id(0).to(tl.int64) * POINTS + tl.arange(0, POINTS)
     level = tl.program_id(1).to(tl.int64)
     inside = point < points
-    at0, at1, at2, at3, at4, at5, at6, at7, x, y, z = _find_corners(
+    at0, at1, at2, at3, at4, at5, at6, at7, x, y, z = find_corners(
         positions, point, inside, tl.load(scalings + level), size, FEATURES
     )
     for c in tl.static_range(FEATURES):
         grid = table + level * size * FEATURES + c
-        low_low = tl.load(grid + at1, inside, 0.0) * x + tl.load(grid + at0, inside, 0.0) * (1 - x)
-        high_low = tl.load(grid + at3, inside, 0.0) * x + tl.load(grid + at2, inside, 0.0) * (1 - x)
-        low_high = tl.load(grid + at5, inside, 0.0) * x + tl.load(grid + at4, inside, 0.0) * (1 - x)
-        high_high = tl.load(grid + at7, inside, 0.0) * x + tl.load(grid + at6, inside, 0.0) * (1 - x)
-        low = high_low * y + low_low * (1 - y)
-        high = high_high * y + low_high * (1 - y)
+        value = interpolated(grid, inside, at0, at1, at2, at3, at4, at5, at6, at7, x, y, z)
         place = point * point_stride + (level * FEATURES + c) * feature_stride
-        value = high * z + low * (1 - z)
         tl.store(encoded + place, value.to(encoded.dtype.element_ty), inside)
 
 
@@ -163,7 +170,7 @@ def _table_gradient_kernel(
     feature = tl.arange(0, BLOCK)[None]
     inside = point < points
     scaling = tl.load(scalings + level)
-    at0, at1, at2, at3, at4, at5, at6, at7, x, y, z = _find_corners(positions, point, inside, scaling, size, FEATURES)
+    at0, at1, at2, at3, at4, at5, at6, at7, x, y, z = find_corners(positions, point, inside, scaling, size, FEATURES)
     has = inside & (feature < FEATURES)
     g = tl.load(gradient + point * point_stride + (level * FEATURES + feature) * feature_stride, has, 0.0)
     g = g.to(tl.float32)
@@ -217,7 +224,7 @@ def _position_gradient_kernel(
     to_z = tl.zeros((POINTS,), tl.float32)
     for level in range(LEVELS):
         scaling = tl.load(scalings + level)
-        at0, at1, at2, at3, at4, at5, at6, at7, x, y, z = _find_corners(
+        at0, at1, at2, at3, at4, at5, at6, at7, x, y, z = find_corners(
             positions, point, inside, scaling, size, FEATURES
         )
         for c in tl.static_range(FEATURES):

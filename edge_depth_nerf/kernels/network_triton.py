@@ -4,8 +4,12 @@ Products are of float16 with sums of float32, as in torch under autocast, and wh
 chip. Backward computes the hidden layers again and writes them beside their gradients, in float16; torch multiplies
 these to the weights' gradients, as these do not find room on the chip (three layers of 64).
 
+Where nobody follows gradients, the hash grid in front of a network can be computed in the network's kernel, too
+(`encoded_network`): the encoded values are never written to memory. That is the case for proposal networks at rest.
+
 Networks have two or three layers, at most `WIDEST` wide. No GPU has run this: it is off unless the environment says
-EDGE_DEPTH_NERF_NETWORK=triton. With TRITON_INTERPRET=1 set before the import it runs on CPU tensors.
+EDGE_DEPTH_NERF_NETWORK=triton, or triton+encoding for the second form as well. With TRITON_INTERPRET=1 set before the
+import it runs on CPU tensors.
 """
 
 from __future__ import annotations
@@ -19,6 +23,7 @@ import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 
+from edge_depth_nerf.kernels.hash_grid_triton import find_corners, interpolated
 from edge_depth_nerf.kernels.triton_launch import launch
 
 WIDEST = 64
@@ -76,6 +81,27 @@ def _points(pointer, point, inside, stride, width, WIDTH: tl.constexpr):
 
 @triton.jit
 @no_type_check
+def _store(pointer, values, point, inside, width, WIDTH: tl.constexpr):
+    """Store a row for each point."""
+    column = tl.arange(0, WIDTH)[None]
+    has = inside[:, None] & (column < width)
+    tl.store(pointer + point[:, None] * width + column, values.to(pointer.dtype.element_ty), has)
+
+
+@triton.jit
+@no_type_check
+def _other_layers(
+    h, weight1, bias1, weight2, bias2, hidden, out, LAYERS: tl.constexpr, HIDDEN: tl.constexpr, OUT: tl.constexpr
+):
+    """Give the last layer from the first hidden one."""
+    if LAYERS == 3:
+        w1 = _matrix(weight1, hidden, hidden, HIDDEN, HIDDEN)
+        h = tl.maximum(tl.dot(h, tl.trans(w1)) + _bias(bias1, hidden, HIDDEN), 0.0).to(tl.float16)
+    return tl.dot(h, tl.trans(_matrix(weight2, out, hidden, OUT, HIDDEN))) + _bias(bias2, out, OUT)
+
+
+@triton.jit
+@no_type_check
 def _forward_kernel(
     xs,
     weight0,
@@ -101,21 +127,53 @@ def _forward_kernel(
     inside = point < points
     x = _points(xs, point, inside, stride, width, WIDTH)
     h = _first_layer(x, _matrix(weight0, hidden, width, HIDDEN, WIDTH), bias0, point, inside, group, hidden, HIDDEN)
-    if LAYERS == 3:
-        w1 = _matrix(weight1, hidden, hidden, HIDDEN, HIDDEN)
-        h = tl.maximum(tl.dot(h, tl.trans(w1)) + _bias(bias1, hidden, HIDDEN), 0.0).to(tl.float16)
-    y = tl.dot(h, tl.trans(_matrix(weight2, out, hidden, OUT, HIDDEN))) + _bias(bias2, out, OUT)
-    column = tl.arange(0, OUT)[None]
-    tl.store(result + point[:, None] * out + column, y, inside[:, None] & (column < out))
+    y = _other_layers(h, weight1, bias1, weight2, bias2, hidden, out, LAYERS, HIDDEN, OUT)
+    _store(result, y, point, inside, out, OUT)
 
 
 @triton.jit
 @no_type_check
-def _store(pointer, values, point, inside, width, WIDTH: tl.constexpr):
-    """Store a row for each point."""
-    column = tl.arange(0, WIDTH)[None]
-    has = inside[:, None] & (column < width)
-    tl.store(pointer + point[:, None] * width + column, values.to(pointer.dtype.element_ty), has)
+def _encoded_kernel(
+    positions,
+    table,
+    scalings,
+    weight0,
+    bias0,
+    weight1,
+    bias1,
+    weight2,
+    bias2,
+    result,
+    points,
+    size,
+    levels,
+    hidden,
+    out,
+    FEATURES: tl.constexpr,
+    LAYERS: tl.constexpr,
+    HIDDEN: tl.constexpr,
+    OUT: tl.constexpr,
+    POINTS: tl.constexpr,
+):
+    point = tl.program_id(0).to(tl.int64) * POINTS + tl.arange(0, POINTS)
+    inside = point < points
+    column = tl.arange(0, HIDDEN)
+    h = tl.zeros((POINTS, HIDDEN), tl.float32) + _bias(bias0, hidden, HIDDEN)
+    for level in range(levels):
+        at0, at1, at2, at3, at4, at5, at6, at7, x, y, z = find_corners(
+            positions, point, inside, tl.load(scalings + level), size, FEATURES
+        )
+        for c in tl.static_range(FEATURES):
+            place = level * FEATURES + c
+            grid = table + tl.cast(level, tl.int64) * size * FEATURES + c
+            value = interpolated(grid, inside, at0, at1, at2, at3, at4, at5, at6, at7, x, y, z)
+            weight = tl.load(weight0 + column * (levels * FEATURES) + place, column < hidden, 0.0)
+            # rounded as if it had been written for tensor cores
+            value, weight = value.to(tl.float16).to(tl.float32), weight.to(tl.float16).to(tl.float32)
+            h += value[:, None] * weight[None]
+    h = tl.maximum(h, 0.0).to(tl.float16)
+    last = _other_layers(h, weight1, bias1, weight2, bias2, hidden, out, LAYERS, HIDDEN, OUT)
+    _store(result, last, point, inside, out, OUT)
 
 
 @triton.jit
@@ -277,8 +335,59 @@ def _forward(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> 
     return result
 
 
+@torch.no_grad()
+def encoded_network(
+    positions: Float[Tensor, "points 3"],
+    table: Float[Tensor, "rows features"],
+    scalings: Float[Tensor, "levels"],
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+) -> Float[Tensor, "points out"]:
+    """Encode points by a hash grid and apply a network to them, in one kernel, without gradients.
+
+    Args:
+        positions: float32; see `hash_grid.hash_grid`, also for the next two.
+        table: float32.
+        scalings: float32.
+        weights: of each layer, [out, in], for which `fits` says yes; the first layer's `in` is levels * features.
+        biases: of each layer, [out].
+
+    Returns:
+        The last layer, without activation, float32.
+
+    """
+    layers = [(weight.contiguous(), bias.contiguous()) for weight, bias in zip(weights, biases, strict=True)]
+    hidden, out, levels = len(weights[0]), len(weights[-1]), len(scalings)
+    result = torch.empty(len(positions), out, device=positions.device)
+    launch(
+        _encoded_kernel,
+        (triton.cdiv(len(positions), POINTS),),
+        positions,
+        positions.contiguous(),
+        table.contiguous(),
+        scalings,
+        *layers[0],
+        *layers[-2],  # of two layers the one between is not read
+        *layers[-1],
+        result,
+        len(positions),
+        len(table) // levels,
+        levels,
+        hidden,
+        out,
+        FEATURES=table.shape[1],
+        LAYERS=len(weights),
+        HIDDEN=_block(hidden),
+        OUT=_block(out),
+        POINTS=POINTS,
+    )
+    return result
+
+
 def try_out(device: torch.device) -> None:
     """Run each kernel once; raises whatever keeps one from working."""
     for layers in (2, 3):
         square = torch.ones(16, 16, device=device, requires_grad=True)
         network(square[:1], [square] * layers, [square[0]] * layers).sum().backward()
+        table = torch.ones(8 * 2, 2, device=device)
+        encoded_network(square[:1, :3], table, square[0, :8], [square] * layers, [square[0]] * layers)

@@ -110,7 +110,8 @@ def made_by_autocast(device: torch.device) -> torch.dtype:
 
 
 NETWORK = "EDGE_DEPTH_NERF_NETWORK"
-"""Environment variable that turns on the kernels of networks, with the value `triton`; no GPU has compared them yet."""
+"""Environment variable that turns on the kernels of networks; no GPU has compared them yet. `triton`: networks.
+`triton+encoding`: also networks together with the hash grid in front of them, where nobody follows gradients."""
 
 
 def of_network(x: Tensor, weights: Sequence[Tensor]) -> ModuleType | None:
@@ -118,9 +119,16 @@ def of_network(x: Tensor, weights: Sequence[Tensor]) -> ModuleType | None:
 
     They serve what autocast would compute in float16 on CUDA.
     """
-    if os.environ.get(NETWORK) != "triton" or x.device.type != "cuda":
+    if os.environ.get(NETWORK) not in ("triton", "triton+encoding") or x.device.type != "cuda":
         return None
     if not torch.is_autocast_enabled("cuda") or torch.get_autocast_dtype("cuda") != torch.float16:
         return None
     kernels = working("network_triton", x.device, "network")
     return kernels if kernels is not None and kernels.fits(weights) else None
+
+
+def of_encoded_network(positions: Tensor, weights: Sequence[Tensor]) -> ModuleType | None:
+    """Give the kernels of networks that encode positions first; None as for `of_network`, or with gradients."""
+    if os.environ.get(NETWORK) != "triton+encoding" or torch.is_grad_enabled() or positions.dtype != torch.float32:
+        return None
+    return of_network(positions, weights)
