@@ -473,7 +473,7 @@ def other_shape(mono):
 
 
 CONTENTS = [
-    ("lidar", (6,), sparse, "lidar", (6,), "frame 6 of left; 50.00% is usual"),
+    ("lidar", (6,), sparse, "lidar", (6,), "frame 6 of left; 50.00% is usual for training"),
     ("images", (2, 3), lambda picture: picture // 3, "dark", (2, 3), "frames 2, 3 of left is dark: mean grey 33"),
     ("images", (8,), lambda picture: picture * 2 + 30, "bright", (8,), "frame 8 of left is bright"),
     ("mono", tuple(range(12)), lambda mono: mono * 1.5, "mono_scale", (), "1.57 times LiDAR's in left"),
@@ -489,6 +489,24 @@ def test_maps_out_of_the_ordinary(drive, tmp_path, layer, moments, alter, kind, 
     summary = look(drive, tmp_path / "out", frames=1)
     assert [(w["kind"], tuple(w["frames"])) for w in summary["warnings"]] == [(kind, frames)]
     assert words in summary["warnings"][0]["text"]
+
+
+def test_held_out_pictures_have_less_lidar_than_others(drive, tmp_path):
+    """Their maps are of their own sweep alone: few points there are no fault, unless other held-out ones have more."""
+    held_out = tuple(picture.moment for picture in read_scene(drive).pictures if picture.held_out)
+    assert 0 < len(held_out) < 6
+    rewrite(drive, "lidar", held_out, sparse)
+    assert look(drive, tmp_path / "out", frames=1)["warnings"] == []
+    meta = read_json(drive / "transforms.json")
+    names = [frame["file_path"] for frame in meta["frames"]]
+    change(
+        drive, lambda meta: meta.update(train_filenames=names[:6], val_filenames=names[6:], test_filenames=names[6:])
+    )
+    rewrite(drive, "lidar", (8,), sparse)
+    (warning,) = [
+        each for each in look(drive, tmp_path / "again", frames=1)["warnings"] if "held-out pictures" in each["text"]
+    ]
+    assert 8 in warning["frames"]
 
 
 def test_an_inverted_mask(drive, tmp_path):

@@ -261,6 +261,27 @@ def _masks(measured: Sequence[PictureFigures]) -> Iterator[Finding]:
         )
 
 
+def _little_lidar(camera: str, measured: Sequence[PictureFigures]) -> Iterator[Finding]:
+    """Find pictures with far less LiDAR than the others of their camera; held-out ones may have one sweep alone."""
+    for held_out in (False, True):
+        shares = {
+            one.picture.moment: one.lidar_coverage
+            for one in measured
+            if one.lidar_coverage is not None and one.picture.held_out == held_out
+        }
+        usual = float(np.median(list(shares.values()))) if shares else 0.0
+        little = [moment for moment, share in shares.items() if share < LITTLE_LIDAR * usual]
+        if little:
+            of_split = "held-out pictures" if held_out else "training pictures"
+            yield Finding(
+                "lidar",
+                f"LiDAR covers {min(shares[moment] for moment in little):.2%} of {_frames(little)} of {camera}; "
+                f"{usual:.2%} is usual for {of_split}. Check that the sweep is complete and the pose is right.",
+                (camera,),
+                tuple(little),
+            )
+
+
 def _outliers(measured: Sequence[PictureFigures]) -> Iterator[Finding]:
     """Find pictures with far less LiDAR, or far darker or brighter, than the others of their camera."""
     for name, figures in _by_camera(measured).items():
@@ -272,15 +293,7 @@ def _outliers(measured: Sequence[PictureFigures]) -> Iterator[Finding]:
                 f"Most LiDAR maps of {name} are empty. Check the calibration from the scanner to this camera.",
                 (name,),
             )
-        little = [moment for moment, share in coverage.items() if share < LITTLE_LIDAR * usual]
-        if little:
-            yield Finding(
-                "lidar",
-                f"LiDAR covers {min(coverage[moment] for moment in little):.2%} of {_frames(little)} of {name}; "
-                f"{usual:.2%} is usual. Check that the sweep is complete and the pose is right.",
-                (name,),
-                tuple(little),
-            )
+        yield from _little_lidar(name, figures)
         brightness = {one.picture.moment: one.brightness for one in figures}
         usual = float(np.median(list(brightness.values())))
         strange = {
