@@ -9,6 +9,7 @@ import os
 import sys
 import traceback
 from pathlib import Path
+from types import FrameType
 from typing import NoReturn
 
 from edge_depth_nerf import __version__
@@ -16,6 +17,11 @@ from edge_depth_nerf.base.errors import DEBUG_VARIABLE, PROGRAM, STOPPED_STATUS,
 
 DEBUG_OPTION = "--debug"
 BUG_STATUS, INPUT_STATUS, PIPE_STATUS = 1, 2, 141
+
+_SWALLOWERS = ("trimesh",)
+"""Packages that catch every exception, KeyboardInterrupt with them, while they are imported and while they work."""
+
+_SWALLOWERS_WAIT_S = 0.05
 
 
 def main() -> None:
@@ -27,6 +33,7 @@ def main() -> None:
     try:
         # before OpenMP is loaded, and for the commands that this one starts; why: openmp.py
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+        _interrupt_between_swallowers()
         words = sys.argv[1:]
         arguments = [word for word in words if word != DEBUG_OPTION]
         if len(arguments) < len(words):
@@ -44,11 +51,42 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(PIPE_STATUS)
     except Exception as error:
+        if _interrupted(error):
+            _stopped()
         if debugging():
             traceback.print_exc()
         is_input = isinstance(error, (InputError, OSError))
         sys.stderr.write(f"{PROGRAM}: {_explained(error) if is_input else _bug(error)}\n")
         sys.exit(INPUT_STATUS if is_input else BUG_STATUS)
+
+
+def _interrupt_between_swallowers() -> None:
+    """Let Ctrl-C wait until none of `_SWALLOWERS` is at work, in which it would be lost."""
+    import signal
+    import threading
+    from _thread import interrupt_main
+
+    def interrupt(_: int, frame: FrameType | None) -> None:
+        while frame is not None:
+            if frame.f_globals.get("__name__", "").partition(".")[0] in _SWALLOWERS:
+                again = threading.Timer(_SWALLOWERS_WAIT_S, interrupt_main)
+                again.daemon = True
+                again.start()
+                return
+            frame = frame.f_back
+        raise KeyboardInterrupt
+
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, interrupt)
+
+
+def _interrupted(error: BaseException | None) -> bool:
+    """Whether it only tells of Ctrl-C; compiled modules raise ImportError from it while they are imported."""
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def _stopped() -> NoReturn:

@@ -102,6 +102,13 @@ def test_what_the_user_can_mend_is_said_alone(monkeypatch, capsys, error):
     assert end_of(monkeypatch, capsys, "doctor", error=error) == (2, f"edge-depth-nerf: {error}\n")
 
 
+def test_ctrl_c_in_the_words_of_a_compiled_module(monkeypatch, capsys):
+    error = ImportError("initialization failed")
+    error.__cause__ = KeyboardInterrupt()
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    assert end_of(monkeypatch, capsys, "doctor", error=error) == (130, STOPPED)
+
+
 @pytest.mark.parametrize("place", [0, 1, 2])
 def test_debug_gives_the_traceback_wherever_it_stands(monkeypatch, capsys, tmp_path, place):
     arguments = ["inspect", str(tmp_path / "nowhere")]
@@ -157,6 +164,23 @@ sys.argv = Words([*WORDS, "400"])
 main()
 """
     done = interrupted(SYNTHESIS + code, seconds, folder=tmp_path)
+    assert (done.returncode, done.stderr) == (130, STOPPED)
+
+
+def test_ctrl_c_is_not_lost_in_a_package_that_catches_everything(tmp_path):
+    """trimesh does, around each import of its own."""
+    code = """
+import time
+class Slow:
+    def find_spec(self, name, path=None, target=None):
+        if name == "networkx":
+            print("go", flush=True)
+            time.sleep(1)
+sys.meta_path.insert(0, Slow())
+sys.argv = [*WORDS, "400"]
+main()
+"""
+    done = interrupted(SYNTHESIS + code, 0.2, folder=tmp_path)
     assert (done.returncode, done.stderr) == (130, STOPPED)
 
 
