@@ -32,7 +32,7 @@ from edge_depth_nerf.base.files import as_people_count
 from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.base.pictures import SIGMA, colour_distance
 from edge_depth_nerf.cameras import KannalaBrandt
-from edge_depth_nerf.plugin.coarse_to_fine import CoarseToFine
+from edge_depth_nerf.plugin.coarse_to_fine import LONGEST_START_S, CoarseToFine
 from edge_depth_nerf.plugin.viewer import AZIMUTHS, RINGS, DriveLayers, lens_cap, rim_rad
 
 pytestmark = pytest.mark.slow
@@ -321,19 +321,106 @@ def test_the_speed_of_a_gpu_counts_what_was_only_asked_for(machine, monkeypatch)
 
     monkeypatch.setattr(RenderStateMachine, "_render_img", lambda *_: outputs)
     monkeypatch.setattr(torch.cuda, "synchronize", wait)
-    assert machine._render_img(None) is outputs
+    assert machine._render_img(reported(0.0)) is outputs
     assert waited_for == ["cuda"] and 0 < machine._rays_per_s <= 600 / 0.05
 
 
 def test_a_movement_ends_a_fine_picture_and_no_other(machine):
-    move = RenderAction("move", cast(Any, None))
-    for machine.state, machine._is_rendering in (("low_move", True), ("middle", False), ("high", False)):
-        machine.action(move)
+    for number, (machine.state, machine._is_rendering) in enumerate(
+        [("low_move", True), ("middle", False), ("high", False)]
+    ):
+        machine.action(RenderAction("move", reported(number)))
         assert not machine.interrupt_render_flag
-    for machine.state in ("low_static", "middle", "high"):
+    for number, machine.state in enumerate(("low_static", "middle", "high"), start=10):
         machine._is_rendering, machine.next_action = True, None
-        machine.action(move)
+        machine.action(RenderAction("move", reported(number)))
         assert machine.interrupt_render_flag, machine.state
+
+
+def reported(x: float, aspect: float = 1.5) -> CameraState:
+    """What a browser reports from a place."""
+    c2w = torch.eye(4, dtype=torch.float64)[:3]
+    c2w[0, 3] = x
+    return CameraState(1.3, aspect, c2w, CameraType.PERSPECTIVE)
+
+
+def asked(machine: CoarseToFine) -> tuple[str, float, float] | None:
+    """What is rendered next: the action, the place and the aspect ratio."""
+    action = machine.next_action
+    return action and (action.action, float(action.camera_state.c2w[0, 3]), action.camera_state.aspect)
+
+
+def test_a_browser_that_changes_its_size_does_not_move(machine):
+    machine.action(RenderAction("move", reported(0.0)))
+    assert machine.next_action.action == "move"
+    for aspect in (1.4, 1.3):  # before it is rendered: the movement, as the browser is now
+        machine.action(RenderAction("move", reported(0.0, aspect)))
+        assert asked(machine) == ("move", 0.0, aspect)
+    for aspect, machine.state in ((1.2, "low_move"), (1.1, "low_static"), (1.0, "middle")):
+        machine._is_rendering, machine.next_action = True, None
+        machine.action(RenderAction("move", reported(1e-7, aspect)))  # as it was rounded on its way
+        assert asked(machine) == ("static", 1e-7, aspect)
+        assert not machine.interrupt_render_flag, machine.state
+    machine.next_action = None
+    machine.action(RenderAction("move", reported(1e-7, 1.0)))  # nerfstudio, of a switch in its panel
+    assert asked(machine) == ("move", 1e-7, 1.0) and machine.interrupt_render_flag
+    machine.next_action = None
+    machine.action(RenderAction("move", reported(0.1, 1.2)))
+    assert asked(machine) == ("move", 0.1, 1.2) and machine.interrupt_render_flag
+
+
+@pytest.mark.parametrize("report", ["move", "static"])
+def test_a_finished_picture_is_rendered_again_in_another_shape(machine, monkeypatch, report):
+    monkeypatch.setattr(RenderStateMachine, "_render_img", lambda *_: {"rgb": torch.zeros(341, 512, 3)})
+    machine.action(RenderAction("move", reported(0.0)))
+    machine.state, machine.next_action = "high", None
+    machine._render_img(reported(0.0))
+    for aspect, expected in ((1.505, "static"), (1.4, "step")):
+        machine.next_action = None
+        machine.action(RenderAction(report, reported(0.0, aspect)))
+        assert (asked(machine) or ("",))[0] == expected and not machine.interrupt_render_flag
+    assert machine.transitions["high"]["step"] == "high"  # nothing coarse comes in between
+
+
+def test_the_middle_step_comes_twice_if_it_underrated_the_machine(machine, monkeypatch):
+    def rendered(seconds: float) -> str:
+        clock = iter([0.0, seconds])
+        monkeypatch.setattr(time, "perf_counter", lambda: next(clock))
+        machine.state = "middle"
+        machine._render_img(reported(0.0))
+        return machine.transitions["middle"]["static"]
+
+    monkeypatch.setattr(RenderStateMachine, "_render_img", lambda *_: {"rgb": torch.zeros(160, 240, 3)})
+    assert rendered(seconds=1.0) == "middle"  # three seconds are enough for 277 px
+    assert rendered(seconds=2.9) == "high"
+    assert rendered(seconds=1.0) == "middle"
+    monkeypatch.setattr(RenderStateMachine, "_render_img", lambda *_: {"rgb": torch.zeros(341, 512, 3)})
+    assert rendered(seconds=0.1) == "high"  # it is the full size
+
+
+def test_where_a_browser_opened_is_not_rendered(machine, monkeypatch):
+    """It still reports that view when it was sent to another one."""
+    machine.viewer.get_camera_state = lambda _: reported(5.0)
+    monkeypatch.setattr(machine, "start", lambda: None)
+    now_s = 100.0
+    monkeypatch.setattr(time, "monotonic", lambda: now_s)
+    machine.begin(reported(0.0))
+    assert asked(machine) == ("rerender", 5.0, 1.5)
+    machine.next_action = None
+    machine.action(RenderAction("move", reported(0.0)))
+    assert machine.next_action is None
+    machine.action(RenderAction("static", reported(0.0, 1.2)))
+    assert asked(machine) == ("static", 5.0, 1.2)
+    machine.next_action = None
+    machine.action(RenderAction("move", reported(5.0)))  # what the browser says twice while it opens
+    assert asked(machine) == ("static", 5.0, 1.5)
+    machine.next_action = None
+    machine.action(RenderAction("move", reported(6.0)))  # the user, at once
+    assert asked(machine) == ("move", 6.0, 1.5)
+    now_s += LONGEST_START_S + 1
+    machine.next_action = None
+    machine.action(RenderAction("move", reported(0.0)))  # and back there, later
+    assert asked(machine) == ("move", 0.0, 1.5)
 
 
 # ---- the viewer itself, during a training ---------------------------------------------------------------------------

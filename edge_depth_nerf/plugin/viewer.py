@@ -233,12 +233,13 @@ class DriveLayers(ViewerControl):
         of_camera = [index for index, file in enumerate(dataset.image_filenames) if file.parent == folder]
         index = of_camera[len(of_camera) // 2]
         pose = dataset.cameras.camera_to_worlds[index].double().cpu().numpy()
+        first = self.viewer.get_camera_state(client)
         with client.atomic():
             client.camera.position = pose[:, 3] * VISER_NERFSTUDIO_SCALE_RATIO
             client.camera.wxyz = _viser_rotation(pose).wxyz
         self.viewer.current_camera_idx = index
         self.viewer.update_step(self.viewer.step)
-        render_coarse_to_fine(self.viewer, client)
+        render_coarse_to_fine(self.viewer, client, first)
 
     def _hide_lenses(self, hidden: bool) -> None:
         self._hidden = hidden
