@@ -11,7 +11,8 @@ and distances, and views 1 m beside the path. The last table says how far motion
 ceiling. Nothing was chosen on these drives: their seeds (`DRIVES`) were written down before anything was run, and no
 other measurement uses a seed of 100 or more.
 
-Writes table.md and table.json. What is there is not made again: stopped at any moment, the same command goes on.
+Writes table.md, table.json, and priors/, the first table's figures. What is there is not made again: stopped at any
+moment, the same command goes on.
 """
 
 from __future__ import annotations
@@ -80,6 +81,11 @@ def make_scenes(kind: str, seed: int, options: argparse.Namespace) -> dict[str, 
     return scenes
 
 
+def read_judged(kept: Path) -> Judged:
+    """Read what `judged` wrote."""
+    return {name: figures and PriorFigures(**figures) for name, figures in read_json(kept).items()}
+
+
 def judged(scene: Path, kept: Path) -> Judged:
     """How good a scene's default prior is; read from `kept` if it is there."""
     if not kept.is_file():
@@ -87,7 +93,7 @@ def judged(scene: Path, kept: Path) -> Judged:
         parts = {"everywhere": pixels, **{name: pixels[:, pixels[3] == i] for i, name in enumerate(list(PLACES)[1:])}}
         found = {name: prior_figures(part) for name, part in parts.items()}
         write_json(kept, {name: figures and dataclasses.asdict(figures) for name, figures in found.items()})
-    return {name: figures and PriorFigures(**figures) for name, figures in read_json(kept).items()}
+    return read_judged(kept)
 
 
 def prior_table(priors: Mapping[str, Mapping[str, Judged]]) -> Iterator[str]:
@@ -96,13 +102,13 @@ def prior_table(priors: Mapping[str, Mapping[str, Judged]]) -> Iterator[str]:
     yield "|---|---|---|---|---|---|---|---|"
     for drive, by_prior in priors.items():
         for prior, by_place in by_prior.items():
-            for place, title in PLACES.items():
-                if found := by_place[place]:
+            for place, found in by_place.items():
+                if found:
                     cells = (f"{found.have_one:.1%}", f"{found.abs_rel:.4f}", f"{found.median:.4f}")
                     within = (f"{found.within_1:.1%}", f"{found.within_2:.1%}")
                 else:
                     cells, within = ("0 %", "–", "–"), ("–", "–")
-                yield "| " + " | ".join((drive, PRIORS[prior], title, *cells, *within)) + " |"
+                yield "| " + " | ".join((drive, PRIORS[prior], PLACES[place], *cells, *within)) + " |"
 
 
 def rows_of(results: Results, drive: str) -> Iterator[tuple[str, RunResult]]:
@@ -115,13 +121,15 @@ def rows_of(results: Results, drive: str) -> Iterator[tuple[str, RunResult]]:
             yield f"ours, {title}", run
 
 
-def model_table(results: Results, drive: str) -> Iterator[str]:
-    """All models of a drive, as Markdown."""
+def model_table(results: Results, drives: Mapping[str, int]) -> Iterator[str]:
+    """All models, as Markdown."""
     yield "| " + " | ".join(("drive", "method", *COLUMNS)) + " |"
     yield "|---" * (2 + len(COLUMNS)) + "|"
-    for title, run in rows_of(results, drive):
-        cells = [f"{run.figures[metric]:{form}}" if metric in run.figures else "–" for metric, form in COLUMNS.values()]
-        yield "| " + " | ".join((drive, title, *cells)) + " |"
+    for drive in (f"{kind}_{seed}" for kind, seed in drives.items()):
+        for title, run in rows_of(results, drive):
+            figures = run.figures
+            cells = [f"{figures[metric]:{form}}" if metric in figures else "–" for metric, form in COLUMNS.values()]
+            yield "| " + " | ".join((drive, title, *cells)) + " |"
 
 
 def way_table(results: Results, drives: Mapping[str, int]) -> Iterator[str]:
@@ -140,6 +148,14 @@ def way_table(results: Results, drives: Mapping[str, int]) -> Iterator[str]:
             share = f" ({gain / whole:.0%})" if whole else ""
             cells.append(f"{gain:+{form}} of {whole:+{form}}{share}")
         yield "| " + " | ".join((f"{kind}_{seed}", *cells)) + " |"
+
+
+def page(results: Results, priors: Mapping[str, Mapping[str, Judged]], drives: Mapping[str, int]) -> str:
+    """All tables, as Markdown."""
+    lines = ["# What a prior beyond LiDAR's field is worth", "", "## The prior", "", *prior_table(priors)]
+    lines += ["", "## The trained models", "", *model_table(results, drives)]
+    lines += ["", "## From no motion to a prior everywhere", "", *way_table(results, drives), ""]
+    return "\n".join(lines)
 
 
 def main() -> None:
@@ -172,12 +188,7 @@ def main() -> None:
         # a drive is whole before the next begins: a stopped benchmark has a table of those it has
         done = {each: drives[each] for each in options.kinds[: len(priors)]}
         results = read_results(compared / RUNS)
-        page = ["# What a prior beyond LiDAR's field is worth", "", "## The prior", "", *prior_table(priors)]
-        page += ["", "## The trained models"]
-        for each, its_seed in done.items():
-            page += ["", *model_table(results, f"{each}_{its_seed}")]
-        page += ["", "## From no motion to a prior everywhere", "", *way_table(results, done), ""]
-        write_text(options.output / "table.md", "\n".join(page))
+        write_text(options.output / "table.md", page(results, priors, done))
         write_json(options.output / "table.json", results.rows())
 
 

@@ -305,6 +305,25 @@ def test_the_real_drives_tables_are_those_of_its_runs(benchmark_module):
         assert pages.with_part(text, name, pages.under(made, heading)) == text, name
 
 
+def test_the_pages_tables_of_motion_are_those_of_its_runs(benchmark_module):
+    reach, kept, pages = (benchmark_module(name) for name in ("reach", "kept_runs", "pages"))
+    priors = {
+        drive: {"motion": {place: reach.PriorFigures(**figures) for place, figures in by_place.items()}}
+        for drive, by_place in read_json(ROOT / "benchmarks" / "reach_priors.json").items()
+    }
+    made = reach.page(kept.results_of(ROOT / "benchmarks" / "reach.json.xz"), priors, reach.DRIVES)
+    text = (ROOT / "docs" / "prior.md").read_text(encoding="utf-8")
+    for name, heading, rows in (
+        ("reach: prior", "The prior", 8),
+        ("reach: models", "The trained models", 20),
+        ("reach: way", "From no motion to a prior everywhere", 4),
+    ):
+        part = pages.under(made, heading)
+        assert len(part.strip().splitlines()) == 2 + rows
+        assert pages.with_part(text, name, part) == text, name
+        assert f"<!-- {name} -->" in text
+
+
 def test_disturbed_poses_are_off_by_as_much_as_is_said(benchmark_module, tmp_path):
     poses = benchmark_module("poses")
     path = tmp_path / "drive" / "data_poses" / poses.SEQUENCE / "poses.txt"
