@@ -6,6 +6,7 @@ in full size, which takes half a minute on a CPU.
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -37,7 +38,7 @@ SHOWN_PX = 512
 
 
 class CoarseToFine(RenderStateMachine):
-    """Chooses what a browser receives: a coarse picture while the camera moves, then three finer ones."""
+    """Chooses what a browser receives: a coarse picture while the camera moves, then finer ones."""
 
     def __init__(self, viewer: Viewer, client: viser.ClientHandle) -> None:
         """Render for one browser; nothing is rendered before `begin`."""
@@ -49,7 +50,7 @@ class CoarseToFine(RenderStateMachine):
         self._is_rendering = False
         self._requested: CameraState | None = None
         self._first: CameraState | None = None
-        self._first_until_s = 0.0
+        self._first_until_s = -math.inf
         self._rendered: CameraState | None = None
 
     def begin(self, first: CameraState) -> None:
@@ -98,11 +99,11 @@ class CoarseToFine(RenderStateMachine):
 
     def _opens(self) -> bool:
         """Return whether the browser has only just connected."""
-        return self._first is not None and time.monotonic() < self._first_until_s
+        return time.monotonic() < self._first_until_s
 
     def _is_late(self, camera_state: CameraState) -> bool:
         """Return whether this is still the view in which the browser opened, not that to which it was sent."""
-        return self._opens() and self._first is not None and _same_view(self._first, camera_state)
+        return self._first is not None and self._opens() and _same_view(self._first, camera_state)
 
     def _stays(self, before: CameraState, camera_state: CameraState) -> bool:
         """Return whether a reported movement is none, and no request for other settings."""
