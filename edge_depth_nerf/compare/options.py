@@ -85,6 +85,8 @@ class CompareOptions:
     evaluate all on the scenes, and report what prior, loss, extras and the whole are worth (grid.md)."""
     tuning: tuple[Path, ...] = ()
     """With --grid: scene folders to search λ and σ on, of other drives than the evaluated ones."""
+    search_steps: int | None = None
+    """With --grid: training steps of each run of the search. Not set: as many as --steps."""
     lambdas: tuple[float, ...] = ()
     """With --search or --grid: the weights λ of the depth loss to try, 4 at least."""
     sigmas_m: tuple[Sigma, ...] = ()
@@ -125,6 +127,12 @@ class CompareOptions:
             "--preset paper --methods edge-paper",
             "edge, which is the literal method in this preset",
         )
+        require(
+            self.grid or self.search_steps is None,
+            f"--search-steps {self.search_steps} without --grid",
+            "both, or --steps for the runs of --search",
+        )
+        require(self.search_steps is None or self.search_steps >= 1, f"--search-steps {self.search_steps}", "1 or more")
         require(not (self.search and self.grid), "--search with --grid", "one of them: the grid searches first")
         require(self.grid or not self.tuning, "--tuning without --grid", "both, or --search on the tuning scenes")
         if not self.search and not self.grid:
