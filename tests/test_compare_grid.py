@@ -174,6 +174,8 @@ def made_up(monkeypatch):
 
     stops: set[int] = set()
     monkeypatch.setattr(command, "do_runs", train)
+    # plots of all cells take as long as all else
+    monkeypatch.setattr(command, "draw_plots", lambda output, results: [])
     return done, stops
 
 
@@ -205,7 +207,7 @@ def asked(folder: Path, **changes):
 @pytest.mark.slow
 def test_a_grid_searches_every_cell_alike_and_goes_on_where_it_was(tmp_path, made_up):
     done, stops = made_up
-    grid = asked(tmp_path)
+    grid = asked(tmp_path, search_steps=3)
     searches, judgements = len(WITH_LOSS) * len(LAMBDAS) * len(SIGMAS_M) * 2, len(GRID) * 2
     # stopped in the search, and in the comparison
     stops.add(50)
@@ -224,6 +226,7 @@ def test_a_grid_searches_every_cell_alike_and_goes_on_where_it_was(tmp_path, mad
     tries: dict[str, set] = {name: set() for name in WITH_LOSS}
     for run in done:
         spec = run.specification
+        assert spec.steps == (5 if spec.whole_views else 3)
         if not spec.whole_views:
             tries[spec.method].add((Path(spec.scene).name, spec.weight, spec.sigma_m))
         else:
@@ -266,6 +269,8 @@ def test_a_grid_that_cannot_be(tmp_path, monkeypatch):
     refused("other drives than those that are judged", tuning=(*grid.tuning, tmp_path / "street"))
     refused("--grid with --tuned", tuned=tmp_path / "x")
     refused("--search with --grid", search=True)
+    refused("--search-steps 0: expected 1 or more", search_steps=0)
+    refused("--search-steps 3 without --grid", search_steps=3, grid=False, tuning=(), lambdas=(), sigmas_m=())
     refused("--tuning without --grid", grid=False, lambdas=(), sigmas_m=())
     refused("paper has no extras", preset="paper")
     refused("at least 4", lambdas=(1.0, 2.0))

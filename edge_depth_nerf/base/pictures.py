@@ -7,6 +7,7 @@ stand beside them pixel by pixel.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.figure import Figure
+    from matplotlib.legend import Legend
 
 NEAREST_M, FARTHEST_M = 1.0, 60.0
 """The colours of a distance run over these, logarithmically."""
@@ -300,14 +302,21 @@ def add_legend_below(
         place: matplotlib's words for it.
 
     """
-    for columns in range(len(names), 0, -1):
-        legend = figure.legend(handles, names, loc=place, ncols=columns, frameon=False, borderaxespad=0)
-        box = legend.get_window_extent()
-        if box.width <= figure.bbox.width or columns == 1:
-            break
-        legend.remove()
-    else:
+    if not names:
         return
+
+    def legend_in(columns: int) -> Legend:
+        return figure.legend(handles, names, loc=place, ncols=columns, frameon=False, borderaxespad=0)
+
+    def is_too_wide(columns: int) -> bool:
+        legend = legend_in(columns)
+        width = legend.get_window_extent().width
+        legend.remove()
+        return bool(width > figure.bbox.width)
+
+    # each try lays out the whole legend; more columns are wider
+    fitting = bisect_left(range(1, len(names) + 1), True, key=is_too_wide)
+    box = legend_in(max(fitting, 1)).get_window_extent()
     # a single name can be wider than the axes
     figure.set_size_inches(
         max(figure.bbox.width, box.width) / figure.dpi, (figure.bbox.height + box.height) / figure.dpi
