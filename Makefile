@@ -118,6 +118,9 @@ check-dist: dist
 	cd build && fresh/$(SCRIPTS)/edge-depth-nerf --help >/dev/null && fresh/$(SCRIPTS)/edge-depth-nerf doctor
 	cd build && fresh/$(SCRIPTS)/ns-train --help | grep edge-depth-nerf-lite >/dev/null
 	cd build && fresh/$(SCRIPTS)/edge-depth-nerf inspect ../data/sample_drive --frames 1 --output inspection
+	cd build && fresh/$(SCRIPTS)/edge-depth-nerf synthesize --output drive --frames 3 --size 48
+	cd build && fresh/$(SCRIPTS)/edge-depth-nerf process kitti360 --root drive --sequence 2013_05_28_drive_0000_sync \
+		--output scene --holdout-every 2 --no-estimate-depth
 	$(FRESH)/$(SCRIPTS)/pip install --quiet --disable-pip-version-check --no-deps --force-reinstall dist/*.tar.gz
 	cd build && fresh/$(SCRIPTS)/edge-depth-nerf --help >/dev/null && fresh/$(SCRIPTS)/edge-depth-nerf doctor
 	rm -rf $(FRESH)

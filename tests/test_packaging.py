@@ -1,5 +1,4 @@
 import email
-import os
 import re
 import shutil
 import subprocess
@@ -109,36 +108,6 @@ def test_the_wheel_works_without_the_sources(wheel, tmp_path):
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=False)
     assert done.returncode == 0, done.stderr
-
-
-@pytest.mark.slow
-def test_the_wheel_alone_makes_a_scene(wheel, tmp_path):
-    """What the demo begins with, in a folder without the repository; it trains on what comes out."""
-    with zipfile.ZipFile(wheel) as archive:
-        archive.extractall(tmp_path / "wheel")
-    drive, scene = tmp_path / "work" / "drive", tmp_path / "work" / "scene"
-    scene.parent.mkdir()
-    code = (
-        "import sys; from pathlib import Path; from edge_depth_nerf import cli, entry; "
-        f"assert Path(cli.__file__).is_relative_to({str(tmp_path)!r}); sys.argv = sys.argv[1:]; entry.main()"
-    )
-    for arguments in (
-        ["synthesize", "--output", drive, "--frames", 3, "--size", 48],
-        [
-            *("process", "kitti360", "--root", drive, "--sequence", "2013_05_28_drive_0000_sync"),
-            *("--output", scene, "--holdout-every", 2, "--no-estimate-depth"),
-        ],
-    ):
-        done = subprocess.run(
-            [sys.executable, "-c", code, "edge-depth-nerf", *map(str, arguments)],
-            capture_output=True,
-            text=True,
-            cwd=scene.parent,
-            env={**os.environ, "PYTHONPATH": str(tmp_path / "wheel")},
-            check=False,
-        )
-        assert done.returncode == 0, done.stdout + done.stderr
-    assert (scene / "transforms.json").is_file()
 
 
 PAGES = [

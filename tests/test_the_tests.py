@@ -114,3 +114,9 @@ def test_something_is_looked_at_in_every_test(path: Path) -> None:
 def test_the_check_itself(body: str, found: bool) -> None:
     lines = "\n".join(f" {line}" for line in body.splitlines())
     assert vacuous(f"NAMES = ['a', 'b']\ndef test_it():\n{lines}\n") == (["test_it"] if found else [])
+
+
+def test_types_are_checked_in_all_rooms_but_one():
+    hooked = re.findall(r"edge_depth_nerf\.(\w+),", (TESTS.parent / "pyproject.toml").read_text(encoding="utf-8"))
+    rooms = {path.parent.name for path in (TESTS.parent / "edge_depth_nerf").glob("*/__init__.py")}
+    assert set(hooked) == rooms - {"synthetic"}
