@@ -61,7 +61,7 @@ class EstimateDepthOptions:
     """Of PNGs with metric maps, such as 0.00390625 (1/256)."""
     maps_trained_on: TrainedOn | None = None
     """What their network was trained on. scene: on LiDAR only, so that it knows nothing beyond the scanner's field of
-    elevation; there is then no prior there. Not set: elsewhere."""
+    elevation; they then give a prior there only with distances from motion. Not set: elsewhere."""
 
     predict: bool = True
     """Write maps. Off: only train a network, for `--model` later."""

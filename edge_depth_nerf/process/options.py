@@ -81,7 +81,7 @@ class ProcessOptions:
     network trained on the drive makes them."""
     mono_trained_on: Literal["scene", "elsewhere"] = "elsewhere"
     """What the network of the given maps was trained on. scene: on LiDAR only, so that it knows nothing beyond the
-    scanner's field of elevation; there is then no prior there."""
+    scanner's field of elevation; it then gives a prior there only with distances from motion."""
     estimate_depth: bool = True
     """If no monocular maps are given, train a network on the drive's LiDAR, as `edge-depth-nerf estimate-depth` does.
     Off: the scene gets no maps; you can add those of other networks with that command."""
