@@ -30,6 +30,8 @@ LARGEST_SIDE_PX = 1400
 """Larger pictures are made smaller before the search for features."""
 RATIO = 0.8
 """A match must be nearer than this part of the second nearest (Lowe, IJCV 2004)."""
+ROUNDING = 1e-5
+"""Squared distances of unit descriptors below this are rounding: their products are float32 sums of 128 terms."""
 LEAST_BASELINE_M = 0.05
 """Pictures taken nearer to each other have no epipolar plane to speak of."""
 LEAST_FROM_EPIPOLE_RAD = np.radians(3.0)
@@ -189,7 +191,9 @@ def _nearest(products: Float32[np.ndarray, "n m"], ratio: float) -> tuple[Int[np
     # squared distances of unit vectors
     best = 2 - 2 * np.take_along_axis(values, first, -1)[:, 0]
     second = 2 - 2 * np.take_along_axis(values, 1 - first, -1)[:, 0]
-    return np.take_along_axis(two, first, -1)[:, 0], best < ratio**2 * second
+    # float32 may see equal ones at slightly different distances, depending on the processor
+    clear = (best < ratio**2 * second) & (second > ROUNDING)
+    return np.take_along_axis(two, first, -1)[:, 0], clear
 
 
 def match_pictures(
