@@ -17,11 +17,22 @@ from comparisons import fake
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json, write_json
+from edge_depth_nerf.compare.grid import grid_tables
 from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.results import Results, RunResult
+from edge_depth_nerf.compare.search import grids
+from edge_depth_nerf.compare.tables import page_of_tables
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results.json"
+GRID_PARTS = {
+    "grid: prior": "Table G1",
+    "grid: loss": "Table G2",
+    "grid: extras": "Table G3",
+    "grid: whole": "Table G4",
+    "grid: cells": "Table G5",
+}
+"""Parts of docs/results.md, and the headings of grid.md that they stand under."""
 
 
 @pytest.fixture
@@ -322,6 +333,20 @@ def test_the_pages_tables_of_motion_are_those_of_its_runs(benchmark_module):
         assert len(part.strip().splitlines()) == 2 + rows
         assert pages.with_part(text, name, part) == text, name
         assert f"<!-- {name} -->" in text
+
+
+def test_the_pages_grid_is_that_of_its_runs(benchmark_module):
+    kept, pages = (benchmark_module(name) for name in ("kept_runs", "pages"))
+    results = kept.results_of(ROOT / "benchmarks" / "grid.json.xz")
+    searches = grids(kept.results_of(ROOT / "benchmarks" / "grid_search.json.xz"))
+    assert {len(search.psnr) for search in searches} == {16}
+    # nothing that a table shows was chosen on the drives it shows
+    assert not set(results.scenes()) & {"tune_street"}
+    made = page_of_tables("Grid", [], grid_tables(results, searches))
+    text = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
+    for name, heading in GRID_PARTS.items():
+        assert f"<!-- {name} -->" in text
+        assert pages.with_part(text, name, pages.under(made, heading)) == text, name
 
 
 def test_disturbed_poses_are_off_by_as_much_as_is_said(benchmark_module, tmp_path):
