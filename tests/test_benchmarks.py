@@ -349,6 +349,68 @@ def test_the_pages_grid_is_that_of_its_runs(benchmark_module):
         assert pages.with_part(text, name, pages.under(made, heading)) == text, name
 
 
+def test_the_page_of_unseen_drives_by_hand(benchmark_module, tmp_path):
+    unseen, pages = benchmark_module("unseen"), benchmark_module("pages")
+    drives = ("street", "turn")
+    rival, with_extras = unseen.WITHOUT_EXTRAS, "ds-nerf-integrated-extras"
+    # ours takes 90 s for what the rival does in 60: 3,000 steps in the seconds of 2,000, and a little more
+    grid = Results(
+        [
+            fake(scene, method, 0, psnr, seconds=seconds)
+            for scene in drives
+            for method, psnr, seconds in (("edge", 26.0, 90.0), ("edge-lidar", 24.5, 80.0), (rival, 24.0, 60.0))
+        ]
+    )
+    assert unseen.steps_in_our_seconds(grid) == 3000
+    grid.runs[0].curve[-1]["cpu_seconds"] += 0.1
+    assert unseen.steps_in_our_seconds(grid) == 3050
+    claims = Results(
+        [
+            fake(scene, method, seed, psnr, 2000, truth_delta_1_25=0.9)
+            for method, psnr in (("nerfacto", 22.0), (with_extras, 25.0), ("edge-paper", 23.0), ("edge", 26.0))
+            for seed in (0, 1)
+            for scene in drives
+        ]
+    )
+    longer = Results([fake(scene, rival, 0, 24.0, 3050, truth_delta_1_25=0.8) for scene in drives])
+    beside = Results([fake(scene, name, 0, 23.0) for scene in drives for name in ("edge-mono", "edge-gaussian")])
+    nothing = Results([])
+    parts = {"claims": claims, "seconds": longer, "tables": beside, "simulated": nothing, "large": nothing}
+    made = unseen.page(parts, grid)
+    headings = [line.removeprefix("## ") for line in made.splitlines() if line.startswith("## ")]
+    assert headings == [
+        "Claims: pictures",
+        "Claims: geometry",
+        "Claims: time",
+        "Equal seconds",
+        "Sources",
+        "Kernels: pictures",
+        "Kernels: geometry",
+        "Line of sight",
+        "λ and σ",
+    ]
+    seconds = pages.under(made, "Equal seconds").strip().splitlines()
+    # of ours, the rival's seeds alone
+    assert seconds[2] == (
+        "| UrbanNeRF loss, integrated, without extras | street | 24.00 | 0.600 | 0.0417 | 0.800 | 3,050 | 10 |"
+    )
+    assert seconds[3] == "| ours | street | 26.00 | 0.650 | 0.0385 | 0.900 | 2,000 | 10 |"
+    assert [line.split(" | ")[1] for line in seconds[4:]] == ["turn", "turn", "average", "average"]
+    assert "| LiDAR alone | 24.50 |" in pages.under(made, "Sources")
+    assert "| monocular alone | 23.00 |" in pages.under(made, "Sources")
+    assert "| spatial Gaussian | 23.00 |" in pages.under(made, "Kernels: pictures")
+
+    for folder, methods in (
+        ("grid/search", {"edge": {"lambda": 0.03, "sigma_m": "own"}}),
+        ("search", {"edge-mono": {}}),
+    ):
+        write_json(tmp_path / folder / "tuned.json", {"seed": 0, "methods": methods})
+    unseen.write_tuned(tmp_path / "grid", tmp_path / "search", tmp_path / "tuned.json")
+    tuned = read_json(tmp_path / "tuned.json")["methods"]
+    # one σ and one λ for both kernels
+    assert tuned["edge-gaussian"] == tuned["edge"] and "edge-mono" in tuned
+
+
 def test_disturbed_poses_are_off_by_as_much_as_is_said(benchmark_module, tmp_path):
     poses = benchmark_module("poses")
     path = tmp_path / "drive" / "data_poses" / poses.SEQUENCE / "poses.txt"

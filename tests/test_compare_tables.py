@@ -71,6 +71,15 @@ def test_table_1_by_hand(results):
     assert "averages do not follow" in made.caption
 
 
+def test_table_1_has_other_losses_with_our_prior_and_extras(results):
+    more = ("ds-nerf-integrated-extras", "edge-paper", "edge-plain", "edge-gaussian")
+    results.runs += [fake("street", method, 0, 23.0) for method in more]
+    made = table(Results(results.runs, results.options, results.versions, 2), "1")
+    titles = [row.title for row in made.rows]
+    assert titles[:2] == ["nerfacto", "DS-NeRF loss"] and titles[-2:] == ["as published", "ours"]
+    assert titles[2:-2] == ["DS-NeRF loss, integrated, with extras"]
+
+
 def test_one_seed_has_no_spread_and_one_drive_no_average(results):
     results.runs = [run for run in results.runs if run.seed == 1 and run.scene == "turn"]
     made = table(results, "1")

@@ -622,7 +622,8 @@ def test_a_browser_begins_at_a_training_camera(browser, page, training):
     pose = dataset.cameras.camera_to_worlds[5].double().numpy()  # of eleven of the first camera
     assert dataset.image_filenames[5].parent == dataset.image_filenames[0].parent
     camera = server.get_clients()[number].camera
-    assert np.allclose(camera.position, pose[:, 3] * VISER_NERFSTUDIO_SCALE_RATIO, atol=1e-5)
+    # a client is known before the thread that moves its camera has run
+    until(lambda: np.allclose(camera.position, pose[:, 3] * VISER_NERFSTUDIO_SCALE_RATIO, atol=1e-5))
     state = training.viewer.get_camera_state(server.get_clients()[number])
     assert np.allclose(state.c2w, pose, atol=1e-5)
     assert isinstance(training.viewer.render_statemachines[number], CoarseToFine)

@@ -1,0 +1,200 @@
+"""What a claim is about, on drives that took no part in any choice: three seeds, equal seconds, the paper's tables.
+
+    python benchmarks/unseen.py --drives drives --scenes scenes --grid grid --output unseen
+
+It goes on from the grid of docs/results.md: `--drives` and `--scenes` hold its drives, `--grid` is its folder, whose
+search gives λ and σ. Methods that the grid lacks are searched on the same tuning drive, alike; the spatial Gaussian has
+λ and σ of ours, so that the kernel is the only difference. Then, in folders of their own under `--output`:
+
+    claims       nerfacto, the best rival of the grid, the literal method and ours: 2,000 steps, three seeds
+    seconds      the grid's best rival without extras, for as many steps as ours' processor seconds allow
+    tables       Tables 3 and 4 of the paper and UrbanNeRF's line-of-sight form, beside the grid: 1,000 steps, one seed
+    simulated    the same drives with simulated monocular maps in place of the drive's own network
+    large        the literal method on the street with pictures of 700 px
+
+Writes table.md. Stopped at any moment, the same command goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import statistics
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from commands import command
+
+from edge_depth_nerf.base.files import read_json_object, write_json, write_text
+from edge_depth_nerf.compare.command import RUNS
+from edge_depth_nerf.compare.methods import METHODS
+from edge_depth_nerf.compare.options import MethodName
+from edge_depth_nerf.compare.results import Results, read_results
+from edge_depth_nerf.compare.tables import make_tables, page_of_tables
+
+DRIVES = {"street": 101, "parking": 102, "turn": 103, "roundabout": 104}
+"""Kinds of drives and their seeds."""
+TUNING = "tune_street"
+SEQUENCE = "2013_05_28_drive_0000_sync"
+CLAIMED: tuple[MethodName, ...] = ("nerfacto", "ds-nerf-integrated-extras", "edge-paper", "edge")
+"""What the claims are about; the second is the best rival of the grid, with all that it can use."""
+WITHOUT_EXTRAS: MethodName = "urban-nerf-integrated"
+"""The best rival of the grid without extras."""
+BESIDE_THE_GRID: tuple[MethodName, ...] = (
+    "edge-mono",
+    "edge-gaussian",
+    "urban-nerf-los-integrated",
+    "urban-nerf-los",
+)
+SEARCHED: tuple[MethodName, ...] = ("edge-paper", "edge-mono", "urban-nerf-los-integrated", "urban-nerf-los")
+"""Those whose λ and σ the grid's search did not look for."""
+SIMULATED: tuple[MethodName, ...] = (WITHOUT_EXTRAS, "ds-nerf-integrated-extras", "edge-paper", "edge")
+LARGE: tuple[MethodName, ...] = ("nerfacto", "edge-paper", "edge")
+FOLDERS = ("claims", "seconds", "tables", "simulated", "large")
+STEPS, GRIDS_STEPS = 2000, 1000
+IN_SECONDS = {
+    "PSNR": ("truth_masked_psnr", ".2f"),
+    "SSIM": ("truth_masked_ssim", ".3f"),
+    "AbsRel": ("truth_abs_rel", ".4f"),
+    "δ": ("truth_delta_1_25", ".3f"),
+}
+"""Figures at equal seconds, and how they are written."""
+
+
+def ours(*words: object) -> None:
+    """Run one of the project's commands; its output is shown."""
+    command("edge-depth-nerf", *words, shown=True)
+
+
+def write_tuned(grid: Path, search: Path, path: Path) -> Path:
+    """Write λ and σ of all methods: the grid's, those of the further search, and ours' for the spatial Gaussian."""
+    tuned = read_json_object(grid / "search" / "tuned.json")
+    tuned["methods"] |= read_json_object(search / "tuned.json")["methods"]
+    tuned["methods"]["edge-gaussian"] = tuned["methods"]["edge"]
+    write_json(path, tuned)
+    return path
+
+
+def processor_seconds(results: Results, method: MethodName) -> float:
+    """Mean over drives and seeds, of training alone."""
+    return statistics.fmean(run.curve[-1]["cpu_seconds"] for run in results.runs if run.method == method)
+
+
+def steps_in_our_seconds(grid: Results) -> int:
+    """How many steps the best rival without extras does in ours' 2,000, by the grid's seconds, in fifties upwards."""
+    ratio = processor_seconds(grid, "edge") / processor_seconds(grid, WITHOUT_EXTRAS)
+    return 50 * math.ceil(STEPS * ratio / 50)
+
+
+def of(runs: Results, methods: Iterable[MethodName], seeds: Iterable[int] | None = None) -> Results:
+    """Some methods and seeds of the runs."""
+    chosen, some = set(methods), None if seeds is None else set(seeds)
+    return Results([run for run in runs.runs if run.method in chosen and (some is None or run.seed in some)])
+
+
+def seconds_table(claims: Results, longer: Results) -> Iterator[str]:
+    """Ours and the rival after as many processor seconds, drive by drive, as Markdown."""
+    both = {METHODS[WITHOUT_EXTRAS].title: longer, METHODS["edge"].title: of(claims, ["edge"], longer.seeds())}
+    yield "| | " + " | ".join(["drive", *IN_SECONDS, "steps", "processor seconds"]) + " |"
+    yield "|---" * (len(IN_SECONDS) + 4) + "|"
+    for scene in [*longer.scenes(), "average"]:
+        for title, results in both.items():
+            runs = [run for run in results.runs if scene in (run.scene, "average")]
+            means = {name: statistics.fmean(run.figures[name] for run in runs) for name, _ in IN_SECONDS.values()}
+            cells = [f"{means[name]:{form}}" for name, form in IN_SECONDS.values()]
+            steps = " to ".join(f"{each:,}" for each in sorted({run.content["steps"] for run in runs}))
+            seconds = f"{statistics.fmean(run.curve[-1]['cpu_seconds'] for run in runs):.0f}"
+            yield "| " + " | ".join([title, scene, *cells, steps, seconds]) + " |"
+
+
+def page(parts: dict[str, Results], grid: Results) -> str:
+    """All tables as Markdown; a folder without runs has none.
+
+    Args:
+        parts: by folder.
+        grid: the runs of the grid, for Tables 3 and 4.
+
+    """
+    lines = ["# Unseen drives", ""]
+
+    def add(title: str, results: Results, *labels: str) -> None:
+        made = [table for table in make_tables(results) if table.label in labels] if results.runs else []
+        if made:
+            # a heading for each, and the tables under it without theirs
+            text = page_of_tables("", [], made).split("\n\n")
+            kept = [part for part in text if not part.startswith("#")]
+            lines.extend([f"## {title}", "", "\n\n".join(kept).strip(), ""])
+
+    claims = parts["claims"]
+    add("Claims: pictures", claims, "1")
+    add("Claims: geometry", claims, "5, average")
+    add("Claims: time", claims, "6, average")
+    if claims.runs and parts["seconds"].runs:
+        lines += ["## Equal seconds", "", *seconds_table(claims, parts["seconds"]), ""]
+    beside = parts["tables"]
+    one_seed = of(grid, ["edge", "edge-lidar", *BESIDE_THE_GRID], [0])
+    add("Sources", Results([*one_seed.runs, *of(beside, ["edge-mono"]).runs]), "3")
+    kernels = Results([*of(one_seed, ["edge"]).runs, *of(beside, ["edge-gaussian"]).runs])
+    add("Kernels: pictures", kernels, "4")
+    add("Kernels: geometry", kernels, "5, average")
+    forms = of(grid, ["urban-nerf", WITHOUT_EXTRAS], [0])
+    of_sight = of(beside, [name for name in BESIDE_THE_GRID if name.startswith("urban-nerf")])
+    add("Line of sight", Results([*forms.runs, *of_sight.runs]), "5, average")
+    add("Simulated maps: pictures", parts["simulated"], "1")
+    add("Simulated maps: geometry", parts["simulated"], "5, average")
+    large = parts["large"]
+    add("700 px", large, *(f"5, {scene}" for scene in large.scenes()))
+    used = [run for results in (claims, beside) for run in results.runs]
+    if used:
+        add("λ and σ", Results(used, {"tuned": dict.fromkeys(METHODS)}), "7")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for name, words in (
+        ("drives", "the grid's raw drives, such as street_101"),
+        ("scenes", f"its scenes, and {TUNING}"),
+        ("grid", "the --output of its compare --grid"),
+    ):
+        parser.add_argument(f"--{name}", type=Path, required=True, help=words)
+    parser.add_argument("--output", type=Path, default=Path("outputs/unseen"))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--jobs", type=int, default=1, help="trainings at a time")
+    options = parser.parse_args()
+    out = options.output
+    names = [f"{kind}_{seed}" for kind, seed in DRIVES.items()]
+    scenes = [options.scenes / name for name in names]
+    ours(
+        *("compare", options.scenes / TUNING, "--search", "--methods", *SEARCHED, "--steps", 200),
+        *("--lambdas", 0.0003, 0.003, 0.03, 0.3, "--sigmas-m", "own", 0.05, 0.3, 1.0),
+        *("--jobs", options.jobs, "--output", out / "search"),
+    )
+    tuned = write_tuned(options.grid, out / "search", out / "tuned.json")
+
+    def compare(folder: str, where: Iterable[Path], methods: Iterable[MethodName], steps: int, *seeds: int) -> None:
+        of_run = ("--steps", steps, "--seeds", *(seeds or (0,)), "--tuned", tuned, "--jobs", options.jobs)
+        ours("compare", *where, "--methods", *methods, *of_run, "--output", out / folder)
+
+    grid = read_results(options.grid / "comparison" / RUNS)
+    for seed in options.seeds:
+        # a seed is whole before the next begins: a stopped benchmark has a table of those it has
+        compare("claims", scenes, CLAIMED, STEPS, seed)
+    compare("seconds", scenes, [WITHOUT_EXTRAS], steps_in_our_seconds(grid))
+    compare("tables", scenes, BESIDE_THE_GRID, GRIDS_STEPS)
+    process = ("process", "kitti360", "--sequence", SEQUENCE)
+    for name in names:
+        raw = options.drives / name
+        maps = ("--mono", raw / "simulated_mono" / SEQUENCE)
+        ours(*process, "--root", raw, *maps, "--output", out / "simulated_scenes" / name)
+    compare("simulated", [out / "simulated_scenes" / name for name in names], SIMULATED, GRIDS_STEPS)
+    large = ("--scene", "street", "--seed", DRIVES["street"], "--frames", 24, "--size", 700)
+    ours("synthesize", "--output", out / "drive_700", *large)
+    ours(*process, "--root", out / "drive_700", "--output", out / "street_101_700")
+    compare("large", [out / "street_101_700"], LARGE, STEPS)
+    parts = {folder: read_results(out / folder / RUNS) for folder in FOLDERS}
+    write_text(out / "table.md", page(parts, grid))
+
+
+if __name__ == "__main__":
+    main()
