@@ -33,6 +33,17 @@ GRID_PARTS = {
     "grid: cells": "Table G5",
 }
 """Parts of docs/results.md, and the headings of grid.md that they stand under."""
+UNSEEN_PARTS = {
+    "unseen: pictures": "Claims: pictures",
+    "unseen: geometry": "Claims: geometry",
+    "unseen: seconds": "Equal seconds",
+    "unseen: sources": "Sources",
+    "unseen: kernels": "Kernels: pictures",
+    "unseen: kernels in depth": "Kernels: geometry",
+    "unseen: sight": "Line of sight",
+    "unseen: settings": "λ and σ",
+}
+"""The same of `benchmarks/unseen.py`."""
 
 
 @pytest.fixture
@@ -349,6 +360,27 @@ def test_the_pages_grid_is_that_of_its_runs(benchmark_module):
         assert pages.with_part(text, name, pages.under(made, heading)) == text, name
 
 
+def test_the_pages_unseen_drives_are_those_of_its_runs(benchmark_module):
+    unseen, kept, pages = (benchmark_module(name) for name in ("unseen", "kept_runs", "pages"))
+    runs = kept.results_of(ROOT / "benchmarks" / "unseen.json.xz").runs
+    parts = {folder: Results([run for run in runs if run.folder.parts[0] == folder]) for folder in unseen.FOLDERS}
+    claims = parts["claims"]
+    # every claim has the same seeds of each method and drive
+    assert len(claims.runs) == len(unseen.CLAIMED) * len(unseen.DRIVES) * len(claims.seeds())
+    made = unseen.page(parts, kept.results_of(ROOT / "benchmarks" / "grid.json.xz"))
+    text = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
+    for name, heading in UNSEEN_PARTS.items():
+        assert f"<!-- {name} -->" in text
+        assert pages.with_part(text, name, pages.under(made, heading)) == text, name
+
+
+def test_the_pages_curves_are_those_of_their_runs(benchmark_module):
+    curves, pages = benchmark_module("curves"), benchmark_module("pages")
+    text = curves.PAGE.read_text(encoding="utf-8")
+    assert f"<!-- {curves.PART} -->" in text
+    assert pages.with_part(text, curves.PART, "\n".join(curves.table(curves.kept()))) == text
+
+
 def test_the_page_of_unseen_drives_by_hand(benchmark_module, tmp_path):
     unseen, pages = benchmark_module("unseen"), benchmark_module("pages")
     drives = ("street", "turn")
@@ -409,6 +441,28 @@ def test_the_page_of_unseen_drives_by_hand(benchmark_module, tmp_path):
     tuned = read_json(tmp_path / "tuned.json")["methods"]
     # one σ and one λ for both kernels
     assert tuned["edge-gaussian"] == tuned["edge"] and "edge-mono" in tuned
+
+
+def test_curves_over_processor_seconds_by_hand(benchmark_module, tmp_path):
+    """A curve of 20 dB in 10 s has 10 dB after 5 s; ours takes 10 s on the street and 20 s on the turn."""
+    curves = benchmark_module("curves")
+    runs = [fake("street", "edge", 0, 30.0), fake("turn", "edge", 0, 30.0, seconds=20.0)]
+    runs += [fake(scene, "ds-nerf", 0, 20.0) for scene in ("street", "turn")]
+    longer = Results([fake(scene, "ds-nerf", 0, 24.0, seconds=20.0) for scene in ("street", "turn")])
+    drives = curves.Drives("drives", Results(runs), longer)
+    assert list(drives.rows()) == ["DS-NeRF loss", "DS-NeRF loss, in ours' seconds", "ours"]
+    rows = [line.split(" | ") for line in curves.table([drives])][2:]
+    assert [row[0] for row in rows] == [f"| drives: {title}" for title in drives.rows()]
+    # half of ours: 5 s and 10 s. The rival's curve: 10 and 20 dB; the longer one's: 12 (its first point) and 12
+    assert [row[3] for row in rows] == ["15.00", "12.00", "15.00"]
+    assert [row[5] for row in rows] == ["20.00", "18.00", "30.00"]
+    assert {row[2] for row in rows} == {"–"}
+    for run in (*runs, *longer.runs):
+        for point in run.curve:
+            point["trained_truth_psnr"] = point["truth_psnr"] + 1
+    assert [line.split(" | ")[6] for line in [*curves.table([drives])][2:]] == ["21.00 |", "19.00 |", "31.00 |"]
+    curves.draw([drives, drives], tmp_path / "curves.svg")
+    assert ElementTree.parse(tmp_path / "curves.svg").getroot().tag.endswith("svg")
 
 
 def test_disturbed_poses_are_off_by_as_much_as_is_said(benchmark_module, tmp_path):
