@@ -20,7 +20,7 @@ from edge_depth_nerf.base.files import read_json, write_json
 from edge_depth_nerf.compare.grid import grid_tables
 from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.results import Results, RunResult
-from edge_depth_nerf.compare.search import grids
+from edge_depth_nerf.compare.search import grids, write_search
 from edge_depth_nerf.compare.tables import page_of_tables
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -360,7 +360,7 @@ def test_the_pages_grid_is_that_of_its_runs(benchmark_module):
         assert pages.with_part(text, name, pages.under(made, heading)) == text, name
 
 
-def test_the_pages_unseen_drives_are_those_of_its_runs(benchmark_module):
+def test_the_pages_unseen_drives_are_those_of_its_runs(benchmark_module, tmp_path):
     unseen, kept, pages = (benchmark_module(name) for name in ("unseen", "kept_runs", "pages"))
     runs = kept.results_of(ROOT / "benchmarks" / "unseen.json.xz").runs
     parts = {folder: Results([run for run in runs if run.folder.parts[0] == folder]) for folder in unseen.FOLDERS}
@@ -372,6 +372,18 @@ def test_the_pages_unseen_drives_are_those_of_its_runs(benchmark_module):
     for name, heading in UNSEEN_PARTS.items():
         assert f"<!-- {name} -->" in text
         assert pages.with_part(text, name, pages.under(made, heading)) == text, name
+    searches = [kept.results_of(ROOT / "benchmarks" / f"{name}_search.json.xz") for name in ("grid", "unseen")]
+    write_search(tmp_path, searches[1])
+    written = pages.lowered((tmp_path / "search.md").read_text(encoding="utf-8"))
+    assert pages.with_part(text, "unseen: search", written) == text
+    # each was trained with what its search found; the spatial Gaussian with what ours' did
+    best = {grid.method: grid.best for results in searches for grid in grids(results)}
+    assert {len(grid.psnr) for grid in grids(searches[1])} == {16}
+    for run in runs:
+        if run.method != "nerfacto":
+            wanted = best["edge" if run.method == "edge-gaussian" else run.method]
+            assert (run.specification["weight"], run.specification["sigma_m"]) == wanted, run.folder
+    assert not set(searches[1].scenes()) & {run.scene for run in runs}
 
 
 def test_the_pages_curves_are_those_of_their_runs(benchmark_module):
