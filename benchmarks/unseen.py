@@ -48,7 +48,7 @@ BESIDE_THE_GRID: tuple[MethodName, ...] = (
 )
 SEARCHED: tuple[MethodName, ...] = ("edge-paper", "edge-mono", "urban-nerf-los-integrated", "urban-nerf-los")
 """Those whose λ and σ the grid's search did not look for."""
-SIMULATED: tuple[MethodName, ...] = (WITHOUT_EXTRAS, "ds-nerf-integrated-extras", "edge-paper", "edge")
+SIMULATED: tuple[MethodName, ...] = (WITHOUT_EXTRAS, "edge")
 LARGE: tuple[MethodName, ...] = ("nerfacto", "edge-paper", "edge")
 FOLDERS = ("claims", "seconds", "tables", "simulated", "large")
 STEPS, GRIDS_STEPS = 2000, 1000

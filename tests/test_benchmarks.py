@@ -40,7 +40,10 @@ UNSEEN_PARTS = {
     "unseen: sources": "Sources",
     "unseen: kernels": "Kernels: pictures",
     "unseen: kernels in depth": "Kernels: geometry",
+    "unseen: large": "700 px",
     "unseen: sight": "Line of sight",
+    "unseen: simulated": "Simulated maps: pictures",
+    "unseen: simulated in depth": "Simulated maps: geometry",
     "unseen: settings": "λ and σ",
 }
 """The same of `benchmarks/unseen.py`."""
