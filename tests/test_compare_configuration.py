@@ -141,6 +141,7 @@ def test_the_table_shows_each_field_in_which_methods_differ(preset):
         run.content["configuration"] = described(config)
         runs.append(run)
         values[name] = flattened(config)
+    names = Results(runs).methods()
     made = fields_table(Results(runs))
     shown = {row.title: [cell.text() for cell in row.cells] for row in made.rows}
     assert [heading for _, heading in made.headings()] == [METHODS[name].title for name in names]

@@ -293,7 +293,9 @@ def make_tables(results: Results) -> list[MadeTable]:
         "2": [scene for scene in results.scenes() if kinds[scene] == JBNU],
     }
     # each loss with each prior and extras that was trained; Tables 3 and 4 have ours with one thing changed
-    of_other_losses = [name for name, method in METHODS.items() if method.cell and method.cell.loss != "edge"]
+    of_other_losses: list[MethodName] = [
+        method.name for method in METHODS.values() if method.cell and method.cell.loss != "edge"
+    ]
     rivals: list[MethodName] = ["nerfacto-embedding", *of_other_losses, "edge-paper", "edge"]
     of_the_paper = {*kinds.values()} <= {KITTI360, JBNU}
     rivals_title = "Rivals, drives of KITTI-360's kind" if of_the_paper else "Rivals"
