@@ -12,7 +12,7 @@ from nerfstudio.field_components.spatial_distortions import SceneContraction
 from nerfstudio.model_components.losses import lossfun_distortion, lossfun_outer
 from nerfstudio.model_components.ray_samplers import PDFSampler, UniformLinDispPiecewiseSampler
 
-from edge_depth_nerf.kernels import hash_grid_numba
+from edge_depth_nerf.kernels import hash_grid_numba, network_numba
 from edge_depth_nerf.kernels import network as network_module
 from edge_depth_nerf.kernels.contraction import contract
 from edge_depth_nerf.kernels.fields import FusedMLP, FusedNerfactoField, use_fused_fields
@@ -24,9 +24,9 @@ from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
 
 
 @pytest.fixture(autouse=True)
-def small_parts(monkeypatch):
-    """Let even a few points be several parts."""
-    monkeypatch.setattr(network_module, "PART", 64)
+def small_shares(monkeypatch):
+    """Let even a few points be shared out to several threads."""
+    monkeypatch.setattr(network_numba, "LEAST_SHARE", 64)
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -51,7 +51,7 @@ def straight(x: torch.Tensor, weights: list[torch.Tensor], biases: list[torch.Te
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("widths", [(16, 64, 16), (15, 64, 64, 3), (10, 16, 1), (4, 2)], ids=str)
 @pytest.mark.parametrize("groups", [0, 1, 25, 600])
-def test_the_network_in_parts(widths, groups, threads):
+def test_the_network_in_tiles(widths, groups, threads):
     torch.manual_seed(0)
     torch.set_num_threads(threads)
     weights, biases = layers(*widths)
@@ -74,6 +74,34 @@ def test_the_network_in_parts(widths, groups, threads):
     torch.testing.assert_close(by_layer.double(), expected, rtol=1e-5, atol=1e-4)
     for each, other in zip(torch.autograd.grad(by_layer, leaves, gradient), gradients, strict=True):
         torch.testing.assert_close(each, other, rtol=1e-4, atol=1e-5 * float(other.abs().max()))
+
+
+@pytest.mark.parametrize("points", [1, 63, 64, 129])
+def test_tiles_that_are_not_full(points):
+    torch.manual_seed(1)
+    weights, biases = layers(5, 33, 7)
+    x = torch.randn(points, 5, requires_grad=True)
+    found = network(x, weights, biases)
+    expected = straight(x.double(), [each.double() for each in weights], [each.double() for each in biases])
+    torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=1e-4)
+    for slope, exact in zip(
+        torch.autograd.grad(found.sum(), [x, *weights, *biases]),
+        torch.autograd.grad(expected.sum(), [x, *weights, *biases]),
+        strict=True,
+    ):
+        torch.testing.assert_close(slope, exact, rtol=1e-4, atol=1e-5 * float(exact.abs().max()))
+
+
+def test_one_bad_point_spoils_no_other():
+    torch.manual_seed(0)
+    weights, biases = layers(6, 40, 20, 3)
+    x = torch.randn(300, 6)
+    x[70] = float("nan")
+    found = network(x, weights, biases)
+    assert found[70].isnan().all()
+    sound = torch.arange(300) != 70
+    expected = straight(x[sound].double(), [w.double() for w in weights], [b.double() for b in biases])
+    torch.testing.assert_close(found[sound].double(), expected, rtol=1e-5, atol=1e-4)
 
 
 def test_the_network_has_no_second_derivative():

@@ -15,6 +15,7 @@ from numba import njit
 
 TRAINING = (
     "edge_depth_nerf.kernels.hash_grid_numba",
+    "edge_depth_nerf.kernels.network_numba",
     "edge_depth_nerf.kernels.contraction",
     "edge_depth_nerf.kernels.ray_kernels",
     "edge_depth_nerf.kernels.table_adam_numba",

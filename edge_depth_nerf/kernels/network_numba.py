@@ -1,0 +1,336 @@
+"""A small network on the CPU, a tile of points at a time: meaning and shapes as in `network`.
+
+The points of a tile pass all layers, forward and backward, and stay in the nearest caches. Backward computes the layers
+again: that is faster than writing them to memory and reading them. All three products of a layer (values, gradient to
+the inputs, gradient to the weights) are the same sum of products with other strides. Its function keeps the sums in
+registers. LLVM is told the vectors' length, because it makes no vectors of loops that keep more than one sum.
+
+Rows of layers and weights are filled up to whole vectors; what stands there is 0. Importing this module imports Numba.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Any, no_type_check
+
+import llvmlite.binding as llvm
+import numpy as np
+import torch
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+from torch import Tensor
+
+from edge_depth_nerf.kernels.compiled import compiled
+from edge_depth_nerf.kernels.hash_grid_numba import share_out, stretches
+
+TILE = 64
+"""Points worked on together, a multiple of 8: a layer of 64 takes 16 kB of them."""
+LEAST_SHARE = 1 << 11
+"""A thread gets at least so many points."""
+_WIDE = llvm.get_host_cpu_features().get("avx512f", False)
+VECTOR = 16 if _WIDE else 8
+"""Numbers of a vector."""
+BLOCK = 4 if _WIDE else 2
+"""Vectors of each of four rows whose sums are kept in registers: as many as a core has registers for."""
+ZERO = np.float32(0)
+
+
+def _sums_of_products(rows: int, vectors: int) -> Callable[..., Any]:
+    """Make the function that writes sums of products to a block of `rows` by `vectors`.
+
+    Its arguments are (a, at_a, a_row, a_term, b, at_b, b_term, terms, start, at_start, start_row, into, at, row), with
+    flat arrays. into[at + r · row + c] becomes start[at_start + r · start_row + c] plus the sum over t of
+    a[at_a + r · a_row + t · a_term] · b[at_b + t · b_term + c].
+    """
+
+    def generate(context: Any, build: Any, signature: Any, given: Any) -> Any:
+        number, whole, index = ir.FloatType(), ir.IntType(64), ir.IntType(32)
+        vector, nothing = ir.VectorType(number, VECTOR), ir.Constant(ir.VectorType(number, VECTOR), ir.Undefined)
+        arrays = (0, 4, 8, 11)
+        a, b, start, into = (context.make_array(signature.args[k])(context, build, given[k]).data for k in arrays)
+        at_a, a_row, a_term, at_b, b_term, terms, at_start, start_row, at, row = (
+            each for k, each in enumerate(given) if k not in arrays
+        )
+
+        def place(base: Any, begin: Any, count: int, step: Any, more: int = 0) -> Any:
+            """Give the address of base[begin + count · step + more]."""
+            moved = build.add(begin, build.mul(ir.Constant(whole, count), step))
+            return build.gep(base, [build.add(moved, ir.Constant(whole, more))])
+
+        def load(address: Any) -> Any:
+            value = build.load(build.bitcast(address, vector.as_pointer()))
+            value.align = 4
+            return value
+
+        block = [(r, c) for r in range(rows) for c in range(vectors)]
+        before = [load(place(start, at_start, r, start_row, c * VECTOR)) for r, c in block]
+        entry, loop, end = build.block, build.append_basic_block(), build.append_basic_block()
+        some = build.icmp_signed(">", terms, ir.Constant(whole, 0))
+        build.cbranch(some, loop, end)
+        build.position_at_end(loop)
+        term, sums = build.phi(whole), [build.phi(vector) for _ in block]
+        of_a, of_b = build.add(at_a, build.mul(term, a_term)), build.add(at_b, build.mul(term, b_term))
+        columns = [load(place(b, of_b, 0, row, c * VECTOR)) for c in range(vectors)]
+        factors = []
+        for r in range(rows):
+            first = build.insert_element(nothing, build.load(place(a, of_a, r, a_row)), ir.Constant(index, 0))
+            factors.append(
+                build.shuffle_vector(first, nothing, ir.Constant(ir.VectorType(index, VECTOR), [0] * VECTOR))
+            )
+        # "contract": one fused multiply-add where the processor has it
+        products = [build.fmul(factors[r], columns[c], flags=("contract",)) for r, c in block]
+        more = [build.fadd(product, each, flags=("contract",)) for product, each in zip(products, sums, strict=True)]
+        following = build.add(term, ir.Constant(whole, 1))
+        build.cbranch(build.icmp_signed("<", following, terms), loop, end)
+        phis = zip([term, *sums], [ir.Constant(whole, 0), *before], [following, *more], strict=True)
+        for phi, first, then in phis:
+            phi.add_incoming(first, entry)
+            phi.add_incoming(then, loop)
+        build.position_at_end(end)
+        results = [build.phi(vector) for _ in block]
+        for phi, first, then in zip(results, before, more, strict=True):
+            phi.add_incoming(first, entry)
+            phi.add_incoming(then, loop)
+        for (r, c), result in zip(block, results, strict=True):
+            address = place(into, at, r, row, c * VECTOR)
+            build.store(result, build.bitcast(address, vector.as_pointer())).align = 4
+        return context.get_dummy_value()
+
+    @intrinsic
+    @no_type_check
+    def sums_of_products(_, a, at_a, a_row, a_term, b, at_b, b_term, terms, start, at_start, start_row, into, at, row):
+        n = types.intp
+        return types.void(a, n, n, n, b, n, n, n, start, n, n, into, n, n), generate
+
+    return sums_of_products
+
+
+_of_four_rows, _of_eight_rows = _sums_of_products(4, BLOCK), _sums_of_products(8, 1)
+
+
+@compiled()
+@no_type_check
+def _multiply(a, at_a, a_row, a_term, b, at_b, b_term, terms, start, at_start, start_row, into, at, row, rows, columns):
+    """Write `rows` by `columns` (whole vectors) sums of products; `rows` is rounded up to a multiple of 4 or 8."""
+    wide = columns - columns % (BLOCK * VECTOR)
+    for c in range(0, wide, BLOCK * VECTOR):
+        for r in range(0, rows, 4):
+            _of_four_rows(
+                *(a, at_a + r * a_row, a_row, a_term, b, at_b + c, b_term, terms),
+                *(start, at_start + r * start_row + c, start_row, into, at + r * row + c, row),
+            )
+    for c in range(wide, columns, VECTOR):
+        for r in range(0, rows, 8):
+            _of_eight_rows(
+                *(a, at_a + r * a_row, a_row, a_term, b, at_b + c, b_term, terms),
+                *(start, at_start + r * start_row + c, start_row, into, at + r * row + c, row),
+            )
+
+
+@compiled()
+@no_type_check
+def _filled(width):
+    """A layer's width in whole vectors."""
+    return (width + VECTOR - 1) // VECTOR * VECTOR
+
+
+@compiled()
+@no_type_check
+def _copy(values, begin, into, at, count):
+    """Copy numbers of one flat array to another.
+
+    Without a sign: else Numba looks whether an index counts from the end, and no vector instructions come out.
+    """
+    for i in range(count):
+        into[np.uint64(at + i)] = values[np.uint64(begin + i)]
+
+
+@compiled()
+@no_type_check
+def _add(values, begin, into, at, count):
+    """Add numbers of one flat array to another."""
+    for i in range(count):
+        into[np.uint64(at + i)] += values[np.uint64(begin + i)]
+
+
+@compiled()
+@no_type_check
+def _fill(into, at, count):
+    """Set numbers to 0."""
+    for i in range(count):
+        into[np.uint64(at + i)] = ZERO
+
+
+@compiled()
+@no_type_check
+def _load(values, width, first, count, into, row):
+    """Copy some rows of `width` to a tile whose other numbers become 0."""
+    _fill(into, 0, TILE * row)
+    for p in range(count):
+        _copy(values, (first + p) * width, into, p * row, width)
+
+
+@compiled()
+@no_type_check
+def _apply_layers(layers, room, widths, down, begins, biases, shared, first, group, last):
+    """Compute a tile's layers up to `last` from the inputs in front; layer by layer, `room` numbers each.
+
+    What stands beyond a layer's width is 0 in new layers, and stays so.
+    """
+    for layer in range(last):
+        inputs, row, at = _filled(widths[layer]), _filled(widths[layer + 1]), (layer + 1) * room
+        width, of_layer = widths[layer + 1], begins[len(widths) + layer]
+        start, at_start, start_row = biases, of_layer, 0
+        if layer == 0 and len(shared) > width:
+            start, at_start, start_row = layers, at, row
+            for p in range(TILE):
+                _copy(shared, min((first + p) // group * width, len(shared) - width), layers, at + p * row, width)
+        _multiply(
+            *(layers, layer * room, inputs, 1, down, begins[layer], row, widths[layer]),
+            *(start, at_start, start_row, layers, at, row, TILE, row),
+        )
+        if layer + 2 < len(widths):
+            for i in range(TILE * row):
+                place = np.uint64(at + i)
+                layers[place] = ZERO if layers[place] < ZERO else layers[place]
+
+
+@compiled()
+@no_type_check
+def _forward(x, widths, down, begins, biases, shared, group, result, begin, end):
+    """Apply the network to points from `begin` to `end`; calls for different points may run at once."""
+    count, room = len(widths) - 1, TILE * _filled(widths.max())
+    layers = np.zeros((count + 1) * room, np.float32)
+    inputs, row = _filled(widths[0]), _filled(widths[count])
+    for first in range(begin, end, TILE):
+        points = min(TILE, end - first)
+        _load(x, widths[0], first, points, layers, inputs)
+        _apply_layers(layers, room, widths, down, begins, biases, shared, first, group, count)
+        for p in range(points):
+            _copy(layers, count * room + p * row, result, (first + p) * widths[count], widths[count])
+
+
+@compiled()
+@no_type_check
+def _backward(
+    x, widths, down, begins, up, begins_up, biases, shared, group, gradient, to_x, to_up, to_biases, to_shared,
+    begin, end,
+):  # fmt: skip
+    """Add the gradients that points from `begin` to `end` give; `to_x` is written, and may be empty.
+
+    Calls for different points may run at once, if each has `to_up` and `to_biases` of its own, and all points of a
+    group, which has its own place in `to_shared`.
+    """
+    count, room = len(widths) - 1, TILE * _filled(widths.max())
+    layers, slopes = np.zeros(count * room, np.float32), np.zeros(2 * room, np.float32)
+    nothing = np.zeros(room // TILE, np.float32)
+    for first in range(begin, end, TILE):
+        points = min(TILE, end - first)
+        _load(x, widths[0], first, points, layers, _filled(widths[0]))
+        _apply_layers(layers, room, widths, down, begins, biases, shared, first, group, count - 1)
+        at = 0
+        _load(gradient, widths[count], first, points, slopes, _filled(widths[count]))
+        for layer in range(count - 1, -1, -1):
+            inputs, outputs, width = _filled(widths[layer]), _filled(widths[layer + 1]), widths[layer + 1]
+            _multiply(
+                *(slopes, at, 1, outputs, layers, layer * room, inputs, points, to_up, begins_up[layer], inputs),
+                *(to_up, begins_up[layer], inputs, width, inputs),
+            )
+            for p in range(points):
+                if layer == 0 and len(shared) > width:
+                    of_group = min((first + p) // group * width, len(shared) - width)
+                    _add(slopes, at + p * outputs, to_shared, of_group, width)
+                else:
+                    _add(slopes, at + p * outputs, to_biases, begins[len(widths) + layer], width)
+            if layer == 0 and len(to_x) == 0:
+                break
+            to = room - at
+            _multiply(
+                *(slopes, at, outputs, 1, up, begins_up[layer], inputs, width, nothing, 0, 0),
+                *(slopes, to, inputs, TILE, inputs),
+            )
+            at = to
+            if layer > 0:
+                for i in range(TILE * inputs):
+                    value, place = layers[np.uint64(layer * room + i)], np.uint64(at + i)
+                    slopes[place] = slopes[place] if value > ZERO else ZERO
+            else:
+                for p in range(points):
+                    _copy(slopes, at + p * inputs, to_x, (first + p) * widths[0], widths[0])
+
+
+def _packed(weights: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Give matrices in one array, their rows filled up to whole vectors, and where each begins."""
+    rows = [-(-weight.shape[1] // VECTOR) * VECTOR for weight in weights]
+    begins = np.cumsum([0, *(len(weight) * row for weight, row in zip(weights, rows, strict=True))])
+    packed = np.zeros(begins[-1], np.float32)
+    for weight, row, begin, end in zip(weights, rows, begins, begins[1:], strict=False):
+        packed[begin:end].reshape(-1, row)[:, : weight.shape[1]] = weight
+    return packed, begins
+
+
+class _Arrays:
+    """A network as the compiled functions want it: flat arrays."""
+
+    def __init__(self, x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> None:
+        self.points, self.groups = len(x), len(biases[0])
+        self.weights = [weight.detach().numpy() for weight in weights]
+        # [in, out] each
+        down, begins = _packed([weight.T for weight in self.weights])
+        self.widths = np.array([weights[0].shape[1], *(len(weight) for weight in weights)])
+        self.shared = _flat(biases[0])
+        self.biases, begins_of_biases = _packed([bias.detach().numpy()[:1] for bias in biases])
+        # where each layer's bias begins, behind where its weights do
+        self.begins = np.concatenate([begins, begins_of_biases])
+        group = self.points if self.groups == 1 else self.points // self.groups
+        self.step = 1 if self.groups == 1 else group
+        self.arrays = _flat(x), self.widths, down, self.begins
+        self.of_groups = self.biases, self.shared, group
+
+    def parts(self) -> list[tuple[int, int]]:
+        """Equal parts of the points for the threads, of whole groups."""
+        threads = max(1, min(torch.get_num_threads(), self.points // LEAST_SHARE))
+        return [(first * self.step, last * self.step) for first, last in stretches(self.points // self.step, threads)]
+
+
+def _flat(values: Tensor) -> np.ndarray:
+    return values.detach().contiguous().view(-1).numpy()
+
+
+def _unpacked(packed: np.ndarray, begins: np.ndarray, shapes: Sequence[Sequence[int]]) -> list[Tensor]:
+    """Give matrices without what their rows were filled up with."""
+    return [
+        torch.from_numpy(packed[begin:end].reshape(rows, -1)[:, :columns])
+        for (begin, end), (rows, columns) in zip(pairwise(begins), shapes, strict=True)
+    ]
+
+
+def forward(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tensor:
+    """Apply a network; see `network`. The first bias is [groups, out], the others are [1, out]."""
+    net, result = _Arrays(x, weights, biases), torch.empty(len(x), len(weights[-1]))
+    arrays = *net.arrays, *net.of_groups, _flat(result)
+    share_out(lambda part: _forward(*arrays, *part), net.parts())
+    return result
+
+
+def backward(
+    x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], gradient: Tensor, follow_x: bool
+) -> tuple[Tensor | None, list[Tensor], list[Tensor]]:
+    """Give the gradients to the inputs (None unless `follow_x`), to the weights and to the biases."""
+    net, to_x = _Arrays(x, weights, biases), torch.empty(len(x) if follow_x else 0, x.shape[1])
+    up, begins_up = _packed(net.weights)
+    arrays = *net.arrays, up, begins_up, *net.of_groups, _flat(gradient), _flat(to_x)
+    parts, to_shared = net.parts(), np.zeros_like(net.shared)
+    # rows are added eight at once, some of them (zeros) behind the last matrix
+    room = len(up) + 8 * (net.widths.max() + VECTOR)
+    own = [(np.zeros(room, np.float32), np.zeros_like(net.biases)) for _ in parts]
+    share_out(lambda number: _backward(*arrays, *own[number], to_shared, *parts[number]), list(range(len(parts))))
+    # in one order, whichever thread was ready first: the same sums each time
+    to_up, to_biases = (np.sum(each, axis=0) for each in zip(*own, strict=True))
+    to_weights = _unpacked(to_up, begins_up, [each.shape for each in weights])
+    of_layers = _unpacked(to_biases, net.begins[len(net.widths) :], [(1, len(weight)) for weight in net.weights])
+    if net.groups > 1:
+        of_layers[0] = torch.from_numpy(to_shared).view(net.groups, -1)
+    return (to_x if follow_x else None), to_weights, of_layers
