@@ -5,7 +5,9 @@ again: that is faster than writing them to memory and reading them. All three pr
 the inputs, gradient to the weights) are the same sum of products with other strides. Its function keeps the sums in
 registers. LLVM is told the vectors' length, because it makes no vectors of loops that keep more than one sum.
 
-Rows of layers and weights are filled up to whole vectors; what stands there is 0. Importing this module imports Numba.
+Rows of layers and weights are filled up to a multiple of 16; what stands there is 0.
+
+Importing this module imports Numba.
 """
 
 from __future__ import annotations
@@ -25,15 +27,15 @@ from torch import Tensor
 from edge_depth_nerf.kernels.compiled import compiled
 from edge_depth_nerf.kernels.hash_grid_numba import share_out, stretches
 
-TILE = 64
-"""Points worked on together, a multiple of 8: a layer of 64 takes 16 kB of them."""
+TILE = 96
+"""Points worked on together, a multiple of 16."""
 LEAST_SHARE = 1 << 11
 """A thread gets at least so many points."""
 _WIDE = llvm.get_host_cpu_features().get("avx512f", False)
 VECTOR = 16 if _WIDE else 8
 """Numbers of a vector."""
-BLOCK = 4 if _WIDE else 2
-"""Vectors of each of four rows whose sums are kept in registers: as many as a core has registers for."""
+FULL = 16
+"""Rows are filled up to a multiple of so many numbers."""
 ZERO = np.float32(0)
 
 
@@ -107,33 +109,44 @@ def _sums_of_products(rows: int, vectors: int) -> Callable[..., Any]:
     return sums_of_products
 
 
-_of_four_rows, _of_eight_rows = _sums_of_products(4, BLOCK), _sums_of_products(8, 1)
+_FOUR_ROWS = 4 * VECTOR if _WIDE else 2 * VECTOR
+"""Columns of the sums that registers have room for, of four rows at once."""
+_four_rows = _sums_of_products(4, _FOUR_ROWS // VECTOR)
+# not called without wide vectors
+_eight_rows, _sixteen_rows = _sums_of_products(8, 2), _sums_of_products(16, 1)
 
 
 @compiled()
 @no_type_check
 def _multiply(a, at_a, a_row, a_term, b, at_b, b_term, terms, start, at_start, start_row, into, at, row, rows, columns):
-    """Write `rows` by `columns` (whole vectors) sums of products; `rows` is rounded up to a multiple of 4 or 8."""
-    wide = columns - columns % (BLOCK * VECTOR)
-    for c in range(0, wide, BLOCK * VECTOR):
+    """Write `rows` by `columns` sums of products; both are filled up to a multiple of 16."""
+    done = columns - columns % _FOUR_ROWS
+    for c in range(0, done, _FOUR_ROWS):
         for r in range(0, rows, 4):
-            _of_four_rows(
+            _four_rows(
                 *(a, at_a + r * a_row, a_row, a_term, b, at_b + c, b_term, terms),
                 *(start, at_start + r * start_row + c, start_row, into, at + r * row + c, row),
             )
-    for c in range(wide, columns, VECTOR):
+    if columns - done >= 2 * VECTOR:
         for r in range(0, rows, 8):
-            _of_eight_rows(
-                *(a, at_a + r * a_row, a_row, a_term, b, at_b + c, b_term, terms),
-                *(start, at_start + r * start_row + c, start_row, into, at + r * row + c, row),
+            _eight_rows(
+                *(a, at_a + r * a_row, a_row, a_term, b, at_b + done, b_term, terms),
+                *(start, at_start + r * start_row + done, start_row, into, at + r * row + done, row),
+            )
+        done += 2 * VECTOR
+    if columns > done:
+        for r in range(0, rows, 16):
+            _sixteen_rows(
+                *(a, at_a + r * a_row, a_row, a_term, b, at_b + done, b_term, terms),
+                *(start, at_start + r * start_row + done, start_row, into, at + r * row + done, row),
             )
 
 
 @compiled()
 @no_type_check
 def _filled(width):
-    """A layer's width in whole vectors."""
-    return (width + VECTOR - 1) // VECTOR * VECTOR
+    """A layer's width, filled up."""
+    return (width + FULL - 1) // FULL * FULL
 
 
 @compiled()
@@ -262,8 +275,8 @@ def _backward(
 
 
 def _packed(weights: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Give matrices in one array, their rows filled up to whole vectors, and where each begins."""
-    rows = [-(-weight.shape[1] // VECTOR) * VECTOR for weight in weights]
+    """Give matrices in one array, their rows filled up, and where each begins."""
+    rows = [-(-weight.shape[1] // FULL) * FULL for weight in weights]
     begins = np.cumsum([0, *(len(weight) * row for weight, row in zip(weights, rows, strict=True))])
     packed = np.zeros(begins[-1], np.float32)
     for weight, row, begin, end in zip(weights, rows, begins, begins[1:], strict=False):
@@ -323,8 +336,8 @@ def backward(
     up, begins_up = _packed(net.weights)
     arrays = *net.arrays, up, begins_up, *net.of_groups, _flat(gradient), _flat(to_x)
     parts, to_shared = net.parts(), np.zeros_like(net.shared)
-    # rows are added eight at once, some of them (zeros) behind the last matrix
-    room = len(up) + 8 * (net.widths.max() + VECTOR)
+    # rows are added sixteen at once, some of them (zeros) behind the last matrix
+    room = len(up) + FULL * (net.widths.max() + FULL)
     own = [(np.zeros(room, np.float32), np.zeros_like(net.biases)) for _ in parts]
     share_out(lambda number: _backward(*arrays, *own[number], to_shared, *parts[number]), list(range(len(parts))))
     # in one order, whichever thread was ready first: the same sums each time
