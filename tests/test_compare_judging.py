@@ -13,7 +13,16 @@ from scenes import write_scene
 from test_pipeline import build
 
 from edge_depth_nerf.base.files import read_json, write_json
-from edge_depth_nerf.compare.judging import choose_pixels, judge_beams, judge_pixels, shifted_views
+from edge_depth_nerf.compare.figures import affine_fitted
+from edge_depth_nerf.compare.judging import (
+    ViewJudge,
+    choose_pixels,
+    evaluated,
+    judge_beams,
+    judge_pixels,
+    shifted_views,
+)
+from edge_depth_nerf.method.metrics import masked_psnr
 from edge_depth_nerf.plugin.config import make_specifications, read_method_file
 
 
@@ -73,8 +82,8 @@ def test_the_pixels_are_always_the_same_and_inside_the_mask(tmp_path):
         assert torch.equal(chosen.known["image"], dataset[view]["image"][row, column])
 
 
-def test_shifted_views_stand_where_the_scene_says(tmp_path):
-    scene = write_scene(tmp_path)
+def with_shifted_views(scene):
+    """Views where a held-out picture stands and beside it, with that picture's files as their truth."""
     meta = read_json(scene / "transforms.json")
     for frame in meta["frames"]:
         frame["camera"] = "only"
@@ -90,6 +99,11 @@ def test_shifted_views_stand_where_the_scene_says(tmp_path):
         ],
     }
     write_json(scene / "transforms.json", meta)
+    return scene
+
+
+def test_shifted_views_stand_where_the_scene_says(tmp_path):
+    scene = with_shifted_views(write_scene(tmp_path))
     pipeline, _ = build(scene)
     dataset = pipeline.datamanager.eval_dataset
     views = shifted_views(scene, dataset)
@@ -101,6 +115,35 @@ def test_shifted_views_stand_where_the_scene_says(tmp_path):
     assert float(metres) == pytest.approx(np.linalg.norm([0.3, -0.2, 0.1]), abs=1e-5)
     assert same.batch["image"].shape == (28, 32, 3) and same.batch["mask"].shape == (28, 32, 1)
     assert (same.batch["truth_distance_m"] > 0).any()
+
+
+def test_shifted_views_have_the_figures_of_the_whole_picture(tmp_path):
+    """Only what lies inside the mask is rendered: the figures are those of a rendering of everything."""
+    scene = with_shifted_views(write_scene(tmp_path))
+    pipeline, _ = build(scene)
+    model, dataset = pipeline.model, pipeline.datamanager.eval_dataset
+    rendered, original = [], model.forward
+    model.forward = lambda ray_bundle: (rendered.append(len(ray_bundle)), original(ray_bundle))[1]
+    model.config.eval_num_rays_per_chunk = 100
+    views, told = shifted_views(scene, dataset), []
+    found = ViewJudge(pipeline, lambda: told.append(1)).shifted(views)
+    assert len(told) == 2 and max(rendered) <= 100
+    assert sum(rendered) == 2 * int(dataset.mask(0).sum()) < 2 * dataset.mask(0).size
+    expected = {}
+    with evaluated(model):
+        for metres in views:
+            view = views[metres][0]()
+            model.reset_depth_errors()
+            outputs = model.get_outputs_for_camera(view.camera)
+            figures, _ = model.get_image_metrics_and_images(outputs, view.batch)
+            mask, target = view.batch["mask"][..., 0], view.batch["image"]
+            fitted = affine_fitted(outputs["rgb"].clamp(0, 1), target, mask)
+            figures["affine_masked_psnr"] = float(masked_psnr(fitted, target, mask))
+            figures |= model.pooled_depth_errors()
+            kept = ("masked_", "affine_", "truth_")
+            expected |= {f"shifted_{metres}m_{name}": value for name, value in figures.items() if name.startswith(kept)}
+    assert {"shifted_1m_masked_psnr", "shifted_1m_masked_ssim", "shifted_0m_truth_abs_rel"} <= set(found)
+    assert found == pytest.approx(expected, rel=1e-5) and found["shifted_0m_truth_pixels"] > 100
 
 
 def test_training_views_are_judged_by_the_beams_that_were_held_out(tmp_path, monkeypatch):

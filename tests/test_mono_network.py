@@ -53,10 +53,12 @@ from edge_depth_nerf.mono.scene_maps import write_mono_maps
 from edge_depth_nerf.mono.training import (
     Batch,
     TrainingOptions,
+    _losses,
     augmented,
     make_batch,
     scale_invariant_loss,
     smoothness_loss,
+    torch_threads,
     train,
 )
 from edge_depth_nerf.scene.format import TRUST_FILE
@@ -328,6 +330,33 @@ def test_the_same_seed_gives_the_same_weights_and_another_one_others(small_stree
     assert same(weights[0], weights[1]) and not same(weights[0], weights[2])
 
 
+def test_it_gives_the_same_weights_on_one_thread_and_on_two(small_street):
+    examples, weights = examples_of(small_street), []
+    for threads in (1, 2):
+        with torch_threads(threads):
+            weights.append(weights_of(train(examples, None, TINY, TrainingOptions(steps=4)).network))
+            assert torch.get_num_threads() == threads
+    assert same(*weights)
+
+
+def test_the_loss_of_a_batch_is_the_sum_of_its_parts(small_street):
+    """Also where the parts have unlike numbers of measured pictures and of usable pixels."""
+    options, network = TrainingOptions(steps=1), DepthNetwork(TINY)
+    torch.nn.init.normal_(network.head.weight, generator=torch.Generator().manual_seed(0))
+    batch = make_batch(examples_of(small_street), np.arange(4), TINY, CPU)
+    batch.lidar_m[1] = 0
+    batch.usable[3, 4:] = False
+    log_ratio = network(batch.rgb, batch.geometry, batch.usable)
+    valid = (batch.lidar_m > 0) & batch.usable
+    log_error = log_ratio + batch.log_room - batch.lidar_m.clamp(min=1e-3).log()
+    expected = scale_invariant_loss(log_error, valid, options.balance, batch.weight)
+    expected = expected + options.smoothness * smoothness_loss(log_ratio, batch.rgb, batch.usable)
+    parts = [loss() for loss in _losses(network, batch, options)]
+    assert len(parts) == 2 and float(expected.detach()) > 0
+    assert not torch.isclose(parts[0], parts[1], rtol=1e-2)
+    torch.testing.assert_close(sum(parts), expected)
+
+
 def test_a_killed_training_goes_on_as_if_nothing_had_been(small_street, tmp_path):
     examples, kept = examples_of(small_street), examples_of(small_street, held_out=True)
     options = TrainingOptions(steps=12, evaluate_every=3)
@@ -382,7 +411,8 @@ def test_training_ends_in_time_and_where_nothing_improves(small_street):
     assert time.monotonic() - begun < 5 and 0 < in_time.steps < 10**5
 
     kept = dataclasses.replace(examples, lidar_m=np.where(examples.lidar_m > 0, 0.11, 0).astype(np.float32))
-    stopped = train(examples, kept, TINY, TrainingOptions(steps=200, evaluate_every=2, patience=3, learning_rate=1e-6))
+    hardly = TrainingOptions(steps=200, evaluate_every=2, patience=3, learning_rate=1e-6, hidden_learning_rate=1e-6)
+    stopped = train(examples, kept, TINY, hardly)
     assert stopped.steps <= stopped.best_step + 6 < 200 and stopped.stopped_early
 
 

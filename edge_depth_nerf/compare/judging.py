@@ -20,7 +20,8 @@ from torch import Tensor
 
 from edge_depth_nerf.base.files import read_distance_png, read_image, write_png
 from edge_depth_nerf.compare.figures import ANGLE_EDGES_DEG, DISTANCE_EDGES_M, BinnedErrors, affine_fitted
-from edge_depth_nerf.method.metrics import LEAST_SQUARED_ERROR, DepthErrors, masked_psnr
+from edge_depth_nerf.method.metrics import LEAST_SQUARED_ERROR, DepthErrors, masked_lpips, masked_psnr, masked_ssim
+from edge_depth_nerf.plugin.compat import without_undefined_ray
 from edge_depth_nerf.plugin.dataset import FisheyeDepthDataset
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
 from edge_depth_nerf.plugin.pipeline import JudgedViews
@@ -258,12 +259,44 @@ class ViewJudge:
         return figures, {"by_angle_deg": by_angle.compute(), "by_distance_m": by_distance.compute()}
 
     def shifted(self, views: dict[str, list[Callable[[], JudgedView]]]) -> dict[str, float]:
-        """Evaluate views beside the path against their ground truth, inside the mask: shifted_1m_masked_psnr etc."""
+        """Evaluate views beside the path against their ground truth, inside the mask: shifted_1m_masked_psnr etc.
+
+        No figure reads what lies outside the mask, so it is not rendered.
+        """
         figures: dict[str, float] = {}
-        kept = ("masked_", "affine_", "truth_")
         for metres, chosen in views.items():
-            found = self._mean((load() for load in chosen), lambda *_: None) if chosen else {}
-            figures |= {f"shifted_{metres}m_{name}": found[name] for name in found if name.startswith(kept)}
+            found, errors = [], DepthErrors()
+            with evaluated(self.model):
+                for view in (load() for load in chosen):
+                    found.append(self._inside_mask(view, errors))
+                    self.on_view()
+            pooled = errors.compute("truth_")
+            figures |= {f"shifted_{metres}m_{name}": value for name, value in {**_means(found), **pooled}.items()}
+        return figures
+
+    def _inside_mask(self, view: JudgedView, errors: DepthErrors) -> dict[str, float]:
+        """Render the pixels of a view inside its mask; its figures there, and its distances added to `errors`."""
+        model, mask, target = self.model, view.batch["mask"][..., 0].cpu(), view.batch["image"][..., :3].cpu()
+        rgb, distance_m = torch.zeros(*mask.shape, 3), torch.zeros(mask.shape)
+        camera = without_undefined_ray(view.camera.to(model.device))
+        # nerfstudio's coordinates are those of the pixels' centres
+        at = mask.nonzero() + 0.5
+        parts = [
+            model(camera.generate_rays(camera_indices=0, coords=part.to(model.device)))
+            for part in at.split(model.config.eval_num_rays_per_chunk)
+        ]
+        rgb[mask] = torch.cat([part["rgb"] for part in parts]).cpu().clamp(0, 1)
+        distance_m[mask] = torch.cat([part["depth"][:, 0] for part in parts]).cpu() * model.metres_per_unit
+        errors.update(distance_m, view.batch["truth_distance_m"][..., 0].cpu(), mask)
+        figures = {
+            "masked_psnr": float(masked_psnr(rgb, target, mask)),
+            "masked_ssim": float(masked_ssim(rgb, target, mask)),
+            "affine_masked_psnr": float(masked_psnr(affine_fitted(rgb, target, mask), target, mask)),
+        }
+        lpips = model.lpips.load(model.device)
+        if lpips is not None:
+            device = model.device
+            figures["masked_lpips"] = float(masked_lpips(rgb.to(device), target.to(device), mask.to(device), lpips))
         return figures
 
     def _mean(self, views: Iterator[JudgedView], look: Callable[..., None]) -> dict[str, float]:
@@ -284,5 +317,10 @@ class ViewJudge:
                 look(view, outputs, images)
                 found.append(figures)
                 self.on_view()
-        means = {name: float(np.mean([figures[name] for figures in found])) for name in found[0]}
-        return {name: value for name, value in means.items() if math.isfinite(value)} | model.pooled_depth_errors()
+        return _means(found) | model.pooled_depth_errors()
+
+
+def _means(found: list[dict[str, float]]) -> dict[str, float]:
+    """Means over views of those figures whose mean is finite."""
+    means = {name: float(np.mean([figures[name] for figures in found])) for name in (found[0] if found else {})}
+    return {name: value for name, value in means.items() if math.isfinite(value)}

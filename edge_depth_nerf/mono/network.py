@@ -102,9 +102,18 @@ class DepthNetwork(nn.Module):
             skipped.append(features)
         for level in range(len(self.decoder) - 1, -1, -1):
             finer = skipped[level]
-            above = F.interpolate(self.lateral[level](features), size=finer.shape[-2:], mode="nearest")
+            above = F.interpolate(_pointwise(self.lateral[level], features), size=finer.shape[-2:], mode="nearest")
             features = self.decoder[level](finer + above)
         return F.pixel_shuffle(self.head(features), 2)[:, 0]
+
+
+def _pointwise(convolution: nn.Module, features: Tensor) -> Tensor:
+    """Apply a convolution of 1×1 pixels as a matrix product.
+
+    On one thread torch would copy the features into another order for it.
+    """
+    weight, bias = convolution.get_parameter("weight"), convolution.get_parameter("bias")
+    return F.linear(features.permute(0, 2, 3, 1), weight[:, :, 0, 0], bias).permute(0, 3, 1, 2)
 
 
 class _Residual(nn.Module):

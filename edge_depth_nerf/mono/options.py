@@ -40,8 +40,8 @@ class EstimateDepthOptions:
     output: Path | None = None
     """Where the trained weights go. Not set: mono_network.safetensors in the first scene."""
     seed: int = 0
-    """Seed of the initial weights and of the order of pictures. On one thread, the same seed gives the same weights,
-    unless --seconds ends the training."""
+    """Seed of the initial weights and of the order of pictures. With one or two threads, the same seed gives the same
+    weights, unless --seconds ends the training."""
     hf: str | None = None
     """A ready-made network instead: the folder of a depth network of the transformers library, or its name in Hugging
     Face's cache, such as depth-anything/Depth-Anything-V2-Small-hf. Nothing is downloaded. Needs `pip install
