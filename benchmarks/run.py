@@ -2,8 +2,8 @@
 
     python benchmarks/run.py [--work outputs/benchmark] [--results benchmarks/results.json] [--parts PART …]
 
-Parts, each of which is kept in the results as soon as it is there and not measured again (remove it there, or the
-file, to have it anew):
+Parts, each of which is kept in the results, with the commit it is of, as soon as it is there and not measured again
+(remove it there, or the file, to have it anew):
 
     encoding     the hash grid, forward + backward, at three sizes (benchmarks/encoding.py)
     lite, full   training steps and views of the two presets (benchmarks/speed.py)
@@ -241,6 +241,14 @@ def preparation(work: Path) -> list[dict[str, Any]]:
     return rows
 
 
+def commit() -> str:
+    """The checked-out commit; with a + if files differ from it."""
+    git = ["git", "-C", str(HERE)]
+    shown = subprocess.run([*git, "rev-parse", "--short=7", "HEAD"], check=True, capture_output=True, text=True)
+    changed = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", "../edge_depth_nerf"]).returncode
+    return shown.stdout.strip() + ("+" if changed else "")
+
+
 class temporary:
     """A folder beside the scenes (pictures are linked into it), removed in the end."""
 
@@ -291,6 +299,8 @@ def main() -> None:
             found = measure()
             results[name] = found
             results.setdefault("seconds", {})[name] = round(time.perf_counter() - started, 1)
+            results.setdefault("commits", {})[name] = commit()
+            results["sizes"] = {preset: speed.sizes_of(preset) for preset in speed.PRESETS}
             write_json(options.results, results)
     write_tables(results, [HERE.parent / "docs" / "speed.md"])
     draw(results, HERE.parent / "docs" / "speed.svg")

@@ -283,6 +283,21 @@ def machine() -> dict[str, Any]:
     }
 
 
+def sizes_of(preset: str) -> dict[str, Any]:
+    """What a step's time of a preset depends on, from its configuration."""
+    config: Any = PRESETS[preset].config
+    data, model = config.pipeline.datamanager, config.pipeline.model
+    names = ("num_levels", "log2_hashmap_size", "features_per_level", "max_res", "hidden_dim", "hidden_dim_color")
+    return {
+        "rays": data.train_num_rays_per_batch,
+        "surface_rays": data.surface_rays_per_batch,
+        **{name: getattr(model, name) for name in names},
+        "samples": model.num_nerf_samples_per_ray,
+        "proposal_samples": list(model.num_proposal_samples_per_ray),
+        "proposal_networks": [dict(network) for network in model.proposal_net_args_list],
+    }
+
+
 def spread_of(values: Sequence[float], form: str) -> str:
     """Median and range; a dash where there are none."""
     if not values:

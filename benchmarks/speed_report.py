@@ -145,7 +145,15 @@ def rest(results: dict[str, Any]) -> str:
     return rows_of(["", "measured"], rows)
 
 
-TABLES = {"summary": summary, "trainers": trainers, "growth": growth, "data": data, "rest": rest}
+def commits(results: dict[str, Any]) -> str:
+    """Which commit each part is of."""
+    of_commit: dict[str, list[str]] = {}
+    for part, commit in results.get("commits", {}).items():
+        of_commit.setdefault(commit, []).append(part)
+    return rows_of(["commit", "parts"], [[commit, ", ".join(names)] for commit, names in of_commit.items()])
+
+
+TABLES = {"commits": commits, "summary": summary, "trainers": trainers, "growth": growth, "data": data, "rest": rest}
 
 
 def with_tables(page: str, results: dict[str, Any]) -> str:

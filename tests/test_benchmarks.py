@@ -71,6 +71,17 @@ def test_the_page_has_the_tables_of_the_results(report):
     assert report.with_tables(text, json.loads(RESULTS.read_text())) == text
 
 
+def test_the_pages_figures_are_of_todays_sizes(benchmark_module):
+    """A preset that changes its sizes needs the page's figures anew: python benchmarks/run.py."""
+    measured, speed = json.loads(RESULTS.read_text()), benchmark_module("speed")
+    assert set(measured["sizes"]) == {"lite", "full"} == set(speed.PRESETS)
+    for preset, sizes in measured["sizes"].items():
+        assert sizes == json.loads(json.dumps(speed.sizes_of(preset)))
+    assert measured["commits"].keys() == measured["seconds"].keys()
+    page = (ROOT / "docs/speed.md").read_text(encoding="utf-8")
+    assert all(f"| {commit} |" in page for commit in measured["commits"].values())
+
+
 def test_a_ratio_is_made_of_the_seconds(report):
     """The tables' ratios are the file's; these must follow from its seconds."""
     results = json.loads(RESULTS.read_text())

@@ -48,6 +48,14 @@ def test_rays_of_the_table_are_nerfstudios(tmp_path, kind, monkeypatch):
         torch.testing.assert_close(rays.metadata["directions_norm"], expected.metadata["directions_norm"])
 
 
+def test_a_pixel_that_is_not_there(tmp_path):
+    generator = TableRayGenerator(cameras(), tmp_path / "rays")
+    assert len(generator(torch.zeros(0, 3, dtype=torch.long))) == 0
+    for indices in ([0, 1000, 0], [0, -5, 0], [5, 0, 0]):
+        with pytest.raises(IndexError):
+            generator(torch.tensor([[0, 0, 0], indices]))
+
+
 def test_a_broken_table_of_rays_is_made_anew_and_one_that_cannot_be_kept_stays_in_memory(tmp_path):
     given = cameras()
     expected = TableRayGenerator(given, tmp_path / "rays").table.clone()

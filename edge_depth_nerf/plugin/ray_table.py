@@ -35,7 +35,7 @@ MOST_PIXELS = 1 << 24
 """Lenses with more pixels than this in all (a table of 335 MB) get no table."""
 STRIP = 1 << 16
 """So many rays are made at once."""
-DIRECTION, AREA, NORM = slice(0, 3), slice(3, 4), slice(4, 5)
+DIRECTION, REST = slice(0, 3), slice(3, 5)
 """Columns: direction in the camera's frame (OpenGL, unit length), the area of the pixel at distance 1, and the length
 of the direction before it was normalised."""
 
@@ -143,12 +143,20 @@ class TableRayGenerator(RayGenerator):
     def forward(self, ray_indices: Int[Tensor, "num_rays 3"]) -> RayBundle:
         """Rays of pixels, given by picture, row and column."""
         picture, row, column = ray_indices.unbind(-1)
-        ray = self.table[self.first[picture] + row * self.widths[picture] + column]
-        pose = self.poses[picture]
+        place = self.first[picture] + row * self.widths[picture] + column
+        if place.device.type == "cpu":
+            # imported here, because Numba takes half a second to load
+            from edge_depth_nerf.kernels.table_rays_numba import turned
+
+            origins, directions, rest = turned(self.table, place, picture, self.poses)
+        else:
+            ray, pose = self.table[place], self.poses[picture]
+            origins, rest = pose[:, :3, 3], ray[:, REST]
+            directions = torch.sum(ray[:, None, DIRECTION] * pose[:, :3, :3], dim=-1)
         return RayBundle(
-            origins=pose[:, :3, 3],
-            directions=torch.sum(ray[:, None, DIRECTION] * pose[:, :3, :3], dim=-1),
-            pixel_area=ray[:, AREA],
+            origins=origins,
+            directions=directions,
+            pixel_area=rest[:, :1],
             camera_indices=picture[:, None],
-            metadata={"directions_norm": ray[:, NORM]},
+            metadata={"directions_norm": rest[:, 1:]},
         )
