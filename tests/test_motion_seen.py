@@ -228,6 +228,7 @@ def test_beyond_the_field_a_monocular_distance_counts_only_where_neighbours_conf
     trust = combine(frames, PriorOptions(), "key", False, motion_errors=MotionErrors(0.01, 0.02))
     rng = np.random.default_rng(2)
     usable = np.ones(SIZE, bool)
+    assert len(maps) >= 4
     for truth, of_source in maps[:4]:
         # a beam before the ceiling, which no picture has matched; something of half the distance; and a few points
         shown = np.kron(rng.choice([0.0, 0.5, 1.0], (8, 12)), np.ones((10, 10)))

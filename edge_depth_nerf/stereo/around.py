@@ -12,7 +12,6 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from jaxtyping import Float32
-from numpy.typing import NDArray
 
 from edge_depth_nerf.lidar.projection import project_points
 from edge_depth_nerf.stereo.views import View
@@ -21,7 +20,9 @@ SPACING_PX = 1.5
 """Each point stands for a patch as wide as so many pixels of the neighbour's picture: about a pixel's diagonal."""
 
 
-def seen_around(view: View, neighbours: Sequence[View], theirs: Sequence[Float32[np.ndarray, "_ _"]]) -> NDArray:
+def seen_around(
+    view: View, neighbours: Sequence[View], theirs: Sequence[Float32[np.ndarray, "_ _"]]
+) -> Float32[np.ndarray, "h w"]:
     """Project the neighbours' distances into a picture: the median of those that fall into a pixel.
 
     Args:
@@ -30,7 +31,7 @@ def seen_around(view: View, neighbours: Sequence[View], theirs: Sequence[Float32
         theirs: their distances from motion, metres, 0 = none.
 
     Returns:
-        Metres along the picture's own rays, float32, 0 where no neighbour shows anything.
+        Metres along the picture's own rays, 0 where no neighbour shows anything.
 
     """
     found = np.full((len(neighbours), *view.grey.shape), np.nan, np.float32)
