@@ -100,6 +100,7 @@ def test_training_pictures_get_right_maps_and_held_out_ones_none(ball: Path) -> 
     for number, (picture, found) in enumerate(zip(scene.pictures, motion_maps(ball), strict=True)):
         if number == HELD_OUT:
             assert not found.any()
+            assert not read_distance_png(picture.files["motion_around"]).any()
             continue
         truth, kept = scene.distance_m(picture, "truth_distance"), found > 0
         assert truth is not None
@@ -111,6 +112,12 @@ def test_training_pictures_get_right_maps_and_held_out_ones_none(ball: Path) -> 
         # by parallax and confidence: no better than 1 %, no worse than what is wrong
         assert 0.009 < (sigma_m / np.where(kept, found, 1))[kept].min()
         assert (sigma_m / np.where(kept, found, 1))[kept].max() < 0.2
+        # the neighbours show nearly all of it, also what was not matched here
+        around_m = scene.distance_m(picture, "motion_around")
+        assert around_m is not None
+        shown = (around_m > 0) & (truth > 0)
+        assert shown.sum() > 0.4 * (truth > 0).sum() and (shown & ~kept).any()
+        assert np.median(np.abs(around_m - truth)[shown] / truth[shown]) < 0.02
     # what it was made by is not kept
     assert not (ball / ".cache" / "motion").exists()
 
@@ -235,6 +242,17 @@ def test_process_finds_motion_once_unless_told_not_to(tmp_path: Path) -> None:
     assert len(before) == 12
     assert "from motion" not in run()
     assert {path: path.stat().st_mtime_ns for path in before} == before
+    # a scene of before has no maps of what neighbours show; those of other tools need none
+    transforms = tmp_path / "scene" / "transforms.json"
+    meta = read_json(transforms)
+    for frame in meta["frames"]:
+        del frame["motion_around_file_path"]
+    write_json(transforms, {**meta, "motion": {"kind": "another"}})
+    assert "Motion gives distances for" not in run()
+    meta = read_json(transforms)
+    write_json(transforms, {**meta, "motion": {"kind": "sphere sweep"}})
+    assert "Motion gives distances for" in run()
+    assert read_scene(tmp_path / "scene").has("motion_around")
     # other pictures, other maps
     next(drive.root.rglob("image_02/**/0000000002.png")).touch()
     said = run()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -14,6 +15,7 @@ from edge_depth_nerf.cameras import Camera, KannalaBrandt, Pinhole
 from edge_depth_nerf.cameras.projection_series import WRONG_PX, projection_series
 from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.kernels import sphere_sweep
+from edge_depth_nerf.stereo.around import seen_around
 from edge_depth_nerf.stereo.consistency import (
     LEAST_AGREEING,
     LEAST_CONFIDENCE,
@@ -50,6 +52,13 @@ def of_wall(camera: Camera, to_world: np.ndarray, contrast: float = 1.0) -> tupl
     return View(np.rint(grey).astype(np.float32), camera, to_world), distance
 
 
+def shifted_by(x_m: float) -> np.ndarray:
+    """Pose of a camera beside the world's origin."""
+    to_world = np.eye(4)
+    to_world[0, 3] = x_m
+    return to_world
+
+
 def found(views: list[View], index: int = MIDDLE) -> MotionDistance:
     motion = Motion(np.stack([view.camera_to_world[:3, 3] for view in views]), lambda number: views[number])
     return motion.confirm(index, motion.sweep)
@@ -71,6 +80,37 @@ def ball() -> tuple[list[View], np.ndarray]:
 @pytest.fixture(scope="module")
 def of_ball(ball) -> MotionDistance:
     return found(ball[0])
+
+
+def test_neighbours_distances_are_seen_where_they_lie(ball):
+    views, truth = ball
+    others = [number for number in range(len(STEPS)) if number != MIDDLE]
+    theirs = [in_ball(FISHEYE, pose(x, 0.1 * x, 0.05, 0.1 * x))[1] for x in STEPS]
+    theirs = [np.where(views[number].used, theirs[number], 0).astype(np.float32) for number in others]
+    # one of four is wrong
+    theirs[0] = 0.5 * theirs[0]
+    seen_m = seen_around(views[MIDDLE], [views[number] for number in others], theirs)
+    kept = seen_m > 0
+    assert kept[views[MIDDLE].used].mean() > 0.9 and not kept[~views[MIDDLE].used].any()
+    error = np.abs(seen_m - truth)[kept] / truth[kept]
+    assert np.median(error) < 0.01 and np.mean(error < 0.1) > 0.9
+    nothing = [np.zeros_like(each) for each in theirs]
+    assert not seen_around(views[MIDDLE], [views[number] for number in others], nothing).any()
+
+
+def test_what_a_near_thing_hides_is_not_seen():
+    # a wall at 5 m and a board at 2 m before its middle, both known from beside
+    view, beside = (View(np.full((80, 110), 100, np.float32), WALL, pose) for pose in (np.eye(4), shifted_by(0.3)))
+
+    def scene_m(position_x: float) -> np.ndarray:
+        x, y, z = np.moveaxis(rays(WALL).directions, -1, 0)
+        on_board = (np.abs(position_x + 2 * x / z) < 0.5) & (np.abs(2 * y / z) < 0.5)
+        return np.where(on_board, 2 / z, 5 / z).astype(np.float32)
+
+    seen_m, truth = seen_around(view, [beside], [scene_m(0.3)]), scene_m(0.0)
+    board = cv2.erode((truth < 3).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    assert board.sum() > 300 and (seen_m[board] > 0).mean() > 0.7
+    np.testing.assert_allclose(seen_m[board & (seen_m > 0)], truth[board & (seen_m > 0)], rtol=0.02)
 
 
 # ---- lenses ----------------------------------------------------------------------------------------------------

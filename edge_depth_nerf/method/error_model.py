@@ -44,13 +44,15 @@ KNOTS: dict[str, tuple[float, ...]] = {
 }
 """Where each feature's factor is kept; between them it is interpolated, beyond them it stays."""
 MOTION_KNOTS: dict[str, tuple[float, ...]] = {
-    "distance_m": KNOTS["distance_m"],
+    "elevation_deg": (-60.0, -40.0, -25.0, -10.0),
     "by_matching": (0.02, 0.03, 0.04, 0.06, 0.08, 0.12),
     "rim_px": (0.0, 1.0, 2.0, 4.0, 8.0),
     "spread": KNOTS["spread"],
     "step": KNOTS["step"],
 }
-"""The same of a prior that motion alone gives."""
+"""The same of a prior that motion alone gives. Distance is not among them: what is near in LiDAR's field is mostly
+road, which matches far better than the crown of a tree at the same distance above it. Elevation tells one from the
+other: above its last knot most things stand upright, in the field and beyond."""
 _ALL_KNOTS = {**KNOTS, **MOTION_KNOTS}
 _LOGARITHMIC = ("distance_m", "spread", "step", "by_matching")
 RIM_STEP = 0.1
@@ -103,10 +105,14 @@ def pixel_features(
 
 
 def motion_features(
-    features: Features, motion_m: Float[np.ndarray, "h w"], sigma_m: Float[np.ndarray, "h w"]
+    features: Features,
+    motion_m: Float[np.ndarray, "h w"],
+    sigma_m: Float[np.ndarray, "h w"],
+    elevation_rad: Float[np.ndarray, "h w"],
 ) -> dict[str, NDArray[np.float32]]:
     """The features of pixels whose prior is from motion alone, H×W each.
 
+    elevation_deg angle of the ray above the horizon
     by_matching   the distance's standard deviation by parallax and confidence, as a part of it
     rim_px        pixels to the nearest jump of the map, or to the nearest pixel without distance: matching by windows
                   puts outlines some pixels off
@@ -115,6 +121,7 @@ def motion_features(
         features: from `pixel_features`.
         motion_m: distances from motion, 0 = none.
         sigma_m: their standard deviation.
+        elevation_rad: of each ray.
 
     """
     known = (motion_m > 0).astype(np.uint8)
@@ -123,7 +130,9 @@ def motion_features(
     jump = np.asarray(cv2.dilate(logs, kernel) - cv2.erode(logs, kernel))
     whole = (np.asarray(cv2.erode(known, kernel, borderValue=(1,))) > 0) & (jump < RIM_STEP)
     return {
+        # distance is no factor, but σ̂ is a share of it
         **{name: features[name] for name in ("distance_m", "spread", "step")},
+        "elevation_deg": np.degrees(elevation_rad).astype(np.float32),
         "by_matching": sigma_m / np.maximum(motion_m, np.float32(1e-3)),
         "rim_px": np.asarray(cv2.distanceTransform(whole.astype(np.uint8), cv2.DIST_L2, 5), np.float32),
     }

@@ -41,7 +41,7 @@ from edge_depth_nerf.method.integration import (
     weight_of_errors,
 )
 
-CACHE_VERSION = 5
+CACHE_VERSION = 6
 """Part of every key: raised whenever the same inputs give another prior."""
 
 KEPT_SETS = 4
@@ -52,6 +52,12 @@ FARTHEST_M = 200.0
 
 LOWEST_SKY_DEG = 2.0
 """Nearer to the horizon a missing monocular distance may be the end of the world's hills as well as sky."""
+
+SAME_SHARE = 0.1
+"""A monocular distance and one that neighbours show are the same if they differ by at most this share of it."""
+
+BESIDE_MOTION = ("motion_sigma", "motion_around")
+"""The layers that are read with distances from motion, where a scene has them."""
 
 CALIBRATED = (INTEGRATED, "mono")
 """The sources whose error is measured against held-out LiDAR points."""
@@ -191,6 +197,9 @@ class MotionMap:
     alone: NDArray[np.bool_]
     """H×W, True where motion counts alone if it has a distance: beyond LiDAR's field. There the monocular map is fitted
     to it, as to LiDAR points in the field."""
+    around_m: NDArray[np.float32] | None = None
+    """H×W, what the neighbours' distances show at the picture's pixels, 0 = nothing. Beyond LiDAR's field a monocular
+    distance counts only where this confirms it. None: it needs no confirmation."""
 
 
 def integrate_frame(
@@ -230,6 +239,8 @@ def integrate_frame(
         # where the monocular map means "far" a return takes no part, with motion or without
         lidar_m = np.where(mask, lidar_m, np.float32(0))
         mono_counts = mask & motion.mono_counts & ~(motion.alone & (motion.distance_m > 0))
+        if motion.around_m is not None:
+            mono_counts &= ~motion.alone | confirmed(mono_m, motion.around_m)
         mono_m = _joined(np.where(mono_counts, mono_m, np.float32(0)), motion.distance_m, motion.weight)
         mask = anywhere
     # the spread is wanted at returns, too, so they are kept afterwards
@@ -250,6 +261,21 @@ def integrate_frame(
         distance = np.where(returns, lidar_m, distance)
     known = np.where(np.isfinite(mono_m), mono_m, 0)
     return IntegratedFrame(distance, spread, known, returns, from_motion)
+
+
+def confirmed(mono_m: NDArray[np.float32], around_m: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Where neighbouring pictures show the same distance, at a pixel or at one of the eight beside it.
+
+    Args:
+        mono_m: H×W, the aligned monocular map, 0 = none.
+        around_m: H×W, what the neighbours' distances from motion show, 0 = nothing.
+
+    """
+    height, width = mono_m.shape
+    padded = np.pad(around_m, 1)
+    shifted = (padded[row : row + height, column : column + width] for row in range(3) for column in range(3))
+    same = [(seen_m > 0) & (np.abs(seen_m - mono_m) <= SAME_SHARE * mono_m) for seen_m in shifted]
+    return np.logical_or.reduce(same)
 
 
 def _measured(lidar_m: NDArray[np.float32], motion: MotionMap) -> NDArray[np.float32]:
@@ -273,7 +299,7 @@ def sigma_of(
         sigma_m[where] = beyond.network_model.sigma_m({name: values[where] for name, values in of_network.items()})
     if beyond.motion_model is not None:
         where = outside & frame.from_motion
-        of_motion = motion_features(features, motion.distance_m, motion_sigma_m)
+        of_motion = motion_features(features, motion.distance_m, motion_sigma_m, view.elevation_rad)
         sigma_m[where] = beyond.motion_model.sigma_m({name: values[where] for name, values in of_motion.items()})
     return sigma_m
 
@@ -289,7 +315,11 @@ def _joined(mono_m: NDArray[np.float32], motion_m: NDArray[np.float32], motion_w
 
 
 def motion_map(
-    motion_m: NDArray[np.float32], trust: Trust, view: View, lidar_m: NDArray[np.float32] | None
+    motion_m: NDArray[np.float32],
+    trust: Trust,
+    view: View,
+    lidar_m: NDArray[np.float32] | None,
+    around_m: NDArray[np.float32] | None = None,
 ) -> MotionMap:
     """How a picture's distances from motion take part under a calibration that measured them.
 
@@ -298,6 +328,7 @@ def motion_map(
         trust: the drive's calibration, with what it says of motion.
         view: of the picture.
         lidar_m: its LiDAR, 0 = no LiDAR point; None without.
+        around_m: what the neighbours' distances from motion show, 0 = nothing; None where that is not known.
 
     """
     assert trust.motion is not None
@@ -309,7 +340,14 @@ def motion_map(
         motion_m = np.where(in_field, motion_m, np.float32(0))
     known = motion_m > 0 if lidar_m is None else (motion_m > 0) | (np.nan_to_num(lidar_m) > 0)
     counts = in_field | trust.everywhere | beyond.network_reaches(view.elevation_rad, known)
-    return MotionMap(motion_m, trust.motion.weight, counts, ~in_field)
+    if trust.everywhere:
+        return MotionMap(motion_m, trust.motion.weight, counts, ~in_field)
+    return MotionMap(motion_m, trust.motion.weight, counts, ~in_field, around_or_nothing(motion_m, around_m))
+
+
+def around_or_nothing(motion_m: NDArray[np.float32], around_m: NDArray[np.float32] | None) -> NDArray[np.float32]:
+    """What neighbours show: as it came, or nothing for scenes without."""
+    return np.zeros_like(motion_m) if around_m is None else around_m
 
 
 def motion_sigma(motion_m: NDArray[np.float32], sigma_m: NDArray[np.float32] | None) -> NDArray[np.float32]:
@@ -346,7 +384,7 @@ def make_prior(
         assert view is not None
         motion, motion_sigma_m = None, np.zeros(mask.shape, np.float32)
         if motion_m is not None and trust.motion is not None:
-            motion = motion_map(motion_m, trust, view, lidar_m)
+            motion = motion_map(motion_m, trust, view, lidar_m, maps.get("motion_around"))
             motion_sigma_m = motion_sigma(motion_m, maps.get("motion_sigma"))
         else:
             mask = mask if trust.everywhere else mask & trust.in_field(view.elevation_rad)

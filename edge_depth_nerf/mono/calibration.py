@@ -49,11 +49,14 @@ from edge_depth_nerf.method.error_model import (
 )
 from edge_depth_nerf.method.integration import INTEGRATED, weight_of_errors
 from edge_depth_nerf.method.prior import (
+    BESIDE_MOTION,
     CACHE_VERSION,
     MotionMap,
     PriorOptions,
     View,
+    around_or_nothing,
     beyond_features,
+    confirmed,
     integrate_frame,
     motion_sigma,
     view_of,
@@ -75,7 +78,7 @@ HELD_OUT_ROWS = (0.1, 0.95)
 """In every second frame LiDAR points below and above these quantiles of their elevation are held out."""
 FIELD_QUANTILES = (0.001, 0.999)
 """LiDAR's field of elevation, except for stray points."""
-_BEYOND_VERSION = 1
+_BEYOND_VERSION = 2
 """Part of the key of calibrations with motion: raised when they measure otherwise beyond LiDAR's field."""
 REACH_QUANTILE = 0.95
 """Of how far left-out distances from motion lie from the nearest that is known: beyond, nothing is measured."""
@@ -273,7 +276,7 @@ def _made_of(scene: SceneFolder, pictures: Sequence[ScenePicture], depth_source:
     for picture in pictures:
         pose = picture.rotation.round(9).tolist(), picture.position_m.round(6).tolist()
         digest.update(repr((picture.name, picture.lens, pose)).encode())
-        for layer in ("lidar", "mono", "mask", *(["motion", "motion_sigma"] if with_motion else [])):
+        for layer in ("lidar", "mono", "mask", *(["motion", *BESIDE_MOTION] if with_motion else [])):
             path = picture.files.get(layer)
             if path is not None and path not in contents:
                 contents[path] = hashlib.sha256(path.read_bytes()).digest()
@@ -327,7 +330,9 @@ def _calibrate(
         view = view_of(picture.lens, picture.up_in_camera)
         motion_m, motion = maps.distances_m.get("motion"), None
         if errors is not None and motion_m is not None:
-            motion = MotionMap(motion_m, errors.weight, np.ones_like(maps.usable), ~_within(field_rad, view))
+            around_m = around_or_nothing(motion_m, maps.distances_m.get("motion_around"))
+            beyond = ~_within(field_rad, view)
+            motion = MotionMap(motion_m, errors.weight, np.ones_like(maps.usable), beyond, around_m)
         far_seen_m = seen_above(cloud, scene, picture, (picture.lens.width, picture.lens.height))
         measured = measure_frame(
             *(picture.name, number, maps.lidar_m, maps.mono_m, maps.usable, view, options, far_seen_m, depth_source),
@@ -337,10 +342,10 @@ def _calibrate(
             return measured
         left_out = left_out_pixels(scene, picture, motion.distance_m)
         sigma_m = motion_sigma(motion.distance_m, maps.distances_m.get("motion_sigma"))
-        beyond = measure_beyond(
+        measured_beyond = measure_beyond(
             *(number, maps.lidar_m, maps.mono_m, maps.usable, view, options), motion, sigma_m, left_out
         )
-        return dataclasses.replace(measured, beyond=beyond)
+        return dataclasses.replace(measured, beyond=measured_beyond)
 
     bars = progress_bars(console or Console(quiet=True), transient=True)
     with bars as progress, ThreadPoolExecutor(2) as pool:
@@ -511,16 +516,17 @@ def measure_beyond(
         options: of the prior.
         motion: distances from motion; beyond LiDAR's field they count alone.
         motion_sigma_m: their standard deviation by parallax and confidence.
-        left_out: where they lie in places that the network was not taught.
+        left_out: where they lie in places that the network was not taught. Neighbours confirm them nevertheless: that
+            is how it is where the prior is used.
 
     """
     rng = np.random.default_rng([10, number])
     none = np.zeros_like(lidar_m)
     nowhere, everywhere = np.zeros_like(usable), np.ones_like(usable)
-    by_motion = dataclasses.replace(motion, mono_counts=nowhere, alone=everywhere)
+    by_motion = dataclasses.replace(motion, mono_counts=nowhere, alone=everywhere, around_m=None)
     frame = integrate_frame(none, none, usable, INTEGRATED, options, motion=by_motion)
     features = pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, frame.returns, view.theta_rad)
-    of_motion = motion_features(features, motion.distance_m, motion_sigma_m)
+    of_motion = motion_features(features, motion.distance_m, motion_sigma_m, view.elevation_rad)
     judged = _some(usable & (lidar_m > 0) & frame.from_motion, _JUDGED_A_FRAME, rng)
     motion_error = np.abs(frame.distance_m[judged] - lidar_m[judged]) / frame.distance_m[judged]
 
@@ -534,7 +540,11 @@ def measure_beyond(
     fewer, _ = held_out_returns(both(lidar_m, mono_m, usable), view.elevation_rad, number)
     of_two = integrate_frame(np.where(fewer, np.float32(0), lidar_m), mono_m, usable, INTEGRATED, options)
     of_field = pixel_features(of_two.distance_m, of_two.spread_m, of_two.mono_m, of_two.returns, view.theta_rad)
-    tried = _some(fewer & (of_two.distance_m > 0), _JUDGED_A_FRAME, rng)
+    found = fewer & (of_two.distance_m > 0)
+    if motion.around_m is not None:
+        # beyond, no other is used
+        found &= confirmed(of_two.mono_m, motion.around_m)
+    tried = _some(found, _JUDGED_A_FRAME, rng)
     return MeasuredBeyond(
         {name: values[judged] for name, values in of_motion.items()},
         motion_error,

@@ -44,6 +44,7 @@ from edge_depth_nerf.method.error_model import Trust
 from edge_depth_nerf.method.integration import INTEGRATED
 from edge_depth_nerf.method.metrics import has_whole_window
 from edge_depth_nerf.method.prior import (
+    BESIDE_MOTION,
     CACHE_VERSION,
     CALIBRATED,
     PriorCache,
@@ -384,7 +385,7 @@ class PriorRecipe:
     def layers(self) -> tuple[str, ...]:
         """The layers that are read: the source's own, and those that show where the sky is."""
         if self.depth_source == INTEGRATED and self.options.motion:
-            return ("lidar", "mono", "motion", "motion_sigma")
+            return ("lidar", "mono", "motion", *BESIDE_MOTION)
         return ("lidar", "mono") if self.depth_source in CALIBRATED else (self.depth_source,)
 
 
@@ -410,9 +411,10 @@ def _load(
         if recipe is None or cache is None:
             return PicturePixels(rgb, mask)
         maps = {layer: dataset.distance_m(image_idx, layer) for layer in recipe.layers}
-        if maps.get("motion_sigma") is None:
-            # a scene without keeps the priors that it has
-            maps.pop("motion_sigma", None)
+        for layer in BESIDE_MOTION:
+            if maps.get(layer) is None:
+                # a scene without keeps the priors that it has
+                maps.pop(layer, None)
         picture, mono = dataset.pictures[image_idx], maps.get("mono")
         view = view_of(picture.lens, picture.up_in_camera) if mono is not None else None
         prior = cache.prior(maps, mask, view if recipe.trust is not None else None)

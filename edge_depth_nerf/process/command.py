@@ -13,6 +13,7 @@ from edge_depth_nerf.base.console import say
 from edge_depth_nerf.base.one_writer import only_writer
 from edge_depth_nerf.process.converters import convert
 from edge_depth_nerf.process.options import ProcessOptions
+from edge_depth_nerf.scene.format import OWN_MOTION
 from edge_depth_nerf.scene.reader import SceneFolder, read_scene
 from edge_depth_nerf.scene.writer import ProcessReport
 
@@ -43,9 +44,16 @@ def _check_network(options: ProcessOptions) -> None:
         load_network(options.mono_model)
 
 
+def _has_motion(scene: SceneFolder) -> bool:
+    """Whether a scene has distances from motion, with all that today's `process` puts beside its own."""
+    source = scene.meta.get("motion")
+    own = isinstance(source, dict) and source.get("kind") == OWN_MOTION
+    return scene.has("motion") and (scene.has("motion_around") or not own)
+
+
 def _add_motion(scene: SceneFolder, options: ProcessOptions, console: Console) -> None:
     """Give the scene distances from motion, if it has none."""
-    if options.motion and not scene.has("motion"):
+    if options.motion and not _has_motion(scene):
         from edge_depth_nerf.process.motion import add_motion
 
         add_motion(scene, console)

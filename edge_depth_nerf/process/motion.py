@@ -1,6 +1,7 @@
 """Distances from motion for a scene that is written: `motion/CAMERA/0000000123.png`.
 
-Their standard deviations by parallax and confidence go to `motion_sigma/`.
+Their standard deviations by parallax and confidence go to `motion_sigma/`, and what the neighbours' distances show at a
+picture's pixels to `motion_around/`.
 
 Held-out pictures take no part, and get an empty map. Sweeps and what is confirmed of them are kept in `.cache/motion`
 until all maps are written, so that a stopped run resumes where it stopped.
@@ -28,8 +29,10 @@ from edge_depth_nerf.base.checked_cache import content_of, write_checked
 from edge_depth_nerf.base.console import progress_bars, run_jobs, say
 from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE
 from edge_depth_nerf.cameras.transforms import opencv_to_opengl
+from edge_depth_nerf.scene.format import OWN_MOTION
 from edge_depth_nerf.scene.put_maps import write_maps
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
+from edge_depth_nerf.stereo.around import seen_around
 from edge_depth_nerf.stereo.consistency import LEAST_AGREEING, MotionDistance
 from edge_depth_nerf.stereo.motion import Motion
 from edge_depth_nerf.stereo.sweep import Swept
@@ -71,26 +74,35 @@ def add_motion(scene: SceneFolder, console: Console) -> None:
     numbers = {picture.name: index for index, picture in enumerate(pictures)}
     shares: list[float] = []
 
-    def maps(sigma: bool) -> Iterator[tuple[str, Float32[np.ndarray, "_ _"]]]:
+    def around(index: int) -> MotionDistance:
+        neighbours = motion.neighbours(index)
+        theirs = [store.confirmed(other).distance_m for other in neighbours]
+        seen_m = seen_around(motion.view(index), [motion.view(other) for other in neighbours], theirs)
+        return dataclasses.replace(store.confirmed(index), distance_m=seen_m)
+
+    def maps(layer: str) -> Iterator[tuple[str, Float32[np.ndarray, "_ _"]]]:
         for picture in scene.pictures:
             size = (picture.lens.height, picture.lens.width)
             if picture.held_out:
                 yield picture.name, np.zeros(size, np.float32)
                 continue
-            found = store.confirmed(numbers[picture.name])
-            factor = working_factor(picture.lens)
-            if sigma:
+            index, factor = numbers[picture.name], working_factor(picture.lens)
+            if layer == "motion_around":
+                yield picture.name, enlarged(around(index), factor, size)
+                continue
+            found = store.confirmed(index)
+            if layer == "motion_sigma":
                 yield picture.name, enlarged_sigma(found, factor, size)
                 continue
-            used = motion.view(numbers[picture.name]).used
+            used = motion.view(index).used
             shares.append(float((found.distance_m > 0).sum() / max(1, used.sum())))
             yield picture.name, enlarged(found, factor, size)
 
-    source = {"kind": "sphere sweep"}
+    source = {"kind": OWN_MOTION}
     with progress_bars(console) as progress:
-        # a scene that has the distances has these too
-        write_maps(scene.folder, "motion_sigma", maps(sigma=True), source, progress, some_empty=True)
-        write_maps(scene.folder, "motion", maps(sigma=False), source, progress, some_empty=True)
+        # a scene that has the distances has the others too
+        for layer in ("motion_sigma", "motion_around", "motion"):
+            write_maps(scene.folder, layer, maps(layer), source, progress, some_empty=True)
     shutil.rmtree(store.folder.parent, ignore_errors=True)
     said = f"Motion gives distances for {np.mean(shares):.0%} of the pixels inside the masks of training pictures"
     if still:

@@ -25,7 +25,10 @@ POINTS = "points.ply"
 TRUST_FILE = "mono_trust.json"
 """The calibration of the prior, beside the maps that it was measured on."""
 
-LayerKind = Literal["picture", "mask", "distance", "sigma"]
+OWN_MOTION = "sphere sweep"
+"""Kind of distances from motion that `process` finds itself, in transforms.json."""
+
+LayerKind = Literal["picture", "mask", "distance", "sigma", "check"]
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,7 @@ class Layer:
     """Where `process` and `write_maps` put the files."""
     kind: LayerKind
     """picture: RGB. mask: 255 = use. distance: metres along the ray, 0 = none. sigma: standard deviation of another
-    layer's distances, metres, 0 = none."""
+    layer's distances, metres, 0 = none. check: distances that others are compared with, metres, 0 = none."""
     words: str
     """What messages call it."""
     is_truth: bool = False
@@ -52,6 +55,9 @@ LAYERS: dict[str, Layer] = {
     "mono": Layer("mono_file_path", "mono/{camera}", "distance", "monocular maps"),
     "motion": Layer("motion_file_path", "motion/{camera}", "distance", "maps from motion"),
     "motion_sigma": Layer("motion_sigma_file_path", "motion_sigma/{camera}", "sigma", "errors of maps from motion"),
+    "motion_around": Layer(
+        "motion_around_file_path", "motion_around/{camera}", "check", "maps from motion of neighbouring pictures"
+    ),
     "beams": Layer("beams_file_path", "beams/{camera}", "distance", "held-out LiDAR beams", True),
     "truth_distance": Layer("truth_distance_file_path", "truth/{camera}/distance", "distance", "true distances", True),
     "truth_rgb": Layer("truth_rgb_file_path", "truth/{camera}/rgb", "picture", "true pictures", True),
@@ -70,8 +76,9 @@ def depth_sources() -> list[str]:
 
 
 def later_layers() -> list[str]:
-    """The layers that can be put into a scene that exists: sources of depth, and what is known of their errors."""
-    return [name for name, layer in LAYERS.items() if layer.kind in ("distance", "sigma") and not layer.is_truth]
+    """The layers that can be put into a scene that exists: sources of depth, their errors, and what checks them."""
+    kinds = ("distance", "sigma", "check")
+    return [name for name, layer in LAYERS.items() if layer.kind in kinds and not layer.is_truth]
 
 
 def path_keys() -> list[str]:

@@ -39,7 +39,7 @@ from edge_depth_nerf.scene.format import (
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 FISHEYE_MODEL = "OPENCV_FISHEYE"
-_IN_METRES = ("distance", "sigma")
+_IN_METRES = ("distance", "sigma", "check")
 
 
 @dataclass(frozen=True)

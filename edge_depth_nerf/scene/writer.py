@@ -760,7 +760,7 @@ def _kept_later_maps(
                 "Those of the drive's own network are made again. Add others again with `edge-depth-nerf "
                 "estimate-depth`."
             )
-        if name in ("motion", "motion_sigma"):
+        if name in ("motion", "motion_sigma", "motion_around"):
             remedy = "They are made again, unless --no-motion is given."
         of_what = "estimated monocular maps" if name == "mono" else f"{LAYERS[name].words} put in later"
         notices.append(
