@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import pytest
 import torch
 from models import build
@@ -90,6 +94,36 @@ def test_tiles_that_are_not_full(points):
         strict=True,
     ):
         torch.testing.assert_close(slope, exact, rtol=1e-4, atol=1e-5 * float(exact.abs().max()))
+
+
+NARROW = """
+import llvmlite.binding as llvm
+import torch
+from edge_depth_nerf.kernels import hash_grid_numba, network  # Numba has read the features by now
+features = llvm.get_host_cpu_features()
+llvm.get_host_cpu_features = lambda: {**features, "avx512f": not features.get("avx512f", False)}
+from edge_depth_nerf.kernels import network_numba as compiled
+torch.manual_seed(0)
+weights, biases = [torch.randn(33, 15), torch.randn(40, 33), torch.randn(3, 40)], [torch.randn(50, 33)]
+biases += [torch.randn(1, 40), torch.randn(1, 3)]
+x, gradient = torch.randn(150, 15), torch.randn(150, 3)
+exact = [each.double().requires_grad_() for each in (x, *weights, *biases)]
+expected = network._layer_by_layer(exact[0], exact[1:4], exact[4:])
+to_x, to_weights, to_biases = compiled.backward(x, weights, biases, gradient, True)
+found = [compiled.forward(x, weights, biases), to_x, *to_weights, *to_biases]
+for each, other in zip(found, [expected, *torch.autograd.grad(expected, exact, gradient.double())], strict=True):
+    assert float((each - other).abs().max()) <= 1e-5 * float(other.abs().max())
+print("vectors of", compiled.VECTOR)
+"""
+
+
+@pytest.mark.slow
+def test_the_network_of_other_processors(tmp_path):
+    """Vectors have 16 numbers with AVX-512, else 8: here the form that this processor does not have."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", NARROW], env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split()[-1] == str(24 - network_numba.VECTOR)
 
 
 def test_one_bad_point_spoils_no_other():

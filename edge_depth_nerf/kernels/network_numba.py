@@ -238,7 +238,8 @@ def _backward(
     """
     count, room = len(widths) - 1, TILE * _filled(widths.max())
     layers, slopes = np.zeros(count * room, np.float32), np.zeros(2 * room, np.float32)
-    nothing = np.zeros(room // TILE, np.float32)
+    nothing, one = np.zeros(room // TILE, np.float32), np.ones(1, np.float32)
+    total = np.zeros(FULL * len(nothing), np.float32)
     for first in range(begin, end, TILE):
         points = min(TILE, end - first)
         _load(x, widths[0], first, points, layers, _filled(widths[0]))
@@ -251,12 +252,14 @@ def _backward(
                 *(slopes, at, 1, outputs, layers, layer * room, inputs, points, to_up, begins_up[layer], inputs),
                 *(to_up, begins_up[layer], inputs, width, inputs),
             )
-            for p in range(points):
-                if layer == 0 and len(shared) > width:
+            if layer == 0 and len(shared) > width:
+                for p in range(points):
                     of_group = min((first + p) // group * width, len(shared) - width)
                     _add(slopes, at + p * outputs, to_shared, of_group, width)
-                else:
-                    _add(slopes, at + p * outputs, to_biases, begins[len(widths) + layer], width)
+            else:
+                # 1 times each row; all rows of the result are the same
+                _multiply(one, 0, 0, 0, slopes, at, outputs, points, nothing, 0, 0, total, 0, outputs, 1, outputs)
+                _add(total, 0, to_biases, begins[len(widths) + layer], width)
             if layer == 0 and len(to_x) == 0:
                 break
             to = room - at
