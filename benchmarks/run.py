@@ -2,8 +2,8 @@
 
     python benchmarks/run.py [--work outputs/benchmark] [--results benchmarks/results.json] [--parts PART …]
 
-Parts, each of which is kept in the results, with the commit it is of, as soon as it is there and not measured again
-(remove it there, or the file, to have it anew):
+Parts, each of which is kept in the results, with the commit and the machine it is of, as soon as it is there and not
+measured again (remove it there, or the file, to have it anew):
 
     encoding     the hash grid, forward + backward, at three sizes (benchmarks/encoding.py)
     lite, full   training steps and views of the two presets (benchmarks/speed.py)
@@ -289,9 +289,6 @@ def main() -> None:
     parser.add_argument("--parts", nargs="*", default=list(parts(Path())), choices=list(parts(Path())))
     options = parser.parse_args()
     results = read_json(options.results) if options.results.is_file() else {}
-    about = speed.machine()
-    if results.setdefault("machine", about) != about:
-        sys.exit(f"{options.results}: from another machine ({results['machine']}); remove it, or choose another file.")
     for name, measure in parts(options.work.resolve()).items():
         if name in options.parts and name not in results:
             CONSOLE.rule(name)
@@ -299,7 +296,7 @@ def main() -> None:
             found = measure()
             results[name] = found
             results.setdefault("seconds", {})[name] = round(time.perf_counter() - started, 1)
-            results.setdefault("commits", {})[name] = commit()
+            results.setdefault("of", {})[name] = {"commit": commit(), **speed.machine()}
             results["sizes"] = {preset: speed.sizes_of(preset) for preset in speed.PRESETS}
             write_json(options.results, results)
     write_tables(results, [HERE.parent / "docs" / "speed.md"])

@@ -146,11 +146,12 @@ def rest(results: dict[str, Any]) -> str:
 
 
 def commits(results: dict[str, Any]) -> str:
-    """Which commit each part is of."""
-    of_commit: dict[str, list[str]] = {}
-    for part, commit in results.get("commits", {}).items():
-        of_commit.setdefault(commit, []).append(part)
-    return rows_of(["commit", "parts"], [[commit, ", ".join(names)] for commit, names in of_commit.items()])
+    """Which commit and machine each part is of."""
+    same: dict[tuple[str, str, str], list[str]] = {}
+    for part, of in results.get("of", {}).items():
+        same.setdefault((of["commit"], of["processor"], of["torch"]), []).append(part)
+    rows = [[", ".join(names), *of] for of, names in same.items()]
+    return rows_of(["parts", "commit", "processor", "torch"], rows)
 
 
 TABLES = {"commits": commits, "summary": summary, "trainers": trainers, "growth": growth, "data": data, "rest": rest}
