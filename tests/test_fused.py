@@ -71,6 +71,7 @@ def test_the_network_in_tiles(widths, groups, threads):
     torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=1e-4)
     for each, other in zip(gradients, torch.autograd.grad(expected, exact, gradient.double()), strict=True):
         assert float((each - other).abs().max()) <= 1e-5 * float(other.abs().max())
+    assert all(each.is_contiguous() for each in gradients)
     with torch.no_grad():
         assert torch.equal(network(x, weights, biases), found)
     # as it is on a GPU

@@ -316,9 +316,12 @@ def _flat(values: Tensor) -> np.ndarray:
 
 
 def _unpacked(packed: np.ndarray, begins: np.ndarray, shapes: Sequence[Sequence[int]]) -> list[Tensor]:
-    """Give matrices without what their rows were filled up with."""
+    """Give matrices without what their rows were filled up with.
+
+    Contiguous: torch's fused Adam reads a gradient as if it had its parameter's strides.
+    """
     return [
-        torch.from_numpy(packed[begin:end].reshape(rows, -1)[:, :columns])
+        torch.from_numpy(np.ascontiguousarray(packed[begin:end].reshape(rows, -1)[:, :columns]))
         for (begin, end), (rows, columns) in zip(pairwise(begins), shapes, strict=True)
     ]
 
