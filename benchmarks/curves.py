@@ -2,8 +2,8 @@
 
     python benchmarks/curves.py
 
-Reads the kept runs of the real drive (`real_drive_curves.json.xz`) and of the unseen rendered drives (`unseen.json.xz`)
-and writes the table of docs/speed.md, after a fifth, half and all of ours' seconds, and
+Reads the kept runs of the real drive (`real_drive.json.xz`, `real_drive_seconds.json.xz`) and of the unseen rendered
+drives (`unseen.json.xz`) and writes the table of docs/speed.md, after a fifth, half and all of ours' seconds, and
 docs/speed_curves.svg. All methods run in the same kernels on the CPU. The best rival without extras is there twice: for
 as many steps as ours, and for as many as ours' seconds allow, its learning rates falling over these. A method that ends
 before ours keeps its last PSNR.
@@ -57,15 +57,16 @@ class Drives:
 
 def kept(folder: Path = HERE) -> list[Drives]:
     """The kept runs."""
-    found = []
-    for title, file, parts in (
-        ("real drive", "real_drive_curves", ("compared", "half_ds-nerf_")),
-        ("rendered drives", "unseen", ("claims", "seconds")),
-    ):
-        every = results_of(folder / f"{file}.json.xz").runs
-        of_part = [Results([run for run in every if run.folder.parts[0].startswith(part)]) for part in parts]
-        found.append(Drives(title, *of_part))
-    return found
+    unseen = results_of(folder / "unseen.json.xz").runs
+    of_part = {part: [run for run in unseen if run.folder.parts[0] == part] for part in ("claims", "seconds")}
+    return [
+        Drives(
+            "real drive",
+            results_of(folder / "real_drive.json.xz"),
+            results_of(folder / "real_drive_seconds.json.xz"),
+        ),
+        Drives("rendered drives", Results(of_part["claims"]), Results(of_part["seconds"])),
+    ]
 
 
 def our_seconds(drives: Drives) -> dict[str, float]:
