@@ -32,8 +32,8 @@ from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.results import Results, read_results
 from edge_depth_nerf.compare.tables import make_tables, page_of_tables
 
-DRIVES = {"street": 101, "parking": 102, "turn": 103, "roundabout": 104}
-"""Kinds of drives and their seeds."""
+DRIVES = {"street": 301, "parking": 302, "turn": 303, "roundabout": 304}
+"""Kinds of drives and their seeds; written down before any was made. 101 to 104 showed a fault that is corrected."""
 TUNING = "tune_street"
 SEQUENCE = "2013_05_28_drive_0000_sync"
 CLAIMED: tuple[MethodName, ...] = ("nerfacto", "ds-nerf-integrated-extras", "edge-paper", "edge")
