@@ -3,8 +3,10 @@
     python benchmarks/unseen.py --drives drives --scenes scenes --grid grid --output unseen
 
 It goes on from the grid of docs/results.md: `--drives` and `--scenes` hold its drives, `--grid` is its folder, whose
-search gives λ and σ. Methods that the grid lacks are searched on the same tuning drive, alike; the spatial Gaussian has
-λ and σ of ours, so that the kernel is the only difference. Then, in folders of their own under `--output`:
+search gives λ and σ, and whose runs say which rivals are the best. Methods that the grid lacks are searched on the same
+tuning drive, alike; the spatial Gaussian has λ and σ of ours, so that the kernel is the only difference. With
+`--kept-search` nothing is searched: λ and σ are those of the searches that the repository keeps, and the grid's cells
+are trained with them, if they are not yet. Then, in folders of their own under `--output`:
 
     claims       nerfacto, the best rival of the grid, the literal method and ours: 2,000 steps, three seeds
     seconds      the grid's best rival without extras, for as many steps as ours' processor seconds allow
@@ -24,22 +26,21 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from commands import command
+from kept_runs import results_of
 
 from edge_depth_nerf.base.files import read_json_object, write_json, write_text
 from edge_depth_nerf.compare.command import RUNS
-from edge_depth_nerf.compare.methods import METHODS
+from edge_depth_nerf.compare.grid import BEST_OF_ALL, BEST_WITHOUT_EXTRAS, best_rivals
+from edge_depth_nerf.compare.methods import GRID, METHODS
 from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.results import Results, read_results
+from edge_depth_nerf.compare.search import grids
 from edge_depth_nerf.compare.tables import make_tables, page_of_tables
 
 DRIVES = {"street": 301, "parking": 302, "turn": 303, "roundabout": 304}
 """Kinds of drives and their seeds; written down before any was made. 101 to 104 showed a fault that is corrected."""
 TUNING = "tune_street"
 SEQUENCE = "2013_05_28_drive_0000_sync"
-CLAIMED: tuple[MethodName, ...] = ("nerfacto", "ds-nerf-integrated-extras", "edge-paper", "edge")
-"""What the claims are about; the second is the best rival of the grid, with all that it can use."""
-WITHOUT_EXTRAS: MethodName = "urban-nerf-integrated"
-"""The best rival of the grid without extras."""
 BESIDE_THE_GRID: tuple[MethodName, ...] = (
     "edge-mono",
     "edge-gaussian",
@@ -48,10 +49,14 @@ BESIDE_THE_GRID: tuple[MethodName, ...] = (
 )
 SEARCHED: tuple[MethodName, ...] = ("edge-paper", "edge-mono", "urban-nerf-los-integrated", "urban-nerf-los")
 """Those whose λ and σ the grid's search did not look for."""
-SIMULATED: tuple[MethodName, ...] = (WITHOUT_EXTRAS, "edge")
 LARGE: tuple[MethodName, ...] = ("nerfacto", "edge-paper", "edge")
 FOLDERS = ("claims", "seconds", "tables", "simulated", "large")
 STEPS, GRIDS_STEPS = 2000, 1000
+CELLS: tuple[MethodName, ...] = tuple(
+    name for cell, name in GRID.items() if cell.loss != "urban-nerf-los" and name != "nerfacto-lidar-extras"
+)
+"""The cells of the grid on docs/results.md: LiDAR shows no sky, so without a loss it has little to give."""
+KEPT_SEARCHES = [Path(__file__).with_name(f"{name}_search.json.xz") for name in ("grid", "unseen")]
 IN_SECONDS = {
     "PSNR": ("truth_masked_psnr", ".2f"),
     "SSIM": ("truth_masked_ssim", ".3f"),
@@ -66,12 +71,30 @@ def ours(*words: object) -> None:
     command("edge-depth-nerf", *words, shown=True)
 
 
+def claimed(grid: Results) -> tuple[MethodName, ...]:
+    """What the claims are about: the best rival is the grid's, with all that it can use."""
+    return ("nerfacto", best_rivals(grid)[BEST_OF_ALL], "edge-paper", "edge")
+
+
+def without_extras(grid: Results) -> MethodName:
+    """The best rival of the grid without extras."""
+    return best_rivals(grid)[BEST_WITHOUT_EXTRAS]
+
+
 def write_tuned(grid: Path, search: Path, path: Path) -> Path:
     """Write λ and σ of all methods: the grid's, those of the further search, and ours' for the spatial Gaussian."""
     tuned = read_json_object(grid / "search" / "tuned.json")
     tuned["methods"] |= read_json_object(search / "tuned.json")["methods"]
     tuned["methods"]["edge-gaussian"] = tuned["methods"]["edge"]
     write_json(path, tuned)
+    return path
+
+
+def write_kept(path: Path) -> Path:
+    """Write λ and σ of all methods as the searches found them that the repository keeps."""
+    best = {grid.method: grid.best for file in KEPT_SEARCHES for grid in grids(results_of(file))}
+    best["edge-gaussian"] = best["edge"]
+    write_json(path, {"methods": {name: {"lambda": each[0], "sigma_m": each[1]} for name, each in best.items()}})
     return path
 
 
@@ -82,7 +105,7 @@ def processor_seconds(results: Results, method: MethodName) -> float:
 
 def steps_in_our_seconds(grid: Results) -> int:
     """How many steps the best rival without extras does in ours' 2,000, by the grid's seconds, in fifties upwards."""
-    ratio = processor_seconds(grid, "edge") / processor_seconds(grid, WITHOUT_EXTRAS)
+    ratio = processor_seconds(grid, "edge") / processor_seconds(grid, without_extras(grid))
     return 50 * math.ceil(STEPS * ratio / 50)
 
 
@@ -94,7 +117,8 @@ def of(runs: Results, methods: Iterable[MethodName], seeds: Iterable[int] | None
 
 def seconds_table(claims: Results, longer: Results) -> Iterator[str]:
     """Ours and the rival after as many processor seconds, drive by drive, as Markdown."""
-    both = {METHODS[WITHOUT_EXTRAS].title: longer, METHODS["edge"].title: of(claims, ["edge"], longer.seeds())}
+    rival = longer.methods()[0]
+    both = {METHODS[rival].title: longer, METHODS["edge"].title: of(claims, ["edge"], longer.seeds())}
     yield "| | " + " | ".join(["drive", *IN_SECONDS, "steps", "processor seconds"]) + " |"
     yield "|---" * (len(IN_SECONDS) + 4) + "|"
     for scene in [*longer.scenes(), "average"]:
@@ -137,7 +161,7 @@ def page(parts: dict[str, Results], grid: Results) -> str:
     kernels = Results([*of(one_seed, ["edge"]).runs, *of(beside, ["edge-gaussian"]).runs])
     add("Kernels: pictures", kernels, "4")
     add("Kernels: geometry", kernels, "5, average")
-    forms = of(grid, ["urban-nerf", WITHOUT_EXTRAS], [0])
+    forms = of(grid, ["urban-nerf", "urban-nerf-integrated"], [0])
     of_sight = of(beside, [name for name in BESIDE_THE_GRID if name.startswith("urban-nerf")])
     add("Line of sight", Results([*forms.runs, *of_sight.runs]), "5, average")
     add("Simulated maps: pictures", parts["simulated"], "1")
@@ -160,38 +184,47 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=Path, required=True, help=words)
     parser.add_argument("--output", type=Path, default=Path("outputs/unseen"))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--kept-search", action="store_true", help="λ and σ of the searches in the repository")
     parser.add_argument("--jobs", type=int, default=1, help="trainings at a time")
     options = parser.parse_args()
     out = options.output
     names = [f"{kind}_{seed}" for kind, seed in DRIVES.items()]
     scenes = [options.scenes / name for name in names]
-    ours(
-        *("compare", options.scenes / TUNING, "--search", "--methods", *SEARCHED, "--steps", 200),
-        *("--lambdas", 0.0003, 0.003, 0.03, 0.3, "--sigmas-m", "own", 0.05, 0.3, 1.0),
-        *("--jobs", options.jobs, "--output", out / "search"),
-    )
-    tuned = write_tuned(options.grid, out / "search", out / "tuned.json")
 
-    def compare(folder: str, where: Iterable[Path], methods: Iterable[MethodName], steps: int, *seeds: int) -> None:
+    def compare(folder: Path, where: Iterable[Path], methods: Iterable[MethodName], steps: int, *seeds: int) -> None:
         of_run = ("--steps", steps, "--seeds", *(seeds or (0,)), "--tuned", tuned, "--jobs", options.jobs)
-        ours("compare", *where, "--methods", *methods, *of_run, "--output", out / folder)
+        ours("compare", *where, "--methods", *methods, *of_run, "--output", folder)
 
+    if options.kept_search:
+        tuned = write_kept(out / "tuned.json")
+        compare(options.grid / "comparison", scenes, CELLS, GRIDS_STEPS)
+    else:
+        ours(
+            *("compare", options.scenes / TUNING, "--search", "--methods", *SEARCHED, "--steps", 200),
+            *("--lambdas", 0.0003, 0.003, 0.03, 0.3, "--sigmas-m", "own", 0.05, 0.3, 1.0),
+            *("--jobs", options.jobs, "--output", out / "search"),
+        )
+        tuned = write_tuned(options.grid, out / "search", out / "tuned.json")
     grid = read_results(options.grid / "comparison" / RUNS)
-    for seed in options.seeds:
+
+    compare(out / "claims", scenes, claimed(grid), STEPS, options.seeds[0])
+    compare(out / "seconds", scenes, [without_extras(grid)], steps_in_our_seconds(grid))
+    compare(out / "tables", scenes, BESIDE_THE_GRID, GRIDS_STEPS)
+    for seed in options.seeds[1:]:
         # a seed is whole before the next begins: a stopped benchmark has a table of those it has
-        compare("claims", scenes, CLAIMED, STEPS, seed)
-    compare("seconds", scenes, [WITHOUT_EXTRAS], steps_in_our_seconds(grid))
-    compare("tables", scenes, BESIDE_THE_GRID, GRIDS_STEPS)
+        compare(out / "claims", scenes, claimed(grid), STEPS, seed)
     process = ("process", "kitti360", "--sequence", SEQUENCE)
+    street = f"street_{DRIVES['street']}_700"
+    large = ("--scene", "street", "--seed", DRIVES["street"], "--frames", 24, "--size", 700)
+    ours("synthesize", "--output", out / "drive_700", *large)
+    ours(*process, "--root", out / "drive_700", "--output", out / street)
+    compare(out / "large", [out / street], LARGE, STEPS)
     for name in names:
         raw = options.drives / name
         maps = ("--mono", raw / "simulated_mono" / SEQUENCE)
         ours(*process, "--root", raw, *maps, "--output", out / "simulated_scenes" / name)
-    compare("simulated", [out / "simulated_scenes" / name for name in names], SIMULATED, GRIDS_STEPS)
-    large = ("--scene", "street", "--seed", DRIVES["street"], "--frames", 24, "--size", 700)
-    ours("synthesize", "--output", out / "drive_700", *large)
-    ours(*process, "--root", out / "drive_700", "--output", out / "street_101_700")
-    compare("large", [out / "street_101_700"], LARGE, STEPS)
+    simulated = [out / "simulated_scenes" / name for name in names]
+    compare(out / "simulated", simulated, [without_extras(grid), "edge"], GRIDS_STEPS)
     parts = {folder: read_results(out / folder / RUNS) for folder in FOLDERS}
     write_text(out / "table.md", page(parts, grid))
 

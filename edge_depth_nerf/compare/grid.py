@@ -27,6 +27,7 @@ from edge_depth_nerf.report.tables import Cell as Figure
 from edge_depth_nerf.report.tables import MadeTable, Metric, Row, mark_best, mean_and_spread
 from edge_depth_nerf.scene.format import read_transforms
 
+BEST_WITHOUT_EXTRAS, BEST_OF_ALL = "the best rival without extras", "the best rival of all"
 NOTE = "dB: the gain in PSNR. AbsRel ×: AbsRel divided by the other's; below 1 is better."
 
 
@@ -125,22 +126,29 @@ def _extras_rows(judged: _Judged) -> list[Row]:
     return _with_mean(rows)
 
 
+def best_rivals(results: Results) -> dict[str, MethodName]:
+    """nerfacto, and of all cells with another loss than the edge loss those of the best mean PSNR, by what they are."""
+    return _best_rivals(_Judged(results))
+
+
+def _best_rivals(judged: _Judged) -> dict[str, MethodName]:
+    rivals: list[tuple[Cell, MethodName]] = [(cell, name) for cell, name in judged.cells.items() if cell.loss != "edge"]
+    candidates: dict[str, list[MethodName]] = {
+        "nerfacto": [name for cell, name in rivals if cell == Cell("none", None, False)],
+        BEST_WITHOUT_EXTRAS: [name for cell, name in rivals if not cell.extras],
+        BEST_OF_ALL: [name for _, name in rivals],
+    }
+    return {words: max(names, key=judged.mean_psnr) for words, names in candidates.items() if names}
+
+
 def _whole_rows(judged: _Judged) -> list[Row]:
     whole = judged.name("edge", "integrated", True)
     if whole is None:
         return []
-    rivals: list[tuple[Cell, MethodName]] = [(cell, name) for cell, name in judged.cells.items() if cell.loss != "edge"]
-    candidates: dict[str, list[MethodName]] = {
-        "nerfacto": [name for cell, name in rivals if cell == Cell("none", None, False)],
-        "the best rival without extras": [name for cell, name in rivals if not cell.extras],
-        "the best rival of all": [name for _, name in rivals],
-    }
     rows = []
-    for words, names in candidates.items():
-        if names:
-            best = max(names, key=judged.mean_psnr)
-            named = "" if words == "nerfacto" else f", {_in_words(best)}"
-            rows.append(judged.row(f"over {words}{named}", whole, best))
+    for words, best in _best_rivals(judged).items():
+        named = "" if words == "nerfacto" else f", {_in_words(best)}"
+        rows.append(judged.row(f"over {words}{named}", whole, best))
     return rows
 
 
