@@ -15,6 +15,7 @@ from scenes import write_scene
 from trainings import trainer_of
 
 from edge_depth_nerf.jobs.runs import newest_checkpoint
+from edge_depth_nerf.kernels.threads import kernel_threads
 from edge_depth_nerf.plugin.grad_scaler import PatientGradScaler
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
 from edge_depth_nerf.plugin.trainer import EdgeDepthTrainer
@@ -82,6 +83,28 @@ def test_lambda_falls_over_the_whole_training_also_of_one_taken_up_again(trainer
     assert isinstance(model, EdgeDepthNerfModel)
     share = 0.01 ** ((2 * STEPS - 1) / (2 * STEPS))
     assert model._depth_weight() == pytest.approx(whole.config.depth_loss_mult * share)
+
+
+def test_in_a_step_torch_has_one_thread_and_the_kernels_have_all(trainer, monkeypatch):
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    seen = []
+    given = trainer.pipeline.get_train_loss_dict
+
+    def watched(*, step: int):
+        seen.append((torch.get_num_threads(), kernel_threads()))
+        return given(step=step)
+
+    monkeypatch.setattr(trainer.pipeline, "get_train_loss_dict", watched)
+    try:
+        trainer.train_iteration(0)
+        # nerfstudio's own code in torch is left as it is
+        trainer.pipeline.model.fused = False
+        trainer.train_iteration(1)
+        assert seen == [(1, 3), (3, 3)]
+        assert torch.get_num_threads() == kernel_threads() == 3
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_ctrl_c_in_the_last_step_leaves_nothing_to_go_on_with(trainer, monkeypatch, capsys):

@@ -29,6 +29,7 @@ from numba.extending import intrinsic
 from torch import Tensor
 
 from edge_depth_nerf.kernels.compiled import compiled
+from edge_depth_nerf.kernels.threads import kernel_threads
 
 TILE = 64
 """Points worked on together: their rows of the table, 32 kB at most, stay in the nearest cache."""
@@ -228,7 +229,7 @@ def _pool(process: int, threads: int) -> ThreadPoolExecutor:
 
 
 def _threads(points: int, levels: int) -> int:
-    return max(1, min(torch.get_num_threads(), points * levels // LEAST_SHARE))
+    return max(1, min(kernel_threads(), points * levels // LEAST_SHARE))
 
 
 def share_out(work: Callable[[Any], None], shares: list[Any]) -> None:

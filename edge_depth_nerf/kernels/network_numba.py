@@ -26,6 +26,7 @@ from torch import Tensor
 
 from edge_depth_nerf.kernels.compiled import compiled
 from edge_depth_nerf.kernels.hash_grid_numba import share_out, stretches
+from edge_depth_nerf.kernels.threads import kernel_threads
 
 TILE = 96
 """Points worked on together, a multiple of 16."""
@@ -307,7 +308,7 @@ class _Arrays:
 
     def parts(self) -> list[tuple[int, int]]:
         """Equal parts of the points for the threads, of whole groups."""
-        threads = max(1, min(torch.get_num_threads(), self.points // LEAST_SHARE))
+        threads = max(1, min(kernel_threads(), self.points // LEAST_SHARE))
         return [(first * self.step, last * self.step) for first, last in stretches(self.points // self.step, threads)]
 
 

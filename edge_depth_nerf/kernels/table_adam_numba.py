@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import no_type_check
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from edge_depth_nerf.kernels.compiled import compiled
 from edge_depth_nerf.kernels.hash_grid_numba import share_out, stretches
+from edge_depth_nerf.kernels.threads import kernel_threads
 
 LEAST_SHARE = 1 << 18
 """A thread gets at least so many numbers."""
@@ -57,7 +57,7 @@ def adam(
         eps: added to √v / spread.
 
     """
-    threads = max(1, min(torch.get_num_threads(), len(values) // LEAST_SHARE))
+    threads = max(1, min(kernel_threads(), len(values) // LEAST_SHARE))
     numbers = (beta1, beta2, rate, spread, eps)
     arrays = (values, gradient, mean, square)
     parts = [[each[first:last] for each in arrays] for first, last in stretches(len(values), threads)]

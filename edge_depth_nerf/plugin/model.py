@@ -244,7 +244,7 @@ class EdgeDepthNerfModel(NerfactoModel):
             let_idle_threads_sleep()
         # nerfstudio knows two of them; the model's own configuration says which was built
         self.config = replace(self.config, implementation="tcnn" if implementation == "tcnn" else "torch")
-        self._fused = implementation == "fused"
+        self.fused = implementation == "fused"
         if self.config.exposure != "embedding":
             self.config.use_appearance_embedding = False
         self._has_sky = self.config.depth_loss != "none" and self.config.sky_background
@@ -404,7 +404,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         every = RayBundle(origins, directions, areas, pictures)
         at = torch.cat(distances)[:, None, None]
         samples = every.get_ray_samples(bin_starts=0.99 * at, bin_ends=1.01 * at)
-        return fused(samples) if self._fused else samples
+        return fused(samples) if self.fused else samples
 
     def _fields(self, parts: list[RaySamples]) -> list[dict[FieldHeadNames, Tensor]]:
         """The field at several sets of samples."""
@@ -458,7 +458,7 @@ class EdgeDepthNerfModel(NerfactoModel):
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
         """Nerfacto's metrics and, in training, the share of rays with a prior."""
-        if self.training and self._fused:
+        if self.training and self.fused:
             rendered = outputs["rgb"]
             metrics = {
                 "psnr": self.psnr(rendered, self.renderer_rgb.blend_background(batch["image"].to(self.device))),
@@ -477,7 +477,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Any] | None = None
     ) -> dict[str, Tensor]:
         """Nerfacto's losses and the one on the distance prior: L_color + λ·L_edge."""
-        if self.training and self._fused and metrics_dict is not None and not self.config.predict_normals:
+        if self.training and self.fused and metrics_dict is not None and not self.config.predict_normals:
             losses = self._nerfacto_losses(outputs, batch, metrics_dict)
         else:
             losses = super().get_loss_dict(outputs, batch, metrics_dict)

@@ -9,7 +9,7 @@ import shutil
 import signal
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
@@ -24,6 +24,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from edge_depth_nerf.base.errors import STOPPED_STATUS, InputError
 from edge_depth_nerf.base.files import remove_leftovers, write_text
 from edge_depth_nerf.jobs.runs import checkpoints_in, newest_checkpoint
+from edge_depth_nerf.kernels.threads import torch_on_one_thread
 from edge_depth_nerf.plugin.compat import count_steps_against_all, ignore_deprecations_of_host, total_steps
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig, transforms_path
 from edge_depth_nerf.plugin.grad_scaler import PatientGradScaler
@@ -165,12 +166,17 @@ class EdgeDepthTrainer(Trainer):
 
         """
         try:
-            with self._interruption.put_off():
+            with self._interruption.put_off(), self._threads():
                 result = super().train_iteration(step)
                 self._last_step = step
             return result
         except NotFiniteError as error:
             raise InputError(f"{error} {self._kept()}") from error
+
+    def _threads(self) -> AbstractContextManager[None]:
+        """Give the fused kernels on the CPU the threads, and torch one."""
+        fused = self.device == "cpu" and getattr(self.pipeline.model, "fused", False)
+        return torch_on_one_thread() if fused else nullcontext()
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
