@@ -349,7 +349,7 @@ def counted_view(gpu: FakeGpu, trainer: Any) -> Counts:
 
 def counted(case: str, scene: Path, folder: Path) -> dict[str, Any]:
     """Count a case, in a process that was started by `in_a_process`."""
-    from edge_depth_nerf.kernels.triton_back_end import working
+    from edge_depth_nerf.kernels.back_ends import working
 
     working.cache_clear()  # as in a new process: a view may be the first that needs the kernels
     method, changes = CASES[case]

@@ -10,12 +10,12 @@ from interpreted import NEEDS_A_GPU, in_interpreter, on_a_gpu
 
 def check_places() -> None:
     """Near and far, on borders, no numbers; no multiple of what a program works on, and no point at all."""
-    from edge_depth_nerf.kernels import contraction, contraction_triton
+    from edge_depth_nerf.kernels import contraction_numba, contraction_triton
 
     at = torch.tensor([-30.0, -2.0, -1.0, -0.5, 0.0, 0.3, 1.0, 1e6, 1e30, float("nan")])
     x = torch.cat([torch.cartesian_prod(at, at, at), 3 * torch.randn(300, 3)])
     usable = ~x.isnan().any(1)
-    (places, inside), (expected, marked) = (module.contract(x) for module in (contraction_triton, contraction))
+    (places, inside), (expected, marked) = (module.contract(x) for module in (contraction_triton, contraction_numba))
     assert torch.equal(inside[usable], marked[usable]) and 0 < int(inside.sum()) < len(x)
     torch.testing.assert_close(places[usable], expected[usable], rtol=2e-7, atol=0)
     assert not inside[~usable].any() and places[~usable].isnan().any(1).all()

@@ -21,7 +21,7 @@ from edge_depth_nerf.kernels.fields import CubeContraction
 from edge_depth_nerf.kernels.fused_hash_grid import FusedHashEncoding, use_fused_encodings
 from edge_depth_nerf.kernels.hash_grid import back_end
 from edge_depth_nerf.kernels.table_adam import TableAdam
-from edge_depth_nerf.kernels.triton_back_end import working
+from edge_depth_nerf.kernels.back_ends import working
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
 
 SIZES = {

@@ -18,7 +18,7 @@ from nerfstudio.model_components.ray_samplers import PDFSampler, UniformLinDispP
 
 from edge_depth_nerf.kernels import hash_grid_numba, network_numba
 from edge_depth_nerf.kernels import network as network_module
-from edge_depth_nerf.kernels.contraction import contract
+from edge_depth_nerf.kernels.contraction_numba import contract
 from edge_depth_nerf.kernels.fields import FusedMLP, FusedNerfactoField, use_fused_fields
 from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss, proposal_loss
 from edge_depth_nerf.kernels.network import network

@@ -12,7 +12,7 @@ from ahead_of_time import ARCHITECTURES, compiled
 from interpreted import NEEDS_A_GPU, assert_near, in_interpreter, on_a_gpu
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from edge_depth_nerf.kernels import triton_back_end
+from edge_depth_nerf.kernels import back_ends
 from edge_depth_nerf.kernels.fields import use_fused_fields
 
 WIDTHS = ((32, 64, 16), (15, 64, 64, 3), (10, 16, 1))
@@ -162,17 +162,17 @@ def test_compiled_without_spills(architecture, tmp_path):
 def test_it_is_off_unless_it_is_asked_for(monkeypatch):
     """And serves what autocast would compute in float16 on CUDA."""
     asked = []
-    monkeypatch.setattr(triton_back_end, "working", lambda *given: asked.append(given))
+    monkeypatch.setattr(back_ends, "working", lambda *given: asked.append(given))
     weights, _ = layers((32, 64, 16))
     with FakeTensorMode():
         x = torch.empty(4, 32, device="cuda")
     monkeypatch.setattr(torch, "get_autocast_dtype", lambda _: torch.float16)
     for chosen, half, expected in ((None, True, 0), ("torch", True, 0), ("triton", False, 0), ("triton", True, 1)):
-        monkeypatch.setenv(triton_back_end.NETWORK, chosen or "")
+        monkeypatch.setenv(back_ends.NETWORK, chosen or "")
         monkeypatch.setattr(torch, "is_autocast_enabled", lambda _, half=half: half)
-        assert triton_back_end.of_network(x, weights) is None
+        assert back_ends.of_network(x, weights) is None
         assert len(asked) == expected
-    assert triton_back_end.of_network(torch.empty(4, 32), weights) is None
+    assert back_ends.of_network(torch.empty(4, 32), weights) is None
     assert [module for module, *_ in asked] == ["network_triton"]
 
 
@@ -198,8 +198,8 @@ def test_the_encoding_joins_the_network_where_no_gradient_is_followed(chosen, mo
 
     stand_in = ModuleType("stand_in")
     monkeypatch.setattr(stand_in, "encoded_network", joined, raising=False)
-    monkeypatch.setenv(triton_back_end.NETWORK, chosen)
-    monkeypatch.setattr(triton_back_end, "of_network", lambda *_: stand_in)
+    monkeypatch.setenv(back_ends.NETWORK, chosen)
+    monkeypatch.setattr(back_ends, "of_network", lambda *_: stand_in)
     torch.testing.assert_close(base(places), expected)
     assert not called
     with torch.no_grad():

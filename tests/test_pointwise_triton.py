@@ -8,7 +8,7 @@ from ahead_of_time import ARCHITECTURES, compiled
 from interpreted import NEEDS_A_GPU, assert_near, in_interpreter, moved_in_interpreter, on_a_gpu
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from edge_depth_nerf.kernels import triton_back_end
+from edge_depth_nerf.kernels import back_ends
 
 SIZES = ((1, 1), (5, 17), (33, 49), (3, 256), (7, 300))
 """Rays and samples, of which few are multiples of what a program works on."""
@@ -142,14 +142,14 @@ def test_compiled_without_spills(architecture, tmp_path):
 def test_what_the_kernels_serve(monkeypatch):
     """float32 on a GPU, where nobody asks for a gradient."""
     asked = []
-    monkeypatch.setattr(triton_back_end, "working", lambda *given: asked.append(given))
+    monkeypatch.setattr(back_ends, "working", lambda *given: asked.append(given))
     with FakeTensorMode():
         x = torch.empty(4, 3, device="cuda")
         followed, half = torch.empty(4, 3, device="cuda", requires_grad=True), x.half()
     for given in ((x.cpu(),), (x, half), (x, followed)):
-        assert triton_back_end.by_number(*given) is None
+        assert back_ends.by_number(*given) is None
     assert not asked
-    triton_back_end.by_number(x, x)
+    back_ends.by_number(x, x)
     with torch.no_grad():
-        triton_back_end.by_number(followed)
+        back_ends.by_number(followed)
     assert [module for module, *_ in asked] == ["pointwise_triton"] * 2

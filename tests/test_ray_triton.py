@@ -14,7 +14,7 @@ from ahead_of_time import ARCHITECTURES, compiled
 from interpreted import NEEDS_A_GPU, assert_near, in_interpreter, on_a_gpu
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from edge_depth_nerf.kernels import triton_back_end
+from edge_depth_nerf.kernels import back_ends
 
 SIZES = ((2, 1), (5, 16), (33, 17), (9, 48), (3, 256), (2, 300))
 """Rays and samples, of which few are multiples of what a program works on."""
@@ -82,7 +82,7 @@ def check_weights_of_what_is_not_finite() -> None:
 
 
 def check_places() -> None:
-    from edge_depth_nerf.kernels import ray_kernels, ray_triton
+    from edge_depth_nerf.kernels import ray_numba, ray_triton
 
     for rays, samples in SIZES:
         for places, padding in ((1, 0.01), (17, 0.0), (49, 0.01)):
@@ -92,7 +92,7 @@ def check_places() -> None:
             wanted = torch.rand(rays, places).sort(dim=1)[0]
             wanted[0, 0], wanted[-1, -1] = 0, 1
             placed = ray_triton.place_samples(weights, edges, wanted, padding, 1e-5)
-            expected = ray_kernels.place_samples(weights, edges, wanted, padding, 1e-5)
+            expected = ray_numba.place_samples(weights, edges, wanted, padding, 1e-5)
             assert_near(placed, expected, 1e-6)
             # in the same order, but for rounding
             assert not bool((placed.diff() < -1e-6).any())
@@ -113,12 +113,12 @@ def exact_bound_loss(edges, weights, outer_edges, outer_weights) -> torch.Tensor
 
 
 def check_the_proposal_loss() -> None:
-    from edge_depth_nerf.kernels import ray_kernels, ray_triton
+    from edge_depth_nerf.kernels import ray_numba, ray_triton
 
     for (rays, samples), intervals in zip(SIZES, (1, 7, 64, 96, 257, 31), strict=True):
         edges, weights, outer_edges, outer_weights = histograms(rays, samples, intervals)
         outer_weights.requires_grad_()
-        forms = exact_bound_loss, ray_triton.bound_loss, ray_kernels.bound_loss
+        forms = exact_bound_loss, ray_triton.bound_loss, ray_numba.bound_loss
         losses = [form(edges, weights, outer_edges, outer_weights) for form in forms]
         gradients = [torch.autograd.grad(3 * loss, outer_weights)[0] for loss in losses]
         # the CPU's takes differences of cumulative sums, which have lost digits
@@ -132,7 +132,7 @@ def check_the_proposal_loss() -> None:
         loss = ray_triton.bound_loss(edges, weights, outer_edges, column_major)
         assert torch.equal(torch.autograd.grad(3 * loss, column_major)[0], gradients[1])
     weights[1] = float("nan")  # of such a ray neither form adds anything
-    losses = [module.bound_loss(edges, weights, outer_edges, outer_weights) for module in (ray_kernels, ray_triton)]
+    losses = [module.bound_loss(edges, weights, outer_edges, outer_weights) for module in (ray_numba, ray_triton)]
     assert float(losses[0].detach()) > 0
     assert float(losses[1].detach()) == pytest.approx(float(losses[0].detach()), rel=1e-5)
     nothing = ray_triton.bound_loss(edges[:0], weights[:0], outer_edges[:0], outer_weights[:0])
@@ -237,16 +237,16 @@ def test_a_kernel_that_fails_is_left_to_torch(monkeypatch):
     contents = {"whole": {"try_out": lambda _: tried.append("whole")}, "broken": {"try_out": fail}}
     modules = {name: module_with(name, **each) for name, each in contents.items()}
     for name in modules:
-        monkeypatch.setitem(triton_back_end.MODULES, name, partial(modules.__getitem__, name))
-    triton_back_end.working.cache_clear()
+        monkeypatch.setitem(back_ends.MODULES, name, partial(modules.__getitem__, name))
+    back_ends.working.cache_clear()
     device = torch.device("cuda")
-    assert triton_back_end.working("whole", torch.device("cpu"), "sum") is None and not tried
-    assert triton_back_end.working("whole", device, "sum") is modules["whole"]
+    assert back_ends.working("whole", torch.device("cpu"), "sum") is None and not tried
+    assert back_ends.working("whole", device, "sum") is modules["whole"]
     with pytest.warns(UserWarning, match="fused sum does not work on cuda .RuntimeError: no compiler"):
-        assert triton_back_end.working("broken", device, "sum") is None
-    assert triton_back_end.working("broken", device, "sum") is None
+        assert back_ends.working("broken", device, "sum") is None
+    assert back_ends.working("broken", device, "sum") is None
     assert tried == ["whole", "cuda"]
-    triton_back_end.working.cache_clear()
+    back_ends.working.cache_clear()
 
 
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
@@ -269,30 +269,30 @@ def test_a_rendering_may_be_the_first_that_needs_the_kernels(monkeypatch, mode):
 
     asked, slopes = [], []
     module = module_with("module", try_out=try_out)
-    monkeypatch.setitem(triton_back_end.MODULES, "module", lambda: module)
+    monkeypatch.setitem(back_ends.MODULES, "module", lambda: module)
     before = sys.gettrace()
     with mode():
         sys.settrace(traced)
         try:
-            found = triton_back_end.working("module", torch.device("cuda"), "sum")
+            found = back_ends.working("module", torch.device("cuda"), "sum")
         except Interrupted:
             found = None  # after the trial, where it is a rendering that ends
         finally:
             sys.settrace(before)
     assert [float(slope) for slope in slopes] == [2.0]
-    assert (found or triton_back_end.working("module", torch.device("cuda"), "sum")) is module
-    triton_back_end.working.cache_clear()
+    assert (found or back_ends.working("module", torch.device("cuda"), "sum")) is module
+    back_ends.working.cache_clear()
 
 
 def test_what_the_kernels_along_rays_serve(monkeypatch):
     """float32 on CUDA, and rays that stay on the chip."""
     kernels = module_with("kernels", fits=lambda *samples: max(samples) <= 2048)
-    monkeypatch.setattr(triton_back_end, "working", lambda *_: kernels)
+    monkeypatch.setattr(back_ends, "working", lambda *_: kernels)
 
     def served(*columns: int, device: str = "cuda", dtype: torch.dtype = torch.float32) -> bool:
         with FakeTensorMode():
             matrices = [torch.empty(4, each, device=device, dtype=dtype) for each in columns]
-        return triton_back_end.along_rays(*matrices) is kernels
+        return back_ends.along_rays(*matrices) is kernels
 
     assert served(48, 2048)
     assert not served(48, 2049)
@@ -302,8 +302,8 @@ def test_what_the_kernels_along_rays_serve(monkeypatch):
 def check_that_trying_out_runs_each_kernel() -> None:
     from edge_depth_nerf.kernels import triton_launch
 
-    modules: list[Any] = [load() for load in triton_back_end.MODULES.values()]
-    assert "pointwise_triton" in triton_back_end.MODULES
+    modules: list[Any] = [load() for load in back_ends.MODULES.values()]
+    assert "pointwise_triton" in back_ends.MODULES
     for module in modules:
         launched = set()
 

@@ -16,8 +16,8 @@ from numba import njit
 TRAINING = (
     "edge_depth_nerf.kernels.hash_grid_numba",
     "edge_depth_nerf.kernels.network_numba",
-    "edge_depth_nerf.kernels.contraction",
-    "edge_depth_nerf.kernels.ray_kernels",
+    "edge_depth_nerf.kernels.contraction_numba",
+    "edge_depth_nerf.kernels.ray_numba",
     "edge_depth_nerf.kernels.table_adam_numba",
     "edge_depth_nerf.kernels.integration_numba",
     "edge_depth_nerf.kernels.table_rays_numba",

@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from edge_depth_nerf.kernels.fused_hash_grid import FusedHashEncoding, use_fused_encodings
 from edge_depth_nerf.kernels.network import network
-from edge_depth_nerf.kernels.triton_back_end import by_number, made_by_autocast, of_encoded_network, of_network, working
+from edge_depth_nerf.kernels.back_ends import by_number, made_by_autocast, of_encoded_network, of_network, working
 
 
 class CubeContraction(SceneContraction):
@@ -101,9 +101,9 @@ def _contraction(device: torch.device) -> ModuleType | None:
     """Give the module that contracts positions on a device."""
     if device.type == "cpu":
         # imported here, because Numba takes half a second to load
-        from edge_depth_nerf.kernels import contraction
+        from edge_depth_nerf.kernels import contraction_numba
 
-        return contraction
+        return contraction_numba
     return working("contraction_triton", device, "contraction")
 
 

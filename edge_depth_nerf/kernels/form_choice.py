@@ -9,7 +9,7 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import fields
 from typing import Any, TypeVar
 
-from edge_depth_nerf.kernels.triton_back_end import undisturbed
+from edge_depth_nerf.kernels.back_ends import undisturbed
 
 Form = TypeVar("Form")
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from edge_depth_nerf.kernels.hash_grid import back_end, hash_grid
 from edge_depth_nerf.kernels.table_adam import IN_PLACE
-from edge_depth_nerf.kernels.triton_back_end import made_by_autocast
+from edge_depth_nerf.kernels.back_ends import made_by_autocast
 
 
 class FusedHashEncoding(HashEncoding):

@@ -25,7 +25,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from edge_depth_nerf.kernels.table_adam import CLEARED, IN_PLACE, adds_in_place
-from edge_depth_nerf.kernels.triton_back_end import working
+from edge_depth_nerf.kernels.back_ends import working
 
 
 def back_end(device: torch.device) -> ModuleType | None:

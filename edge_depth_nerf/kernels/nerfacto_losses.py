@@ -10,7 +10,7 @@ from jaxtyping import Float
 from nerfstudio.model_components.losses import lossfun_outer
 from torch import Tensor
 
-from edge_depth_nerf.kernels.triton_back_end import along_rays
+from edge_depth_nerf.kernels.back_ends import along_rays
 
 
 def distortion_loss(edges: Float[Tensor, "rays edges"], weights: Float[Tensor, "rays samples"]) -> Float[Tensor, ""]:
@@ -51,6 +51,6 @@ def proposal_loss(
     if weights.device.type != "cpu" or weights.dtype != torch.float32:
         return lossfun_outer(edges, weights.detach(), proposal_edges, proposal_weights).mean()
     # imported here, because Numba takes half a second to load
-    from edge_depth_nerf.kernels.ray_kernels import bound_loss
+    from edge_depth_nerf.kernels.ray_numba import bound_loss
 
     return bound_loss(edges, weights, proposal_edges, proposal_weights)

@@ -19,7 +19,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from edge_depth_nerf.kernels.triton_back_end import of_network
+from edge_depth_nerf.kernels.back_ends import of_network
 
 
 class _Network(torch.autograd.Function):

@@ -14,16 +14,16 @@ from nerfstudio.cameras.rays import Frustums, RayBundle, RaySamples
 from nerfstudio.model_components.ray_samplers import PDFSampler, UniformLinDispPiecewiseSampler
 from torch import Tensor, nn
 
-from edge_depth_nerf.kernels.triton_back_end import along_rays, by_number
+from edge_depth_nerf.kernels.back_ends import along_rays, by_number
 
 
 def _placing(weights: Tensor) -> ModuleType | None:
     """Give the module whose `place_samples` works on such weights, [rays, samples]."""
     if weights.device.type == "cpu":
         # imported here, because Numba takes half a second to load
-        from edge_depth_nerf.kernels import ray_kernels
+        from edge_depth_nerf.kernels import ray_numba
 
-        return ray_kernels
+        return ray_numba
     return along_rays(weights)
 
 

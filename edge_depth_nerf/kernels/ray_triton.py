@@ -1,6 +1,6 @@
 """Sums along rays on a GPU: weights, where samples go, the proposal and the distortion loss with their gradients.
 
-A program holds one or a few rays on the chip. What the CPU finds by walking two sorted lists (`ray_kernels`) is found
+A program holds one or a few rays on the chip. What the CPU finds by walking two sorted lists (`ray_numba`) is found
 here by comparing each of one with each of the other: more comparisons, none of which waits. Sums of a ray are of
 float32, but for the cumulative distribution that samples are placed by, which is of float64 as on the CPU.
 
@@ -182,7 +182,7 @@ def place_samples(
     padding: float,
     least: float,
 ) -> Float[Tensor, "rays places"]:
-    """Invert the cumulative distribution of a histogram over each ray; arguments as in `ray_kernels.place_samples`."""
+    """Invert the cumulative distribution of a histogram over each ray; arguments as in `ray_numba.place_samples`."""
     rays, samples = weights.shape
     places = wanted.shape[1]
     weights, edges, wanted = (each.detach().contiguous() for each in (weights, edges, wanted))
@@ -296,7 +296,7 @@ def bound_loss(
     outer_edges: Float[Tensor, "rays outer_edges"],
     outer_weights: Float[Tensor, "rays outer_samples"],
 ) -> Float[Tensor, ""]:
-    """Compute the proposal loss of mip-NeRF 360 (Eq. 13); as `ray_kernels.bound_loss`, edges ascending."""
+    """Compute the proposal loss of mip-NeRF 360 (Eq. 13); as `ray_numba.bound_loss`, edges ascending."""
     loss = _BoundLoss.apply(edges, weights, outer_edges, outer_weights)
     assert isinstance(loss, Tensor)
     return loss

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.kernels.triton_back_end import working
+from edge_depth_nerf.kernels.back_ends import working
 
 Gaussian = Literal["point", "interval"]
 
