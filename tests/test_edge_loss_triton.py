@@ -1,6 +1,8 @@
-"""Eq. 4's Triton kernels against the slow twin and against torch in float64, in Triton's interpreter; and compiled."""
+"""Eq. 4's kernels against the slow twin and torch in float64: Numba's, and Triton's interpreted and compiled."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ import torch
 from ahead_of_time import ARCHITECTURES, compiled
 from interpreted import NEEDS_A_GPU, assert_near, in_interpreter, on_a_gpu
 
+from edge_depth_nerf.kernels import back_ends, edge_loss_numba
 from edge_depth_nerf.method import losses
 from edge_depth_nerf.method.losses import EPS, NARROW, Gaussian, edge_loss, edge_losses
 
@@ -33,10 +36,11 @@ def levels_of(rays: int, *samples: int, seed: int = 0) -> tuple[list[Level], tor
     return levels, torch.tensor(prior, dtype=torch.float32), torch.tensor(sigma, dtype=torch.float32)
 
 
-def by_kernels(levels, prior, sigma, gaussian="interval", norm=True) -> torch.Tensor:
-    from edge_depth_nerf.kernels import edge_loss_triton
+def by_kernels(levels, prior, sigma, gaussian="interval", norm=True, kernels: Any = None) -> torch.Tensor:
+    if kernels is None:
+        from edge_depth_nerf.kernels import edge_loss_triton as kernels
 
-    return edge_loss_triton.edge_losses(
+    return kernels.edge_losses(
         levels,
         prior,
         sigma,
@@ -48,13 +52,13 @@ def by_kernels(levels, prior, sigma, gaussian="interval", norm=True) -> torch.Te
     )
 
 
-def check_values_and_gradients() -> None:
+def check_values_and_gradients(kernels: Any = None) -> None:
     """Rays and samples that are no multiple of what a program works on, several programs and several passes."""
     for (gaussian, norm), (rays, *samples) in zip(
         FORMS, ((13, 30, 65, 5), (8, 64), (70, 1, 130), (21, 48)), strict=True
     ):
         levels, prior, sigma = levels_of(rays, *samples)
-        found = by_kernels(levels, prior, sigma, gaussian, norm)
+        found = by_kernels(levels, prior, sigma, gaussian, norm, kernels=kernels)
         factors = torch.arange(1.0, len(levels) + 1)
         gradients = torch.autograd.grad((found * factors).sum(), [level[0] for level in levels])
         for number, (weights, starts, ends) in enumerate(levels):
@@ -69,41 +73,41 @@ def check_values_and_gradients() -> None:
             assert_near(gradients[number], expected, 5e-6)
 
 
-def check_nothing_to_look_at() -> None:
+def check_nothing_to_look_at(kernels: Any = None) -> None:
     for rays, samples in ((0, 5), (5, 0), (4, 7)):  # the first four rays have no prior
         levels, prior, sigma = levels_of(max(rays, 1), max(samples, 1))
         weights, starts, ends = (each.detach()[:rays, :samples] for each in levels[0])
         levels = [(weights.requires_grad_(), starts, ends)]
         prior, sigma = (each[:1].expand(rays).contiguous() if rays != 4 else each for each in (prior, sigma))
-        loss = by_kernels(levels, prior, sigma)
+        loss = by_kernels(levels, prior, sigma, kernels=kernels)
         assert float(loss.detach()) == 0
         (gradient,) = torch.autograd.grad(loss.sum(), weights)
         assert gradient.shape == (rays, samples) and not gradient.any()
 
 
-def check_what_is_not_finite() -> None:
+def check_what_is_not_finite(kernels: Any = None) -> None:
     """In a ray without a prior it counts for nothing; in another one a sample without an end gives nothing."""
     levels, prior, sigma = levels_of(9, 20)
-    expected = by_kernels(levels, prior, sigma)
+    expected = by_kernels(levels, prior, sigma, kernels=kernels)
     weights, starts, ends = (each.detach().clone() for each in levels[0])
     weights[1], starts[2], ends[3] = float("nan"), float("nan"), float("inf")
-    assert torch.equal(by_kernels([(weights, starts, ends)], prior, sigma), expected)
+    assert torch.equal(by_kernels([(weights, starts, ends)], prior, sigma, kernels=kernels), expected)
     starts[7, 3], ends[8, 4:6] = -float("inf"), float("nan")
     weights.requires_grad_()
-    loss = by_kernels([(weights, starts, ends)], prior, sigma)
+    loss = by_kernels([(weights, starts, ends)], prior, sigma, kernels=kernels)
     of_torch = edge_loss(weights, starts * 3, ends * 3, prior, sigma, gaussian="interval", divide_by_norm=True)
     assert float(loss.detach()) == pytest.approx(float(of_torch.detach()), rel=1e-6)
     gradients = [torch.autograd.grad(each.sum(), weights)[0] for each in (loss, of_torch)]
     assert_near(gradients[0], gradients[1], 1e-6)
     with torch.no_grad():
         weights[8] = float("nan")  # a broken training has to be seen
-    assert by_kernels([(weights, starts, ends)], prior, sigma).isnan().all()
+    assert by_kernels([(weights, starts, ends)], prior, sigma, kernels=kernels).isnan().all()
 
 
-def check_a_level_that_rests() -> None:
+def check_a_level_that_rests(kernels: Any = None) -> None:
     levels, prior, sigma = levels_of(9, 20, 7)
     levels[0][0].requires_grad_(False)
-    by_kernels(levels, prior, sigma).sum().backward()
+    by_kernels(levels, prior, sigma, kernels=kernels).sum().backward()
     gradient = levels[1][0].grad
     assert levels[0][0].grad is None and gradient is not None and gradient.any()
 
@@ -114,6 +118,13 @@ def test_in_the_interpreter():
     in_interpreter(
         check_values_and_gradients, check_nothing_to_look_at, check_what_is_not_finite, check_a_level_that_rests
     )
+
+
+@pytest.mark.parametrize(
+    "check", [check_values_and_gradients, check_nothing_to_look_at, check_what_is_not_finite, check_a_level_that_rests]
+)
+def test_the_same_on_the_cpu(check):
+    check(edge_loss_numba)
 
 
 @NEEDS_A_GPU
@@ -142,17 +153,19 @@ def test_several_levels_are_edge_loss_of_each(gaussian, norm):
         edge_loss(weights, starts * 3, ends * 3, prior, sigma, gaussian=gaussian, divide_by_norm=norm)
         for weights, starts, ends in levels
     ]
-    assert torch.equal(found, torch.stack(expected))
+    torch.testing.assert_close(found, torch.stack(expected), rtol=5e-6, atol=0)
 
 
 def test_the_kernels_serve_what_they_can_do(monkeypatch):
     """float32 and half precision with a gradient to the weights alone; all else is left to torch."""
     asked = []
-    monkeypatch.setattr(losses, "working", lambda module, device, what: asked.append((module, device.type)))
+    monkeypatch.setattr(losses, "of_edge_loss", lambda device: asked.append(device.type))
     levels, prior, sigma = levels_of(12, 30)
     edge_losses(levels, prior, sigma)
-    assert asked == [("edge_loss_triton", "cpu")]
+    assert asked == ["cpu"]
     weights, starts, ends = (each.double() for each in levels[0])
     edge_losses([(weights, starts, ends)], prior, sigma)
     edge_losses(levels, prior, sigma.clone().requires_grad_())
     assert len(asked) == 1
+    monkeypatch.undo()
+    assert back_ends.of_edge_loss(torch.device("cpu")) is edge_loss_numba

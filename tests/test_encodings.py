@@ -17,11 +17,11 @@ from nerfstudio.field_components.encodings import HashEncoding
 from nerfstudio.field_components.spatial_distortions import SceneContraction
 
 from edge_depth_nerf.kernels import hash_grid_numba as cpu
+from edge_depth_nerf.kernels.back_ends import working
 from edge_depth_nerf.kernels.fields import CubeContraction
 from edge_depth_nerf.kernels.fused_hash_grid import FusedHashEncoding, use_fused_encodings
 from edge_depth_nerf.kernels.hash_grid import back_end
 from edge_depth_nerf.kernels.table_adam import TableAdam
-from edge_depth_nerf.kernels.back_ends import working
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
 
 SIZES = {

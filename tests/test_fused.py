@@ -213,23 +213,24 @@ def test_samples_lie_where_nerfstudio_puts_them(training, single_jitter):
 
 
 def test_all_samples_of_a_fused_model_have_fused_weights():
-    """On the CPU they are nerfstudio's to the last bit."""
     model = build().train()
     outputs = model(bundle())
     assert [type(samples) for samples in outputs["ray_samples_list"]] == [FusedRaySamples] * 3
     samples, densities = outputs["ray_samples_list"][0], torch.rand(outputs["weights_list"][0].shape)
-    assert torch.equal(samples.get_weights(densities), RaySamples.get_weights(samples, densities))
+    torch.testing.assert_close(
+        samples.get_weights(densities), RaySamples.get_weights(samples, densities), rtol=1e-5, atol=1e-7
+    )
     torch_form = build(implementation="torch").train()(bundle())
     assert FusedRaySamples not in {type(samples) for samples in torch_form["ray_samples_list"]}
 
 
 @pytest.mark.parametrize("training", [True, False])
 @pytest.mark.parametrize("single_jitter", [True, False])
-def test_the_first_samples_lie_where_nerfstudio_puts_them_on_a_gpu_too(training, single_jitter):
+def test_the_first_samples_lie_where_nerfstudio_puts_them(training, single_jitter):
     rays = bundle()
     sampler = FirstSampler(single_jitter).train(training)
     found = []
-    for place in (UniformLinDispPiecewiseSampler(single_jitter=single_jitter).train(training), sampler.placed):
+    for place in (UniformLinDispPiecewiseSampler(single_jitter=single_jitter).train(training), sampler):
         torch.manual_seed(2)
         samples = place(rays, 30)
         assert samples.spacing_to_euclidean_fn is not None
@@ -238,9 +239,6 @@ def test_the_first_samples_lie_where_nerfstudio_puts_them_on_a_gpu_too(training,
     for expected, placed in zip(*found, strict=True):
         torch.testing.assert_close(placed, expected, rtol=1e-5, atol=1e-5)
     assert found[0][1].std() > 1
-    # the CPU keeps nerfstudio's own
-    torch.manual_seed(2)
-    assert torch.equal(sampler(rays, 30).frustums.starts, found[0][1])
 
 
 def histograms(seed: int = 0, rays: int = 50) -> tuple[torch.Tensor, ...]:
@@ -318,10 +316,15 @@ def test_training_goes_as_with_torch(options):
     fused_history = train(build(implementation="fused", **options), FusedAdamConfig(lr=1e-2, eps=1e-15), 6)
     loss = "depth_loss" if "depth_loss" in options else "edge_loss"
     assert torch_history[-1][loss] < torch_history[0][loss]
-    for expected, found in zip(torch_history, fused_history, strict=True):
+    for step, (expected, found) in enumerate(zip(torch_history, fused_history, strict=True)):
         assert set(found) == set(expected)
         for name, value in expected.items():
-            assert found[name] == pytest.approx(value, rel=2e-3, abs=1e-7), name
+            if name == "interlevel_loss" and step > 0:
+                # what is left of it are squares of differences near 0, which rounding and Adam make larger
+                near = pytest.approx(value, rel=2e-3, abs=0.01 * torch_history[0][name])
+            else:
+                near = pytest.approx(value, rel=2e-4, abs=1e-9)
+            assert found[name] == near, (step, name)
 
 
 TABLE = "field.mlp_base.model.0.hash_table"

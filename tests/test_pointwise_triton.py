@@ -1,6 +1,8 @@
-"""The Triton kernels that work number by number against float64 twins, in Triton's interpreter; and compiled."""
+"""The kernels that work number by number against float64 twins: Numba's, and Triton's interpreted and compiled."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import pytest
 import torch
@@ -8,7 +10,7 @@ from ahead_of_time import ARCHITECTURES, compiled
 from interpreted import NEEDS_A_GPU, assert_near, in_interpreter, moved_in_interpreter, on_a_gpu
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from edge_depth_nerf.kernels import back_ends
+from edge_depth_nerf.kernels import back_ends, pointwise_numba, threads
 
 SIZES = ((1, 1), (5, 17), (33, 49), (3, 256), (7, 300))
 """Rays and samples, of which few are multiples of what a program works on."""
@@ -19,52 +21,57 @@ def spaced(distance: torch.Tensor) -> torch.Tensor:
     return torch.where(distance < 1, distance / 2, 1 - 1 / (2 * distance))
 
 
-def check_distances() -> None:
+def by_triton() -> Any:
     from edge_depth_nerf.kernels import pointwise_triton
 
+    return pointwise_triton
+
+
+def check_distances(kernels: Any = None) -> None:
+    kernels = kernels or by_triton()
     for rays, count in SIZES:
         torch.manual_seed(rays)
         places = torch.rand(rays, count + 1).sort(dim=1)[0][:, :-1]
         nears, fars = 0.01 + 0.3 * torch.rand(rays, 1), 2 + 30 * torch.rand(rays, 1)
-        found = pointwise_triton.distances(places, nears, fars)
+        found = kernels.distances(places, nears, fars)
         first, last, exact = spaced(nears.double()), spaced(fars.double()), places.double()
         x = first + exact * (last - first)
         assert_near(found, torch.where(x < 0.5, 2 * x, 1 / (2 - 2 * x)), 1e-5)
         # as far as float32 goes, the inverse of the distance is that of torch, to two units in the last place of 1
         x = torch.lerp(spaced(nears), spaced(torch.full_like(fars, 1e4)), places)
-        found = pointwise_triton.distances(places, nears, torch.full_like(fars, 1e4))
+        found = kernels.distances(places, nears, torch.full_like(fars, 1e4))
         inverse = torch.where(x < 0.5, 1 / (2 * x), 2 - 2 * x)
         torch.testing.assert_close(1 / found, inverse, rtol=1e-6, atol=2.4e-7)
     even = torch.linspace(0, 1, 7).expand(3, -1)  # one row for all rays
-    assert torch.equal(*(pointwise_triton.distances(each, nears[:3], fars[:3]) for each in (even, even.clone())))
-    assert pointwise_triton.distances(places[:0], nears[:0], fars[:0]).shape == (0, count)
+    assert torch.equal(*(kernels.distances(each, nears[:3], fars[:3]) for each in (even, even.clone())))
+    assert kernels.distances(places[:0], nears[:0], fars[:0]).shape == (0, count)
 
 
-def check_positions() -> None:
-    from edge_depth_nerf.kernels import pointwise_triton
-
+def check_positions(kernels: Any = None) -> None:
+    kernels = kernels or by_triton()
     for rays, count in SIZES:
         torch.manual_seed(rays)
         origins, directions = torch.randn(rays, 3, 4)[..., 0], torch.randn(2 * rays, 3)[::2]
         edges = torch.rand(rays, count + 1).cumsum(1)
-        found = pointwise_triton.middles(origins.contiguous(), directions, edges[:, :-1], edges[:, 1:])
+        found = kernels.middles(origins.contiguous(), directions, edges[:, :-1], edges[:, 1:])
         middles = (edges[:, :-1].double() + edges[:, 1:]) / 2
         assert_near(found, origins[:, None].double() + directions[:, None] * middles[..., None], 3e-7)
-        assert torch.equal(found, pointwise_triton.middles(origins, directions, edges[:, :-1], edges[:, 1:]))
-    assert pointwise_triton.middles(origins[:0], directions[:0], edges[:0], edges[:0]).shape == (0, count + 1, 3)
+        assert torch.equal(found, kernels.middles(origins, directions, edges[:, :-1], edges[:, 1:]))
+    assert kernels.middles(origins[:0], directions[:0], edges[:0], edges[:0]).shape == (0, count + 1, 3)
 
 
-def check_densities() -> None:
-    from edge_depth_nerf.kernels import pointwise_triton
-
+def check_densities(kernels: Any = None) -> None:
+    kernels = kernels or by_triton()
     for count in (1, 255, 700):
         torch.manual_seed(count)
-        for dtype, tolerance in ((torch.float32, 1e-6), (torch.float16, 1e-3)):
+        for dtype, tolerance in ((torch.float32, 1e-6), (torch.float16, 1e-3))[
+            : 1 if kernels is pointwise_numba else 2
+        ]:
             features = (12 * torch.randn(count, 5)).to(dtype)
             features[-1, 0] = 20  # steeper than the gradient follows
             before = features[:, 0].detach().requires_grad_()
             inside, gradient = (torch.arange(count) % 3 != 1).float(), torch.randn(count) * 1e-3
-            found = pointwise_triton.density(before, inside, 0.01)
+            found = kernels.density(before, inside, 0.01)
             exact = before.detach().double()
             assert_near(found.detach(), 0.01 * exact.exp() * inside, 1e-6)
             (to_before,) = torch.autograd.grad(found, before, gradient)
@@ -73,34 +80,45 @@ def check_densities() -> None:
             assert_near(to_before, expected, tolerance)
     with torch.no_grad():
         before[3] = float("nan")
-    assert pointwise_triton.density(before, inside, 1.0).isnan().nonzero().tolist() == [[3]]
-    found = pointwise_triton.density(before, inside, 1.0)
+    assert kernels.density(before, inside, 1.0).isnan().nonzero().tolist() == [[3]]
+    found = kernels.density(before, inside, 1.0)
     assert torch.autograd.grad(found.sum(), before)[0].isnan().nonzero().tolist() == [[3]]
-    assert pointwise_triton.density(before[:0], inside[:0], 1.0).shape == (0,)
+    assert kernels.density(before[:0], inside[:0], 1.0).shape == (0,)
 
 
-def check_harmonics() -> None:
+def check_harmonics(kernels: Any = None) -> None:
     from nerfstudio.utils.math import components_from_spherical_harmonics
 
-    from edge_depth_nerf.kernels import pointwise_triton
-
+    kernels = kernels or by_triton()
     for count in (1, 255, 700):
         directions = torch.nn.functional.normalize(torch.randn(count, 4)[:, :3], dim=1)
         exact = (directions.double() + 1) / 2
         expected = components_from_spherical_harmonics(4, exact)
         for dtype, tolerance in ((torch.float32, 1e-6), (torch.float16, 5e-4)):
-            found = pointwise_triton.harmonics(directions, dtype)
+            found = kernels.harmonics(directions, dtype)
             assert found.dtype == dtype
             assert_near(found, expected, tolerance)
         expanded = directions[:, None].expand(-1, 4, -1)[:, 2]
-        assert torch.equal(pointwise_triton.harmonics(expanded, dtype), found)
-    assert pointwise_triton.harmonics(directions[:0], dtype).shape == (0, 16)
+        assert torch.equal(kernels.harmonics(expanded, dtype), found)
+    assert kernels.harmonics(directions[:0], dtype).shape == (0, 16)
 
 
 @pytest.mark.slow
 def test_in_the_interpreter():
     pytest.importorskip("triton")
     in_interpreter(check_distances, check_positions, check_densities, check_harmonics)
+
+
+@pytest.mark.parametrize("check", [check_distances, check_positions, check_densities, check_harmonics])
+def test_the_same_on_the_cpu(check):
+    check(pointwise_numba)
+
+
+@pytest.mark.parametrize("check", [check_distances, check_positions, check_densities])
+def test_the_same_on_three_threads(check, monkeypatch):
+    monkeypatch.setattr(threads, "kernel_threads", lambda: 3)
+    monkeypatch.setattr(pointwise_numba, "LEAST_SHARE", 2)
+    check(pointwise_numba)
 
 
 @NEEDS_A_GPU
@@ -140,14 +158,15 @@ def test_compiled_without_spills(architecture, tmp_path):
 
 
 def test_what_the_kernels_serve(monkeypatch):
-    """float32 on a GPU, where nobody asks for a gradient."""
+    """float32, where nobody asks for a gradient."""
     asked = []
     monkeypatch.setattr(back_ends, "working", lambda *given: asked.append(given))
     with FakeTensorMode():
         x = torch.empty(4, 3, device="cuda")
         followed, half = torch.empty(4, 3, device="cuda", requires_grad=True), x.half()
-    for given in ((x.cpu(),), (x, half), (x, followed)):
+    for given in ((x, half), (x, followed), (half.cpu(),), (x, x.cpu())):
         assert back_ends.by_number(*given) is None
+    assert back_ends.by_number(x.cpu()) is pointwise_numba
     assert not asked
     back_ends.by_number(x, x)
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""The Triton kernels along rays against float64 and the CPU's kernels, in Triton's interpreter; and compiled."""
+"""The kernels along rays against float64 and each other: Numba's, and Triton's interpreted and compiled."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ahead_of_time import ARCHITECTURES, compiled
 from interpreted import NEEDS_A_GPU, assert_near, in_interpreter, on_a_gpu
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from edge_depth_nerf.kernels import back_ends
+from edge_depth_nerf.kernels import back_ends, ray_numba, threads
 
 SIZES = ((2, 1), (5, 16), (33, 17), (9, 48), (3, 256), (2, 300))
 """Rays and samples, of which few are multiples of what a program works on."""
@@ -46,16 +46,21 @@ def torch_weights(densities: torch.Tensor, deltas: torch.Tensor) -> torch.Tensor
     return torch.nan_to_num((1 - torch.exp(-depth)) * torch.exp(-before))
 
 
-def check_weights() -> None:
+def by_triton() -> Any:
     from edge_depth_nerf.kernels import ray_triton
 
+    return ray_triton
+
+
+def check_weights(kernels: Any = None) -> None:
+    kernels = kernels or by_triton()
     for rays, samples in SIZES:
         densities = 10 ** (4 * torch.rand(rays, samples) - 2)
         densities[0] = 0
         densities[-1, samples // 2 :] = 1e9
         deltas = torch.rand(rays, samples) / samples
         gradient = torch.randn(rays, samples)
-        found = ray_triton.weights_from_densities(densities.requires_grad_(), deltas)
+        found = kernels.weights_from_densities(densities.requires_grad_(), deltas)
         (to_densities,) = torch.autograd.grad(found, densities, gradient)
         exact = densities.detach().double().requires_grad_()
         expected = torch_weights(exact, deltas.double())
@@ -63,17 +68,16 @@ def check_weights() -> None:
         assert_near(to_densities, torch.autograd.grad(expected, exact, gradient.double())[0], 1e-6)
     for shape in ((0, 5), (5, 0)):
         empty = torch.empty(shape, requires_grad=True)
-        found = ray_triton.weights_from_densities(empty, torch.empty(shape))
+        found = kernels.weights_from_densities(empty, torch.empty(shape))
         assert found.shape == shape and torch.autograd.grad(found.sum(), empty)[0].shape == shape
 
 
-def check_weights_of_what_is_not_finite() -> None:
-    from edge_depth_nerf.kernels import ray_triton
-
+def check_weights_of_what_is_not_finite(kernels: Any = None) -> None:
+    kernels = kernels or by_triton()
     densities, deltas, gradient = torch.rand(4, 10), torch.rand(4, 10), torch.randn(4, 10)
     densities[1, 4], densities[2, 3] = float("inf"), float("nan")
     densities.requires_grad_()
-    found, expected = (form(densities, deltas) for form in (ray_triton.weights_from_densities, torch_weights))
+    found, expected = (form(densities, deltas) for form in (kernels.weights_from_densities, torch_weights))
     assert_near(found.detach(), expected.detach(), 1e-6)
     assert not found.isnan().any()
     gradients = [torch.autograd.grad(each, densities, gradient)[0] for each in (found, expected)]
@@ -82,7 +86,7 @@ def check_weights_of_what_is_not_finite() -> None:
 
 
 def check_places() -> None:
-    from edge_depth_nerf.kernels import ray_numba, ray_triton
+    from edge_depth_nerf.kernels import ray_triton
 
     for rays, samples in SIZES:
         for places, padding in ((1, 0.01), (17, 0.0), (49, 0.01)):
@@ -113,7 +117,7 @@ def exact_bound_loss(edges, weights, outer_edges, outer_weights) -> torch.Tensor
 
 
 def check_the_proposal_loss() -> None:
-    from edge_depth_nerf.kernels import ray_numba, ray_triton
+    from edge_depth_nerf.kernels import ray_triton
 
     for (rays, samples), intervals in zip(SIZES, (1, 7, 64, 96, 257, 31), strict=True):
         edges, weights, outer_edges, outer_weights = histograms(rays, samples, intervals)
@@ -139,13 +143,12 @@ def check_the_proposal_loss() -> None:
     assert float(nothing.detach()) == 0 and torch.autograd.grad(nothing, outer_weights)[0].shape == outer_weights.shape
 
 
-def check_the_distortion_loss() -> None:
-    from edge_depth_nerf.kernels import ray_triton
-
+def check_the_distortion_loss(kernels: Any = None) -> None:
+    kernels = kernels or by_triton()
     for rays, samples in SIZES:
         edges, weights, _, _ = histograms(rays, samples, 5)
         weights.requires_grad_()
-        found = ray_triton.distortion_loss(edges, weights)
+        found = kernels.distortion_loss(edges, weights)
         (gradient,) = torch.autograd.grad(3 * found, weights)
         exact, middles = weights.detach().double().requires_grad_(), (edges[:, 1:] + edges[:, :-1]).double() / 2
         pairs = exact[:, :, None] * exact[:, None] * (middles[:, :, None] - middles[:, None]).abs()
@@ -155,12 +158,12 @@ def check_the_distortion_loss() -> None:
         torch.testing.assert_close(gradient.double(), to_weights, rtol=1e-5, atol=1e-8)
         assert gradient.any() or samples == 1
         column_major = weights.detach().t().contiguous().t().requires_grad_()
-        loss = ray_triton.distortion_loss(edges, column_major)
+        loss = kernels.distortion_loss(edges, column_major)
         assert torch.equal(torch.autograd.grad(3 * loss, column_major)[0], gradient)
-    assert float(ray_triton.distortion_loss(edges[:0], weights[:0]).detach()) == 0
+    assert float(kernels.distortion_loss(edges[:0], weights[:0]).detach()) == 0
     with torch.no_grad():
         weights[0, 0] = float("nan")
-    assert ray_triton.distortion_loss(edges, weights).isnan()
+    assert kernels.distortion_loss(edges, weights).isnan()
 
 
 @pytest.mark.slow
@@ -177,6 +180,20 @@ def check_the_distortion_loss() -> None:
 def test_in_the_interpreter(check):
     pytest.importorskip("triton")
     in_interpreter(check)
+
+
+ON_THE_CPU = [check_weights, check_weights_of_what_is_not_finite, check_the_distortion_loss]
+
+
+@pytest.mark.parametrize("check", ON_THE_CPU)
+def test_the_same_on_the_cpu(check):
+    check(ray_numba)
+
+
+def test_weights_are_the_same_on_three_threads(monkeypatch):
+    monkeypatch.setattr(threads, "kernel_threads", lambda: 3)
+    monkeypatch.setattr(ray_numba, "LEAST_SHARE", 2)
+    check_weights(ray_numba)
 
 
 def step(samples: int = 48, intervals: int = 256) -> None:
@@ -285,7 +302,7 @@ def test_a_rendering_may_be_the_first_that_needs_the_kernels(monkeypatch, mode):
 
 
 def test_what_the_kernels_along_rays_serve(monkeypatch):
-    """float32 on CUDA, and rays that stay on the chip."""
+    """float32; on CUDA rays that stay on the chip."""
     kernels = module_with("kernels", fits=lambda *samples: max(samples) <= 2048)
     monkeypatch.setattr(back_ends, "working", lambda *_: kernels)
 
@@ -296,6 +313,8 @@ def test_what_the_kernels_along_rays_serve(monkeypatch):
 
     assert served(48, 2048)
     assert not served(48, 2049)
+    assert back_ends.along_rays(torch.empty(4, 4096)) is ray_numba
+    assert back_ends.along_rays(torch.empty(4, 48), torch.empty(4, 48, dtype=torch.float64)) is None
     assert not served(48, device="cpu") and not served(48, dtype=torch.float16)
 
 

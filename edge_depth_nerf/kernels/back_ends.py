@@ -1,4 +1,4 @@
-"""Whether Triton kernels work on a device.
+"""Which kernels serve some tensors: Numba's on the CPU, Triton's on a GPU if they work there.
 
 Triton may be missing, find no C compiler, or not know the GPU. A module of kernels says how to find out: its function
 `try_out` calls each of them once on a few numbers.
@@ -77,11 +77,22 @@ def working(module: str, device: torch.device, what: str) -> ModuleType | None:
     return None
 
 
-def along_rays(*tensors: Tensor) -> ModuleType | None:
-    """Give the kernels along rays, `ray_triton`, for matrices that have a row a ray; None where they do not serve them.
+def _on_the_cpu(tensors: Sequence[Tensor]) -> bool:
+    """Whether these are float32 on the CPU."""
+    return all(each.device.type == "cpu" and each.dtype == torch.float32 for each in tensors)
 
-    They serve float32 on CUDA, and rays whose samples stay on the chip.
+
+def along_rays(*tensors: Tensor) -> ModuleType | None:
+    """Give the kernels along rays for matrices that have a row a ray; None where none serve them.
+
+    On the CPU they are `ray_numba`. On CUDA they are `ray_triton`, for rays whose samples stay on the chip. Both serve
+    float32.
     """
+    if _on_the_cpu(tensors):
+        # imported here, because Numba takes half a second to load
+        from edge_depth_nerf.kernels import ray_numba
+
+        return ray_numba
     if any(each.device.type != "cuda" or each.dtype != torch.float32 for each in tensors):
         return None
     kernels = working("ray_triton", tensors[0].device, "form of samples along rays")
@@ -89,14 +100,28 @@ def along_rays(*tensors: Tensor) -> ModuleType | None:
 
 
 def by_number(*tensors: Tensor) -> ModuleType | None:
-    """Give the kernels `pointwise_triton` for what is computed number by number; None where they do not serve it.
+    """Give the kernels of what is computed number by number, Numba's or Triton's; None where none serve it.
 
-    They serve float32 on CUDA where nobody asks for a gradient to these tensors.
+    They serve float32 where nobody asks for a gradient to these tensors.
     """
-    followed = torch.is_grad_enabled() and any(each.requires_grad for each in tensors)
-    if followed or any(each.device.type != "cuda" or each.dtype != torch.float32 for each in tensors):
+    if torch.is_grad_enabled() and any(each.requires_grad for each in tensors):
+        return None
+    if _on_the_cpu(tensors):
+        from edge_depth_nerf.kernels import pointwise_numba
+
+        return pointwise_numba
+    if any(each.device.type != "cuda" or each.dtype != torch.float32 for each in tensors):
         return None
     return working("pointwise_triton", tensors[0].device, "arithmetic of samples")
+
+
+def of_edge_loss(device: torch.device) -> ModuleType | None:
+    """Give the kernels of the edge loss, Numba's or Triton's; None where none serve a device."""
+    if device.type == "cpu":
+        from edge_depth_nerf.kernels import edge_loss_numba
+
+        return edge_loss_numba
+    return working("edge_loss_triton", device, "edge loss")
 
 
 def made_by_autocast(device: torch.device) -> torch.dtype:

@@ -24,9 +24,9 @@ from nerfstudio.fields.density_fields import HashMLPDensityField
 from nerfstudio.fields.nerfacto_field import NerfactoField
 from torch import Tensor, nn
 
+from edge_depth_nerf.kernels.back_ends import by_number, made_by_autocast, of_encoded_network, of_network, working
 from edge_depth_nerf.kernels.fused_hash_grid import FusedHashEncoding, use_fused_encodings
 from edge_depth_nerf.kernels.network import network
-from edge_depth_nerf.kernels.back_ends import by_number, made_by_autocast, of_encoded_network, of_network, working
 
 
 class CubeContraction(SceneContraction):
@@ -124,7 +124,8 @@ def _unit_cube(field: Any, positions: Float[Tensor, "*bs 3"]) -> tuple[Tensor, T
 
 def _densities(before: Float[Tensor, "*bs 1"], inside: Float[Tensor, "*bs 1"], scale: float) -> Float[Tensor, "*bs 1"]:
     """Densities from a network's outputs; 0 where a point is not inside."""
-    kernels = by_number(inside)
+    mixed = before.device.type == "cpu" and before.dtype != torch.float32
+    kernels = None if mixed else by_number(inside)
     if kernels is None:
         return scale * trunc_exp(before.to(inside)) * inside
     return kernels.density(before.reshape(-1), inside.reshape(-1), scale).view(inside.shape)

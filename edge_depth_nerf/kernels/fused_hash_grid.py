@@ -10,9 +10,9 @@ from jaxtyping import Float
 from nerfstudio.field_components.encodings import HashEncoding
 from torch import Tensor, nn
 
+from edge_depth_nerf.kernels.back_ends import made_by_autocast
 from edge_depth_nerf.kernels.hash_grid import back_end, hash_grid
 from edge_depth_nerf.kernels.table_adam import IN_PLACE
-from edge_depth_nerf.kernels.back_ends import made_by_autocast
 
 
 class FusedHashEncoding(HashEncoding):

@@ -24,8 +24,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from edge_depth_nerf.kernels.table_adam import CLEARED, IN_PLACE, adds_in_place
 from edge_depth_nerf.kernels.back_ends import working
+from edge_depth_nerf.kernels.table_adam import CLEARED, IN_PLACE, adds_in_place
 
 
 def back_end(device: torch.device) -> ModuleType | None:

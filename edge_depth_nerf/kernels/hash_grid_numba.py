@@ -14,11 +14,7 @@ Importing this module imports Numba.
 
 from __future__ import annotations
 
-import functools
-import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import numpy as np
 import torch
@@ -29,7 +25,7 @@ from numba.extending import intrinsic
 from torch import Tensor
 
 from edge_depth_nerf.kernels.compiled import compiled
-from edge_depth_nerf.kernels.threads import kernel_threads
+from edge_depth_nerf.kernels.threads import kernel_threads, share_out, stretches
 
 TILE = 64
 """Points worked on together: their rows of the table, 32 kB at most, stay in the nearest cache."""
@@ -222,29 +218,8 @@ def _differentiate_points(axes, table, features, scalings, gradient, to_position
                     to_positions[first + j, 2] += to_z * scaling
 
 
-@functools.lru_cache(maxsize=1)
-def _pool(process: int, threads: int) -> ThreadPoolExecutor:
-    """Threads that stay for the next call; a forked process (another `process` id) has to start its own."""
-    return ThreadPoolExecutor(threads, thread_name_prefix="hash-grid")
-
-
 def _threads(points: int, levels: int) -> int:
     return max(1, min(kernel_threads(), points * levels // LEAST_SHARE))
-
-
-def share_out(work: Callable[[Any], None], shares: list[Any]) -> None:
-    """Call `work` once for each share, all at once, the first one in this thread."""
-    waiting = [_pool(os.getpid(), len(shares) - 1).submit(work, share) for share in shares[1:]]
-    try:
-        work(shares[0])
-    finally:
-        for future in waiting:
-            future.result()
-
-
-def stretches(count: int, parts: int) -> list[tuple[int, int]]:
-    """Give where `parts` equal parts of a range begin and end."""
-    return [(count * part // parts, count * (part + 1) // parts) for part in range(parts)]
 
 
 def _axes(positions: Tensor) -> np.ndarray:

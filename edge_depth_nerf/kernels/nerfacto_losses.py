@@ -5,7 +5,6 @@ Host-facing. Shapes: `[rays, samples]`; edges, of which there is one more than s
 
 from __future__ import annotations
 
-import torch
 from jaxtyping import Float
 from nerfstudio.model_components.losses import lossfun_outer
 from torch import Tensor
@@ -48,9 +47,4 @@ def proposal_loss(
     kernels = along_rays(edges, weights, proposal_edges, proposal_weights)
     if kernels is not None:
         return kernels.bound_loss(edges, weights, proposal_edges, proposal_weights)
-    if weights.device.type != "cpu" or weights.dtype != torch.float32:
-        return lossfun_outer(edges, weights.detach(), proposal_edges, proposal_weights).mean()
-    # imported here, because Numba takes half a second to load
-    from edge_depth_nerf.kernels.ray_numba import bound_loss
-
-    return bound_loss(edges, weights, proposal_edges, proposal_weights)
+    return lossfun_outer(edges, weights.detach(), proposal_edges, proposal_weights).mean()

@@ -25,8 +25,7 @@ from numba.extending import intrinsic
 from torch import Tensor
 
 from edge_depth_nerf.kernels.compiled import compiled
-from edge_depth_nerf.kernels.hash_grid_numba import share_out, stretches
-from edge_depth_nerf.kernels.threads import kernel_threads
+from edge_depth_nerf.kernels.threads import kernel_threads, share_out, stretches
 
 TILE = 96
 """Points worked on together, a multiple of 16."""

@@ -1,11 +1,10 @@
-"""nerfstudio's placing of samples along rays: in one pass, without a copy from the host, and on a GPU their weights.
+"""nerfstudio's placing of samples along rays, and their weights: each in one pass, without a copy from the host.
 
 Host-facing; the numbers are nerfstudio's to float32's noise, from the same random numbers.
 """
 
 from __future__ import annotations
 
-from types import ModuleType
 from typing import Any
 
 import torch
@@ -17,21 +16,8 @@ from torch import Tensor, nn
 from edge_depth_nerf.kernels.back_ends import along_rays, by_number
 
 
-def _placing(weights: Tensor) -> ModuleType | None:
-    """Give the module whose `place_samples` works on such weights, [rays, samples]."""
-    if weights.device.type == "cpu":
-        # imported here, because Numba takes half a second to load
-        from edge_depth_nerf.kernels import ray_numba
-
-        return ray_numba
-    return along_rays(weights)
-
-
 class FirstSampler(UniformLinDispPiecewiseSampler):
-    """nerfstudio's first sampler, which makes its constants again in each step and copies them from the host.
-
-    On the CPU it is left to nerfstudio.
-    """
+    """nerfstudio's first sampler, which makes its constants again in each step and copies them from the host."""
 
     def __init__(self, single_jitter: bool) -> None:
         super().__init__(single_jitter=single_jitter)
@@ -41,12 +27,8 @@ class FirstSampler(UniformLinDispPiecewiseSampler):
         """Place samples, in training anywhere within their intervals."""
         assert ray_bundle is not None
         count = num_samples or self.num_samples
-        if ray_bundle.origins.device.type == "cpu" or not count:
+        if not count:
             return super().generate_ray_samples(ray_bundle, num_samples)
-        return self.placed(ray_bundle, count)
-
-    def placed(self, ray_bundle: RayBundle, count: int) -> RaySamples:
-        """Place so many samples, on any device."""
         assert ray_bundle.nears is not None and ray_bundle.fars is not None
         device = ray_bundle.origins.device
         lower, lengths = self._between(count, device)
@@ -97,7 +79,7 @@ class FusedPDFSampler(PDFSampler):
         """Place samples by the weights of earlier ones."""
         assert ray_bundle is not None and ray_samples is not None and weights is not None
         count = num_samples or self.num_samples
-        kernels = None if self.include_original or weights.ndim != 3 else _placing(weights[..., 0])
+        kernels = None if self.include_original or weights.ndim != 3 else along_rays(weights[..., 0])
         if kernels is None or not count:
             return super().generate_ray_samples(ray_bundle, ray_samples, weights, num_samples, eps)
         places, device = count + 1, weights.device
@@ -138,7 +120,7 @@ def edges_of(samples: RaySamples) -> Tensor:
 
 
 class FusedRaySamples(RaySamples):
-    """nerfstudio's `RaySamples`; on a GPU weights come from one kernel."""
+    """nerfstudio's `RaySamples`; weights come from one kernel."""
 
     def get_weights(self, densities: Float[Tensor, "*batch samples 1"]) -> Float[Tensor, "*batch samples 1"]:
         """Rendering weights of the samples."""
@@ -154,7 +136,7 @@ class FusedRaySamples(RaySamples):
 
 
 class FusedFrustums(Frustums):
-    """nerfstudio's `Frustums`; on a GPU positions without a gradient come from one kernel."""
+    """nerfstudio's `Frustums`; positions without a gradient come from one kernel."""
 
     def get_positions(self) -> Float[Tensor, "*batch 3"]:
         """Positions in the middle of the samples."""

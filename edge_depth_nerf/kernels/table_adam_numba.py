@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_depth_nerf.kernels.compiled import compiled
-from edge_depth_nerf.kernels.hash_grid_numba import share_out, stretches
-from edge_depth_nerf.kernels.threads import kernel_threads
+from edge_depth_nerf.kernels.threads import kernel_threads, share_out, stretches
 
 LEAST_SHARE = 1 << 18
 """A thread gets at least so many numbers."""

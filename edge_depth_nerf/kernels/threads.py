@@ -1,4 +1,4 @@
-"""How many threads the compiled kernels on the CPU take, and torch in a training step.
+"""Threads of the compiled kernels on the CPU, and of torch in a training step.
 
 A step's tensors in torch are small: to wake a second thread takes longer than it saves (docs/speed.md). So torch gets
 one thread in a step, and the kernels, which have the large work, all of them.
@@ -6,8 +6,12 @@ one thread in a step, and the kernels, which have the large work, all of them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import functools
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from typing import Any
 
 import torch
 
@@ -33,3 +37,33 @@ def torch_on_one_thread() -> Iterator[None]:
     finally:
         torch.set_num_threads(_kept)
         _kept = None
+
+
+@functools.lru_cache(maxsize=1)
+def _pool(process: int) -> ThreadPoolExecutor:
+    """Threads that stay for the next call; a forked process (another `process` id) has to start its own."""
+    return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="kernels")
+
+
+def share_out(work: Callable[[Any], None], shares: list[Any]) -> None:
+    """Call `work` once for each share, all at once, the first one in this thread."""
+    if len(shares) == 1:
+        work(shares[0])
+        return
+    waiting = [_pool(os.getpid()).submit(work, share) for share in shares[1:]]
+    try:
+        work(shares[0])
+    finally:
+        for future in waiting:
+            future.result()
+
+
+def stretches(count: int, parts: int) -> list[tuple[int, int]]:
+    """Give where `parts` equal parts of a range begin and end."""
+    return [(count * part // parts, count * (part + 1) // parts) for part in range(parts)]
+
+
+def in_parts(work: Callable[[int, int], None], count: int, least: int) -> None:
+    """Call `work` with the beginning and the end of equal parts of a range, all at once; of `least` each at least."""
+    threads = max(1, min(kernel_threads(), count // max(1, least)))
+    share_out(lambda part: work(*part), stretches(count, threads))

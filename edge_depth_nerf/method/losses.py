@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.kernels.back_ends import working
+from edge_depth_nerf.kernels.back_ends import of_edge_loss
 
 Gaussian = Literal["point", "interval"]
 
@@ -109,7 +109,7 @@ def edge_losses(
     gaussian: Gaussian = "point",
     divide_by_norm: bool = False,
 ) -> Float[Tensor, "levels"]:
-    """Compute `edge_loss` of several levels of samples of the same rays; on a GPU all in one pass.
+    """Compute `edge_loss` of several levels of samples of the same rays, by kernels where there are some.
 
     Args:
         levels: rendering weights of each, and where its samples begin and end, in any unit of length.
@@ -120,8 +120,8 @@ def edge_losses(
         divide_by_norm: as in `edge_loss`.
 
     Returns:
-        The loss of each level. On a GPU it is differentiable once, and by the weights alone, unless starts, ends or the
-        prior ask for a gradient too.
+        The loss of each level. By kernels it is differentiable once, and by the weights alone; where starts, ends or
+        the prior ask for a gradient, or a tensor is float64, torch computes it.
 
     Raises:
         InputError: as in `edge_loss`.
@@ -131,7 +131,7 @@ def edge_losses(
     every = (*weights, *starts, *ends, prior_m, sigma_m)
     is_float = all(each.dtype in (torch.float32, torch.float16, torch.bfloat16) for each in every)
     of_weights_alone = not any(each.requires_grad for each in (*starts, *ends, prior_m, sigma_m))
-    kernels = working("edge_loss_triton", prior_m.device, "edge loss") if is_float and of_weights_alone else None
+    kernels = of_edge_loss(prior_m.device) if is_float and of_weights_alone else None
     if kernels is None or gaussian not in get_args(Gaussian):
         per_level = [
             edge_loss(

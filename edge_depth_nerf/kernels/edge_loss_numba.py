@@ -1,0 +1,117 @@
+"""Eq. 4 on the CPU: the edge loss of a level of samples and its gradient in one pass, as `losses.edge_loss` has it.
+
+Samples whose part of the Gaussian is 0 in float32 are passed over: the most, as a prior is narrow and rays are long.
+float32 but for the sum over all samples. Importing this module imports Numba.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, no_type_check
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from edge_depth_nerf.kernels.compiled import compiled
+from edge_depth_nerf.kernels.pointwise_numba import flat_rows
+
+ZERO, ONE, TWO, HALF = np.float32(0), np.float32(1), np.float32(2), np.float32(0.5)
+FAR = np.float32(15)
+"""In units of σ̂: the Gaussian there is 0 in float32."""
+SQRT_HALF, SQRT_HALF_PI, SQRT_TWO_PI = (np.float32(math.sqrt(each)) for each in (0.5, math.pi / 2, 2 * math.pi))
+SECOND_ORDER = np.float32(1 / 24)
+
+
+@compiled()
+@no_type_check
+def _edge_loss(
+    weights, weight_stride, starts, start_stride, ends, end_stride, priors, sigmas, slopes, samples,
+    metres_per_unit, eps, narrow, interval, norm, follow,
+):  # fmt: skip
+    """Give the sum of the loss and how many rays have a prior; `slopes` gets what each weight would change it by."""
+    loss, count = 0.0, 0
+    for ray in range(len(priors)):
+        prior, sigma = priors[ray], sigmas[ray]
+        if not (ZERO < prior < np.inf and ZERO < sigma < np.inf):
+            continue
+        count += 1
+        for k in range(samples):
+            begin, end = starts[ray * start_stride + k] * metres_per_unit, ends[ray * end_stride + k] * metres_per_unit
+            # false with NaN, too
+            if not (-np.inf < begin < end < np.inf):
+                continue
+            # in units of σ̂; the length from the ends themselves, as their distances to a far prior have lost digits
+            length = (end - begin) / sigma
+            low, high = (begin - prior) / sigma, (end - prior) / sigma
+            if low > FAR or high < -FAR:
+                continue
+            middle = low + length / TWO
+            if interval and not length < narrow:
+                mass = SQRT_HALF_PI * (np.float32(math.erf(high * SQRT_HALF)) - np.float32(math.erf(low * SQRT_HALF)))
+            else:
+                mass = np.float32(math.exp(-HALF * middle * middle)) * length
+                if interval:
+                    mass *= ONE + (middle * middle - ONE) * length * length * SECOND_ORDER
+            target = mass / SQRT_TWO_PI if norm else mass * sigma
+            weight = weights[ray * weight_stride + k] + eps
+            loss -= target * np.float32(math.log(weight))
+            if follow:
+                slopes[ray * samples + k] = -target / weight
+    return loss, count
+
+
+class _EdgeLoss(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, weights: Tensor, starts: Tensor, ends: Tensor, prior: Tensor, sigma: Tensor, options: tuple[Any, ...]
+    ) -> Tensor:
+        follow = ctx.needs_input_grad[0]
+        slopes = torch.zeros(weights.shape if follow else (0, 0))
+        matrices = [each for matrix in (weights, starts, ends) for each in flat_rows(matrix)]
+        of_rays = (each.detach().contiguous().numpy() for each in (prior, sigma))
+        total, count = _edge_loss(*matrices, *of_rays, slopes.view(-1).numpy(), weights.shape[1], *options, follow)
+        if follow:
+            ctx.save_for_backward(slopes)
+        ctx.count = max(1, count)
+        return torch.tensor(total / ctx.count, dtype=torch.float32)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        return ctx.saved_tensors[0] * (gradients[0] / ctx.count), None, None, None, None, None
+
+
+def edge_losses(
+    levels: Sequence[tuple[Tensor, Tensor, Tensor]],
+    prior_m: Float[Tensor, "rays"],
+    sigma_m: Float[Tensor, "rays"],
+    *,
+    metres_per_unit: float,
+    interval: bool,
+    divide_by_norm: bool,
+    eps: float,
+    narrow: float,
+) -> Float[Tensor, "levels"]:
+    """Compute Eq. 4 of each level of samples, mean over the rays that have a prior; float32.
+
+    Args:
+        levels: weights, starts and ends, each [rays, samples of the level], the lengths in any unit. Differentiable
+            once, by the weights alone.
+        prior_m: d̃, metres; a ray where it is not positive and finite adds nothing.
+        sigma_m: σ̂, metres; likewise.
+        metres_per_unit: metres in one unit of starts and ends.
+        interval: take the Gaussian's mass over a sample, not its value at the middle.
+        divide_by_norm: divide by σ̂ √(2π).
+        eps: added to the weights inside the logarithm.
+        narrow: below this length, in units of σ̂, an interval's mass comes from its midpoint.
+
+    Returns:
+        The loss of each level.
+
+    """
+    options = np.float32(metres_per_unit), np.float32(eps), np.float32(narrow), interval, divide_by_norm
+    of_rays = prior_m.float(), sigma_m.float()
+    return torch.stack([_EdgeLoss.apply(*(each.float() for each in level), *of_rays, options) for level in levels])
