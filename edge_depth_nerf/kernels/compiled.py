@@ -24,6 +24,7 @@ TRAINING = (
     "edge_depth_nerf.kernels.table_adam_numba",
     "edge_depth_nerf.kernels.integration_numba",
     "edge_depth_nerf.kernels.table_rays_numba",
+    "edge_depth_nerf.kernels.pixel_records_numba",
 )
 """The modules whose kernels a training on the CPU calls."""
 _folders: set[Path] = set()

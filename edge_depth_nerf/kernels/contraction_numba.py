@@ -18,14 +18,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from edge_depth_nerf.kernels.compiled import compiled
+from edge_depth_nerf.kernels.threads import in_parts
 
+LEAST_SHARE = 1 << 14
+"""A thread gets at least so many points."""
 ONE, TWO, FOUR = np.float32(1), np.float32(2), np.float32(4)
 
 
 @compiled()
 @no_type_check
-def _contract(positions, axes, inside):
-    for j in range(len(positions)):
+def _contract(positions, axes, inside, first, last):
+    for j in range(first, last):
         x, y, z = positions[j, 0], positions[j, 1], positions[j, 2]
         norm = max(max(abs(x), abs(y)), abs(z))
         if not norm < ONE:
@@ -46,5 +49,6 @@ def contract(positions: Float[Tensor, "points 3"]) -> tuple[Float[Tensor, "point
 
     """
     axes, inside = torch.empty(3, len(positions)), torch.empty(len(positions))
-    _contract(positions.detach().numpy(), axes.numpy(), inside.numpy())
+    arrays = positions.detach().numpy(), axes.numpy(), inside.numpy()
+    in_parts(lambda first, last: _contract(*arrays, first, last), len(positions), LEAST_SHARE)
     return axes.t(), inside

@@ -228,20 +228,21 @@ class FusedNerfactoField(NerfactoField):
         if of_rays is None:
             of_rays = self._encoded(directions[:, 0])
         weights, biases = _parameters(self.mlp_head)
-        of_direction, of_features, of_appearance = torch.split(
-            weights[0], [of_rays.shape[1], self.geo_feat_dim, self.appearance_embedding_dim], dim=1
-        )
-        shared = torch.addmm(biases[0], of_rays, of_direction.t())
-        if self.embedding_appearance is not None:
-            if self.training:
-                shared = torch.addmm(shared, self.embedding_appearance(cameras[:, 0, 0]), of_appearance.t())
-            elif self.use_average_appearance_embedding:
-                shared = shared + of_appearance @ self.embedding_appearance.mean(dim=0)
-        colours = network(
-            density_embedding.reshape(-1, self.geo_feat_dim),
-            [of_features, *weights[1:]],
-            [shared, *biases[1:]],
-        )
+        features, widths = density_embedding.reshape(-1, self.geo_feat_dim), (of_rays.shape[1], self.geo_feat_dim)
+        if _in_parts(features) and len(features) == len(of_rays) and self.embedding_appearance is None:
+            # a ray of one sample has nothing that samples share
+            colours = network(torch.cat([of_rays, features], dim=1), weights, biases)
+        else:
+            of_direction, of_features, of_appearance = torch.split(
+                weights[0], [*widths, self.appearance_embedding_dim], dim=1
+            )
+            shared = torch.addmm(biases[0], of_rays, of_direction.t())
+            if self.embedding_appearance is not None:
+                if self.training:
+                    shared = torch.addmm(shared, self.embedding_appearance(cameras[:, 0, 0]), of_appearance.t())
+                elif self.use_average_appearance_embedding:
+                    shared = shared + of_appearance @ self.embedding_appearance.mean(dim=0)
+            colours = network(features, [of_features, *weights[1:]], [shared, *biases[1:]])
         # float32 also where autocast had it otherwise, as nerfstudio's
         return {FieldHeadNames.RGB: torch.sigmoid(colours).view(directions.shape).to(directions)}
 

@@ -25,6 +25,8 @@ from edge_depth_nerf.kernels.threads import in_parts
 ZERO, ONE, TWO, THREE = (np.float32(number) for number in range(4))
 LEAST_SHARE = 1 << 16
 """A thread gets at least so many samples."""
+LEAST_WALKED = 1 << 15
+"""The same where lists are walked, which takes longer."""
 EPS = np.float32(1e-7)
 """nerfstudio's, in the proposal loss."""
 
@@ -116,10 +118,10 @@ def weights_from_densities(
 
 @compiled()
 @no_type_check
-def _place_samples(weights, edges, wanted, padding, least, placed):
+def _place_samples(weights, edges, wanted, padding, least, placed, first, last):
     samples = weights.shape[1]
     cumulative = np.empty(samples + 1, np.float32)
-    for ray in range(len(weights)):
+    for ray in range(first, last):
         total = 0.0
         for i in range(samples):
             total += weights[ray, i] + padding
@@ -166,20 +168,22 @@ def place_samples(
 
     """
     placed = torch.empty(wanted.shape)
-    arrays = (each.detach().contiguous().numpy() for each in (weights, edges, wanted))
-    _place_samples(*arrays, np.float32(padding), np.float32(least), placed.numpy())
+    arrays = [each.detach().contiguous().numpy() for each in (weights, edges, wanted)]
+    arguments = *arrays, np.float32(padding), np.float32(least), placed.numpy()
+    numbers = weights.shape[1] + wanted.shape[1]
+    in_parts(lambda first, last: _place_samples(*arguments, first, last), len(weights), LEAST_WALKED // numbers)
     return placed
 
 
 @compiled()
 @no_type_check
-def _bound_loss(edges, weights, outer_edges, outer_weights, to_outer, follow):
+def _bound_loss(edges, weights, outer_edges, outer_weights, to_outer, follow, begin, end):
     """Give the sum of the loss; what each outer weight would change it by goes to `to_outer`, if wanted."""
     samples, intervals = weights.shape[1], outer_weights.shape[1]
     cumulative = np.empty(intervals + 1, np.float32)
     slope = np.empty(intervals + 1, np.float32)
     loss = 0.0
-    for ray in range(len(weights)):
+    for ray in range(begin, end):
         cumulative[0] = ZERO
         running = 0.0
         for i in range(intervals):
@@ -213,8 +217,15 @@ class _BoundLoss(torch.autograd.Function):
     def forward(ctx: Any, edges: Tensor, weights: Tensor, outer_edges: Tensor, outer_weights: Tensor) -> Tensor:
         follow = ctx.needs_input_grad[3]
         slope = torch.empty(outer_weights.shape if follow else (0, 0))
-        arrays = (each.detach().contiguous().numpy() for each in (edges, weights, outer_edges, outer_weights))
-        loss = _bound_loss(*arrays, slope.numpy(), follow) / max(1, weights.numel())
+        arrays = [each.detach().contiguous().numpy() for each in (edges, weights, outer_edges, outer_weights)]
+        # in the order of the rays, whichever thread was ready first: the same sum each time
+        of_parts: dict[int, float] = {}
+
+        def work(first: int, last: int) -> None:
+            of_parts[first] = _bound_loss(*arrays, slope.numpy(), follow, first, last)
+
+        in_parts(work, len(weights), LEAST_WALKED // max(1, weights.shape[1] + outer_weights.shape[1]))
+        loss = sum(of_parts[first] for first in sorted(of_parts)) / max(1, weights.numel())
         if follow:
             ctx.save_for_backward(slope / weights.numel())
         return torch.tensor(loss, dtype=torch.float32)

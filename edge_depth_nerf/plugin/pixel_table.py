@@ -145,20 +145,11 @@ class PixelTable:
 
     def batch(self, start: int, count: int) -> PixelBatch:
         """Read `count` pixels from number `start` on; after the last one comes the first again."""
-        records = self.records(start, count)
+        # imported here, because Numba takes half a second to load
+        from edge_depth_nerf.kernels.pixel_records_numba import unpacked
 
-        def metres(steps: NDArray[np.uint16]) -> Tensor:
-            return torch.from_numpy(steps.astype(np.float32) / DISTANCE_STEPS_PER_METRE)[:, None]
-
-        sky = (records["distance"] == 0) & (records["sigma"] == SKY)
-        where = np.stack([records[name].astype(np.int64) for name in ("picture", "row", "column")], axis=1)
-        return PixelBatch(
-            indices=torch.from_numpy(where),
-            rgb=torch.from_numpy(records["rgb"].astype(np.float32) / 255),
-            prior_distance_m=metres(records["distance"]),
-            prior_sigma_m=metres(np.where(sky, 0, records["sigma"])),
-            sky=torch.from_numpy(sky)[:, None],
-        )
+        packed = np.ascontiguousarray(self.records(start, count)).view(np.uint8)
+        return PixelBatch(*unpacked(packed, DISTANCE_STEPS_PER_METRE, SKY))
 
 
 @dataclass(frozen=True, eq=False)

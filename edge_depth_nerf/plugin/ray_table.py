@@ -143,13 +143,13 @@ class TableRayGenerator(RayGenerator):
     def forward(self, ray_indices: Int[Tensor, "num_rays 3"]) -> RayBundle:
         """Rays of pixels, given by picture, row and column."""
         picture, row, column = ray_indices.unbind(-1)
-        place = self.first[picture] + row * self.widths[picture] + column
-        if place.device.type == "cpu":
+        if ray_indices.device.type == "cpu":
             # imported here, because Numba takes half a second to load
             from edge_depth_nerf.kernels.table_rays_numba import turned
 
-            origins, directions, rest = turned(self.table, place, picture, self.poses)
+            origins, directions, rest = turned(self.table, self.first, self.widths, ray_indices, self.poses)
         else:
+            place = self.first[picture] + row * self.widths[picture] + column
             ray, pose = self.table[place], self.poses[picture]
             origins, rest = pose[:, :3, 3], ray[:, REST]
             directions = torch.sum(ray[:, None, DIRECTION] * pose[:, :3, :3], dim=-1)
