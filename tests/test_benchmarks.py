@@ -410,6 +410,38 @@ def test_the_pages_curves_are_those_of_their_runs(benchmark_module):
     assert pages.with_part(text, curves.PART, "\n".join(curves.table(curves.kept()))) == text
 
 
+def test_the_pages_parts_of_a_step_are_those_that_were_measured(benchmark_module):
+    parts, pages = benchmark_module("step_parts"), benchmark_module("pages")
+    results = read_json(parts.RESULTS)
+    text = (ROOT / "docs" / "speed.md").read_text(encoding="utf-8")
+    assert f"<!-- {parts.PART} -->" in text
+    assert pages.with_part(text, parts.PART, parts.table(results)) == text
+    for each in results["threads"].values():
+        # what is left out of no part is the whole, but for the measuring itself
+        assert sum(each["parts"].values()) == pytest.approx(each["ms"], rel=0.15)
+
+
+def test_a_part_of_a_step_is_without_what_it_contains(benchmark_module, monkeypatch):
+    parts = benchmark_module("step_parts")
+    now = [0.0]
+    monkeypatch.setattr(parts.time, "perf_counter", lambda: now[0])
+
+    class Step:
+        def inner(self) -> None:
+            now[0] += 2
+
+        def outer(self) -> None:
+            now[0] += 1
+            self.inner()
+            self.inner()
+
+    clock, step = parts.Clock(), Step()
+    clock.measure(step, "inner", "networks")
+    clock.measure(step, "outer", "rest")
+    step.outer()
+    assert clock.seconds == {"networks": 4, "rest": 1}
+
+
 def test_the_page_of_unseen_drives_by_hand(benchmark_module, tmp_path):
     unseen, pages = benchmark_module("unseen"), benchmark_module("pages")
     drives = ("street", "turn")
@@ -472,13 +504,14 @@ def test_the_page_of_unseen_drives_by_hand(benchmark_module, tmp_path):
 
     for folder, methods in (
         ("grid/search", {"edge": {"lambda": 0.03, "sigma_m": "own"}}),
-        ("search", {"edge-mono": {}}),
+        ("search", {"edge-mono": {}, "edge-paper": {"lambda": 0.003, "sigma_m": 0.3}}),
     ):
         write_json(tmp_path / folder / "tuned.json", {"seed": 0, "methods": methods})
     unseen.write_tuned(tmp_path / "grid", tmp_path / "search", tmp_path / "tuned.json")
     tuned = read_json(tmp_path / "tuned.json")["methods"]
     # one σ and one λ for both kernels
     assert tuned["edge-gaussian"] == tuned["edge"] and "edge-mono" in tuned
+    assert {name: tuned[name]["sigma_m"] for name in unseen.LITERAL} == dict.fromkeys(unseen.LITERAL, 0.3)
     # every method that is trained has what a kept search found for it
     kept = read_json(unseen.write_kept(tmp_path / "kept.json"))["methods"]
     trained = {*unseen.CELLS, *unseen.BESIDE_THE_GRID, *unseen.claimed(grid), *unseen.LARGE}

@@ -26,7 +26,7 @@ from edge_depth_nerf.compare import command
         ({"seeds": ()}, "--seeds"),
         ({"seeds": (1, 1)}, "--seeds 1 1: expected each once"),
         ({"methods": ("edge", "edge")}, "--methods edge edge"),
-        ({"preset": "paper", "methods": ("edge-paper",)}, "edge, which is the literal method"),
+        ({"preset": "paper", "methods": ("edge-paper",)}, "expected edge, edge-lidar, .* of the literal method"),
         ({"lambdas": (0.1,)}, "without --search"),
         ({"search": True}, "--lambdas"),
         ({"search": True, "lambdas": (1.0, 2.0, 3.0, 4.0)}, "--sigmas-m"),

@@ -87,6 +87,8 @@ ALLOWED = {
     "edge-lidar-plain": {SOURCE, *EXTRAS},
     "edge-plain": EXTRAS,
 }
+ALLOWED["edge-paper-lidar"] = ALLOWED["edge-paper-mono"] = ALLOWED["edge-paper"]
+ALLOWED["edge-paper-gaussian"] = {*ALLOWED["edge-paper"], "pipeline.datamanager.prior.integration.kernel"}
 """What each method may have otherwise than `edge`; no method may be missing here."""
 
 
@@ -132,7 +134,7 @@ def test_methods_say_which_extras_they_go_without(method):
 @pytest.mark.parametrize("preset", ["lite", "paper"])
 def test_the_table_shows_each_field_in_which_methods_differ(preset):
     """Against the configurations themselves, value by value, for each pair of methods."""
-    names: list[MethodName] = [name for name in METHODS if not (preset == "paper" and name == "edge-paper")]
+    names: list[MethodName] = [name for name in METHODS if not (preset == "paper" and name.startswith("edge-paper"))]
     runs, values = [], {}
     for name in names:
         specification = RunSpecification("/scenes/a", "", preset, name, 0, 10)
@@ -174,6 +176,14 @@ def test_each_method_is_what_its_name_says():
     assert loss_and_source("edge-mono") == ("edge", "mono", "edge-aware")
     assert loss_and_source("edge-gaussian") == ("edge", "integrated", "spatial-gaussian")
     assert loss_and_source("edge") == loss_and_source("edge-paper") == ("edge", "integrated", "edge-aware")
+    kernel = "pipeline.datamanager.prior.integration.kernel"
+    for name, field, value in (
+        ("edge-paper-lidar", SOURCE, "lidar"),
+        ("edge-paper-mono", SOURCE, "mono"),
+        ("edge-paper-gaussian", kernel, "spatial-gaussian"),
+    ):
+        changed = differing(resolved("edge-paper"), resolved(name))
+        assert {**changed} == {field: (resolved("edge-paper")[field], value)}, name
 
 
 @pytest.mark.parametrize("steps", [1000, 4000])

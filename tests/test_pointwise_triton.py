@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, no_type_check
 
+import numpy as np
 import pytest
 import torch
 from ahead_of_time import ARCHITECTURES, compiled
 from interpreted import NEEDS_A_GPU, assert_near, in_interpreter, moved_in_interpreter, on_a_gpu
+from numba import njit
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from edge_depth_nerf.kernels import back_ends, pointwise_numba, threads
+from edge_depth_nerf.kernels.exponential_numba import exp
 
 SIZES = ((1, 1), (5, 17), (33, 49), (3, 256), (7, 300))
 """Rays and samples, of which few are multiples of what a program works on."""
@@ -107,6 +110,26 @@ def check_harmonics(kernels: Any = None) -> None:
 def test_in_the_interpreter():
     pytest.importorskip("triton")
     in_interpreter(check_distances, check_positions, check_densities, check_harmonics)
+
+
+@njit
+@no_type_check
+def exponentials(x, into):
+    for k in range(len(x)):
+        into[k] = exp(x[k])
+
+
+def test_the_exponential_function():
+    x = np.linspace(-87.3, 88.3, 1_000_003, dtype=np.float32)
+    found = np.empty_like(x)
+    exponentials(x, found)
+    exact = np.exp(x.astype(np.float64))
+    assert np.abs(found / exact - 1).max() < 1.5 * 2**-23
+    assert (np.diff(found) >= 0).mean() > 0.999
+    x = np.array([0, -0.0, -88, -np.inf, 89, np.inf, np.nan, 1], np.float32)
+    exponentials(x, found[:8])
+    np.testing.assert_array_equal(found[:7], np.array([1, 1, 0, 0, np.inf, np.inf, np.nan], np.float32))
+    assert found[7] == np.float32(np.e)
 
 
 @pytest.mark.parametrize("check", [check_distances, check_positions, check_densities, check_harmonics])

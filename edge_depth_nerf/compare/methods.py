@@ -114,6 +114,11 @@ def _of_grid_alone(cell: Cell) -> Method:
     return replace(method, only_in_grid=True)
 
 
+def _of_the_literal(name: MethodName, title: str, needs: tuple[str, ...], **changed: Any) -> Method:
+    """The literal method with one thing changed: a row of the paper's Table 3 or 4."""
+    return replace(_edge(name, title, needs, literal=True, **changed), only_in_grid=True)
+
+
 def _name(name: str) -> MethodName:
     assert name in get_args(MethodName), name
     return cast(MethodName, name)
@@ -159,6 +164,14 @@ METHODS: dict[MethodName, Method] = {
         _of_grid_alone(Cell("ds-nerf", "integrated", True)),
         _of_grid_alone(Cell("edge", "lidar", False)),
         _of_grid_alone(Cell("edge", "integrated", False)),
+        _of_the_literal("edge-paper-lidar", "as published, LiDAR alone", ("lidar",), depth_source="lidar"),
+        _of_the_literal("edge-paper-mono", "as published, monocular alone", ("mono",), depth_source="mono"),
+        _of_the_literal(
+            "edge-paper-gaussian",
+            "as published, spatial Gaussian",
+            ("lidar", "mono"),
+            overrides={_KERNEL: "spatial-gaussian"},
+        ),
     )
 }
 """λ and σ of the rivals stand here; those of edge-… are the configuration's own, unless a search found better ones."""

@@ -38,6 +38,9 @@ MethodName = Literal[
     "ds-nerf-integrated-extras",
     "edge-lidar-plain",
     "edge-plain",
+    "edge-paper-lidar",
+    "edge-paper-mono",
+    "edge-paper-gaussian",
 ]
 Sigma = float | Literal["own"]
 
@@ -58,8 +61,8 @@ class CompareOptions:
     output: Path
     """Folder for the runs, results.csv and results.json, tables.md and tables.tex, pictures and plots."""
     methods: tuple[MethodName, ...] = ()
-    """Which methods. Not set: all except those of the grid; with --preset paper also without edge-paper, which equals
-    edge there; with --grid all its cells."""
+    """Which methods. Not set: all except those of the grid and edge-paper-…; with --preset paper also without
+    edge-paper, which equals edge there; with --grid all its cells."""
     steps: int | None = None
     """Training steps of each run; the learning rates fall over them. Not set: the preset's."""
     seeds: tuple[int, ...] = (0,)
@@ -122,10 +125,11 @@ class CompareOptions:
             ("sigmas-m", self.sigmas_m),
         ):
             require(len(set(values)) == len(values), f"--{name} {' '.join(map(str, values))}", "each once")
+        literal = [name for name in self.methods if name.startswith("edge-paper")]
         require(
-            not (self.preset == "paper" and "edge-paper" in self.methods),
-            "--preset paper --methods edge-paper",
-            "edge, which is the literal method in this preset",
+            not literal or self.preset != "paper",
+            f"--preset paper --methods {' '.join(literal)}",
+            "edge, edge-lidar, edge-mono, edge-gaussian, which are of the literal method in this preset",
         )
         require(
             self.grid or self.search_steps is None,

@@ -304,6 +304,20 @@ def make_tables(results: Results) -> list[MadeTable]:
         ("2", "Rivals, drives of JBNU-Depth360", drives["2"], rivals, []),
         ("3", "Source of depth", results.scenes(), ["edge-lidar", "edge-mono", "edge"], [INTEGRATED, SAME_ROW]),
         ("4", "Kernel of the integration", results.scenes(), ["edge-gaussian", "edge"], [EDGE_AWARE]),
+        (
+            "3, as published",
+            "Source of depth, the published method",
+            results.scenes(),
+            ["edge-paper-lidar", "edge-paper-mono", "edge-paper"],
+            [INTEGRATED],
+        ),
+        (
+            "4, as published",
+            "Kernel of the integration, the published method",
+            results.scenes(),
+            ["edge-paper-gaussian", "edge-paper"],
+            [EDGE_AWARE],
+        ),
     ]
     tables = []
     for label, title, scenes, names, notes in wanted:
