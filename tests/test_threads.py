@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import numpy as np
 import pytest
 import torch
 
+from edge_depth_nerf.kernels import contraction_numba, pixel_records_numba, ray_numba, table_rays_numba, threads
 from edge_depth_nerf.kernels.hash_grid_numba import _threads
 from edge_depth_nerf.kernels.threads import kernel_threads, torch_on_one_thread
 
@@ -35,3 +39,66 @@ def test_an_error_gives_torch_its_threads_back():
     with pytest.raises(ZeroDivisionError), torch_on_one_thread():
         _ = 1 / 0
     assert (torch.get_num_threads(), kernel_threads()) == (3, 3)
+
+
+def places() -> torch.Tensor:
+    edges, weights = torch.rand(7, 10).sort(dim=1)[0], torch.rand(7, 9)
+    return ray_numba.place_samples(weights, edges, torch.rand(7, 5).sort(dim=1)[0], 0.01, 1e-5)
+
+
+def proposal_loss() -> tuple[torch.Tensor, torch.Tensor]:
+    edges, outer_edges = (torch.rand(7, count).sort(dim=1)[0] for count in (6, 9))
+    outer_weights = (torch.rand(7, 8) / 50).requires_grad_()
+    loss = ray_numba.bound_loss(edges, torch.rand(7, 5), outer_edges, outer_weights)
+    return loss.detach(), torch.autograd.grad(loss, outer_weights)[0]
+
+
+def contracted() -> tuple[torch.Tensor, ...]:
+    return contraction_numba.contract(4 * torch.randn(11, 3))
+
+
+def unpacked() -> tuple[torch.Tensor, ...]:
+    return pixel_records_numba.unpacked(torch.randint(256, (11 * 15,), dtype=torch.uint8).numpy(), 256, 65535)
+
+
+def turned() -> tuple[torch.Tensor, ...]:
+    indices = torch.stack([torch.randint(2, (11,)), torch.randint(4, (11,)), torch.randint(3, (11,))], dim=1)
+    begins, widths = torch.tensor([0, 12]), torch.tensor([3, 3])
+    return table_rays_numba.turned(torch.rand(24, 5), begins, widths, indices, torch.rand(2, 3, 4))
+
+
+@pytest.mark.parametrize("work", [places, proposal_loss, contracted, unpacked, turned])
+def test_the_same_on_three_threads(work: Callable[[], torch.Tensor | tuple[torch.Tensor, ...]], monkeypatch):
+    def once() -> list[np.ndarray]:
+        torch.manual_seed(3)
+        found = work()
+        return [each.numpy() for each in ([found] if isinstance(found, torch.Tensor) else found)]
+
+    alone = once()
+    shares = []
+    given = threads.share_out
+
+    def counted(work, parts) -> None:
+        shares.append(len(parts))
+        given(work, parts)
+
+    monkeypatch.setattr(threads, "share_out", counted)
+    monkeypatch.setattr(threads, "kernel_threads", lambda: 3)
+    for module in (ray_numba, contraction_numba, pixel_records_numba, table_rays_numba):
+        for name in ("LEAST_SHARE", "LEAST_WALKED"):
+            monkeypatch.setattr(module, name, 2, raising=False)
+    for together, one in zip(once(), alone, strict=True):
+        np.testing.assert_allclose(together, one, rtol=1e-6)
+    assert 3 in shares
+
+
+def test_a_pixel_that_is_not_there_is_found_by_every_thread(monkeypatch):
+    monkeypatch.setattr(threads, "kernel_threads", lambda: 3)
+    monkeypatch.setattr(table_rays_numba, "LEAST_SHARE", 2)
+    begins, widths, poses = torch.tensor([0, 12]), torch.tensor([3, 3]), torch.rand(2, 3, 4)
+    for place in range(9):
+        for wrong in ([2, 0, 0], [-1, 0, 0], [1, 4, 0], [0, -1, 0]):
+            indices = torch.zeros(9, 3, dtype=torch.int64)
+            indices[place] = torch.tensor(wrong)
+            with pytest.raises(IndexError, match="2 cameras, and 24 pixels"):
+                table_rays_numba.turned(torch.rand(24, 5), begins, widths, indices, poses)
