@@ -16,7 +16,7 @@ import os
 import statistics
 import tempfile
 import time
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -79,7 +79,7 @@ class Clock:
     """Seconds of parts, each without those that it contains."""
 
     def __init__(self) -> None:
-        self.seconds: Counter[str] = Counter()
+        self.seconds: defaultdict[str, float] = defaultdict(float)
         self._inner: list[float] = []
 
     def measure(self, holder: Any, name: str, part: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import fields
 
 import pytest
 import torch
@@ -22,7 +23,14 @@ from edge_depth_nerf.kernels.contraction_numba import contract
 from edge_depth_nerf.kernels.fields import FusedMLP, FusedNerfactoField, use_fused_fields
 from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss, proposal_loss
 from edge_depth_nerf.kernels.network import network
-from edge_depth_nerf.kernels.ray_samplers import FirstSampler, FusedPDFSampler, FusedRaySamples, edges_of
+from edge_depth_nerf.kernels.ray_samplers import (
+    FirstSampler,
+    FusedFrustums,
+    FusedPDFSampler,
+    FusedRaySamples,
+    edges_of,
+    samples_along,
+)
 from edge_depth_nerf.plugin.config import FusedAdamConfig
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
 
@@ -110,8 +118,9 @@ biases += [torch.randn(1, 40), torch.randn(1, 3)]
 x, gradient = torch.randn(150, 15), torch.randn(150, 3)
 exact = [each.double().requires_grad_() for each in (x, *weights, *biases)]
 expected = network._layer_by_layer(exact[0], exact[1:4], exact[4:])
-to_x, to_weights, to_biases = compiled.backward(x, weights, biases, gradient, True)
-found = [compiled.forward(x, weights, biases), to_x, *to_weights, *to_biases]
+arrays = compiled.Arrays(x, weights, biases)
+to_x, to_weights, to_biases = compiled.backward(arrays, gradient, True)
+found = [compiled.forward(arrays), to_x, *to_weights, *to_biases]
 for each, other in zip(found, [expected, *torch.autograd.grad(expected, exact, gradient.double())], strict=True):
     assert float((each - other).abs().max()) <= 1e-5 * float(other.abs().max())
 print("vectors of", compiled.VECTOR)
@@ -239,6 +248,39 @@ def test_the_first_samples_lie_where_nerfstudio_puts_them(training, single_jitte
     for expected, placed in zip(*found, strict=True):
         torch.testing.assert_close(placed, expected, rtol=1e-5, atol=1e-5)
     assert found[0][1].std() > 1
+
+
+@pytest.mark.parametrize("shape", [(40,), (20, 2)], ids=str)
+def test_samples_along_rays_are_nerfstudios_field_by_field(shape):
+    rays = bundle()
+    rays.metadata["directions_norm"] = torch.rand(40, 1)
+    rays = rays.reshape(shape)
+    edges = torch.rand(*rays.shape, 8, 1).cumsum(-2)
+    more = {"spacing_starts": edges[..., :-1, :] / 9, "spacing_to_euclidean_fn": torch.exp}
+    expected = rays.get_ray_samples(bin_starts=edges[..., :-1, :], bin_ends=edges[..., 1:, :], **more)
+    found = samples_along(rays, edges[..., :-1, :], edges[..., 1:, :], **more)
+    assert (type(found), type(found.frustums)) == (FusedRaySamples, FusedFrustums)
+    assert found.shape == expected.shape == (*rays.shape, 7)
+    assert expected.metadata
+    compared = []
+    for mine, theirs in (
+        (found, expected),
+        (found.frustums, expected.frustums),
+        (found.frustums[2:4], expected.frustums[2:4]),
+        (found.frustums.reshape((2, -1)), expected.frustums.reshape((2, -1))),
+    ):
+        assert mine.shape == theirs.shape
+        for field in fields(mine):
+            value, wanted = getattr(mine, field.name), getattr(theirs, field.name)
+            if isinstance(wanted, torch.Tensor):
+                assert torch.equal(value, wanted) and value.shape == wanted.shape, field.name
+                compared.append(field.name)
+            elif field.name == "metadata":
+                assert value.keys() == wanted.keys()
+                assert all(torch.equal(value[name], wanted[name]) for name in wanted)
+            elif field.name != "frustums":
+                assert value is wanted, field.name
+    assert len(compared) == 3 + 3 * 5
 
 
 def histograms(seed: int = 0, rays: int = 50) -> tuple[torch.Tensor, ...]:

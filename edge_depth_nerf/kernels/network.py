@@ -28,22 +28,24 @@ class _Network(torch.autograd.Function):
         # imported here, because Numba takes half a second to load
         from edge_depth_nerf.kernels import network_numba
 
+        ctx.arrays = network_numba.Arrays(x, parameters[::2], parameters[1::2])
         ctx.save_for_backward(x, *parameters)
-        return network_numba.forward(x, parameters[::2], parameters[1::2])
+        return network_numba.forward(ctx.arrays)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        return _Gradients.apply(gradients[0], ctx.needs_input_grad[0], *ctx.saved_tensors)
+        # saved_tensors finds out if one was changed since
+        return _Gradients.apply(gradients[0], ctx.needs_input_grad[0], ctx.arrays, *ctx.saved_tensors)
 
 
 class _Gradients(torch.autograd.Function):
     """The gradients, as a step of its own that refuses to be differentiated once more."""
 
     @staticmethod
-    def forward(ctx: Any, gradient: Tensor, follow_x: bool, x: Tensor, *parameters: Tensor) -> tuple[Any, ...]:
+    def forward(ctx: Any, gradient: Tensor, follow_x: bool, arrays: Any, *_: Tensor) -> tuple[Any, ...]:
         from edge_depth_nerf.kernels import network_numba
 
-        to_x, to_weights, to_biases = network_numba.backward(x, parameters[::2], parameters[1::2], gradient, follow_x)
+        to_x, to_weights, to_biases = network_numba.backward(arrays, gradient, follow_x)
         return to_x, *(each for pair in zip(to_weights, to_biases, strict=True) for each in pair)
 
     @staticmethod

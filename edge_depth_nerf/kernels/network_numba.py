@@ -287,10 +287,14 @@ def _packed(weights: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     return packed, begins
 
 
-class _Arrays:
-    """A network as the compiled functions want it: flat arrays."""
+class Arrays:
+    """A network and its points as the compiled functions want them: flat arrays.
+
+    Weights and biases are copies.
+    """
 
     def __init__(self, x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> None:
+        """Arrange what `network` is given; the first bias is [groups, out], the others are [1, out]."""
         self.points, self.groups = len(x), len(biases[0])
         self.weights = [weight.detach().numpy() for weight in weights]
         # [in, out] each
@@ -326,19 +330,17 @@ def _unpacked(packed: np.ndarray, begins: np.ndarray, shapes: Sequence[Sequence[
     ]
 
 
-def forward(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tensor:
-    """Apply a network; see `network`. The first bias is [groups, out], the others are [1, out]."""
-    net, result = _Arrays(x, weights, biases), torch.empty(len(x), len(weights[-1]))
+def forward(net: Arrays) -> Tensor:
+    """Apply a network; see `network`."""
+    result = torch.empty(net.points, len(net.weights[-1]))
     arrays = *net.arrays, *net.of_groups, _flat(result)
     share_out(lambda part: _forward(*arrays, *part), net.parts())
     return result
 
 
-def backward(
-    x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], gradient: Tensor, follow_x: bool
-) -> tuple[Tensor | None, list[Tensor], list[Tensor]]:
+def backward(net: Arrays, gradient: Tensor, follow_x: bool) -> tuple[Tensor | None, list[Tensor], list[Tensor]]:
     """Give the gradients to the inputs (None unless `follow_x`), to the weights and to the biases."""
-    net, to_x = _Arrays(x, weights, biases), torch.empty(len(x) if follow_x else 0, x.shape[1])
+    weights, to_x = net.weights, torch.empty(net.points if follow_x else 0, int(net.widths[0]))
     up, begins_up = _packed(net.weights)
     arrays = *net.arrays, up, begins_up, *net.of_groups, _flat(gradient), _flat(to_x)
     parts, to_shared = net.parts(), np.zeros_like(net.shared)

@@ -40,7 +40,13 @@ from edge_depth_nerf.kernels.allocator import keep_freed_memory
 from edge_depth_nerf.kernels.fields import CubeContraction, FusedNerfactoField, use_fused_fields
 from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss, proposal_loss
 from edge_depth_nerf.kernels.openmp import let_idle_threads_sleep
-from edge_depth_nerf.kernels.ray_samplers import FirstSampler, FusedPDFSampler, edges_of, fused, use_fused_samples
+from edge_depth_nerf.kernels.ray_samplers import (
+    FirstSampler,
+    FusedPDFSampler,
+    edges_of,
+    samples_along,
+    use_fused_samples,
+)
 from edge_depth_nerf.method.losses import URBAN_TERMS, UrbanTerms, edge_losses, sky_loss, urban_nerf_loss
 from edge_depth_nerf.method.metrics import DepthErrors, load_lpips, masked_lpips, masked_psnr, masked_ssim
 from edge_depth_nerf.method.uncertainty import termination_std
@@ -403,8 +409,8 @@ class EdgeDepthNerfModel(NerfactoModel):
         )
         every = RayBundle(origins, directions, areas, pictures)
         at = torch.cat(distances)[:, None, None]
-        samples = every.get_ray_samples(bin_starts=0.99 * at, bin_ends=1.01 * at)
-        return fused(samples) if self.fused else samples
+        along = samples_along if self.fused else RayBundle.get_ray_samples
+        return along(every, 0.99 * at, 1.01 * at)
 
     def _fields(self, parts: list[RaySamples]) -> list[dict[FieldHeadNames, Tensor]]:
         """The field at several sets of samples."""

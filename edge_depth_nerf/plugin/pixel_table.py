@@ -80,6 +80,9 @@ class PixelBatch:
 
     def __getitem__(self, chosen: Bool[Tensor, "n"] | slice) -> PixelBatch:
         """Some of the pixels."""
+        if not isinstance(chosen, slice):
+            # looked up once, not for each field
+            chosen = chosen.nonzero()[:, 0]
         return PixelBatch(**{entry.name: getattr(self, entry.name)[chosen] for entry in fields(self)})
 
 
