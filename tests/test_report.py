@@ -24,8 +24,9 @@ from edge_depth_nerf import cli
 from edge_depth_nerf.base.files import write_png
 from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.base.pictures import NO_VALUE_RGB, colour_distance, distance_of_colours
+from edge_depth_nerf.compare.methods import METHODS
 from edge_depth_nerf.compare.options import CompareOptions, MethodName
-from edge_depth_nerf.compare.plots import Bins, plot_bins
+from edge_depth_nerf.compare.plots import Bins, plot_bins, style_of
 from edge_depth_nerf.demo.options import DemoOptions
 from edge_depth_nerf.jobs.runs import command_line
 from edge_depth_nerf.process.options import Kitti360Options
@@ -410,6 +411,10 @@ def test_only_its_own_script_and_style_count(report):
     for name, contents in (("script-src", page.texts["script"][1:]), ("style-src", page.texts["style"])):
         digests = [base64.b64encode(hashlib.sha256(content.encode()).digest()).decode() for content in contents]
         assert digests and parts[name].split(" ") == [f"'sha256-{digest}'" for digest in digests]
+
+
+def test_every_method_has_a_line_of_its_own():
+    assert len({style_of(name) for name in METHODS}) == len(METHODS)
 
 
 def test_plots_are_svg_in_two_colours():

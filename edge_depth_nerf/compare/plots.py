@@ -36,6 +36,9 @@ STYLES: dict[MethodName, tuple[str, str, str, str]] = {
     "edge-mono": ("#8ab17d", "#a9d39a", ":", "D"),
     "edge-gaussian": ("#9b5de5", "#bb92f5", "-.", "P"),
     "edge-paper": ("#3a86ff", "#70a9ff", "-.", "X"),
+    "edge-paper-lidar": ("#2a9d8f", "#3cc4b3", "--", "1"),
+    "edge-paper-mono": ("#8ab17d", "#a9d39a", "--", "2"),
+    "edge-paper-gaussian": ("#9b5de5", "#bb92f5", "--", "3"),
     "edge": ("#d62828", "#ff625c", "-", "o"),
 }
 BINS = {"by_angle_deg": "angle from the optical axis, degrees", "by_distance_m": "distance, m"}

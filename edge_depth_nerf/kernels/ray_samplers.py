@@ -177,7 +177,7 @@ def samples_along(
         more: other fields of the samples, of their shape.
 
     """
-    if rays.origins.ndim != 2:
+    if rays.origins.ndim != 2 or any(isinstance(each, dict) for each in rays.metadata.values()):
         return fused(rays.get_ray_samples(bin_starts=starts, bin_ends=ends, **more))
     shape = len(rays), starts.shape[1]
 
@@ -199,7 +199,8 @@ def samples_along(
         frustums=frustums,
         camera_indices=None if rays.camera_indices is None else of_rays(rays.camera_indices),
         deltas=ends - starts,
-        metadata={name: of_rays(values) for name, values in rays.metadata.items()},
+        # a number, such as a camera's, stays
+        metadata={name: of_rays(each) if isinstance(each, Tensor) else each for name, each in rays.metadata.items()},
         times=None if rays.times is None else of_rays(rays.times),
         **more,
     )
