@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from dataclasses import fields
+from typing import Any
 
 import pytest
 import torch
@@ -253,7 +254,8 @@ def test_the_first_samples_lie_where_nerfstudio_puts_them(training, single_jitte
 @pytest.mark.parametrize("shape", [(40,), (20, 2)], ids=str)
 def test_samples_along_rays_are_nerfstudios_field_by_field(shape):
     rays = bundle()
-    rays.metadata |= {"directions_norm": torch.rand(40, 1), "cam_idx": 0}
+    metadata: dict[str, Any] = rays.metadata
+    metadata |= {"directions_norm": torch.rand(40, 1), "cam_idx": 0}
     rays = rays.reshape(shape)
     edges = torch.rand(*rays.shape, 8, 1).cumsum(-2)
     more = {"spacing_starts": edges[..., :-1, :] / 9, "spacing_to_euclidean_fn": torch.exp}
