@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from threading import Event, Thread
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import torch
 
 from edge_depth_nerf.kernels import contraction_numba, pixel_records_numba, ray_numba, table_rays_numba, threads
 from edge_depth_nerf.kernels.hash_grid_numba import _threads
-from edge_depth_nerf.kernels.threads import kernel_threads, torch_on_one_thread
+from edge_depth_nerf.kernels.threads import kernel_threads, take_all_threads, torch_on_one_thread
 
 
 @pytest.fixture
@@ -39,6 +40,34 @@ def test_an_error_gives_torch_its_threads_back():
     with pytest.raises(ZeroDivisionError), torch_on_one_thread():
         _ = 1 / 0
     assert (torch.get_num_threads(), kernel_threads()) == (3, 3)
+
+
+@pytest.mark.usefixtures("three_threads")
+def test_a_viewer_that_begins_during_a_step_renders_on_all_threads():
+    begun, done, found = Event(), Event(), []
+
+    def view() -> None:
+        torch.ones(10).add_(1)
+        found.append(torch.get_num_threads())
+        begun.set()
+        done.wait()
+        found.append(torch.get_num_threads())
+        take_all_threads()
+        found.append(torch.get_num_threads())
+
+    viewer = Thread(target=view)
+    with torch_on_one_thread():
+        viewer.start()
+        begun.wait()
+        take_all_threads()
+        assert torch.get_num_threads() == 1
+    done.set()
+    viewer.join()
+    # without that it would stay at one
+    assert found == [1, 1, 3]
+    torch.set_num_threads(2)
+    take_all_threads()
+    assert torch.get_num_threads() == 2
 
 
 def places() -> torch.Tensor:

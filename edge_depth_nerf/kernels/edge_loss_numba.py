@@ -95,23 +95,7 @@ def edge_losses(
     eps: float,
     narrow: float,
 ) -> Float[Tensor, "levels"]:
-    """Compute Eq. 4 of each level of samples, mean over the rays that have a prior; float32.
-
-    Args:
-        levels: weights, starts and ends, each [rays, samples of the level], the lengths in any unit. Differentiable
-            once, by the weights alone.
-        prior_m: d̃, metres; a ray where it is not positive and finite adds nothing.
-        sigma_m: σ̂, metres; likewise.
-        metres_per_unit: metres in one unit of starts and ends.
-        interval: take the Gaussian's mass over a sample, not its value at the middle.
-        divide_by_norm: divide by σ̂ √(2π).
-        eps: added to the weights inside the logarithm.
-        narrow: below this length, in units of σ̂, an interval's mass comes from its midpoint.
-
-    Returns:
-        The loss of each level.
-
-    """
+    """Compute Eq. 4 of each level of samples, mean over rays that have a prior, as `edge_loss_triton` does."""
     options = np.float32(metres_per_unit), np.float32(eps), np.float32(narrow), interval, divide_by_norm
     of_rays = prior_m.float(), sigma_m.float()
     return torch.stack([_EdgeLoss.apply(*(each.float() for each in level), *of_rays, options) for level in levels])

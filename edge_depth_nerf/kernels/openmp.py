@@ -1,9 +1,9 @@
 """What OpenMP's threads do on the CPU while they have nothing to do.
 
 GNU's OpenMP, which torch brings, lets a thread that is done with its part turn in a loop for some milliseconds, in case
-that more is to come. A training step here goes back and forth between torch's threads and Numba's, and those that turn
-take the cores from those that work: a step takes a sixth longer, and five times as long beside one busy process
-(docs/speed.md).
+that more is to come. Rendering here goes back and forth between torch's threads and the kernels', and those that turn
+take the cores from those that work. (In a training step torch has one thread, see `threads`. Before that a step took a
+sixth longer with threads that turn, and five times as long beside one busy process.)
 
 `OMP_WAIT_POLICY=passive` lets them sleep, but is read when the library is loaded; in `ns-train` that is before this
 package is. The library also lets threads turn only briefly before they sleep, once it has created more threads than

@@ -33,17 +33,24 @@ EPS = np.float32(1e-7)
 
 @compiled()
 @no_type_check
+def _sum_depths(density, delta, depths, reached):
+    """Write the optical depths of a ray's samples, and the sums of those in front of each."""
+    for k in range(len(depths)):
+        depths[k] = delta[k] * density[k]
+    running = 0.0
+    for k in range(len(depths)):
+        reached[k] = np.float32(running)
+        running += depths[k]
+
+
+@compiled()
+@no_type_check
 def _weights(densities, deltas, weights, samples, first, last):
     depths, reached = np.empty(samples, np.float32), np.empty(samples, np.float32)
     for ray in range(first, last):
         begin = ray * samples
         density, delta, weight = densities[begin:], deltas[begin:], weights[begin:]
-        for k in range(samples):
-            depths[k] = delta[k] * density[k]
-        running = 0.0
-        for k in range(samples):
-            reached[k] = np.float32(running)
-            running += depths[k]
+        _sum_depths(density, delta, depths, reached)
         for k in range(samples):
             found = (ONE - exp(-depths[k])) * exp(-reached[k])
             # as nerfstudio: what is not a number weighs nothing
@@ -58,12 +65,7 @@ def _density_gradients(densities, deltas, gradient, to_densities, samples, first
         begin = ray * samples
         density, delta = densities[begin:], deltas[begin:]
         of_weight, into = gradient[begin:], to_densities[begin:]
-        for k in range(samples):
-            depths[k] = delta[k] * density[k]
-        running = 0.0
-        for k in range(samples):
-            reached[k] = np.float32(running)
-            running += depths[k]
+        _sum_depths(density, delta, depths, reached)
         for k in range(samples):
             depths[k], reached[k] = exp(-depths[k]), exp(-reached[k])
         # Σ_j>k g_j w_j, of what lies behind each sample; 0 times what is not a number is none: a broken training shows

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import os
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -16,6 +17,9 @@ from typing import Any
 import torch
 
 _kept: int | None = None
+"""What torch had before the step that is under way."""
+_trained: tuple[int, int] | None = None
+"""The thread that did the last step, and what torch has in it outside of steps."""
 
 
 def kernel_threads() -> int:
@@ -26,17 +30,28 @@ def kernel_threads() -> int:
 @contextmanager
 def torch_on_one_thread() -> Iterator[None]:
     """Let torch work on one thread, and the kernels on as many as before."""
-    global _kept
+    global _kept, _trained
     if _kept is not None:
         yield
         return
     _kept = torch.get_num_threads()
+    _trained = threading.get_ident(), _kept
     torch.set_num_threads(1)
     try:
         yield
     finally:
         torch.set_num_threads(_kept)
         _kept = None
+
+
+def take_all_threads() -> None:
+    """Give torch in this thread as many threads as where it trains.
+
+    Each thread keeps the number that it found at its first use of torch. A viewer's, which begins during a step, would
+    render on one for ever.
+    """
+    if _kept is None and _trained is not None and _trained[0] != threading.get_ident():
+        torch.set_num_threads(_trained[1])
 
 
 @functools.lru_cache(maxsize=1)

@@ -47,6 +47,7 @@ from edge_depth_nerf.kernels.ray_samplers import (
     samples_along,
     use_fused_samples,
 )
+from edge_depth_nerf.kernels.threads import take_all_threads
 from edge_depth_nerf.method.losses import URBAN_TERMS, UrbanTerms, edge_losses, sky_loss, urban_nerf_loss
 from edge_depth_nerf.method.metrics import DepthErrors, load_lpips, masked_lpips, masked_psnr, masked_ssim
 from edge_depth_nerf.method.uncertainty import termination_std
@@ -457,6 +458,7 @@ class EdgeDepthNerfModel(NerfactoModel):
 
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
         """Outputs of a whole view; distance and uncertainty also in colours that always mean the same metres."""
+        take_all_threads()
         outputs = super().get_outputs_for_camera(without_undefined_ray(camera), obb_box)
         for name, scale in (("distance", DISTANCE), ("distance_uncertainty", SIGMA)):
             outputs[f"{name}_coloured"] = coloured(outputs[name][..., 0], scale)
