@@ -172,6 +172,18 @@ def test_latex_and_markdown_hold_the_same_cells(results):
         assert {line.count(" & ") + 1 for line in cells} == {columns}
 
 
+def test_tables_say_whose_the_monocular_maps_are(results):
+    """Maps that the generator made of the truth are not those of the default pipeline."""
+    assert "Monocular maps" not in tables.as_markdown(results, [])
+    for run in results.runs:
+        run.content["mono_trained_on"] = "scene" if run.scene == "turn" else "elsewhere"
+    line = "Monocular maps: of a network trained on the drive (turn); made elsewhere (street)."
+    assert line in tables.as_markdown(results, []).splitlines()
+    for run in results.runs:
+        run.content["mono_trained_on"] = None
+    assert "Monocular maps" not in tables.as_markdown(results, [])
+
+
 def test_runs_that_differ_in_unnamed_fields_are_refused(results):
     check_fair(results)
     results.runs[-1].content["configuration"]["b"] = "2"

@@ -66,6 +66,7 @@ def test_it_leaves_figures_tables_and_pictures(finished):
         styles = [each.get("style", "") for each in plot.iter("{http://www.w3.org/2000/svg}path")]
         assert all(any(f"stroke: {colour}" in style for style in styles) for colour in ("#888888", "#d62828"))
     for run in results.runs:
+        assert run.content["mono_trained_on"] == "scene"
         assert [point["step"] for point in run.curve][-1] == 12
         assert all(math.isfinite(point["trained_psnr"]) for point in run.curve)
         seconds = [point["seconds"] for point in run.curve]

@@ -357,10 +357,24 @@ def introduction(results: Results) -> list[str]:
         lines.append("LPIPS is missing: its weights were not on this machine.")
     if any(run.specification["implementation"] == "torch" for run in results.runs):
         lines.append("nerfacto, UrbanNeRF and DS-NeRF ran in nerfstudio's own torch code.")
+    lines += _maps_lines(results)
     departures = sorted({text for run in results.runs for text in run.content.get("departures", [])})
     if departures:
         lines.append("Departures from the paper: " + "; ".join(departures) + ".")
     return lines
+
+
+MAPS = {"scene": "of a network trained on the drive", "elsewhere": "made elsewhere"}
+"""What made monocular maps, by where that was trained."""
+
+
+def _maps_lines(results: Results) -> list[str]:
+    """Whose monocular maps the drives have, where the runs say it."""
+    words = []
+    for trained_on, title in MAPS.items():
+        scenes = sorted({run.scene for run in results.runs if run.content.get("mono_trained_on") == trained_on})
+        words += [f"{title} ({', '.join(scenes)})"] if scenes else []
+    return [f"Monocular maps: {'; '.join(words)}."] if words else []
 
 
 def as_markdown(results: Results, tables: Sequence[MadeTable]) -> str:

@@ -39,8 +39,9 @@ from edge_depth_nerf.compare.protocol import departures
 from edge_depth_nerf.compare.specification import FIGURES, PROGRESS, SPECIFICATION, VIEWS, RunSpecification
 from edge_depth_nerf.jobs.runs import end_with_parent, steps_done
 from edge_depth_nerf.jobs.tasks import WORK
+from edge_depth_nerf.mono.calibration import maps_trained_on
 from edge_depth_nerf.plugin.trainer import EdgeDepthTrainer
-from edge_depth_nerf.scene.format import read_transforms
+from edge_depth_nerf.scene.format import LAYERS, read_transforms
 
 CURVE = (0.025, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 """When the random pixels are judged, as shares of the training."""
@@ -225,7 +226,7 @@ def do_run(folder: Path) -> None:
         found, bins = judge.held_out(folder / VIEWS)
         figures |= found | judge.shifted(beside) | judge_beams(trainer.pipeline)
     weight, sigma = setting_of(config, run.method)
-    meta = read_transforms(Path(run.scene) / "transforms.json")
+    meta, layer = read_transforms(Path(run.scene) / "transforms.json"), LAYERS["mono"].key
     write_json(
         folder / FIGURES,
         {
@@ -237,6 +238,7 @@ def do_run(folder: Path) -> None:
             "steps": steps,
             "device": config.machine.device_type,
             "source": source.get("kind") if isinstance(source := meta.get("source"), dict) else None,
+            "mono_trained_on": maps_trained_on(meta) if any(layer in frame for frame in meta["frames"]) else None,
             "departures": departures(meta) if run.preset == "paper" else [],
             "figures": figures,
             "curve": trainer.curve,

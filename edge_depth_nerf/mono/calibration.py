@@ -18,10 +18,11 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -271,7 +272,9 @@ def _made_of(scene: SceneFolder, pictures: Sequence[ScenePicture], depth_source:
     else:
         del relevant["motion"]
     units = [scene.lidar_metres_per_count, scene.lidar_is_z_depth, round(scene.theta_max_rad, 9)]
-    digest = hashlib.sha256(json.dumps([CACHE_VERSION, relevant, _trained_on(scene), units], sort_keys=True).encode())
+    digest = hashlib.sha256(
+        json.dumps([CACHE_VERSION, relevant, maps_trained_on(scene.meta), units], sort_keys=True).encode()
+    )
     contents: dict[Path, bytes] = {}
     for picture in pictures:
         pose = picture.rotation.round(9).tolist(), picture.position_m.round(6).tolist()
@@ -288,9 +291,14 @@ def _with_motion(scene: SceneFolder, depth_source: str, options: PriorOptions) -
     return options.motion and depth_source == INTEGRATED and scene.has("motion")
 
 
-def _trained_on(scene: SceneFolder) -> str:
-    """Where the maps' source was trained: elsewhere only if the source states it."""
-    later, drive = scene.meta.get("mono"), scene.meta.get("source")
+def maps_trained_on(meta: Mapping[str, Any]) -> str:
+    """Where the source of the monocular maps was trained: elsewhere only if the source states it, else scene.
+
+    Args:
+        meta: the scene's transforms.json.
+
+    """
+    later, drive = meta.get("mono"), meta.get("source")
     if isinstance(later, dict):
         found = later.get("trained_on")
     else:
@@ -363,7 +371,7 @@ def _calibrate(
             frames.append(frame)
             progress.advance(task)
     made_of = _made_of(scene, pictures, depth_source, options)
-    return combine(frames, options, made_of, _trained_on(scene) == "elsewhere", depth_source, errors)
+    return combine(frames, options, made_of, maps_trained_on(scene.meta) == "elsewhere", depth_source, errors)
 
 
 @dataclasses.dataclass(frozen=True)
