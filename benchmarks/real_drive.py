@@ -3,7 +3,7 @@
     python benchmarks/real_drive.py --real REAL --output outputs/real_drive
     make real REAL=REAL
 
-REAL holds kitti360_drive, a recording that `process rig` reads (docs/results.md says which). It is processed at full
+REAL holds kitti360_drive, a recording that `process rig` reads (docs/real_drive.md says which). It is processed at full
 and at half size: every sixth frame is held out with its LiDAR, and a tenth of the LiDAR's beams is held out of all
 sweeps. λ and σ are those that a search on a rendered drive found (tuned.json), for all methods alike; nothing is chosen
 on this drive. Then the rival with the best PSNR is trained once more, for as many steps as ours' processor seconds
@@ -54,8 +54,6 @@ HOLDOUT = ("--holdout-every", "6", "--holdout-beams", "10")
 
 SHOWN = ("img", "distance")
 """Judged views that are drawn."""
-SHORT = ("PSNR", "SSIM", "AbsRel", "δ")
-"""Columns of the README."""
 
 
 @dataclass(frozen=True)
@@ -208,9 +206,7 @@ def page(results: Results, longer: Mapping[str, Results], cells: Results, curves
     """
     parts = ["# A real drive, by all methods"]
     for scene in results.scenes():
-        short = [column for column in COLUMNS if column.title in SHORT]
         parts += ["", f"## {scene}", "", *table(results, scene, COLUMNS)]
-        parts += ["", f"## Short: {scene}", "", *table(results, scene, short)]
         parts += ["", f"## Ours against the best rival after as many steps: {scene}", "", *margins(results, scene)]
         size = scene.removeprefix("kitti360_")
         if size in longer:
@@ -285,7 +281,7 @@ def main() -> None:
     drive = options.real / "kitti360_drive"
     if not drive.is_dir():
         sys.exit(
-            f"{drive}: no such folder; the real drive is not part of the project. docs/results.md says what it is."
+            f"{drive}: no such folder; the real drive is not part of the project. docs/real_drive.md says what it is."
         )
     steps = ("--steps", options.steps) if options.steps else ()
     curve_steps = ("--steps", options.curve_steps) if options.curve_steps else steps

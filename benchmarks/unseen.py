@@ -10,10 +10,12 @@ are trained with them, if they are not yet. Then, in folders of their own under 
 
     claims       nerfacto, the best rival of the grid, the literal method and ours: 2,000 steps, three seeds
     seconds      the grid's best rival without extras, for as many steps as ours' processor seconds allow
-    tables       Tables 3 and 4 of the paper, with ours and with the literal method, and UrbanNeRF's line-of-sight form,
-                 beside the grid: 1,000 steps, one seed
-    simulated    the same drives with simulated monocular maps in place of the drive's own network
-    large        the literal method on the street with pictures of 700 px
+    tables       Tables 3 and 4 of the paper, with ours and with the literal method, beside the grid, and UrbanNeRF's
+                 line-of-sight form beside nerfstudio's: 1,000 steps, one seed
+    simulated    the claims with simulated monocular maps in place of the drive's own network
+    large        pictures of 700 px, 2,000 steps, one seed: nerfacto, DS-NeRF's loss, the literal method and ours on
+                 the street (the last view of comparison_street_301_700.png is docs/unseen.jpg), ours on all drives
+    large_seconds    there, the best rival without extras, for as many steps as `seconds`
 
 Writes table.md. Stopped at any moment, the same command goes on.
 """
@@ -51,13 +53,17 @@ BESIDE_THE_GRID: tuple[MethodName, ...] = (
     "edge-gaussian",
     "urban-nerf-los-integrated",
     "urban-nerf-los",
+    # of the grid, too; trained beside the other form
+    "urban-nerf-integrated",
+    "urban-nerf",
 )
 SETTINGS_OF: dict[MethodName, MethodName] = {"edge-gaussian": "edge", **dict.fromkeys(LITERAL, "edge-paper")}
 """Methods that have λ and σ of another one, so that one thing alone differs."""
 SEARCHED: tuple[MethodName, ...] = ("edge-paper", "edge-mono", "urban-nerf-los-integrated", "urban-nerf-los")
 """Those whose λ and σ the grid's search did not look for."""
-LARGE: tuple[MethodName, ...] = ("nerfacto", "edge-paper", "edge")
-FOLDERS = ("claims", "seconds", "tables", "simulated", "large")
+LARGE_PX = 700
+LARGE: tuple[MethodName, ...] = ("nerfacto", "ds-nerf", "edge-paper", "edge")
+FOLDERS = ("claims", "seconds", "tables", "simulated", "large", "large_seconds")
 STEPS, GRIDS_STEPS = 2000, 1000
 CELLS: tuple[MethodName, ...] = tuple(
     name for cell, name in GRID.items() if cell.loss != "urban-nerf-los" and name != "nerfacto-lidar-extras"
@@ -122,6 +128,22 @@ def of(runs: Results, methods: Iterable[MethodName], seeds: Iterable[int] | None
     return Results([run for run in runs.runs if run.method in chosen and (some is None or run.seed in some)])
 
 
+def short_table(claims: Results) -> Iterator[str]:
+    """Means over the drives, with their standard deviation over seeds, as Markdown: the README's table."""
+    yield "| " + " | ".join(["method", *IN_SECONDS, "steps", "processor seconds"]) + " |"
+    yield "|---" * (len(IN_SECONDS) + 3) + "|"
+    for method in claims.methods():
+        of_seeds = [of(claims, [method], [seed]).runs for seed in claims.seeds()]
+        cells = []
+        for name, form in IN_SECONDS.values():
+            means = [statistics.fmean(run.figures[name] for run in runs) for runs in of_seeds if runs]
+            spread = f" ± {statistics.stdev(means):{form}}" if len(means) > 1 else ""
+            cells.append(f"{statistics.fmean(means):{form}}{spread}")
+        seconds = f"{processor_seconds(claims, method):.0f}"
+        steps = " to ".join(f"{each:,}" for each in sorted({run.content["steps"] for run in of_seeds[0]}))
+        yield "| " + " | ".join([METHODS[method].title, *cells, steps, seconds]) + " |"
+
+
 def seconds_table(claims: Results, longer: Results) -> Iterator[str]:
     """Ours and the rival after as many processor seconds, drive by drive, as Markdown."""
     rival = longer.methods()[0]
@@ -158,6 +180,8 @@ def page(parts: dict[str, Results], grid: Results) -> str:
 
     claims = parts["claims"]
     add("Claims: pictures", claims, "1")
+    if claims.runs:
+        lines += ["## Claims: short", "", *short_table(claims), ""]
     add("Claims: geometry", claims, "5, average")
     add("Claims: time", claims, "6, average")
     if claims.runs and parts["seconds"].runs:
@@ -172,13 +196,14 @@ def page(parts: dict[str, Results], grid: Results) -> str:
     add("As published, sources", literal, "3, as published")
     add("As published, kernels", literal, "4, as published")
     add("As published, geometry", literal, "5, average")
-    forms = of(grid, ["urban-nerf", "urban-nerf-integrated"], [0])
-    of_sight = of(beside, [name for name in BESIDE_THE_GRID if name.startswith("urban-nerf")])
-    add("Line of sight", Results([*forms.runs, *of_sight.runs]), "5, average")
+    forms = of(beside, [name for name in BESIDE_THE_GRID if name.startswith("urban-nerf")])
+    add("Line of sight", forms, "5, average")
     add("Simulated maps: pictures", parts["simulated"], "1")
     add("Simulated maps: geometry", parts["simulated"], "5, average")
     large = parts["large"]
-    add("700 px", large, *(f"5, {scene}" for scene in large.scenes()))
+    add("700 px", large, *(f"5, {scene}" for scene in large.scenes() if scene.startswith("street")))
+    if large.runs and parts["large_seconds"].runs:
+        lines += ["## Equal seconds at 700 px", "", *seconds_table(large, parts["large_seconds"]), ""]
     used = [run for results in (claims, beside) for run in results.runs]
     if used:
         add("λ and σ", Results(used, {"tuned": dict.fromkeys(METHODS)}), "7")
@@ -219,23 +244,28 @@ def main() -> None:
     grid = read_results(options.grid / "comparison" / RUNS)
 
     compare(out / "claims", scenes, claimed(grid), STEPS, options.seeds[0])
-    compare(out / "seconds", scenes, [without_extras(grid)], steps_in_our_seconds(grid))
+    compare(out / "seconds", scenes, [without_extras(grid)], steps_in_our_seconds(grid), options.seeds[0])
     compare(out / "tables", scenes, BESIDE_THE_GRID, GRIDS_STEPS)
     for seed in options.seeds[1:]:
         # a seed is whole before the next begins: a stopped benchmark has a table of those it has
         compare(out / "claims", scenes, claimed(grid), STEPS, seed)
+        compare(out / "seconds", scenes, [without_extras(grid)], steps_in_our_seconds(grid), seed)
     process = ("process", "kitti360", "--sequence", SEQUENCE)
-    street = f"street_{DRIVES['street']}_700"
-    large = ("--scene", "street", "--seed", DRIVES["street"], "--frames", 24, "--size", 700)
-    ours("synthesize", "--output", out / "drive_700", *large)
-    ours(*process, "--root", out / "drive_700", "--output", out / street)
-    compare(out / "large", [out / street], LARGE, STEPS)
+    large = [out / f"{name}_{LARGE_PX}" for name in names]
+    for (kind, seed), scene in zip(DRIVES.items(), large, strict=True):
+        raw = out / f"drive_{kind}_{LARGE_PX}"
+        ours("synthesize", "--output", raw, "--scene", kind, "--seed", seed, "--frames", 24, "--size", LARGE_PX)
+        ours(*process, "--root", raw, "--output", scene)
+    compare(out / "large", large[:1], LARGE, STEPS)
+    compare(out / "large_seconds", large, [without_extras(grid)], steps_in_our_seconds(grid))
+    compare(out / "large", large, ["edge"], STEPS)
     for name in names:
         raw = options.drives / name
         maps = ("--mono", raw / "simulated_mono" / SEQUENCE)
         ours(*process, "--root", raw, *maps, "--output", out / "simulated_scenes" / name)
     simulated = [out / "simulated_scenes" / name for name in names]
-    compare(out / "simulated", simulated, [without_extras(grid), "edge"], GRIDS_STEPS)
+    for seed in options.seeds:
+        compare(out / "simulated", simulated, claimed(grid), STEPS, seed)
     parts = {folder: read_results(out / folder / RUNS) for folder in FOLDERS}
     write_text(out / "table.md", page(parts, grid))
 

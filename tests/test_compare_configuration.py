@@ -55,7 +55,7 @@ ALLOWED = {
     "edge-lidar": {SOURCE},
     "edge-mono": {SOURCE},
     "edge-gaussian": {"pipeline.datamanager.prior.integration.kernel"},
-    # what the paper says of the prior and of Eq. 4, and the extras, which it does not have; exposure is none of these
+    # what the paper says of the prior and of Eq. 4, λ and σ, and the extras, which it does not have; exposure is none
     "edge-paper": {
         SOURCE,
         *EXTRAS,
@@ -65,6 +65,7 @@ ALLOWED = {
         "pipeline.model.edge_divide_by_norm",
         PRIOR + "align",
         PRIOR + "sigma_mode",
+        PRIOR + "sigma_constant_m",
         PRIOR + "motion",
         PRIOR + "integration.least_returns",
         PRIOR + "integration.sigma_depth_growth_per_m",

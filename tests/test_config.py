@@ -78,7 +78,9 @@ def test_constants_carry_their_source():
 def test_the_paper_preset_is_the_literal_form():
     model, data = (getattr(all_methods["edge-depth-nerf-paper"].pipeline, part) for part in ("model", "datamanager"))
     assert (model.edge_gaussian, model.edge_divide_by_norm, model.depth_loss_levels) == ("point", False, "final")
-    assert data.prior == PriorOptions(align="none", sigma_mode="image", motion=False, integration=IntegrationOptions())
+    assert data.prior == PriorOptions(
+        align="none", sigma_mode="constant", sigma_constant_m=0.3, motion=False, integration=IntegrationOptions()
+    )
     how = data.prior.integration
     assert (how.normalise, how.keep_returns, how.range_guide) == ("pooled", False, "mono")
     assert (how.alpha, how.kernel_size, how.sigma_space_px, how.sigma_depth_m) == (0.7, 9, 3.0, 1.0)

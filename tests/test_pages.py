@@ -306,21 +306,24 @@ def test_the_pictures_are_current(tmp_path):
     assert sum(path.stat().st_size for path in committed) < 1 << 20
 
 
-def test_the_chart_is_of_the_table(tmp_path):
-    chart = load("make_chart")
-    page = (DOCS / "results.md").read_text(encoding="utf-8")
-    found = chart.results(page)
-    assert [one.title for one in found][-1] == "ours" and len(found) == 6
-    committed = (DOCS / chart.CHART).read_text(encoding="utf-8")
-    table = page.partition("<!-- real: table -->")[2].partition("<!-- end -->")[0]
-    figures = re.findall(r"^\| [^|]+ \| (\d\d\.\d\d) ± ", table, re.MULTILINE)
-    assert len(figures) == 5 and not [psnr for psnr in figures if f">{psnr}<" not in committed]
-    chart.draw(found, tmp_path / chart.CHART)
-    made = (tmp_path / chart.CHART).read_text(encoding="utf-8")
+@pytest.mark.parametrize(("which", "table", "rows", "added"), [(0, "unseen: geometry", 4, 0), (1, "real: table", 5, 1)])
+def test_the_charts_are_of_the_tables(which, table, rows, added, tmp_path):
+    module = load("make_chart")
+    chart = module.CHARTS[which]
+    page = (DOCS / chart.page).read_text(encoding="utf-8")
+    assert f"({chart.file})" in page and next(iter(chart.tables)) == table
+    found = module.results(chart, page)
+    assert [one.title for one in found][-1] == "ours" and len(found) == rows + added
+    committed = (DOCS / chart.file).read_text(encoding="utf-8")
+    part = page.partition(f"<!-- {table} -->")[2].partition("<!-- end -->")[0]
+    figures = re.findall(r"^\| [^|]+ \| \**(\d\d\.\d\d) ± ", part, re.MULTILINE)
+    assert len(figures) == rows and not [psnr for psnr in figures if f">{psnr}<" not in committed]
+    module.draw(chart, found, tmp_path / chart.file)
+    made = (tmp_path / chart.file).read_text(encoding="utf-8")
     texts = [re.findall(r"<text[^>]*>([^<]+)</text>", svg) for svg in (made, committed)]
     assert texts[0] == texts[1], "run python docs/make_chart.py"
     with pytest.raises(InputError, match="has no rows"):
-        chart.results(page.replace("<!-- real: table -->", ""))
+        module.results(chart, page.replace(f"<!-- {table} -->", ""))
 
 
 def test_the_pictures_do_not_depend_on_what_trainings_left(sample_drive, tmp_path, monkeypatch):

@@ -1,0 +1,436 @@
+"""The results page against what made comparisons unfair before: each check is shown to find it.
+
+The figures of all runs are in the repository, each with its whole configuration. Every function here lists what is
+wrong; its test holds that to be nothing, and then puts the former fault back.
+"""
+
+from __future__ import annotations
+
+import copy
+import importlib
+import re
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from edge_depth_nerf.compare.configuration import flattened, literal_form
+from edge_depth_nerf.compare.methods import GRID, METHODS, WITHOUT_EXTRAS, Cell
+from edge_depth_nerf.compare.options import MethodName
+from edge_depth_nerf.compare.results import Results, RunResult
+from edge_depth_nerf.compare.search import grids
+from edge_depth_nerf.compare.specification import OF_A_RUN
+from edge_depth_nerf.plugin.config import make_specifications, read_method_file
+
+ROOT = Path(__file__).resolve().parent.parent
+BENCHMARKS = ROOT / "benchmarks"
+LOSS, SOURCE = "pipeline.model.depth_loss", "pipeline.datamanager.depth_source"
+PRIOR = "pipeline.datamanager.prior."
+KERNEL = PRIOR + "integration.kernel"
+SEARCHED = {LOSS + "_mult", "pipeline.model.depth_sigma", PRIOR + "sigma_mode", PRIOR + "sigma_constant_m"}
+"""λ and σ, which each method has from its own search."""
+CHOICES = {
+    "tune_street": "λ, σ and some defaults",
+    "tune_parking": "defaults",
+    "tune_turn": "defaults",
+    "street": "defaults",
+    "parking": "defaults",
+    "turn": "defaults",
+    "turn_few": "defaults",
+    "kitti360_half": "learning rates and Adam's decay",
+    "kitti360_full": "learning rates and Adam's decay",
+    **dict.fromkeys(
+        ("street_101", "parking_102", "turn_103", "roundabout_104"), "what confirms a prior beyond LiDAR's field"
+    ),
+}
+"""Drives that took part in a choice, and in which (docs/ablation.md, docs/prior.md)."""
+RUNS_OF = {
+    "grid": ("grid",),
+    "unseen": ("unseen", "grid"),
+    "before": ("unseen_before", "grid_before"),
+    "real": ("real_drive", "real_drive_seconds", "real_drive_cells", "real_drive_full", "real_drive_lambda"),
+    "unseen: search": ("unseen_search",),
+}
+"""Whose runs a generated part of a page is made of, by its name or by what stands before the colon."""
+
+
+@pytest.fixture(scope="module")
+def unseen() -> Iterator[ModuleType]:
+    """benchmarks/unseen.py."""
+    before = set(sys.modules)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(BENCHMARKS))
+        yield importlib.import_module("unseen")
+    for name in set(sys.modules) - before:
+        if (BENCHMARKS / f"{name}.py").is_file():
+            sys.modules.pop(name)
+
+
+@pytest.fixture(scope="module")
+def kept(unseen) -> dict[str, list[RunResult]]:
+    names = {name for files in RUNS_OF.values() for name in files} | {"grid_search"}
+    return {name: unseen.results_of(BENCHMARKS / f"{name}.json.xz").runs for name in names}
+
+
+def changed(one: RunResult, other: RunResult) -> set[str]:
+    """The fields of the configuration in which two runs differ, but for those of any run."""
+    ours, theirs = one.content["configuration"], other.content["configuration"]
+    return {name for name in {*ours, *theirs} - {*OF_A_RUN} if ours.get(name) != theirs.get(name)}
+
+
+def with_fields(run: RunResult, **fields: object) -> RunResult:
+    """A copy of a run that was trained with other values of some fields; their dots are double underscores."""
+    found = copy.deepcopy(run)
+    for name, value in fields.items():
+        dotted = name.replace("__", ".")
+        assert dotted in found.content["configuration"], dotted
+        found.content["configuration"][dotted] = str(value)
+    return found
+
+
+# --- the drives of the tables -----------------------------------------------------------------------------------------
+
+
+def drives_of_choices(page: str, runs: dict[str, list[RunResult]]) -> set[str]:
+    """Drives that took part in a choice and that a page's tables are of."""
+    parts = re.findall(r"<!-- (.+?) -->", page)
+    names = [name for name in parts if name not in ("end", "run") and not name.startswith("--8<--")]
+    assert names
+    files = {file for name in names for file in RUNS_OF.get(name, RUNS_OF.get(name.partition(":")[0], ()))}
+    assert all(name in RUNS_OF or name.partition(":")[0] in RUNS_OF for name in names), names
+    return {run.scene for file in files for run in runs[file]} & {*CHOICES}
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/results.md"])
+def test_tables_are_of_drives_that_took_part_in_no_choice(page, kept):
+    text = (ROOT / page).read_text(encoding="utf-8")
+    assert drives_of_choices(text, kept) == set()
+    # both opened with the real drive, and results.md had tables of the drives that showed a fault, and the search
+    former = text + "<!-- real: table -->\n<!-- end -->\n<!-- before: large -->\n<!-- end -->\n"
+    assert {"kitti360_half", "street_101"} <= drives_of_choices(former, kept)
+    assert drives_of_choices(text + "<!-- unseen: search -->", kept) == {"tune_street"}
+
+
+def test_drives_of_the_tables_are_those_that_were_written_down(unseen, kept):
+    names = {f"{kind}_{seed}" for kind, seed in unseen.DRIVES.items()}
+    large = {f"{name}_{unseen.LARGE_PX}" for name in names}
+    assert {run.scene for run in kept["grid"]} == names
+    assert {run.scene for run in kept["unseen"]} == names | large
+
+
+def maps_of_claims(runs: list[RunResult]) -> dict[str, set[str]]:
+    """The scenes of each drive, by the SHA-256 of their transforms.json, that its claims were made on."""
+    found: dict[str, set[str]] = {}
+    for run in runs:
+        if run.folder.parts[0] in ("claims", "simulated"):
+            found.setdefault(f"{run.folder.parts[0]}/{run.scene}", set()).add(run.specification["scene_sha256"])
+    return found
+
+
+def test_the_default_pipeline_and_simulated_maps_are_told_apart(unseen, kept):
+    """All results were of simulated maps, and no row of the default pipeline, whose own network makes them."""
+    scenes = maps_of_claims(kept["unseen"])
+    assert all(len(digests) == 1 for digests in scenes.values())
+    for kind, seed in unseen.DRIVES.items():
+        assert scenes[f"claims/{kind}_{seed}"] != scenes[f"simulated/{kind}_{seed}"]
+    for part in ("claims", "simulated"):
+        rows = {(run.method, run.scene, run.seed) for run in kept["unseen"] if run.folder.parts[0] == part}
+        methods, drives, seeds = ({key[index] for key in rows} for index in range(3))
+        assert seeds == {0, 1, 2} and len(drives) == 4
+        assert methods == {"nerfacto", "ds-nerf-integrated-extras", "edge-paper", "edge"}
+        assert len(rows) == 4 * 4 * 3
+    results = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
+    commands = [line for line in results.splitlines() if line.startswith("    edge-depth-nerf process")]
+    # the first command, of the claims' scenes, brings no maps
+    assert commands and "--mono" not in results.partition(commands[0])[2].partition("\n\n")[0]
+
+
+# --- one difference at a time -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two rows of a table, and the fields that they may differ in."""
+
+    one: MethodName
+    other: MethodName
+    fields: frozenset[str]
+
+
+TABLES_3_AND_4 = (
+    Pair("edge-paper", "edge-paper-lidar", frozenset({SOURCE})),
+    Pair("edge-paper", "edge-paper-mono", frozenset({SOURCE})),
+    Pair("edge-paper", "edge-paper-gaussian", frozenset({KERNEL})),
+    Pair("edge", "edge-gaussian", frozenset({KERNEL})),
+    Pair("edge", "edge-lidar", frozenset({SOURCE, *SEARCHED})),
+    Pair("edge", "edge-mono", frozenset({SOURCE, *SEARCHED})),
+)
+
+
+def of_cells() -> list[Pair]:
+    """Cells of the grid that differ in loss, prior or extras alone."""
+    found = []
+    for one, other in combinations(GRID, 2):
+        different = {name for name in ("loss", "prior", "extras") if getattr(one, name) != getattr(other, name)}
+        if len(different) == 1 and None not in (one.prior, other.prior):
+            fields = {"loss": {LOSS}, "prior": {SOURCE}, "extras": {*WITHOUT_EXTRAS}}[different.pop()]
+            found.append(Pair(GRID[one], GRID[other], frozenset(fields | SEARCHED)))
+    return found
+
+
+def unfair(runs: list[RunResult], pair: Pair) -> set[str]:
+    """The fields beyond those of the pair in which its rows differ, on any drive that has both."""
+    rows = {(run.scene, run.seed, run.method): run for run in runs}
+    both = [
+        (run, rows[scene, seed, pair.other])
+        for (scene, seed, method), run in rows.items()
+        if method == pair.one and (scene, seed, pair.other) in rows
+    ]
+    assert both, pair
+    return {name for one, other in both for name in changed(one, other) - pair.fields}
+
+
+def first_seeds(kept: dict[str, list[RunResult]]) -> list[RunResult]:
+    """Runs of 1,000 steps: the grid, and what is trained beside it."""
+    beside = [run for run in kept["unseen"] if run.folder.parts[0] == "tables"]
+    return [*kept["grid"], *(run for run in beside if not run.method.startswith("urban-nerf"))]
+
+
+@pytest.mark.parametrize("pair", TABLES_3_AND_4, ids=lambda pair: f"{pair.one} {pair.other}")
+def test_rows_of_tables_3_and_4_differ_in_one_thing(pair, kept):
+    runs = first_seeds(kept)
+    assert unfair(runs, pair) == set()
+    # Table 4 had a constant σ for the Gaussian alone; Table 3 changed alignment, σ and sky with the source
+    former = {
+        f"{PRIOR}align": "none",
+        "pipeline.model.sky_loss_mult": 0.5,
+        **({} if pair.fields & SEARCHED else {f"{PRIOR}sigma_constant_m": 7.0}),
+    }
+    fields = {name.replace(".", "__"): value for name, value in former.items()}
+    others = [with_fields(run, **fields) if run.method == pair.other else run for run in runs]
+    assert unfair(others, pair) >= {*former} - ({f"{PRIOR}align"} if "paper" in pair.other else set())
+
+
+def test_cells_of_the_grid_differ_in_one_thing(kept):
+    """Extras came with the edge loss alone: rows with another loss and extras did not exist."""
+    trained = {run.method for run in kept["grid"]}
+    pairs = [pair for pair in of_cells() if {pair.one, pair.other} <= trained]
+    assert len(pairs) >= 25
+    for pair in pairs:
+        assert unfair(kept["grid"], pair) == set(), pair
+    for loss in ("urban-nerf", "ds-nerf", "edge"):
+        for prior in ("lidar", "integrated"):
+            assert {GRID[Cell(loss, prior, extras)] for extras in (False, True)} <= trained
+    # as it was: the row with extras goes without them
+    bound = {name.replace(".", "__"): value for name, value in WITHOUT_EXTRAS.items()}
+    former = [with_fields(run, **bound) if run.method == "ds-nerf-integrated-extras" else run for run in kept["grid"]]
+    pair = next(pair for pair in pairs if {pair.one, pair.other} == {"ds-nerf-integrated-extras", "edge"})
+    assert unfair(former, pair) == {*WITHOUT_EXTRAS}
+
+
+FORMS_OF_URBAN_NERF = (
+    Pair("urban-nerf", "urban-nerf-los", frozenset({LOSS, *SEARCHED})),
+    Pair("urban-nerf-integrated", "urban-nerf-los-integrated", frozenset({LOSS, *SEARCHED})),
+)
+EXPECTED, *OF_SIGHT = (f"pipeline.model.urban.{name}" for name in ("expected", "near", "empty"))
+
+
+def under_one_weight(runs: list[RunResult]) -> set[MethodName]:
+    """Methods with UrbanNeRF's line of sight whose squared metres weigh as much as its other terms."""
+    return {
+        run.method
+        for run in runs
+        if run.method.startswith("urban-nerf-los")
+        and float(run.content["configuration"][EXPECTED])
+        >= min(float(run.content["configuration"][name]) for name in OF_SIGHT)
+    }
+
+
+def test_urban_nerf_is_compared_in_both_forms(kept):
+    """nerfstudio's form alone was a rival: squared metres under the one weight of all its terms."""
+    beside = [run for run in kept["unseen"] if run.folder.parts[0] == "tables"]
+    for pair in FORMS_OF_URBAN_NERF:
+        assert unfair(beside, pair) == set()
+    assert under_one_weight(beside) == set()
+    fields = {EXPECTED.replace(".", "__"): 1.0}
+    former = [with_fields(run, **fields) if run.method == "urban-nerf-los" else run for run in beside]
+    assert under_one_weight(former) == {"urban-nerf-los"}
+
+
+def other_exposures(runs: list[RunResult]) -> set[MethodName]:
+    """Methods whose exposure model is not that of ours."""
+    ours = {run.content["configuration"]["pipeline.model.exposure"] for run in runs if run.method == "edge"}
+    return {run.method for run in runs if run.content["configuration"]["pipeline.model.exposure"] not in ours}
+
+
+def test_all_rows_have_one_exposure_model(kept):
+    runs = [*kept["grid"], *kept["unseen"]]
+    assert other_exposures(runs) == set()
+    former = [
+        with_fields(run, pipeline__model__exposure="embedding") if run.method == "edge-paper" else run for run in runs
+    ]
+    assert other_exposures(former) == {"edge-paper"}
+
+
+# --- the searches -----------------------------------------------------------------------------------------------------
+
+
+def shape_of_search(runs: list[RunResult]) -> dict[MethodName, tuple[object, ...]]:
+    """For each method, what it was searched with: drives, seeds, steps, λ and σ."""
+    found = {}
+    for method in {run.method for run in runs}:
+        of_it = [run for run in runs if run.method == method]
+        found[method] = tuple(
+            tuple(sorted({str(value) for value in values}))
+            for values in (
+                (run.scene for run in of_it),
+                (run.specification["scene_sha256"] for run in of_it),
+                (run.seed for run in of_it),
+                (run.content["steps"] for run in of_it),
+                ((run.specification["weight"], run.specification["sigma_m"]) for run in of_it),
+            )
+        )
+    return found
+
+
+def of_another_length(runs: list[RunResult]) -> set[MethodName]:
+    """Methods whose search is not that of ours."""
+    shapes = shape_of_search(runs)
+    return {method for method, shape in shapes.items() if shape != shapes["edge"]}
+
+
+def without_a_search(
+    runs: list[RunResult], searches: list[RunResult], same_as: dict[MethodName, MethodName]
+) -> set[MethodName]:
+    """Methods of the tables whose λ and σ are not those that a kept search found, for them or for what they are of."""
+    best = {grid.method: grid.best for grid in grids(Results(searches))}
+    found = set()
+    for run in runs:
+        setting = (run.specification["weight"], run.specification["sigma_m"])
+        if METHODS[run.method].sigma_field and setting != best.get(same_as.get(run.method, run.method)):
+            found.add(run.method)
+    return found
+
+
+def test_all_methods_have_equal_searches_that_are_kept(unseen, kept):
+    runs = [*kept["grid"], *kept["unseen"]]
+    searches = [*kept["grid_search"], *kept["unseen_search"]]
+    assert of_another_length(searches) == set()
+    assert without_a_search(runs, searches, unseen.SETTINGS_OF) == set()
+    # the rivals' searches had other lengths …
+    shorter = [run for run in searches if not (run.method == "ds-nerf" and run.specification["sigma_m"] == "own")]
+    assert of_another_length(shorter) == {"ds-nerf"}
+    longer = copy.deepcopy(searches)
+    for run in longer:
+        if run.method == "urban-nerf":
+            run.content["steps"] = 300
+    assert of_another_length(longer) == {"urban-nerf"}
+    # … and were not kept
+    lost = [run for run in searches if run.method != "ds-nerf-integrated-extras"]
+    assert without_a_search(runs, lost, unseen.SETTINGS_OF) == {"ds-nerf-integrated-extras"}
+
+
+# --- what is shipped is what is compared ------------------------------------------------------------------------------
+
+
+def unlike_compared(preset: dict[str, object], runs: list[RunResult]) -> set[str]:
+    """Fields of the literal form in which the preset `paper` is not what the tables call as published."""
+    found = set()
+    for run in runs:
+        for name in literal_form() if run.method == "edge-paper" else ():
+            # a run has values as Python writes them
+            if run.content["configuration"][name] not in (repr(preset[name]), str(preset[name])):
+                found.add(name)
+    return found
+
+
+def test_the_preset_paper_is_the_method_of_the_tables(kept):
+    """λ and σ, too: the preset had λ = 1e-5, with one σ̂ for a frame."""
+    assert "edge-paper" in {run.method for run in kept["unseen"]}
+    preset = flattened(make_specifications(read_method_file())["edge-depth-nerf-paper"].config)
+    assert unlike_compared(preset, kept["unseen"]) == set()
+    former = {**preset, LOSS + "_mult": 1e-5, PRIOR + "sigma_mode": "image"}
+    assert unlike_compared(former, kept["unseen"]) == {LOSS + "_mult", PRIOR + "sigma_mode"}
+
+
+# --- what the pages say in words --------------------------------------------------------------------------------------
+
+
+def gain_db(runs: list[RunResult], one: MethodName, other: MethodName, others: list[RunResult] | None = None) -> float:
+    """Mean of the differences in PSNR over the drives and seeds that both have."""
+    psnr = {(run.scene, run.seed, run.method): run.figures["truth_masked_psnr"] for run in runs}
+    theirs = {
+        (run.scene, run.seed): run.figures["truth_masked_psnr"]
+        for run in (runs if others is None else others)
+        if run.method == other
+    }
+    differences = [psnr[(*key, one)] - value for key, value in theirs.items() if (*key, one) in psnr]
+    assert len(differences) >= 4
+    return sum(differences) / len(differences)
+
+
+def lower_abs_rel(runs: list[RunResult], one: MethodName, other: MethodName) -> float:
+    """By which share a method's mean AbsRel is below another's, %."""
+    mine, theirs = ([run.figures["truth_abs_rel"] for run in runs if run.method == method] for method in (one, other))
+    return 100 * (1 - (sum(mine) / len(mine)) / (sum(theirs) / len(theirs)))
+
+
+def missing_figures(text: str, wanted: dict[str, list[str]]) -> list[str]:
+    """Figures that the bullet of a page that begins so does not have; the bullet itself, if there is none."""
+    bullets = re.findall(r"^- \*\*(.+?)\*\*(.*?)(?=^- |^$)", text, re.MULTILINE | re.DOTALL)
+    found = {title.strip(" .").lower(): " ".join(words.split()) for title, words in bullets}
+    return [
+        f"{title}: {figure}"
+        for title, figures in wanted.items()
+        for figure in (figures if title in found else ["bullet"])
+        if not re.search(rf"(?<![\d.]){re.escape(figure)}(?!\d)", found.get(title, ""))
+    ]
+
+
+def test_the_first_figures_of_the_pages_are_those_of_the_runs(kept):
+    grid = first_seeds(kept)
+    claims, seconds, large, larger = (
+        [run for run in kept["unseen"] if run.folder.parts[0] == name]
+        for name in ("claims", "seconds", "large", "large_seconds")
+    )
+    rival, without = "ds-nerf-integrated-extras", "urban-nerf-integrated"
+    figures = {
+        "over lidar": f"{gain_db(grid, 'edge', 'edge-lidar'):.2f} dB",
+        "over mono": f"{gain_db(grid, 'edge', 'edge-mono'):.2f} dB",
+        "loss": f"{gain_db(grid, 'edge', rival):.2f} dB",
+        "loss, 2,000 steps": f"{gain_db(claims, 'edge', rival):.2f} dB",
+        "loss, AbsRel": f"{lower_abs_rel(claims, 'edge', rival):.0f} %",
+        "extras": f"{gain_db(grid, 'edge', 'edge-plain'):.2f} dB",
+        "whole": f"{gain_db(grid, 'edge', 'nerfacto'):.2f} dB",
+        "whole, 2,000 steps": f"{gain_db(claims, 'edge', 'nerfacto'):.2f} dB",
+        "without extras": f"{gain_db(grid, 'edge', without):.2f} dB",
+        "seconds": f"{gain_db(claims, 'edge', without, seconds):.2f} dB",
+        "seconds at 700 px": f"{gain_db(large, 'edge', without, larger):.2f} dB",
+        "published": f"{gain_db(claims, 'edge-paper', 'nerfacto'):+.2f} dB",
+    }
+    results = (ROOT / "docs" / "results.md").read_text(encoding="utf-8").partition("## Rendered drives")[0]
+    in_results = {
+        "the prior": ["over lidar", "over mono"],
+        "the loss": ["loss", "loss, 2,000 steps", "loss, AbsRel"],
+        "the extras": ["extras"],
+        "the whole": ["whole", "whole, 2,000 steps", "without extras", "seconds"],
+        "the published method": ["published"],
+    }
+    in_readme = {
+        "prior": ["over lidar"],
+        "loss": ["loss, 2,000 steps", "loss, AbsRel"],
+        "extras": ["extras"],
+        "whole": ["whole, 2,000 steps", "seconds", "seconds at 700 px"],
+    }
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    for text, names in ((results, in_results), (readme, in_readme)):
+        wanted = {title: [figures[name] for name in each] for title, each in names.items()}
+        assert missing_figures(text, wanted) == []
+        # another figure is found, and so is a bullet that went
+        (title, first), *_ = wanted.items()
+        assert missing_figures(text.replace(first[0], "9.99 dB", 1), wanted) == [f"{title}: {first[0]}"]
+        assert missing_figures(text, {"the weather": ["1"]}) == ["the weather: bullet"]
