@@ -14,7 +14,8 @@ are trained with them, if they are not yet. Then, in folders of their own under 
                  line-of-sight form beside nerfstudio's: 1,000 steps, one seed
     simulated    the claims with simulated monocular maps in place of the drive's own network
     large        pictures of 700 px, 2,000 steps, one seed: nerfacto, DS-NeRF's loss, the literal method and ours on
-                 the street (the last view of comparison_street_301_700.png is docs/unseen.jpg), ours on all drives
+                 the street (the last view of comparison_street_301_700.png is docs/unseen.jpg), nerfacto and ours on
+                 all drives
     large_seconds    there, the best rival without extras, for as many steps as `seconds`
 
 Writes table.md. Stopped at any moment, the same command goes on.
@@ -36,7 +37,7 @@ from edge_depth_nerf.compare.command import RUNS
 from edge_depth_nerf.compare.grid import BEST_OF_ALL, BEST_WITHOUT_EXTRAS, best_rivals
 from edge_depth_nerf.compare.methods import GRID, METHODS
 from edge_depth_nerf.compare.options import MethodName
-from edge_depth_nerf.compare.results import Results, read_results
+from edge_depth_nerf.compare.results import Results, RunResult, read_results
 from edge_depth_nerf.compare.search import grids
 from edge_depth_nerf.compare.tables import make_tables, page_of_tables
 
@@ -63,6 +64,7 @@ SEARCHED: tuple[MethodName, ...] = ("edge-paper", "edge-mono", "urban-nerf-los-i
 """Those whose λ and σ the grid's search did not look for."""
 LARGE_PX = 700
 LARGE: tuple[MethodName, ...] = ("nerfacto", "ds-nerf", "edge-paper", "edge")
+ON_ALL_LARGE: tuple[MethodName, ...] = ("nerfacto", "edge")
 FOLDERS = ("claims", "seconds", "tables", "simulated", "large", "large_seconds")
 STEPS, GRIDS_STEPS = 2000, 1000
 CELLS: tuple[MethodName, ...] = tuple(
@@ -76,7 +78,7 @@ IN_SECONDS = {
     "AbsRel": ("truth_abs_rel", ".4f"),
     "δ": ("truth_delta_1_25", ".3f"),
 }
-"""Figures at equal seconds, and how they are written."""
+"""Figures of the README's table and of those at equal seconds, and how they are written."""
 
 
 def ours(*words: object) -> None:
@@ -128,6 +130,11 @@ def of(runs: Results, methods: Iterable[MethodName], seeds: Iterable[int] | None
     return Results([run for run in runs.runs if run.method in chosen and (some is None or run.seed in some)])
 
 
+def steps_of(runs: Iterable[RunResult]) -> str:
+    """How many steps runs have, as a table says it."""
+    return " to ".join(f"{each:,}" for each in sorted({run.content["steps"] for run in runs}))
+
+
 def short_table(claims: Results) -> Iterator[str]:
     """Means over the drives, with their standard deviation over seeds, as Markdown: the README's table."""
     yield "| " + " | ".join(["method", *IN_SECONDS, "steps", "processor seconds"]) + " |"
@@ -140,8 +147,7 @@ def short_table(claims: Results) -> Iterator[str]:
             spread = f" ± {statistics.stdev(means):{form}}" if len(means) > 1 else ""
             cells.append(f"{statistics.fmean(means):{form}}{spread}")
         seconds = f"{processor_seconds(claims, method):.0f}"
-        steps = " to ".join(f"{each:,}" for each in sorted({run.content["steps"] for run in of_seeds[0]}))
-        yield "| " + " | ".join([METHODS[method].title, *cells, steps, seconds]) + " |"
+        yield "| " + " | ".join([METHODS[method].title, *cells, steps_of(of_seeds[0]), seconds]) + " |"
 
 
 def seconds_table(claims: Results, longer: Results) -> Iterator[str]:
@@ -155,9 +161,8 @@ def seconds_table(claims: Results, longer: Results) -> Iterator[str]:
             runs = [run for run in results.runs if scene in (run.scene, "average")]
             means = {name: statistics.fmean(run.figures[name] for run in runs) for name, _ in IN_SECONDS.values()}
             cells = [f"{means[name]:{form}}" for name, form in IN_SECONDS.values()]
-            steps = " to ".join(f"{each:,}" for each in sorted({run.content["steps"] for run in runs}))
             seconds = f"{statistics.fmean(run.curve[-1]['cpu_seconds'] for run in runs):.0f}"
-            yield "| " + " | ".join([title, scene, *cells, steps, seconds]) + " |"
+            yield "| " + " | ".join([title, scene, *cells, steps_of(runs), seconds]) + " |"
 
 
 def page(parts: dict[str, Results], grid: Results) -> str:
@@ -202,6 +207,7 @@ def page(parts: dict[str, Results], grid: Results) -> str:
     add("Simulated maps: geometry", parts["simulated"], "5, average")
     large = parts["large"]
     add("700 px", large, *(f"5, {scene}" for scene in large.scenes() if scene.startswith("street")))
+    add("All drives at 700 px", of(large, ON_ALL_LARGE), "1")
     if large.runs and parts["large_seconds"].runs:
         lines += ["## Equal seconds at 700 px", "", *seconds_table(large, parts["large_seconds"]), ""]
     used = [run for results in (claims, beside) for run in results.runs]
@@ -258,7 +264,7 @@ def main() -> None:
         ours(*process, "--root", raw, "--output", scene)
     compare(out / "large", large[:1], LARGE, STEPS)
     compare(out / "large_seconds", large, [without_extras(grid)], steps_in_our_seconds(grid))
-    compare(out / "large", large, ["edge"], STEPS)
+    compare(out / "large", large, ON_ALL_LARGE, STEPS)
     for name in names:
         raw = options.drives / name
         maps = ("--mono", raw / "simulated_mono" / SEQUENCE)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import importlib
 import json
 import lzma
 import sys
@@ -13,6 +12,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from benchmark_modules import benchmark_modules
 from comparisons import fake
 
 from edge_depth_nerf.base.errors import InputError
@@ -44,6 +44,7 @@ UNSEEN_PARTS = {
     "unseen: literal kernels": "As published, kernels",
     "unseen: literal geometry": "As published, geometry",
     "unseen: large": "700 px",
+    "unseen: large pictures": "All drives at 700 px",
     "unseen: large seconds": "Equal seconds at 700 px",
     "unseen: sight": "Line of sight",
     "unseen: simulated": "Simulated maps: pictures",
@@ -61,14 +62,10 @@ BEFORE_PARTS = {
 
 
 @pytest.fixture
-def benchmark_module(monkeypatch):
+def benchmark_module():
     """Import a module of benchmarks/ by its name."""
-    before = set(sys.modules)
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    yield importlib.import_module
-    for name in set(sys.modules) - before:
-        if (ROOT / "benchmarks" / f"{name}.py").is_file():
-            sys.modules.pop(name)
+    with benchmark_modules() as load:
+        yield load
 
 
 @pytest.fixture

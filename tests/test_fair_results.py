@@ -7,9 +7,7 @@ wrong; its test holds that to be nothing, and then puts the former fault back.
 from __future__ import annotations
 
 import copy
-import importlib
 import re
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations
@@ -17,6 +15,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from benchmark_modules import BENCHMARKS, benchmark_modules
 
 from edge_depth_nerf.compare.configuration import flattened, literal_form
 from edge_depth_nerf.compare.methods import GRID, METHODS, WITHOUT_EXTRAS, Cell
@@ -27,7 +26,6 @@ from edge_depth_nerf.compare.specification import OF_A_RUN
 from edge_depth_nerf.plugin.config import make_specifications, read_method_file
 
 ROOT = Path(__file__).resolve().parent.parent
-BENCHMARKS = ROOT / "benchmarks"
 LOSS, SOURCE = "pipeline.model.depth_loss", "pipeline.datamanager.depth_source"
 PRIOR = "pipeline.datamanager.prior."
 KERNEL = PRIOR + "integration.kernel"
@@ -61,13 +59,8 @@ RUNS_OF = {
 @pytest.fixture(scope="module")
 def unseen() -> Iterator[ModuleType]:
     """benchmarks/unseen.py."""
-    before = set(sys.modules)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(BENCHMARKS))
-        yield importlib.import_module("unseen")
-    for name in set(sys.modules) - before:
-        if (BENCHMARKS / f"{name}.py").is_file():
-            sys.modules.pop(name)
+    with benchmark_modules() as load:
+        yield load("unseen")
 
 
 @pytest.fixture(scope="module")
