@@ -44,8 +44,7 @@ STEPS = 40
 PARTS = {
     "networks": "networks, forward and backward",
     "hash grid": "hash grid",
-    "table": "gradient of its table",
-    "optimisers": "Adam",
+    "optimisers": "gradient of its table, and Adam",
     "batch": "pixels of the batch, their rays",
     "samples": "samples: places, positions, densities, weights",
     "losses": "losses",
@@ -107,7 +106,6 @@ class Clock:
         for holder, names, part in (
             (network_numba, ("forward", "backward"), "networks"),
             (hash_grid_numba, ("encode",), "hash grid"),
-            (hash_grid_numba, ("add_table_gradient", "table_gradient"), "table"),
             (trainer.optimizers, ("optimizer_scaler_step_some", "zero_grad_some"), "optimisers"),
             (pipeline.datamanager, ("next_train",), "batch"),
             (sampler, ("generate_ray_samples",), "samples"),

@@ -420,7 +420,7 @@ def test_a_training_step_is_the_torch_step(options):
 
 
 def test_gradients_by_positions_alone_leave_the_tables_be():
-    """Normals ask for them in each step; from the second one on, gradients could be added to the tables in place."""
+    """Normals ask for them in each step; from the second one on, gradients could be summed up later."""
     options = {"max_res": 512, "predict_normals": True}
     models = [build(implementation=implementation, **options) for implementation in ("torch", "fused")]
     for model in models:

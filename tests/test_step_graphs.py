@@ -11,7 +11,7 @@ from scenes import write_scene
 from torch.utils._pytree import tree_leaves
 from trainings import trainer_of
 
-from edge_depth_nerf.kernels.table_adam import IN_PLACE
+from edge_depth_nerf.kernels.table_adam import SUMS_LATER
 from edge_depth_nerf.plugin.step_graphs import EAGER_STEPS, StepGraphs, why_not
 from edge_depth_nerf.plugin.trainer import EdgeDepthTrainer
 
@@ -49,8 +49,8 @@ def trainer_in(folder: Path, name: str, **changes: Any) -> EdgeDepthTrainer:
     manager: Any = trainer.pipeline.datamanager
     manager.next_train = lambda step: manager.batch_of(manager.upload(step))
     for parameter in trainer.pipeline.model.parameters():
-        if hasattr(parameter, IN_PLACE):
-            delattr(parameter, IN_PLACE)  # of the CPU alone
+        if hasattr(parameter, SUMS_LATER):
+            delattr(parameter, SUMS_LATER)  # of the CPU alone
     # both kinds of steps, from the first graph on
     sampler: Any = trainer.pipeline.model.proposal_sampler
     sampler.update_sched = lambda step: 2

@@ -1,4 +1,4 @@
-"""Adam for tables whose gradients are added in place, against torch's Adam."""
+"""Adam for tables whose gradients are summed up level by level, against torch's Adam."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from nerfstudio.field_components.encodings import HashEncoding
 
 from edge_depth_nerf.kernels.fused_hash_grid import use_fused_encodings
-from edge_depth_nerf.kernels.table_adam import CLEARED, IN_PLACE, TableAdam
+from edge_depth_nerf.kernels.table_adam import PARTS, SUMS_LATER, TableAdam
 
 SETTINGS: dict[str, Any] = {"lr": 1e-2, "eps": 1e-15}
 
@@ -56,18 +56,25 @@ def test_its_steps_are_torchs(threads, betas, monkeypatch):
         torch.testing.assert_close(each, other, rtol=1e-5, atol=1e-7)
 
 
-def test_the_gradient_stays_where_it_is_and_is_cleared():
+def whole_gradient(encoding: HashEncoding) -> torch.Tensor:
+    """What the table's gradient is made of, summed up."""
+    from edge_depth_nerf.kernels.hash_grid_numba import table_gradient
+
+    parts = getattr(encoding.hash_table, PARTS)
+    return torch.stack([table_gradient(*part, len(encoding.hash_table)) for part in parts]).sum(dim=0)
+
+
+def test_no_gradient_of_the_tables_size_is_made():
     encoding = grid()
     optimizer = TableAdam(encoding.parameters(), **SETTINGS)
     train(encoding, optimizer, range(1))
-    gradient = encoding.hash_table.grad
-    assert gradient is not None and not bool(gradient.any())
     optimizer.zero_grad()
-    assert encoding.hash_table.grad is gradient
     loss(encoding, 1).backward()
-    assert encoding.hash_table.grad is gradient and bool(gradient.any())
+    assert encoding.hash_table.grad is None and len(getattr(encoding.hash_table, PARTS)) == 2
+    before = encoding.hash_table.detach().clone()
     optimizer.step()
-    assert not bool(gradient.any())
+    assert encoding.hash_table.grad is None and not getattr(encoding.hash_table, PARTS)
+    assert not torch.equal(encoding.hash_table, before)
 
 
 def test_gradients_of_several_passes_add_up():
@@ -75,14 +82,63 @@ def test_gradients_of_several_passes_add_up():
     optimizer = TableAdam(ours.parameters(), **SETTINGS)
     train(ours, optimizer, range(1))
     others.load_state_dict(ours.state_dict())
+    optimizer.zero_grad()
     for step in (1, 2):
         loss(ours, step).backward()
         loss(others, step).backward()
-    assert ours.hash_table.grad is not None and others.hash_table.grad is not None
-    torch.testing.assert_close(ours.hash_table.grad, others.hash_table.grad)
-    # what no step has read is cleared when that is asked for
+    assert others.hash_table.grad is not None
+    torch.testing.assert_close(whole_gradient(ours), others.hash_table.grad)
+    # what no step has used is dropped when that is asked for
+    table = ours.hash_table.detach().clone()
     optimizer.zero_grad()
-    assert ours.hash_table.grad is None or not bool(ours.hash_table.grad.any())
+    optimizer.step()
+    assert torch.equal(ours.hash_table, table)
+
+
+def test_a_whole_gradient_beside_parts_is_not_lost():
+    """As where one pass of a step is nerfstudio's own."""
+    ours, others = grid(), grid()
+    optimizer, of_torch = TableAdam(ours.parameters(), **SETTINGS), torch.optim.Adam(others.parameters(), **SETTINGS)
+    train(ours, optimizer, range(1))
+    train(others, of_torch, range(1))
+    for encoding, adam in ((ours, optimizer), (others, of_torch)):
+        adam.zero_grad()
+        loss(encoding, 1).backward()
+        more = torch.full_like(encoding.hash_table, 1e-3)
+        encoding.hash_table.grad = more if encoding.hash_table.grad is None else encoding.hash_table.grad + more
+        adam.step()
+    torch.testing.assert_close(ours.hash_table, others.hash_table, rtol=1e-5, atol=1e-7)
+
+
+def test_a_closure_computes_the_gradients_of_its_step():
+    ours, others = grid(), grid()
+    optimizers = TableAdam(ours.parameters(), **SETTINGS), torch.optim.Adam(others.parameters(), **SETTINGS)
+
+    def closure(encoding: HashEncoding, adam: torch.optim.Optimizer, step: int) -> torch.Tensor:
+        adam.zero_grad()
+        value = loss(encoding, step)
+        value.backward()
+        return value
+
+    for step in range(3):
+        values = [
+            adam.step(lambda encoding=encoding, adam=adam: closure(encoding, adam, step))  # noqa: B023
+            for encoding, adam in zip((ours, others), optimizers, strict=True)
+        ]
+        torch.testing.assert_close(values[0], values[1])
+    torch.testing.assert_close(ours.hash_table, others.hash_table, rtol=1e-5, atol=1e-7)
+
+
+def test_gradients_that_are_clipped_are_whole():
+    from edge_depth_nerf.plugin.config import FusedAdamConfig
+
+    for max_norm, is_whole in ((1.0, True), (None, False)):
+        encoding = grid()
+        optimizer = FusedAdamConfig(lr=1e-2, eps=1e-15, max_norm=max_norm).setup(list(encoding.parameters()))
+        train(encoding, optimizer, range(2))
+        optimizer.zero_grad()
+        loss(encoding, 2).backward()
+        assert (encoding.hash_table.grad is not None) is is_whole
 
 
 def test_a_table_without_gradient_is_left_alone():
@@ -117,11 +173,11 @@ def test_other_forms_of_adam_are_torchs(options):
     found = train(ours, TableAdam(ours.parameters(), **SETTINGS, **options), range(3))[-1]
     expected = train(others, torch.optim.Adam(others.parameters(), **SETTINGS, **options), range(3))[-1]
     assert torch.equal(found, expected)
-    assert getattr(ours.hash_table, IN_PLACE) is False and not getattr(ours.hash_table, CLEARED, False)
+    assert getattr(ours.hash_table, SUMS_LATER) is False
 
 
 def test_with_several_processes_gradients_go_through_torch(monkeypatch):
     monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
     encoding = grid()
     train(encoding, TableAdam(encoding.parameters(), **SETTINGS), range(2))
-    assert getattr(encoding.hash_table, IN_PLACE) is False
+    assert getattr(encoding.hash_table, SUMS_LATER) is False

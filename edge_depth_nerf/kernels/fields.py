@@ -254,17 +254,17 @@ FUSED: dict[type[nn.Module], type[nn.Module]] = {
 }
 
 
-def use_fused_fields(module: nn.Module, add_in_place: bool = True) -> None:
+def use_fused_fields(module: nn.Module, sum_later: bool = True) -> None:
     """Let all fields, networks and hash encodings below `module` compute in fused forms.
 
     In place; parameters stay the same objects.
 
     Args:
         module: whose parts change.
-        add_in_place: as for `use_fused_encodings`.
+        sum_later: as for `use_fused_encodings`.
 
     """
-    use_fused_encodings(module, add_in_place)
+    use_fused_encodings(module, sum_later)
     for part in module.modules():
         if type(part) in FUSED and not (isinstance(part, MLP) and not _is_plain(part)):
             # the class alone differs; another object would have to be found by all who hold this one

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from edge_depth_nerf.kernels.back_ends import made_by_autocast
 from edge_depth_nerf.kernels.hash_grid import back_end, hash_grid
-from edge_depth_nerf.kernels.table_adam import IN_PLACE
+from edge_depth_nerf.kernels.table_adam import SUMS_LATER
 
 
 class FusedHashEncoding(HashEncoding):
@@ -37,18 +37,18 @@ class FusedHashEncoding(HashEncoding):
         return encoded.view(*in_tensor.shape[:-1], self.get_out_dim())
 
 
-def use_fused_encodings(module: nn.Module, add_in_place: bool = True) -> None:
+def use_fused_encodings(module: nn.Module, sum_later: bool = True) -> None:
     """Let all hash encodings below `module` compute in the fused form; in place, parameters stay the same objects.
 
     Args:
         module: whose encodings change.
-        add_in_place: whether an optimiser may have the gradients of their tables added in place. Not where, within a
-            step, `torch.autograd.grad` asks for the gradient by positions: backward cannot tell that from a step's own.
+        sum_later: whether an optimiser may sum up the gradients of their tables later. Not where, within a step,
+            `torch.autograd.grad` asks for the gradient by positions: backward cannot tell that from a step's own.
 
     """
     for part in module.modules():
         if type(part) is HashEncoding:
             # the class alone differs; another object would have to be found by all who hold this one
             part.__class__ = FusedHashEncoding
-            if add_in_place:
-                setattr(part.hash_table, IN_PLACE, False)  # until an optimiser says that it can do with it
+            if sum_later:
+                setattr(part.hash_table, SUMS_LATER, False)  # until an optimiser says that it can do with it

@@ -25,7 +25,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from edge_depth_nerf.kernels.back_ends import working
-from edge_depth_nerf.kernels.table_adam import CLEARED, IN_PLACE, adds_in_place
+from edge_depth_nerf.kernels.table_adam import SUMS_LATER, TablePart, keep_part
 
 
 def back_end(device: torch.device) -> ModuleType | None:
@@ -49,7 +49,7 @@ class _HashGrid(torch.autograd.Function):
         # without a gradient to the positions the table is not needed again
         ctx.save_for_backward(positions, table if ctx.needs_input_grad[0] else None, scalings)
         ctx.work, ctx.rows = work, len(table)
-        ctx.table = table if hasattr(table, IN_PLACE) else None
+        ctx.table = table if hasattr(table, SUMS_LATER) else None
         encode = work.encode if dtype == torch.float32 else partial(work.encode, dtype=dtype)
         return encode(positions, table, scalings)
 
@@ -57,11 +57,9 @@ class _HashGrid(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         positions, table, scalings = ctx.saved_tensors
         rows = ctx.rows if ctx.needs_input_grad[1] else None
-        if rows is not None and ctx.table is not None:
-            if adds_in_place(ctx.table):
-                ctx.work.add_table_gradient(positions, gradients[0], scalings, ctx.table.grad)
-                rows = None
-            setattr(ctx.table, CLEARED, False)
+        later = rows is not None and ctx.table is not None
+        if later and keep_part(ctx.table, TablePart(positions, gradients[0], scalings)):
+            rows = None
         return *_Gradients.apply(gradients[0], positions, table, scalings, rows, ctx.work), None, None, None
 
 

@@ -14,7 +14,7 @@ Importing this module imports Numba.
 
 from __future__ import annotations
 
-from typing import no_type_check
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ from numba.extending import intrinsic
 from torch import Tensor
 
 from edge_depth_nerf.kernels.compiled import compiled
-from edge_depth_nerf.kernels.threads import kernel_threads, share_out, stretches
+from edge_depth_nerf.kernels.threads import in_parts, kernel_threads, share_out, stretches
 
 TILE = 64
 """Points worked on together: their rows of the table, 32 kB at most, stay in the nearest cache."""
@@ -118,6 +118,17 @@ def _corners_of(begins, j, c):
 
 @compiled()
 @no_type_check
+def _turn(values, turned, begin, end):
+    """Copy [points, n] to [n, points], some points, tile by tile; calls for different points may run at once."""
+    for first in range(begin, end, TILE):
+        last = min(first + TILE, end)
+        for column in range(values.shape[1]):
+            for point in range(first, last):
+                turned[column, point] = values[point, column]
+
+
+@compiled()
+@no_type_check
 def _encode_points(axes, table, features, scalings, encoded, first_point, last_point):
     """Encode some points; calls for different points may run at once.
 
@@ -154,7 +165,7 @@ def _encode_points(axes, table, features, scalings, encoded, first_point, last_p
 def _add_to_grid(axes, scaling, gradient, column, features, grid, first_point, last_point):
     """Add to one level's flat gradient what some points give; calls for different ones may run at once.
 
-    The level's features begin at `column` of `gradient`.
+    The level's features begin at row `column` of `gradient`, [levels * features, points].
     """
     size = len(grid) // len(features)
     begins, offsets = np.empty(8 * TILE, np.uint32), np.empty(3 * TILE, np.float32)
@@ -169,7 +180,7 @@ def _add_to_grid(axes, scaling, gradient, column, features, grid, first_point, l
             low_low, high_low, low_high, high_high = rest_y * rest_z, y * rest_z, rest_y * z, y * z
             for c in range(len(features)):
                 r0, r1, r2, r3, r4, r5, r6, r7 = _corners_of(begins, j, c)
-                g = gradient[first + j, column + c]
+                g = gradient[column + c, first + j]
                 grid[r0] += g * low_low * rest_x
                 grid[r1] += g * low_low * x
                 grid[r2] += g * high_low * rest_x
@@ -222,12 +233,18 @@ def _threads(points: int, levels: int) -> int:
     return max(1, min(kernel_threads(), points * levels // LEAST_SHARE))
 
 
-def _axes(positions: Tensor) -> np.ndarray:
-    """[points, 3] to [3, points], so that neighbours in memory are neighbouring points."""
-    return positions.detach().t().contiguous().numpy()
+def _by_column(values: Tensor) -> np.ndarray:
+    """[points, n] to [n, points], so that neighbours in memory are neighbouring points."""
+    columns = values.detach().t()
+    if columns.is_contiguous():
+        return columns.numpy()
+    given = columns.t().contiguous().numpy()
+    turned = np.empty(given.shape[::-1], np.float32)
+    in_parts(lambda begin, end: _turn(given, turned, begin, end), len(given), LEAST_SHARE)
+    return turned
 
 
-def _flat(table: Tensor) -> np.ndarray:
+def flat_numbers(table: Tensor) -> np.ndarray:
     """A table's numbers, row after row."""
     return table.detach().contiguous().view(-1).numpy()
 
@@ -238,9 +255,33 @@ def encode(
     """Encode points, float32; see `hash_grid`."""
     points, levels = len(positions), len(scalings)
     encoded = torch.empty(points, levels * table.shape[1])
-    arrays = _axes(positions), _flat(table), (0,) * table.shape[1], scalings.numpy(), encoded.numpy()
+    arrays = _by_column(positions), flat_numbers(table), (0,) * table.shape[1], scalings.numpy(), encoded.numpy()
     share_out(lambda part: _encode_points(*arrays, *part), stretches(points, _threads(points, levels)))
     return encoded
+
+
+class Prepared(NamedTuple):
+    """A pass of points, as the compiled functions want it."""
+
+    axes: np.ndarray
+    """Positions, [3, points]."""
+    gradient: np.ndarray
+    """To the encoded values, [levels * features, points]: a level reads its own rows alone."""
+    scalings: np.ndarray
+
+
+def prepared(positions: Tensor, gradient: Tensor, scalings: Tensor) -> Prepared:
+    """Arrange a pass of points for `add_to_level`."""
+    return Prepared(_by_column(positions), _by_column(gradient), scalings.numpy())
+
+
+def add_to_level(
+    points: Prepared, level: int, features: int, grid: np.ndarray, first: int = 0, last: int | None = None
+) -> None:
+    """Add what points from `first` to `last` give to the gradient of one level of a table, flat; in this thread."""
+    axes, gradient, scalings = points
+    last = axes.shape[1] if last is None else last
+    _add_to_grid(axes, scalings[level], gradient, level * features, (0,) * features, grid, first, last)
 
 
 def table_gradient(
@@ -249,57 +290,40 @@ def table_gradient(
     scalings: Float[Tensor, "levels"],
     rows: int,
 ) -> Float[Tensor, "rows features"]:
-    """Give the gradient to a table of `rows` rows, from the gradient to the encoded values."""
-    # NumPy asks the system for large pages, torch does not: a third of the time of a table of 64 MB
-    into = torch.from_numpy(np.empty((rows, gradient.shape[1] // len(scalings)), np.float32))
-    _sum_up(positions, gradient, scalings, into, anew=True)
-    return into
-
-
-def add_table_gradient(
-    positions: Float[Tensor, "points 3"],
-    gradient: Float[Tensor, "points encoded"],
-    scalings: Float[Tensor, "levels"],
-    into: Float[Tensor, "rows features"],
-) -> None:
-    """Add the gradient to a table to what `into` holds; contiguous."""
-    _sum_up(positions, gradient, scalings, into, anew=False)
-
-
-def _sum_up(positions: Tensor, gradient: Tensor, scalings: Tensor, into: Tensor, anew: bool) -> None:
-    """Add a table's gradient to `into`, or write it there.
+    """Give the gradient to a table of `rows` rows, from the gradient to the encoded values.
 
     Each thread takes an equal stretch of the levels' points, levels far apart in resolution one after the other (fine
     ones take longer). Where a stretch begins within a level, which another thread begins, it adds into a table of its
     own, and that is added in the end.
     """
-    points, levels = len(positions), len(scalings)
-    size, features = len(into) // levels, into.shape[1]
-    axes, given, scaling_of = _axes(positions), gradient.detach().contiguous().numpy(), scalings.numpy()
-    grids = into.view(levels, size * features).numpy()
-    threads = _threads(points, levels)
+    count, levels = len(positions), len(scalings)
+    size, features = rows // levels, gradient.shape[1] // levels
+    points = prepared(positions, gradient, scalings)
+    # NumPy asks the system for large pages, torch does not: a third of the time of a table of 64 MB
+    grids = np.empty((levels, size * features), np.float32)
+    threads = _threads(count, levels)
     order = [level for thread in range(threads) for level in range(thread, levels, threads)]
     own_grids: dict[tuple[int, int], np.ndarray] = {}
 
     def work(stretch: tuple[int, int]) -> None:
-        for place in range(stretch[0] // max(1, points), levels):
-            first, last = max(stretch[0] - place * points, 0), min(stretch[1] - place * points, points)
-            if last <= first and points > 0:
+        for place in range(stretch[0] // max(1, count), levels):
+            first, last = max(stretch[0] - place * count, 0), min(stretch[1] - place * count, count)
+            if last <= first and count > 0:
                 break
             level = order[place]
             if first == 0:
                 grid = grids[level]
-                if anew:
-                    grid[:] = 0
+                grid[:] = 0
             else:
                 grid = np.zeros(size * features, np.float32)
                 own_grids[level, first] = grid
-            _add_to_grid(axes, scaling_of[level], given, level * features, (0,) * features, grid, first, last)
+            add_to_level(points, level, features, grid, first, last)
 
-    share_out(work, stretches(points * levels, threads))
+    share_out(work, stretches(count * levels, threads))
     # in one order, whichever thread was ready first: the same sums each time
     for (level, _), grid in sorted(own_grids.items(), key=lambda item: item[0]):
         grids[level] += grid
+    return torch.from_numpy(grids).view(rows, features)
 
 
 def position_gradient(
@@ -312,8 +336,8 @@ def position_gradient(
     points, levels = len(positions), len(scalings)
     result = torch.empty(points, 3)
     arrays = (
-        _axes(positions),
-        _flat(table),
+        _by_column(positions),
+        flat_numbers(table),
         (0,) * table.shape[1],
         scalings.numpy(),
         gradient.detach().contiguous().numpy(),

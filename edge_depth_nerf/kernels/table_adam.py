@@ -1,7 +1,8 @@
-"""Adam for hash tables on the CPU, whose gradients are added in place.
+"""Adam for hash tables on the CPU, whose gradients are summed up and used level by level.
 
-A table of 50 MB has a gradient of 50 MB. torch makes it again in each step: it is filled with zeros, added to, read by
-Adam and dropped. Here one array stays: backward adds to it (`hash_grid`), and Adam clears each number after reading it.
+A table of 50 MB has a gradient of 50 MB. torch fills it with zeros, adds to it, reads it in Adam and drops it. Here
+backward keeps what the gradient is made of: the points, and the gradient to their encoded values (`TablePart`). Adam
+sums up the gradient of one level, 4 MB that stay in a cache, does its step with it, and goes on to the next level.
 The steps are those of torch's Adam, and so is what checkpoints hold.
 
 Importing this module does not import Numba; the first step does.
@@ -10,52 +11,90 @@ Importing this module does not import Numba; the first step does.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import torch.distributed as dist
+from jaxtyping import Float
 from torch import Tensor
 
-IN_PLACE = "gradient_is_added_in_place"
-"""Attribute of a table's parameter: whether backward adds to its `grad`, where it has one, and returns none."""
-CLEARED = "gradient_is_cleared"
-"""Attribute of such a parameter: whether its `grad` is all zeros, as Adam left it."""
+from edge_depth_nerf.kernels.threads import kernel_threads
+
+SUMS_LATER = "gradient_is_summed_later"
+"""Attribute of a table's parameter: whether backward gives its optimiser what makes the gradient, instead of the gradient."""
+PARTS = "parts_of_gradient"
+"""Attribute of such a parameter: a list of `TablePart` since the last step."""
 
 
-def adds_in_place(table: Tensor) -> bool:
-    """Whether backward has to add to `table.grad`."""
-    return getattr(table, IN_PLACE, False) and table.grad is not None
+class TablePart(NamedTuple):
+    """What gives a gradient to a table: one pass of points through the hash grid."""
+
+    positions: Float[Tensor, "points 3"]
+    gradient: Float[Tensor, "points encoded"]
+    """To the encoded values."""
+    scalings: Float[Tensor, "levels"]
+
+
+def keep_part(table: Tensor, part: TablePart) -> bool:
+    """Keep what backward got for the table's optimiser. False: that optimiser wants the gradient itself."""
+    if not getattr(table, SUMS_LATER, False):
+        return False
+    parts = getattr(table, PARTS, None)
+    if parts is None:
+        parts = []
+        setattr(table, PARTS, parts)
+    parts.append(part)
+    return True
+
+
+def take_parts(table: Tensor) -> list[TablePart]:
+    """Give what was kept of a table since the last call."""
+    parts = getattr(table, PARTS, None) or []
+    setattr(table, PARTS, None)
+    return parts
 
 
 class TableAdam(torch.optim.Adam):
-    """torch's Adam; hash tables on the CPU have gradients that stay where they are."""
+    """torch's Adam; hash tables on the CPU get their gradients level by level, and `grad` stays None."""
+
+    sums_later: bool = True
+    """False: tables have a whole gradient in `grad`, for what reads or changes it before the step."""
 
     def _tables(self, group: dict[str, Any]) -> list[Tensor]:
-        """The tables of a group that this class steps itself."""
+        """The tables of a group whose gradients this class may sum up itself."""
+        return [table for table in group["params"] if hasattr(table, SUMS_LATER) and table.device.type == "cpu"]
+
+    def _may_sum(self, group: dict[str, Any]) -> bool:
+        """Whether it does the steps of a group's tables itself."""
         plain = not (group["amsgrad"] or group["maximize"] or group["weight_decay"] or group["differentiable"])
-        # torch's hooks, by which processes share their gradients, are not called for what is added in place
+        # torch's hooks, by which processes share their gradients, are not called for what is summed up later
         alone = not (dist.is_available() and dist.is_initialized())
-        if not (plain and alone):
-            return []
-        return [table for table in group["params"] if hasattr(table, IN_PLACE) and table.device.type == "cpu"]
+        return self.sums_later and plain and alone
 
     @torch.no_grad()
     def step(self, closure: Any = None) -> Any:
-        """Do one step; tables that no gradient was added to are left alone, as torch leaves what has none."""
-        apart = [(group, table, table.grad) for group in self.param_groups for table in self._tables(group)]
-        for _, table, _ in apart:
-            table.grad = None
-        loss = super().step(closure)
-        for group, table, gradient in apart:
-            table.grad = gradient
-            if gradient is not None and not getattr(table, CLEARED, False):
-                self._step_table(group, table, gradient)
-                setattr(table, IN_PLACE, True)
-                setattr(table, CLEARED, True)
+        """Do one step; tables that got no gradient are left alone, as torch leaves what has none."""
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        apart = []
+        for group in self.param_groups:
+            may_sum = self._may_sum(group)
+            for table in self._tables(group):
+                parts = take_parts(table)
+                if parts and may_sum and table.grad is None:
+                    apart.append((group, table, parts))
+                else:
+                    _add_to_grad(table, parts)
+                setattr(table, SUMS_LATER, may_sum)
+        super().step()
+        for group, table, parts in apart:
+            self._step_table(group, table, parts)
         return loss
 
-    def _step_table(self, group: dict[str, Any], table: Tensor, gradient: Tensor) -> None:
-        from edge_depth_nerf.kernels.table_adam_numba import adam
+    def _step_table(self, group: dict[str, Any], table: Tensor, parts: list[TablePart]) -> None:
+        from edge_depth_nerf.kernels.table_adam_numba import step_levels
 
         state = self.state[table]
         if not state:
@@ -63,19 +102,28 @@ class TableAdam(torch.optim.Adam):
             state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(table), torch.zeros_like(table)
         state["step"] += 1
         step, (beta1, beta2) = float(state["step"]), group["betas"]
-        adam(
-            *(each.detach().view(-1).numpy() for each in (table, gradient, state["exp_avg"], state["exp_avg_sq"])),
+        step_levels(
+            *(table, state["exp_avg"], state["exp_avg_sq"], parts),
             beta1=beta1,
             beta2=beta2,
             rate=float(group["lr"]) / (1 - beta1**step),
             spread=math.sqrt(1 - beta2**step),
             eps=group["eps"],
+            threads=kernel_threads(),
         )
 
     def zero_grad(self, set_to_none: bool = True) -> None:
-        """Clear gradients; those of tables that are clear stay."""
-        every = [table for group in self.param_groups for table in self._tables(group)]
-        kept = [(table, table.grad) for table in every if getattr(table, CLEARED, False)]
+        """Clear gradients, and what was kept for them."""
         super().zero_grad(set_to_none)
-        for table, gradient in kept:
-            table.grad = gradient
+        for group in self.param_groups:
+            for table in self._tables(group):
+                take_parts(table)
+
+
+def _add_to_grad(table: Tensor, parts: list[TablePart]) -> None:
+    """Sum up a table's gradient as torch has it."""
+    from edge_depth_nerf.kernels.hash_grid_numba import table_gradient
+
+    for part in parts:
+        gradient = table_gradient(*part, len(table))
+        table.grad = gradient if table.grad is None else table.grad + gradient

@@ -1,22 +1,28 @@
-"""Adam's step on the numbers of a table, which also clears the gradient. Importing this module imports Numba."""
+"""Adam's step on a hash table, a level at a time, with the gradient summed up just before.
+
+Importing this module imports Numba.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import no_type_check
 
 import numpy as np
-from numpy.typing import NDArray
+from torch import Tensor
 
 from edge_depth_nerf.kernels.compiled import compiled
-from edge_depth_nerf.kernels.threads import kernel_threads, share_out, stretches
+from edge_depth_nerf.kernels.hash_grid_numba import add_to_level, flat_numbers, prepared
+from edge_depth_nerf.kernels.threads import share_out
 
 LEAST_SHARE = 1 << 18
-"""A thread gets at least so many numbers."""
+"""A thread gets at least so many numbers of a table."""
 
 
 @compiled(error_model="numpy")
 @no_type_check
 def _adam(values, gradient, mean, square, beta1, beta2, rate, spread, eps):
+    """Do Adam's step (Kingma & Ba, Algorithm 1) in place, and set the gradient to 0."""
     fresh, fresh_square = np.float32(1 - beta1), np.float32(1 - beta2)
     kept_square, rate, spread, eps = np.float32(beta2), np.float32(rate), np.float32(spread), np.float32(eps)
     # a range from 0 on: with any other Numba has to look for negative indices, and no vector instructions come out
@@ -30,34 +36,46 @@ def _adam(values, gradient, mean, square, beta1, beta2, rate, spread, eps):
         gradient[i] = np.float32(0)
 
 
-def adam(
-    values: NDArray[np.float32],
-    gradient: NDArray[np.float32],
-    mean: NDArray[np.float32],
-    square: NDArray[np.float32],
+def step_levels(
+    table: Tensor,
+    mean: Tensor,
+    square: Tensor,
+    parts: Sequence[tuple[Tensor, Tensor, Tensor]],
     *,
     beta1: float,
     beta2: float,
     rate: float,
     spread: float,
     eps: float,
+    threads: int,
 ) -> None:
-    """Do Adam's step (Kingma & Ba, Algorithm 1) in place, and set the gradient to 0.
+    """Do Adam's step of a table in place, level by level; a thread has whole levels, so sums have one order.
 
     Args:
-        values: what is learned, flat.
-        gradient: its gradient.
-        mean: m, the running mean of gradients.
+        table: [levels * rows, features], float32.
+        mean: m, the running mean of gradients, of the same shape.
         square: v, that of their squares.
+        parts: what the gradient is the sum of: positions, gradient to their encoded values and scalings of each pass.
         beta1: how much of m is kept.
         beta2: how much of v is kept.
         rate: learning rate over 1 - beta1^t.
         spread: √(1 - beta2^t).
         eps: added to √v / spread.
+        threads: as many at most.
 
     """
-    threads = max(1, min(kernel_threads(), len(values) // LEAST_SHARE))
-    numbers = (beta1, beta2, rate, spread, eps)
-    arrays = (values, gradient, mean, square)
-    parts = [[each[first:last] for each in arrays] for first, last in stretches(len(values), threads)]
-    share_out(lambda part: _adam(*part, *numbers), parts)
+    levels = len(parts[0].scalings)
+    values, means, squares = (flat_numbers(each).reshape(levels, -1) for each in (table, mean, square))
+    given = [prepared(*part) for part in parts]
+    features = table.shape[1]
+    # fine levels first, which take longer; who is ready takes the next one
+    remaining = iter(range(levels - 1, -1, -1))
+
+    def work(_: int) -> None:
+        gradient = np.zeros(values.shape[1], np.float32)
+        for level in remaining:
+            for part in given:
+                add_to_level(part, level, features, gradient)
+            _adam(values[level], gradient, means[level], squares[level], beta1, beta2, rate, spread, eps)
+
+    share_out(work, list(range(max(1, min(threads, levels, values.size // LEAST_SHARE)))))

@@ -46,6 +46,13 @@ class FusedAdamConfig(AdamOptimizerConfig):
     betas: tuple[float, float] = (0.9, 0.999)
     """Decay a step of the gradients' running mean, and of that of their squares."""
 
+    def setup(self, params: Any) -> torch.optim.Optimizer:
+        """Make the optimiser; nerfstudio clips whole gradients, which hash tables then have."""
+        optimizer = super().setup(params)
+        if isinstance(optimizer, TableAdam):
+            optimizer.sums_later = self.max_norm is None
+        return optimizer
+
 
 METHOD_FILE = "nerfstudio_method.toml"
 

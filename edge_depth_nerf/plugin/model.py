@@ -271,7 +271,7 @@ class EdgeDepthNerfModel(NerfactoModel):
                         "Compiling kernels for the first steps. This takes about a minute, once on this machine."
                     )
             # normals differentiate by the positions alone, which would add to the tables' gradients, too
-            use_fused_fields(self, add_in_place=not self.config.predict_normals)
+            use_fused_fields(self, sum_later=not self.config.predict_normals)
             if isinstance(self.proposal_sampler.initial_sampler, UniformLinDispPiecewiseSampler):
                 jitter = self.proposal_sampler.initial_sampler.single_jitter
                 self.proposal_sampler.initial_sampler = FirstSampler(single_jitter=jitter)
