@@ -10,7 +10,7 @@ import torch
 from nerfstudio.field_components.encodings import HashEncoding
 
 from edge_depth_nerf.kernels.fused_hash_grid import use_fused_encodings
-from edge_depth_nerf.kernels.table_adam import PARTS, SUMS_LATER, TableAdam
+from edge_depth_nerf.kernels.table_adam import PARTS, SUMS_LATER, TableAdam, TablePart
 
 SETTINGS: dict[str, Any] = {"lr": 1e-2, "eps": 1e-15}
 
@@ -60,7 +60,7 @@ def whole_gradient(encoding: HashEncoding) -> torch.Tensor:
     """What the table's gradient is made of, summed up."""
     from edge_depth_nerf.kernels.hash_grid_numba import table_gradient
 
-    parts = getattr(encoding.hash_table, PARTS)
+    parts: list[TablePart] = getattr(encoding.hash_table, PARTS)
     return torch.stack([table_gradient(*part, len(encoding.hash_table)) for part in parts]).sum(dim=0)
 
 

@@ -57,9 +57,9 @@ class _HashGrid(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         positions, table, scalings = ctx.saved_tensors
         rows = ctx.rows if ctx.needs_input_grad[1] else None
-        later = rows is not None and ctx.table is not None
-        if later and keep_part(ctx.table, TablePart(positions, gradients[0], scalings)):
-            rows = None
+        if rows is not None and ctx.table is not None:
+            kept = keep_part(ctx.table, TablePart(positions, gradients[0], scalings))
+            rows = None if kept else rows
         return *_Gradients.apply(gradients[0], positions, table, scalings, rows, ctx.work), None, None, None
 
 

@@ -70,6 +70,10 @@ class FirstSampler(UniformLinDispPiecewiseSampler):
 class FusedPDFSampler(PDFSampler):
     """nerfstudio's `PDFSampler(include_original=False)`; devices without kernels are left to nerfstudio."""
 
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._even: dict[tuple[int, torch.device], Tensor] = {}
+
     def generate_ray_samples(
         self,
         ray_bundle: RayBundle | None = None,
@@ -85,7 +89,9 @@ class FusedPDFSampler(PDFSampler):
         if kernels is None or not count:
             return super().generate_ray_samples(ray_bundle, ray_samples, weights, num_samples, eps)
         places, device = count + 1, weights.device
-        wanted = torch.linspace(0, 1 - 1 / places, places, device=device).expand(len(weights), -1)
+        if (places, device) not in self._even:
+            self._even[places, device] = torch.linspace(0, 1 - 1 / places, places, device=device)
+        wanted = self._even[places, device].expand(len(weights), -1)
         if self.train_stratified and self.training:
             drawn = torch.rand(len(weights), 1 if self.single_jitter else places, device=device)
             wanted = torch.add(wanted, drawn, alpha=1 / places)
@@ -144,7 +150,8 @@ class FusedFrustums(Frustums):
     def get_positions(self) -> Float[Tensor, "*batch 3"]:
         """Positions in the middle of the samples."""
         given = self.origins, self.directions, self.starts, self.ends
-        of_rays = self.origins.ndim == 3 and all(each.stride(1) == 0 for each in given[:2])
+        one = self.origins.ndim == 3 and self.origins.shape[1] == 1
+        of_rays = one or (self.origins.ndim == 3 and all(each.stride(1) == 0 for each in given[:2]))
         kernels = by_number(*given) if of_rays and self.offsets is None else None
         if kernels is None:
             return super().get_positions()

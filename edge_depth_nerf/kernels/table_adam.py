@@ -21,7 +21,7 @@ from torch import Tensor
 from edge_depth_nerf.kernels.threads import kernel_threads
 
 SUMS_LATER = "gradient_is_summed_later"
-"""Attribute of a table's parameter: whether backward gives its optimiser what makes the gradient, instead of the gradient."""
+"""Attribute of a table's parameter: whether backward gives its optimiser no gradient, but what makes it."""
 PARTS = "parts_of_gradient"
 """Attribute of such a parameter: a list of `TablePart` since the last step."""
 

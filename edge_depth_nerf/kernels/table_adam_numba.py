@@ -64,7 +64,7 @@ def step_levels(
         threads: as many at most.
 
     """
-    levels = len(parts[0].scalings)
+    levels = len(parts[0][2])
     values, means, squares = (flat_numbers(each).reshape(levels, -1) for each in (table, mean, square))
     given = [prepared(*part) for part in parts]
     features = table.shape[1]

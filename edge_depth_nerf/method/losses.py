@@ -271,7 +271,7 @@ def sky_loss(weights: Float[Tensor, "rays samples"], sky: Bool[Tensor, "rays"]) 
 
     """
     hit = weights.sum(dim=1, dtype=torch.promote_types(weights.dtype, torch.float32))
-    return hit.masked_fill(~sky, 0).sum() / sky.sum().clamp(min=1)
+    return (hit * (sky / sky.sum().clamp(min=1))).sum()
 
 
 def _check_shapes(

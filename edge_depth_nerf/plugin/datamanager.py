@@ -18,7 +18,7 @@ import json
 import os
 import tempfile
 from collections import deque
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -157,10 +157,10 @@ class TablePixelSampler:
         """Set the rays of a batch (nerfstudio's interface)."""
         self.num_rays_per_batch = num_rays_per_batch
 
-    def sample(self, step: int = 0) -> PixelBatch:
-        """Read the next batch; at a later step of the training, the batch of that step."""
+    def sample(self, step: int = 0, keep: Callable[..., Any] | None = None) -> PixelBatch:
+        """Read the next batch, or what `PixelTable.batch` keeps of it; at a later step, the batch of that step."""
         stretch = self.draw(step)
-        return self.table.batch(stretch.start, stretch.count)
+        return self.table.batch(stretch.start, stretch.count, keep)
 
     def draw(self, step: int = 0) -> Stretch:
         """Return which records are the next batch."""
@@ -187,6 +187,8 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
     eval_pixel_sampler: TablePixelSampler | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
     trained_on: Tensor
     """Picture, row and column of each ray of the last training batch."""
+    serves_places: bool = True
+    """Whether rays' metadata say where in its picture each pixel lies."""
 
     def __init__(self, config: FisheyeDepthDataManagerConfig, *args: Any, **kwargs: Any):
         self._temporary: list[tempfile.TemporaryDirectory[str]] = []
@@ -229,11 +231,10 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         self.trained_on = pixels.indices
         rays, batch = self._serve(pixels, self.train_ray_generator)
         if self._surface_sampler is not None:
-            further = self._surface_sampler.sample(step)
-            chosen = _of_use(further)[:, 0]
+            further = self._surface_sampler.sample(step, keep=_of_use)
             # the mean over no pixels would be NaN
-            if chosen.any():
-                batch["surface_rays"], surface = self._serve(further[chosen], self.train_ray_generator)
+            if len(further.sky):
+                batch["surface_rays"], surface = self._serve(further, self.train_ray_generator)
                 batch |= _of_surface(surface)
         return rays, batch
 
@@ -254,7 +255,8 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         if self._surface_sampler is not None:
             batch["surface_rays"] = every[count:]
             batch |= _of_surface({name: value[count:] for name, value in values.items()})
-            batch["surface_counts"] = _of_use(pixels[count:])
+            further = pixels[count:]
+            batch["surface_counts"] = _of_use(further.prior_distance_m, further.prior_sigma_m, further.sky)
         return every[:count], batch
 
     def pictures_of(self, rays: Tensor | None = None) -> list[str]:
@@ -289,7 +291,8 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         indices = batch.indices.to(self.device)
         rays = generator(indices)
         sizes: Any = generator.sizes
-        rays.metadata[PLACE] = (indices[:, 1:].flip(-1) + 0.5) / sizes[indices[:, 0]]
+        if self.serves_places:
+            rays.metadata[PLACE] = (indices[:, 1:].flip(-1) + 0.5) / sizes[indices[:, 0]]
         return rays, {
             "image": batch.rgb.to(self.device),
             "indices": batch.indices,
@@ -358,10 +361,10 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         return PixelTable(path)
 
 
-def _of_use(pixels: PixelBatch) -> Tensor:
-    """Whether a pixel's surface is known: it is sky, or its prior is not too vague, [n, 1]."""
-    vague = pixels.prior_sigma_m > SURFACE_SIGMA_M + SURFACE_SIGMA_SHARE * pixels.prior_distance_m
-    return pixels.sky | (pixels.prior_distance_m > 0) & ~vague
+def _of_use(distance_m: Any, sigma_m: Any, sky: Any) -> Any:
+    """Whether a pixel's surface is known: it is sky, or its prior is not too vague. Arrays or tensors."""
+    vague = sigma_m > SURFACE_SIGMA_M + SURFACE_SIGMA_SHARE * distance_m
+    return sky | (distance_m > 0) & ~vague
 
 
 def _of_surface(values: dict[str, Tensor]) -> dict[str, Tensor]:

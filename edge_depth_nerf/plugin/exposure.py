@@ -34,8 +34,8 @@ class Gains(nn.Module):
         self, colours: Float[Tensor, "rays 3"], picture: Int[Tensor, "rays"], place: Float[Tensor, "rays 2"] | None
     ) -> Float[Tensor, "rays 3"]:
         """Colours as the pictures have them."""
-        gains = self.log_gains - self.log_gains.mean(dim=0)
-        return colours * gains[picture].exp()
+        gains = (self.log_gains - self.log_gains.mean(dim=0)).exp()
+        return colours * gains[picture]
 
     def unevenness(self) -> Float[Tensor, ""]:
         """How far the maps are from the identity, or from smooth: nothing that needs a penalty."""

@@ -142,6 +142,8 @@ def settled(implementation: Literal["auto", "fused", "tcnn", "torch"], device_ty
     return implementation
 
 
+LEAST_DISTANCE_M = 1e-6
+"""What is nearer is no distance: without a prior it is 0."""
 INFINITELY_FAR = 1e4
 """Scene units: so far that the place in the contracted scene is the direction alone."""
 LEAST_HIT = 0.05
@@ -156,6 +158,9 @@ class NothingBehind(RGBRenderer):
 
     def forward(self, rgb: Tensor, weights: Tensor, *args: Any, **kwargs: Any) -> Tensor:
         """Give the colours, [rays, 3]."""
+        if self.training and not args and not kwargs:
+            # nerfstudio also sums up the weights, for the background
+            return (weights * rgb).sum(dim=-2)
         # its word for a background that is added later
         return super().forward(rgb, weights, *args, **{**kwargs, "background_color": "random"})
 
@@ -375,7 +380,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         outputs, further = self._rendered(ray_bundle, batch)
         if self._has_sky:
             behind, further = further[: len(ray_bundle)], further[len(ray_bundle) :]
-            outputs["rgb"] = outputs["rgb"] + (1 - outputs["accumulation"]) * behind
+            outputs["rgb"] = torch.addcmul(outputs["rgb"], 1 - outputs["accumulation"], behind)
         if self._has_surface(batch):
             bundles = [ray_bundle, batch["surface_rays"]]
             outputs["rgb"], outputs["surface_rgb"] = self._exposed([outputs["rgb"], further], bundles)
@@ -411,7 +416,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         every = RayBundle(origins, directions, areas, pictures)
         at = torch.cat(distances)[:, None, None]
         along = samples_along if self.fused else RayBundle.get_ray_samples
-        return along(every, 0.99 * at, 1.01 * at)
+        return along(every, at, at)
 
     def _fields(self, parts: list[RaySamples]) -> list[dict[FieldHeadNames, Tensor]]:
         """The field at several sets of samples."""
@@ -503,7 +508,8 @@ class EdgeDepthNerfModel(NerfactoModel):
 
         No sample lies elsewhere: such a prior would draw all weight to the first sample or to the last.
         """
-        return (prior_m >= self.config.near_m) & (prior_m <= self.config.far_m) & (prior_m > 0)
+        nearest_m = max(self.config.near_m, LEAST_DISTANCE_M)
+        return (prior_m >= nearest_m) & (prior_m <= self.config.far_m)
 
     def schedule(self) -> tuple[float, float]:
         """What differs between steps: λ, and the exponent by which the sampler's weights are annealed."""
@@ -565,7 +571,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         distance_m, sigma_m = batch["surface_distance_m"][:, 0], batch["surface_sigma_m"][:, 0]
         off_m = sigma_m * torch.randn_like(sigma_m)
         drawn_m = distance_m + off_m
-        beyond = (drawn_m < self.config.near_m) | (drawn_m > self.config.far_m)
+        beyond = drawn_m != drawn_m.clamp(self.config.near_m, self.config.far_m)
         return torch.where(beyond, distance_m - off_m, drawn_m).clamp(self.config.near_m, self.config.far_m)
 
     def _nerfacto_losses(
@@ -582,7 +588,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         bounds = [proposal_loss(final[0], final[1].detach(), *proposal) for proposal in proposals]
         losses = {
             "rgb_loss": self.rgb_loss(image, rendered),
-            "interlevel_loss": self.config.interlevel_loss_mult * torch.stack(bounds).sum(),
+            "interlevel_loss": self.config.interlevel_loss_mult * sum(bounds[1:], bounds[0]),
             "distortion_loss": self.config.distortion_loss_mult * metrics["distortion"],
         }
         self.camera_optimizer.get_loss_dict(losses)

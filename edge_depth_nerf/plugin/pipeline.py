@@ -84,6 +84,7 @@ class EdgeDepthPipeline(VanillaPipeline):
                 f"{FARTHEST_UNITS:g} float32 cannot distinguish the samples along a ray. Lower "
                 "--pipeline.model.far-m, or leave --pipeline.datamanager.dataparser.metres-per-unit at its default."
             )
+        manager.serves_places = model.exposure == "grid"
         sampler = manager.train_pixel_sampler
         if model.depth_loss != "none" and sampler is not None and sampler.table.share_with_prior == 0:
             raise InputError(
@@ -133,7 +134,7 @@ class EdgeDepthPipeline(VanillaPipeline):
             found = self.graphs.replayed(packed, step) or self._computed(*manager.batch_of(packed))
         outputs, losses, _ = found
         if torch.device(self.device).type == "cpu":
-            if not all(bool(loss.detach().isfinite()) for loss in losses.values()):
+            if not bool(torch.stack([loss.detach() for loss in losses.values()]).isfinite().all()):
                 raise NotFiniteError(self._not_finite(step, outputs, losses))
         else:
             self._count_not_finite(step, outputs, losses)
