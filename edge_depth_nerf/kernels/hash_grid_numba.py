@@ -244,7 +244,7 @@ def _by_column(values: Tensor) -> np.ndarray:
     return turned
 
 
-def flat_numbers(table: Tensor) -> np.ndarray:
+def _flat(table: Tensor) -> np.ndarray:
     """A table's numbers, row after row."""
     return table.detach().contiguous().view(-1).numpy()
 
@@ -255,7 +255,7 @@ def encode(
     """Encode points, float32; see `hash_grid`."""
     points, levels = len(positions), len(scalings)
     encoded = torch.empty(points, levels * table.shape[1])
-    arrays = _by_column(positions), flat_numbers(table), (0,) * table.shape[1], scalings.numpy(), encoded.numpy()
+    arrays = _by_column(positions), _flat(table), (0,) * table.shape[1], scalings.numpy(), encoded.numpy()
     share_out(lambda part: _encode_points(*arrays, *part), stretches(points, _threads(points, levels)))
     return encoded
 
@@ -337,7 +337,7 @@ def position_gradient(
     result = torch.empty(points, 3)
     arrays = (
         _by_column(positions),
-        flat_numbers(table),
+        _flat(table),
         (0,) * table.shape[1],
         scalings.numpy(),
         gradient.detach().contiguous().numpy(),

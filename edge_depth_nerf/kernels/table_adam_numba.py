@@ -12,7 +12,7 @@ import numpy as np
 from torch import Tensor
 
 from edge_depth_nerf.kernels.compiled import compiled
-from edge_depth_nerf.kernels.hash_grid_numba import add_to_level, flat_numbers, prepared
+from edge_depth_nerf.kernels.hash_grid_numba import add_to_level, prepared
 from edge_depth_nerf.kernels.threads import share_out
 
 LEAST_SHARE = 1 << 18
@@ -65,7 +65,7 @@ def step_levels(
 
     """
     levels = len(parts[0][2])
-    values, means, squares = (flat_numbers(each).reshape(levels, -1) for each in (table, mean, square))
+    values, means, squares = (each.detach().view(levels, -1).numpy() for each in (table, mean, square))
     given = [prepared(*part) for part in parts]
     features = table.shape[1]
     # fine levels first, which take longer; who is ready takes the next one
