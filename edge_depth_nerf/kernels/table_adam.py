@@ -57,8 +57,22 @@ def take_parts(table: Tensor) -> list[TablePart]:
 class TableAdam(torch.optim.Adam):
     """torch's Adam; hash tables on the CPU get their gradients level by level, and `grad` stays None."""
 
-    sums_later: bool = True
-    """False: tables have a whole gradient in `grad`, for what reads or changes it before the step."""
+    _whole: bool = False
+
+    def add_param_group(self, param_group: dict[str, Any]) -> None:
+        """Take parameters; from here on the tables among them have no gradients of their own."""
+        super().add_param_group(param_group)
+        self._tell_tables(self.param_groups[-1])
+
+    def want_whole_gradients(self) -> None:
+        """Let tables have a whole gradient in `grad`, for what reads or changes it before the step."""
+        self._whole = True
+        for group in self.param_groups:
+            self._tell_tables(group)
+
+    def _tell_tables(self, group: dict[str, Any]) -> None:
+        for table in self._tables(group):
+            setattr(table, SUMS_LATER, self._may_sum(group))
 
     def _tables(self, group: dict[str, Any]) -> list[Tensor]:
         """The tables of a group whose gradients this class may sum up itself."""
@@ -69,7 +83,7 @@ class TableAdam(torch.optim.Adam):
         plain = not (group["amsgrad"] or group["maximize"] or group["weight_decay"] or group["differentiable"])
         # torch's hooks, by which processes share their gradients, are not called for what is summed up later
         alone = not (dist.is_available() and dist.is_initialized())
-        return self.sums_later and plain and alone
+        return plain and alone and not self._whole
 
     @torch.no_grad()
     def step(self, closure: Any = None) -> Any:

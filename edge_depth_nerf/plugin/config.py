@@ -49,8 +49,8 @@ class FusedAdamConfig(AdamOptimizerConfig):
     def setup(self, params: Any) -> torch.optim.Optimizer:
         """Make the optimiser; nerfstudio clips whole gradients, which hash tables then have."""
         optimizer = super().setup(params)
-        if isinstance(optimizer, TableAdam):
-            optimizer.sums_later = self.max_norm is None
+        if isinstance(optimizer, TableAdam) and self.max_norm is not None:
+            optimizer.want_whole_gradients()
         return optimizer
 
 
