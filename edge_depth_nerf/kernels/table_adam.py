@@ -37,7 +37,8 @@ class TablePart(NamedTuple):
 
 def keep_part(table: Tensor, part: TablePart) -> bool:
     """Keep what backward got for the table's optimiser. False: that optimiser wants the gradient itself."""
-    if not getattr(table, SUMS_LATER, False):
+    # a table may have been moved since its optimiser saw it
+    if not getattr(table, SUMS_LATER, False) or table.device.type != "cpu":
         return False
     parts = getattr(table, PARTS, None)
     if parts is None:
