@@ -150,8 +150,7 @@ class FusedFrustums(Frustums):
     def get_positions(self) -> Float[Tensor, "*batch 3"]:
         """Positions in the middle of the samples."""
         given = self.origins, self.directions, self.starts, self.ends
-        one = self.origins.ndim == 3 and self.origins.shape[1] == 1
-        of_rays = one or (self.origins.ndim == 3 and all(each.stride(1) == 0 for each in given[:2]))
+        of_rays = self.origins.ndim == 3 and all(each.shape[1] == 1 or each.stride(1) == 0 for each in given[:2])
         kernels = by_number(*given) if of_rays and self.offsets is None else None
         if kernels is None:
             return super().get_positions()

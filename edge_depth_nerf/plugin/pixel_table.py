@@ -153,7 +153,7 @@ class PixelTable:
             start: number of the first one.
             count: of pixels.
             keep: whether a pixel is in the batch, by its distance and sigma in metres and whether it shows the sky, [n]
-                each. None: all are. To choose before the rest is unpacked takes a sixth of the time.
+                each. None: all are.
 
         """
         # imported here, because Numba takes half a second to load
