@@ -34,6 +34,7 @@ from edge_depth_nerf.kernels import (
     hash_grid_numba,
     network_numba,
     ray_samplers,
+    rendering_numba,
 )
 from edge_depth_nerf.plugin import model as plugin_model
 
@@ -46,7 +47,7 @@ PARTS = {
     "hash grid": "hash grid",
     "optimisers": "gradient of its table, and Adam",
     "batch": "pixels of the batch, their rays",
-    "samples": "samples: places, positions, densities, weights",
+    "samples": "samples: places, positions, weights; rendering",
     "losses": "losses",
     "rest": "all else: autograd, colours, nerfstudio",
 }
@@ -104,7 +105,7 @@ class Clock:
         model: Any = pipeline.model
         sampler = model.proposal_sampler
         for holder, names, part in (
-            (network_numba, ("forward", "backward"), "networks"),
+            (network_numba, ("write_forward", "write_backward"), "networks"),
             (hash_grid_numba, ("encode",), "hash grid"),
             (trainer.optimizers, ("optimizer_scaler_step_some", "zero_grad_some"), "optimisers"),
             (pipeline.datamanager, ("next_train",), "batch"),
@@ -113,6 +114,7 @@ class Clock:
             (fields, ("_densities",), "samples"),
             (ray_samplers.FusedFrustums, ("get_positions",), "samples"),
             (ray_samplers.FusedRaySamples, ("get_weights",), "samples"),
+            (rendering_numba, ("render",), "samples"),
             (model, ("get_loss_dict", "get_metrics_dict"), "losses"),
             (plugin_model, ("proposal_loss", "distortion_loss", "edge_losses"), "losses"),
             (trainer, ("train_iteration",), "rest"),

@@ -145,8 +145,13 @@ def test_uncertainty_is_of_the_weights_that_colour_the_ray(pipeline):
     model = pipeline.model.eval()
     rays = view_of(pipeline).generate_rays(camera_indices=0)[10, 10:12]
     kept = {}
-    original = model.renderer_accumulation.forward
-    model.renderer_accumulation.forward = lambda weights: kept.update(weights=weights) or original(weights=weights)
+    original = model.field.render
+
+    def rendered(*args, **kwargs):
+        kept["rendered"] = original(*args, **kwargs)
+        return kept["rendered"]
+
+    model.field.render = rendered
     samples = {}
     sampler = model.proposal_sampler.forward
 
@@ -160,11 +165,11 @@ def test_uncertainty_is_of_the_weights_that_colour_the_ray(pipeline):
         with torch.no_grad():
             outputs = model(rays)
     finally:
-        model.renderer_accumulation.forward, model.proposal_sampler.forward = original, sampler
+        model.field.render, model.proposal_sampler.forward = original, sampler
     rng = np.random.default_rng(0)
     frustums = samples["final"].frustums
     for ray in range(2):
-        weights = kept["weights"][ray, :, 0].double().numpy()
+        weights = kept["rendered"].weights[ray].double().numpy()
         starts, ends = frustums.starts[ray, :, 0].numpy(), frustums.ends[ray, :, 0].numpy()
         chosen = rng.choice(len(weights), 200_000, p=weights / weights.sum())
         drawn = starts[chosen] + (ends - starts)[chosen] * rng.random(200_000)

@@ -17,7 +17,10 @@ from torch import Tensor
 
 from edge_depth_nerf.kernels.compiled import compiled
 from edge_depth_nerf.kernels.pointwise_numba import flat_rows
+from edge_depth_nerf.kernels.threads import in_parts
 
+LEAST_SHARE = 1 << 13
+"""A thread gets at least so many samples."""
 ZERO, ONE, TWO, HALF = np.float32(0), np.float32(1), np.float32(2), np.float32(0.5)
 FAR = np.float32(15)
 """In units of σ̂: the Gaussian there is 0 in float32."""
@@ -29,11 +32,11 @@ SECOND_ORDER = np.float32(1 / 24)
 @no_type_check
 def _edge_loss(
     weights, weight_stride, starts, start_stride, ends, end_stride, priors, sigmas, slopes, samples,
-    metres_per_unit, eps, narrow, interval, norm, follow,
+    metres_per_unit, eps, narrow, interval, norm, follow, first, last,
 ):  # fmt: skip
     """Give the sum of the loss and how many rays have a prior; `slopes` gets what each weight would change it by."""
     loss, count = 0.0, 0
-    for ray in range(len(priors)):
+    for ray in range(first, last):
         prior, sigma = priors[ray], sigmas[ray]
         if not (ZERO < prior < np.inf and ZERO < sigma < np.inf):
             continue
@@ -72,7 +75,16 @@ class _EdgeLoss(torch.autograd.Function):
         slopes = torch.zeros(weights.shape if follow else (0, 0))
         matrices = [each for matrix in (weights, starts, ends) for each in flat_rows(matrix)]
         of_rays = (each.detach().contiguous().numpy() for each in (prior, sigma))
-        total, count = _edge_loss(*matrices, *of_rays, slopes.view(-1).numpy(), weights.shape[1], *options, follow)
+        rays, samples = weights.shape
+        arrays = *matrices, *of_rays, slopes.view(-1).numpy(), samples, *options, follow
+        # in the order of the rays, whichever thread was ready first: the same sum each time
+        of_parts: dict[int, tuple[float, int]] = {}
+
+        def work(first: int, last: int) -> None:
+            of_parts[first] = _edge_loss(*arrays, first, last)
+
+        in_parts(work, rays, LEAST_SHARE // max(1, samples))
+        total, count = (sum(of_parts[first][k] for first in sorted(of_parts)) for k in (0, 1))
         if follow:
             ctx.save_for_backward(slopes)
         ctx.count = max(1, count)

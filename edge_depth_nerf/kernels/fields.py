@@ -26,7 +26,8 @@ from torch import Tensor, nn
 
 from edge_depth_nerf.kernels.back_ends import by_number, made_by_autocast, of_encoded_network, of_network, working
 from edge_depth_nerf.kernels.fused_hash_grid import FusedHashEncoding, use_fused_encodings
-from edge_depth_nerf.kernels.network import network
+from edge_depth_nerf.kernels.network import joined_networks, network
+from edge_depth_nerf.kernels.rendering import Behind, Rendered
 
 
 class CubeContraction(SceneContraction):
@@ -192,6 +193,63 @@ class FusedNerfactoField(NerfactoField):
             else:
                 results.append(self.get_outputs(samples, features[..., 1:], of_rays))
         return results
+
+    def render(self, samples: RaySamples, places: RaySamples | None, behind: Behind) -> Rendered | None:
+        """Render pixels on the CPU in two passes: from encoded positions through both networks, and along the rays.
+
+        Args:
+            samples: of the rays, [rays, samples].
+            places: single points, [points, 1]; with `Behind.SINGLE_POINT` those behind the rays come first.
+            behind: what colours light that no sample stops.
+
+        Returns:
+            What `forward_together`, weights and nerfstudio's renderer give; None where this form does not serve.
+
+        """
+        parts = [samples, *([] if places is None else [places])]
+        if not self._may_render(parts):
+            return None
+        from edge_depth_nerf.kernels.rendering_numba import render
+
+        positions = torch.cat([each.frustums.get_positions().reshape(-1, 3) for each in parts])
+        points, inside = _unit_cube(self, positions)
+        encoding, first = self.mlp_base.model
+        assert isinstance(first, FusedMLP)
+        weights, biases = _parameters(self.mlp_head)
+        widths = [self.direction_encoding.get_out_dim(), self.geo_feat_dim, self.appearance_embedding_dim]
+        of_direction, of_features, of_appearance = torch.split(weights[0], widths, dim=1)
+        of_rays, by_ray = self._encoded(torch.cat([each.frustums.directions[:, 0] for each in parts])), of_direction
+        if self.embedding_appearance is not None:
+            of_rays = torch.cat([of_rays, self._appearance(parts)], dim=1)
+            by_ray = torch.cat([of_direction, of_appearance], dim=1)
+        second = [of_features, *weights[1:]], biases
+        rays, count = samples.frustums.shape
+        values = joined_networks(encoding(points), of_rays, (rays, count), _parameters(first), second, by_ray)
+        deltas: Any = samples.deltas
+        return render(values, inside[:, 0], deltas.view(rays, count), self.average_init_density, behind)
+
+    def _may_render(self, parts: Sequence[RaySamples]) -> bool:
+        """Whether `render` covers what this field has, for these samples."""
+        first, deltas = parts[0], parts[0].deltas
+        more_heads = self.use_transient_embedding or self.use_semantics or self.use_pred_normals
+        if more_heads or not isinstance(self.spatial_distortion, CubeContraction) or deltas is None:
+            return False
+        if type(getattr(self.mlp_base, "model", None)) is not FusedEncodedMLP or type(self.mlp_head) is not FusedMLP:
+            return False
+        plain = self.mlp_base.model[1].out_activation is None and isinstance(self.mlp_head.out_activation, nn.Sigmoid)
+        cameras = self.embedding_appearance is None or all(each.camera_indices is not None for each in parts)
+        one_a_ray = all(_one_a_ray(each.frustums.directions) for each in parts)
+        given = _in_parts(first.frustums.origins) and self.mlp_base.model[0].hash_table.dtype == torch.float32
+        return plain and cameras and one_a_ray and given and deltas.numel() > 0 and not deltas.requires_grad
+
+    def _appearance(self, parts: Sequence[RaySamples]) -> Tensor:
+        """The appearance of each ray's picture; at evaluation the mean of all, or none, as nerfstudio has it."""
+        assert self.embedding_appearance is not None
+        if self.training:
+            return self.embedding_appearance(torch.cat([each.camera_indices[:, 0, 0] for each in parts]))  # pyright: ignore[reportOptionalSubscript]
+        mean = self.embedding_appearance.mean(dim=0)
+        shown = mean if self.use_average_appearance_embedding else torch.zeros_like(mean)
+        return shown.expand(sum(len(each) for each in parts), -1)
 
     def _encoded_directions(self, parts: Sequence[RaySamples]) -> Sequence[Tensor | None]:
         """The directions of the rays of each part, encoded together; None where samples have their own."""

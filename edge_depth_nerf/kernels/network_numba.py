@@ -187,24 +187,32 @@ def _load(values, width, first, count, into, row):
 
 @compiled()
 @no_type_check
-def _apply_layers(layers, room, widths, down, begins, biases, shared, first, group, last):
+def _apply_layers(
+    layers, room, ins, more_width, joint, down, begins, biases, shared, more, first, points, group, last
+):  # fmt: skip
     """Compute a tile's layers up to `last` from the inputs in front; layer by layer, `room` numbers each.
 
     What stands beyond a layer's width is 0 in new layers, and stays so.
     """
     for layer in range(last):
-        inputs, row, at = _filled(widths[layer]), _filled(widths[layer + 1]), (layer + 1) * room
-        width, of_layer = widths[layer + 1], begins[len(widths) + layer]
-        start, at_start, start_row = biases, of_layer, 0
-        if layer == 0 and len(shared) > width:
+        inputs, row, at = _filled(ins[layer]), _filled(ins[layer + 1]), (layer + 1) * room
+        joins = joint > 0 and layer + 1 == joint
+        width = ins[layer + 1] - more_width if joins else ins[layer + 1]
+        columns = _filled(width)
+        start, at_start, start_row = biases, begins[len(ins) + layer], 0
+        if layer == joint and len(shared) > width:
             start, at_start, start_row = layers, at, row
             for p in range(TILE):
                 _copy(shared, min((first + p) // group * width, len(shared) - width), layers, at + p * row, width)
         _multiply(
-            *(layers, layer * room, inputs, 1, down, begins[layer], row, widths[layer]),
-            *(start, at_start, start_row, layers, at, row, TILE, row),
+            *(layers, layer * room, inputs, 1, down, begins[layer], columns, ins[layer]),
+            *(start, at_start, start_row, layers, at, row, TILE, columns),
         )
-        if layer + 2 < len(widths):
+        if joins:
+            if more_width > 0:
+                for p in range(points):
+                    _copy(more, (first + p) * more_width, layers, at + p * row + width, more_width)
+        elif layer + 2 < len(ins):
             for i in range(TILE * row):
                 place = np.uint64(at + i)
                 layers[place] = ZERO if layers[place] < ZERO else layers[place]
@@ -212,69 +220,100 @@ def _apply_layers(layers, room, widths, down, begins, biases, shared, first, gro
 
 @compiled()
 @no_type_check
-def _forward(x, widths, down, begins, biases, shared, group, result, begin, end):
+def _forward(
+    x, ins, more_width, joint, down, begins, biases, shared, more, group, result, to_point, to_number, begin, end
+):  # fmt: skip
     """Apply the network to points from `begin` to `end`; calls for different points may run at once."""
-    count, room = len(widths) - 1, TILE * _filled(widths.max())
+    count, room = len(ins) - 1, TILE * _filled(ins.max())
     layers = np.zeros((count + 1) * room, np.float32)
-    inputs, row = _filled(widths[0]), _filled(widths[count])
+    inputs, row, width = _filled(ins[0]), _filled(ins[count]), ins[count]
     for first in range(begin, end, TILE):
         points = min(TILE, end - first)
-        _load(x, widths[0], first, points, layers, inputs)
-        _apply_layers(layers, room, widths, down, begins, biases, shared, first, group, count)
+        _load(x, ins[0], first, points, layers, inputs)
+        _apply_layers(
+            layers, room, ins, more_width, joint, down, begins, biases, shared, more, first, points, group, count
+        )
+        if joint == 0:
+            for p in range(points):
+                _copy(layers, count * room + p * row, result, (first + p) * to_point, width)
+            continue
+        of_joint = _filled(ins[joint])
         for p in range(points):
-            _copy(layers, count * room + p * row, result, (first + p) * widths[count], widths[count])
+            result[first + p] = layers[joint * room + p * of_joint]
+        for c in range(width):
+            for p in range(points):
+                result[np.uint64((c + 1) * to_number + first + p)] = layers[np.uint64(count * room + p * row + c)]
 
 
 @compiled()
 @no_type_check
 def _backward(
-    x, widths, down, begins, up, begins_up, biases, shared, group, gradient, to_x, to_up, to_biases, to_shared,
-    begin, end,
+    x, ins, more_width, joint, down, begins, up, begins_up, biases, shared, more, group, gradient, to_number, to_x,
+    to_up, to_biases, to_shared, begin, end,
 ):  # fmt: skip
     """Add the gradients that points from `begin` to `end` give; `to_x` is written, and may be empty.
 
     Calls for different points may run at once, if each has `to_up` and `to_biases` of its own, and all points of a
     group, which has its own place in `to_shared`.
     """
-    count, room = len(widths) - 1, TILE * _filled(widths.max())
+    count, room = len(ins) - 1, TILE * _filled(ins.max())
     layers, slopes = np.zeros(count * room, np.float32), np.zeros(2 * room, np.float32)
     nothing, one = np.zeros(room // TILE, np.float32), np.ones(1, np.float32)
     total = np.zeros(FULL * len(nothing), np.float32)
     for first in range(begin, end, TILE):
         points = min(TILE, end - first)
-        _load(x, widths[0], first, points, layers, _filled(widths[0]))
-        _apply_layers(layers, room, widths, down, begins, biases, shared, first, group, count - 1)
+        _load(x, ins[0], first, points, layers, _filled(ins[0]))
+        _apply_layers(
+            layers, room, ins, more_width, joint, down, begins, biases, shared, more, first, points, group, count - 1
+        )
         at = 0
-        _load(gradient, widths[count], first, points, slopes, _filled(widths[count]))
+        if joint == 0:
+            _load(gradient, ins[count], first, points, slopes, _filled(ins[count]))
+        else:
+            row = _filled(ins[count])
+            _fill(slopes, 0, TILE * row)
+            for c in range(ins[count]):
+                for p in range(points):
+                    slopes[np.uint64(p * row + c)] = gradient[np.uint64((c + 1) * to_number + first + p)]
         for layer in range(count - 1, -1, -1):
-            inputs, outputs, width = _filled(widths[layer]), _filled(widths[layer + 1]), widths[layer + 1]
+            inputs, row = _filled(ins[layer]), _filled(ins[layer + 1])
+            width = ins[layer + 1] - more_width if joint > 0 and layer + 1 == joint else ins[layer + 1]
+            outputs = _filled(width)
             _multiply(
-                *(slopes, at, 1, outputs, layers, layer * room, inputs, points, to_up, begins_up[layer], inputs),
+                *(slopes, at, 1, row, layers, layer * room, inputs, points, to_up, begins_up[layer], inputs),
                 *(to_up, begins_up[layer], inputs, width, inputs),
             )
-            if layer == 0 and len(shared) > width:
+            if layer == joint and len(shared) > width:
                 for p in range(points):
                     of_group = min((first + p) // group * width, len(shared) - width)
-                    _add(slopes, at + p * outputs, to_shared, of_group, width)
+                    _add(slopes, at + p * row, to_shared, of_group, width)
             else:
                 # 1 times each row; all rows of the result are the same
-                _multiply(one, 0, 0, 0, slopes, at, outputs, points, nothing, 0, 0, total, 0, outputs, 1, outputs)
-                _add(total, 0, to_biases, begins[len(widths) + layer], width)
+                _multiply(one, 0, 0, 0, slopes, at, row, points, nothing, 0, 0, total, 0, outputs, 1, outputs)
+                _add(total, 0, to_biases, begins[len(ins) + layer], width)
             if layer == 0 and len(to_x) == 0:
                 break
             to = room - at
+            # nobody asks for the gradient to what is joined
+            columns = _filled(ins[layer] - more_width) if layer == joint else inputs
             _multiply(
-                *(slopes, at, outputs, 1, up, begins_up[layer], inputs, width, nothing, 0, 0),
-                *(slopes, to, inputs, TILE, inputs),
+                *(slopes, at, row, 1, up, begins_up[layer], inputs, width, nothing, 0, 0),
+                *(slopes, to, inputs, TILE, columns),
             )
             at = to
-            if layer > 0:
+            if layer == 0:
+                for p in range(points):
+                    _copy(slopes, at + p * inputs, to_x, (first + p) * ins[0], ins[0])
+            elif layer == joint:
+                own = ins[layer] - more_width
+                for p in range(points):
+                    slopes[np.uint64(at + p * inputs)] += gradient[np.uint64(first + p)]
+                    # what is joined is no output of the layer before
+                    _fill(slopes, at + p * inputs + own, columns - own)
+            else:
                 for i in range(TILE * inputs):
                     value, place = layers[np.uint64(layer * room + i)], np.uint64(at + i)
                     slopes[place] = slopes[place] if value > ZERO else ZERO
-            else:
-                for p in range(points):
-                    _copy(slopes, at + p * inputs, to_x, (first + p) * widths[0], widths[0])
 
 
 def _packed(weights: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -293,21 +332,40 @@ class Arrays:
     Weights and biases are copies.
     """
 
-    def __init__(self, x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> None:
-        """Arrange what `network` is given; the first bias is [groups, out], the others are [1, out]."""
-        self.points, self.groups = len(x), len(biases[0])
+    def __init__(
+        self,
+        x: Tensor,
+        weights: Sequence[Tensor],
+        biases: Sequence[Tensor],
+        joint: int = 0,
+        more: Tensor | None = None,
+    ) -> None:
+        """Arrange what a network is given.
+
+        Args:
+            x: [points, in].
+            weights: [out, in] of each layer; of layer `joint` the inputs in front are the layer's before.
+            biases: of each layer, [1, out]; that of layer `joint` may be [groups, out].
+            joint: a layer that gets what the one before gives without ReLU. The first number of that, which it leaves
+                out (its weights there are 0), is also a result. 0: none.
+            more: further inputs of that layer, [points, more], without a gradient.
+
+        """
+        self.points, self.groups = len(x), len(biases[joint])
         self.weights = [weight.detach().numpy() for weight in weights]
         # [in, out] each
         down, begins = _packed([weight.T for weight in self.weights])
-        self.widths = np.array([weights[0].shape[1], *(len(weight) for weight in weights)])
-        self.shared = _flat(biases[0])
+        self.ins = np.array([*(weight.shape[1] for weight in weights), len(weights[-1])])
+        self.shared = _flat(biases[joint])
         self.biases, begins_of_biases = _packed([bias.detach().numpy()[:1] for bias in biases])
         # where each layer's bias begins, behind where its weights do
         self.begins = np.concatenate([begins, begins_of_biases])
         group = self.points if self.groups == 1 else self.points // self.groups
         self.step = 1 if self.groups == 1 else group
-        self.arrays = _flat(x), self.widths, down, self.begins
-        self.of_groups = self.biases, self.shared, group
+        joined = np.empty(0, np.float32) if more is None else _flat(more)
+        self.joint, self.joins = joint, more is not None
+        self.arrays = _flat(x), self.ins, 0 if more is None else more.shape[1], joint, down, self.begins
+        self.of_groups = self.biases, self.shared, joined, group
 
     def parts(self) -> list[tuple[int, int]]:
         """Equal parts of the points for the threads, of whole groups."""
@@ -319,13 +377,13 @@ def _flat(values: Tensor) -> np.ndarray:
     return values.detach().contiguous().view(-1).numpy()
 
 
-def _unpacked(packed: np.ndarray, begins: np.ndarray, shapes: Sequence[Sequence[int]]) -> list[Tensor]:
+def _unpacked(packed: np.ndarray, begins: np.ndarray, shapes: Sequence[Sequence[int]]) -> list[np.ndarray]:
     """Give matrices without what their rows were filled up with.
 
     Contiguous: torch's fused Adam reads a gradient as if it had its parameter's strides.
     """
     return [
-        torch.from_numpy(np.ascontiguousarray(packed[begin:end].reshape(rows, -1)[:, :columns]))
+        np.ascontiguousarray(packed[begin:end].reshape(rows, -1)[:, :columns])
         for (begin, end), (rows, columns) in zip(pairwise(begins), shapes, strict=True)
     ]
 
@@ -333,25 +391,47 @@ def _unpacked(packed: np.ndarray, begins: np.ndarray, shapes: Sequence[Sequence[
 def forward(net: Arrays) -> Tensor:
     """Apply a network; see `network`."""
     result = torch.empty(net.points, len(net.weights[-1]))
-    arrays = *net.arrays, *net.of_groups, _flat(result)
-    share_out(lambda part: _forward(*arrays, *part), net.parts())
+    write_forward(net, _flat(result), 0)
     return result
+
+
+def write_forward(net: Arrays, result: np.ndarray, to_number: int) -> None:
+    """Apply a network, and write what it gives to a flat array.
+
+    With a joint the result is one row for each number that a point gets, the joint's first: a row begins `to_number`
+    behind the one before.
+    """
+    arrays = *net.arrays, *net.of_groups, result, int(net.ins[-1]), to_number
+    share_out(lambda part: _forward(*arrays, *part), net.parts())
 
 
 def backward(net: Arrays, gradient: Tensor, follow_x: bool) -> tuple[Tensor | None, list[Tensor], list[Tensor]]:
     """Give the gradients to the inputs (None unless `follow_x`), to the weights and to the biases."""
-    weights, to_x = net.weights, torch.empty(net.points if follow_x else 0, int(net.widths[0]))
-    up, begins_up = _packed(net.weights)
-    arrays = *net.arrays, up, begins_up, *net.of_groups, _flat(gradient), _flat(to_x)
+    to_x = torch.empty(net.points if follow_x else 0, int(net.ins[0]))
+    to_parameters = write_backward(net, _flat(gradient), 0, _flat(to_x))
+    to_weights, to_biases = ([torch.from_numpy(each) for each in arrays] for arrays in to_parameters)
+    return (to_x if follow_x else None), to_weights, to_biases
+
+
+def write_backward(
+    net: Arrays, gradient: np.ndarray, to_number: int, to_x: np.ndarray
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Write the gradient to the inputs to a flat array, unless it is empty; give those to the weights and biases.
+
+    `gradient` is that to what `write_forward` writes.
+    """
+    weights = net.weights
+    up, begins_up = _packed(weights)
+    arrays = *net.arrays, up, begins_up, *net.of_groups, gradient, to_number, to_x
     parts, to_shared = net.parts(), np.zeros_like(net.shared)
     # rows are added sixteen at once, some of them (zeros) behind the last matrix
-    room = len(up) + FULL * (net.widths.max() + FULL)
+    room = len(up) + FULL * (net.ins.max() + FULL)
     own = [(np.zeros(room, np.float32), np.zeros_like(net.biases)) for _ in parts]
     share_out(lambda number: _backward(*arrays, *own[number], to_shared, *parts[number]), list(range(len(parts))))
     # in one order, whichever thread was ready first: the same sums each time
     to_up, to_biases = (np.sum(each, axis=0) for each in zip(*own, strict=True))
     to_weights = _unpacked(to_up, begins_up, [each.shape for each in weights])
-    of_layers = _unpacked(to_biases, net.begins[len(net.widths) :], [(1, len(weight)) for weight in net.weights])
+    of_layers = _unpacked(to_biases, net.begins[len(net.ins) :], [(1, len(weight)) for weight in weights])
     if net.groups > 1:
-        of_layers[0] = torch.from_numpy(to_shared).view(net.groups, -1)
-    return (to_x if follow_x else None), to_weights, of_layers
+        of_layers[net.joint] = to_shared.reshape(net.groups, -1)
+    return to_weights, of_layers

@@ -35,7 +35,8 @@ class Gains(nn.Module):
     ) -> Float[Tensor, "rays 3"]:
         """Colours as the pictures have them."""
         gains = (self.log_gains - self.log_gains.mean(dim=0)).exp()
-        return colours * gains[picture]
+        # faster than an index, forward and backward
+        return colours * gains.index_select(0, picture)
 
     def unevenness(self) -> Float[Tensor, ""]:
         """How far the maps are from the identity, or from smooth: nothing that needs a penalty."""

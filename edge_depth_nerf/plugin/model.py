@@ -21,6 +21,7 @@ from nerfstudio.cameras.rays import RayBundle, RaySamples
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.field_components.field_heads import FieldHeadNames
+from nerfstudio.model_components import renderers
 from nerfstudio.model_components.losses import (
     ds_nerf_depth_loss,
     scale_gradients_by_distance_squared,
@@ -47,6 +48,7 @@ from edge_depth_nerf.kernels.ray_samplers import (
     samples_along,
     use_fused_samples,
 )
+from edge_depth_nerf.kernels.rendering import Behind, Rendered
 from edge_depth_nerf.kernels.threads import take_all_threads
 from edge_depth_nerf.method.losses import URBAN_TERMS, UrbanTerms, edge_losses, sky_loss, urban_nerf_loss
 from edge_depth_nerf.method.metrics import DepthErrors, load_lpips, masked_lpips, masked_psnr, masked_ssim
@@ -146,6 +148,8 @@ LEAST_DISTANCE_M = 1e-6
 """What is nearer is no distance: without a prior it is 0."""
 INFINITELY_FAR = 1e4
 """Scene units: so far that the place in the contracted scene is the direction alone."""
+BEHIND = {"last_sample": Behind.LAST_SAMPLE, "black": Behind.NOTHING, "random": Behind.NOTHING}
+"""What the model's backgrounds add to a rendered pixel; a random one is added where losses are computed."""
 LEAST_HIT = 0.05
 """Rays that stop less than this share of their light count as hitting nothing."""
 
@@ -372,15 +376,12 @@ class EdgeDepthNerfModel(NerfactoModel):
         return self.get_outputs(ray_bundle, batch)
 
     def get_outputs(self, ray_bundle: RayBundle, batch: dict[str, Any] | None = None) -> dict[str, Any]:
-        """Nerfacto's outputs before the sky; in training without the depths that no loss reads.
+        """Nerfacto's outputs and the sky; in training without the depths that no loss reads.
 
         In evaluation also, in metres, the median `distance` and `distance_uncertainty`, the standard deviation of where
         the ray ends. (nerfstudio divides outputs with "depth" in their name by the scene's scale; these have none.)
         """
         outputs, further = self._rendered(ray_bundle, batch)
-        if self._has_sky:
-            behind, further = further[: len(ray_bundle)], further[len(ray_bundle) :]
-            outputs["rgb"] = torch.addcmul(outputs["rgb"], 1 - outputs["accumulation"], behind)
         if self._has_surface(batch):
             bundles = [ray_bundle, batch["surface_rays"]]
             outputs["rgb"], outputs["surface_rgb"] = self._exposed([outputs["rgb"], further], bundles)
@@ -425,30 +426,56 @@ class EdgeDepthNerfModel(NerfactoModel):
         return [self.field.forward(samples) for samples in parts]
 
     def _rendered(self, rays: RayBundle, batch: dict[str, Any] | None) -> tuple[dict[str, Any], Tensor]:
-        """Nerfacto's outputs, and the field's colours at `_places`, [places, 3]."""
+        """Nerfacto's outputs with the sky, and the field's colours at the surfaces of further pixels, [pixels, 3]."""
         if self.config.predict_normals:
             outputs = super().get_outputs(rays)
             places = self._places(rays, batch)
             further = rays.origins[:0] if places is None else self.field.forward(places)[FieldHeadNames.RGB][:, 0]
-            return outputs, further
+            return self._before_sky(outputs, further)
         if self.training:
             self.camera_optimizer.apply_to_raybundle(rays)
         samples, weights_list, samples_list = self.proposal_sampler(rays, density_fns=self.density_fns)
         places = self._places(rays, batch)
-        found, *others = self._fields([samples, *([] if places is None else [places])])
-        if self.config.use_gradient_scaling:
-            found = scale_gradients_by_distance_squared(found, samples)
-        weights = samples.get_weights(found[FieldHeadNames.DENSITY])
+        rendered = self._rendered_at_once(samples, places)
+        if rendered is None:
+            found, *others = self._fields([samples, *([] if places is None else [places])])
+            if self.config.use_gradient_scaling:
+                found = scale_gradients_by_distance_squared(found, samples)
+            weights = samples.get_weights(found[FieldHeadNames.DENSITY])
+            outputs: dict[str, Any] = {
+                "rgb": self.renderer_rgb(rgb=found[FieldHeadNames.RGB], weights=weights),
+                "accumulation": self.renderer_accumulation(weights=weights),
+            }
+            further = others[0][FieldHeadNames.RGB].squeeze(1) if others else rays.origins[:0]
+            outputs, further = self._before_sky(outputs, further)
+        else:
+            rgb, accumulation, weights, further = rendered
+            # nerfstudio's, at evaluation
+            rgb = rgb if self.training else torch.nan_to_num(rgb).clamp(0, 1)
+            outputs, weights = {"rgb": rgb, "accumulation": accumulation}, weights[..., None]
         weights_list.append(weights)
         samples_list.append(samples)
-        outputs = {
-            "rgb": self.renderer_rgb(rgb=found[FieldHeadNames.RGB], weights=weights),
-            "accumulation": self.renderer_accumulation(weights=weights),
-            **self._depths(weights_list, samples_list),
-        }
+        outputs |= self._depths(weights_list, samples_list)
         if self.training:
             outputs |= {"weights_list": weights_list, "ray_samples_list": samples_list}
-        return outputs, others[0][FieldHeadNames.RGB].squeeze(1) if others else rays.origins[:0]
+        return outputs, further
+
+    def _rendered_at_once(self, samples: RaySamples, places: RaySamples | None) -> Rendered | None:
+        """What the fused field renders on the CPU; None where it does not serve."""
+        # an exporter of nerfstudio sets a background of its own
+        if self.config.use_gradient_scaling or renderers.BACKGROUND_COLOR_OVERRIDE is not None:
+            return None
+        behind = Behind.SINGLE_POINT if self._has_sky else BEHIND.get(str(self.config.background_color))
+        if behind is None or not isinstance(self.field, FusedNerfactoField):
+            return None
+        return self.field.render(samples, places, behind)
+
+    def _before_sky(self, outputs: dict[str, Any], further: Tensor) -> tuple[dict[str, Any], Tensor]:
+        """Add the sky, whose colours come first among those at `_places`, behind what the samples stop."""
+        if not self._has_sky:
+            return outputs, further
+        behind, further = further.split([len(outputs["rgb"]), len(further) - len(outputs["rgb"])])
+        return {**outputs, "rgb": torch.addcmul(outputs["rgb"], 1 - outputs["accumulation"], behind)}, further
 
     def _depths(self, weights_list: list[Tensor], samples_list: list[RaySamples]) -> dict[str, Any]:
         """Nerfacto's depths, of the final samples and of those of the proposal networks."""

@@ -1,0 +1,206 @@
+"""Networks and rendering in two compiled passes, against the same arithmetic in float64 and against nerfstudio's."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from models import build
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.model_components import renderers
+from torch import Tensor
+
+from edge_depth_nerf.kernels import network_numba, rendering_numba
+from edge_depth_nerf.kernels.fields import FusedNerfactoField
+from edge_depth_nerf.kernels.network import joined_networks
+from edge_depth_nerf.kernels.pointwise_numba import STEEPEST
+from edge_depth_nerf.kernels.rendering import Behind
+from edge_depth_nerf.kernels.rendering_numba import render
+
+
+@pytest.fixture(autouse=True, params=[1, 2], ids=["one thread", "two threads"])
+def threads(request, monkeypatch):
+    """Let even a few points be shared out to several threads."""
+    monkeypatch.setattr(network_numba, "LEAST_SHARE", 64)
+    monkeypatch.setattr(rendering_numba, "LEAST_SHARE", 16)
+    before = torch.get_num_threads()
+    torch.set_num_threads(request.param)
+    yield
+    torch.set_num_threads(before)
+
+
+def layers(*widths: int) -> tuple[list[Tensor], list[Tensor]]:
+    shapes = list(zip(widths[1:], widths, strict=False))
+    return [torch.randn(s, requires_grad=True) for s in shapes], [torch.randn(s[0], requires_grad=True) for s in shapes]
+
+
+def straight_networks(x: Tensor, of_points: Tensor, first: Any, second: Any, by_ray: Tensor) -> Tensor:
+    """Both networks one layer after the other."""
+    (weights, biases), (more_weights, more_biases) = first, second
+    for number, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+        x = (x.relu() if number else x) @ weight.T + bias
+    density, x = x[:, :1], x[:, 1:] @ more_weights[0].T + of_points @ by_ray.T + more_biases[0]
+    for weight, bias in zip(more_weights[1:], more_biases[1:], strict=True):
+        x = x.relu() @ weight.T + bias
+    return torch.cat([density, x], dim=1).T
+
+
+@pytest.mark.parametrize("widths", [((24, 64, 16), (64, 64, 3)), ((5, 7), (33, 3)), ((6, 18, 20, 4), (3,))], ids=str)
+@pytest.mark.parametrize("shape", [(40, 24, 300), (0, 24, 70), (50, 3, 0), (1, 7, 1), (30, 1, 5)], ids=str)
+@pytest.mark.parametrize("of_pictures", [False, True], ids=["directions", "appearance"])
+def test_both_networks_in_one_pass(widths, shape, of_pictures):
+    torch.manual_seed(0)
+    rays, samples, singles = shape
+    first = layers(*widths[0])
+    second = layers(widths[0][-1] - 1, *widths[1])
+    by_ray = torch.randn(widths[1][0], 9, requires_grad=True)
+    of_rays = torch.randn(rays + singles, 9, requires_grad=of_pictures)
+    x = torch.randn(rays * samples + singles, widths[0][0], requires_grad=True)
+    leaves = [x, *([of_rays] if of_pictures else []), *first[0], *first[1], *second[0], *second[1], by_ray]
+    found = joined_networks(x, of_rays, (rays, samples), first, second, by_ray)
+    gradient = torch.randn(found.shape)
+    gradients = torch.autograd.grad(found, leaves, gradient)
+
+    exact = {leaf: leaf.detach().double().requires_grad_() for leaf in leaves}
+    of_points = exact.get(of_rays, of_rays.double())
+    repeated = torch.cat([of_points[:rays].repeat_interleave(samples, 0), of_points[rays:]])
+    one, other = ([[exact[each] for each in part] for part in network] for network in (first, second))
+    expected = straight_networks(exact[x], repeated, one, other, exact[by_ray])
+    assert float((found - expected).abs().max()) <= 1e-5 * float(expected.abs().max())
+    slopes = torch.autograd.grad(expected, list(exact.values()), gradient.double())
+    for each, other in zip(gradients, slopes, strict=True):
+        assert float((each - other).abs().max()) <= 1e-5 * float(other.abs().max())
+    assert all(each.is_contiguous() for each in gradients)
+    with torch.no_grad():
+        torch.testing.assert_close(
+            joined_networks(x, of_rays, (rays, samples), first, second, by_ray), found, rtol=1e-5, atol=1e-4
+        )
+
+
+def test_positions_that_nobody_follows_cost_no_gradient():
+    first, second = layers(4, 8, 3), layers(2, 8, 3)
+    x, by_ray = torch.randn(20, 4), torch.randn(8, 2)
+    values = joined_networks(x, torch.randn(8, 2), (6, 3), first, second, by_ray)
+    values.sum().backward()
+    assert x.grad is None and by_ray.grad is None
+    assert all(each.grad is not None for part in (*first, *second) for each in part)
+
+
+def straight_pixels(values: Tensor, inside: Tensor, deltas: Tensor, scale: float, behind: Behind) -> list[Tensor]:
+    """What `render` gives, step by step; the density's slope limited as in nerfstudio's trunc_exp."""
+    rays, samples = deltas.shape
+    before = values[0, : rays * samples]
+    slope = before.detach().clamp(-STEEPEST, STEEPEST).exp()
+    density = before.detach().exp() + slope * (before - before.detach())
+    depths = (scale * density * inside[: rays * samples]).view(rays, samples) * deltas
+    reached = torch.cumsum(depths, 1) - depths
+    weights = (1 - torch.exp(-depths)) * torch.exp(-reached)
+    weights = torch.nan_to_num(weights, nan=0.0)
+    colours = torch.sigmoid(values[1:].T)
+    of_samples, singles = colours[: rays * samples].view(rays, samples, 3), colours[rays * samples :]
+    hit = weights.sum(1, keepdim=True)
+    rgb = (weights[..., None] * of_samples).sum(1)
+    if behind == Behind.LAST_SAMPLE:
+        rgb = rgb + (1 - hit) * of_samples[:, -1]
+    elif behind == Behind.SINGLE_POINT:
+        rgb, singles = rgb + (1 - hit) * singles[:rays], singles[rays:]
+    return [rgb, hit, weights, singles]
+
+
+@pytest.mark.parametrize("behind", list(Behind))
+@pytest.mark.parametrize("shape", [(37, 24, 100), (5, 1, 8), (1, 13, 1), (70, 7, 70)], ids=str)
+def test_pixels_and_their_gradients(behind, shape):
+    torch.manual_seed(1)
+    rays, samples, singles = shape
+    points = rays * samples + singles
+    values = (2 * torch.randn(4, points)).requires_grad_()
+    with torch.no_grad():
+        values[0, ::11] = 16
+        values[0, 1::11] = -17
+    inside, deltas = (torch.rand(points) > 0.1).float(), 0.3 * torch.rand(rays, samples)
+    found = render(values, inside, deltas, 1.7, behind)
+    exact = values.detach().double().requires_grad_()
+    expected = straight_pixels(exact, inside.double(), deltas.double(), 1.7, behind)
+    for each, other in zip(found, expected, strict=True):
+        assert each.shape == other.shape
+        torch.testing.assert_close(each.double(), other, rtol=1e-5, atol=1e-6)
+    gradients = [torch.randn(each.shape) for each in found]
+    (slope,) = torch.autograd.grad(list(found), values, gradients)
+    (other,) = torch.autograd.grad(expected, exact, [each.double() for each in gradients])
+    assert float((slope - other).abs().max()) <= 2e-5 * float(other.abs().max())
+    # whatever a loss reads alone
+    for number in range(4):
+        if found[number].numel():
+            (slope,) = torch.autograd.grad(render(values, inside, deltas, 1.7, behind)[number].square().sum(), values)
+            again = straight_pixels(exact, inside.double(), deltas.double(), 1.7, behind)[number].square().sum()
+            (other,) = torch.autograd.grad(again, exact)
+            assert float((slope - other).abs().max()) <= 2e-5 * float(other.abs().max()) + 1e-6
+
+
+def test_a_density_that_is_not_a_number_weighs_nothing_and_shows():
+    values = torch.zeros(4, 9)
+    values[0, 4] = float("nan")
+    values.requires_grad_()
+    rendered = render(values, torch.ones(9), torch.full((3, 3), 0.5), 1.0, Behind.NOTHING)
+    assert rendered.weights[1, 1:].tolist() == [0, 0] and rendered.weights[0].min() > 0
+    rendered.rgb.sum().backward()
+    assert values.grad is not None and values.grad[:, :3].isfinite().all() and values.grad[0, 3:6].isnan().any()
+
+
+def bundle(count: int = 40) -> RayBundle:
+    generator = torch.Generator().manual_seed(1)
+    return RayBundle(
+        origins=torch.rand(count, 3, generator=generator) - 0.5,
+        directions=torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1),
+        pixel_area=torch.full((count, 1), 1e-4),
+        camera_indices=torch.arange(count)[:, None] % 3,
+    )
+
+
+def outputs_both_ways(model: Any, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """The model's outputs as rendered at once, and step by step from the same samples."""
+    found = []
+    for at_once in (True, False):
+        if not at_once:
+            monkeypatch.setattr(FusedNerfactoField, "render", lambda *_: None)
+        torch.manual_seed(3)
+        found.append(model(bundle()))
+    return found
+
+
+@pytest.mark.parametrize("training", [True, False], ids=["training", "evaluation"])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"sky_background": False},
+        {"depth_loss": "none", "background_color": "random"},
+        {"exposure": "embedding"},
+        {"exposure": "embedding", "use_average_appearance_embedding": False, "depth_loss": "none"},
+    ],
+    ids=str,
+)
+def test_a_model_renders_the_same_at_once_and_step_by_step(options, training, monkeypatch):
+    model = build(**options).train(training)
+    with torch.no_grad():
+        for network in (model.field, *model.proposal_networks):
+            for parameter in network.parameters():
+                if parameter.shape[-1] == 2:
+                    parameter.uniform_(-0.5, 0.5)
+    at_once, by_steps = outputs_both_ways(model, monkeypatch)
+    assert set(at_once) == set(by_steps)
+    for name in ("rgb", "accumulation"):
+        torch.testing.assert_close(at_once[name], by_steps[name], rtol=1e-4, atol=1e-5)
+    assert float(at_once["rgb"].std()) > 1e-3
+
+
+@pytest.mark.parametrize("case", ["a background of the exporter's", "gradients scaled by distance", "normals"])
+def test_what_is_not_covered_is_rendered_step_by_step(case, monkeypatch):
+    options = {"gradients scaled by distance": {"use_gradient_scaling": True}, "normals": {"predict_normals": True}}
+    model = build(depth_loss="none", **options.get(case, {})).eval()
+    if case == "a background of the exporter's":
+        monkeypatch.setattr(renderers, "BACKGROUND_COLOR_OVERRIDE", torch.ones(3))
+    used = []
+    monkeypatch.setattr(rendering_numba, "render", lambda *_: used.append(1))
+    assert model(bundle())["rgb"].isfinite().all() and not used
