@@ -132,15 +132,16 @@ class _Joined(torch.autograd.Function):
 
         x, of_rays, by_ray, *parameters = ctx.saved_tensors
         joint, width = ctx.joint, parameters[2 * ctx.joint].shape[1]
-        to_x = torch.empty_like(x) if ctx.needs_input_grad[0] else None
+        # input after input in memory, as the hash grid's backward wants it
+        to_x = x.new_empty(x.shape[::-1]) if ctx.needs_input_grad[0] else x.new_empty(0, 0)
         to_rays = torch.zeros_like(of_rays) if ctx.needs_input_grad[1] else None
         gradient = gradients[0].contiguous().view(-1)
         # of all parts; in numpy, which needs fewer calls for small matrices
         totals: list[np.ndarray] = []
         for net, part, rows, joins in ctx.parts:
-            to_part = by_ray.new_empty(0) if to_x is None else to_x[part].view(-1)
+            begin = part.start or 0
             to_weights, to_biases = network_numba.write_backward(
-                net, gradient[part.start or 0 :].numpy(), len(x), to_part.numpy()
+                net, gradient[begin:].numpy(), len(x), to_x.view(-1)[begin:].numpy()
             )
             of_joint, to_shared = to_weights[joint], to_biases[joint]
             to_by_ray = of_joint[:, 1 + width :]
@@ -157,7 +158,7 @@ class _Joined(torch.autograd.Function):
             torch.from_numpy(np.ascontiguousarray(each)).view(parameter.shape)
             for each, parameter in zip(totals, (by_ray, *parameters), strict=True)
         ]
-        return to_x, to_rays, None, None, *found
+        return (to_x.t() if ctx.needs_input_grad[0] else None), to_rays, None, None, *found
 
 
 def joined_networks(

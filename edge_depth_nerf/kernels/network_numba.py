@@ -301,9 +301,13 @@ def _backward(
                 *(slopes, to, inputs, TILE, columns),
             )
             at = to
-            if layer == 0:
+            if layer == 0 and joint == 0:
                 for p in range(points):
                     _copy(slopes, at + p * inputs, to_x, (first + p) * ins[0], ins[0])
+            elif layer == 0:
+                for c in range(ins[0]):
+                    for p in range(points):
+                        to_x[np.uint64(c * to_number + first + p)] = slopes[np.uint64(at + p * inputs + c)]
             elif layer == joint:
                 own = ins[layer] - more_width
                 for p in range(points):
@@ -418,7 +422,7 @@ def write_backward(
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Write the gradient to the inputs to a flat array, unless it is empty; give those to the weights and biases.
 
-    `gradient` is that to what `write_forward` writes.
+    `gradient` is that to what `write_forward` writes. With a joint, that to the inputs has one row for each input, too.
     """
     weights = net.weights
     up, begins_up = _packed(weights)

@@ -45,6 +45,7 @@ from edge_depth_nerf.kernels.ray_samplers import (
     FirstSampler,
     FusedPDFSampler,
     edges_of,
+    rays_of,
     samples_along,
     use_fused_samples,
 )
@@ -414,7 +415,7 @@ class EdgeDepthNerfModel(NerfactoModel):
             torch.cat([getattr(bundle, name) for bundle in bundles])
             for name in ("origins", "directions", "pixel_area", "camera_indices")
         )
-        every = RayBundle(origins, directions, areas, pictures)
+        every = rays_of(origins, directions, areas, pictures)
         at = torch.cat(distances)[:, None, None]
         along = samples_along if self.fused else RayBundle.get_ray_samples
         return along(every, at, at)

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from edge_depth_nerf.base.checked_cache import is_whole, keep_last, used, write_checked
 from edge_depth_nerf.base.console import progress_bars
+from edge_depth_nerf.kernels.ray_samplers import rays_of
 
 TABLE_VERSION = 2
 """Raised whenever the form of the file changes."""
@@ -153,7 +154,7 @@ class TableRayGenerator(RayGenerator):
             ray, pose = self.table[place], self.poses[picture]
             origins, rest = pose[:, :3, 3], ray[:, REST]
             directions = torch.sum(ray[:, None, DIRECTION] * pose[:, :3, :3], dim=-1)
-        return RayBundle(
+        return rays_of(
             origins=origins,
             directions=directions,
             pixel_area=rest[:, :1],
