@@ -26,7 +26,7 @@ RESULTS = Path(__file__).with_name("wrong_prior.json")
 PART = "wrong prior"
 SHARE, BY = 0.1, 0.3
 """Of the pixels; of their distance."""
-BLOCKS = {"as it is": 0, "single pixels wrong": 1, "blocks of pixels wrong": 16}
+BLOCKS = {"unchanged": 0, "single pixels wrong": 1, "blocks of pixels wrong": 16}
 """Sides of what is wrong together, pixels; 0: nothing is."""
 METHODS: dict[str, dict[str, Any]] = {
     "ours": {},

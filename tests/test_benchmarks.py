@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+import torch
 from benchmark_modules import benchmark_modules
 from comparisons import fake
 
@@ -446,6 +447,28 @@ def test_the_pages_parts_of_a_step_are_those_that_were_measured(benchmark_module
     for each in results["threads"].values():
         # what is left out of no part is the whole, but for the measuring itself
         assert sum(each["parts"].values()) == pytest.approx(each["ms"], rel=0.15)
+
+
+def test_the_pages_wrong_prior_is_that_of_its_runs(benchmark_module):
+    wrong, pages = benchmark_module("wrong_prior"), benchmark_module("pages")
+    kept = read_json(wrong.RESULTS)
+    page = (ROOT / "docs" / "ablation.md").read_text(encoding="utf-8")
+    assert pages.with_part(page, wrong.PART, wrong.table(kept)) == page and wrong.table(kept).count("\n") > 5
+
+
+def test_a_wrong_prior_is_wrong_as_often_and_as_much_as_is_said(benchmark_module):
+    wrong = benchmark_module("wrong_prior")
+    indices = torch.cartesian_prod(torch.arange(6), torch.arange(128), torch.arange(160))
+    for block in (1, 16):
+        factors = wrong.factors(indices, block)[:, 0]
+        assert torch.equal(factors, wrong.factors(indices, block)[:, 0])
+        assert sorted(factors.unique().tolist()) == pytest.approx([0.7, 1, 1.3])
+        assert float((factors != 1).float().mean()) == pytest.approx(0.1, abs=0.03)
+        picture = factors.view(6, 128, 160)
+        together = picture.unfold(1, block, block).unfold(2, block, block).flatten(3)
+        assert torch.equal(together.amin(-1), together.amax(-1))
+        # other pictures are wrong elsewhere
+        assert float(((picture[0] != 1) & (picture[1] != 1)).float().mean()) < 0.05
 
 
 def test_a_part_of_a_step_is_without_what_it_contains(benchmark_module, monkeypatch):
