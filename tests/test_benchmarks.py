@@ -15,6 +15,7 @@ import pytest
 import torch
 from benchmark_modules import benchmark_modules
 from comparisons import fake
+from nerfstudio.cameras.cameras import Cameras, CameraType
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json, write_json
@@ -454,6 +455,39 @@ def test_the_pages_wrong_prior_is_that_of_its_runs(benchmark_module):
     kept = read_json(wrong.RESULTS)
     page = (ROOT / "docs" / "ablation.md").read_text(encoding="utf-8")
     assert pages.with_part(page, wrong.PART, wrong.table(kept)) == page and wrong.table(kept).count("\n") > 5
+
+
+def test_the_pages_detail_is_that_of_its_runs(benchmark_module):
+    detail, pages = benchmark_module("detail"), benchmark_module("pages")
+    kept = read_json(detail.RESULTS)
+    page = (ROOT / "docs" / "ablation.md").read_text(encoding="utf-8")
+    assert pages.with_part(page, detail.PART, detail.table(kept)) == page and detail.table(kept).count("\n") > 5
+    for scene in kept["scenes"].values():
+        for found in scene.values():
+            assert 0.8 <= round(found["with detail, PSNR"] - found["rendered, PSNR"], 1) <= 1.5
+
+
+def test_a_place_is_found_in_the_picture_where_its_ray_begins(benchmark_module):
+    detail = benchmark_module("detail")
+    turned = torch.tensor([[0.0, 0, 1, 3], [1, 0, 0, -2], [0, 1, 0, 0.5]])
+    cameras = Cameras(
+        turned[None],
+        *(torch.tensor([[number]]) for number in (90.0, 92.0, 100.5, 99.0)),
+        width=200,
+        height=200,
+        distortion_params=torch.tensor([[0.02, -0.01, 0.003, -0.001, 0, 0]]),
+        camera_type=CameraType.FISHEYE,
+    )
+    rays = cameras.generate_rays(camera_indices=0)
+    distance = 2 + torch.rand(200, 200)
+    column, row, found = detail.pixels_of(cameras, 0, rays.origins + distance[..., None] * rays.directions)
+    rows, columns = torch.meshgrid(torch.arange(200) + 0.5, torch.arange(200) + 0.5, indexing="ij")
+    near = torch.hypot(rows - 99, columns - 100.5) < 90
+    assert float((column - columns)[near].abs().max()) < 0.02 and float((row - rows)[near].abs().max()) < 0.02
+    torch.testing.assert_close(found[near], distance[near], rtol=1e-4, atol=1e-4)
+    values = torch.stack([columns, rows], dim=-1)
+    looked_up = detail.looked_up(values, column, row)[near]
+    assert float((looked_up - values[near]).abs().max()) < 0.05
 
 
 def test_a_wrong_prior_is_wrong_as_often_and_as_much_as_is_said(benchmark_module):
