@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import run
 import torch
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
@@ -78,6 +79,19 @@ def train(
             callback.run_callback_at_location(step, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
     seconds = (time.monotonic() - started) / steps
     return {"seconds a step": seconds, **judge_pixels(pipeline, pixels)}
+
+
+def begun(path: Path, steps: int) -> dict[str, Any]:
+    """Figures of scenes that a file keeps of this commit and of as many steps; else none."""
+    results: dict[str, Any] = read_json(path) if path.is_file() else {}
+    if results.get("commit") == run.commit() and results.get("steps") == steps:
+        return results
+    return {"commit": run.commit(), "steps": steps, "scenes": {}}
+
+
+def falling_over(steps: int) -> dict[str, int]:
+    """Overrides by which the learning rates fall over so many steps."""
+    return {f"optimizers.{name}.scheduler.max_steps": steps for name in ("fields", "proposal_networks")}
 
 
 def key_of(options: argparse.Namespace, variant: str, seed: int) -> str:

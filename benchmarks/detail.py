@@ -21,14 +21,13 @@ from typing import Any
 import ablate
 import numpy as np
 import pages
-import run
 import torch
 import torch.nn.functional as F
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from rich.console import Console
 from torch import Tensor
 
-from edge_depth_nerf.base.files import read_json, write_json, write_text
+from edge_depth_nerf.base.files import write_json, write_text
 from edge_depth_nerf.compare.methods import METHODS
 from edge_depth_nerf.method.metrics import masked_psnr, masked_ssim
 
@@ -135,8 +134,7 @@ def judged(pipeline: Any) -> dict[str, float]:
 def trained(scene: Path, overrides: Mapping[str, Any], steps: int) -> dict[str, float]:
     """Train a method, and judge it."""
     kept: list[Any] = []
-    schedule = {f"optimizers.{name}.scheduler.max_steps": steps for name in ("fields", "proposal_networks")}
-    ablate.train(scene, {**overrides, **schedule}, steps, 0, kept.append)
+    ablate.train(scene, {**overrides, **ablate.falling_over(steps)}, steps, 0, kept.append)
     return judged(kept[0])
 
 
@@ -161,9 +159,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, default=RESULTS)
     parser.add_argument("--page", type=Path)
     options = parser.parse_args()
-    results: dict[str, Any] = read_json(options.json) if options.json.is_file() else {}
-    if results.get("commit") != run.commit() or results.get("steps") != options.steps:
-        results = {"commit": run.commit(), "steps": options.steps, "scenes": {}}
+    results = ablate.begun(options.json, options.steps)
     for scene in options.scenes:
         found = results["scenes"].setdefault(scene.resolve().name, {})
         for method in options.methods:

@@ -16,11 +16,10 @@ from typing import Any
 
 import ablate
 import pages
-import run
 import torch
 from rich.console import Console
 
-from edge_depth_nerf.base.files import read_json, read_json_object, write_json, write_text
+from edge_depth_nerf.base.files import read_json_object, write_json, write_text
 
 RESULTS = Path(__file__).with_name("wrong_prior.json")
 PART = "wrong prior"
@@ -84,10 +83,8 @@ def main() -> None:
     parser.add_argument("--json", type=Path, default=RESULTS)
     parser.add_argument("--page", type=Path)
     options = parser.parse_args()
-    results: dict[str, Any] = read_json(options.json) if options.json.is_file() else {}
-    if results.get("commit") != run.commit() or results.get("steps") != options.steps:
-        results = {"commit": run.commit(), "steps": options.steps, "scenes": {}}
-    schedule = {f"optimizers.{name}.scheduler.max_steps": options.steps for name in ("fields", "proposal_networks")}
+    results = ablate.begun(options.json, options.steps)
+    schedule = ablate.falling_over(options.steps)
     for scene in options.scenes:
         found = results["scenes"].setdefault(scene.resolve().name, {})
         for method, overrides in METHODS.items():

@@ -176,7 +176,7 @@ def rays_of(
     camera_indices: Int[Tensor, "rays 1"] | None,
     metadata: dict[str, Any] | None = None,
 ) -> RayBundle:
-    """Make rays of fields of one shape, a sixth of a millisecond faster than nerfstudio's constructor."""
+    """Make rays of fields of one shape, as nerfstudio's constructor does without looking it up."""
     fields_of_rays = {
         "origins": origins,
         "directions": directions,
