@@ -35,6 +35,7 @@ from edge_depth_nerf.compare import command
         ({"search": True, "seeds": (0, 1)}, "2 seeds"),
         ({"search": True, "methods": ("nerfacto",)}, "depth loss"),
         ({"search": True, "tuned": Path("x")}, "--tuned"),
+        ({"search": True, "detail": True}, "--search with --detail"),
     ],
 )
 def test_options_that_cannot_be(changes, message):
@@ -104,6 +105,8 @@ def test_a_folder_keeps_what_its_runs_share(tmp_path, monkeypatch):
         command.compare(replace(first, steps=6), QUIET)
     with pytest.raises(InputError, match="preset lite, not full"):
         command.compare(replace(first, preset="full"), QUIET)
+    with pytest.raises(InputError, match="detail False, not True"):
+        command.compare(replace(first, detail=True), QUIET)
     with monkeypatch.context() as patched:
         # said at once, not after whoever writes there
         patched.setattr(command, "only_writer", lambda *_: pytest.fail("waits for the folder"))

@@ -26,9 +26,8 @@ from edge_depth_nerf.compare import command, tables
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("compare")
-    asked = options(
-        write_compared_scene(folder / "sample"), output=folder / "out", methods=("nerfacto", "edge"), steps=12, jobs=2
-    )
+    scene, both = write_compared_scene(folder / "sample"), ("nerfacto", "edge")
+    asked = options(scene, output=folder / "out", methods=both, steps=12, jobs=2, detail=True)
     return asked, command.compare(asked, QUIET)
 
 
@@ -44,6 +43,7 @@ def test_it_leaves_figures_tables_and_pictures(finished):
     metrics = {row["metric"] for row in rows if row["method"] == "edge"}
     assert {"masked_psnr", "truth_masked_ssim", "truth_affine_masked_psnr", "truth_abs_rel", "seconds"} <= metrics
     assert {"shifted_1m_masked_psnr", "shifted_2m_masked_psnr", "shifted_1m_truth_abs_rel"} <= metrics
+    assert {"detail_truth_masked_psnr", "detail_shifted_1m_masked_psnr"} <= metrics
     assert np.isfinite([float(row["value"]) for row in rows]).all()
     tidy = json.loads((asked.output / "results.json").read_text())["rows"]
     assert [(row["metric"], row["value"]) for row in tidy] == [(row["metric"], float(row["value"])) for row in rows]
@@ -58,6 +58,7 @@ def test_it_leaves_figures_tables_and_pictures(finished):
         and "| pipeline.model.depth_loss | none | edge |" in text
     )
     assert "| pipeline.model.exposure |" not in text
+    assert " with detail ↑ |" in text and " 1 m beside, with detail ↑ |" in text
     assert r"\bottomrule" in (asked.output / "tables.tex").read_text()
     assert read_image(asked.output / "comparison_sample.png").std() > 5
     for name in ("psnr_by_steps", "psnr_by_seconds", "error_by_angle", "error_by_distance"):
@@ -67,6 +68,9 @@ def test_it_leaves_figures_tables_and_pictures(finished):
         assert all(any(f"stroke: {colour}" in style for style in styles) for colour in ("#888888", "#d62828"))
     for run in results.runs:
         assert run.content["mono_trained_on"] == "scene"
+        # twelve steps render a blur: the pictures around a view show more
+        assert run.figures["detail_truth_masked_psnr"] > run.figures["truth_masked_psnr"] + 1
+        assert len([*(run.folder / "views").glob("eval_detail_*.png")]) == 2
         assert [point["step"] for point in run.curve][-1] == 12
         assert all(math.isfinite(point["trained_psnr"]) for point in run.curve)
         seconds = [point["seconds"] for point in run.curve]

@@ -114,6 +114,7 @@ def compare_grid(options: CompareOptions, console: Console) -> Results:
             options,
             grid=False,
             search=True,
+            detail=False,
             scenes=options.tuning,
             tuning=(),
             steps=options.search_steps or options.steps,
@@ -186,6 +187,7 @@ def _opened_runs(options: CompareOptions, tuned: dict[str, Setting]) -> list[Run
             sigma_m=setting.sigma_m,
             implementation=options.rivals_implementation if METHODS[name].rival else "same",
             whole_views=not options.search,
+            detail=options.detail and not options.search,
         )
         # the first seeds of all drives come first: tables of an unfinished comparison are of whole rows
         for seed in options.seeds
@@ -337,6 +339,7 @@ def _record(options: CompareOptions, tuned: dict[str, Setting]) -> dict[str, Any
         "preset": options.preset,
         "steps": options.steps,
         "rivals_implementation": options.rivals_implementation,
+        "detail": options.detail,
         "tuned": {name: {"lambda": setting.weight, "sigma_m": setting.sigma_m} for name, setting in tuned.items()},
         "tuned_on": None if options.tuned is None else _tuned_on(options.tuned),
     }

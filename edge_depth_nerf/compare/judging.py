@@ -23,6 +23,7 @@ from edge_depth_nerf.compare.figures import ANGLE_EDGES_DEG, DISTANCE_EDGES_M, B
 from edge_depth_nerf.method.metrics import LEAST_SQUARED_ERROR, DepthErrors, masked_lpips, masked_psnr, masked_ssim
 from edge_depth_nerf.plugin.compat import without_undefined_ray
 from edge_depth_nerf.plugin.dataset import FisheyeDepthDataset
+from edge_depth_nerf.plugin.detail import detail_shown
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
 from edge_depth_nerf.plugin.pipeline import JudgedViews
 from edge_depth_nerf.scene.format import read_transforms
@@ -240,8 +241,7 @@ class ViewJudge:
         def look(view: JudgedView, outputs: dict[str, Tensor], images: dict[str, Tensor]) -> None:
             number, batch = view.number, view.batch
             for name in ("img", "distance"):
-                pixels = (images[name].clamp(0, 1).cpu().numpy() * 255).round().astype(np.uint8)
-                write_png(folder / f"eval_{name}_{number:04d}.png", pixels)
+                _save(images[name], folder / f"eval_{name}_{number:04d}.png")
             rgb = outputs["rgb"].clamp(0, 1).cpu()
             distance_m = outputs["depth"][..., 0].cpu() * self.model.metres_per_unit
             mask = batch["mask"][..., 0].cpu()
@@ -253,10 +253,32 @@ class ViewJudge:
             if true_m is not None:
                 by_distance.update(true_m, mask, rgb, target, distance_m, true_m)
 
-        loader = JudgedViews(self.pipeline, self.pipeline.datamanager.fixed_indices_eval_dataloader)
-        views = (JudgedView(number, camera, batch) for number, (camera, batch) in enumerate(loader))
-        figures = self._mean(views, look)
+        figures = self._mean(self._held_out_views(), look)
         return figures, {"by_angle_deg": by_angle.compute(), "by_distance_m": by_distance.compute()}
+
+    def with_detail(
+        self, folder: Path, beside: dict[str, list[Callable[[], JudgedView]]] | None = None
+    ) -> dict[str, float]:
+        """Judge all held-out views, and those beside the path, with the detail of training pictures.
+
+        The colours of each held-out view are saved in a folder, as eval_detail_0000.png and so on.
+
+        Returns:
+            The figures of colours inside the mask: detail_masked_psnr, detail_truth_masked_psnr,
+            detail_shifted_1m_masked_psnr, and so on. Distances are the same as without.
+
+        """
+
+        def look(view: JudgedView, outputs: dict[str, Tensor], images: dict[str, Tensor]) -> None:
+            _save(outputs["rgb"], folder / f"eval_detail_{view.number:04d}.png")
+
+        with detail_shown(True):
+            found = self._mean(self._held_out_views(), look) | self.shifted(beside or {})
+        return {f"detail_{name}": value for name, value in found.items() if "masked_" in name}
+
+    def _held_out_views(self) -> Iterator[JudgedView]:
+        loader = JudgedViews(self.pipeline, self.pipeline.datamanager.fixed_indices_eval_dataloader)
+        return (JudgedView(number, camera, batch) for number, (camera, batch) in enumerate(loader))
 
     def shifted(self, views: dict[str, list[Callable[[], JudgedView]]]) -> dict[str, float]:
         """Evaluate views beside the path against their ground truth, inside the mask: shifted_1m_masked_psnr etc.
@@ -280,13 +302,12 @@ class ViewJudge:
         rgb, distance_m = torch.zeros(*mask.shape, 3), torch.zeros(mask.shape)
         camera = without_undefined_ray(view.camera.to(model.device))
         # nerfstudio's coordinates are those of the pixels' centres
-        at = mask.nonzero() + 0.5
-        parts = [
-            model(camera.generate_rays(camera_indices=0, coords=part.to(model.device)))
-            for part in at.split(model.config.eval_num_rays_per_chunk)
-        ]
-        rgb[mask] = torch.cat([part["rgb"] for part in parts]).cpu().clamp(0, 1)
-        distance_m[mask] = torch.cat([part["depth"][:, 0] for part in parts]).cpu() * model.metres_per_unit
+        at = (mask.nonzero() + 0.5).to(model.device)
+        # as a picture of one row
+        rays = camera.generate_rays(camera_indices=0, coords=at).reshape((1, len(at)))
+        outputs = model.get_outputs_for_camera_ray_bundle(rays)
+        rgb[mask] = outputs["rgb"][0].cpu().clamp(0, 1)
+        distance_m[mask] = outputs["depth"][0, :, 0].cpu() * model.metres_per_unit
         errors.update(distance_m, view.batch["truth_distance_m"][..., 0].cpu(), mask)
         figures = {
             "masked_psnr": float(masked_psnr(rgb, target, mask)),
@@ -318,6 +339,11 @@ class ViewJudge:
                 found.append(figures)
                 self.on_view()
         return _means(found) | model.pooled_depth_errors()
+
+
+def _save(colours: Tensor, path: Path) -> None:
+    """Save colours of 0 to 1 as a PNG."""
+    write_png(path, (colours.clamp(0, 1).cpu().numpy() * 255).round().astype(np.uint8))
 
 
 def _means(found: list[dict[str, float]]) -> dict[str, float]:

@@ -75,6 +75,9 @@ class CompareOptions:
     rivals_implementation: Implementation = "same"
     """torch: nerfacto, ds-nerf and both forms of UrbanNeRF run in nerfstudio's own torch code, with the same results,
     to compare at equal seconds."""
+    detail: bool = False
+    """Evaluate all views twice, for all methods: as the model renders them, and with the detail that training pictures
+    show beyond their own renderings (with detail). Training pictures are rendered for it, which takes time."""
     jobs: int | None = None
     """Parallel trainings. Not set: one per core; on a GPU, one."""
     cluster: str | None = None
@@ -137,6 +140,7 @@ class CompareOptions:
             "both, or --steps for the runs of --search",
         )
         require(self.search_steps is None or self.search_steps >= 1, f"--search-steps {self.search_steps}", "1 or more")
+        require(not (self.search and self.detail), "--search with --detail", "one of them: a search renders no views")
         require(not (self.search and self.grid), "--search with --grid", "one of them: the grid searches first")
         require(self.grid or not self.tuning, "--tuning without --grid", "both, or --search on the tuning scenes")
         if not self.search and not self.grid:

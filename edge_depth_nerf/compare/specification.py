@@ -41,6 +41,8 @@ class RunSpecification:
     """torch: in nerfstudio's own torch code."""
     whole_views: bool = True
     """Whether whole views are judged at the end, or only the random pixels."""
+    detail: bool = False
+    """Whether whole views are judged with the detail of training pictures, too."""
 
     def to_dict(self) -> dict[str, Any]:
         """What run.json holds."""

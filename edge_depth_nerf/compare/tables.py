@@ -187,11 +187,13 @@ def _geometry_table(results: Results, where: str, scenes: Sequence[str]) -> Made
         psnr_metric(results),
         Metric(f"{truth}affine_masked_psnr", "fitted ↑", ".2f"),
         *([Metric("masked_psnr", "recorded ↑", ".2f")] if truth else []),
+        Metric(f"detail_{truth}masked_psnr", "with detail ↑", ".2f"),
         Metric(f"{reference}_abs_rel", "AbsRel ↓", ".3f", -1),
         Metric(f"{reference}_rmse_m", "RMSE m ↓", ".2f", -1),
         Metric(f"{reference}_delta_1_25", "δ<1.25 ↑", ".3f"),
         Metric("shifted_1m_masked_psnr", "1 m beside ↑", ".2f"),
         Metric("shifted_2m_masked_psnr", "2 m beside ↑", ".2f"),
+        Metric("detail_shifted_1m_masked_psnr", "1 m beside, with detail ↑", ".2f"),
     ]
     metrics = [metric for metric in metrics if any(metric.name in run.figures for run in results.runs)]
     notes = ["Fitted: PSNR after an affine fit of each view's colours."]
@@ -200,6 +202,8 @@ def _geometry_table(results: Results, where: str, scenes: Sequence[str]) -> Made
     notes.append(
         f"AbsRel, RMSE, δ: rendered median distance against {known}, 1-60 m, over all pixels together, without sky."
     )
+    if any(metric.name.startswith("detail_") for metric in metrics):
+        notes.append("With detail: PSNR with what training pictures show beyond their own renderings.")
     if any(metric.name.startswith("shifted_") for metric in metrics):
         notes.append("Beside: PSNR of views moved sideways.")
     columns = [_column(metric) for metric in metrics]

@@ -194,6 +194,7 @@ def do_run(folder: Path) -> None:
     dataset: Any = trainer.pipeline.datamanager.eval_dataset
     beside = shifted_views(Path(run.scene), dataset) if run.whole_views else {}
     views = len(dataset) + sum(map(len, beside.values())) if run.whole_views else 0
+    views *= 2 if run.detail else 1
     # nerfstudio prints each step; the bar wants the share of all the work
     rays_of_a_view = int((dataset.cameras.width * dataset.cameras.height).float().mean())
     batches_of_a_view = rays_of_a_view / trainer.pipeline.datamanager.get_train_rays_per_batch()
@@ -225,6 +226,8 @@ def do_run(folder: Path) -> None:
         judge = ViewJudge(trainer.pipeline, on_view)
         found, bins = judge.held_out(folder / VIEWS)
         figures |= found | judge.shifted(beside) | judge_beams(trainer.pipeline)
+        if run.detail:
+            figures |= judge.with_detail(folder / VIEWS, beside)
     weight, sigma = setting_of(config, run.method)
     meta, layer = read_transforms(Path(run.scene) / "transforms.json"), LAYERS["mono"].key
     write_json(

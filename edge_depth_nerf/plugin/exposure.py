@@ -30,13 +30,23 @@ class Gains(nn.Module):
         super().__init__()
         self.log_gains = nn.Parameter(torch.zeros(pictures, 3))
 
+    @property
+    def gains(self) -> Float[Tensor, "pictures 3"]:
+        """The factors."""
+        return (self.log_gains - self.log_gains.mean(dim=0)).exp()
+
     def forward(
         self, colours: Float[Tensor, "rays 3"], picture: Int[Tensor, "rays"], place: Float[Tensor, "rays 2"] | None
     ) -> Float[Tensor, "rays 3"]:
         """Colours as the pictures have them."""
-        gains = (self.log_gains - self.log_gains.mean(dim=0)).exp()
         # faster than an index, forward and backward
-        return colours * gains.index_select(0, picture)
+        return colours * self.gains.index_select(0, picture)
+
+    def beyond(
+        self, image: Float[Tensor, "h w 3"], rendered: Float[Tensor, "h w 3"], picture: int
+    ) -> Float[Tensor, "h w 3"]:
+        """What a picture shows beyond its neutral rendering, in neutral colours."""
+        return image / self.gains[picture] - rendered
 
     def unevenness(self) -> Float[Tensor, ""]:
         """How far the maps are from the identity, or from smooth: nothing that needs a penalty."""
@@ -59,8 +69,13 @@ class AffineMaps(nn.Module):
         self, colours: Float[Tensor, "rays 3"], picture: Int[Tensor, "rays"], place: Float[Tensor, "rays 2"] | None
     ) -> Float[Tensor, "rays 3"]:
         """Colours as the pictures have them."""
-        maps = self.offsets[picture]
-        return colours + (maps[..., :3] * colours[:, None]).sum(dim=-1) + maps[..., 3]
+        return _mapped(colours, self.offsets[picture])
+
+    def beyond(
+        self, image: Float[Tensor, "h w 3"], rendered: Float[Tensor, "h w 3"], picture: int
+    ) -> Float[Tensor, "h w 3"]:
+        """What a picture shows beyond its neutral rendering, in neutral colours."""
+        return _unmapped(image, rendered, self.offsets[picture].expand(*image.shape[:2], 3, 4))
 
     def unevenness(self) -> Float[Tensor, ""]:
         """Mean square of what the maps do beyond the identity."""
@@ -91,6 +106,24 @@ class BilateralGrids(nn.Module):
     ) -> Float[Tensor, "rays 3"]:
         """Colours as the pictures have them; `place`: column and row of each pixel, 0 to 1 over its picture."""
         assert place is not None
+        return _mapped(colours, self._maps(colours, picture, place))
+
+    def beyond(
+        self, image: Float[Tensor, "h w 3"], rendered: Float[Tensor, "h w 3"], picture: int
+    ) -> Float[Tensor, "h w 3"]:
+        """What a picture shows beyond its neutral rendering, in neutral colours; by the maps of the rendering."""
+        height, width = image.shape[:2]
+        at = [(torch.arange(size, device=image.device) + 0.5) / size for size in (height, width)]
+        row, column = torch.meshgrid(*at, indexing="ij")
+        place = torch.stack([column, row], dim=-1).view(-1, 2)
+        pictures = torch.full((height * width,), picture, device=image.device)
+        maps = self._maps(rendered.reshape(-1, 3), pictures, place)
+        return _unmapped(image, rendered, maps.view(height, width, 3, 4))
+
+    def _maps(
+        self, colours: Float[Tensor, "rays 3"], picture: Int[Tensor, "rays"], place: Float[Tensor, "rays 2"]
+    ) -> Float[Tensor, "rays 3 4"]:
+        """The maps of pixels, less the identity."""
         depth = GRID_SHAPE[0]
         offsets = self.offsets
         # all pictures' grids one behind the other: one call for rays of many pictures, no cell between two of them
@@ -99,14 +132,26 @@ class BilateralGrids(nn.Module):
         layers = len(offsets) * depth
         behind = (picture * depth + brightness * (depth - 1)) / max(1, layers - 1)
         at = 2 * torch.cat([place, behind[:, None]], dim=-1) - 1
-        maps = F.grid_sample(volume, at.view(1, 1, 1, -1, 3), align_corners=True)[0, :, 0, 0].t().view(-1, 3, 4)
-        return colours + (maps[..., :3] * colours[:, None]).sum(dim=-1) + maps[..., 3]
+        return F.grid_sample(volume, at.view(1, 1, 1, -1, 3), align_corners=True)[0, :, 0, 0].t().view(-1, 3, 4)
 
     def unevenness(self) -> Float[Tensor, ""]:
         """Total variation, squared, and a little of the mean square."""
         grids = self.offsets
         steps = [grids.diff(dim=axis).square().mean() for axis in (2, 3, 4)]
         return torch.stack(steps).sum() + 0.1 * grids.square().mean()
+
+
+def _mapped(colours: Float[Tensor, "*pixels 3"], offsets: Float[Tensor, "*pixels 3 4"]) -> Float[Tensor, "*pixels 3"]:
+    """Apply affine maps, given less the identity."""
+    return colours + (offsets[..., :3] * colours[..., None, :]).sum(dim=-1) + offsets[..., 3]
+
+
+def _unmapped(
+    image: Float[Tensor, "h w 3"], rendered: Float[Tensor, "h w 3"], offsets: Float[Tensor, "h w 3 4"]
+) -> Float[Tensor, "h w 3"]:
+    """What a picture shows beyond a rendering that affine maps would have made like it, before these maps."""
+    linear = torch.eye(3, device=offsets.device, dtype=offsets.dtype) + offsets[..., :3]
+    return torch.linalg.solve(linear, image - _mapped(rendered, offsets))
 
 
 KINDS: dict[str, type[Gains | AffineMaps | BilateralGrids]] = {

@@ -56,6 +56,7 @@ from edge_depth_nerf.method.metrics import DepthErrors, load_lpips, masked_lpips
 from edge_depth_nerf.method.uncertainty import termination_std
 from edge_depth_nerf.plugin.colours import coloured
 from edge_depth_nerf.plugin.compat import lpips_not_built, total_steps, without_undefined_ray
+from edge_depth_nerf.plugin.detail import TrainingDetail
 from edge_depth_nerf.plugin.exposure import KINDS
 from edge_depth_nerf.plugin.pose_refinement import MOMENTS, PoseRefiner, PoseRefinerConfig
 from edge_depth_nerf.plugin.ray_table import PLACE
@@ -116,6 +117,9 @@ class EdgeDepthNerfModelConfig(NerfactoModelConfig):
     over its interval."""
     edge_divide_by_norm: bool = True
     """Divide Eq. 4's Gaussian by σ̂·√(2π), so that a wide one does not pull harder than a narrow one."""
+    detail: bool = False
+    """Add to rendered views what the training pictures that see most of them show beyond their own renderings. A view
+    from a new place then takes longer: up to eight training pictures are rendered first. Training stays the same."""
     implementation: Literal["auto", "fused", "tcnn", "torch"] = "auto"  # pyright: ignore[reportIncompatibleVariableOverride]
     """What computes fields, samples and losses. fused: our own kernels (Numba on the CPU; on CUDA Triton for hash
     grids, samples along rays, densities, directions and the edge loss). torch: nerfstudio's code, with the same
@@ -319,6 +323,8 @@ class EdgeDepthNerfModel(NerfactoModel):
         self._step = 0
         self._training_steps = 30_000
         self._scheduled_weight: Tensor | None = None
+        self.detail: TrainingDetail | None = None
+        """Of the training pictures; the pipeline sets it."""
         self.reset_depth_errors()
 
     def _refine_poses(self, metadata: dict[str, Any]) -> None:
@@ -496,6 +502,40 @@ class EdgeDepthNerfModel(NerfactoModel):
         for name, scale in (("distance", DISTANCE), ("distance_uncertainty", SIGMA)):
             outputs[f"{name}_coloured"] = coloured(outputs[name][..., 0], scale)
         return outputs
+
+    def get_outputs_for_camera_ray_bundle(self, camera_ray_bundle: RayBundle) -> dict[str, Tensor]:
+        """Outputs of a whole view, with the detail of training pictures if it is asked for.
+
+        A background of the viewer's or of an exporter says that a part is cut out: then there is no detail.
+        """
+        outputs = super().get_outputs_for_camera_ray_bundle(camera_ray_bundle)
+        if self.training or self.detail is None or not self.detail.is_shown:
+            return outputs
+        if renderers.BACKGROUND_COLOR_OVERRIDE is None:
+            detail = self.detail.of_view(camera_ray_bundle, outputs["depth"])
+            outputs["rgb"] = (outputs["rgb"] + detail).clamp(0, 1)
+        return outputs
+
+    def rendered_alone(self, camera: Cameras) -> dict[str, Tensor]:
+        """Outputs of a whole view without detail."""
+        rays = without_undefined_ray(camera).generate_rays(camera_indices=0, keep_shape=True)
+        return super().get_outputs_for_camera_ray_bundle(rays)
+
+    @contextmanager
+    def with_appearance_of(self, picture: int) -> Iterator[None]:
+        """With nerfacto's appearance embedding, render as a training picture looks; else nothing changes."""
+        embedding: Any = self.field.embedding_appearance
+        if embedding is None:
+            yield
+            return
+        # what both forms of the field ask for at evaluation
+        embedding.mean = lambda dim: embedding.embedding.weight[picture]
+        averages, self.field.use_average_appearance_embedding = self.field.use_average_appearance_embedding, True
+        try:
+            yield
+        finally:
+            del embedding.mean
+            self.field.use_average_appearance_embedding = averages
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
         """Nerfacto's metrics and, in training, the share of rays with a prior."""

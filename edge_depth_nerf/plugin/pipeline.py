@@ -20,6 +20,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.plugin.compat import ignore_deprecations_of_host
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManager, FisheyeDepthDataManagerConfig
+from edge_depth_nerf.plugin.detail import TrainingDetail
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel, EdgeDepthNerfModelConfig
 from edge_depth_nerf.plugin.plain_errors import say_errors_plainly
 from edge_depth_nerf.plugin.pose_refinement import PoseRefinerConfig, fit_pose, halves
@@ -92,6 +93,9 @@ class EdgeDepthPipeline(VanillaPipeline):
                 f"{model.depth_loss!r}. Process the drive with LiDAR, make monocular maps with `edge-depth-nerf "
                 "estimate-depth`, or train without a prior with --pipeline.model.depth-loss none."
             )
+        assert isinstance(self.model, EdgeDepthNerfModel)
+        self.detail = self.model.detail = TrainingDetail(self.model, manager.train_dataset)
+        self.model.register_load_state_dict_post_hook(lambda *_: self.detail.forget())
         self.drive = DrivePanel(manager)
         self._odd_steps: torch.Tensor | None = None
         self.graphs: StepGraphs | None = None
@@ -127,6 +131,7 @@ class EdgeDepthPipeline(VanillaPipeline):
         """
         manager = self.datamanager
         assert isinstance(manager, FisheyeDepthDataManager)
+        self.detail.forget()
         if self.graphs is None:
             found = self._computed(*manager.next_train(step))
         else:

@@ -150,11 +150,17 @@ def fit_pose(
             scheduler.step()
     with torch.no_grad():
         correction = exp_map_SO3xR3(adjustment * sigmas)[0].to(camera.camera_to_worlds)
-    pose = camera.camera_to_worlds[0]
-    moved = torch.cat([correction[:, :3] @ pose[:, :3], pose[:, 3:] + correction[:, 3:]], dim=-1)
     found = camera[:]
-    found.camera_to_worlds = moved[None]
+    found.camera_to_worlds = moved_pose(camera.camera_to_worlds, correction)
     return found
+
+
+def moved_pose(
+    poses: Float[Tensor, "pictures 3 4"], correction: Float[Tensor, "*pictures 3 4"]
+) -> Float[Tensor, "pictures 3 4"]:
+    """Camera poses after a correction of their rays: a turn about each camera, and a shift, both in the world."""
+    turned = correction[..., :3] @ poses[..., :3]
+    return torch.cat([turned, poses[..., 3:] + correction[..., 3:]], dim=-1)
 
 
 def halves(mask: Bool[Tensor, "h w 1"]) -> tuple[Bool[Tensor, "h w 1"], Bool[Tensor, "h w 1"]]:

@@ -1,0 +1,131 @@
+"""Adds to rendered views what training pictures show beyond their own renderings.
+
+Host-facing; the formulas stand in `method.detail`. A training picture is rendered when a view near it first needs it,
+and its detail is kept until the model changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+from contextvars import ContextVar
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Protocol
+
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.rays import RayBundle
+from torch import Tensor
+
+from edge_depth_nerf.method.detail import Detail, carried, detail_of, pictures_that_see
+from edge_depth_nerf.plugin.pose_refinement import moved_pose
+
+if TYPE_CHECKING:
+    from edge_depth_nerf.plugin.dataset import FisheyeDepthDataset
+
+    class Renders(Protocol):
+        """What is asked of a model."""
+
+        config: Any
+        camera_optimizer: Any
+        exposure: Any
+
+        @property
+        def device(self) -> Any:
+            """Where it is."""
+            ...
+
+        def rendered_alone(self, camera: Cameras) -> dict[str, Tensor]:
+            """Outputs of a whole view without detail."""
+            ...
+
+        def with_appearance_of(self, picture: int) -> AbstractContextManager[None]:
+            """Render as a training picture looks."""
+            ...
+
+
+PICTURES = 8
+"""So many training pictures, those that see most of a view, add their detail to it."""
+CONSIDERED = 64
+"""The pictures that are compared for it: so many, the nearest."""
+MOST_BYTES = 1 << 30
+"""Details in memory, all together; one more than a view needs at least."""
+BYTES_A_PIXEL = 8
+_shown: ContextVar[bool | None] = ContextVar("detail_shown", default=None)
+
+
+@contextmanager
+def detail_shown(shown: bool) -> Iterator[None]:
+    """Render views with or without detail, whatever the configuration says; in this thread."""
+    token = _shown.set(shown)
+    try:
+        yield
+    finally:
+        _shown.reset(token)
+
+
+class TrainingDetail:
+    """The detail of a model's training pictures."""
+
+    def __init__(self, model: Renders, dataset: FisheyeDepthDataset) -> None:
+        self.model, self.dataset = model, dataset
+        pixels = int((dataset.cameras.width * dataset.cameras.height).max())
+        self.kept = max(PICTURES + 1, MOST_BYTES // (BYTES_A_PIXEL * pixels))
+        """So many pictures' detail is kept, that which was used last."""
+        self.of_picture = lru_cache(self.kept)(self._of_picture)
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether views are rendered with it: as the configuration says, or `detail_shown`."""
+        shown = _shown.get()
+        return self.model.config.detail if shown is None else shown
+
+    def forget(self) -> None:
+        """Forget what was kept: the model is no longer what rendered it."""
+        if self.of_picture.cache_info().currsize:
+            self.of_picture.cache_clear()
+
+    def of_view(self, rays: RayBundle, distance: Float[Tensor, "*rays 1"]) -> Float[Tensor, "*rays 3"]:
+        """Look up the detail of a view.
+
+        Args:
+            rays: the view's, from one place or nearly so.
+            distance: at which they end, scene units.
+
+        Returns:
+            What is to be added to its colours, on the distance's device.
+
+        """
+        device = self.model.device
+        origins, directions = (each.reshape(-1, 3).to(device) for each in (rays.origins, rays.directions))
+        flat = distance.reshape(-1).to(device)
+        poses = self._poses()
+        away = (poses[:, :, 3] - origins.mean(dim=0)).norm(dim=-1)
+        near = away.argsort(stable=True)[:CONSIDERED].tolist()
+        lenses = [(self.dataset.camera(picture), poses[picture]) for picture in near]
+        chosen = pictures_that_see(origins, directions, flat, lenses, PICTURES)
+        found = carried(origins, directions, flat, [self.of_picture(near[number]) for number in chosen])
+        return found.view(*distance.shape[:-1], 3).to(distance)
+
+    def _poses(self) -> Float[Tensor, "pictures 3 4"]:
+        """The poses of the training pictures, as training has moved them."""
+        poses = self.dataset.cameras.camera_to_worlds.to(self.model.device)
+        optimizer = self.model.camera_optimizer
+        if optimizer.config.mode == "off":
+            return poses
+        with torch.no_grad():
+            return moved_pose(poses, optimizer(torch.arange(len(poses), device=poses.device)))
+
+    def _of_picture(self, number: int) -> Detail:
+        """Render a training picture where its camera was, and take what it shows beyond that."""
+        model, item = self.model, self.dataset[number]
+        camera = self.dataset.cameras[number : number + 1].to(model.device)
+        camera.camera_to_worlds = self._poses()[number : number + 1]
+        with torch.no_grad(), model.with_appearance_of(number):
+            outputs = model.rendered_alone(camera)
+            rgb, distance = outputs["rgb"].to(model.device), outputs["depth"][..., 0].to(model.device)
+            image = item["image"][..., :3].to(rgb)
+            beyond = image - rgb if model.exposure is None else model.exposure.beyond(image, rgb, number)
+        usable = item["mask"][..., 0].to(model.device)
+        return detail_of(self.dataset.camera(number), camera.camera_to_worlds[0], beyond, distance, usable)

@@ -1,0 +1,358 @@
+"""Detail of training pictures: what it adds to views, from where, and when it is rendered again."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+
+import numpy as np
+import pytest
+import torch
+from models import shrink
+from nerfstudio.configs.method_configs import all_methods
+from nerfstudio.model_components.renderers import background_color_override_context
+from scenes import RADIUS_M, fisheye, pinhole, view, write_scene
+
+from edge_depth_nerf.base.files import read_json, write_json
+from edge_depth_nerf.compare.judging import ViewJudge, evaluated, shifted_views
+from edge_depth_nerf.method.detail import carried, detail_of, pictures_that_see, seen_from
+from edge_depth_nerf.plugin import detail as plugin_detail
+from edge_depth_nerf.plugin.detail import TrainingDetail, detail_shown
+from edge_depth_nerf.plugin.exposure import KINDS
+
+GREY = 0.5
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+LENSES = {"fisheye": [fisheye(64, 56)], "pinhole": [pinhole(64, 56)], "both": [fisheye(64, 56), pinhole(64, 56)]}
+
+
+# ---- the formulas ---------------------------------------------------------------------------------------------------
+
+
+def at(x: float, angle: float = 0.0) -> np.ndarray:
+    """A camera-to-world matrix, OpenCV axes: beside the ball's middle, turned about y."""
+    pose = np.eye(4)
+    pose[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    pose[0, 3] = x
+    return pose
+
+
+def opengl(pose: np.ndarray) -> torch.Tensor:
+    return torch.tensor((pose @ FLIP)[:3], dtype=torch.float32)
+
+
+def seen(lens, pose: np.ndarray):
+    """Truth, distance, rays (origins, directions) and usable pixels of a view, flat."""
+    colours, distance, _ = view(lens, pose)
+    directions, valid = lens.unproject(lens.pixel_centres())
+    world = torch.nan_to_num(directions).reshape(-1, 3).float() @ torch.tensor(pose[:3, :3].T).float()
+    return (
+        torch.tensor(colours / 255.0).float(),
+        torch.tensor(distance).float(),
+        torch.tensor(pose[:3, 3]).float().expand(len(world), 3),
+        world,
+        valid,
+    )
+
+
+def grey_detail(lens, pose: np.ndarray, usable: torch.Tensor | None = None, shift: float = 1.0):
+    """Detail of a picture that was rendered grey at its true distances, times `shift`."""
+    colours, distance, _, _, valid = seen(lens, pose)
+    return detail_of(lens, opengl(pose), colours - GREY, distance * shift, valid if usable is None else valid & usable)
+
+
+@pytest.mark.parametrize("lens", [fisheye(64, 56), pinhole(64, 56)], ids=["fisheye", "pinhole"])
+def test_a_picture_looks_up_its_own_pixels(lens):
+    pose = at(0.4, 0.3)
+    colours, distance, origins, directions, valid = seen(lens, pose)
+    inside = valid.flatten()
+    points = (origins + directions * distance.reshape(-1, 1))[inside]
+    place, to_points, from_picture = seen_from(lens, opengl(pose), points)
+    pixels = (place + 1) / 2 * torch.tensor([64.0, 56.0])
+    torch.testing.assert_close(pixels, lens.pixel_centres().reshape(-1, 2).float()[inside], atol=2e-3, rtol=0)
+    torch.testing.assert_close(to_points, directions[inside], atol=1e-5, rtol=0)
+    torch.testing.assert_close(from_picture, distance.flatten()[inside], atol=1e-4, rtol=1e-5)
+    added = carried(origins[inside], directions[inside], distance.flatten()[inside], [grey_detail(lens, pose)])
+    # one picture, same direction, same distance: weight 1 of 1.1
+    expected = (colours.reshape(-1, 3)[inside] - GREY) / 1.1
+    torch.testing.assert_close(added, expected, atol=4e-3, rtol=0)
+
+
+def test_neighbours_show_what_a_grey_view_lacks():
+    lens, pose = fisheye(64, 56), at(0.5)
+    colours, distance, origins, directions, valid = seen(lens, pose)
+    around = [grey_detail(lens, at(x)) for x in (0.2, 0.8)]
+    added = carried(origins, directions, distance.flatten(), around).view(56, 64, 3)
+    inside = valid & (lens.pixel_centres() - torch.tensor([32.0, 28.0])).norm(dim=-1).lt(20)
+    before, after = (GREY - colours)[inside].abs().mean(), (GREY + added - colours)[inside].abs().mean()
+    assert after < 0.1 * before
+
+
+def test_what_a_picture_does_not_see_or_may_not_show_adds_nothing():
+    lens, pose = fisheye(64, 56), at(0.5)
+    _, distance, origins, directions, valid = seen(lens, pose)
+
+    def added(*details):
+        return carried(origins, directions, distance.flatten(), details)[valid.flatten()]
+
+    assert float(added(grey_detail(lens, at(0.2))).abs().mean()) > 0.05
+    assert float(added().abs().max()) == 0
+    # something hides the wall from the picture; it may not be used; it looks the other way
+    assert float(added(grey_detail(lens, at(0.2), shift=0.7)).abs().max()) < 1e-6
+    assert float(added(grey_detail(lens, at(0.2), usable=torch.zeros(56, 64, dtype=torch.bool))).abs().max()) == 0
+    narrow = pinhole(64, 56)
+    behind = carried(origins[:1], -directions[:1], distance.flatten()[:1], [grey_detail(narrow, at(0.2))])
+    assert float(behind.abs().max()) == 0
+
+
+def test_the_pictures_that_see_most_come_first_and_blind_ones_never():
+    lens = pinhole(64, 56)
+    _, distance, origins, directions, _ = seen(lens, at(0.0))
+    pictures = [(lens, opengl(at(0.1, angle))) for angle in (np.pi, 0.5, 0.0, -0.2)]
+    assert pictures_that_see(origins, directions, distance.flatten(), pictures, 8) == [2, 3, 1]
+    assert pictures_that_see(origins, directions, distance.flatten(), pictures, 2) == [2, 3]
+    assert pictures_that_see(origins, directions, distance.flatten(), [], 2) == []
+
+
+# ---- exposures ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_picture_that_is_its_rendering_exposed_shows_nothing_beyond(kind):
+    generator = torch.Generator().manual_seed(0)
+    exposure = KINDS[kind](4)
+    with torch.no_grad():
+        for parameter in exposure.parameters():
+            parameter.normal_(0, 1.0, generator=generator)
+    rendered = torch.rand(6, 8, 3, generator=generator)
+    row, column = torch.meshgrid(torch.arange(6), torch.arange(8), indexing="ij")
+    place = (torch.stack([column, row], dim=-1).view(-1, 2) + 0.5) / torch.tensor([8, 6])
+    with torch.no_grad():
+        exposed = exposure(rendered.view(-1, 3), torch.full((48,), 2), place).view(6, 8, 3)
+        assert float((exposed - rendered).abs().max()) > 0.05
+        torch.testing.assert_close(exposure.beyond(exposed, rendered, 2), torch.zeros(6, 8, 3), atol=1e-5, rtol=0)
+        # what is added before the exposure is found
+        if kind != "grid":  # whose maps differ with brightness
+            more = torch.rand(6, 8, 3, generator=generator)
+            exposed = exposure((rendered + more).view(-1, 3), torch.full((48,), 2), place).view(6, 8, 3)
+            torch.testing.assert_close(exposure.beyond(exposed, rendered, 2), more, atol=1e-5, rtol=1e-4)
+
+
+# ---- in the model ---------------------------------------------------------------------------------------------------
+
+
+def build(scene, poses="off", **model):
+    config = deepcopy(all_methods["edge-depth-nerf-lite"].pipeline)
+    config.datamanager.data = scene
+    shrink(config.model, 2, 8)
+    config.model.camera_optimizer.mode = poses
+    for name, value in model.items():
+        setattr(config.model, name, value)
+    return config.setup(device="cpu", test_mode="val")
+
+
+def grey_ball(pipeline, monkeypatch):
+    """Let a model render the scene's ball in grey, at its true distance; give the numbers of rays that it rendered."""
+    model, dataset, rendered = pipeline.model, pipeline.datamanager.train_dataset, []
+    outputs = dataset._dataparser_outputs
+    unit, to_scene = dataset.metadata["metres_per_unit"], outputs.dataparser_transform
+    middle = to_scene[:3, 3] * outputs.dataparser_scale
+
+    def forward(ray_bundle, batch=None):
+        rendered.append(len(ray_bundle))
+        beside = ray_bundle.origins - middle
+        along = (ray_bundle.directions * beside).sum(-1)
+        radius = RADIUS_M / unit
+        depth = -along + (along.square() + radius**2 - beside.square().sum(-1)).sqrt()
+        shape = (len(ray_bundle), 1)
+        return {
+            "rgb": torch.full((len(ray_bundle), 3), GREY),
+            "depth": depth[:, None],
+            "distance": depth[:, None] * unit,
+            "distance_uncertainty": torch.ones(shape),
+            "accumulation": torch.ones(shape),
+            **{f"prop_depth_{number}": depth[:, None] for number in range(2)},
+        }
+
+    monkeypatch.setattr(model, "forward", forward)
+    return rendered
+
+
+def errors(pipeline, number: int = 0) -> tuple[float, float]:
+    """Mean error of a held-out view inside the mask, without and with detail."""
+    dataset = pipeline.datamanager.eval_dataset
+    item, found = dataset[number], []
+    for shown in (False, True):
+        with evaluated(pipeline.model), detail_shown(shown):
+            rgb = pipeline.model.get_outputs_for_camera(dataset.cameras[number : number + 1])["rgb"]
+        found.append(float((rgb - item["image"])[item["mask"][..., 0]].abs().mean()))
+    return found[0], found[1]
+
+
+@pytest.mark.parametrize("lenses", LENSES)
+def test_a_grey_model_shows_the_colours_of_its_training_pictures(tmp_path, monkeypatch, lenses):
+    pipeline = build(write_scene(tmp_path, LENSES[lenses], frames=17))
+    grey_ball(pipeline, monkeypatch)
+    before, after = errors(pipeline)
+    assert before > 0.15 and after < 0.25 * before
+
+
+def test_the_option_shows_it_and_is_off_by_default(tmp_path, monkeypatch):
+    scene = write_scene(tmp_path)
+    for option in (False, True):
+        pipeline = build(scene, detail=True) if option else build(scene)
+        grey_ball(pipeline, monkeypatch)
+        assert pipeline.model.config.detail is option and pipeline.detail.is_shown is option
+        camera = pipeline.datamanager.eval_dataset.cameras[:1]
+        with evaluated(pipeline.model):
+            rgb = pipeline.model.get_outputs_for_camera(camera)["rgb"]
+            with detail_shown(not option):
+                other = pipeline.model.get_outputs_for_camera(camera)["rgb"]
+        assert bool((rgb == GREY).all()) is not option and bool((other == GREY).all()) is option
+        figures = pipeline.get_average_eval_image_metrics()
+        assert (figures["masked_psnr"] > 14) is option
+
+
+def test_training_never_shows_it_and_cut_views_do_not(tmp_path, monkeypatch):
+    pipeline = build(write_scene(tmp_path), detail=True)
+    rendered = grey_ball(pipeline, monkeypatch)
+    model, camera = pipeline.model, pipeline.datamanager.eval_dataset.cameras[:1]
+    model.train()
+    assert (model.get_outputs_for_camera(camera)["rgb"] == GREY).all()
+    with evaluated(model), background_color_override_context(torch.zeros(3)):
+        assert (model.get_outputs_for_camera(camera)["rgb"] == GREY).all()
+    assert sum(rendered) == 2 * 28 * 32
+
+
+def test_training_pictures_are_rendered_once_until_the_model_changes(tmp_path, monkeypatch):
+    pipeline = build(write_scene(tmp_path))
+    trained_step = pipeline.get_train_loss_dict
+    state = deepcopy(pipeline.state_dict())
+    original = pipeline.model.forward
+    rendered = grey_ball(pipeline, monkeypatch)
+    camera, pixels = pipeline.datamanager.eval_dataset.cameras[:1], 28 * 32
+
+    def cost() -> float:
+        rendered.clear()
+        with evaluated(pipeline.model), detail_shown(True):
+            pipeline.model.get_outputs_for_camera(camera)
+        return sum(rendered) / pixels
+
+    first = cost()
+    assert 1 < first <= 1 + plugin_detail.PICTURES
+    assert cost() == 1
+    grey = pipeline.model.forward
+    monkeypatch.setattr(pipeline.model, "forward", original)
+    trained_step(0)
+    monkeypatch.setattr(pipeline.model, "forward", grey)
+    assert cost() == first
+    pipeline.load_state_dict(state)
+    assert cost() == first
+
+
+def test_few_are_kept_where_pictures_are_large(tmp_path, monkeypatch):
+    pipeline = build(write_scene(tmp_path))
+    dataset = pipeline.datamanager.train_dataset
+    assert TrainingDetail(pipeline.model, dataset).kept == plugin_detail.MOST_BYTES // (8 * 28 * 32)
+    monkeypatch.setattr(plugin_detail, "MOST_BYTES", 1)
+    detail = TrainingDetail(pipeline.model, dataset)
+    assert detail.kept == plugin_detail.PICTURES + 1 and detail.of_picture.cache_info().maxsize == detail.kept
+    with evaluated(pipeline.model):
+        kept = detail.of_picture(0)
+    held = sum(each.element_size() * each.nelement() for each in (kept.colours, kept.distance))
+    assert held == plugin_detail.BYTES_A_PIXEL * 28 * 32
+
+
+def test_detail_is_without_the_pictures_exposure(tmp_path, monkeypatch):
+    pipeline = build(write_scene(tmp_path))
+    grey_ball(pipeline, monkeypatch)
+    straight = errors(pipeline)[1]
+    gains = pipeline.model.exposure.log_gains
+    gains.data = torch.randn(gains.shape, generator=torch.Generator().manual_seed(0)) * 0.3
+    pipeline.detail.forget()
+    assert errors(pipeline)[1] > 1.5 * straight
+    # pictures taken with these gains
+    dataset, factors = pipeline.datamanager.train_dataset, pipeline.model.exposure.gains.detach()
+    original = type(dataset).__getitem__
+
+    def exposed(self, number):
+        item = original(self, number)
+        return {**item, "image": item["image"] * factors[number]} if self is dataset else item
+
+    monkeypatch.setattr(type(dataset), "__getitem__", exposed)
+    pipeline.detail.forget()
+    assert errors(pipeline)[1] == pytest.approx(straight, rel=0.01)
+
+
+def test_detail_is_seen_from_where_training_has_moved_the_cameras(tmp_path, monkeypatch):
+    scene = write_scene(tmp_path)
+    right = build(scene)
+    grey_ball(right, monkeypatch)
+    straight = errors(right)[1]
+    meta = read_json(scene / "transforms.json")
+    # training pictures are said to be 0.8 m beside where they were taken, every other one to the other side
+    train = set(meta["train_filenames"])
+    signs = iter([1.0, -1.0] * len(train))
+    moved = {name: next(signs) for name in sorted(train)}
+    for frame in meta["frames"]:
+        frame["transform_matrix"][1][3] += 0.8 * moved.get(frame["file_path"], 0.0)
+    write_json(scene / "transforms.json", meta)
+    wrong = build(scene, poses="SO3xR3")
+    grey_ball(wrong, monkeypatch)
+    assert errors(wrong)[1] > 1.3 * straight
+    optimizer = wrong.model.camera_optimizer
+    names = [f"images/{file.name}" for file in wrong.datamanager.train_dataset.image_filenames]
+    back = wrong.datamanager.train_dataset._dataparser_outputs.dataparser_transform[:3, 1]
+    with torch.no_grad():
+        offs = torch.stack([-0.8 * moved[name] * back for name in names])
+        optimizer.pose_adjustment[:, :3] = (offs - offs.mean(dim=0)) / optimizer.config.sigma_m
+    wrong.detail.forget()
+    assert errors(wrong)[1] < 1.05 * straight
+
+
+@pytest.mark.parametrize("implementation", ["fused", "torch"])
+def test_with_an_embedding_a_picture_is_rendered_as_it_looks(tmp_path, implementation):
+    pipeline = build(write_scene(tmp_path), exposure="embedding", depth_loss="none", implementation=implementation)
+    model, camera = pipeline.model, pipeline.datamanager.train_dataset.cameras[:1]
+    with torch.no_grad():
+        model.field.embedding_appearance.embedding.weight.normal_(0, 20.0)
+    with evaluated(model):
+        usual = model.rendered_alone(camera)["rgb"]
+        with model.with_appearance_of(2):
+            third = model.rendered_alone(camera)["rgb"]
+        with model.with_appearance_of(3):
+            fourth = model.rendered_alone(camera)["rgb"]
+        assert torch.equal(model.rendered_alone(camera)["rgb"], usual)
+        # a mean of one picture is that picture's
+        model.field.embedding_appearance.embedding.weight[:] = model.field.embedding_appearance.embedding.weight[
+            2
+        ].clone()
+        torch.testing.assert_close(model.rendered_alone(camera)["rgb"], third)
+    assert float((third - usual).abs().max()) > 0.01 and float((third - fourth).abs().max()) > 0.01
+
+
+# ---- judged ---------------------------------------------------------------------------------------------------------
+
+
+def test_views_are_judged_with_detail_beside_those_without(tmp_path, monkeypatch):
+    scene = write_scene(tmp_path / "scene", frames=17)
+    meta = read_json(scene / "transforms.json")
+    for frame in meta["frames"]:
+        frame["camera"] = "only"
+    held_out = next(frame for frame in meta["frames"] if frame["file_path"] == meta["test_filenames"][0])
+    files = {key: held_out[key] for key in ("truth_rgb_file_path", "truth_distance_file_path")}
+    meta["shifted_views"] = {"1": [{"camera": "only", "transform_matrix": held_out["transform_matrix"], **files}]}
+    write_json(scene / "transforms.json", meta)
+    pipeline = build(scene)
+    grey_ball(pipeline, monkeypatch)
+    told: list[int] = []
+    judge = ViewJudge(pipeline, lambda: told.append(1))
+    beside = shifted_views(scene, pipeline.datamanager.eval_dataset)
+    plain, _ = judge.held_out(tmp_path / "views")
+    plain |= judge.shifted(beside)
+    found = judge.with_detail(tmp_path / "views", beside)
+    for name in ("masked_psnr", "truth_masked_psnr", "shifted_1m_masked_psnr"):
+        assert found[f"detail_{name}"] > plain[name] + 6, name
+    assert all("masked_" in name for name in found)
+    count = len(pipeline.datamanager.eval_dataset)
+    assert len(told) == 2 * (count + 1)
+    assert len([*(tmp_path / "views").glob("eval_detail_*.png")]) == count
+    assert len([*(tmp_path / "views").glob("eval_img_*.png")]) == count
