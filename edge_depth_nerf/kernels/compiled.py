@@ -11,7 +11,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numba import njit
+from torch import Tensor
 
 TRAINING = (
     "edge_depth_nerf.kernels.hash_grid_numba",
@@ -47,6 +49,11 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any
             return njit(nogil=True, **options)(function)
 
     return decorate
+
+
+def flat(values: Tensor) -> np.ndarray:
+    """A tensor's numbers in a row, for a kernel; of a contiguous one the same memory."""
+    return values.detach().contiguous().view(-1).numpy()
 
 
 def compiled_before(modules: Sequence[str] = TRAINING) -> bool:

@@ -24,7 +24,7 @@ from numba import types
 from numba.extending import intrinsic
 from torch import Tensor
 
-from edge_depth_nerf.kernels.compiled import compiled
+from edge_depth_nerf.kernels.compiled import compiled, flat
 from edge_depth_nerf.kernels.threads import in_parts, kernel_threads, share_out, stretches
 
 TILE = 64
@@ -244,18 +244,13 @@ def _by_column(values: Tensor) -> np.ndarray:
     return turned
 
 
-def _flat(table: Tensor) -> np.ndarray:
-    """A table's numbers, row after row."""
-    return table.detach().contiguous().view(-1).numpy()
-
-
 def encode(
     positions: Float[Tensor, "points 3"], table: Float[Tensor, "rows features"], scalings: Float[Tensor, "levels"]
 ) -> Float[Tensor, "points encoded"]:
     """Encode points, float32; see `hash_grid`."""
     points, levels = len(positions), len(scalings)
     encoded = torch.empty(points, levels * table.shape[1])
-    arrays = _by_column(positions), _flat(table), (0,) * table.shape[1], scalings.numpy(), encoded.numpy()
+    arrays = _by_column(positions), flat(table), (0,) * table.shape[1], scalings.numpy(), encoded.numpy()
     share_out(lambda part: _encode_points(*arrays, *part), stretches(points, _threads(points, levels)))
     return encoded
 
@@ -337,7 +332,7 @@ def position_gradient(
     result = torch.empty(points, 3)
     arrays = (
         _by_column(positions),
-        _flat(table),
+        flat(table),
         (0,) * table.shape[1],
         scalings.numpy(),
         gradient.detach().contiguous().numpy(),

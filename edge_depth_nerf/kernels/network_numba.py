@@ -24,7 +24,7 @@ from numba import types
 from numba.extending import intrinsic
 from torch import Tensor
 
-from edge_depth_nerf.kernels.compiled import compiled
+from edge_depth_nerf.kernels.compiled import compiled, flat
 from edge_depth_nerf.kernels.threads import kernel_threads, share_out, stretches
 
 TILE = 96
@@ -360,25 +360,21 @@ class Arrays:
         # [in, out] each
         down, begins = _packed([weight.T for weight in self.weights])
         self.ins = np.array([*(weight.shape[1] for weight in weights), len(weights[-1])])
-        self.shared = _flat(biases[joint])
+        self.shared = flat(biases[joint])
         self.biases, begins_of_biases = _packed([bias.detach().numpy()[:1] for bias in biases])
         # where each layer's bias begins, behind where its weights do
         self.begins = np.concatenate([begins, begins_of_biases])
         group = self.points if self.groups == 1 else self.points // self.groups
         self.step = 1 if self.groups == 1 else group
-        joined = np.empty(0, np.float32) if more is None else _flat(more)
+        joined = np.empty(0, np.float32) if more is None else flat(more)
         self.joint, self.joins = joint, more is not None
-        self.arrays = _flat(x), self.ins, 0 if more is None else more.shape[1], joint, down, self.begins
+        self.arrays = flat(x), self.ins, 0 if more is None else more.shape[1], joint, down, self.begins
         self.of_groups = self.biases, self.shared, joined, group
 
     def parts(self) -> list[tuple[int, int]]:
         """Equal parts of the points for the threads, of whole groups."""
         threads = max(1, min(kernel_threads(), self.points // LEAST_SHARE))
         return [(first * self.step, last * self.step) for first, last in stretches(self.points // self.step, threads)]
-
-
-def _flat(values: Tensor) -> np.ndarray:
-    return values.detach().contiguous().view(-1).numpy()
 
 
 def _unpacked(packed: np.ndarray, begins: np.ndarray, shapes: Sequence[Sequence[int]]) -> list[np.ndarray]:
@@ -395,7 +391,7 @@ def _unpacked(packed: np.ndarray, begins: np.ndarray, shapes: Sequence[Sequence[
 def forward(net: Arrays) -> Tensor:
     """Apply a network; see `network`."""
     result = torch.empty(net.points, len(net.weights[-1]))
-    write_forward(net, _flat(result), 0)
+    write_forward(net, flat(result), 0)
     return result
 
 
@@ -412,7 +408,7 @@ def write_forward(net: Arrays, result: np.ndarray, to_number: int) -> None:
 def backward(net: Arrays, gradient: Tensor, follow_x: bool) -> tuple[Tensor | None, list[Tensor], list[Tensor]]:
     """Give the gradients to the inputs (None unless `follow_x`), to the weights and to the biases."""
     to_x = torch.empty(net.points if follow_x else 0, int(net.ins[0]))
-    to_parameters = write_backward(net, _flat(gradient), 0, _flat(to_x))
+    to_parameters = write_backward(net, flat(gradient), 0, flat(to_x))
     to_weights, to_biases = ([torch.from_numpy(each) for each in arrays] for arrays in to_parameters)
     return (to_x if follow_x else None), to_weights, to_biases
 

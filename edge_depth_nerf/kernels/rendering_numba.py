@@ -18,13 +18,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from edge_depth_nerf.kernels.compiled import compiled
+from edge_depth_nerf.kernels.compiled import compiled, flat
 from edge_depth_nerf.kernels.exponential_numba import exp
 from edge_depth_nerf.kernels.pointwise_numba import STEEPEST
 from edge_depth_nerf.kernels.rendering import Behind, Rendered
 from edge_depth_nerf.kernels.threads import in_parts
 
 ZERO, ONE = np.float32(0), np.float32(1)
+LAST_SAMPLE, SINGLE_POINT = int(Behind.LAST_SAMPLE), int(Behind.SINGLE_POINT)
 LEAST_SHARE = 1 << 13
 """A thread gets at least so many points."""
 
@@ -76,13 +77,13 @@ def _render(
             total = 0.0
             for k in range(samples):
                 total += depths[k]
-            if behind == 1:
+            if behind == LAST_SAMPLE:
                 total += (1 - hit) * _sigmoid(of_ray[samples - 1])
-            elif behind == 2:
+            elif behind == SINGLE_POINT:
                 total += (1 - hit) * _sigmoid(plane[begin_of_singles + ray])
             rgb[3 * ray + c] = total
     # each part takes its share of the points that are not behind a ray
-    begin_of_further = begin_of_singles + (rays if behind == 2 else 0)
+    begin_of_further = begin_of_singles + (rays if behind == SINGLE_POINT else 0)
     count = points - begin_of_further
     from_point, to_point = count * first // rays, count * last // rays
     for c in range(3):
@@ -116,9 +117,9 @@ def _gradients(
         to_hit = to_accumulation[ray]
         for c in range(3):
             g = to_rgb[3 * ray + c]
-            if behind == 1:
+            if behind == LAST_SAMPLE:
                 to_hit -= g * _sigmoid(values[(c + 1) * points + begin + samples - 1])
-            elif behind == 2:
+            elif behind == SINGLE_POINT:
                 to_hit -= g * _sigmoid(values[(c + 1) * points + begin_of_singles + ray])
         for k in range(samples):
             of_weight[k] = given[k] + to_hit
@@ -131,10 +132,10 @@ def _gradients(
                 of_weight[k] += g * colour
                 own = weight[k] if weight[k] == weight[k] else ZERO
                 into_ray[k] = g * own * colour * (ONE - colour)
-            if behind == 1:
+            if behind == LAST_SAMPLE:
                 colour = _sigmoid(of_ray[samples - 1])
                 into_ray[samples - 1] += g * left * colour * (ONE - colour)
-            elif behind == 2:
+            elif behind == SINGLE_POINT:
                 colour = _sigmoid(plane[begin_of_singles + ray])
                 to_plane[begin_of_singles + ray] = g * left * colour * (ONE - colour)
         # Σ_j>k g_j w_j, of what lies behind each sample; 0 times what is not a number is none: a broken training shows
@@ -147,7 +148,7 @@ def _gradients(
             slope = most * within[k] if before[k] > steepest else densities[k]
             slope = least * within[k] if before[k] < -steepest else slope
             into[k] = to_density * slope
-    begin_of_further = begin_of_singles + (rays if behind == 2 else 0)
+    begin_of_further = begin_of_singles + (rays if behind == SINGLE_POINT else 0)
     count = points - begin_of_further
     from_point, to_point = count * first // rays, count * last // rays
     for c in range(3):
@@ -164,10 +165,6 @@ def _gradients(
         to_values[k] = ZERO
 
 
-def _flat(values: Tensor) -> np.ndarray:
-    return values.detach().contiguous().view(-1).numpy()
-
-
 class _Rendering(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -179,9 +176,9 @@ class _Rendering(torch.autograd.Function):
         rendered = Rendered(
             torch.empty(rays, 3), torch.empty(rays, 1), torch.empty(rays, samples), torch.empty(further, 3)
         )
-        ctx.given = _flat(values), _flat(inside), _flat(deltas), np.float32(scale), int(behind)
+        ctx.given = flat(values), flat(inside), flat(deltas), np.float32(scale), int(behind)
         ctx.counts = rays, samples, singles
-        arrays = *ctx.given, *(_flat(each) for each in rendered), *ctx.counts
+        arrays = *ctx.given, *(flat(each) for each in rendered), *ctx.counts
         in_parts(lambda first, last: _render(*arrays, first, last), rays, _least_rays(ctx.counts))
         # finds out if it was changed since
         ctx.save_for_backward(values)
@@ -193,7 +190,7 @@ class _Rendering(torch.autograd.Function):
         (values,) = ctx.saved_tensors
         rays, samples, singles = ctx.counts
         to_values = torch.empty(values.shape)
-        arrays = *ctx.given, *(_flat(each) for each in gradients), _flat(to_values), rays, samples, singles
+        arrays = *ctx.given, *(flat(each) for each in gradients), flat(to_values), rays, samples, singles
         steepest = np.float32(STEEPEST)
         in_parts(lambda first, last: _gradients(*arrays, steepest, first, last), rays, _least_rays(ctx.counts))
         return to_values, None, None, None, None
