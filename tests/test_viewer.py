@@ -330,6 +330,37 @@ def test_the_speed_of_a_gpu_counts_what_was_only_asked_for(machine, monkeypatch)
     assert waited_for == ["cuda"] and 0 < machine._rays_per_s <= 600 / 0.05
 
 
+def test_complete_pictures_alone_have_detail_and_none_during_a_training(machine, pipeline, monkeypatch):
+    detail, rendered = pipeline.detail, []
+
+    def render(*_) -> dict[str, torch.Tensor]:
+        rendered.append(detail.is_shown)
+        return {"rgb": torch.zeros(20, 30, 3)}
+
+    monkeypatch.setattr(RenderStateMachine, "_render_img", render)
+    layers = pipeline.drive.layers
+    monkeypatch.setattr(layers, "viewer", SimpleNamespace(trainer=None), raising=False)
+    machine._shows_detail = layers.shows_detail
+    # the training's own setting does not matter here
+    monkeypatch.setattr(pipeline.model.config, "detail", True)
+    states = ("low_move", "low_static", "middle", "high")
+    assert not layers.detail.value
+    for value in (False, True):
+        layers.detail.value = value
+        for machine.state in states:
+            machine._render_img(reported(0.0))
+    layers.viewer.trainer = SimpleNamespace(training_state="training")
+    machine._render_img(reported(0.0))
+    layers.viewer.trainer.training_state = "completed"
+    machine._render_img(reported(0.0))
+    assert rendered == [False] * 7 + [True, False, True]
+    assert detail.is_shown
+
+
+def test_the_switch_of_detail_begins_as_the_training_has_it(scene):
+    assert [pipeline_of(scene, detail=on).drive.layers.detail.value for on in (False, True)] == [False, True]
+
+
 def test_a_movement_ends_a_fine_picture_and_no_other(machine):
     for number, (machine.state, machine._is_rendering) in enumerate(
         [("low_move", True), ("middle", False), ("high", False)]
@@ -610,7 +641,7 @@ def changed(one: np.ndarray, other: np.ndarray) -> int:
 def test_the_page_shows_the_scene(page, training):
     picture = settled(page)
     assert picture.std(axis=(0, 1)).max() > 5  # not blank
-    for label in ("Lenses", "Path", "LiDAR points", "Depth prior"):
+    for label in ("Lenses", "Path", "LiDAR points", "Depth prior", "Detail of training pictures"):
         assert page.get_by_label(label).count() == 1, label
     until(lambda: "distance_coloured" in training.viewer.control_panel._output_render.options)
 

@@ -117,7 +117,8 @@ def pictures_that_see(
         Their numbers, the best first; fewer if fewer see anything.
 
     """
-    some = torch.linspace(0, len(distance) - 1, min(SOME_POINTS, len(distance)), device=distance.device).long()
+    count = min(SOME_POINTS, len(distance))
+    some = torch.arange(count, device=distance.device) * len(distance) // max(1, count)
     origins, directions, distance = origins[some], directions[some], distance[some]
     points = origins + directions * distance[:, None]
     worth = []

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,8 @@ import torch
 import torch.nn.functional as F
 from nerfstudio.viewer.render_state_machine import RenderAction, RenderStateMachine
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
+
+from edge_depth_nerf.plugin.detail import detail_shown
 
 if TYPE_CHECKING:
     import viser
@@ -40,12 +43,22 @@ SHOWN_PX = 512
 class CoarseToFine(RenderStateMachine):
     """Chooses what a browser receives: a coarse picture while the camera moves, then finer ones."""
 
-    def __init__(self, viewer: Viewer, client: viser.ClientHandle) -> None:
-        """Render for one browser; nothing is rendered before `begin`."""
+    def __init__(
+        self, viewer: Viewer, client: viser.ClientHandle, shows_detail: Callable[[], bool] = lambda: False
+    ) -> None:
+        """Render for one browser; nothing is rendered before `begin`.
+
+        Args:
+            viewer: nerfstudio's.
+            client: the browser.
+            shows_detail: whether complete pictures are to have the detail of training pictures.
+
+        """
         super().__init__(viewer, VISER_NERFSTUDIO_SCALE_RATIO, client)
         self._moves: dict[str, dict[str, str]] = self.transitions  # pyright: ignore[reportAttributeAccessIssue]
         self._moves["low_static"]["static"] = "middle"
         self._moves["middle"] = {"static": "high", "step": "high", "move": "low_move", "rerender": "low_static"}
+        self._shows_detail = shows_detail
         self._rays_per_s = FIRST_RAYS_PER_S
         self._is_rendering = False
         self._requested: CameraState | None = None
@@ -114,7 +127,9 @@ class CoarseToFine(RenderStateMachine):
         started = time.perf_counter()
         self._is_rendering, self._rendered = True, camera_state
         try:
-            outputs = super()._render_img(camera_state)
+            # a coarse picture has none, and is to come soon
+            with detail_shown(self.state == "high" and self._shows_detail()):
+                outputs = super()._render_img(camera_state)
             if outputs["rgb"].is_cuda:
                 torch.cuda.synchronize(outputs["rgb"].device)  # until here it was only asked for
         finally:
@@ -164,11 +179,13 @@ def _enlarged(values: Any, size: tuple[int, int]) -> Any:
     return F.interpolate(channels_first, size, mode="bilinear", align_corners=False)[0].permute(1, 2, 0).to(dtype)
 
 
-def render_coarse_to_fine(viewer: Viewer, client: viser.ClientHandle, first: CameraState) -> None:
+def render_coarse_to_fine(
+    viewer: Viewer, client: viser.ClientHandle, first: CameraState, shows_detail: Callable[[], bool]
+) -> None:
     """Serve a new browser with `CoarseToFine`, which was sent away from its `first` view."""
     before = viewer.render_statemachines[client.client_id]
     # an idle machine checks its flag only after a rendering, or if its picture is complete
     before.state, before.running = "high", False
-    machine = CoarseToFine(viewer, client)
+    machine = CoarseToFine(viewer, client, shows_detail)
     viewer.render_statemachines[client.client_id] = machine
     machine.begin(first)

@@ -96,7 +96,7 @@ class EdgeDepthPipeline(VanillaPipeline):
         assert isinstance(self.model, EdgeDepthNerfModel)
         self.detail = self.model.detail = TrainingDetail(self.model, manager.train_dataset)
         self.model.register_load_state_dict_post_hook(lambda *_: self.detail.forget())
-        self.drive = DrivePanel(manager)
+        self.drive = DrivePanel(manager, model.detail)
         self._odd_steps: torch.Tensor | None = None
         self.graphs: StepGraphs | None = None
 

@@ -177,7 +177,7 @@ def _viser_rotation(pose: Float64[np.ndarray, "3 4"]) -> viser.transforms.SO3:
 class DriveLayers(ViewerControl):
     """Draws the layers. nerfstudio calls `_setup` when its viewer is ready."""
 
-    def __init__(self, manager: FisheyeDepthDataManager) -> None:
+    def __init__(self, manager: FisheyeDepthDataManager, shows_detail: bool) -> None:
         self.manager = manager
         sampler = manager.train_pixel_sampler
         has_prior = sampler is not None and sampler.table.share_with_prior > 0
@@ -196,6 +196,12 @@ class DriveLayers(ViewerControl):
             list(COLOURS),
             cb_hook=lambda _: self._recolour(),
             hint="Sigma of the prior: dark is certain (0.05 m), bright is uncertain (20 m)",
+        )
+        self.detail = ViewerCheckbox(
+            "Detail of training pictures",
+            shows_detail,
+            cb_hook=lambda _: self.viewer._trigger_rerender(),
+            hint="After training: adds what training pictures show beyond their renderings. New places take longer",
         )
         self._frames: dict[str, viser.FrameHandle] = {}
         self._clouds: dict[str, Cloud] = {}
@@ -221,7 +227,7 @@ class DriveLayers(ViewerControl):
         """Put the layers' switches above the panel's tabs, where they are visible at once."""
         gui = viewer.viser_server.gui
         with gui.add_folder(FOLDER, order=viewer.stats_markdown.order + 0.5):
-            for element in (*self.switches.values(), self.meaning):
+            for element in (*self.switches.values(), self.meaning, self.detail):
                 element.install(viewer.viser_server)
         labels = ", ".join(switch.name for switch in self.switches.values() if not switch.disabled)
         CONSOLE.print(f"The viewer's panel switches these layers on and off: {labels}.")
@@ -239,7 +245,12 @@ class DriveLayers(ViewerControl):
             client.camera.wxyz = _viser_rotation(pose).wxyz
         self.viewer.current_camera_idx = index
         self.viewer.update_step(self.viewer.step)
-        render_coarse_to_fine(self.viewer, client, first)
+        render_coarse_to_fine(self.viewer, client, first, self.shows_detail)
+
+    def shows_detail(self) -> bool:
+        """Return whether complete pictures have detail: never during a training, which changes it at each step."""
+        trainer = self.viewer.trainer
+        return bool(self.detail.value) and (trainer is None or trainer.training_state != "training")
 
     def _hide_lenses(self, hidden: bool) -> None:
         self._hidden = hidden
@@ -389,6 +400,6 @@ class DriveLayers(ViewerControl):
 class DrivePanel(torch.nn.Module):
     """A module that contains the layers: nerfstudio searches the pipeline's modules for viewer controls."""
 
-    def __init__(self, manager: FisheyeDepthDataManager) -> None:
+    def __init__(self, manager: FisheyeDepthDataManager, shows_detail: bool) -> None:
         super().__init__()
-        self.layers = DriveLayers(manager)
+        self.layers = DriveLayers(manager, shows_detail)
