@@ -107,6 +107,11 @@ def test_a_folder_keeps_what_its_runs_share(tmp_path, monkeypatch):
         command.compare(replace(first, preset="full"), QUIET)
     with pytest.raises(InputError, match="detail False, not True"):
         command.compare(replace(first, detail=True), QUIET)
+    # what a version without --detail began
+    for file in (output / "compare.json", output / "runs" / "x" / "nerfacto_seed-0" / "run.json"):
+        write_json(file, {name: value for name, value in read_json(file).items() if name != "detail"})
+    with pytest.raises(Stop):
+        command.compare(first, QUIET)
     with monkeypatch.context() as patched:
         # said at once, not after whoever writes there
         patched.setattr(command, "only_writer", lambda *_: pytest.fail("waits for the folder"))

@@ -130,6 +130,22 @@ def test_judging_gives_the_figures_of_ns_eval(finished):
 
 
 @pytest.mark.slow
+def test_a_finished_training_gets_detail_by_a_line_of_its_configuration(finished, tmp_path):
+    """As docs/method.md says."""
+    asked, results = finished
+    copied(asked.output, tmp_path / "out")
+    run = next(run for run in results.runs if run.method == "edge")
+    config = next((tmp_path / "out" / run.folder.relative_to(asked.output)).rglob("config.yml"))
+    before = config.read_text().splitlines()
+    subprocess.run(["sed", "-i", "s/detail: false/detail: true/", config], check=True)
+    after = config.read_text().splitlines()
+    assert [line.strip() for line, other in zip(after, before, strict=True) if line != other] == ["detail: true"]
+    _, pipeline, *_ = eval_setup(config, test_mode="test")
+    found: Any = pipeline.get_average_eval_image_metrics()
+    assert found["truth_masked_psnr"] == pytest.approx(run.figures["detail_truth_masked_psnr"], abs=1e-3)
+
+
+@pytest.mark.slow
 def test_what_is_there_is_not_done_again(finished, monkeypatch):
     asked, results = finished
     monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: pytest.fail("started a command"))

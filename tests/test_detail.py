@@ -107,9 +107,37 @@ def test_the_pictures_that_see_most_come_first_and_blind_ones_never():
     lens = pinhole(64, 56)
     _, distance, origins, directions, _ = seen(lens, at(0.0))
     pictures = [(lens, opengl(at(0.1, angle))) for angle in (np.pi, 0.5, 0.0, -0.2)]
-    assert pictures_that_see(origins, directions, distance.flatten(), pictures, 8) == [2, 3, 1]
-    assert pictures_that_see(origins, directions, distance.flatten(), pictures, 2) == [2, 3]
+    found = pictures_that_see(origins, directions, distance.flatten(), pictures, 8)
+    assert found[0] == 2 and sorted(found) == [1, 2, 3]
+    assert pictures_that_see(origins, directions, distance.flatten(), pictures, 2) == found[:2]
     assert pictures_that_see(origins, directions, distance.flatten(), [], 2) == []
+
+
+def test_pictures_are_chosen_that_together_see_a_view():
+    """Of eight alike and one that looks elsewhere, one is of each kind before a second of the same."""
+    lens, turn = pinhole(64, 56), np.pi / 2
+    both = [seen(lens, at(0.0, angle)) for angle in (0.0, turn)]
+    origins, directions = (torch.cat([each[place] for each in both]) for place in (2, 3))
+    distance = torch.cat([each[1].flatten() for each in both])
+    pictures = [*((lens, opengl(at(0.01 * number))) for number in range(8)), (lens, opengl(at(0.5, turn)))]
+    assert set(pictures_that_see(origins, directions, distance, pictures, 2)) == {0, 8}
+
+
+def test_undefined_rays_get_nothing_and_take_nothing_from_others():
+    """nerfstudio's rays at the rim of a lens can be no numbers."""
+    lens, pose = fisheye(64, 56), at(0.5)
+    _, distance, origins, directions, valid = seen(lens, pose)
+    distance, broken = distance.flatten(), directions.clone()
+    broken[0] = torch.nan
+    pictures = [(lens, opengl(at(0.2)))]
+    assert pictures_that_see(origins, broken, distance, pictures, 8) == [0]
+    details = [grey_detail(lens, at(0.2))]
+    added, whole = (carried(origins, each, distance, details) for each in (broken, directions))
+    assert torch.equal(added[0], torch.zeros(3)) and torch.equal(added[1:], whole[1:])
+    assert float(whole[valid.flatten()].abs().max()) > 0.1
+    # nor does an exposure that is nearly 0
+    huge = detail_of(lens, opengl(at(0.2)), torch.full((56, 64, 3), 1e6), torch.ones(56, 64), valid)
+    assert float(carried(origins, directions, distance, [huge]).abs().max()) <= 1
 
 
 # ---- exposures ------------------------------------------------------------------------------------------------------
@@ -271,15 +299,29 @@ def test_detail_is_without_the_pictures_exposure(tmp_path, monkeypatch):
     assert errors(pipeline)[1] > 1.5 * straight
     # pictures taken with these gains
     dataset, factors = pipeline.datamanager.train_dataset, pipeline.model.exposure.gains.detach()
-    original = type(dataset).__getitem__
-
-    def exposed(self, number):
-        item = original(self, number)
-        return {**item, "image": item["image"] * factors[number]} if self is dataset else item
-
-    monkeypatch.setattr(type(dataset), "__getitem__", exposed)
+    original = dataset.rgb
+    monkeypatch.setattr(dataset, "rgb", lambda number: original(number) * factors[number].numpy())
     pipeline.detail.forget()
     assert errors(pipeline)[1] == pytest.approx(straight, rel=0.01)
+
+
+def test_overexposed_pixels_do_not_darken_what_is_bright(tmp_path, monkeypatch):
+    pipeline = build(write_scene(tmp_path))
+    grey_ball(pipeline, monkeypatch)
+    dataset, gains = pipeline.datamanager.train_dataset, pipeline.model.exposure.log_gains
+    gains.data[0] = 1.5
+    gain = float(pipeline.model.exposure.gains[0, 0])
+    assert 1 / gain < GREY
+    # white, and below it, in a picture of a long exposure
+    picture = np.full((28, 32, 3), 255, np.uint8)
+    picture[14:] = 100
+    monkeypatch.setattr(dataset, "rgb", lambda _: picture)
+    usable = torch.from_numpy(dataset.mask(0))
+    with evaluated(pipeline.model):
+        colours = pipeline.detail.of_picture(0).colours
+    above, below = colours[:, :14][:, usable[:14]], colours[:, 14:][:, usable[14:]]
+    assert float(above.abs().max()) == 0 and above.numel() > 100
+    torch.testing.assert_close(below, torch.full_like(below, 100 / 255 / gain - GREY), atol=1e-3, rtol=0)
 
 
 def test_detail_is_seen_from_where_training_has_moved_the_cameras(tmp_path, monkeypatch):

@@ -354,6 +354,10 @@ def test_complete_pictures_alone_have_detail_and_none_during_a_training(machine,
     layers.viewer.trainer.training_state = "completed"
     machine._render_img(reported(0.0))
     assert rendered == [False] * 7 + [True, False, True]
+    # a picture with detail says nothing of the machine's speed
+    speed = machine._rays_per_s
+    machine._render_img(reported(0.0))
+    assert rendered[-1] and machine._rays_per_s == speed
     assert detail.is_shown
 
 

@@ -46,6 +46,8 @@ SEARCH, COMPARISON = "search", "comparison"
 GRID_PAGE = "grid.md"
 """The two folders of a grid, and its page."""
 LOG = "run.log"
+WITHOUT_DETAIL = {"detail": False}
+"""What files of versions before `--detail` do not name."""
 VIEWS_SHOWN = 3
 MAX_SETTING = 1e6
 """No λ or σ is larger."""
@@ -345,7 +347,7 @@ def _record(options: CompareOptions, tuned: dict[str, Setting]) -> dict[str, Any
     }
     path = options.output / RECORD
     if path.is_file():
-        found = read_json_object(path)
+        found = {**WITHOUT_DETAIL, **read_json_object(path)}
         added = [name for name in record["tuned"] if name not in found.get("tuned", {})]
         if not [run for name in added for run in options.output.glob(f"runs/*/{name}_seed-*")]:
             # methods that have no run yet may be tuned later than the others
@@ -391,7 +393,7 @@ class Run:
         """
         path, wanted = self.folder / SPECIFICATION, self.specification.to_dict()
         if path.is_file():
-            found = read_json_object(path)
+            found = {**WITHOUT_DETAIL, **read_json_object(path)}
             different = [name for name in wanted if wanted[name] != found.get(name)]
             if different:
                 name = different[0]

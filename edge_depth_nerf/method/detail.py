@@ -53,13 +53,13 @@ def detail_of(
     Args:
         lens: the picture's.
         pose: camera to scene, as in `Detail`.
-        beyond: its colours less its rendering's.
+        beyond: its colours less its rendering's; more than 1 counts as 1.
         distance: rendered, in the scene's unit.
         usable: which pixels count.
 
     """
     # half the memory; rounding is 0.05 %, much less than AGREEMENT
-    colours = torch.where(usable[..., None], beyond, 0).movedim(-1, 0).half()
+    colours = torch.where(usable[..., None], beyond, 0).clamp(-1, 1).movedim(-1, 0).half()
     return Detail(lens, pose, colours.contiguous(), torch.where(usable, distance, 0)[None].half())
 
 
@@ -104,7 +104,10 @@ def pictures_that_see(
     pictures: Sequence[tuple[Camera, Float[Tensor, "3 4"]]],
     most: int,
 ) -> list[int]:
-    """Choose the pictures that see most of a view, as far as lenses and poses tell.
+    """Choose the pictures that together see most of a view, as far as lenses and poses tell.
+
+    One after the other, always the one that adds most to what the others show: two pictures of one place in one
+    direction add less than two of different directions.
 
     Args:
         origins: of the view's rays.
@@ -114,23 +117,33 @@ def pictures_that_see(
         most: at most so many are chosen.
 
     Returns:
-        Their numbers, the best first; fewer if fewer see anything.
+        Their numbers, in the order of choice; fewer if fewer see anything.
 
     """
     count = min(SOME_POINTS, len(distance))
     some = torch.arange(count, device=distance.device) * len(distance) // max(1, count)
     origins, directions, distance = origins[some], directions[some], distance[some]
     points = origins + directions * distance[:, None]
-    worth = []
+    rows = []
     for lens, pose in pictures:
         place, to_points, from_picture = seen_from(lens, pose, points)
         inside = (place.abs() < 1).all(-1)
-        worth.append((inside * _counts(directions, distance, to_points, from_picture)).sum())
-    if not worth:
-        return []
-    sums = torch.stack(worth)
-    best = sums.argsort(descending=True, stable=True)[:most]
-    return best[sums[best] > 0].tolist()
+        # a ray of nerfstudio's can be undefined, at the rim of a lens
+        rows.append(torch.where(inside, _counts(directions, distance, to_points, from_picture), 0).nan_to_num(nan=0.0))
+    chosen: list[int] = []
+    if not rows:
+        return chosen
+    counts, total = torch.stack(rows), torch.zeros_like(distance)
+    for _ in range(min(most, len(rows))):
+        together = total + counts
+        added = (together / (together + LEAST) - total / (total + LEAST)).sum(dim=-1)
+        added[chosen] = 0
+        best = int(added.argmax())
+        if not added[best] > 0:
+            break
+        chosen.append(best)
+        total = total + counts[best]
+    return chosen
 
 
 def carried(
@@ -167,7 +180,7 @@ def _carried(origins: Tensor, directions: Tensor, distance: Tensor, details: lis
         # between an edge's two sides nothing has the distance halfway
         rendered = _looked_up(detail.distance, place, "nearest")[:, 0]
         agrees = torch.exp(-0.5 * ((rendered / from_picture.clamp(min=1e-9) - 1) / AGREEMENT).square())
-        weight = agrees * _counts(directions, distance, to_points, from_picture)
+        weight = (agrees * _counts(directions, distance, to_points, from_picture)).nan_to_num(nan=0.0)
         total += weight[:, None] * _looked_up(detail.colours, place, "bilinear")
         weights += weight
     return total / weights[:, None]

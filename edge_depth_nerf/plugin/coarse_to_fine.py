@@ -128,14 +128,16 @@ class CoarseToFine(RenderStateMachine):
         self._is_rendering, self._rendered = True, camera_state
         try:
             # a coarse picture has none, and is to come soon
-            with detail_shown(self.state == "high" and self._shows_detail()):
+            with_detail = self.state == "high" and self._shows_detail()
+            with detail_shown(with_detail):
                 outputs = super()._render_img(camera_state)
             if outputs["rgb"].is_cuda:
                 torch.cuda.synchronize(outputs["rgb"].device)  # until here it was only asked for
         finally:
             self._is_rendering = False
         rays = outputs["rgb"].shape[0] * outputs["rgb"].shape[1]
-        self._rays_per_s = rays / max(time.perf_counter() - started, 1e-6)
+        if not with_detail:  # whose time is that of other pictures, too
+            self._rays_per_s = rays / max(time.perf_counter() - started, 1e-6)
         if self.state == "middle":
             # small pictures underrate the machine: once more, if its time is now enough for a much finer one
             affordable, _ = self._calculate_image_res(camera_state.aspect)

@@ -52,6 +52,8 @@ CONSIDERED = 64
 MOST_BYTES = 1 << 30
 """Details in memory, all together; one more than a view needs at least."""
 BYTES_A_PIXEL = 8
+OVEREXPOSED = 254.5 / 255
+"""From here on a colour is clipped."""
 _shown: ContextVar[bool | None] = ContextVar("detail_shown", default=None)
 
 
@@ -119,13 +121,15 @@ class TrainingDetail:
 
     def _of_picture(self, number: int) -> Detail:
         """Render a training picture where its camera was, and take what it shows beyond that."""
-        model, item = self.model, self.dataset[number]
+        model = self.model
+        image = torch.from_numpy(self.dataset.rgb(number)).to(model.device).float() / 255
+        usable = torch.from_numpy(self.dataset.mask(number)).to(model.device)
         camera = self.dataset.cameras[number : number + 1].to(model.device)
         camera.camera_to_worlds = self._poses()[number : number + 1]
         with torch.no_grad(), model.with_appearance_of(number):
             outputs = model.rendered_alone(camera)
             rgb, distance = outputs["rgb"].to(model.device), outputs["depth"][..., 0].to(model.device)
-            image = item["image"][..., :3].to(rgb)
             beyond = image - rgb if model.exposure is None else model.exposure.beyond(image, rgb, number)
-        usable = item["mask"][..., 0].to(model.device)
+        # an overexposed pixel may be any brighter: it does not say that a bright rendering is too bright
+        beyond = torch.where(image >= OVEREXPOSED, beyond.clamp(min=0), beyond)
         return detail_of(self.dataset.camera(number), camera.camera_to_worlds[0], beyond, distance, usable)

@@ -506,7 +506,7 @@ class EdgeDepthNerfModel(NerfactoModel):
     def get_outputs_for_camera_ray_bundle(self, camera_ray_bundle: RayBundle) -> dict[str, Tensor]:
         """Outputs of a whole view, with the detail of training pictures if it is asked for.
 
-        A background of the viewer's or of an exporter says that a part is cut out: then there is no detail.
+        Where a part is cut out (the viewer's crop, `ns-render`'s), which sets a background, there is no detail.
         """
         outputs = super().get_outputs_for_camera_ray_bundle(camera_ray_bundle)
         if self.training or self.detail is None or not self.detail.is_shown:
@@ -528,13 +528,14 @@ class EdgeDepthNerfModel(NerfactoModel):
         if embedding is None:
             yield
             return
-        # what both forms of the field ask for at evaluation
-        embedding.mean = lambda dim: embedding.embedding.weight[picture]
-        averages, self.field.use_average_appearance_embedding = self.field.use_average_appearance_embedding, True
+        averages = self.field.use_average_appearance_embedding
         try:
+            # what both forms of the field ask for at evaluation
+            embedding.mean = lambda dim: embedding.embedding.weight[picture]
+            self.field.use_average_appearance_embedding = True
             yield
         finally:
-            del embedding.mean
+            vars(embedding).pop("mean", None)
             self.field.use_average_appearance_embedding = averages
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:

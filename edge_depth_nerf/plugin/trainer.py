@@ -20,6 +20,7 @@ import yaml
 from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerConfig
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
+from nerfstudio.viewer.viewer import Viewer
 
 from edge_depth_nerf.base.errors import STOPPED_STATUS, InputError
 from edge_depth_nerf.base.files import remove_leftovers, write_text
@@ -29,7 +30,7 @@ from edge_depth_nerf.plugin.compat import count_steps_against_all, ignore_deprec
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig, transforms_path
 from edge_depth_nerf.plugin.grad_scaler import PatientGradScaler
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModelConfig, settled
-from edge_depth_nerf.plugin.pipeline import NotFiniteError
+from edge_depth_nerf.plugin.pipeline import EdgeDepthPipeline, NotFiniteError
 from edge_depth_nerf.plugin.plain_errors import say_errors_plainly
 from edge_depth_nerf.plugin.settings import changed_settings
 from edge_depth_nerf.plugin.step_graphs import GpuCapture, StepGraphs, why_not
@@ -157,6 +158,15 @@ class EdgeDepthTrainer(Trainer):
                 markup=False,
             )
         raise SystemExit(STOPPED_STATUS) from None
+
+    def _train_complete_viewer(self) -> None:
+        """Show detail from now on, where the viewer's switch asks for it; then wait for Ctrl-C, as nerfstudio does."""
+        viewer, pipeline = self.viewer_state, self.pipeline
+        ours = isinstance(pipeline, EdgeDepthPipeline) and pipeline.drive.layers.detail.value
+        if ours and isinstance(viewer, Viewer):
+            self.training_state = "completed"
+            viewer._trigger_rerender()
+        super()._train_complete_viewer()
 
     def train_iteration(self, step: int) -> TRAIN_INTERATION_OUTPUT:
         """Do a step as nerfstudio does.

@@ -177,7 +177,7 @@ def _viser_rotation(pose: Float64[np.ndarray, "3 4"]) -> viser.transforms.SO3:
 class DriveLayers(ViewerControl):
     """Draws the layers. nerfstudio calls `_setup` when its viewer is ready."""
 
-    def __init__(self, manager: FisheyeDepthDataManager, shows_detail: bool) -> None:
+    def __init__(self, manager: FisheyeDepthDataManager, detail: bool) -> None:
         self.manager = manager
         sampler = manager.train_pixel_sampler
         has_prior = sampler is not None and sampler.table.share_with_prior > 0
@@ -199,7 +199,7 @@ class DriveLayers(ViewerControl):
         )
         self.detail = ViewerCheckbox(
             "Detail of training pictures",
-            shows_detail,
+            detail,
             cb_hook=lambda _: self.viewer._trigger_rerender(),
             hint="After training: adds what training pictures show beyond their renderings. New places take longer",
         )
@@ -400,6 +400,6 @@ class DriveLayers(ViewerControl):
 class DrivePanel(torch.nn.Module):
     """A module that contains the layers: nerfstudio searches the pipeline's modules for viewer controls."""
 
-    def __init__(self, manager: FisheyeDepthDataManager, shows_detail: bool) -> None:
+    def __init__(self, manager: FisheyeDepthDataManager, detail: bool) -> None:
         super().__init__()
-        self.layers = DriveLayers(manager, shows_detail)
+        self.layers = DriveLayers(manager, detail)
