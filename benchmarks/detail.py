@@ -1,175 +1,166 @@
-"""What training pictures could add to a new view: what they show beyond their own rendering, carried there by distance.
+"""What the detail of training pictures adds to views: unseen drives, equal seconds, and a real drive.
 
-    python benchmarks/detail.py SCENE... [--methods nerfacto ds-nerf edge] [--steps 1000] [--json FILE] [--page FILE]
+    python benchmarks/detail.py --scenes scenes --output detail --jobs 2
+    python benchmarks/detail.py --page docs/results.md docs/real_drive.md
+    python benchmarks/detail.py --scenes scenes --output detail --picture docs/detail.jpg
 
-A trial, not a part of the package. After a training, each training picture is rendered, and what it shows beyond its
-rendering is kept: its detail. A held-out view is rendered, too. Each of its pixels has a place in the scene, by its
-rendered distance. This place is looked up in the eight training pictures next to the view. Where a picture's own
-rendered distance agrees, it sees the place, and its detail counts; closer pictures and similar directions count more.
-The mean of the details is added to the view. PSNR is against the noise-free picture inside the mask, mean over all
-held-out views. λ and σ of the methods are their defaults in `compare`.
+`--scenes` holds the rendered drives of docs/results.md and kitti360_half, the real drive at half size as
+`benchmarks/real_drive.py` processes it. In folders of their own under `--output`, all with `compare --detail`:
+
+    claims          nerfacto, the best rival with our prior and extras, and ours: 2,000 steps
+    seconds         the best rival without extras, for as many steps as benchmarks/unseen.json.xz has of it
+    real            nerfacto, the DS-NeRF loss on LiDAR and ours on the real drive: 1,000 steps
+    real_seconds    there, the DS-NeRF loss for as many steps as benchmarks/real_drive_seconds.json.xz has of it
+
+λ and σ are those of the kept searches. Each run is judged twice: as the model renders, and with detail. Stopped at any
+moment, the same command goes on, and at its end it keeps all runs in benchmarks/detail.json.xz and detail_real.json.xz.
+The second command puts tables of kept runs into pages, the third draws parts of views of the first one.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
-from dataclasses import dataclass
+import statistics
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
 
-import ablate
+import cv2
 import numpy as np
 import pages
-import torch
-import torch.nn.functional as F
-from nerfstudio.cameras.cameras import Cameras, CameraType
-from rich.console import Console
-from torch import Tensor
+from kept_runs import keep, results_of
+from numpy.typing import NDArray
+from unseen import DRIVES, GRIDS_STEPS, STEPS, ours, steps_of, write_kept
 
-from edge_depth_nerf.base.files import write_json, write_text
+from edge_depth_nerf.base.files import read_image, write_bytes, write_text
+from edge_depth_nerf.base.pictures import resize, side_by_side
+from edge_depth_nerf.compare.command import RUNS
 from edge_depth_nerf.compare.methods import METHODS
-from edge_depth_nerf.method.metrics import masked_psnr, masked_ssim
+from edge_depth_nerf.compare.options import MethodName
+from edge_depth_nerf.compare.results import Results, RunResult
+from edge_depth_nerf.compare.specification import VIEWS
+from edge_depth_nerf.report.compared_views import held_out_frames
 
-RESULTS = Path(__file__).with_name("detail.json")
-PART = "detail"
-PICTURES = 8
-"""So many training pictures, the ones nearest to a view, are looked at."""
-AGREEMENT = 0.03
-"""Standard deviation of the ratio of two distances that agree."""
-TURN = 0.2
-"""Directions count exp((cos - 1) / TURN): 40° count a third."""
-LEAST = 0.1
-"""Added to the sum of the weights: where no picture counts, nothing is added."""
-
-
-@dataclass(frozen=True)
-class Seen:
-    """A training picture after the training, H×W each."""
-
-    detail: Tensor
-    distance: Tensor
-    """Scene units."""
-    mask: Tensor
+ROOT = Path(__file__).parent
+KEPT = {ROOT / "detail.json.xz": ("claims", "seconds"), ROOT / "detail_real.json.xz": ("real", "real_seconds")}
+"""Which folders' runs are kept in which file."""
+REAL = "kitti360_half"
+REAL_STEPS = GRIDS_STEPS
+CLAIMS: tuple[MethodName, ...] = ("nerfacto", "ds-nerf-integrated-extras", "edge")
+OF_REAL: tuple[MethodName, ...] = ("nerfacto", "ds-nerf", "edge")
+SHOWN = {"street_301": (5, 60, 64), "parking_302": (5, 60, 64)}
+"""View, first row and first column of the parts that the picture shows."""
+SIDE_PX, VIEWS_OF = 128, ("img", "detail")
+TRUE, RECORDED = "truth_masked_psnr", "masked_psnr"
 
 
-def rendered(model: Any, cameras: Cameras, number: int) -> tuple[Tensor, Tensor]:
-    """Colours and median distances (scene units) of a view."""
-    with torch.no_grad():
-        outputs = model.get_outputs_for_camera(cameras[number : number + 1])
-    return outputs["rgb"].clamp(0, 1), outputs["depth"][..., 0]
+def longer(kept: str, but: Iterable[int]) -> tuple[MethodName, int]:
+    """The rival of a kept comparison at equal seconds, and its steps, which no other method has."""
+    runs = [run for run in results_of(ROOT / f"{kept}.json.xz").runs if run.content["steps"] not in but]
+    assert len({(run.method, run.content["steps"]) for run in runs}) == 1
+    return runs[0].method, runs[0].content["steps"]
 
 
-def details(pipeline: Any) -> list[Seen]:
-    """What each training picture shows beyond its rendering, without its exposure."""
-    model, dataset = pipeline.model, pipeline.datamanager.train_dataset
-    log_gains = model.exposure.log_gains.detach()
-    gains = (log_gains - log_gains.mean(dim=0)).exp()
-    found = []
-    for number in range(len(dataset)):
-        rgb, distance = rendered(model, dataset.cameras, number)
-        item = dataset[number]
-        found.append(Seen(item["image"][..., :3] / gains[number] - rgb, distance, item["mask"][..., 0].float()))
-    return found
+def figures_of(runs: Iterable[RunResult], name: str) -> str:
+    """Mean over drives, with its standard deviation over seeds where there are several."""
+    runs = list(runs)
+    seeds = sorted({run.seed for run in runs})
+    means = [statistics.fmean(run.figures[name] for run in runs if run.seed == seed) for seed in seeds]
+    spread = f" ± {statistics.stdev(means):.2f}" if len(means) > 1 else ""
+    return f"{statistics.fmean(means):.2f}{spread}"
 
 
-def pixels_of(cameras: Cameras, number: int, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Column and row (the first pixel's centre is 0.5) and distance of points in a fisheye picture."""
-    assert int(cameras.camera_type[number]) == CameraType.FISHEYE.value and cameras.distortion_params is not None
-    pose, lens = cameras.camera_to_worlds[number], cameras.distortion_params[number]
-    x, y, z = ((points - pose[:, 3]) @ pose[:, :3] * torch.tensor([1.0, -1, -1])).unbind(-1)
-    radius = torch.hypot(x, y)
-    theta = torch.atan2(radius, z)
-    squared = theta.square()
-    series = 1 + squared * (lens[0] + squared * (lens[1] + squared * (lens[2] + squared * lens[3])))
-    scale = theta * series / radius.clamp(min=1e-9)
-    column = cameras.fx[number, 0] * x * scale + cameras.cx[number, 0]
-    row = cameras.fy[number, 0] * y * scale + cameras.cy[number, 0]
-    return column, row, torch.sqrt(x.square() + y.square() + z.square())
+def rows_of(results: Results, methods: Iterable[tuple[MethodName, int]]) -> Iterator[tuple[str, list[RunResult]]]:
+    """Methods with their steps, as tables call them, and their runs."""
+    for method, steps in methods:
+        runs = [run for run in results.runs if (run.method, run.content["steps"]) == (method, steps)]
+        if runs:
+            yield METHODS[method].title, runs
 
 
-def looked_up(values: Tensor, column: Tensor, row: Tensor, mode: str = "bilinear") -> Tensor:
-    """Values of a picture, H×W×n, at places between its pixels."""
-    height, width = values.shape[:2]
-    at = torch.stack([2 * column / width - 1, 2 * row / height - 1], dim=-1)[None]
-    return F.grid_sample(values.movedim(-1, 0)[None], at, mode=mode, align_corners=False)[0].movedim(0, -1)
-
-
-def carried(cameras: Cameras, seen: list[Seen], view: Cameras, number: int, distance: Tensor) -> Tensor:
-    """The detail of a view, H×W×3, from training pictures."""
-    rays = view.generate_rays(camera_indices=number)
-    points = rays.origins + rays.directions * distance[..., None]
-    away = (cameras.camera_to_worlds[:, :, 3] - view.camera_to_worlds[number][:, 3]).norm(dim=-1)
-    total, weights = torch.zeros_like(points), torch.zeros_like(distance)
-    for picture in away.argsort()[:PICTURES].tolist():
-        column, row, own_distance = pixels_of(cameras, picture, points)
-        kept = seen[picture]
-        inside = looked_up(kept.mask[..., None], column, row)[..., 0] > 0.999
-        rendered_distance = looked_up(kept.distance[..., None], column, row, "nearest")[..., 0]
-        agrees = torch.exp(-0.5 * ((rendered_distance / own_distance - 1) / AGREEMENT).square())
-        to_points = F.normalize(points - cameras.camera_to_worlds[picture][:, 3], dim=-1)
-        turned = torch.exp(((to_points * rays.directions).sum(-1) - 1) / TURN)
-        weight = inside * agrees * turned * (distance / own_distance).clamp(max=1)
-        total += weight[..., None] * looked_up(kept.detail, column, row)
-        weights += weight
-    return total / (weights + LEAST)[..., None]
-
-
-def judged(pipeline: Any) -> dict[str, float]:
-    """PSNR and SSIM of held-out views as they are rendered, and with the detail of training pictures."""
-    model, manager = pipeline.model.eval(), pipeline.datamanager
-    seen, dataset = details(pipeline), manager.eval_dataset
-    figures: dict[str, list[float]] = {}
-    for number in range(len(dataset)):
-        rgb, distance = rendered(model, dataset.cameras, number)
-        item = dataset[number]
-        target, mask = item["truth_rgb"][..., :3], item["mask"][..., 0].bool()
-        detail = carried(manager.train_dataset.cameras, seen, dataset.cameras, number, distance)
-        for name, picture in (("rendered", rgb), ("with detail", (rgb + detail).clamp(0, 1))):
-            figures.setdefault(f"{name}, PSNR", []).append(float(masked_psnr(picture, target, mask)))
-            figures.setdefault(f"{name}, SSIM", []).append(float(masked_ssim(picture, target, mask)))
-    return {name: float(np.mean(found)) for name, found in figures.items()}
-
-
-def trained(scene: Path, overrides: Mapping[str, Any], steps: int) -> dict[str, float]:
-    """Train a method, and judge it."""
-    kept: list[Any] = []
-    ablate.train(scene, {**overrides, **ablate.falling_over(steps)}, steps, 0, kept.append)
-    return judged(kept[0])
-
-
-def table(results: dict[str, Any]) -> str:
-    """PSNR and SSIM of each, as Markdown."""
-    scenes: dict[str, Any] = results["scenes"]
-    lines = ["| PSNR, SSIM | " + " | ".join(scenes) + " |", "|---|" + "---|" * len(scenes)]
-    for method in next(iter(scenes.values())):
-        for name in ("rendered", "with detail"):
-            cells = [
-                f"{each[method][f'{name}, PSNR']:.2f}, {each[method][f'{name}, SSIM']:.3f}" for each in scenes.values()
-            ]
-            lines.append(f"| {METHODS[method].title}, {name} | " + " | ".join(cells) + " |")
+def table(results: Results, name: str, methods: Iterable[tuple[MethodName, int]]) -> str:
+    """PSNR without and with detail, drive by drive, as Markdown."""
+    rows = list(rows_of(results, methods))
+    scenes = sorted({run.scene for _, runs in rows for run in runs})
+    shown = [*scenes, "average"] if len(scenes) > 1 else scenes
+    lines = ["| method | " + " | ".join([*shown, "steps", "processor seconds"]) + " |", "|---" * (len(shown) + 3) + "|"]
+    for title, runs in rows:
+        seconds = f"{statistics.fmean(run.curve[-1]['cpu_seconds'] for run in runs):.0f}"
+        for words, metric in (("", name), (", with detail", f"detail_{name}")):
+            cells = [figures_of((run for run in runs if scene in (run.scene, "average")), metric) for scene in shown]
+            lines.append("| " + " | ".join([title + words, *cells, steps_of(runs), seconds]) + " |")
     return "\n".join(lines)
+
+
+def tables() -> dict[str, str]:
+    """The pages' parts by their names, of the kept runs."""
+    rendered: list[tuple[MethodName, int]] = [(method, STEPS) for method in CLAIMS]
+    rendered.insert(1, longer("unseen", (STEPS, GRIDS_STEPS)))
+    of_real: list[tuple[MethodName, int]] = [(method, REAL_STEPS) for method in OF_REAL]
+    of_real.insert(2, longer("real_drive_seconds", (REAL_STEPS,)))
+    on_rendered, on_real = (results_of(file) for file in KEPT)
+    return {
+        "detail: pictures": table(on_rendered, TRUE, rendered),
+        "detail: beside": table(on_rendered, "shifted_1m_masked_psnr", rendered),
+        "detail_real": table(on_real, RECORDED, of_real),
+    }
+
+
+def picture(scenes: Path, output: Path) -> NDArray[np.uint8]:
+    """Parts of held-out views of two drives, without and with detail."""
+    shown: tuple[MethodName, ...] = ("nerfacto", "edge")
+    rows = []
+    for drive, (view, top, left) in SHOWN.items():
+        scene = scenes / drive
+        frame = held_out_frames(scene)[view]
+        row = [read_image(scene / frame["truth_rgb_file_path"])]
+        for method in shown:
+            folder = output / "claims" / RUNS / drive / f"{method}_seed-0" / VIEWS
+            # nerfstudio's `img` has the recorded picture on its left
+            row += [read_image(folder / f"eval_{name}_{view:04d}.png")[:, -row[0].shape[1] :] for name in VIEWS_OF]
+        part = slice(top, top + SIDE_PX), slice(left, left + SIDE_PX)
+        rows.append([resize(each[part], (2 * SIDE_PX, 2 * SIDE_PX)) for each in row])
+    titles = [words for method in shown for words in (METHODS[method].title, f"{METHODS[method].title}, with detail")]
+    return side_by_side(rows, ["ground truth", *titles])
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", type=Path, nargs="+")
-    parser.add_argument("--methods", nargs="+", default=["nerfacto", "ds-nerf", "edge"], choices=list(METHODS))
-    parser.add_argument("--steps", type=int, default=1000)
-    parser.add_argument("--json", type=Path, default=RESULTS)
-    parser.add_argument("--page", type=Path)
+    parser.add_argument("--scenes", type=Path, default=Path("scenes"))
+    parser.add_argument("--output", type=Path, default=Path("outputs/detail"))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--jobs", type=int, default=1, help="trainings at a time")
+    parser.add_argument("--page", type=Path, nargs="*", default=[], help="only put the tables of the kept runs there")
+    parser.add_argument("--picture", type=Path, help="only draw a picture of what is there")
     options = parser.parse_args()
-    results = ablate.begun(options.json, options.steps)
-    for scene in options.scenes:
-        found = results["scenes"].setdefault(scene.resolve().name, {})
-        for method in options.methods:
-            if method not in found:
-                found[method] = trained(scene, METHODS[method].overrides, options.steps)
-                write_json(options.json, results)
-    Console(width=200).print(table(results), markup=False)
+    if options.picture:
+        drawn = picture(options.scenes, options.output)[..., ::-1]
+        write_bytes(options.picture, cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes())
+        return
     if options.page:
-        text = options.page.read_text(encoding="utf-8")
-        write_text(options.page, pages.with_part(text, PART, table(results)))
+        for page in options.page:
+            text = page.read_text(encoding="utf-8")
+            for name, part in tables().items():
+                text = pages.with_part(text, name, part)
+            write_text(page, text)
+        return
+    out, scenes = options.output, [options.scenes / f"{kind}_{seed}" for kind, seed in DRIVES.items()]
+    tuned, tuned_of_real = write_kept(out / "tuned.json"), ROOT / "tuned.json"
+
+    def compare(folder: str, where: list[Path], methods: Iterable[MethodName], steps: int, seed: int) -> None:
+        settings = tuned_of_real if where == real else tuned
+        of_run = ("--steps", steps, "--seeds", seed, "--tuned", settings, "--jobs", options.jobs, "--detail")
+        ours("compare", *where, "--methods", *methods, *of_run, "--output", out / folder)
+
+    real = [options.scenes / REAL]
+    rival, rivals_steps = longer("unseen", (STEPS, GRIDS_STEPS))
+    of_real, of_reals_steps = longer("real_drive_seconds", (REAL_STEPS,))
+    for seed in options.seeds:
+        compare("claims", scenes, CLAIMS, STEPS, seed)
+        compare("seconds", scenes, [rival], rivals_steps, seed)
+        compare("real", real, OF_REAL, REAL_STEPS, seed)
+        compare("real_seconds", real, [of_real], of_reals_steps, seed)
+    for file, folders in KEPT.items():
+        keep(file, *(out / folder for folder in folders))
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ import pytest
 import torch
 from benchmark_modules import benchmark_modules
 from comparisons import fake
-from nerfstudio.cameras.cameras import Cameras, CameraType
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json, write_json
@@ -457,37 +456,94 @@ def test_the_pages_wrong_prior_is_that_of_its_runs(benchmark_module):
     assert pages.with_part(page, wrong.PART, wrong.table(kept)) == page and wrong.table(kept).count("\n") > 5
 
 
+PAGES_OF_DETAIL = {
+    "results": "docs/results.md",
+    "real": "docs/real_drive.md",
+    "readme": "README.md",
+    "changelog": "CHANGELOG.md",
+}
+
+
 def test_the_pages_detail_is_that_of_its_runs(benchmark_module):
     detail, pages = benchmark_module("detail"), benchmark_module("pages")
-    kept = read_json(detail.RESULTS)
-    page = (ROOT / "docs" / "ablation.md").read_text(encoding="utf-8")
-    assert pages.with_part(page, detail.PART, detail.table(kept)) == page and detail.table(kept).count("\n") > 5
-    for scene in kept["scenes"].values():
-        for found in scene.values():
-            assert 0.8 <= round(found["with detail, PSNR"] - found["rendered, PSNR"], 1) <= 1.5
+    tables = detail.tables()
+    for name, page in (("pictures", "results"), ("beside", "results"), ("real", "real_drive")):
+        part = f"detail_{name}" if page == "real_drive" else f"detail: {name}"
+        text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
+        assert f"<!-- {part} -->" in text and pages.with_part(text, part, tables[part]) == text
+        assert tables[part].count("\n") == 2 + 2 * 4 - 1, part
+    for file in detail.KEPT:
+        for run in detail.results_of(file).runs:
+            assert run.specification["detail"] is True and "detail_masked_psnr" in run.figures
 
 
-def test_a_place_is_found_in_the_picture_where_its_ray_begins(benchmark_module):
+def test_what_the_pages_say_of_detail_follows_from_its_runs(benchmark_module):
     detail = benchmark_module("detail")
-    turned = torch.tensor([[0.0, 0, 1, 3], [1, 0, 0, -2], [0, 1, 0, 0.5]])
-    cameras = Cameras(
-        turned[None],
-        *(torch.tensor([[number]]) for number in (90.0, 92.0, 100.5, 99.0)),
-        width=200,
-        height=200,
-        distortion_params=torch.tensor([[0.02, -0.01, 0.003, -0.001, 0, 0]]),
-        camera_type=CameraType.FISHEYE,
+    rendered, real = (detail.results_of(file).runs for file in detail.KEPT)
+
+    def mean(runs, method: str, name: str, steps: int | None = None) -> float:
+        found = [run for run in runs if run.method == method and steps in (None, run.content["steps"])]
+        return sum(run.figures[name] for run in found) / len(found)
+
+    def gain(runs, method: str, name: str, steps: int | None = None) -> str:
+        return f"{mean(runs, method, f'detail_{name}', steps) - mean(runs, method, name, steps):.2f}"
+
+    def lead(runs, name: str, method: str, steps: int | None = None) -> str:
+        return f"{mean(runs, 'edge', name) - mean(runs, method, name, steps):.2f}"
+
+    true, recorded, longer, best = detail.TRUE, detail.RECORDED, "urban-nerf-integrated", "ds-nerf-integrated-extras"
+    pages = {
+        name: " ".join((ROOT / file).read_text(encoding="utf-8").split()) for name, file in PAGES_OF_DETAIL.items()
+    }
+    gains = sorted(run.figures[f"detail_{true}"] - run.figures[true] for run in rendered)
+    assert f"with each seed: {gains[0]:.2f} to {gains[-1]:.2f} dB." in pages["results"]
+    assert f"{gains[0]:.2f} to {gains[-1]:.2f} dB on rendered drives" in pages["changelog"]
+    of = {method: gain(rendered, method, true) for method in (*detail.CLAIMS, longer)}
+    assert (
+        f"Ours gains {of['edge']} dB, nerfacto {of['nerfacto']} dB, the others {of[best]} and {of[longer]} dB"
+        in (pages["results"])
     )
-    rays = cameras.generate_rays(camera_indices=0)
-    distance = 2 + torch.rand(200, 200)
-    column, row, found = detail.pixels_of(cameras, 0, rays.origins + distance[..., None] * rays.directions)
-    rows, columns = torch.meshgrid(torch.arange(200) + 0.5, torch.arange(200) + 0.5, indexing="ij")
-    near = torch.hypot(rows - 99, columns - 100.5) < 90
-    assert float((column - columns)[near].abs().max()) < 0.02 and float((row - rows)[near].abs().max()) < 0.02
-    torch.testing.assert_close(found[near], distance[near], rtol=1e-4, atol=1e-4)
-    values = torch.stack([columns, rows], dim=-1)
-    looked_up = detail.looked_up(values, column, row)[near]
-    assert float((looked_up - values[near]).abs().max()) < 0.05
+    assert f"gains {of['edge']} dB" in pages["readme"] and f"[gains {of['edge']} dB]" in pages["results"]
+    others = sorted(value for method, value in of.items() if method != "edge")
+    assert f"{others[0]} to {others[-1]} dB with the other methods" in pages["results"]
+    with_detail = f"detail_{true}"
+    for method, words in (
+        ("nerfacto", "over nerfacto {} dB without and {} dB with detail"),
+        (best, "{} and {} dB (ahead"),
+    ):
+        assert words.format(lead(rendered, true, method), lead(rendered, with_detail, method)) in pages["results"]
+    both = [f"{lead(rendered, name, longer)}" for name in (true, with_detail)]
+    assert f"at equal seconds of training, {both[0]} and {both[1]} dB" in pages["results"]
+    alone = mean(rendered, "edge", with_detail) - mean(rendered, longer, true)
+    assert f"and this rival has none, it is {alone:.2f} dB" in pages["results"]
+    pairs = {(run.scene, run.seed): run for run in rendered if run.method == best}
+    ahead = [
+        sum(run.figures[name] > pairs[run.scene, run.seed].figures[name] for run in rendered if run.method == "edge")
+        for name in (true, with_detail)
+    ]
+    assert f"(ahead in {ahead[0]} and in {ahead[1]} of {len(pairs)} pairs)" in pages["results"]
+    beside = sorted(gain(rendered, method, "shifted_1m_masked_psnr") for method in of)
+    assert f"gain {beside[0]} to {beside[-1]} dB" in pages["results"]
+    steps = [gain(real, "ds-nerf", recorded, count) for count in (1000, 1330)]
+    assert (
+        f"Ours gains {gain(real, 'edge', recorded)} dB, the DS-NeRF loss {steps[0]} dB ({steps[1]} dB" in pages["real"]
+    )
+    assert abs(float(gain(real, "nerfacto", recorded))) < 0.05
+    seconds = [lead(real, name, "ds-nerf", 1330) for name in (f"detail_{recorded}", recorded)]
+    assert f"by {seconds[0]} dB with detail and by {seconds[1]} dB without" in pages["real"]
+
+
+def test_the_pages_constants_of_detail_are_those_that_were_measured(benchmark_module):
+    constants, pages = benchmark_module("detail_constants"), benchmark_module("pages")
+    kept = read_json(constants.RESULTS)
+    page = (ROOT / "docs" / "ablation.md").read_text(encoding="utf-8")
+    assert f"<!-- {constants.PART} -->" in page
+    assert pages.with_part(page, constants.PART, constants.table(kept)) == page
+    for name, (module, _, values) in constants.CONSTANTS.items():
+        before = getattr(module, name)
+        with constants.changed(name, values[0]):
+            assert getattr(module, name) == values[0] != before
+        assert getattr(module, name) == before
 
 
 def test_a_wrong_prior_is_wrong_as_often_and_as_much_as_is_said(benchmark_module):

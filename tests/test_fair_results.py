@@ -50,6 +50,7 @@ RUNS_OF = {
     "grid": ("grid",),
     "unseen": ("unseen", "grid"),
     "before": ("unseen_before", "grid_before"),
+    "detail": ("detail",),
     "real": ("real_drive", "real_drive_seconds", "real_drive_cells", "real_drive_full", "real_drive_lambda"),
     "unseen: search": ("unseen_search",),
 }
@@ -113,6 +114,7 @@ def test_drives_of_the_tables_are_those_that_were_written_down(unseen, kept):
     large = {f"{name}_{unseen.LARGE_PX}" for name in names}
     assert {run.scene for run in kept["grid"]} == names
     assert {run.scene for run in kept["unseen"]} == names | large
+    assert {run.scene for run in kept["detail"]} == names
 
 
 def maps_of_claims(runs: list[RunResult]) -> dict[str, set[str]]:
@@ -261,7 +263,7 @@ def other_exposures(runs: list[RunResult]) -> set[MethodName]:
 
 
 def test_all_rows_have_one_exposure_model(kept):
-    runs = [*kept["grid"], *kept["unseen"]]
+    runs = [*kept["grid"], *kept["unseen"], *kept["detail"]]
     assert other_exposures(runs) == set()
     former = [
         with_fields(run, pipeline__model__exposure="embedding") if run.method == "edge-paper" else run for run in runs
@@ -310,7 +312,7 @@ def without_a_search(
 
 
 def test_all_methods_have_equal_searches_that_are_kept(unseen, kept):
-    runs = [*kept["grid"], *kept["unseen"]]
+    runs = [*kept["grid"], *kept["unseen"], *kept["detail"]]
     searches = [*kept["grid_search"], *kept["unseen_search"]]
     assert of_another_length(searches) == set()
     assert without_a_search(runs, searches, unseen.SETTINGS_OF) == set()

@@ -5,12 +5,15 @@ from __future__ import annotations
 import os
 import signal
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 import yaml
+from nerfstudio.engine.trainer import Trainer
 from nerfstudio.pipelines.base_pipeline import Pipeline
 from nerfstudio.utils import writer
+from nerfstudio.viewer.viewer import Viewer
 from scenes import write_scene
 from trainings import trainer_of
 
@@ -140,6 +143,25 @@ def test_ctrl_c_ends_the_viewer_of_a_complete_training_without_error(trainer, mo
     monkeypatch.setattr(trainer, "_after_train", waits)
     trainer.train()
     assert "Stopped" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("switched_on", [False, True])
+def test_detail_appears_when_training_ends(trainer, monkeypatch, switched_on):
+    """The picture that the viewer shows is of before; nothing else asks for another one."""
+    asked = []
+    viewer = object.__new__(Viewer)
+    monkeypatch.setattr(
+        Viewer, "_trigger_rerender", lambda _: asked.append(trainer.pipeline.drive.layers.shows_detail())
+    )
+    monkeypatch.setattr(Trainer, "_train_complete_viewer", lambda _: asked.append("waits"))
+    monkeypatch.setattr(trainer, "viewer_state", viewer)
+    layers = trainer.pipeline.drive.layers
+    monkeypatch.setattr(layers, "viewer", SimpleNamespace(trainer=trainer), raising=False)
+    trainer.training_state = "training"
+    layers.detail.value = switched_on
+    assert not layers.shows_detail()
+    trainer._train_complete_viewer()
+    assert asked == ([True, "waits"] if switched_on else ["waits"])
 
 
 def test_a_relative_scene_is_said_to_be_relative(trainer, tmp_path, monkeypatch):
