@@ -56,7 +56,8 @@ def seen(lens, pose: np.ndarray):
 def grey_detail(lens, pose: np.ndarray, usable: torch.Tensor | None = None, shift: float = 1.0):
     """Detail of a picture that was rendered grey at its true distances, times `shift`."""
     colours, distance, _, _, valid = seen(lens, pose)
-    return detail_of(lens, opengl(pose), colours - GREY, distance * shift, valid if usable is None else valid & usable)
+    counts = valid if usable is None else valid & usable
+    return detail_of(lens, opengl(pose), colours, colours - GREY, distance * shift, counts)
 
 
 @pytest.mark.parametrize("lens", [fisheye(64, 56), pinhole(64, 56)], ids=["fisheye", "pinhole"])
@@ -136,7 +137,8 @@ def test_undefined_rays_get_nothing_and_take_nothing_from_others():
     assert torch.equal(added[0], torch.zeros(3)) and torch.equal(added[1:], whole[1:])
     assert float(whole[valid.flatten()].abs().max()) > 0.1
     # nor does an exposure that is nearly 0
-    huge = detail_of(lens, opengl(at(0.2)), torch.full((56, 64, 3), 1e6), torch.ones(56, 64), valid)
+    white, ones = torch.full((56, 64, 3), 1e6), torch.ones(56, 64)
+    huge = detail_of(lens, opengl(at(0.2)), torch.ones(56, 64, 3), white, ones, valid)
     assert float(carried(origins, directions, distance, [huge]).abs().max()) <= 1
 
 

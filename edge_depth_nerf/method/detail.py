@@ -23,6 +23,8 @@ TURN = 0.2
 """Directions count exp((cos - 1) / TURN): 40° count a third."""
 LEAST = 0.1
 """Added to the sum of the weights: where no picture counts, nothing is added."""
+OVEREXPOSED = 254.5 / 255
+"""From here on a colour is clipped."""
 POINTS_AT_ONCE = 1 << 18
 SOME_POINTS = 400
 """So many points of a view are enough to find the pictures that see most of it."""
@@ -44,6 +46,7 @@ class Detail:
 def detail_of(
     lens: Camera,
     pose: Float[Tensor, "3 4"],
+    image: Float[Tensor, "h w 3"],
     beyond: Float[Tensor, "h w 3"],
     distance: Float[Tensor, "h w"],
     usable: Bool[Tensor, "h w"],
@@ -53,11 +56,14 @@ def detail_of(
     Args:
         lens: the picture's.
         pose: camera to scene, as in `Detail`.
+        image: its colours, 0 to 1. An overexposed one may be any brighter: it does not say that a bright rendering is
+            too bright.
         beyond: its colours less its rendering's; more than 1 counts as 1.
         distance: rendered, in the scene's unit.
         usable: which pixels count.
 
     """
+    beyond = torch.where(image >= OVEREXPOSED, beyond.clamp(min=0), beyond)
     # half the memory; rounding is 0.05 %, much less than AGREEMENT
     colours = torch.where(usable[..., None], beyond, 0).clamp(-1, 1).movedim(-1, 0).half()
     return Detail(lens, pose, colours.contiguous(), torch.where(usable, distance, 0)[None].half())

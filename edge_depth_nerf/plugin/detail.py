@@ -52,8 +52,6 @@ CONSIDERED = 64
 MOST_BYTES = 1 << 30
 """Details in memory, all together; one more than a view needs at least."""
 BYTES_A_PIXEL = 8
-OVEREXPOSED = 254.5 / 255
-"""From here on a colour is clipped."""
 _shown: ContextVar[bool | None] = ContextVar("detail_shown", default=None)
 
 
@@ -130,6 +128,4 @@ class TrainingDetail:
             outputs = model.rendered_alone(camera)
             rgb, distance = outputs["rgb"].to(model.device), outputs["depth"][..., 0].to(model.device)
             beyond = image - rgb if model.exposure is None else model.exposure.beyond(image, rgb, number)
-        # an overexposed pixel may be any brighter: it does not say that a bright rendering is too bright
-        beyond = torch.where(image >= OVEREXPOSED, beyond.clamp(min=0), beyond)
-        return detail_of(self.dataset.camera(number), camera.camera_to_worlds[0], beyond, distance, usable)
+        return detail_of(self.dataset.camera(number), camera.camera_to_worlds[0], image, beyond, distance, usable)
