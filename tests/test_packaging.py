@@ -5,10 +5,13 @@ import subprocess
 import sys
 import tarfile
 import zipfile
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
 import pytest
 import yaml
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 
 import edge_depth_nerf
 
@@ -216,3 +219,25 @@ def test_contributing_names_what_exists():
     for name in re.findall(r"`([\w./]+\.(?:py|toml|txt|cff)|[\w]+/)`", text):
         folders = (ROOT, ROOT / "edge_depth_nerf", ROOT / "tests")
         assert name in ("rig.toml", "tests/test_MODULE.py") or any((folder / name).exists() for folder in folders), name
+
+
+def test_the_constraints_suit_every_python_that_is_allowed():
+    """Of what is installed: Debian 12 has Python 3.11.2, which a version for 3.11.5 and later does not suit."""
+    read = 0
+    for line in (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines():
+        if not line or line.startswith("#"):
+            continue
+        pinned = Requirement(line)
+        try:
+            installed = distribution(pinned.name)
+        except PackageNotFoundError:
+            continue
+        needs = installed.metadata["Requires-Python"]
+        if needs is None or not pinned.specifier.contains(installed.version):
+            continue
+        read += 1
+        for python in ("3.10.0", "3.11.0", "3.12.0"):
+            environment = {"python_version": python.rpartition(".")[0], "python_full_version": python}
+            if pinned.marker is None or pinned.marker.evaluate(environment):
+                assert SpecifierSet(needs).contains(python), f"{line}: needs Python {needs}, not {python}"
+    assert read > 50
