@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import json
 import lzma
+import statistics
 import sys
 from pathlib import Path
 from xml.etree import ElementTree
@@ -23,6 +24,7 @@ from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.results import Results, RunResult
 from edge_depth_nerf.compare.search import grids, write_search
 from edge_depth_nerf.compare.tables import page_of_tables
+from edge_depth_nerf.plugin.pixel_table import RECORD
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results.json"
@@ -544,6 +546,60 @@ def test_the_pages_constants_of_detail_are_those_that_were_measured(benchmark_mo
         with constants.changed(name, values[0]):
             assert getattr(module, name) == values[0] != before
         assert getattr(module, name) == before
+
+
+@pytest.mark.parametrize(
+    ("name", "page"), [("known_rays", "ablation"), ("pixel_order", "ablation"), ("judging", "speed")]
+)
+def test_a_page_has_the_table_that_was_measured(benchmark_module, name, page):
+    benchmark, pages = benchmark_module(name), benchmark_module("pages")
+    table = benchmark.table(read_json(benchmark.RESULTS))
+    text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
+    assert f"<!-- {benchmark.PART} -->" in text and table.count("\n") > 5
+    assert pages.with_part(text, benchmark.PART, table) == text
+
+
+def test_what_the_page_says_of_rays_that_know_follows_from_its_runs(benchmark_module):
+    scenes = read_json(benchmark_module("known_rays").RESULTS)["scenes"].values()
+    page = " ".join((ROOT / "docs" / "ablation.md").read_text(encoding="utf-8").split())
+
+    def against_today(name: str) -> list[tuple[float, float]]:
+        """How many times as fast, and how many dB lower, on each drive."""
+        today = "today's way, 64 + 32 + 24 samples"
+        return [
+            (found[today]["seconds"] / found[name]["seconds"], found[today]["psnr"] - found[name]["psnr"])
+            for found in scenes
+        ]
+
+    names = {name for found in scenes for name in found}
+    neighbours = [each for name in names if name.startswith("from neighbours") for each in against_today(name)]
+    faster, lower = zip(*neighbours, strict=True)
+    gain, loss = f"{min(faster):.1f} to {max(faster):.1f} times", f"{min(lower):.2f} to {max(lower):.1f} dB"
+    assert f"make rendering {gain} as fast, and lose {loss}." in page
+    assert max(faster for name in names for faster, _ in against_today(name)) < 2
+    fewer, known = against_today("today's way, 32 + 16 + 24 samples"), against_today("from neighbours, 24 samples")
+    means = [statistics.mean(lower for _, lower in each) for each in (fewer, known)]
+    assert means[0] == pytest.approx(means[1], abs=0.02)
+    assert all(one[0] < other[0] for one, other in zip(fewer, known, strict=True))
+
+
+def test_orders_of_pixels_hold_every_pixel_once_and_are_what_they_say(benchmark_module):
+    orders = benchmark_module("pixel_order").ORDERS
+    records = np.zeros(2 * 64 * 64, RECORD)
+    records["picture"], records["row"], records["column"] = np.indices((2, 64, 64)).reshape(3, -1)
+    records = records[np.random.default_rng(1).permutation(len(records))]
+    for name, order in orders.items():
+        ordered = order(records)
+        assert len(np.unique(ordered)) == len(records), name
+        blocks = np.stack([ordered["picture"], ordered["row"] // 8, ordered["column"] // 8])
+        if name == "blocks of 8 × 8 px":
+            stretches = blocks.reshape(3, -1, 64)
+            assert (stretches == stretches[..., :1]).all()
+            # the blocks are at random
+            assert (np.diff(stretches[0, :, 0].astype(int)) != 0).mean() > 0.3
+        # of 128 that follow each other, each block has one, nearly
+        of_block = np.unique(blocks[:, 100:228], axis=1, return_counts=True)[1]
+        assert (of_block.max() <= 2) == (name == "spread evenly"), name
 
 
 def test_a_wrong_prior_is_wrong_as_often_and_as_much_as_is_said(benchmark_module):
