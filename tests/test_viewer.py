@@ -22,7 +22,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.viewer.render_state_machine import RenderAction, RenderStateMachine
 from nerfstudio.viewer.utils import CameraState, get_camera, parse_object
-from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
+from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
 from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerElement
 from scenes import RADIUS_M, copy_sample_drive, fisheye, pinhole, write_scene
 from torch._subclasses.fake_tensor import FakeTensorMode
@@ -496,6 +496,17 @@ def training(tmp_path_factory) -> Iterator[SimpleNamespace]:
     trainer.shutdown()
     thread.join(TIMEOUT_S)
     assert not thread.is_alive()
+
+
+@pytest.mark.parametrize("switched_on", [False, True])
+def test_pausing_a_training_asks_for_a_picture_with_detail(training, monkeypatch, switched_on):
+    layers, asked = training.trainer.pipeline.drive.layers, []
+    monkeypatch.setattr(Viewer, "_trigger_rerender", lambda viewer: asked.append(viewer))
+    monkeypatch.setattr(layers.detail, "value", switched_on)
+    ours = [each for each in training.viewer.pause_train._impl.update_cb if each.__module__ == layers.__module__]
+    assert len(ours) == 1
+    ours[0](None)
+    assert asked == ([training.viewer] if switched_on else [])
 
 
 def seen(training, layer: str) -> bool | None:

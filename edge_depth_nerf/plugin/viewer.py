@@ -201,7 +201,7 @@ class DriveLayers(ViewerControl):
             "Detail of training pictures",
             detail,
             cb_hook=lambda _: self.viewer._trigger_rerender(),
-            hint="After training: adds what training pictures show beyond their renderings. New places take longer",
+            hint="Not in training: adds what training pictures show beyond their renderings. New places take longer",
         )
         self._frames: dict[str, viser.FrameHandle] = {}
         self._clouds: dict[str, Cloud] = {}
@@ -218,6 +218,8 @@ class DriveLayers(ViewerControl):
         viewer.viser_server.on_client_connect(self._welcome)
         # created before nerfstudio's frusta, this parent shows or hides all of them
         self._host_frusta = viewer.viser_server.scene.add_frame(HOST_FRUSTA, show_axes=False)
+        # nerfstudio asks for no other picture when a training is paused
+        viewer.pause_train.on_click(lambda _: self._ask_for_detail())
         viewer.hide_images.on_click(lambda _: self._hide_lenses(True))
         viewer.show_images.on_click(lambda _: self._hide_lenses(False))
         for layer in self.switches:
@@ -251,6 +253,11 @@ class DriveLayers(ViewerControl):
         """Return whether complete pictures have detail: never during a training, which changes it at each step."""
         trainer = self.viewer.trainer
         return bool(self.detail.value) and (trainer is None or trainer.training_state != "training")
+
+    def _ask_for_detail(self) -> None:
+        """Ask for another picture, if that one has detail."""
+        if self.detail.value:
+            self.viewer._trigger_rerender()
 
     def _hide_lenses(self, hidden: bool) -> None:
         self._hidden = hidden
