@@ -3,8 +3,8 @@
 Of each sample a network gives four numbers: one for the density, three for the colour. The density is
 d = scale exp(first) inside the scene and 0 outside, and the weights are w_k = (1 - exp(-d_k δ_k)) exp(-Σ_j<k d_j δ_j).
 The colours c_k are the sigmoid of the other numbers. A pixel is Σ w_k c_k, plus (1 - Σ w_k) times what is behind.
-The gradient comes from a second pass,
-which computes everything again: that is faster than to write it to memory and read it.
+The gradient comes from a second pass, which computes everything again: that is faster than to write it to memory and
+read it.
 
 Pure. Importing this module imports Numba.
 """
