@@ -585,6 +585,7 @@ def test_what_the_page_says_of_rays_that_know_follows_from_its_runs(benchmark_mo
 
 def test_orders_of_pixels_hold_every_pixel_once_and_are_what_they_say(benchmark_module):
     orders = benchmark_module("pixel_order").ORDERS
+    assert next(iter(orders)) == "random" and {"blocks of 8 × 8 px", "spread evenly"} <= set(orders)
     records = np.zeros(2 * 64 * 64, RECORD)
     records["picture"], records["row"], records["column"] = np.indices((2, 64, 64)).reshape(3, -1)
     records = records[np.random.default_rng(1).permutation(len(records))]
