@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.model_components.ray_generators import RayGenerator
 
-from edge_depth_nerf.plugin.ray_table import TableRayGenerator
+from edge_depth_nerf.plugin import ray_table
+from edge_depth_nerf.plugin.ray_table import KEPT_VIEWS, TableRayGenerator, ViewRays
 
 
 def cameras(kind: CameraType = CameraType.FISHEYE, **extra) -> Cameras:
@@ -71,3 +76,47 @@ def test_cameras_without_a_table(monkeypatch):
     assert not TableRayGenerator.suits(cameras(times=torch.zeros(5, 1)))
     monkeypatch.setattr("edge_depth_nerf.plugin.ray_table.MOST_PIXELS", 1000)
     assert not TableRayGenerator.suits(cameras())
+
+
+def assert_the_same(rays: RayBundle, expected: RayBundle) -> None:
+    assert rays.shape == expected.shape
+    assert torch.equal(rays.origins, expected.origins) and torch.equal(rays.camera_indices, expected.camera_indices)
+    torch.testing.assert_close(rays.directions, expected.directions, rtol=0, atol=3e-7)
+    torch.testing.assert_close(rays.pixel_area, expected.pixel_area, rtol=2e-4, atol=0)
+    assert rays.metadata.keys() == expected.metadata.keys()
+    for name, values in expected.metadata.items():
+        torch.testing.assert_close(rays.metadata[name], values)
+
+
+@pytest.mark.parametrize("kind", [CameraType.FISHEYE, CameraType.PERSPECTIVE])
+def test_rays_of_views_are_nerfstudios_and_those_of_a_lens_are_made_once(kind, monkeypatch):
+    made, make = [], ray_table._make
+
+    def counted(lenses: torch.Tensor, advance: Callable[[int], object]) -> np.ndarray:
+        made.append(len(lenses))
+        return make(lenses, advance)
+
+    monkeypatch.setattr(ray_table, "_make", counted)
+    views, given = ViewRays(), cameras(kind)
+    for _ in range(2):
+        for number in range(5):
+            camera = given[number : number + 1]
+            assert_the_same(views.of(camera), camera.generate_rays(camera_indices=0, keep_shape=True))
+    assert made == [1, 1]
+
+
+def test_no_more_lenses_are_kept_than_is_said():
+    views, given = ViewRays(), cameras()[:1]
+    for number in range(KEPT_VIEWS + 3):
+        given.fx = given.fx + number
+        views.of(given)
+    assert views._of_lens.cache_info().currsize == KEPT_VIEWS
+
+
+@pytest.mark.parametrize("extra", [{"times": torch.zeros(5, 1)}, {"metadata": {"of_it": torch.ones(5, 1)}}])
+def test_rays_of_a_view_without_a_table_are_nerfstudios_own(extra, monkeypatch):
+    monkeypatch.setattr(ray_table, "_make", lambda *_: pytest.fail("made a table"))
+    camera = cameras(**extra)[1:2]
+    rays, expected = ViewRays().of(camera), camera.generate_rays(camera_indices=0, keep_shape=True)
+    assert_the_same(rays, expected)
+    assert torch.equal(rays.directions, expected.directions)

@@ -21,7 +21,6 @@ from torch import Tensor
 from edge_depth_nerf.base.files import read_distance_png, read_image, write_png
 from edge_depth_nerf.compare.figures import ANGLE_EDGES_DEG, DISTANCE_EDGES_M, BinnedErrors, affine_fitted
 from edge_depth_nerf.method.metrics import LEAST_SQUARED_ERROR, DepthErrors, masked_lpips, masked_psnr, masked_ssim
-from edge_depth_nerf.plugin.compat import without_undefined_ray
 from edge_depth_nerf.plugin.dataset import FisheyeDepthDataset
 from edge_depth_nerf.plugin.detail import detail_shown
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
@@ -300,11 +299,8 @@ class ViewJudge:
         """Render the pixels of a view inside its mask; its figures there, and its distances added to `errors`."""
         model, mask, target = self.model, view.batch["mask"][..., 0].cpu(), view.batch["image"][..., :3].cpu()
         rgb, distance_m = torch.zeros(*mask.shape, 3), torch.zeros(mask.shape)
-        camera = without_undefined_ray(view.camera.to(model.device))
-        # nerfstudio's coordinates are those of the pixels' centres
-        at = (mask.nonzero() + 0.5).to(model.device)
         # as a picture of one row
-        rays = camera.generate_rays(camera_indices=0, coords=at).reshape((1, len(at)))
+        rays = model.rays_of_view(view.camera.to(model.device))[mask.to(model.device)].reshape((1, int(mask.sum())))
         outputs = model.get_outputs_for_camera_ray_bundle(rays)
         rgb[mask] = outputs["rgb"][0].cpu().clamp(0, 1)
         distance_m[mask] = outputs["depth"][0, :, 0].cpu() * model.metres_per_unit

@@ -59,7 +59,7 @@ from edge_depth_nerf.plugin.compat import lpips_not_built, total_steps, without_
 from edge_depth_nerf.plugin.detail import TrainingDetail
 from edge_depth_nerf.plugin.exposure import KINDS
 from edge_depth_nerf.plugin.pose_refinement import MOMENTS, PoseRefiner, PoseRefinerConfig
-from edge_depth_nerf.plugin.ray_table import PLACE
+from edge_depth_nerf.plugin.ray_table import PLACE, ViewRays
 
 LARGEST_NEAR_PLANE_M = 0.5
 """A near plane beyond this cuts off road and car beside the camera."""
@@ -325,6 +325,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         self._scheduled_weight: Tensor | None = None
         self.detail: TrainingDetail | None = None
         """Of the training pictures; the pipeline sets it."""
+        self._view_rays = ViewRays()
         self.reset_depth_errors()
 
     def _refine_poses(self, metadata: dict[str, Any]) -> None:
@@ -495,10 +496,18 @@ class EdgeDepthNerfModel(NerfactoModel):
         named = {f"prop_depth_{number}": each for number, each in enumerate(before)}
         return {"depth": depth, "expected_depth": expected, **named}
 
+    def rays_of_view(self, camera: Cameras, obb_box: OrientedBox | None = None) -> RayBundle:
+        """Rays of a whole view, [height, width]; with a box, they begin and end at it."""
+        camera = without_undefined_ray(camera)
+        if obb_box is not None:
+            return camera.generate_rays(camera_indices=0, keep_shape=True, obb_box=obb_box)
+        return self._view_rays.of(camera)
+
+    @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
         """Outputs of a whole view; distance and uncertainty also in colours that always mean the same metres."""
         take_all_threads()
-        outputs = super().get_outputs_for_camera(without_undefined_ray(camera), obb_box)
+        outputs = self.get_outputs_for_camera_ray_bundle(self.rays_of_view(camera, obb_box))
         for name, scale in (("distance", DISTANCE), ("distance_uncertainty", SIGMA)):
             outputs[f"{name}_coloured"] = coloured(outputs[name][..., 0], scale)
         return outputs
@@ -518,8 +527,7 @@ class EdgeDepthNerfModel(NerfactoModel):
 
     def rendered_alone(self, camera: Cameras) -> dict[str, Tensor]:
         """Outputs of a whole view without detail."""
-        rays = without_undefined_ray(camera).generate_rays(camera_indices=0, keep_shape=True)
-        return super().get_outputs_for_camera_ray_bundle(rays)
+        return super().get_outputs_for_camera_ray_bundle(self.rays_of_view(camera))
 
     @contextmanager
     def with_appearance_of(self, picture: int) -> Iterator[None]:

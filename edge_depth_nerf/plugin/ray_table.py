@@ -3,14 +3,15 @@
 Host-facing. nerfstudio inverts a lens's polynomial by ten iterations for each pixel of each batch, and twice more for
 its neighbours. The table holds what comes out, made once by nerfstudio's own `generate_rays` from a camera that is not
 turned: the numbers are the same but for the rounding of one rotation. It lies in the scene's cache and is mapped into
-memory; a lens of 1400×1400 px takes 39 MB there, and five seconds once.
+memory; a lens of 1400×1400 px takes 39 MB there, and five seconds once. Whole views keep the tables of the lenses that
+were rendered last in the process's own memory.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,8 @@ PLACE = "place"
 """Metadata of training rays: column and row of the pixel, 0 to 1 over its picture."""
 KEPT_TABLES = 4
 """So many tables are kept of a scene, those used last: one for each set of lenses that was trained or shown."""
+KEPT_VIEWS = 4
+"""So many lenses' rays are kept in memory for whole views: of a drive's cameras, or of the viewer's resolutions."""
 MOST_PIXELS = 1 << 24
 """Lenses with more pixels than this in all (a table of 335 MB) get no table."""
 STRIP = 1 << 16
@@ -161,3 +164,37 @@ class TableRayGenerator(RayGenerator):
             camera_indices=picture[:, None],
             metadata={"directions_norm": rest[:, 1:]},
         )
+
+
+class ViewRays:
+    """Rays of whole views, as nerfstudio's `generate_rays` makes them, but for the rounding of one rotation.
+
+    On the CPU, the rays of a lens are made once and then turned: making them takes a sixth of a view.
+    """
+
+    def __init__(self) -> None:
+        self._of_lens = lru_cache(KEPT_VIEWS)(_make_in_memory)
+
+    def of(self, camera: Cameras) -> RayBundle:
+        """Rays of a camera of shape [1], as [height, width]."""
+        suits = camera.shape == (1,) and torch.device(camera.device).type == "cpu" and TableRayGenerator.suits(camera)
+        if not suits:
+            return camera.generate_rays(camera_indices=0, keep_shape=True)
+        lenses, _ = _lenses(camera)
+        directions, areas, lengths = self._of_lens(tuple(lenses[0].tolist()))
+        pose, shape = camera.camera_to_worlds[0], (int(camera.height), int(camera.width))
+        return RayBundle(
+            # nerfstudio flattens them for each part of the view, and would copy them each time
+            origins=pose[:, 3].expand(*shape, 3).contiguous(),
+            directions=(directions @ pose[:, :3].T).view(*shape, 3),
+            pixel_area=areas.view(*shape, 1),
+            camera_indices=torch.zeros(*shape, 1, dtype=torch.long),
+            metadata={"directions_norm": lengths.view(*shape, 1)},
+        )
+
+
+def _make_in_memory(lens: tuple[float, ...]) -> tuple[Tensor, Tensor, Tensor]:
+    """Directions as the camera has them, areas, and lengths of a lens's rays; [pixels, 3 or 1]."""
+    table = torch.from_numpy(_make(torch.tensor([lens], dtype=torch.float64), lambda _: None))
+    directions, areas, lengths = (part.contiguous() for part in table.split((3, 1, 1), dim=1))
+    return directions, areas, lengths
