@@ -559,6 +559,15 @@ def test_a_page_has_the_table_that_was_measured(benchmark_module, name, page):
     assert pages.with_part(text, benchmark.PART, table) == text
 
 
+def test_what_the_page_says_of_judging_follows_from_its_run(benchmark_module):
+    results = read_json(benchmark_module("judging").RESULTS)
+    seconds = results["seconds"]
+    held_out = sum(seconds[name] for name in ("rendering", "figures", "pictures"))
+    share = round(100 * held_out / seconds["training"])
+    text = " ".join((ROOT / "docs" / "speed.md").read_text(encoding="utf-8").split())
+    assert results["views"] == 10 and f"The ten held-out views take {share} % of the training's time" in text
+
+
 def test_what_the_page_says_of_rays_that_know_follows_from_its_runs(benchmark_module):
     scenes = read_json(benchmark_module("known_rays").RESULTS)["scenes"].values()
     page = " ".join((ROOT / "docs" / "ablation.md").read_text(encoding="utf-8").split())
