@@ -17,10 +17,12 @@ import json
 import time
 from collections.abc import Callable
 from copy import deepcopy
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pages
 import run
 import torch
 from nerfstudio.configs.method_configs import all_methods
@@ -29,7 +31,7 @@ from nerfstudio.engine.optimizers import Optimizers
 from rich.console import Console
 from rich.table import Table
 
-from edge_depth_nerf.base.files import read_json, write_json
+from edge_depth_nerf.base.files import read_json, write_json, write_text
 from edge_depth_nerf.compare.judging import PIXELS_PER_VIEW, choose_pixels, judge_pixels
 from edge_depth_nerf.plugin.config import apply_overrides
 
@@ -87,6 +89,43 @@ def begun(path: Path, steps: int) -> dict[str, Any]:
     if results.get("commit") == run.commit() and results.get("steps") == steps:
         return results
     return {"commit": run.commit(), "steps": steps, "scenes": {}}
+
+
+def scene_by_scene(
+    description: str | None,
+    kept: Path,
+    part: str,
+    table: Callable[[dict[str, Any]], str],
+    measure: Callable[[Path, dict[str, Any], Callable[[], None]], None],
+) -> None:
+    """Run a benchmark that measures scene after scene: its options, the file that keeps its figures, table and page.
+
+    Args:
+        description: of the command.
+        kept: the file, unless `--json` names another one.
+        part: of the page.
+        table: of the figures, as Markdown.
+        measure: adds to the figures what they lack of a scene, and calls its last argument to keep them.
+
+    """
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", type=Path, nargs="+")
+    parser.add_argument("--steps", type=int, default=1000)
+    parser.add_argument("--json", type=Path, default=kept)
+    parser.add_argument("--page", type=Path)
+    options = parser.parse_args()
+    results = begun(options.json, options.steps)
+    for scene in options.scenes:
+        measure(scene, results, partial(write_json, options.json, results))
+    Console(width=200).print(table(results), markup=False)
+    if options.page:
+        text = options.page.read_text(encoding="utf-8")
+        write_text(options.page, pages.with_part(text, part, table(results)))
+
+
+def of_scene(results: dict[str, Any], scene: Path) -> dict[str, Any]:
+    """The figures of a scene, to add to."""
+    return results["scenes"].setdefault(scene.resolve().name, {})
 
 
 def falling_over(steps: int) -> dict[str, int]:

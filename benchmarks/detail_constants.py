@@ -9,18 +9,14 @@ the views. Use drives that no results table is made of.
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import ablate
 import numpy as np
-import pages
-from rich.console import Console
 
-from edge_depth_nerf.base.files import write_json, write_text
 from edge_depth_nerf.compare.judging import evaluated
 from edge_depth_nerf.method import detail as formulas
 from edge_depth_nerf.method.metrics import masked_psnr
@@ -92,24 +88,16 @@ def table(results: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def measure(scene: Path, results: dict[str, Any], keep: Callable[[], None]) -> None:
+    steps, found, kept = results["steps"], ablate.of_scene(results, scene), []
+    if not found:
+        ablate.train(scene, ablate.falling_over(steps), steps, 0, kept.append)
+        found.update(found_with(kept[0]))
+        keep()
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", type=Path, nargs="+")
-    parser.add_argument("--steps", type=int, default=1000)
-    parser.add_argument("--json", type=Path, default=RESULTS)
-    parser.add_argument("--page", type=Path)
-    options = parser.parse_args()
-    results = ablate.begun(options.json, options.steps)
-    for scene in options.scenes:
-        name, kept = scene.resolve().name, []
-        if name not in results["scenes"]:
-            ablate.train(scene, ablate.falling_over(options.steps), options.steps, 0, kept.append)
-            results["scenes"][name] = found_with(kept[0])
-            write_json(options.json, results)
-    Console(width=200).print(table(results), markup=False)
-    if options.page:
-        text = options.page.read_text(encoding="utf-8")
-        write_text(options.page, pages.with_part(text, PART, table(results)))
+    ablate.scene_by_scene(__doc__, RESULTS, PART, table, measure)
 
 
 if __name__ == "__main__":

@@ -1,19 +1,18 @@
 """Whether training pixels should come in another order than a random one.
 
-    python benchmarks/pixel_order.py SCENE... [--steps 1000] [--rounds 8] [--json FILE] [--page FILE]
+    python benchmarks/pixel_order.py SCENE... [--steps 1000] [--json FILE] [--page FILE]
 
 - In blocks: the pixels of a block of a picture follow each other, and share rows of the hash table; the blocks come in
   random order.
 - Spread evenly: as many pixels as one likes that follow each other are spread evenly over all pictures and over each.
 
-First, for each scene, a training with each order; then, on the first scene, steps with each order take turns. PSNR and
+First, on the first scene, steps with each order take turns; then, for each scene, a training with each order. PSNR and
 AbsRel are of 3,000 random pixels of each held-out view. Run it on an idle machine, with drives that no results table is
 made of.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
 import statistics
 import tempfile
@@ -25,17 +24,13 @@ from typing import Any
 
 import ablate
 import numpy as np
-import pages
 import speed
 from numpy.typing import NDArray
-from rich.console import Console
 from step_parts import Clock
-
-from edge_depth_nerf.base.files import write_json, write_text
 
 RESULTS = Path(__file__).with_name("pixel_order.json")
 PART = "pixel order"
-STEPS_IN_A_TURN = 20
+STEPS_IN_A_TURN, ROUNDS = 20, 8
 PARTS = {"whole": "a step", "hash grid": "… hash grid", "optimisers": "… gradient of its table, and Adam"}
 GOLDEN_RATIO = (1 + math.sqrt(5)) / 2
 
@@ -84,7 +79,7 @@ def put_in_order(order: str, pipeline: Any) -> None:
     table._records = ORDERS[order](np.asarray(table._records))
 
 
-def timed(scene: Path, rounds: int) -> dict[str, dict[str, float]]:
+def timed(scene: Path) -> dict[str, dict[str, float]]:
     """Milliseconds of steps and of their parts, by the order of pixels; median over turns."""
     config = speed.configurations("lite", scene, ["ours"])["ours"]
     spread = [int((k + 0.5) * config.max_num_iterations / STEPS_IN_A_TURN) for k in range(STEPS_IN_A_TURN)]
@@ -97,7 +92,7 @@ def timed(scene: Path, rounds: int) -> dict[str, dict[str, float]]:
         clock = Clock()
         clock.measure_step(runner.trainer)
         runner.iterate(spread)
-        for number in range(rounds):
+        for number in range(ROUNDS):
             for order in ORDERS if number % 2 else reversed(ORDERS):
                 table._records = records[order]
                 clock.seconds.clear()
@@ -120,30 +115,20 @@ def table(results: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", type=Path, nargs="+")
-    parser.add_argument("--steps", type=int, default=1000)
-    parser.add_argument("--rounds", type=int, default=8)
-    parser.add_argument("--json", type=Path, default=RESULTS)
-    parser.add_argument("--page", type=Path)
-    options = parser.parse_args()
-    results = ablate.begun(options.json, options.steps)
-    for scene in options.scenes:
-        of_scene = results["scenes"].setdefault(scene.resolve().name, {})
-        for order in ORDERS:
-            if order not in of_scene:
-                falling = ablate.falling_over(options.steps)
-                found = ablate.train(scene, falling, options.steps, 0, partial(put_in_order, order))
-                of_scene[order] = {"psnr": found["truth_psnr"], "abs_rel": found["truth_abs_rel"]}
-                write_json(options.json, results)
+def measure(scene: Path, results: dict[str, Any], keep: Callable[[], None]) -> None:
+    steps, found = results["steps"], ablate.of_scene(results, scene)
     if "ms" not in results:
-        results["ms"] = timed(options.scenes[0], options.rounds)
-        write_json(options.json, results)
-    Console(width=200).print(table(results), markup=False)
-    if options.page:
-        text = options.page.read_text(encoding="utf-8")
-        write_text(options.page, pages.with_part(text, PART, table(results)))
+        results["ms"] = timed(scene)
+        keep()
+    for order in ORDERS:
+        if order not in found:
+            figures = ablate.train(scene, ablate.falling_over(steps), steps, 0, partial(put_in_order, order))
+            found[order] = {"psnr": figures["truth_psnr"], "abs_rel": figures["truth_abs_rel"]}
+            keep()
+
+
+def main() -> None:
+    ablate.scene_by_scene(__doc__, RESULTS, PART, table, measure)
 
 
 if __name__ == "__main__":

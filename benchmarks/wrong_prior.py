@@ -10,16 +10,12 @@ search (docs/results.md), ours its defaults.
 
 from __future__ import annotations
 
-import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import ablate
-import pages
 import torch
-from rich.console import Console
-
-from edge_depth_nerf.base.files import read_json_object, write_json, write_text
 
 RESULTS = Path(__file__).with_name("wrong_prior.json")
 PART = "wrong prior"
@@ -76,28 +72,19 @@ def table(results: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def measure(scene: Path, results: dict[str, Any], keep: Callable[[], None]) -> None:
+    steps, found = results["steps"], ablate.of_scene(results, scene)
+    for method, overrides in METHODS.items():
+        for title, block in BLOCKS.items():
+            key = f"{method}, {title}"
+            if key not in found:
+                change = (lambda pipeline, block=block: spoil(pipeline, block)) if block else None
+                found[key] = ablate.train(scene, {**overrides, **ablate.falling_over(steps)}, steps, 0, change)
+                keep()
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", type=Path, nargs="+")
-    parser.add_argument("--steps", type=int, default=1000)
-    parser.add_argument("--json", type=Path, default=RESULTS)
-    parser.add_argument("--page", type=Path)
-    options = parser.parse_args()
-    results = ablate.begun(options.json, options.steps)
-    schedule = ablate.falling_over(options.steps)
-    for scene in options.scenes:
-        found = results["scenes"].setdefault(scene.resolve().name, {})
-        for method, overrides in METHODS.items():
-            for title, block in BLOCKS.items():
-                key = f"{method}, {title}"
-                if key not in found:
-                    change = (lambda pipeline, block=block: spoil(pipeline, block)) if block else None
-                    found[key] = ablate.train(scene, {**overrides, **schedule}, options.steps, 0, change)
-                    write_json(options.json, results)
-    Console(width=200).print(table(results), markup=False)
-    if options.page:
-        text = options.page.read_text(encoding="utf-8")
-        write_text(options.page, pages.with_part(text, PART, table(read_json_object(options.json))))
+    ablate.scene_by_scene(__doc__, RESULTS, PART, table, measure)
 
 
 if __name__ == "__main__":
