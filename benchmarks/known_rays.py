@@ -80,6 +80,9 @@ class View:
     def render(self, chosen: Tensor, edges: Tensor | None = None) -> Rendered:
         """Render chosen rays as today, or with samples between given edges, [chosen, samples + 1]."""
         model, parts, seen = self.model, [], []
+        if not chosen.any():
+            nothing = torch.zeros(0, 1)
+            return Rendered(nothing.expand(0, 3), nothing, nothing, nothing)
 
         def look(weights: list[Tensor], samples: list[Any]) -> dict[str, Tensor]:
             seen.append((samples[-1].frustums, weights[-1][..., 0]))
