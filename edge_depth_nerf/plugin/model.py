@@ -499,7 +499,7 @@ class EdgeDepthNerfModel(NerfactoModel):
     def rays_of_view(self, camera: Cameras, obb_box: OrientedBox | None = None) -> RayBundle:
         """Rays of a whole view, [height, width]; with a box, they begin and end at it."""
         camera = without_undefined_ray(camera)
-        if obb_box is not None:
+        if obb_box is not None or self.device.type != "cpu":
             return camera.generate_rays(camera_indices=0, keep_shape=True, obb_box=obb_box)
         return self._view_rays.of(camera)
 

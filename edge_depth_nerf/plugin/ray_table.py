@@ -167,9 +167,9 @@ class TableRayGenerator(RayGenerator):
 
 
 class ViewRays:
-    """Rays of whole views, as nerfstudio's `generate_rays` makes them, but for the rounding of one rotation.
+    """Rays of whole views on the CPU, as nerfstudio's `generate_rays` makes them, but for the rounding of one rotation.
 
-    On the CPU, the rays of a lens are made once and then turned: making them takes a sixth of a view.
+    The rays of a lens are made once and then turned: making them takes a sixth of a view.
     """
 
     def __init__(self) -> None:
@@ -177,8 +177,7 @@ class ViewRays:
 
     def of(self, camera: Cameras) -> RayBundle:
         """Rays of a camera of shape [1], as [height, width]."""
-        suits = camera.shape == (1,) and torch.device(camera.device).type == "cpu" and TableRayGenerator.suits(camera)
-        if not suits:
+        if camera.shape != (1,) or not TableRayGenerator.suits(camera):
             return camera.generate_rays(camera_indices=0, keep_shape=True)
         lenses, _ = _lenses(camera)
         directions, areas, lengths = self._of_lens(tuple(lenses[0].tolist()))
