@@ -7,6 +7,7 @@ elsewhere, and they continue from what they find on disk.
 
 from __future__ import annotations
 
+import asyncio
 import importlib.metadata
 import logging
 import os
@@ -261,7 +262,7 @@ def on_cluster(address: str, tasks: Sequence[Task], reads: Sequence[Path], conso
         else:
             try:
                 client = Client(address, timeout=CONNECT_S, set_as_default=False)
-            except (OSError, TimeoutError, ValueError, TypeError) as error:
+            except (OSError, asyncio.TimeoutError, ValueError, TypeError) as error:
                 raise InputError(
                     f"--cluster {address}: no scheduler answers ({_first_line(error)}). Start one with `dask "
                     "scheduler` where this machine can reach it; for tls://, Dask's own settings name the "
@@ -297,7 +298,7 @@ def _await_workers(client: Any, address: str, console: Console) -> None:
         say(console, f"Cluster {address}: no worker yet; waiting up to {WAIT_FOR_WORKERS_S:g} s at most.", "yellow")
     try:
         client.wait_for_workers(1, timeout=WAIT_FOR_WORKERS_S)
-    except TimeoutError:
+    except asyncio.TimeoutError:  # Dask's; with Python 3.10, another one than Python's own
         raise InputError(
             f"--cluster {address}: the scheduler has no worker after {WAIT_FOR_WORKERS_S:g} s. Start some with `dask "
             f"worker {address} --nthreads 1`, and with --resources 'GPU=1' on machines with a GPU."

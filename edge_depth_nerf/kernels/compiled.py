@@ -6,7 +6,6 @@ result is kept beside the module, or in the user's cache if that folder cannot b
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
@@ -42,8 +41,6 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        # jaxtyping before 0.3.11, the only one for Python 3.10, wraps it all the same
-        function = inspect.unwrap(function)
         try:
             kernel = njit(cache=True, nogil=True, **options)(function)
             _folders.add(Path(str(kernel.stats.cache_path)))
