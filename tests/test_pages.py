@@ -299,7 +299,7 @@ def test_the_pictures_are_current(tmp_path):
     for name in ("method_maps.png", "method_kernel.png"):
         made, committed = (read_image(folder / name).astype(float) for folder in (tmp_path, DOCS))
         assert made.shape == committed.shape, name
-        # another OpenCV may draw text by a shade differently, and the last matplotlib for Python 3.10 places it elsewhere
+        # another OpenCV may draw text a shade differently; the last matplotlib for Python 3.10 places it elsewhere
         assert sys.version_info < (3, 11) or np.abs(made - committed).mean() < 1, name
     assert (tmp_path / "method_ray.svg").stat().st_size > 5000
     committed = [path for path in DOCS.iterdir() if path.name.startswith("method_")]
