@@ -232,9 +232,9 @@ def test_the_constraints_suit_every_python_that_is_allowed():
             installed = distribution(pinned.name)
         except PackageNotFoundError:
             continue
-        needs = installed.metadata.get("Requires-Python")
-        if needs is None or not pinned.specifier.contains(installed.version):
+        if "Requires-Python" not in installed.metadata or not pinned.specifier.contains(installed.version):
             continue
+        needs = installed.metadata["Requires-Python"]
         read += 1
         for python in ("3.10.0", "3.11.0", "3.12.0"):
             environment = {"python_version": python.rpartition(".")[0], "python_full_version": python}

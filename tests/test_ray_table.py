@@ -80,6 +80,7 @@ def test_cameras_without_a_table(monkeypatch):
 
 def assert_the_same(rays: RayBundle, expected: RayBundle) -> None:
     assert rays.shape == expected.shape
+    assert rays.camera_indices is not None and expected.camera_indices is not None
     assert torch.equal(rays.origins, expected.origins) and torch.equal(rays.camera_indices, expected.camera_indices)
     torch.testing.assert_close(rays.directions, expected.directions, rtol=0, atol=3e-7)
     torch.testing.assert_close(rays.pixel_area, expected.pixel_area, rtol=2e-4, atol=0)
