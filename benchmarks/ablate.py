@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from copy import deepcopy
 from functools import partial
 from pathlib import Path
@@ -121,6 +121,20 @@ def scene_by_scene(
     if options.page:
         text = options.page.read_text(encoding="utf-8")
         write_text(options.page, pages.with_part(text, part, table(results)))
+
+
+def of_trained(
+    look: Callable[[Any], dict[str, Any] | Iterable[tuple[str, Any]]],
+    scene: Path,
+    results: dict[str, Any],
+    keep: Callable[[], None],
+) -> None:
+    """Add what `look` finds with a trained pipeline of ours to the figures of a scene, if it has none."""
+    steps, found, kept = results["steps"], of_scene(results, scene), []
+    if not found:
+        train(scene, falling_over(steps), steps, 0, kept.append)
+        found.update(look(kept[0]))
+        keep()
 
 
 def of_scene(results: dict[str, Any], scene: Path) -> dict[str, Any]:

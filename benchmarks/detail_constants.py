@@ -9,8 +9,9 @@ the views. Use drives that no results table is made of.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -88,16 +89,8 @@ def table(results: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def measure(scene: Path, results: dict[str, Any], keep: Callable[[], None]) -> None:
-    steps, found, kept = results["steps"], ablate.of_scene(results, scene), []
-    if not found:
-        ablate.train(scene, ablate.falling_over(steps), steps, 0, kept.append)
-        found.update(found_with(kept[0]))
-        keep()
-
-
 def main() -> None:
-    ablate.scene_by_scene(__doc__, RESULTS, PART, table, measure)
+    ablate.scene_by_scene(__doc__, RESULTS, PART, table, partial(ablate.of_trained, found_with))
 
 
 if __name__ == "__main__":

@@ -252,16 +252,8 @@ def table(results: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def measure(scene: Path, results: dict[str, Any], keep: Callable[[], None]) -> None:
-    steps, found, kept = results["steps"], ablate.of_scene(results, scene), []
-    if not found:
-        ablate.train(scene, ablate.falling_over(steps), steps, 0, kept.append)
-        found.update(ways(kept[0]))
-        keep()
-
-
 def main() -> None:
-    ablate.scene_by_scene(__doc__, RESULTS, PART, table, measure)
+    ablate.scene_by_scene(__doc__, RESULTS, PART, table, partial(ablate.of_trained, ways))
 
 
 if __name__ == "__main__":
