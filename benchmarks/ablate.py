@@ -137,6 +137,20 @@ def of_trained(
         keep()
 
 
+def table_of_scenes(corner: str, scenes: Iterable[str], rows: dict[str, list[str]]) -> str:
+    """A column for each scene, as Markdown.
+
+    Args:
+        corner: what stands in the cells.
+        scenes: their names.
+        rows: the cells of each.
+
+    """
+    head = [corner, *scenes]
+    lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    return "\n".join([*lines, *(f"| {name} | {' | '.join(cells)} |" for name, cells in rows.items())])
+
+
 def of_scene(results: dict[str, Any], scene: Path) -> dict[str, Any]:
     """The figures of a scene, to add to."""
     return results["scenes"].setdefault(scene.resolve().name, {})

@@ -78,15 +78,14 @@ def found_with(pipeline: Any) -> dict[str, float]:
 def table(results: dict[str, Any]) -> str:
     """PSNR of each, as Markdown; of changed constants, what they gain."""
     scenes: dict[str, dict[str, float]] = results["scenes"]
-    lines = ["| PSNR, dB | " + " | ".join(scenes) + " |", "|---" * (len(scenes) + 1) + "|"]
+    rows = {}
     for name in next(iter(scenes.values())):
         plain = name in ("without detail", "with detail")
-        cells = [
+        rows[name] = [
             f"{each[name]:.2f}" if plain else f"{round(each[name] - each['with detail'], 2) + 0.0:+.2f}"
             for each in scenes.values()
         ]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+    return ablate.table_of_scenes("PSNR, dB", scenes, rows)
 
 
 def main() -> None:

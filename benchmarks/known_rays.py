@@ -240,16 +240,13 @@ def ways(pipeline: Any) -> Iterator[tuple[str, dict[str, float]]]:
 def table(results: dict[str, Any]) -> str:
     """Of each way: share of rays, seconds, PSNR and AbsRel, as Markdown."""
     scenes: dict[str, dict[str, dict[str, float]]] = results["scenes"]
-    head = ["rays that know, s a view, PSNR, AbsRel", *scenes]
-    lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
-    for name in next(iter(scenes.values())):
-        cells = [
-            f"{found[name]['share']:.0%}, {found[name]['seconds']:.2f} s, {found[name]['psnr']:.2f} dB, "
-            f"{found[name]['abs_rel']:.4f}"
-            for found in scenes.values()
-        ]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+
+    def cell(found: dict[str, float]) -> str:
+        seconds, psnr, errors = found["seconds"], found["psnr"], found["abs_rel"]
+        return f"{found['share']:.0%}, {seconds:.2f} s, {psnr:.2f} dB, {errors:.4f}"
+
+    rows = {name: [cell(of[name]) for of in scenes.values()] for name in next(iter(scenes.values()))}
+    return ablate.table_of_scenes("rays that know, s a view, PSNR, AbsRel", scenes, rows)
 
 
 def main() -> None:

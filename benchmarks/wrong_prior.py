@@ -63,13 +63,13 @@ def spoil(pipeline: Any, block: int) -> None:
 def table(results: dict[str, Any]) -> str:
     """PSNR and AbsRel of each, as Markdown."""
     scenes: dict[str, Any] = results["scenes"]
-    lines = ["| PSNR, AbsRel | " + " | ".join(scenes) + " |", "|---|" + "---|" * len(scenes)]
+    rows = {}
     for method in METHODS:
         for title in BLOCKS:
             found = [each[f"{method}, {title}"] for each in scenes.values()]
             cells = [f"{each['truth_psnr']:.2f}, {each['truth_abs_rel']:.4f}" for each in found]
-            lines.append(f"| {method}, prior {title} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+            rows[f"{method}, prior {title}"] = cells
+    return ablate.table_of_scenes("PSNR, AbsRel", scenes, rows)
 
 
 def measure(scene: Path, results: dict[str, Any], keep: Callable[[], None]) -> None:

@@ -9,6 +9,7 @@ import lzma
 import statistics
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -16,6 +17,7 @@ import pytest
 import torch
 from benchmark_modules import benchmark_modules
 from comparisons import fake
+from nerfstudio.cameras.cameras import Cameras
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json, write_json
@@ -24,7 +26,9 @@ from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.results import Results, RunResult
 from edge_depth_nerf.compare.search import grids, write_search
 from edge_depth_nerf.compare.tables import page_of_tables
-from edge_depth_nerf.plugin.pixel_table import RECORD
+from edge_depth_nerf.kernels.ray_samplers import FirstSampler, rays_of
+from edge_depth_nerf.plugin.datamanager import TablePixelSampler
+from edge_depth_nerf.plugin.pixel_table import RECORD, PicturePixels, PixelTable, PixelTableWriter
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results.json"
@@ -55,6 +59,7 @@ UNSEEN_PARTS = {
     "unseen: settings": "λ and σ",
 }
 """The same of `benchmarks/unseen.py`."""
+ON_ABLATION = ("wrong_prior", "detail_constants", "known_rays", "known_training", "pixel_order", "same_seconds")
 BEFORE_PARTS = {
     "before: large": "700 px",
     "before: sight": "Line of sight",
@@ -538,7 +543,7 @@ def test_a_constant_of_detail_is_changed_for_a_while(benchmark_module):
 @pytest.mark.parametrize(
     ("name", "page"),
     [
-        *((name, "ablation") for name in ("wrong_prior", "detail_constants", "known_rays", "pixel_order")),
+        *((name, "ablation") for name in ON_ABLATION),
         *((name, "speed") for name in ("step_parts", "judging")),
     ],
 )
@@ -583,6 +588,69 @@ def test_what_the_page_says_of_rays_that_know_follows_from_its_runs(benchmark_mo
     assert all(one[0] < other[0] for one, other in zip(fewer, known, strict=True))
 
 
+def test_what_the_page_says_of_rays_that_know_in_training_follows_from_its_runs(benchmark_module):
+    known = benchmark_module("known_training")
+    scenes = read_json(known.RESULTS)["scenes"]
+    page = " ".join((ROOT / "docs" / "ablation.md").read_text(encoding="utf-8").split())
+    today, more, most = known.TODAY, f"{known.TODAY}, more rays", "corrected, 8 samples, more rays"
+    in_the_same_time = [name for name, way in known.WAYS.items() if way.rays is None and name != today]
+    ways = [of["ways"] for of in scenes.values()]
+    gains = {name: [of[name]["psnr"] - of[today]["psnr"] for of in ways] for name in in_the_same_time}
+    errors = [100 * (of[name]["abs_rel"] / of[today]["abs_rel"] - 1) for of in ways for name in in_the_same_time]
+    every = [gain for of_way in gains.values() for gain in of_way]
+    assert f"change PSNR by {min(every):.2f} to +{max(every):.2f} dB" in page
+    assert f"AbsRel by {min(errors):.0f} to +{max(errors):.0f} %, and no way gains on all drives" in page
+    assert all(min(of_way) < 0 for of_way in gains.values())
+    ms = [of["ms"] for of in scenes.values()]
+    shorter = [100 * (1 - each["by the prior, 8 samples"] / each[today]) for each in ms]
+    assert f"a step of 1,024 rays is {min(shorter):.0f} to {max(shorter):.0f} % shorter" in page
+    second = [each[known.IN_TWO] - each[today] for each in ms]
+    assert f"two calls take {min(second):.0f} to {max(second):.0f} ms more than one" in page
+    higher = [of[most]["psnr"] - of[today]["psnr"] for of in ways]
+    longer = [of[most]["ms"] - of[today]["ms"] for of in ways]
+    assert f"have {min(higher):.2f} to {max(higher):.2f} dB more than today's 1,024" in page
+    assert f"their step is {min(longer):.0f} to {max(longer):.0f} ms longer" in page
+    # longer than a second call takes
+    assert all(more_ms > call for more_ms, call in zip(longer, second, strict=True))
+    lower = [of[more]["psnr"] - of[most]["psnr"] for of in ways]
+    assert f"has {min(lower):.2f} to {max(lower):.2f} dB more than they" in page and min(lower) > 0
+    assert all(of[most]["ms"] == pytest.approx(of[more]["ms"], rel=0.09) for of in ways)
+
+
+def test_what_the_page_says_of_the_same_seconds_follows_from_its_runs(benchmark_module):
+    same = benchmark_module("same_seconds")
+    results = read_json(same.RESULTS)
+    page = " ".join((ROOT / "docs" / "ablation.md").read_text(encoding="utf-8").split())
+    gains = {name: same.gains(results, name, 0) for name in same.VARIANTS if name != same.TODAY}
+    every = [gain for of_variant in gains.values() for gain in of_variant]
+    assert f"The variants change PSNR by {min(every):.2f} to +{max(every):.2f} dB." in page
+    assert len(results["scenes"]) == 4 and all(min(of_variant) < 0 for of_variant in gains.values())
+    best = sorted(gains, key=lambda name: statistics.mean(gains[name]))[-2:]
+    assert set(best) == set(same.BEST[1:])
+    of_seeds = {name: [same.gains(results, name, seed) for seed in same.SEEDS] for name in same.BEST[1:]}
+    fewer, by_error = (statistics.mean(gain for of_seed in each for gain in of_seed) for each in of_seeds.values())
+    found = f"they gain {fewer:.2f} dB (16 final samples) and {by_error:.2f} dB (rays by their last error) on average"
+    assert f"With three seeds, {found}." in page
+    ranges = []
+    for of in results["scenes"].values():
+        psnr = [of["variants"][same.TODAY][str(seed)]["psnr"] for seed in same.SEEDS]
+        ranges.append(max(psnr) - min(psnr))
+    assert f"defaults differ by {min(ranges):.2f} to {max(ranges):.2f} dB between seeds" in page
+    real = results["scenes"]["kitti360_half"]["variants"]
+    pairs = [(real[same.BEST[2]][str(seed)], real[same.TODAY][str(seed)]) for seed in same.SEEDS]
+    larger = [100 * (one["abs_rel"] / today["abs_rel"] - 1) for one, today in pairs]
+    assert f"On the real drive, their AbsRel is {min(larger):.0f} to {max(larger):.0f} % larger." in page
+    of_drives = [statistics.mean(each) for each in zip(*of_seeds[same.BEST[2]], strict=True)]
+    assert f"gain {min(of_drives):.2f} to {max(of_drives):.2f} dB on each drive, as means of three seeds" in page
+
+
+def test_the_page_says_how_small_a_part_of_a_step_the_losses_are(benchmark_module):
+    of_two = read_json(benchmark_module("step_parts").RESULTS)["threads"]["2"]
+    share = round(100 * of_two["parts"]["losses"] / of_two["ms"])
+    text = " ".join((ROOT / "docs" / "speed.md").read_text(encoding="utf-8").split())
+    assert f"the table's row of losses, which is {share} % of a step on two threads" in text
+
+
 def test_orders_of_pixels_hold_every_pixel_once_and_are_what_they_say(benchmark_module):
     orders = benchmark_module("pixel_order").ORDERS
     assert next(iter(orders)) == "random" and {"blocks of 8 × 8 px", "spread evenly"} <= set(orders)
@@ -601,6 +669,67 @@ def test_orders_of_pixels_hold_every_pixel_once_and_are_what_they_say(benchmark_
         # of 128 that follow each other, each block has one, nearly
         of_block = np.unique(blocks[:, 100:228], axis=1, return_counts=True)[1]
         assert (of_block.max() <= 2) == (name == "spread evenly"), name
+
+
+def cameras_of(pictures: int, height: int, width: int) -> Cameras:
+    return Cameras(torch.eye(4)[:3].expand(pictures, -1, -1), 20.0, 20.0, width / 2, height / 2, width, height)
+
+
+def test_rays_that_know_have_samples_around_their_surface_and_in_front_of_it(benchmark_module):
+    known = benchmark_module("known_training")
+    model = SimpleNamespace(
+        metres_per_unit=2.0, proposal_sampler=SimpleNamespace(initial_sampler=FirstSampler(single_jitter=False))
+    )
+    manager = SimpleNamespace(
+        train_dataset=SimpleNamespace(cameras=cameras_of(1, 16, 16)),
+        train_pixel_sampler=None,
+        config=SimpleNamespace(train_num_rays_per_batch=3),
+    )
+    pipeline = SimpleNamespace(model=model, datamanager=manager, _computed=None)
+    steps = known.Steps(pipeline, known.Way(16), 100)
+    rays = rays_of(torch.zeros(3, 3), torch.eye(3), torch.ones(3, 1), torch.zeros(3, 1, dtype=torch.long))
+    rays.nears, rays.fars = torch.full((3, 1), 0.1), torch.full((3, 1), 500.0)
+    # two surfaces, the first one almost at the near plane, and the sky
+    samples = steps.samples(rays, torch.tensor([0.22, 20.0, 0.0]), torch.tensor([0.01, 0.2, 0.0]))
+    starts, ends = samples.frustums.starts[..., 0], samples.frustums.ends[..., 0]
+    assert samples.shape == (3, 16)
+    assert torch.equal(starts[:, 1:], ends[:, :-1]) and (ends >= starts).all()
+    assert starts[:2, 0].tolist() == pytest.approx([0.1, 0.1], rel=1e-4) and 0.1 <= float(starts[2, 0]) < 0.2
+    spacing = model.proposal_sampler.initial_sampler.spacing_fn
+    ends_there = (spacing(ends) - spacing(rays.nears)) / (spacing(rays.fars) - spacing(rays.nears))
+    assert samples.spacing_ends[..., 0] == pytest.approx(ends_there, abs=1e-5)
+    within = ((starts > 9.7) & (starts < 10.3)).sum(dim=1)
+    assert within.tolist()[:2] == [0, 12]
+    assert ends[:2, -1].tolist() == pytest.approx([2 * 0.125, 2 * 10.3], rel=1e-3)
+    assert ends_there[2, -1] > 1 - 0.6 / 16
+
+
+def test_rendered_distances_correct_a_prior_in_their_block(benchmark_module):
+    known = benchmark_module("known_training")
+    correction = known.Correction(cameras_of(2, 40, 40))
+    for ratio in (1.1, 1.2, 1.1, 1.2):
+        correction.see(torch.tensor([[1, 17, 3]]), torch.tensor([ratio]))
+    ratio, sigma, seen = correction.at(torch.tensor([[1, 31, 15], [1, 17, 16], [0, 17, 3]]))
+    assert seen.tolist() == [True, False, False]
+    assert ratio.tolist() == pytest.approx([1.15, 1, 1])
+    assert 0.02 < float(sigma[0]) < 0.1 and sigma[1:].tolist() == pytest.approx([0.01, 0.01])
+
+
+def test_pixels_are_drawn_by_the_last_error_of_their_block(benchmark_module, tmp_path):
+    same = benchmark_module("same_seconds")
+    with PixelTableWriter(tmp_path / "table.npy", 64 * 64) as writer:
+        writer.add(PicturePixels(np.zeros((64, 64, 3), np.uint8), np.ones((64, 64), bool)))
+        writer.finish()
+    sampler = TablePixelSampler(PixelTable(tmp_path / "table.npy"), 256)
+    manager = SimpleNamespace(
+        train_dataset=SimpleNamespace(cameras=cameras_of(1, 64, 64)), train_pixel_sampler=sampler
+    )  # fmt: skip
+    errors = same.LastErrors(SimpleNamespace(datamanager=manager, _computed=None), ("train_pixel_sampler",))
+    # the upper half was 16 times as wrong: it is drawn 4 times as often
+    errors.of_blocks[:] = 0.01
+    errors.of_blocks[:, :4] = 0.16
+    rows = torch.cat([sampler.sample(step).indices[:, 1] for step in range(5)])
+    assert len(rows) == 5 * 256 and 0.65 < float((rows < 32).float().mean()) < 0.8
 
 
 def test_a_wrong_prior_is_wrong_as_often_and_as_much_as_is_said(benchmark_module):
