@@ -25,11 +25,13 @@ import numpy as np
 import pages
 import run
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
 from rich.console import Console
 from rich.table import Table
+from torch import Tensor
 
 from edge_depth_nerf.base.files import read_json, write_json, write_text
 from edge_depth_nerf.compare.judging import PIXELS_PER_VIEW, choose_pixels, judge_pixels
@@ -81,6 +83,13 @@ def train(
             callback.run_callback_at_location(step, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
     seconds = (time.monotonic() - started) / steps
     return {"seconds a step": seconds, **judge_pixels(pipeline, pixels)}
+
+
+def against_truth(figures: dict[str, float]) -> dict[str, float]:
+    """PSNR and AbsRel of a training against the truth; against pictures and LiDAR where it is not known."""
+    if "truth_psnr" in figures:
+        return {"psnr": figures["truth_psnr"], "abs_rel": figures["truth_abs_rel"]}
+    return {"psnr": figures["psnr"], "abs_rel": figures["lidar_abs_rel"]}
 
 
 def begun(path: Path, steps: int) -> dict[str, Any]:
@@ -135,6 +144,17 @@ def of_trained(
         train(scene, falling_over(steps), steps, 0, kept.append)
         found.update(look(kept[0]))
         keep()
+
+
+def blocks_of(cameras: Cameras, side_px: int) -> tuple[int, int, int]:
+    """How many square blocks there are of all pictures: pictures, rows, columns."""
+    rows, columns = (int(each.max()) // side_px + 1 for each in (cameras.height, cameras.width))
+    return len(cameras), rows, columns
+
+
+def block_of(indices: Tensor, side_px: int) -> tuple[Tensor, Tensor, Tensor]:
+    """In which block pixels lie, by picture, row and column, [n, 3]."""
+    return indices[:, 0], indices[:, 1] // side_px, indices[:, 2] // side_px
 
 
 def table_of_scenes(corner: str, scenes: Iterable[str], rows: dict[str, list[str]]) -> str:

@@ -81,26 +81,23 @@ class Correction:
     """What rendered distances are to the prior's, in blocks of pixels."""
 
     def __init__(self, cameras: Cameras) -> None:
-        shape = len(cameras), int(cameras.height.max()) // BLOCK_PX + 1, int(cameras.width.max()) // BLOCK_PX + 1
+        shape = ablate.blocks_of(cameras, BLOCK_PX)
         self.ratio, self.variance, self.seen = torch.ones(shape), torch.zeros(shape), torch.zeros(shape)
 
     def at(self, indices: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Ratio, σ as a share of the distance, and whether enough rays were seen."""
-        block = self._block(indices)
+        block = ablate.block_of(indices, BLOCK_PX)
         sigma = self.variance[block].sqrt().clamp(min=LEAST_SIGMA)
         return self.ratio[block], sigma, self.seen[block] >= LEAST_SEEN
 
     def see(self, indices: Tensor, ratio: Tensor) -> None:
         """Take rendered distances into the means; of several in a block one counts."""
-        block = self._block(indices)
+        block = ablate.block_of(indices, BLOCK_PX)
         self.seen[block] += 1
         latest = (1 / self.seen[block]).clamp(min=LATEST)
         off = ratio - self.ratio[block]
         self.ratio[block] += latest * off
         self.variance[block] += latest * (off.square() - self.variance[block])
-
-    def _block(self, indices: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        return indices[:, 0], indices[:, 1] // BLOCK_PX, indices[:, 2] // BLOCK_PX
 
 
 class Steps:
@@ -123,9 +120,8 @@ class Steps:
             outputs, losses, metrics = self.as_today(rays, batch)
             self._see(batch, outputs)
             return outputs, losses, metrics
-        others = {name: value[~known] for name, value in batch.items() if not name.startswith("surface_")}
-        own = {name: value[known] for name, value in batch.items() if not name.startswith("surface_")}
-        surfaces = {name: value for name, value in batch.items() if name.startswith("surface_")}
+        of_rays, surfaces = _apart(batch)
+        others, own = _some(of_rays, ~known), _some(of_rays, known)
         outputs, losses, metrics = self.as_today(rays[~known], others | surfaces)
         self._see(others, outputs)
         share = known.float().mean()
@@ -139,18 +135,10 @@ class Steps:
         """Today's step with every other ray in a call of its own, where `computed` would take two."""
         if self.model.updates_proposals():
             return self.as_today(rays, batch)
-        found = [
-            self.as_today(
-                rays[first::2],
-                {
-                    name: value if name.startswith("surface_") else value[first::2]
-                    for name, value in batch.items()
-                    if not first or not name.startswith("surface_")
-                },
-            )
-            for first in (0, 1)
-        ]
-        (outputs, losses, metrics), (_, others, _) = found
+        of_rays, surfaces = _apart(batch)
+        half = torch.arange(len(rays)) % 2 == 0
+        outputs, losses, metrics = self.as_today(rays[half], _some(of_rays, half) | surfaces)
+        _, others, _ = self.as_today(rays[~half], _some(of_rays, ~half))
         return outputs, {name: loss + others.get(name, 0) for name, loss in losses.items()}, metrics
 
     def _surfaces(self, batch: dict[str, Any]) -> tuple[Tensor, Tensor, Tensor]:
@@ -223,6 +211,16 @@ class Steps:
         )  # fmt: skip
 
 
+def _apart(batch: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What a batch has of its rays, and of its surface pixels."""
+    surfaces = {name: value for name, value in batch.items() if name.startswith("surface_")}
+    return {name: value for name, value in batch.items() if name not in surfaces}, surfaces
+
+
+def _some(of_rays: dict[str, Any], chosen: Tensor) -> dict[str, Any]:
+    return {name: value[chosen] for name, value in of_rays.items()}
+
+
 def timed(scene: Path, steps: int) -> tuple[dict[str, int], dict[str, float]]:
     """Rays of each way whose steps take as long as today's, and milliseconds of a step with today's rays."""
     config = speed.configurations("lite", scene, ["ours"])["ours"]
@@ -274,9 +272,7 @@ def measure(scene: Path, results: dict[str, Any], keep: Callable[[], None]) -> N
                 pipeline._computed = Steps(pipeline, way, steps).computed
 
         figures = ablate.train(scene, ablate.falling_over(steps), steps, 0, know)
-        of = "truth_" if "truth_psnr" in figures else ""
-        errors = figures["truth_abs_rel" if of else "lidar_abs_rel"]
-        found["ways"][name] = {"psnr": figures[f"{of}psnr"], "abs_rel": errors, "ms": figures["seconds a step"] * 1e3}
+        found["ways"][name] = {**ablate.against_truth(figures), "ms": figures["seconds a step"] * 1e3}
         keep()
 
 

@@ -24,7 +24,6 @@ import ablate
 import speed
 import torch
 from nerfstudio.cameras.rays import RayBundle
-from torch import Tensor
 
 from edge_depth_nerf.plugin.config import apply_overrides
 from edge_depth_nerf.plugin.datamanager import TablePixelSampler
@@ -47,9 +46,7 @@ class LastErrors:
 
     def __init__(self, pipeline: Any, samplers: tuple[str, ...]) -> None:
         manager = pipeline.datamanager
-        cameras = manager.train_dataset.cameras
-        shape = len(cameras), int(cameras.height.max()) // BLOCK_PX + 1, int(cameras.width.max()) // BLOCK_PX + 1
-        self.of_blocks = torch.full(shape, UNSEEN)
+        self.of_blocks = torch.full(ablate.blocks_of(manager.train_dataset.cameras, BLOCK_PX), UNSEEN)
         self.as_today = pipeline._computed
         for name in samplers:
             sampler: Any = getattr(manager, name)
@@ -60,10 +57,9 @@ class LastErrors:
         """Draw a batch."""
         count = sampler.num_rays_per_batch
         pixels = sampler.table.batch(sampler.draw(step).start * READ, READ * count, keep)
-        errors = self.of_blocks[self._block(pixels.indices)]
-        wanted = len(errors) * count // (READ * count)
+        errors = self.of_blocks[ablate.block_of(pixels.indices, BLOCK_PX)]
         chosen = torch.zeros(len(errors), dtype=torch.bool)
-        chosen[torch.multinomial(errors.sqrt(), wanted)] = True
+        chosen[torch.multinomial(errors.sqrt(), len(errors) // READ)] = True
         return pixels[chosen]
 
     def computed(self, rays: RayBundle, batch: dict[str, Any]) -> Any:
@@ -71,11 +67,8 @@ class LastErrors:
         outputs, losses, metrics = self.as_today(rays, batch)
         for prefix in ("surface_", ""):
             error = (outputs[f"{prefix}rgb"].detach() - batch[f"{prefix}image"]).square().mean(dim=1)
-            self.of_blocks[self._block(batch[f"{prefix}indices"])] = error.clamp(min=LEAST_ERROR)
+            self.of_blocks[ablate.block_of(batch[f"{prefix}indices"], BLOCK_PX)] = error.clamp(min=LEAST_ERROR)
         return outputs, losses, metrics
-
-    def _block(self, indices: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        return indices[:, 0], indices[:, 1] // BLOCK_PX, indices[:, 2] // BLOCK_PX
 
 
 @dataclass(frozen=True)
@@ -157,13 +150,7 @@ def trained(scene: Path, name: str, steps_today: int, ms: dict[str, float], seed
     """Steps, seconds, PSNR and AbsRel of a variant that takes as long as so many steps of today's defaults."""
     steps, variant = round(steps_today * ms[TODAY] / ms[name]), VARIANTS[name]
     figures = ablate.train(scene, variant.overrides | ablate.falling_over(steps), steps, seed, variant.change)
-    of = "truth_" if "truth_psnr" in figures else ""
-    return {
-        "steps": steps,
-        "psnr": figures[f"{of}psnr"],
-        "abs_rel": figures[f"{of or 'lidar_'}abs_rel"],
-        "seconds": figures["seconds a step"] * steps,
-    }
+    return {"steps": steps, **ablate.against_truth(figures), "seconds": figures["seconds a step"] * steps}
 
 
 def gains(results: dict[str, Any], name: str, seed: int) -> list[float]:
