@@ -13,6 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -604,7 +605,19 @@ def browser():
 
 
 @pytest.fixture(scope="module")
-def page(browser, training):
+def interruptible() -> Iterator[None]:
+    """Renderings that may be interrupted: types are not checked.
+
+    Nerfstudio ends a rendering by an exception in whatever line it is at. In the tests' type checker, that would be
+    taken for a wrong type, and the browser would get no picture any more.
+    """
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture(scope="module")
+def page(browser, training, interruptible):
     """The viewer in a browser without a network, looking at the drive from above; the training waits."""
     server = training.viewer.viser_server
     here = f"http://127.0.0.1:{server.get_port()}"
