@@ -160,6 +160,16 @@ def test_make_has_what_is_called_phony():
     assert phony and set(phony[1].split()) <= make_targets()
 
 
+def test_setup_asks_for_space_before_it_begins(tmp_path):
+    setup = ["make", "setup", f"PYTHON={sys.executable}", f"VENV={tmp_path / 'new' / 'venv'}"]
+    done = subprocess.run([*setup, "PACKAGES_GB=1e6"], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    needed = re.search(r"installing needs ([\d.]+) GB on the disk of (\S+), and ([\d.]+) GB are free", done.stderr)
+    assert needed, done.stdout + done.stderr
+    assert float(needed[1]) >= 1e6 and needed[2] == str(tmp_path) and float(needed[3]) < 1e6
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.name)
 def test_workflows_call_what_exists(path):
     workflow = yaml.safe_load(path.read_text(encoding="utf-8"))
