@@ -14,7 +14,7 @@ from comparisons import QUIET, options
 from scenes import write_scene
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import read_json, write_json
+from edge_depth_nerf.base.files import read_distance_png, read_json, write_distance_png, write_json
 from edge_depth_nerf.compare import command
 
 
@@ -107,9 +107,17 @@ def test_a_folder_keeps_what_its_runs_share(tmp_path, monkeypatch):
         command.compare(replace(first, preset="full"), QUIET)
     with pytest.raises(InputError, match="detail False, not True"):
         command.compare(replace(first, detail=True), QUIET)
-    # what a version without --detail began
+    distances = sorted((scene / "mono").iterdir())[0]
+    before = distances.read_bytes()
+    write_distance_png(distances, read_distance_png(distances) * 1.1)  # maps of another network under the same names
+    with pytest.raises(InputError, match="started with layers_sha256"):
+        command.compare(first, QUIET)
+    distances.write_bytes(before)
+    # what versions without --detail and without digests of maps began
     for file in (output / "compare.json", output / "runs" / "x" / "nerfacto_seed-0" / "run.json"):
-        write_json(file, {name: value for name, value in read_json(file).items() if name != "detail"})
+        write_json(
+            file, {name: value for name, value in read_json(file).items() if name not in ("detail", "layers_sha256")}
+        )
     with pytest.raises(Stop):
         command.compare(first, QUIET)
     with monkeypatch.context() as patched:
@@ -148,6 +156,29 @@ def test_methods_may_be_tuned_after_others(tmp_path):
     (output / "runs" / "x" / "edge-lidar_seed-0").mkdir()  # trained with the default
     with pytest.raises(InputError, match="contains a comparison with tuned"):
         open_with(("edge-lidar",), ds_nerf=0.1, edge=0.01, edge_lidar=0.01)
+
+
+def test_a_tuned_method_joins_methods_with_their_defaults(tmp_path):
+    """As the quick start adds one to the comparison of `demo`, with a file that has values for all."""
+    scene, output, path = write_scene(tmp_path / "x"), tmp_path / "out", tmp_path / "tuned.json"
+    first = options(scene, output=output, steps=5, methods=("nerfacto", "edge"))
+    command.open_output(first, {})
+    (output / "runs" / "x" / "edge_seed-0").mkdir(parents=True)
+    setting = {"lambda": 0.1, "sigma_m": 0.5}
+    write_json(path, {"scene": "tuning", "methods": {"ds-nerf": setting, "edge": {"lambda": 0.02, "sigma_m": "own"}}})
+    tuned = command.read_tuned(path)
+    command.open_output(replace(first, methods=("ds-nerf",), tuned=path), tuned)
+    record = read_json(output / "compare.json")
+    assert record["tuned"] == {"ds-nerf": setting} and record["tuned_on"] == "tuning"
+    (output / "runs" / "x" / "ds-nerf_seed-0").mkdir()
+    command.open_output(first, {})  # goes on with what needs no file
+    assert read_json(output / "compare.json")["tuned"] == {"ds-nerf": setting}
+    for methods, file in ((("edge",), path), (("ds-nerf",), None)):
+        with pytest.raises(InputError, match="contains a comparison with tuned"):
+            command.open_output(replace(first, methods=methods, tuned=file), tuned if file else {})
+    write_json(path, {"scene": "another", "methods": {"ds-nerf": setting}})
+    with pytest.raises(InputError, match="contains a comparison with tuned_on tuning, not another"):
+        command.open_output(replace(first, methods=("ds-nerf",), tuned=path), command.read_tuned(path))
 
 
 def test_a_run_that_fails_names_its_log(tmp_path, monkeypatch):

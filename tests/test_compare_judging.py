@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from copy import deepcopy
 from types import SimpleNamespace
 
@@ -12,7 +13,7 @@ from nerfstudio.engine.optimizers import Optimizers
 from scenes import write_scene
 from test_pipeline import build
 
-from edge_depth_nerf.base.files import read_json, write_json
+from edge_depth_nerf.base.files import read_json, write_json, write_mask
 from edge_depth_nerf.compare.figures import affine_fitted
 from edge_depth_nerf.compare.judging import (
     ViewJudge,
@@ -68,6 +69,20 @@ def test_pixels_of_a_few_views_are_spread_evenly(tmp_path):
     chosen = [int(view.indices[0, 0]) for view in few]
     assert len(few) == 2 and [len(view.indices) for view in few] == [3, 3]
     assert chosen == [len(dataset) // 4, 3 * len(dataset) // 4]
+
+
+def test_a_view_without_a_usable_pixel_is_passed_over(tmp_path):
+    scene = write_scene(tmp_path)
+    meta = read_json(scene / "transforms.json")
+    write_mask(scene / "masks/none.png", np.zeros((28, 32), bool))
+    for frame in meta["frames"]:
+        if frame["file_path"] == meta["train_filenames"][2]:
+            frame["mask_path"] = "masks/none.png"
+    write_json(scene / "transforms.json", meta)
+    pipeline, _ = build(scene)
+    chosen = choose_pixels(pipeline.datamanager.train_dataset)
+    assert [int(view.indices[0, 0]) for view in chosen] == [0, 1, 3, 4, 5, 6, 7]
+    assert math.isfinite(judge_pixels(pipeline, chosen, trained_on=True)["psnr"])
 
 
 def test_the_pixels_are_always_the_same_and_inside_the_mask(tmp_path):

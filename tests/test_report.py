@@ -21,7 +21,7 @@ from rich.console import Console
 from scenes import write_scene
 
 from edge_depth_nerf import cli
-from edge_depth_nerf.base.files import write_png
+from edge_depth_nerf.base.files import read_json, write_json, write_png
 from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.base.pictures import NO_VALUE_RGB, colour_distance, distance_of_colours
 from edge_depth_nerf.compare.methods import METHODS
@@ -29,6 +29,7 @@ from edge_depth_nerf.compare.options import CompareOptions, MethodName
 from edge_depth_nerf.compare.plots import Bins, plot_bins, style_of
 from edge_depth_nerf.demo.options import DemoOptions
 from edge_depth_nerf.jobs.runs import command_line
+from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.report import views
 from edge_depth_nerf.report.build import Commands, Facts, Plot, Report, build_report, write_report
@@ -179,6 +180,25 @@ def test_drives_are_read_from_what_runs_left(tmp_path):
         one, two = (float(view.figures[name]["PSNR, dB"]) for name in ("one", "two"))
         assert one > two + 5
         assert (view.figures["one"]["δ<1.25, 2-40 m"], view.figures["two"]["δ<1.25, 2-40 m"]) == ("1.000", "0.000")
+
+
+def test_views_come_in_the_order_of_the_evaluation(tmp_path):
+    """nerfstudio sorts folder by folder; letter by letter, "front-left/" comes before "front/"."""
+    scene = write_scene(tmp_path / "x", frames=4, split=False)
+    meta = read_json(scene / "transforms.json")
+    wanted = ("front/0000", "front/0001", "front-left/0000", "front-left/0001")
+    for frame, name in zip(meta["frames"], wanted, strict=True):
+        path = scene / f"images/{name}.png"
+        path.parent.mkdir(exist_ok=True)
+        (scene / frame["file_path"]).rename(path)
+        frame["file_path"] = f"images/{name}.png"
+    names = [frame["file_path"] for frame in meta["frames"]]
+    meta |= {f"{split}_filenames": names for split in ("train", "val", "test")}
+    write_json(scene / "transforms.json", meta)
+    parser = FisheyeDepthDataParserConfig(data=scene).setup()
+    judged = [str(path.relative_to(scene)) for path in parser.get_dataparser_outputs("test").image_filenames]
+    assert judged == names != sorted(names)
+    assert [frame["file_path"] for frame in held_out_frames(scene)] == judged
 
 
 # --- points -----------------------------------------------------------------------------------------------------------

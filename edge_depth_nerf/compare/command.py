@@ -38,7 +38,7 @@ from edge_depth_nerf.report.build import Report, write_report
 from edge_depth_nerf.report.compared_views import compared_views
 from edge_depth_nerf.report.tables import MadeTable
 from edge_depth_nerf.report.views import REPORT
-from edge_depth_nerf.scene.format import LAYERS, layers_of, read_transforms
+from edge_depth_nerf.scene.format import DEPTH_KEY, LAYERS, layers_of, read_transforms
 
 RECORD = "compare.json"
 RUNS = "runs"
@@ -165,9 +165,14 @@ def finished_runs(options: CompareOptions, console: Console) -> Iterator[Results
         yield read_comparison(options.output)
 
 
+def _methods(options: CompareOptions) -> Sequence[MethodName]:
+    """The methods that are asked for."""
+    return options.methods or default_methods(options.preset, with_loss=options.search)
+
+
 def _opened_runs(options: CompareOptions, tuned: dict[str, Setting]) -> list[Run]:
     """Check the scenes, and begin the folders of all runs that are asked for."""
-    methods = options.methods or default_methods(options.preset, with_loss=options.search)
+    methods = _methods(options)
     scenes = {scene.resolve().name: scene.resolve() for scene in options.scenes}
     if len(scenes) < len(options.scenes):
         raise InputError(
@@ -175,6 +180,7 @@ def _opened_runs(options: CompareOptions, tuned: dict[str, Setting]) -> list[Run
             "Rename one, or give each scene once."
         )
     digests = {name: check_scene(folder, methods, options.preset) for name, folder in scenes.items()}
+    of_layers = {name: layers_digest(folder) for name, folder in scenes.items()}
     open_output(options, tuned)
 
     specifications = [
@@ -190,6 +196,7 @@ def _opened_runs(options: CompareOptions, tuned: dict[str, Setting]) -> list[Run
             implementation=options.rivals_implementation if METHODS[name].rival else "same",
             whole_views=not options.search,
             detail=options.detail and not options.search,
+            layers_sha256=of_layers[scene],
         )
         # the first seeds of all drives come first: tables of an unfinished comparison are of whole rows
         for seed in options.seeds
@@ -238,6 +245,22 @@ def _settings(options: CompareOptions, name: MethodName, tuned: dict[str, Settin
     if options.search:
         return [Setting(weight, sigma_m) for weight in options.lambdas for sigma_m in options.sigmas_m]
     return [tuned.get(name, Setting())]
+
+
+def layers_digest(folder: Path) -> str:
+    """SHA-256 of all files that a scene has beside its pictures: masks, maps, and the truth to judge by.
+
+    Other maps may have the names of those before, and then transforms.json stays as it is.
+    """
+    keys = [layer.key for name, layer in LAYERS.items() if name != "image"]
+    frames = read_transforms(folder / "transforms.json")["frames"]
+    digest = hashlib.sha256()
+    for name in sorted(
+        {frame[key] for frame in frames for key in (*keys, DEPTH_KEY) if isinstance(frame.get(key), str)}
+    ):
+        digest.update(f"{name}\n".encode())
+        digest.update(hashlib.sha256((folder / name).read_bytes()).digest())
+    return digest.hexdigest()
 
 
 def check_scene(folder: Path, methods: Sequence[MethodName], preset: str) -> str:
@@ -332,26 +355,36 @@ def _tuned_on(path: Path) -> Any:
 def _record(options: CompareOptions, tuned: dict[str, Setting]) -> dict[str, Any]:
     """What the output folder's record is to hold of what all its runs share, beside the commands so far.
 
+    What is tuned binds methods that have a run; others may be tuned later, or anew.
+
     Raises:
         InputError: the folder holds another comparison, or something else.
 
     """
+    asked = _methods(options)
+    settings = {name: {"lambda": tuned[name].weight, "sigma_m": tuned[name].sigma_m} for name in asked if name in tuned}
     record = {
         "kind": "search" if options.search else "comparison",
         "preset": options.preset,
         "steps": options.steps,
         "rivals_implementation": options.rivals_implementation,
         "detail": options.detail,
-        "tuned": {name: {"lambda": setting.weight, "sigma_m": setting.sigma_m} for name, setting in tuned.items()},
-        "tuned_on": None if options.tuned is None else _tuned_on(options.tuned),
+        "tuned": settings,
+        "tuned_on": _tuned_on(options.tuned) if options.tuned is not None and settings else None,
     }
     path = options.output / RECORD
     if path.is_file():
         found = {**WITHOUT_DETAIL, **read_json_object(path)}
-        added = [name for name in record["tuned"] if name not in found.get("tuned", {})]
-        if not [run for name in added for run in options.output.glob(f"runs/*/{name}_seed-*")]:
-            # methods that have no run yet may be tuned later than the others
-            found["tuned"] = {**found.get("tuned", {}), **{name: record["tuned"][name] for name in added}}
+        before: dict[str, Any] = found.get("tuned", {})
+        begun = {name for name in asked if any(options.output.glob(f"{RUNS}/*/{name}_seed-*"))}
+        of_others = {name: setting for name, setting in before.items() if name not in asked}
+        bound = {**of_others, **{name: setting for name, setting in before.items() if name in begun}}
+        found["tuned"] = {**bound, **{name: setting for name, setting in settings.items() if name not in begun}}
+        record["tuned"] = {**of_others, **settings}
+        if not bound:
+            found["tuned_on"] = record["tuned_on"]
+        elif not settings:
+            record["tuned_on"] = found["tuned_on"]
         different = [name for name in record if record[name] != found.get(name)]
         if different:
             name = different[0]
@@ -393,7 +426,8 @@ class Run:
         """
         path, wanted = self.folder / SPECIFICATION, self.specification.to_dict()
         if path.is_file():
-            found = {**WITHOUT_DETAIL, **read_json_object(path)}
+            unknown = {"layers_sha256": wanted["layers_sha256"]}
+            found = {**WITHOUT_DETAIL, **unknown, **read_json_object(path)}
             different = [name for name in wanted if wanted[name] != found.get(name)]
             if different:
                 name = different[0]

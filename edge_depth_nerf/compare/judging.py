@@ -89,6 +89,9 @@ def choose_pixels(
         most: at most so many of all.
         most_views: at most so many views, spread evenly; None: every view.
 
+    Returns:
+        Those of each view; none of a view that its mask hides.
+
     """
     generator = torch.Generator().manual_seed(0)
     count = len(dataset) if most_views is None else min(len(dataset), most_views)
@@ -97,6 +100,8 @@ def choose_pixels(
     for view in (len(dataset) * (2 * number + 1) // (2 * count) for number in range(count)):
         item = dataset[view]
         at = item["mask"][..., 0].nonzero()
+        if not len(at):
+            continue
         at = at[torch.randperm(len(at), generator=generator)[:per_view]]
         row, column = at.T
         known = {

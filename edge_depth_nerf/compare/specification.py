@@ -43,6 +43,8 @@ class RunSpecification:
     """Whether whole views are judged at the end, or only the random pixels."""
     detail: bool = False
     """Whether whole views are judged with the detail of training pictures, too."""
+    layers_sha256: str = ""
+    """Of the scene's masks and maps; empty: not known."""
 
     def to_dict(self) -> dict[str, Any]:
         """What run.json holds."""

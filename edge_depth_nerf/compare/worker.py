@@ -11,6 +11,8 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import MISSING
+from dataclasses import fields as fields_of
 from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -153,7 +155,9 @@ def read_specification(path: Path) -> RunSpecification:
         InputError: it is not of this form.
 
     """
-    content, fields = read_json_object(path), get_type_hints(RunSpecification)
+    # what an earlier version did not write has its default
+    defaults = {field.name: field.default for field in fields_of(RunSpecification) if field.default is not MISSING}
+    content, fields = {**defaults, **read_json_object(path)}, get_type_hints(RunSpecification)
     wrong = [name for name in {*content, *fields} if name not in fields or not _is(content.get(name), fields[name])]
     if wrong:
         name = min(wrong)

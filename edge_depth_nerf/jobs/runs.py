@@ -136,7 +136,7 @@ def steps_done(checkpoints: Path) -> int:
 
 def viewer_command(config: Path) -> str:
     """How to look around in a trained model, on this machine alone."""
-    return f"ns-viewer --load-config {config} --viewer.websocket-host 127.0.0.1"
+    return f"ns-viewer --load-config {shlex.quote(str(config))} --viewer.websocket-host 127.0.0.1"
 
 
 def command_line(words: Sequence[str], options: Any) -> str:

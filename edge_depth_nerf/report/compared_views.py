@@ -24,7 +24,8 @@ def held_out_frames(scene: Path) -> list[dict[str, Any]]:
     transforms = read_transforms(scene / "transforms.json")
     names = set(transforms.get("test_filenames", ()))
     frames = [frame for frame in transforms["frames"] if frame["file_path"] in names]
-    return sorted(frames, key=lambda frame: frame["file_path"])
+    # as nerfstudio's parser: folder by folder, not letter by letter
+    return sorted(frames, key=lambda frame: Path(frame["file_path"]))
 
 
 @dataclass(frozen=True, eq=False)
