@@ -174,7 +174,7 @@ def check_lpips() -> Iterator[Finding]:
 def check_extras() -> Iterator[Finding]:
     """Optional libraries and programs."""
     for name, package, extra, what in (
-        ("COLMAP", "pycolmap", "colmap", "poses from pictures (process --poses colmap)"),
+        ("COLMAP", "pycolmap", "colmap", "refined poses (by default in process) and --poses colmap"),
         ("KISS-ICP", "kiss_icp", "odometry", "poses from LiDAR (process --poses lidar)"),
         ("transformers", "transformers", "hf", "ready-made depth networks (estimate-depth --hf)"),
         ("Dask", "distributed", "cluster", "many machines (--cluster)"),

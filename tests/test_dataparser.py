@@ -190,6 +190,35 @@ def test_the_scale_must_be_positive(tmp_path, value):
         parse(write_scene(tmp_path), metres_per_unit=value)
 
 
+def test_a_principal_point_on_a_pixel_centre_has_a_ray(tmp_path):
+    """OpenCV's convention of an even size; nerfstudio's ray of that pixel is 0/0."""
+    scene = write_scene(tmp_path)
+    edit(scene, lambda meta: [frame.update(cx=15.5, cy=13.5) for frame in meta["frames"]])
+    rays = parse(scene).cameras.generate_rays(0)
+    assert rays.directions[13, 15].isfinite().all() and rays.directions.norm(dim=-1)[13, 15] == pytest.approx(1)
+
+
+@pytest.mark.parametrize("of_all", [False, True])
+def test_distortion_may_be_a_list(tmp_path, of_all):
+    """nerfstudio's other key; what the scene gives for all goes before what a picture gives, as in nerfstudio."""
+    scene, values = write_scene(tmp_path), [0.03, -0.002, 1e-3, 2e-4, 3e-4, -1e-3]
+
+    def change(meta):
+        for frame in [] if of_all else meta["frames"]:
+            for key in ("k1", "k2", "k3", "k4", "p1", "p2"):
+                del frame[key]
+            frame["distortion_params"] = values
+        if of_all:
+            meta.update(distortion_params=values, fl_x=8.0)
+
+    edit(scene, change)
+    outputs = parse(scene)
+    ours = FisheyeDepthDataset(outputs).camera(0).to_dict()
+    assert [ours[key] for key in ("k1", "k2", "k3", "k4", "p1", "p2")] == values
+    assert outputs.cameras.distortion_params[0].tolist() == pytest.approx(values)
+    assert ours["fx"] == outputs.cameras.fx[0] == (8.0 if of_all else 9.0)
+
+
 def test_k4_is_read(tmp_path):
     scene = write_scene(tmp_path)
     edit(scene, lambda meta: [frame.update(k4=0.0123) for frame in meta["frames"]])

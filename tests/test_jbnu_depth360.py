@@ -17,6 +17,7 @@ from edge_depth_nerf.cameras import KannalaBrandt
 from edge_depth_nerf.process.converters import convert
 from edge_depth_nerf.process.jbnu_depth360 import read_jbnu_depth360
 from edge_depth_nerf.process.options import JbnuDepth360Options
+from edge_depth_nerf.process.recording import RecordedSweep
 from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 
@@ -140,6 +141,28 @@ def test_what_stands_in_the_file_is_taken(published: Path) -> None:
     assert sweep.time_s == pytest.approx(2.0 + 0.01 - 0.025)
     assert sweep.timing is not None and not sweep.timing.clockwise
     assert len(sweep.read().points_m) == 16
+
+
+def test_a_key_in_the_file_replaces_its_assumption_alone(published: Path) -> None:
+    path = published.parents[1] / "calibration.toml"
+    content = path.read_text()
+
+    def sweep_with(keys: str) -> RecordedSweep:
+        path.write_text(f"{content}\n[lidars.ouster]\n{keys}\n")
+        return read_jbnu_depth360(given(published)).sweeps[0]
+
+    assumed = sweep_with('columns = ["x", "y", "z", "intensity"]')
+    assert assumed.timing is not None and assumed.timing.clockwise and np.array_equal(assumed.to_vehicle, np.eye(4))
+    for keys, turn_s, clockwise, to_middle_s in (
+        ('direction = "counter-clockwise"', 0.1, False, 0.0),
+        ('timestamp = "start"', 0.1, True, 0.05),
+        ("turn_s = 0.08", 0.08, True, 0.0),
+    ):
+        sweep = sweep_with(keys)
+        assert sweep.timing is not None and sweep.timing.turn_s == pytest.approx(turn_s)
+        assert sweep.timing.clockwise == clockwise
+        assert sweep.time_s - assumed.time_s == pytest.approx(to_middle_s)
+    assert sweep_with('corrected_to = "middle"').timing is None
 
 
 @pytest.mark.parametrize(

@@ -417,6 +417,14 @@ def test_other_poses_found_make_other_maps(tmp_path: Path, monkeypatch: pytest.M
         assert (tmp_path / "scene" / name).read_bytes() == (tmp_path / "fresh" / name).read_bytes(), name
 
 
+def test_the_only_frame_is_without_a_sweep(drive: RoomDrive, tmp_path: Path) -> None:
+    path = drive.sweep(drive.frames[0])
+    path.write_bytes(path.read_bytes()[:-3])
+    with pytest.raises(InputError, match=r"\.bin: .*expected a multiple of 16.*choose more by --frames"):
+        process(drive, tmp_path / "scene", frames=1, strict=False)
+    assert not (tmp_path / "scene").exists()
+
+
 def test_a_search_that_cannot_begin_leaves_nothing_behind(drive: RoomDrive, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="2 pictures, expected 3 or more"):
         process(drive, tmp_path / "scene", poses="colmap", frames=1)

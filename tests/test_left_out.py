@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -130,6 +131,26 @@ def test_a_picture_that_is_mended_comes_into_the_scene(drive: RoomDrive) -> None
     assert report.written and not report.left_out and "Left out" not in said
     run(drive, "other")
     assert contents(report.scene) == contents(drive.root.parent / "other")
+
+
+def test_a_mended_file_may_have_an_older_date(drive: RoomDrive) -> None:
+    """As `cp -p`, tar and wget leave it."""
+    path = drive.image("image_03", 5)
+    whole, dates = path.read_bytes(), path.stat()
+    damage(path)
+    assert run(drive)[0].left_out
+    path.write_bytes(whole)
+    os.utime(path, ns=(dates.st_atime_ns, dates.st_mtime_ns))
+    assert not run(drive)[0].left_out
+
+
+def test_a_camera_without_pictures_for_training(drive: RoomDrive) -> None:
+    """Those of a stretch may be missing; nothing is masked then."""
+    for frame in drive.frames:
+        drive.image("image_03", frame).unlink()
+    report, said = run(drive, find_ego=True)
+    assert {frame["camera"] for frame in read_json(report.scene / "transforms.json")["frames"]} == {"image_02"}
+    assert "image_03" in said and "0 pictures are too few" in said
 
 
 def test_a_fault_of_the_whole_drive_is_an_error(drive: RoomDrive) -> None:

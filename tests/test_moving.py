@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -263,6 +264,24 @@ def test_training_pictures_know_nothing_of_sweeps_that_are_held_out(drive: Path,
         masks.append([read_mask(path) for path in paths if path is not None])
     assert sum((~mask).sum() for mask in masks[0]) > 100
     assert all(np.array_equal(a, b) for a, b in zip(*masks, strict=True))
+
+
+@pytest.mark.slow
+def test_a_picture_that_is_damaged_gets_no_mask(drive: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(drive, tmp_path / "drive"))
+    wanted = options(root, tmp_path / "scene")
+    recording = read_drive(wanted)
+    whole, _ = find_moving(recording, wanted, {4, 12}, {}, Console(quiet=True))
+    hidden = [picture for picture in whole.pictures if not read_mask(picture.moving_mask).all()]  # pyright: ignore
+    assert hidden and hidden[0].moving_mask is not None
+    hidden[0].moving_mask.unlink()
+    content = bytearray(hidden[0].path.read_bytes())
+    content[len(content) // 2] ^= 0x5A
+    hidden[0].path.write_bytes(content)
+    found, _ = find_moving(recording, wanted, {4, 12}, {}, Console(quiet=True))
+    assert [picture.path for picture in found.pictures if picture.moving_mask is None] == [hidden[0].path]
+    with pytest.raises(InputError, match=hidden[0].path.name):
+        find_moving(recording, dataclasses.replace(wanted, strict=True), {4, 12}, {}, Console(quiet=True))
 
 
 @pytest.mark.slow

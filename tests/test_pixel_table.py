@@ -51,6 +51,16 @@ def test_every_valid_pixel_comes_once_with_its_own_prior(tmp_path, monkeypatch, 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["t.json", "t.npy"]
 
 
+def test_only_so_many_files_are_open(tmp_path, monkeypatch):
+    monkeypatch.setattr(pixel_table, "BUCKET_BYTES", 100)
+    monkeypatch.setattr(pixel_table, "MOST_BUCKETS", 3)
+    with PixelTableWriter(tmp_path / "t.npy", 600, 0, 8.0) as writer:
+        assert len(writer._buckets) == 3
+        writer.add(PicturePixels(picture(20, 30), np.ones((20, 30), bool)))
+        writer.finish()
+    assert len({*map(tuple, PixelTable(tmp_path / "t.npy").batch(0, 600).indices.tolist())}) == 600
+
+
 def test_after_the_last_pixel_comes_the_first(tmp_path):
     table = table_of(tmp_path / "t.npy", [np.ones((5, 6), bool)])
     whole = table.batch(0, 30).indices

@@ -229,15 +229,22 @@ def test_a_vehicle_that_is_not_found_is_said_once_with_the_option(mine: Path) ->
 # ---- no LiDAR ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("mono", [False, True])
-def test_neither_lidar_nor_depth_is_said(mine: Path, drive: Path, mono: bool) -> None:
+@pytest.mark.parametrize(
+    ("mono", "motion", "words"),
+    [
+        (True, True, "monocular maps only"),
+        (False, True, "distances from motion only"),
+        (False, False, "plain nerfacto"),
+    ],
+)
+def test_neither_lidar_nor_depth_is_said(mine: Path, drive: Path, mono: bool, motion: bool, words: str) -> None:
     edit(mine, lambda text: text[: text.index("[lidars.roof]")])
     if mono:
         shutil.copytree(drive / "mono", mine / "mono")
         edit(mine, lambda text: re.sub(r"\[cameras\.(\w+)\]\n", r'[cameras.\1]\nmono = "mono/\1"\n', text))
-    report, said = run(mine)
+    report, said = run(mine, motion=motion)
     (notice,) = [one for one in report.notices if "neither LiDAR nor depth maps" in one]
-    assert ("monocular maps only" if mono else "plain nerfacto") in notice and notice in said
+    assert words in notice and notice in said
 
 
 # ---- exposure ----------------------------------------------------------------------------------------------------

@@ -411,6 +411,11 @@ def test_options_bring_masks_and_monocular_maps(mine: Path) -> None:
                 values = np.full(size, 255, np.uint8 if kind == "moving" else np.uint16)
                 (mine / kind / name).mkdir(parents=True, exist_ok=True)
                 write_png(mine / kind / name / f"{frame:010d}.png", values)
+    # they go before what the rig file names
+    shutil.copytree(mine / "images/left", mine / "other_masks")
+    edit(mine, ("[cameras.left]\n", '[cameras.left]\nmasks = "other_masks"\n'))
+    masks = [picture.mask for picture in read_rig_recording(options(mine)).pictures if picture.camera == "left"]
+    assert masks[0] == mine / "other_masks/000000.png"
     recording = read_rig_recording(options(mine, frame_masks=mine / "moving", mono=mine / "depth"))
     for picture in recording.pictures:
         assert picture.mask == mine / f"moving/{picture.camera}/{picture.frame:010d}.png"
@@ -587,7 +592,7 @@ LEFT = '[cameras.left]\nimages = "images/left"'
         (
             LEFT,
             LEFT + '\ndepth = {files = "mono/left", kind = "z_depth", metres_per_count = 0.001}',
-            r"depth maps take the place of LiDAR",
+            r"depth maps take the place of LiDAR; give one of them, not both\.",
         ),
     ],
 )

@@ -17,6 +17,7 @@ from nerfstudio.viewer.viewer import Viewer
 from scenes import write_scene
 from trainings import trainer_of
 
+from edge_depth_nerf.base.files import read_json, write_json
 from edge_depth_nerf.jobs.runs import newest_checkpoint
 from edge_depth_nerf.kernels.threads import kernel_threads
 from edge_depth_nerf.plugin.grad_scaler import PatientGradScaler
@@ -183,6 +184,19 @@ def test_a_prior_of_lidar_alone_is_said(tmp_path, monkeypatch, capsys, mono):
     monkeypatch.setenv("COLUMNS", "300")
     trainer_of(write_scene(tmp_path / "scene", mono=mono), tmp_path / "runs", max_num_iterations=STEPS)
     assert ("LiDAR alone" in capsys.readouterr().out) is not mono
+
+
+def test_a_drive_without_lidar_has_no_prior_of_it(tmp_path, monkeypatch, capsys):
+    """With distances from motion alone, these are the prior."""
+    monkeypatch.setenv("COLUMNS", "300")
+    scene = write_scene(tmp_path / "scene", lidar=False)
+    meta = read_json(scene / "transforms.json")
+    for frame in meta["frames"]:
+        frame["motion_file_path"] = frame.pop("mono_file_path")
+    write_json(scene / "transforms.json", meta)
+    trainer_of(scene, tmp_path / "runs", max_num_iterations=STEPS)
+    said = capsys.readouterr().out
+    assert "with a depth prior" in said and "LiDAR alone" not in said
 
 
 def test_ctrl_c_before_the_first_step(trainer, monkeypatch, capsys):

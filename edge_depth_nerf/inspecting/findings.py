@@ -12,6 +12,7 @@ from edge_depth_nerf.inspecting.figures import PictureFigures, Step, recorded, s
 from edge_depth_nerf.inspecting.pose_check import BAD_MEDIAN_PX, bad_steps, pose_figures
 from edge_depth_nerf.masks.ego_files import ego_mask_path, vehicles_unknown
 from edge_depth_nerf.poses.matches import Agreement
+from edge_depth_nerf.scene.format import REFINED_POSES
 from edge_depth_nerf.scene.reader import SceneFolder
 from edge_depth_nerf.scene.writer import best_holdout
 
@@ -172,8 +173,7 @@ def _path(scene: SceneFolder) -> Iterator[Finding]:
 
 
 def _poses(scene: SceneFolder, agreements: Sequence[Agreement]) -> Iterator[Finding]:
-    source = scene.meta.get("source")
-    refined = isinstance(source, dict) and source.get("refine_poses") is True
+    refined = scene.path.with_name(REFINED_POSES).is_file()
     remedy = (
         "find new poses with --poses lidar or --poses colmap, and check the lens and the times of the pictures"
         if refined

@@ -314,7 +314,7 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
             CONSOLE.log(f"Depth prior: {trust.summary()}")
         elif source == "mono" and options.sigma_mode == "calibrated":
             trust = field_of_source(scene)
-        elif self.config.depth_source == "auto" and "mono" not in sources:
+        elif self.config.depth_source == "auto" and source == "lidar":
             CONSOLE.log(
                 f"[yellow]Depth prior: LiDAR alone, because the scene has no monocular maps, or not all of them. To "
                 f"make them, run `edge-depth-nerf estimate-depth {escape(str(self.config.dataparser.data))}`.",

@@ -17,6 +17,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
 
 from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.plugin.compat import without_undefined_ray
 from edge_depth_nerf.plugin.scale import default_metres_per_unit
 from edge_depth_nerf.scene.format import INTRINSICS, LAYERS, DepthKind, path_keys, pose_of, read_transforms
 from edge_depth_nerf.scene.reader import ScenePicture, scene_of
@@ -162,6 +163,7 @@ class FisheyeDepth(Nerfstudio):
         outputs = super()._generate_dataparser_outputs(split)
         if not outputs.image_filenames:
             raise InputError(f"{path}: no picture is left for the split {split!r}; it needs one at least.")
+        outputs.cameras = without_undefined_ray(outputs.cameras)
 
         scene = scene_of(meta, path, self.config.depth_kind, self.config.depth_unit_scale_factor)
         names = {self._get_fname(Path(frame["file_path"]), path.parent): frame["file_path"] for frame in frames}

@@ -33,7 +33,9 @@ from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE, read_json_objec
 TABLE_VERSION = 5
 """Raised whenever the form of the file changes."""
 BUCKET_BYTES = 64 << 20
-"""So much is shuffled in memory at once."""
+"""So much is shuffled in memory at once, as long as `MOST_BUCKETS` are enough."""
+MOST_BUCKETS = 128
+"""Open at a time; a process may have 256 files or more."""
 RECORD = np.dtype(
     [
         ("rgb", "u1", 3),
@@ -214,7 +216,7 @@ class PixelTableWriter:
     def __enter__(self) -> PixelTableWriter:
         """Open the temporary files."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        for _ in range(max(1, -(-self._most_bytes // BUCKET_BYTES))):
+        for _ in range(min(MOST_BUCKETS, max(1, -(-self._most_bytes // BUCKET_BYTES)))):
             file = tempfile.TemporaryFile(dir=self.path.parent, prefix=".pixels.")
             self._buckets.append(self._stack.enter_context(file))
         return self

@@ -410,7 +410,9 @@ class _Builder:
             prior = (
                 "the prior is made of monocular maps only, and nothing checks their scale"
                 if "mono" in self.layers
-                else ("no ray has a prior, and training equals plain nerfacto")
+                else "the prior is made of distances from motion only, where there are any"
+                if self._options.motion
+                else "no ray has a prior, and training equals plain nerfacto"
             )
             found.append(
                 f"The drive has neither LiDAR nor depth maps: {prior}. Name its scans or depth maps in the "

@@ -55,15 +55,19 @@ def _fill_in(content: dict[str, Any]) -> None:
             camera.setdefault("height", 1080)
             camera.setdefault("images", "image" if len(cameras) == 1 else f"image/{name}")
             _fill_in_clock(camera)
-    # without a scanner in the file, the vehicle's frame is the scanner's
+    # the vehicle's frame is the scanner's, if the file does not say otherwise
     identity = [[float(row == column) for column in range(4)] for row in range(4)]
-    lidars = content.setdefault("lidars", {SCANNER: {"to_vehicle": identity}})
+    lidars = content.setdefault("lidars", {SCANNER: {}})
     for lidar in lidars.values() if isinstance(lidars, dict) else ():
         if isinstance(lidar, dict):
+            lidar.setdefault("to_vehicle", identity)
             lidar.setdefault("scans", "bin")
             _fill_in_clock(lidar)
-            if "turn_s" not in lidar and "point_times" not in lidar:
-                lidar |= {"turn_s": 1 / RATE_HZ, "direction": "clockwise", "timestamp": "middle"}
+            if "point_times" not in lidar:
+                lidar.setdefault("turn_s", 1 / RATE_HZ)
+                lidar.setdefault("timestamp", "middle")
+                if "corrected_to" not in lidar:
+                    lidar.setdefault("direction", "clockwise")
     poses = content.get("poses")
     if isinstance(poses, dict):
         poses.setdefault("format", "tum")

@@ -111,12 +111,15 @@ def find_moving(
         )
         found = [_ScannersThings(scanner, held_out, console) for scanner in store.scanners]
         jobs = [
-            partial(_write_mask, paths[id(picture)], recording, picture, found, ego, options.theta_max_deg)
+            partial(
+                _write_mask, paths[id(picture)], recording, picture, found, ego, options.theta_max_deg, options.strict
+            )
             for picture in missing
         ]
         run_jobs(jobs, "Masking what moves", console)
-    pictures = tuple(replace(picture, moving_mask=paths[id(picture)]) for picture in recording.pictures)
-    shares = [1 - float(read_mask(path).mean()) for path in paths.values()]
+    made = {id(picture): paths[id(picture)] for picture in recording.pictures if paths[id(picture)].is_file()}
+    pictures = tuple(replace(picture, moving_mask=made.get(id(picture))) for picture in recording.pictures)
+    shares = [1 - float(read_mask(path).mean()) for path in made.values()]
     notice = (
         f"Moving objects were found in {sum(share > 0 for share in shares)} of {len(shares)} pictures and hides "
         f"{np.mean(shares):.1%} of them. Look at {options.output / MOVING_MASKS}: correct them there and process "
@@ -224,8 +227,9 @@ def _write_mask(
     found: Sequence[_ScannersThings],
     ego: Mapping[str, NDArray[np.bool_]],
     theta_max_deg: float,
+    strict: bool,
 ) -> None:
-    """Find what moves in one picture, and write its mask."""
+    """Find what moves in one picture, and write its mask; none for a picture that cannot be read, unless strict."""
     full = next(camera.camera for camera in recording.cameras if camera.name == picture.camera)
     moving = np.zeros((full.height, full.width), bool)
     for things in found:
@@ -236,7 +240,13 @@ def _write_mask(
             usable = lens_circle(camera, theta_max_deg)
             if picture.camera in ego:
                 usable &= downscale_mask(ego[picture.camera], factor)
-            image = smaller(read_image(picture.path), factor)
+            try:
+                image = smaller(read_image(picture.path), factor)
+            except (InputError, FileNotFoundError):
+                if strict:
+                    raise
+                # it is told of when its turn comes; once it is mended, it gets a mask
+                return
             grown = _moving_pixels(image, camera, usable, recording.pose(picture), picture.time_s, things, seen)
             moving |= larger_again(grown, factor, (full.height, full.width))
     write_mask(path, ~moving)

@@ -152,7 +152,7 @@ def recording_of_rig(rig: Rig, root: Path, options: RigOptions | JbnuDepth360Opt
         skipped=tuple(skipped),
         left_out=tolerance.left_out,
         notices=tuple(
-            f"{lidar.name}: neither turn_s nor point_times is given; all points of a scan get one time."
+            f"{lidar.name}: neither turn_s with direction nor point_times is given; all points of a scan get one time."
             for lidar in rig.lidars
             if lidar.timing is None and lidar.format.times is None and lidar.corrected_to is None
         ),
@@ -525,7 +525,8 @@ class _Companions:
     ) -> RecordedPicture:
         """A picture with all that comes with it."""
         _check_picture(picture.path, camera)
-        mask = self._by_name(camera, "masks", picture.path) or self._by_number("frame_masks", camera, frame)
+        # an option goes before what the rig file names
+        mask = self._by_number("frame_masks", camera, frame) or self._by_name(camera, "masks", picture.path)
         mono = self._by_number("mono", camera, frame) or self._by_name(camera, "mono", picture.path)
         depth = self._by_name(camera, "depth.files", picture.path)
         truth_distance, truth_rgb = (

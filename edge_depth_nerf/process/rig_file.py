@@ -459,7 +459,7 @@ def _rig(whole: _Whole, path: Path) -> Rig:
     if lidars and (both := [camera.name for camera in cameras if camera.depth]):
         raise InputError(
             f"{path}: cameras.{both[0]}.depth and [lidars.{lidars[0].name}]: depth maps take the place of LiDAR; give "
-            "use one form for all lines."
+            "one of them, not both."
         )
     with_depth = [camera.name for camera in cameras if camera.depth]
     if with_depth and len(with_depth) < len(cameras):

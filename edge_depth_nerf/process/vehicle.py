@@ -130,7 +130,9 @@ def _find_mask(
 ) -> tuple[NDArray[np.bool_], EgoMask | NoEgo]:
     """Find the vehicle and the lens's dark rim in a camera's pictures, at their own size; and how it went."""
     camera = recorded.camera
-    spread = [pictures[index] for index in np.unique(np.linspace(0, len(pictures) - 1, _PICTURES).astype(int))]
+    # a camera may have held-out pictures alone, or none
+    numbers = np.unique(np.linspace(0, len(pictures) - 1, _PICTURES).astype(int)) if pictures else ()
+    spread = [pictures[number] for number in numbers]
     if not options.strict:
         # those that cannot be read are told of when their turn comes
         spread = [picture for picture in spread if _readable(picture.path)]

@@ -24,6 +24,8 @@ TRANSFORMS = "transforms.json"
 POINTS = "points.ply"
 TRUST_FILE = "mono_trust.json"
 """The calibration of the prior, beside the maps that it was measured on."""
+REFINED_POSES = "refined_poses.json"
+"""What refining the poses by the pictures found; the next `process` reads it."""
 
 OWN_MOTION = "sphere sweep"
 """Kind of distances from motion that `process` finds itself, in transforms.json."""
@@ -94,6 +96,8 @@ def layers_of(frame: Mapping[str, Any]) -> set[str]:
 INTRINSICS = ("fl_x", "fl_y", "cx", "cy")
 """Keys of a frame, or of the whole scene, that are numbers of pixels."""
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+DISTORTION_PARAMS = "distortion_params"
+"""Another key of nerfstudio's: these six in a list."""
 _MAX_FRAMES = 1_000_000
 """Also an upper bound of frame numbers."""
 _NUMBERS = (*INTRINSICS, *DISTORTION, "timestamp_s")
@@ -210,10 +214,9 @@ def _check_size(entry: Mapping[str, Any], where: str) -> None:
 
 
 def _check_distortion(entry: Mapping[str, Any], where: str) -> None:
-    """Another way of nerfstudio's to write k1 to p2."""
-    given = entry.get("distortion_params", [0.0] * 6)
+    given = entry.get(DISTORTION_PARAMS, [0.0] * 6)
     if not isinstance(given, list) or len(given) != 6 or any(finite(value) is None for value in given):
-        raise InputError(f"{where}: distortion_params is {shown(given)}, expected 6 numbers. Repair the file.")
+        raise InputError(f"{where}: {DISTORTION_PARAMS} is {shown(given)}, expected 6 numbers. Repair the file.")
 
 
 def _check_scene(meta: Mapping[str, Any], path: Path) -> None:

@@ -26,6 +26,7 @@ from edge_depth_nerf.lidar.scans import read_cloud
 from edge_depth_nerf.scene.format import (
     DEPTH_KEY,
     DISTORTION,
+    DISTORTION_PARAMS,
     INTRINSICS,
     LAYERS,
     TRANSFORMS,
@@ -395,8 +396,12 @@ def _moments(frames: list[dict[str, Any]]) -> dict[str, int]:
 
 def _lens(meta: dict[str, Any], frame: dict[str, Any], model: str, path: Path) -> KannalaBrandt | Pinhole:
     where = f"{path}: {frame['file_path']}"
-    size_and_focal = [number_of(frame.get(key, meta.get(key)), f"{where}: {key}") for key in ("w", "h", *INTRINSICS)]
-    distortion = [number_of(frame.get(key, meta.get(key, 0.0)), f"{where}: {key}") for key in DISTORTION]
+    # as nerfstudio's parser: what the scene gives for all its pictures goes first
+    size_and_focal = [number_of(meta.get(key, frame.get(key)), f"{where}: {key}") for key in ("w", "h", *INTRINSICS)]
+    of_all = any(key in meta for key in ("k1", "k2", "k3", "p1", "p2", DISTORTION_PARAMS))
+    given = meta if of_all else frame
+    values = given.get(DISTORTION_PARAMS, [given.get(key, 0.0) for key in DISTORTION])
+    distortion = [number_of(value, f"{where}: {key}") for key, value in zip(DISTORTION, values, strict=True)]
     width, height, fx, fy, cx, cy = size_and_focal
     k1, k2, k3, k4, p1, p2 = distortion
     try:

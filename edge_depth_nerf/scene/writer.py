@@ -577,6 +577,14 @@ def _modified_ns(path: Path) -> int:
         return 0
 
 
+def _changed_ns(path: Path) -> int:
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        return 0
+    return max(found.st_mtime_ns, found.st_ctime_ns)
+
+
 def _broken_before(output: Path, frames: Sequence[SceneFrame]) -> dict[str, str]:
     """Which frames an earlier run left out, and why, as far as none of their files has changed since."""
     path = output / LEFT_OUT
@@ -588,7 +596,8 @@ def _broken_before(output: Path, frames: Sequence[SceneFrame]) -> dict[str, str]
         for frame in frames
         if isinstance(found, dict)
         and frame.key in found
-        and max((_modified_ns(file) for file in frame.inputs), default=0) < written_ns
+        # a copy may keep the date of its content, but not that of its file
+        and max((_changed_ns(file) for file in frame.inputs), default=0) < written_ns
     }
 
 

@@ -50,6 +50,7 @@ from edge_depth_nerf.process.colmap.scale import moment_times
 from edge_depth_nerf.process.feature_masks import FeatureMasks
 from edge_depth_nerf.process.options import ProcessOptions
 from edge_depth_nerf.process.recording import RecordedPicture, Recording
+from edge_depth_nerf.scene.format import REFINED_POSES
 
 OPTION = "--refine-poses"
 SOFTNESS = Softness(position_m=0.1, turn_rad=math.radians(0.3))
@@ -61,8 +62,6 @@ FURTHEST_DEG = 1.5
 LEAST_GAIN = 0.05
 """The features that took no part must come nearer to their curves by this share; less is chance."""
 
-REFINED_POSES = "refined_poses.json"
-"""File of the scene with what was found, for the next run."""
 _VERSION = 2
 """Of what is done with the inputs; raised when results change."""
 _APART = (1, 2, 3, 5, 8)

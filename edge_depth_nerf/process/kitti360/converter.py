@@ -65,6 +65,8 @@ def read_kitti360(options: Kitti360Options) -> Recording:
             whole.add(number)
     # a moment needs a sweep of its own
     kept = [(name, frame) for name, frame in kept if frame in whole]
+    if not kept:
+        raise InputError(f"{tolerance.left_out[0].fault} No other frame is chosen: choose more by --frames.")
     files = drive.check_files(rig, kept, tolerance)
     moments = sorted({frame for _, frame in kept})
     stamps = {name: drive.read_timestamps(name, moments) for name in options.cameras}
