@@ -147,7 +147,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("drives", type=Path, nargs="+")
     parser.add_argument("--frames", type=int, nargs=2, default=[2, 6])
-    parser.add_argument("--pictures", type=int, default=320_000)
+    parser.add_argument("--pictures", type=int, default=160_000)
     parser.add_argument("--frames-per-scene", type=int, default=150)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
