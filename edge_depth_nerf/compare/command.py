@@ -248,9 +248,9 @@ def _settings(options: CompareOptions, name: MethodName, tuned: dict[str, Settin
 
 
 def layers_digest(folder: Path) -> str:
-    """SHA-256 of all files that a scene has beside its pictures: masks, maps, and the truth to judge by.
+    """SHA-256 of all files that a scene has beside its pictures: masks, maps, and what they are judged by.
 
-    Other maps may have the names of those before, and then transforms.json stays as it is.
+    Other maps may have the names of those before, and then transforms.json does not change.
     """
     keys = [layer.key for name, layer in LAYERS.items() if name != "image"]
     frames = read_transforms(folder / "transforms.json")["frames"]
@@ -355,7 +355,7 @@ def _tuned_on(path: Path) -> Any:
 def _record(options: CompareOptions, tuned: dict[str, Setting]) -> dict[str, Any]:
     """What the output folder's record is to hold of what all its runs share, beside the commands so far.
 
-    What is tuned binds methods that have a run; others may be tuned later, or anew.
+    What is tuned binds methods that have a run; others may be tuned later, or again.
 
     Raises:
         InputError: the folder holds another comparison, or something else.
