@@ -219,6 +219,23 @@ def test_distortion_may_be_a_list(tmp_path, of_all):
     assert ours["fx"] == outputs.cameras.fx[0] == (8.0 if of_all else 9.0)
 
 
+def test_arrays_of_other_tools_say_none_in_many_ways(tmp_path):
+    scene = write_scene(tmp_path, mono=False)
+    values = np.full((28, 32), 4000.0, np.float32)
+    values[0, :4] = np.inf, np.nan, -1, 0
+    np.save(scene / "depth.npy", values)
+
+    def change(meta):
+        for frame in meta["frames"]:
+            del frame["lidar_file_path"]
+            frame["depth_file_path"] = "depth.npy"
+        meta["depth_unit_scale_factor"] = 1e-3
+
+    edit(scene, change)
+    found = FisheyeDepthDataset(parse(scene)).distance_m(0, "lidar")
+    assert found[0, :5].tolist() == pytest.approx([0, 0, 0, 0, 4])
+
+
 def test_k4_is_read(tmp_path):
     scene = write_scene(tmp_path)
     edit(scene, lambda meta: [frame.update(k4=0.0123) for frame in meta["frames"]])

@@ -144,6 +144,23 @@ def test_a_mended_file_may_have_an_older_date(drive: RoomDrive) -> None:
     assert not run(drive)[0].left_out
 
 
+@pytest.mark.parametrize("kind", ["picture", "sweep"])
+def test_a_file_that_is_copied_again_may_have_another_size(drive: RoomDrive, kind: str) -> None:
+    path = drive.image("image_03", 5) if kind == "picture" else drive.sweep(7)
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-3])
+    assert run(drive)[0].left_out
+    path.write_bytes(whole)
+    report, _ = run(drive)
+    assert not report.left_out and report.training + report.held_out == 24
+    run(drive, "other")
+    assert contents(report.scene) == contents(drive.root.parent / "other")
+    # from here on it is whole, and another drive is another drive
+    path.write_bytes(whole[:-3])
+    with pytest.raises(InputError, match="contains another scene: inputs_sha256"):
+        run(drive)
+
+
 def test_a_camera_without_pictures_for_training(drive: RoomDrive) -> None:
     """Those of a stretch may be missing; nothing is masked then."""
     for frame in drive.frames:

@@ -229,3 +229,10 @@ def test_other_weights_for_a_scene_that_has_maps(room: RoomDrive, tmp_path: Path
     run(options_of(room, tmp_path / "scene"))
     other = (tmp_path / "scene" / WEIGHTS).rename(tmp_path / "other.safetensors")
     assert "which are kept" in run(options_of(room, tmp_path / "scene", mono_model=other))
+
+
+def test_options_that_come_too_late_are_told(room: RoomDrive, tmp_path: Path) -> None:
+    run(options_of(room, tmp_path / "scene", motion=True))
+    said = run(options_of(room, tmp_path / "scene", motion=False, mono_preset="full"))
+    assert "has distances from motion already, which are kept and used" in said
+    assert "has monocular maps already, of the preset lite, which are kept" in said

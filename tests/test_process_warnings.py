@@ -18,9 +18,14 @@ from rich.console import Console
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, read_mask, write_png
+from edge_depth_nerf.lidar import Sweep
 from edge_depth_nerf.masks.lens import lens_circle
 from edge_depth_nerf.process.agreement import Agreement, agreement_notices, agreements
+from edge_depth_nerf.process.build import _never_held_out
+from edge_depth_nerf.process.colmap.scale import _scan
 from edge_depth_nerf.process.converters import convert
+from edge_depth_nerf.process.feature_masks import FeatureMasks
+from edge_depth_nerf.process.found_path import upright
 from edge_depth_nerf.process.options import RigOptions
 from edge_depth_nerf.process.recording import Recording
 from edge_depth_nerf.process.rig import read_rig_recording
@@ -172,6 +177,55 @@ def test_no_fit_is_said_where_the_pictures_could_tell() -> None:
     assert "no inverse of a transform fits, either: front with roof (0.10)" in said
     # noise has no agreement either way
     assert agreement_notices([replace(unfit, still=0.3)]) == []
+
+
+def test_a_camera_that_is_never_held_out_is_named(recording: Recording) -> None:
+    """As of two that take turns, when every 8th moment is always one of the first."""
+    turns = [
+        replace(picture, frame=2 * picture.frame + (picture.camera == "left"))
+        for picture in recording.pictures
+        if picture.camera != "front"
+    ]
+    alternating = replace(recording, pictures=tuple(turns))
+    (notice,) = _never_held_out(alternating, {4, 12}, 4)
+    assert notice.startswith("No picture of left is held out") and "--holdout-every 5" in notice
+    assert _never_held_out(alternating, {4, 9}, 4) == _never_held_out(recording, {4}, 4) == []
+    assert _never_held_out(alternating, set(), 4) == []
+
+
+def test_a_scanner_may_hang_head_down(recording: Recording) -> None:
+    """A path that is found is upright as the cameras are."""
+    trajectory = recording.trajectory
+    assert trajectory is not None
+    sweeps = [
+        replace(sweep, to_vehicle=sweep.to_vehicle @ np.diag([1.0, -1.0, -1.0, 1.0])) for sweep in recording.sweeps
+    ]
+    turned = upright(replace(recording, sweeps=tuple(sweeps)), trajectory)
+    assert turned.vehicle_to_world == pytest.approx(upright(recording, trajectory).vehicle_to_world)
+
+
+@pytest.mark.parametrize("strict", [False, True])
+def test_damaged_masks_and_scans_do_not_stop_what_looks_for_features(
+    recording: Recording, tmp_path: Path, strict: bool
+) -> None:
+    """They are reported when their maps are made."""
+    damaged = tmp_path / "mask.png"
+    damaged.write_bytes(b"no PNG")
+    options = RigOptions(root=tmp_path, output=tmp_path / "scene", strict=strict)
+    masks = FeatureMasks(recording, options, {camera.name: 1.5 for camera in recording.cameras})
+    picture = recording.pictures[0]
+    assert masks.of(picture).any()
+    if strict:
+        with pytest.raises(InputError, match=r"mask\.png"):
+            masks.of(replace(picture, mask=damaged))
+    else:
+        assert not masks.of(replace(picture, mask=damaged)).any()
+
+    def unreadable() -> Sweep:
+        raise InputError("none of its points can be used")
+
+    assert _scan(replace(recording.sweeps[0], read=unreadable), recording.trajectory) is None
+    assert _scan(recording.sweeps[0], recording.trajectory) is not None
 
 
 def test_process_says_it_before_the_work(mine: Path) -> None:

@@ -204,6 +204,15 @@ def test_a_turn_says_the_same_as_the_points_own_times(mine: Path) -> None:
     on_clock = read_rig_recording(options(mine)).sweeps[2].read()
     assert on_clock.offset_s is not None
     assert (on_clock.offset_s - by_point.offset_s).abs().max() < 1e-6
+    # a clock that is off moves points and scans alike
+    edit(mine, ('counted_from = "clock"}', 'counted_from = "clock"}\ntime_offset_s = 0.02'))
+    late = read_rig_recording(options(mine)).sweeps[2]
+    late_points = late.read()
+    assert late.time_s - timed.time_s == pytest.approx(0.02, abs=1e-6) and late_points.offset_s is not None
+    assert (late_points.offset_s - by_point.offset_s).abs().max() < 1e-6
+    edit(mine, ('unit = "ns", counted_from = "clock"', 'unit = "us", counted_from = "clock"'))
+    with pytest.raises(InputError, match=r"points' times are .* s from the scan's own \(median\)\. Correct unit or"):
+        read_rig_recording(options(mine)).sweeps[2].read()
 
 
 @pytest.mark.parametrize(
@@ -228,6 +237,40 @@ def test_points_in_the_vehicles_frame(mine: Path) -> None:
     assert np.array_equal(in_vehicle.to_vehicle, in_scanner.to_vehicle)
     moved = in_vehicle.read().points_m.numpy() @ in_vehicle.to_vehicle[:3, :3].T + in_vehicle.to_vehicle[:3, 3]
     assert moved == pytest.approx(in_scanner.read().points_m.numpy(), abs=1e-9)
+
+
+def test_missing_echoes_in_the_vehicles_frame_are_no_points(mine: Path) -> None:
+    """A recorder that moves the whole cloud moves them to the scanner's place."""
+    edit(mine, ('timestamp = "start"', 'timestamp = "start"\npoints_in = "vehicle"'))
+    sweep = read_rig_recording(options(mine)).sweeps[1]
+    points = sweep.read()
+    place = sweep.to_vehicle[:3, 3]
+    lines = sweep.path.read_bytes().partition(b"DATA binary\n")
+    record = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("t", "<u4")]
+    values = np.frombuffer(lines[2], record).copy()
+    for name, number in zip("xyz", place, strict=True):
+        values[name][:7] = number
+    sweep.path.write_bytes(lines[0] + lines[1] + values.tobytes())
+    without = read_rig_recording(options(mine)).sweeps[1].read()
+    assert without.out_of_range == points.out_of_range + 7
+    assert len(without.points_m) == len(points.points_m) - 7 and without.points_m.norm(dim=-1).min() > 0.5
+
+
+def test_a_folder_for_each_moment(mine: Path) -> None:
+    """Names are alike then; folders are in the order of their numbers, and of maps none may take another's place."""
+    for number in reversed(range(FRAMES)):
+        folder = mine / f"moments/{number + 7}"
+        folder.mkdir(parents=True)
+        shutil.copy(mine / f"images/left/{number:06d}.png", folder / "left.png")
+    edit(mine, ('images = "images/left"', 'images = "moments/*/left.png"'))
+    text = (mine / "rig.toml").read_text()
+    (mine / "rig.toml").write_text(re.sub(r"(?m)^mono = .*\n", "", text))
+    pictures = [picture for picture in read_rig_recording(options(mine)).pictures if picture.camera == "left"]
+    assert [int(picture.path.parent.name) for picture in pictures] == [*range(7, 7 + FRAMES)]
+    assert [picture.time_s for picture in pictures] == sorted(picture.time_s for picture in pictures)
+    edit(mine, ("[cameras.left]\n", '[cameras.left]\nmasks = "moments/*/left.png"\n'))
+    with pytest.raises(InputError, match=r"cameras\.left\.masks: .*have one name\. Give files of different names"):
+        read_rig_recording(options(mine))
 
 
 def test_the_path_is_the_vehicles(mine: Path) -> None:

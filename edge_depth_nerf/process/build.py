@@ -10,6 +10,7 @@ import dataclasses
 import hashlib
 import threading
 from collections import defaultdict
+from collections.abc import Collection
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,9 @@ from edge_depth_nerf.scene.format import TRANSFORMS
 from edge_depth_nerf.scene.points import PointCloud
 from edge_depth_nerf.scene.writer import (
     CLOUD,
+    INCOMPLETE,
+    INPUTS,
+    WHOLE,
     DistanceMap,
     FrameContent,
     ProcessReport,
@@ -123,6 +127,7 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
         strict=options.strict,
         console=console,
     )
+    notices += _never_held_out(recording, held_out, options.holdout_every)
     if not report.held_out:
         notices.append(_none_held_out(len({picture.frame for picture in recording.pictures}), options.holdout_every))
     report = dataclasses.replace(
@@ -146,6 +151,20 @@ def _none_held_out(frames: int, holdout_every: int) -> str:
     if any(held_out_frames(frames, holdout_every)):
         return f"{text} All held-out frames were left out because of broken or missing files."
     return f"{text} {frames} frames are too few for --holdout-every {holdout_every}: use --holdout-every {best}."
+
+
+def _never_held_out(recording: Recording, held_out: Collection[int], holdout_every: int) -> list[str]:
+    """Name cameras whose pictures all are for training although others' are held out, as of two that take turns."""
+    of_camera: dict[str, set[int]] = defaultdict(set)
+    for picture in recording.pictures:
+        of_camera[picture.camera].add(picture.frame)
+    never = [name for name, frames in of_camera.items() if len(frames) >= holdout_every and not frames & {*held_out}]
+    if not held_out or not never:
+        return []
+    return [
+        f"No picture of {', '.join(never)} is held out, so nothing evaluates it. Use --holdout-every "
+        f"{holdout_every + 1}, which meets other frames."
+    ]
 
 
 def _disagreements(
@@ -461,6 +480,7 @@ def _source(recording: Recording, options: ProcessOptions) -> dict[str, Any]:
                 f"({', '.join(recorded.name for recorded in recording.cameras)})."
             )
         digest.update(path.read_bytes())
+    whole_sha256 = digest.hexdigest()
     # the maps' sizes tell one drive from another; reading them all would take as long as the work
     sized = [path for picture in recording.pictures for path in picture.inputs]
     sized += [sweep.path for sweep in recording.sweeps]
@@ -489,7 +509,9 @@ def _source(recording: Recording, options: ProcessOptions) -> dict[str, Any]:
         "theta_max_deg": options.theta_max_deg,
         "holdout_every": options.holdout_every,
         **({"holdout_beams": options.holdout_beams} if options.holdout_beams else {}),
-        "inputs_sha256": digest.hexdigest(),
+        WHOLE: whole_sha256,
+        INPUTS: digest.hexdigest(),
+        **({INCOMPLETE: True} if recording.left_out else {}),
     }
 
 

@@ -53,10 +53,24 @@ def _has_motion(scene: SceneFolder) -> bool:
 
 def _add_motion(scene: SceneFolder, options: ProcessOptions, console: Console) -> None:
     """Give the scene distances from motion, if it has none."""
+    if not options.motion and scene.has("motion"):
+        say(
+            console,
+            f"{scene.folder}: has distances from motion already, which are kept and used. For a scene without them, "
+            "give another --output.",
+            "yellow",
+        )
     if options.motion and not _has_motion(scene):
         from edge_depth_nerf.process.motion import add_motion
 
         add_motion(scene, console)
+
+
+def _preset_of(scene: SceneFolder) -> str | None:
+    """The preset of the network that was trained on a scene and made its monocular maps; None without one."""
+    source = scene.meta.get("mono")
+    preset = source.get("preset") if scene.has("mono") and isinstance(source, dict) else None
+    return preset if isinstance(preset, str) else None
 
 
 def _add_mono(scene: SceneFolder, options: ProcessOptions, console: Console) -> None:
@@ -71,6 +85,14 @@ def _add_mono(scene: SceneFolder, options: ProcessOptions, console: Console) -> 
                 "`edge-depth-nerf estimate-depth SCENE --model …`.",
                 "yellow",
             )
+    preset = _preset_of(scene)
+    if options.mono_preset == "full" and preset not in (None, "full"):
+        say(
+            console,
+            f"{scene.folder}: has monocular maps already, of the preset {preset}, which are kept. For those of "
+            "full: `edge-depth-nerf estimate-depth SCENE --preset full`.",
+            "yellow",
+        )
     if not scene.has("mono") and options.estimate_depth:
         if lidar or options.mono_model is not None:
             with console.status("Starting the depth network …"):

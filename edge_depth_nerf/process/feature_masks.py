@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.masks.lens import lens_circle
 from edge_depth_nerf.masks.semantics import keep_static, read_labels
 from edge_depth_nerf.process.options import ProcessOptions
@@ -27,10 +28,10 @@ class FeatureMasks:
         }
 
     def of(self, picture: RecordedPicture) -> NDArray[np.bool_]:
-        """The mask of one picture, at its own size, True = use.
+        """The mask of one picture, at its own size, True = use; nothing of a picture whose own mask is damaged.
 
         Raises:
-            InputError: a mask cannot be read, or has another size.
+            InputError: a camera's mask cannot be read, or has another size; with --strict, a picture's.
 
         """
         name = picture.camera
@@ -41,8 +42,14 @@ class FeatureMasks:
                 shared if ego_mask is None else shared & read_camera_mask(ego_mask, self._cameras[name])
             )
         mask = self._shared[name]
-        if picture.mask is not None:
-            mask = mask & read_camera_mask(picture.mask, self._cameras[name])
-        if picture.semantics is not None:
-            mask = mask & keep_static(read_labels(picture.semantics), self._options.moving_classes)
+        try:
+            if picture.mask is not None:
+                mask = mask & read_camera_mask(picture.mask, self._cameras[name])
+            if picture.semantics is not None:
+                mask = mask & keep_static(read_labels(picture.semantics), self._options.moving_classes)
+        except (InputError, FileNotFoundError):
+            if self._options.strict:
+                raise
+            # it is left out, and reported when its turn comes
+            return np.zeros_like(mask)
         return mask

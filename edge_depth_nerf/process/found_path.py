@@ -82,10 +82,11 @@ def upright(recording: Recording, trajectory: Trajectory) -> Trajectory:
 
 def _up_in_vehicle(recording: Recording) -> Float64[np.ndarray, "3"]:
     scanners = {sweep.scanner: sweep.to_vehicle for sweep in recording.sweeps}
+    up = of_cameras = -np.sum([camera.to_vehicle[:3, 1] for camera in recording.cameras], axis=0)
     if scanners:
-        up = np.sum([to_vehicle[:3, 2] for to_vehicle in scanners.values()], axis=0)
-    else:
-        up = -np.sum([camera.to_vehicle[:3, 1] for camera in recording.cameras], axis=0)
+        axes = [to_vehicle[:3, 2] for to_vehicle in scanners.values()]
+        # one may hang head down
+        up = np.sum([-axis if axis @ of_cameras < 0 else axis for axis in axes], axis=0)
     up /= np.linalg.norm(up)
     # scanners sit on a vehicle a little askew; its own frame has an upright axis, which one depends on the recording
     axis = np.zeros(3)

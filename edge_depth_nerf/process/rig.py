@@ -25,6 +25,7 @@ from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE, as_people_count
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar import Sweep, transform_points
 from edge_depth_nerf.lidar.scans import SCAN_SUFFIXES, check_scan, read_scan
+from edge_depth_nerf.lidar.sweeps import usable_returns
 from edge_depth_nerf.lidar.trajectory import MAX_POSE_GAP_S, Trajectory
 from edge_depth_nerf.process.options import JbnuDepth360Options, RigOptions
 from edge_depth_nerf.process.poses import read_kitti, read_nerfstudio, read_times, read_tum
@@ -42,6 +43,8 @@ from edge_depth_nerf.scene.writer import Skipped, summarise
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 """Pictures that are found in a folder."""
 _RIG_FILES = ("rig.toml", "rig.json")
+_MOST_LATE_S = 60.0
+"""A scan's points are measured within this time of the scan's own; beyond, their unit or their clock is another."""
 
 
 @dataclass(frozen=True)
@@ -200,7 +203,16 @@ def _files(root: Path, given: str, suffixes: tuple[str, ...]) -> list[Path]:
         raise FileNotFoundError(f"{path}: no such folder; it is named in the rig file.")
     if not found:
         raise FileNotFoundError(f"{path}: {what}; expected {', '.join(suffixes)} files.")
-    return sorted(found, key=as_people_count)
+    return sorted(found, key=lambda file: [as_people_count(Path(part)) for part in file.relative_to(root).parts])
+
+
+def _by_stem(files: list[Path], where: str) -> dict[str, Path]:
+    """Files by their names without ending."""
+    found = {path.stem: path for path in files}
+    if len(found) < len(files):
+        twice = next(path for path in files if found[path.stem] != path)
+        raise InputError(f"{where}: {twice} and {found[twice.stem]} have one name. Give files of different names.")
+    return found
 
 
 def _number_in(path: Path) -> float:
@@ -462,7 +474,8 @@ def _sweeps(
             except (InputError, FileNotFoundError) as error:
                 tolerance.add(frame, lidar.name, error)
                 continue
-            counted_from_s = middle_s if absolute else lidar.to_middle_s
+            # points' times of the scanner's own clock are off as its scans' are
+            counted_from_s = middle_s - lidar.clock.offset_s if absolute else lidar.to_middle_s
             found.append(
                 RecordedSweep(
                     path=item.path,
@@ -480,10 +493,17 @@ def _sweeps(
 def _read(path: Path, lidar: RigLidar, counted_from_s: float) -> Sweep:
     """Read a scan, in the scanner's frame."""
     sweep = read_scan(path, lidar.format, counted_from_s)
+    if sweep.offset_s is not None and abs(late_s := float(sweep.offset_s.median())) > _MOST_LATE_S:
+        raise InputError(
+            f"{path}: its points' times are {late_s:.6g} s from the scan's own (median). Correct unit or counted_from "
+            f"of lidars.{lidar.name}.point_times in the rig file."
+        )
     if lidar.points_in == "scanner":
         return sweep
     to_scanner = torch.from_numpy(np.linalg.inv(lidar.to_vehicle))
-    return replace(sweep, points_m=transform_points(to_scanner, sweep.points_m))
+    # echoes that are missing lie at the scanner's own place
+    again = usable_returns(path, transform_points(to_scanner, sweep.points_m), sweep.reflectance, sweep.offset_s)
+    return replace(again, not_finite=sweep.not_finite, out_of_range=sweep.out_of_range + again.out_of_range)
 
 
 # ---- what comes with the pictures ------------------------------------------------------------------------------
@@ -508,7 +528,7 @@ class _Companions:
                     f"{rig}: cameras.{lacking[0]}.{key} is missing; give it for every camera that is used, or for none."
                 )
         self._found = {
-            (camera.name, what): {path.stem: path for path in _files(root, given, (".png",))}
+            (camera.name, what): _by_stem(_files(root, given, (".png",)), f"{rig}: cameras.{camera.name}.{what}")
             for camera in cameras
             for what, given in (
                 ("masks", camera.masks),

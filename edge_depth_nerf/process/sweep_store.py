@@ -187,6 +187,13 @@ class Scanner:
         nearest = min(around, key=lambda index: abs(self.times_s[index] - time_s))
         return nearest if abs(self.times_s[nearest] - time_s) <= 2 * self.half_turn_s else None
 
+    def is_own(self, index: int, frame: int, time_s: float) -> bool:
+        """Whether a sweep shows what a picture shows: it belongs to its frame, or was taken within half a turn.
+
+        The time of a sweep is that of its poses, which may be its end.
+        """
+        return self.sweeps[index].frame == frame or bool(abs(self.times_s[index] - time_s) <= self.half_turn_s)
+
     def whole(self, index: int) -> WorldSweep:
         """A sweep with all its points."""
         return self._loaded.get(index).world
@@ -274,7 +281,7 @@ class SweepStore:
         for scanner in self.scanners:
             own = scanner.own(frame, time_s)
             beams = None if own is None else scanner.beams(own)
-            if own is not None and beams is not None and abs(scanner.times_s[own] - time_s) <= scanner.half_turn_s:
+            if own is not None and beams is not None and scanner.is_own(own, frame, time_s):
                 found.append(beams.points_m)
         return torch.cat(found)
 
@@ -294,7 +301,7 @@ class SweepStore:
             window = [*window[:1], *filter(scanner.readable, window[1:])]
             for rank, index in enumerate(window):
                 age_s = abs(float(scanner.times_s[index]) - time_s)
-                if rank == 0 and age_s <= scanner.half_turn_s:
+                if rank == 0 and scanner.is_own(index, frame, time_s):
                     sweep = scanner.whole(index)
                     # a picture that is held out has no others around it, and nothing lasting is made of it
                     moved = torch.zeros(len(sweep.points_m), dtype=torch.bool)

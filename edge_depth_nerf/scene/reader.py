@@ -203,6 +203,9 @@ class SceneFolder:
         else:
             metres = read_distance_png(path, metres_per_count)
         metres = self._checked(picture, layer, metres)
+        if path.suffix == ".npy":
+            # other tools write infinity, NaN or -1 for none
+            metres = np.where(np.isfinite(metres) & (metres > 0), metres, np.float32(0))
         if layer == "lidar" and self.lidar_is_z_depth:
             return distance_from_z_depth(metres, self.rays(picture))
         return metres

@@ -70,6 +70,9 @@ from edge_depth_nerf.scene.points import PointCloud, merge_parts, write_part
 
 RECORD = "process.json"
 LEFT_OUT = "left_out.json"
+WHOLE, INPUTS, INCOMPLETE = "whole_sha256", "inputs_sha256", "some_left_out"
+"""Keys of the record: of the files that describe the whole drive, of these with the sizes of all others, and whether
+some of those cannot be used."""
 """Pictures of the drive that are not in the scene, because one of their files is broken: what is wrong with each."""
 CLOUD = "cloud"
 """The layer that becomes points.ply."""
@@ -405,7 +408,15 @@ def open_scene(output: Path, source: Mapping[str, Any]) -> None:
         there = read_json(path)
         there = there if isinstance(there, dict) else {}
         differing = [key for key in dict.fromkeys((*record, *there)) if there.get(key) != record.get(key)]
-        if differing and not any(entry.name != RECORD for entry in output.iterdir()):
+        if WHOLE not in there:
+            # as a version before wrote it
+            differing = [key for key in differing if key not in (WHOLE, INCOMPLETE)]
+        some_left_out = there.get(INCOMPLETE) is True or (output / LEFT_OUT).is_file()
+        if not differing or (WHOLE in there and some_left_out and {*differing} <= {INPUTS, INCOMPLETE}):
+            # what was left out may have been repaired; which pictures that concerns, their own files tell
+            if there != record:
+                write_json(path, record)
+        elif differing and not any(entry.name != RECORD for entry in output.iterdir()):
             # a run that failed before it wrote anything does not bind the next one
             write_json(path, record)
         elif differing:

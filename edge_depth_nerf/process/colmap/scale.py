@@ -331,7 +331,7 @@ def _ratios(
     along = {}
     for frame in frames:
         found = [np.ones(0)]
-        scans = [_scan(sweep, trajectory) for sweep in sweeps[frame]]
+        scans = [scan for sweep in sweeps[frame] if (scan := _scan(sweep, trajectory)) is not None]
         for number, index in sorted(registered[frame]):
             picture = recording.pictures[index]
             returns = _returns_in_camera(recording, picture, scans, trajectory)
@@ -343,9 +343,15 @@ def _ratios(
     return along
 
 
-def _scan(sweep: RecordedSweep, trajectory: Trajectory | None) -> Float64[np.ndarray, "returns 3"]:
-    """A sweep's points in the world, each by the vehicle's pose at its time; without a path, in the vehicle's frame."""
-    read = sweep.read()
+def _scan(sweep: RecordedSweep, trajectory: Trajectory | None) -> Float64[np.ndarray, "returns 3"] | None:
+    """A sweep's points in the world, each by the vehicle's pose at its time; without a path, in the vehicle's frame.
+
+    None for one that cannot be read: it is reported when its maps are made.
+    """
+    try:
+        read = sweep.read()
+    except (InputError, FileNotFoundError):
+        return None
     if trajectory is None:
         return transform_points(torch.from_numpy(sweep.to_vehicle), read.points_m).numpy()
     return sweep_in_world(read, sweep.time_s, sweep.to_vehicle, trajectory, sweep.timing).points_m.numpy()
@@ -370,7 +376,11 @@ def _depth_points(picture: RecordedPicture, camera: Camera) -> Float64[np.ndarra
     """The points of a depth map in the camera's frame."""
     if picture.depth is None:
         return np.zeros((0, 3))
-    distance = read_depth(picture.depth, camera).astype(np.float64)
+    try:
+        distance = read_depth(picture.depth, camera).astype(np.float64)
+    except (InputError, FileNotFoundError):
+        # reported when its map is made
+        return np.zeros((0, 3))
     of_pixels = rays(camera)
     return (of_pixels.directions * distance[..., None])[of_pixels.within & (distance > 0)]
 
