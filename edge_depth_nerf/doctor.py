@@ -171,6 +171,14 @@ def check_lpips() -> Iterator[Finding]:
     )
 
 
+def _version_of(package: str) -> str:
+    """The version of an installed module, as far as a package of its name says it (pycolmap-cuda12 has another)."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "installed"
+
+
 def check_extras() -> Iterator[Finding]:
     """Optional libraries and programs."""
     for name, package, extra, what in (
@@ -183,7 +191,7 @@ def check_extras() -> Iterator[Finding]:
         yield Finding(
             name,
             "ok" if there else "note",
-            version(package) if there else f"not installed; needed only for {what}",
+            _version_of(package) if there else f"not installed; needed only for {what}",
             "" if there else f"pip install '.[{extra}]'",
         )
     ffmpeg = shutil.which("ffmpeg")

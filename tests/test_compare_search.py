@@ -64,3 +64,11 @@ def test_a_search_writes_what_compare_takes(tmp_path, monkeypatch):
     assert read == {"ds-nerf": Setting(0.1, 0.5), "edge": Setting(1.0, "own")}
     # more values come to those that are there
     assert len(command.compare(replace(asked, lambdas=(0.01, 0.1, 0.3, 3.0)), QUIET).runs) == 2 * 5 * 4
+    # seeds do not compete with each other: those count that most values have
+    first, more = (0.01, 0.1, 0.3, 1.0, 3.0), (0.1, 5.0, 6.0, 7.0)
+    every = tuple(sorted({*first, *more}))
+    for seed, lambdas, counts, of in ((8, more, (7,), first), (8, first, (8,), every), (7, more, (7, 8), every)):
+        found = command.compare(replace(asked, seeds=(seed,), lambdas=lambdas), QUIET)
+        assert {(grid.seeds, *grid.lambdas) for grid in search.grids(found)} == {(counts, *of)}
+    assert "x, seeds 7, 8, preset" in (output / "search.md").read_text()
+    assert read_json(output / "tuned.json")["seed"] == [7, 8]

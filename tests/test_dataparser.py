@@ -233,7 +233,7 @@ def test_arrays_of_other_tools_say_none_in_many_ways(tmp_path):
 
     edit(scene, change)
     found = FisheyeDepthDataset(parse(scene)).distance_m(0, "lidar")
-    assert found[0, :5].tolist() == pytest.approx([0, 0, 0, 0, 4])
+    assert found is not None and found[0, :5].tolist() == pytest.approx([0, 0, 0, 0, 4])
 
 
 def test_k4_is_read(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import subprocess
 import sys
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import pytest
@@ -84,6 +85,16 @@ def test_missing_libraries_are_findings(monkeypatch):
     assert found(doctor.check_kernels)["Hash grids"].state == "problem"
     hidden.remove("numba")
     assert found(doctor.check_kernels)["Hash grids"].state == "ok"
+
+
+def test_a_module_of_another_package(monkeypatch):
+    """pycolmap-cuda12 installs the module pycolmap."""
+
+    def version(name: str) -> str:
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr(doctor, "version", version)
+    assert found(doctor.check_extras)["COLMAP"].found == "installed"
 
 
 def test_methods_that_are_not_registered(monkeypatch):

@@ -35,6 +35,17 @@ def test_a_skipped_step_is_seen_at_the_next_look_alone(scaler):
     assert scales[0][0] == 2.0**16 and scales[-1][1] == 2.0**15
 
 
+def test_while_gradients_add_up_the_scale_stays(scaler):
+    """--gradient-accumulation-steps: in most steps no optimiser steps, but nerfstudio updates the scale."""
+    weight = torch.nn.Parameter(torch.zeros(1))
+    for _ in range(3):
+        scaler.scale((weight * 2.0).sum()).backward()
+        scaler.update()
+    assert scaler.get_scale() == 2.0**16 and scaler._updates == 0
+    step(scaler, weight, 1.0)
+    assert scaler._updates == 1
+
+
 def test_a_checkpoint_keeps_the_scale_of_its_moment(scaler, monkeypatch):
     weight = torch.nn.Parameter(torch.zeros(1))
     step(scaler, weight, float("inf"))

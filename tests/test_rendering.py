@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 import torch
 from models import build
 from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.model_components import renderers
 from torch import Tensor
 
@@ -160,12 +162,17 @@ def bundle(count: int = 40) -> RayBundle:
 
 def outputs_both_ways(model: Any, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     """The model's outputs as rendered at once, and step by step from the same samples."""
+    return both_ways(model, monkeypatch, bundle)
+
+
+def both_ways(model: Any, monkeypatch: pytest.MonkeyPatch, rays: Callable[[], RayBundle]) -> list[dict[str, Any]]:
+    """The same of other rays."""
     found = []
     for at_once in (True, False):
         if not at_once:
             monkeypatch.setattr(FusedNerfactoField, "render", lambda *_: None)
         torch.manual_seed(3)
-        found.append(model(bundle()))
+        found.append(model(rays()))
     return found
 
 
@@ -193,6 +200,50 @@ def test_a_model_renders_the_same_at_once_and_step_by_step(options, training, mo
     for name in ("rgb", "accumulation"):
         torch.testing.assert_close(at_once[name], by_steps[name], rtol=1e-4, atol=1e-5)
     assert float(at_once["rgb"].std()) > 1e-3
+
+
+def test_rays_that_end_early_have_no_sky(monkeypatch):
+    """Those of a mesh's texture: behind them is what their last sample shows, as in nerfacto, not the far sky."""
+    model, whole = build(depth_loss="edge").eval(), bundle()
+    model.field.average_init_density = 0.1
+    with torch.no_grad():
+        for name, parameter in model.field.named_parameters():
+            if "hash_table" in name:
+                parameter.uniform_(-0.5, 0.5)
+
+    def short() -> RayBundle:
+        rays = bundle()
+        rays.nears, rays.fars = (torch.full((len(rays), 1), distance) for distance in (0.0, 0.05))
+        return rays
+
+    with_sky = model(whole)
+    assert whole.fars is None and torch.equal(model(whole)["rgb"], with_sky["rgb"])  # and once more
+    colours: list[Any] = []
+    fields = model._fields
+    monkeypatch.setattr(model, "_fields", lambda parts: [colours.append(each) or each for each in fields(parts)])
+    at_once, by_steps = both_ways(model, monkeypatch, short)
+    torch.testing.assert_close(at_once["rgb"], by_steps["rgb"], rtol=1e-4, atol=1e-5)
+    (found,) = colours
+    behind = (1 - by_steps["accumulation"]) * found[FieldHeadNames.RGB][:, -1]
+    assert float(behind.max()) > 0.1
+    last_alone = found[FieldHeadNames.RGB][:, -1]
+    nearly_empty = by_steps["accumulation"][:, 0] < 0.02
+    assert nearly_empty.any()
+    assert (by_steps["rgb"] - last_alone)[nearly_empty].abs().max() < 0.03
+
+
+def test_a_crop_shows_its_background_alone(monkeypatch):
+    """What is cut away has the chosen colour, not the sky as well, which would exceed 1."""
+    model = build(depth_loss="edge").eval()
+    model.field.average_init_density = 1e-3
+    rendered = []
+    for colour in (0.0, 1.0):
+        monkeypatch.setattr(renderers, "BACKGROUND_COLOR_OVERRIDE", torch.full((3,), colour))
+        torch.manual_seed(3)
+        rendered.append(model(bundle()))
+    black, white = rendered
+    assert float(white["rgb"].max()) <= 1 + 1e-6 and float(black["accumulation"].min()) < 0.9
+    torch.testing.assert_close(white["rgb"] - black["rgb"], (1 - black["accumulation"]).expand(-1, 3))
 
 
 @pytest.mark.parametrize("case", ["a background of the exporter's", "gradients scaled by distance", "normals"])

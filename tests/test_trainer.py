@@ -199,6 +199,24 @@ def test_a_drive_without_lidar_has_no_prior_of_it(tmp_path, monkeypatch, capsys)
     assert "with a depth prior" in said and "LiDAR alone" not in said
 
 
+@pytest.mark.parametrize("logged", [True, False])
+def test_logged_gradients_are_those_of_tables_too(tmp_path, logged):
+    """Without the log a table has none: its optimiser sums it up level by level."""
+    trainer = trainer_of(write_scene(tmp_path / "scene"), tmp_path / "runs", max_num_iterations=1, log_gradients=logged)
+    trainer.train_iteration(0)
+    tables = {name: each for name, each in trainer.pipeline.model.named_parameters() if "hash_table" in name}
+    assert tables and {each.grad is not None for each in tables.values()} == {logged}
+
+
+def test_checkpoints_may_go_to_another_place(tmp_path):
+    folder = tmp_path / "elsewhere" / "checkpoints"
+    scene = write_scene(tmp_path / "scene")
+    trainer = trainer_of(scene, tmp_path / "runs", max_num_iterations=1, relative_model_dir=folder)
+    trainer.save_checkpoint(0)
+    assert [path.name for path in folder.parent.iterdir()] == ["checkpoints"]
+    assert [path.name for path in folder.iterdir()] == ["step-000000000.ckpt"]
+
+
 def test_ctrl_c_before_the_first_step(trainer, monkeypatch, capsys):
     monkeypatch.setattr(trainer, "_init_viewer_state", lambda: signal.raise_signal(signal.SIGINT))
     with pytest.raises(SystemExit) as ended:

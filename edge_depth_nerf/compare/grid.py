@@ -21,7 +21,7 @@ from edge_depth_nerf.compare.methods import (
 )
 from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.results import Results
-from edge_depth_nerf.compare.search import Grid
+from edge_depth_nerf.compare.search import Grid, grids, seeds_in_words
 from edge_depth_nerf.compare.tables import introduction, per_seed, psnr_metric
 from edge_depth_nerf.report.tables import Cell as Figure
 from edge_depth_nerf.report.tables import MadeTable, Metric, Row, mark_best, mean_and_spread
@@ -218,7 +218,7 @@ def grid_lines(results: Results, searched: Results) -> list[str]:
         *introduction(results),
         *_sweeps_lines({run.scene: Path(run.specification["scene"]) for run in results.runs}),
         f"λ and σ of each cell: the best mean PSNR of random held-out pixels on {' and '.join(searched.scenes())}, "
-        f"which no table uses; seed {run.seed}, {run.content['steps']} steps each.",
+        f"which no table uses; {seeds_in_words(grids(searched))}, {run.content['steps']} steps each.",
         "Extras: colours at the surface, a sky loss, a sky colour at infinity, a decreasing λ. Monocular maps show "
         "where the sky is, so there is no sky loss with LiDAR alone.",
     ]

@@ -6,6 +6,7 @@ Of several drives the mean counts.
 from __future__ import annotations
 
 import statistics
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,12 +26,14 @@ TUNED = "tuned.json"
 
 @dataclass(frozen=True)
 class Grid:
-    """What came out for a method: PSNR, dB, mean over the drives, by λ and σ."""
+    """What came out for a method: PSNR, dB, mean over the drives and seeds, by λ and σ."""
 
     method: MethodName
     lambdas: list[float]
     sigmas: list[float | str]
     psnr: dict[tuple[float, float | str], float]
+    seeds: tuple[int, ...] = (0,)
+    """The same for each λ and σ."""
 
     @property
     def best(self) -> tuple[float, float | str]:
@@ -52,15 +55,11 @@ def grids(results: Results) -> list[Grid]:
     found = []
     for method in results.methods():
         runs = [run for run in results.runs if run.method == method]
-        figures: dict[tuple[float, float | str], dict[str, float]] = {}
+        figures: dict[tuple[float, float | str], dict[tuple[str, int], float]] = {}
         for run in runs:
             pair = (run.specification["weight"], run.specification["sigma_m"])
-            figures.setdefault(pair, {})[run.scene] = run.figures[name]
-        drives = max(len(by_drive) for by_drive in figures.values())
-        # one that not all drives have, as of a search that goes on, is no mean
-        psnr = {
-            pair: statistics.fmean(by_drive.values()) for pair, by_drive in figures.items() if len(by_drive) == drives
-        }
+            figures.setdefault(pair, {})[run.scene, run.seed] = run.figures[name]
+        seeds, psnr = _means(figures)
         sigmas = {sigma for _, sigma in psnr}
         found.append(
             Grid(
@@ -68,9 +67,44 @@ def grids(results: Results) -> list[Grid]:
                 sorted({weight for weight, _ in psnr}),
                 [*sorted(sigma for sigma in sigmas if sigma != "own"), *(["own"] if "own" in sigmas else [])],
                 psnr,
+                seeds,
             )
         )
     return found
+
+
+def _means(
+    figures: Mapping[tuple[float, float | str], Mapping[tuple[str, int], float]],
+) -> tuple[tuple[int, ...], dict[tuple[float, float | str], float]]:
+    """Means over the same drives and seeds, and these seeds, of PSNR by λ and σ, then drive and seed.
+
+    What lacks a drive, as in a search that is not finished, is no mean. Of several seeds count those that most λ and σ
+    have.
+    """
+    runs = {
+        (seed, pair): {drive for drive, of in by_run if of == seed}
+        for pair, by_run in figures.items()
+        for _, seed in by_run
+    }
+    drives = max(runs.values(), key=len)
+    complete: dict[int, set[tuple[float, float | str]]] = {}
+    for (seed, pair), there in runs.items():
+        if there >= drives:
+            complete.setdefault(seed, set()).add(pair)
+    first = max(complete, key=lambda seed: (len(complete[seed]), -seed))
+    seeds = tuple(sorted(seed for seed, pairs in complete.items() if pairs >= complete[first]))
+    means = {
+        pair: statistics.fmean(figures[pair][drive, seed] for drive in sorted(drives) for seed in seeds)
+        for pair in figures
+        if pair in complete[first]
+    }
+    return seeds, means
+
+
+def seeds_in_words(found: Sequence[Grid]) -> str:
+    """The seeds of a search."""
+    seeds = sorted({seed for grid in found for seed in grid.seeds})
+    return f"seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))}"
 
 
 def write_search(output: Path, results: Results) -> None:
@@ -79,7 +113,7 @@ def write_search(output: Path, results: Results) -> None:
     found = grids(results)
     content: dict[str, Any] = {
         "scenes": sorted({each.specification["scene"] for each in results.runs}),
-        "seed": run.seed,
+        "seed": found[0].seeds[0] if len(found[0].seeds) == 1 else [*found[0].seeds],
         "preset": run.specification["preset"],
         "steps": run.content["steps"],
         "chosen_by": f"pixels_{curve_metric(results)}",
@@ -93,8 +127,8 @@ def write_search(output: Path, results: Results) -> None:
     against += ", mean over the drives" if len(results.scenes()) > 1 else ""
     parts = [
         "# Search of λ and σ",
-        f"{', '.join(results.scenes())}, seed {run.seed}, preset {content['preset']}, {content['steps']} steps each; "
-        f"PSNR in dB of random held-out pixels inside the mask{against}.",
+        f"{', '.join(results.scenes())}, {seeds_in_words(found)}, preset {content['preset']}, {content['steps']} steps "
+        f"each; PSNR in dB of random held-out pixels inside the mask{against}.",
     ]
     for grid in found:
         parts.append(f"## {METHODS[grid.method].title}")

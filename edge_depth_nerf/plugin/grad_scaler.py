@@ -27,11 +27,20 @@ class PatientGradScaler(torch.amp.GradScaler):
         return self._seen
 
     def update(self, new_scale: Any = None) -> None:
-        """Adapt the scale after a step; in some steps, look at it."""
+        """Adapt the scale after a step; in some steps, look at it.
+
+        Where gradients are added up over several steps, no optimiser may have stepped: the scale stays.
+        """
+        if self._enabled and new_scale is None and not self._some_stepped():
+            return
         super().update(new_scale)
         self._updates += 1
         if self._updates % STEPS_PER_LOOK == 0:
             self._seen = super().get_scale()
+
+    def _some_stepped(self) -> bool:
+        """Whether an optimiser's gradients were looked at since the last update."""
+        return any(state["found_inf_per_device"] for state in self._per_optimizer_states.values())
 
     def state_dict(self) -> dict[str, Any]:
         """What a checkpoint keeps, the present scale included."""

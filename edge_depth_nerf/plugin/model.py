@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal, TypeGuard
@@ -164,14 +165,17 @@ class NothingBehind(RGBRenderer):
 
     def __init__(self) -> None:
         super().__init__(background_color="black")
+        self.shows_last_sample = False
+        """Behind rays that end before the far plane lies what their last sample shows, as in nerfacto."""
 
     def forward(self, rgb: Tensor, weights: Tensor, *args: Any, **kwargs: Any) -> Tensor:
         """Give the colours, [rays, 3]."""
         if self.training and not args and not kwargs:
             # nerfstudio also sums up the weights, for the background
             return (weights * rgb).sum(dim=-2)
-        # its word for a background that is added later
-        return super().forward(rgb, weights, *args, **{**kwargs, "background_color": "random"})
+        # random: its word for a background that is added later
+        behind = "last_sample" if self.shows_last_sample else "random"
+        return super().forward(rgb, weights, *args, **{**kwargs, "background_color": behind})
 
 
 class DepthInEvaluation(DepthRenderer):
@@ -379,17 +383,24 @@ class EdgeDepthNerfModel(NerfactoModel):
                 outputs hold the colours that the field has at their surfaces, `surface_rgb`.
 
         """
+        bounded = ray_bundle.fars is not None
         if self.collider is not None:
-            ray_bundle = self.collider(ray_bundle)
-        return self.get_outputs(ray_bundle, batch)
+            # a copy: else the caller's own rays would be bounded the next time
+            ray_bundle = self.collider(copy(ray_bundle))
+        return self.get_outputs(ray_bundle, batch, bounded)
 
-    def get_outputs(self, ray_bundle: RayBundle, batch: dict[str, Any] | None = None) -> dict[str, Any]:
+    def get_outputs(
+        self, ray_bundle: RayBundle, batch: dict[str, Any] | None = None, bounded: bool = False
+    ) -> dict[str, Any]:
         """Nerfacto's outputs and the sky; in training without the depths that no loss reads.
+
+        The sky is behind rays up to the far plane, not behind those that end earlier (`bounded`): at the edge of a
+        crop, or behind a mesh's surface when its texture is rendered.
 
         In evaluation also, in metres, the median `distance` and `distance_uncertainty`, the standard deviation of where
         the ray ends. (nerfstudio divides outputs with "depth" in their name by the scene's scale; these have none.)
         """
-        outputs, further = self._rendered(ray_bundle, batch)
+        outputs, further = self._rendered(ray_bundle, batch, bounded)
         if self._has_surface(batch):
             bundles = [ray_bundle, batch["surface_rays"]]
             outputs["rgb"], outputs["surface_rgb"] = self._exposed([outputs["rgb"], further], bundles)
@@ -405,10 +416,10 @@ class EdgeDepthNerfModel(NerfactoModel):
         """Whether there are further pixels whose colour at their surface is compared."""
         return self.training and self.config.surface_loss_mult > 0 and batch is not None and "surface_rays" in batch
 
-    def _places(self, rays: RayBundle, batch: dict[str, Any] | None) -> RaySamples | None:
+    def _places(self, rays: RayBundle, batch: dict[str, Any] | None, sky: bool) -> RaySamples | None:
         """Where the field is asked for colours beside the samples: the sky behind each ray, then the surfaces."""
         bundles, distances = [], []
-        if self._has_sky:
+        if sky:
             bundles.append(rays)
             distances.append(rays.origins.new_full((len(rays),), INFINITELY_FAR))
         if self._has_surface(batch):
@@ -433,18 +444,22 @@ class EdgeDepthNerfModel(NerfactoModel):
             return self.field.forward_together(parts)
         return [self.field.forward(samples) for samples in parts]
 
-    def _rendered(self, rays: RayBundle, batch: dict[str, Any] | None) -> tuple[dict[str, Any], Tensor]:
+    def _rendered(self, rays: RayBundle, batch: dict[str, Any] | None, bounded: bool) -> tuple[dict[str, Any], Tensor]:
         """Nerfacto's outputs with the sky, and the field's colours at the surfaces of further pixels, [pixels, 3]."""
+        # nerfstudio's crops and exporters set a background of their own
+        sky = self._has_sky and not bounded and renderers.BACKGROUND_COLOR_OVERRIDE is None
+        if isinstance(self.renderer_rgb, NothingBehind):
+            self.renderer_rgb.shows_last_sample = bounded
         if self.config.predict_normals:
             outputs = super().get_outputs(rays)
-            places = self._places(rays, batch)
+            places = self._places(rays, batch, sky)
             further = rays.origins[:0] if places is None else self.field.forward(places)[FieldHeadNames.RGB][:, 0]
-            return self._before_sky(outputs, further)
+            return self._before_sky(outputs, further, sky)
         if self.training:
             self.camera_optimizer.apply_to_raybundle(rays)
         samples, weights_list, samples_list = self.proposal_sampler(rays, density_fns=self.density_fns)
-        places = self._places(rays, batch)
-        rendered = self._rendered_at_once(samples, places)
+        places = self._places(rays, batch, sky)
+        rendered = self._rendered_at_once(samples, places, sky)
         if rendered is None:
             found, *others = self._fields([samples, *([] if places is None else [places])])
             if self.config.use_gradient_scaling:
@@ -455,7 +470,7 @@ class EdgeDepthNerfModel(NerfactoModel):
                 "accumulation": self.renderer_accumulation(weights=weights),
             }
             further = others[0][FieldHeadNames.RGB].squeeze(1) if others else rays.origins[:0]
-            outputs, further = self._before_sky(outputs, further)
+            outputs, further = self._before_sky(outputs, further, sky)
         else:
             rgb, accumulation, weights, further = rendered
             # nerfstudio's, at evaluation
@@ -468,19 +483,21 @@ class EdgeDepthNerfModel(NerfactoModel):
             outputs |= {"weights_list": weights_list, "ray_samples_list": samples_list}
         return outputs, further
 
-    def _rendered_at_once(self, samples: RaySamples, places: RaySamples | None) -> Rendered | None:
+    def _rendered_at_once(self, samples: RaySamples, places: RaySamples | None, sky: bool) -> Rendered | None:
         """What the fused field renders on the CPU; None where it does not serve."""
-        # an exporter of nerfstudio sets a background of its own
         if self.config.use_gradient_scaling or renderers.BACKGROUND_COLOR_OVERRIDE is not None:
             return None
-        behind = Behind.SINGLE_POINT if self._has_sky else BEHIND.get(str(self.config.background_color))
+        if self._has_sky:
+            behind = Behind.SINGLE_POINT if sky else Behind.LAST_SAMPLE
+        else:
+            behind = BEHIND.get(str(self.config.background_color))
         if behind is None or not isinstance(self.field, FusedNerfactoField):
             return None
         return self.field.render(samples, places, behind)
 
-    def _before_sky(self, outputs: dict[str, Any], further: Tensor) -> tuple[dict[str, Any], Tensor]:
+    def _before_sky(self, outputs: dict[str, Any], further: Tensor, sky: bool) -> tuple[dict[str, Any], Tensor]:
         """Add the sky, whose colours come first among those at `_places`, behind what the samples stop."""
-        if not self._has_sky:
+        if not sky:
             return outputs, further
         behind, further = further.split([len(outputs["rgb"]), len(further) - len(outputs["rgb"])])
         return {**outputs, "rgb": torch.addcmul(outputs["rgb"], 1 - outputs["accumulation"], behind)}, further

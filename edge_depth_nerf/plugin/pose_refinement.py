@@ -9,6 +9,8 @@ adjustment. The drive's mean adjustment is kept at zero: it would move the scene
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -134,7 +136,7 @@ def fit_pose(
     log_gains = torch.nn.Parameter(torch.zeros(3, device=model.device))
     optimizer = torch.optim.Adam([adjustment, log_gains], FIT_LEARNING_RATE)
     scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, FIT_STEPS)
-    with torch.enable_grad():
+    with torch.enable_grad(), _constant(model):
         for _ in range(FIT_STEPS):
             chosen = torch.randint(len(at), (min(FIT_RAYS, len(at)),), generator=generator)
             part = rays[chosen]
@@ -143,7 +145,6 @@ def fit_pose(
             colours = model(part)["rgb"] * log_gains.exp()
             loss = (colours - target[chosen]).square().mean()
             loss = loss + config.prior_mult * adjustment.square().mean()
-            # the model's own parameters get no gradient
             gradients = torch.autograd.grad(loss, [adjustment, log_gains])
             adjustment.grad, log_gains.grad = gradients
             optimizer.step()
@@ -153,6 +154,19 @@ def fit_pose(
     found = camera[:]
     found.camera_to_worlds = moved_pose(camera.camera_to_worlds, correction)
     return found
+
+
+@contextmanager
+def _constant(model: torch.nn.Module) -> Iterator[None]:
+    """Let no parameter of a model ask for a gradient: hash tables on the CPU would keep what gives theirs."""
+    learning = [parameter for parameter in model.parameters() if parameter.requires_grad]
+    for parameter in learning:
+        parameter.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for parameter in learning:
+            parameter.requires_grad_(True)
 
 
 def moved_pose(

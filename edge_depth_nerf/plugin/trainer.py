@@ -17,6 +17,7 @@ from typing import Any, Literal
 
 import torch
 import yaml
+from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerConfig
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -25,6 +26,7 @@ from nerfstudio.viewer.viewer import Viewer
 from edge_depth_nerf.base.errors import STOPPED_STATUS, InputError
 from edge_depth_nerf.base.files import remove_leftovers, write_text
 from edge_depth_nerf.jobs.runs import checkpoints_in, newest_checkpoint
+from edge_depth_nerf.kernels.table_adam import TableAdam
 from edge_depth_nerf.kernels.threads import torch_on_one_thread
 from edge_depth_nerf.plugin.compat import count_steps_against_all, ignore_deprecations_of_host, total_steps
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig, transforms_path
@@ -123,6 +125,15 @@ class EdgeDepthTrainer(Trainer):
         else:
             CONSOLE.print(f"[yellow]Training goes without CUDA graphs: {reason}.")
 
+    def setup_optimizers(self) -> Optimizers:
+        """Set up as nerfstudio does; where it logs gradients, hash tables have whole ones."""
+        optimizers = super().setup_optimizers()
+        if self.config.log_gradients:
+            for optimizer in optimizers.optimizers.values():
+                if isinstance(optimizer, TableAdam):
+                    optimizer.want_whole_gradients()
+        return optimizers
+
     def train(self) -> None:
         """Train as nerfstudio does.
 
@@ -210,7 +221,8 @@ class EdgeDepthTrainer(Trainer):
 
     def _save_whole(self, step: int) -> None:
         folder = self.checkpoint_dir
-        partial = self.base_dir / ".unfinished_checkpoint"
+        # on the same disk, wherever --relative-model-dir leads
+        partial = folder.parent / ".unfinished_checkpoint"
         shutil.rmtree(partial, ignore_errors=True)
         self.checkpoint_dir = partial
         try:

@@ -8,6 +8,7 @@ So neither a training nor a command without a viewer waits for it.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from io import BytesIO
@@ -330,12 +331,13 @@ class DriveLayers(ViewerControl):
             positions = dataset.cameras.camera_to_worlds[:, :3, 3].cpu().numpy()
             for file, position in zip(dataset.image_filenames, positions, strict=True):
                 places.setdefault(file.parent, []).append((file, position))
+        named = Counter(folder.name for folder in places)
         for number, (folder, camera) in enumerate(sorted(places.items())):
             line = np.stack([position for _, position in sorted(camera, key=lambda place: as_people_count(place[0]))])
             if len(line) < 2:
                 continue
             self.viser_server.scene.add_spline_catmull_rom(
-                f"{node}/{folder.name}",
+                f"{node}/{folder.name if named[folder.name] == 1 else f'{folder.parent.name}_{folder.name}'}",
                 line * VISER_NERFSTUDIO_SCALE_RATIO,
                 line_width=3,
                 color=PATH_COLOURS[number % len(PATH_COLOURS)],
