@@ -89,7 +89,7 @@ def judge(scene_path: Path, output: Path, every: int) -> tuple[list[tuple[str, .
     scene = read_scene(scene_path)
     pictures = [picture for picture in scene.pictures if not picture.held_out]
     positions = np.stack([picture.position_m for picture in pictures])
-    motion = Motion(positions, lambda index: view(scene, pictures[index]))
+    motion = Motion(positions, [picture.camera for picture in pictures], lambda index: view(scene, pictures[index]))
     store = SweepStore(output / "sweeps" / scene.folder.name, scene, pictures, motion)
     seconds: list[float] = []
 

@@ -60,7 +60,9 @@ def shifted_by(x_m: float) -> np.ndarray:
 
 
 def found(views: list[View], index: int = MIDDLE) -> MotionDistance:
-    motion = Motion(np.stack([view.camera_to_world[:3, 3] for view in views]), lambda number: views[number])
+    motion = Motion(
+        np.stack([view.camera_to_world[:3, 3] for view in views]), ["only"] * len(views), lambda number: views[number]
+    )
     return motion.confirm(index, motion.sweep)
 
 
@@ -429,12 +431,24 @@ def test_too_few_neighbours_confirm_nothing():
 # ---- neighbours and hypotheses ---------------------------------------------------------------------------------
 
 
+def test_a_stop_leaves_place_for_views_from_elsewhere():
+    """Two cameras, side by side, that stand for 40 frames and then drive."""
+    along_m = [*np.zeros(40), *np.arange(1, 21) * 0.5]
+    positions = np.array([[x, side, 0.0] for x in along_m for side in (0.0, 0.01)])
+    cameras = ["left", "right"] * len(along_m)
+    near = nearest_views(positions, 0, cameras)
+    assert near[:3] == [1, 80, 81] and len(near) == 32
+    assert {cameras[view] for view in near} == {"left", "right"} and len({*near}) == 32
+    # from the last one all others of both cameras are there but for the stop's
+    assert sum(view < 80 for view in nearest_views(positions, 119, cameras)) == 0
+
+
 def test_neighbours_lie_on_both_sides_and_see_the_same():
     views = [of_wall(WALL, pose(x))[0] for x in (0.0, 0.3, -0.3, 0.6, -0.6, 0.01)]
     turned = of_wall(WALL, pose(0.4))[0]
     backward = View(turned.grey, WALL, pose(0.4, turn_rad=math.pi))
     others = [*views[1:], backward]
-    assert nearest_views(np.array([[0.0, 0, 0], [3, 0, 0], [1, 0, 0]]), 0) == [2, 1]
+    assert nearest_views(np.array([[0.0, 0, 0], [3, 0, 0], [1, 0, 0]]), 0, ["a"] * 3) == [2, 1]
     two = choose_neighbours(views[0], others, 2)
     assert {others[index].camera_to_world[0, 3] > 0 for index in two} == {True, False}
     everyone = choose_neighbours(views[0], others, 8)

@@ -61,7 +61,9 @@ def add_motion(scene: SceneFolder, console: Console) -> None:
         say(console, f"No distances from motion: {len(pictures)} training pictures are too few.", "yellow")
         return
     motion = Motion(
-        np.stack([picture.position_m for picture in pictures]), lambda index: scene_view(scene, pictures[index])
+        np.stack([picture.position_m for picture in pictures]),
+        [picture.camera for picture in pictures],
+        lambda index: scene_view(scene, pictures[index]),
     )
     with console.status("Searching for neighbours of pictures …"):
         still = sum(len(motion.neighbours(index)) < LEAST_AGREEING for index in range(len(pictures)))

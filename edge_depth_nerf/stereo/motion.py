@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -19,15 +19,18 @@ _KEPT_VIEWS = 96
 class Motion:
     """The pictures of a drive that take part: held-out ones are not among them."""
 
-    def __init__(self, positions_m: Float64[np.ndarray, "views 3"], view: Callable[[int], View]) -> None:
+    def __init__(
+        self, positions_m: Float64[np.ndarray, "views 3"], cameras: Sequence[str], view: Callable[[int], View]
+    ) -> None:
         """Say which pictures there are.
 
         Args:
             positions_m: their cameras' centres.
+            cameras: the camera of each, by name.
             view: gives one of them; asked for again when it has been dropped.
 
         """
-        self._positions_m = positions_m
+        self._positions_m, self._cameras = positions_m, cameras
         self.view = lru_cache(_KEPT_VIEWS)(view)
         """Gives one of the pictures, from memory if it was asked for lately."""
         self._neighbours = lru_cache(None)(self._choose)
@@ -37,7 +40,7 @@ class Motion:
         return self._neighbours(index)
 
     def _choose(self, index: int) -> tuple[int, ...]:
-        near = nearest_views(self._positions_m, index)
+        near = nearest_views(self._positions_m, index, self._cameras)
         chosen = choose_neighbours(self.view(index), [self.view(other) for other in near])
         return tuple(near[place] for place in chosen)
 

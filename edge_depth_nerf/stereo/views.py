@@ -33,6 +33,8 @@ _WIDEST_RAD = 0.7
 """From here on nothing looks alike."""
 NEAREST_VIEWS = 32
 """So many views are worth trying: those whose centres lie nearest."""
+_SAME_PLACE_M = 0.03
+"""Within this distance a camera stands."""
 _LEAST_GAIN_PX = 0.05
 """Mean over what is tried, of roots of pixels: a neighbour that adds less is not taken."""
 
@@ -95,17 +97,28 @@ def working_factor(camera: Camera) -> int:
     return max(1, math.ceil(math.sqrt(camera.width * camera.height / MOST_PIXELS)))
 
 
-def nearest_views(positions_m: Float64[np.ndarray, "views 3"], index: int) -> list[int]:
+def nearest_views(positions_m: Float64[np.ndarray, "views 3"], index: int, cameras: Sequence[str]) -> list[int]:
     """Which views to offer to `choose_neighbours`: the `NEAREST_VIEWS` nearest to a view, without itself.
+
+    Of a camera that stands, one view is enough: else a stop of some frames would leave no place for those from where
+    things look different.
 
     Args:
         positions_m: centres of all views.
         index: which of them.
+        cameras: of each view, by name.
 
     """
-    away_m = np.linalg.norm(positions_m - positions_m[index], axis=1)
-    away_m[index] = np.inf
-    return np.argsort(away_m, kind="stable")[: min(NEAREST_VIEWS, len(away_m) - 1)].tolist()
+    of_camera = np.asarray(cameras)
+    from_view_m = np.linalg.norm(positions_m - positions_m[index], axis=1)
+    left, taken = np.ones(len(positions_m), bool), [index]
+    while len(taken) <= NEAREST_VIEWS:
+        away_m = np.linalg.norm(positions_m - positions_m[taken[-1]], axis=1)
+        left[(of_camera == of_camera[taken[-1]]) & (away_m <= _SAME_PLACE_M)] = False
+        if not left.any():
+            break
+        taken.append(int(np.where(left, from_view_m, np.inf).argmin()))
+    return taken[1:]
 
 
 def choose_neighbours(view: View, others: Sequence[View], most: int = 8) -> list[int]:
