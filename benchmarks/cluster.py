@@ -1,6 +1,6 @@
 """Storage and time for many pictures, from rates measured on few; and what a cluster adds to a task.
 
-    python benchmarks/cluster.py DRIVE [DRIVE …] [--frames 2 6] [--pictures 320000] [--frames-per-scene 150]
+    python benchmarks/cluster.py DRIVE [DRIVE …] [--frames 2 6] [--pictures 160000] [--frames-per-scene 150]
 
 DRIVE is one that `synthesize` has written (two cameras). Two stretches of it go through `process` without monocular
 maps, through `estimate-depth` with weights that exist (its time does not depend on what is in them), and through
