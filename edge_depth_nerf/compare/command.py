@@ -251,15 +251,23 @@ def layers_digest(folder: Path) -> str:
     """SHA-256 of all files that a scene has beside its pictures: masks, maps, and what they are judged by.
 
     Other maps may have the names of those before, and then transforms.json does not change.
+
+    Raises:
+        FileNotFoundError: one of them is missing.
+
     """
     keys = [layer.key for name, layer in LAYERS.items() if name != "image"]
-    frames = read_transforms(folder / "transforms.json")["frames"]
+    transforms = folder / "transforms.json"
+    frames = read_transforms(transforms)["frames"]
     digest = hashlib.sha256()
     for name in sorted(
         {frame[key] for frame in frames for key in (*keys, DEPTH_KEY) if isinstance(frame.get(key), str)}
     ):
+        path = folder / name
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: no such file, but {transforms} names it. Process the drive again.")
         digest.update(f"{name}\n".encode())
-        digest.update(hashlib.sha256((folder / name).read_bytes()).digest())
+        digest.update(hashlib.sha256(path.read_bytes()).digest())
     return digest.hexdigest()
 
 

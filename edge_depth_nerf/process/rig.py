@@ -203,7 +203,7 @@ def _files(root: Path, given: str, suffixes: tuple[str, ...]) -> list[Path]:
         raise FileNotFoundError(f"{path}: no such folder; it is named in the rig file.")
     if not found:
         raise FileNotFoundError(f"{path}: {what}; expected {', '.join(suffixes)} files.")
-    return sorted(found, key=lambda file: [as_people_count(Path(part)) for part in file.relative_to(root).parts])
+    return sorted(found, key=lambda file: [as_people_count(Path(part)) for part in file.parts])
 
 
 def _by_stem(files: list[Path], where: str) -> dict[str, Path]:
