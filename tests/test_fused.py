@@ -188,22 +188,23 @@ def test_the_contraction_is_nerfactos():
     assert torch.equal(places, expected * inside[:, None])
 
 
-def bundle(count: int = 40, seed: int = 1) -> RayBundle:
+def bundle(count: int = 40, seed: int = 1, planes: bool = False) -> RayBundle:
+    """Rays, with near and far planes of their own or without."""
     generator = torch.Generator().manual_seed(seed)
     return RayBundle(
         origins=torch.rand(count, 3, generator=generator) - 0.5,
         directions=torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1),
         pixel_area=torch.full((count, 1), 1e-4),
         camera_indices=torch.arange(count)[:, None] % 3,
-        nears=torch.full((count, 1), 0.01),
-        fars=torch.full((count, 1), 50.0),
+        nears=torch.full((count, 1), 0.01) if planes else None,
+        fars=torch.full((count, 1), 50.0) if planes else None,
     )
 
 
 @pytest.mark.parametrize("training", [True, False])
 @pytest.mark.parametrize("single_jitter", [True, False])
 def test_samples_lie_where_nerfstudio_puts_them(training, single_jitter):
-    rays = bundle()
+    rays = bundle(planes=True)
     first = UniformLinDispPiecewiseSampler(num_samples=30).train(training)(rays)
     generator = torch.Generator().manual_seed(5)
     weights = torch.rand(40, 30, 1, generator=generator) ** 8
@@ -237,7 +238,7 @@ def test_all_samples_of_a_fused_model_have_fused_weights():
 @pytest.mark.parametrize("training", [True, False])
 @pytest.mark.parametrize("single_jitter", [True, False])
 def test_the_first_samples_lie_where_nerfstudio_puts_them(training, single_jitter):
-    rays = bundle()
+    rays = bundle(planes=True)
     sampler = FirstSampler(single_jitter).train(training)
     found = []
     for place in (UniformLinDispPiecewiseSampler(single_jitter=single_jitter).train(training), sampler):
@@ -253,7 +254,7 @@ def test_the_first_samples_lie_where_nerfstudio_puts_them(training, single_jitte
 
 @pytest.mark.parametrize("shape", [(40,), (20, 2)], ids=str)
 def test_samples_along_rays_are_nerfstudios_field_by_field(shape):
-    rays = bundle()
+    rays = bundle(planes=True)
     metadata: dict[str, Any] = rays.metadata
     metadata |= {"directions_norm": torch.rand(40, 1), "cam_idx": 0}
     rays = rays.reshape(shape)
@@ -385,8 +386,12 @@ def surface(count: int = 30) -> dict[str, RayBundle | torch.Tensor]:
     }
 
 
-def test_samples_sky_and_surfaces_are_looked_up_together(monkeypatch):
-    """One gradient of the field's table a step, not three that are added; the numbers are those of torch's calls."""
+@pytest.mark.parametrize("planes", [False, True])
+def test_samples_sky_and_surfaces_are_looked_up_together(monkeypatch, planes):
+    """One gradient of the field's table a step, not three that are added; the numbers are those of torch's calls.
+
+    Rays with planes of their own have no sky.
+    """
     models = [build(implementation=kind).train() for kind in ("torch", "fused")]
     models[1].load_state_dict(models[0].state_dict())
     table = models[1].get_parameter(TABLE)
@@ -396,7 +401,7 @@ def test_samples_sky_and_surfaces_are_looked_up_together(monkeypatch):
     found = []
     for model in models:
         torch.manual_seed(1)
-        outputs = model(bundle(), surface())
+        outputs = model(bundle(planes=planes), surface())
         (outputs["rgb"].sum() + outputs["surface_rgb"].square().sum()).backward()
         found.append((outputs["rgb"], outputs["surface_rgb"], model.get_parameter(TABLE).grad))
     assert made.count(len(table)) == 1
@@ -433,7 +438,7 @@ def test_a_fields_normals_can_be_had_at_evaluation():
     """ns-export asks the field for normals, whatever the model was trained with."""
     model = build().eval()
     assert isinstance(model.field, FusedNerfactoField)
-    samples, _, _ = model.proposal_sampler(bundle(), density_fns=model.density_fns)
+    samples, _, _ = model.proposal_sampler(bundle(planes=True), density_fns=model.density_fns)
     with torch.no_grad():
         outputs = model.field(samples, compute_normals=True)
     normals = next(value for key, value in outputs.items() if key.name == "NORMALS")

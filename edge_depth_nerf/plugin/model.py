@@ -170,7 +170,7 @@ class NothingBehind(RGBRenderer):
 
     def forward(self, rgb: Tensor, weights: Tensor, *args: Any, **kwargs: Any) -> Tensor:
         """Give the colours, [rays, 3]."""
-        if self.training and not args and not kwargs:
+        if self.training and not args and not kwargs and not self.shows_last_sample:
             # nerfstudio also sums up the weights, for the background
             return (weights * rgb).sum(dim=-2)
         # random: its word for a background that is added later
