@@ -21,12 +21,15 @@ help:
 	@echo "make check-dist  build wheel and sdist (dist/), install them into a fresh environment"
 	@echo "make setup       the virtual environment in $(VENV), with the versions of constraints.txt"
 
-# What the packages take, and what pip needs in the folder of temporary files until it has moved them.
+# What the packages take, and what pip needs in the folder of temporary files until it has moved them. Most of it is
+# torch for CUDA, which pip takes on such machines alone.
 PACKAGES_GB := 9.7
 TEMPORARY_GB := 3.6
 define ENOUGH_DISK
-import shutil, sys, tempfile
+import platform, shutil, sys, tempfile
 from pathlib import Path
+if (platform.system(), platform.machine()) != ("Linux", "x86_64"):
+    sys.exit()
 venv, temporary = Path(sys.argv[1]).absolute(), Path(tempfile.gettempdir())
 disk = next(folder for folder in [venv, *venv.parents] if folder.is_dir())
 here = sum(path.lstat().st_size for path in venv.rglob("*")) / 1e9

@@ -1,4 +1,5 @@
 import email
+import platform
 import re
 import shutil
 import subprocess
@@ -160,6 +161,9 @@ def test_make_has_what_is_called_phony():
     assert phony and set(phony[1].split()) <= make_targets()
 
 
+@pytest.mark.skipif(
+    (platform.system(), platform.machine()) != ("Linux", "x86_64"), reason="pip takes torch for CUDA there alone"
+)
 def test_setup_asks_for_space_before_it_begins(tmp_path):
     setup = ["make", "setup", f"PYTHON={sys.executable}", f"VENV={tmp_path / 'new' / 'venv'}"]
     done = subprocess.run([*setup, "PACKAGES_GB=1e6"], cwd=ROOT, capture_output=True, text=True, check=False)
