@@ -224,8 +224,6 @@ def test_rays_that_end_early_have_no_sky(monkeypatch):
     at_once, by_steps = both_ways(model, monkeypatch, short)
     torch.testing.assert_close(at_once["rgb"], by_steps["rgb"], rtol=1e-4, atol=1e-5)
     (found,) = colours
-    behind = (1 - by_steps["accumulation"]) * found[FieldHeadNames.RGB][:, -1]
-    assert float(behind.max()) > 0.1
     last_alone = found[FieldHeadNames.RGB][:, -1]
     nearly_empty = by_steps["accumulation"][:, 0] < 0.02
     assert nearly_empty.any()
