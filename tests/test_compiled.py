@@ -22,6 +22,27 @@ def test_it_is_known_whether_kernels_lie_compiled_on_disk(tmp_path, monkeypatch)
     assert not compiled.compiled_before(())
 
 
+def test_a_change_of_a_function_reaches_those_that_call_it(tmp_path):
+    """Numba alone would go on with the old one: it looks at a function's own module only."""
+    head = "from edge_depth_nerf.kernels.compiled import compiled\n\n\n@compiled()\n"
+    (tmp_path / "calling.py").write_text(
+        f"from called import step\n{head}def twice(x):\n    return step(step(x))\n", encoding="utf-8"
+    )
+    found = []
+    for number, added in enumerate((1, 10, 10)):
+        called = tmp_path / "called.py"
+        text = f"{head}def step(x):\n    return x + {added}\n"
+        if not called.exists() or called.read_text(encoding="utf-8") != text:
+            called.write_text(text, encoding="utf-8")
+        code = f"from calling import twice; print(twice({number}), sum(twice.stats.cache_hits.values()))"
+        done = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120, cwd=tmp_path
+        )
+        found.append([int(each) for each in done.stdout.split()])
+    # what did not change is not compiled again
+    assert found == [[2, 0], [21, 0], [22, 1]]
+
+
 def test_what_a_training_calls_is_looked_at_before_it_is_called():
     """A process that has computed no prior has not imported it."""
     code = (

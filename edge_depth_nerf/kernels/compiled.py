@@ -6,7 +6,9 @@ result is kept beside the module, or in the user's cache if that folder cannot b
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -43,12 +45,30 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         try:
             kernel = njit(cache=True, nogil=True, **options)(function)
-            _folders.add(Path(str(kernel.stats.cache_path)))
+            folder = Path(str(kernel.stats.cache_path))
+            if folder not in _folders:
+                _folders.add(folder)
+                _forget_older(folder, Path(function.__code__.co_filename).parent)
             return kernel
         except RuntimeError:  # Numba found no folder that can be written
             return njit(nogil=True, **options)(function)
 
     return decorate
+
+
+def _forget_older(compiled_in: Path, sources: Path) -> None:
+    """Forget what was compiled before the newest change of a folder of sources.
+
+    Numba compiles a function anew if its own module changed, not if that of a function did which it calls.
+    """
+    changed = [source.stat().st_mtime for source in sources.glob("*.py")]
+    # nothing is newer than a time that is still to come
+    newest = max((at for at in changed if at <= time.time()), default=0.0)
+    for index in compiled_in.glob("*.nbi"):
+        # another process may do the same
+        with suppress(FileNotFoundError):
+            if index.stat().st_mtime < newest:
+                index.unlink()
 
 
 def flat(values: Tensor) -> np.ndarray:
