@@ -47,8 +47,8 @@ PARTS = {
     "hash grid": "hash grid",
     "optimisers": "gradient of its table, and Adam",
     "batch": "pixels of the batch, their rays",
-    "samples": "samples: places, positions, weights; rendering",
-    "losses": "losses",
+    "samples": "samples: places, positions, weights; rendering, with its losses",
+    "losses": "losses of proposal networks; weighing all losses",
     "rest": "all else: autograd, colours, nerfstudio",
 }
 """What the table calls the parts."""

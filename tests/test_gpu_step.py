@@ -151,7 +151,9 @@ def test_the_rival_losses_copy_nothing_from_the_host(gpu_counts):
         lengths = torch.rand(7, 5, 1)
         along = lengths.expand(7, 5, 3)
         samples = RaySamples(Frustums(along, along, starts=lengths, ends=lengths, pixel_area=lengths))
-        model: Any = SimpleNamespace(config=config, metres_per_unit=2.0, _can_be_met=lambda prior_m: prior_m > 0)
+        model: Any = SimpleNamespace(
+            config=config, metres_per_unit=2.0, _met_prior=lambda batch: batch["prior_distance_m"]
+        )
         with counter:
             EdgeDepthNerfModel._depth_loss(model, lengths, samples, {}, {"prior_distance_m": torch.rand(7, 1)})
     assert counter.counts.parts["other"].kernels > 0 and not counter.counts.synchronisations

@@ -4,6 +4,7 @@ from typing import Any
 
 import pytest
 import torch
+from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.cameras.rays import Frustums, RayBundle, RaySamples
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.data.scene_box import SceneBox
@@ -322,6 +323,66 @@ def test_further_pixels_that_do_not_count_change_no_loss():
     assert losses["surface_loss"] == 0 and losses["surface_loss"].requires_grad
 
 
+PASS: list[dict[str, Any]] = [
+    {},
+    {"depth_loss": "none"},
+    {"depth_loss": "ds-nerf"},
+    {"depth_loss": "urban-nerf"},
+    {"depth_loss_levels": "final", "edge_gaussian": "point", "edge_divide_by_norm": False},
+    {"depth_loss_mult": 0.0, "sky_loss_mult": 0.0},
+    {"surface_loss_mult": 0.0, "sky_background": False},
+    {"exposure": "none", "camera_optimizer": CameraOptimizerConfig(mode="SO3xR3")},
+    {"exposure": "embedding"},
+    {"exposure": "affine"},
+    {"depth_loss": "none", "background_color": "random"},
+]
+
+
+@pytest.mark.parametrize("rests", [False, True], ids=["proposals learn", "proposals rest"])
+@pytest.mark.parametrize("options", PASS, ids=lambda options: ", ".join(options) or "defaults")
+def test_losses_are_the_same_in_the_pass_that_renders_and_by_themselves(options, rests, monkeypatch):
+    """Losses, metrics and gradients; `supervised` are those options whose colours the pass knows."""
+    found = []
+    for in_the_pass in (True, False):
+        model = build(**options).train()
+        if rests:
+            model.proposal_sampler._step, model.proposal_sampler._steps_since_update = 1000, 1
+        with torch.no_grad():
+            for parameter in [*model.field.parameters(), *(model.exposure.parameters() if model.exposure else ())]:
+                parameter.copy_(0.3 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(5)))
+        if not in_the_pass:
+            monkeypatch.setattr(model, "_supervision", lambda *_: None)
+        supervision = batch() | surface()
+        supervision["surface_counts"] = torch.tensor([True, False, True, True, False, True])[:, None]
+        torch.manual_seed(3)
+        outputs = model(rays(), supervision)
+        supervised = in_the_pass and options.get("exposure") != "affine" and "background_color" not in options
+        assert ("supervised" in outputs) == supervised
+        torch.manual_seed(4)
+        metrics = model.get_metrics_dict(outputs, supervision)
+        losses = model.get_loss_dict(outputs, supervision, metrics)
+        torch.stack(list(losses.values())).sum().backward()
+        gradients = {name: each.grad for name, each in model.named_parameters() if each.grad is not None}
+        found.append((losses, metrics, {"rgb": outputs["rgb"]}, gradients))
+    for one, other in zip(*found, strict=True):
+        assert set(one) == set(other) and one
+        for name, value in one.items():
+            right = other[name].detach()
+            largest = float(right.abs().max())
+            torch.testing.assert_close(value.detach(), right, rtol=1e-4, atol=1e-5 * largest + 1e-9, msg=name)
+
+
+def test_losses_of_the_pass_are_those_of_its_own_batch():
+    model = build().train()
+    supervision, other = batch(), batch()
+    other["image"] = 1 - other["image"]
+    torch.manual_seed(3)
+    outputs = model(rays(), supervision)
+    losses = model.get_loss_dict(outputs, other, model.get_metrics_dict(outputs, other))
+    expected = (outputs["rgb"] - other["image"]).square().mean()
+    assert float(losses["rgb_loss"]) == pytest.approx(float(expected), rel=1e-5)
+
+
 def test_the_surface_is_drawn_between_the_planes():
     model = build(near_m=0.2, far_m=50.0).train()
     count = 4000
@@ -347,20 +408,23 @@ def test_a_surface_that_is_not_between_the_planes_says_nothing(distance_m):
     model = build(near_m=0.2, far_m=50.0).train()
     given = surface()
     given["surface_distance_m"][0] = distance_m
-    torch.manual_seed(3)
-    supervision = batch() | given
-    outputs = model(rays(), supervision)
     image = given["surface_image"].clone()
+
+    def loss() -> float:
+        torch.manual_seed(3)
+        supervision = batch() | given
+        outputs = model(rays(), supervision)
+        found = model.get_loss_dict(outputs, supervision, model.get_metrics_dict(outputs, supervision))
+        return float(found["surface_loss"])
+
     losses = []
     for red in (0.0, 1.0):
         given["surface_image"][0] = red
-        found = model.get_loss_dict(outputs, supervision, model.get_metrics_dict(outputs, supervision))
-        losses.append(float(found["surface_loss"]))
+        losses.append(loss())
     assert losses[0] == pytest.approx(losses[1], rel=1e-5) and losses[0] > 0
     # another pixel's colour does matter
     given["surface_image"][1] = 1 - image[1].round()
-    found = model.get_loss_dict(outputs, supervision, model.get_metrics_dict(outputs, supervision))
-    assert float(found["surface_loss"]) != pytest.approx(losses[0], rel=1e-3)
+    assert loss() != pytest.approx(losses[0], rel=1e-3)
 
 
 @pytest.mark.parametrize("kind", LOSSES)

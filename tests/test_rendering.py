@@ -15,10 +15,12 @@ from torch import Tensor
 
 from edge_depth_nerf.kernels import network_numba, rendering_numba
 from edge_depth_nerf.kernels.fields import FusedNerfactoField
+from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss
 from edge_depth_nerf.kernels.network import joined_networks
 from edge_depth_nerf.kernels.pointwise_numba import STEEPEST
-from edge_depth_nerf.kernels.rendering import Behind
+from edge_depth_nerf.kernels.rendering import Behind, Supervision
 from edge_depth_nerf.kernels.rendering_numba import render
+from edge_depth_nerf.method.losses import EPS, NARROW, edge_loss, sky_loss
 
 
 @pytest.fixture(autouse=True, params=[1, 2], ids=["one thread", "two threads"])
@@ -121,23 +123,126 @@ def test_pixels_and_their_gradients(behind, shape):
         values[0, ::11] = 16
         values[0, 1::11] = -17
     inside, deltas = (torch.rand(points) > 0.1).float(), 0.3 * torch.rand(rays, samples)
-    found = render(values, inside, deltas, 1.7, behind)
+    *found, losses = render(values, inside, deltas, 1.7, behind)
+    assert losses is None
     exact = values.detach().double().requires_grad_()
     expected = straight_pixels(exact, inside.double(), deltas.double(), 1.7, behind)
     for each, other in zip(found, expected, strict=True):
         assert each.shape == other.shape
         torch.testing.assert_close(each.double(), other, rtol=1e-5, atol=1e-6)
     gradients = [torch.randn(each.shape) for each in found]
-    (slope,) = torch.autograd.grad(list(found), values, gradients)
+    (slope,) = torch.autograd.grad(found, values, gradients)
     (other,) = torch.autograd.grad(expected, exact, [each.double() for each in gradients])
     assert float((slope - other).abs().max()) <= 2e-5 * float(other.abs().max())
     # whatever a loss reads alone
     for number in range(4):
         if found[number].numel():
-            (slope,) = torch.autograd.grad(render(values, inside, deltas, 1.7, behind)[number].square().sum(), values)
+            *once_more, _ = render(values, inside, deltas, 1.7, behind)
+            (slope,) = torch.autograd.grad(once_more[number].square().sum(), values)
             again = straight_pixels(exact, inside.double(), deltas.double(), 1.7, behind)[number].square().sum()
             (other,) = torch.autograd.grad(again, exact)
             assert float((slope - other).abs().max()) <= 2e-5 * float(other.abs().max()) + 1e-6
+
+
+def supervision_of(shape: tuple[int, int, int], behind: Behind) -> Supervision:
+    """Two thirds of the rays with a prior, a fifth of them sky, two thirds of the further pixels of use."""
+    rays, samples, singles = shape
+    further = singles - (rays if behind == Behind.SINGLE_POINT else 0)
+    edges = torch.rand(rays, samples + 1).sort(dim=1)[0]
+    starts, ends = 12 * edges[:, :-1] ** 2, 12 * edges[:, 1:] ** 2
+    numbers = torch.arange(rays)
+    return Supervision(
+        image=torch.rand(rays + further, 3),
+        counts=torch.arange(further) % 3 > 0,
+        gains=(1 + 0.2 * torch.randn(4, 3)).requires_grad_(),
+        pictures=torch.arange(rays + further) % 4,
+        edges=edges,
+        starts=starts,
+        ends=ends,
+        prior_m=torch.where(numbers % 3 > 0, 30 * torch.rand(rays), 0),
+        sigma_m=0.05 + 3 * torch.rand(rays),
+        sky=numbers % 5 == 4,
+        metres_per_unit=3.0,
+        interval=True,
+        divide_by_norm=True,
+        eps=EPS,
+        narrow=NARROW,
+    )
+
+
+def straight_losses(rendered: list[Tensor], gains: Tensor, told: Supervision) -> tuple[list[Tensor], list[Tensor]]:
+    """Rendered colours as the pictures have them, and the losses, each by its own function, in float64."""
+    rgb, _, weights, further = rendered
+    rays = len(rgb)
+    image, factors = told.image.double(), gains[told.pictures]
+    rgb, further = rgb * factors[:rays], further * factors[rays:]
+    off = torch.where(told.counts[:, None], further - image[rays:], 0)
+    starts, ends = (each.double() * told.metres_per_unit for each in (told.starts, told.ends))
+    form: Any = {"gaussian": "interval" if told.interval else "point", "divide_by_norm": told.divide_by_norm}
+    losses = [
+        (rgb - image[:rays]).square().mean(),
+        off.square().mean() if len(off) else off.sum(),
+        edge_loss(weights, starts, ends, told.prior_m.double(), told.sigma_m.double(), **form),
+        distortion_loss(told.edges.double(), weights),
+        sky_loss(weights, told.sky),
+    ]
+    return [rgb, rendered[1], weights, further], losses
+
+
+FORMS: list[dict[str, Any]] = [
+    {},
+    {"interval": False, "divide_by_norm": False},
+    {"sigma_m": torch.tensor(0.0), "sky": torch.tensor(False), "counts": torch.tensor(False)},
+]
+
+
+@pytest.mark.parametrize("form", FORMS, ids=["interval", "point", "nothing told but colours"])
+@pytest.mark.parametrize("behind", list(Behind))
+@pytest.mark.parametrize("shape", [(37, 24, 100), (5, 1, 5), (1, 13, 1), (70, 7, 70)], ids=str)
+def test_losses_of_a_ray_in_the_pass_that_renders_it(form, shape, behind):
+    torch.manual_seed(2)
+    rays, samples, singles = shape
+    points = rays * samples + singles
+    values = torch.randn(4, points).requires_grad_()
+    inside, deltas = (torch.rand(points) > 0.1).float(), 0.3 * torch.rand(rays, samples)
+    told = supervision_of(shape, behind)
+    alike = {name: each.expand_as(getattr(told, name)) for name, each in form.items() if isinstance(each, Tensor)}
+    told = told._replace(**{**form, **alike})
+    *found, losses = render(values, inside, deltas, 1.7, behind, told)
+    assert losses is not None
+    exact, gains = (each.detach().double().requires_grad_() for each in (values, told.gains))
+    by_steps = straight_pixels(exact, inside.double(), deltas.double(), 1.7, behind)
+    expected, expected_losses = straight_losses(by_steps, gains, told)
+    every, expected_every = [*found, *losses], [*expected, *expected_losses]
+    for each, other in zip(every, expected_every, strict=True):
+        assert each.shape == other.shape and each.dtype == torch.float32
+        torch.testing.assert_close(each.double(), other, rtol=2e-5, atol=1e-6)
+
+    def same_slopes(number: int | None) -> None:
+        """By all that is given, each with its own factor, or by one alone."""
+        torch.manual_seed(3)
+        factors = [torch.randn(each.shape) for each in every]
+        chosen = range(len(every)) if number is None else [number]
+        one = torch.stack([(factors[k] * every[k]).sum() for k in chosen]).sum()
+        other = torch.stack([(factors[k].double() * expected_every[k]).sum() for k in chosen]).sum()
+        slopes = torch.autograd.grad(one, [values, told.gains], retain_graph=True)
+        others = torch.autograd.grad(other, [exact, gains], retain_graph=True, allow_unused=True)
+        for slope, right in zip(slopes, others, strict=True):
+            right = torch.zeros(slope.shape).double() if right is None else right
+            assert float((slope - right).abs().max()) <= 3e-5 * float(right.abs().max()) + 1e-7
+
+    for number in (None, *range(len(every))):
+        same_slopes(number)
+
+
+def test_gains_that_do_not_learn_get_no_gradient():
+    shape = 6, 4, 9
+    told = supervision_of(shape, Behind.NOTHING)._replace(gains=torch.ones(4, 3))
+    values = torch.randn(4, 33).requires_grad_()
+    rendered = render(values, torch.ones(33), torch.rand(6, 4), 1.0, Behind.NOTHING, told)
+    assert rendered.losses is not None
+    torch.stack(list(rendered.losses)).sum().backward()
+    assert values.grad is not None and bool(values.grad.abs().sum() > 0) and told.gains.grad is None
 
 
 def test_a_density_that_is_not_a_number_weighs_nothing_and_shows():
@@ -170,7 +275,7 @@ def both_ways(model: Any, monkeypatch: pytest.MonkeyPatch, rays: Callable[[], Ra
     found = []
     for at_once in (True, False):
         if not at_once:
-            monkeypatch.setattr(FusedNerfactoField, "render", lambda *_: None)
+            monkeypatch.setattr(FusedNerfactoField, "may_render", lambda *_: False)
         torch.manual_seed(3)
         found.append(model(rays()))
     return found

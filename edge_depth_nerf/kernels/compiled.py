@@ -59,7 +59,7 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any
 def _forget_older(compiled_in: Path, sources: Path) -> None:
     """Forget what was compiled before the newest change of a folder of sources.
 
-    Numba compiles a function anew if its own module changed, not if that of a function did which it calls.
+    Numba compiles a function again if its own module changed, not if that of a function did which it calls.
     """
     changed = [source.stat().st_mtime for source in sources.glob("*.py")]
     # nothing is newer than a time that is still to come

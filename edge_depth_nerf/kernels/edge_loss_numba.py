@@ -30,6 +30,51 @@ SECOND_ORDER = np.float32(1 / 24)
 
 @compiled()
 @no_type_check
+def edge_loss_of_ray(
+    weights, starts, ends, prior, sigma, slopes, samples, metres_per_unit, eps, narrow, interval, norm, follow
+):
+    """Give the loss of a ray that has a prior; `slopes`, which are 0, get what each weight would change it by."""
+    loss = 0.0
+    # a sample begins where the one before it ends: its value of Φ serves again
+    last, of_last = np.float32(np.inf), ZERO
+    for k in range(samples):
+        begin, end = starts[k] * metres_per_unit, ends[k] * metres_per_unit
+        # false with NaN, too
+        if not (-np.inf < begin < end < np.inf):
+            continue
+        # in units of σ̂; the length from the ends themselves, as their distances to a far prior have lost digits
+        length = (end - begin) / sigma
+        low, high = (begin - prior) / sigma, (end - prior) / sigma
+        if low > FAR or high < -FAR:
+            continue
+        middle = low + length / TWO
+        if interval and not length < narrow:
+            of_low = of_last if low == last else np.float32(math.erf(low * SQRT_HALF))
+            last, of_last = high, np.float32(math.erf(high * SQRT_HALF))
+            mass = SQRT_HALF_PI * (of_last - of_low)
+        else:
+            mass = np.float32(math.exp(-HALF * middle * middle)) * length
+            if interval:
+                mass *= ONE + (middle * middle - ONE) * length * length * SECOND_ORDER
+        if mass == ZERO:
+            continue
+        target = mass / SQRT_TWO_PI if norm else mass * sigma
+        weight = weights[k] + eps
+        loss -= target * np.float32(math.log(weight))
+        if follow:
+            slopes[k] = -target / weight
+    return loss
+
+
+@compiled()
+@no_type_check
+def has_prior(prior, sigma):
+    """Whether a ray has one."""
+    return ZERO < prior < np.inf and ZERO < sigma < np.inf
+
+
+@compiled()
+@no_type_check
 def _edge_loss(
     weights, weight_stride, starts, start_stride, ends, end_stride, priors, sigmas, slopes, samples,
     metres_per_unit, eps, narrow, interval, norm, follow, first, last,
@@ -37,32 +82,12 @@ def _edge_loss(
     """Give the sum of the loss and how many rays have a prior; `slopes` gets what each weight would change it by."""
     loss, count = 0.0, 0
     for ray in range(first, last):
-        prior, sigma = priors[ray], sigmas[ray]
-        if not (ZERO < prior < np.inf and ZERO < sigma < np.inf):
-            continue
-        count += 1
-        for k in range(samples):
-            begin, end = starts[ray * start_stride + k] * metres_per_unit, ends[ray * end_stride + k] * metres_per_unit
-            # false with NaN, too
-            if not (-np.inf < begin < end < np.inf):
-                continue
-            # in units of σ̂; the length from the ends themselves, as their distances to a far prior have lost digits
-            length = (end - begin) / sigma
-            low, high = (begin - prior) / sigma, (end - prior) / sigma
-            if low > FAR or high < -FAR:
-                continue
-            middle = low + length / TWO
-            if interval and not length < narrow:
-                mass = SQRT_HALF_PI * (np.float32(math.erf(high * SQRT_HALF)) - np.float32(math.erf(low * SQRT_HALF)))
-            else:
-                mass = np.float32(math.exp(-HALF * middle * middle)) * length
-                if interval:
-                    mass *= ONE + (middle * middle - ONE) * length * length * SECOND_ORDER
-            target = mass / SQRT_TWO_PI if norm else mass * sigma
-            weight = weights[ray * weight_stride + k] + eps
-            loss -= target * np.float32(math.log(weight))
-            if follow:
-                slopes[ray * samples + k] = -target / weight
+        if has_prior(priors[ray], sigmas[ray]):
+            count += 1
+            loss += edge_loss_of_ray(
+                weights[ray * weight_stride :], starts[ray * start_stride :], ends[ray * end_stride :], priors[ray],
+                sigmas[ray], slopes[ray * samples :], samples, metres_per_unit, eps, narrow, interval, norm, follow,
+            )  # fmt: skip
     return loss, count
 
 

@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from edge_depth_nerf.kernels.back_ends import by_number, made_by_autocast, of_encoded_network, of_network, working
 from edge_depth_nerf.kernels.fused_hash_grid import FusedHashEncoding, use_fused_encodings
 from edge_depth_nerf.kernels.network import joined_networks, network
-from edge_depth_nerf.kernels.rendering import Behind, Rendered
+from edge_depth_nerf.kernels.rendering import Behind, Rendered, Supervision
 
 
 class CubeContraction(SceneContraction):
@@ -194,23 +194,24 @@ class FusedNerfactoField(NerfactoField):
                 results.append(self.get_outputs(samples, features[..., 1:], of_rays))
         return results
 
-    def render(self, samples: RaySamples, places: RaySamples | None, behind: Behind) -> Rendered | None:
+    def render(
+        self, samples: RaySamples, places: RaySamples | None, behind: Behind, supervision: Supervision | None = None
+    ) -> Rendered:
         """Render pixels on the CPU in two passes: from encoded positions through both networks, and along the rays.
 
         Args:
-            samples: of the rays, [rays, samples].
+            samples: of the rays, [rays, samples]; `may_render` says whether this form serves them.
             places: single points, [points, 1]; with `Behind.SINGLE_POINT` those behind the rays come first.
             behind: what colours light that no sample stops.
+            supervision: what a batch tells of the pixels; then their losses are computed, too.
 
         Returns:
-            What `forward_together`, weights and nerfstudio's renderer give; None where this form does not serve.
+            What `forward_together`, weights and nerfstudio's renderer give.
 
         """
-        parts = [samples, *([] if places is None else [places])]
-        if not self._may_render(parts):
-            return None
         from edge_depth_nerf.kernels.rendering_numba import render
 
+        parts = [samples, *([] if places is None else [places])]
         positions = torch.cat([each.frustums.get_positions().reshape(-1, 3) for each in parts])
         points, inside = _unit_cube(self, positions)
         encoding, first = self.mlp_base.model
@@ -226,11 +227,11 @@ class FusedNerfactoField(NerfactoField):
         rays, count = samples.frustums.shape
         values = joined_networks(encoding(points), of_rays, (rays, count), _parameters(first), second, by_ray)
         deltas: Any = samples.deltas
-        return render(values, inside[:, 0], deltas.view(rays, count), self.average_init_density, behind)
+        return render(values, inside[:, 0], deltas.view(rays, count), self.average_init_density, behind, supervision)
 
-    def _may_render(self, parts: Sequence[RaySamples]) -> bool:
+    def may_render(self, samples: RaySamples, places: RaySamples | None) -> bool:
         """Whether `render` covers what this field has, for these samples."""
-        first, deltas = parts[0], parts[0].deltas
+        parts, deltas = [samples, *([] if places is None else [places])], samples.deltas
         more_heads = self.use_transient_embedding or self.use_semantics or self.use_pred_normals
         if more_heads or not isinstance(self.spatial_distortion, CubeContraction) or deltas is None:
             return False
@@ -239,7 +240,7 @@ class FusedNerfactoField(NerfactoField):
         plain = self.mlp_base.model[1].out_activation is None and isinstance(self.mlp_head.out_activation, nn.Sigmoid)
         cameras = self.embedding_appearance is None or all(each.camera_indices is not None for each in parts)
         one_a_ray = all(_one_a_ray(each.frustums.directions) for each in parts)
-        given = _in_parts(first.frustums.origins) and self.mlp_base.model[0].hash_table.dtype == torch.float32
+        given = _in_parts(samples.frustums.origins) and self.mlp_base.model[0].hash_table.dtype == torch.float32
         return plain and cameras and one_a_ray and given and deltas.numel() > 0 and not deltas.requires_grad
 
     def _appearance(self, parts: Sequence[RaySamples]) -> Tensor:

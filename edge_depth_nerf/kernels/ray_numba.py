@@ -256,29 +256,38 @@ def bound_loss(
 
 @compiled()
 @no_type_check
+def distortion_of_ray(edge, weight, slopes, before, samples, follow):
+    """Give the loss of a ray; what each weight would change it by goes to `slopes`, if wanted. Overwrites `before`."""
+    loss = 0.0
+    # Σ_j<k w_j and Σ_j<k w_j m_j, then the same of what lies behind
+    total = moment = 0.0
+    for k in range(samples):
+        middle = (edge[k] + edge[k + 1]) / TWO
+        before[k] = middle * total - moment
+        total += weight[k]
+        moment += weight[k] * middle
+    total = moment = 0.0
+    for k in range(samples - 1, -1, -1):
+        middle = (edge[k] + edge[k + 1]) / TWO
+        away = before[k] + moment - middle * total
+        own = weight[k] * (edge[k + 1] - edge[k]) / THREE
+        loss += weight[k] * (away + own)
+        if follow:
+            slopes[k] = 2 * (away + own)
+        total += weight[k]
+        moment += weight[k] * middle
+    return loss
+
+
+@compiled()
+@no_type_check
 def _distortion_loss(edges, edge_stride, weights, slopes, samples, follow):
     """Give the sum of the loss; what each weight would change it by goes to `slopes`, if wanted."""
     before = np.empty(samples, np.float64)
     loss = 0.0
     for ray in range(len(weights) // max(1, samples)):
-        edge, weight = edges[ray * edge_stride :], weights[ray * samples :]
-        # Σ_j<k w_j and Σ_j<k w_j m_j, then the same of what lies behind
-        total = moment = 0.0
-        for k in range(samples):
-            middle = (edge[k] + edge[k + 1]) / TWO
-            before[k] = middle * total - moment
-            total += weight[k]
-            moment += weight[k] * middle
-        total = moment = 0.0
-        for k in range(samples - 1, -1, -1):
-            middle = (edge[k] + edge[k + 1]) / TWO
-            away = before[k] + moment - middle * total
-            own = weight[k] * (edge[k + 1] - edge[k]) / THREE
-            loss += weight[k] * (away + own)
-            if follow:
-                slopes[ray * samples + k] = 2 * (away + own)
-            total += weight[k]
-            moment += weight[k] * middle
+        begin = ray * samples
+        loss += distortion_of_ray(edges[ray * edge_stride :], weights[begin:], slopes[begin:], before, samples, follow)
     return loss
 
 

@@ -50,15 +50,23 @@ from edge_depth_nerf.kernels.ray_samplers import (
     samples_along,
     use_fused_samples,
 )
-from edge_depth_nerf.kernels.rendering import Behind, Rendered
+from edge_depth_nerf.kernels.rendering import Behind, Losses, Rendered, Supervision
 from edge_depth_nerf.kernels.threads import take_all_threads
-from edge_depth_nerf.method.losses import URBAN_TERMS, UrbanTerms, edge_losses, sky_loss, urban_nerf_loss
+from edge_depth_nerf.method.losses import (
+    EPS,
+    NARROW,
+    URBAN_TERMS,
+    UrbanTerms,
+    edge_losses,
+    sky_loss,
+    urban_nerf_loss,
+)
 from edge_depth_nerf.method.metrics import DepthErrors, load_lpips, masked_lpips, masked_psnr, masked_ssim
 from edge_depth_nerf.method.uncertainty import termination_std
 from edge_depth_nerf.plugin.colours import coloured
 from edge_depth_nerf.plugin.compat import lpips_not_built, total_steps, without_undefined_ray
 from edge_depth_nerf.plugin.detail import TrainingDetail
-from edge_depth_nerf.plugin.exposure import KINDS
+from edge_depth_nerf.plugin.exposure import KINDS, Gains
 from edge_depth_nerf.plugin.pose_refinement import MOMENTS, PoseRefiner, PoseRefinerConfig
 from edge_depth_nerf.plugin.ray_table import PLACE, ViewRays
 
@@ -247,6 +255,12 @@ def _density_at(density_fn: Callable[..., Tensor], positions: Tensor, *args: Any
     return density_fn(positions.detach(), *args, **kwargs)
 
 
+def _supervised(outputs: dict[str, Any], batch: dict[str, Any]) -> Losses | None:
+    """Give the losses of a batch that were computed with the outputs; None without any, or of another batch."""
+    of_batch, losses = outputs.get("supervised", (None, None))
+    return losses if of_batch is batch else None
+
+
 class EdgeDepthNerfModel(NerfactoModel):
     """nerfacto supervised by a distance prior."""
 
@@ -401,7 +415,11 @@ class EdgeDepthNerfModel(NerfactoModel):
         the ray ends. (nerfstudio divides outputs with "depth" in their name by the scene's scale; these have none.)
         """
         outputs, further = self._rendered(ray_bundle, batch, bounded)
-        if self._has_surface(batch):
+        if "supervised" in outputs:
+            # the colours are those of the pictures already
+            if self._has_surface(batch):
+                outputs["surface_rgb"] = further
+        elif self._has_surface(batch):
             bundles = [ray_bundle, batch["surface_rays"]]
             outputs["rgb"], outputs["surface_rgb"] = self._exposed([outputs["rgb"], further], bundles)
         else:
@@ -459,7 +477,7 @@ class EdgeDepthNerfModel(NerfactoModel):
             self.camera_optimizer.apply_to_raybundle(rays)
         samples, weights_list, samples_list = self.proposal_sampler(rays, density_fns=self.density_fns)
         places = self._places(rays, batch, sky)
-        rendered = self._rendered_at_once(samples, places, sky)
+        rendered = self._rendered_at_once(rays, samples, places, sky, batch)
         if rendered is None:
             found, *others = self._fields([samples, *([] if places is None else [places])])
             if self.config.use_gradient_scaling:
@@ -472,10 +490,12 @@ class EdgeDepthNerfModel(NerfactoModel):
             further = others[0][FieldHeadNames.RGB].squeeze(1) if others else rays.origins[:0]
             outputs, further = self._before_sky(outputs, further, sky)
         else:
-            rgb, accumulation, weights, further = rendered
+            rgb, accumulation, weights, further, losses = rendered
             # nerfstudio's, at evaluation
             rgb = rgb if self.training else torch.nan_to_num(rgb).clamp(0, 1)
             outputs, weights = {"rgb": rgb, "accumulation": accumulation}, weights[..., None]
+            if losses is not None:
+                outputs["supervised"] = batch, losses
         weights_list.append(weights)
         samples_list.append(samples)
         outputs |= self._depths(weights_list, samples_list)
@@ -483,17 +503,58 @@ class EdgeDepthNerfModel(NerfactoModel):
             outputs |= {"weights_list": weights_list, "ray_samples_list": samples_list}
         return outputs, further
 
-    def _rendered_at_once(self, samples: RaySamples, places: RaySamples | None, sky: bool) -> Rendered | None:
-        """What the fused field renders on the CPU; None where it does not serve."""
+    def _rendered_at_once(
+        self, rays: RayBundle, samples: RaySamples, places: RaySamples | None, sky: bool, batch: dict[str, Any] | None
+    ) -> Rendered | None:
+        """What the fused field renders on the CPU, with the losses of a batch; None where it does not serve."""
         if self.config.use_gradient_scaling or renderers.BACKGROUND_COLOR_OVERRIDE is not None:
             return None
         if self._has_sky:
             behind = Behind.SINGLE_POINT if sky else Behind.LAST_SAMPLE
         else:
             behind = BEHIND.get(str(self.config.background_color))
-        if behind is None or not isinstance(self.field, FusedNerfactoField):
+        field = self.field
+        if behind is None or not isinstance(field, FusedNerfactoField) or not field.may_render(samples, places):
             return None
-        return self.field.render(samples, places, behind)
+        return field.render(samples, places, behind, self._supervision(rays, samples, batch))
+
+    def _supervision(self, rays: RayBundle, samples: RaySamples, batch: dict[str, Any] | None) -> Supervision | None:
+        """What a training batch tells of its pixels; None where their losses are computed by themselves.
+
+        Maps of colours other than a factor, and random colours behind a ray, are for these.
+        """
+        if not self.training or batch is None or "image" not in batch or rays.camera_indices is None:
+            return None
+        if not isinstance(self.exposure, Gains | None) or self.config.background_color == "random":
+            return None
+        images, bundles, counts = [batch["image"]], [rays], rays.origins.new_empty(0, dtype=torch.bool)
+        if self._has_surface(batch):
+            images.append(batch["surface_image"])
+            bundles.append(batch["surface_rays"])
+            counts = self._surface_counts(batch)
+        if images[0].shape[-1] != 3 or images[0].dtype != torch.float32:
+            return None
+        gains = torch.ones(self.num_train_data, 3) if self.exposure is None else self.exposure.gains
+        pictures: list[Any] = [bundle.camera_indices for bundle in bundles]
+        with_prior = self.config.depth_loss == "edge" and self.config.depth_loss_mult > 0
+        count = len(rays)
+        return Supervision(
+            image=torch.cat(images),
+            counts=counts,
+            gains=gains,
+            pictures=torch.cat(pictures)[:, 0],
+            edges=edges_of(samples),
+            starts=samples.frustums.starts[..., 0],
+            ends=samples.frustums.ends[..., 0],
+            prior_m=self._met_prior(batch)[:, 0] if with_prior else torch.zeros(count),
+            sigma_m=batch["prior_sigma_m"][:, 0] if with_prior else torch.zeros(count),
+            sky=batch["sky"][:, 0] if self._has_sky_loss() else torch.zeros(count, dtype=torch.bool),
+            metres_per_unit=self.metres_per_unit,
+            interval=self.config.edge_gaussian == "interval",
+            divide_by_norm=self.config.edge_divide_by_norm,
+            eps=EPS,
+            narrow=NARROW,
+        )
 
     def _before_sky(self, outputs: dict[str, Any], further: Tensor, sky: bool) -> tuple[dict[str, Any], Tensor]:
         """Add the sky, whose colours come first among those at `_places`, behind what the samples stop."""
@@ -566,13 +627,16 @@ class EdgeDepthNerfModel(NerfactoModel):
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
         """Nerfacto's metrics and, in training, the share of rays with a prior."""
         if self.training and self.fused:
-            rendered = outputs["rgb"]
-            metrics = {
-                "psnr": self.psnr(rendered, self.renderer_rgb.blend_background(batch["image"].to(self.device))),
-                "distortion": distortion_loss(
+            supervised = _supervised(outputs, batch)
+            if supervised is not None:
+                psnr, distortion = -10 * torch.log10(supervised.colour.detach()), supervised.distortion
+            else:
+                image = self.renderer_rgb.blend_background(batch["image"].to(self.device))
+                psnr = self.psnr(outputs["rgb"], image)
+                distortion = distortion_loss(
                     edges_of(outputs["ray_samples_list"][-1]), outputs["weights_list"][-1].squeeze(-1)
-                ),
-            }
+                )
+            metrics = {"psnr": psnr, "distortion": distortion}
             self.camera_optimizer.get_metrics_dict(metrics)
         else:
             metrics = super().get_metrics_dict(outputs, batch)
@@ -605,6 +669,11 @@ class EdgeDepthNerfModel(NerfactoModel):
         nearest_m = max(self.config.near_m, LEAST_DISTANCE_M)
         return (prior_m >= nearest_m) & (prior_m <= self.config.far_m)
 
+    def _met_prior(self, batch: dict[str, Any]) -> Float[Tensor, "rays 1"]:
+        """The prior between the planes, metres; 0 where there is none."""
+        prior_m = batch["prior_distance_m"].to(self.device, torch.float32)
+        return torch.where(self._can_be_met(prior_m), prior_m, 0)
+
     def schedule(self) -> tuple[float, float]:
         """What differs between steps: λ, and the exponent by which the sampler's weights are annealed."""
         return float(self._depth_weight()), float(self.proposal_sampler._anneal)
@@ -636,25 +705,36 @@ class EdgeDepthNerfModel(NerfactoModel):
         steps = self._training_steps if self.config.depth_loss_steps is None else self.config.depth_loss_steps
         return min(1.0, self._step / max(1, steps))
 
+    def _has_sky_loss(self) -> bool:
+        return self.config.depth_loss != "none" and self.config.sky_loss_mult > 0
+
     def _sky_and_surface_losses(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
-        losses = {}
-        if self.config.sky_loss_mult > 0:
+        losses, supervised = {}, _supervised(outputs, batch)
+        if self._has_sky_loss():
             sky = batch["sky"][:, 0].to(self.device)
+            levels = [weights.squeeze(-1) for weights in outputs["weights_list"]]
             # the mean over the levels, of all their weights in one row
-            every = torch.cat([weights.squeeze(-1) for weights in outputs["weights_list"]], dim=1)
-            share = self.config.sky_loss_mult / len(outputs["weights_list"])
-            losses["sky_loss"] = share * sky_loss(every, sky)
+            hit = sky_loss(torch.cat(levels if supervised is None else levels[:-1], dim=1), sky)
+            hit = hit if supervised is None else hit + supervised.sky
+            losses["sky_loss"] = self.config.sky_loss_mult / len(levels) * hit
         if "surface_rgb" in outputs:
-            colours, sky = outputs["surface_rgb"], batch["surface_sky"][:, 0]
-            # no error where the surface is not between the planes; choosing pixels would make a GPU wait
-            told = sky | self._can_be_met(batch["surface_distance_m"][:, 0])
             weight: Any = self.config.surface_loss_mult
             if "surface_counts" in batch:
                 counts = batch["surface_counts"][:, 0]
-                told, weight = told & counts, weight * (len(counts) / counts.sum().clamp(min=1))
-            colours = torch.where(told[:, None], colours, batch["surface_image"])
-            losses["surface_loss"] = weight * self.rgb_loss(batch["surface_image"], colours)
+                weight = weight * (len(counts) / counts.sum().clamp(min=1))
+            if supervised is not None:
+                error = supervised.surface
+            else:
+                # no error of others; choosing pixels would make a GPU wait
+                counts, image = self._surface_counts(batch), batch["surface_image"]
+                error = self.rgb_loss(image, torch.where(counts[:, None], outputs["surface_rgb"], image))
+            losses["surface_loss"] = weight * error
         return losses
+
+    def _surface_counts(self, batch: dict[str, Any]) -> Bool[Tensor, "pixels"]:
+        """Which further pixels have a surface between the planes, or are sky, and are of use."""
+        counts = batch["surface_sky"][:, 0] | self._can_be_met(batch["surface_distance_m"][:, 0])
+        return counts & batch["surface_counts"][:, 0] if "surface_counts" in batch else counts
 
     def _surface_drawn(self, batch: dict[str, Any]) -> Float[Tensor, "rays"]:
         """Draw where the surface of each further pixel is: any place within what its prior leaves open, in metres.
@@ -672,16 +752,21 @@ class EdgeDepthNerfModel(NerfactoModel):
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics: dict[str, Any]
     ) -> dict[str, Tensor]:
         """Nerfacto's losses without normals, in fewer passes."""
-        rendered, image = self.renderer_rgb.blend_background_for_loss_computation(
-            outputs["rgb"], outputs["accumulation"], batch["image"].to(self.device)
-        )
+        supervised = _supervised(outputs, batch)
+        if supervised is not None:
+            of_colour = supervised.colour
+        else:
+            rendered, image = self.renderer_rgb.blend_background_for_loss_computation(
+                outputs["rgb"], outputs["accumulation"], batch["image"].to(self.device)
+            )
+            of_colour = self.rgb_loss(image, rendered)
         *proposals, final = (
             (edges_of(samples), weights.squeeze(-1))
             for samples, weights in zip(outputs["ray_samples_list"], outputs["weights_list"], strict=True)
         )
         bounds = [proposal_loss(final[0], final[1].detach(), *proposal) for proposal in proposals]
         losses = {
-            "rgb_loss": self.rgb_loss(image, rendered),
+            "rgb_loss": of_colour,
             "interlevel_loss": self.config.interlevel_loss_mult * sum(bounds[1:], bounds[0]),
             "distortion_loss": self.config.distortion_loss_mult * metrics["distortion"],
         }
@@ -700,14 +785,18 @@ class EdgeDepthNerfModel(NerfactoModel):
         every = self.config.depth_loss == "urban-nerf"
         learning = [level for level in levels if every or level[0].requires_grad] or levels
         if self.config.depth_loss == "edge":
-            per_level = self._edge_losses(learning, batch)
+            supervised = _supervised(outputs, batch)
+            if supervised is None:
+                return self._edge_losses(learning, batch).sum() / len(levels)
+            *learning, _ = learning
+            others = self._edge_losses(learning, batch).sum() if learning else 0.0
+            return (supervised.edge + others) / len(levels)
         else:
             per_level = torch.stack([self._depth_loss(*level, outputs, batch) for level in learning])
         return per_level.sum() / len(levels)
 
     def _edge_losses(self, levels: list[tuple[Tensor, RaySamples]], batch: dict[str, Any]) -> Float[Tensor, "levels"]:
-        prior_m = batch["prior_distance_m"].to(levels[0][0])
-        prior_m = torch.where(self._can_be_met(prior_m), prior_m, 0)
+        prior_m = self._met_prior(batch)
         return edge_losses(
             [
                 (weights.squeeze(-1), samples.frustums.starts[..., 0], samples.frustums.ends[..., 0])
@@ -729,8 +818,7 @@ class EdgeDepthNerfModel(NerfactoModel):
     ) -> Float[Tensor, ""]:
         starts_m = samples.frustums.starts * self.metres_per_unit
         ends_m = samples.frustums.ends * self.metres_per_unit
-        prior_m = batch["prior_distance_m"].to(weights)
-        prior_m = torch.where(self._can_be_met(prior_m), prior_m, 0)
+        prior_m = self._met_prior(batch)
         if self.config.depth_loss == "urban-nerf-los":
             narrowed_m = self.config.urban.sigma_m(self.config.depth_sigma, self._share_done())
             return urban_nerf_loss(
