@@ -49,7 +49,7 @@ PARTS = {
     "batch": "pixels of the batch, their rays",
     "samples": "samples: places, positions, weights; rendering, with its losses",
     "losses": "losses of proposal networks; weighing all losses",
-    "rest": "all else: autograd, colours, nerfstudio",
+    "rest": "all else: autograd, nerfstudio",
 }
 """What the table calls the parts."""
 VIEWS = {

@@ -644,11 +644,13 @@ def test_what_the_page_says_of_the_same_seconds_follows_from_its_runs(benchmark_
     assert f"gain {min(of_drives):.2f} to {max(of_drives):.2f} dB on each drive, as means of three seeds" in page
 
 
-def test_the_page_says_how_small_a_part_of_a_step_the_losses_are(benchmark_module):
+def test_the_page_says_how_small_a_part_of_a_step_losses_are_and_how_many_calls_it_makes(benchmark_module):
     of_two = read_json(benchmark_module("step_parts").RESULTS)["threads"]["2"]
     share = round(100 * of_two["parts"]["losses"] / of_two["ms"])
     text = " ".join((ROOT / "docs" / "speed.md").read_text(encoding="utf-8").split())
     assert f"the table's row of losses, which is {share} % of a step on two threads" in text
+    compute, views = (round(of_two["calls"][name]) for name in ("compute", "views"))
+    assert f"A step makes {compute} calls into torch that compute something, and {views:,} that only make views" in text
 
 
 def test_orders_of_pixels_hold_every_pixel_once_and_are_what_they_say(benchmark_module):
