@@ -28,8 +28,8 @@ from edge_depth_nerf.kernels.hash_grid_numba import (
     TILE,
     _by_column,
     _call_corners,
-    _encode_points,
     _find_corners,
+    encode_points,
 )
 from edge_depth_nerf.kernels.table_adam_numba import _adam
 from edge_depth_nerf.kernels.threads import share_out, stretches
@@ -53,7 +53,7 @@ def _as_word(_, number):
 @njit(nogil=True)
 @no_type_check
 def _between(a, b, c, d, e, f, g, h, x, y, z):
-    """Interpolate between the corners of a cell, in the order of `_encode_points`."""
+    """Interpolate between the corners of a cell, in the order of `encode_points`."""
     low = (d * x + c * (ONE - x)) * y + (b * x + a * (ONE - x)) * (ONE - y)
     high = (h * x + g * (ONE - x)) * y + (f * x + e * (ONE - x)) * (ONE - y)
     return high * z + low * (ONE - z)
@@ -62,7 +62,7 @@ def _between(a, b, c, d, e, f, g, h, x, y, z):
 @njit(nogil=True)
 @no_type_check
 def _encode_words(axes, table, scalings, encoded, first_point, last_point):
-    """Encode points with rows of one word; as `_encode_points`."""
+    """Encode points with rows of one word; as `encode_points`."""
     rows = len(table) // len(scalings)
     begins, offsets = np.empty(8 * TILE, np.uint32), np.empty(3 * TILE, np.float32)
     for block in range(first_point, last_point, BLOCK):
@@ -148,7 +148,7 @@ def main() -> None:
 
         def whole(threads: int = threads) -> None:
             arrays = axes, flat, (0, 0), scalings, encoded[0]
-            share_out(lambda part: _encode_points(*arrays, *part), stretches(len(at), threads))
+            share_out(lambda part: encode_points(*arrays, *part), stretches(len(at), threads))
 
         def halved(threads: int = threads) -> None:
             arrays = axes, words, scalings, encoded[1]

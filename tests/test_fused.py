@@ -16,9 +16,13 @@ from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.field_components.mlp import MLP
 from nerfstudio.field_components.spatial_distortions import SceneContraction
 from nerfstudio.model_components.losses import lossfun_distortion, lossfun_outer
-from nerfstudio.model_components.ray_samplers import PDFSampler, UniformLinDispPiecewiseSampler
+from nerfstudio.model_components.ray_samplers import (
+    PDFSampler,
+    ProposalNetworkSampler,
+    UniformLinDispPiecewiseSampler,
+)
 
-from edge_depth_nerf.kernels import hash_grid_numba, network_numba
+from edge_depth_nerf.kernels import hash_grid_numba, network_numba, proposals_numba
 from edge_depth_nerf.kernels import network as network_module
 from edge_depth_nerf.kernels.contraction_numba import contract
 from edge_depth_nerf.kernels.fields import FusedMLP, FusedNerfactoField, use_fused_fields
@@ -28,6 +32,7 @@ from edge_depth_nerf.kernels.ray_samplers import (
     FirstSampler,
     FusedFrustums,
     FusedPDFSampler,
+    FusedProposalSampler,
     FusedRaySamples,
     edges_of,
     samples_along,
@@ -250,6 +255,60 @@ def test_the_first_samples_lie_where_nerfstudio_puts_them(training, single_jitte
     for expected, placed in zip(*found, strict=True):
         torch.testing.assert_close(placed, expected, rtol=1e-5, atol=1e-5)
     assert found[0][1].std() > 1
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("anneal", [1.0, 0.3])
+@pytest.mark.parametrize("steps", [0, 1, 2], ids=["evaluation", "networks learn", "networks rest"])
+def test_the_fused_sampler_proposes_as_nerfstudios(steps, anneal, threads, monkeypatch):
+    """Samples, weights and gradients of all rounds; a network that rests is asked at once, in shares for threads."""
+    monkeypatch.setattr(proposals_numba, "LEAST_SHARE", 16)
+    torch.set_num_threads(threads)
+    model = build().train(steps > 0)
+    asked, found = [], []
+    with torch.no_grad():
+        for parameter in model.proposal_networks.parameters():
+            parameter.copy_(0.4 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(4)))
+    sampler = model.proposal_sampler
+    assert isinstance(sampler, FusedProposalSampler)
+    whole = proposals_numba.weigh
+    monkeypatch.setattr(proposals_numba, "weigh", lambda *given: asked.append(1) or whole(*given))
+    for kind in (ProposalNetworkSampler, FusedProposalSampler):
+        sampler._step, sampler._steps_since_update = (0, 3) if steps == 1 else (1000, 1)
+        sampler.set_anneal(anneal)
+        torch.manual_seed(2)
+        with torch.set_grad_enabled(steps > 0):
+            samples, weights, before = kind.generate_ray_samples(
+                sampler, bundle(planes=True), density_fns=model.density_fns
+            )
+        gradients = []
+        if steps == 1:
+            loss = torch.stack([each.square().sum() for each in weights]).sum()
+            gradients = list(torch.autograd.grad(loss, list(model.proposal_networks.parameters())))
+        assert [each.requires_grad for each in weights] == [steps == 1] * 2
+        assert sampler._steps_since_update == (0 if steps == 1 else 1)
+        found.append([*(edges_of(each) for each in (*before, samples)), *weights, *gradients])
+    assert len(asked) == (0 if steps == 1 else 2)
+    for expected, mine in zip(*found, strict=True):
+        largest = float(expected.abs().max())
+        torch.testing.assert_close(mine, expected, rtol=1e-4, atol=2e-5 * largest)
+    assert float(found[0][4].std()) > 0
+
+
+@pytest.mark.parametrize("case", ["gradients are followed", "positions in a box", "half precision", "other rays"])
+def test_what_a_network_cannot_weigh_at_once(case):
+    model = build(disable_scene_contraction=case == "positions in a box").eval()
+    network: Any = model.proposal_networks[0]
+    samples = model.proposal_sampler.initial_sampler(bundle(planes=True), num_samples=7)
+    with torch.no_grad():
+        if case != "positions in a box":
+            assert network.weigh(samples).shape == (40, 7, 1)
+        if case == "other rays":
+            samples.frustums.directions = samples.frustums.directions.clone()
+        if case == "half precision":
+            network.mlp_base[0].hash_table.data = network.mlp_base[0].hash_table.data.half()
+        with torch.set_grad_enabled(case == "gradients are followed"):
+            assert network.weigh(samples) is None
 
 
 @pytest.mark.parametrize("shape", [(40,), (20, 2)], ids=str)

@@ -24,6 +24,7 @@ TRAINING = (
     "edge_depth_nerf.kernels.exponential_numba",
     "edge_depth_nerf.kernels.pointwise_numba",
     "edge_depth_nerf.kernels.ray_numba",
+    "edge_depth_nerf.kernels.proposals_numba",
     "edge_depth_nerf.kernels.rendering_numba",
     "edge_depth_nerf.kernels.edge_loss_numba",
     "edge_depth_nerf.kernels.table_adam_numba",

@@ -27,7 +27,8 @@ ONE, TWO, FOUR = np.float32(1), np.float32(2), np.float32(4)
 
 @compiled()
 @no_type_check
-def _contract(positions, axes, inside, first, last):
+def contract_points(positions, axes, inside, first, last):
+    """Contract points from `first` to `last`; calls for different ones may run at once."""
     for j in range(first, last):
         x, y, z = positions[j, 0], positions[j, 1], positions[j, 2]
         norm = max(max(abs(x), abs(y)), abs(z))
@@ -50,5 +51,5 @@ def contract(positions: Float[Tensor, "points 3"]) -> tuple[Float[Tensor, "point
     """
     axes, inside = torch.empty(3, len(positions)), torch.empty(len(positions))
     arrays = positions.detach().numpy(), axes.numpy(), inside.numpy()
-    in_parts(lambda first, last: _contract(*arrays, first, last), len(positions), LEAST_SHARE)
+    in_parts(lambda first, last: contract_points(*arrays, first, last), len(positions), LEAST_SHARE)
     return axes.t(), inside

@@ -143,6 +143,34 @@ class FusedDensityField(HashMLPDensityField):
         before = self.mlp_base(places).view(*positions.shape[:-1], 1)
         return _densities(before, inside, self.average_init_density)
 
+    def weigh(self, samples: RaySamples) -> Float[Tensor, "rays samples 1"] | None:
+        """Give rendering weights of samples by this network's density, on the CPU without a gradient.
+
+        None where this form does not serve; the weights are those of `density_fn` and nerfstudio's `get_weights`.
+        """
+        frustums = samples.frustums
+        if torch.is_grad_enabled() or not isinstance(self.spatial_distortion, CubeContraction) or self.use_linear:
+            return None
+        if type(self.mlp_base) is not FusedEncodedMLP or samples.deltas is None:
+            return None
+        encoding, mlp = self.mlp_base
+        assert isinstance(encoding, FusedHashEncoding) and isinstance(mlp, FusedMLP)
+        one_a_ray = _one_a_ray(frustums.origins) and _one_a_ray(frustums.directions)
+        plain = _in_parts(frustums.origins) and encoding.hash_table.dtype == torch.float32
+        plain = plain and frustums.offsets is None and mlp.out_activation is None
+        if not (plain and one_a_ray) or samples.deltas.numel() == 0:
+            return None
+        from edge_depth_nerf.kernels.proposals_numba import weigh
+
+        weights = weigh(
+            *(frustums.origins[:, 0], frustums.directions[:, 0], frustums.starts[..., 0], frustums.ends[..., 0]),
+            samples.deltas[..., 0],
+            (encoding.hash_table, encoding.scalings.to(torch.float32)),
+            _parameters(mlp),
+            self.average_init_density,
+        )
+        return weights[..., None]
+
 
 class FusedNerfactoField(NerfactoField):
     """nerfacto's field; what the samples of a ray share is computed once a ray."""

@@ -129,7 +129,7 @@ def _turn(values, turned, begin, end):
 
 @compiled()
 @no_type_check
-def _encode_points(axes, table, features, scalings, encoded, first_point, last_point):
+def encode_points(axes, table, features, scalings, encoded, first_point, last_point):
     """Encode some points; calls for different points may run at once.
 
     `axes` are the positions, [3, points]; `table` is flat: rows of `len(features)` numbers, level after level.
@@ -251,7 +251,7 @@ def encode(
     points, levels = len(positions), len(scalings)
     encoded = torch.empty(points, levels * table.shape[1])
     arrays = _by_column(positions), flat(table), (0,) * table.shape[1], scalings.numpy(), encoded.numpy()
-    share_out(lambda part: _encode_points(*arrays, *part), stretches(points, _threads(points, levels)))
+    share_out(lambda part: encode_points(*arrays, *part), stretches(points, _threads(points, levels)))
     return encoded
 
 

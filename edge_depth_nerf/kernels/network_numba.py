@@ -220,7 +220,7 @@ def _apply_layers(
 
 @compiled()
 @no_type_check
-def _forward(
+def apply_to_points(
     x, ins, more_width, joint, down, begins, biases, shared, more, group, result, to_point, to_number, begin, end
 ):  # fmt: skip
     """Apply the network to points from `begin` to `end`; calls for different points may run at once."""
@@ -402,7 +402,7 @@ def write_forward(net: Arrays, result: np.ndarray, to_number: int) -> None:
     behind the one before.
     """
     arrays = *net.arrays, *net.of_groups, result, int(net.ins[-1]), to_number
-    share_out(lambda part: _forward(*arrays, *part), net.parts())
+    share_out(lambda part: apply_to_points(*arrays, *part), net.parts())
 
 
 def backward(net: Arrays, gradient: Tensor, follow_x: bool) -> tuple[Tensor | None, list[Tensor], list[Tensor]]:

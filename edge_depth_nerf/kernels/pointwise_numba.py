@@ -79,10 +79,11 @@ def distances(
 
 @compiled()
 @no_type_check
-def _middles(
+def find_middles(
     origins, origin_stride, directions, direction_stride, starts, start_stride, ends, end_stride, positions, columns,
     first, last,
 ):  # fmt: skip
+    """Write the positions of the samples of some rays; calls for different ones may run at once."""
     for ray in range(first, last):
         origin, direction = origins[ray * origin_stride :], directions[ray * direction_stride :]
         x, y, z = origin[0], origin[1], origin[2]
@@ -106,13 +107,14 @@ def middles(
     positions = torch.empty(rays, columns, 3)
     matrices = [each for matrix in (origins, directions, starts, ends) for each in flat_rows(matrix)]
     arrays = *matrices, positions.view(-1).numpy(), columns
-    in_parts(lambda first, last: _middles(*arrays, first, last), rays, LEAST_SHARE // max(1, columns))
+    in_parts(lambda first, last: find_middles(*arrays, first, last), rays, LEAST_SHARE // max(1, columns))
     return positions
 
 
 @compiled()
 @no_type_check
-def _densities(before, stride, inside, densities, scale, first, last):
+def find_densities(before, stride, inside, densities, scale, first, last):
+    """Write the densities of some points; calls for different ones may run at once."""
     given, within, found = before[first * stride :], inside[first:], densities[first:]
     for k in range(last - first):
         found[k] = scale * exp(given[np.uint64(k * stride)]) * within[k]
@@ -138,7 +140,7 @@ class _Density(torch.autograd.Function):
         inside, densities = inside.detach().contiguous(), torch.empty(len(before))
         given, stride = flat_rows(before[:, None])
         arrays = given, stride, inside.numpy(), densities.numpy(), np.float32(scale)
-        in_parts(lambda first, last: _densities(*arrays, first, last), len(before), LEAST_SHARE)
+        in_parts(lambda first, last: find_densities(*arrays, first, last), len(before), LEAST_SHARE)
         if ctx.needs_input_grad[0]:
             ctx.save_for_backward(before, inside, densities)
             ctx.scale = scale

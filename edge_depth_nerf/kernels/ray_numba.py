@@ -45,7 +45,8 @@ def _sum_depths(density, delta, depths, reached):
 
 @compiled()
 @no_type_check
-def _weights(densities, deltas, weights, samples, first, last):
+def find_weights(densities, deltas, weights, samples, first, last):
+    """Write the weights of some rays; calls for different ones may run at once."""
     depths, reached = np.empty(samples, np.float32), np.empty(samples, np.float32)
     for ray in range(first, last):
         begin = ray * samples
@@ -82,7 +83,7 @@ class _Weights(torch.autograd.Function):
     def forward(ctx: Any, densities: Tensor, deltas: Tensor) -> Tensor:
         densities, deltas = densities.detach().contiguous(), deltas.detach().contiguous()
         weights = torch.empty_like(densities)
-        _along(_weights, densities, deltas, weights)
+        _along(find_weights, densities, deltas, weights)
         if ctx.needs_input_grad[0]:
             ctx.save_for_backward(densities, deltas)
         return weights

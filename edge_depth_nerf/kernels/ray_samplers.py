@@ -5,13 +5,18 @@ Host-facing; the numbers are nerfstudio's to float32's noise, from the same rand
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from nerfstudio.cameras.rays import Frustums, RayBundle, RaySamples
-from nerfstudio.model_components.ray_samplers import PDFSampler, UniformLinDispPiecewiseSampler
+from nerfstudio.model_components.ray_samplers import (
+    PDFSampler,
+    ProposalNetworkSampler,
+    UniformLinDispPiecewiseSampler,
+)
 from torch import Tensor, nn
 
 from edge_depth_nerf.kernels.back_ends import along_rays, by_number
@@ -110,6 +115,51 @@ class FusedPDFSampler(PDFSampler):
             spacing_ends=placed[:, 1:],
             spacing_to_euclidean_fn=to_euclidean,
         )
+
+
+class FusedProposalSampler(ProposalNetworkSampler):
+    """nerfstudio's sampler; a network that rests gives the weights of its samples at once, where it can."""
+
+    weigh: Sequence[Callable[[RaySamples], Tensor | None]]
+    """For each round of proposals, the function that does so; it gives None where it cannot."""
+
+    def generate_ray_samples(
+        self, ray_bundle: RayBundle | None = None, density_fns: list[Callable[..., Any]] | None = None
+    ) -> tuple[RaySamples, list[Any], list[Any]]:
+        """Place samples by what the proposal networks say of those before; also give these and their weights."""
+        assert ray_bundle is not None and density_fns is not None
+        learns = self._steps_since_update > self.update_sched(self._step) or self._step < 10
+        samples = self.initial_sampler(ray_bundle, num_samples=self.num_proposal_samples_per_ray[0])
+        every: list[RaySamples] = []
+        weights_of_every: list[Tensor] = []
+        counts = [*self.num_proposal_samples_per_ray, self.num_nerf_samples_per_ray]
+        for level in range(self.num_proposal_network_iterations):
+            with torch.set_grad_enabled(learns and torch.is_grad_enabled()):
+                weights = self.weigh[level](samples)
+                if weights is None:
+                    weights = samples.get_weights(density_fns[level](samples.frustums.get_positions()))
+            every.append(samples)
+            weights_of_every.append(weights)
+            annealed = weights if isinstance(self._anneal, float) and self._anneal == 1 else weights**self._anneal
+            samples = self.pdf_sampler(ray_bundle, samples, annealed, num_samples=counts[level + 1])
+        if learns:
+            self._steps_since_update = 0
+        return samples, weights_of_every, every
+
+
+def use_fused_proposals(sampler: ProposalNetworkSampler, networks: Sequence[Any]) -> None:
+    """Let a sampler ask networks that rest for weights at once; in place.
+
+    Args:
+        sampler: nerfstudio's.
+        networks: for each round of proposals its own, or the one of all rounds.
+
+    """
+    if type(sampler) is ProposalNetworkSampler and all(hasattr(network, "weigh") for network in networks):
+        # the class alone differs
+        sampler.__class__ = FusedProposalSampler
+        assert isinstance(sampler, FusedProposalSampler)
+        sampler.weigh = [network.weigh for network in networks]
 
 
 def edges_of(samples: RaySamples) -> Tensor:

@@ -48,6 +48,7 @@ from edge_depth_nerf.kernels.ray_samplers import (
     edges_of,
     rays_of,
     samples_along,
+    use_fused_proposals,
     use_fused_samples,
 )
 from edge_depth_nerf.kernels.rendering import Behind, Losses, Rendered, Supervision
@@ -308,7 +309,9 @@ class EdgeDepthNerfModel(NerfactoModel):
                 jitter = self.proposal_sampler.initial_sampler.single_jitter
                 self.proposal_sampler.initial_sampler = FirstSampler(single_jitter=jitter)
             # bound before the networks were of the fused class
-            self.density_fns = [density_fn.__self__.density_fn for density_fn in self.density_fns]
+            networks: list[Any] = [density_fn.__self__ for density_fn in self.density_fns]
+            self.density_fns = [network.density_fn for network in networks]
+            use_fused_proposals(self.proposal_sampler, networks)
             pdf = self.proposal_sampler.pdf_sampler
             self.proposal_sampler.pdf_sampler = FusedPDFSampler(
                 include_original=pdf.include_original, single_jitter=pdf.single_jitter
