@@ -8,6 +8,7 @@ import json
 import lzma
 import statistics
 import sys
+import threading
 from pathlib import Path
 from types import SimpleNamespace
 from xml.etree import ElementTree
@@ -768,6 +769,11 @@ def test_a_part_of_a_step_is_without_what_it_contains(benchmark_module, monkeypa
     clock.measure(step, "outer", "rest")
     step.outer()
     assert clock.seconds == {"networks": 4, "rest": 1}
+    # what other threads do at the same time is not the step's
+    other = threading.Thread(target=step.inner, name="kernels_0")
+    other.start()
+    other.join()
+    assert now[0] == 7 and clock.seconds == {"networks": 4, "rest": 1}
 
 
 def test_the_page_of_unseen_drives_by_hand(benchmark_module, tmp_path):

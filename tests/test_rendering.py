@@ -1,4 +1,4 @@
-"""Networks and rendering in two compiled passes, against the same arithmetic in float64 and against nerfstudio's."""
+"""Networks, rendering and losses in one pass, against the same arithmetic in float64 and against nerfstudio's."""
 
 from __future__ import annotations
 
@@ -13,12 +13,11 @@ from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.model_components import renderers
 from torch import Tensor
 
-from edge_depth_nerf.kernels import network_numba, rendering_numba
+from edge_depth_nerf.kernels import rendering_numba
 from edge_depth_nerf.kernels.fields import FusedNerfactoField
 from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss
-from edge_depth_nerf.kernels.network import joined_networks
 from edge_depth_nerf.kernels.pointwise_numba import STEEPEST
-from edge_depth_nerf.kernels.rendering import Behind, Supervision
+from edge_depth_nerf.kernels.rendering import Behind, Networks, Rendered, Supervision
 from edge_depth_nerf.kernels.rendering_numba import render
 from edge_depth_nerf.method.losses import EPS, NARROW, edge_loss, sky_loss
 
@@ -26,7 +25,6 @@ from edge_depth_nerf.method.losses import EPS, NARROW, edge_loss, sky_loss
 @pytest.fixture(autouse=True, params=[1, 2], ids=["one thread", "two threads"])
 def threads(request, monkeypatch):
     """Let even a few points be shared out to several threads."""
-    monkeypatch.setattr(network_numba, "LEAST_SHARE", 64)
     monkeypatch.setattr(rendering_numba, "LEAST_SHARE", 16)
     before = torch.get_num_threads()
     torch.set_num_threads(request.param)
@@ -51,48 +49,73 @@ def straight_networks(x: Tensor, of_points: Tensor, first: Any, second: Any, by_
 
 
 @pytest.mark.parametrize("widths", [((24, 64, 16), (64, 64, 3)), ((5, 7), (33, 3)), ((6, 18, 20, 4), (3,))], ids=str)
-@pytest.mark.parametrize("shape", [(40, 24, 300), (0, 24, 70), (50, 3, 0), (1, 7, 1), (30, 1, 5)], ids=str)
+@pytest.mark.parametrize("shape", [(40, 24, 300), (50, 3, 0), (1, 7, 1), (30, 1, 30)], ids=str)
 @pytest.mark.parametrize("of_pictures", [False, True], ids=["directions", "appearance"])
-def test_both_networks_in_one_pass(widths, shape, of_pictures):
+def test_both_networks_and_the_rays_in_one_pass(widths, shape, of_pictures):
     torch.manual_seed(0)
     rays, samples, singles = shape
+    behind = Behind.SINGLE_POINT if singles >= rays else Behind.LAST_SAMPLE
     first = layers(*widths[0])
     second = layers(widths[0][-1] - 1, *widths[1])
     by_ray = torch.randn(widths[1][0], 9, requires_grad=True)
     of_rays = torch.randn(rays + singles, 9, requires_grad=of_pictures)
-    x = torch.randn(rays * samples + singles, widths[0][0], requires_grad=True)
+    points = rays * samples + singles
+    x = (0.3 * torch.randn(points, widths[0][0])).requires_grad_()
+    with torch.no_grad():
+        for weight in (*first[0], *second[0], by_ray):
+            weight *= 0.3
     leaves = [x, *([of_rays] if of_pictures else []), *first[0], *first[1], *second[0], *second[1], by_ray]
-    found = joined_networks(x, of_rays, (rays, samples), first, second, by_ray)
-    gradient = torch.randn(found.shape)
-    gradients = torch.autograd.grad(found, leaves, gradient)
+    inside, deltas = (torch.rand(points) > 0.1).float(), 0.3 * torch.rand(rays, samples)
+    networks = Networks(first, second, by_ray)
+    *found, _ = render(x, of_rays, networks, inside, deltas, 0.7, behind)
+    factors = [torch.randn(each.shape) for each in found]
+    gradients = torch.autograd.grad(found, leaves, factors)
 
     exact = {leaf: leaf.detach().double().requires_grad_() for leaf in leaves}
     of_points = exact.get(of_rays, of_rays.double())
     repeated = torch.cat([of_points[:rays].repeat_interleave(samples, 0), of_points[rays:]])
     one, other = ([[exact[each] for each in part] for part in network] for network in (first, second))
-    expected = straight_networks(exact[x], repeated, one, other, exact[by_ray])
-    assert float((found - expected).abs().max()) <= 1e-5 * float(expected.abs().max())
-    slopes = torch.autograd.grad(expected, list(exact.values()), gradient.double())
-    for each, other in zip(gradients, slopes, strict=True):
-        assert float((each - other).abs().max()) <= 1e-5 * float(other.abs().max())
+    values = straight_networks(exact[x], repeated, one, other, exact[by_ray])
+    expected = straight_pixels(values, inside.double(), deltas.double(), 0.7, behind)
+    for each, right in zip(found, expected, strict=True):
+        torch.testing.assert_close(each.double(), right, rtol=1e-4, atol=1e-5)
+    slopes = torch.autograd.grad(expected, list(exact.values()), [each.double() for each in factors])
+    for each, right in zip(gradients, slopes, strict=True):
+        assert float((each - right).abs().max()) <= 5e-5 * float(right.abs().max()), each.shape
     assert gradients[0].t().is_contiguous() and all(each.is_contiguous() for each in gradients[1:])
     with torch.no_grad():
-        torch.testing.assert_close(
-            joined_networks(x, of_rays, (rays, samples), first, second, by_ray), found, rtol=1e-5, atol=1e-4
-        )
+        *again, _ = render(x, of_rays, networks, inside, deltas, 0.7, behind)
+    for each, right in zip(again, found, strict=True):
+        torch.testing.assert_close(each, right.detach(), rtol=1e-5, atol=1e-6)
 
 
 def test_positions_that_nobody_follows_cost_no_gradient():
     first, second = layers(4, 8, 3), layers(2, 8, 3)
     x, by_ray = torch.randn(20, 4), torch.randn(8, 2)
-    values = joined_networks(x, torch.randn(8, 2), (6, 3), first, second, by_ray)
-    values.sum().backward()
+    given = torch.ones(20), torch.rand(6, 3), 1.0, Behind.NOTHING
+    *rendered, _ = render(x, torch.randn(8, 2), Networks(first, second, by_ray), *given)
+    torch.stack([each.sum() for each in rendered]).sum().backward()
     assert x.grad is None and by_ray.grad is None
     assert all(each.grad is not None for part in (*first, *second) for each in part)
 
 
+def render_values(
+    values: Tensor,
+    inside: Tensor,
+    deltas: Tensor,
+    scale: float,
+    behind: Behind,
+    supervision: Supervision | None = None,
+) -> Rendered:
+    """Render what networks give, [4, points]: behind networks that pass it on."""
+    networks = Networks(([torch.eye(4)], [torch.zeros(4)]), ([torch.eye(3)], [torch.zeros(3)]), torch.zeros(3, 1))
+    singles = values.shape[1] - deltas.numel()
+    nothing = torch.zeros(len(deltas) + singles, 1)
+    return render(values.t(), nothing, networks, inside, deltas, scale, behind, supervision)
+
+
 def straight_pixels(values: Tensor, inside: Tensor, deltas: Tensor, scale: float, behind: Behind) -> list[Tensor]:
-    """What `render` gives, step by step; the density's slope limited as in nerfstudio's trunc_exp."""
+    """What `render_values` gives, step by step; the density's slope limited as in nerfstudio's trunc_exp."""
     rays, samples = deltas.shape
     before = values[0, : rays * samples]
     slope = before.detach().clamp(-STEEPEST, STEEPEST).exp()
@@ -123,7 +146,7 @@ def test_pixels_and_their_gradients(behind, shape):
         values[0, ::11] = 16
         values[0, 1::11] = -17
     inside, deltas = (torch.rand(points) > 0.1).float(), 0.3 * torch.rand(rays, samples)
-    *found, losses = render(values, inside, deltas, 1.7, behind)
+    *found, losses = render_values(values, inside, deltas, 1.7, behind)
     assert losses is None
     exact = values.detach().double().requires_grad_()
     expected = straight_pixels(exact, inside.double(), deltas.double(), 1.7, behind)
@@ -137,7 +160,7 @@ def test_pixels_and_their_gradients(behind, shape):
     # whatever a loss reads alone
     for number in range(4):
         if found[number].numel():
-            *once_more, _ = render(values, inside, deltas, 1.7, behind)
+            *once_more, _ = render_values(values, inside, deltas, 1.7, behind)
             (slope,) = torch.autograd.grad(once_more[number].square().sum(), values)
             again = straight_pixels(exact, inside.double(), deltas.double(), 1.7, behind)[number].square().sum()
             (other,) = torch.autograd.grad(again, exact)
@@ -208,7 +231,7 @@ def test_losses_of_a_ray_in_the_pass_that_renders_it(form, shape, behind):
     told = supervision_of(shape, behind)
     alike = {name: each.expand_as(getattr(told, name)) for name, each in form.items() if isinstance(each, Tensor)}
     told = told._replace(**{**form, **alike})
-    *found, losses = render(values, inside, deltas, 1.7, behind, told)
+    *found, losses = render_values(values, inside, deltas, 1.7, behind, told)
     assert losses is not None
     exact, gains = (each.detach().double().requires_grad_() for each in (values, told.gains))
     by_steps = straight_pixels(exact, inside.double(), deltas.double(), 1.7, behind)
@@ -239,7 +262,7 @@ def test_gains_that_do_not_learn_get_no_gradient():
     shape = 6, 4, 9
     told = supervision_of(shape, Behind.NOTHING)._replace(gains=torch.ones(4, 3))
     values = torch.randn(4, 33).requires_grad_()
-    rendered = render(values, torch.ones(33), torch.rand(6, 4), 1.0, Behind.NOTHING, told)
+    rendered = render_values(values, torch.ones(33), torch.rand(6, 4), 1.0, Behind.NOTHING, told)
     assert rendered.losses is not None
     torch.stack(list(rendered.losses)).sum().backward()
     assert values.grad is not None and bool(values.grad.abs().sum() > 0) and told.gains.grad is None
@@ -249,7 +272,7 @@ def test_a_density_that_is_not_a_number_weighs_nothing_and_shows():
     values = torch.zeros(4, 9)
     values[0, 4] = float("nan")
     values.requires_grad_()
-    rendered = render(values, torch.ones(9), torch.full((3, 3), 0.5), 1.0, Behind.NOTHING)
+    rendered = render_values(values, torch.ones(9), torch.full((3, 3), 0.5), 1.0, Behind.NOTHING)
     assert rendered.weights[1, 1:].tolist() == [0, 0] and rendered.weights[0].min() > 0
     rendered.rgb.sum().backward()
     assert values.grad is not None and values.grad[:, :3].isfinite().all() and values.grad[0, 3:6].isnan().any()

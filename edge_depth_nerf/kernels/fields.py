@@ -26,8 +26,8 @@ from torch import Tensor, nn
 
 from edge_depth_nerf.kernels.back_ends import by_number, made_by_autocast, of_encoded_network, of_network, working
 from edge_depth_nerf.kernels.fused_hash_grid import FusedHashEncoding, use_fused_encodings
-from edge_depth_nerf.kernels.network import joined_networks, network
-from edge_depth_nerf.kernels.rendering import Behind, Rendered, Supervision
+from edge_depth_nerf.kernels.network import network
+from edge_depth_nerf.kernels.rendering import Behind, Networks, Rendered, Supervision
 
 
 class CubeContraction(SceneContraction):
@@ -225,7 +225,7 @@ class FusedNerfactoField(NerfactoField):
     def render(
         self, samples: RaySamples, places: RaySamples | None, behind: Behind, supervision: Supervision | None = None
     ) -> Rendered:
-        """Render pixels on the CPU in two passes: from encoded positions through both networks, and along the rays.
+        """Render pixels on the CPU in one pass: from encoded positions through both networks, and along the rays.
 
         Args:
             samples: of the rays, [rays, samples]; `may_render` says whether this form serves them.
@@ -251,11 +251,11 @@ class FusedNerfactoField(NerfactoField):
         if self.embedding_appearance is not None:
             of_rays = torch.cat([of_rays, self._appearance(parts)], dim=1)
             by_ray = torch.cat([of_direction, of_appearance], dim=1)
-        second = [of_features, *weights[1:]], biases
+        networks = Networks(_parameters(first), ([of_features, *weights[1:]], biases), by_ray)
         rays, count = samples.frustums.shape
-        values = joined_networks(encoding(points), of_rays, (rays, count), _parameters(first), second, by_ray)
         deltas: Any = samples.deltas
-        return render(values, inside[:, 0], deltas.view(rays, count), self.average_init_density, behind, supervision)
+        pixels = deltas.view(rays, count), self.average_init_density, behind, supervision
+        return render(encoding(points), of_rays, networks, inside[:, 0], *pixels)
 
     def may_render(self, samples: RaySamples, places: RaySamples | None) -> bool:
         """Whether `render` covers what this field has, for these samples."""

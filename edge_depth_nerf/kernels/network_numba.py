@@ -391,47 +391,64 @@ def _unpacked(packed: np.ndarray, begins: np.ndarray, shapes: Sequence[Sequence[
 def forward(net: Arrays) -> Tensor:
     """Apply a network; see `network`."""
     result = torch.empty(net.points, len(net.weights[-1]))
-    write_forward(net, flat(result), 0)
+    write = writes_forward(net, flat(result), 0)
+    share_out(lambda part: write(*part), net.parts())
     return result
 
 
-def write_forward(net: Arrays, result: np.ndarray, to_number: int) -> None:
-    """Apply a network, and write what it gives to a flat array.
+def writes_forward(net: Arrays, result: np.ndarray, to_number: int) -> Callable[[int, int], None]:
+    """Make the function that applies a network to points from one to another, and writes to a flat array.
 
     With a joint the result is one row for each number that a point gets, the joint's first: a row begins `to_number`
     behind the one before.
     """
     arrays = *net.arrays, *net.of_groups, result, int(net.ins[-1]), to_number
-    share_out(lambda part: apply_to_points(*arrays, *part), net.parts())
+    return lambda begin, end: apply_to_points(*arrays, begin, end)
 
 
 def backward(net: Arrays, gradient: Tensor, follow_x: bool) -> tuple[Tensor | None, list[Tensor], list[Tensor]]:
     """Give the gradients to the inputs (None unless `follow_x`), to the weights and to the biases."""
     to_x = torch.empty(net.points if follow_x else 0, int(net.ins[0]))
-    to_parameters = write_backward(net, flat(gradient), 0, flat(to_x))
-    to_weights, to_biases = ([torch.from_numpy(each) for each in arrays] for arrays in to_parameters)
+    slopes, parts = Slopes(net, flat(gradient), 0, flat(to_x)), net.parts()
+    sums = [slopes.nothing() for _ in parts]
+    share_out(lambda number: slopes.add(sums[number], *parts[number]), list(range(len(parts))))
+    to_weights, to_biases = ([torch.from_numpy(each) for each in arrays] for arrays in slopes.total(sums))
     return (to_x if follow_x else None), to_weights, to_biases
 
 
-def write_backward(
-    net: Arrays, gradient: np.ndarray, to_number: int, to_x: np.ndarray
-) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Write the gradient to the inputs to a flat array, unless it is empty; give those to the weights and biases.
+class Slopes:
+    """The gradients of a network, which threads sum up over points of their own."""
 
-    `gradient` is that to what `write_forward` writes. With a joint, that to the inputs has one row for each input, too.
-    """
-    weights = net.weights
-    up, begins_up = _packed(weights)
-    arrays = *net.arrays, up, begins_up, *net.of_groups, gradient, to_number, to_x
-    parts, to_shared = net.parts(), np.zeros_like(net.shared)
-    # rows are added sixteen at once, some of them (zeros) behind the last matrix
-    room = len(up) + FULL * (net.ins.max() + FULL)
-    own = [(np.zeros(room, np.float32), np.zeros_like(net.biases)) for _ in parts]
-    share_out(lambda number: _backward(*arrays, *own[number], to_shared, *parts[number]), list(range(len(parts))))
-    # in one order, whichever thread was ready first: the same sums each time
-    to_up, to_biases = (np.sum(each, axis=0) for each in zip(*own, strict=True))
-    to_weights = _unpacked(to_up, begins_up, [each.shape for each in weights])
-    of_layers = _unpacked(to_biases, net.begins[len(net.ins) :], [(1, len(weight)) for weight in weights])
-    if net.groups > 1:
-        of_layers[net.joint] = to_shared.reshape(net.groups, -1)
-    return to_weights, of_layers
+    def __init__(self, net: Arrays, gradient: np.ndarray, to_number: int, to_x: np.ndarray) -> None:
+        """Prepare for the gradient to what the network gives.
+
+        Args:
+            net: the network and its points.
+            gradient: to what `writes_forward` writes.
+            to_number: as there.
+            to_x: gets the gradient to the inputs, unless it is empty; with a joint, it has a row for each input.
+
+        """
+        self.net, (up, self.begins) = net, _packed(net.weights)
+        self.to_shared = np.zeros_like(net.shared)
+        self.arrays = *net.arrays, up, self.begins, *net.of_groups, gradient, to_number, to_x
+        # rows are added sixteen at once, some of them (zeros) behind the last matrix
+        self.room = len(up) + FULL * (net.ins.max() + FULL)
+
+    def nothing(self) -> tuple[np.ndarray, np.ndarray]:
+        """Give sums of no points, for a thread."""
+        return np.zeros(self.room, np.float32), np.zeros_like(self.net.biases)
+
+    def add(self, sums: tuple[np.ndarray, np.ndarray], begin: int, end: int) -> None:
+        """Add what points from `begin` to `end` give; calls for different ones, of whole groups, may run at once."""
+        _backward(*self.arrays, *sums, self.to_shared, begin, end)
+
+    def total(self, every: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Give the gradients to weights and biases, in the order of the threads: the same sums each time."""
+        net = self.net
+        to_up, to_biases = (np.sum(each, axis=0) for each in zip(*every, strict=True))
+        to_weights = _unpacked(to_up, self.begins, [each.shape for each in net.weights])
+        of_layers = _unpacked(to_biases, net.begins[len(net.ins) :], [(1, len(weight)) for weight in net.weights])
+        if net.groups > 1:
+            of_layers[net.joint] = self.to_shared.reshape(net.groups, -1)
+        return to_weights, of_layers

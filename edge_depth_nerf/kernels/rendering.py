@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -18,6 +19,21 @@ class Behind(IntEnum):
     """The colour of the ray's last sample, as in nerfacto."""
     SINGLE_POINT = 2
     """The colour of a point of its own for each ray."""
+
+
+class Networks(NamedTuple):
+    """Two networks, the second one behind the first, as nerfacto's field has them.
+
+    The first one's first output becomes the density. The second one gets the other outputs and what a ray has, and
+    gives the colour.
+    """
+
+    first: tuple[Sequence[Tensor], Sequence[Tensor]]
+    """Weights, [out, in], and biases of its layers."""
+    second: tuple[Sequence[Tensor], Sequence[Tensor]]
+    """Likewise; the weights of its first layer are for the first network's outputs alone."""
+    by_ray: Float[Tensor, "width shared"]
+    """Those of that layer for what rays have."""
 
 
 class Supervision(NamedTuple):
