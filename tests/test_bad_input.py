@@ -58,6 +58,14 @@ def bounded_memory():
 
 
 def throw(read, path: Path) -> None:
+    seconds = seconds_of(read, path)
+    if seconds >= MOST_SECONDS:
+        # what takes long takes long again; a busy machine, or the collection of garbage, does not
+        seconds = min(seconds, seconds_of(read, path))
+    assert seconds < MOST_SECONDS, f"{seconds:.1f} s; {describe(path)}"
+
+
+def seconds_of(read, path: Path) -> float:
     started = time.process_time()
     try:
         with warnings.catch_warnings():
@@ -67,8 +75,7 @@ def throw(read, path: Path) -> None:
         assert len(str(error)) <= LONGEST_MESSAGE + 200 and "\x1b" not in str(error)
     except BaseException as error:
         raise AssertionError(f"{type(error).__name__}: {error}; {describe(path)}") from error
-    seconds = time.process_time() - started
-    assert seconds < MOST_SECONDS, f"{seconds:.1f} s; {describe(path)}"
+    return time.process_time() - started
 
 
 @pytest.fixture(scope="module", params=READERS)
