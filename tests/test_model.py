@@ -372,6 +372,19 @@ def test_losses_are_the_same_in_the_pass_that_renders_and_by_themselves(options,
             torch.testing.assert_close(value.detach(), right, rtol=1e-4, atol=1e-5 * largest + 1e-9, msg=name)
 
 
+def test_losses_of_the_pass_without_proposals():
+    """Rays whose samples are known have final ones alone."""
+    model = build(sky_loss_mult=0.5).train()
+    propose, supervision = model.proposal_sampler.forward, batch()
+    model.proposal_sampler.forward = lambda *given, **more: (propose(*given, **more)[0], [], [])
+    outputs = model(rays(), supervision)
+    (weights,) = outputs["weights_list"]
+    losses = model._sky_and_surface_losses(outputs, supervision)
+    hit = weights[supervision["sky"][:, 0]].sum(dim=1).mean()
+    assert float(losses["sky_loss"]) == pytest.approx(0.5 * float(hit), rel=1e-4)
+    assert float(model._depth_losses(outputs, supervision)) > 0
+
+
 def test_losses_of_the_pass_are_those_of_its_own_batch():
     model = build().train()
     supervision, other = batch(), batch()

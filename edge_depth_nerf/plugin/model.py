@@ -716,10 +716,12 @@ class EdgeDepthNerfModel(NerfactoModel):
         if self._has_sky_loss():
             sky = batch["sky"][:, 0].to(self.device)
             levels = [weights.squeeze(-1) for weights in outputs["weights_list"]]
-            # the mean over the levels, of all their weights in one row
-            hit = sky_loss(torch.cat(levels if supervised is None else levels[:-1], dim=1), sky)
-            hit = hit if supervised is None else hit + supervised.sky
-            losses["sky_loss"] = self.config.sky_loss_mult / len(levels) * hit
+            others = levels if supervised is None else levels[:-1]
+            # of all their weights in one row
+            hit = [sky_loss(torch.cat(others, dim=1), sky)] if others else []
+            hit += [] if supervised is None else [supervised.sky]
+            # the mean over the levels
+            losses["sky_loss"] = self.config.sky_loss_mult / len(levels) * sum(hit[1:], hit[0])
         if "surface_rgb" in outputs:
             weight: Any = self.config.surface_loss_mult
             if "surface_counts" in batch:
