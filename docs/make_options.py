@@ -21,7 +21,7 @@ import tyro
 from edge_depth_nerf import cli
 from edge_depth_nerf.base.files import write_text
 from edge_depth_nerf.method.integration import IntegrationOptions
-from edge_depth_nerf.method.losses import UrbanTerms
+from edge_depth_nerf.method.depth_losses import LOSSES
 from edge_depth_nerf.method.prior import PriorOptions
 from edge_depth_nerf.plugin.config import make_specifications, read_method_file
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
@@ -214,7 +214,7 @@ def methods() -> str:
         ("The depth prior", "pipeline.datamanager.prior", PriorOptions),
         ("Its integration", "pipeline.datamanager.prior.integration", IntegrationOptions),
         ("The model and its loss", "pipeline.model", EdgeDepthNerfModelConfig),
-        ("UrbanNeRF's loss", "pipeline.model.urban", UrbanTerms),
+        *((f"The loss {name}", f"pipeline.model.losses.{name.replace('-', '_')}", kind) for name, kind in LOSSES.items()),
         ("Poses refined in training", "pipeline.model.camera_optimizer", PoseRefinerConfig),
         ("Evaluation", "pipeline", EdgeDepthPipelineConfig),
         ("The scene", "pipeline.datamanager.dataparser", FisheyeDepthDataParserConfig),
@@ -230,7 +230,7 @@ def methods() -> str:
         for entry in dataclasses.fields(cls):
             # a group of options has a table of its own
             full = f"{place}.{entry.name}".removeprefix(".")
-            if entry.name not in docs or entry.name == "_target" or full in places:
+            if entry.name not in docs or entry.name in ("_target", "losses") or full in places:
                 continue
             values = {name: at(config, full) for name, config in configs.items()}
             first = next(iter(values.values()))
@@ -258,7 +258,7 @@ def presets() -> str:
         *(FisheyeDepthDataManagerConfig, PriorOptions, IntegrationOptions),
         *(
             EdgeDepthNerfModelConfig,
-            UrbanTerms,
+            *LOSSES.values(),
             PoseRefinerConfig,
             EdgeDepthPipelineConfig,
             FisheyeDepthDataParserConfig,

@@ -93,15 +93,12 @@ def check_torch() -> Iterator[Finding]:
 
 def check_kernels() -> Iterator[Finding]:
     """What computes hash grids."""
-    if find_spec("tinycudann") is not None:
-        yield Finding("Hash grids", "ok", "tiny-cuda-nn on a GPU, Numba on the CPU")
-        return
     numba, triton = find_spec("numba") is not None, find_spec("triton") is not None
     found = " and ".join(name for name, there in (("Numba (CPU)", numba), ("Triton (CUDA)", triton)) if there)
     yield Finding(
         "Hash grids",
         "ok" if numba else "problem",
-        f"fused kernels: {found or 'none'}; no tiny-cuda-nn, none is needed",
+        f"fused kernels: {found or 'none'}; tiny-cuda-nn is not used",
         "" if numba else "Reinstall edge-depth-nerf: it brings Numba.",
     )
 

@@ -45,7 +45,7 @@ EXTRAS = {
     "pipeline.model.sky_background",
     "pipeline.model.depth_loss_final",
 }
-RIVAL = {LOSS, SOURCE, *EXTRAS, "pipeline.model.depth_loss_mult", "pipeline.model.depth_sigma"}
+RIVAL = {LOSS, SOURCE, *EXTRAS, "pipeline.model.depth_loss_mult", "pipeline.model.losses.ds_nerf.sigma_m"}
 ALLOWED = {
     "nerfacto": {LOSS, SOURCE, *EXTRAS},
     "nerfacto-embedding": {LOSS, SOURCE, EXPOSURE, *EXTRAS},
@@ -61,8 +61,8 @@ ALLOWED = {
         *EXTRAS,
         "pipeline.model.depth_loss_mult",
         "pipeline.model.depth_loss_levels",
-        "pipeline.model.edge_gaussian",
-        "pipeline.model.edge_divide_by_norm",
+        "pipeline.model.losses.edge.gaussian",
+        "pipeline.model.losses.edge.divide_by_norm",
         PRIOR + "align",
         PRIOR + "sigma_mode",
         PRIOR + "sigma_constant_m",
@@ -234,8 +234,8 @@ def test_a_configuration_reads_the_same_in_every_process():
 
 def test_lambda_and_sigma_go_where_each_method_has_them():
     rival = resolved("ds-nerf", weight=0.07, sigma_m=0.2)
-    assert (rival["pipeline.model.depth_loss_mult"], rival["pipeline.model.depth_sigma"]) == (0.07, 0.2)
-    assert set(differing(rival, resolved("ds-nerf"))) == {LOSS + "_mult", "pipeline.model.depth_sigma"}
+    assert (rival["pipeline.model.depth_loss_mult"], rival["pipeline.model.losses.ds_nerf.sigma_m"]) == (0.07, 0.2)
+    assert set(differing(rival, resolved("ds-nerf"))) == {LOSS + "_mult", "pipeline.model.losses.ds_nerf.sigma_m"}
     ours = resolved("edge", weight=0.07, sigma_m=0.2)
     assert (ours[PRIOR + "sigma_mode"], ours[PRIOR + "sigma_constant_m"]) == ("constant", 0.2)
     own = resolved("edge", weight=0.07, sigma_m="own")

@@ -48,7 +48,7 @@ def test_the_grid_has_each_loss_with_each_prior_without_and_with_extras():
 
 def test_cells_that_differ_in_one_thing_differ_in_its_fields_alone():
     """As long as λ and σ are the defaults; those are searched for each."""
-    settings = {"pipeline.model.depth_loss_mult", "pipeline.model.depth_sigma"}
+    settings = {"pipeline.model.depth_loss_mult", "pipeline.model.losses.ds_nerf.sigma_m"}
     seen = {"prior": 0, "extras": 0, "loss": 0}
     for (one, first), (other, second) in combinations(GRID.items(), 2):
         found = differing(first, second)

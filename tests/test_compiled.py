@@ -13,13 +13,13 @@ def test_it_is_known_whether_kernels_lie_compiled_on_disk(tmp_path, monkeypatch)
     for folder in folders:
         folder.mkdir()
     monkeypatch.setattr(compiled, "_folders", set(folders))
-    assert not compiled.compiled_before(())
+    assert not compiled.all_on_disk()
     (folders[0] / "kernel.nbi").touch()
-    assert not compiled.compiled_before(())  # those of the other folder are still to be compiled
+    assert not compiled.all_on_disk()  # those of the other folder are still to be compiled
     (folders[1] / "kernel.nbi").touch()
-    assert compiled.compiled_before(())
+    assert compiled.all_on_disk()
     monkeypatch.setattr(compiled, "_folders", set())  # no folder can be written: anew each time
-    assert not compiled.compiled_before(())
+    assert not compiled.all_on_disk()
 
 
 def test_a_change_of_a_function_reaches_those_that_call_it(tmp_path):
@@ -46,8 +46,8 @@ def test_a_change_of_a_function_reaches_those_that_call_it(tmp_path):
 def test_what_a_training_calls_is_looked_at_before_it_is_called():
     """A process that has computed no prior has not imported it."""
     code = (
-        "import sys; from edge_depth_nerf.kernels import compiled; compiled.compiled_before()\n"
-        "print(*[module in sys.modules for module in compiled.TRAINING], bool(compiled._folders))"
+        "from edge_depth_nerf.kernels import compiled; from edge_depth_nerf.plugin.fused.build import compiled_before\n"
+        "print(len(compiled._folders)); compiled_before(); print(len(compiled._folders))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
-    assert done.stdout.split() == ["True"] * (len(compiled.TRAINING) + 1)
+    assert [int(count) for count in done.stdout.split()] == [0, 3]

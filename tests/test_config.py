@@ -12,6 +12,7 @@ from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.plugins.types import MethodSpecification
 
 from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.method.depth_losses import EdgeLoss
 from edge_depth_nerf.method.integration import IntegrationOptions
 from edge_depth_nerf.method.prior import PriorOptions
 from edge_depth_nerf.plugin import config
@@ -77,7 +78,7 @@ def test_constants_carry_their_source():
 
 def test_the_paper_preset_is_the_literal_form():
     model, data = (getattr(all_methods["edge-depth-nerf-paper"].pipeline, part) for part in ("model", "datamanager"))
-    assert (model.edge_gaussian, model.edge_divide_by_norm, model.depth_loss_levels) == ("point", False, "final")
+    assert (model.losses.edge, model.depth_loss_levels) == (EdgeLoss(gaussian="point", divide_by_norm=False), "final")
     assert data.prior == PriorOptions(
         align="none", sigma_mode="constant", sigma_constant_m=0.3, motion=False, integration=IntegrationOptions()
     )

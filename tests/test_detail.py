@@ -16,7 +16,7 @@ from edge_depth_nerf.base.files import read_json, write_json
 from edge_depth_nerf.compare.judging import ViewJudge, evaluated, shifted_views
 from edge_depth_nerf.method.detail import carried, detail_of, pictures_that_see, seen_from
 from edge_depth_nerf.plugin import detail as plugin_detail
-from edge_depth_nerf.plugin.detail import TrainingDetail, detail_shown
+from edge_depth_nerf.plugin.detail import TrainingDetail, detail_shown, with_appearance_of
 from edge_depth_nerf.plugin.exposure import KINDS
 
 GREY = 0.5
@@ -360,9 +360,9 @@ def test_with_an_embedding_a_picture_is_rendered_as_it_looks(tmp_path, implement
         model.field.embedding_appearance.embedding.weight.normal_(0, 20.0)
     with evaluated(model):
         usual = model.rendered_alone(camera)["rgb"]
-        with model.with_appearance_of(2):
+        with with_appearance_of(model.field, 2):
             third = model.rendered_alone(camera)["rgb"]
-        with model.with_appearance_of(3):
+        with with_appearance_of(model.field, 3):
             fourth = model.rendered_alone(camera)["rgb"]
         assert torch.equal(model.rendered_alone(camera)["rgb"], usual)
         # a mean of one picture is that picture's

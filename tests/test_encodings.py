@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import multiprocessing
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -19,7 +18,7 @@ from nerfstudio.field_components.spatial_distortions import SceneContraction
 from edge_depth_nerf.kernels import hash_grid_numba as cpu
 from edge_depth_nerf.kernels.back_ends import working
 from edge_depth_nerf.kernels.fields import CubeContraction
-from edge_depth_nerf.kernels.fused_hash_grid import FusedHashEncoding, use_fused_encodings
+from edge_depth_nerf.kernels.fused_hash_grid import FusedHashEncoding
 from edge_depth_nerf.kernels.hash_grid import back_end
 from edge_depth_nerf.kernels.table_adam import TableAdam
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
@@ -52,12 +51,12 @@ def small_shares(monkeypatch):
 
 def both(seed: int = 0, **size) -> tuple[HashEncoding, FusedHashEncoding]:
     """nerfstudio's encoding and a fused one with the same table, its values between -1 and 1."""
-    torch.manual_seed(seed)
-    host = HashEncoding(**{"hash_init_scale": 1.0, **size}, implementation="torch")
-    fused = copy.deepcopy(host)
-    use_fused_encodings(fused)
-    assert isinstance(fused, FusedHashEncoding)
-    return host, fused
+    made = []
+    for kind in (HashEncoding, FusedHashEncoding):
+        torch.manual_seed(seed)
+        made.append(kind(**{"hash_init_scale": 1.0, **size}, implementation="torch"))
+    assert torch.equal(made[0].hash_table, made[1].hash_table)
+    return made[0], made[1]
 
 
 def points(scalings: torch.Tensor, count: int = 3000) -> torch.Tensor:
@@ -453,14 +452,11 @@ def test_the_contraction_is_nerfactos():
     torch.testing.assert_close(found[1][1], found[0][1], equal_nan=True)
 
 
-def test_the_choice_of_implementation(monkeypatch):
-    assert all_methods["edge-depth-nerf"].pipeline.model.implementation == "auto"
-    assert all_methods["edge-depth-nerf-lite"].pipeline.model.implementation == "auto"
-    for choice, kind in (("auto", FusedHashEncoding), ("fused", FusedHashEncoding), ("torch", HashEncoding)):
+def test_the_choice_of_implementation():
+    assert all_methods["edge-depth-nerf"].pipeline.model.implementation == "fused"
+    assert all_methods["edge-depth-nerf-lite"].pipeline.model.implementation == "fused"
+    for choice, kind in (("fused", FusedHashEncoding), ("torch", HashEncoding)):
         assert [type(part) for part in encodings_of(build(implementation=choice))] == [kind] * 3
-    # tiny-cuda-nn serves no CPU
-    monkeypatch.setattr("edge_depth_nerf.plugin.model.TCNN_EXISTS", True)
-    assert [type(part) for part in encodings_of(build(implementation="auto"))] == [FusedHashEncoding] * 3
 
 
 def test_other_devices_are_left_to_torch():

@@ -18,9 +18,10 @@ from trainings import trainer_of
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_image, read_json, write_distance_png, write_json, write_mask, write_png
-from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss, proposal_loss
+from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss, interlevel_loss
+from edge_depth_nerf.method.depth_losses import DsNerfLoss, EdgeLoss, UrbanNerfLoss, UrbanNerfSightLoss
 from edge_depth_nerf.method.integration import IntegrationOptions, integrate_depth, select_prior, sigma_m
-from edge_depth_nerf.method.losses import UrbanTerms, edge_loss, urban_nerf_loss
+from edge_depth_nerf.method.losses import edge_loss, urban_nerf_loss
 from edge_depth_nerf.method.prior import PriorOptions
 
 HALVES = [torch.float16, torch.bfloat16]
@@ -62,7 +63,7 @@ def test_the_edge_loss_is_finite(gaussian: Any, divide: bool, dtype: torch.dtype
                 torch.full_like(prior, sigma),
                 gaussian=gaussian,
                 divide_by_norm=divide,
-            )
+            ).sum()
         (gradient,) = torch.autograd.grad(loss, weights)
         assert math.isfinite(loss.item()), sigma
         # float16 ends at 65,504: a gradient beyond is infinite in it, and the scaler of mixed precision skips the step
@@ -78,7 +79,8 @@ def test_urban_nerfs_loss_is_finite(dtype: torch.dtype, autocast: Any) -> None:
     prior = torch.tensor([2.0, 3.0, 250.0, 1e-3, 4.0, torch.nan, 0.0]).to(dtype)
     for sigma in (1e-3, 0.3, 300.0):
         with torch.autocast("cpu", autocast or torch.bfloat16, enabled=autocast is not None):
-            loss = urban_nerf_loss(weights, edges[:, :-1], edges[:, 1:], prior, sigma, UrbanTerms())
+            terms = {"expected": 0.01, "empty": 1.0, "near": 1.0}
+            loss = urban_nerf_loss(weights, edges[:, :-1], edges[:, 1:], prior, sigma, **terms).sum()
         (gradient,) = torch.autograd.grad(loss, weights)
         assert math.isfinite(loss.item()), sigma
         assert torch.isfinite(gradient).all() or dtype == torch.float16, sigma
@@ -89,7 +91,7 @@ def test_urban_nerfs_loss_is_finite(dtype: torch.dtype, autocast: Any) -> None:
 def test_a_batch_without_a_prior_gives_nothing(rays: int) -> None:
     weights = torch.rand(rays, 4, requires_grad=True)
     edges = torch.arange(5.0).repeat(rays, 1)
-    loss = edge_loss(weights, edges[:, :-1], edges[:, 1:], torch.zeros(rays), torch.ones(rays))
+    loss = edge_loss(weights, edges[:, :-1], edges[:, 1:], torch.zeros(rays), torch.ones(rays)).sum()
     (gradient,) = torch.autograd.grad(loss, weights)
     assert loss.item() == 0 and (gradient == 0).all()
 
@@ -102,7 +104,7 @@ def test_the_losses_of_samples_are_finite(dtype: torch.dtype) -> None:
     outer = edges[:, ::3].contiguous()
     for loss_of, trained in (
         (lambda w: distortion_loss(edges, w), weights),
-        (lambda w: proposal_loss(edges, weights, outer, w), torch.zeros(7, 4, dtype=dtype)),
+        (lambda w: interlevel_loss(edges, weights, outer, w), torch.zeros(7, 4, dtype=dtype)),
     ):
         given = trained.clone().requires_grad_()
         loss = loss_of(given)
@@ -249,7 +251,7 @@ HOSTILE: dict[str, tuple[Callable[[Path], Any], dict[str, Any]]] = {
     "all at 4 mm": (both(fill("mono", 1 / 256), fill("lidar", 1 / 256)), {}),
     "flat maps, no alignment, literal sigma": (
         both(fill("mono", 7.0), fill("lidar", 7.0)),
-        {"data__prior": PriorOptions(align="none", sigma_mode="image"), "model__edge_gaussian": "point"},
+        {"data__prior": PriorOptions(align="none", sigma_mode="image"), "losses__edge": EdgeLoss(gaussian="point")},
     ),
     "masks of one pixel": (one_pixel, {}),
     "one training picture": (one_training_picture, {}),
@@ -265,11 +267,17 @@ HOSTILE: dict[str, tuple[Callable[[Path], Any], dict[str, Any]]] = {
     "far plane at 1e9 m": (lambda scene: None, {"model__far_m": 1e9}),
     "near plane at 0.1 mm": (lambda scene: None, {"model__near_m": 1e-4}),
     "large weight": (lambda scene: None, {"model__depth_loss_mult": 1e4}),
-    "ds-nerf at the limit": (lambda scene: None, {"model__depth_loss": "ds-nerf", "model__depth_sigma": 1e-3}),
-    "urban-nerf at the limit": (lambda scene: None, {"model__depth_loss": "urban-nerf", "model__depth_sigma": 1e-3}),
+    "ds-nerf at the limit": (
+        lambda scene: None,
+        {"model__depth_loss": "ds-nerf", "losses__ds_nerf": DsNerfLoss(sigma_m=1e-3)},
+    ),
+    "urban-nerf at the limit": (
+        lambda scene: None,
+        {"model__depth_loss": "urban-nerf", "losses__urban_nerf": UrbanNerfLoss(sigma_m=1e-3)},
+    ),
     "urban-nerf-los at the limit": (
         lambda scene: None,
-        {"model__depth_loss": "urban-nerf-los", "model__depth_sigma": 1e-3},
+        {"model__depth_loss": "urban-nerf-los", "losses__urban_nerf_los": UrbanNerfSightLoss(sigma_m=1e-3)},
     ),
 }
 

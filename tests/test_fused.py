@@ -25,8 +25,8 @@ from nerfstudio.model_components.ray_samplers import (
 from edge_depth_nerf.kernels import hash_grid_numba, network_numba, proposals_numba
 from edge_depth_nerf.kernels import network as network_module
 from edge_depth_nerf.kernels.contraction_numba import contract
-from edge_depth_nerf.kernels.fields import FusedMLP, FusedNerfactoField, use_fused_fields
-from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss, proposal_loss
+from edge_depth_nerf.kernels.fields import FusedMLP, FusedNerfactoField
+from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss, interlevel_loss
 from edge_depth_nerf.kernels.network import network
 from edge_depth_nerf.kernels.ray_samplers import (
     FirstSampler,
@@ -163,18 +163,14 @@ def test_the_network_has_no_second_derivative():
 
 
 def test_networks_that_are_not_covered_stay_nerfstudios():
-    model = torch.nn.ModuleList(
-        [
-            MLP(4, 2, 8, 3, implementation="torch"),
-            MLP(4, 3, 8, 3, skip_connections=(1,), implementation="torch"),
-            MLP(4, 2, 8, 3, activation=torch.nn.Softplus(), implementation="torch"),
-        ]
+    fused, *others = (
+        FusedMLP(4, 2, 8, 3, implementation="torch"),
+        FusedMLP(4, 3, 8, 3, skip_connections=(1,), implementation="torch"),
+        FusedMLP(4, 2, 8, 3, activation=torch.nn.Softplus(), implementation="torch"),
     )
-    use_fused_fields(model)
-    assert [type(part) for part in model] == [FusedMLP, MLP, MLP]
-    fused = model[0]
-    assert isinstance(fused, FusedMLP)
     x = torch.randn(2, 5, 4)
+    assert [part.is_plain for part in (fused, *others)] == [True, False, False]
+    assert all(torch.equal(part(x), MLP.forward(part, x)) for part in others)
     assert torch.allclose(fused(x), MLP.forward(fused, x), atol=1e-6)
     assert fused(x[:, :0]).shape == (2, 0, 3)
     assert fused.double()(x.double()).dtype == torch.float64
@@ -365,14 +361,14 @@ def test_the_proposal_loss_is_nerfstudios():
     edges, weights, outer_edges, outer = histograms()
     outers = [outer.clone().requires_grad_() for _ in range(2)]
     expected = lossfun_outer(edges, weights, outer_edges, outers[0]).mean()
-    found = proposal_loss(edges, weights, outer_edges, outers[1])
+    found = interlevel_loss(edges, weights, outer_edges, outers[1])
     assert float(found) == pytest.approx(float(expected), rel=1e-5)
     assert expected > 0
     expected.backward()
     found.backward()
     assert outers[0].grad is not None and outers[1].grad is not None
     torch.testing.assert_close(outers[1].grad, outers[0].grad, rtol=1e-4, atol=1e-7)
-    assert not proposal_loss(edges, weights, outer_edges, outer).requires_grad
+    assert not interlevel_loss(edges, weights, outer_edges, outer).requires_grad
 
 
 def test_the_distortion_loss_is_nerfstudios():

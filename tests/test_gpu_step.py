@@ -5,16 +5,14 @@ from __future__ import annotations
 import importlib
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
-from nerfstudio.cameras.rays import Frustums, RaySamples
 from torch._subclasses.fake_tensor import FakeTensorMode
 
+from edge_depth_nerf.method.depth_losses import LOSSES, Level, depth_loss
 from edge_depth_nerf.plugin.exposure import KINDS
-from edge_depth_nerf.plugin.model import EdgeDepthNerfModel, EdgeDepthNerfModelConfig
 
 pytestmark = pytest.mark.slow
 
@@ -144,18 +142,13 @@ def test_maps_of_colours_copy_nothing_from_the_host(gpu_counts, kind):
     assert counter.counts.parts["other"].kernels > 0 and not counter.counts.synchronisations
 
 
-def test_the_rival_losses_copy_nothing_from_the_host(gpu_counts):
+@pytest.mark.parametrize("name", ["ds-nerf", "urban-nerf", "urban-nerf-los"])
+def test_the_rival_losses_copy_nothing_from_the_host(name, gpu_counts):
     counter = gpu_counts.Counter()
-    config = EdgeDepthNerfModelConfig(depth_loss="ds-nerf")
     with FakeTensorMode(), torch.device("cuda"):
-        lengths = torch.rand(7, 5, 1)
-        along = lengths.expand(7, 5, 3)
-        samples = RaySamples(Frustums(along, along, starts=lengths, ends=lengths, pixel_area=lengths))
-        model: Any = SimpleNamespace(
-            config=config, metres_per_unit=2.0, _met_prior=lambda batch: batch["prior_distance_m"]
-        )
+        level = Level(torch.rand(7, 5), torch.rand(7, 5), torch.rand(7, 5), torch.rand(7), torch.rand(7))
         with counter:
-            EdgeDepthNerfModel._depth_loss(model, lengths, samples, {}, {"prior_distance_m": torch.rand(7, 1)})
+            depth_loss(LOSSES[name](), [level], [True])
     assert counter.counts.parts["other"].kernels > 0 and not counter.counts.synchronisations
 
 

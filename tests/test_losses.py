@@ -8,7 +8,8 @@ import reference
 import torch
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.method.losses import EPS, Gaussian, UrbanTerms, edge_loss, sky_loss, urban_nerf_loss
+from edge_depth_nerf.method import losses
+from edge_depth_nerf.method.losses import EPS, Gaussian, sky_loss
 
 GAUSSIANS: tuple[Gaussian, ...] = ("point", "interval")
 FORMS = [(gaussian, norm) for gaussian in GAUSSIANS for norm in (False, True)]
@@ -27,6 +28,24 @@ def random_rays(seed: int, rays: int = 12, samples: int = 30, dtype: torch.dtype
     sigma[4:6] = [0, np.nan]
     arrays = {"weights": weights, "starts_m": ends[:, :-1], "ends_m": ends[:, 1:], "prior_m": prior, "sigma_m": sigma}
     return {name: torch.tensor(array, dtype=dtype) for name, array in arrays.items()}
+
+
+def edge_loss(weights, starts_m, ends_m, prior_m, sigma_m, **form) -> torch.Tensor:
+    """Mean of Eq. 4 over the rays that have a prior, as a training takes it; `sigma_m` may be one number."""
+    sigma_m = sigma_m if isinstance(sigma_m, torch.Tensor) else torch.full_like(prior_m, sigma_m)
+    has_prior = (prior_m > 0) & prior_m.isfinite() & (sigma_m > 0) & sigma_m.isfinite()
+    per_ray = losses.edge_loss(weights, starts_m, ends_m, prior_m, sigma_m, **form)
+    assert not per_ray[~has_prior].any()
+    return per_ray.sum() / has_prior.sum().clamp(min=1)
+
+
+def urban_nerf_loss(weights, starts_m, ends_m, prior_m, sigma_m, expected=0.01, empty=1.0, near=1.0) -> torch.Tensor:
+    """Mean of UrbanNeRF's loss over the rays that have a prior."""
+    has_prior = (prior_m > 0) & prior_m.isfinite()
+    terms = {"expected": expected, "empty": empty, "near": near}
+    per_ray = losses.urban_nerf_loss(weights, starts_m, ends_m, prior_m, sigma_m, **terms)
+    assert not per_ray[~has_prior].any()
+    return per_ray.sum() / has_prior.sum().clamp(min=1)
 
 
 def one_ray(weights, edges, prior: float, sigma: float, **form) -> float:
@@ -226,12 +245,6 @@ def test_gradient_at_weight_zero():
     assert float(weights.grad) == pytest.approx(-1 / EPS)
 
 
-def test_a_number_and_a_tensor_of_sigma_are_the_same():
-    rays = random_rays(6)
-    rays["sigma_m"] = torch.full((12,), 0.7, dtype=torch.float64)
-    torch.testing.assert_close(edge_loss(**{**rays, "sigma_m": 0.7}), edge_loss(**rays))
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -240,15 +253,13 @@ def test_a_number_and_a_tensor_of_sigma_are_the_same():
         ({"prior_m": torch.ones(12, 1)}, r"prior_m \(12, 1\) does not fit weights \(12, 30\); expected \(12,\)"),
         ({"sigma_m": torch.ones(11)}, r"sigma_m \(11,\) does not fit"),
         ({"weights": torch.ones(12, 30, 1)}, r"weights \(12, 30, 1\); expected two dimensions"),
-        ({"sigma_m": 0.0}, "sigma_m is 0.0; expected a positive number"),
-        ({"sigma_m": math.nan}, "sigma_m is nan"),
         ({"gaussian": "line"}, "gaussian is 'line'; expected one of"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )
 def test_wrong_input(change, words, unchecked_types):
     with pytest.raises(InputError, match=words):
-        edge_loss(**{**random_rays(7), **change})
+        losses.edge_loss(**{**random_rays(7), **change})
 
 
 def test_the_sky_loss_is_the_mean_share_that_is_stopped():
@@ -270,7 +281,10 @@ def urban_rays(seed: int, dtype: torch.dtype = torch.float64) -> dict:
     return rays
 
 
-TERMS = [UrbanTerms(1.0, 0.0, 0.0), UrbanTerms(0.0, 1.0, 0.0), UrbanTerms(0.0, 0.0, 1.0), UrbanTerms(0.3, 2.0, 0.7)]
+TERMS = [
+    {"expected": expected, "empty": empty, "near": near}
+    for expected, empty, near in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.3, 2.0, 0.7))
+]
 
 
 @pytest.mark.parametrize(("dtype", "rtol"), [(torch.float64, 1e-5), (torch.float32, 1e-3)], ids=str)
@@ -280,10 +294,9 @@ TERMS = [UrbanTerms(1.0, 0.0, 0.0), UrbanTerms(0.0, 1.0, 0.0), UrbanTerms(0.0, 0
 def test_urban_nerfs_loss_equals_its_twin(seed, sigma_m, terms, dtype, rtol):
     rays = urban_rays(seed, dtype)
     rays["weights"][:, ::5] = 0
-    loss = urban_nerf_loss(**rays, sigma_m=sigma_m, terms=terms)
+    loss = urban_nerf_loss(**rays, sigma_m=sigma_m, **terms)
     arrays = {name: tensor.numpy().astype(np.float64) for name, tensor in rays.items()}
-    weights = {"expected": terms.expected, "empty": terms.empty, "near": terms.near}
-    twin = reference.urban_nerf_loss(**arrays, sigma_m=sigma_m, **weights)
+    twin = reference.urban_nerf_loss(**arrays, sigma_m=sigma_m, **terms)
     assert loss.dtype == dtype and twin > 0
     assert float(loss) == pytest.approx(twin, rel=rtol)
 
@@ -292,13 +305,13 @@ def test_urban_nerfs_loss_equals_its_twin(seed, sigma_m, terms, dtype, rtol):
 def test_urban_nerfs_gradient_equals_finite_differences(terms):
     rays = {name: tensor[:8, :10] if tensor.ndim == 2 else tensor[:8] for name, tensor in urban_rays(1).items()}
     weights = (rays.pop("weights") + 0.01).requires_grad_()
-    assert torch.autograd.gradcheck(lambda w: urban_nerf_loss(w, **rays, sigma_m=4.0, terms=terms), (weights,))
+    assert torch.autograd.gradcheck(lambda w: urban_nerf_loss(w, **rays, sigma_m=4.0, **terms), (weights,))
 
 
-def urban_ray(weights, edges, prior: float, sigma: float, terms: UrbanTerms) -> float:
+def urban_ray(weights, edges, prior: float, sigma: float, terms: dict[str, float]) -> float:
     edges = torch.tensor(edges, dtype=torch.float64)[None]
     given = torch.tensor(weights, dtype=torch.float64)[None]
-    return float(urban_nerf_loss(given, edges[:, :-1], edges[:, 1:], torch.tensor([prior]).double(), sigma, terms))
+    return float(urban_nerf_loss(given, edges[:, :-1], edges[:, 1:], torch.tensor([prior]).double(), sigma, **terms))
 
 
 def test_urban_nerfs_terms_by_hand():
@@ -321,7 +334,7 @@ def test_urban_nerfs_loss_is_least_where_light_ends_as_the_kernel_says():
     for at in (4.0, 5.0, 6.0):
         for width in (0.1, 0.3, 0.9):
             weights = np.exp(-((middles - at) ** 2) / (2 * width**2))
-            losses[at, width] = urban_ray(weights / weights.sum(), edges.tolist(), 5.0, 0.3, UrbanTerms())
+            losses[at, width] = urban_ray(weights / weights.sum(), edges.tolist(), 5.0, 0.3, {})
     assert min(losses, key=lambda key: losses[key]) == (5.0, 0.3)
     # the kernel itself, but for its cut ends: nothing is left
     assert losses[5.0, 0.3] == pytest.approx(0, abs=1e-2)
@@ -330,14 +343,9 @@ def test_urban_nerfs_loss_is_least_where_light_ends_as_the_kernel_says():
 
 def test_urban_nerfs_loss_does_not_depend_on_how_a_ray_is_cut_into_samples():
     """nerfstudio's does: its target grows with no sample's length."""
-    coarse = urban_ray([0.2, 0.3, 0.4], [1.0, 2.0, 5.0, 9.0], 4.2, 0.2, UrbanTerms())
-    fine = urban_ray([0.1, 0.1, 0.1, 0.2, 0.4], [1.0, 1.5, 2.0, 3.0, 5.0, 9.0], 4.2, 0.2, UrbanTerms())
+    coarse = urban_ray([0.2, 0.3, 0.4], [1.0, 2.0, 5.0, 9.0], 4.2, 0.2, {})
+    fine = urban_ray([0.1, 0.1, 0.1, 0.2, 0.4], [1.0, 1.5, 2.0, 3.0, 5.0, 9.0], 4.2, 0.2, {})
     assert fine == pytest.approx(coarse, rel=1e-9)
-
-
-def test_urban_nerfs_sigma_narrows_over_the_training():
-    terms = UrbanTerms(narrowing=16.0)
-    assert [terms.sigma_m(0.1, share) for share in (0.0, 0.5, 1.0)] == pytest.approx([1.6, 0.4, 0.1])
 
 
 def test_urban_nerfs_rays_without_a_prior_do_not_count():

@@ -4,22 +4,30 @@ from typing import Any
 
 import pytest
 import torch
-from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.cameras.rays import Frustums, RayBundle, RaySamples
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.model_components.losses import ds_nerf_depth_loss, urban_radiance_field_depth_loss
+from nerfstudio.model_components.renderers import DepthRenderer
 from nerfstudio.models.nerfacto import NerfactoModel
 
-from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.method.losses import UrbanTerms, edge_loss, urban_nerf_loss
+from edge_depth_nerf.method.depth_losses import (
+    DsNerfLoss,
+    EdgeLoss,
+    Level,
+    UrbanNerfLoss,
+    UrbanNerfSightLoss,
+)
+from edge_depth_nerf.method.losses import edge_loss, urban_nerf_loss
 from edge_depth_nerf.plugin.compat import lpips_not_built
-from edge_depth_nerf.plugin.model import DepthInEvaluation, EdgeDepthNerfModel, settled
+from edge_depth_nerf.plugin.model import EdgeDepthNerfModel, LossOptions
+from edge_depth_nerf.plugin.renderers import DepthInEvaluation
+from edge_depth_nerf.plugin.step_losses import Planes, Step, draw_surface_m
 
 METRES_PER_UNIT = 20.0
-LOSSES = ("edge", "ds-nerf", "urban-nerf", "urban-nerf-los")
+LOSSES = {name: f"{name.replace('-', '_')}_loss" for name in ("edge", "ds-nerf", "urban-nerf", "urban-nerf-los")}
 NO_EXTRAS = {"sky_loss_mult": 0.0, "sky_background": False, "surface_loss_mult": 0.0, "depth_loss_final": 1.0}
 
 
@@ -95,14 +103,15 @@ def test_a_far_near_plane_is_warned_of(capsys):
 
 
 def test_the_edge_loss_is_eq_4_in_metres():
-    model = build(depth_loss_mult=0.25, depth_loss_levels="final", edge_gaussian="point", edge_divide_by_norm=False)
+    literal = LossOptions(edge=EdgeLoss(gaussian="point", divide_by_norm=False))
+    model = build(depth_loss_mult=0.25, depth_loss_levels="final", losses=literal)
     outputs, losses = trained_step(model)
     weights, samples = outputs["weights_list"][-1], outputs["ray_samples_list"][-1]
     starts, ends = (edge[..., 0] * METRES_PER_UNIT for edge in (samples.frustums.starts, samples.frustums.ends))
     supervision = batch()
     prior, sigma = supervision["prior_distance_m"][:, 0], supervision["prior_sigma_m"][:, 0]
-    expected = 0.25 * edge_loss(weights[..., 0], starts, ends, prior, sigma, gaussian="point", divide_by_norm=False)
-    assert torch.allclose(losses["edge_loss"], expected)
+    per_ray = edge_loss(weights[..., 0], starts, ends, prior, sigma, gaussian="point", divide_by_norm=False)
+    assert torch.allclose(losses["edge_loss"], 0.25 * per_ray.sum() / 12)
     assert losses["edge_loss"] > 0
     losses["edge_loss"].backward()
     gradients = [p.grad for p in model.field.mlp_base.parameters()]
@@ -120,7 +129,8 @@ def test_all_levels_reach_the_proposal_networks():
 
 @pytest.mark.parametrize("kind", ["ds-nerf", "urban-nerf"])
 def test_baselines_are_the_host_own_losses_in_metres(kind):
-    model = build(depth_loss=kind, depth_loss_mult=0.5, depth_sigma=0.3)
+    options = LossOptions(ds_nerf=DsNerfLoss(sigma_m=0.3), urban_nerf=UrbanNerfLoss(sigma_m=0.3))
+    model = build(depth_loss=kind, depth_loss_mult=0.5, losses=options)
     outputs, losses = trained_step(model)
     total = torch.zeros(())
     prior, sigma = batch()["prior_distance_m"], torch.tensor([0.3])
@@ -130,39 +140,38 @@ def test_baselines_are_the_host_own_losses_in_metres(kind):
         if kind == "ds-nerf":
             total += ds_nerf_depth_loss(weights, prior, middles, ends - starts, sigma**2)
         else:
-            rendered = outputs["expected_depth"] * METRES_PER_UNIT
+            final = outputs["weights_list"][-1], outputs["ray_samples_list"][-1]
+            rendered = DepthRenderer(method="expected")(*final) * METRES_PER_UNIT
             total += urban_radiance_field_depth_loss(weights, prior, rendered, middles, sigma)
-    assert torch.allclose(losses["depth_loss"], 0.5 * total / 3)
+    assert torch.allclose(losses[LOSSES[kind]], 0.5 * total / 3)
     assert "edge_loss" not in losses
 
 
 def test_urban_nerf_of_its_authors_is_in_metres_and_narrows():
-    terms = UrbanTerms(0.1, 2.0, 0.5, narrowing=4.0)
-    model = build(depth_loss="urban-nerf-los", depth_loss_mult=0.5, depth_loss_final=1.0, depth_sigma=0.3, urban=terms)
+    terms = {"expected": 0.1, "empty": 2.0, "near": 0.5}
+    options = LossOptions(urban_nerf_los=UrbanNerfSightLoss(sigma_m=0.3, **terms, narrowing=4.0))
+    model = build(depth_loss="urban-nerf-los", depth_loss_mult=0.5, depth_loss_final=1.0, losses=options)
     for step, sigma_m in ((0, 1.2), (15_000, 0.6), (30_000, 0.3)):
         model._step = step
         outputs, losses = trained_step(model)
         total = torch.zeros(())
         for weights, samples in zip(outputs["weights_list"], outputs["ray_samples_list"], strict=True):
             starts, ends = (edge[..., 0] * METRES_PER_UNIT for edge in (samples.frustums.starts, samples.frustums.ends))
-            total += urban_nerf_loss(weights[..., 0], starts, ends, batch()["prior_distance_m"][:, 0], sigma_m, terms)
-        assert torch.allclose(losses["depth_loss"], 0.5 * total / 3)
-    losses["depth_loss"].backward()
+            prior_m = batch()["prior_distance_m"][:, 0]
+            total += urban_nerf_loss(weights[..., 0], starts, ends, prior_m, sigma_m, **terms).sum() / 12
+        assert torch.allclose(losses["urban_nerf_los_loss"], 0.5 * total / 3)
+    losses["urban_nerf_los_loss"].backward()
     gradients = [p.grad for p in model.field.mlp_base.parameters()]
     assert any(g is not None and bool(g.abs().sum() > 0) for g in gradients)
 
 
 def test_sigma_of_ds_nerf_is_a_standard_deviation_in_metres():
     """One sample a ray, one sigma from the prior: it is pulled exp(-1/2) as hard as one at the prior."""
-    model = build(depth_loss="ds-nerf", depth_sigma=0.3, depth_loss_mult=1.0)
     pulls = []
-    for middle_m in (5.0, 5.3):
-        starts, ends = (torch.full((1, 1, 1), (middle_m + half) / METRES_PER_UNIT) for half in (-0.05, 0.05))
-        zero = torch.zeros(1, 1, 3)
-        frustums = Frustums(origins=zero, directions=zero, starts=starts, ends=ends, pixel_area=starts)
-        supervision = {"prior_distance_m": torch.full((1, 1), 5.0)}
-        weights = torch.full((1, 1, 1), 0.5)
-        pulls.append(float(model._depth_loss(weights, RaySamples(frustums=frustums), {}, supervision)))
+    for midpoint_m in (5.0, 5.3):
+        starts_m, ends_m = (torch.full((1, 1), midpoint_m + half) for half in (-0.05, 0.05))
+        level = Level(torch.full((1, 1), 0.5), starts_m, ends_m, torch.tensor([5.0]), torch.tensor([9.0]))
+        pulls.append(float(DsNerfLoss(sigma_m=0.3)(level)))
     assert pulls[1] / pulls[0] == pytest.approx(math.exp(-0.5), rel=1e-4)
 
 
@@ -189,7 +198,7 @@ def step_with_surface(model):
 
 @pytest.mark.parametrize("kind", LOSSES)
 def test_surface_sky_and_falling_weight_are_options_of_any_depth_loss(kind):
-    name = "edge_loss" if kind == "edge" else "depth_loss"
+    name = LOSSES[kind]
     model, plain = build(depth_loss=kind), build(depth_loss=kind, **NO_EXTRAS)
     outputs, losses = step_with_surface(model)
     plain_outputs, without = step_with_surface(plain)
@@ -200,9 +209,9 @@ def test_surface_sky_and_falling_weight_are_options_of_any_depth_loss(kind):
         assert float(losses[extra].detach()) == pytest.approx(float(of_edge[extra].detach()), rel=1e-5)
     assert not torch.allclose(outputs["rgb"], plain_outputs["rgb"], atol=1e-2)
     for each, share in ((model, 0.01), (plain, 1.0)):
-        weight = each._depth_weight()
+        weight = each.depth_weight()
         each._step = 30_000
-        assert each._depth_weight() == pytest.approx(share * weight)
+        assert each.depth_weight() == pytest.approx(share * weight)
 
 
 def test_without_weight_the_prior_serves_surface_and_sky_alone():
@@ -219,7 +228,8 @@ def colours_at(model, bundle: RayBundle, distance_units) -> torch.Tensor:
 
 
 def test_the_weight_of_the_depth_loss_falls_over_the_training():
-    model = build(depth_loss_mult=0.5, depth_loss_final=0.01, depth_loss_steps=100)
+    model = build(depth_loss_mult=0.5, depth_loss_final=0.01)
+    model._training_steps = 100
     expected = float(trained_step(model)[1]["edge_loss"])
     (tell,) = (
         callback
@@ -323,86 +333,26 @@ def test_further_pixels_that_do_not_count_change_no_loss():
     assert losses["surface_loss"] == 0 and losses["surface_loss"].requires_grad
 
 
-PASS: list[dict[str, Any]] = [
-    {},
-    {"depth_loss": "none"},
-    {"depth_loss": "ds-nerf"},
-    {"depth_loss": "urban-nerf"},
-    {"depth_loss_levels": "final", "edge_gaussian": "point", "edge_divide_by_norm": False},
-    {"depth_loss_mult": 0.0, "sky_loss_mult": 0.0},
-    {"surface_loss_mult": 0.0, "sky_background": False},
-    {"exposure": "none", "camera_optimizer": CameraOptimizerConfig(mode="SO3xR3")},
-    {"exposure": "embedding"},
-    {"exposure": "affine"},
-    {"depth_loss": "none", "background_color": "random"},
-]
-
-
-@pytest.mark.parametrize("rests", [False, True], ids=["proposals learn", "proposals rest"])
-@pytest.mark.parametrize("options", PASS, ids=lambda options: ", ".join(options) or "defaults")
-def test_losses_are_the_same_in_the_pass_that_renders_and_by_themselves(options, rests, monkeypatch):
-    """Losses, metrics and gradients; `supervised` are those options whose colours the pass knows."""
-    found = []
-    for in_the_pass in (True, False):
-        model = build(**options).train()
-        if rests:
-            model.proposal_sampler._step, model.proposal_sampler._steps_since_update = 1000, 1
-        with torch.no_grad():
-            for parameter in [*model.field.parameters(), *(model.exposure.parameters() if model.exposure else ())]:
-                parameter.copy_(0.3 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(5)))
-        if not in_the_pass:
-            monkeypatch.setattr(model, "_supervision", lambda *_: None)
-        supervision = batch() | surface()
-        supervision["surface_counts"] = torch.tensor([True, False, True, True, False, True])[:, None]
-        torch.manual_seed(3)
-        outputs = model(rays(), supervision)
-        supervised = in_the_pass and options.get("exposure") != "affine" and "background_color" not in options
-        assert ("supervised" in outputs) == supervised
-        torch.manual_seed(4)
-        metrics = model.get_metrics_dict(outputs, supervision)
-        losses = model.get_loss_dict(outputs, supervision, metrics)
-        torch.stack(list(losses.values())).sum().backward()
-        gradients = {name: each.grad for name, each in model.named_parameters() if each.grad is not None}
-        found.append((losses, metrics, {"rgb": outputs["rgb"]}, gradients))
-    for one, other in zip(*found, strict=True):
-        assert set(one) == set(other) and one
-        for name, value in one.items():
-            right = other[name].detach()
-            largest = float(right.abs().max())
-            torch.testing.assert_close(value.detach(), right, rtol=1e-4, atol=1e-5 * largest + 1e-9, msg=name)
-
-
-def test_losses_of_the_pass_without_proposals():
-    """Rays whose samples are known have final ones alone."""
+def test_losses_of_final_samples_alone():
+    """Rays whose samples are known have no proposals."""
     model = build(sky_loss_mult=0.5).train()
     propose, supervision = model.proposal_sampler.forward, batch()
     model.proposal_sampler.forward = lambda *given, **more: (propose(*given, **more)[0], [], [])
     outputs = model(rays(), supervision)
     (weights,) = outputs["weights_list"]
-    losses = model._sky_and_surface_losses(outputs, supervision)
+    step = Step(outputs, supervision, model.planes, 0.0, 1.0)
     hit = weights[supervision["sky"][:, 0]].sum(dim=1).mean()
-    assert float(losses["sky_loss"]) == pytest.approx(0.5 * float(hit), rel=1e-4)
-    assert float(model._depth_losses(outputs, supervision)) > 0
-
-
-def test_losses_of_the_pass_are_those_of_its_own_batch():
-    model = build().train()
-    supervision, other = batch(), batch()
-    other["image"] = 1 - other["image"]
-    torch.manual_seed(3)
-    outputs = model(rays(), supervision)
-    losses = model.get_loss_dict(outputs, other, model.get_metrics_dict(outputs, other))
-    expected = (outputs["rgb"] - other["image"]).square().mean()
-    assert float(losses["rgb_loss"]) == pytest.approx(float(expected), rel=1e-5)
+    assert float(model.step_losses["sky_loss"](step)) == pytest.approx(0.5 * float(hit), rel=1e-4)
+    assert float(model.step_losses["edge_loss"](step)) > 0
 
 
 def test_the_surface_is_drawn_between_the_planes():
-    model = build(near_m=0.2, far_m=50.0).train()
+    planes = Planes(0.2, 50.0, METRES_PER_UNIT)
     count = 4000
     near, far = torch.full((count, 1), 0.25), torch.full((count, 1), 49.0)
     given = {"surface_distance_m": torch.cat([near, far]), "surface_sigma_m": torch.cat([0.1 + 0 * near, 4 + 0 * far])}
     torch.manual_seed(0)
-    drawn_m = model._surface_drawn(given)
+    drawn_m = draw_surface_m(given, planes)
     assert 0.2 <= float(drawn_m.min()) and float(drawn_m.max()) <= 50
     close, distant = drawn_m.split(count)
     # it does not pile up at the planes: a tenth of the Gaussian beyond one sigma to the inside is a sixth now
@@ -411,7 +361,7 @@ def test_the_surface_is_drawn_between_the_planes():
     assert float((distant < 45).float().mean()) == pytest.approx(2 * 0.1587, abs=0.03)
     # between them it is the Gaussian
     given = {"surface_distance_m": torch.full((count, 1), 20.0), "surface_sigma_m": torch.full((count, 1), 2.0)}
-    drawn_m = model._surface_drawn(given)
+    drawn_m = draw_surface_m(given, planes)
     assert float(drawn_m.mean()) == pytest.approx(20, abs=0.15)
     assert float(drawn_m.std()) == pytest.approx(2, abs=0.1)
 
@@ -446,7 +396,7 @@ def test_a_prior_that_is_not_between_the_planes_is_none(kind, distance_m):
     model = build(depth_loss=kind, near_m=0.2, far_m=50.0).train()
     torch.manual_seed(3)
     outputs = model(rays())
-    name = "edge_loss" if kind == "edge" else "depth_loss"
+    name = LOSSES[kind]
     found = []
     for value in (0.0, distance_m):
         supervision = batch()
@@ -542,7 +492,7 @@ def test_views_are_judged_inside_the_mask(monkeypatch, tmp_path):
 
 def test_lpips_is_used_where_its_weights_are(monkeypatch):
     model, outputs, truth = judged_view()
-    monkeypatch.setattr("edge_depth_nerf.plugin.model.load_lpips", lambda: _MeanDifference())
+    monkeypatch.setattr("edge_depth_nerf.plugin.evaluation.load_lpips", lambda: _MeanDifference())
     metrics, _ = model.get_image_metrics_and_images(outputs, truth)
     difference = (outputs["rgb"] - truth["image"]).abs()
     assert metrics["lpips"] == pytest.approx(difference.mean().item(), abs=1e-5)
@@ -567,7 +517,7 @@ def test_same_parameters_as_nerfacto():
     host.load_state_dict(ours.state_dict())
 
 
-@pytest.mark.parametrize("loss", ["edge", "ds-nerf", "urban-nerf", "urban-nerf-los"])
+@pytest.mark.parametrize("loss", LOSSES)
 def test_levels_that_do_not_learn_are_left_out_and_the_others_pull_as_before(loss):
     """nerfstudio lets its proposal networks rest in most steps; their levels would give a number, and no gradient.
 
@@ -579,25 +529,15 @@ def test_levels_that_do_not_learn_are_left_out_and_the_others_pull_as_before(los
             model.proposal_sampler._step, model.proposal_sampler._steps_since_update = 1000, 1
         torch.manual_seed(3)
         outputs = model(rays(), batch())
-        *proposals, final = zip(outputs["weights_list"], outputs["ray_samples_list"], strict=True)
-        assert [weights.requires_grad for weights, _ in proposals] == [not rests] * 2
+        assert [weights.requires_grad for weights in outputs["weights_list"]] == [not rests] * 2 + [True]
         losses = model.get_loss_dict(outputs, batch(), model.get_metrics_dict(outputs, batch()))
-        levels = [final] if rests and loss != "urban-nerf" else [*proposals, final]
-        if loss == "edge":
-            expected = float(model._edge_losses(levels, batch()).sum()) / 3
-        else:
-            expected = sum(float(model._depth_loss(*level, outputs, batch())) for level in levels) / 3
-        assert float(losses["edge_loss" if loss == "edge" else "depth_loss"]) == pytest.approx(expected, rel=1e-5)
-
-
-def test_what_auto_stands_for(monkeypatch):
-    module = "edge_depth_nerf.plugin.model.TCNN_EXISTS"
-    monkeypatch.setattr(module, False)
-    assert [settled("auto", "cpu"), settled("auto", "cuda"), settled("torch", "cuda")] == ["fused", "fused", "torch"]
-    with pytest.raises(InputError, match=r"tiny-cuda-nn is not installed.*checkpoints need it too"):
-        settled("tcnn", "cuda")
-    monkeypatch.setattr(module, True)
-    assert [settled("auto", "cpu"), settled("auto", "cuda"), settled("fused", "cuda")] == ["fused", "tcnn", "fused"]
-    assert settled("tcnn", "cuda") == "tcnn"
-    with pytest.raises(InputError, match="there is no GPU"):
-        settled("tcnn", "cpu")
+        prior, sigma = batch()["prior_distance_m"][:, 0], batch()["prior_sigma_m"][:, 0]
+        levels = []
+        for weights, samples in zip(outputs["weights_list"], outputs["ray_samples_list"], strict=True):
+            ends = (each[..., 0] * METRES_PER_UNIT for each in (samples.frustums.starts, samples.frustums.ends))
+            levels.append(Level(weights[..., 0], *ends, prior, sigma))
+        object_of = model.step_losses[LOSSES[loss]].loss
+        counted = 16 if object_of.over_all_rays else 12
+        used = levels[-1:] if rests and loss != "urban-nerf" else levels
+        found = [object_of(replace(level, final=levels[-1])).sum() / counted for level in used]
+        assert float(losses[LOSSES[loss]]) == pytest.approx(float(sum(found)) / 3, rel=1e-5)

@@ -31,6 +31,7 @@ from edge_depth_nerf import cli
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, write_json
 from edge_depth_nerf.entry import DEBUG_OPTION
+from edge_depth_nerf.method.depth_losses import Level
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -121,7 +122,7 @@ PARSED = [
     pytest.param(words, id=f"{block.page}: {' '.join(words)}")
     for block, words in ALL_CALLS
     # of a method that is registered in the block itself; it has to be run
-    if "NERFSTUDIO_METHOD_CONFIGS" not in block.text or not words[0].startswith("ns-")
+    if not re.search("NERFSTUDIO_METHOD_CONFIGS|EDGE_DEPTH_NERF_LOSSES", block.text) or not words[0].startswith("ns-")
 ]
 
 
@@ -566,8 +567,8 @@ def test_the_quick_start_as_it_is_typed(clone):
 @pytest.mark.slow
 def test_the_examples_as_they_are_typed(clone):
     said = run_blocks("docs/extending.md", clone)
-    (config,) = (clone / "outputs/sample_drive/ratio").glob("*/config.yml")
-    assert "ratio_delta: 0.2" in config.read_text()
+    (config,) = (clone / "outputs/ratio/edge-depth-nerf-lite").glob("*/config.yml")
+    assert "depth_loss: ratio" in config.read_text() and "delta: 0.2" in config.read_text()
     # the flat road: every map is there, and of the road it is right
     meta = read_json(clone / "scenes/flat_road/transforms.json")
     assert meta["mono"]["trained_on"] == "elsewhere"
@@ -617,32 +618,64 @@ def test_a_new_source_of_depth_reaches_the_prior(tmp_path, monkeypatch):
 
 
 def test_the_example_of_a_loss():
-    module = load("examples/new_loss")
+    loss_of = load("examples/new_loss").RatioLoss(delta=0.1)
     generator = torch.Generator().manual_seed(0)
     weights = torch.rand(5, 7, generator=generator, dtype=torch.float64).requires_grad_()
-    middles = torch.rand(5, 7, generator=generator, dtype=torch.float64) * 10
+    edges = (torch.rand(5, 8, generator=generator, dtype=torch.float64) * 10).sort(dim=1).values
     prior = torch.tensor([3.0, 0, 8, 20, 0.5], dtype=torch.float64)
-    loss = module.ratio_loss(weights, middles, prior, 0.1)
-    ratio = np.log((weights.detach().numpy() * middles.numpy()).sum(1) + 1e-3) - np.log(np.where(prior > 0, prior, 1))
+    level = Level(weights, edges[:, :-1], edges[:, 1:], prior, torch.ones_like(prior))
+    loss = loss_of(level)
+    midpoints = (edges[:, 1:] + edges[:, :-1]).numpy() / 2
+    ratio = np.log((weights.detach().numpy() * midpoints).sum(1) + 1e-3) - np.log(np.where(prior > 0, prior, 1))
     huber = np.where(np.abs(ratio) < 0.1, ratio**2 / 2, 0.1 * (np.abs(ratio) - 0.05))
-    assert float(loss.detach()) == pytest.approx(huber[prior.numpy() > 0].mean())
-    loss.backward()
+    np.testing.assert_allclose(loss.detach().numpy(), np.where(prior > 0, huber, 0))
+    loss.sum().backward()
     assert weights.grad is not None and (weights.grad[1] == 0).all() and (weights.grad[0] != 0).all()
-    assert float(module.ratio_loss(weights.detach(), middles, prior * 0, 0.1)) == 0
 
 
-def test_the_example_of_a_loss_is_a_method_of_its_own():
-    from edge_depth_nerf.plugin.config import edge_depth_nerf_lite
+TWO_STEPS = """
+import sys
+from pathlib import Path
+from new_loss import RatioLoss
+from trainings import trainer_of
+from edge_depth_nerf.method import depth_losses
+from edge_depth_nerf.plugin.trainer import EdgeDepthTrainer
 
-    made = load("examples/new_loss").ratio().config
-    lite = edge_depth_nerf_lite.config
-    differing = {
-        entry.name
-        for entry in dataclasses.fields(lite.pipeline.model)
-        if getattr(made.pipeline.model, entry.name) != getattr(lite.pipeline.model, entry.name)
-    }
-    assert differing == {"_target", "depth_loss_mult"}
-    assert lite.method_name == "edge-depth-nerf-lite" and made.method_name == "ratio"
+def refuse(*_, **__):
+    raise AssertionError("Eq. 4 was computed")
+
+depth_losses.EdgeLoss.__call__ = depth_losses.edge_loss = refuse
+calls, loss_of = [], RatioLoss.__call__
+RatioLoss.__call__ = lambda loss, level: calls.append(loss.delta) or loss_of(loss, level)
+for implementation in ("fused", "torch"):
+    changes = {"model__implementation": implementation, "model__depth_loss": "ratio", "losses__ratio": RatioLoss(0.2)}
+    trainer = trainer_of(Path(sys.argv[1]), Path(sys.argv[2]) / implementation, **changes)
+    before = [each.clone() for each in trainer.pipeline.model.field.parameters()]
+    for step in range(2):
+        calls.clear()
+        _, losses, _ = trainer.train_iteration(step)
+        print(implementation, sorted(losses), calls, float(losses["ratio_loss"]) > 0)
+    changed = [not (a == b).all() for a, b in zip(before, trainer.pipeline.model.field.parameters())]
+    assert any(changed)
+"""
+
+
+@pytest.mark.slow
+def test_the_program_trains_with_the_example_of_a_loss(sample_drive, tmp_path):
+    """Registered by the environment, its function is called, its key is among the losses, and Eq. 4 is not computed."""
+    paths = os.pathsep.join([str(DOCS / "examples"), str(Path(__file__).parent)])
+    done = subprocess.run(
+        [sys.executable, "-c", TWO_STEPS, str(sample_drive), str(tmp_path)],
+        env={**os.environ, "PYTHONPATH": paths, "EDGE_DEPTH_NERF_LOSSES": "ratio=new_loss:RatioLoss"},
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-4000:]
+    names = "['distortion_loss', 'interlevel_loss', 'ratio_loss', 'rgb_loss', 'sky_loss', 'surface_loss']"
+    found = [line for line in done.stdout.splitlines() if line.startswith(("fused", "torch"))]
+    assert found == [f"{kind} {names} [0.2, 0.2, 0.2] True" for kind in ("fused", "fused", "torch", "torch")]
 
 
 def test_the_example_of_a_network(sample_drive):

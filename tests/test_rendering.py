@@ -1,4 +1,4 @@
-"""Networks, rendering and losses in one pass, against the same arithmetic in float64 and against nerfstudio's."""
+"""Networks and rendering in one pass, against the same arithmetic in float64 and against nerfstudio's."""
 
 from __future__ import annotations
 
@@ -15,11 +15,9 @@ from torch import Tensor
 
 from edge_depth_nerf.kernels import rendering_numba
 from edge_depth_nerf.kernels.fields import FusedNerfactoField
-from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss
 from edge_depth_nerf.kernels.pointwise_numba import STEEPEST
-from edge_depth_nerf.kernels.rendering import Behind, Networks, Rendered, Supervision
+from edge_depth_nerf.kernels.rendering import Background, Networks, Rendered
 from edge_depth_nerf.kernels.rendering_numba import render
-from edge_depth_nerf.method.losses import EPS, NARROW, edge_loss, sky_loss
 
 
 @pytest.fixture(autouse=True, params=[1, 2], ids=["one thread", "two threads"])
@@ -54,7 +52,7 @@ def straight_networks(x: Tensor, of_points: Tensor, first: Any, second: Any, by_
 def test_both_networks_and_the_rays_in_one_pass(widths, shape, of_pictures):
     torch.manual_seed(0)
     rays, samples, singles = shape
-    behind = Behind.SINGLE_POINT if singles >= rays else Behind.LAST_SAMPLE
+    background = Background.POINT if singles >= rays else Background.LAST_SAMPLE
     first = layers(*widths[0])
     second = layers(widths[0][-1] - 1, *widths[1])
     by_ray = torch.randn(widths[1][0], 9, requires_grad=True)
@@ -67,7 +65,7 @@ def test_both_networks_and_the_rays_in_one_pass(widths, shape, of_pictures):
     leaves = [x, *([of_rays] if of_pictures else []), *first[0], *first[1], *second[0], *second[1], by_ray]
     inside, deltas = (torch.rand(points) > 0.1).float(), 0.3 * torch.rand(rays, samples)
     networks = Networks(first, second, by_ray)
-    *found, _ = render(x, of_rays, networks, inside, deltas, 0.7, behind)
+    found = render(x, of_rays, networks, inside, deltas, 0.7, background)
     factors = [torch.randn(each.shape) for each in found]
     gradients = torch.autograd.grad(found, leaves, factors)
 
@@ -76,7 +74,7 @@ def test_both_networks_and_the_rays_in_one_pass(widths, shape, of_pictures):
     repeated = torch.cat([of_points[:rays].repeat_interleave(samples, 0), of_points[rays:]])
     one, other = ([[exact[each] for each in part] for part in network] for network in (first, second))
     values = straight_networks(exact[x], repeated, one, other, exact[by_ray])
-    expected = straight_pixels(values, inside.double(), deltas.double(), 0.7, behind)
+    expected = straight_pixels(values, inside.double(), deltas.double(), 0.7, background)
     for each, right in zip(found, expected, strict=True):
         torch.testing.assert_close(each.double(), right, rtol=1e-4, atol=1e-5)
     slopes = torch.autograd.grad(expected, list(exact.values()), [each.double() for each in factors])
@@ -84,7 +82,7 @@ def test_both_networks_and_the_rays_in_one_pass(widths, shape, of_pictures):
         assert float((each - right).abs().max()) <= 5e-5 * float(right.abs().max()), each.shape
     assert gradients[0].t().is_contiguous() and all(each.is_contiguous() for each in gradients[1:])
     with torch.no_grad():
-        *again, _ = render(x, of_rays, networks, inside, deltas, 0.7, behind)
+        again = render(x, of_rays, networks, inside, deltas, 0.7, background)
     for each, right in zip(again, found, strict=True):
         torch.testing.assert_close(each, right.detach(), rtol=1e-5, atol=1e-6)
 
@@ -92,8 +90,8 @@ def test_both_networks_and_the_rays_in_one_pass(widths, shape, of_pictures):
 def test_positions_that_nobody_follows_cost_no_gradient():
     first, second = layers(4, 8, 3), layers(2, 8, 3)
     x, by_ray = torch.randn(20, 4), torch.randn(8, 2)
-    given = torch.ones(20), torch.rand(6, 3), 1.0, Behind.NOTHING
-    *rendered, _ = render(x, torch.randn(8, 2), Networks(first, second, by_ray), *given)
+    given = torch.ones(20), torch.rand(6, 3), 1.0, Background.BLACK
+    rendered = render(x, torch.randn(8, 2), Networks(first, second, by_ray), *given)
     torch.stack([each.sum() for each in rendered]).sum().backward()
     assert x.grad is None and by_ray.grad is None
     assert all(each.grad is not None for part in (*first, *second) for each in part)
@@ -104,17 +102,18 @@ def render_values(
     inside: Tensor,
     deltas: Tensor,
     scale: float,
-    behind: Behind,
-    supervision: Supervision | None = None,
+    background: Background,
 ) -> Rendered:
     """Render what networks give, [4, points]: behind networks that pass it on."""
     networks = Networks(([torch.eye(4)], [torch.zeros(4)]), ([torch.eye(3)], [torch.zeros(3)]), torch.zeros(3, 1))
     singles = values.shape[1] - deltas.numel()
     nothing = torch.zeros(len(deltas) + singles, 1)
-    return render(values.t(), nothing, networks, inside, deltas, scale, behind, supervision)
+    return render(values.t(), nothing, networks, inside, deltas, scale, background)
 
 
-def straight_pixels(values: Tensor, inside: Tensor, deltas: Tensor, scale: float, behind: Behind) -> list[Tensor]:
+def straight_pixels(
+    values: Tensor, inside: Tensor, deltas: Tensor, scale: float, background: Background
+) -> list[Tensor]:
     """What `render_values` gives, step by step; the density's slope limited as in nerfstudio's trunc_exp."""
     rays, samples = deltas.shape
     before = values[0, : rays * samples]
@@ -128,16 +127,16 @@ def straight_pixels(values: Tensor, inside: Tensor, deltas: Tensor, scale: float
     of_samples, singles = colours[: rays * samples].view(rays, samples, 3), colours[rays * samples :]
     hit = weights.sum(1, keepdim=True)
     rgb = (weights[..., None] * of_samples).sum(1)
-    if behind == Behind.LAST_SAMPLE:
+    if background == Background.LAST_SAMPLE:
         rgb = rgb + (1 - hit) * of_samples[:, -1]
-    elif behind == Behind.SINGLE_POINT:
+    elif background == Background.POINT:
         rgb, singles = rgb + (1 - hit) * singles[:rays], singles[rays:]
     return [rgb, hit, weights, singles]
 
 
-@pytest.mark.parametrize("behind", list(Behind))
+@pytest.mark.parametrize("background", list(Background))
 @pytest.mark.parametrize("shape", [(37, 24, 100), (5, 1, 8), (1, 13, 1), (70, 7, 70)], ids=str)
-def test_pixels_and_their_gradients(behind, shape):
+def test_pixels_and_their_gradients(background, shape):
     torch.manual_seed(1)
     rays, samples, singles = shape
     points = rays * samples + singles
@@ -146,10 +145,9 @@ def test_pixels_and_their_gradients(behind, shape):
         values[0, ::11] = 16
         values[0, 1::11] = -17
     inside, deltas = (torch.rand(points) > 0.1).float(), 0.3 * torch.rand(rays, samples)
-    *found, losses = render_values(values, inside, deltas, 1.7, behind)
-    assert losses is None
+    found = render_values(values, inside, deltas, 1.7, background)
     exact = values.detach().double().requires_grad_()
-    expected = straight_pixels(exact, inside.double(), deltas.double(), 1.7, behind)
+    expected = straight_pixels(exact, inside.double(), deltas.double(), 1.7, background)
     for each, other in zip(found, expected, strict=True):
         assert each.shape == other.shape
         torch.testing.assert_close(each.double(), other, rtol=1e-5, atol=1e-6)
@@ -160,119 +158,18 @@ def test_pixels_and_their_gradients(behind, shape):
     # whatever a loss reads alone
     for number in range(4):
         if found[number].numel():
-            *once_more, _ = render_values(values, inside, deltas, 1.7, behind)
+            once_more = render_values(values, inside, deltas, 1.7, background)
             (slope,) = torch.autograd.grad(once_more[number].square().sum(), values)
-            again = straight_pixels(exact, inside.double(), deltas.double(), 1.7, behind)[number].square().sum()
+            again = straight_pixels(exact, inside.double(), deltas.double(), 1.7, background)[number].square().sum()
             (other,) = torch.autograd.grad(again, exact)
             assert float((slope - other).abs().max()) <= 2e-5 * float(other.abs().max()) + 1e-6
-
-
-def supervision_of(shape: tuple[int, int, int], behind: Behind) -> Supervision:
-    """Two thirds of the rays with a prior, a fifth of them sky, two thirds of the further pixels of use."""
-    rays, samples, singles = shape
-    further = singles - (rays if behind == Behind.SINGLE_POINT else 0)
-    edges = torch.rand(rays, samples + 1).sort(dim=1)[0]
-    starts, ends = 12 * edges[:, :-1] ** 2, 12 * edges[:, 1:] ** 2
-    numbers = torch.arange(rays)
-    return Supervision(
-        image=torch.rand(rays + further, 3),
-        counts=torch.arange(further) % 3 > 0,
-        gains=(1 + 0.2 * torch.randn(4, 3)).requires_grad_(),
-        pictures=torch.arange(rays + further) % 4,
-        edges=edges,
-        starts=starts,
-        ends=ends,
-        prior_m=torch.where(numbers % 3 > 0, 30 * torch.rand(rays), 0),
-        sigma_m=0.05 + 3 * torch.rand(rays),
-        sky=numbers % 5 == 4,
-        metres_per_unit=3.0,
-        interval=True,
-        divide_by_norm=True,
-        eps=EPS,
-        narrow=NARROW,
-    )
-
-
-def straight_losses(rendered: list[Tensor], gains: Tensor, told: Supervision) -> tuple[list[Tensor], list[Tensor]]:
-    """Rendered colours as the pictures have them, and the losses, each by its own function, in float64."""
-    rgb, _, weights, further = rendered
-    rays = len(rgb)
-    image, factors = told.image.double(), gains[told.pictures]
-    rgb, further = rgb * factors[:rays], further * factors[rays:]
-    off = torch.where(told.counts[:, None], further - image[rays:], 0)
-    starts, ends = (each.double() * told.metres_per_unit for each in (told.starts, told.ends))
-    form: Any = {"gaussian": "interval" if told.interval else "point", "divide_by_norm": told.divide_by_norm}
-    losses = [
-        (rgb - image[:rays]).square().mean(),
-        off.square().mean() if len(off) else off.sum(),
-        edge_loss(weights, starts, ends, told.prior_m.double(), told.sigma_m.double(), **form),
-        distortion_loss(told.edges.double(), weights),
-        sky_loss(weights, told.sky),
-    ]
-    return [rgb, rendered[1], weights, further], losses
-
-
-FORMS: list[dict[str, Any]] = [
-    {},
-    {"interval": False, "divide_by_norm": False},
-    {"sigma_m": torch.tensor(0.0), "sky": torch.tensor(False), "counts": torch.tensor(False)},
-]
-
-
-@pytest.mark.parametrize("form", FORMS, ids=["interval", "point", "nothing told but colours"])
-@pytest.mark.parametrize("behind", list(Behind))
-@pytest.mark.parametrize("shape", [(37, 24, 100), (5, 1, 5), (1, 13, 1), (70, 7, 70)], ids=str)
-def test_losses_of_a_ray_in_the_pass_that_renders_it(form, shape, behind):
-    torch.manual_seed(2)
-    rays, samples, singles = shape
-    points = rays * samples + singles
-    values = torch.randn(4, points).requires_grad_()
-    inside, deltas = (torch.rand(points) > 0.1).float(), 0.3 * torch.rand(rays, samples)
-    told = supervision_of(shape, behind)
-    alike = {name: each.expand_as(getattr(told, name)) for name, each in form.items() if isinstance(each, Tensor)}
-    told = told._replace(**{**form, **alike})
-    *found, losses = render_values(values, inside, deltas, 1.7, behind, told)
-    assert losses is not None
-    exact, gains = (each.detach().double().requires_grad_() for each in (values, told.gains))
-    by_steps = straight_pixels(exact, inside.double(), deltas.double(), 1.7, behind)
-    expected, expected_losses = straight_losses(by_steps, gains, told)
-    every, expected_every = [*found, *losses], [*expected, *expected_losses]
-    for each, other in zip(every, expected_every, strict=True):
-        assert each.shape == other.shape and each.dtype == torch.float32
-        torch.testing.assert_close(each.double(), other, rtol=2e-5, atol=1e-6)
-
-    def same_slopes(number: int | None) -> None:
-        """By all that is given, each with its own factor, or by one alone."""
-        torch.manual_seed(3)
-        factors = [torch.randn(each.shape) for each in every]
-        chosen = range(len(every)) if number is None else [number]
-        one = torch.stack([(factors[k] * every[k]).sum() for k in chosen]).sum()
-        other = torch.stack([(factors[k].double() * expected_every[k]).sum() for k in chosen]).sum()
-        slopes = torch.autograd.grad(one, [values, told.gains], retain_graph=True)
-        others = torch.autograd.grad(other, [exact, gains], retain_graph=True, allow_unused=True)
-        for slope, right in zip(slopes, others, strict=True):
-            right = torch.zeros(slope.shape).double() if right is None else right
-            assert float((slope - right).abs().max()) <= 3e-5 * float(right.abs().max()) + 1e-7
-
-    for number in (None, *range(len(every))):
-        same_slopes(number)
-
-
-def test_gains_that_do_not_learn_get_no_gradient():
-    shape = 6, 4, 9
-    told = supervision_of(shape, Behind.NOTHING)._replace(gains=torch.ones(4, 3))
-    values = torch.randn(4, 33).requires_grad_()
-    rendered = render_values(values, torch.ones(33), torch.rand(6, 4), 1.0, Behind.NOTHING, told)
-    assert rendered.losses is not None
-    torch.stack(list(rendered.losses)).sum().backward()
-    assert values.grad is not None and bool(values.grad.abs().sum() > 0) and told.gains.grad is None
 
 
 def test_a_density_that_is_not_a_number_weighs_nothing_and_shows():
     values = torch.zeros(4, 9)
     values[0, 4] = float("nan")
     values.requires_grad_()
-    rendered = render_values(values, torch.ones(9), torch.full((3, 3), 0.5), 1.0, Behind.NOTHING)
+    rendered = render_values(values, torch.ones(9), torch.full((3, 3), 0.5), 1.0, Background.BLACK)
     assert rendered.weights[1, 1:].tolist() == [0, 0] and rendered.weights[0].min() > 0
     rendered.rgb.sum().backward()
     assert values.grad is not None and values.grad[:, :3].isfinite().all() and values.grad[0, 3:6].isnan().any()
@@ -347,8 +244,10 @@ def test_rays_that_end_early_have_no_sky(monkeypatch):
     with_sky = model(whole)
     assert whole.fars is None and torch.equal(model(whole)["rgb"], with_sky["rgb"])  # and once more
     colours: list[Any] = []
-    fields = model._fields
-    monkeypatch.setattr(model, "_fields", lambda parts: [colours.append(each) or each for each in fields(parts)])
+    at = model.field.forward_together
+    monkeypatch.setattr(
+        model.field, "forward_together", lambda parts: [colours.append(each) or each for each in at(parts)]
+    )
     at_once, by_steps = both_ways(model, monkeypatch, short)
     torch.testing.assert_close(at_once["rgb"], by_steps["rgb"], rtol=1e-4, atol=1e-5)
     (found,) = colours

@@ -44,7 +44,7 @@ class RunAgain:
 
 def trainer_in(folder: Path, name: str, **changes: Any) -> EdgeDepthTrainer:
     """A training whose batches come as on a GPU, with as many rays at each step."""
-    changes |= {"max_num_iterations": STEPS, "model__depth_loss_steps": STEPS}
+    changes |= {"max_num_iterations": STEPS}
     trainer = trainer_of(folder / "scene", folder / name, **changes)
     manager: Any = trainer.pipeline.datamanager
     manager.next_train = lambda step: manager.batch_of(manager.upload(step))

@@ -9,7 +9,7 @@ import pytest
 import torch
 from nerfstudio.field_components.encodings import HashEncoding
 
-from edge_depth_nerf.kernels.fused_hash_grid import use_fused_encodings
+from edge_depth_nerf.kernels.fused_hash_grid import FusedHashEncoding, sum_tables_later
 from edge_depth_nerf.kernels.table_adam import PARTS, SUMS_LATER, TableAdam, TablePart
 
 SETTINGS: dict[str, Any] = {"lr": 1e-2, "eps": 1e-15}
@@ -17,8 +17,8 @@ SETTINGS: dict[str, Any] = {"lr": 1e-2, "eps": 1e-15}
 
 def grid() -> HashEncoding:
     torch.manual_seed(0)
-    encoding = HashEncoding(num_levels=4, max_res=64, log2_hashmap_size=8, implementation="torch")
-    use_fused_encodings(encoding)
+    encoding = FusedHashEncoding(num_levels=4, max_res=64, log2_hashmap_size=8, implementation="torch")
+    sum_tables_later(encoding)
     return encoding
 
 

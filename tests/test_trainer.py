@@ -9,7 +9,6 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-import yaml
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.pipelines.base_pipeline import Pipeline
 from nerfstudio.utils import writer
@@ -75,9 +74,9 @@ def test_ctrl_c_finishes_the_step_saves_it_and_says_how_to_go_on(trainer, tmp_pa
 def test_lambda_falls_over_the_whole_training_also_of_one_taken_up_again(trainer, tmp_path):
     whole = trainer.pipeline.model
     assert isinstance(whole, EdgeDepthNerfModel)
-    assert whole.config.depth_loss_steps is None and whole.config.depth_loss_final == 0.01
+    assert whole.config.depth_loss_final == 0.01
     trainer.train()
-    last = whole._depth_weight()
+    last = whole.depth_weight()
     assert last == pytest.approx(whole.config.depth_loss_mult * 0.01 ** ((STEPS - 1) / STEPS))
     folder = trainer.checkpoint_dir
     longer = trainer_of(trainer.config.data, tmp_path / "longer", load_dir=folder, max_num_iterations=STEPS)
@@ -86,7 +85,7 @@ def test_lambda_falls_over_the_whole_training_also_of_one_taken_up_again(trainer
     model = longer.pipeline.model
     assert isinstance(model, EdgeDepthNerfModel)
     share = 0.01 ** ((2 * STEPS - 1) / (2 * STEPS))
-    assert model._depth_weight() == pytest.approx(whole.config.depth_loss_mult * share)
+    assert model.depth_weight() == pytest.approx(whole.config.depth_loss_mult * share)
 
 
 def test_in_a_step_torch_has_one_thread_and_the_kernels_have_all(trainer, monkeypatch):
@@ -253,17 +252,3 @@ def test_a_checkpoint_of_the_full_preset_on_a_cpu_is_taken_up_on_a_gpu_and_back(
     loaded(PatientGradScaler(enabled=True), 1)
     loaded(PatientGradScaler(enabled=False), 2)
     assert scalers[0] == {} and scalers[1]["scale"] == 2.0**16
-
-
-def test_the_configuration_that_is_saved_says_what_auto_stood_for(trainer, monkeypatch):
-    assert trainer.config.pipeline.model.implementation == "auto"
-    trainer.config.save_config()
-    saved = yaml.load((trainer.base_dir / "config.yml").read_text(), Loader=yaml.Loader)
-    assert saved.pipeline.model.implementation == "fused"
-    # on a GPU that had tiny-cuda-nn
-    monkeypatch.setattr("edge_depth_nerf.plugin.model.TCNN_EXISTS", True)
-    trainer.config.machine.device_type = "cuda"
-    trainer.config.pipeline.model.implementation = "auto"
-    trainer.config.save_config()
-    saved = yaml.load((trainer.base_dir / "config.yml").read_text(), Loader=yaml.Loader)
-    assert saved.pipeline.model.implementation == "tcnn"

@@ -14,7 +14,7 @@ from edge_depth_nerf.plugin.trainer import EdgeDepthTrainer
 
 
 def trainer_of(scene: Path, output: Path, rank: int = 0, world_size: int = 1, **changes: Any) -> EdgeDepthTrainer:
-    """edge-depth-nerf-lite, small, set up; `model__x`, `data__x` and `parser__x` go to the parts, others to itself."""
+    """edge-depth-nerf-lite, small, set up; `model__x`, `losses__x`, `data__x` and `parser__x` go to these parts."""
     config = copy.deepcopy(all_methods["edge-depth-nerf-lite"])
     config.output_dir, config.experiment_name, config.timestamp = output, "small", "run"
     config.vis, config.data = "tensorboard", scene
@@ -24,6 +24,7 @@ def trainer_of(scene: Path, output: Path, rank: int = 0, world_size: int = 1, **
     pipeline.datamanager.train_num_rays_per_batch = 64
     shrink(pipeline.model, 4, 12)
     parts = {"model": pipeline.model, "data": pipeline.datamanager, "parser": pipeline.datamanager.dataparser}
+    parts["losses"] = pipeline.model.losses
     for name, value in changes.items():
         part, _, field = name.rpartition("__")
         node = parts[part] if part else config

@@ -12,7 +12,6 @@ LAMBDA = "pipeline.model.depth_loss_mult"
 """The weight of the depth loss, in every method."""
 _SOURCE = "pipeline.datamanager.depth_source"
 _LOSS = "pipeline.model.depth_loss"
-_LOSS_SIGMA = "pipeline.model.depth_sigma"
 _EXPOSURE = "pipeline.model.exposure"
 _PRIOR_SIGMA = "pipeline.datamanager.prior.sigma_constant_m"
 SIGMA_MODE = "pipeline.datamanager.prior.sigma_mode"
@@ -91,9 +90,10 @@ def _edge(
 
 
 def _rival(name: MethodName, title: str, loss: Loss, prior: PriorName = "lidar", extras: bool = False) -> Method:
-    named = {_LOSS: loss, _SOURCE: prior, LAMBDA: 0.01, _LOSS_SIGMA: 0.5, **({} if extras else WITHOUT_EXTRAS)}
+    sigma = f"pipeline.model.losses.{loss.replace('-', '_')}.sigma_m"
+    named = {_LOSS: loss, _SOURCE: prior, LAMBDA: 0.01, sigma: 0.5, **({} if extras else WITHOUT_EXTRAS)}
     cell = Cell(loss, prior, extras)
-    return Method(name, title, named, _NEEDS[prior], sigma_field=_LOSS_SIGMA, rival=not extras, cell=cell)
+    return Method(name, title, named, _NEEDS[prior], sigma_field=sigma, rival=not extras, cell=cell)
 
 
 def _of_grid_alone(cell: Cell) -> Method:

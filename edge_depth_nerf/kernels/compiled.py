@@ -7,9 +7,8 @@ result is kept beside the module, or in the user's cache if that folder cannot b
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -17,22 +16,6 @@ import numpy as np
 from numba import njit
 from torch import Tensor
 
-TRAINING = (
-    "edge_depth_nerf.kernels.hash_grid_numba",
-    "edge_depth_nerf.kernels.network_numba",
-    "edge_depth_nerf.kernels.contraction_numba",
-    "edge_depth_nerf.kernels.exponential_numba",
-    "edge_depth_nerf.kernels.pointwise_numba",
-    "edge_depth_nerf.kernels.ray_numba",
-    "edge_depth_nerf.kernels.proposals_numba",
-    "edge_depth_nerf.kernels.rendering_numba",
-    "edge_depth_nerf.kernels.edge_loss_numba",
-    "edge_depth_nerf.kernels.table_adam_numba",
-    "edge_depth_nerf.kernels.integration_numba",
-    "edge_depth_nerf.kernels.table_rays_numba",
-    "edge_depth_nerf.kernels.pixel_records_numba",
-)
-"""The modules whose kernels a training on the CPU calls."""
 _folders: set[Path] = set()
 """Where Numba keeps what it compiled."""
 
@@ -77,8 +60,6 @@ def flat(values: Tensor) -> np.ndarray:
     return values.detach().contiguous().view(-1).numpy()
 
 
-def compiled_before(modules: Sequence[str] = TRAINING) -> bool:
-    """Whether the kernels of modules lie compiled on disk; otherwise their first calls take long."""
-    for module in modules:
-        import_module(module)  # tells its folder
+def all_on_disk() -> bool:
+    """Whether something lies compiled in each folder of the modules of kernels that were imported so far."""
     return bool(_folders) and all(any(folder.glob("*.nbi")) for folder in _folders)

@@ -24,10 +24,10 @@ from nerfstudio.fields.density_fields import HashMLPDensityField
 from nerfstudio.fields.nerfacto_field import NerfactoField
 from torch import Tensor, nn
 
-from edge_depth_nerf.kernels.back_ends import by_number, made_by_autocast, of_encoded_network, of_network, working
-from edge_depth_nerf.kernels.fused_hash_grid import FusedHashEncoding, use_fused_encodings
+from edge_depth_nerf.kernels.back_ends import by_number, made_by_autocast, working
+from edge_depth_nerf.kernels.fused_hash_grid import FusedHashEncoding
 from edge_depth_nerf.kernels.network import network
-from edge_depth_nerf.kernels.rendering import Behind, Networks, Rendered, Supervision
+from edge_depth_nerf.kernels.rendering import Background, Networks, Rendered
 
 
 class CubeContraction(SceneContraction):
@@ -57,45 +57,26 @@ def _one_a_ray(directions: Tensor) -> bool:
     return directions.ndim == 3 and (directions.shape[1] == 1 or directions.stride(1) == 0)
 
 
-def _is_plain(mlp: MLP) -> bool:
-    """Whether it is layers with ReLU between them, in torch."""
-    return mlp.tcnn_encoding is None and not mlp.skip_connections and isinstance(mlp.activation, nn.ReLU)
-
-
 def _parameters(mlp: MLP) -> tuple[list[Any], list[Any]]:
     """Weights and biases, layer by layer."""
     return [layer.weight for layer in mlp.layers], [layer.bias for layer in mlp.layers]
 
 
 class FusedMLP(MLP):
-    """nerfstudio's `MLP(implementation="torch")` with ReLU, in parts that stay in the CPU's cache."""
+    """nerfstudio's `MLP(implementation="torch")`; with ReLU, in parts that stay in the CPU's cache."""
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether it is layers with ReLU between them, in torch."""
+        return self.tcnn_encoding is None and not self.skip_connections and isinstance(self.activation, nn.ReLU)
 
     def forward(self, in_tensor: Float[Tensor, "*bs in_dim"]) -> Float[Tensor, "*bs out_dim"]:
         """Apply the network."""
-        kernels = of_network(in_tensor, _parameters(self)[0])
-        if in_tensor.numel() == 0 or (kernels is None and not _in_parts(in_tensor)):
+        if in_tensor.numel() == 0 or not (self.is_plain and _in_parts(in_tensor)):
             return super().forward(in_tensor)
         flat = in_tensor.reshape(-1, in_tensor.shape[-1])
-        compute = network if kernels is None else kernels.network
-        result = compute(flat, *_parameters(self)).view(*in_tensor.shape[:-1], -1)
+        result = network(flat, *_parameters(self)).view(*in_tensor.shape[:-1], -1)
         return result if self.out_activation is None else self.out_activation(result)
-
-
-class FusedEncodedMLP(nn.Sequential):
-    """A hash encoding and the network behind it: one after the other, or in one kernel."""
-
-    def forward(self, input: Float[Tensor, "*bs 3"]) -> Float[Tensor, "*bs out_dim"]:
-        """Encode positions in 0..1 and apply the network."""
-        encoding, mlp = self
-        assert isinstance(encoding, FusedHashEncoding) and isinstance(mlp, FusedMLP)
-        weights, biases = _parameters(mlp)
-        table = encoding.hash_table
-        kernels = of_encoded_network(input, weights) if table.dtype == torch.float32 else None
-        if kernels is None or input.numel() == 0:
-            return super().forward(input)
-        flat, scalings = input.reshape(-1, 3), encoding.scalings.to(input.device, torch.float32)
-        result = kernels.encoded_network(flat, table, scalings, weights, biases).view(*input.shape[:-1], -1)
-        return result if mlp.out_activation is None else mlp.out_activation(result)
 
 
 def _contraction(device: torch.device) -> ModuleType | None:
@@ -151,10 +132,9 @@ class FusedDensityField(HashMLPDensityField):
         frustums = samples.frustums
         if torch.is_grad_enabled() or not isinstance(self.spatial_distortion, CubeContraction) or self.use_linear:
             return None
-        if type(self.mlp_base) is not FusedEncodedMLP or samples.deltas is None:
-            return None
         encoding, mlp = self.mlp_base
-        assert isinstance(encoding, FusedHashEncoding) and isinstance(mlp, FusedMLP)
+        if not (isinstance(encoding, FusedHashEncoding) and isinstance(mlp, FusedMLP)) or samples.deltas is None:
+            return None
         one_a_ray = _one_a_ray(frustums.origins) and _one_a_ray(frustums.directions)
         plain = _in_parts(frustums.origins) and encoding.hash_table.dtype == torch.float32
         plain = plain and frustums.offsets is None and mlp.out_activation is None
@@ -222,16 +202,13 @@ class FusedNerfactoField(NerfactoField):
                 results.append(self.get_outputs(samples, features[..., 1:], of_rays))
         return results
 
-    def render(
-        self, samples: RaySamples, places: RaySamples | None, behind: Behind, supervision: Supervision | None = None
-    ) -> Rendered:
+    def render(self, samples: RaySamples, points: RaySamples | None, background: Background) -> Rendered:
         """Render pixels on the CPU in one pass: from encoded positions through both networks, and along the rays.
 
         Args:
             samples: of the rays, [rays, samples]; `may_render` says whether this form serves them.
-            places: single points, [points, 1]; with `Behind.SINGLE_POINT` those behind the rays come first.
-            behind: what colours light that no sample stops.
-            supervision: what a batch tells of the pixels; then their losses are computed, too.
+            points: single points, [points, 1]; with `Background.POINT` those behind the rays come first.
+            background: what colours light that no sample stops.
 
         Returns:
             What `forward_together`, weights and nerfstudio's renderer give.
@@ -239,9 +216,9 @@ class FusedNerfactoField(NerfactoField):
         """
         from edge_depth_nerf.kernels.rendering_numba import render
 
-        parts = [samples, *([] if places is None else [places])]
+        parts = [samples, *([] if points is None else [points])]
         positions = torch.cat([each.frustums.get_positions().reshape(-1, 3) for each in parts])
-        points, inside = _unit_cube(self, positions)
+        places, inside = _unit_cube(self, positions)
         encoding, first = self.mlp_base.model
         assert isinstance(first, FusedMLP)
         weights, biases = _parameters(self.mlp_head)
@@ -254,21 +231,22 @@ class FusedNerfactoField(NerfactoField):
         networks = Networks(_parameters(first), ([of_features, *weights[1:]], biases), by_ray)
         rays, count = samples.frustums.shape
         deltas: Any = samples.deltas
-        pixels = deltas.view(rays, count), self.average_init_density, behind, supervision
-        return render(encoding(points), of_rays, networks, inside[:, 0], *pixels)
+        pixels = deltas.view(rays, count), self.average_init_density, background
+        return render(encoding(places), of_rays, networks, inside[:, 0], *pixels)
 
-    def may_render(self, samples: RaySamples, places: RaySamples | None) -> bool:
+    def may_render(self, samples: RaySamples, points: RaySamples | None) -> bool:
         """Whether `render` covers what this field has, for these samples."""
-        parts, deltas = [samples, *([] if places is None else [places])], samples.deltas
+        parts, deltas = [samples, *([] if points is None else [points])], samples.deltas
         more_heads = self.use_transient_embedding or self.use_semantics or self.use_pred_normals
         if more_heads or not isinstance(self.spatial_distortion, CubeContraction) or deltas is None:
             return False
-        if type(getattr(self.mlp_base, "model", None)) is not FusedEncodedMLP or type(self.mlp_head) is not FusedMLP:
+        encoding, first = self.mlp_base.model
+        if not all(isinstance(each, FusedMLP) and each.is_plain for each in (first, self.mlp_head)):
             return False
-        plain = self.mlp_base.model[1].out_activation is None and isinstance(self.mlp_head.out_activation, nn.Sigmoid)
+        plain = first.out_activation is None and isinstance(self.mlp_head.out_activation, nn.Sigmoid)
         cameras = self.embedding_appearance is None or all(each.camera_indices is not None for each in parts)
         one_a_ray = all(_one_a_ray(each.frustums.directions) for each in parts)
-        given = _in_parts(samples.frustums.origins) and self.mlp_base.model[0].hash_table.dtype == torch.float32
+        given = _in_parts(samples.frustums.origins) and encoding.hash_table.dtype == torch.float32
         return plain and cameras and one_a_ray and given and deltas.numel() > 0 and not deltas.requires_grad
 
     def _appearance(self, parts: Sequence[RaySamples]) -> Tensor:
@@ -308,7 +286,7 @@ class FusedNerfactoField(NerfactoField):
         directions, cameras = ray_samples.frustums.directions, ray_samples.camera_indices
         assert density_embedding is not None
         more_heads = self.use_transient_embedding or self.use_semantics or self.use_pred_normals
-        plain = isinstance(self.mlp_head, FusedMLP) and _by_network(density_embedding)
+        plain = isinstance(self.mlp_head, FusedMLP) and self.mlp_head.is_plain and _by_network(density_embedding)
         if more_heads or cameras is None or not _one_a_ray(directions) or not plain:
             return super().get_outputs(ray_samples, density_embedding)
         of_rays = encoded
@@ -332,30 +310,3 @@ class FusedNerfactoField(NerfactoField):
             colours = network(features, [of_features, *weights[1:]], [shared, *biases[1:]])
         # float32 also where autocast had it otherwise, as nerfstudio's
         return {FieldHeadNames.RGB: torch.sigmoid(colours).view(directions.shape).to(directions)}
-
-
-FUSED: dict[type[nn.Module], type[nn.Module]] = {
-    MLP: FusedMLP,
-    HashMLPDensityField: FusedDensityField,
-    NerfactoField: FusedNerfactoField,
-}
-
-
-def use_fused_fields(module: nn.Module, sum_later: bool = True) -> None:
-    """Let all fields, networks and hash encodings below `module` compute in fused forms.
-
-    In place; parameters stay the same objects.
-
-    Args:
-        module: whose parts change.
-        sum_later: as for `use_fused_encodings`.
-
-    """
-    use_fused_encodings(module, sum_later)
-    for part in module.modules():
-        if type(part) in FUSED and not (isinstance(part, MLP) and not _is_plain(part)):
-            # the class alone differs; another object would have to be found by all who hold this one
-            part.__class__ = FUSED[type(part)]  # pyright: ignore[reportAttributeAccessIssue]
-    for part in module.modules():
-        if type(part) is nn.Sequential and [type(each) for each in part] == [FusedHashEncoding, FusedMLP]:
-            part.__class__ = FusedEncodedMLP

@@ -37,18 +37,12 @@ class FusedHashEncoding(HashEncoding):
         return encoded.view(*in_tensor.shape[:-1], self.get_out_dim())
 
 
-def use_fused_encodings(module: nn.Module, sum_later: bool = True) -> None:
-    """Let all hash encodings below `module` compute in the fused form; in place, parameters stay the same objects.
+def sum_tables_later(module: nn.Module) -> None:
+    """Let optimisers sum up the gradients of all hash tables below `module`, if they can.
 
-    Args:
-        module: whose encodings change.
-        sum_later: whether an optimiser may sum up the gradients of their tables later. Not where, within a step,
-            `torch.autograd.grad` asks for the gradient by positions: backward cannot tell that from a step's own.
-
+    Not where, within a step, `torch.autograd.grad` asks for the gradient by positions: backward cannot tell that from
+    a step's own.
     """
     for part in module.modules():
-        if type(part) is HashEncoding:
-            # the class alone differs; another object would have to be found by all who hold this one
-            part.__class__ = FusedHashEncoding
-            if sum_later:
-                setattr(part.hash_table, SUMS_LATER, False)  # until an optimiser says that it can do with it
+        if isinstance(part, FusedHashEncoding):
+            setattr(part.hash_table, SUMS_LATER, False)  # until an optimiser says that it can do with it

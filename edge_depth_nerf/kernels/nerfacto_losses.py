@@ -34,7 +34,7 @@ def distortion_loss(edges: Float[Tensor, "rays edges"], weights: Float[Tensor, "
     return (between + within).mean()
 
 
-def proposal_loss(
+def interlevel_loss(
     edges: Float[Tensor, "rays edges"],
     weights: Float[Tensor, "rays samples"],
     proposal_edges: Float[Tensor, "rays proposal_edges"],

@@ -17,7 +17,7 @@ from nerfstudio.model_components.ray_samplers import (
     ProposalNetworkSampler,
     UniformLinDispPiecewiseSampler,
 )
-from torch import Tensor, nn
+from torch import Tensor
 
 from edge_depth_nerf.kernels.back_ends import along_rays, by_number
 
@@ -118,10 +118,17 @@ class FusedPDFSampler(PDFSampler):
 
 
 class FusedProposalSampler(ProposalNetworkSampler):
-    """nerfstudio's sampler; a network that rests gives the weights of its samples at once, where it can."""
+    """nerfstudio's sampler with the samplers above; a network that rests gives the weights of its samples at once."""
 
-    weigh: Sequence[Callable[[RaySamples], Tensor | None]]
-    """For each round of proposals, the function that does so; it gives None where it cannot."""
+    networks: Sequence[Any] = ()
+    """For each round of proposals its network; with a method `weigh`, which gives None where it cannot."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        pdf = self.pdf_sampler
+        self.pdf_sampler = FusedPDFSampler(include_original=pdf.include_original, single_jitter=pdf.single_jitter)
+        if isinstance(self.initial_sampler, UniformLinDispPiecewiseSampler):
+            self.initial_sampler = FirstSampler(single_jitter=self.initial_sampler.single_jitter)
 
     def generate_ray_samples(
         self, ray_bundle: RayBundle | None = None, density_fns: list[Callable[..., Any]] | None = None
@@ -135,7 +142,7 @@ class FusedProposalSampler(ProposalNetworkSampler):
         counts = [*self.num_proposal_samples_per_ray, self.num_nerf_samples_per_ray]
         for level in range(self.num_proposal_network_iterations):
             with torch.set_grad_enabled(learns and torch.is_grad_enabled()):
-                weights = self.weigh[level](samples)
+                weights = self.networks[level].weigh(samples) if self.networks else None
                 if weights is None:
                     weights = samples.get_weights(density_fns[level](samples.frustums.get_positions()))
             every.append(samples)
@@ -145,21 +152,6 @@ class FusedProposalSampler(ProposalNetworkSampler):
         if learns:
             self._steps_since_update = 0
         return samples, weights_of_every, every
-
-
-def use_fused_proposals(sampler: ProposalNetworkSampler, networks: Sequence[Any]) -> None:
-    """Let a sampler ask networks that rest for weights at once; in place.
-
-    Args:
-        sampler: nerfstudio's.
-        networks: for each round of proposals its own, or the one of all rounds.
-
-    """
-    if type(sampler) is ProposalNetworkSampler and all(hasattr(network, "weigh") for network in networks):
-        # the class alone differs
-        sampler.__class__ = FusedProposalSampler
-        assert isinstance(sampler, FusedProposalSampler)
-        sampler.weigh = [network.weigh for network in networks]
 
 
 def edges_of(samples: RaySamples) -> Tensor:
@@ -247,14 +239,14 @@ def samples_along(
     nerfstudio looks up the common shape of all fields and brings them there, twice: half a millisecond.
 
     Args:
-        rays: a row of rays; of any other shape nerfstudio's are made fused.
+        rays: a row of rays; of any other shape the samples are nerfstudio's.
         starts: distances along the rays, scene units.
         ends: likewise.
         more: other fields of the samples, of their shape.
 
     """
     if rays.origins.ndim != 2 or any(isinstance(each, dict) for each in rays.metadata.values()):
-        return fused(rays.get_ray_samples(bin_starts=starts, bin_ends=ends, **more))
+        return rays.get_ray_samples(bin_starts=starts, bin_ends=ends, **more)
     shape = len(rays), starts.shape[1]
 
     def of_rays(values: Tensor) -> Tensor:
@@ -280,19 +272,3 @@ def samples_along(
         times=None if rays.times is None else of_rays(rays.times),
         **more,
     )
-
-
-def fused(samples: RaySamples) -> RaySamples:
-    """Let samples compute weights and positions in the fused form; in place."""
-    # the classes alone differ
-    samples.__class__, samples.frustums.__class__ = FusedRaySamples, FusedFrustums
-    return samples
-
-
-def _given_fused(_: nn.Module, __: Any, samples: RaySamples) -> RaySamples:
-    return fused(samples)
-
-
-def use_fused_samples(sampler: nn.Module) -> None:
-    """Let the samples that a sampler gives compute in the fused form; in place."""
-    sampler.register_forward_hook(_given_fused)

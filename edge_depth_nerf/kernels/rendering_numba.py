@@ -1,13 +1,11 @@
-"""From encoded positions to pixels and their losses on the CPU, in one pass over shares of the rays.
+"""From encoded positions to pixels on the CPU, in one pass over shares of the rays.
 
 Of each sample the networks give four numbers: one for the density, three for the colour. The density is
 d = scale exp(first) inside the scene and 0 outside, and the weights are w_k = (1 - exp(-d_k δ_k)) exp(-Σ_j<k d_j δ_j).
-The colours c_k are the sigmoid of the other numbers. A pixel is Σ w_k c_k, plus (1 - Σ w_k) times what is behind, times
-the gain of its picture. In training the same pass holds colours and weights against what the batch tells of them.
+The colours c_k are the sigmoid of the other numbers. A pixel is Σ w_k c_k, plus (1 - Σ w_k) times its background.
 The gradient comes from a second pass, along the rays and back through the networks, which computes densities, colours
-and layers again: that is faster than to write them to memory and read them. What a weight would change Eq. 4 and the
-distortion loss by is kept from the first pass. A tile of points passes all layers of both networks, so that what stands
-between them is never in memory; a thread takes the points of its rays through all of it.
+and layers again: that is faster than to write them to memory and read them. A tile of points passes all layers of both
+networks, so that what stands between them is never in memory; a thread takes the points of its rays through all of it.
 
 Pure. Importing this module imports Numba.
 """
@@ -23,16 +21,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from edge_depth_nerf.kernels.compiled import compiled, flat
-from edge_depth_nerf.kernels.edge_loss_numba import edge_loss_of_ray, has_prior
 from edge_depth_nerf.kernels.exponential_numba import exp
 from edge_depth_nerf.kernels.network_numba import Arrays, Slopes, writes_forward
-from edge_depth_nerf.kernels.pointwise_numba import STEEPEST, flat_rows
-from edge_depth_nerf.kernels.ray_numba import distortion_of_ray
-from edge_depth_nerf.kernels.rendering import Behind, Losses, Networks, Rendered, Supervision
+from edge_depth_nerf.kernels.pointwise_numba import STEEPEST
+from edge_depth_nerf.kernels.rendering import Background, Networks, Rendered
 from edge_depth_nerf.kernels.threads import in_parts
 
 ZERO, ONE = np.float32(0), np.float32(1)
-LAST_SAMPLE, SINGLE_POINT = int(Behind.LAST_SAMPLE), int(Behind.SINGLE_POINT)
+LAST_SAMPLE, POINT = int(Background.LAST_SAMPLE), int(Background.POINT)
 LEAST_SHARE = 1 << 11
 """A thread gets at least so many points."""
 
@@ -44,60 +40,20 @@ class _Given(NamedTuple):
     inside: Any
     deltas: Any
     scale: np.float32
-    behind: int
+    background: int
     rays: int
     samples: int
-    singles: int
-
-
-class _Told(NamedTuple):
-    """`Supervision` for the kernels, flat; rows of matrices lie `..._stride` numbers apart."""
-
-    is_there: bool
-    image: Any
-    counts: Any
-    gains: Any
-    pictures: Any
-    edges: Any
-    edge_stride: int
-    starts: Any
-    start_stride: int
-    ends: Any
-    end_stride: int
-    prior: Any
-    sigma: Any
-    sky: Any
-    metres_per_unit: np.float32
-    eps: np.float32
-    narrow: np.float32
-    interval: bool
-    norm: bool
+    single: int
+    """Points that are no samples."""
 
 
 class _Gradients(NamedTuple):
-    """Of what was rendered, flat and empty where there is none; of each loss by one ray, pixel or colour."""
+    """Of what was rendered, flat and empty where there is none."""
 
     rgb: Any
     accumulation: Any
     weights: Any
-    further: Any
-    colour: Any
-    surface: Any
-    edge: Any
-    distortion: Any
-    sky: Any
-
-
-class _Sums(NamedTuple):
-    """Over rays or pixels: losses, and how many have a prior or the sky."""
-
-    colour: float
-    surface: float
-    edge: float
-    distortion: float
-    sky: float
-    priors: int
-    skies: int
+    point_rgb: Any
 
 
 @compiled(error_model="numpy")
@@ -121,44 +77,20 @@ def _sum_depths(before, inside, delta, scale, densities, depths, reached):
 
 @compiled()
 @no_type_check
-def _further(given, first, last):
-    """Give where the points begin that are not behind a ray, and which of them a part of the rays takes."""
-    begin = given.rays * given.samples + (given.rays if given.behind == SINGLE_POINT else 0)
-    count = given.rays * given.samples + given.singles - begin
+def _own_points(given, first, last):
+    """Give where the points begin that are no background, and which of them a part of the rays takes."""
+    begin = given.rays * given.samples + (given.rays if given.background == POINT else 0)
+    count = given.rays * given.samples + given.single - begin
     return begin, count * first // given.rays, count * last // given.rays
 
 
 @compiled(error_model="numpy")
 @no_type_check
-def _render_further(given, told, further, first, last):
-    """Write the colours of the points that are not behind a ray; give the sum of their loss."""
-    rays, points = given.rays, given.rays * given.samples + given.singles
-    begin, from_point, to_point = _further(given, first, last)
-    for c in range(3):
-        plane = given.values[(c + 1) * points + begin :]
-        for k in range(from_point, to_point):
-            further[3 * k + c] = _sigmoid(plane[k])
-    loss = 0.0
-    if told.is_there:
-        for k in range(from_point, to_point):
-            gains = told.gains[3 * told.pictures[rays + k] :]
-            for c in range(3):
-                further[3 * k + c] *= gains[c]
-                if told.counts[k]:
-                    off = further[3 * k + c] - told.image[3 * (rays + k) + c]
-                    loss += off * off
-    return loss
-
-
-@compiled(error_model="numpy")
-@no_type_check
-def _render(given, told, rgb, accumulation, weights, further, edge_slopes, distortion_slopes, first, last):
-    values, rays, samples, behind = given.values, given.rays, given.samples, given.behind
-    points, begin_of_singles = rays * samples + given.singles, rays * samples
+def _render(given, rgb, accumulation, weights, point_rgb, first, last):
+    values, rays, samples, background = given.values, given.rays, given.samples, given.background
+    points, begin_of_single = rays * samples + given.single, rays * samples
     densities, depths, reached = (np.empty(samples, np.float32), np.empty(samples, np.float32),
                                   np.empty(samples, np.float32))  # fmt: skip
-    before = np.empty(samples, np.float64)
-    of_colour, of_edge, of_distortion, of_sky, priors, skies = 0.0, 0.0, 0.0, 0.0, 0, 0
     for ray in range(first, last):
         begin = ray * samples
         weight = weights[begin:]
@@ -171,20 +103,6 @@ def _render(given, told, rgb, accumulation, weights, further, edge_slopes, disto
         for k in range(samples):
             hit += weight[k]
         accumulation[ray] = hit
-        if told.is_there:
-            of_distortion += distortion_of_ray(
-                told.edges[ray * told.edge_stride :], weight, distortion_slopes[begin:], before, samples, True
-            )
-            if has_prior(told.prior[ray], told.sigma[ray]):
-                priors += 1
-                of_edge += edge_loss_of_ray(
-                    weight, told.starts[ray * told.start_stride :], told.ends[ray * told.end_stride :],
-                    told.prior[ray], told.sigma[ray], edge_slopes[begin:], samples,
-                    told.metres_per_unit, told.eps, told.narrow, told.interval, told.norm, True,
-                )  # fmt: skip
-            if told.sky[ray]:
-                skies += 1
-                of_sky += hit
         for c in range(3):
             plane = values[(c + 1) * points :]
             of_ray = plane[begin:]
@@ -193,46 +111,23 @@ def _render(given, told, rgb, accumulation, weights, further, edge_slopes, disto
             total = 0.0
             for k in range(samples):
                 total += depths[k]
-            if behind == LAST_SAMPLE:
+            if background == LAST_SAMPLE:
                 total += (1 - hit) * _sigmoid(of_ray[samples - 1])
-            elif behind == SINGLE_POINT:
-                total += (1 - hit) * _sigmoid(plane[begin_of_singles + ray])
-            if told.is_there:
-                total *= told.gains[3 * told.pictures[ray] + c]
-                off = total - told.image[3 * ray + c]
-                of_colour += off * off
+            elif background == POINT:
+                total += (1 - hit) * _sigmoid(plane[begin_of_single + ray])
             rgb[3 * ray + c] = total
-    of_surface = _render_further(given, told, further, first, last)
-    return of_colour, of_surface, of_edge, of_distortion, of_sky, priors, skies
+    begin, from_point, to_point = _own_points(given, first, last)
+    for c in range(3):
+        plane = values[(c + 1) * points + begin :]
+        for k in range(from_point, to_point):
+            point_rgb[3 * k + c] = _sigmoid(plane[k])
 
 
 @compiled(error_model="numpy")
 @no_type_check
-def _further_gradients(given, told, further, gradients, to_values, to_gains, first, last):
-    rays, points = given.rays, given.rays * given.samples + given.singles
-    begin, from_point, to_point = _further(given, first, last)
-    for k in range(from_point, to_point):
-        # single points have no density
-        to_values[begin + k] = ZERO
-        for c in range(3):
-            g, gain = gradients.further[3 * k + c] if len(gradients.further) else ZERO, ONE
-            if told.is_there:
-                picture = 3 * told.pictures[rays + k] + c
-                gain = told.gains[picture]
-                if told.counts[k]:
-                    g += gradients.surface * (further[3 * k + c] - told.image[3 * (rays + k) + c])
-                to_gains[picture] += g * further[3 * k + c] / gain
-            # the sigmoid's slope by its value, c (1 - c) with c = further / gain
-            to_values[(c + 1) * points + begin + k] = g * further[3 * k + c] * (ONE - further[3 * k + c] / gain)
-
-
-@compiled(error_model="numpy")
-@no_type_check
-def _all_gradients(
-    given, told, rgb, further, edge_slopes, distortion_slopes, gradients, to_values, to_gains, steepest, first, last
-):
-    values, rays, samples, behind = given.values, given.rays, given.samples, given.behind
-    points, begin_of_singles = rays * samples + given.singles, rays * samples
+def _all_gradients(given, point_rgb, gradients, to_values, steepest, first, last):
+    values, rays, samples, background = given.values, given.rays, given.samples, given.background
+    points, begin_of_single = rays * samples + given.single, rays * samples
     densities, depths, reached = (np.empty(samples, np.float32), np.empty(samples, np.float32),
                                   np.empty(samples, np.float32))  # fmt: skip
     weight, of_weight = np.empty(samples, np.float32), np.empty(samples, np.float32)
@@ -249,21 +144,10 @@ def _all_gradients(
             hit += weight[k] if weight[k] == weight[k] else ZERO
         left = np.float32(1 - hit)
         to_hit = gradients.accumulation[ray] if len(gradients.accumulation) else ZERO
-        if told.is_there and told.sky[ray]:
-            to_hit += gradients.sky
         for k in range(samples):
             of_weight[k] = gradients.weights[begin + k] if len(gradients.weights) else ZERO
-        if told.is_there:
-            edge_slope, distortion_slope = edge_slopes[begin:], distortion_slopes[begin:]
-            for k in range(samples):
-                of_weight[k] += gradients.edge * edge_slope[k] + gradients.distortion * distortion_slope[k]
         for c in range(3):
             g = gradients.rgb[3 * ray + c] if len(gradients.rgb) else ZERO
-            if told.is_there:
-                picture = 3 * told.pictures[ray] + c
-                g += gradients.colour * (rgb[3 * ray + c] - told.image[3 * ray + c])
-                to_gains[picture] += g * rgb[3 * ray + c] / told.gains[picture]
-                g *= told.gains[picture]
             plane, to_plane = values[(c + 1) * points :], to_values[(c + 1) * points :]
             of_ray, into_ray = plane[begin:], to_plane[begin:]
             for k in range(samples):
@@ -271,16 +155,16 @@ def _all_gradients(
                 of_weight[k] += g * colour
                 own = weight[k] if weight[k] == weight[k] else ZERO
                 into_ray[k] = g * own * colour * (ONE - colour)
-            if behind == LAST_SAMPLE:
+            if background == LAST_SAMPLE:
                 colour = _sigmoid(of_ray[samples - 1])
                 into_ray[samples - 1] += g * left * colour * (ONE - colour)
                 to_hit -= g * colour
-            elif behind == SINGLE_POINT:
-                colour = _sigmoid(plane[begin_of_singles + ray])
-                to_plane[begin_of_singles + ray] = g * left * colour * (ONE - colour)
+            elif background == POINT:
+                colour = _sigmoid(plane[begin_of_single + ray])
+                to_plane[begin_of_single + ray] = g * left * colour * (ONE - colour)
                 to_hit -= g * colour
-        if behind == SINGLE_POINT:
-            to_values[begin_of_singles + ray] = ZERO
+        if background == POINT:
+            to_values[begin_of_single + ray] = ZERO
         # Σ_j>k g_j w_j, of what lies behind each sample; 0 times what is not a number is none: a broken training shows
         after = 0.0
         for k in range(samples - 1, -1, -1):
@@ -291,63 +175,13 @@ def _all_gradients(
             slope = most * within[k] if before[k] > steepest else densities[k]
             slope = least * within[k] if before[k] < -steepest else slope
             into[k] = to_density * slope
-    _further_gradients(given, told, further, gradients, to_values, to_gains, first, last)
-
-
-def _nothing() -> Supervision:
-    """Give supervision that tells nothing."""
-    numbers, truths, matrix = torch.empty(0), torch.empty(0, dtype=torch.bool), torch.empty(0, 0)
-    return Supervision(
-        image=torch.empty(0, 3),
-        counts=truths,
-        gains=torch.empty(0, 3),
-        pictures=torch.empty(0, dtype=torch.int64),
-        edges=matrix,
-        starts=matrix,
-        ends=matrix,
-        prior_m=numbers,
-        sigma_m=numbers,
-        sky=truths,
-        metres_per_unit=1.0,
-        interval=False,
-        divide_by_norm=False,
-        eps=0.0,
-        narrow=0.0,
-    )
-
-
-def _for_kernels(supervision: Supervision | None) -> _Told:
-    """Give arrays of what is told, empty ones if nothing is."""
-    told = _nothing() if supervision is None else supervision
-    (edges, edge_stride), (starts, start_stride), (ends, end_stride) = map(
-        flat_rows, (told.edges, told.starts, told.ends)
-    )
-    return _Told(
-        is_there=supervision is not None,
-        image=flat(told.image),
-        counts=flat(told.counts),
-        gains=flat(told.gains),
-        pictures=flat(told.pictures),
-        edges=edges,
-        edge_stride=edge_stride,
-        starts=starts,
-        start_stride=start_stride,
-        ends=ends,
-        end_stride=end_stride,
-        prior=flat(told.prior_m),
-        sigma=flat(told.sigma_m),
-        sky=flat(told.sky),
-        metres_per_unit=np.float32(told.metres_per_unit),
-        eps=np.float32(told.eps),
-        narrow=np.float32(told.narrow),
-        interval=told.interval,
-        norm=told.divide_by_norm,
-    )
-
-
-def _sum_of(parts: dict[int, tuple[float | int, ...]]) -> _Sums:
-    """Sum up what the parts gave, in the order of the rays, whichever thread was ready first: always the same sum."""
-    return _Sums(*(sum(numbers) for numbers in zip(*(parts[first] for first in sorted(parts)), strict=True)))
+    begin, from_point, to_point = _own_points(given, first, last)
+    for k in range(from_point, to_point):
+        # single points have no density
+        to_values[begin + k] = ZERO
+        for c in range(3):
+            g, colour = gradients.point_rgb[3 * k + c] if len(gradients.point_rgb) else ZERO, point_rgb[3 * k + c]
+            to_values[(c + 1) * points + begin + k] = g * colour * (ONE - colour)
 
 
 class _Part(NamedTuple):
@@ -409,9 +243,9 @@ def _stretches(part: _Part, given: _Given, first: int, last: int) -> list[tuple[
     """Give which points of a part belong to rays from `first` to `last`."""
     if part.begin == 0:
         return [(first * given.samples, last * given.samples)]
-    behind = [(first, last)] if given.behind == SINGLE_POINT else []
-    begin, from_point, to_point = _further(given, first, last)
-    return [*behind, (begin - part.begin + from_point, begin - part.begin + to_point)]
+    background = [(first, last)] if given.background == POINT else []
+    begin, from_point, to_point = _own_points(given, first, last)
+    return [*background, (begin - part.begin + from_point, begin - part.begin + to_point)]
 
 
 class _Pass(torch.autograd.Function):
@@ -421,87 +255,64 @@ class _Pass(torch.autograd.Function):
         x: Tensor,
         of_rays: Tensor,
         by_ray: Tensor,
-        gains: Tensor | None,
         joint: int,
-        more: tuple[Tensor, Tensor, float, Behind, Supervision | None],
+        more: tuple[Tensor, Tensor, float, Background],
         *parameters: Tensor,
     ) -> tuple[Tensor, ...]:
-        inside, deltas, scale, behind, supervision = more
+        inside, deltas, scale, background = more
         (rays, samples), points = deltas.shape, len(x)
-        singles = points - rays * samples
-        further = singles - (rays if behind == Behind.SINGLE_POINT else 0)
-        rendered = torch.empty(rays, 3), torch.empty(rays, 1), torch.empty(rays, samples), torch.empty(further, 3)
-        slopes = [np.zeros(0 if supervision is None else deltas.numel(), np.float32) for _ in range(2)]
+        single = points - rays * samples
+        own = single - (rays if background == Background.POINT else 0)
+        rendered = torch.empty(rays, 3), torch.empty(rays, 1), torch.empty(rays, samples), torch.empty(own, 3)
         values = flat(torch.empty(4, points))
-        given = _Given(values, flat(inside), flat(deltas), np.float32(scale), int(behind), rays, samples, singles)
-        told = _for_kernels(supervision)
+        given = _Given(values, flat(inside), flat(deltas), np.float32(scale), int(background), rays, samples, single)
         parts = _parts(x, of_rays, deltas.shape, joint, by_ray, parameters, ctx.needs_input_grad[1])
         networks = [(part, writes_forward(part.net, values[part.begin :], points)) for part in parts]
-        arrays = given, told, *(flat(each) for each in rendered), *slopes
-        sums: dict[int, tuple[float | int, ...]] = {}
+        arrays = given, *(flat(each) for each in rendered)
 
         def work(first: int, last: int) -> None:
             for part, apply in networks:
                 for stretch in _stretches(part, given, first, last):
                     apply(*stretch)
-            sums[first] = _render(*arrays, first, last)
+            _render(*arrays, first, last)
 
         in_parts(work, rays, _least_rays(given))
-        ctx.given, ctx.told, ctx.slopes, ctx.parts, ctx.joint = given, told, slopes, parts, joint
+        ctx.given, ctx.parts, ctx.joint = given, parts, joint
         ctx.set_materialize_grads(False)
         # finds out if they were changed since
-        ctx.save_for_backward(rendered[0], rendered[3], x, of_rays, by_ray, *parameters)
-        if supervision is None:
-            return rendered
-        total = _sum_of(sums)
-        ctx.over = 3 * rays, 3 * max(1, further), max(1, total.priors), rays, max(1, total.skies)
-        losses = (torch.tensor(each / over, dtype=torch.float32) for each, over in zip(total, ctx.over, strict=False))
-        return *rendered, *losses
+        ctx.save_for_backward(rendered[3], x, of_rays, by_ray, *parameters)
+        return rendered
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        rgb, further, x, of_rays, by_ray, *parameters = ctx.saved_tensors
-        given, told = ctx.given, ctx.told
+        point_rgb, x, of_rays, by_ray, *parameters = ctx.saved_tensors
+        given = ctx.given
         points = len(x)
-        to_rendered = [np.empty(0, np.float32) if each is None else flat(each) for each in gradients[:4]]
-        to_losses = [ZERO] * 5
-        if told.is_there:
-            # a squared error has the slope of twice the error
-            factors = 2, 2, 1, 1, 1
-            to_losses = [
-                ZERO if each is None else np.float32(factor * float(each) / over)
-                for each, factor, over in zip(gradients[4:], factors, ctx.over, strict=True)
-            ]
+        to_rendered = _Gradients(*(np.empty(0, np.float32) if each is None else flat(each) for each in gradients))
         to_values = flat(torch.empty(4, points))
-        arrays = given, told, flat(rgb), flat(further), *ctx.slopes, _Gradients(*to_rendered, *to_losses), to_values
-        steepest = np.float32(STEEPEST)
+        arrays = given, flat(point_rgb), to_rendered, to_values, np.float32(STEEPEST)
         # input after input in memory, as the hash grid's backward wants it
         to_x = x.new_empty(x.shape[::-1] if ctx.needs_input_grad[0] else (0, 0))
         slopes = [Slopes(part.net, to_values[part.begin :], points, flat(to_x)[part.begin :]) for part in ctx.parts]
-        to_gains: dict[int, np.ndarray] = {}
         sums: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
 
         def work(first: int, last: int) -> None:
-            to_gains[first], sums[first] = np.zeros(len(told.gains)), [each.nothing() for each in slopes]
-            _all_gradients(*arrays, to_gains[first], steepest, first, last)
+            sums[first] = [each.nothing() for each in slopes]
+            _all_gradients(*arrays, first, last)
             for part, of_part, own in zip(ctx.parts, slopes, sums[first], strict=True):
                 for stretch in _stretches(part, given, first, last):
                     of_part.add(own, *stretch)
 
         in_parts(work, given.rays, _least_rays(given))
-        order = sorted(sums)
-        every = zip(slopes, zip(*(sums[first] for first in order), strict=True), strict=True)
+        # in the order of the rays, whichever thread was ready first: always the same sum
+        every = zip(slopes, zip(*(sums[first] for first in sorted(sums)), strict=True), strict=True)
         totals = [of_part.total(own) for of_part, own in every]
         to_rays, to_parameters = _to_networks(ctx, totals, of_rays, by_ray, parameters)
-        of_gains = None
-        if told.is_there and ctx.needs_input_grad[3]:
-            of_gains = torch.from_numpy(sum(to_gains[first] for first in order)).to(torch.float32).view(-1, 3)
         return (
             to_x.t() if ctx.needs_input_grad[0] else None,
             to_rays,
             to_parameters[0],
-            of_gains,
             None,
             None,
             *to_parameters[1:],
@@ -540,7 +351,7 @@ def _to_networks(
 
 def _least_rays(given: _Given) -> int:
     """How many rays a thread gets at least."""
-    return max(1, LEAST_SHARE * given.rays // (given.rays * given.samples + given.singles))
+    return max(1, LEAST_SHARE * given.rays // (given.rays * given.samples + given.single))
 
 
 def render(
@@ -550,13 +361,12 @@ def render(
     inside: Float[Tensor, "points"],
     deltas: Float[Tensor, "rays samples"],
     scale: float,
-    behind: Behind,
-    supervision: Supervision | None = None,
+    background: Background,
 ) -> Rendered:
     """Render pixels from encoded positions of the samples of rays, and of single points after them.
 
     Args:
-        x: float32. First come all samples, ray by ray, then any single points; with `Behind.SINGLE_POINT` those of the
+        x: float32. First come all samples, ray by ray, then any single points; with `Background.POINT` those of the
             rays come before others.
         of_rays: what the second network gets beside the first one's outputs: for each ray, then each single point.
         networks: from encoded positions to density and colour; the density is `scale` times e to the power of the
@@ -564,20 +374,16 @@ def render(
         inside: 1 where a point is inside the scene, else 0.
         deltas: the samples' lengths; one ray at least.
         scale: the density of an output of 0.
-        behind: what colours light that no sample stops.
-        supervision: what a batch tells of the pixels.
+        background: what colours light that no sample stops.
 
     Returns:
-        Weights that are not a number are 0, as in nerfstudio. Differentiable once, by x, of_rays, the networks and the
-        gains.
+        Weights that are not a number are 0, as in nerfstudio. Differentiable once, by x, of_rays and the networks.
 
     """
     layers, biases = ([*networks.first[k], *networks.second[k]] for k in range(2))
     parameters = [each for pair in zip(layers, biases, strict=True) for each in pair]
-    gains = None if supervision is None else supervision.gains
-    more = inside, deltas, scale, behind, supervision
+    more = inside, deltas, scale, background
     x, of_rays, joint = x.contiguous(), of_rays.contiguous(), len(networks.first[0])
-    found = _Pass.apply(x, of_rays, networks.by_ray, gains, joint, more, *parameters)
-    assert isinstance(found, tuple)
-    rgb, accumulation, weights, further, *losses = found
-    return Rendered(rgb, accumulation, weights, further, Losses(*losses) if losses else None)
+    rendered = _Pass.apply(x, of_rays, networks.by_ray, joint, more, *parameters)
+    assert isinstance(rendered, tuple)
+    return Rendered(*rendered)

@@ -7,7 +7,7 @@ and its detail is kept until the model changes.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Protocol
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
         config: Any
         camera_optimizer: Any
+        field: Any
         exposure: Any
 
         @property
@@ -40,10 +41,6 @@ if TYPE_CHECKING:
             """Outputs of a whole view without detail."""
             ...
 
-        def with_appearance_of(self, picture: int) -> AbstractContextManager[None]:
-            """Render as a training picture looks."""
-            ...
-
 
 PICTURES = 8
 """So many training pictures, those that see most of a view, add their detail to it."""
@@ -53,6 +50,24 @@ MOST_BYTES = 1 << 30
 """Details in memory, all together; one more than a view needs at least."""
 BYTES_A_PIXEL = 8
 _shown: ContextVar[bool | None] = ContextVar("detail_shown", default=None)
+
+
+@contextmanager
+def with_appearance_of(field: Any, picture: int) -> Iterator[None]:
+    """With nerfacto's appearance embedding, let a field look as a training picture; else nothing changes."""
+    embedding: Any = field.embedding_appearance
+    if embedding is None:
+        yield
+        return
+    averages = field.use_average_appearance_embedding
+    try:
+        # what both forms of the field ask for at evaluation
+        embedding.mean = lambda dim: embedding.embedding.weight[picture]
+        field.use_average_appearance_embedding = True
+        yield
+    finally:
+        vars(embedding).pop("mean", None)
+        field.use_average_appearance_embedding = averages
 
 
 @contextmanager
@@ -124,7 +139,7 @@ class TrainingDetail:
         usable = torch.from_numpy(self.dataset.mask(number)).to(model.device)
         camera = self.dataset.cameras[number : number + 1].to(model.device)
         camera.camera_to_worlds = self._poses()[number : number + 1]
-        with torch.no_grad(), model.with_appearance_of(number):
+        with torch.no_grad(), with_appearance_of(model.field, number):
             outputs = model.rendered_alone(camera)
             rgb, distance = outputs["rgb"].to(model.device), outputs["depth"][..., 0].to(model.device)
             beyond = image - rgb if model.exposure is None else model.exposure.beyond(image, rgb, number)

@@ -85,7 +85,6 @@ class EdgeDepthPipeline(VanillaPipeline):
                 f"{FARTHEST_UNITS:g} float32 cannot distinguish the samples along a ray. Lower "
                 "--pipeline.model.far-m, or leave --pipeline.datamanager.dataparser.metres-per-unit at its default."
             )
-        manager.serves_places = model.exposure == "grid"
         sampler = manager.train_pixel_sampler
         if model.depth_loss != "none" and sampler is not None and sampler.table.share_with_prior == 0:
             raise InputError(
@@ -104,20 +103,14 @@ class EdgeDepthPipeline(VanillaPipeline):
         """Load a checkpoint as nerfstudio does.
 
         Raises:
-            InputError: it is of another implementation; nerfstudio would load what fits, and say nothing of the rest.
+            InputError: it is of tiny-cuda-nn; nerfstudio would load what fits, and say nothing of the rest.
 
         """
         # tiny-cuda-nn keeps table and network in one parameter
-        tables = [any(key.endswith(".hash_table") for key in keys) for keys in (loaded_state, self.model.state_dict())]
-        if tables[0] and not tables[1]:
+        if not any(key.endswith(".hash_table") for key in loaded_state):
             raise InputError(
-                "This checkpoint was made without tiny-cuda-nn, which the model uses here. Choose "
-                "--pipeline.model.implementation fused (in a config.yml: implementation: fused)."
-            )
-        if tables[1] and not tables[0]:
-            raise InputError(
-                "This checkpoint was made with tiny-cuda-nn: to be loaded it needs a GPU, tiny-cuda-nn, and "
-                "--pipeline.model.implementation tcnn (in a config.yml: implementation: tcnn)."
+                "This checkpoint has no hash tables: it was made with tiny-cuda-nn, which keeps them in another form. "
+                "Train again; the fused kernels need no tiny-cuda-nn and are faster."
             )
         super().load_pipeline(loaded_state, step)
 

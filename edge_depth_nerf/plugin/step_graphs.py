@@ -17,15 +17,19 @@ from __future__ import annotations
 
 import copy
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import torch
+from jaxtyping import Float
+from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
+from edge_depth_nerf.plugin.step_losses import PriorLoss
 
 EAGER_STEPS = 20
 """So many steps are taken first without a graph: kernels are compiled and measured, the scaler is made."""
@@ -88,6 +92,28 @@ class _Gradients(torch.autograd.Function):
         return None, None, None, None
 
 
+def schedule(model: EdgeDepthNerfModel) -> tuple[float, float]:
+    """Give what differs between steps: λ, and the exponent by which the sampler's weights are annealed."""
+    return float(model.depth_weight()), float(model.proposal_sampler._anneal)
+
+
+@contextmanager
+def scheduled_by(model: EdgeDepthNerfModel, numbers: Float[Tensor, "2"]) -> Iterator[None]:
+    """Let a model take what `schedule` gives from a tensor, where it can change without the host."""
+    sampler: Any = model.proposal_sampler
+    before = sampler._anneal
+    model.scheduled_weight, sampler._anneal = numbers[0], numbers[1]
+    try:
+        yield
+    finally:
+        model.scheduled_weight, sampler._anneal = None, before
+
+
+def updates_proposals(sampler: ProposalNetworkSampler) -> bool:
+    """Whether the next step trains the proposal networks, as nerfstudio's sampler decides it."""
+    return sampler._steps_since_update > sampler.update_sched(sampler._step) or sampler._step < 10
+
+
 def why_not(model: EdgeDepthNerfModel, device: str, world_size: int, accumulates: bool) -> str | None:
     """Why the steps of a training cannot be recorded; None where they can.
 
@@ -104,8 +130,8 @@ def why_not(model: EdgeDepthNerfModel, device: str, world_size: int, accumulates
         return "several processes train together"
     if accumulates:
         return "gradients of several steps are added"
-    if model.config.depth_loss == "urban-nerf-los":
-        return "the σ of urban-nerf-los changes at each step"
+    if any(isinstance(loss, PriorLoss) and loss.loss.varies for loss in model.step_losses.values()):
+        return f"the loss {model.config.depth_loss} changes at each step"
     if model.config.predict_normals:
         return "normals are trained"
     return None
@@ -178,9 +204,9 @@ class StepGraphs:
             raise RuntimeError("the rays of a batch, the parameters or the model's options have changed")
         self._packed.copy_(packed)
         # numbers of the host, which a kernel's launch takes with it: no copy that has to be waited for
-        for place, number in enumerate(model.schedule()):
+        for place, number in enumerate(schedule(model)):
             self._schedule[place].fill_(number)
-        updated = model.updates_proposals()
+        updated = updates_proposals(model.proposal_sampler)
         if updated not in self._recorded:
             self._recorded[updated] = self._record(model)
         recorded, sampler = self._recorded[updated], model.proposal_sampler
@@ -212,7 +238,7 @@ class StepGraphs:
             # each run is of one kind
             model.proposal_sampler._steps_since_update = before
             torch.clear_autocast_cache()
-            with model.scheduled_by(self._schedule):
+            with scheduled_by(model, self._schedule):
                 rays, batch = manager.batch_of(self._packed)
                 outputs = pipeline._model(rays, batch)
                 metrics = model.get_metrics_dict(outputs, batch)

@@ -31,7 +31,6 @@ from edge_depth_nerf.kernels.threads import torch_on_one_thread
 from edge_depth_nerf.plugin.compat import count_steps_against_all, ignore_deprecations_of_host, total_steps
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig, transforms_path
 from edge_depth_nerf.plugin.grad_scaler import PatientGradScaler
-from edge_depth_nerf.plugin.model import EdgeDepthNerfModelConfig, settled
 from edge_depth_nerf.plugin.pipeline import EdgeDepthPipeline, NotFiniteError
 from edge_depth_nerf.plugin.plain_errors import say_errors_plainly
 from edge_depth_nerf.plugin.settings import changed_settings
@@ -64,9 +63,6 @@ class EdgeDepthTrainerConfig(TrainerConfig):
     def save_config(self) -> None:
         """Save config.yml as nerfstudio does, but atomically: half a file could not be loaded.
 
-        The implementation `auto` is replaced by the chosen one. Another machine might choose differently, and
-        tiny-cuda-nn cannot load the checkpoints of the others.
-
         Raises:
             FileNotFoundError: there is no scene at `--data`; then nothing is written.
 
@@ -76,9 +72,6 @@ class EdgeDepthTrainerConfig(TrainerConfig):
         data: Any = self.pipeline.datamanager
         if isinstance(data.dataparser, FisheyeDepthDataParserConfig):
             transforms_path(Path(data.data or data.dataparser.data))
-        model = self.pipeline.model
-        if isinstance(model, EdgeDepthNerfModelConfig):
-            model.implementation = settled(model.implementation, self.machine.device_type)
         path = self.get_base_dir() / "config.yml"
         CONSOLE.log(f"Saving config to: {path}")
         write_text(path, yaml.dump(self))

@@ -1,0 +1,1 @@
+"""nerfstudio's classes with our kernels: the same parameters, names and numbers."""

@@ -1,0 +1,197 @@
+"""Losses of a training step: nerfacto's, and beside them those of the prior, of the sky and of surface pixels.
+
+Host-facing; formulas stand in `method`. A loss is an object that reads a `Step` and gives a weighted number; the model
+adds up those that its configuration asks for.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, make_dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss, interlevel_loss
+from edge_depth_nerf.kernels.ray_samplers import edges_of
+from edge_depth_nerf.method.depth_losses import LOSSES, VARIABLE, DepthLoss, Level, depth_loss, register
+from edge_depth_nerf.method.losses import sky_loss
+
+register(os.environ.get(VARIABLE, ""))
+if TYPE_CHECKING:
+    DepthLossName = str
+    LossOptions = Any
+else:
+    DepthLossName = Literal[(*LOSSES, "none")]
+    """Names of losses on the prior."""
+    LossOptions = make_dataclass(
+        "LossOptions",
+        [(name.replace("-", "_"), kind, field(default_factory=kind)) for name, kind in LOSSES.items()],
+        namespace={"__module__": __name__, "__doc__": "Options of each loss on the distance prior."},
+    )
+
+LEAST_DISTANCE_M = 1e-6
+"""What is nearer is no distance: without a prior it is 0."""
+
+
+@dataclass(frozen=True)
+class Planes:
+    """Where samples lie along a ray."""
+
+    near_m: float
+    far_m: float
+    metres_per_unit: float
+
+    def hold(self, distance_m: Float[Tensor, "*rays"]) -> Bool[Tensor, "*rays"]:
+        """Whether a distance lies between the planes; without a prior it is 0, in front of the near plane.
+
+        No sample lies elsewhere: a prior there would draw all weight to the first sample or to the last.
+        """
+        return (distance_m >= max(self.near_m, LEAST_DISTANCE_M)) & (distance_m <= self.far_m)
+
+
+@dataclass(frozen=True)
+class Step:
+    """What losses read."""
+
+    outputs: Mapping[str, Any]
+    """The model's, with `weights_list` and `ray_samples_list`, the final samples last."""
+    batch: Mapping[str, Any]
+    """The datamanager's."""
+    planes: Planes
+    share_done: float
+    """The share of the training that is behind, 0 to 1."""
+    depth_weight: float | Tensor
+    """λ at this step."""
+
+
+StepLoss = Callable[[Step], Tensor]
+"""A loss of a training step: it gives a weighted number."""
+
+
+@dataclass(frozen=True)
+class PriorLoss:
+    """λ times a loss on the distance prior."""
+
+    loss: DepthLoss
+    final_alone: bool
+    """Whether it applies to the final samples only, not to those of the proposal networks."""
+
+    def __call__(self, step: Step) -> Float[Tensor, ""]:
+        """Give the weighted loss."""
+        prior_m, sigma_m = (
+            step.batch[name][:, 0].to(step.outputs["rgb"].device, torch.float32)
+            for name in ("prior_distance_m", "prior_sigma_m")
+        )
+        met = step.planes.hold(prior_m) & (sigma_m > 0) & torch.isfinite(sigma_m)
+        prior_m = torch.where(met, prior_m, 0)
+        levels, learns, final = [], [], None
+        for weights, samples in reversed(
+            [*zip(step.outputs["weights_list"], step.outputs["ray_samples_list"], strict=True)]
+        ):
+            starts_m, ends_m = (
+                each[..., 0] * step.planes.metres_per_unit for each in (samples.frustums.starts, samples.frustums.ends)
+            )
+            levels.append(Level(weights.squeeze(-1), starts_m, ends_m, prior_m, sigma_m, final, step.share_done))
+            learns.append(weights.requires_grad)
+            final = final or levels[0]
+            if self.final_alone:
+                break
+        return step.depth_weight * depth_loss(self.loss, levels, learns)
+
+
+@dataclass(frozen=True)
+class SkyLoss:
+    """What rays into the sky hit: the mean over the levels of samples."""
+
+    mult: float
+
+    def __call__(self, step: Step) -> Float[Tensor, ""]:
+        """Give the weighted loss."""
+        every = step.outputs["weights_list"]
+        sky = step.batch["sky"][:, 0].to(every[-1].device)
+        # of all their weights in one row
+        return self.mult / len(every) * sky_loss(torch.cat([weights.squeeze(-1) for weights in every], dim=1), sky)
+
+
+@dataclass(frozen=True)
+class SurfaceLoss:
+    """The colour error of the field at the surfaces of surface pixels, mean over those that are of use."""
+
+    mult: float
+
+    def __call__(self, step: Step) -> Float[Tensor, ""]:
+        """Give the weighted loss."""
+        batch, weight = step.batch, self.mult
+        counts = surface_counts(batch, step.planes)
+        if "surface_counts" in batch:
+            served = batch["surface_counts"][:, 0]
+            weight = weight * (len(served) / served.sum().clamp(min=1))
+        # no error of others; choosing pixels would make a GPU wait
+        image = batch["surface_image"]
+        return weight * (torch.where(counts[:, None], step.outputs["surface_rgb"], image) - image).square().mean()
+
+
+def step_losses_of(config: Any) -> dict[str, StepLoss]:
+    """Give the losses beside nerfacto's that a model's configuration asks for, by their names.
+
+    Raises:
+        InputError: the loss on the prior is not registered.
+
+    """
+    name = config.depth_loss
+    if name == "none":
+        return {}
+    if name not in LOSSES:
+        raise InputError(
+            f"--pipeline.model.depth-loss {name}: there is no such loss; expected one of {', '.join(LOSSES)}, none. "
+            f"One of your own is registered by the environment variable {VARIABLE}={name}=MODULE:CLASS."
+        )
+    # config.yml may be from before a loss was registered
+    loss = getattr(config.losses, name.replace("-", "_"), None) or LOSSES[name]()
+    losses: dict[str, StepLoss] = {}
+    if config.depth_loss_mult > 0:
+        losses[f"{name.replace('-', '_')}_loss"] = PriorLoss(loss, config.depth_loss_levels == "final")
+    if config.sky_loss_mult > 0:
+        losses["sky_loss"] = SkyLoss(config.sky_loss_mult)
+    if config.surface_loss_mult > 0:
+        losses["surface_loss"] = SurfaceLoss(config.surface_loss_mult)
+    return losses
+
+
+def surface_counts(batch: Mapping[str, Any], planes: Planes) -> Bool[Tensor, "pixels"]:
+    """Which surface pixels have a surface between the planes, or are sky, and are of use."""
+    counts = batch["surface_sky"][:, 0] | planes.hold(batch["surface_distance_m"][:, 0])
+    return counts & batch["surface_counts"][:, 0] if "surface_counts" in batch else counts
+
+
+def draw_surface_m(batch: Mapping[str, Any], planes: Planes) -> Float[Tensor, "pixels"]:
+    """Draw where the surface of each surface pixel is: any place within what its prior leaves open, metres.
+
+    Nothing is rendered in front of the near plane or behind the far one: what is drawn there is mirrored at the prior,
+    to its other side.
+    """
+    distance_m, sigma_m = batch["surface_distance_m"][:, 0], batch["surface_sigma_m"][:, 0]
+    off_m = sigma_m * torch.randn_like(sigma_m)
+    drawn_m = distance_m + off_m
+    beyond = drawn_m != drawn_m.clamp(planes.near_m, planes.far_m)
+    return torch.where(beyond, distance_m - off_m, drawn_m).clamp(planes.near_m, planes.far_m)
+
+
+def distortion_of(outputs: Mapping[str, Any]) -> Float[Tensor, ""]:
+    """Compute nerfacto's distortion loss, without its weight."""
+    return distortion_loss(edges_of(outputs["ray_samples_list"][-1]), outputs["weights_list"][-1].squeeze(-1))
+
+
+def interlevel_of(outputs: Mapping[str, Any]) -> Float[Tensor, ""]:
+    """Compute nerfacto's loss of the proposal networks, without its weight."""
+    *proposals, final = (
+        (edges_of(samples), weights.squeeze(-1))
+        for samples, weights in zip(outputs["ray_samples_list"], outputs["weights_list"], strict=True)
+    )
+    losses = [interlevel_loss(final[0], final[1].detach(), *proposal) for proposal in proposals]
+    return sum(losses[1:], losses[0])
