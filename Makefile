@@ -21,34 +21,13 @@ help:
 	@echo "make check-dist  build wheel and sdist (dist/), install them into a fresh environment"
 	@echo "make setup       the virtual environment in $(VENV), with the versions of constraints.txt"
 
-# What the packages take, and what pip needs in the folder of temporary files until it has moved them. Most of it is
-# torch for CUDA, which pip takes on such machines alone.
+# What the packages take, and what pip needs in the folder of temporary files until it has moved them.
 PACKAGES_GB := 9.7
 TEMPORARY_GB := 3.6
-define ENOUGH_DISK
-import platform, shutil, sys, tempfile
-from pathlib import Path
-if (platform.system(), platform.machine()) != ("Linux", "x86_64"):
-    sys.exit()
-venv, temporary = Path(sys.argv[1]).absolute(), Path(tempfile.gettempdir())
-disk = next(folder for folder in [venv, *venv.parents] if folder.is_dir())
-here = sum(path.lstat().st_size for path in venv.rglob("*")) / 1e9
-packages, more = max(0, float(sys.argv[2]) - here), float(sys.argv[3])
-needed = [(disk, packages), (temporary, more)]
-if disk.stat().st_dev == temporary.stat().st_dev:
-    needed = [(disk, packages + more)]
-for folder, least in needed:
-    free = shutil.disk_usage(folder).free / 1e9
-    if free < least:
-        sys.exit(f"Too little space: installing needs {least:.1f} GB on the disk of {folder}, and {free:.1f} GB are free. "
-            "Remove something there, or choose another disk with VENV=FOLDER (for the packages) or the environment "
-            "variable TMPDIR (for temporary files).")
-endef
-export ENOUGH_DISK
 
 # OpenCV comes in several wheels that overwrite each other; the one with contrib and without a window goes last.
 $(VENV)/.installed: pyproject.toml constraints.txt
-	@$(PYTHON) -c "$$ENOUGH_DISK" $(VENV) $(PACKAGES_GB) $(TEMPORARY_GB)
+	@$(PYTHON) .ci/enough_space.py $(VENV) $(PACKAGES_GB) $(TEMPORARY_GB)
 	@echo "Installing into $(VENV): some minutes, 9 GB. pip prints nothing while it works, except warnings of other packages."
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
