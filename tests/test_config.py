@@ -156,3 +156,62 @@ def test_the_plugin_adds_little_to_nerfstudios_commands():
     )
     done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+UNCHANGED = """
+import importlib.metadata as metadata
+import sys
+found, metadata.entry_points = metadata.entry_points, lambda **_: metadata.EntryPoints()
+import nerfstudio.scripts.eval, nerfstudio.scripts.train, nerfstudio.scripts.viewer.run_viewer  # without plugins
+from nerfstudio.plugins import registry, registry_dataparser
+import contextlib, logging, os, random, signal, threading, types, warnings
+import numpy as np, torch
+
+assert not [name for name in sys.modules if name.startswith("edge_depth_nerf")]
+sys.argv[0] = "ns-train"
+registry.entry_points = registry_dataparser.entry_points = found
+
+def settings():
+    return {
+        "hooks": (sys.excepthook, sys.unraisablehook, threading.excepthook),
+        "safe globals": set(torch.serialization.get_safe_globals()),
+        "filters of warnings": list(warnings.filters),
+        "environment": dict(os.environ),
+        "path": list(sys.path),
+        "signals": [signal.getsignal(number) for number in signal.valid_signals()],
+        "threads": (torch.get_num_threads(), threading.active_count()),
+        "numbers": (torch.get_default_dtype(), np.geterr(), torch.are_deterministic_algorithms_enabled()),
+        "seeds": (random.getstate(), np.random.get_state()[1].tolist(), torch.get_rng_state().tolist()),
+        "logging": (logging.root.level, list(logging.root.handlers)),
+    }
+
+def names():
+    found = {}
+    for module in [each for each in sys.modules.values() if type(each) is types.ModuleType]:
+        if module.__name__.partition(".")[0] in ("nerfstudio", "torch", "tyro", "viser", "yaml", "json", "pathlib"):
+            for name, value in list(vars(module).items()):
+                found[module.__name__, name] = value
+                if isinstance(value, type) and value.__module__ == module.__name__:
+                    found |= {(module.__name__, name, each): what for each, what in list(vars(value).items())}
+    return found
+
+before, named = settings(), names()
+methods, dataparsers = registry.discover_methods()[0], registry_dataparser.discover_dataparsers()[0]
+after, named_after = settings(), names()
+assert "edge-depth-nerf-lite" in methods and "fisheye-depth-data" in dataparsers and len(named) > 10_000
+changed = [what for what in before if before[what] != after[what]]
+changed += [name for name, value in named.items() if named_after.get(name, named) is not value]
+assert not changed, changed
+with contextlib.suppress(Exception):  # there is no scene
+    methods["edge-depth-nerf-lite"].pipeline.setup(device="cpu")
+after = settings()
+changed = [what for what in before if before[what] != after[what]]
+assert changed == ["hooks", "safe globals", "filters of warnings"], changed
+"""
+
+
+@pytest.mark.slow
+def test_users_of_other_methods_are_left_alone():
+    """Every ns-* command loads the entry points; hooks, settings and others' classes stay until one of ours is set up."""
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", UNCHANGED], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

@@ -283,32 +283,6 @@ def test_errors_of_others_stay_theirs(hook, capsys, tmp_path):
     assert "theirs" not in capsys.readouterr().err
 
 
-def test_a_slip_in_load_config(hook, capsys, tmp_path):
-    """Said plainly in nerfstudio's commands."""
-    from nerfstudio.utils.eval_utils import eval_setup
-
-    (tmp_path / "page.md").write_text("# A page\n[with](a link) ![and](a picture): what\n  is: no YAML\n")
-    (tmp_path / "scene.json").write_text("{}")
-    for name, what in (
-        ("", "is a folder. --load-config takes a training's config.yml"),
-        ("none.yml", "no such file. --load-config takes"),
-        ("page.md", "cannot be read (ParserError: "),
-        ("scene.json", "is not the configuration of a training. --load-config takes"),
-    ):
-        sys.excepthook(*raised(eval_setup, tmp_path / name))
-        assert f"{tmp_path / name}: {what}" in capsys.readouterr().err
-    assert hook == []
-
-
-def test_what_goes_wrong_after_the_config_is_nerfstudios_to_say(hook, tmp_path):
-    def eval_setup(config_path):
-        config = type("Config", (), {"get_checkpoint_dir": None})
-        raise FileNotFoundError(f"{config_path}, {config}: no checkpoint")
-
-    sys.excepthook(*raised(eval_setup, tmp_path / "config.yml"))
-    assert len(hook) == 1
-
-
 def test_whoever_reads_the_output_may_go(tmp_path):
     call = [sys.executable, "-m", "edge_depth_nerf", "compare", "--help"]
     with subprocess.Popen(call, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=tmp_path) as process:

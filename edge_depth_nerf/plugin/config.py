@@ -1,5 +1,8 @@
 """The methods that nerfstudio registers, made from nerfstudio_method.toml.
 
+Every ns-* command imports this module. Nothing is changed by that: what a command needs for our methods is set up when
+one of them is (`EdgeDepthPipelineConfig.setup`, `EdgeDepthTrainerConfig.save_config`).
+
 An override is a dotted name in the configuration and a value. Names and types are checked against the configuration
 itself; one error reports all that is wrong.
 """
@@ -10,7 +13,6 @@ import difflib
 import sys
 from dataclasses import dataclass, fields, is_dataclass, replace
 from importlib import resources
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -22,11 +24,9 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.kernels.table_adam import TableAdam
-from edge_depth_nerf.plugin.compat import allow_numpy_scalars_in_checkpoints
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModelConfig
 from edge_depth_nerf.plugin.pipeline import EdgeDepthPipelineConfig
-from edge_depth_nerf.plugin.plain_errors import say_config_slips_plainly
 from edge_depth_nerf.plugin.trainer import EdgeDepthTrainerConfig
 
 if sys.version_info >= (3, 11):
@@ -55,11 +55,6 @@ class FusedAdamConfig(AdamOptimizerConfig):
 
 
 METHOD_FILE = "nerfstudio_method.toml"
-
-# every ns-* command imports this module and may load a checkpoint afterwards
-allow_numpy_scalars_in_checkpoints()
-if Path(sys.argv[0]).name.startswith("ns-"):
-    say_config_slips_plainly()
 
 
 def read_method_file() -> dict[str, Any]:

@@ -18,7 +18,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.plugin.compat import ignore_deprecations_of_host
+from edge_depth_nerf.plugin.compat import allow_numpy_scalars_in_checkpoints, ignore_deprecations_of_host
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManager, FisheyeDepthDataManagerConfig
 from edge_depth_nerf.plugin.detail import TrainingDetail
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel, EdgeDepthNerfModelConfig
@@ -48,7 +48,8 @@ class EdgeDepthPipelineConfig(VanillaPipelineConfig):
     errors of `model.camera_optimizer`. Only the right half, inside the mask, is then evaluated."""
 
     def setup(self, **kwargs: Any) -> Any:
-        """Build the pipeline; from here on nerfstudio's commands say our errors without a traceback."""
+        """Build the pipeline; from here on nerfstudio's commands load its checkpoints, and print our errors plainly."""
+        allow_numpy_scalars_in_checkpoints()
         say_errors_plainly()
         ignore_deprecations_of_host()
         return super().setup(**kwargs)
