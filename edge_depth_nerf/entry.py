@@ -18,10 +18,13 @@ from edge_depth_nerf.base.errors import DEBUG_VARIABLE, PROGRAM, STOPPED_STATUS,
 DEBUG_OPTION = "--debug"
 BUG_STATUS, INPUT_STATUS, PIPE_STATUS = 1, 2, 141
 
-_SWALLOWERS = ("trimesh",)
-"""Packages that catch every exception, KeyboardInterrupt with them, while they are imported and while they work."""
-
-_SWALLOWERS_WAIT_S = 0.05
+_IMPORTS = "<frozen importlib._bootstrap>"
+"""The file of Python's own frames while a module is imported. Modules may turn any exception into one of their own."""
+_DEAF = "trimesh"
+"""A package that catches every exception while it works, KeyboardInterrupt included."""
+_WAIT_S = 0.05
+"""Ctrl-C asks again after so long whether it may interrupt."""
+_STOPPED = "\nStopped. Run the same command again to resume.\n"
 
 
 def main() -> None:
@@ -33,7 +36,7 @@ def main() -> None:
     try:
         # before OpenMP is loaded, and for the commands that this one starts; why: openmp.py
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-        _interrupt_between_swallowers()
+        _interrupt_between_imports()
         words = sys.argv[1:]
         arguments = [word for word in words if word != DEBUG_OPTION]
         if len(arguments) < len(words):
@@ -51,8 +54,6 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(PIPE_STATUS)
     except Exception as error:
-        if _interrupted(error):
-            _stopped()
         if debugging():
             traceback.print_exc()
         is_input = isinstance(error, (InputError, OSError))
@@ -60,32 +61,48 @@ def main() -> None:
         sys.exit(INPUT_STATUS if is_input else BUG_STATUS)
 
 
-def _interrupt_between_swallowers() -> None:
-    """Let Ctrl-C wait until none of `_SWALLOWERS` is at work, in which it would be lost."""
+def _interrupt_between_imports() -> None:
+    """Let Ctrl-C wait until no import is running, in which it could be lost; a second one ends the program at once."""
     import signal
-    import threading
-    from _thread import interrupt_main
+    import time
+    from _thread import get_ident, interrupt_main, start_new_thread
+
+    waiting = asks_again = False
+    main_thread = get_ident()
+
+    def ask_again() -> None:
+        nonlocal asks_again
+        time.sleep(_WAIT_S)
+        if waiting:
+            asks_again = True
+            if sys.platform == "win32":
+                interrupt_main()
+            else:
+                signal.pthread_kill(main_thread, signal.SIGINT)  # ends a wait of the system's, too
 
     def interrupt(_: int, frame: FrameType | None) -> None:
-        while frame is not None:
-            if frame.f_globals.get("__name__", "").partition(".")[0] in _SWALLOWERS:
-                again = threading.Timer(_SWALLOWERS_WAIT_S, interrupt_main)
-                again.daemon = True
-                again.start()
-                return
-            frame = frame.f_back
-        raise KeyboardInterrupt
+        nonlocal waiting, asks_again
+        pressed, asks_again = not asks_again, False
+        if not _would_be_lost(frame):
+            waiting = False
+            raise KeyboardInterrupt
+        if waiting and pressed:
+            # a line that shows progress has hidden the cursor
+            os.write(2, (("\033[?25h" if os.isatty(2) else "") + _STOPPED).encode())
+            os._exit(STOPPED_STATUS)
+        waiting = True
+        start_new_thread(ask_again, ())
 
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, interrupt)
 
 
-def _interrupted(error: BaseException | None) -> bool:
-    """Whether it only tells of Ctrl-C; compiled modules raise ImportError from it while they are imported."""
-    while error is not None:
-        if isinstance(error, KeyboardInterrupt):
+def _would_be_lost(frame: FrameType | None) -> bool:
+    """Whether code is at work, in this frame or around it, that may swallow an exception or make another one of it."""
+    while frame is not None:
+        if frame.f_code.co_filename == _IMPORTS or frame.f_globals.get("__name__", "").partition(".")[0] == _DEAF:
             return True
-        error = error.__cause__ or error.__context__
+        frame = frame.f_back
     return False
 
 
@@ -94,7 +111,7 @@ def _stopped() -> NoReturn:
 
     # threads may still be writing their last file: whoever does not want to wait for them gets no traceback either
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    sys.stderr.write("\nStopped. Run the same command again to resume.\n")
+    sys.stderr.write(_STOPPED)
     sys.exit(STOPPED_STATUS)
 
 

@@ -212,6 +212,6 @@ assert changed == ["hooks", "safe globals", "filters of warnings"], changed
 
 @pytest.mark.slow
 def test_users_of_other_methods_are_left_alone():
-    """Every ns-* command loads the entry points; hooks, settings and others' classes stay until one of ours is set up."""
+    """Every ns-* command loads the entry points; hooks, settings and others' classes stay the same."""
     done = subprocess.run([sys.executable, "-W", "ignore", "-c", UNCHANGED], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -102,13 +102,6 @@ def test_what_the_user_can_mend_is_said_alone(monkeypatch, capsys, error):
     assert end_of(monkeypatch, capsys, "doctor", error=error) == (2, f"edge-depth-nerf: {error}\n")
 
 
-def test_ctrl_c_in_the_words_of_a_compiled_module(monkeypatch, capsys):
-    error = ImportError("initialization failed")
-    error.__cause__ = KeyboardInterrupt()
-    monkeypatch.setattr(signal, "signal", lambda *_: None)
-    assert end_of(monkeypatch, capsys, "doctor", error=error) == (130, STOPPED)
-
-
 @pytest.mark.parametrize("place", [0, 1, 2])
 def test_debug_gives_the_traceback_wherever_it_stands(monkeypatch, capsys, tmp_path, place):
     arguments = ["inspect", str(tmp_path / "nowhere")]
@@ -167,21 +160,73 @@ main()
     assert (done.returncode, done.stderr) == (130, STOPPED)
 
 
-def test_ctrl_c_is_not_lost_in_a_package_that_catches_everything(tmp_path):
-    """trimesh does, around each import of its own."""
+@pytest.mark.parametrize("ending", ["raise ImportError('Please report an issue.') from None", "pass"])
+@pytest.mark.parametrize(("import_s", "more_s"), [(1.0, ()), (60.0, (0.3,)), (60.0, (0.2, 0.2))])
+def test_ctrl_c_waits_for_the_end_of_an_import(tmp_path, ending, import_s, more_s):
+    """Modules turn it into errors of their own, or swallow it. Whoever presses it twice does not wait."""
+    lines = ["try:", f"    print('go', flush=True), time.sleep({import_s})", "except BaseException:", f"    {ending}"]
+    (tmp_path / "slow.py").write_text("\n".join(["import time", *lines, "print('imported', flush=True)"]))
     code = """
-import time
-class Slow:
-    def find_spec(self, name, path=None, target=None):
-        if name == "networkx":
-            print("go", flush=True)
-            time.sleep(1)
-sys.meta_path.insert(0, Slow())
-sys.argv = [*WORDS, "400"]
-main()
+import sys, time
+from edge_depth_nerf import cli, entry
+def run(_):
+    import slow
+    time.sleep(60)
+cli.run = run
+sys.argv = ["edge-depth-nerf", "doctor"]
+entry.main()
 """
-    done = interrupted(SYNTHESIS + code, 0.2, folder=tmp_path)
+    started = time.monotonic()
+    done = interrupted(code, 0.2, *more_s, folder=tmp_path)
     assert (done.returncode, done.stderr) == (130, STOPPED)
+    assert done.stdout == ("" if more_s else "imported\n")
+    assert time.monotonic() - started < 30
+
+
+def test_ctrl_c_is_not_lost_in_a_package_that_catches_everything(tmp_path):
+    """trimesh does while it works, too."""
+    (tmp_path / "trimesh.py").write_text("""
+import time
+def work():
+    try:
+        print("go", flush=True)
+        time.sleep(1)
+    except BaseException:
+        pass
+    print("worked", flush=True)
+""")
+    code = """
+import sys, time
+sys.path.insert(0, "")
+import trimesh
+from edge_depth_nerf import cli, entry
+def run(_):
+    trimesh.work()
+    time.sleep(60)
+cli.run = run
+sys.argv = ["edge-depth-nerf", "doctor"]
+entry.main()
+"""
+    done = interrupted(code, 0.2, folder=tmp_path)
+    assert (done.returncode, done.stderr, done.stdout) == (130, STOPPED, "worked\n")
+
+
+def test_ctrl_c_ends_work_at_once():
+    code = """
+import sys, time
+from edge_depth_nerf import cli, entry
+def run(_):
+    print("go", flush=True)
+    while True:
+        time.sleep(0.01)
+cli.run = run
+sys.argv = ["edge-depth-nerf", "doctor"]
+entry.main()
+"""
+    started = time.monotonic()
+    done = interrupted(code, 0.1)
+    assert (done.returncode, done.stderr) == (130, STOPPED)
+    assert time.monotonic() - started < 20
 
 
 @pytest.mark.slow
