@@ -6,7 +6,6 @@ Each check stands alone and never fails itself: a library that cannot be importe
 from __future__ import annotations
 
 import ctypes.util
-import importlib
 import os
 import platform
 import shutil
@@ -143,7 +142,7 @@ def check_opencv() -> Iterator[Finding]:
         if (name := (found.metadata["Name"] or "").lower().replace("_", "-")).startswith("opencv-")
     )
     try:
-        cv2 = importlib.import_module("cv2")
+        import cv2
     except Exception as error:
         yield _broken("OpenCV", "opencv-contrib-python-headless", error)
         return

@@ -118,15 +118,14 @@ def test_lpips_weights(monkeypatch, tmp_path):
     assert found(doctor.check_lpips)["LPIPS"].state == "ok"
 
 
-def test_an_opencv_that_does_not_load_and_one_that_does(monkeypatch):
-    def fail(_):
-        raise ImportError("libGL.so.1: cannot open shared object file")
-
-    monkeypatch.setattr(doctor.importlib, "import_module", fail)
+def test_an_opencv_that_does_not_load_and_one_that_does(monkeypatch, tmp_path):
+    (tmp_path / "cv2.py").write_text("raise ImportError('libGL.so.1: cannot open shared object file')")
+    monkeypatch.delitem(sys.modules, "cv2", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
     broken = found(doctor.check_opencv)["OpenCV"]
     assert broken.state == "problem" and "libGL" in broken.found
     plain = type("cv2", (), {"__version__": "4.10"})
-    monkeypatch.setattr(doctor.importlib, "import_module", lambda _: plain)
+    monkeypatch.setitem(sys.modules, "cv2", plain)
     finding = found(doctor.check_opencv)["OpenCV"]
     assert finding.state == "ok" and finding.found.startswith("4.10; installed: ")
 

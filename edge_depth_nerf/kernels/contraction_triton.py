@@ -1,4 +1,4 @@
-"""nerfacto's contraction of space into the unit cube on a GPU, in one kernel; meaning as in `contraction`.
+"""nerfacto's contraction of space into the unit cube on a GPU, in one kernel; meaning as in `contraction_numba`.
 
 With TRITON_INTERPRET=1 set before the import it runs on CPU tensors.
 """

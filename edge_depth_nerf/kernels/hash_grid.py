@@ -10,8 +10,8 @@ coarse levels too, takes no half-cell offset, and on a border of cells lower and
 the gradient to the position is 0 on that axis.
 
 Shapes: positions [points, 3], table [levels * rows, features] with a power of two of rows, scalings [levels], encoded
-[points, levels * features]; float32. Pure: knows nothing of nerfstudio. CPU tensors are worked on by Numba (`cpu`),
-CUDA tensors by Triton (`cuda`).
+[points, levels * features]; float32. Pure: knows nothing of nerfstudio. `hash_grid_numba` works on CPU
+tensors, `hash_grid_triton` on CUDA tensors.
 """
 
 from __future__ import annotations

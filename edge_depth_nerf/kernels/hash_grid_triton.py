@@ -1,4 +1,4 @@
-"""The hash grid on a GPU: Triton kernels; meaning and shapes as in `hash_grid`, functions as in `cpu`.
+"""The hash grid on a GPU: Triton kernels; meaning and shapes as in `hash_grid`, functions as in `hash_grid_numba`.
 
 Triton comes with torch on Linux, and compiles at the first call for each number of features. In the table's gradient
 results differ from the CPU's by the order of additions, which are atomic. A row's features are added as one block: GPUs

@@ -86,7 +86,7 @@ class PriorOptions:
     """How the monocular map is fitted to the frame's LiDAR before both are integrated. Without LiDAR it is not
     changed."""
     sigma_mode: PriorSigma = "calibrated"
-    """calibrated: from the errors of the drive's training frames at left-out LiDAR points (see `mono.error_model`),
+    """calibrated: from the errors of the drive's training frames at left-out LiDAR points (see `error_model`),
     with no prior where the error is unknown; combined if there is no calibration. For the others see
     `integration.sigma_m`."""
     sigma_constant_m: float = 1.0

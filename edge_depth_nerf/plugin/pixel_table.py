@@ -190,7 +190,7 @@ class PixelTableWriter:
     """Writes a table, picture by picture; a context in which temporary files live.
 
     with PixelTableWriter(path, most_pixels) as writer:
-        writer.add(rgb, mask, distance_m, sigma_m)
+        writer.add(PicturePixels(rgb, mask, distance_m, sigma_m))
         writer.finish()
     """
 

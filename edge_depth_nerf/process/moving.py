@@ -121,7 +121,7 @@ def find_moving(
     pictures = tuple(replace(picture, moving_mask=made.get(id(picture))) for picture in recording.pictures)
     shares = [1 - float(read_mask(path).mean()) for path in made.values()]
     notice = (
-        f"Moving objects were found in {sum(share > 0 for share in shares)} of {len(shares)} pictures and hides "
+        f"Moving objects were found in {sum(share > 0 for share in shares)} of {len(shares)} pictures and hide "
         f"{np.mean(shares):.1%} of them. Look at {options.output / MOVING_MASKS}: correct them there and process "
         "the drive again."
     )

@@ -70,10 +70,10 @@ from edge_depth_nerf.scene.points import PointCloud, merge_parts, write_part
 
 RECORD = "process.json"
 LEFT_OUT = "left_out.json"
+"""Pictures of the drive that are not in the scene, because one of their files is broken: what is wrong with each."""
 WHOLE, INPUTS, INCOMPLETE = "whole_sha256", "inputs_sha256", "some_left_out"
 """Keys of the record: of the files that describe the whole drive, of these with the sizes of all others, and whether
 some of those cannot be used."""
-"""Pictures of the drive that are not in the scene, because one of their files is broken: what is wrong with each."""
 CLOUD = "cloud"
 """The layer that becomes points.ply."""
 
