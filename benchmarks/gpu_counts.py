@@ -349,9 +349,9 @@ def counted_view(gpu: FakeGpu, trainer: Any) -> Counts:
 
 def counted(case: str, scene: Path, folder: Path) -> dict[str, Any]:
     """Count a case, in a process that was started by `in_a_process`."""
-    from edge_depth_nerf.kernels.back_ends import working
+    from edge_depth_nerf.kernels import back_ends
 
-    working.cache_clear()  # as in a new process: a view may be the first that needs the kernels
+    back_ends._tried.clear()  # as in a new process: a view may be the first that needs the kernels
     method, changes = CASES[case]
     gpu = FakeGpu()
     trainer = fake_trainer(gpu, method, scene, folder, **changes)

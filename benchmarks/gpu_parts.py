@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 import importlib.util
-import itertools
 import math
 import os
 import re
@@ -124,11 +123,13 @@ def kernels(settings: Settings) -> dict[str, Any]:
     from nerfstudio.field_components.encodings import HashEncoding
 
     from edge_depth_nerf.kernels import hash_grid_numba as on_cpu
-    from edge_depth_nerf.kernels.hash_grid import back_end
+    from edge_depth_nerf.kernels.functions import HASH_GRID
 
-    work = back_end(torch.device(settings.device))
-    if work is None:
+    if HASH_GRID.on(torch.device(settings.device)) is None:
         raise RuntimeError("Triton's kernels do not work on this GPU; the warning above says why")
+    work: Any = on_cpu
+    if not settings.fake:
+        from edge_depth_nerf.kernels import hash_grid_triton as work
     rows = []
     for name, (levels, log2_rows, count, finest) in (SIZES if settings.fake else SIZES_ON_CUDA).items():
         if settings.fake:
@@ -190,44 +191,29 @@ def sorted_edges(rays: int, samples: int, settings: Settings) -> torch.Tensor:
 
 
 def work_by_number(rays: int, samples: int, settings: Settings) -> dict[str, Pair]:
-    """Places, positions, densities and directions."""
+    """Places and directions."""
     import torch.nn.functional as F
-    from nerfstudio.field_components.activations import trunc_exp
     from nerfstudio.utils.math import components_from_spherical_harmonics
 
-    from edge_depth_nerf.kernels import contraction_triton, pointwise_triton
+    from edge_depth_nerf.kernels import pointwise_triton
     from edge_depth_nerf.kernels.fields import CubeContraction
 
-    count = rays * samples
     near, far = (torch.full((rays, 1), value, device=settings.device) for value in (0.01, 50.0))
     edges = sorted_edges(rays, samples, settings)
     directions = F.normalize(torch.randn(rays, 3, device=settings.device), dim=1)
-    before = torch.randn(count, device=settings.device, requires_grad=True)
-    inside, anywhere = torch.ones(count, device=settings.device), 3 * torch.randn(count, 3, device=settings.device)
+    anywhere = 3 * torch.randn(rays * samples, 3, device=settings.device)
     contraction = CubeContraction(order=float("inf"))
 
     def distances() -> torch.Tensor:
         x = torch.lerp(spaced(near), spaced(far), edges)
         return torch.where(x < 0.5, 2 * x, 1 / (2 - 2 * x))
 
-    def middles() -> torch.Tensor:
-        starts, ends = edges[:, :-1, None], edges[:, 1:, None]
-        return directions[:, None] + directions[:, None] * (starts + ends) / 2
-
     return {
         "contraction": (
-            lambda: contraction_triton.contract(anywhere)[0],
+            lambda: pointwise_triton.contract(anywhere)[0],
             lambda: (contraction(anywhere) + 2) / 4,
         ),
         "distances": (lambda: pointwise_triton.distances(edges, near, far), distances),
-        "positions": (
-            lambda: pointwise_triton.middles(directions, directions, edges[:, :-1], edges[:, 1:]),
-            middles,
-        ),
-        "densities": (
-            lambda: followed(pointwise_triton.density(before, inside, 0.01), before),
-            lambda: followed(0.01 * trunc_exp(before) * inside, before),
-        ),
         "directions": (
             lambda: pointwise_triton.harmonics(directions, torch.float32),
             lambda: components_from_spherical_harmonics(4, (directions + 1) / 2),
@@ -236,14 +222,13 @@ def work_by_number(rays: int, samples: int, settings: Settings) -> dict[str, Pai
 
 
 def work_along_rays(rays: int, samples: int, settings: Settings) -> dict[str, Pair]:
-    """Weights, placing samples and the losses on samples, with their gradients."""
+    """Placing samples and the losses on samples, with their gradients."""
     from nerfstudio.model_components.losses import lossfun_distortion, lossfun_outer
 
     from edge_depth_nerf.kernels import edge_loss_triton, ray_triton
     from edge_depth_nerf.method.losses import EPS, NARROW, edge_loss
 
     final = max(2, samples // 5)
-    densities = (5 * torch.rand(rays, samples, device=settings.device)).requires_grad_()
     outer_edges, edges = (sorted_edges(rays, each, settings) for each in (samples, final))
     outer, weights = (
         torch.rand(rays, each, device=settings.device).pow(4).div(each).requires_grad_() for each in (samples, final)
@@ -251,12 +236,6 @@ def work_along_rays(rays: int, samples: int, settings: Settings) -> dict[str, Pa
     prior, sigma = 0.1 + torch.rand(rays, device=settings.device), torch.full((rays,), 0.2, device=settings.device)
     wanted = torch.linspace(0.01, 0.99, final, device=settings.device).expand(rays, -1).contiguous()
     levels = [(outer, outer_edges[:, :-1], outer_edges[:, 1:]), (weights, edges[:, :-1], edges[:, 1:])]
-    deltas = outer_edges.diff()
-
-    def torch_weights() -> torch.Tensor:
-        depth = densities * deltas
-        before = depth.cumsum(1) - depth
-        return followed((1 - torch.exp(-depth)) * torch.exp(-before) * wanted[:, :1], densities)
 
     def placed() -> torch.Tensor:
         share = outer.detach() + 0.01
@@ -284,10 +263,6 @@ def work_along_rays(rays: int, samples: int, settings: Settings) -> dict[str, Pa
         return followed(torch.stack(each), outer, weights)
 
     return {
-        "weights": (
-            lambda: followed(ray_triton.weights_from_densities(densities, deltas) * wanted[:, :1], densities),
-            torch_weights,
-        ),
         "placing samples": (lambda: ray_triton.place_samples(outer, outer_edges, wanted, 0.01, 1e-5), placed),
         "proposal loss": (
             lambda: followed(ray_triton.bound_loss(edges, weights.detach(), outer_edges, outer), outer),
@@ -301,66 +276,11 @@ def work_along_rays(rays: int, samples: int, settings: Settings) -> dict[str, Pa
     }
 
 
-def layers(widths: Sequence[int], settings: Settings) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
-    """Weights and biases of a network, by chance."""
-    pairs = list(itertools.pairwise(widths))
-    weights = [torch.randn(out, width, device=settings.device).requires_grad_() for width, out in pairs]
-    return weights, [torch.randn(out, device=settings.device).requires_grad_() for out in widths[1:]]
-
-
-def work_of_networks(points: int, settings: Settings) -> dict[str, Pair]:
-    """nerfacto's networks, forward and backward; of a proposal network five times the points."""
-    from edge_depth_nerf.kernels import network_triton
-    from edge_depth_nerf.kernels.network import _layer_by_layer
-
-    found: dict[str, Pair] = {}
-    for widths, count in (((10, 16, 1), 5 * points), ((32, 64, 16), points), ((15, 64, 64, 3), points)):
-        weights, biases = layers(widths, settings)
-        x = torch.randn(count, widths[0], device=settings.device).requires_grad_()
-
-        def step(network: Any, x: Any = x, weights: Any = weights, biases: Any = biases) -> torch.Tensor:
-            with torch.autocast(settings.device, enabled=not settings.fake, dtype=torch.float16):
-                result = network(x, weights, biases)
-            return followed(result, x, *weights, *biases)
-
-        name = f"network of {'-'.join(map(str, widths))}, forward and backward"
-        found[name] = partial(step, network_triton.network), partial(step, _layer_by_layer)
-    return found
-
-
-def work_at_rest(points: int, settings: Settings) -> dict[str, Pair]:
-    """A proposal network with its hash grid, without gradients."""
-    from nerfstudio.field_components.encodings import HashEncoding
-
-    from edge_depth_nerf.kernels import network_triton
-    from edge_depth_nerf.kernels.network import _layer_by_layer
-
-    encoding = HashEncoding(5, 16, 256, 17, hash_init_scale=1.0, implementation="torch").to(settings.device)
-    table, scalings = encoding.hash_table.detach(), encoding.scalings.float().to(settings.device)
-    weights, biases = layers((10, 16, 1), settings)
-    places = torch.rand(points, 3, device=settings.device)
-
-    @torch.no_grad()
-    def by_torch() -> torch.Tensor:
-        with torch.autocast(settings.device, enabled=not settings.fake, dtype=torch.float16):
-            return _layer_by_layer(encoding(places), weights, biases)
-
-    def by_triton() -> torch.Tensor:
-        return network_triton.encoded_network(places, table, scalings, weights, biases)
-
-    return {"network of 10-16-1 with its hash grid, forward": (by_triton, by_torch)}
-
-
-def samples_and_networks(settings: Settings) -> dict[str, Any]:
-    """Triton's kernels for samples, losses and networks beside torch's, at the sizes of a full step."""
+def samples(settings: Settings) -> dict[str, Any]:
+    """Triton's kernels for samples and losses beside torch's, at the sizes of a full step."""
     torch.manual_seed(0)
-    rays, samples = (16, 8) if settings.fake else (4096, 256)
-    pairs = {
-        **work_by_number(rays, samples, settings),
-        **work_along_rays(rays, samples, settings),
-        **work_of_networks(rays * samples // 5, settings),
-        **work_at_rest(rays * samples, settings),
-    }
+    sizes = (16, 8) if settings.fake else (4096, 256)
+    pairs = {**work_by_number(*sizes, settings), **work_along_rays(*sizes, settings)}
     rows = []
     for name, (by_triton, by_torch) in pairs.items():
         work = by_triton if has_kernels(settings) else by_torch
@@ -583,7 +503,7 @@ PARTS = {
     "counts": Part(counts, 120),
     "tests": Part(gpu_tests, 180),
     "kernels": Part(kernels, 120),
-    "samples and networks": Part(samples_and_networks, 120),
+    "samples": Part(samples, 120),
     "our steps": Part(our_steps, 180),
     "other steps": Part(other_steps, 180),
     "profile": Part(profile, 120),

@@ -34,11 +34,10 @@ from edge_depth_nerf.kernels import (
     fields,
     hash_grid_numba,
     network_numba,
-    proposals_numba,
     ray_samplers,
     rendering_numba,
 )
-from edge_depth_nerf.plugin import model as plugin_model
+from edge_depth_nerf.plugin import step_losses
 
 RESULTS = Path(__file__).with_name("step_parts.json")
 PART = "speed: step"
@@ -47,7 +46,6 @@ STEPS = 40
 PARTS = {
     "networks": "networks, forward and backward",
     "hash grid": "hash grid",
-    "proposals": "proposal networks that rest, all of it",
     "optimisers": "gradient of its table, and Adam",
     "batch": "pixels of the batch, their rays",
     "samples": "samples: places, positions, weights; rendering, with its losses",
@@ -113,7 +111,6 @@ class Clock:
             (network_numba, ("apply_to_points", "_backward"), "networks"),
             # and waiting for other threads
             (rendering_numba, ("in_parts",), "networks"),
-            (proposals_numba, ("weigh",), "proposals"),
             (hash_grid_numba, ("encode",), "hash grid"),
             (trainer.optimizers, ("optimizer_scaler_step_some", "zero_grad_some"), "optimisers"),
             (pipeline.datamanager, ("next_train",), "batch"),
@@ -124,7 +121,7 @@ class Clock:
             (ray_samplers.FusedRaySamples, ("get_weights",), "samples"),
             (rendering_numba, ("render", "_render", "_all_gradients"), "samples"),
             (model, ("get_loss_dict", "get_metrics_dict"), "losses"),
-            (plugin_model, ("proposal_loss", "distortion_loss", "edge_losses"), "losses"),
+            (step_losses, ("interlevel_loss", "distortion_loss", "depth_loss", "sky_loss"), "losses"),
             (trainer, ("train_iteration",), "rest"),
         ):
             for name in names:

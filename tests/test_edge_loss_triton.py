@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from interpreted import NEEDS_A_GPU, assert_near, in_interpreter, on_a_gpu
 from edge_depth_nerf.kernels import edge_loss_numba
 from edge_depth_nerf.method import depth_losses
 from edge_depth_nerf.method.depth_losses import EdgeLoss, Level
-from edge_depth_nerf.method.losses import EPS, NARROW, Gaussian, edge_loss
+from edge_depth_nerf.method.losses import EDGE_LOSS, EPS, NARROW, Gaussian, edge_loss
 
 FORMS: list[tuple[Gaussian, bool]] = [("point", False), ("point", True), ("interval", False), ("interval", True)]
 
@@ -118,8 +119,8 @@ def test_compiled_without_spills(gaussian, architecture, tmp_path):
 
 def test_the_kernels_serve_what_they_can_do(monkeypatch):
     """float32 and half precision with a gradient to the weights alone; all else is left to torch."""
-    asked, of_edge_loss = [], depth_losses.of_edge_loss
-    monkeypatch.setattr(depth_losses, "of_edge_loss", lambda device: asked.append(device.type))
+    asked: list[str] = []
+    monkeypatch.setattr(depth_losses, "EDGE_LOSS", SimpleNamespace(on=lambda device: asked.append(device.type)))
     level = level_of(12, 30)
     expected = EdgeLoss()(Level(*level))
     EdgeLoss()(Level(*(each.detach().half() for each in level[:3]), *level[3:]))
@@ -128,5 +129,5 @@ def test_the_kernels_serve_what_they_can_do(monkeypatch):
     EdgeLoss()(Level(*level[:4], level[4].clone().requires_grad_()))
     assert len(asked) == 2
     monkeypatch.undo()
-    assert of_edge_loss(torch.device("cpu")) is edge_loss_numba
+    assert EDGE_LOSS.on(torch.device("cpu")) is edge_loss_numba.edge_loss
     torch.testing.assert_close(EdgeLoss()(Level(*level)), expected, rtol=2e-5, atol=1e-6)

@@ -11,21 +11,21 @@ from typing import Any
 import pytest
 import torch
 from models import build
-from nerfstudio.cameras.rays import RayBundle, RaySamples
+from nerfstudio.cameras.rays import Frustums, RayBundle, RaySamples
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.field_components.encodings import HashEncoding
 from nerfstudio.field_components.mlp import MLP
 from nerfstudio.field_components.spatial_distortions import SceneContraction
+from nerfstudio.fields.nerfacto_field import NerfactoField
 from nerfstudio.model_components.losses import lossfun_distortion, lossfun_outer
-from nerfstudio.model_components.ray_samplers import (
-    PDFSampler,
-    ProposalNetworkSampler,
-    UniformLinDispPiecewiseSampler,
-)
+from nerfstudio.model_components.ray_samplers import PDFSampler, UniformLinDispPiecewiseSampler
+from nerfstudio.models import nerfacto
 
-from edge_depth_nerf.kernels import hash_grid_numba, network_numba, proposals_numba
+from edge_depth_nerf.kernels import hash_grid_numba, network_numba
 from edge_depth_nerf.kernels import network as network_module
 from edge_depth_nerf.kernels.contraction_numba import contract
-from edge_depth_nerf.kernels.fields import FusedMLP, FusedNerfactoField
+from edge_depth_nerf.kernels.fields import FusedDensityField, FusedMLP, FusedNerfactoField
+from edge_depth_nerf.kernels.fused_hash_grid import FusedHashEncoding
 from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss, interlevel_loss
 from edge_depth_nerf.kernels.network import network
 from edge_depth_nerf.kernels.ray_samplers import (
@@ -38,6 +38,7 @@ from edge_depth_nerf.kernels.ray_samplers import (
     samples_along,
 )
 from edge_depth_nerf.plugin.config import FusedAdamConfig
+from edge_depth_nerf.plugin.fused.build import FORMS, fused_forms
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
 
 
@@ -253,58 +254,19 @@ def test_the_first_samples_lie_where_nerfstudio_puts_them(training, single_jitte
     assert found[0][1].std() > 1
 
 
-@pytest.mark.parametrize("threads", [1, 2])
-@pytest.mark.parametrize("anneal", [1.0, 0.3])
-@pytest.mark.parametrize("steps", [0, 1, 2], ids=["evaluation", "networks learn", "networks rest"])
-def test_the_fused_sampler_proposes_as_nerfstudios(steps, anneal, threads, monkeypatch):
-    """Samples, weights and gradients of all rounds; a network that rests is asked at once, in shares for threads."""
-    monkeypatch.setattr(proposals_numba, "LEAST_SHARE", 16)
-    torch.set_num_threads(threads)
-    model = build().train(steps > 0)
-    asked, found = [], []
-    with torch.no_grad():
-        for parameter in model.proposal_networks.parameters():
-            parameter.copy_(0.4 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(4)))
-    sampler = model.proposal_sampler
-    assert isinstance(sampler, FusedProposalSampler)
-    whole = proposals_numba.weigh
-    monkeypatch.setattr(proposals_numba, "weigh", lambda *given: asked.append(1) or whole(*given))
-    for kind in (ProposalNetworkSampler, FusedProposalSampler):
-        sampler._step, sampler._steps_since_update = (0, 3) if steps == 1 else (1000, 1)
-        sampler.set_anneal(anneal)
-        torch.manual_seed(2)
-        with torch.set_grad_enabled(steps > 0):
-            samples, weights, before = kind.generate_ray_samples(
-                sampler, bundle(planes=True), density_fns=model.density_fns
-            )
-        gradients = []
-        if steps == 1:
-            loss = torch.stack([each.square().sum() for each in weights]).sum()
-            gradients = list(torch.autograd.grad(loss, list(model.proposal_networks.parameters())))
-        assert [each.requires_grad for each in weights] == [steps == 1] * 2
-        assert sampler._steps_since_update == (0 if steps == 1 else 1)
-        found.append([*(edges_of(each) for each in (*before, samples)), *weights, *gradients])
-    assert len(asked) == (0 if steps == 1 else 2)
-    for expected, mine in zip(*found, strict=True):
-        largest = float(expected.abs().max())
-        torch.testing.assert_close(mine, expected, rtol=1e-4, atol=2e-5 * largest)
-    assert float(found[0][4].std()) > 0
-
-
-@pytest.mark.parametrize("case", ["gradients are followed", "positions in a box", "half precision", "other rays"])
-def test_what_a_network_cannot_weigh_at_once(case):
-    model = build(disable_scene_contraction=case == "positions in a box").eval()
-    network: Any = model.proposal_networks[0]
-    samples = model.proposal_sampler.initial_sampler(bundle(planes=True), num_samples=7)
-    with torch.no_grad():
-        if case != "positions in a box":
-            assert network.weigh(samples).shape == (40, 7, 1)
-        if case == "other rays":
-            samples.frustums.directions = samples.frustums.directions.clone()
-        if case == "half precision":
-            network.mlp_base[0].hash_table.data = network.mlp_base[0].hash_table.data.half()
-        with torch.set_grad_enabled(case == "gradients are followed"):
-            assert network.weigh(samples) is None
+def test_nerfactos_parts_are_built_as_ours_and_nobody_elses():
+    """Their constructors' names are nerfstudio's again afterwards."""
+    kinds = {type(part) for part in build().modules()}
+    assert {FusedNerfactoField, FusedDensityField, FusedMLP, FusedHashEncoding, FusedProposalSampler} < kinds
+    assert {FirstSampler, FusedPDFSampler} < kinds and not {MLP, HashEncoding, PDFSampler} & kinds
+    for module, forms in FORMS:
+        assert not [name for name, form in forms.items() if getattr(module, name) is form]
+    with pytest.raises(ZeroDivisionError), fused_forms():
+        assert nerfacto.NerfactoField is FusedNerfactoField
+        raise ZeroDivisionError
+    assert nerfacto.NerfactoField is NerfactoField
+    torch_form = {type(part) for part in build(implementation="torch").modules()}
+    assert {MLP, HashEncoding, PDFSampler} < torch_form and not {FusedMLP, FusedHashEncoding} & torch_form
 
 
 @pytest.mark.parametrize("shape", [(40,), (20, 2)], ids=str)
@@ -317,7 +279,8 @@ def test_samples_along_rays_are_nerfstudios_field_by_field(shape):
     more = {"spacing_starts": edges[..., :-1, :] / 9, "spacing_to_euclidean_fn": torch.exp}
     expected = rays.get_ray_samples(bin_starts=edges[..., :-1, :], bin_ends=edges[..., 1:, :], **more)
     found = samples_along(rays, edges[..., :-1, :], edges[..., 1:, :], **more)
-    assert (type(found), type(found.frustums)) == (FusedRaySamples, FusedFrustums)
+    kinds = (FusedRaySamples, FusedFrustums) if len(shape) == 1 else (RaySamples, Frustums)
+    assert (type(found), type(found.frustums)) == kinds
     assert found.shape == expected.shape == (*rays.shape, 7)
     assert expected.metadata
     compared = []

@@ -1,18 +1,13 @@
-"""The forms of the hash grid's Triton kernels against the CPU's kernels, and which of them runs."""
+"""The hash grid's Triton kernels against the CPU's kernels, in Triton's interpreter; and compiled."""
 
 from __future__ import annotations
-
-import dataclasses
-import os
-from dataclasses import dataclass
 
 import pytest
 import torch
 from ahead_of_time import ARCHITECTURES, compiled
 from interpreted import NEEDS_A_GPU, assert_near, in_interpreter, on_a_gpu
 
-from edge_depth_nerf.kernels import form_choice, hash_grid_numba
-from edge_depth_nerf.kernels.form_choice import form_for
+from edge_depth_nerf.kernels import hash_grid_numba
 
 SIZES = ((3, 2, 150), (2, 4, 5), (1, 1, 128), (5, 3, 65))
 """Levels, features and points."""
@@ -30,9 +25,6 @@ def inputs(levels: int, features: int, count: int) -> tuple[torch.Tensor, ...]:
     return x, torch.randn(levels * 256, features), scalings, torch.randn(count, levels * features)
 
 
-FORMS_OF_ADDING = "points=128", "points=64,sums_below=60", "points=32,sums_below=1000"
-
-
 def check_encoding() -> None:
     from edge_depth_nerf.kernels import hash_grid_triton as kernels
 
@@ -40,13 +32,10 @@ def check_encoding() -> None:
         x, table, scalings, gradient = inputs(levels, features, count)
         expected = hash_grid_numba.encode(x, table, scalings)
         slope = hash_grid_numba.position_gradient(x, table, gradient, scalings)
-        for form in ("points=256", "points=64,level_major=1"):
-            os.environ[kernels.VARIABLE] = form
-            found = kernels.encode(x, table, scalings)
-            assert_near(found, expected, 1e-6)
-            assert (found.stride(0) == 1) == ("level_major" in form or levels * features == 1)
-            # in half precision it is rounded at the end
-            assert torch.equal(kernels.encode(x, table, scalings, torch.float16), found.half())
+        found = kernels.encode(x, table, scalings)
+        assert_near(found, expected, 1e-6)
+        # in half precision it is rounded at the end
+        assert torch.equal(kernels.encode(x, table, scalings, torch.float16), found.half())
         for given in (gradient, gradient.t().contiguous().t()):
             assert_near(kernels.position_gradient(x, table, given, scalings), slope, 1e-5)
     nowhere = kernels.encode(x[:0], table, scalings)
@@ -60,9 +49,7 @@ def check_the_tables_gradient() -> None:
     for levels, features, count in SIZES:
         x, table, scalings, gradient = inputs(levels, features, count)
         expected = hash_grid_numba.table_gradient(x, gradient, scalings, len(table))
-        for form in FORMS_OF_ADDING:
-            os.environ[kernels.VARIABLE] = form
-            given = gradient.t().contiguous().t() if form == FORMS_OF_ADDING[0] else gradient
+        for given in (gradient, gradient.t().contiguous().t()):
             assert_near(kernels.table_gradient(x, given, scalings, len(table)), expected, 2e-6)
             whole = kernels.table_gradient(x, given.half().float(), scalings, len(table))
             assert_near(kernels.table_gradient(x, given.half(), scalings, len(table)), whole, 1e-6)
@@ -80,10 +67,8 @@ def check_what_is_not_finite() -> None:
     gradient[33, 1], gradient[40, 2] = float("nan"), float("inf")
     expected = hash_grid_numba.table_gradient(x, gradient, scalings, len(table))
     assert expected.isnan().any() and not expected.isnan().all()
-    for form in FORMS_OF_ADDING:
-        os.environ[kernels.VARIABLE] = form
-        found = kernels.table_gradient(x, gradient, scalings, len(table))
-        torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5, equal_nan=True)
+    found = kernels.table_gradient(x, gradient, scalings, len(table))
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5, equal_nan=True)
     x[5, 1], x[6] = float("nan"), float("inf")
     usable = x.isfinite().all(1)
     found = kernels.encode(x, table, scalings)
@@ -106,17 +91,14 @@ def test_the_same_on_a_gpu():
 @pytest.mark.slow
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
 @pytest.mark.parametrize("features", [2, 4])
-def test_each_form_compiles_without_spills(architecture, features, tmp_path, monkeypatch):
+def test_compiled_without_spills(architecture, features, tmp_path):
     kernels = pytest.importorskip("edge_depth_nerf.kernels.hash_grid_triton")
     x, table, scalings, gradient = inputs(5, features, 1000)
 
     def run():
-        for form in dict.fromkeys((*kernels.ENCODING, *kernels.ADDING)):
-            numbers = dataclasses.asdict(form).items()
-            monkeypatch.setenv(kernels.VARIABLE, ",".join(f"{name}={int(number)}" for name, number in numbers))
-            # as under autocast; float32 takes no more registers
-            kernels.encode(x, table, scalings, torch.float16)
-            kernels.table_gradient(x, gradient.half(), scalings, len(table))
+        # as under autocast; float32 takes no more registers
+        kernels.encode(x, table, scalings, torch.float16)
+        kernels.table_gradient(x, gradient.half(), scalings, len(table))
         kernels.position_gradient(x, table, gradient, scalings)
 
     found = compiled(run, architecture, tmp_path)
@@ -137,53 +119,3 @@ def test_each_form_compiles_without_spills(architecture, features, tmp_path, mon
     }
     # a row's features in one instruction, where the architecture has it
     assert additions == {8 if architecture >= 90 else 8 * features}
-
-
-@dataclass(frozen=True)
-class Form:
-    points: int = 128
-    share: float = 0.5
-    wide: bool = False
-
-
-def not_run(form: Form) -> None:
-    pytest.fail(f"{form} is not to be run")
-
-
-FORMS = Form(), Form(256), Form(64, wide=True)
-
-
-def test_the_fastest_form_is_measured_once_for_each_size(monkeypatch):
-    monkeypatch.setattr(form_choice, "_fastest", {})
-    monkeypatch.delenv("A_FORM", raising=False)
-    ran = []
-
-    def run(form: Form) -> None:
-        ran.append(form)
-        if form.points == 64:
-            raise RuntimeError("out of registers")
-
-    def seconds(call) -> float:
-        call()
-        return {128: 3.0, 256: 2.0}[ran[-1].points]
-
-    for _ in range(2):
-        assert form_for("A_FORM", FORMS, (7,), run, True, seconds) == Form(256)
-    assert ran == [*FORMS]
-    assert form_for("A_FORM", FORMS, (8,), run, True, seconds) == Form(256)
-    assert ran == [*FORMS, *FORMS]
-
-
-def test_without_a_gpu_the_first_form_runs_and_the_environment_names_another(monkeypatch):
-    monkeypatch.delenv("A_FORM", raising=False)
-    assert form_for("A_FORM", FORMS, (7,), not_run, False) == Form()
-    monkeypatch.setenv("A_FORM", "points=32,wide=1,share=0.25")
-    for on_gpu in (True, False):
-        assert form_for("A_FORM", FORMS, (7,), not_run, on_gpu) == Form(32, 0.25, True)
-
-
-@pytest.mark.parametrize("given", ["size=3", "points=many", "points", "points=64,"])
-def test_a_form_that_there_is_not(given, monkeypatch):
-    monkeypatch.setenv("A_FORM", given)
-    with pytest.raises(ValueError, match=r"A_FORM=.*expected points=…, share=…, wide=…"):
-        form_for("A_FORM", FORMS, (7,), not_run, False)

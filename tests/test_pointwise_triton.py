@@ -10,9 +10,8 @@ import torch
 from ahead_of_time import ARCHITECTURES, compiled
 from interpreted import NEEDS_A_GPU, assert_near, in_interpreter, moved_in_interpreter, on_a_gpu
 from numba import njit
-from torch._subclasses.fake_tensor import FakeTensorMode
 
-from edge_depth_nerf.kernels import back_ends, pointwise_numba, threads
+from edge_depth_nerf.kernels import pointwise_numba, threads
 from edge_depth_nerf.kernels.exponential_numba import exp
 
 SIZES = ((1, 1), (5, 17), (33, 49), (3, 256), (7, 300))
@@ -50,8 +49,7 @@ def check_distances(kernels: Any = None) -> None:
     assert kernels.distances(places[:0], nears[:0], fars[:0]).shape == (0, count)
 
 
-def check_positions(kernels: Any = None) -> None:
-    kernels = kernels or by_triton()
+def check_positions(kernels: Any) -> None:
     for rays, count in SIZES:
         torch.manual_seed(rays)
         origins, directions = torch.randn(rays, 3, 4)[..., 0], torch.randn(2 * rays, 3)[::2]
@@ -63,24 +61,20 @@ def check_positions(kernels: Any = None) -> None:
     assert kernels.middles(origins[:0], directions[:0], edges[:0], edges[:0]).shape == (0, count + 1, 3)
 
 
-def check_densities(kernels: Any = None) -> None:
-    kernels = kernels or by_triton()
+def check_densities(kernels: Any) -> None:
     for count in (1, 255, 700):
         torch.manual_seed(count)
-        for dtype, tolerance in ((torch.float32, 1e-6), (torch.float16, 1e-3))[
-            : 1 if kernels is pointwise_numba else 2
-        ]:
-            features = (12 * torch.randn(count, 5)).to(dtype)
-            features[-1, 0] = 20  # steeper than the gradient follows
-            before = features[:, 0].detach().requires_grad_()
-            inside, gradient = (torch.arange(count) % 3 != 1).float(), torch.randn(count) * 1e-3
-            found = kernels.density(before, inside, 0.01)
-            exact = before.detach().double()
-            assert_near(found.detach(), 0.01 * exact.exp() * inside, 1e-6)
-            (to_before,) = torch.autograd.grad(found, before, gradient)
-            expected = 0.01 * exact.clamp(-15, 15).exp() * inside * gradient
-            assert to_before.dtype == dtype and found.dtype == torch.float32
-            assert_near(to_before, expected, tolerance)
+        features = 12 * torch.randn(count, 5)
+        features[-1, 0] = 20  # steeper than the gradient follows
+        before = features[:, 0].detach().requires_grad_()
+        inside, gradient = (torch.arange(count) % 3 != 1).float(), torch.randn(count) * 1e-3
+        found = kernels.density(before, inside, 0.01)
+        exact = before.detach().double()
+        assert_near(found.detach(), 0.01 * exact.exp() * inside, 1e-6)
+        (to_before,) = torch.autograd.grad(found, before, gradient)
+        expected = 0.01 * exact.clamp(-15, 15).exp() * inside * gradient
+        assert to_before.dtype == found.dtype == torch.float32
+        assert_near(to_before, expected, 1e-6)
     with torch.no_grad():
         before[3] = float("nan")
     assert kernels.density(before, inside, 1.0).isnan().nonzero().tolist() == [[3]]
@@ -106,10 +100,24 @@ def check_harmonics(kernels: Any = None) -> None:
     assert kernels.harmonics(directions[:0], dtype).shape == (0, 16)
 
 
+def check_contraction() -> None:
+    """Near and far, on borders, no numbers; no multiple of what a program works on, and no point at all."""
+    from edge_depth_nerf.kernels import contraction_numba, pointwise_triton
+
+    at = torch.tensor([-30.0, -2.0, -1.0, -0.5, 0.0, 0.3, 1.0, 1e6, 1e30, float("nan")])
+    x = torch.cat([torch.cartesian_prod(at, at, at), 3 * torch.randn(300, 3)])
+    usable = ~x.isnan().any(1)
+    (places, inside), (expected, marked) = (module.contract(x) for module in (pointwise_triton, contraction_numba))
+    assert torch.equal(inside[usable], marked[usable]) and 0 < int(inside.sum()) < len(x)
+    torch.testing.assert_close(places[usable], expected[usable], rtol=2e-7, atol=0)
+    assert not inside[~usable].any() and places[~usable].isnan().any(1).all()
+    assert [each.shape for each in pointwise_triton.contract(x[:0])] == [(0, 3), (0,)]
+
+
 @pytest.mark.slow
 def test_in_the_interpreter():
     pytest.importorskip("triton")
-    in_interpreter(check_distances, check_positions, check_densities, check_harmonics)
+    in_interpreter(check_distances, check_contraction, check_harmonics)
 
 
 @njit
@@ -146,13 +154,13 @@ def test_the_same_on_three_threads(check, monkeypatch):
 
 @NEEDS_A_GPU
 def test_the_same_on_a_gpu():
-    on_a_gpu(check_distances, check_positions, check_densities, check_harmonics)
+    on_a_gpu(check_distances, check_contraction, check_harmonics)
 
 
 @pytest.mark.slow
 def test_memory_goes_there_and_back_as_it_lies():
     pytest.importorskip("triton")
-    moved_in_interpreter(check_positions, check_densities)
+    moved_in_interpreter(check_distances, check_harmonics)
 
 
 @pytest.mark.slow
@@ -161,37 +169,17 @@ def test_compiled_without_spills(architecture, tmp_path):
     kernels = pytest.importorskip("edge_depth_nerf.kernels.pointwise_triton")
 
     def step():
-        rays, before = torch.rand(300, 3), torch.rand(300, 16).half().requires_grad_()
+        rays = torch.rand(300, 3)
         kernels.distances(rays, rays[:, :1], rays[:, :1])
-        kernels.middles(rays, rays, rays, rays)
-        kernels.density(before[:, 0], rays[:, 0], 0.01).sum().backward()
+        kernels.contract(rays)
         for dtype in (torch.float16, torch.float32):
             kernels.harmonics(rays, dtype)
 
     found = compiled(step, architecture, tmp_path)
     assert sorted({kernel.name.split()[0] for kernel in found}) == [
-        "_before_gradient_kernel",
-        "_density_kernel",
+        "_contract_kernel",
         "_distance_kernel",
         "_harmonics_kernel",
-        "_middle_kernel",
     ]
     assert {kernel.spilled for kernel in found} == {0}
     assert max(kernel.registers for kernel in found) <= 64
-
-
-def test_what_the_kernels_serve(monkeypatch):
-    """float32, where nobody asks for a gradient."""
-    asked = []
-    monkeypatch.setattr(back_ends, "working", lambda *given: asked.append(given))
-    with FakeTensorMode():
-        x = torch.empty(4, 3, device="cuda")
-        followed, half = torch.empty(4, 3, device="cuda", requires_grad=True), x.half()
-    for given in ((x, half), (x, followed), (half.cpu(),), (x, x.cpu())):
-        assert back_ends.by_number(*given) is None
-    assert back_ends.by_number(x.cpu()) is pointwise_numba
-    assert not asked
-    back_ends.by_number(x, x)
-    with torch.no_grad():
-        back_ends.by_number(followed)
-    assert [module for module, *_ in asked] == ["pointwise_triton"] * 2

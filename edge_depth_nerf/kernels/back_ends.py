@@ -1,40 +1,30 @@
-"""Which kernels serve some tensors: Numba's on the CPU, Triton's on a GPU if they work there.
+"""Which form of a function serves some tensors: Numba's on the CPU, Triton's on a GPU if it gives torch's numbers.
 
-Triton may be missing, find no C compiler, or not know the GPU. A module of kernels says how to find out: its function
-`try_out` calls each of them once on a few numbers.
+Triton may be missing, find no C compiler, not know the GPU, or compile something that computes something else. So the
+first use of a kernel on a device compares it with its formula in torch.
 """
 
 from __future__ import annotations
 
-import functools
-import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from importlib import import_module
-from types import ModuleType
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
-MODULES: dict[str, Callable[[], ModuleType]] = {
-    # imported when they are asked for, because Triton takes half a second to load
-    "contraction_triton": lambda: import_module("edge_depth_nerf.kernels.contraction_triton"),
-    "edge_loss_triton": lambda: import_module("edge_depth_nerf.kernels.edge_loss_triton"),
-    "hash_grid_triton": lambda: import_module("edge_depth_nerf.kernels.hash_grid_triton"),
-    "network_triton": lambda: import_module("edge_depth_nerf.kernels.network_triton"),
-    "pointwise_triton": lambda: import_module("edge_depth_nerf.kernels.pointwise_triton"),
-    "ray_triton": lambda: import_module("edge_depth_nerf.kernels.ray_triton"),
-}
-"""The modules of kernels by their names."""
+Example = dict[str, Any]
+"""Arguments of a function by their names; tensors that require a gradient get one."""
 
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Enable gradients and stop tracing, to try out and measure kernels.
+    """Enable gradients and stop tracing, to try out kernels.
 
-    The first caller may be a rendering. It has no gradients, which `try_out` needs. In the viewer's thread nerfstudio
+    The first caller may be a rendering. It has no gradients, which a trial needs. In the viewer's thread nerfstudio
     also traces each line of Python, and ends a picture by an error there. It would look like an error of the kernel.
     """
     trace = sys.gettrace()
@@ -46,82 +36,151 @@ def undisturbed() -> Iterator[None]:
         sys.settrace(trace)
 
 
-@functools.lru_cache
-def working(module: str, device: torch.device, what: str) -> ModuleType | None:
-    """Give a module of `edge_depth_nerf.kernels` whose kernels work on a device, None where they do not.
+class KernelDiffersError(Exception):
+    """Says how far a kernel is from its formula."""
 
-    The first call for a CUDA device runs the kernels and warns where one fails.
+
+@dataclass(frozen=True, eq=False)
+class GpuForm:
+    """A kernel of Triton beside its formula, and what both are tried out on."""
+
+    name: str
+    """As a warning calls it."""
+    load: Callable[[], Callable[..., Any]]
+    """Gives the kernel's function. It imports Triton, which takes half a second."""
+    formula: Callable[..., Any]
+    """The same in torch, of float64."""
+    examples: Callable[[torch.device], Sequence[Example]]
+    """Makes arguments of a few hundred numbers, of no round sizes."""
+    tolerance: float
+    """Greatest difference of results and of gradients, relative to the largest value."""
+    most_columns: int | None = None
+    """So many columns of a matrix it serves; None: any number."""
+
+    def try_out(self, device: torch.device) -> Callable[..., Any]:
+        """Give the kernel's function if its results and gradients on a device are those of the formula.
+
+        Raises:
+            KernelDiffersError: they are not.
+            Exception: whatever keeps it from working.
+
+        """
+        kernel = self.load()
+        for example in self.examples(device):
+            expected = _outcome(self.formula, example, torch.float64)
+            for (what, found), (_, exact) in zip(_outcome(kernel, example), expected, strict=True):
+                self._compare(what, found, exact)
+        return kernel
+
+    def _compare(self, what: str, found: Tensor | None, exact: Tensor | None) -> None:
+        if found is None or exact is None or found.shape != exact.shape:
+            raise KernelDiffersError(f"its {what} is missing or has another shape")
+        allowed = max(self.tolerance, torch.finfo(found.dtype).eps)
+        off, largest = (found.double() - exact).abs().max(), exact.abs().max()
+        # so that what is no number fails; one number for the host to wait for
+        if not bool(off <= allowed * largest):
+            share = float(off / largest)
+            raise KernelDiffersError(f"its {what} is off by {share:.1e} of the largest value, allowed is {allowed:.0e}")
+
+
+def _outcome(
+    function: Callable[..., Any], example: Example, dtype: torch.dtype | None = None
+) -> list[tuple[str, Tensor | None]]:
+    """Give what a function returns, and the gradients to its arguments, each with a word for it.
 
     Args:
-        module: its name; it has a function `try_out(device)`.
-        device: of the tensors; without a GPU there is nothing to try.
-        what: what the kernels compute, for the warning.
+        function: takes the example's arguments.
+        example: is not changed.
+        dtype: that of tensors of floats; None: their own.
 
     """
-    if device.type != "cuda":
-        return None
-    failure = None
-    with undisturbed():
-        try:
-            kernels = MODULES[module]()
-            kernels.try_out(device)
-        except Exception as error:  # whatever keeps Triton from working here
-            failure = error
-    if failure is None:
-        return kernels
+    leaves: list[Tensor] = []
+
+    def given(value: Any) -> Any:
+        if isinstance(value, (list, tuple)):
+            return type(value)(map(given, value))
+        if not isinstance(value, Tensor) or not value.is_floating_point():
+            return value
+        # where no gradient is asked for a view stays a view
+        made = value if dtype is None else value.to(dtype)
+        if value.requires_grad:
+            made = made.detach().clone().requires_grad_()
+            leaves.append(made)
+        return made
+
+    found = function(**{name: given(value) for name, value in example.items()})
+    results = found if isinstance(found, tuple) else (found,)
+    if leaves:
+        # factors that differ, as errors may cancel out in a sum, and have no more digits than half precision
+        every = torch.cat([each.flatten().double() for each in results])
+        (every * (torch.arange(len(every), device=every.device) % 7 - 2.5)).sum().backward()
+    return [*(("result", each.detach()) for each in results), *(("gradient", leaf.grad) for leaf in leaves)]
+
+
+_tried: dict[tuple[GpuForm, torch.device], Callable[..., Any] | None] = {}
+"""What trials have found."""
+
+
+def tried_out(form: GpuForm, device: torch.device) -> Callable[..., Any] | None:
+    """Give a kernel's function if it works on a device; else None.
+
+    The first call runs the kernel, and warns where it does not work. While a CUDA graph is recorded, which a trial
+    would spoil, nothing new is tried.
+    """
+    key = form, device
+    if key not in _tried:
+        if torch.cuda.is_initialized() and torch.cuda.is_current_stream_capturing():
+            return None
+        with undisturbed():
+            _tried[key] = _try_out(form, device)
+    return _tried[key]
+
+
+def _try_out(form: GpuForm, device: torch.device) -> Callable[..., Any] | None:
+    try:
+        return form.try_out(device)
+    except KernelDiffersError as error:
+        failure = str(error)
+    except Exception as error:  # whatever keeps Triton from working here
+        failure = f"{type(error).__name__}: {error}"
     warnings.warn(
-        f"The fused {what} does not work on {device} ({type(failure).__name__}: {failure}); "
-        "nerfstudio's torch form takes its place, with the same results but slower.",
+        f"The fused {form.name} does not work on {device} ({failure}); torch's form takes its place, with the same "
+        "results but slower.",
         stacklevel=2,
     )
     return None
 
 
-def _on_the_cpu(tensors: Sequence[Tensor]) -> bool:
-    """Whether these are float32 on the CPU."""
-    return all(each.device.type == "cpu" and each.dtype == torch.float32 for each in tensors)
+@dataclass(frozen=True, eq=False)
+class Function:
+    """A function that has compiled forms, which give what torch gives in fewer passes."""
 
+    on_cpu: Callable[[], Callable[..., Any]]
+    """Gives the form of the CPU. It imports Numba, which takes half a second."""
+    on_gpu: GpuForm | None = None
+    """None: torch serves a GPU as fast."""
+    follows: bool = True
+    """Whether compiled forms have gradients."""
 
-def along_rays(*tensors: Tensor) -> ModuleType | None:
-    """Give the kernels along rays for matrices that have a row a ray; None where none serve them.
+    def on(self, device: torch.device) -> Callable[..., Any] | None:
+        """Give the form for a device; None where torch's has to serve."""
+        if device.type == "cpu":
+            return self.on_cpu()
+        if device.type != "cuda" or self.on_gpu is None:
+            return None
+        return tried_out(self.on_gpu, device)
 
-    On the CPU they are `ray_numba`. On CUDA they are `ray_triton`, for rays whose samples stay on the chip. Both serve
-    float32.
-    """
-    if _on_the_cpu(tensors):
-        # imported here, because Numba takes half a second to load
-        from edge_depth_nerf.kernels import ray_numba
-
-        return ray_numba
-    if any(each.device.type != "cuda" or each.dtype != torch.float32 for each in tensors):
-        return None
-    kernels = working("ray_triton", tensors[0].device, "form of samples along rays")
-    return kernels if kernels is not None and kernels.fits(*(each.shape[1] for each in tensors)) else None
-
-
-def by_number(*tensors: Tensor) -> ModuleType | None:
-    """Give the kernels of what is computed number by number, Numba's or Triton's; None where none serve it.
-
-    They serve float32 where nobody asks for a gradient to these tensors.
-    """
-    if torch.is_grad_enabled() and any(each.requires_grad for each in tensors):
-        return None
-    if _on_the_cpu(tensors):
-        from edge_depth_nerf.kernels import pointwise_numba
-
-        return pointwise_numba
-    if any(each.device.type != "cuda" or each.dtype != torch.float32 for each in tensors):
-        return None
-    return working("pointwise_triton", tensors[0].device, "arithmetic of samples")
-
-
-def of_edge_loss(device: torch.device) -> ModuleType | None:
-    """Give the kernels of the edge loss, Numba's or Triton's; None where none serve a device."""
-    if device.type == "cpu":
-        from edge_depth_nerf.kernels import edge_loss_numba
-
-        return edge_loss_numba
-    return working("edge_loss_triton", device, "edge loss")
+    def compiled_for(self, *tensors: Tensor) -> Callable[..., Any] | None:
+        """Give the form for float32 tensors of one device; None where torch's has to serve."""
+        device = tensors[0].device
+        if any(each.device.type != device.type or each.dtype != torch.float32 for each in tensors):
+            return None
+        if not self.follows and torch.is_grad_enabled() and any(each.requires_grad for each in tensors):
+            return None
+        most = None if self.on_gpu is None or device.type == "cpu" else self.on_gpu.most_columns
+        if most is not None and any(each.shape[1] > most for each in tensors):
+            return None
+        return self.on(device)
 
 
 def made_by_autocast(device: torch.device) -> torch.dtype:
@@ -132,28 +191,3 @@ def made_by_autocast(device: torch.device) -> torch.dtype:
     if device.type == "cuda" and torch.is_autocast_enabled("cuda"):
         return torch.get_autocast_dtype("cuda")
     return torch.float32
-
-
-NETWORK = "EDGE_DEPTH_NERF_NETWORK"
-"""Environment variable that turns on the kernels of networks; no GPU has compared them yet. `triton`: networks.
-`triton+encoding`: also networks together with the hash grid in front of them, where nobody follows gradients."""
-
-
-def of_network(x: Tensor, weights: Sequence[Tensor]) -> ModuleType | None:
-    """Give the kernels of networks, `network_triton`; None where not requested, or for an unsupported network.
-
-    They serve what autocast would compute in float16 on CUDA.
-    """
-    if os.environ.get(NETWORK) not in ("triton", "triton+encoding") or x.device.type != "cuda":
-        return None
-    if not torch.is_autocast_enabled("cuda") or torch.get_autocast_dtype("cuda") != torch.float16:
-        return None
-    kernels = working("network_triton", x.device, "network")
-    return kernels if kernels is not None and kernels.fits(weights) else None
-
-
-def of_encoded_network(positions: Tensor, weights: Sequence[Tensor]) -> ModuleType | None:
-    """Give the kernels of networks that encode positions first; None as for `of_network`, or with gradients."""
-    if os.environ.get(NETWORK) != "triton+encoding" or torch.is_grad_enabled() or positions.dtype != torch.float32:
-        return None
-    return of_network(positions, weights)

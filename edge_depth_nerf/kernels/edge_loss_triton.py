@@ -135,12 +135,3 @@ def edge_loss(
     losses = _EdgeLoss.apply(*(each.float() for each in (weights, starts_m, ends_m, prior_m, sigma_m)), options)
     assert isinstance(losses, Tensor)
     return losses
-
-
-def try_out(device: torch.device) -> None:
-    """Run each kernel once; raises whatever keeps it from working."""
-    edges = torch.arange(1.0, 4.0, device=device)[None]
-    weights = torch.full((1, 2), 0.5, device=device, requires_grad=True)
-    one = torch.ones(1, device=device)
-    given = weights, edges[:, :-1], edges[:, 1:], one, one
-    edge_loss(*given, interval=True, divide_by_norm=True, eps=1e-7, narrow=0.05).sum().backward()

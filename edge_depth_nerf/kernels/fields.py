@@ -8,7 +8,6 @@ positions in a box) is left to nerfstudio's.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from types import ModuleType
 from typing import Any
 
 import torch
@@ -24,8 +23,9 @@ from nerfstudio.fields.density_fields import HashMLPDensityField
 from nerfstudio.fields.nerfacto_field import NerfactoField
 from torch import Tensor, nn
 
-from edge_depth_nerf.kernels.back_ends import by_number, made_by_autocast, working
-from edge_depth_nerf.kernels.fused_hash_grid import FusedHashEncoding
+from edge_depth_nerf.kernels import formulas
+from edge_depth_nerf.kernels.back_ends import made_by_autocast
+from edge_depth_nerf.kernels.functions import CONTRACT, DENSITY, HARMONICS
 from edge_depth_nerf.kernels.network import network
 from edge_depth_nerf.kernels.rendering import Background, Networks, Rendered
 
@@ -38,8 +38,7 @@ class CubeContraction(SceneContraction):
 
     def forward(self, positions: Float[Tensor, "*bs 3"]) -> Float[Tensor, "*bs 3"]:
         """Contract positions in scene units to -2..2."""
-        norm = positions.abs().amax(dim=-1, keepdim=True)
-        return torch.where(norm < 1, positions, (2 - 1 / norm) * (positions / norm))
+        return formulas.cube(positions)
 
 
 def _in_parts(x: Tensor) -> bool:
@@ -79,38 +78,20 @@ class FusedMLP(MLP):
         return result if self.out_activation is None else self.out_activation(result)
 
 
-def _contraction(device: torch.device) -> ModuleType | None:
-    """Give the module that contracts positions on a device."""
-    if device.type == "cpu":
-        # imported here, because Numba takes half a second to load
-        from edge_depth_nerf.kernels import contraction_numba
-
-        return contraction_numba
-    return working("contraction_triton", device, "contraction")
-
-
-def _unit_cube(field: Any, positions: Float[Tensor, "*bs 3"]) -> tuple[Tensor, Tensor]:
+def _unit_cube(positions: Float[Tensor, "*bs 3"]) -> tuple[Tensor, Tensor]:
     """Positions in scene units to 0..1, flat, and 1 for those strictly inside (else 0), of shape [*bs, 1]."""
     flat = positions.reshape(-1, 3)
-    kernels = None
-    if flat.dtype == torch.float32 and not flat.requires_grad:
-        kernels = _contraction(flat.device)
-    if kernels is not None:
-        places, inside = kernels.contract(flat)
-    else:
-        places = (field.spatial_distortion(flat) + 2) / 4
-        inside = ((places > 0) & (places < 1)).all(dim=-1).to(flat)
-        places = places * inside[..., None]
+    plain = flat.dtype == torch.float32 and not flat.requires_grad
+    places, inside = ((CONTRACT.on(flat.device) if plain else None) or formulas.contract)(flat)
     return places, inside.view(*positions.shape[:-1], 1)
 
 
 def _densities(before: Float[Tensor, "*bs 1"], inside: Float[Tensor, "*bs 1"], scale: float) -> Float[Tensor, "*bs 1"]:
     """Densities from a network's outputs; 0 where a point is not inside."""
-    mixed = before.device.type == "cpu" and before.dtype != torch.float32
-    kernels = None if mixed else by_number(inside)
-    if kernels is None:
+    compute = DENSITY.compiled_for(before, inside)
+    if compute is None:
         return scale * trunc_exp(before.to(inside)) * inside
-    return kernels.density(before.reshape(-1), inside.reshape(-1), scale).view(inside.shape)
+    return compute(before.reshape(-1), inside.reshape(-1), scale).view(inside.shape)
 
 
 class FusedDensityField(HashMLPDensityField):
@@ -120,36 +101,9 @@ class FusedDensityField(HashMLPDensityField):
         """Density at positions in scene units."""
         if not isinstance(self.spatial_distortion, CubeContraction) or self.use_linear or positions.requires_grad:
             return super().density_fn(positions, times)
-        places, inside = _unit_cube(self, positions)
+        places, inside = _unit_cube(positions)
         before = self.mlp_base(places).view(*positions.shape[:-1], 1)
         return _densities(before, inside, self.average_init_density)
-
-    def weigh(self, samples: RaySamples) -> Float[Tensor, "rays samples 1"] | None:
-        """Give rendering weights of samples by this network's density, on the CPU without a gradient.
-
-        None where this form does not serve; the weights are those of `density_fn` and nerfstudio's `get_weights`.
-        """
-        frustums = samples.frustums
-        if torch.is_grad_enabled() or not isinstance(self.spatial_distortion, CubeContraction) or self.use_linear:
-            return None
-        encoding, mlp = self.mlp_base
-        if not (isinstance(encoding, FusedHashEncoding) and isinstance(mlp, FusedMLP)) or samples.deltas is None:
-            return None
-        one_a_ray = _one_a_ray(frustums.origins) and _one_a_ray(frustums.directions)
-        plain = _in_parts(frustums.origins) and encoding.hash_table.dtype == torch.float32
-        plain = plain and frustums.offsets is None and mlp.out_activation is None
-        if not (plain and one_a_ray) or samples.deltas.numel() == 0:
-            return None
-        from edge_depth_nerf.kernels.proposals_numba import weigh
-
-        weights = weigh(
-            *(frustums.origins[:, 0], frustums.directions[:, 0], frustums.starts[..., 0], frustums.ends[..., 0]),
-            samples.deltas[..., 0],
-            (encoding.hash_table, encoding.scalings.to(torch.float32)),
-            _parameters(mlp),
-            self.average_init_density,
-        )
-        return weights[..., None]
 
 
 class FusedNerfactoField(NerfactoField):
@@ -164,7 +118,7 @@ class FusedNerfactoField(NerfactoField):
         if follows or not isinstance(self.spatial_distortion, CubeContraction):
             return super().get_density(ray_samples)
         positions = ray_samples.frustums.get_positions()
-        places, inside = _unit_cube(self, positions)
+        places, inside = _unit_cube(positions)
         features = self.mlp_base(places).view(*positions.shape[:-1], -1)
         return self._density(features, inside)
 
@@ -189,7 +143,7 @@ class FusedNerfactoField(NerfactoField):
             return [self.forward(samples) for samples in parts]
         positions = [samples.frustums.get_positions().reshape(-1, 3) for samples in parts]
         counts = [len(each) for each in positions]
-        places, inside = _unit_cube(self, torch.cat(positions))
+        places, inside = _unit_cube(torch.cat(positions))
         encoded = self._encoded_directions(parts)
         of_parts = zip(parts, self.mlp_base(places).split(counts), inside.split(counts), encoded, strict=True)
         results = []
@@ -218,7 +172,7 @@ class FusedNerfactoField(NerfactoField):
 
         parts = [samples, *([] if points is None else [points])]
         positions = torch.cat([each.frustums.get_positions().reshape(-1, 3) for each in parts])
-        places, inside = _unit_cube(self, positions)
+        places, inside = _unit_cube(positions)
         encoding, first = self.mlp_base.model
         assert isinstance(first, FusedMLP)
         weights, biases = _parameters(self.mlp_head)
@@ -269,12 +223,11 @@ class FusedNerfactoField(NerfactoField):
     def _encoded(self, directions: Float[Tensor, "rays 3"]) -> Float[Tensor, "rays encoded"]:
         """Directions in spherical harmonics, without a gradient, as nerfstudio has them."""
         encoding = self.direction_encoding
-        kernels = None
-        if isinstance(encoding, SHEncoding) and encoding.tcnn_encoding is None:
-            kernels = by_number(directions.detach())
-        if kernels is None or encoding.get_out_dim() != kernels.HARMONICS:
+        plain = isinstance(encoding, SHEncoding) and encoding.get_out_dim() == formulas.HARMONICS
+        compute = HARMONICS.compiled_for(directions.detach()) if plain else None
+        if compute is None:
             return encoding(get_normalized_directions(directions))
-        return kernels.harmonics(directions, made_by_autocast(directions.device))
+        return compute(directions, made_by_autocast(directions.device))
 
     def get_outputs(
         self,

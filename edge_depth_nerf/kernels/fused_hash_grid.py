@@ -11,7 +11,7 @@ from nerfstudio.field_components.encodings import HashEncoding
 from torch import Tensor, nn
 
 from edge_depth_nerf.kernels.back_ends import made_by_autocast
-from edge_depth_nerf.kernels.hash_grid import back_end, hash_grid
+from edge_depth_nerf.kernels.functions import HASH_GRID
 from edge_depth_nerf.kernels.table_adam import SUMS_LATER
 
 
@@ -25,15 +25,15 @@ class FusedHashEncoding(HashEncoding):
     def forward(self, in_tensor: Float[Tensor, "*bs 3"]) -> Float[Tensor, "*bs encoded"]:
         """Encode positions in 0..1 of any leading shape; half precision is encoded in float32, as in nerfstudio."""
         dtypes = (torch.float32, torch.float16, torch.bfloat16)
-        work = None
+        compute = None
         if self.tcnn_encoding is None and self.hash_table.dtype == torch.float32 and in_tensor.dtype in dtypes:
-            work = back_end(in_tensor.device)
-        if work is None:
+            compute = HASH_GRID.on(in_tensor.device)
+        if compute is None:
             return super().forward(in_tensor)
         # moved once, not at each call
         self.scalings = self.scalings.to(in_tensor.device, torch.float32)
         dtype = made_by_autocast(in_tensor.device)
-        encoded = hash_grid(in_tensor.reshape(-1, 3).float(), self.hash_table, self.scalings, work, dtype)
+        encoded = compute(in_tensor.reshape(-1, 3).float(), self.hash_table, self.scalings, dtype=dtype)
         return encoded.view(*in_tensor.shape[:-1], self.get_out_dim())
 
 

@@ -10,8 +10,8 @@ coarse levels too, takes no half-cell offset, and on a border of cells lower and
 the gradient to the position is 0 on that axis.
 
 Shapes: positions [points, 3], table [levels * rows, features] with a power of two of rows, scalings [levels], encoded
-[points, levels * features]; float32. Pure: knows nothing of nerfstudio. `hash_grid_numba` works on CPU
-tensors, `hash_grid_triton` on CUDA tensors.
+[points, levels * features]; float32. Pure: knows nothing of nerfstudio. CPU tensors are worked on by Numba
+(`hash_grid_numba`), CUDA tensors by Triton (`hash_grid_triton`); `functions.HASH_GRID` says which.
 """
 
 from __future__ import annotations
@@ -24,21 +24,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from edge_depth_nerf.kernels.back_ends import working
 from edge_depth_nerf.kernels.table_adam import SUMS_LATER, TablePart, keep_part
-
-
-def back_end(device: torch.device) -> ModuleType | None:
-    """Give the module that works on tensors of this device, None if there is none.
-
-    On CUDA each kernel takes one point to find out: Triton may be missing, find no C compiler, or not know the GPU.
-    """
-    if device.type == "cpu":
-        # imported here, because Numba takes half a second to load
-        from edge_depth_nerf.kernels import hash_grid_numba as cpu
-
-        return cpu
-    return working("hash_grid_triton", device, "hash grid")
 
 
 class _HashGrid(torch.autograd.Function):
@@ -102,7 +88,7 @@ def hash_grid(
         positions: float32.
         table: float32, all levels one after the other, each with the same power of two of rows.
         scalings: float32, cells along an axis of the unit cube, for each level.
-        work: the back end, from `back_end`.
+        work: the module of kernels, for the device of these tensors.
         dtype: of what is given; the CPU has float32 alone.
 
     Returns:

@@ -4,15 +4,11 @@ Triton comes with torch on Linux, and compiles at the first call for each number
 results differ from the CPU's by the order of additions, which are atomic. A row's features are added as one block: GPUs
 from sm_90 on take it in one instruction.
 
-There are several forms of the kernels (`Form`), which compute the same. On a GPU the first call of each size measures
-them and keeps the fastest one, unless the environment names one: EDGE_DEPTH_NERF_HASH_GRID=points=128,sums_below=200.
 With TRITON_INTERPRET=1 set before the import the kernels run on CPU tensors.
 """
 
 from __future__ import annotations
 
-from collections.abc import Hashable
-from dataclasses import dataclass
 from typing import no_type_check
 
 import torch
@@ -21,31 +17,10 @@ import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 
-from edge_depth_nerf.kernels.form_choice import form_for
 from edge_depth_nerf.kernels.triton_launch import launch
 
-VARIABLE = "EDGE_DEPTH_NERF_HASH_GRID"
-"""Environment variable that names a form; what it does not mention is as in `Form`."""
-
-
-@dataclass(frozen=True)
-class Form:
-    """One form of the kernels."""
-
-    points: int = 128
-    """Points that one program works on, one a thread; a power of two of at least 32."""
-    sums_below: float = 0.0
-    """The table's gradient at levels of fewer cells along an axis: what neighbouring points add to the same rows is
-    summed up first, and added once. (At the coarsest level a warp's 32 points lie in one or two cells.)"""
-    level_major: bool = False
-    """Encoded values lie in memory feature after feature, not point after point: neighbouring points are neighbours,
-    and what reads them gets a transposed matrix."""
-
-
-ENCODING = tuple(Form(points, level_major=major) for points in (128, 256) for major in (False, True))
-"""What is measured for encoding."""
-ADDING = Form(128), Form(256), Form(64, sums_below=60.0), Form(64, sums_below=200.0)
-"""What is measured for the table's gradient; sums of more points would not find registers on all GPUs."""
+POINTS = 128
+"""Points that one program works on, one a thread."""
 
 
 @triton.jit
@@ -60,7 +35,7 @@ def _corner_pair(scaled, prime: tl.constexpr):
 
 @triton.jit
 @no_type_check
-def find_corners(positions, point, inside, scaling, size, FEATURES: tl.constexpr):
+def _find_corners(positions, point, inside, scaling, size, FEATURES: tl.constexpr):
     """Give where the features of a point's eight corners begin in a level's grid, and the place between them."""
     x0, x1, x = _corner_pair(tl.load(positions + 3 * point, inside, 0.0) * scaling, 1)
     y0, y1, y = _corner_pair(tl.load(positions + 3 * point + 1, inside, 0.0) * scaling, 2654435761)
@@ -79,7 +54,7 @@ def find_corners(positions, point, inside, scaling, size, FEATURES: tl.constexpr
 
 @triton.jit
 @no_type_check
-def interpolated(grid, inside, at0, at1, at2, at3, at4, at5, at6, at7, x, y, z):
+def _interpolated(grid, inside, at0, at1, at2, at3, at4, at5, at6, at7, x, y, z):
     """Give one feature of points from its values at their corners, on x, then y, then z."""
     low_low = tl.load(grid + at1, inside, 0.0) * x + tl.load(grid + at0, inside, 0.0) * (1 - x)
     high_low = tl.load(grid + at3, inside, 0.0) * x + tl.load(grid + at2, inside, 0.0) * (1 - x)
@@ -99,52 +74,21 @@ def _encode_kernel(
     encoded,
     points,
     size,
-    point_stride,
-    feature_stride,
+    width,
     FEATURES: tl.constexpr,
     POINTS: tl.constexpr,
 ):
     point = tl.program_id(0).to(tl.int64) * POINTS + tl.arange(0, POINTS)
     level = tl.program_id(1).to(tl.int64)
     inside = point < points
-    at0, at1, at2, at3, at4, at5, at6, at7, x, y, z = find_corners(
+    at0, at1, at2, at3, at4, at5, at6, at7, x, y, z = _find_corners(
         positions, point, inside, tl.load(scalings + level), size, FEATURES
     )
     for c in tl.static_range(FEATURES):
         grid = table + level * size * FEATURES + c
-        value = interpolated(grid, inside, at0, at1, at2, at3, at4, at5, at6, at7, x, y, z)
-        place = point * point_stride + (level * FEATURES + c) * feature_stride
+        value = _interpolated(grid, inside, at0, at1, at2, at3, at4, at5, at6, at7, x, y, z)
+        place = point * width + level * FEATURES + c
         tl.store(encoded + place, value.to(encoded.dtype.element_ty), inside)
-
-
-@triton.jit
-@no_type_check
-def _same_cell(positions, point, other, inside, scaling):
-    """Whether two points have the same corners; what is no number has none."""
-    same = inside
-    for axis in tl.static_range(3):
-        here = tl.load(positions + 3 * point + axis, inside, 0.0) * scaling
-        there = tl.load(positions + 3 * other + axis, inside, 0.0) * scaling
-        same = same & (tl.floor(here) == tl.floor(there)) & (tl.ceil(here) == tl.ceil(there))
-    return same
-
-
-@triton.jit
-@no_type_check
-def _add_to_run(start0, a0, a1, a2, a3, a4, a5, a6, a7, start1, b0, b1, b2, b3, b4, b5, b6, b7):
-    """Add what stands before, unless a run starts between."""
-    anew = start1 != 0
-    return (
-        start0 | start1,
-        tl.where(anew, b0, a0 + b0),
-        tl.where(anew, b1, a1 + b1),
-        tl.where(anew, b2, a2 + b2),
-        tl.where(anew, b3, a3 + b3),
-        tl.where(anew, b4, a4 + b4),
-        tl.where(anew, b5, a5 + b5),
-        tl.where(anew, b6, a6 + b6),
-        tl.where(anew, b7, a7 + b7),
-    )
 
 
 @triton.jit
@@ -158,11 +102,9 @@ def _table_gradient_kernel(
     size,
     point_stride,
     feature_stride,
-    sums_below,
     FEATURES: tl.constexpr,
     BLOCK: tl.constexpr,
     POINTS: tl.constexpr,
-    SUMS: tl.constexpr,
 ):
     local = tl.arange(0, POINTS)[:, None]
     point = tl.program_id(0).to(tl.int64) * POINTS + local
@@ -170,7 +112,7 @@ def _table_gradient_kernel(
     feature = tl.arange(0, BLOCK)[None]
     inside = point < points
     scaling = tl.load(scalings + level)
-    at0, at1, at2, at3, at4, at5, at6, at7, x, y, z = find_corners(positions, point, inside, scaling, size, FEATURES)
+    at0, at1, at2, at3, at4, at5, at6, at7, x, y, z = _find_corners(positions, point, inside, scaling, size, FEATURES)
     has = inside & (feature < FEATURES)
     g = tl.load(gradient + point * point_stride + (level * FEATURES + feature) * feature_stride, has, 0.0)
     g = g.to(tl.float32)
@@ -179,17 +121,6 @@ def _table_gradient_kernel(
     g2, g3 = g * high_low * (1 - x), g * high_low * x
     g4, g5 = g * low_high * (1 - x), g * low_high * x
     g6, g7 = g * high_high * (1 - x), g * high_high * x
-    if SUMS:
-        if scaling < sums_below:
-            continues = (local > 0) & _same_cell(positions, point, point - 1, inside & (local > 0), scaling)
-            follows = (local < POINTS - 1) & (point + 1 < points)
-            follows = _same_cell(positions, point, point + 1, follows, scaling)
-            start = tl.where(continues, 0, 1) + tl.zeros((POINTS, BLOCK), tl.int32)
-            _, g0, g1, g2, g3, g4, g5, g6, g7 = tl.associative_scan(
-                (start, g0, g1, g2, g3, g4, g5, g6, g7), 0, _add_to_run
-            )
-            # the last of a run has its sum
-            has = has & (follows == 0)
     grid = to_table + level * size * FEATURES + feature
     tl.atomic_add(grid + at0, g0, has, sem="relaxed")
     tl.atomic_add(grid + at1, g1, has, sem="relaxed")
@@ -224,7 +155,7 @@ def _position_gradient_kernel(
     to_z = tl.zeros((POINTS,), tl.float32)
     for level in range(LEVELS):
         scaling = tl.load(scalings + level)
-        at0, at1, at2, at3, at4, at5, at6, at7, x, y, z = find_corners(
+        at0, at1, at2, at3, at4, at5, at6, at7, x, y, z = _find_corners(
             positions, point, inside, scaling, size, FEATURES
         )
         for c in tl.static_range(FEATURES):
@@ -247,11 +178,6 @@ def _position_gradient_kernel(
     tl.store(to_positions + 3 * point + 2, to_z, inside)
 
 
-def _size(positions: Tensor, *others: int) -> tuple[Hashable, ...]:
-    """Numbers of points that need as many binary digits are one size: they differ from step to step."""
-    return positions.device, len(positions).bit_length(), *others
-
-
 def encode(
     positions: Float[Tensor, "points 3"],
     table: Float[Tensor, "rows features"],
@@ -261,29 +187,22 @@ def encode(
     """Encode points in float32; see `hash_grid`. What is given may be rounded to another type at the end."""
     positions, table = positions.detach().contiguous(), table.detach().contiguous()
     points, (rows, features), levels = len(positions), table.shape, len(scalings)
-
-    def run(form: Form) -> Tensor:
-        shape = (levels * features, points) if form.level_major else (points, levels * features)
-        encoded = positions.new_empty(shape, dtype=dtype)
-        encoded = encoded.t() if form.level_major else encoded
-        launch(
-            _encode_kernel,
-            (triton.cdiv(points, form.points), levels),
-            positions,
-            positions,
-            table,
-            scalings,
-            encoded,
-            points,
-            rows // levels,
-            *encoded.stride(),
-            FEATURES=features,
-            POINTS=form.points,
-            num_warps=form.points // 32,
-        )
-        return encoded
-
-    return run(form_for(VARIABLE, ENCODING, (dtype, *_size(positions, levels, rows, features)), run, positions.is_cuda))
+    encoded = positions.new_empty((points, levels * features), dtype=dtype)
+    launch(
+        _encode_kernel,
+        (triton.cdiv(points, POINTS), levels),
+        positions,
+        positions,
+        table,
+        scalings,
+        encoded,
+        points,
+        rows // levels,
+        levels * features,
+        FEATURES=features,
+        POINTS=POINTS,
+    )
+    return encoded
 
 
 def table_gradient(
@@ -297,30 +216,21 @@ def table_gradient(
     points, levels = len(positions), len(scalings)
     features = gradient.shape[1] // levels
     result = positions.new_zeros(rows, features)
-
-    def run(form: Form, into: Tensor) -> None:
-        launch(
-            _table_gradient_kernel,
-            (triton.cdiv(points, form.points), levels),
-            positions,
-            positions,
-            gradient,
-            scalings,
-            into,
-            points,
-            rows // levels,
-            *gradient.stride(),
-            float(form.sums_below),
-            FEATURES=features,
-            BLOCK=triton.next_power_of_2(features),
-            POINTS=form.points,
-            num_warps=form.points // 32,
-            SUMS=form.sums_below > 0,
-        )
-
-    # what is measured is added elsewhere
-    size = _size(positions, levels, rows, features)
-    run(form_for(VARIABLE, ADDING, size, lambda form: run(form, torch.empty_like(result)), positions.is_cuda), result)
+    launch(
+        _table_gradient_kernel,
+        (triton.cdiv(points, POINTS), levels),
+        positions,
+        positions,
+        gradient,
+        scalings,
+        result,
+        points,
+        rows // levels,
+        *gradient.stride(),
+        FEATURES=features,
+        BLOCK=triton.next_power_of_2(features),
+        POINTS=POINTS,
+    )
     return result
 
 
@@ -336,7 +246,7 @@ def position_gradient(
     result = torch.empty_like(positions)
     launch(
         _position_gradient_kernel,
-        (triton.cdiv(points, Form.points),),
+        (triton.cdiv(points, POINTS),),
         positions,
         positions,
         table,
@@ -348,14 +258,6 @@ def position_gradient(
         *gradient.stride(),
         LEVELS=levels,
         FEATURES=features,
-        POINTS=Form.points,
+        POINTS=POINTS,
     )
     return result
-
-
-def try_out(device: torch.device) -> None:
-    """Run each kernel once; raises whatever keeps one from working."""
-    x, table, scalings, gradient = (torch.ones(shape, device=device) for shape in ((1, 3), (2, 2), (1,), (1, 2)))
-    encode(x, table, scalings)
-    table_gradient(x, gradient, scalings, len(table))
-    position_gradient(x, table, gradient, scalings)

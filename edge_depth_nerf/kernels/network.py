@@ -19,8 +19,6 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from edge_depth_nerf.kernels.back_ends import of_network
-
 
 class _Network(torch.autograd.Function):
     @staticmethod
@@ -83,8 +81,7 @@ def network(
 
     """
     if x.device.type != "cpu":
-        kernels = of_network(x, weights)
-        return (_layer_by_layer if kernels is None else kernels.network)(x, weights, biases)
+        return _layer_by_layer(x, weights, biases)
     rows = [bias.view(-1, bias.shape[-1]) for bias in biases]
     parameters = [each for pair in zip(weights, rows, strict=True) for each in pair]
     result = _Network.apply(x, *parameters)

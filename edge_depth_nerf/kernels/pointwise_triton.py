@@ -1,12 +1,12 @@
-"""What nerfacto computes number by number on a GPU, each in one kernel: torch needs four to seventy.
+"""What nerfacto computes number by number on a GPU, each in one kernel: torch needs seventeen to seventy.
 
-Where samples lie, their distances from places in 0..1, densities, and directions in spherical harmonics. All arithmetic
-is float32. With TRITON_INTERPRET=1 set before the import the kernels run on CPU tensors.
+Distances of places in 0..1, positions in the unit cube, and directions in spherical harmonics. All arithmetic is
+float32. With TRITON_INTERPRET=1 set before the import the kernels run on CPU tensors.
 """
 
 from __future__ import annotations
 
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import torch
 import triton
@@ -14,14 +14,11 @@ import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 
+from edge_depth_nerf.kernels.formulas import HARMONICS
 from edge_depth_nerf.kernels.triton_launch import launch, rows_of
 
 NUMBERS = 256
 """Numbers that one program works on."""
-HARMONICS = 16
-"""Spherical harmonics of four degrees."""
-STEEPEST = tl.constexpr(15.0)
-"""nerfstudio's: the gradient of exp(x) is taken at an x of this at most."""
 
 
 @triton.jit
@@ -62,107 +59,39 @@ def distances(
 
 @triton.jit
 @no_type_check
-def _middle_kernel(
-    origins,
-    directions,
-    starts,
-    ends,
-    positions,
-    samples,
-    origin_stride,
-    direction_stride,
-    start_stride,
-    end_stride,
-    columns,
-    NUMBERS: tl.constexpr,
-):
-    sample = tl.program_id(0).to(tl.int64) * NUMBERS + tl.arange(0, NUMBERS)
-    inside = sample < samples
-    ray, column = sample // columns, sample % columns
-    start = tl.load(starts + ray * start_stride + column, inside, 0.0)
-    middles = start + tl.load(ends + ray * end_stride + column, inside, 0.0)
-    for axis in tl.static_range(3):
-        origin = tl.load(origins + ray * origin_stride + axis, inside, 0.0)
-        direction = tl.load(directions + ray * direction_stride + axis, inside, 0.0)
-        tl.store(positions + 3 * sample + axis, origin + direction * middles / 2, inside)
+def _contract_kernel(positions, places, inside, points, NUMBERS: tl.constexpr):
+    point = tl.program_id(0).to(tl.int64) * NUMBERS + tl.arange(0, NUMBERS)
+    given = point < points
+    x = tl.load(positions + 3 * point, given, 0.0)
+    y = tl.load(positions + 3 * point + 1, given, 0.0)
+    z = tl.load(positions + 3 * point + 2, given, 0.0)
+    norm = tl.maximum(tl.maximum(tl.abs(x), tl.abs(y)), tl.abs(z))
+    far = norm >= 1
+    size = tl.where(far, norm, 1.0)
+    factor = 2 - tl.div_rn(1.0, size)
+    # what is no number is not inside
+    x = (tl.where(far, factor * tl.div_rn(x, size), x) + 2) / 4
+    y = (tl.where(far, factor * tl.div_rn(y, size), y) + 2) / 4
+    z = (tl.where(far, factor * tl.div_rn(z, size), z) + 2) / 4
+    within = (x > 0) & (y > 0) & (z > 0) & (x < 1) & (y < 1) & (z < 1)
+    tl.store(places + 3 * point, tl.where(within, x, x * 0), given)
+    tl.store(places + 3 * point + 1, tl.where(within, y, y * 0), given)
+    tl.store(places + 3 * point + 2, tl.where(within, z, z * 0), given)
+    tl.store(inside + point, tl.where(within, 1.0, 0.0), given)
 
 
-def middles(
-    origins: Float[Tensor, "rays 3"],
-    directions: Float[Tensor, "rays 3"],
-    starts: Float[Tensor, "rays samples"],
-    ends: Float[Tensor, "rays samples"],
-) -> Float[Tensor, "rays samples 3"]:
-    """Give the positions in the middle of samples, without a gradient; float32."""
-    (rays, columns), device = starts.shape, starts.device
-    matrices, strides = zip(*(rows_of(each) for each in (origins, directions, starts, ends)), strict=True)
-    positions = torch.empty(rays, columns, 3, device=device)
-    programs = triton.cdiv(rays * columns, NUMBERS)
-    arguments = *matrices, positions, rays * columns, *strides, columns
-    launch(_middle_kernel, (programs,), positions, *arguments, NUMBERS=NUMBERS)
-    return positions
-
-
-@triton.jit
-@no_type_check
-def _density_kernel(before, inside, densities, numbers, stride, scale, NUMBERS: tl.constexpr):
-    number = tl.program_id(0).to(tl.int64) * NUMBERS + tl.arange(0, NUMBERS)
-    given = number < numbers
-    x = tl.load(before + number * stride, given, 0.0).to(tl.float32)
-    tl.store(densities + number, scale * tl.exp(x) * tl.load(inside + number, given, 0.0), given)
-
-
-@triton.jit
-@no_type_check
-def _before_gradient_kernel(before, inside, gradient, to_before, numbers, stride, scale, NUMBERS: tl.constexpr):
-    number = tl.program_id(0).to(tl.int64) * NUMBERS + tl.arange(0, NUMBERS)
-    given = number < numbers
-    x = tl.load(before + number * stride, given, 0.0).to(tl.float32)
-    # what is no number stays none
-    x = tl.where(x > STEEPEST, STEEPEST, tl.where(x < -STEEPEST, -STEEPEST, x))
-    g = tl.load(gradient + number, given, 0.0) * tl.load(inside + number, given, 0.0)
-    tl.store(to_before + number, (g * scale * tl.exp(x)).to(to_before.dtype.element_ty), given)
-
-
-class _Density(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, before: Tensor, inside: Tensor, scale: float) -> Tensor:
-        before, inside = before.detach(), inside.detach().contiguous()
-        densities = torch.empty(len(before), device=before.device)
-        programs = triton.cdiv(len(before), NUMBERS)
-        arguments = before, inside, densities, len(before), before.stride(0), scale
-        launch(_density_kernel, (programs,), before, *arguments, NUMBERS=NUMBERS)
-        if ctx.needs_input_grad[0]:
-            ctx.save_for_backward(before, inside)
-            ctx.scale = scale
-        return densities
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
-        before, inside = ctx.saved_tensors
-        to_before = torch.empty(before.shape, dtype=before.dtype, device=before.device)
-        programs = triton.cdiv(len(before), NUMBERS)
-        arguments = before, inside, gradients[0].contiguous(), to_before, len(before), before.stride(0), ctx.scale
-        launch(_before_gradient_kernel, (programs,), before, *arguments, NUMBERS=NUMBERS)
-        return to_before, None, None
-
-
-def density(before: Float[Tensor, "points"], inside: Float[Tensor, "points"], scale: float) -> Float[Tensor, "points"]:
-    """Compute densities, scale · exp(before) inside the scene and 0 outside; the gradient as nerfstudio's `trunc_exp`.
-
-    Args:
-        before: a network's outputs, half precision or float32, any stride. Differentiable once, by them alone.
-        inside: 1 where a point is inside, else 0; float32.
-        scale: the density of what a new network gives.
+def contract(positions: Float[Tensor, "points 3"]) -> tuple[Float[Tensor, "points 3"], Float[Tensor, "points"]]:
+    """Contract positions, float32, without a gradient.
 
     Returns:
-        float32.
+        The positions in 0..1; 1 where a point is inside, else 0.
 
     """
-    found = _Density.apply(before, inside, scale)
-    assert isinstance(found, Tensor)
-    return found
+    positions = positions.detach().contiguous()
+    places, inside = torch.empty_like(positions), positions.new_empty(len(positions))
+    programs = triton.cdiv(len(positions), NUMBERS)
+    launch(_contract_kernel, (programs,), positions, positions, places, inside, len(positions), NUMBERS=NUMBERS)
+    return places, inside
 
 
 @triton.jit
@@ -209,13 +138,3 @@ def harmonics(directions: Float[Tensor, "rays 3"], dtype: torch.dtype) -> Float[
     programs = triton.cdiv(len(directions), NUMBERS)
     launch(_harmonics_kernel, (programs,), encoded, directions, encoded, len(directions), stride, NUMBERS=NUMBERS)
     return encoded
-
-
-def try_out(device: torch.device) -> None:
-    """Run each kernel once; raises whatever keeps one from working."""
-    ones = torch.ones(1, 1, device=device)
-    distances(ones, ones, ones)
-    middles(ones.expand(1, 3), ones.expand(1, 3), ones, ones)
-    harmonics(torch.ones(1, 3, device=device), torch.float32)
-    before = torch.ones(1, device=device, requires_grad=True)
-    density(before, ones[0], 1.0).backward(ones[0])

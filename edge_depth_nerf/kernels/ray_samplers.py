@@ -5,7 +5,6 @@ Host-facing; the numbers are nerfstudio's to float32's noise, from the same rand
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -19,7 +18,7 @@ from nerfstudio.model_components.ray_samplers import (
 )
 from torch import Tensor
 
-from edge_depth_nerf.kernels.back_ends import along_rays, by_number
+from edge_depth_nerf.kernels.functions import DISTANCES, PLACE_SAMPLES, POSITIONS, WEIGHTS
 
 
 class FirstSampler(UniformLinDispPiecewiseSampler):
@@ -46,9 +45,9 @@ class FirstSampler(UniformLinDispPiecewiseSampler):
             edges = torch.linspace(0, 1, count + 1, device=device).expand(len(ray_bundle), -1)
 
         def to_euclidean(places: Tensor) -> Tensor:
-            kernels = by_number(places, nears, fars)
-            if kernels is not None and places.ndim == 2 and len(places) == len(nears):
-                return kernels.distances(places, nears, fars)
+            compute = DISTANCES.compiled_for(places, nears, fars) if places.ndim == 2 else None
+            if compute is not None and len(places) == len(nears):
+                return compute(places, nears, fars)
             return self.spacing_fn_inv(torch.lerp(self.spacing_fn(nears), self.spacing_fn(fars), places))
 
         distances, edges = to_euclidean(edges)[..., None], edges[..., None]
@@ -90,8 +89,8 @@ class FusedPDFSampler(PDFSampler):
         """Place samples by the weights of earlier ones."""
         assert ray_bundle is not None and ray_samples is not None and weights is not None
         count = num_samples or self.num_samples
-        kernels = None if self.include_original or weights.ndim != 3 else along_rays(weights[..., 0])
-        if kernels is None or not count:
+        place = None if self.include_original or weights.ndim != 3 else PLACE_SAMPLES.compiled_for(weights[..., 0])
+        if place is None or not count:
             return super().generate_ray_samples(ray_bundle, ray_samples, weights, num_samples, eps)
         places, device = count + 1, weights.device
         if (places, device) not in self._even:
@@ -103,7 +102,7 @@ class FusedPDFSampler(PDFSampler):
         else:
             wanted = wanted + 1 / (2 * places)
         edges = edges_of(ray_samples)
-        placed = kernels.place_samples(weights[..., 0].float(), edges, wanted, self.histogram_padding, eps)[..., None]
+        placed = place(weights[..., 0].float(), edges, wanted, self.histogram_padding, eps)[..., None]
         to_euclidean = ray_samples.spacing_to_euclidean_fn
         assert to_euclidean is not None
         distances = to_euclidean(placed[..., 0])[..., None]
@@ -118,10 +117,7 @@ class FusedPDFSampler(PDFSampler):
 
 
 class FusedProposalSampler(ProposalNetworkSampler):
-    """nerfstudio's sampler with the samplers above; a network that rests gives the weights of its samples at once."""
-
-    networks: Sequence[Any] = ()
-    """For each round of proposals its network; with a method `weigh`, which gives None where it cannot."""
+    """nerfstudio's sampler with the samplers above."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -129,29 +125,6 @@ class FusedProposalSampler(ProposalNetworkSampler):
         self.pdf_sampler = FusedPDFSampler(include_original=pdf.include_original, single_jitter=pdf.single_jitter)
         if isinstance(self.initial_sampler, UniformLinDispPiecewiseSampler):
             self.initial_sampler = FirstSampler(single_jitter=self.initial_sampler.single_jitter)
-
-    def generate_ray_samples(
-        self, ray_bundle: RayBundle | None = None, density_fns: list[Callable[..., Any]] | None = None
-    ) -> tuple[RaySamples, list[Any], list[Any]]:
-        """Place samples by what the proposal networks say of those before; also give these and their weights."""
-        assert ray_bundle is not None and density_fns is not None
-        learns = self._steps_since_update > self.update_sched(self._step) or self._step < 10
-        samples = self.initial_sampler(ray_bundle, num_samples=self.num_proposal_samples_per_ray[0])
-        every: list[RaySamples] = []
-        weights_of_every: list[Tensor] = []
-        counts = [*self.num_proposal_samples_per_ray, self.num_nerf_samples_per_ray]
-        for level in range(self.num_proposal_network_iterations):
-            with torch.set_grad_enabled(learns and torch.is_grad_enabled()):
-                weights = self.networks[level].weigh(samples) if self.networks else None
-                if weights is None:
-                    weights = samples.get_weights(density_fns[level](samples.frustums.get_positions()))
-            every.append(samples)
-            weights_of_every.append(weights)
-            annealed = weights if isinstance(self._anneal, float) and self._anneal == 1 else weights**self._anneal
-            samples = self.pdf_sampler(ray_bundle, samples, annealed, num_samples=counts[level + 1])
-        if learns:
-            self._steps_since_update = 0
-        return samples, weights_of_every, every
 
 
 def edges_of(samples: RaySamples) -> Tensor:
@@ -180,10 +153,10 @@ class FusedRaySamples(RaySamples):
             return super().get_weights(densities)
         # squeezed, not indexed: backward of an index fills zeros and copies
         densities_of_rays, deltas_of_rays = densities.squeeze(-1), deltas.squeeze(-1)
-        kernels = along_rays(densities_of_rays, deltas_of_rays)
-        if kernels is None:
+        compute = WEIGHTS.compiled_for(densities_of_rays, deltas_of_rays)
+        if compute is None:
             return super().get_weights(densities)
-        return kernels.weights_from_densities(densities_of_rays, deltas_of_rays)[..., None]
+        return compute(densities_of_rays, deltas_of_rays)[..., None]
 
 
 class FusedFrustums(Frustums):
@@ -193,10 +166,10 @@ class FusedFrustums(Frustums):
         """Positions in the middle of the samples."""
         given = self.origins, self.directions, self.starts, self.ends
         of_rays = self.origins.ndim == 3 and all(each.shape[1] == 1 or each.stride(1) == 0 for each in given[:2])
-        kernels = by_number(*given) if of_rays and self.offsets is None else None
-        if kernels is None:
+        compute = POSITIONS.compiled_for(*given) if of_rays and self.offsets is None else None
+        if compute is None:
             return super().get_positions()
-        return kernels.middles(self.origins[:, 0], self.directions[:, 0], self.starts[..., 0], self.ends[..., 0])
+        return compute(self.origins[:, 0], self.directions[:, 0], self.starts[..., 0], self.ends[..., 0])
 
 
 def _whole(kind: type[Any], shape: tuple[int, ...], **values: Any) -> Any:

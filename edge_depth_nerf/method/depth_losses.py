@@ -18,8 +18,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from edge_depth_nerf.kernels.back_ends import of_edge_loss
 from edge_depth_nerf.method.losses import (
+    EDGE_LOSS,
     EPS,
     NARROW,
     Gaussian,
@@ -88,11 +88,11 @@ class EdgeLoss(DepthLoss):
         given = level.weights, level.starts_m, level.ends_m, level.prior_m, level.sigma_m
         is_float = all(each.dtype in (torch.float32, torch.float16, torch.bfloat16) for each in given)
         of_weights_alone = not any(each.requires_grad for each in given[1:])
-        kernels = of_edge_loss(level.prior_m.device) if is_float and of_weights_alone else None
-        if kernels is None:
+        compute = EDGE_LOSS.on(level.prior_m.device) if is_float and of_weights_alone else None
+        if compute is None:
             return edge_loss(*given, gaussian=self.gaussian, divide_by_norm=self.divide_by_norm)
         options = {"interval": self.gaussian == "interval", "divide_by_norm": self.divide_by_norm}
-        return kernels.edge_loss(*given, **options, eps=EPS, narrow=NARROW)
+        return compute(*given, **options, eps=EPS, narrow=NARROW)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ float64.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Literal, get_args
 
 import torch
@@ -17,6 +17,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.kernels.back_ends import Example, Function, GpuForm
+from edge_depth_nerf.kernels.functions import spread
 
 Gaussian = Literal["point", "interval"]
 
@@ -84,6 +86,38 @@ def edge_loss(
     target = torch.where(counts, mass, 0)
     target = target / math.sqrt(2 * math.pi) if divide_by_norm else target * sigma
     return -(target * torch.log(weights + EPS)).sum(-1)
+
+
+def _by_numba() -> Callable[..., Tensor]:
+    from edge_depth_nerf.kernels import edge_loss_numba
+
+    return edge_loss_numba.edge_loss
+
+
+def _by_triton() -> Callable[..., Tensor]:
+    from edge_depth_nerf.kernels import edge_loss_triton
+
+    return edge_loss_triton.edge_loss
+
+
+def _by_torch(*, interval: bool, divide_by_norm: bool, eps: float, narrow: float, **rays: Tensor) -> Tensor:
+    """Compute `edge_loss` with the arguments of its kernels; EPS and NARROW are its own."""
+    assert (eps, narrow) == (EPS, NARROW)
+    return edge_loss(**rays, gaussian="interval" if interval else "point", divide_by_norm=divide_by_norm)
+
+
+def _examples(device: torch.device) -> Sequence[Example]:
+    """Samples of rays, of which some have no prior; both forms of the Gaussian."""
+    edges = 120 * spread(device, 13, 38).sort(dim=1)[0]
+    weights = (spread(device, 13, 37, seed=3) ** 4).requires_grad_()
+    prior_m, sigma_m = 100 * spread(device, 13, seed=5) - 8, 0.2 + 8 * spread(device, 13, seed=7)
+    given = {"weights": weights, "starts_m": edges[:, :-1], "ends_m": edges[:, 1:], "prior_m": prior_m}
+    forms = ({"interval": True, "divide_by_norm": True}, {"interval": False, "divide_by_norm": False})
+    return [{**given, "sigma_m": sigma_m, **form, "eps": EPS, "narrow": NARROW} for form in forms]
+
+
+EDGE_LOSS = Function(_by_numba, GpuForm("edge loss", _by_triton, _by_torch, _examples, tolerance=1e-4))
+"""`edge_loss` in its compiled forms, differentiable once, by the weights alone."""
 
 
 def ds_nerf_loss(

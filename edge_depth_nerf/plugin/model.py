@@ -32,7 +32,6 @@ from edge_depth_nerf.kernels.allocator import keep_freed_memory
 from edge_depth_nerf.kernels.fields import CubeContraction, FusedNerfactoField
 from edge_depth_nerf.kernels.fused_hash_grid import sum_tables_later
 from edge_depth_nerf.kernels.openmp import let_idle_threads_sleep
-from edge_depth_nerf.kernels.ray_samplers import FusedProposalSampler
 from edge_depth_nerf.kernels.rendering import Rendered
 from edge_depth_nerf.kernels.threads import take_all_threads
 from edge_depth_nerf.plugin.colours import coloured
@@ -188,11 +187,9 @@ class EdgeDepthNerfModel(NerfactoModel):
         if not self.config.predict_normals:
             # normals differentiate by the positions alone, which would add to the tables' gradients, too
             sum_tables_later(self)
-        assert isinstance(self.field, FusedNerfactoField) and isinstance(self.proposal_sampler, FusedProposalSampler)
+        assert isinstance(self.field, FusedNerfactoField)
         # nerfacto's field prepares a gradient to the positions at every step, for normals or poses
         self.field.follows_positions = self.config.predict_normals or self.config.camera_optimizer.mode != "off"
-        networks: list[Any] = [density_fn.__self__ for density_fn in self.density_fns]
-        self.proposal_sampler.networks = networks
 
     def _refine_poses(self, metadata: dict[str, Any]) -> None:
         """Let poses be learned from what the field shows, not from where the proposals put their samples."""

@@ -58,7 +58,6 @@ def compiled_before() -> bool:
         network_numba,
         pixel_records_numba,
         pointwise_numba,
-        proposals_numba,
         ray_numba,
         rendering_numba,
         table_adam_numba,

@@ -1,0 +1,158 @@
+"""The functions that have compiled forms, and the table of a GPU's kernels.
+
+Modules of Numba and of Triton are imported when one of their functions is asked for, as each takes half a second.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from edge_depth_nerf.kernels import formulas
+from edge_depth_nerf.kernels.back_ends import Example, Function, GpuForm
+from edge_depth_nerf.kernels.hash_grid import hash_grid
+
+
+def _ray_numba() -> Any:
+    from edge_depth_nerf.kernels import ray_numba
+
+    return ray_numba
+
+
+def _ray_triton() -> Any:
+    from edge_depth_nerf.kernels import ray_triton
+
+    return ray_triton
+
+
+def _pointwise_numba() -> Any:
+    from edge_depth_nerf.kernels import pointwise_numba
+
+    return pointwise_numba
+
+
+def _pointwise_triton() -> Any:
+    from edge_depth_nerf.kernels import pointwise_triton
+
+    return pointwise_triton
+
+
+def _contraction_numba() -> Callable[..., Any]:
+    from edge_depth_nerf.kernels.contraction_numba import contract
+
+    return contract
+
+
+def _hash_grid_numba() -> Callable[..., Tensor]:
+    from edge_depth_nerf.kernels import hash_grid_numba
+
+    return partial(hash_grid, work=hash_grid_numba)
+
+
+def _hash_grid_triton() -> Callable[..., Tensor]:
+    from edge_depth_nerf.kernels import hash_grid_triton
+
+    return partial(hash_grid, work=hash_grid_triton)
+
+
+def spread(device: torch.device, *shape: int, seed: int = 2) -> Tensor:
+    """Give float32 numbers that are spread over 0..1, everywhere the same ones: multiples of a root, modulo 1."""
+    numbers = torch.arange(1, math.prod(shape) + 1, device=device, dtype=torch.float64)
+    return (numbers * math.sqrt(seed) % 1).float().view(shape)
+
+
+def _histogram(device: torch.device, rays: int, samples: int, seed: int) -> tuple[Tensor, Tensor]:
+    """Edges in 0..1 and weights that add up to 1, most of them small."""
+    edges = spread(device, rays, samples + 1, seed=seed).sort(dim=1)[0]
+    weights = spread(device, rays, samples, seed=seed + 1) ** 4
+    return edges, weights / weights.sum(1, keepdim=True)
+
+
+def _positions(device: torch.device) -> Sequence[Example]:
+    return [{"positions": 8 * spread(device, 151, 3) - 4}]
+
+
+def _places(device: torch.device) -> Sequence[Example]:
+    nears, fars = (low + length * spread(device, 7, 1) for low, length in ((0.01, 0.3), (2, 30)))
+    # where samples begin is a view of all edges
+    return [{"places": spread(device, 7, 38).sort(dim=1)[0][:, :-1], "nears": nears, "fars": fars}]
+
+
+def _directions(device: torch.device) -> Sequence[Example]:
+    directions = torch.nn.functional.normalize(2 * spread(device, 67, 3) - 1, dim=1)
+    return [{"directions": directions, "dtype": dtype} for dtype in (torch.float32, torch.float16)]
+
+
+def _wanted(device: torch.device) -> Sequence[Example]:
+    edges, weights = _histogram(device, 7, 43, 2)
+    wanted = spread(device, 7, 29, seed=5).sort(dim=1)[0]
+    return [{"weights": weights, "edges": edges, "wanted": wanted, "padding": 0.01, "least": 1e-5}]
+
+
+def _proposals(device: torch.device) -> Sequence[Example]:
+    (edges, weights), (outer_edges, outer) = _histogram(device, 7, 29, 2), _histogram(device, 7, 43, 6)
+    given = {"edges": edges, "weights": weights, "outer_edges": outer_edges}
+    return [{**given, "outer_weights": outer.requires_grad_()}]
+
+
+def _samples(device: torch.device) -> Sequence[Example]:
+    edges, weights = _histogram(device, 7, 43, 2)
+    return [{"edges": edges, "weights": weights.requires_grad_()}]
+
+
+def _points(device: torch.device) -> Sequence[Example]:
+    scalings = torch.tensor([4.0, 23.0, 64.0], device=device)
+    points = {"positions": spread(device, 151, 3).requires_grad_(), "scalings": scalings}
+    table = (2 * spread(device, 3 << 8, 2) - 1).requires_grad_()
+    # under autocast it is given in half precision
+    return [{**points, "table": table, "dtype": dtype} for dtype in (torch.float32, torch.float16)]
+
+
+MOST = 2048
+"""So many samples of a ray stay on a GPU's chip."""
+
+HASH_GRID = Function(
+    _hash_grid_numba, GpuForm("hash grid", _hash_grid_triton, formulas.hash_grid, _points, tolerance=2e-5)
+)
+CONTRACT = Function(
+    _contraction_numba,
+    GpuForm("contraction", lambda: _pointwise_triton().contract, formulas.contract, _positions, tolerance=1e-5),
+    follows=False,
+)
+DISTANCES = Function(
+    lambda: _pointwise_numba().distances,
+    GpuForm("distances", lambda: _pointwise_triton().distances, formulas.distances, _places, tolerance=1e-4),
+    follows=False,
+)
+HARMONICS = Function(
+    lambda: _pointwise_numba().harmonics,
+    GpuForm("directions", lambda: _pointwise_triton().harmonics, formulas.harmonics, _directions, tolerance=1e-5),
+    follows=False,
+)
+PLACE_SAMPLES = Function(
+    lambda: _ray_numba().place_samples,
+    GpuForm("placing of samples", lambda: _ray_triton().place_samples, formulas.place_samples, _wanted, 1e-4, MOST),
+)
+BOUND_LOSS = Function(
+    lambda: _ray_numba().bound_loss,
+    GpuForm("proposal loss", lambda: _ray_triton().bound_loss, formulas.bound_loss, _proposals, 1e-4, MOST),
+)
+DISTORTION_LOSS = Function(
+    lambda: _ray_numba().distortion_loss,
+    GpuForm("distortion loss", lambda: _ray_triton().distortion_loss, formulas.distortion_loss, _samples, 1e-4, MOST),
+)
+POSITIONS = Function(lambda: _pointwise_numba().middles, follows=False)
+DENSITY = Function(lambda: _pointwise_numba().density)
+WEIGHTS = Function(lambda: _ray_numba().weights_from_densities)
+
+ON_GPU: tuple[GpuForm, ...] = tuple(
+    each.on_gpu
+    for each in (HASH_GRID, CONTRACT, DISTANCES, HARMONICS, PLACE_SAMPLES, BOUND_LOSS, DISTORTION_LOSS)
+    if each.on_gpu is not None
+)
+"""The kernels of a GPU, with what each is compared with; that of the edge loss is in `method.losses`."""
