@@ -112,7 +112,7 @@ def about_kernels(found: dict[str, Any], copied_gb_s: float | None) -> str:
     return table(["", "kernel", "ms", "GB/s", "of a copy's", "off the CPU"], rows)
 
 
-def about_samples(found: dict[str, Any]) -> str:
+def about_samples_and_losses(found: dict[str, Any]) -> str:
     """Times of kernels beside torch's."""
     rows = [
         (row["what"], f"{row['triton_ms']:.3f}", f"{row['torch_ms']:.3f}", f"{row['off_torch']:.1e}")
@@ -169,7 +169,7 @@ def report(results: dict[str, dict[str, Any]], fake: bool) -> str:
         "counts": about_counts,
         "tests": about_tests,
         "kernels": lambda found: about_kernels(found, copied),
-        "samples": about_samples,
+        "samples and losses": about_samples_and_losses,
         "our steps": about_steps,
         "other steps": about_steps,
         "profile": about_profile,

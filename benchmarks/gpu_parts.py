@@ -191,7 +191,7 @@ def sorted_edges(rays: int, samples: int, settings: Settings) -> torch.Tensor:
 
 
 def work_by_number(rays: int, samples: int, settings: Settings) -> dict[str, Pair]:
-    """Places and directions."""
+    """Distances, contraction and directions."""
     import torch.nn.functional as F
     from nerfstudio.utils.math import components_from_spherical_harmonics
 
@@ -222,7 +222,7 @@ def work_by_number(rays: int, samples: int, settings: Settings) -> dict[str, Pai
 
 
 def work_along_rays(rays: int, samples: int, settings: Settings) -> dict[str, Pair]:
-    """Placing samples and the losses on samples, with their gradients."""
+    """Placing samples, and the losses on samples with their gradients."""
     from nerfstudio.model_components.losses import lossfun_distortion, lossfun_outer
 
     from edge_depth_nerf.kernels import edge_loss_triton, ray_triton
@@ -276,11 +276,14 @@ def work_along_rays(rays: int, samples: int, settings: Settings) -> dict[str, Pa
     }
 
 
-def samples(settings: Settings) -> dict[str, Any]:
+def samples_and_losses(settings: Settings) -> dict[str, Any]:
     """Triton's kernels for samples and losses beside torch's, at the sizes of a full step."""
     torch.manual_seed(0)
-    sizes = (16, 8) if settings.fake else (4096, 256)
-    pairs = {**work_by_number(*sizes, settings), **work_along_rays(*sizes, settings)}
+    rays, samples = (16, 8) if settings.fake else (4096, 256)
+    pairs = {
+        **work_by_number(rays, samples, settings),
+        **work_along_rays(rays, samples, settings),
+    }
     rows = []
     for name, (by_triton, by_torch) in pairs.items():
         work = by_triton if has_kernels(settings) else by_torch
@@ -503,7 +506,7 @@ PARTS = {
     "counts": Part(counts, 120),
     "tests": Part(gpu_tests, 180),
     "kernels": Part(kernels, 120),
-    "samples": Part(samples, 120),
+    "samples and losses": Part(samples_and_losses, 120),
     "our steps": Part(our_steps, 180),
     "other steps": Part(other_steps, 180),
     "profile": Part(profile, 120),

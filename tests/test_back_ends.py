@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import sys
 import warnings
 from dataclasses import replace
@@ -34,7 +33,7 @@ from edge_depth_nerf.method.losses import EDGE_LOSSES
 
 CPU = torch.device("cpu")
 FUNCTIONS = PLACE_SAMPLES, BOUND_LOSS, DISTORTION_LOSS, CONTRACT, DISTANCES, HARMONICS
-EVERY = (*ON_GPU, EDGE_LOSSES.on_gpu)
+EVERY: tuple[Any, ...] = (*ON_GPU, EDGE_LOSSES.on_gpu)
 
 
 @pytest.fixture(autouse=True)
@@ -127,8 +126,9 @@ def test_examples_are_a_few_hundred_numbers_of_no_round_sizes():
 
 def check_that_trials_run_each_kernel() -> None:
     """All kernels give what their formulas give; where one is spoilt, it alone is left out."""
-    names = ("hash_grid_triton", "pointwise_triton", "ray_triton", "edge_loss_triton")
-    modules: list[Any] = [importlib.import_module(f"edge_depth_nerf.kernels.{name}") for name in names]
+    from edge_depth_nerf.kernels import edge_loss_triton, hash_grid_triton, pointwise_triton, ray_triton
+
+    modules: list[Any] = [hash_grid_triton, pointwise_triton, ray_triton, edge_loss_triton]
     launch, launched = modules[0].launch, set()
 
     def launching(kernel: Any, *given: Any, **constants: Any) -> None:
@@ -143,12 +143,11 @@ def check_that_trials_run_each_kernel() -> None:
     assert launched == {name for module in modules for name in vars(module) if name.endswith("_kernel")}
 
     back_ends._tried.clear()
-    distortion = modules[2]._DistortionLoss
 
     def doubled(ctx: Any, *gradients: torch.Tensor) -> tuple[None, torch.Tensor]:
         return None, 2 * gradients[0] * ctx.saved_tensors[0]
 
-    distortion.backward = staticmethod(torch.autograd.function.once_differentiable(doubled))
+    modules[2]._DistortionLoss.backward = staticmethod(torch.autograd.function.once_differentiable(doubled))
     with pytest.warns(UserWarning, match="fused distortion loss does not work .*gradient") as said:
         found = {form.name: tried_out(form, CPU) for form in EVERY}
     assert len(said) == 1 and [name for name, each in found.items() if each is None] == ["distortion loss"]
@@ -180,8 +179,7 @@ def test_a_rendering_may_be_the_first_that_needs_a_kernel(mode):
         return traced
 
     asked = []
-    assert DISTORTION_LOSS.on_gpu is not None
-    right = spoilt(DISTORTION_LOSS.on_gpu, "right")
+    right = spoilt(EVERY[-1], "right")
 
     def examples(device: torch.device) -> Any:
         asked.append(device)

@@ -10,7 +10,7 @@ import torch
 from ahead_of_time import ARCHITECTURES, compiled
 from interpreted import NEEDS_A_GPU, assert_near, in_interpreter, on_a_gpu
 
-from edge_depth_nerf.kernels import ray_numba, threads
+from edge_depth_nerf.kernels import formulas, ray_numba, threads
 
 SIZES = ((2, 1), (5, 16), (33, 17), (9, 48), (3, 256), (2, 300))
 """Rays and samples, of which few are multiples of what a program works on."""
@@ -100,14 +100,9 @@ def check_places() -> None:
     assert placed[1].isnan().all() and placed[0].isfinite().all()
 
 
-def exact_bound_loss(edges, weights, outer_edges, outer_weights) -> torch.Tensor:
-    """mip-NeRF 360's Eq. 13 in float64; the outermost intervals stand for what lies beyond them."""
-    begins, ends = outer_edges[:, None, :-1].clone(), outer_edges[:, None, 1:].clone()
-    begins[..., 0], ends[..., -1] = -float("inf"), float("inf")
-    touched = (ends > edges[:, :-1, None]) & (begins <= edges[:, 1:, None])
-    bound = (touched * outer_weights.double()[:, None]).sum(-1)
-    weights = weights.double()
-    return ((weights - bound).clamp(min=0).square() / (weights + 1e-7)).mean()
+def exact_bound_loss(*given: torch.Tensor) -> torch.Tensor:
+    """The formula in float64."""
+    return formulas.bound_loss(*(each.double() for each in given))
 
 
 def check_the_proposal_loss() -> None:

@@ -2,8 +2,8 @@
 
 A program holds a ray on the chip, so a ray has at most `functions.MOST` samples. What the CPU finds by walking two
 sorted lists (`ray_numba`) is found here by comparing each of one with each of the other: more comparisons, none of
-which waits. Sums of a ray are of float32, but for the cumulative distribution that samples are placed by, which is of float64
-as on the CPU. With TRITON_INTERPRET=1 set before the import the kernels run on CPU tensors.
+which waits. Sums of a ray are of float32, but for the cumulative distribution that samples are placed by, which is of
+float64 as on the CPU. With TRITON_INTERPRET=1 set before the import the kernels run on CPU tensors.
 """
 
 from __future__ import annotations
