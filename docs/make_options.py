@@ -20,8 +20,8 @@ import tyro
 
 from edge_depth_nerf import cli
 from edge_depth_nerf.base.files import write_text
-from edge_depth_nerf.method.integration import IntegrationOptions
 from edge_depth_nerf.method.depth_losses import LOSSES
+from edge_depth_nerf.method.integration import IntegrationOptions
 from edge_depth_nerf.method.prior import PriorOptions
 from edge_depth_nerf.plugin.config import make_specifications, read_method_file
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
@@ -214,7 +214,10 @@ def methods() -> str:
         ("The depth prior", "pipeline.datamanager.prior", PriorOptions),
         ("Its integration", "pipeline.datamanager.prior.integration", IntegrationOptions),
         ("The model and its loss", "pipeline.model", EdgeDepthNerfModelConfig),
-        *((f"The loss {name}", f"pipeline.model.losses.{name.replace('-', '_')}", kind) for name, kind in LOSSES.items()),
+        *(
+            (f"The loss {name}", f"pipeline.model.losses.{name.replace('-', '_')}", kind)
+            for name, kind in LOSSES.items()
+        ),
         ("Poses refined in training", "pipeline.model.camera_optimizer", PoseRefinerConfig),
         ("Evaluation", "pipeline", EdgeDepthPipelineConfig),
         ("The scene", "pipeline.datamanager.dataparser", FisheyeDepthDataParserConfig),
