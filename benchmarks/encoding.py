@@ -30,7 +30,7 @@ import torch
 from nerfstudio.field_components.encodings import HashEncoding
 from torch import Tensor
 
-from edge_depth_nerf.kernels.fused_hash_grid import use_fused_encodings
+from edge_depth_nerf.plugin.fused.hash_grid import use_fused_encodings
 
 PAUSE_S = 0.02
 """Before each run: torch's threads spin for some milliseconds after their work, which would be the next form's time."""

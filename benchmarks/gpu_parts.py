@@ -196,7 +196,7 @@ def work_by_number(rays: int, samples: int, settings: Settings) -> dict[str, Pai
     from nerfstudio.utils.math import components_from_spherical_harmonics
 
     from edge_depth_nerf.kernels import pointwise_triton
-    from edge_depth_nerf.kernels.fields import CubeContraction
+    from edge_depth_nerf.plugin.fused.fields import CubeContraction
 
     near, far = (torch.full((rays, 1), value, device=settings.device) for value in (0.01, 50.0))
     edges = sorted_edges(rays, samples, settings)
@@ -225,7 +225,8 @@ def work_along_rays(rays: int, samples: int, settings: Settings) -> dict[str, Pa
     """Placing samples, and the losses on samples with their gradients."""
     from nerfstudio.model_components.losses import lossfun_distortion, lossfun_outer
 
-    from edge_depth_nerf.kernels import edge_loss_triton, ray_triton
+    from edge_depth_nerf.kernels import ray_triton
+    from edge_depth_nerf.method import edge_loss_triton
     from edge_depth_nerf.method.losses import EPS, NARROW, edge_loss
 
     final = max(2, samples // 5)

@@ -35,11 +35,11 @@ from torch import Tensor
 
 from edge_depth_nerf.compare.judging import evaluated
 from edge_depth_nerf.kernels.back_ends import along_rays
-from edge_depth_nerf.kernels.ray_samplers import samples_along
 from edge_depth_nerf.method.detail import seen_from
 from edge_depth_nerf.method.metrics import DepthErrors, masked_psnr
 from edge_depth_nerf.plugin.compat import without_undefined_ray
 from edge_depth_nerf.plugin.detail import detail_shown
+from edge_depth_nerf.plugin.fused.ray_samplers import samples_along
 
 RESULTS = Path(__file__).with_name("known_rays.json")
 PART = "known rays"

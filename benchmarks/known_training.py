@@ -35,8 +35,8 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle, RaySamples
 from torch import Tensor
 
-from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss
-from edge_depth_nerf.kernels.ray_samplers import edges_of, samples_along
+from edge_depth_nerf.plugin.fused.nerfacto_losses import distortion_loss
+from edge_depth_nerf.plugin.fused.ray_samplers import edges_of, samples_along
 
 RESULTS = Path(__file__).with_name("known_training.json")
 PART = "known training"

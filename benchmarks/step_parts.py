@@ -29,15 +29,9 @@ import torch
 from torch.profiler import ProfilerActivity, profile
 
 from edge_depth_nerf.base.files import read_json_object, write_json, write_text
-from edge_depth_nerf.kernels import (
-    contraction_numba,
-    fields,
-    hash_grid_numba,
-    network_numba,
-    ray_samplers,
-    rendering_numba,
-)
+from edge_depth_nerf.kernels import contraction_numba, hash_grid_numba, network_numba, rendering_numba
 from edge_depth_nerf.plugin import step_losses
+from edge_depth_nerf.plugin.fused import fields, ray_samplers
 
 RESULTS = Path(__file__).with_name("step_parts.json")
 PART = "speed: step"

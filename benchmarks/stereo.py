@@ -36,13 +36,13 @@ from rich.console import Console
 from rich.table import Table
 
 from edge_depth_nerf.base.files import write_png
-from edge_depth_nerf.kernels import sphere_sweep
 from edge_depth_nerf.method.integration import INTEGRATED
 from edge_depth_nerf.method.prior import PriorOptions, make_prior, view_of
 from edge_depth_nerf.mono.calibration import find_trust
 from edge_depth_nerf.process.motion import SweepStore
 from edge_depth_nerf.process.motion import scene_view as view
 from edge_depth_nerf.scene.reader import SceneFolder, read_scene
+from edge_depth_nerf.stereo import sphere_sweep
 from edge_depth_nerf.stereo.motion import Motion
 from edge_depth_nerf.stereo.sweep import Geometry, Swept, rays_of
 from edge_depth_nerf.stereo.views import View, working_factor

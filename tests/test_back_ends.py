@@ -28,12 +28,12 @@ from edge_depth_nerf.kernels.functions import (
     POSITIONS,
     WEIGHTS,
 )
-from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss
-from edge_depth_nerf.method.losses import EDGE_LOSSES
+from edge_depth_nerf.method.losses import EDGE_LOSS
+from edge_depth_nerf.plugin.fused.nerfacto_losses import distortion_loss
 
 CPU = torch.device("cpu")
 FUNCTIONS = PLACE_SAMPLES, BOUND_LOSS, DISTORTION_LOSS, CONTRACT, DISTANCES, HARMONICS
-EVERY: tuple[Any, ...] = (*ON_GPU, EDGE_LOSSES.on_gpu)
+EVERY: tuple[Any, ...] = (*ON_GPU, EDGE_LOSS.on_gpu)
 
 
 @pytest.fixture(autouse=True)
@@ -126,7 +126,8 @@ def test_examples_are_a_few_hundred_numbers_of_no_round_sizes():
 
 def check_that_trials_run_each_kernel() -> None:
     """All kernels give what their formulas give; where one is spoilt, it alone is left out."""
-    from edge_depth_nerf.kernels import edge_loss_triton, hash_grid_triton, pointwise_triton, ray_triton
+    from edge_depth_nerf.kernels import hash_grid_triton, pointwise_triton, ray_triton
+    from edge_depth_nerf.method import edge_loss_triton
 
     modules: list[Any] = [hash_grid_triton, pointwise_triton, ray_triton, edge_loss_triton]
     launch, launched = modules[0].launch, set()

@@ -27,8 +27,8 @@ from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.results import Results, RunResult
 from edge_depth_nerf.compare.search import grids, write_search
 from edge_depth_nerf.compare.tables import page_of_tables
-from edge_depth_nerf.kernels.ray_samplers import FirstSampler, rays_of
 from edge_depth_nerf.plugin.datamanager import TablePixelSampler
+from edge_depth_nerf.plugin.fused.ray_samplers import FirstSampler, rays_of
 from edge_depth_nerf.plugin.pixel_table import RECORD, PicturePixels, PixelTable, PixelTableWriter
 
 ROOT = Path(__file__).resolve().parent.parent

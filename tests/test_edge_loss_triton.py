@@ -12,8 +12,7 @@ import torch
 from ahead_of_time import ARCHITECTURES, compiled
 from interpreted import NEEDS_A_GPU, assert_near, in_interpreter, on_a_gpu
 
-from edge_depth_nerf.kernels import edge_loss_numba
-from edge_depth_nerf.method import depth_losses
+from edge_depth_nerf.method import depth_losses, edge_loss_numba
 from edge_depth_nerf.method.depth_losses import EdgeLoss, Level
 from edge_depth_nerf.method.losses import EDGE_LOSS, EPS, NARROW, Gaussian, edge_loss
 
@@ -36,7 +35,7 @@ def level_of(rays: int, samples: int, seed: int = 0) -> tuple[torch.Tensor, ...]
 
 def by_kernels(level, gaussian="interval", norm=True, kernels: Any = None) -> torch.Tensor:
     if kernels is None:
-        from edge_depth_nerf.kernels import edge_loss_triton as kernels
+        from edge_depth_nerf.method import edge_loss_triton as kernels
 
     return kernels.edge_loss(*level, interval=gaussian == "interval", divide_by_norm=norm, eps=EPS, narrow=NARROW)
 

@@ -17,10 +17,10 @@ from nerfstudio.field_components.spatial_distortions import SceneContraction
 
 from edge_depth_nerf.kernels import back_ends, formulas
 from edge_depth_nerf.kernels import hash_grid_numba as cpu
-from edge_depth_nerf.kernels.fields import CubeContraction
 from edge_depth_nerf.kernels.functions import HASH_GRID
-from edge_depth_nerf.kernels.fused_hash_grid import FusedHashEncoding
 from edge_depth_nerf.kernels.table_adam import TableAdam
+from edge_depth_nerf.plugin.fused.fields import CubeContraction
+from edge_depth_nerf.plugin.fused.hash_grid import FusedHashEncoding
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
 
 SIZES = {

@@ -18,11 +18,11 @@ from trainings import trainer_of
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_image, read_json, write_distance_png, write_json, write_mask, write_png
-from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss, interlevel_loss
 from edge_depth_nerf.method.depth_losses import DsNerfLoss, EdgeLoss, UrbanNerfLoss, UrbanNerfSightLoss
 from edge_depth_nerf.method.integration import IntegrationOptions, integrate_depth, select_prior, sigma_m
 from edge_depth_nerf.method.losses import edge_loss, urban_nerf_loss
 from edge_depth_nerf.method.prior import PriorOptions
+from edge_depth_nerf.plugin.fused.nerfacto_losses import distortion_loss, interlevel_loss
 
 HALVES = [torch.float16, torch.bfloat16]
 

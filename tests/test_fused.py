@@ -24,11 +24,13 @@ from nerfstudio.models import nerfacto
 from edge_depth_nerf.kernels import hash_grid_numba, network_numba
 from edge_depth_nerf.kernels import network as network_module
 from edge_depth_nerf.kernels.contraction_numba import contract
-from edge_depth_nerf.kernels.fields import FusedDensityField, FusedMLP, FusedNerfactoField
-from edge_depth_nerf.kernels.fused_hash_grid import FusedHashEncoding
-from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss, interlevel_loss
 from edge_depth_nerf.kernels.network import network
-from edge_depth_nerf.kernels.ray_samplers import (
+from edge_depth_nerf.plugin.config import FusedAdamConfig
+from edge_depth_nerf.plugin.fused.build import FORMS, fused_forms
+from edge_depth_nerf.plugin.fused.fields import FusedDensityField, FusedMLP, FusedNerfactoField
+from edge_depth_nerf.plugin.fused.hash_grid import FusedHashEncoding
+from edge_depth_nerf.plugin.fused.nerfacto_losses import distortion_loss, interlevel_loss
+from edge_depth_nerf.plugin.fused.ray_samplers import (
     FirstSampler,
     FusedFrustums,
     FusedPDFSampler,
@@ -37,8 +39,6 @@ from edge_depth_nerf.kernels.ray_samplers import (
     edges_of,
     samples_along,
 )
-from edge_depth_nerf.plugin.config import FusedAdamConfig
-from edge_depth_nerf.plugin.fused.build import FORMS, fused_forms
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
 
 

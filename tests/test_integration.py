@@ -15,8 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.kernels import integration_numba
-from edge_depth_nerf.method import integration
+from edge_depth_nerf.method import integration, integration_numba
 from edge_depth_nerf.method.integration import (
     IntegratedDepth,
     IntegrationOptions,

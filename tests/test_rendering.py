@@ -14,10 +14,10 @@ from nerfstudio.model_components import renderers
 from torch import Tensor
 
 from edge_depth_nerf.kernels import rendering_numba
-from edge_depth_nerf.kernels.fields import FusedNerfactoField
 from edge_depth_nerf.kernels.pointwise_numba import STEEPEST
 from edge_depth_nerf.kernels.rendering import Background, Networks, Rendered
 from edge_depth_nerf.kernels.rendering_numba import render
+from edge_depth_nerf.plugin.fused.fields import FusedNerfactoField
 
 
 @pytest.fixture(autouse=True, params=[1, 2], ids=["one thread", "two threads"])

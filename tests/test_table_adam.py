@@ -9,8 +9,8 @@ import pytest
 import torch
 from nerfstudio.field_components.encodings import HashEncoding
 
-from edge_depth_nerf.kernels.fused_hash_grid import FusedHashEncoding, sum_tables_later
 from edge_depth_nerf.kernels.table_adam import PARTS, SUMS_LATER, TableAdam, TablePart
+from edge_depth_nerf.plugin.fused.hash_grid import FusedHashEncoding, sum_tables_later
 
 SETTINGS: dict[str, Any] = {"lr": 1e-2, "eps": 1e-15}
 

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from edge_depth_nerf.kernels import contraction_numba, pixel_records_numba, ray_numba, table_rays_numba, threads
+from edge_depth_nerf.kernels import contraction_numba, ray_numba, threads
 from edge_depth_nerf.kernels.hash_grid_numba import _threads
 from edge_depth_nerf.kernels.threads import kernel_threads, take_all_threads, torch_on_one_thread
+from edge_depth_nerf.plugin import pixel_records_numba, table_rays_numba
 
 
 @pytest.fixture

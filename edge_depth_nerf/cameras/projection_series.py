@@ -3,7 +3,7 @@
 In all camera models a ray goes to a plane by a factor of its angle from the axis alone, and the plane is bent by
 `Distortion`. Both factors are smooth functions of the cosine of that angle, also on the axis, so that low polynomials
 give them as far as the picture reaches, and a projection is a root, a division and some products: what a compiler turns
-into vector instructions. `kernels.sphere_sweep` evaluates them.
+into vector instructions. `stereo.sphere_sweep` evaluates them.
 """
 
 from __future__ import annotations

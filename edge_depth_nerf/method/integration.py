@@ -243,7 +243,7 @@ def _integrate_on_cpu(lidar: Tensor, mono: Tensor, valid: Tensor, options: Integ
     allow concurrent callers and forked processes. There are as many as torch may use.
     """
     # imported here, because Numba takes half a second to load
-    from edge_depth_nerf.kernels.integration_numba import TILE, integrate_rows
+    from edge_depth_nerf.method.integration_numba import TILE, integrate_rows
 
     height, width = mono.shape
     integrate = functools.partial(

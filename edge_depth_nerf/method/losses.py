@@ -89,13 +89,13 @@ def edge_loss(
 
 
 def _by_numba() -> Callable[..., Tensor]:
-    from edge_depth_nerf.kernels import edge_loss_numba
+    from edge_depth_nerf.method import edge_loss_numba
 
     return edge_loss_numba.edge_loss
 
 
 def _by_triton() -> Callable[..., Tensor]:
-    from edge_depth_nerf.kernels import edge_loss_triton
+    from edge_depth_nerf.method import edge_loss_triton
 
     return edge_loss_triton.edge_loss
 

@@ -29,8 +29,6 @@ from torch import Tensor
 
 from edge_depth_nerf.base.pictures import DISTANCE, SIGMA, colour_distance
 from edge_depth_nerf.kernels.allocator import keep_freed_memory
-from edge_depth_nerf.kernels.fields import CubeContraction, FusedNerfactoField
-from edge_depth_nerf.kernels.fused_hash_grid import sum_tables_later
 from edge_depth_nerf.kernels.openmp import let_idle_threads_sleep
 from edge_depth_nerf.kernels.rendering import Rendered
 from edge_depth_nerf.kernels.threads import take_all_threads
@@ -40,6 +38,8 @@ from edge_depth_nerf.plugin.detail import TrainingDetail
 from edge_depth_nerf.plugin.evaluation import LpipsAtFirstUse, Psnr, ViewEvaluation
 from edge_depth_nerf.plugin.exposure import Gains
 from edge_depth_nerf.plugin.fused.build import compiled_before, fused_forms
+from edge_depth_nerf.plugin.fused.fields import CubeContraction, FusedNerfactoField
+from edge_depth_nerf.plugin.fused.hash_grid import sum_tables_later
 from edge_depth_nerf.plugin.pose_refinement import MOMENTS, PoseRefiner, PoseRefinerConfig
 from edge_depth_nerf.plugin.ray_table import ViewRays
 from edge_depth_nerf.plugin.renderers import (

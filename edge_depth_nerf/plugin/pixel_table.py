@@ -159,7 +159,7 @@ class PixelTable:
 
         """
         # imported here, because Numba takes half a second to load
-        from edge_depth_nerf.kernels.pixel_records_numba import unpacked
+        from edge_depth_nerf.plugin.pixel_records_numba import unpacked
 
         records = self.records(start, count)
         if keep is not None:

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from edge_depth_nerf.base.checked_cache import is_whole, keep_last, used, write_checked
 from edge_depth_nerf.base.console import progress_bars
-from edge_depth_nerf.kernels.ray_samplers import rays_of
+from edge_depth_nerf.plugin.fused.ray_samplers import rays_of
 
 TABLE_VERSION = 2
 """Raised whenever the form of the file changes."""
@@ -149,7 +149,7 @@ class TableRayGenerator(RayGenerator):
         picture, row, column = ray_indices.unbind(-1)
         if ray_indices.device.type == "cpu":
             # imported here, because Numba takes half a second to load
-            from edge_depth_nerf.kernels.table_rays_numba import turned
+            from edge_depth_nerf.plugin.table_rays_numba import turned
 
             origins, directions, rest = turned(self.table, self.first, self.widths, ray_indices, self.poses)
         else:

@@ -16,10 +16,10 @@ from nerfstudio.model_components.losses import scale_gradients_by_distance_squar
 from nerfstudio.model_components.renderers import AccumulationRenderer, DepthRenderer, RGBRenderer
 from torch import Tensor
 
-from edge_depth_nerf.kernels.fields import FusedNerfactoField
-from edge_depth_nerf.kernels.ray_samplers import rays_of, samples_along
 from edge_depth_nerf.kernels.rendering import Background, Rendered
 from edge_depth_nerf.method.uncertainty import termination_std
+from edge_depth_nerf.plugin.fused.fields import FusedNerfactoField
+from edge_depth_nerf.plugin.fused.ray_samplers import rays_of, samples_along
 
 INFINITELY_FAR = 1e4
 """Scene units: so far that the place in the contracted scene is the direction alone."""

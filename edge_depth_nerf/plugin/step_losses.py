@@ -16,10 +16,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.kernels.nerfacto_losses import distortion_loss, interlevel_loss
-from edge_depth_nerf.kernels.ray_samplers import edges_of
 from edge_depth_nerf.method.depth_losses import LOSSES, VARIABLE, DepthLoss, Level, depth_loss, register
 from edge_depth_nerf.method.losses import sky_loss
+from edge_depth_nerf.plugin.fused.nerfacto_losses import distortion_loss, interlevel_loss
+from edge_depth_nerf.plugin.fused.ray_samplers import edges_of
 
 register(os.environ.get(VARIABLE, ""))
 if TYPE_CHECKING:

@@ -81,7 +81,7 @@ def confirm(
 
     """
     # imported here, because Numba takes half a second to load
-    from edge_depth_nerf.kernels import sphere_sweep
+    from edge_depth_nerf.stereo import sphere_sweep
 
     size = view.grey.shape
     asked = worth_asking(swept)

@@ -120,7 +120,7 @@ def sweep_view(view: View, neighbours: Sequence[View]) -> Swept:
     if len(inverses_per_m) < 3:
         return nothing
     # imported here, because Numba takes half a second to load
-    from edge_depth_nerf.kernels import sphere_sweep
+    from edge_depth_nerf.stereo import sphere_sweep
 
     height, width = view.grey.shape
     geometry, directions = Geometry.of(view, neighbours), rays_of(view)

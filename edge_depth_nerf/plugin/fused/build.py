@@ -10,9 +10,9 @@ from nerfstudio.field_components import mlp
 from nerfstudio.fields import density_fields, nerfacto_field
 from nerfstudio.models import nerfacto
 
-from edge_depth_nerf.kernels.fields import FusedDensityField, FusedMLP, FusedNerfactoField
-from edge_depth_nerf.kernels.fused_hash_grid import FusedHashEncoding
-from edge_depth_nerf.kernels.ray_samplers import FusedProposalSampler
+from edge_depth_nerf.plugin.fused.fields import FusedDensityField, FusedMLP, FusedNerfactoField
+from edge_depth_nerf.plugin.fused.hash_grid import FusedHashEncoding
+from edge_depth_nerf.plugin.fused.ray_samplers import FusedProposalSampler
 
 FORMS: list[tuple[Any, dict[str, type]]] = [
     (
@@ -49,19 +49,18 @@ def fused_forms() -> Iterator[None]:
 
 def compiled_before() -> bool:
     """Whether the kernels of a training on the CPU lie compiled on disk; otherwise their first calls take long."""
-    from edge_depth_nerf.kernels import (  # noqa: F401 - each tells its folder; Numba takes half a second to load
+    # each tells its folder; Numba takes half a second to load
+    from edge_depth_nerf.kernels import (  # noqa: F401
         compiled,
         contraction_numba,
-        edge_loss_numba,
         hash_grid_numba,
-        integration_numba,
         network_numba,
-        pixel_records_numba,
         pointwise_numba,
         ray_numba,
         rendering_numba,
         table_adam_numba,
-        table_rays_numba,
     )
+    from edge_depth_nerf.method import edge_loss_numba, integration_numba  # noqa: F401
+    from edge_depth_nerf.plugin import pixel_records_numba, table_rays_numba  # noqa: F401
 
     return compiled.all_on_disk()
