@@ -42,11 +42,11 @@ demo: setup
 # All methods on the real drive in a folder of yours (docs/real_drive.md says which): make real REAL=FOLDER; some hours.
 real: setup
 	@test -n "$(REAL)" || { echo "Give the folder with the real drive: make real REAL=FOLDER"; exit 2; }
-	$(BIN)/python benchmarks/real_drive.py --real "$(REAL)" --output outputs/real_drive
+	$(BIN)/python -m benchmarks.quality.real_drive --real "$(REAL)" --output outputs/real_drive
 
 # In parts of at most three minutes; called again it does what is missing. GPU=--fake goes the same way without a GPU.
 gpu: setup
-	$(BIN)/python benchmarks/gpu.py $(GPU)
+	$(BIN)/python -m benchmarks.speed.gpu $(GPU)
 
 # In a folder of their own, which is removed if they pass; of those that fail it can be looked at.
 in_a_folder = folder=$$(mktemp -d) && if $(BIN)/pytest --basetemp=$$folder/tests $(1); then rm -rf $$folder; else \

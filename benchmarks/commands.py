@@ -1,4 +1,4 @@
-"""Running the installed commands, for benchmarks."""
+"""What benchmarks share: the project's command, and λ and σ of the methods that take part in no search."""
 
 from __future__ import annotations
 
@@ -6,18 +6,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+TUNED = Path(__file__).with_name("tuned.json")
+"""λ and σ that an old search on a rendered drive found, by method (docs/earlier_results.md of commit fc8242a)."""
 
-def command(name: str, *words: object, shown: bool = False) -> None:
-    """Run one of the commands of this environment; ends the program if it fails.
 
-    Args:
-        name: of the command.
-        words: its arguments.
-        shown: whether its output is; else only the end of what a failed one wrote.
-
-    """
-    pipe = None if shown else subprocess.PIPE
-    call = [str(Path(sys.executable).with_name(name)), *map(str, words)]
-    done = subprocess.run(call, stdout=pipe, stderr=None if shown else subprocess.STDOUT, text=True, check=False)
-    if done.returncode:
-        sys.exit(f"{name} {' '.join(map(str, words))} failed.\n{(done.stdout or '')[-3000:]}")
+def ours(*words: object) -> None:
+    """Run `edge-depth-nerf` of this environment with its output shown; a failure ends the program."""
+    call = [str(Path(sys.executable).with_name("edge-depth-nerf")), *map(str, words)]
+    if subprocess.run(call, check=False).returncode:
+        sys.exit(f"{' '.join(call)} failed.")

@@ -1,10 +1,8 @@
 """Generated tables of the pages: replaces the text between `<!-- NAME -->` and the next `<!-- end -->`.
 
-    python benchmarks/pages.py PAGE NAME=FILE[#HEADING] [NAME=FILE[#HEADING] ...]
+    python -m benchmarks.pages PAGE NAME=FILE#HEADING [NAME=FILE#HEADING ...]
 
-puts Markdown that a command wrote (`tables.md`, `search.md`) into a page such as docs/results.md. The title is left
-out, headings go one level down, and tables of single drives are folded. With #HEADING, only the text under that heading
-is inserted.
+puts what stands under a heading of Markdown that a command wrote (`tables.md`) into a page such as docs/results.md.
 """
 
 from __future__ import annotations
@@ -29,26 +27,6 @@ def with_part(page: str, name: str, content: str) -> str:
     return f"{page[:begin]}\n{content.strip()}\n{page[page.index(END, begin) :]}"
 
 
-def lowered(markdown: str) -> str:
-    """Without its title, other headings a level further down."""
-    lines = [line for line in markdown.splitlines() if not line.startswith("# ")]
-    return "\n".join(f"#{line}" if line.startswith("##") else line for line in lines)
-
-
-def folded(markdown: str) -> str:
-    """Markdown whose sections `### Table 5, DRIVE. …` are folded away, except the average over drives."""
-    first, *sections = re.split(r"^(?=### )", markdown, flags=re.MULTILINE)
-    parts = [first]
-    for section in sections:
-        title, _, content = section.partition("\n")
-        if re.match(r"### Table \d+, (?!average\b)", title):
-            # `markdown` lets MkDocs format what is inside
-            opening = f"<details markdown><summary>{title.removeprefix('### ')}</summary>"
-            section = f"{opening}\n\n{content.strip()}\n\n</details>\n\n"
-        parts.append(section)
-    return "".join(parts)
-
-
 def under(markdown: str, heading: str) -> str:
     """What stands under the first heading that begins with these words, without it.
 
@@ -66,7 +44,7 @@ def under(markdown: str, heading: str) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("page", type=Path)
-    parser.add_argument("parts", nargs="+", metavar="NAME=FILE[#HEADING]")
+    parser.add_argument("parts", nargs="+", metavar="NAME=FILE#HEADING")
     options = parser.parse_args()
     page = options.page.read_text(encoding="utf-8")
     for part in options.parts:
@@ -76,7 +54,7 @@ def main() -> None:
             parser.error(f"{options.page} has no line <!-- {name} -->")
         content = Path(file).read_text(encoding="utf-8")
         try:
-            page = with_part(page, name, under(content, heading) if heading else folded(lowered(content)))
+            page = with_part(page, name, under(content, heading))
         except InputError as error:
             parser.error(f"{file}: {error}")
     write_text(options.page, page)

@@ -24,7 +24,7 @@ else:
 
 ROOT = Path(__file__).resolve().parents[1]
 RULES = Path(__file__).with_name("prose_rules.toml")
-PAGES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "data/README.md", "docs/*.md")
+PAGES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "data/README.md", "benchmarks/README.md", "docs/*.md")
 MODULES = "edge_depth_nerf/**/*.py"
 LEAST_WORDS = 4
 """Strings of a module with fewer words are names and keys, not messages."""

@@ -1,6 +1,6 @@
 """Draw the charts of docs/results.md and docs/real_drive.md from their own tables: `python docs/make_chart.py`.
 
-Run it after `benchmarks/pages.py` has written new tables.
+Run it after `benchmarks.pages` has written new tables.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def results(chart: Chart, page: str) -> list[Result]:
         rows = [[cell.strip(" *") for cell in line.strip("|").split("|")] for line in lines]
         if len(rows) < 3:
             raise InputError(
-                f"{chart.page}: the table under <!-- {mark} --> has no rows. Write it with benchmarks/pages.py."
+                f"{chart.page}: the table under <!-- {mark} --> has no rows. Write it with python -m benchmarks.pages."
             )
         # a table of `compare` has an arrow that says which way is better
         columns = [[heading.split(" ")[0] for heading in rows[0]].index(name) for name in ("PSNR", "AbsRel")]

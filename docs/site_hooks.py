@@ -17,7 +17,7 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = ("data/README.md", "CONTRIBUTING.md", "CHANGELOG.md")
+PAGES = ("data/README.md", "benchmarks/README.md", "CONTRIBUTING.md", "CHANGELOG.md")
 """Pages of the site that lie elsewhere in the repository."""
 SLIDER = "slider.html"
 """The page of pictures, beside results.html."""

@@ -1,4 +1,4 @@
-"""Importing the programs of benchmarks/, which are no package."""
+"""Importing the programs of benchmarks/, which are not installed."""
 
 from __future__ import annotations
 
@@ -16,11 +16,9 @@ BENCHMARKS = Path(__file__).resolve().parent.parent / "benchmarks"
 
 @contextmanager
 def benchmark_modules() -> Iterator[Callable[[str], ModuleType]]:
-    """A function that imports one by its name; afterwards none of them is imported any more."""
-    before = set(sys.modules)
+    """A function that imports one by its name, such as quality.unseen; afterwards none of them is imported any more."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(BENCHMARKS))
-        yield importlib.import_module
-    for name in set(sys.modules) - before:
-        if (BENCHMARKS / f"{name}.py").is_file():
-            sys.modules.pop(name)
+        patch.syspath_prepend(str(BENCHMARKS.parent))
+        yield lambda name: importlib.import_module(f"benchmarks.{name}")
+    for name in [name for name in sys.modules if name.partition(".")[0] == "benchmarks"]:
+        sys.modules.pop(name)

@@ -16,7 +16,7 @@ from edge_depth_nerf.compare.specification import RunSpecification
 
 
 def test_folders_of_runs_say_their_setting(tmp_path):
-    """As far as they have one: benchmarks/equal_seconds.py trains nerfacto without whole views, too."""
+    """As far as they have one: a search of `nerfacto` trains it without whole views, too."""
     nerfacto = RunSpecification("/x/street", "0", "lite", "nerfacto", 3, 10, whole_views=False)
     searched = replace(nerfacto, method="ds-nerf", weight=0.01, sigma_m="own")
     names = [command.Run(each, tmp_path).folder.relative_to(tmp_path) for each in (nerfacto, searched)]

@@ -49,7 +49,6 @@ CHOICES = {
 RUNS_OF = {
     "grid": ("grid",),
     "unseen": ("unseen", "grid"),
-    "before": ("unseen_before", "grid_before"),
     "detail": ("detail",),
     "real": ("real_drive", "real_drive_seconds", "real_drive_cells", "real_drive_full", "real_drive_lambda"),
     "unseen: search": ("unseen_search",),
@@ -59,15 +58,15 @@ RUNS_OF = {
 
 @pytest.fixture(scope="module")
 def unseen() -> Iterator[ModuleType]:
-    """benchmarks/unseen.py."""
+    """benchmarks/quality/unseen.py."""
     with benchmark_modules() as load:
-        yield load("unseen")
+        yield load("quality.unseen")
 
 
 @pytest.fixture(scope="module")
 def kept(unseen) -> dict[str, list[RunResult]]:
     names = {name for files in RUNS_OF.values() for name in files} | {"grid_search"}
-    return {name: unseen.results_of(BENCHMARKS / f"{name}.json.xz").runs for name in names}
+    return {name: unseen.results_of(BENCHMARKS / "quality" / f"{name}.json.xz").runs for name in names}
 
 
 def changed(one: RunResult, other: RunResult) -> set[str]:
@@ -103,9 +102,9 @@ def drives_of_choices(page: str, runs: dict[str, list[RunResult]]) -> set[str]:
 def test_tables_are_of_drives_that_took_part_in_no_choice(page, kept):
     text = (ROOT / page).read_text(encoding="utf-8")
     assert drives_of_choices(text, kept) == set()
-    # both opened with the real drive, and results.md had tables of the drives that showed a fault, and the search
-    former = text + "<!-- real: table -->\n<!-- end -->\n<!-- before: large -->\n<!-- end -->\n"
-    assert {"kitti360_half", "street_101"} <= drives_of_choices(former, kept)
+    # both opened with the real drive, and results.md had tables of the search
+    former = text + "<!-- real: table -->\n<!-- end -->\n"
+    assert {"kitti360_half", "kitti360_full"} <= drives_of_choices(former, kept)
     assert drives_of_choices(text + "<!-- unseen: search -->", kept) == {"tune_street"}
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from benchmark_modules import benchmark_modules
 from interpreted import in_interpreter
 
 from edge_depth_nerf.base.files import read_json, write_json
@@ -17,16 +18,12 @@ from edge_depth_nerf.base.files import read_json, write_json
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).resolve().parent.parent
-OURS = ("gpu", "gpu_parts", "gpu_counts", "speed", "encoding")
 
 
 @pytest.fixture(scope="module")
 def gpu() -> Any:
-    sys.path.insert(0, str(ROOT / "benchmarks"))
-    yield importlib.import_module("gpu")
-    sys.path.remove(str(ROOT / "benchmarks"))
-    for name in OURS:
-        sys.modules.pop(name, None)
+    with benchmark_modules() as load:
+        yield load("speed.gpu")
 
 
 def test_every_part_runs_to_its_end_without_a_gpu(gpu, sample_drive, tmp_path, capsys):
@@ -73,8 +70,8 @@ def test_a_part_that_fails_or_takes_too_long_says_so_and_ends_no_other(gpu, tmp_
 
 
 def check_the_work_that_is_timed() -> None:
-    sys.path.insert(0, str(ROOT / "benchmarks"))
-    gpu_parts: Any = importlib.import_module("gpu_parts")
+    sys.path.insert(0, str(ROOT))
+    gpu_parts: Any = importlib.import_module("benchmarks.speed.gpu_parts")
     settings = gpu_parts.Settings(Path(), Path(), fake=True)
     assert gpu_parts.has_kernels(settings)
     off = {row["what"]: row["off_torch"] for row in gpu_parts.samples_and_losses(settings)["rows"]}
@@ -89,7 +86,7 @@ def test_the_kernels_that_are_timed_do_the_work_of_torch():
 
 
 def test_the_tests_of_a_gpu_are_found(gpu):
-    parts = importlib.import_module("gpu_parts")
+    parts = importlib.import_module("benchmarks.speed.gpu_parts")
     found = {path.name for path in parts.tests_of_a_gpu()}
     needing = {
         path.name
@@ -100,7 +97,7 @@ def test_the_tests_of_a_gpu_are_found(gpu):
 
 
 def test_a_trainer_that_fails_ends_no_other(gpu, monkeypatch):
-    parts = importlib.import_module("gpu_parts")
+    parts = importlib.import_module("benchmarks.speed.gpu_parts")
     settings = parts.Settings(ROOT, ROOT)
 
     def raced(_: Any, names: list[str]) -> dict[str, Any]:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from benchmark_modules import benchmark_modules
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from edge_depth_nerf.method.depth_losses import LOSSES, Level, depth_loss
@@ -40,12 +39,8 @@ MOST_GIGABYTES = {
 
 @pytest.fixture(scope="module")
 def gpu_counts() -> Any:
-    sys.path.insert(0, str(ROOT / "benchmarks"))
-    try:
-        return importlib.import_module("gpu_counts")
-    finally:
-        sys.path.remove(str(ROOT / "benchmarks"))
-        sys.modules.pop("gpu_counts", None)
+    with benchmark_modules() as load:
+        return load("speed.gpu_counts")
 
 
 @pytest.fixture(scope="module")

@@ -35,10 +35,8 @@ from edge_depth_nerf.method.depth_losses import Level
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PAGES = sorted(
-    str(path.relative_to(ROOT))
-    for path in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "data/README.md", *DOCS.glob("*.md"))
-)
+OTHER_PAGES = ("README.md", "CONTRIBUTING.md", "data/README.md", "benchmarks/README.md")
+PAGES = sorted(str(path.relative_to(ROOT)) for path in (*(ROOT / name for name in OTHER_PAGES), *DOCS.glob("*.md")))
 RUN = "<!-- run -->"
 """The block after this comment is run, not only parsed."""
 PROGRAM = r"edge-depth-nerf|ns-[a-z]+|python|make"
@@ -207,7 +205,7 @@ def test_the_pages_are_read():
         programs = {words[0] for words in by_page[page]}
         assert {"edge-depth-nerf", "ns-train", "ns-eval", "ns-viewer"} <= programs, page
     lists = [words for words in by_page["docs/ablation.md"] if "synthesize" in words]
-    assert [words[words.index("--scene") + 1] for words in lists] == ["street"] * 5
+    assert [words[words.index("--scene") + 1] for words in lists] == ["street"]
     for page in PAGES:
         text = (ROOT / page).read_text(encoding="utf-8")
         found = len(re.findall(r"^ +(?:edge-depth-nerf|ns-[a-z]+) ", text, re.MULTILINE))
@@ -259,7 +257,7 @@ def test_options_named_in_the_text_exist(page, known_options):
         if not re.match(r"(pip|hf|python|pytest|apt-get|git|ssh|dask) ", span)
     ]
     named = {name for span in spans for name in re.findall(r"(?<![\w-])--[a-z][\w.-]*\w", span)}
-    # of pip, and of benchmarks/gpu.py
+    # of pip, and of benchmarks/speed/gpu.py
     assert not named - known_options - {"--force-reinstall", "--fake"}
 
 

@@ -1,5 +1,5 @@
-"""Real KITTI-360 excerpts go the whole way: scene, prior, training, judging. How good it gets is a benchmark's
-matter (benchmarks/real_input.py); here the geometry must hold and the training must learn."""
+"""Real KITTI-360 excerpts go the whole way: scene, prior, training, evaluation. Here the geometry must hold and the
+training must learn; how good it gets is a matter of benchmarks/quality/real_drive.py."""
 
 from __future__ import annotations
 

@@ -1,0 +1,1 @@
+"""Programs that measure the package; README.md lists them."""
