@@ -14,7 +14,7 @@ import tyro
 from rich.console import Console
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.compare.options import CompareOptions
+from edge_depth_nerf.compare.options import CompareOptions, GridOptions, SearchOptions
 from edge_depth_nerf.demo.options import DemoOptions
 from edge_depth_nerf.films.options import CameraPathOptions
 from edge_depth_nerf.inspecting.options import InspectOptions
@@ -50,6 +50,8 @@ Command = (
     | Annotated[InspectOptions, tyro.conf.subcommand("inspect")]
     | Annotated[CameraPathOptions, tyro.conf.subcommand("camera-path")]
     | Annotated[CompareOptions, tyro.conf.subcommand("compare")]
+    | Annotated[SearchOptions, tyro.conf.subcommand("search")]
+    | Annotated[GridOptions, tyro.conf.subcommand("grid")]
     | Annotated[DemoOptions, tyro.conf.subcommand("demo")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
 )
@@ -159,6 +161,16 @@ def run(command: Command) -> None:
             from edge_depth_nerf.compare.command import compare
 
         compare(command)
+    elif isinstance(command, GridOptions):
+        with _starting():
+            from edge_depth_nerf.compare.grid import grid
+
+        grid(command)
+    elif isinstance(command, SearchOptions):
+        with _starting():
+            from edge_depth_nerf.compare.search import search
+
+        search(command)
     elif isinstance(command, Doctor):
         from edge_depth_nerf.doctor import run_doctor
 

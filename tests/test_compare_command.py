@@ -16,6 +16,7 @@ from scenes import write_scene
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_json, write_distance_png, write_json
 from edge_depth_nerf.compare import command
+from edge_depth_nerf.compare.options import SearchOptions
 
 
 @pytest.mark.parametrize(
@@ -27,20 +28,32 @@ from edge_depth_nerf.compare import command
         ({"seeds": (1, 1)}, "--seeds 1 1: expected each once"),
         ({"methods": ("edge", "edge")}, "--methods edge edge"),
         ({"preset": "paper", "methods": ("edge-paper",)}, "expected edge, edge-lidar, .* of the literal method"),
-        ({"lambdas": (0.1,)}, "without --search"),
-        ({"search": True}, "--lambdas"),
-        ({"search": True, "lambdas": (1.0, 2.0, 3.0, 4.0)}, "--sigmas-m"),
-        ({"search": True, "lambdas": (1.0, 2.0, 3.0, -4.0), "sigmas_m": (1.0, 2.0, 3.0)}, "positive"),
-        ({"search": True, "lambdas": (1.0, 2.0, 3.0, 4.0), "sigmas_m": ("own", 1.0)}, "at least 3"),
-        ({"search": True, "seeds": (0, 1)}, "2 seeds"),
-        ({"search": True, "methods": ("nerfacto",)}, "depth loss"),
-        ({"search": True, "tuned": Path("x")}, "--tuned"),
-        ({"search": True, "detail": True}, "--search with --detail"),
+        ({"jobs": 2, "cluster": "local"}, "--jobs with --cluster"),
+        ({"methods": ("edge-lidr",)}, "edge-lidr: no such method. Is edge-lidar meant"),
+        # a name leaves out what is usual
+        ({"methods": ("ds-nerf-lidar",)}, "ds-nerf-lidar: no such method. Is ds-nerf"),
     ],
 )
 def test_options_that_cannot_be(changes, message):
     with pytest.raises(InputError, match=message):
         options(Path("a"), **changes).check()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"lambdas": ()}, "--lambdas"),
+        ({"lambdas": (1.0, 2.0, 3.0, -4.0)}, "positive"),
+        ({"lambdas": (1.0, 2.0, 3.0, 3.0)}, "--lambdas .* each once"),
+        ({"sigmas_m": ("own", 1.0)}, "at least 3"),
+        ({"methods": ("edge", "nerfacto")}, "--methods nerfacto: expected methods with a depth loss"),
+    ],
+)
+def test_a_search_that_cannot_be(changes, message):
+    fine = {"lambdas": (1.0, 2.0, 3.0, 4.0), "sigmas_m": ("own", 1.0, 2.0)}
+    options(Path("a"), of=SearchOptions, **fine).check()
+    with pytest.raises(InputError, match=message):
+        options(Path("a"), of=SearchOptions, **{**fine, **changes}).check()
 
 
 def test_no_scene_is_an_error():

@@ -17,8 +17,15 @@ from edge_depth_nerf.compare.configuration import (
     literal_form,
     setting_of,
 )
-from edge_depth_nerf.compare.methods import METHODS, WITHOUT_EXTRAS, default_methods
-from edge_depth_nerf.compare.options import MethodName, Preset
+from edge_depth_nerf.compare.methods import (
+    METHODS,
+    WITHOUT_EXTRAS,
+    Method,
+    MethodName,
+    Preset,
+    default_methods,
+    sigma_field,
+)
 from edge_depth_nerf.compare.protocol import departures
 from edge_depth_nerf.compare.results import Results
 from edge_depth_nerf.compare.specification import OF_A_RUN, RunSpecification
@@ -45,57 +52,40 @@ EXTRAS = {
     "pipeline.model.sky_background",
     "pipeline.model.depth_loss_final",
 }
-RIVAL = {LOSS, SOURCE, *EXTRAS, "pipeline.model.depth_loss_mult", "pipeline.model.losses.ds_nerf.sigma_m"}
-ALLOWED = {
-    "nerfacto": {LOSS, SOURCE, *EXTRAS},
-    "nerfacto-embedding": {LOSS, SOURCE, EXPOSURE, *EXTRAS},
-    "urban-nerf": RIVAL,
-    "urban-nerf-los": RIVAL,
-    "ds-nerf": RIVAL,
-    "edge-lidar": {SOURCE},
-    "edge-mono": {SOURCE},
-    "edge-gaussian": {"pipeline.datamanager.prior.integration.kernel"},
-    # what the paper says of the prior and of Eq. 4, λ and σ, and the extras, which it does not have; exposure is none
-    "edge-paper": {
-        SOURCE,
-        *EXTRAS,
-        "pipeline.model.depth_loss_mult",
-        "pipeline.model.depth_loss_levels",
-        "pipeline.model.losses.edge.gaussian",
-        "pipeline.model.losses.edge.divide_by_norm",
-        PRIOR + "align",
-        PRIOR + "sigma_mode",
-        PRIOR + "sigma_constant_m",
-        PRIOR + "motion",
-        PRIOR + "integration.least_returns",
-        PRIOR + "integration.sigma_depth_growth_per_m",
-        PRIOR + "integration.normalise",
-        PRIOR + "integration.keep_returns",
-        PRIOR + "integration.range_guide",
-    },
-    "edge": set(),
-    "nerfacto-lidar-extras": {SOURCE, "pipeline.model.depth_loss_mult"},
-    "nerfacto-integrated-extras": {"pipeline.model.depth_loss_mult"},
-    "urban-nerf-integrated": RIVAL - {SOURCE},
-    "urban-nerf-extras": RIVAL - EXTRAS,
-    "urban-nerf-integrated-extras": RIVAL - EXTRAS - {SOURCE},
-    "urban-nerf-los-integrated": RIVAL - {SOURCE},
-    "urban-nerf-los-extras": RIVAL - EXTRAS,
-    "urban-nerf-los-integrated-extras": RIVAL - EXTRAS - {SOURCE},
-    "ds-nerf-integrated": RIVAL - {SOURCE},
-    "ds-nerf-extras": RIVAL - EXTRAS,
-    "ds-nerf-integrated-extras": RIVAL - EXTRAS - {SOURCE},
-    "edge-lidar-plain": {SOURCE, *EXTRAS},
-    "edge-plain": EXTRAS,
+LAMBDA, KERNEL = "pipeline.model.depth_loss_mult", "pipeline.datamanager.prior.integration.kernel"
+PAPER = {
+    LAMBDA,
+    "pipeline.model.depth_loss_levels",
+    "pipeline.model.losses.edge.gaussian",
+    "pipeline.model.losses.edge.divide_by_norm",
+    PRIOR + "align",
+    PRIOR + "sigma_mode",
+    PRIOR + "sigma_constant_m",
+    PRIOR + "motion",
+    PRIOR + "integration.least_returns",
+    PRIOR + "integration.sigma_depth_growth_per_m",
+    PRIOR + "integration.normalise",
+    PRIOR + "integration.keep_returns",
+    PRIOR + "integration.range_guide",
 }
-ALLOWED["edge-paper-lidar"] = ALLOWED["edge-paper-mono"] = ALLOWED["edge-paper"]
-ALLOWED["edge-paper-gaussian"] = {*ALLOWED["edge-paper"], "pipeline.datamanager.prior.integration.kernel"}
-"""What each method may have otherwise than `edge`; no method may be missing here."""
+"""What the paper says of the prior and of Eq. 4, and λ and σ; exposure is none of it."""
+
+
+def allowed(method: Method) -> set[str]:
+    """What a method may have otherwise than `edge`."""
+    fields = {"": set(), "paper": PAPER, "embedding": {EXPOSURE}}[method.variant] | set()
+    fields |= set() if method.extras else EXTRAS
+    fields |= {None: {SOURCE}, "lidar": {SOURCE}, "mono": {SOURCE}, "gaussian": {KERNEL}, "integrated": set()}[
+        method.prior
+    ]
+    if method.loss == "none":
+        return fields | ({LAMBDA} if method.extras else {LOSS})
+    return fields | (set() if method.loss == "edge" else {LOSS, LAMBDA, sigma_field(method.loss)})
 
 
 def unstated(method, preset: Preset = "lite"):
     """The fields in which a method differs from `edge` though nobody says so."""
-    return set(differing(resolved("edge", preset), resolved(method, preset))) - ALLOWED[method]
+    return set(differing(resolved("edge", preset), resolved(method, preset))) - allowed(METHODS[method])
 
 
 @pytest.mark.parametrize("preset", ["lite", "full", "paper"])
@@ -109,9 +99,8 @@ def test_configurations_differ_in_the_named_fields_alone(preset, method):
 def test_another_exposure_of_the_literal_method_is_found(monkeypatch):
     """It had nerfacto's embedding, alone of all that the tables hold against each other."""
     literal = METHODS["edge-paper"]
-    before = replace(literal, overrides={**literal.overrides, EXPOSURE: "embedding"})
-    monkeypatch.setitem(METHODS, "edge-paper", before)
-    assert unstated("edge-paper") == {EXPOSURE}
+    monkeypatch.setitem(METHODS, "edge-paper", replace(literal, variant="embedding"))
+    assert differing(resolved("edge"), resolved("edge-paper")).keys() - allowed(literal) == {EXPOSURE}
 
 
 @pytest.mark.parametrize("preset", ["lite", "full", "paper"])
@@ -162,13 +151,33 @@ def test_the_table_shows_each_field_in_which_methods_differ(preset):
     assert {LOSS, SOURCE} < set(shown)
 
 
+@pytest.mark.parametrize(
+    ("name", "made"),
+    [
+        ("nerfacto", Method("none", None, False)),
+        ("nerfacto-integrated-extras", Method("none", "integrated", True)),
+        ("urban-nerf-los", Method("urban-nerf-los", "lidar", False)),
+        ("urban-nerf-los-extras", Method("urban-nerf-los", "lidar", True)),
+        ("ds-nerf-integrated", Method("ds-nerf", "integrated", False)),
+        ("ds-nerf-mono-extras", Method("ds-nerf", "mono", True)),
+        ("edge", Method("edge", "integrated", True)),
+        ("edge-lidar-plain", Method("edge", "lidar", False)),
+        ("edge-paper", Method("edge", "integrated", False, "paper")),
+        ("edge-paper-gaussian", Method("edge", "gaussian", False, "paper")),
+    ],
+)
+def test_names_follow_from_loss_prior_and_extras(name, made):
+    assert METHODS[name] == made and made.name == name
+    assert len({method.title for method in METHODS.values()}) == len(METHODS)
+
+
 def test_each_method_is_what_its_name_says():
     def loss_and_source(method):
         found = resolved(method)
         return found[LOSS], found[SOURCE], found["pipeline.datamanager.prior.integration.kernel"]
 
     assert loss_and_source("nerfacto")[0] == loss_and_source("nerfacto-embedding")[0] == "none"
-    exposures = {method: resolved(method)[EXPOSURE] for method in ALLOWED}
+    exposures = {method: resolved(method)[EXPOSURE] for method in METHODS}
     assert {name for name, exposure in exposures.items() if exposure == "embedding"} == {"nerfacto-embedding"}
     assert loss_and_source("urban-nerf") == ("urban-nerf", "lidar", "edge-aware")
     assert loss_and_source("urban-nerf-los") == ("urban-nerf-los", "lidar", "edge-aware")
@@ -234,8 +243,8 @@ def test_a_configuration_reads_the_same_in_every_process():
 
 def test_lambda_and_sigma_go_where_each_method_has_them():
     rival = resolved("ds-nerf", weight=0.07, sigma_m=0.2)
-    assert (rival["pipeline.model.depth_loss_mult"], rival["pipeline.model.losses.ds_nerf.sigma_m"]) == (0.07, 0.2)
-    assert set(differing(rival, resolved("ds-nerf"))) == {LOSS + "_mult", "pipeline.model.losses.ds_nerf.sigma_m"}
+    assert (rival[LAMBDA], rival[sigma_field("ds-nerf")]) == (0.07, 0.2)
+    assert set(differing(rival, resolved("ds-nerf"))) == {LAMBDA, sigma_field("ds-nerf")}
     ours = resolved("edge", weight=0.07, sigma_m=0.2)
     assert (ours[PRIOR + "sigma_mode"], ours[PRIOR + "sigma_constant_m"]) == ("constant", 0.2)
     own = resolved("edge", weight=0.07, sigma_m="own")

@@ -15,9 +15,18 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json, write_json
 from edge_depth_nerf.compare import command
 from edge_depth_nerf.compare.configuration import configuration, flattened
-from edge_depth_nerf.compare.grid import grid_tables
-from edge_depth_nerf.compare.methods import GRID, LOSS_TITLES, METHODS, WITHOUT_EXTRAS, Cell, default_methods
-from edge_depth_nerf.compare.options import MethodName
+from edge_depth_nerf.compare.grid import grid, grid_tables
+from edge_depth_nerf.compare.methods import (
+    GRID,
+    LOSS_TITLES,
+    METHODS,
+    WITHOUT_EXTRAS,
+    Method,
+    MethodName,
+    default_methods,
+    sigma_field,
+)
+from edge_depth_nerf.compare.options import GridOptions
 from edge_depth_nerf.compare.results import Results
 from edge_depth_nerf.compare.search import Grid
 from edge_depth_nerf.compare.specification import RunSpecification
@@ -36,19 +45,23 @@ def differing(one, other):
 
 def test_the_grid_has_each_loss_with_each_prior_without_and_with_extras():
     wanted = {
-        Cell(loss, None if loss == "none" and not extras else prior, extras)
+        Method(loss, None if loss == "none" and not extras else prior, extras)
         for loss in LOSS_TITLES
         for prior in ("lidar", "integrated")
         for extras in (False, True)
     }
     assert set(GRID) == wanted and len(GRID) == 4 * len(LOSS_TITLES) - 1
-    assert not set(default_methods("lite")) & {name for name in GRID.values() if METHODS[name].only_in_grid}
+    assert all(METHODS[name] == cell for cell, name in GRID.items())
+    assert {"nerfacto-lidar-extras", "edge-plain", "ds-nerf-extras"} < {*GRID.values()} - {*default_methods("lite")}
     assert {"nerfacto", "ds-nerf", "edge-lidar", "edge"} < set(GRID.values())
 
 
 def test_cells_that_differ_in_one_thing_differ_in_its_fields_alone():
     """As long as λ and σ are the defaults; those are searched for each."""
-    settings = {"pipeline.model.depth_loss_mult", "pipeline.model.losses.ds_nerf.sigma_m"}
+    settings = {
+        "pipeline.model.depth_loss_mult",
+        *(sigma_field(loss) for loss in LOSS_TITLES if loss not in ("none", "edge")),
+    }
     seen = {"prior": 0, "extras": 0, "loss": 0}
     for (one, first), (other, second) in combinations(GRID.items(), 2):
         found = differing(first, second)
@@ -194,7 +207,7 @@ def asked(folder: Path, **changes):
         scenes["turn"],
         **{
             "tuning": (scenes["tune_a"], scenes["tune_b"]),
-            "grid": True,
+            "of": GridOptions,
             "lambdas": LAMBDAS,
             "sigmas_m": SIGMAS_M,
             "output": folder / "out",
@@ -207,20 +220,20 @@ def asked(folder: Path, **changes):
 @pytest.mark.slow
 def test_a_grid_searches_every_cell_alike_and_goes_on_where_it_was(tmp_path, made_up):
     done, stops = made_up
-    grid = asked(tmp_path, search_steps=3)
+    options = asked(tmp_path, search_steps=3)
     searches, judgements = len(WITH_LOSS) * len(LAMBDAS) * len(SIGMAS_M) * 2, len(GRID) * 2
     # stopped in the search, and in the comparison
     stops.add(50)
     with pytest.raises(KeyboardInterrupt):
-        command.compare(grid, QUIET)
+        grid(options, QUIET)
     assert len(done) == 50
     stops.add(searches + 3)
     with pytest.raises(KeyboardInterrupt):
-        command.compare(grid, QUIET)
-    results = command.compare(grid, QUIET)
+        grid(options, QUIET)
+    results = grid(options, QUIET)
     assert len(done) == searches + judgements == len({run.folder for run in done})
     assert len(results.runs) == judgements and results.scenes() == ["street", "turn"]
-    command.compare(grid, QUIET)
+    grid(options, QUIET)
     assert len(done) == searches + judgements
 
     tries: dict[str, set] = {name: set() for name in WITH_LOSS}
@@ -234,8 +247,8 @@ def test_a_grid_searches_every_cell_alike_and_goes_on_where_it_was(tmp_path, mad
     every = {(scene, weight, sigma) for scene in ("tune_a", "tune_b") for weight in LAMBDAS for sigma in SIGMAS_M}
     assert set(map(frozenset, tries.values())) == {frozenset(every)}
 
-    tuned = read_json(grid.output / "search" / "tuned.json")
-    assert tuned["scenes"] == sorted(map(str, grid.tuning)) and set(tuned["methods"]) == set(WITH_LOSS)
+    tuned = read_json(options.output / "search" / "tuned.json")
+    assert tuned["scenes"] == sorted(map(str, options.tuning)) and set(tuned["methods"]) == set(WITH_LOSS)
     assert tuned["methods"]["ds-nerf"]["lambda"] == 1.0 and tuned["methods"]["ds-nerf"]["sigma_m"] == 0.1
     assert tuned["methods"]["edge"] == {"lambda": 0.1, "sigma_m": "own", "psnr": 30.0}
     # one drive alone would have 2 m, at 30 dB; of both that is 29.25, and 0.5 m is 28.61
@@ -246,35 +259,32 @@ def test_a_grid_searches_every_cell_alike_and_goes_on_where_it_was(tmp_path, mad
         assert (judged_with[name].weight, judged_with[name].sigma_m) == (found["lambda"], found["sigma_m"])
     assert judged_with["nerfacto"].weight is None and judged_with["nerfacto-lidar-extras"].weight is None
 
-    text = (grid.output / "grid.md").read_text(encoding="utf-8")
+    text = (options.output / "grid.md").read_text(encoding="utf-8")
     places = [text.index(f"What {words} worth") for words in ("the prior is", "the loss is", "the extras are")]
     assert places == sorted(places) and places[-1] < text.index("What the whole is worth")
     assert "LiDAR: 7 sweeps in each map of street, 7 sweeps in each map of turn." in text
-    assert "on tune_a and tune_b" in text and "tune_a" in (grid.output / "comparison" / "tables.md").read_text()
+    assert "on tune_a and tune_b" in text and "tune_a" in (options.output / "comparison" / "tables.md").read_text()
     # a finer search comes too late for what was judged with another
     with pytest.raises(InputError, match="contains a comparison with tuned"):
-        command.compare(replace(grid, sigmas_m=(1.5, *SIGMAS_M)), QUIET)
+        grid(replace(options, sigmas_m=(1.5, *SIGMAS_M)), QUIET)
 
 
 def test_a_grid_that_cannot_be(tmp_path, monkeypatch):
     monkeypatch.setattr(command, "do_runs", lambda *_: pytest.fail("started"))
-    grid = asked(tmp_path)
+    options = asked(tmp_path)
 
     def refused(message, **changes):
         with pytest.raises(InputError, match=message):
-            command.compare(replace(grid, **changes), QUIET)
-        assert changes.get("output") or not grid.output.exists()
+            grid(replace(options, **changes), QUIET)
+        assert changes.get("output") or not options.output.exists()
 
-    refused("--grid without --tuning", tuning=())
-    refused("other drives than those that are judged", tuning=(*grid.tuning, tmp_path / "street"))
-    refused("--grid with --tuned", tuned=tmp_path / "x")
-    refused("--search with --grid", search=True)
+    refused("--tuning: expected at least one scene", tuning=())
+    refused("other drives than those that are evaluated", tuning=(*options.tuning, tmp_path / "street"))
     refused("--search-steps 0: expected 1 or more", search_steps=0)
-    refused("--search-steps 3 without --grid", search_steps=3, grid=False, tuning=(), lambdas=(), sigmas_m=())
-    refused("--tuning without --grid", grid=False, lambdas=(), sigmas_m=())
     refused("paper has no extras", preset="paper")
     refused("at least 4", lambdas=(1.0, 2.0))
-    refused("--grid --methods edge-mono: expected cells", methods=("edge", "edge-mono"))
+    refused("--methods edge-mono: expected cells", methods=("edge", "edge-mono"))
+    refused("--methods nerfacto: expected at least one that has a loss", methods=("nerfacto",))
     refused("no monocular maps", scenes=(write_scene(tmp_path / "bare", mono=False),))
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").touch()

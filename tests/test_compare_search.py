@@ -12,13 +12,14 @@ from scenes import write_scene
 from edge_depth_nerf.base.files import read_json, write_json
 from edge_depth_nerf.compare import command, search
 from edge_depth_nerf.compare.methods import Setting
+from edge_depth_nerf.compare.options import SearchOptions
 from edge_depth_nerf.compare.specification import RunSpecification
 
 
 def test_folders_of_runs_say_their_setting(tmp_path):
-    """As far as they have one: a search of `nerfacto` trains it without whole views, too."""
-    nerfacto = RunSpecification("/x/street", "0", "lite", "nerfacto", 3, 10, whole_views=False)
-    searched = replace(nerfacto, method="ds-nerf", weight=0.01, sigma_m="own")
+    """As far as they have one."""
+    nerfacto = RunSpecification("/x/street", "0", "lite", "nerfacto", 3, 10)
+    searched = replace(nerfacto, whole_views=False, method="ds-nerf", weight=0.01, sigma_m="own")
     names = [command.Run(each, tmp_path).folder.relative_to(tmp_path) for each in (nerfacto, searched)]
     assert names == [Path("street/nerfacto_seed-3"), Path("street/ds-nerf_lambda-0.01_sigma-own_seed-3")]
 
@@ -42,14 +43,14 @@ def test_a_search_writes_what_compare_takes(tmp_path, monkeypatch):
     scene, output = write_scene(tmp_path / "x"), tmp_path / "out"
     asked = options(
         scene,
+        of=SearchOptions,
         output=output,
-        search=True,
         seeds=(7,),
         methods=("ds-nerf", "edge"),
         lambdas=(0.01, 0.1, 0.3, 1.0),
         sigmas_m=("own", 0.1, 0.5, 2.0),
     )
-    found = command.compare(asked, QUIET)
+    found = search.search(asked, QUIET)
     assert len(found.runs) == 2 * 4 * 4
     tuned = read_json(output / "tuned.json")
     assert tuned["scenes"] == [str(scene)] and tuned["seed"] == 7
@@ -63,12 +64,12 @@ def test_a_search_writes_what_compare_takes(tmp_path, monkeypatch):
     read = command.read_tuned(output / "tuned.json")
     assert read == {"ds-nerf": Setting(0.1, 0.5), "edge": Setting(1.0, "own")}
     # more values come to those that are there
-    assert len(command.compare(replace(asked, lambdas=(0.01, 0.1, 0.3, 3.0)), QUIET).runs) == 2 * 5 * 4
+    assert len(search.search(replace(asked, lambdas=(0.01, 0.1, 0.3, 3.0)), QUIET).runs) == 2 * 5 * 4
     # seeds do not compete with each other: those count that most values have
     first, more = (0.01, 0.1, 0.3, 1.0, 3.0), (0.1, 5.0, 6.0, 7.0)
     every = tuple(sorted({*first, *more}))
     for seed, lambdas, counts, of in ((8, more, (7,), first), (8, first, (8,), every), (7, more, (7, 8), every)):
-        found = command.compare(replace(asked, seeds=(seed,), lambdas=lambdas), QUIET)
+        found = search.search(replace(asked, seeds=(seed,), lambdas=lambdas), QUIET)
         assert {(grid.seeds, *grid.lambdas) for grid in search.grids(found)} == {(counts, *of)}
     assert "x, seeds 7, 8, preset" in (output / "search.md").read_text()
     assert read_json(output / "tuned.json")["seed"] == [7, 8]

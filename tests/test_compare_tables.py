@@ -11,6 +11,7 @@ from comparisons import fake
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.compare import tables
 from edge_depth_nerf.compare.results import Results, check_fair
+from edge_depth_nerf.report.tables import latex_of_tables, page_of_tables
 
 PSNR_OF = {
     ("street", "nerfacto"): (20.0, 21.0, 22.5),
@@ -160,7 +161,8 @@ def test_a_run_that_never_gets_there_leaves_no_mean(results):
 
 def test_latex_and_markdown_hold_the_same_cells(results):
     made = tables.make_tables(results)
-    markdown, latex = tables.as_markdown(results, made), tables.as_latex(results, made)
+    lines = tables.introduction(results)
+    markdown, latex = page_of_tables("Comparison", lines, made), latex_of_tables(lines, made)
     assert "| nerfacto | 21.17 ± 1.26 |" in markdown
     assert r"nerfacto & 21.17 $\pm$ 1.26 &" in latex
     assert latex.count(r"\toprule") == latex.count(r"\bottomrule") == latex.count(r"\end{table}") == len(made)
@@ -174,14 +176,14 @@ def test_latex_and_markdown_hold_the_same_cells(results):
 
 def test_tables_say_whose_the_monocular_maps_are(results):
     """Maps that the generator made of the truth are not those of the default pipeline."""
-    assert "Monocular maps" not in tables.as_markdown(results, [])
+    assert "Monocular maps" not in " ".join(tables.introduction(results))
     for run in results.runs:
         run.content["mono_trained_on"] = "scene" if run.scene == "turn" else "elsewhere"
     line = "Monocular maps: of a network trained on the drive (turn); made elsewhere (street)."
-    assert line in tables.as_markdown(results, []).splitlines()
+    assert line in tables.introduction(results)
     for run in results.runs:
         run.content["mono_trained_on"] = None
-    assert "Monocular maps" not in tables.as_markdown(results, [])
+    assert "Monocular maps" not in " ".join(tables.introduction(results))
 
 
 def test_runs_that_differ_in_unnamed_fields_are_refused(results):

@@ -118,7 +118,7 @@ def test_trained_configurations_differ_in_the_named_fields_alone(finished):
 
 
 @pytest.mark.slow
-def test_judging_gives_the_figures_of_ns_eval(finished):
+def test_evaluation_gives_the_figures_of_ns_eval(finished):
     _, results = finished
     run = next(run for run in results.runs if run.method == "edge")
     _, pipeline, *_ = eval_setup(next(run.folder.rglob("config.yml")), test_mode="test")

@@ -13,7 +13,7 @@ from nerfstudio.model_components.renderers import background_color_override_cont
 from scenes import RADIUS_M, fisheye, pinhole, view, write_scene
 
 from edge_depth_nerf.base.files import read_json, write_json
-from edge_depth_nerf.compare.judging import ViewJudge, evaluated, shifted_views
+from edge_depth_nerf.compare.evaluation import ViewEvaluator, evaluated, shifted_views
 from edge_depth_nerf.method.detail import carried, detail_of, pictures_that_see, seen_from
 from edge_depth_nerf.plugin import detail as plugin_detail
 from edge_depth_nerf.plugin.detail import TrainingDetail, detail_shown, with_appearance_of
@@ -376,7 +376,7 @@ def test_with_an_embedding_a_picture_is_rendered_as_it_looks(tmp_path, implement
 # ---- judged ---------------------------------------------------------------------------------------------------------
 
 
-def test_views_are_judged_with_detail_beside_those_without(tmp_path, monkeypatch):
+def test_views_are_evaluated_with_detail_beside_those_without(tmp_path, monkeypatch):
     scene = write_scene(tmp_path / "scene", frames=17)
     meta = read_json(scene / "transforms.json")
     for frame in meta["frames"]:
@@ -388,11 +388,11 @@ def test_views_are_judged_with_detail_beside_those_without(tmp_path, monkeypatch
     pipeline = build(scene)
     grey_ball(pipeline, monkeypatch)
     told: list[int] = []
-    judge = ViewJudge(pipeline, lambda: told.append(1))
+    evaluator = ViewEvaluator(pipeline, lambda: told.append(1))
     beside = shifted_views(scene, pipeline.datamanager.eval_dataset)
-    plain, _ = judge.held_out(tmp_path / "views")
-    plain |= judge.shifted(beside)
-    found = judge.with_detail(tmp_path / "views", beside)
+    plain, _ = evaluator.held_out(tmp_path / "views")
+    plain |= evaluator.shifted(beside)
+    found = evaluator.with_detail(tmp_path / "views", beside)
     for name in ("masked_psnr", "truth_masked_psnr", "shifted_1m_masked_psnr"):
         assert found[f"detail_{name}"] > plain[name] + 6, name
     assert all("masked_" in name for name in found)

@@ -18,8 +18,7 @@ import pytest
 from benchmark_modules import BENCHMARKS, benchmark_modules
 
 from edge_depth_nerf.compare.configuration import flattened, literal_form
-from edge_depth_nerf.compare.methods import GRID, METHODS, WITHOUT_EXTRAS, Cell
-from edge_depth_nerf.compare.options import MethodName
+from edge_depth_nerf.compare.methods import GRID, METHODS, WITHOUT_EXTRAS, Method, MethodName
 from edge_depth_nerf.compare.results import Results, RunResult
 from edge_depth_nerf.compare.search import grids
 from edge_depth_nerf.compare.specification import OF_A_RUN
@@ -218,7 +217,7 @@ def test_cells_of_the_grid_differ_in_one_thing(kept):
         assert unfair(kept["grid"], pair) == set(), pair
     for loss in ("urban-nerf", "ds-nerf", "edge"):
         for prior in ("lidar", "integrated"):
-            assert {GRID[Cell(loss, prior, extras)] for extras in (False, True)} <= trained
+            assert {GRID[Method(loss, prior, extras)] for extras in (False, True)} <= trained
     # as it was: the row with extras goes without them
     bound = {name.replace(".", "__"): value for name, value in WITHOUT_EXTRAS.items()}
     former = [with_fields(run, **bound) if run.method == "ds-nerf-integrated-extras" else run for run in kept["grid"]]

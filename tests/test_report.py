@@ -24,8 +24,8 @@ from edge_depth_nerf import cli
 from edge_depth_nerf.base.files import read_json, write_json, write_png
 from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.base.pictures import NO_VALUE_RGB, colour_distance, distance_of_colours
-from edge_depth_nerf.compare.methods import METHODS
-from edge_depth_nerf.compare.options import CompareOptions, MethodName
+from edge_depth_nerf.compare.methods import METHODS, MethodName
+from edge_depth_nerf.compare.options import CompareOptions, SearchOptions
 from edge_depth_nerf.compare.plots import Bins, plot_bins, style_of
 from edge_depth_nerf.demo.options import DemoOptions
 from edge_depth_nerf.jobs.runs import command_line
@@ -259,7 +259,15 @@ def test_a_broken_cloud_costs_the_view_in_3d_alone(tmp_path, capsys):
                 output=Path("out"),
                 methods=("nerfacto", "edge"),
                 seeds=(0, 1),
-                search=True,
+                detail=True,
+            ),
+        ),
+        (
+            ("search",),
+            SearchOptions(
+                scenes=(Path("a b"),),
+                output=Path("out"),
+                lambdas=(0.1, 1.0),
                 sigmas_m=("own", 0.5),
             ),
         ),

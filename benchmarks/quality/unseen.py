@@ -36,7 +36,8 @@ from edge_depth_nerf.compare.methods import GRID, METHODS
 from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.results import Results, RunResult, read_results
 from edge_depth_nerf.compare.search import grids
-from edge_depth_nerf.compare.tables import make_tables, page_of_tables
+from edge_depth_nerf.compare.tables import make_tables
+from edge_depth_nerf.report.tables import page_of_tables
 
 DRIVES = {"street": 301, "parking": 302, "turn": 303, "roundabout": 304}
 """Kinds of drives and their seeds; written down before any was made. 101 to 104 showed a fault that is corrected."""

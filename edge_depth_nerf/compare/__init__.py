@@ -1,1 +1,1 @@
-"""Fair comparisons: methods that differ in named fields alone, trained and judged alike, and the paper's tables."""
+"""Fair comparisons: methods that differ in named fields alone, trained and evaluated alike, and the paper's tables."""

@@ -7,8 +7,7 @@ from typing import Any
 
 from nerfstudio.engine.trainer import TrainerConfig
 
-from edge_depth_nerf.compare.methods import LAMBDA, METHODS, SIGMA_MODE, Setting
-from edge_depth_nerf.compare.options import MethodName, Preset
+from edge_depth_nerf.compare.methods import LAMBDA, METHODS, SIGMA_MODE, MethodName, Preset, Setting
 from edge_depth_nerf.compare.specification import RunSpecification
 from edge_depth_nerf.plugin.config import apply_overrides, make_specifications, read_method_file
 from edge_depth_nerf.plugin.settings import flattened
@@ -20,7 +19,7 @@ REGISTERED: dict[Preset, str] = {
 }
 """The registered method that each preset begins with."""
 COMMON = {
-    # a training that judges now and then, by the trainer's own measure, would not be timed alone
+    # a training that is evaluated now and then, by the trainer's own measure, would not be timed alone
     "steps_per_eval_batch": 0,
     "steps_per_eval_image": 0,
     "steps_per_eval_all_images": 0,
@@ -72,7 +71,7 @@ def configuration(run: RunSpecification, folder: Path | None = None) -> tuple[Tr
         **({} if folder is None else {"output_dir": folder.parent, "experiment_name": folder.name}),
     }
     named = {
-        **(literal_form() if method.literal else {}),
+        **(literal_form() if method.variant == "paper" else {}),
         **method.overrides,
         **Setting(run.weight, run.sigma_m).overrides(method),
         **({"pipeline.model.implementation": "torch"} if run.implementation == "torch" else {}),
@@ -83,13 +82,11 @@ def configuration(run: RunSpecification, folder: Path | None = None) -> tuple[Tr
 
 def setting_of(config: TrainerConfig, name: MethodName) -> tuple[float | None, float | str | None]:
     """λ and σ (metres, or the prior's own as its sigma_mode) that a configuration ends up with; None without a loss."""
-    method = METHODS[name]
+    method, values = METHODS[name], flattened(config)
     if method.sigma_field is None:
         return None, None
-    values = flattened(config)
-    mode = values[SIGMA_MODE]
-    takes_own = SIGMA_MODE in method.sigma and mode != "constant"
-    return values[LAMBDA], mode if takes_own else values[method.sigma_field]
+    takes_own = method.loss == "edge" and values[SIGMA_MODE] != "constant"
+    return values[LAMBDA], values[SIGMA_MODE if takes_own else method.sigma_field]
 
 
 def described(config: TrainerConfig) -> dict[str, str]:

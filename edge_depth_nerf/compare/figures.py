@@ -1,6 +1,6 @@
 """Figures beyond the metrics of every evaluation: after a colour fit, and binned. Pure.
 
-Pictures are `[h, w, 3]` in 0 to 1, masks `[h, w]` (True = judge the pixel), distances `[h, w]` metres along the ray.
+Pictures are `[h, w, 3]` in 0 to 1, masks `[h, w]` (True = evaluate the pixel), distances `[h, w]` metres along the ray.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class BinnedErrors:
 
         Args:
             values: the quantity at each pixel; outside all bins or not finite = not counted.
-            mask: True = judge.
+            mask: True = evaluate.
             pred: rendered colours.
             target: true colours.
             pred_m: rendered distance, metres.

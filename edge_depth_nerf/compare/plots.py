@@ -19,8 +19,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from edge_depth_nerf.base.files import write_bytes
 from edge_depth_nerf.base.pictures import add_legend_below
-from edge_depth_nerf.compare.methods import METHODS
-from edge_depth_nerf.compare.options import MethodName
+from edge_depth_nerf.compare.methods import METHODS, MethodName
 from edge_depth_nerf.compare.results import Results, RunResult
 from edge_depth_nerf.compare.tables import CLOCKS, clock_metric, curve_metric
 from edge_depth_nerf.report.build import Plot
@@ -36,9 +35,6 @@ STYLES: dict[MethodName, tuple[str, str, str, str]] = {
     "edge-mono": ("#8ab17d", "#a9d39a", ":", "D"),
     "edge-gaussian": ("#9b5de5", "#bb92f5", "-.", "P"),
     "edge-paper": ("#3a86ff", "#70a9ff", "-.", "X"),
-    "edge-paper-lidar": ("#2a9d8f", "#3cc4b3", "--", "1"),
-    "edge-paper-mono": ("#8ab17d", "#a9d39a", "--", "2"),
-    "edge-paper-gaussian": ("#9b5de5", "#bb92f5", "--", "3"),
     "edge": ("#d62828", "#ff625c", "-", "o"),
 }
 BINS = {"by_angle_deg": "angle from the optical axis, degrees", "by_distance_m": "distance, m"}
@@ -110,15 +106,14 @@ def _twice(title: str, draw: Callable[[bool], bytes]) -> Plot:
 
 
 def style_of(method: MethodName) -> tuple[str, str, str, str]:
-    """Colour on white, on dark, line and marker; of the grid's cells by loss, extras and prior."""
-    cell = METHODS[method].cell
-    if method in STYLES or cell is None:
+    """Colour on white, on dark, line and marker; of those without their own by loss, extras and prior."""
+    if method in STYLES:
         return STYLES[method]
-    return (
-        *STYLES["nerfacto" if cell.loss == "none" else cell.loss][:2],
-        "-" if cell.extras else "--",
-        "D" if cell.prior == "integrated" else "v",
-    )
+    made = METHODS[method]
+    assert made.prior is not None
+    of_loss = f"edge-{made.prior}" if made.variant else "nerfacto" if made.loss == "none" else made.loss
+    marker = {"lidar": "v", "mono": "<", "gaussian": ">", "integrated": "D"}[made.prior]
+    return (*STYLES[of_loss][:2], "-" if made.extras else "--", marker)
 
 
 def _draw(axis: Axes, method: MethodName, line: Line, dark: bool) -> None:

@@ -12,8 +12,7 @@ from typing import Any
 from edge_depth_nerf.base.bounds import finite
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json_object, write_json, write_text
-from edge_depth_nerf.compare.methods import METHODS
-from edge_depth_nerf.compare.options import MethodName
+from edge_depth_nerf.compare.methods import METHODS, MethodName
 from edge_depth_nerf.compare.specification import FIGURES, OF_A_RUN, VIEWS
 
 
@@ -45,7 +44,7 @@ class RunResult:
 
     @property
     def to_look_at(self) -> bool:
-        """Whether its judged views and its config.yml are there: all but the figures may be removed to save space."""
+        """Whether its rendered views and its config.yml are there: all but the figures may be removed to save space."""
         return (self.folder / VIEWS).is_dir() and self.config is not None
 
     @property

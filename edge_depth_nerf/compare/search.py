@@ -1,10 +1,11 @@
-"""The search of λ and σ: what came out of each pair, and the best of each method.
+"""`edge-depth-nerf search`: what came out of each pair of λ and σ, and the best of each method.
 
 Of several drives the mean counts.
 """
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,12 +17,15 @@ from rich.table import Table
 
 from edge_depth_nerf.base.console import say
 from edge_depth_nerf.base.files import write_json, write_text
-from edge_depth_nerf.compare.methods import METHODS
-from edge_depth_nerf.compare.options import MethodName
+from edge_depth_nerf.compare.command import finished_runs
+from edge_depth_nerf.compare.methods import METHODS, MethodName
+from edge_depth_nerf.compare.options import SearchOptions
 from edge_depth_nerf.compare.results import Results, write_rows
 from edge_depth_nerf.compare.tables import curve_metric
 
 TUNED = "tuned.json"
+Pair = tuple[float, float | str]
+"""λ, and σ in metres or own."""
 
 
 @dataclass(frozen=True)
@@ -31,12 +35,12 @@ class Grid:
     method: MethodName
     lambdas: list[float]
     sigmas: list[float | str]
-    psnr: dict[tuple[float, float | str], float]
+    psnr: dict[Pair, float]
     seeds: tuple[int, ...] = (0,)
     """The same for each λ and σ."""
 
     @property
-    def best(self) -> tuple[float, float | str]:
+    def best(self) -> Pair:
         """λ and σ of the largest PSNR."""
         return max(self.psnr, key=lambda pair: self.psnr[pair])
 
@@ -48,34 +52,66 @@ class Grid:
         found = ["λ"] if weight in (self.lambdas[0], self.lambdas[-1]) else []
         return found + (["σ"] if sigma in (numbers[:1] + numbers[-1:]) else [])
 
+    @property
+    def advice(self) -> str:
+        """What to do if the best is at an end; empty if it is not."""
+        best = " and ".join(self.at_the_edge)
+        return f"The best {best} is at an end of the range. Add values with the same command." if best else ""
+
+    @property
+    def headings(self) -> list[str]:
+        """Those of its table: a column for each σ."""
+        return ["λ", *("σ its own" if sigma == "own" else f"σ {sigma:g} m" for sigma in self.sigmas)]
+
+    def rows(self, mark: str) -> list[list[str]]:
+        """Those of its table, one for each λ; the best has a mark on both sides."""
+        found = []
+        for weight in self.lambdas:
+            values = [self.psnr.get((weight, sigma)) for sigma in self.sigmas]
+            marks = [mark if (weight, sigma) == self.best else "" for sigma in self.sigmas]
+            cells = ["–" if value is None else f"{value:.2f}" for value in values]
+            found.append([f"{weight:g}", *(f"{mark}{cell}{mark}" for mark, cell in zip(marks, cells, strict=True))])
+        return found
+
+
+def search(options: SearchOptions, console: Console | None = None) -> Results:
+    """Run or finish a search; give all that the output folder holds.
+
+    Raises:
+        InputError: options, scenes or the output folder cannot be used, or a run failed (its log is named).
+
+    """
+    console = console or Console()
+    with finished_runs(options, console) as results:
+        write_search(options.output, results)
+        for grid in grids(results):
+            table = Table(*grid.headings, title=METHODS[grid.method].title, caption=grid.advice or None)
+            for row in grid.rows("*"):
+                table.add_row(*row)
+            console.print(table)
+        tuned = options.output / TUNED
+        say(console, f"The best of each: {tuned}; `edge-depth-nerf compare … --tuned {tuned}` uses it.")
+    return results
+
 
 def grids(results: Results) -> list[Grid]:
     """What the runs of a search found, by method."""
     name = f"pixels_{curve_metric(results)}"
     found = []
     for method in results.methods():
-        runs = [run for run in results.runs if run.method == method]
-        figures: dict[tuple[float, float | str], dict[tuple[str, int], float]] = {}
-        for run in runs:
+        figures: dict[Pair, dict[tuple[str, int], float]] = {}
+        for run in (run for run in results.runs if run.method == method):
             pair = (run.specification["weight"], run.specification["sigma_m"])
             figures.setdefault(pair, {})[run.scene, run.seed] = run.figures[name]
         seeds, psnr = _means(figures)
-        sigmas = {sigma for _, sigma in psnr}
-        found.append(
-            Grid(
-                method,
-                sorted({weight for weight, _ in psnr}),
-                [*sorted(sigma for sigma in sigmas if sigma != "own"), *(["own"] if "own" in sigmas else [])],
-                psnr,
-                seeds,
-            )
-        )
+        sigmas = sorted({sigma for _, sigma in psnr}, key=lambda sigma: math.inf if sigma == "own" else float(sigma))
+        found.append(Grid(method, sorted({weight for weight, _ in psnr}), sigmas, psnr, seeds))
     return found
 
 
 def _means(
-    figures: Mapping[tuple[float, float | str], Mapping[tuple[str, int], float]],
-) -> tuple[tuple[int, ...], dict[tuple[float, float | str], float]]:
+    figures: Mapping[Pair, Mapping[tuple[str, int], float]],
+) -> tuple[tuple[int, ...], dict[Pair, float]]:
     """Means over the same drives and seeds, and these seeds, of PSNR by λ and σ, then drive and seed.
 
     What lacks a drive, as in a search that is not finished, is no mean. Of several seeds count those that most λ and σ
@@ -87,7 +123,7 @@ def _means(
         for _, seed in by_run
     }
     drives = max(runs.values(), key=len)
-    complete: dict[int, set[tuple[float, float | str]]] = {}
+    complete: dict[int, set[Pair]] = {}
     for (seed, pair), there in runs.items():
         if there >= drives:
             complete.setdefault(seed, set()).add(pair)
@@ -131,42 +167,8 @@ def write_search(output: Path, results: Results) -> None:
         f"each; PSNR in dB of random held-out pixels inside the mask{against}.",
     ]
     for grid in found:
-        parts.append(f"## {METHODS[grid.method].title}")
-        lines = ["| λ | " + " | ".join(_heading(sigma) for sigma in grid.sigmas) + " |"]
-        lines.append("|---|" + "---|" * len(grid.sigmas))
-        lines += ["| " + " | ".join(_cells(grid, weight, "**")) + " |" for weight in grid.lambdas]
-        parts.append("\n".join(lines))
-        if grid.at_the_edge:
-            parts.append(_advice(grid))
+        lines = [f"| {' | '.join(row)} |" for row in (grid.headings, *grid.rows("**"))]
+        lines.insert(1, "|---" * len(grid.headings) + "|")
+        parts += [f"## {METHODS[grid.method].title}", "\n".join(lines), *([grid.advice] if grid.advice else [])]
     write_text(output / "search.md", "\n\n".join(parts) + "\n")
     write_rows(output, results)
-
-
-def _heading(sigma: float | str) -> str:
-    return "σ its own" if sigma == "own" else f"σ {sigma:g} m"
-
-
-def _cells(grid: Grid, weight: float, mark: str) -> list[str]:
-    cells = [f"{weight:g}"]
-    for sigma in grid.sigmas:
-        value = grid.psnr.get((weight, sigma))
-        best = mark if (weight, sigma) == grid.best else ""
-        cells.append("–" if value is None else f"{best}{value:.2f}{best}")
-    return cells
-
-
-def _advice(grid: Grid) -> str:
-    best = " and ".join(grid.at_the_edge)
-    return f"The best {best} is at an end of the range. Add values with the same command."
-
-
-def show_search(output: Path, results: Results, console: Console) -> None:
-    """Print the tables and what to do with them."""
-    for grid in grids(results):
-        table = Table("λ", *(_heading(sigma) for sigma in grid.sigmas), title=METHODS[grid.method].title)
-        for weight in grid.lambdas:
-            table.add_row(*_cells(grid, weight, "*"))
-        console.print(table)
-        if grid.at_the_edge:
-            say(console, _advice(grid))
-    say(console, f"The best of each: {output / TUNED}; `edge-depth-nerf compare … --tuned {output / TUNED}` uses it.")

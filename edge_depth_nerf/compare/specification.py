@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from edge_depth_nerf.compare.options import Implementation, MethodName, Preset, Sigma
+from edge_depth_nerf.compare.methods import MethodName, Preset, Sigma
+from edge_depth_nerf.compare.options import Implementation
 
 SPECIFICATION = "run.json"
 """What is trained."""
@@ -14,7 +15,7 @@ FIGURES = "figures.json"
 PROGRESS = "progress.json"
 """What was measured up to each checkpoint."""
 VIEWS = "views"
-"""Folder of the judged views."""
+"""Folder of the evaluated views."""
 
 OF_A_RUN = ("machine.seed", "pipeline.datamanager.data", "output_dir", "experiment_name")
 """Fields of the configuration that any two runs may differ in."""
@@ -40,9 +41,9 @@ class RunSpecification:
     implementation: Implementation = "same"
     """torch: in nerfstudio's own torch code."""
     whole_views: bool = True
-    """Whether whole views are judged at the end, or only the random pixels."""
+    """Whether whole views are evaluated at the end, or only the random pixels."""
     detail: bool = False
-    """Whether whole views are judged with the detail of training pictures, too."""
+    """Whether whole views are evaluated with the detail of training pictures, too."""
     layers_sha256: str = ""
     """Of the scene's masks and maps; empty: not known."""
 

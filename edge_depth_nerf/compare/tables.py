@@ -11,8 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from edge_depth_nerf.compare.methods import METHODS
-from edge_depth_nerf.compare.options import MethodName
+from edge_depth_nerf.compare.methods import METHODS, MethodName
 from edge_depth_nerf.compare.results import Results, RunResult
 from edge_depth_nerf.compare.specification import OF_A_RUN
 from edge_depth_nerf.report.tables import Cell, MadeTable, Metric, Row, mark_best, mean_and_spread
@@ -41,6 +40,11 @@ PSNR = Metric("masked_psnr", "PSNR ↑", ".2f")
 TRUE_PSNR = Metric("truth_masked_psnr", "PSNR ↑", ".2f")
 
 
+def means_over(scenes: Sequence[str]) -> list[tuple[str, list[str]]]:
+    """Each drive alone and, of several, their average: a title and the drives."""
+    return [*((scene, [scene]) for scene in scenes), *([("average", [*scenes])] if len(scenes) > 1 else [])]
+
+
 def per_seed(
     results: Results, scenes: Sequence[str], method: MethodName, value: Callable[[RunResult], float | None]
 ) -> dict[int, float]:
@@ -54,13 +58,26 @@ def per_seed(
     return found
 
 
-def _cell(
-    results: Results, scenes: Sequence[str], method: MethodName, form: str, value: Callable[[RunResult], float | None]
-) -> Cell:
-    found = list(per_seed(results, scenes, method, value).values())
+@dataclass(frozen=True)
+class _Column:
+    """A column of a table with a row for each method."""
+
+    heading: str
+    form: str
+    value: Callable[[RunResult], float | None]
+    best: int = 1
+    """As in `Metric`."""
+
+
+def _column(metric: Metric) -> _Column:
+    return _Column(metric.heading, metric.form, lambda run: run.figures.get(metric.name), metric.best)
+
+
+def _cell(results: Results, scenes: Sequence[str], method: MethodName, column: _Column) -> Cell:
+    found = list(per_seed(results, scenes, method, column.value).values())
     if math.inf in found:
         return Cell(None, words="never")
-    return Cell(*mean_and_spread(found), form=form)
+    return Cell(*mean_and_spread(found), form=column.form)
 
 
 def ahead(results: Results, scenes: Sequence[str], method: MethodName, metric: str) -> Cell:
@@ -89,28 +106,20 @@ def _quality_table(
     results: Results, label: str, title: str, scenes: list[str], methods: Sequence[MethodName]
 ) -> MadeTable:
     metrics = quality_metrics(results)
-    columns = [*((scene, [scene]) for scene in scenes), *([("average", scenes)] if len(scenes) > 1 else [])]
+    columns = means_over(scenes)
     groups = [(name, [metric.heading for metric in metrics]) for name, _ in columns]
-    better = [metric.best for _ in columns for metric in metrics]
     published = PAPER_AHEAD_DB.get(label, {})
-    shows_ahead = "edge" in methods
     rows = []
     for method in methods:
-        cells = [
-            _cell(results, chosen, method, metric.form, lambda run, name=metric.name: run.figures.get(name))
-            for _, chosen in columns
-            for metric in metrics
-        ]
-        if shows_ahead:
-            itself = method == "edge"
-            cells.append(Cell(None) if itself else ahead(results, scenes, method, metrics[0].name))
-            if published:
-                cells.append(Cell(published.get(method) if not itself else None, form="+.2f"))
+        cells = [_cell(results, chosen, method, _column(metric)) for _, chosen in columns for metric in metrics]
+        if "edge" in methods:
+            cells.append(Cell(None) if method == "edge" else ahead(results, scenes, method, metrics[0].name))
+            cells += [Cell(published.get(method), form="+.2f")] if published else []
         rows.append(Row(METHODS[method].title, cells))
-    if shows_ahead:
+    if "edge" in methods:
         groups.append(("ours ahead", ["dB", "paper, dB"] if published else ["dB"]))
-        better += [0, 0] if published else [0]
-    mark_best(rows, better)
+    better = [metric.best for _ in columns for metric in metrics]
+    mark_best(rows, better + [0] * (len(rows[0].cells) - len(better)))
     return MadeTable(label, title, groups, rows, [AVERAGES, TEXT] if published else [])
 
 
@@ -153,26 +162,11 @@ def clock_metric(results: Results) -> str:
     return "cpu_seconds" if on_cpu else "seconds"
 
 
-@dataclass(frozen=True)
-class _Column:
-    """A column of a table with a row for each method."""
-
-    heading: str
-    form: str
-    value: Callable[[RunResult], float | None]
-    best: int = 1
-    """As in `Metric`."""
-
-
-def _column(metric: Metric) -> _Column:
-    return _Column(metric.heading, metric.form, lambda run: run.figures.get(metric.name), metric.best)
-
-
 def _table(
     results: Results, label: str, title: str, scenes: Sequence[str], columns: Sequence[_Column], note: str
 ) -> MadeTable:
     rows = [
-        Row(METHODS[method].title, [_cell(results, scenes, method, column.form, column.value) for column in columns])
+        Row(METHODS[method].title, [_cell(results, scenes, method, column) for column in columns])
         for method in results.methods()
     ]
     mark_best(rows, [column.best for column in columns])
@@ -242,18 +236,18 @@ def _time_table(results: Results, where: str, scenes: Sequence[str]) -> MadeTabl
 
 
 def _settings_table(results: Results) -> MadeTable:
-    def words(value: float | str | None) -> str:
-        return "–" if value is None else value if isinstance(value, str) else f"{value:g}"
+    def words(method: MethodName, name: str) -> str:
+        values = {run.content[name] for run in results.runs if run.method == method}
+        return ", ".join(
+            sorted("–" if each is None else each if isinstance(each, str) else f"{each:g}" for each in values)
+        )
 
     tuned = results.options.get("tuned", {})
     rows = []
     for method in results.methods():
-        found = {
-            (words(run.content["lambda"]), words(run.content["sigma"])) for run in results.runs if run.method == method
-        }
-        weight, sigma = (", ".join(sorted(values)) for values in zip(*found, strict=True))
-        searched = "–" if METHODS[method].sigma_field is None else "searched" if method in tuned else "default"
-        rows.append(Row(METHODS[method].title, [Cell(None, words=text) for text in (weight, sigma, searched)]))
+        searched = "–" if METHODS[method].loss == "none" else "searched" if method in tuned else "default"
+        texts = (words(method, "lambda"), words(method, "sigma"), searched)
+        rows.append(Row(METHODS[method].title, [Cell(None, words=text) for text in texts]))
     notes = ["σ in metres, or the mode that gives the prior's own σ at each pixel."]
     searched_on = results.options.get("tuned_on")
     if searched_on is not None:
@@ -291,54 +285,35 @@ def fields_table(results: Results) -> MadeTable:
 
 def make_tables(results: Results) -> list[MadeTable]:
     """Make the tables that the runs are enough for."""
-    kinds = {run.scene: run.content.get("source") for run in results.runs}
-    drives = {
-        "1": [scene for scene in results.scenes() if kinds[scene] != JBNU],
-        "2": [scene for scene in results.scenes() if kinds[scene] == JBNU],
-    }
+    kinds, everywhere = {run.scene: run.content.get("source") for run in results.runs}, results.scenes()
+    of_jbnu = [scene for scene in everywhere if kinds[scene] == JBNU]
     # each loss with each prior and extras that was trained; Tables 3 and 4 have ours with one thing changed
-    of_other_losses: list[MethodName] = [
-        method.name for method in METHODS.values() if method.cell and method.cell.loss != "edge"
+    of_other_losses = [name for name, method in METHODS.items() if method.loss != "edge" and not method.variant]
+    rivals = ["nerfacto-embedding", *of_other_losses, "edge-paper", "edge"]
+    of_the_paper = ", drives of KITTI-360's kind" if {*kinds.values()} <= {KITTI360, JBNU} else ""
+    wanted = [
+        ("1", f"Rivals{of_the_paper}", [scene for scene in everywhere if scene not in of_jbnu], rivals, []),
+        ("2", "Rivals, drives of JBNU-Depth360", of_jbnu, rivals, []),
+        ("3", "Source of depth", everywhere, ["edge-lidar", "edge-mono", "edge"], [INTEGRATED, SAME_ROW]),
+        ("4", "Kernel of the integration", everywhere, ["edge-gaussian", "edge"], [EDGE_AWARE]),
     ]
-    rivals: list[MethodName] = ["nerfacto-embedding", *of_other_losses, "edge-paper", "edge"]
-    of_the_paper = {*kinds.values()} <= {KITTI360, JBNU}
-    rivals_title = "Rivals, drives of KITTI-360's kind" if of_the_paper else "Rivals"
-    wanted: list[tuple[str, str, list[str], list[MethodName], list[str]]] = [
-        ("1", rivals_title, drives["1"], rivals, []),
-        ("2", "Rivals, drives of JBNU-Depth360", drives["2"], rivals, []),
-        ("3", "Source of depth", results.scenes(), ["edge-lidar", "edge-mono", "edge"], [INTEGRATED, SAME_ROW]),
-        ("4", "Kernel of the integration", results.scenes(), ["edge-gaussian", "edge"], [EDGE_AWARE]),
-        (
-            "3, as published",
-            "Source of depth, the published method",
-            results.scenes(),
-            ["edge-paper-lidar", "edge-paper-mono", "edge-paper"],
-            [INTEGRATED],
-        ),
-        (
-            "4, as published",
-            "Kernel of the integration, the published method",
-            results.scenes(),
-            ["edge-paper-gaussian", "edge-paper"],
-            [EDGE_AWARE],
-        ),
-    ]
+    for label, title, _, names, notes in wanted[2:]:
+        literal = [name.replace("edge", "edge-paper", 1) for name in names]
+        wanted.append((f"{label}, as published", f"{title}, the published method", everywhere, literal, notes[:1]))
     tables = []
     for label, title, scenes, names, notes in wanted:
         there = {run.method for run in results.runs if run.scene in scenes}
-        methods: list[MethodName] = [name for name in names if name in there]
-        if scenes and len(methods) > 1:
+        methods = [name for name in names if name in there]
+        if len(methods) > 1:
             made = _quality_table(results, label, title, scenes, methods)
             made.notes += notes
             tables.append(made)
-    parts = [*([("average", results.scenes())] if len(results.scenes()) > 1 else [])]
-    parts += [(scene, [scene]) for scene in results.scenes()]
-    for place, (where, scenes) in enumerate(parts):
+    # the average stands for its drives, which the page folds away
+    *drives, first = means_over(everywhere)
+    for where, scenes in (first, *drives):
         for make in (_geometry_table, _time_table):
-            # the average stands for its drives, which the page folds away
-            tables.append(replace(make(results, where, scenes), on_terminal=place == 0))
-    tables.append(_settings_table(results))
-    return tables
+            tables.append(replace(make(results, where, scenes), on_terminal=where == first[0]))
+    return [*tables, _settings_table(results)]
 
 
 def introduction(results: Results) -> list[str]:
@@ -379,66 +354,3 @@ def _maps_lines(results: Results) -> list[str]:
         scenes = sorted({run.scene for run in results.runs if run.content.get("mono_trained_on") == trained_on})
         words += [f"{title} ({', '.join(scenes)})"] if scenes else []
     return [f"Monocular maps: {'; '.join(words)}."] if words else []
-
-
-def as_markdown(results: Results, tables: Sequence[MadeTable]) -> str:
-    """All tables as Markdown."""
-    return page_of_tables("Comparison", introduction(results), tables)
-
-
-def page_of_tables(title: str, lines: Sequence[str], tables: Sequence[MadeTable]) -> str:
-    """Give a title, paragraphs and tables as Markdown."""
-    parts = [f"# {title}", *lines]
-    for table in tables:
-        headings = [f"{group} {heading}".strip() for group, heading in table.headings()]
-        lines = [f"| | {' | '.join(headings)} |", "|---|" + "---|" * len(headings)]
-        for row in table.rows:
-            cells = [f"**{cell.text()}**" if cell.best else cell.text() for cell in row.cells]
-            lines.append(f"| {row.title} | {' | '.join(cells)} |")
-        parts += [f"## Table {table.label}. {table.title}", "\n".join(lines), *([table.caption] if table.notes else [])]
-    return "\n\n".join(parts) + "\n"
-
-
-_LATEX = {
-    "\\": r"\textbackslash{}",
-    **{char: f"\\{char}" for char in "&%$#_{}"},
-    "↑": r"$\uparrow$",
-    "↓": r"$\downarrow$",
-    "±": r"$\pm$",
-    "δ": r"$\delta$",
-    "λ": r"$\lambda$",
-    "σ": r"$\sigma$",
-    "<": "$<$",
-    ">": "$>$",
-    "–": "--",
-    "≥": r"$\geq$",
-}
-
-
-def latex_text(text: str) -> str:
-    """Text as LaTeX takes it."""
-    return "".join(_LATEX.get(char, char) for char in text)
-
-
-def as_latex(results: Results, tables: Sequence[MadeTable]) -> str:
-    """All tables as LaTeX; no package beyond booktabs."""
-    parts = ["% \\usepackage{booktabs}", *(f"% {line}" for line in introduction(results))]
-    for table in tables:
-        columns = sum(len(headings) for _, headings in table.groups)
-        lines = [r"\begin{table}", r"\centering", rf"\caption{{{latex_text(f'{table.title}. {table.caption}')}}}"]
-        lines += [rf"\begin{{tabular}}{{l{'r' * columns}}}", r"\toprule"]
-        if any(group for group, _ in table.groups):
-            spans, rules, first = [], [], 2
-            for group, headings in table.groups:
-                spans.append(rf"\multicolumn{{{len(headings)}}}{{c}}{{{latex_text(group)}}}")
-                rules.append(rf"\cmidrule(lr){{{first}-{first + len(headings) - 1}}}")
-                first += len(headings)
-            lines += [" & " + " & ".join(spans) + r" \\", "".join(rules)]
-        lines += [" & " + " & ".join(latex_text(heading) for _, heading in table.headings()) + r" \\", r"\midrule"]
-        for row in table.rows:
-            cells = [latex_text(cell.text()) for cell in row.cells]
-            bold = [rf"\textbf{{{text}}}" if cell.best else text for text, cell in zip(cells, row.cells, strict=True)]
-            lines.append(f"{latex_text(row.title)} & {' & '.join(bold)} \\\\")
-        lines += [r"\bottomrule", r"\end{tabular}", r"\end{table}"]
-        parts.append(f"% Table {table.label}\n" + "\n".join(lines))
-    return "\n\n".join(parts) + "\n"

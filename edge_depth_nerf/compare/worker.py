@@ -1,4 +1,4 @@
-"""Trains and judges one run: `python -m edge_depth_nerf.compare.worker FOLDER`, with a run.json in the folder.
+"""Trains and evaluates one run: `python -m edge_depth_nerf.compare.worker FOLDER`, with a run.json in the folder.
 
 It is a process of its own, so that a run that dies stops no other run. One process does both, because nerfstudio takes
 long to start. The process can be killed at any time; it resumes from its last checkpoint.
@@ -11,30 +11,26 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import MISSING
-from dataclasses import fields as fields_of
 from pathlib import Path
-from types import UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from rich.console import Console
 
-from edge_depth_nerf.base.bounds import finite, shown
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import explain, read_json_object, write_json
 from edge_depth_nerf.base.one_writer import only_writer
 from edge_depth_nerf.compare.configuration import configuration, described, setting_of
-from edge_depth_nerf.compare.judging import (
+from edge_depth_nerf.compare.evaluation import (
     COLOURS,
     MOST_TRAINED_PIXELS,
     MOST_TRAINED_VIEWS,
-    ViewJudge,
+    ViewEvaluator,
     choose_pixels,
-    judge_beams,
-    judge_pixels,
+    evaluate_beams,
+    evaluate_pixels,
     shifted_views,
 )
 from edge_depth_nerf.compare.protocol import departures
@@ -46,7 +42,7 @@ from edge_depth_nerf.plugin.trainer import EdgeDepthTrainer
 from edge_depth_nerf.scene.format import LAYERS, read_transforms
 
 CURVE = (0.025, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
-"""When the random pixels are judged, as shares of the training."""
+"""When the random pixels are evaluated, as shares of the training."""
 STEP_IN_BATCHES = 3
 """A step of training takes about as long as rendering so many batches of its rays."""
 
@@ -83,7 +79,7 @@ class Clock:
 
 
 class MeasuredTrainer(EdgeDepthTrainer):
-    """Counts the seconds of training, and stops the clock while it judges the random pixels.
+    """Counts the seconds of training, and stops the clock while it evaluates the random pixels.
 
     Measurements are kept with the checkpoints, so that a resumed training continues them.
     """
@@ -97,7 +93,7 @@ class MeasuredTrainer(EdgeDepthTrainer):
         """The clock at each checkpoint, by steps."""
         self.clock = Clock(self.device)
         self.on_step: Callable[[int], None] = lambda _: None
-        self._judged_at = {max(1, round(share * total_steps)) for share in CURVE}
+        self._evaluated_at = {max(1, round(share * total_steps)) for share in CURVE}
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "test") -> None:
         """Set up as nerfstudio does, and continue the measurements made before."""
@@ -138,43 +134,29 @@ class MeasuredTrainer(EdgeDepthTrainer):
             super().save_checkpoint(step)
 
     def _after_step(self, steps: int) -> None:
-        if steps in self._judged_at:
+        if steps in self._evaluated_at:
             with self.clock.stopped():
-                figures = judge_pixels(self.pipeline, self._pixels)
-                trained_on = judge_pixels(self.pipeline, self._trained_on, trained_on=True)
+                figures = evaluate_pixels(self.pipeline, self._pixels)
+                trained_on = evaluate_pixels(self.pipeline, self._trained_on, trained_on=True)
                 figures |= {f"trained_{name}": value for name, value in trained_on.items() if name in COLOURS}
                 self.curve.append({"step": float(steps), **self.clock.passed, **figures})
         self.on_step(steps)
 
 
 def read_specification(path: Path) -> RunSpecification:
-    """Read what is to be trained.
+    """Read what is to be trained, as the command wrote it.
 
     Raises:
         FileNotFoundError: there is no such file.
         InputError: it is not of this form.
 
     """
-    # what an earlier version did not write has its default
-    defaults = {field.name: field.default for field in fields_of(RunSpecification) if field.default is not MISSING}
-    content, fields = {**defaults, **read_json_object(path)}, get_type_hints(RunSpecification)
-    wrong = [name for name in {*content, *fields} if name not in fields or not _is(content.get(name), fields[name])]
-    if wrong:
-        name = min(wrong)
+    try:
+        return RunSpecification(**read_json_object(path))
+    except TypeError as error:
         raise InputError(
-            f"{path}: {name} is {shown(content.get(name))}, which is not valid for a run. Remove its folder; the "
-            "same command then trains it again."
-        )
-    return RunSpecification(**content)
-
-
-def _is(value: Any, hint: Any) -> bool:
-    """Whether a value of JSON is of a field's type."""
-    if get_origin(hint) in (Union, UnionType):
-        return any(_is(value, each) for each in get_args(hint))
-    if get_origin(hint) is Literal:
-        return isinstance(value, str) and value in get_args(hint)
-    return finite(value) is not None if hint is float else type(value) is hint
+            f"{path}: is not a run of this version ({error}). Remove its folder; the same command then trains it again."
+        ) from None
 
 
 def do_run(folder: Path) -> None:
@@ -203,10 +185,10 @@ def do_run(folder: Path) -> None:
     rays_of_a_view = int((dataset.cameras.width * dataset.cameras.height).float().mean())
     batches_of_a_view = rays_of_a_view / trainer.pipeline.datamanager.get_train_rays_per_batch()
     whole = STEP_IN_BATCHES * steps + batches_of_a_view * views
-    judged = 0
+    views_done = 0
 
     def tell(steps_behind: int) -> None:
-        share = (STEP_IN_BATCHES * steps_behind + batches_of_a_view * judged) / whole
+        share = (STEP_IN_BATCHES * steps_behind + batches_of_a_view * views_done) / whole
         print(f"\n{WORK}{share:.4f}", flush=True)  # noqa: T201
 
     def on_step(steps_behind: int) -> None:
@@ -214,8 +196,8 @@ def do_run(folder: Path) -> None:
             tell(steps_behind)
 
     def on_view() -> None:
-        nonlocal judged
-        judged += 1
+        nonlocal views_done
+        views_done += 1
         tell(steps)
 
     trainer.on_step = on_step
@@ -227,11 +209,11 @@ def do_run(folder: Path) -> None:
     figures |= {f"pixels_{name}": value for name, value in last.items() if name != "step" and name not in figures}
     bins: dict[str, Any] = {}
     if run.whole_views:
-        judge = ViewJudge(trainer.pipeline, on_view)
-        found, bins = judge.held_out(folder / VIEWS)
-        figures |= found | judge.shifted(beside) | judge_beams(trainer.pipeline)
+        evaluator = ViewEvaluator(trainer.pipeline, on_view)
+        found, bins = evaluator.held_out(folder / VIEWS)
+        figures |= found | evaluator.shifted(beside) | evaluate_beams(trainer.pipeline)
         if run.detail:
-            figures |= judge.with_detail(folder / VIEWS, beside)
+            figures |= evaluator.with_detail(folder / VIEWS, beside)
     weight, sigma = setting_of(config, run.method)
     meta, layer = read_transforms(Path(run.scene) / "transforms.json"), LAYERS["mono"].key
     write_json(

@@ -23,11 +23,10 @@ from edge_depth_nerf.compare.command import (
     finished_runs,
     picture_name,
     read_comparison,
-    show_tables,
     write_comparison,
 )
-from edge_depth_nerf.compare.methods import METHODS
-from edge_depth_nerf.compare.options import CompareOptions, MethodName
+from edge_depth_nerf.compare.methods import METHODS, MethodName
+from edge_depth_nerf.compare.options import CompareOptions
 from edge_depth_nerf.compare.specification import FIGURES
 from edge_depth_nerf.compare.tables import make_tables
 from edge_depth_nerf.demo.options import DemoOptions
@@ -35,6 +34,7 @@ from edge_depth_nerf.jobs.runs import command_line, viewer_command
 from edge_depth_nerf.process.command import process
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.report.build import Commands, Facts, Report, write_report
+from edge_depth_nerf.report.tables import show_tables
 from edge_depth_nerf.report.views import REPORT
 from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.options import SynthesizeOptions

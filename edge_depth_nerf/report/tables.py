@@ -9,6 +9,9 @@ import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from rich.console import Console
+from rich.table import Table
+
 
 @dataclass(frozen=True)
 class Metric:
@@ -90,3 +93,74 @@ def mark_best(rows: Sequence[Row], better: Sequence[int]) -> None:
             best = max(texts, key=lambda text: sign * float(text))
             for cell in cells:
                 cell.best = cell.text().split(" ")[0] == best
+
+
+def show_tables(tables: Sequence[MadeTable], console: Console) -> None:
+    """Print the tables that fit a terminal."""
+    for made in tables:
+        if not made.on_terminal:
+            continue
+        table = Table("", title=f"Table {made.label}. {made.title}", caption=made.caption)
+        for group, heading in made.headings():
+            table.add_column(f"{group}\n{heading}" if group else heading, justify="right")
+        for row in made.rows:
+            table.add_row(row.title, *(cell.text() for cell in row.cells))
+        console.print(table)
+
+
+def page_of_tables(title: str, lines: Sequence[str], tables: Sequence[MadeTable]) -> str:
+    """Give a title, paragraphs and tables as Markdown."""
+    parts = [f"# {title}", *lines]
+    for table in tables:
+        headings = [f"{group} {heading}".strip() for group, heading in table.headings()]
+        lines = [f"| | {' | '.join(headings)} |", "|---|" + "---|" * len(headings)]
+        for row in table.rows:
+            cells = [f"**{cell.text()}**" if cell.best else cell.text() for cell in row.cells]
+            lines.append(f"| {row.title} | {' | '.join(cells)} |")
+        parts += [f"## Table {table.label}. {table.title}", "\n".join(lines), *([table.caption] if table.notes else [])]
+    return "\n\n".join(parts) + "\n"
+
+
+_LATEX = {
+    "\\": r"\textbackslash{}",
+    **{char: f"\\{char}" for char in "&%$#_{}"},
+    "↑": r"$\uparrow$",
+    "↓": r"$\downarrow$",
+    "±": r"$\pm$",
+    "δ": r"$\delta$",
+    "λ": r"$\lambda$",
+    "σ": r"$\sigma$",
+    "<": "$<$",
+    ">": "$>$",
+    "–": "--",
+    "≥": r"$\geq$",
+}
+
+
+def latex_text(text: str) -> str:
+    """Text as LaTeX takes it."""
+    return "".join(_LATEX.get(char, char) for char in text)
+
+
+def latex_of_tables(lines: Sequence[str], tables: Sequence[MadeTable]) -> str:
+    """Give lines of comment and tables as LaTeX; no package beyond booktabs."""
+    parts = ["% \\usepackage{booktabs}", *(f"% {line}" for line in lines)]
+    for table in tables:
+        columns = sum(len(headings) for _, headings in table.groups)
+        lines = [r"\begin{table}", r"\centering", rf"\caption{{{latex_text(f'{table.title}. {table.caption}')}}}"]
+        lines += [rf"\begin{{tabular}}{{l{'r' * columns}}}", r"\toprule"]
+        if any(group for group, _ in table.groups):
+            spans, rules, first = [], [], 2
+            for group, headings in table.groups:
+                spans.append(rf"\multicolumn{{{len(headings)}}}{{c}}{{{latex_text(group)}}}")
+                rules.append(rf"\cmidrule(lr){{{first}-{first + len(headings) - 1}}}")
+                first += len(headings)
+            lines += [" & " + " & ".join(spans) + r" \\", "".join(rules)]
+        lines += [" & " + " & ".join(latex_text(heading) for _, heading in table.headings()) + r" \\", r"\midrule"]
+        for row in table.rows:
+            cells = [latex_text(cell.text()) for cell in row.cells]
+            bold = [rf"\textbf{{{text}}}" if cell.best else text for text, cell in zip(cells, row.cells, strict=True)]
+            lines.append(f"{latex_text(row.title)} & {' & '.join(bold)} \\\\")
+        lines += [r"\bottomrule", r"\end{tabular}", r"\end{table}"]
+        parts.append(f"% Table {table.label}\n" + "\n".join(lines))
+    return "\n\n".join(parts) + "\n"

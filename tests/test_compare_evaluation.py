@@ -1,4 +1,4 @@
-"""Judging: on which pixels and views, and without a trace in the training."""
+"""Evaluation: on which pixels and views, and without a trace in the training."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from scenes import write_scene
 from test_pipeline import build
 
 from edge_depth_nerf.base.files import read_json, write_json, write_mask
-from edge_depth_nerf.compare.figures import affine_fitted
-from edge_depth_nerf.compare.judging import (
-    ViewJudge,
+from edge_depth_nerf.compare.evaluation import (
+    ViewEvaluator,
     choose_pixels,
+    evaluate_beams,
+    evaluate_pixels,
     evaluated,
-    judge_beams,
-    judge_pixels,
     shifted_views,
 )
+from edge_depth_nerf.compare.figures import affine_fitted
 from edge_depth_nerf.method.metrics import masked_psnr
 from edge_depth_nerf.plugin.config import make_specifications, read_method_file
 
 
-def test_judging_leaves_no_trace_in_a_training(tmp_path):
+def test_evaluation_leaves_no_trace_in_a_training(tmp_path):
     pipeline, _ = build(write_scene(tmp_path), depth_loss="edge", num_proposal_samples_per_ray=(8, 8))
     pipeline.datamanager.train_pixel_sampler.set_num_rays_per_batch(32)
     start = deepcopy(pipeline.state_dict())
     chosen = choose_pixels(pipeline.datamanager.eval_dataset)
     trained_on = choose_pixels(pipeline.datamanager.train_dataset)
     ends, figures, of_trained = [], [], []
-    for judged in (False, True):
+    for evaluating in (False, True):
         pipeline.load_state_dict(start)
         pipeline.datamanager.train_pixel_sampler._drawn = pipeline.datamanager._surface_sampler._drawn = 0
         sampler = pipeline.model.proposal_sampler
@@ -49,9 +49,9 @@ def test_judging_leaves_no_trace_in_a_training(tmp_path):
             optimisers.zero_grad_all()
             torch.stack(list(pipeline.get_train_loss_dict(0)[1].values())).sum().backward()
             optimisers.optimizer_step_all()
-            if judged and step in (11, 12, 13):
-                figures.append(judge_pixels(pipeline, chosen))
-                of_trained.append(judge_pixels(pipeline, trained_on, trained_on=True))
+            if evaluating and step in (11, 12, 13):
+                figures.append(evaluate_pixels(pipeline, chosen))
+                of_trained.append(evaluate_pixels(pipeline, trained_on, trained_on=True))
                 assert pipeline.model.training
         ends.append(deepcopy(pipeline.state_dict()))
     assert all(torch.equal(ends[0][name], ends[1][name]) for name in ends[0])
@@ -82,7 +82,7 @@ def test_a_view_without_a_usable_pixel_is_passed_over(tmp_path):
     pipeline, _ = build(scene)
     chosen = choose_pixels(pipeline.datamanager.train_dataset)
     assert [int(view.indices[0, 0]) for view in chosen] == [0, 1, 3, 4, 5, 6, 7]
-    assert math.isfinite(judge_pixels(pipeline, chosen, trained_on=True)["psnr"])
+    assert math.isfinite(evaluate_pixels(pipeline, chosen, trained_on=True)["psnr"])
 
 
 def test_the_pixels_are_always_the_same_and_inside_the_mask(tmp_path):
@@ -141,7 +141,7 @@ def test_shifted_views_have_the_figures_of_the_whole_picture(tmp_path):
     model.forward = lambda ray_bundle: (rendered.append(len(ray_bundle)), original(ray_bundle))[1]
     model.config.eval_num_rays_per_chunk = 100
     views, told = shifted_views(scene, dataset), []
-    found = ViewJudge(pipeline, lambda: told.append(1)).shifted(views)
+    found = ViewEvaluator(pipeline, lambda: told.append(1)).shifted(views)
     assert len(told) == 2 and max(rendered) <= 100
     assert sum(rendered) == 2 * int(dataset.mask(0).sum()) < 2 * dataset.mask(0).size
     expected = {}
@@ -161,19 +161,19 @@ def test_shifted_views_have_the_figures_of_the_whole_picture(tmp_path):
     assert found == pytest.approx(expected, rel=1e-5) and found["shifted_0m_truth_pixels"] > 100
 
 
-def test_training_views_are_judged_by_the_beams_that_were_held_out(tmp_path, monkeypatch):
+def test_training_views_are_evaluated_by_the_beams_that_were_held_out(tmp_path, monkeypatch):
     scene = write_scene(tmp_path)
     meta = read_json(scene / "transforms.json")
     plain, _ = build(scene)
-    assert judge_beams(plain) == {}
+    assert evaluate_beams(plain) == {}
     for frame in meta["frames"]:
         frame["beams_file_path"] = frame["truth_distance_file_path"]
     write_json(scene / "transforms.json", meta)
     pipeline, _ = build(scene)
-    found = judge_beams(pipeline, most=200)
+    found = evaluate_beams(pipeline, most=200)
     count = len(pipeline.datamanager.train_dataset)
     assert found["beams_pixels"] <= 200 and found["beams_pixels"] > 0.5 * (200 // count) * count
-    assert found == judge_beams(pipeline, most=200)
+    assert found == evaluate_beams(pipeline, most=200)
     # a model that renders what is there, from the poses that training ended with
     dataset, model = pipeline.datamanager.train_dataset, pipeline.model
     true_m = [torch.from_numpy(dataset.distance_m(view, "beams")) for view in range(count)]
@@ -186,5 +186,5 @@ def test_training_views_are_judged_by_the_beams_that_were_held_out(tmp_path, mon
     monkeypatch.setattr(model, "forward", exact)
     monkeypatch.setattr(model.camera_optimizer, "apply_to_raybundle", moved.append)
     manager = SimpleNamespace(train_dataset=dataset, train_ray_generator=lambda pixels: pixels)
-    assert judge_beams(SimpleNamespace(model=model, datamanager=manager), most=200)["beams_abs_rel"] < 1e-6
+    assert evaluate_beams(SimpleNamespace(model=model, datamanager=manager), most=200)["beams_abs_rel"] < 1e-6
     assert len(moved) == count

@@ -1,4 +1,4 @@
-"""Judges a model: on random pixels, cheaply and often, and on whole views, held out and from beside the path.
+"""Evaluates a model: on random pixels, cheaply and often, and on whole views, held out and from beside the path.
 
 Host-facing. Masks and metrics of whole views are those of `ns-eval`, the same for all methods.
 """
@@ -33,12 +33,12 @@ MOST_PIXELS = 20_000
 MOST_TRAINED_VIEWS, MOST_TRAINED_PIXELS = 10, 10_000
 """Of training pictures, whose PSNR says how much has been learned at all."""
 COLOURS = {"psnr": "image", "truth_psnr": "truth_rgb"}
-DISTANCES = {"lidar": "lidar_distance_m", "truth": "truth_distance_m"}
+DISTANCES = {name: f"{name}_distance_m" for name in ("lidar", "truth", "beams")}
 
 
 @contextmanager
 def evaluated(model: EdgeDepthNerfModel) -> Iterator[None]:
-    """Let a model in training be judged as after loading it, without any trace in the training."""
+    """Let a model in training be evaluated as after loading it, without any trace in the training."""
     sampler = model.proposal_sampler
     kept = {name: getattr(sampler, name) for name in ("_anneal", "_steps_since_update")}
     was_training = model.training
@@ -55,8 +55,8 @@ def evaluated(model: EdgeDepthNerfModel) -> Iterator[None]:
 
 
 @dataclass(frozen=True, eq=False)
-class JudgedView:
-    """A view to render, with what it is judged by."""
+class EvaluatedView:
+    """A view to render, with what it is evaluated by."""
 
     number: int
     """Of the held-out picture whose lens and mask it has."""
@@ -67,12 +67,23 @@ class JudgedView:
 
 @dataclass(frozen=True, eq=False)
 class ChosenPixels:
-    """Some pixels of a view with what they are judged by."""
+    """Some pixels of a view with what they are evaluated by."""
 
     indices: Tensor
     """n×3: picture, row, column."""
     known: dict[str, Tensor]
     """By the dataset's names: colours n×3, distances n×1 metres."""
+
+
+def _chosen(
+    view: int, usable: Tensor, most: int, generator: torch.Generator, maps: dict[str, Any]
+) -> list[ChosenPixels]:
+    """Random pixels of a view where it is usable, with their values in the maps that there are; none without any."""
+    at = usable.nonzero()
+    at = at[torch.randperm(len(at), generator=generator)[: max(1, most)]]
+    row, column = at.T
+    known = {name: values[row, column] for name, values in maps.items() if values is not None}
+    return [ChosenPixels(torch.cat([torch.full((len(at), 1), view), at], dim=1), known)] if len(at) else []
 
 
 def choose_pixels(
@@ -83,71 +94,43 @@ def choose_pixels(
 ) -> list[ChosenPixels]:
     """Choose random pixels inside the masks of a split's views; always the same ones.
 
-    Args:
-        dataset: the split.
-        per_view: at most so many of a view.
-        most: at most so many of all.
-        most_views: at most so many views, spread evenly; None: every view.
-
-    Returns:
-        Those of each view; none of a view that its mask hides.
-
+    At most `per_view` of a view and `most` of all, of `most_views` spread evenly; None: of every view. A view that its
+    mask hides has none.
     """
     generator = torch.Generator().manual_seed(0)
     count = len(dataset) if most_views is None else min(len(dataset), most_views)
-    per_view = max(1, min(per_view, most // count))
     chosen = []
     for view in (len(dataset) * (2 * number + 1) // (2 * count) for number in range(count)):
         item = dataset[view]
-        at = item["mask"][..., 0].nonzero()
-        if not len(at):
-            continue
-        at = at[torch.randperm(len(at), generator=generator)[:per_view]]
-        row, column = at.T
-        known = {
-            name: item[name][row, column]
-            for name in (*COLOURS.values(), *DISTANCES.values())
-            if item.get(name) is not None
-        }
-        chosen.append(ChosenPixels(torch.cat([torch.full((len(at), 1), view), at], dim=1), known))
+        maps = {name: item.get(name) for name in (*COLOURS.values(), *DISTANCES.values())}
+        chosen += _chosen(view, item["mask"][..., 0], min(per_view, most // count), generator, maps)
     return chosen
 
 
-def judge_beams(pipeline: Any, most: int = MOST_PIXELS) -> dict[str, float]:
-    """Judge training views by the LiDAR beams that were held out of everything (`process --holdout-beams`).
+def evaluate_beams(pipeline: Any, most: int = MOST_PIXELS) -> dict[str, float]:
+    """Evaluate training views by the LiDAR beams that were held out of everything (`process --holdout-beams`).
 
     Returns:
         The depth errors beams_abs_rel and so on, pooled over random LiDAR points of all training views, rendered from
         the poses that training ended with; nothing for a scene without such beams.
 
     """
-    model, manager = pipeline.model, pipeline.datamanager
-    dataset, errors = manager.train_dataset, DepthErrors()
+    dataset = pipeline.datamanager.train_dataset
     if "beams" not in dataset.sources():
         return {}
-    generator = torch.Generator().manual_seed(0)
-    with evaluated(model):
-        for view in range(len(dataset)):
-            true_m = torch.from_numpy(dataset.distance_m(view, "beams"))
-            at = ((true_m > 0) & torch.from_numpy(dataset.mask(view))).nonzero()
-            at = at[torch.randperm(len(at), generator=generator)[: max(1, most // len(dataset))]]
-            if not len(at):
-                continue
-            rays = manager.train_ray_generator(torch.cat([torch.full((len(at), 1), view), at], 1).to(model.device))
-            model.camera_optimizer.apply_to_raybundle(rays)
-            distance_m = model(rays)["depth"][:, 0].cpu() * model.metres_per_unit
-            errors.update(distance_m[None], true_m[at[:, 0], at[:, 1]][None], torch.ones(1, len(at), dtype=torch.bool))
-    return errors.compute("beams_")
+    generator, chosen = torch.Generator().manual_seed(0), []
+    for view in range(len(dataset)):
+        true_m = torch.from_numpy(dataset.distance_m(view, "beams"))[..., None]
+        usable = (true_m[..., 0] > 0) & torch.from_numpy(dataset.mask(view))
+        chosen += _chosen(view, usable, most // len(dataset), generator, {DISTANCES["beams"]: true_m})
+    return evaluate_pixels(pipeline, chosen, trained_on=True)
 
 
-def judge_pixels(pipeline: Any, chosen: list[ChosenPixels], trained_on: bool = False) -> dict[str, float]:
-    """Judge chosen pixels.
+def evaluate_pixels(pipeline: Any, chosen: list[ChosenPixels], trained_on: bool = False) -> dict[str, float]:
+    """Evaluate chosen pixels of a pipeline that trains, or has trained.
 
-    Args:
-        pipeline: that trains, or has trained.
-        chosen: the pixels.
-        trained_on: whether they are of training pictures, not of held-out ones. Their poses are those that training
-            has now; the colours are neutral, without the pictures' exposures.
+    Those of training pictures (`trained_on`) have the poses that training has now; their colours are neutral, without
+    the pictures' exposures.
 
     Returns:
         psnr and, where it is known, truth_psnr against the picture without noise: means over views, dB; and the
@@ -166,23 +149,21 @@ def judge_pixels(pipeline: Any, chosen: list[ChosenPixels], trained_on: bool = F
                 if trained_on:
                     model.camera_optimizer.apply_to_raybundle(rays)
                 parts.append(model(rays))
-            rgb = torch.cat([part["rgb"] for part in parts]).cpu().clamp(0, 1)
-            distance_m = torch.cat([part["depth"][:, 0] for part in parts]).cpu() * model.metres_per_unit
-            for name, key in COLOURS.items():
-                if key in view.known:
-                    squared = float((rgb - view.known[key][:, :3]).square().mean())
-                    psnr[name].append(-10 * math.log10(max(squared, LEAST_SQUARED_ERROR)))
-            for name, key in DISTANCES.items():
-                if key in view.known:
-                    everywhere = torch.ones(1, len(rgb), dtype=torch.bool)
-                    errors[name].update(distance_m[None], view.known[key][None, :, 0], everywhere)
+            for name in (name for name, key in COLOURS.items() if key in view.known):
+                rgb = torch.cat([part["rgb"] for part in parts]).cpu().clamp(0, 1)
+                squared = float((rgb - view.known[COLOURS[name]][:, :3]).square().mean())
+                psnr[name].append(-10 * math.log10(max(squared, LEAST_SQUARED_ERROR)))
+            distance_m = torch.cat([part["depth"][:, 0] for part in parts]).cpu()[None] * model.metres_per_unit
+            everywhere = torch.ones_like(distance_m, dtype=torch.bool)
+            for name in (name for name, key in DISTANCES.items() if key in view.known):
+                errors[name].update(distance_m, view.known[DISTANCES[name]][None, :, 0], everywhere)
     figures = {name: float(np.mean(found)) for name, found in psnr.items() if found}
     for name, pool in errors.items():
         figures |= pool.compute(f"{name}_")
     return figures
 
 
-def shifted_views(scene: Path, dataset: FisheyeDepthDataset) -> dict[str, list[Callable[[], JudgedView]]]:
+def shifted_views(scene: Path, dataset: FisheyeDepthDataset) -> dict[str, list[Callable[[], EvaluatedView]]]:
     """The views from beside the path whose truth a rendered drive brings; none in recorded ones.
 
     Returns:
@@ -198,7 +179,7 @@ def shifted_views(scene: Path, dataset: FisheyeDepthDataset) -> dict[str, list[C
     for number, image in enumerate(dataset.image_filenames):
         of_camera.setdefault(cameras[image], number)
 
-    def load(entry: dict[str, Any]) -> JudgedView:
+    def load(entry: dict[str, Any]) -> EvaluatedView:
         number = of_camera[entry["camera"]]
         pose = to_scene @ torch.tensor(entry["transform_matrix"], dtype=torch.float64)
         pose[:, 3] *= outputs.dataparser_scale
@@ -206,7 +187,7 @@ def shifted_views(scene: Path, dataset: FisheyeDepthDataset) -> dict[str, list[C
         camera.camera_to_worlds = pose[None].to(camera.camera_to_worlds)
         rgb = read_image(scene / entry["truth_rgb_file_path"]).astype(np.float32) / 255
         distance_m = read_distance_png(scene / entry["truth_distance_file_path"])
-        return JudgedView(
+        return EvaluatedView(
             number,
             camera,
             {
@@ -222,8 +203,8 @@ def shifted_views(scene: Path, dataset: FisheyeDepthDataset) -> dict[str, list[C
     }
 
 
-class ViewJudge:
-    """Judges whole views, one after the other."""
+class ViewEvaluator:
+    """Evaluates whole views, one after the other."""
 
     def __init__(self, pipeline: Any, on_view: Callable[[], None]) -> None:
         """Take a pipeline; `on_view` is called after each view."""
@@ -232,7 +213,7 @@ class ViewJudge:
         self.on_view = on_view
 
     def held_out(self, folder: Path) -> tuple[dict[str, float], dict[str, list[dict[str, float]]]]:
-        """Judge all held-out views; colours and distance of each are saved in a folder, as `ns-eval` names them.
+        """Evaluate all held-out views; colours and distance of each are saved in a folder, as `ns-eval` names them.
 
         Returns:
             The figures of `ns-eval` and, under affine_… and truth_affine_…, those after a colour fit; and the bins
@@ -242,7 +223,7 @@ class ViewJudge:
         dataset = self.pipeline.datamanager.eval_dataset
         by_angle, by_distance = BinnedErrors(ANGLE_EDGES_DEG), BinnedErrors(DISTANCE_EDGES_M)
 
-        def look(view: JudgedView, outputs: dict[str, Tensor], images: dict[str, Tensor]) -> None:
+        def look(view: EvaluatedView, outputs: dict[str, Tensor], images: dict[str, Tensor]) -> None:
             number, batch = view.number, view.batch
             for name in ("img", "distance"):
                 _save(images[name], folder / f"eval_{name}_{number:04d}.png")
@@ -261,9 +242,9 @@ class ViewJudge:
         return figures, {"by_angle_deg": by_angle.compute(), "by_distance_m": by_distance.compute()}
 
     def with_detail(
-        self, folder: Path, beside: dict[str, list[Callable[[], JudgedView]]] | None = None
+        self, folder: Path, beside: dict[str, list[Callable[[], EvaluatedView]]] | None = None
     ) -> dict[str, float]:
-        """Judge all held-out views, and those beside the path, with the detail of training pictures.
+        """Evaluate all held-out views, and those beside the path, with the detail of training pictures.
 
         The colours of each held-out view are saved in a folder, as eval_detail_0000.png and so on.
 
@@ -273,18 +254,18 @@ class ViewJudge:
 
         """
 
-        def look(view: JudgedView, outputs: dict[str, Tensor], images: dict[str, Tensor]) -> None:
+        def look(view: EvaluatedView, outputs: dict[str, Tensor], images: dict[str, Tensor]) -> None:
             _save(outputs["rgb"], folder / f"eval_detail_{view.number:04d}.png")
 
         with detail_shown(True):
             found = self._mean(self._held_out_views(), look) | self.shifted(beside or {})
         return {f"detail_{name}": value for name, value in found.items() if "masked_" in name}
 
-    def _held_out_views(self) -> Iterator[JudgedView]:
+    def _held_out_views(self) -> Iterator[EvaluatedView]:
         loader = JudgedViews(self.pipeline, self.pipeline.datamanager.fixed_indices_eval_dataloader)
-        return (JudgedView(number, camera, batch) for number, (camera, batch) in enumerate(loader))
+        return (EvaluatedView(number, camera, batch) for number, (camera, batch) in enumerate(loader))
 
-    def shifted(self, views: dict[str, list[Callable[[], JudgedView]]]) -> dict[str, float]:
+    def shifted(self, views: dict[str, list[Callable[[], EvaluatedView]]]) -> dict[str, float]:
         """Evaluate views beside the path against their ground truth, inside the mask: shifted_1m_masked_psnr etc.
 
         No figure reads what lies outside the mask, so it is not rendered.
@@ -300,7 +281,7 @@ class ViewJudge:
             figures |= {f"shifted_{metres}m_{name}": value for name, value in {**_means(found), **pooled}.items()}
         return figures
 
-    def _inside_mask(self, view: JudgedView, errors: DepthErrors) -> dict[str, float]:
+    def _inside_mask(self, view: EvaluatedView, errors: DepthErrors) -> dict[str, float]:
         """Render the pixels of a view inside its mask; its figures there, and its distances added to `errors`."""
         model, mask, target = self.model, view.batch["mask"][..., 0].cpu(), view.batch["image"][..., :3].cpu()
         rgb, distance_m = torch.zeros(*mask.shape, 3), torch.zeros(mask.shape)
@@ -321,7 +302,7 @@ class ViewJudge:
             figures["masked_lpips"] = float(masked_lpips(rgb.to(device), target.to(device), mask.to(device), lpips))
         return figures
 
-    def _mean(self, views: Iterator[JudgedView], look: Callable[..., None]) -> dict[str, float]:
+    def _mean(self, views: Iterator[EvaluatedView], look: Callable[..., None]) -> dict[str, float]:
         """Means over views of the model's own figures and of those after a colour fit; depth errors are pooled."""
         model, found = self.model, []
         model.reset_depth_errors()
