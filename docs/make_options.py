@@ -63,7 +63,7 @@ These are from [nerfstudio_method.toml](../nerfstudio_method.toml). – means ne
 
 """
 
-SHARED = "Options of all converters:\n\n"
+SHARED = "Options of all of them:\n\n"
 
 
 # ---- reading dataclasses ---------------------------------------------------------------------------------------
@@ -166,7 +166,7 @@ def option_rows(cls: type, declared_by: type) -> list[tuple[str, ...]]:
     docs, hints = field_docs(declared_by), get_type_hints(cls, include_extras=True)
     rows = []
     for entry in dataclasses.fields(cls):
-        if entry.name not in docs:
+        if entry.name not in docs or tyro.conf.Suppress in get_args(hints[entry.name]):
             continue
         default, name = default_of(entry), f"`--{dashed(entry.name)}`"
         if is_positional(hints[entry.name]):
@@ -184,12 +184,16 @@ def own_commands() -> str:
     """The section of `edge-depth-nerf`."""
     header = ("option", "values", "default", "what")
     found = list(commands())
-    groups: dict[str, list[tuple[tuple[str, ...], type]]] = {}
+    groups: dict[type, list[tuple[tuple[str, ...], type]]] = {}
     for words, cls in found:
-        groups.setdefault(words[0], []).append((words, cls))
+        # commands that share a dataclass have a section in common
+        groups.setdefault(next(base for base in reversed(cls.__mro__) if dataclasses.is_dataclass(base)), []).append(
+            (words, cls)
+        )
     text = ""
-    for name, members in groups.items():
-        text += f"### `edge-depth-nerf {name}`\n\n"
+    for members in groups.values():
+        names = ", ".join(f"`{name}`" for name in dict.fromkeys(words[0] for words, _ in members))
+        text += f"### {names.replace('`', '`edge-depth-nerf ', 1)}\n\n"
         ancestors = [[base for base in cls.__mro__ if dataclasses.is_dataclass(base)] for _, cls in members]
         shared = [base for base in ancestors[0] if len(members) > 1 and all(base in each for each in ancestors)]
         for base in shared:

@@ -71,6 +71,6 @@ def write_compared_scene(folder: Path) -> Path:
     return folder
 
 
-def options(*scenes, of=CompareOptions, **changes):
-    """Options of a comparison, or of another command, that writes nowhere unless `output` is given."""
-    return of(scenes=tuple(scenes), **{"output": Path("/nonexistent/out"), **changes})
+def options(*scenes, **changes):
+    """Options of a comparison that writes nowhere unless `output` is given."""
+    return CompareOptions(scenes=tuple(scenes), **{"output": Path("/nonexistent/out"), **changes})

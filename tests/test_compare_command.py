@@ -50,10 +50,12 @@ def test_options_that_cannot_be(changes, message):
     ],
 )
 def test_a_search_that_cannot_be(changes, message):
-    fine = {"lambdas": (1.0, 2.0, 3.0, 4.0), "sigmas_m": ("own", 1.0, 2.0)}
-    options(Path("a"), of=SearchOptions, **fine).check()
+    fine = SearchOptions(
+        scenes=(Path("a"),), output=Path("out"), lambdas=(1.0, 2.0, 3.0, 4.0), sigmas_m=("own", 1.0, 2.0)
+    )
+    fine.check()
     with pytest.raises(InputError, match=message):
-        options(Path("a"), of=SearchOptions, **{**fine, **changes}).check()
+        replace(fine, **changes).check()
 
 
 def test_no_scene_is_an_error():
@@ -147,54 +149,62 @@ def test_a_folder_keeps_what_its_runs_share(tmp_path, monkeypatch):
         command.compare(first, QUIET)
 
 
-def test_methods_may_be_tuned_after_others(tmp_path):
-    scene, output = write_scene(tmp_path / "x"), tmp_path / "out"
-
-    def open_with(methods: tuple[str, ...], **tuned: float) -> None:
-        path = tmp_path / "tuned.json"
-        content = {name.replace("_", "-"): {"lambda": value, "sigma_m": 0.5} for name, value in tuned.items()}
-        write_json(path, {"scene": "tuning", "methods": content})
-        asked = options(scene, output=output, steps=5, methods=methods, tuned=path)
-        command.open_output(asked, command.read_tuned(path))
-        for name in methods:
-            (output / "runs" / "x" / f"{name}_seed-0").mkdir(parents=True, exist_ok=True)
-
-    open_with(("ds-nerf",), ds_nerf=0.1)
-    open_with(("edge",), ds_nerf=0.1, edge=0.01)
-    assert read_json(output / "compare.json")["tuned"] == {
-        "ds-nerf": {"lambda": 0.1, "sigma_m": 0.5},
-        "edge": {"lambda": 0.01, "sigma_m": 0.5},
-    }
-    open_with(("nerfacto",), ds_nerf=0.1, edge=0.01)
-    for tuned in ({"ds_nerf": 0.1, "edge": 0.02}, {"ds_nerf": 0.1}):  # another value; one that is gone
-        with pytest.raises(InputError, match="contains a comparison with tuned"):
-            open_with(("edge",), **tuned)
-    (output / "runs" / "x" / "edge-lidar_seed-0").mkdir()  # trained with the default
-    with pytest.raises(InputError, match="contains a comparison with tuned"):
-        open_with(("edge-lidar",), ds_nerf=0.1, edge=0.01, edge_lidar=0.01)
+def tuned_values(path: Path, scene: object = "tuning", **tuned: float | str) -> Path:
+    """A file of λ = 0.1 and these σ."""
+    methods = {name.replace("_", "-"): {"lambda": 0.1, "sigma_m": sigma_m} for name, sigma_m in tuned.items()}
+    write_json(path, {"scene": scene, "methods": methods})
+    return path
 
 
-def test_a_tuned_method_joins_methods_with_their_defaults(tmp_path):
+@pytest.fixture
+def begun(tmp_path, monkeypatch):
+    """Gives what begins the runs of methods with a file of tuned values; nothing is trained."""
+
+    class Stop(Exception):
+        pass
+
+    def stop(*_):
+        raise Stop
+
+    monkeypatch.setattr(command, "do_runs", stop)
+    scene = write_scene(tmp_path / "x")
+
+    def begin(*methods: str, **changes: Path) -> None:
+        with pytest.raises(Stop):
+            command.compare(options(scene, output=tmp_path / "out", steps=5, methods=methods, **changes), QUIET)
+
+    return begin
+
+
+def test_methods_may_be_tuned_after_others(tmp_path, begun):
+    path = tmp_path / "tuned.json"
+    begun("ds-nerf", tuned=tuned_values(path, ds_nerf=0.5))
+    begun("edge", tuned=tuned_values(path, ds_nerf=0.5, edge=0.7))
+    begun("nerfacto", tuned=path)
+    run = read_json(tmp_path / "out" / "runs" / "x" / "edge_seed-0" / "run.json")
+    assert (run["weight"], run["sigma_m"]) == (0.1, 0.7)
+    for tuned in ({"ds_nerf": 0.5, "edge": 0.2}, {"ds_nerf": 0.5}):  # another value; one that is gone
+        with pytest.raises(InputError, match=r"edge_seed-0/run.json: .* started with λ 0.1 and σ 0.7, not"):
+            begun("edge", tuned=tuned_values(path, **tuned))
+    begun("edge-lidar")  # trained with the default
+    with pytest.raises(InputError, match=r"started with its own λ and σ, not λ 0\.1 and σ own"):
+        begun("edge-lidar", tuned=tuned_values(path, edge_lidar="own"))
+
+
+def test_a_tuned_method_joins_methods_with_their_defaults(tmp_path, begun):
     """As the quick start adds one to the comparison of `demo`, with a file that has values for all."""
-    scene, output, path = write_scene(tmp_path / "x"), tmp_path / "out", tmp_path / "tuned.json"
-    first = options(scene, output=output, steps=5, methods=("nerfacto", "edge"))
-    command.open_output(first, {})
-    (output / "runs" / "x" / "edge_seed-0").mkdir(parents=True)
-    setting = {"lambda": 0.1, "sigma_m": 0.5}
-    write_json(path, {"scene": "tuning", "methods": {"ds-nerf": setting, "edge": {"lambda": 0.02, "sigma_m": "own"}}})
-    tuned = command.read_tuned(path)
-    command.open_output(replace(first, methods=("ds-nerf",), tuned=path), tuned)
-    record = read_json(output / "compare.json")
-    assert record["tuned"] == {"ds-nerf": setting} and record["tuned_on"] == "tuning"
-    (output / "runs" / "x" / "ds-nerf_seed-0").mkdir()
-    command.open_output(first, {})  # goes on with what needs no file
-    assert read_json(output / "compare.json")["tuned"] == {"ds-nerf": setting}
-    for methods, file in ((("edge",), path), (("ds-nerf",), None)):
-        with pytest.raises(InputError, match="contains a comparison with tuned"):
-            command.open_output(replace(first, methods=methods, tuned=file), tuned if file else {})
-    write_json(path, {"scene": "another", "methods": {"ds-nerf": setting}})
-    with pytest.raises(InputError, match="contains a comparison with tuned_on tuning, not another"):
-        command.open_output(replace(first, methods=("ds-nerf",), tuned=path), command.read_tuned(path))
+    path = tuned_values(tmp_path / "tuned.json", ds_nerf=0.5, edge="own")
+    begun("nerfacto", "edge")
+    begun("ds-nerf", tuned=path)
+    record = tmp_path / "out" / "compare.json"
+    assert read_json(record)["tuned_on"] == ["tuning"]
+    begun("nerfacto", "edge")  # goes on with what needs no file
+    assert read_json(record)["tuned_on"] == ["tuning"]
+    for methods, changes in ((("edge",), {"tuned": path}), (("ds-nerf",), {})):
+        with pytest.raises(InputError, match="this run was started with"):
+            begun(*methods, **changes)
+    begun("edge-mono", tuned=tuned_values(path, ["another", "tuning"], edge_mono=0.2))
+    assert read_json(record)["tuned_on"] == ["tuning", "another"]
 
 
 def test_a_run_that_fails_names_its_log(tmp_path, monkeypatch):

@@ -19,12 +19,12 @@ from edge_depth_nerf.compare.configuration import (
 )
 from edge_depth_nerf.compare.methods import (
     METHODS,
+    SIGMA_FIELDS,
     WITHOUT_EXTRAS,
     Method,
     MethodName,
     Preset,
     default_methods,
-    sigma_field,
 )
 from edge_depth_nerf.compare.protocol import departures
 from edge_depth_nerf.compare.results import Results
@@ -80,7 +80,7 @@ def allowed(method: Method) -> set[str]:
     ]
     if method.loss == "none":
         return fields | ({LAMBDA} if method.extras else {LOSS})
-    return fields | (set() if method.loss == "edge" else {LOSS, LAMBDA, sigma_field(method.loss)})
+    return fields | (set() if method.loss == "edge" else {LOSS, LAMBDA, SIGMA_FIELDS[method.loss]})
 
 
 def unstated(method, preset: Preset = "lite"):
@@ -243,8 +243,8 @@ def test_a_configuration_reads_the_same_in_every_process():
 
 def test_lambda_and_sigma_go_where_each_method_has_them():
     rival = resolved("ds-nerf", weight=0.07, sigma_m=0.2)
-    assert (rival[LAMBDA], rival[sigma_field("ds-nerf")]) == (0.07, 0.2)
-    assert set(differing(rival, resolved("ds-nerf"))) == {LAMBDA, sigma_field("ds-nerf")}
+    assert (rival[LAMBDA], rival[SIGMA_FIELDS["ds-nerf"]]) == (0.07, 0.2)
+    assert set(differing(rival, resolved("ds-nerf"))) == {LAMBDA, SIGMA_FIELDS["ds-nerf"]}
     ours = resolved("edge", weight=0.07, sigma_m=0.2)
     assert (ours[PRIOR + "sigma_mode"], ours[PRIOR + "sigma_constant_m"]) == ("constant", 0.2)
     own = resolved("edge", weight=0.07, sigma_m="own")

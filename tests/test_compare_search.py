@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-from comparisons import QUIET, fake, options
+from comparisons import QUIET, fake
 from scenes import write_scene
 
 from edge_depth_nerf.base.files import read_json, write_json
@@ -41,9 +41,8 @@ def test_a_search_writes_what_compare_takes(tmp_path, monkeypatch):
 
     monkeypatch.setattr(command, "do_runs", train)
     scene, output = write_scene(tmp_path / "x"), tmp_path / "out"
-    asked = options(
-        scene,
-        of=SearchOptions,
+    asked = SearchOptions(
+        scenes=(scene,),
         output=output,
         seeds=(7,),
         methods=("ds-nerf", "edge"),

@@ -24,9 +24,9 @@ from edge_depth_nerf import cli
 from edge_depth_nerf.base.files import read_json, write_json, write_png
 from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.base.pictures import NO_VALUE_RGB, colour_distance, distance_of_colours
-from edge_depth_nerf.compare.methods import METHODS, MethodName
+from edge_depth_nerf.compare.methods import METHODS
 from edge_depth_nerf.compare.options import CompareOptions, SearchOptions
-from edge_depth_nerf.compare.plots import Bins, plot_bins, style_of
+from edge_depth_nerf.compare.plots import Lines, plot_lines, style_of
 from edge_depth_nerf.demo.options import DemoOptions
 from edge_depth_nerf.jobs.runs import command_line
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
@@ -314,10 +314,8 @@ def shown_view(number: int, distances: bool = True) -> ShownView:
 
 
 def small_plot() -> Plot:
-    bins: dict[str, dict[MethodName, list[Bins]]] = {
-        NASTY: {"edge": [[{"low": 1.0, "high": 2.0, "psnr": 20.0}, {"low": 2.0, "high": 4.0, "psnr": 21.0}]]}
-    }
-    return plot_bins("A plot", bins, "distance, m", [("psnr", "PSNR, dB")], logarithmic_x=True)
+    lines: Lines = {NASTY: {"edge": [([1.5, 3.0], [20.0, 21.0])]}}
+    return plot_lines("A plot", lines, "distance, m", [("psnr", "PSNR, dB")])
 
 
 def write_cloud(folder: Path, points_m: np.ndarray, rgb: np.ndarray | None = None) -> None:

@@ -27,7 +27,7 @@ from edge_depth_nerf.compare.plots import draw_plots
 from edge_depth_nerf.compare.report import first_runs, make_report
 from edge_depth_nerf.compare.results import Results, check_fair, read_results, write_rows
 from edge_depth_nerf.compare.specification import FIGURES, SPECIFICATION, VIEWS, RunSpecification
-from edge_depth_nerf.compare.tables import fields_table, introduction, make_tables
+from edge_depth_nerf.compare.tables import fields_table, introduction, listed, make_tables
 from edge_depth_nerf.jobs.runs import command_line, viewer_command
 from edge_depth_nerf.jobs.tasks import Task, do_tasks, this_machine
 from edge_depth_nerf.report.build import Report, write_report
@@ -39,8 +39,6 @@ from edge_depth_nerf.scene.format import DEPTH_KEY, LAYERS, layers_of, read_tran
 RECORD = "compare.json"
 RUNS = "runs"
 LOG = "run.log"
-WITHOUT_DETAIL = {"detail": False}
-"""What files of versions before `--detail` do not name."""
 VIEWS_SHOWN = 3
 MAX_SETTING = 1e6
 """No λ or σ is larger."""
@@ -262,29 +260,18 @@ def open_output(options: CompareOptions | SearchOptions, tuned: Mapping[MethodNa
     word = "search" if isinstance(options, SearchOptions) else "compare"
     path, command = options.output / RECORD, command_line(["edge-depth-nerf", word], options)
     record = _record(options, tuned)
-    commands = record.get("commands", [])
-    wanted = {**record, "commands": commands if command in commands else [*commands, command]}
+    wanted = {**record, "commands": [*dict.fromkeys([*record.get("commands", []), command])]}
     if not path.is_file() or read_json_object(path) != wanted:
         write_json(path, wanted)
-
-
-def _tuned_on(path: Path) -> Any:
-    """The scenes that tuned values were searched on; files of a search of one drive have them as `scene`."""
-    content = read_json_object(path)
-    return content.get("scenes", content.get("scene"))
 
 
 def _record(options: CompareOptions | SearchOptions, tuned: Mapping[MethodName, Setting]) -> dict[str, Any]:
     """What the output folder's record is to hold of what all its runs share, beside the commands so far.
 
-    What is tuned binds methods that have a run; others may be tuned later, or again.
-
     Raises:
-        InputError: the folder holds another comparison, or something else.
+        InputError: the folder holds something else, another comparison, or runs of a method with another λ or σ.
 
     """
-    asked = _methods(options)
-    settings = {name: {"lambda": tuned[name].weight, "sigma_m": tuned[name].sigma_m} for name in asked if name in tuned}
     compared = options if isinstance(options, CompareOptions) else None
     record: dict[str, Any] = {
         "kind": "comparison" if compared else "search",
@@ -292,32 +279,39 @@ def _record(options: CompareOptions | SearchOptions, tuned: Mapping[MethodName, 
         "steps": options.steps,
         "rivals_implementation": compared.rivals_implementation if compared else "same",
         "detail": compared is not None and compared.detail,
-        "tuned": settings,
-        "tuned_on": _tuned_on(compared.tuned) if compared and compared.tuned and settings else None,
     }
     path = options.output / RECORD
-    if not path.is_file():
-        if options.output.is_dir() and any(options.output.iterdir()):
-            raise InputError(f"{options.output}: contains other files. Choose a new or empty folder for --output.")
-        return record
-    found = {**WITHOUT_DETAIL, **read_json_object(path)}
-    before: dict[str, Any] = found.get("tuned", {})
-    begun = {name for name in asked if any(options.output.glob(f"{RUNS}/*/{name}_seed-*"))}
-    of_others = {name: setting for name, setting in before.items() if name not in asked}
-    bound = {**of_others, **{name: setting for name, setting in before.items() if name in begun}}
-    found["tuned"] = {**bound, **{name: setting for name, setting in settings.items() if name not in begun}}
-    record["tuned"] = {**of_others, **settings}
-    if not bound:
-        found["tuned_on"] = record["tuned_on"]
-    elif not settings:
-        record["tuned_on"] = found["tuned_on"]
+    if not path.is_file() and options.output.is_dir() and any(options.output.iterdir()):
+        raise InputError(f"{options.output}: contains other files. Choose a new or empty folder for --output.")
+    found = {**record, **(read_json_object(path) if path.is_file() else {})}
     for name, value in record.items():
-        if value != found.get(name):
+        if value != found[name]:
             raise InputError(
-                f"{path}: this folder contains a comparison with {name} {found.get(name)}, not {value}. Choose "
-                "another --output."
+                f"{path}: this folder contains a comparison with {name} {found[name]}, not {value}. Choose another "
+                "--output."
             )
+    for name in _methods(options) if compared else ():
+        _check_setting(options.output, name, tuned.get(name, Setting()))
+    if compared and compared.tuned and {*tuned} & {*_methods(options)}:
+        content = read_json_object(compared.tuned)
+        # files of a search of one drive have it as `scene`
+        scenes = [*listed(found.get("tuned_on")), *listed(content.get("scenes", content.get("scene")))]
+        found["tuned_on"] = [*dict.fromkeys(scenes)]
     return found
+
+
+def _check_setting(output: Path, name: MethodName, setting: Setting) -> None:
+    """Make sure that the runs that a method has were begun with a λ and σ.
+
+    Raises:
+        InputError: one has others.
+
+    """
+    for path in sorted(output.glob(f"{RUNS}/*/{name}_seed-*/{SPECIFICATION}")):
+        run = read_json_object(path)
+        found = Setting(run.get("weight"), run.get("sigma_m"))
+        if found != setting:
+            raise InputError(f"{path}: this run was started with {found}, not {setting}. Choose another --output.")
 
 
 class Run:
@@ -348,13 +342,13 @@ class Run:
         if not path.is_file():
             write_json(path, wanted)
             return
-        unknown = {"layers_sha256": wanted["layers_sha256"]}
-        found = {**WITHOUT_DETAIL, **unknown, **read_json_object(path)}
+        # what an earlier version did not name is not known to differ
+        found = {**wanted, **read_json_object(path)}
         for name, value in wanted.items():
-            if value != found.get(name):
+            if value != found[name]:
                 raise InputError(
-                    f"{path}: this run was started with {name} {found.get(name)}, not {value}. Choose another "
-                    f"--output, or remove {self.folder}."
+                    f"{path}: this run was started with {name} {found[name]}, not {value}. Choose another --output, or "
+                    f"remove {self.folder}."
                 )
 
     @property

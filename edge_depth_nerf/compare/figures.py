@@ -45,10 +45,11 @@ class BinnedErrors:
 
     def __init__(self, edges: Sequence[float]) -> None:
         self.edges = torch.tensor(edges, dtype=torch.float64)
-        bins = len(edges) - 1
-        self._pixels, self._squared, self._with_distance, self._relative, self._within = (
-            torch.zeros(bins, dtype=torch.float64) for _ in range(5)
-        )
+        self._sums: dict[str, Tensor] = {}
+
+    def _add(self, name: str, where: Tensor, values: Tensor | None = None) -> None:
+        found = torch.bincount(where, None if values is None else values.double(), minlength=len(self.edges) - 1)
+        self._sums[name] = self._sums.get(name, 0) + found.double()
 
     def update(
         self,
@@ -70,39 +71,29 @@ class BinnedErrors:
             true_m: true distance, metres; counted from 1 to 60 m, the range of all distance errors.
 
         """
-        low, high = self.edges[0], self.edges[-1]
         values = values.double()
-        counted = mask & (values >= low) & (values < high)
+        counted = mask & (values >= self.edges[0]) & (values < self.edges[-1])
         where = torch.bucketize(values[counted], self.edges, right=True) - 1
-        bins = len(self._pixels)
-        self._pixels += torch.bincount(where, minlength=bins)
-        squared = (pred[counted].double() - target[counted].double()).square().mean(dim=-1)
-        self._squared += torch.bincount(where, squared, minlength=bins)
-        if true_m is not None:
-            true = true_m[counted].double()
-            known = (true >= JUDGED_RANGE_M[0]) & (true <= JUDGED_RANGE_M[1])
-            pred_there, true = pred_m[counted].double()[known], true[known]
-            relative = (pred_there - true).abs() / true
-            within = (pred_there < 1.25 * true) & (true < 1.25 * pred_there)
-            self._with_distance += torch.bincount(where[known], minlength=bins)
-            self._relative += torch.bincount(where[known], relative, minlength=bins)
-            self._within += torch.bincount(where[known], within.double(), minlength=bins)
+        self._add("pixels", where)
+        self._add("squared", where, (pred[counted].double() - target[counted].double()).square().mean(dim=-1))
+        if true_m is None:
+            return
+        true = true_m[counted].double()
+        known = (true >= JUDGED_RANGE_M[0]) & (true <= JUDGED_RANGE_M[1])
+        pred_there, true, where = pred_m[counted].double()[known], true[known], where[known]
+        self._add("with distance", where)
+        self._add("abs_rel", where, (pred_there - true).abs() / true)
+        self._add("delta_1_25", where, (pred_there < 1.25 * true) & (true < 1.25 * pred_there))
 
     def compute(self) -> list[dict[str, float]]:
         """The bins that have pixels: low, high, pixels, psnr (dB); where distances are known abs_rel, delta_1_25."""
         found = []
-        for index, pixels in enumerate(self._pixels.tolist()):
-            if not pixels:
-                continue
-            mean = max(float(self._squared[index]) / pixels, LEAST_SQUARED_ERROR)
-            figures = {
-                "low": float(self.edges[index]),
-                "high": float(self.edges[index + 1]),
-                "pixels": pixels,
-                "psnr": -10 * math.log10(mean),
-            }
-            if self._with_distance[index]:
-                figures["abs_rel"] = float(self._relative[index] / self._with_distance[index])
-                figures["delta_1_25"] = float(self._within[index] / self._with_distance[index])
+        for index in self._sums.get("pixels", torch.zeros(0)).nonzero()[:, 0].tolist():
+            sums = {name: float(values[index]) for name, values in self._sums.items()}
+            mean = max(sums["squared"] / sums["pixels"], LEAST_SQUARED_ERROR)
+            figures = {"low": float(self.edges[index]), "high": float(self.edges[index + 1])}
+            figures |= {"pixels": sums["pixels"], "psnr": -10 * math.log10(mean)}
+            if known := sums.get("with distance", 0):
+                figures |= {name: sums[name] / known for name in ("abs_rel", "delta_1_25")}
             found.append(figures)
         return found

@@ -6,8 +6,10 @@ A figure is a difference of two cells that differ in one of the three alone; ove
 from __future__ import annotations
 
 import statistics
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import product
+from operator import sub, truediv
+from typing import Any
 
 from rich.console import Console
 
@@ -40,7 +42,6 @@ from edge_depth_nerf.report.tables import (
     page_of_tables,
     show_tables,
 )
-from edge_depth_nerf.scene.format import read_transforms
 
 SEARCH, COMPARISON = "search", "comparison"
 GRID_PAGE = "grid.md"
@@ -69,35 +70,20 @@ def grid(options: GridOptions, console: Console | None = None) -> Results:
     # what is to be evaluated is looked at before a search of hours
     for scene in options.scenes:
         check_scene(scene, cells, options.preset)
-    searched = search(
-        SearchOptions(
-            scenes=options.tuning,
-            output=folder,
-            methods=tuple(name for name in cells if METHODS[name].loss != "none"),
-            steps=options.search_steps or options.steps,
-            seeds=options.seeds[:1],
-            preset=options.preset,
-            jobs=options.jobs,
-            cluster=options.cluster,
-            lambdas=options.lambdas,
-            sigmas_m=options.sigmas_m,
-        ),
-        console,
+    shared: dict[str, Any] = {name: getattr(options, name) for name in ("preset", "jobs", "cluster")}
+    asked = SearchOptions(
+        scenes=options.tuning,
+        output=folder,
+        methods=tuple(name for name in cells if METHODS[name].loss != "none"),
+        steps=options.search_steps or options.steps,
+        seeds=options.seeds[:1],
+        lambdas=options.lambdas,
+        sigmas_m=options.sigmas_m,
+        **shared,
     )
-    results = compare(
-        CompareOptions(
-            scenes=options.scenes,
-            output=comparison,
-            methods=cells,
-            steps=options.steps,
-            seeds=options.seeds,
-            preset=options.preset,
-            jobs=options.jobs,
-            cluster=options.cluster,
-            tuned=folder / TUNED,
-        ),
-        console,
-    )
+    searched = search(asked, console)
+    shared |= {name: getattr(options, name) for name in ("scenes", "steps", "seeds")}
+    results = compare(CompareOptions(output=comparison, methods=cells, tuned=folder / TUNED, **shared), console)
     tables = grid_tables(results, grids(searched))
     write_text(options.output / GRID_PAGE, page_of_tables("Grid", grid_lines(results, searched), tables))
     show_tables(tables, console)
@@ -110,8 +96,7 @@ class _Cells:
 
     def __init__(self, results: Results) -> None:
         self.results = results
-        there = results.methods()
-        self.names: dict[Method, MethodName] = {cell: name for cell, name in GRID.items() if name in there}
+        self.names = {cell: name for cell, name in GRID.items() if name in results.methods()}
         self.columns = means_over(results.scenes())
         truth = all("truth_abs_rel" in run.figures for run in results.runs)
         self.psnr = psnr_metric(results)
@@ -134,11 +119,10 @@ class _Cells:
         """By how much one is ahead of another, over the seeds that both have."""
         figures = []
         for _, scenes in self.columns:
-            ours, theirs = (self.by_seed(scenes, name, self.psnr) for name in (one, other))
-            found = mean_and_spread([ours[seed] - theirs[seed] for seed in ours if seed in theirs])
-            figures.append(Cell(*found, form="+.2f"))
-            ours, theirs = (self.by_seed(scenes, name, self.abs_rel) for name in (one, other))
-            figures.append(Cell(*mean_and_spread([ours[seed] / theirs[seed] for seed in ours if seed in theirs])))
+            for metric, compare_two, form in ((self.psnr, sub, "+.2f"), (self.abs_rel, truediv, ".2f")):
+                ours, theirs = (self.by_seed(scenes, name, metric) for name in (one, other))
+                found = [compare_two(ours[seed], theirs[seed]) for seed in ours if seed in theirs]
+                figures.append(Cell(*mean_and_spread(found), form=form))
         return Row(title, figures)
 
     def table(self, label: str, title: str, rows: list[Row]) -> MadeTable:
@@ -158,45 +142,41 @@ def _with_mean(rows: list[Row], title: str = "mean") -> list[Row]:
     return [*rows, Row(title, figures)]
 
 
-def _prior_rows(cells: _Cells) -> list[Row]:
-    rows = []
-    for loss, title in LOSS_TITLES.items():
-        for extras, words in EXTRAS_TITLES.items():
-            one, other = cells.name(loss, "integrated", extras), cells.name(loss, "lidar", extras)
-            if one is not None and other is not None and one != other:
-                rows.append(cells.row(f"{title}, {words}", one, other))
-    return _with_mean(rows)
+Named = tuple[str, MethodName | None, MethodName | None]
+"""A row's title, and the two methods that it compares, where they are there."""
+
+
+def _rows(cells: _Cells, pairs: Iterable[Named]) -> list[Row]:
+    """A row for each pair of which both are there, and the mean of all."""
+    return _with_mean([cells.row(title, one, other) for title, one, other in pairs if one and other and one != other])
+
+
+def _prior_pairs(cells: _Cells) -> Iterator[Named]:
+    for loss, extras in product(LOSS_TITLES, EXTRAS_TITLES):
+        title = f"{LOSS_TITLES[loss]}, {EXTRAS_TITLES[extras]}"
+        yield title, cells.name(loss, "integrated", extras), cells.name(loss, "lidar", extras)
+
+
+def _extras_pairs(cells: _Cells) -> Iterator[Named]:
+    for loss, prior in product(LOSS_TITLES, PRIOR_TITLES):
+        title = f"{LOSS_TITLES[loss]}, {PRIOR_TITLES[prior]}"
+        yield title, cells.name(loss, prior, True), cells.name(loss, prior, False)
 
 
 def _loss_rows(cells: _Cells) -> list[Row]:
     over_none, over_best = [], []
-    for prior, of_prior in PRIOR_TITLES.items():
-        for extras, words in EXTRAS_TITLES.items():
-            found: dict[Loss, MethodName] = {
-                loss: name for loss in LOSS_TITLES if (name := cells.name(loss, prior, extras)) is not None
-            }
-            without, edge = found.pop("none", None), found.get("edge")
-            where = f"{of_prior}, {words}"
-            if without is not None:
-                over_none += [
-                    cells.row(f"{where}: {LOSS_TITLES[loss]} over none", name, without) for loss, name in found.items()
-                ]
-            others: dict[Loss, MethodName] = {loss: name for loss, name in found.items() if loss != "edge"}
-            if edge is not None and others:
-                best = max(others, key=lambda loss: cells.mean_psnr(others[loss]))
-                title = f"{where}: edge loss over {LOSS_TITLES[best]}, the best other"
-                over_best.append(cells.row(title, edge, others[best]))
+    for prior, extras in product(PRIOR_TITLES, EXTRAS_TITLES):
+        named = {LOSS_TITLES[loss]: cells.name(loss, prior, extras) for loss in LOSS_TITLES}
+        found = {title: name for title, name in named.items() if name is not None}
+        without, edge = found.pop(LOSS_TITLES["none"], None), named[LOSS_TITLES["edge"]]
+        where = f"{PRIOR_TITLES[prior]}, {EXTRAS_TITLES[extras]}"
+        if without is not None:
+            over_none += [cells.row(f"{where}: {title} over none", name, without) for title, name in found.items()]
+        others = {title: name for title, name in found.items() if name != edge}
+        if edge is not None and others:
+            best = max(others, key=lambda title: cells.mean_psnr(others[title]))
+            over_best.append(cells.row(f"{where}: edge loss over {best}, the best other", edge, others[best]))
     return [*over_none, *_with_mean(over_best, "mean of the edge loss over the best other")]
-
-
-def _extras_rows(cells: _Cells) -> list[Row]:
-    rows = []
-    for loss, title in LOSS_TITLES.items():
-        for prior, of_prior in PRIOR_TITLES.items():
-            one, other = cells.name(loss, prior, True), cells.name(loss, prior, False)
-            if one is not None and other is not None:
-                rows.append(cells.row(f"{title}, {of_prior}", one, other))
-    return _with_mean(rows)
 
 
 def best_rivals(results: Results) -> dict[str, MethodName]:
@@ -212,14 +192,11 @@ def best_rivals(results: Results) -> dict[str, MethodName]:
 
 
 def _whole_rows(cells: _Cells) -> list[Row]:
-    whole = cells.name("edge", "integrated", True)
-    if whole is None:
+    if (whole := cells.name("edge", "integrated", True)) is None:
         return []
-    rows = []
-    for words, best in best_rivals(cells.results).items():
-        named = "" if words == "nerfacto" else f", {_in_words(METHODS[best])}"
-        rows.append(cells.row(f"over {words}{named}", whole, best))
-    return rows
+    rivals = {words: (name, f", {_in_words(METHODS[name])}") for words, name in best_rivals(cells.results).items()}
+    rivals |= {words: (name, "") for words, (name, _) in rivals.items() if words == "nerfacto"}
+    return [cells.row(f"over {words}{named}", whole, name) for words, (name, named) in rivals.items()]
 
 
 def _in_words(cell: Method) -> str:
@@ -257,23 +234,12 @@ def grid_tables(results: Results, searches: Sequence[Grid]) -> list[MadeTable]:
     """Make the tables of a grid: prior, loss, extras, the whole, and all cells; those that there are cells for."""
     cells = _Cells(results)
     made = [
-        cells.table("G1", "What the prior is worth: integrated over LiDAR", _prior_rows(cells)),
+        cells.table("G1", "What the prior is worth: integrated over LiDAR", _rows(cells, _prior_pairs(cells))),
         cells.table("G2", "What the loss is worth", _loss_rows(cells)),
-        cells.table("G3", "What the extras are worth: with them over without", _extras_rows(cells)),
+        cells.table("G3", "What the extras are worth: with them over without", _rows(cells, _extras_pairs(cells))),
         cells.table("G4", "What the whole is worth: edge loss, integrated, with extras", _whole_rows(cells)),
     ]
     return [*(table for table in made if table.rows), _cells_table(cells, searches)]
-
-
-def _sweeps_lines(scenes: Mapping[str, Path]) -> list[str]:
-    """How many sweeps the LiDAR maps are of, where the scenes say that."""
-    found = {name: read_transforms(folder / "transforms.json").get("source") for name, folder in scenes.items()}
-    words = [
-        f"{2 * source['sweeps'] + 1} sweeps in each map of {name}"
-        for name, source in found.items()
-        if isinstance(source, dict) and isinstance(source.get("sweeps"), int)
-    ]
-    return [f"LiDAR: {', '.join(words)}."] if words else []
 
 
 def grid_lines(results: Results, searched: Results) -> list[str]:
@@ -281,7 +247,6 @@ def grid_lines(results: Results, searched: Results) -> list[str]:
     run = searched.runs[0]
     return [
         *introduction(results),
-        *_sweeps_lines({run.scene: Path(run.specification["scene"]) for run in results.runs}),
         f"λ and σ of each cell: the best mean PSNR of random held-out pixels on {' and '.join(searched.scenes())}, "
         f"which no table uses; {seeds_in_words(grids(searched))}, {run.content['steps']} steps each.",
         "Extras: colours at the surface, a sky loss, a sky colour at infinity, a decreasing λ. Monocular maps show "

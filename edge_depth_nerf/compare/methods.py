@@ -44,6 +44,12 @@ EXTRAS_TITLES = {False: "without extras", True: "with extras"}
 
 LAMBDA = "pipeline.model.depth_loss_mult"
 """The weight of the depth loss, in every method."""
+RIVALS: tuple[Loss, ...] = ("urban-nerf", "urban-nerf-los", "ds-nerf")
+SIGMA_FIELDS: dict[Loss, str] = {
+    "edge": "pipeline.datamanager.prior.sigma_constant_m",
+    **{loss: f"pipeline.model.losses.{loss.replace('-', '_')}.sigma_m" for loss in RIVALS},
+}
+"""The options that take a loss's σ, metres."""
 SIGMA_MODE = "pipeline.datamanager.prior.sigma_mode"
 WITHOUT_EXTRAS: dict[str, Any] = {
     "pipeline.model.surface_loss_mult": 0.0,
@@ -53,13 +59,6 @@ WITHOUT_EXTRAS: dict[str, Any] = {
     "pipeline.model.depth_loss_final": 1.0,
 }
 """No colours at the surface, no sky loss, no colour at infinity, a λ that stays: what any depth loss can have, too."""
-
-
-def sigma_field(loss: Loss) -> str | None:
-    """Name the option that takes a loss's σ, metres; None without a loss."""
-    if loss == "edge":
-        return "pipeline.datamanager.prior.sigma_constant_m"
-    return None if loss == "none" else f"pipeline.model.losses.{loss.replace('-', '_')}.sigma_m"
 
 
 @dataclass(frozen=True)
@@ -110,8 +109,8 @@ class Method:
         if self.loss == "none" and self.extras:
             # the prior serves the extras alone
             loss = {"pipeline.model.depth_loss": "edge", LAMBDA: 0.0}
-        elif self.loss not in ("none", "edge"):
-            loss |= {LAMBDA: 0.01, sigma_field(self.loss): 0.5}
+        elif self.loss in RIVALS:
+            loss |= {LAMBDA: 0.01, SIGMA_FIELDS[self.loss]: 0.5}
         source = {None: "none", "gaussian": "integrated"}.get(self.prior, self.prior)
         kernel = {"pipeline.datamanager.prior.integration.kernel": "spatial-gaussian"}
         return {
@@ -132,7 +131,7 @@ class Method:
     @property
     def sigma_field(self) -> str | None:
         """Dotted name of σ, metres; None without a depth loss."""
-        return sigma_field(self.loss)
+        return SIGMA_FIELDS.get(self.loss)
 
     @property
     def rival(self) -> bool:
@@ -204,6 +203,9 @@ class Setting:
             found |= {SIGMA_MODE: "constant"} if method.loss == "edge" else {}
             found[method.sigma_field] = float(self.sigma_m)
         return found
+
+    def __str__(self) -> str:
+        return "its own λ and σ" if self.weight is None else f"λ {self.weight:g} and σ {self.sigma_m}"
 
 
 def default_methods(preset: Preset, with_loss: bool = False) -> tuple[MethodName, ...]:

@@ -9,10 +9,10 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any, Literal
 
 import matplotlib
 import numpy as np
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
@@ -38,71 +38,14 @@ STYLES: dict[MethodName, tuple[str, str, str, str]] = {
     "edge": ("#d62828", "#ff625c", "-", "o"),
 }
 BINS = {"by_angle_deg": "angle from the optical axis, degrees", "by_distance_m": "distance, m"}
-PSNR_LABEL = "PSNR, dB"
 DISTANCE_ERRORS = ("truth_abs_rel", "lidar_abs_rel")
 """Of a curve's points: the better one first."""
 _INK = {False: "#1b2026", True: "#d5dae0"}
 _PAPER = {False: "#ffffff", True: "#161b22"}
 
-Bins = Sequence[Mapping[str, float]]
-"""As `BinnedErrors.compute` gives them."""
 Line = tuple[Sequence[float], Sequence[float]]
 """x and y."""
-
-
-def _axes(titles: Sequence[str], rows: int) -> tuple[Figure, np.ndarray]:
-    # no pyplot: it would look for a display
-    figure = Figure(figsize=(4.8 * len(titles), 3.2 * rows + 0.3), layout="constrained")
-    axes = figure.subplots(rows, len(titles), squeeze=False)
-    for axis, title in zip(axes[0], titles, strict=True):
-        # a drive may be called $x$
-        axis.set_title(title, parse_math=False)
-    for axis in axes.flat:
-        axis.grid(alpha=0.3)
-    return figure, axes
-
-
-def _labelled(axis: Axes) -> list[tuple[str, Artist]]:
-    handles, labels = axis.get_legend_handles_labels()
-    return list(zip(labels, handles, strict=True))
-
-
-def _logarithmic(axis: Axes) -> None:
-    """Let x be logarithmic, with plain numbers at 1, 2, 5, 10 and so on."""
-    axis.set_xscale("log")
-    axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.xaxis.set_minor_formatter(NullFormatter())
-
-
-def _logarithmic_errors(axis: Axes) -> None:
-    """Let y be logarithmic, with plain numbers."""
-    axis.set_yscale("log")
-    axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0, 7.0), numticks=20))
-    axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.yaxis.set_minor_formatter(NullFormatter())
-
-
-def _finished(figure: Figure, axes: np.ndarray) -> bytes:
-    handles = dict(pair for axis in axes.flat for pair in _labelled(axis))
-    add_legend_below(figure, list(handles.values()), list(handles), "outside lower center")
-    content = io.BytesIO()
-    # the same bytes for the same figures
-    figure.savefig(content, format="svg", metadata={"Date": None})
-    return content.getvalue()
-
-
-def _twice(title: str, draw: Callable[[bool], bytes]) -> Plot:
-    drawn = {}
-    for dark in (False, True):
-        ink = dict.fromkeys(
-            ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), _INK[dark]
-        )
-        paper = dict.fromkeys(("figure.facecolor", "axes.facecolor", "savefig.facecolor"), _PAPER[dark])
-        # letters as letters: a third of the bytes that they take as outlines
-        with matplotlib.rc_context({**ink, **paper, "svg.hashsalt": title, "svg.fonttype": "none"}):
-            drawn[dark] = draw(dark)
-    return Plot(title, light=drawn[False], dark=drawn[True])
+Lines = Mapping[str, Mapping[MethodName, Sequence[Line | None]]]
 
 
 def style_of(method: MethodName) -> tuple[str, str, str, str]:
@@ -116,108 +59,116 @@ def style_of(method: MethodName) -> tuple[str, str, str, str]:
     return (*STYLES[of_loss][:2], "-" if made.extras else "--", marker)
 
 
-def _draw(axis: Axes, method: MethodName, line: Line, dark: bool) -> None:
-    on_white, on_dark, pattern, symbol = style_of(method)
-    axis.plot(
-        *line,
-        color=on_dark if dark else on_white,
-        linestyle=pattern,
-        marker=symbol,
-        markersize=4,
-        linewidth=2.2 if method == "edge" else 1.4,
-        label=METHODS[method].title,
-        zorder=3 if method == "edge" else 2,
-    )
+def _logarithmic(axis: Axes, which: Literal["x", "y"]) -> None:
+    """Let an axis be logarithmic, with plain numbers at 1, 2, 5, 10 and so on; errors have some more."""
+    axis.set(**{f"{which}scale": "log"})
+    scale = axis.xaxis if which == "x" else axis.yaxis
+    errors = LogLocator(subs=(1.0, 2.0, 3.0, 5.0, 7.0), numticks=20)
+    scale.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)) if which == "x" else errors)
+    scale.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    scale.set_minor_formatter(NullFormatter())
 
 
-def _runs(results: Results, scene: str) -> dict[MethodName, list[RunResult]]:
-    """The runs of a drive, by method."""
-    found: dict[MethodName, list[RunResult]] = {}
-    for name in results.methods():
-        runs = [run for run in results.runs if run.scene == scene and run.method == name]
-        if runs:
-            found[name] = runs
-    return found
-
-
-def _curves(results: Results, scenes: Sequence[str], title: str, key: str, label: str) -> Plot:
-    """Plot how far held-out and trained-on pixels are right in the course of the training, a column for each drive."""
-    rows = [(curve_metric(results), "PSNR of held-out pixels, dB")]
-    # runs of versions before 0.1 have none
-    if all(f"trained_{rows[0][0]}" in run.curve[-1] for run in results.runs):
-        rows.append((f"trained_{rows[0][0]}", "PSNR of trained-on pixels, dB"))
-    known = (name for name in DISTANCE_ERRORS if all(name in run.curve[-1] for run in results.runs))
-    rows += [(name, "AbsRel of held-out pixels") for name in [*known][:1]]
-
-    def draw(dark: bool) -> bytes:
-        figure, axes = _axes(scenes, len(rows))
-        for column, scene in enumerate(scenes):
-            for method, runs in _runs(results, scene).items():
-                for row, (name, _) in enumerate(rows):
-                    values = ([[point[one] for point in run.curve] for run in runs] for one in (key, name))
-                    x, y = (np.mean(of_runs, axis=0).tolist() for of_runs in values)
-                    _draw(axes[row, column], method, (x, y), dark)
-            axes[-1, column].set_xlabel(label)
-        for axis in axes.flat:
-            _logarithmic(axis)
-        for row, (name, words) in enumerate(rows):
-            axes[row, 0].set_ylabel(words)
-            if name in DISTANCE_ERRORS:
-                for axis in axes[row]:
-                    _logarithmic_errors(axis)
-        return _finished(figure, axes)
-
-    return _twice(title, draw)
-
-
-def plot_bins(
-    title: str,
-    bins: Mapping[str, Mapping[MethodName, Sequence[Bins]]],
-    label: str,
-    rows: Sequence[tuple[str, str]],
-    logarithmic_x: bool,
+def plot_lines(
+    title: str, lines: Lines, label: str, rows: Sequence[tuple[str, str]], logarithmic_x: bool = True
 ) -> Plot:
-    """Plot binned errors, a column for each drive.
+    """Plot the lines of each method, a column for each drive and a row of axes for each figure.
 
     Args:
         title: what the plot shows.
-        bins: by drive and method, those of each run; all runs of a drive have the same.
-        label: what is binned, with its unit.
-        rows: name of a figure and its label, for each row of axes; abs_rel is drawn logarithmically.
+        lines: by drive and method, one for each row; None: there is none.
+        label: what is drawn to the right, with its unit.
+        rows: name of a figure and its label; errors are drawn logarithmically.
         logarithmic_x: whether equal ratios are equally far apart.
 
     """
 
     def draw(dark: bool) -> bytes:
-        figure, axes = _axes(list(bins), len(rows))
-        for column, methods in enumerate(bins.values()):
-            for row, (name, _) in enumerate(rows):
-                for method, of_runs in methods.items():
-                    kept = [[entry for entry in one if name in entry] for one in of_runs]
-                    if kept[0]:
-                        x = [(entry["low"] + entry["high"]) / 2 for entry in kept[0]]
-                        y = np.mean([[entry[name] for entry in one] for one in kept], axis=0)
-                        _draw(axes[row, column], method, (x, y.tolist()), dark)
-                if name == "abs_rel":
-                    _logarithmic_errors(axes[row, column])
-                if logarithmic_x:
-                    _logarithmic(axes[row, column])
+        # no pyplot: it would look for a display
+        figure = Figure(figsize=(4.8 * len(lines), 3.2 * len(rows) + 0.3), layout="constrained")
+        axes, handles = figure.subplots(len(rows), len(lines), squeeze=False), {}
+        for column, (scene, methods) in enumerate(lines.items()):
+            # a drive may be called $x$
+            axes[0, column].set_title(scene, parse_math=False)
             axes[-1, column].set_xlabel(label)
-        for row, (_, words) in enumerate(rows):
-            axes[row, 0].set_ylabel(words)
-        return _finished(figure, axes)
+            for row, (name, words) in enumerate(rows):
+                axis: Axes = axes[row, column]
+                axis.grid(alpha=0.3)
+                axis.set_ylabel("" if column else words)
+                for method, line in ((method, of_rows[row]) for method, of_rows in methods.items()):
+                    if line is None:
+                        continue
+                    on_white, on_dark, pattern, symbol = style_of(method)
+                    (handles[METHODS[method].title],) = axis.plot(
+                        *line,
+                        color=on_dark if dark else on_white,
+                        linestyle=pattern,
+                        marker=symbol,
+                        markersize=4,
+                        linewidth=2.2 if method == "edge" else 1.4,
+                        zorder=3 if method == "edge" else 2,
+                    )
+                if name.endswith("abs_rel"):
+                    _logarithmic(axis, "y")
+                if logarithmic_x:
+                    _logarithmic(axis, "x")
+        add_legend_below(figure, list(handles.values()), list(handles), "outside lower center")
+        content = io.BytesIO()
+        # the same bytes for the same figures
+        figure.savefig(content, format="svg", metadata={"Date": None})
+        return content.getvalue()
 
-    return _twice(title, draw)
+    drawn = {}
+    for dark in (False, True):
+        inks = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")
+        papers = ("figure.facecolor", "axes.facecolor", "savefig.facecolor")
+        colours: dict[Any, Any] = {**dict.fromkeys(inks, _INK[dark]), **dict.fromkeys(papers, _PAPER[dark])}
+        # letters as letters: a third of the bytes that they take as outlines
+        with matplotlib.rc_context({**colours, "svg.hashsalt": title, "svg.fonttype": "none"}):
+            drawn[dark] = draw(dark)
+    return Plot(title, light=drawn[False], dark=drawn[True])
+
+
+def _lines(
+    results: Results,
+    scenes: Sequence[str],
+    rows: Sequence[tuple[str, str]],
+    line: Callable[[Sequence[RunResult], str], Line | None],
+) -> Lines:
+    """The lines of all methods: `line` makes one of a method's runs on a drive and the name of a figure."""
+    found: dict[str, dict[MethodName, list[Line | None]]] = {}
+    for scene in scenes:
+        of_scene = [run for run in results.runs if run.scene == scene]
+        runs_of = {method: [run for run in of_scene if run.method == method] for method in results.methods()}
+        found[scene] = {method: [line(runs, name) for name, _ in rows] for method, runs in runs_of.items() if runs}
+    return found
+
+
+def _curves(results: Results, scenes: Sequence[str], title: str, key: str, label: str) -> Plot:
+    """Plot how far held-out and trained-on pixels are right in the course of the training, a column for each drive."""
+    psnr = curve_metric(results)
+    names = {psnr: "PSNR of held-out pixels, dB", f"trained_{psnr}": "PSNR of trained-on pixels, dB"}
+    names |= dict.fromkeys(DISTANCE_ERRORS, "AbsRel of held-out pixels")
+    known = [name for name in names if all(name in run.curve[-1] for run in results.runs)]
+    rows = [(name, names[name]) for name in known if DISTANCE_ERRORS[0] not in known or name != DISTANCE_ERRORS[1]]
+
+    def line(runs: Sequence[RunResult], name: str) -> Line:
+        x, y = (np.mean([[point[each] for point in run.curve] for run in runs], axis=0) for each in (key, name))
+        return x.tolist(), y.tolist()
+
+    return plot_lines(title, _lines(results, scenes, rows, line), label, rows)
 
 
 def _binned(results: Results, scenes: Sequence[str], title: str, key: str) -> Plot:
-    bins: dict[str, dict[MethodName, list[Bins]]] = {}
-    for scene in scenes:
-        runs_of = _runs(results, scene)
-        bins[scene] = {method: [run.content.get(key, []) for run in runs] for method, runs in runs_of.items()}
-    return plot_bins(
-        title, bins, BINS[key], [("psnr", PSNR_LABEL), ("abs_rel", "AbsRel")], logarithmic_x=key == "by_distance_m"
-    )
+    """Plot errors in bins; all runs of a drive have the same."""
+
+    def line(runs: Sequence[RunResult], name: str) -> Line | None:
+        bins = [[entry for entry in run.content.get(key, []) if name in entry] for run in runs]
+        x = [(entry["low"] + entry["high"]) / 2 for entry in bins[0]]
+        return (x, np.mean([[entry[name] for entry in one] for one in bins], axis=0).tolist()) if x else None
+
+    rows = [("psnr", "PSNR, dB"), ("abs_rel", "AbsRel")]
+    return plot_lines(title, _lines(results, scenes, rows, line), BINS[key], rows, key == "by_distance_m")
 
 
 def draw_plots(output: Path, results: Results) -> list[Plot]:

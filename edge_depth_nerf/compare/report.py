@@ -23,10 +23,7 @@ def make_report(results: Results, tables: Sequence[MadeTable], plots: Sequence[P
     scenes, methods = results.scenes(), [METHODS[name].title for name in results.methods()]
     first = {scene: runs for scene in scenes if (runs := first_runs(results, scene))}
     drives = {
-        scene: (
-            Path(runs[0].specification["scene"]),
-            {METHODS[run.method].title: run.folder / VIEWS for run in runs},
-        )
+        scene: (Path(runs[0].specification["scene"]), {METHODS[run.method].title: run.folder / VIEWS for run in runs})
         for scene, runs in first.items()
     }
     configs = [run.config for runs in first.values() for run in runs if run.config]

@@ -118,8 +118,8 @@ def read_results(runs: Path) -> Results:
     for path in sorted(runs.glob(f"*/*/{FIGURES}")):
         content = read_json_object(path, "run", "named", "configuration", "figures", "curve", "steps")
         _check_run(content, path)
-        content["figures"] = _floats(content["figures"])
-        content["curve"] = [_floats(point) for point in content["curve"]]
+        for figures in (content["figures"], *content["curve"]):
+            figures.update({name: float(value) for name, value in figures.items()})
         found.append(RunResult(path.parent, content["run"], content))
     return Results(sorted(found, key=lambda run: (run.scene, list(METHODS).index(run.method), run.seed)))
 
@@ -144,10 +144,6 @@ def _check_run(content: dict[str, Any], path: Path) -> None:
         )
 
 
-def _floats(figures: dict[str, Any]) -> dict[str, float]:
-    return {name: float(value) for name, value in figures.items()}
-
-
 def _is_figures(found: Any) -> bool:
     return isinstance(found, dict) and all(finite(value) is not None for value in found.values())
 
@@ -167,36 +163,23 @@ def check_fair(results: Results) -> None:
             if other.method == run.method and named:
                 continue
             ours, theirs = run.content["configuration"], other.content["configuration"]
-            different = {name for name in {*ours, *theirs} if ours.get(name) != theirs.get(name)}
-            unnamed = sorted(different - named - {*OF_A_RUN})
-            if unnamed:
-                name = unnamed[0]
-                raise InputError(
-                    f"{run.folder}: its {name} is {ours.get(name)}, that of {other.folder} is {theirs.get(name)}. "
-                    "Compared runs may differ only in the fields that their methods set; one was trained "
-                    "by another version of this program. Remove its folder; the same command then trains "
-                    "it again."
-                )
+            for name in sorted({*ours, *theirs} - named - {*OF_A_RUN}):
+                if ours.get(name) != theirs.get(name):
+                    raise InputError(
+                        f"{run.folder}: its {name} is {ours.get(name)}, that of {other.folder} is {theirs.get(name)}. "
+                        "Compared runs may differ only in the fields that their methods set; one was trained by "
+                        "another version of this program. Remove its folder; the same command then trains it again."
+                    )
 
 
 def write_rows(output: Path, results: Results) -> None:
     """Write results.csv (tidy rows) and results.json (the same with options, versions, curves and bins)."""
-    rows = results.rows()
-    text = io.StringIO()
+    rows, text = results.rows(), io.StringIO()
     table = csv.DictWriter(text, ["scene", "method", "seed", "metric", "value"], lineterminator="\n")
     table.writeheader()
     table.writerows(rows)
     write_text(output / "results.csv", text.getvalue())
-    write_json(
-        output / "results.json",
-        {
-            "options": results.options,
-            "versions": results.versions,
-            "cores": results.cores,
-            "rows": rows,
-            "runs": [
-                {key: value for key, value in run.content.items() if key not in ("figures", "configuration")}
-                for run in results.runs
-            ],
-        },
-    )
+    left_out = ("figures", "configuration")
+    runs = [{key: value for key, value in run.content.items() if key not in left_out} for run in results.runs]
+    shared = {"options": results.options, "versions": results.versions, "cores": results.cores}
+    write_json(output / "results.json", {**shared, "rows": rows, "runs": runs})

@@ -109,32 +109,24 @@ def grids(results: Results) -> list[Grid]:
     return found
 
 
-def _means(
-    figures: Mapping[Pair, Mapping[tuple[str, int], float]],
-) -> tuple[tuple[int, ...], dict[Pair, float]]:
+def _means(figures: Mapping[Pair, Mapping[tuple[str, int], float]]) -> tuple[tuple[int, ...], dict[Pair, float]]:
     """Means over the same drives and seeds, and these seeds, of PSNR by λ and σ, then drive and seed.
 
     What lacks a drive, as in a search that is not finished, is no mean. Of several seeds count those that most λ and σ
     have.
     """
-    runs = {
-        (seed, pair): {drive for drive, of in by_run if of == seed}
-        for pair, by_run in figures.items()
-        for _, seed in by_run
-    }
-    drives = max(runs.values(), key=len)
-    complete: dict[int, set[Pair]] = {}
-    for (seed, pair), there in runs.items():
-        if there >= drives:
-            complete.setdefault(seed, set()).add(pair)
-    first = max(complete, key=lambda seed: (len(complete[seed]), -seed))
-    seeds = tuple(sorted(seed for seed, pairs in complete.items() if pairs >= complete[first]))
-    means = {
-        pair: statistics.fmean(figures[pair][drive, seed] for drive in sorted(drives) for seed in seeds)
-        for pair in figures
-        if pair in complete[first]
-    }
-    return seeds, means
+
+    def drives_of(pair: Pair, seed: int) -> set[str]:
+        return {drive for drive, each in figures[pair] if each == seed}
+
+    seeds = sorted({seed for by_run in figures.values() for _, seed in by_run})
+    drives = max((drives_of(pair, seed) for pair in figures for seed in seeds), key=len)
+    complete = {seed: {pair for pair in figures if drives_of(pair, seed) >= drives} for seed in seeds}
+    most = max(complete.values(), key=len)
+    counted = [seed for seed in seeds if complete[seed] >= most]
+    runs = [(drive, seed) for drive in sorted(drives) for seed in counted]
+    means = {pair: statistics.fmean(by_run[run] for run in runs) for pair, by_run in figures.items() if pair in most}
+    return tuple(counted), means
 
 
 def seeds_in_words(found: Sequence[Grid]) -> str:

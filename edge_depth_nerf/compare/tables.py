@@ -10,6 +10,9 @@ import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from edge_depth_nerf.compare.methods import METHODS, MethodName
 from edge_depth_nerf.compare.results import Results, RunResult
@@ -21,6 +24,8 @@ PAPER_AHEAD_DB: dict[str, dict[MethodName, float]] = {
     "2": {"nerfacto": 0.12, "ds-nerf": 0.04},
 }
 """By how much the published method is ahead of a row, by the paper's Tables 1 and 2, dB of PSNR."""
+MAPS = {"scene": "of a network trained on the drive", "elsewhere": "made elsewhere"}
+"""What made monocular maps, by where that was trained."""
 KITTI360, JBNU = "kitti360", "jbnu-depth360"
 """The kinds of source whose drives make Tables 1 and 2; all others come to Table 1."""
 
@@ -125,14 +130,7 @@ def _quality_table(
 
 def psnr_at(curve: Sequence[dict[str, float]], seconds: float, name: str, clock: str) -> float:
     """PSNR of a curve at a time, between its points in a straight line; before the first it is that of the first."""
-    before = curve[0]
-    for point in curve:
-        if point[clock] >= seconds:
-            gap = point[clock] - before[clock]
-            share = (seconds - before[clock]) / gap if gap > 0 else 1.0
-            return before[name] + max(share, 0.0) * (point[name] - before[name])
-        before = point
-    return before[name]
+    return float(np.interp(seconds, [point[clock] for point in curve], [point[name] for point in curve]))
 
 
 def steps_to(curve: Sequence[dict[str, float]], psnr: float, name: str) -> float | None:
@@ -190,18 +188,17 @@ def _geometry_table(results: Results, where: str, scenes: Sequence[str]) -> Made
         Metric("detail_shifted_1m_masked_psnr", "1 m beside, with detail ↑", ".2f"),
     ]
     metrics = [metric for metric in metrics if any(metric.name in run.figures for run in results.runs)]
-    notes = ["Fitted: PSNR after an affine fit of each view's colours."]
-    if truth:
-        notes.append("Recorded: PSNR against the recorded picture.")
-    notes.append(
-        f"AbsRel, RMSE, δ: rendered median distance against {known}, 1-60 m, over all pixels together, without sky."
-    )
-    if any(metric.name.startswith("detail_") for metric in metrics):
-        notes.append("With detail: PSNR with what training pictures show beyond their own renderings.")
-    if any(metric.name.startswith("shifted_") for metric in metrics):
-        notes.append("Beside: PSNR of views moved sideways.")
-    columns = [_column(metric) for metric in metrics]
-    return _table(results, f"5, {where}", "Pictures and geometry", scenes, columns, " ".join(notes))
+    notes = {
+        "fitted": "Fitted: PSNR after an affine fit of each view's colours.",
+        "recorded": "Recorded: PSNR against the recorded picture.",
+        "AbsRel": f"AbsRel, RMSE, δ: rendered median distance against {known}, 1-60 m, over all pixels together, "
+        "without sky.",
+        "detail": "With detail: PSNR with what training pictures show beyond their own renderings.",
+        "beside": "Beside: PSNR of views moved sideways.",
+    }
+    headings = " ".join(metric.heading for metric in metrics)
+    note = " ".join(text for word, text in notes.items() if word in headings)
+    return _table(results, f"5, {where}", "Pictures and geometry", scenes, list(map(_column, metrics)), note)
 
 
 def _time_table(results: Results, where: str, scenes: Sequence[str]) -> MadeTable:
@@ -229,31 +226,32 @@ def _time_table(results: Results, where: str, scenes: Sequence[str]) -> MadeTabl
     ]
     note = (
         f"{CLOCKS[clock]} of training, without evaluation, saving and making priors. PSNR is of random held-out "
-        "pixels. "
-        "A method that ends before ours keeps its last PSNR."
+        "pixels. A method that ends before ours keeps its last PSNR."
     )
     return _table(results, f"6, {where}", "Time", scenes, columns, note)
+
+
+def listed(found: Any) -> list[str]:
+    """What a file has as one, as several, or not at all."""
+    return [] if found is None else [str(each) for each in (found if isinstance(found, list) else [found])]
 
 
 def _settings_table(results: Results) -> MadeTable:
     def words(method: MethodName, name: str) -> str:
         values = {run.content[name] for run in results.runs if run.method == method}
-        return ", ".join(
-            sorted("–" if each is None else each if isinstance(each, str) else f"{each:g}" for each in values)
-        )
+        texts = ("–" if each is None else each if isinstance(each, str) else f"{each:g}" for each in values)
+        return ", ".join(sorted(texts))
 
-    tuned = results.options.get("tuned", {})
     rows = []
     for method in results.methods():
-        searched = "–" if METHODS[method].loss == "none" else "searched" if method in tuned else "default"
+        found = any(run.method == method and run.specification.get("weight") is not None for run in results.runs)
+        searched = "–" if METHODS[method].loss == "none" else "searched" if found else "default"
         texts = (words(method, "lambda"), words(method, "sigma"), searched)
         rows.append(Row(METHODS[method].title, [Cell(None, words=text) for text in texts]))
     notes = ["σ in metres, or the mode that gives the prior's own σ at each pixel."]
-    searched_on = results.options.get("tuned_on")
-    if searched_on is not None:
-        drives = searched_on if isinstance(searched_on, list) else [searched_on]
-        notes.append(f"Searched on {' and '.join(Path(str(drive)).name for drive in drives)}.")
-        if {run.specification["scene"] for run in results.runs}.intersection(map(str, drives)):
+    if drives := listed(results.options.get("tuned_on")):
+        notes.append(f"Searched on {' and '.join(Path(drive).name for drive in drives)}.")
+        if {run.specification["scene"] for run in results.runs}.intersection(drives):
             notes.append("These tables include a drive of the search: its figures flatter the searched values.")
     return MadeTable("7", "λ and σ", [("", ["λ", "σ", "from"])], rows, notes)
 
@@ -336,21 +334,12 @@ def introduction(results: Results) -> list[str]:
         lines.append("LPIPS is missing: its weights were not on this machine.")
     if any(run.specification["implementation"] == "torch" for run in results.runs):
         lines.append("nerfacto, UrbanNeRF and DS-NeRF ran in nerfstudio's own torch code.")
-    lines += _maps_lines(results)
+    maps = []
+    for trained_on, title in MAPS.items():
+        scenes = sorted({run.scene for run in results.runs if run.content.get("mono_trained_on") == trained_on})
+        maps += [f"{title} ({', '.join(scenes)})"] if scenes else []
+    lines += [f"Monocular maps: {'; '.join(maps)}."] if maps else []
     departures = sorted({text for run in results.runs for text in run.content.get("departures", [])})
     if departures:
         lines.append("Departures from the paper: " + "; ".join(departures) + ".")
     return lines
-
-
-MAPS = {"scene": "of a network trained on the drive", "elsewhere": "made elsewhere"}
-"""What made monocular maps, by where that was trained."""
-
-
-def _maps_lines(results: Results) -> list[str]:
-    """Whose monocular maps the drives have, where the runs say it."""
-    words = []
-    for trained_on, title in MAPS.items():
-        scenes = sorted({run.scene for run in results.runs if run.content.get("mono_trained_on") == trained_on})
-        words += [f"{title} ({', '.join(scenes)})"] if scenes else []
-    return [f"Monocular maps: {'; '.join(words)}."] if words else []

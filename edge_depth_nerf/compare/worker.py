@@ -104,9 +104,7 @@ class MeasuredTrainer(EdgeDepthTrainer):
         if self._start_step:
             measured = read_json_object(self.progress_path, "times", "curve")
             try:
-                self.times = {
-                    step: passed for step, passed in measured["times"].items() if int(step) <= self._start_step
-                }
+                self.times = {step: each for step, each in measured["times"].items() if int(step) <= self._start_step}
                 self.clock.passed = dict(self.times[str(self._start_step)])
                 self.curve = [point for point in measured["curve"] if point["step"] <= self._start_step]
             except (AttributeError, KeyError, TypeError, ValueError) as error:
@@ -114,12 +112,8 @@ class MeasuredTrainer(EdgeDepthTrainer):
                     f"{self.progress_path}: does not match the checkpoint of step {self._start_step} ({error!r}). "
                     "Remove the run's folder; the same command then trains it again."
                 ) from None
-        self.callbacks.append(
-            TrainingCallback(
-                where_to_run=[TrainingCallbackLocation.AFTER_TRAIN_ITERATION],
-                func=lambda step: self._after_step(step + 1),
-            )
-        )
+        after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
+        self.callbacks.append(TrainingCallback(after, lambda step: self._after_step(step + 1)))
 
     def train(self) -> None:
         """Train to the end, by the clock."""
