@@ -97,14 +97,20 @@ def test_input_is_checked_before_anything_starts(tmp_path, monkeypatch):
     refused(InputError, "contains other files", scene, output=tmp_path / "full")
 
 
-def test_a_folder_keeps_what_its_runs_share(tmp_path, monkeypatch):
-    class Stop(Exception):
-        pass
+class Stop(Exception):
+    """Instead of a training."""
 
+
+@pytest.fixture
+def stopped(monkeypatch):
     def stop(*_):
         raise Stop
 
     monkeypatch.setattr(command, "do_runs", stop)
+
+
+@pytest.mark.usefixtures("stopped")
+def test_a_folder_keeps_what_its_runs_share(tmp_path, monkeypatch):
     scene, output = write_scene(tmp_path / "x"), tmp_path / "out"
     first = options(scene, output=output, steps=5, methods=("nerfacto",))
     with pytest.raises(Stop):
@@ -157,16 +163,8 @@ def tuned_values(path: Path, scene: object = "tuning", **tuned: float | str) -> 
 
 
 @pytest.fixture
-def begun(tmp_path, monkeypatch):
-    """Gives what begins the runs of methods with a file of tuned values; nothing is trained."""
-
-    class Stop(Exception):
-        pass
-
-    def stop(*_):
-        raise Stop
-
-    monkeypatch.setattr(command, "do_runs", stop)
+def begun(stopped, tmp_path):
+    """Gives what begins the runs of methods with a file of tuned values."""
     scene = write_scene(tmp_path / "x")
 
     def begin(*methods: str, **changes: Path) -> None:

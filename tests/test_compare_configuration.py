@@ -73,14 +73,13 @@ PAPER = {
 
 def allowed(method: Method) -> set[str]:
     """What a method may have otherwise than `edge`."""
-    fields = {"": set(), "paper": PAPER, "embedding": {EXPOSURE}}[method.variant] | set()
-    fields |= set() if method.extras else EXTRAS
-    fields |= {None: {SOURCE}, "lidar": {SOURCE}, "mono": {SOURCE}, "gaussian": {KERNEL}, "integrated": set()}[
-        method.prior
-    ]
-    if method.loss == "none":
-        return fields | ({LAMBDA} if method.extras else {LOSS})
-    return fields | (set() if method.loss == "edge" else {LOSS, LAMBDA, SIGMA_FIELDS[method.loss]})
+    of_loss = {"none": {LAMBDA} if method.extras else {LOSS}, "edge": set()}
+    return {
+        *{"": (), "paper": PAPER, "embedding": {EXPOSURE}}[method.variant],
+        *(() if method.extras else EXTRAS),
+        *{"integrated": set(), "gaussian": {KERNEL}}.get(method.prior or "", {SOURCE}),
+        *of_loss.get(method.loss, {LOSS, LAMBDA, SIGMA_FIELDS.get(method.loss, "")}),
+    }
 
 
 def unstated(method, preset: Preset = "lite"):
@@ -151,23 +150,20 @@ def test_the_table_shows_each_field_in_which_methods_differ(preset):
     assert {LOSS, SOURCE} < set(shown)
 
 
-@pytest.mark.parametrize(
-    ("name", "made"),
-    [
-        ("nerfacto", Method("none", None, False)),
-        ("nerfacto-integrated-extras", Method("none", "integrated", True)),
-        ("urban-nerf-los", Method("urban-nerf-los", "lidar", False)),
-        ("urban-nerf-los-extras", Method("urban-nerf-los", "lidar", True)),
-        ("ds-nerf-integrated", Method("ds-nerf", "integrated", False)),
-        ("ds-nerf-mono-extras", Method("ds-nerf", "mono", True)),
-        ("edge", Method("edge", "integrated", True)),
-        ("edge-lidar-plain", Method("edge", "lidar", False)),
-        ("edge-paper", Method("edge", "integrated", False, "paper")),
-        ("edge-paper-gaussian", Method("edge", "gaussian", False, "paper")),
-    ],
-)
-def test_names_follow_from_loss_prior_and_extras(name, made):
-    assert METHODS[name] == made and made.name == name
+def test_names_follow_from_loss_prior_and_extras():
+    named = {
+        "nerfacto": Method("none", None, False),
+        "nerfacto-integrated-extras": Method("none", "integrated", True),
+        "urban-nerf-los": Method("urban-nerf-los", "lidar", False),
+        "urban-nerf-los-extras": Method("urban-nerf-los", "lidar", True),
+        "ds-nerf-integrated": Method("ds-nerf", "integrated", False),
+        "ds-nerf-mono-extras": Method("ds-nerf", "mono", True),
+        "edge": Method("edge", "integrated", True),
+        "edge-lidar-plain": Method("edge", "lidar", False),
+        "edge-paper-gaussian": Method("edge", "gaussian", False, "paper"),
+    }
+    assert {name: METHODS[name] for name in named} == named
+    assert [method.name for method in named.values()] == [*named]
     assert len({method.title for method in METHODS.values()}) == len(METHODS)
 
 
