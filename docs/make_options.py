@@ -116,9 +116,9 @@ def dashed(name: str) -> str:
     return name.replace("_", "-")
 
 
-def is_positional(hint: Any) -> bool:
-    """Whether an option is given without its name."""
-    return get_origin(hint) is Annotated and get_args(tyro.conf.Positional[str])[1] in get_args(hint)[1:]
+def is_marked(hint: Any, marker: Any) -> bool:
+    """Whether a field has a marker of tyro's: `Positional` (given without its name) or `Suppress` (no option)."""
+    return get_origin(hint) is Annotated and get_args(marker[str])[1] in get_args(hint)[1:]
 
 
 def cell(text: str) -> str:
@@ -166,10 +166,10 @@ def option_rows(cls: type, declared_by: type) -> list[tuple[str, ...]]:
     docs, hints = field_docs(declared_by), get_type_hints(cls, include_extras=True)
     rows = []
     for entry in dataclasses.fields(cls):
-        if entry.name not in docs or tyro.conf.Suppress in get_args(hints[entry.name]):
+        if entry.name not in docs or is_marked(hints[entry.name], tyro.conf.Suppress):
             continue
         default, name = default_of(entry), f"`--{dashed(entry.name)}`"
-        if is_positional(hints[entry.name]):
+        if is_marked(hints[entry.name], tyro.conf.Positional):
             name = f"`{entry.name.upper()}`"
         elif isinstance(default, bool):
             name = f"`--{dashed(entry.name)}`, `--no-{dashed(entry.name)}`"
@@ -215,8 +215,6 @@ def methods() -> str:
     groups = (
         ("The training", "", EdgeDepthTrainerConfig),
         ("The training data", "pipeline.datamanager", FisheyeDepthDataManagerConfig),
-        ("The depth prior", "pipeline.datamanager.prior", PriorOptions),
-        ("Its integration", "pipeline.datamanager.prior.integration", IntegrationOptions),
         ("The model and its loss", "pipeline.model", EdgeDepthNerfModelConfig),
         *(
             (f"The loss {name}", f"pipeline.model.losses.{name.replace('-', '_')}", kind)
@@ -237,7 +235,8 @@ def methods() -> str:
         for entry in dataclasses.fields(cls):
             # a group of options has a table of its own
             full = f"{place}.{entry.name}".removeprefix(".")
-            if entry.name not in docs or entry.name in ("_target", "losses") or full in places:
+            hidden = is_marked(hints[entry.name], tyro.conf.Suppress)
+            if hidden or entry.name not in docs or entry.name in ("_target", "losses") or full in places:
                 continue
             values = {name: at(config, full) for name, config in configs.items()}
             first = next(iter(values.values()))

@@ -44,7 +44,7 @@ def store(demo: Path, folder: Path = FOLDER) -> None:
     options = results["options"]
     compared = demo / "comparison" / "runs" / options["scene"]
     runs = {"nerfacto": "nerfacto", "ours": "edge"}
-    views_of = {title: compared / f"{method}_seed-{options['seed']}" / "views" for title, method in runs.items()}
+    views_of = {title: compared / f"{method}_seed-0" / "views" for title, method in runs.items()}
     drive = make_drives({options["scene"]: (demo / "scenes" / options["scene"], views_of)}, Console())[0]
     shutil.rmtree(folder, ignore_errors=True)
 

@@ -24,7 +24,6 @@ def integrate_depth(
     normalise="pooled",
     least_returns=0.0,
     keep_returns=False,
-    range_guide="mono",
     motion_m=None,
     motion_weight=0.0,
 ):
@@ -54,7 +53,7 @@ def integrate_depth(
             if keep_returns and has_return(i, j):
                 distance[i, j] = lidar[i, j]
                 continue
-            centre = lidar[i, j] if range_guide == "lidar" and has_return(i, j) else mono[i, j]
+            centre = mono[i, j]
             entries = []  # (is it LiDAR, value, g, spatial part of g)
             for k in range(-radius, radius + 1):
                 for l in range(-radius, radius + 1):

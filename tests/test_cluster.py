@@ -307,7 +307,7 @@ def test_a_command_line_gives_the_options_back(tmp_path: Path) -> None:
         frames=3,
         cameras=("image_03",),
         moving_classes=(),
-        deskew=False,
+        raw_lidar=True,
         ego_mask=Path("masks"),
         theta_max_deg=92.5,
     )

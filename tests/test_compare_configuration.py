@@ -66,7 +66,6 @@ PAPER = {
     PRIOR + "integration.sigma_depth_growth_per_m",
     PRIOR + "integration.normalise",
     PRIOR + "integration.keep_returns",
-    PRIOR + "integration.range_guide",
 }
 """What the paper says of the prior and of Eq. 4, and λ and σ; exposure is none of it."""
 

@@ -17,6 +17,7 @@ from edge_depth_nerf.method.integration import IntegrationOptions
 from edge_depth_nerf.method.prior import PriorOptions
 from edge_depth_nerf.plugin import config
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
+from edge_depth_nerf.plugin.scale import LARGEST_METRES_PER_UNIT
 
 ROOT = Path(__file__).parents[1]
 DECLARED = config.read_method_file()
@@ -53,8 +54,8 @@ def test_configurations_hold_what_the_file_says(name):
 
 @pytest.mark.parametrize("name", DECLARED["methods"])
 def test_the_scale_is_chosen_for_the_grid_of_the_model(name):
-    pipeline = all_methods[name].pipeline
-    assert pipeline.datamanager.dataparser.hash_resolution == pipeline.model.max_res
+    cells = all_methods[name].pipeline.model.max_res
+    assert 4 * LARGEST_METRES_PER_UNIT / cells == 0.25  # metres of the finest cell: so many are 4 units long
 
 
 def test_adams_decay_reaches_the_optimiser():
@@ -83,7 +84,7 @@ def test_the_paper_preset_is_the_literal_form():
         align="none", sigma_mode="constant", sigma_constant_m=0.3, motion=False, integration=IntegrationOptions()
     )
     how = data.prior.integration
-    assert (how.normalise, how.keep_returns, how.range_guide) == ("pooled", False, "mono")
+    assert (how.normalise, how.keep_returns) == ("pooled", False)
     assert (how.alpha, how.kernel_size, how.sigma_space_px, how.sigma_depth_m) == (0.7, 9, 3.0, 1.0)
 
 

@@ -112,7 +112,6 @@ def test_on_a_gpu_a_batch_is_the_same_with_all_further_pixels_and_which_are_of_u
         for one, another in pairs:
             for name in ("origins", "directions", "pixel_area", "camera_indices"):
                 assert torch.equal(getattr(one, name), getattr(another, name)), name
-            assert torch.equal(one.metadata["place"], another.metadata["place"])
         assert set(found) == set(expected)
         for name, value in expected.items():
             assert torch.equal(found[name][counts] if name.startswith("surface_") else found[name], value), name
@@ -262,7 +261,7 @@ def test_the_calibration_of_training_pictures_is_found_or_made(tmp_path):
 def test_the_literal_form_measures_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr("edge_depth_nerf.plugin.datamanager.find_trust", lambda *_: pytest.fail("measured"))
     scene = write_scene(tmp_path)
-    data = manager(scene, prior=PriorOptions("none", "image", integration=IntegrationOptions()))
+    data = manager(scene, prior=PriorOptions("none", "constant", integration=IntegrationOptions()))
     _, batch = data.next_train(0)
     assert (batch["prior_distance_m"] > 0).any()
 
@@ -292,7 +291,7 @@ def test_the_second_training_reads_no_picture(tmp_path, monkeypatch):
         assert torch.equal(first.batch(0, 500).indices, again.batch(0, 500).indices)
         assert len(list((scene / ".cache" / "pixels").glob("*.npy"))) == 2  # training, held out
         with pytest.raises(pytest.fail.Exception):
-            manager(scene, prior_weight=2.0)
+            manager(scene, prior=PriorOptions(align="global"))
         (scene / "images" / "0002.png").touch()
         with pytest.raises(pytest.fail.Exception):
             manager(scene)
@@ -341,15 +340,6 @@ def test_a_resumed_training_goes_on_with_the_next_pixels(tmp_path):
     assert not torch.equal(resumed.next_train(0)[1]["indices"], drawn[5])
     torch.manual_seed(4)
     assert not torch.equal(manager(scene).next_train(0)[1]["indices"], drawn[0])
-
-
-def test_pixels_with_a_prior_can_be_drawn_more_often(tmp_path):
-    scene = write_scene(tmp_path, mono=False)
-    shares = [manager(scene, prior_weight=weight).train_pixel_sampler.table.share_with_prior for weight in (1.0, 4.0)]
-    assert 0 < shares[0] < 0.9
-    assert shares[1] == pytest.approx(4 * shares[0] / (1 + 3 * shares[0]), rel=0.03)
-    with pytest.raises(InputError, match="prior_weight"):
-        manager(scene, prior_weight=0.0)
 
 
 def test_what_motion_sees_has_a_prior_and_is_no_sky(tmp_path):

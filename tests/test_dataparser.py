@@ -40,11 +40,9 @@ def test_positions_are_metres_over_metres_per_unit(tmp_path):
 
 def test_the_default_scale_says_metres():
     line = np.array([[0.0, 0, 0], [60, 3, 0]])
-    assert default_metres_per_unit(line, 2048) == 30  # half of 60 m
-    assert default_metres_per_unit(line / 10, 2048) == 10  # never under 10 m
-    assert default_metres_per_unit(line * 10, 2048) == 128  # 4 · 128 / 2048 = 0.25 m, the coarsest cell allowed
-    assert default_metres_per_unit(line * 10, 512) == 32
-    assert default_metres_per_unit(line * 10, 64) == 10
+    assert default_metres_per_unit(line) == 30  # half of 60 m
+    assert default_metres_per_unit(line / 10) == 10  # never under 10 m
+    assert default_metres_per_unit(line * 10) == 128  # 4 · 128 / 2048 = 0.25 m, the coarsest cell allowed
 
 
 def test_maps_follow_the_pictures(tmp_path):
@@ -266,11 +264,6 @@ def test_a_moment_is_trained_on_or_held_out_with_all_its_cameras(tmp_path):
         parse(scene)
     edit(scene, lambda meta: meta.update({f"{split}_filenames": meta["train_filenames"] for split in ("val", "test")}))
     assert len(parse(scene, "test").image_filenames) == 9  # nothing held out
-
-
-def test_scaling_that_loses_metres_is_refused(tmp_path):
-    with pytest.raises(InputError, match="--metres-per-unit"):
-        parse(write_scene(tmp_path), auto_scale_poses=True)
 
 
 def test_a_truncated_picture_is_named(tmp_path):

@@ -346,7 +346,7 @@ def test_the_preset_paper_is_the_method_of_the_tables(kept):
     assert "edge-paper" in {run.method for run in kept["unseen"]}
     preset = flattened(make_specifications(read_method_file())["edge-depth-nerf-paper"].config)
     assert unlike_compared(preset, kept["unseen"]) == set()
-    former = {**preset, LOSS + "_mult": 1e-5, PRIOR + "sigma_mode": "image"}
+    former = {**preset, LOSS + "_mult": 1e-5, PRIOR + "sigma_mode": "combined"}
     assert unlike_compared(former, kept["unseen"]) == {LOSS + "_mult", PRIOR + "sigma_mode"}
 
 

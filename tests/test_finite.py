@@ -130,7 +130,7 @@ def test_integration_is_finite(dtype: torch.dtype, autocast: Any, normalise: Any
     for valid in (torch.ones_like(one), one, torch.zeros_like(one)):
         with torch.autocast("cpu", autocast or torch.bfloat16, enabled=autocast is not None):
             found = integrate_depth(lidar.to(dtype), mono.to(dtype), valid, options)
-            for mode in ("constant", "image", "spread", "combined"):
+            for mode in ("constant", "combined"):
                 sigma = sigma_m(found, mode, mono_m=mono.to(dtype))
                 assert torch.isfinite(sigma).all() and ((sigma > 0) == (found.distance_m > 0)).all(), mode
         for values in (found.distance_m, found.spread_m, found.mono_share):
@@ -251,7 +251,7 @@ HOSTILE: dict[str, tuple[Callable[[Path], Any], dict[str, Any]]] = {
     "all at 4 mm": (both(fill("mono", 1 / 256), fill("lidar", 1 / 256)), {}),
     "flat maps, no alignment, literal sigma": (
         both(fill("mono", 7.0), fill("lidar", 7.0)),
-        {"data__prior": PriorOptions(align="none", sigma_mode="image"), "losses__edge": EdgeLoss(gaussian="point")},
+        {"data__prior": PriorOptions(align="none", sigma_mode="constant"), "losses__edge": EdgeLoss(gaussian="point")},
     ),
     "masks of one pixel": (one_pixel, {}),
     "one training picture": (one_training_picture, {}),

@@ -11,7 +11,7 @@ from benchmark_modules import benchmark_modules
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from edge_depth_nerf.method.depth_losses import LOSSES, Level, depth_loss
-from edge_depth_nerf.plugin.exposure import KINDS
+from edge_depth_nerf.plugin.exposure import Gains
 
 pytestmark = pytest.mark.slow
 
@@ -127,13 +127,12 @@ def test_the_counter_counts(gpu_counts):
             torch.add(x, torch.ones(5))
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_maps_of_colours_copy_nothing_from_the_host(gpu_counts, kind):
+def test_gains_of_colours_copy_nothing_from_the_host(gpu_counts):
     counter = gpu_counts.Counter()
     with FakeTensorMode(), torch.device("cuda"):
-        maps, colours, picture, place = KINDS[kind](3), torch.rand(7, 3), torch.zeros(7).long(), torch.rand(7, 2)
+        gains, colours, picture = Gains(3), torch.rand(7, 3), torch.zeros(7).long()
         with counter:
-            maps(colours, picture, place).sum()
+            gains(colours, picture).sum()
     assert counter.counts.parts["other"].kernels > 0 and not counter.counts.synchronisations
 
 

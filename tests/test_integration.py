@@ -57,19 +57,15 @@ def assert_same(a: IntegratedDepth, b: IntegratedDepth, atol: float = 1e-5) -> N
 
 
 CHOICES = list(
-    itertools.product(
-        ["edge-aware", "spatial-gaussian"], ["pooled", "per-source"], [False, True], ["mono", "lidar"], [0.7, 0.0, 1.0]
-    )
+    itertools.product(["edge-aware", "spatial-gaussian"], ["pooled", "per-source"], [False, True], [0.7, 0.0, 1.0])
 )
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
-@pytest.mark.parametrize(("kind", "normalise", "keep_returns", "guide", "alpha"), CHOICES)
-def test_equals_twin(kind, normalise, keep_returns, guide, alpha, dtype):
-    options = IntegrationOptions(
-        alpha=alpha, kernel=kind, normalise=normalise, keep_returns=keep_returns, range_guide=guide
-    )
-    lidar, mono, valid = random_maps(CHOICES.index((kind, normalise, keep_returns, guide, alpha)), dtype=dtype)
+@pytest.mark.parametrize(("kind", "normalise", "keep_returns", "alpha"), CHOICES)
+def test_equals_twin(kind, normalise, keep_returns, alpha, dtype):
+    options = IntegrationOptions(alpha=alpha, kernel=kind, normalise=normalise, keep_returns=keep_returns)
+    lidar, mono, valid = random_maps(CHOICES.index((kind, normalise, keep_returns, alpha)), dtype=dtype)
     result = integrate_depth(lidar, mono, valid, options)
     distance, spread, share = reference.integrate_depth(
         lidar.numpy(), mono.numpy(), valid.numpy(), **dataclasses.asdict(options)
@@ -92,7 +88,7 @@ def test_equals_twin(kind, normalise, keep_returns, guide, alpha, dtype):
         {"sigma_depth_m": 0.05},
         {"sigma_depth_m": 30.0, "normalise": "per-source"},
         {"sigma_depth_m": 0.05, "sigma_depth_growth_per_m": 0.01},
-        {"sigma_depth_growth_per_m": 0.05, "normalise": "per-source", "range_guide": "lidar"},
+        {"sigma_depth_growth_per_m": 0.05, "normalise": "per-source"},
         {"least_returns": 4.0, "normalise": "per-source"},
         {"least_returns": 4.0, "normalise": "pooled"},
     ],
@@ -153,19 +149,6 @@ def test_a_lone_return_makes_no_square():
     replaced = IntegrationOptions(normalise="per-source")
     known, unchanged = (integrate_depth(dense, mono, everywhere(mono), one) for one in (options, replaced))
     assert_same(known, unchanged, 0)
-
-
-def test_range_guide_by_hand():
-    # 1 pixel high, kernel 3, σ_s = 3, σ_d = 1. mono 10, 12, 12; a return of 10 at the middle.
-    # Its guide is 10, so g is a = exp(-1/18) for the left (difference 0), and exp(-2) for itself (10 to its d̂ 12)
-    # and a · exp(-2) for the right.  exp(-2) = 0.135335, a = 0.945959
-    #   η = 0.7 · 0.135335 + 0.3 · 0.945959 · (1 + 0.135335) = 0.094735 + 0.322195 = 0.416929
-    #   d̃ = 10 + 2 · 0.3 · 0.945959 · 0.135335 / 0.416929 = 10.184235
-    mono, lidar = torch.tensor([[10.0, 12.0, 12.0]]), torch.tensor([[0.0, 10.0, 0.0]])
-    options = IntegrationOptions(kernel_size=3, range_guide="lidar")
-    assert float(integrate_depth(lidar, mono, everywhere(mono), options).distance_m[0, 1]) == pytest.approx(
-        10.184235, abs=2e-6
-    )
 
 
 @pytest.mark.parametrize("kind", ["edge-aware", "spatial-gaussian"])
@@ -285,18 +268,16 @@ def test_no_pixel_that_agrees_is_no_prior():
     assert result.distance_m.tolist() == [[40.0, 40.0]]
 
 
-@pytest.mark.parametrize("fields", [{"alpha": 0.0}, {"range_guide": "lidar"}], ids=str)
-def test_far_from_every_estimate_the_nearest_counts(fields):
-    # A return of 40 at the middle. α = 0: d̂ there is 40, left 25, right 24; LiDAR's guide: d̂ there 24 too.
+def test_far_from_every_estimate_the_nearest_counts():
+    # A return of 40 at the middle, which does not count. d̂ there is 40, left 25, right 24.
     # 15 σ_d against 16: exp(-112.5) against exp(-128), both below float32's least number.
-    middle = 40.0 if "alpha" in fields else 24.0
-    mono, lidar = torch.tensor([[25.0, middle, 24.0]]), torch.tensor([[0.0, 40.0, 0.0]])
-    result = integrate_depth(lidar, mono, everywhere(mono), IntegrationOptions(**fields))
+    mono, lidar = torch.tensor([[25.0, 40.0, 24.0]]), torch.tensor([[0.0, 40.0, 0.0]])
+    options = IntegrationOptions(alpha=0.0)
+    result = integrate_depth(lidar, mono, everywhere(mono), options)
     assert float(result.distance_m[0, 1]) == pytest.approx(25.0, abs=1e-4)
     # beyond 37 σ_d there is none
     shift = torch.tensor([[0.0, 30.0, 0.0]])
-    mono = mono + shift if "alpha" in fields else mono
-    result = integrate_depth(lidar + shift, mono, everywhere(mono), IntegrationOptions(**fields))
+    result = integrate_depth(lidar + shift, mono + shift, everywhere(mono), options)
     assert result.distance_m[0, 1] == 0
 
 
@@ -374,12 +355,10 @@ def test_distance_factor_is_exact_down_to_the_smallest():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
-@pytest.mark.parametrize(("kind", "normalise", "keep_returns", "guide", "alpha"), CHOICES)
-def test_operations_for_gpus_equal_compiled_loops(kind, normalise, keep_returns, guide, alpha, dtype, monkeypatch):
+@pytest.mark.parametrize(("kind", "normalise", "keep_returns", "alpha"), CHOICES)
+def test_operations_for_gpus_equal_compiled_loops(kind, normalise, keep_returns, alpha, dtype, monkeypatch):
     monkeypatch.setattr(integration, "CUDA_STRIP_PIXELS", 40)  # three rows
-    options = IntegrationOptions(
-        alpha=alpha, kernel=kind, normalise=normalise, keep_returns=keep_returns, range_guide=guide
-    )
+    options = IntegrationOptions(alpha=alpha, kernel=kind, normalise=normalise, keep_returns=keep_returns)
     lidar, mono, valid = random_maps(15, dtype=dtype)
     out = torch.full((3, *mono.shape), torch.nan, dtype=dtype)
     integration._integrate_with_torch(lidar, mono, valid, options, out)
@@ -438,7 +417,6 @@ def test_equals_the_cpu_on_a_gpu(normalise):
         ({"sigma_depth_m": float("inf")}, "sigma_depth_m is inf"),
         ({"kernel": "bilateral"}, "kernel is 'bilateral'; expected one of 'edge-aware', 'spatial-gaussian'"),
         ({"normalise": "none"}, "normalise is 'none'"),
-        ({"range_guide": "radar"}, "range_guide is 'radar'"),
     ],
 )
 def test_bad_options(fields, words, unchecked_types):
@@ -488,20 +466,10 @@ def test_sigma_by_hand():
     torch.testing.assert_close(
         sigma_m(prior, "combined", mono_m=mono), torch.tensor([[0.0, 0.672681, 1.400928]]), rtol=0, atol=1e-6
     )
-    assert sigma_m(prior, "spread").tolist() == [[0.0, pytest.approx(0.3), pytest.approx(0.05)]]
     assert sigma_m(prior, "constant", constant_m=0.5).tolist() == [[0.0, 0.5, 0.5]]
-    # the standard deviation of 10 and 14 is 2
-    torch.testing.assert_close(sigma_m(prior, "image"), torch.tensor([[0.0, 2.0, 2.0]]))
 
 
-def test_sigma_of_an_image_is_its_own():
-    distance = torch.tensor([[[10.0, 14.0]], [[5.0, 5.0]], [[0.0, 0.0]]])
-    prior = IntegratedDepth(distance, torch.zeros_like(distance), torch.ones_like(distance))
-    # 5, 5 has no deviation: the floor; no prior, no σ̂
-    torch.testing.assert_close(sigma_m(prior, "image"), torch.tensor([[[2.0, 2.0]], [[0.05, 0.05]], [[0.0, 0.0]]]))
-
-
-@pytest.mark.parametrize("mode", ["constant", "image", "spread", "combined"])
+@pytest.mark.parametrize("mode", ["constant", "combined"])
 def test_sigma_is_positive_exactly_where_there_is_a_prior(mode):
     lidar, mono, valid = random_maps(12)
     prior = integrate_depth(lidar, mono, valid, IntegrationOptions(keep_returns=True))

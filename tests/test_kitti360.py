@@ -254,7 +254,7 @@ def off_the_walls(drive: RoomDrive, scene: Path) -> np.ndarray:
 
 def test_without_deskewing_points_are_where_the_scanner_was_not(room: RoomDrive, tmp_path: Path) -> None:
     process(room, tmp_path / "moved", frames=3)
-    process(room, tmp_path / "skewed", frames=3, deskew=False)
+    process(room, tmp_path / "skewed", frames=3, raw_lidar=True)
     moved, skewed = (off_the_walls(room, tmp_path / name) for name in ("moved", "skewed"))
     # 0.5 m a turn: up to a quarter of a metre on either side
     assert moved.max() < 0.02 * 30
@@ -532,15 +532,12 @@ def test_frame_masks_and_mono(drive: RoomDrive, tmp_path: Path) -> None:
     assert 0 < len(world) < 3 * 600
 
 
-@pytest.mark.parametrize(("options", "everywhere"), [({}, True), ({"mono_trained_on": "scene"}, False)])
-def test_maps_that_are_brought_count_beyond_lidar_unless_trained_on_it(
-    options: dict[str, Any], everywhere: bool, drive: RoomDrive, tmp_path: Path
-) -> None:
+def test_maps_that_are_brought_count_beyond_lidar(drive: RoomDrive, tmp_path: Path) -> None:
     for name in CAMERAS:
         for frame in drive.frames:
             write_distance_png(tmp_path / f"mono/{name}/{frame:010d}.png", np.full((32, 32), 3.0))
-    process(drive, tmp_path / "scene", mono=tmp_path / "mono", **options)
-    assert calibrate_scene(tmp_path / "scene").everywhere == everywhere
+    process(drive, tmp_path / "scene", mono=tmp_path / "mono")
+    assert calibrate_scene(tmp_path / "scene").everywhere
 
 
 @pytest.mark.parametrize("sky", [True, False])

@@ -689,7 +689,6 @@ def test_bad_scenes_and_options_are_named(tmp_path, small_street, quiet):
         dataclasses.replace(good, train_steps=0),
         dataclasses.replace(good, seconds=0.0),
         dataclasses.replace(good, seconds=float("nan")),
-        dataclasses.replace(good, seed=-1),
         dataclasses.replace(good, output=Path("x.pt")),
     ):
         with pytest.raises(InputError, match="expected"):

@@ -16,8 +16,8 @@ def picture(height, width):
     return np.stack([rows, columns, np.full_like(rows, 9)], axis=-1).astype(np.uint8)
 
 
-def table_of(path: Path, masks, priors=None, seed=0, prior_weight=1.0) -> PixelTable:
-    with PixelTableWriter(path, sum(mask.size for mask in masks), seed, prior_weight) as writer:
+def table_of(path: Path, masks, priors=None, seed=0) -> PixelTable:
+    with PixelTableWriter(path, sum(mask.size for mask in masks), seed) as writer:
         for number, mask in enumerate(masks):
             writer.add(PicturePixels(picture(*mask.shape), mask, *(priors[number] if priors else ())))
         writer.finish()
@@ -97,12 +97,11 @@ def test_the_same_seed_gives_the_same_order(tmp_path):
     assert np.array_equal(first, again) and not np.array_equal(first, other)
 
 
-@pytest.mark.parametrize("weight", [1.0, 2.5, 0.25])
-def test_pixels_with_a_prior_may_count_more(tmp_path, weight):
+def test_the_share_with_a_prior(tmp_path):
     mask = np.ones((100, 100), bool)
     distance = np.where(np.arange(100) < 50, 5.0, 0.0).astype(np.float32) * np.ones((100, 1), np.float32)
-    table = table_of(tmp_path / "t.npy", [mask], [(distance, distance / 10)], prior_weight=weight)
-    assert table.share_with_prior == pytest.approx(weight / (1 + weight), abs=0.01)
+    table = table_of(tmp_path / "t.npy", [mask], [(distance, distance / 10)])
+    assert table.share_with_prior == 0.5
     places = table.batch(0, len(table)).indices[:, 1:].numpy() @ [100, 1]
     assert len(np.unique(places)) == 10_000
 

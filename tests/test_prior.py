@@ -137,12 +137,12 @@ def test_without_alignment_and_calibration_it_is_the_literal_form():
     lidar, mono, mask = maps()
     ramp = np.arange(mask.size, dtype=np.float32).reshape(mask.shape) / 4
     mono, lidar = mono + ramp, np.where(lidar > 0, lidar + ramp, 0).astype(np.float32)
-    options = PriorOptions(align="none", sigma_mode="image", integration=IntegrationOptions())
+    options = PriorOptions("none", "constant", sigma_constant_m=0.3, integration=IntegrationOptions())
     assert not options.wants_trust("integrated")
     literal = make_prior(both(lidar, mono), mask, "integrated", options)
     expected = integrate_depth(torch.from_numpy(lidar), torch.from_numpy(mono), torch.from_numpy(mask))
     np.testing.assert_array_equal(literal.distance_m, expected.distance_m.numpy())
-    np.testing.assert_allclose(literal.sigma_m[mask], np.std(literal.distance_m[mask]), rtol=1e-4)
+    np.testing.assert_array_equal(literal.sigma_m, np.where(literal.distance_m > 0, np.float32(0.3), 0))
 
 
 def test_mono_alone_never_sees_lidar():

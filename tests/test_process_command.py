@@ -11,7 +11,6 @@ import pytest
 from drives import SEQUENCE, RoomDrive, write_room_drive
 from rich.console import Console
 
-from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_json, write_distance_png, write_json
 from edge_depth_nerf.method.error_model import read_trust
 from edge_depth_nerf.mono import estimate
@@ -130,30 +129,6 @@ def test_maps_that_are_given_are_calibrated(room: RoomDrive, tmp_path: Path) -> 
     assert not (tmp_path / "scene" / WEIGHTS).exists() and "Error of the monocular maps" in said
 
 
-def test_weights_of_another_drive_predict_without_training(room: RoomDrive, tmp_path: Path) -> None:
-    run(options_of(room, tmp_path / "first"))
-    said = run(options_of(room, tmp_path / "second", mono_model=tmp_path / "first" / WEIGHTS))
-    assert "Trained" not in said
-    assert read_scene(tmp_path / "second").has("mono")
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"mono_model": Path("nowhere.safetensors")}, "nowhere.safetensors"),
-        ({"mono_seconds": 0.0}, "--mono-seconds 0"),
-        ({"mono_model": Path("x.safetensors"), "mono": Path("mono")}, "exclude each other"),
-        ({"mono_model": Path("x.safetensors"), "estimate_depth": False}, "exclude each other"),
-    ],
-)
-def test_what_cannot_be_is_said_before_anything_is_written(
-    changes: dict[str, Any], message: str, room: RoomDrive, tmp_path: Path
-) -> None:
-    with pytest.raises((InputError, FileNotFoundError), match=message):
-        process(options_of(room, tmp_path / "scene", **changes), Console(quiet=True))
-    assert not (tmp_path / "scene").exists()
-
-
 def test_without_lidar_it_says_what_to_do(room: RoomDrive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = tmp_path / "scene"
     report = process(options_of(room, scene, estimate_depth=False), Console(quiet=True))
@@ -162,7 +137,7 @@ def test_without_lidar_it_says_what_to_do(room: RoomDrive, tmp_path: Path, monke
         del frame["lidar_file_path"], frame["depth_file_path"]
     write_json(scene / "transforms.json", meta)
     monkeypatch.setattr("edge_depth_nerf.process.command.convert", lambda *_: report)
-    assert "--mono-model" in run(options_of(room, scene))
+    assert "estimate-depth SCENE --model" in run(options_of(room, scene))
     assert not read_scene(scene).has("mono")
 
 
@@ -225,14 +200,7 @@ def test_a_map_that_is_lost_is_made_again(room: RoomDrive, tmp_path: Path) -> No
     assert read_scene(scene).has("mono") and (scene / TRUST_FILE).is_file()
 
 
-def test_other_weights_for_a_scene_that_has_maps(room: RoomDrive, tmp_path: Path) -> None:
-    run(options_of(room, tmp_path / "scene"))
-    other = (tmp_path / "scene" / WEIGHTS).rename(tmp_path / "other.safetensors")
-    assert "which are kept" in run(options_of(room, tmp_path / "scene", mono_model=other))
-
-
 def test_options_that_come_too_late_are_told(room: RoomDrive, tmp_path: Path) -> None:
     run(options_of(room, tmp_path / "scene", motion=True))
-    said = run(options_of(room, tmp_path / "scene", motion=False, mono_preset="full"))
+    said = run(options_of(room, tmp_path / "scene", motion=False))
     assert "has distances from motion already, which are kept and used" in said
-    assert "has monocular maps already, of the preset lite, which are kept" in said

@@ -273,7 +273,7 @@ def test_a_broken_cloud_costs_the_view_in_3d_alone(tmp_path, capsys):
         ),
         (
             ("process", "kitti360"),
-            Kitti360Options(root=Path("d"), sequence="s", output=Path("o"), deskew=False, find_ego=False, sweeps=0),
+            Kitti360Options(root=Path("d"), sequence="s", output=Path("o"), raw_lidar=True, find_ego=False, sweeps=0),
         ),
     ],
 )

@@ -25,7 +25,7 @@ from edge_depth_nerf.synthetic.traffic import traffic
 
 pytestmark = pytest.mark.slow
 
-SEQUENCE = SynthesizeOptions(Path()).sequence
+SEQUENCE = SynthesizeOptions.sequence
 FRAMES = 5
 SIZE = 128
 
@@ -254,13 +254,9 @@ def test_a_folder_with_something_else_is_refused_untouched(parking, tmp_path):
         ({"seed": -1}, "--seed -1"),
         ({"moving": -1}, "--moving -1"),
         ({"moving": 9}, "--moving 9"),
-        ({"speed_m_s": 0.0}, "--speed-m-s 0"),
-        ({"speed_m_s": float("nan")}, "--speed-m-s nan"),
         ({"body": "red"}, "--body red.*grey, ground"),
         ({"camera": "phone"}, "--camera phone.*plain, automatic"),
         ({"scene": "moon"}, "--scene moon.*street, parking, turn"),
-        ({"sequence": "../up"}, "--sequence"),
-        ({"sequence": ""}, "--sequence"),
     ],
 )
 def test_bad_options_are_refused_before_anything_is_written(change, message, tmp_path):

@@ -280,7 +280,7 @@ def test_no_prior_beyond_lidars_field_but_from_a_source_trained_elsewhere(tmp_pa
     np.testing.assert_array_equal(prior.sigma_m > 0, expected)
     # other modes keep to what was asked for
     literal = make_prior(
-        both(lidar, mono), mask, "integrated", PriorOptions(align="none", sigma_mode="image"), trust, view
+        both(lidar, mono), mask, "integrated", PriorOptions(align="none", sigma_mode="constant"), trust, view
     )
     assert (literal.distance_m > 0).all()
 

@@ -64,18 +64,15 @@ class Stages:
 def stages_of(options: DemoOptions) -> Stages:
     """Settle what each stage of a demo does."""
     drive, scene = options.output / "drive", options.output / "scenes" / options.scene
-    synthesis = SynthesizeOptions(
-        output=drive, scene=options.scene, frames=options.frames, size=options.size, seed=options.seed
-    )
+    synthesis = SynthesizeOptions(output=drive, scene=options.scene, frames=options.frames, size=options.size)
     return Stages(
         synthesis,
-        Kitti360Options(root=drive, sequence=synthesis.sequence, output=scene, mono_seconds=options.mono_seconds),
+        Kitti360Options(root=drive, sequence=synthesis.sequence, output=scene),
         CompareOptions(
             scenes=(scene,),
             output=options.output / "comparison",
             methods=COMPARED,
             steps=options.steps,
-            seeds=(options.seed,),
             # side by side, each on its share of the cores: two threads do not make one training twice as fast
             jobs=len(COMPARED),
         ),
@@ -136,7 +133,7 @@ def _make(options: DemoOptions, stages: Stages, recorded: dict[str, Any], consol
     runs = {
         METHODS[run.method].title: run
         for run in comparison.runs
-        if run.method in COMPARED and (run.scene, run.seed) == (options.scene, options.seed)
+        if run.method in COMPARED and (run.scene, run.seed) == (options.scene, 0)
     }
     results = {
         "options": recorded,

@@ -22,9 +22,5 @@ class DemoOptions:
     """Frames of the drive, with two pictures each."""
     size: int = 256
     """Width and height of the pictures, px."""
-    mono_seconds: float = 90.0
-    """Seconds of training of the monocular depth network."""
     steps: int = 800
     """Training steps of each model."""
-    seed: int = 0
-    """Seed of the drive and of the training."""

@@ -96,9 +96,8 @@ def write_camera_path(options: CameraPathOptions, console: Console | None = None
             "ffmpeg, or brew install ffmpeg.",
             style="yellow",
         )
-    scene = None if options.scene is None else read_scene(options.scene)
     with console.status("Reading the scene's place in the model's coordinates from nerfstudio …"), quiet_host():
-        scene, to_model = _placed(scene, options)
+        scene, to_model = _placed(options)
 
     pictures = _followed(scene, options.follow)
     drive = Drive(_times_s(pictures), _poses(pictures), up_of(np.stack([p.rotation for p in scene.pictures])))
@@ -106,7 +105,7 @@ def write_camera_path(options: CameraPathOptions, console: Console | None = None
     fps = options.fps or round(drive.frame_rate_hz, 3)
     frames = _frames(drive, options, fps)
     times_s = np.linspace(drive.times_s[0], drive.times_s[-1], frames)
-    forward = options.look == "forward" or (options.look == "auto" and options.camera != "fisheye")
+    forward = options.camera != "fisheye"
     where = f"Along {pictures[0].camera}, {drive.duration_s:.1f} s of the drive"
     if options.kind == "replay":
         poses = replay(drive, times_s, forward)
@@ -119,12 +118,12 @@ def write_camera_path(options: CameraPathOptions, console: Console | None = None
         seen = "the scene has no LiDAR points" if points_m is None else "it keeps clear of the LiDAR points"
         where = f"Around a point {options.ahead_m:g} m ahead of the drive's middle, radius {radius_m:.2f} m ({seen})"
 
-    beside = options.load_config.parent if options.load_config else scene.folder
+    beside = options.load_config.parent
     output = options.output or beside / "camera_paths" / f"{options.kind}_{options.camera}.json"
     write_json(output, path_file(to_model.poses(poses), lens, options, fps))
     say(console, f"{where}: {frames} pictures of {lens.width}×{lens.height}, {frames / fps:.1f} s at {fps:g} a second.")
     say(console, f"Path: {output}\nThe film:")
-    config = str(options.load_config or "CONFIG.yml")
+    config = str(options.load_config)
     command = ("ns-render", "camera-path", "--load-config", config, "--camera-path-filename", str(output))
     say(console, f"  {shlex.join((*command, '--output-path', str(output.with_suffix('.mp4'))))}")
     return output
@@ -134,19 +133,14 @@ def film_lens(lens: KannalaBrandt | Pinhole, options: CameraPathOptions) -> Film
     """Return the film's size and focal length: from the options, or else from the drive's own lens.
 
     Raises:
-        InputError: a computed width or height is out of range.
+        InputError: the computed height is out of range.
 
     """
     aspect = {"fisheye": lens.width / lens.height, "perspective": 16 / 9, "equirectangular": 2.0}[options.camera]
-    width, height = options.width, options.height
-    if width is None:
-        natural = 2.0 * lens.height if options.camera == "equirectangular" else float(lens.width)
-        width = _even(height * aspect if height else natural)
-    height = height or _even(width / aspect)
+    width = options.width or _even(2.0 * lens.height if options.camera == "equirectangular" else float(lens.width))
+    height = _even(width / aspect)
     if max(width, height) > LARGEST_PX:
-        raise InputError(
-            f"the film would be {width}×{height} px, more than {LARGEST_PX}. Give both --width and --height."
-        )
+        raise InputError(f"the film would be {width}×{height} px, more than {LARGEST_PX}. Give a smaller --width.")
     if options.camera == "equirectangular":
         return FilmLens(width, height, height / 2)
     if options.camera == "perspective":
@@ -226,20 +220,13 @@ def _poses(pictures: tuple[ScenePicture, ...]) -> Float64[np.ndarray, "n 4 4"]:
     return poses
 
 
-def _placed(scene: SceneFolder | None, options: CameraPathOptions) -> tuple[SceneFolder, SceneToModel]:
+def _placed(options: CameraPathOptions) -> tuple[SceneFolder, SceneToModel]:
     """Return the scene, and its place in the model's coordinates by the training's own dataparser."""
-    if options.load_config is None:
-        assert scene is not None
-        from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
-
-        dataparser = FisheyeDepthDataParserConfig(metres_per_unit=options.metres_per_unit)
-    else:
-        dataparser = read_dataparser(options.load_config)
-        scene = scene or read_scene(Path(dataparser.data))
+    dataparser = read_dataparser(options.load_config)
+    scene = read_scene(options.scene or Path(dataparser.data))
     dataparser.data = scene.path
     outputs = dataparser.setup().get_dataparser_outputs(split="train")
-    if options.load_config is not None:
-        _check_unchanged(outputs, options.load_config.parent / SAVED_TRANSFORM, scene)
+    _check_unchanged(outputs, options.load_config.parent / SAVED_TRANSFORM, scene)
     # both start from the coordinates before transforms.json, which nerfstudio may have changed
     applied = np.vstack((scene.meta.get("applied_transform", np.eye(4)[:3]), [0, 0, 0, 1])).astype(np.float64)
     transform = outputs.dataparser_transform.numpy().astype(np.float64) @ np.linalg.inv(applied)

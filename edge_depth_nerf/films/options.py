@@ -13,7 +13,6 @@ from edge_depth_nerf.base.errors import InputError
 
 Kind = Literal["replay", "lane-shift", "orbit"]
 FilmCamera = Literal["fisheye", "perspective", "equirectangular"]
-Look = Literal["auto", "camera", "forward"]
 
 SMALLEST_PX, LARGEST_PX = 16, 8192
 LARGEST_FOV_DEG = {"fisheye": 240.0, "perspective": 170.0}
@@ -24,23 +23,20 @@ LARGEST_FOV_DEG = {"fisheye": 240.0, "perspective": 170.0}
 class CameraPathOptions:
     """Write a camera path through a trained scene. `ns-render camera-path` renders it as a film."""
 
-    scene: tyro.conf.Positional[Path | None] = None
-    """The scene folder. With --load-config it is only needed if the folder was moved after the training."""
-    load_config: Path | None = None
+    load_config: Path
     """The training's config.yml. It names the scene and the coordinates that the model was trained in."""
+    scene: tyro.conf.Positional[Path | None] = None
+    """The scene folder. It is only needed if the folder was moved after the training."""
     kind: Kind = "replay"
     """replay: along the recorded path. lane-shift: smoothly to one side of it and back. orbit: a circle around a point
     ahead of the vehicle, looking at it; LiDAR points in the way make the circle smaller."""
     camera: FilmCamera = "fisheye"
-    """fisheye: equidistant, without the distortion of the drive's own lens. perspective: a pinhole. equirectangular:
-    the whole sphere."""
+    """fisheye: equidistant, without the distortion of the drive's own lens; it looks where the drive's camera looked.
+    perspective: a pinhole that looks ahead. equirectangular: the whole sphere."""
     output: Path | None = None
-    """The path file. Not set: camera_paths/KIND_CAMERA.json beside config.yml, or in the scene."""
+    """The path file. Not set: camera_paths/KIND_CAMERA.json beside config.yml."""
     follow: str | None = None
     """The camera of the drive whose path the film follows. Not set: the scene's first camera."""
-    look: Look = "auto"
-    """The viewing direction of replay and lane-shift. camera: that of the drive's camera. forward: the vehicle's
-    direction of travel. auto: camera for fisheye, forward for the others."""
     shift_m: float = 1.0
     """lane-shift: how far to the left, metres; negative to the right."""
     ahead_m: float = 5.0
@@ -48,10 +44,8 @@ class CameraPathOptions:
     radius_m: float = 3.0
     """orbit: the largest radius of the circle, metres."""
     width: int | None = None
-    """The film's width, px. Not set: that of the drive's pictures; for equirectangular twice their height."""
-    height: int | None = None
-    """The film's height, px. Not set: computed from the width. fisheye has the proportions of the drive's pictures,
-    perspective 16:9, equirectangular 2:1."""
+    """The film's width, px. Not set: that of the drive's pictures; for equirectangular twice their height. The height
+    follows: fisheye has the proportions of the drive's pictures, perspective 16:9, equirectangular 2:1."""
     fov_deg: float | None = None
     """Angle of view across the film's width, degrees. Not set: fisheye has that of the drive's lens (180 for a
     pinhole), perspective 90."""
@@ -59,8 +53,6 @@ class CameraPathOptions:
     """Pictures per second. Not set: the drive's own rate, or 10 if the scene has no times."""
     seconds: float | None = None
     """The film's length. Not set: the length of the drive; 6 s for an orbit."""
-    metres_per_unit: float | None = None
-    """Only without --load-config: the --metres-per-unit of the training, if one was set."""
 
     def check(self) -> None:
         """Check the options before any file is read.
@@ -69,23 +61,19 @@ class CameraPathOptions:
             InputError: an option is out of its range, or contradicts another one.
 
         """
-        if self.scene is None and self.load_config is None:
+        width = self.width
+        if width is not None and not (SMALLEST_PX <= width <= LARGEST_PX and width % 2 == 0):
             raise InputError(
-                "neither --load-config nor a scene was given. The path is in the trained model's coordinates, so give "
-                "the training's config.yml with --load-config."
+                f"--width {width}: expected an even number from {SMALLEST_PX} to {LARGEST_PX} px (films are encoded in "
+                "blocks of two pixels)."
             )
-        if self.load_config is not None and self.metres_per_unit is not None:
+        if self.fov_deg is not None and self.camera == "equirectangular":
+            raise InputError("--fov-deg: an equirectangular film always shows the whole sphere. Leave this option out.")
+        if self.fov_deg is not None and not 1 <= self.fov_deg <= LARGEST_FOV_DEG[self.camera]:
             raise InputError(
-                f"--metres-per-unit {self.metres_per_unit} together with --load-config: {self.load_config} already "
-                "contains the scale of the model. Leave out one of the two."
+                f"--fov-deg {self.fov_deg}: expected 1 to {LARGEST_FOV_DEG[self.camera]:g} degrees for "
+                f"--camera {self.camera}."
             )
-        for name, value in (("width", self.width), ("height", self.height)):
-            if value is not None and not (SMALLEST_PX <= value <= LARGEST_PX and value % 2 == 0):
-                raise InputError(
-                    f"--{name} {value}: expected an even number from {SMALLEST_PX} to {LARGEST_PX} px (films are "
-                    "encoded in blocks of two pixels)."
-                )
-        self._check_view()
         for name, value in (("fps", self.fps), ("seconds", self.seconds), ("radius-m", self.radius_m)):
             if value is not None and not (math.isfinite(value) and value > 0):
                 raise InputError(f"--{name} {value}: expected a positive number.")
@@ -93,21 +81,3 @@ class CameraPathOptions:
             raise InputError(f"--shift-m {self.shift_m}: expected a number of metres.")
         if not (math.isfinite(self.ahead_m) and self.ahead_m >= 0):
             raise InputError(f"--ahead-m {self.ahead_m}: expected 0 or more metres.")
-
-    def _check_view(self) -> None:
-        """Check the options that depend on the kind of camera."""
-        if self.camera == "equirectangular":
-            if self.fov_deg is not None:
-                raise InputError(
-                    "--fov-deg: an equirectangular film always shows the whole sphere. Leave this option out."
-                )
-            if self.width and self.height and self.width != 2 * self.height:
-                raise InputError(
-                    f"--width {self.width} --height {self.height}: an equirectangular film is twice as wide as high. "
-                    "Give only one of the two."
-                )
-        elif self.fov_deg is not None and not 1 <= self.fov_deg <= LARGEST_FOV_DEG[self.camera]:
-            raise InputError(
-                f"--fov-deg {self.fov_deg}: expected 1 to {LARGEST_FOV_DEG[self.camera]:g} degrees for "
-                f"--camera {self.camera}."
-            )

@@ -60,7 +60,7 @@ def read_dataparser(path: Path) -> Any:
     if name not in known:
         raise InputError(
             f"{path}: its dataparser is {shown(name)}, expected one of {', '.join(known)}. Train with "
-            "fisheye-depth-data or nerfstudio-data, or give the scene instead of --load-config."
+            "fisheye-depth-data or nerfstudio-data."
         )
     settings = {}
     hints = get_type_hints(known[name])

@@ -22,7 +22,7 @@ class InspectOptions:
     """Folder for the pictures and summary.json. Not set: SCENE_inspection beside the scene."""
     frames: int = 4
     """Number of frames that get a sheet per camera, spread over the drive."""
-    size: int = 640
+    size: tyro.conf.Suppress[int] = 640
     """Longer side of each picture in a sheet, px."""
 
     def check(self) -> None:

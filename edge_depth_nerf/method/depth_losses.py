@@ -15,6 +15,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import ClassVar
 
 import torch
+import tyro
 from jaxtyping import Float
 from torch import Tensor
 
@@ -77,10 +78,10 @@ class DepthLoss:
 class EdgeLoss(DepthLoss):
     """Eq. 4, with the prior's own σ̂."""
 
-    gaussian: Gaussian = "interval"
+    gaussian: tyro.conf.Suppress[Gaussian] = "interval"
     """How Eq. 4 weighs a sample: by the Gaussian's value at its midpoint times its length, or by the Gaussian's mass
     over its interval."""
-    divide_by_norm: bool = True
+    divide_by_norm: tyro.conf.Suppress[bool] = True
     """Divide Eq. 4's Gaussian by σ̂·√(2π), so that a wide one does not pull harder than a narrow one."""
 
     def __call__(self, level: Level) -> Float[Tensor, "rays"]:
@@ -134,13 +135,13 @@ class UrbanNerfSightLoss(DepthLoss):
     varies: ClassVar[bool] = True
     sigma_m: float = 0.5
     """Standard deviation of the kernel at the end of the training, metres."""
-    expected: float = 0.01
+    expected: tyro.conf.Suppress[float] = 0.01
     """Weight of the squared error of the expected distance, per m²."""
-    empty: float = 1.0
+    empty: tyro.conf.Suppress[float] = 1.0
     """Weight of the light that ends before the surface, metres."""
-    near: float = 1.0
+    near: tyro.conf.Suppress[float] = 1.0
     """Weight of how light ends at the surface, metres."""
-    narrowing: float = 10.0
+    narrowing: tyro.conf.Suppress[float] = 10.0
     """Ratio of σ at the start of training to σ at its end; it decreases exponentially."""
 
     def __call__(self, level: Level) -> Float[Tensor, "rays"]:

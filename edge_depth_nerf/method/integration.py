@@ -45,8 +45,7 @@ MOTION_RELATIVE_ERROR, MONO_RELATIVE_ERROR = 0.03, 0.1
 """Standard deviations of estimates as parts of the distance, where nothing was measured."""
 Kernel = Literal["edge-aware", "spatial-gaussian"]
 Normalise = Literal["pooled", "per-source"]
-RangeGuide = Literal["mono", "lidar"]
-SigmaMode = Literal["constant", "image", "spread", "combined"]
+SigmaMode = Literal["constant", "combined"]
 
 CPU_STRIP_PIXELS = 1 << 16
 """On the CPU a map is integrated in strips of about so many pixels: the work that a thread takes at a time."""
@@ -105,9 +104,6 @@ class IntegrationOptions:
     weight is reduced in proportion. 0: a single point has LiDAR's whole weight in its window, and makes a square."""
     keep_returns: bool = False
     """Keep a LiDAR point's distance (d̃ = d, spread 0, monocular share 0) instead of averaging it with its window."""
-    range_guide: RangeGuide = "mono"
-    """What the window's d̂ is compared with: d̂ at the centre (Eq. 7), or a LiDAR point at the centre if there is one
-    (the paper's prose)."""
 
     def __post_init__(self) -> None:
         _check_number("alpha", self.alpha, 0.0, 1.0)
@@ -119,7 +115,6 @@ class IntegrationOptions:
         _check_number("least_returns", self.least_returns, 0.0)
         _check_choice("kernel", self.kernel, Kernel)
         _check_choice("normalise", self.normalise, Normalise)
-        _check_choice("range_guide", self.range_guide, RangeGuide)
 
 
 @dataclass(frozen=True)
@@ -258,7 +253,6 @@ def _integrate_on_cpu(lidar: Tensor, mono: Tensor, valid: Tensor, options: Integ
         options.normalise == "per-source",
         float(options.least_returns),
         options.keep_returns,
-        options.range_guide == "lidar",
     )
     strip = max(1, CPU_STRIP_PIXELS // max(TILE, width))
     tops = range(0, height, strip)
@@ -289,11 +283,10 @@ def _integrate_strip(lidar: Tensor, mono: Tensor, valid: Tensor, options: Integr
     returns = usable & _is_distance(lidar)
     mono = torch.where(usable, mono, 0).double()
     value = torch.where(returns, lidar.double(), mono)
-    guide = value if options.range_guide == "lidar" else mono
-    inverse_variance = torch.full_like(guide, _inverse_variance(options))
+    inverse_variance = torch.full_like(mono, _inverse_variance(options))
     if options.sigma_depth_growth_per_m > 0:
-        # where the guide is 0 there is no prior
-        widest = (options.sigma_depth_growth_per_m * guide.square()).clamp(min=1e-100)
+        # where the estimate is 0 there is no prior
+        widest = (options.sigma_depth_growth_per_m * mono.square()).clamp(min=1e-100)
         inverse_variance = torch.minimum(inverse_variance, widest.pow(-2))
     height, width = mono.shape
     weights = _axis_weights(options)
@@ -319,11 +312,11 @@ def _integrate_strip(lidar: Tensor, mono: Tensor, valid: Tensor, options: Integr
 
     eta, first, second, eta_mono = torch.zeros(4, height, width, dtype=torch.float64, device=mono.device)
     for spatial, (mono_there, value_there, is_mono, is_lidar) in shifted:
-        exponent = (mono_there - guide).square_().mul_(inverse_variance).mul_(-0.5)
+        exponent = (mono_there - mono).square_().mul_(inverse_variance).mul_(-0.5)
         g = torch.where(exponent > LOWEST_EXPONENT, exponent.exp().mul_(spatial), 0)
         from_mono = (g * is_mono).mul_(factors[0])
         weight = g.mul_(is_lidar).mul_(factors[1]).add_(from_mono)
-        x = value_there - guide
+        x = value_there - mono
         eta.add_(weight)
         eta_mono.add_(from_mono)
         first.add_(weight.mul_(x))
@@ -333,7 +326,7 @@ def _integrate_strip(lidar: Tensor, mono: Tensor, valid: Tensor, options: Integr
     eta = torch.where(exists, eta, 1)
     mean = first / eta
     spread = (second / eta - mean.square()).clamp_(min=0).sqrt_()
-    result = torch.stack([guide + mean, spread, eta_mono / eta]) * exists
+    result = torch.stack([mono + mean, spread, eta_mono / eta]) * exists
     if options.keep_returns:
         result[0] = torch.where(returns, lidar.double(), result[0])
         result[1:] *= ~returns
@@ -390,13 +383,7 @@ def sigma_m(
     """Give σ̂, the standard deviation that Eq. 4 grants the prior, for every pixel.
 
     constant   `constant_m`.
-    image      one number a map: the standard deviation of d̃ over the map's pixels that have a prior, the literal
-               reading of Eq. 4.
-    spread     the spread of what was averaged. Over smooth monocular maps it claims centimetres where the error
-               is metres: for ablation.
     combined   σ̂² = spread² + (mono_relative_error · d̂ · monocular share)² + floor_m².
-
-    `image` and `spread` are at least `floor_m`, so that no pixel claims to be exact.
 
     Args:
         prior: what `integrate_depth` or `select_prior` gave.
@@ -422,13 +409,6 @@ def sigma_m(
     exists = distance > 0
     if mode == "constant":
         sigma = torch.full_like(distance, constant_m)
-    elif mode == "image":
-        count = exists.sum((-2, -1), keepdim=True).clamp(min=1)
-        mean = distance.double().sum((-2, -1), keepdim=True) / count
-        variance = torch.where(exists, distance - mean, 0).square().sum((-2, -1), keepdim=True) / count
-        sigma = variance.sqrt().clamp(min=floor_m).to(distance.dtype).expand_as(distance)
-    elif mode == "spread":
-        sigma = prior.spread_m.clamp(min=floor_m)
     else:
         if mono_m is None:
             if prior.mono_share.any():

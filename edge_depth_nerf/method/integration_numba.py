@@ -122,7 +122,6 @@ def integrate_rows(
     per_source,
     least_returns,
     keep_returns,
-    lidar_guides,
     rows_from,
     rows_to,
 ):
@@ -143,7 +142,6 @@ def integrate_rows(
         per_source: divide each source's weights by the sum of its spatial weights.
         least_returns: but LiDAR's by no less than this.
         keep_returns: a LiDAR point is its own prior.
-        lidar_guides: compare with LiDAR where the centre has a LiDAR point.
         rows_from: first row.
         rows_to: row after the last.
     """
@@ -169,7 +167,7 @@ def integrate_rows(
             if count == 0:
                 continue
             for j in range(count):
-                guide = tile[1 if lidar_guides else 0, i + radius, first + j + radius]
+                guide = tile[0, i + radius, first + j + radius]
                 widest = growth_per_m * guide * guide
                 centres[GUIDE * TILE + j] = guide
                 centres[INVERSE_VARIANCE * TILE + j] = (

@@ -70,7 +70,7 @@ def default_source(sources: Container[str]) -> str | None:
     return next((source for source in ("mono", "motion") if source in sources), None)
 
 
-PriorSigma = Literal["calibrated", "constant", "image", "spread", "combined"]
+PriorSigma = Literal["calibrated", "constant", "combined"]
 
 
 @dataclass(frozen=True)

@@ -266,9 +266,7 @@ def _train(
 
     """
     preset = PRESETS[options.preset]
-    training = replace(
-        preset.training, steps=options.train_steps or preset.training.steps, seconds=options.seconds, seed=options.seed
-    )
+    training = replace(preset.training, steps=options.train_steps or preset.training.steps, seconds=options.seconds)
     weights = options.output or scenes[0].folder / WEIGHTS
     checkpoint = weights.with_suffix(".checkpoint")
     found, about = _weights_of_before(weights, options, scenes[0].folder / WEIGHTS, console)

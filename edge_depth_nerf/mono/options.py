@@ -39,9 +39,6 @@ class EstimateDepthOptions:
     """lite: minutes on a laptop's CPU; full: a larger network on larger pictures, for a GPU."""
     output: Path | None = None
     """Where the trained weights go. Not set: mono_network.safetensors in the first scene."""
-    seed: int = 0
-    """Seed of the initial weights and of the order of pictures. With one or two threads, the same seed gives the same
-    weights, unless --seconds ends the training."""
     hf: str | None = None
     """A ready-made network instead: the folder of a depth network of the transformers library, or its name in Hugging
     Face's cache, such as depth-anything/Depth-Anything-V2-Small-hf. Nothing is downloaded. Needs `pip install
@@ -83,8 +80,6 @@ class EstimateDepthOptions:
             raise InputError(f"--train-steps {self.train_steps}: expected 1 or more.")
         if self.seconds is not None and not self.seconds > 0:
             raise InputError(f"--seconds {self.seconds:g}: expected more than 0.")
-        if not 0 <= self.seed < 1 << 63:
-            raise InputError(f"--seed {self.seed}: expected 0 or more, below 2^63.")
         if self.output is not None and self.output.suffix != ".safetensors":
             raise InputError(f"--output {self.output}: expected a file that ends in .safetensors.")
         check_address(self.cluster)
@@ -96,7 +91,6 @@ class EstimateDepthOptions:
         """Check that one source of maps is chosen, and that all options belong to it."""
         own = {"--model": self.model, "--train-steps": self.train_steps, "--seconds": self.seconds}
         own |= {"--output": self.output, "--preset": None if self.preset == "lite" else self.preset}
-        own |= {"--seed": self.seed or None}
         of_hf = {"--hf-output": None if self.hf_output == "auto" else self.hf_output}
         of_files = {"--maps-kind": self.maps_kind, "--maps-along": self.maps_along}
         of_files |= {"--metres-per-count": self.metres_per_count, "--maps-trained-on": self.maps_trained_on}

@@ -26,6 +26,7 @@ from typing import Any
 
 import torch
 import torch.distributed as dist
+import tyro
 from jaxtyping import UInt8
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
@@ -65,7 +66,7 @@ from edge_depth_nerf.plugin.pixel_table import (
     PixelTableWriter,
     decode,
 )
-from edge_depth_nerf.plugin.ray_table import PLACE, TableRayGenerator
+from edge_depth_nerf.plugin.ray_table import TableRayGenerator
 from edge_depth_nerf.plugin.upload import Stretch, Uploads
 from edge_depth_nerf.scene.format import LAYERS, depth_sources
 
@@ -90,19 +91,13 @@ class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig):
     """The prior's source. integrated: LiDAR and monocular maps (Eq. 5), and maps from motion if the scene has them.
     lidar, mono (Table 3), motion or another source of the scene: this source alone. auto: what the scene has. none:
     no prior."""
-    prior: PriorOptions = field(default_factory=PriorOptions)
+    prior: tyro.conf.Suppress[PriorOptions] = field(default_factory=PriorOptions)
     """How the prior is computed from these maps."""
-    prior_weight: float = 1.0
-    """How often a pixel with a prior is drawn, relative to one without."""
     surface_rays_per_batch: int = 16384
     """Number of additional pixels in each training batch; those with a vague prior are dropped. Their colour is
     compared with the field's at the prior's distance, with one sample per ray. 0: none."""
     cache_dir: Path | None = None
     """Folder for integrated priors and tables of training pixels. Not set: .cache/ in the scene folder."""
-
-    def __post_init__(self) -> None:
-        if not 0.01 <= self.prior_weight <= 100:
-            raise InputError(f"prior_weight is {self.prior_weight:g}; expected 0.01 to 100.")
 
     def source_of_prior(self, sources: Collection[str]) -> str | None:
         """Return the depth source; `auto` becomes what the scene has. None: no prior.
@@ -187,8 +182,6 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
     eval_pixel_sampler: TablePixelSampler | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
     trained_on: Tensor
     """Picture, row and column of each ray of the last training batch."""
-    serves_places: bool = True
-    """Whether rays' metadata say where in its picture each pixel lies."""
 
     def __init__(self, config: FisheyeDepthDataManagerConfig, *args: Any, **kwargs: Any):
         self._temporary: list[tempfile.TemporaryDirectory[str]] = []
@@ -275,13 +268,9 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         """Return the table of rays if the cameras allow one, else nerfstudio's generator."""
         cameras = dataset.cameras.to(self.device)
         if TableRayGenerator.suits(cameras):
-            generator = TableRayGenerator(cameras, self._cache_dir() / "rays")
-        else:
-            # its grid of pixels must be on the device of the indices
-            generator = RayGenerator(cameras).to(self.device)
-        sizes = torch.cat([cameras.width, cameras.height], dim=-1)
-        generator.register_buffer("sizes", sizes, persistent=False)
-        return generator
+            return TableRayGenerator(cameras, self._cache_dir() / "rays")
+        # its grid of pixels must be on the device of the indices
+        return RayGenerator(cameras).to(self.device)
 
     def _cache_dir(self) -> Path:
         data = Path(self.config.dataparser.data)
@@ -289,11 +278,7 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
 
     def _serve(self, batch: PixelBatch, generator: RayGenerator) -> tuple[RayBundle, dict[str, Any]]:
         indices = batch.indices.to(self.device)
-        rays = generator(indices)
-        sizes: Any = generator.sizes
-        if self.serves_places:
-            rays.metadata[PLACE] = (indices[:, 1:].flip(-1) + 0.5) / sizes[indices[:, 0]]
-        return rays, {
+        return generator(indices), {
             "image": batch.rgb.to(self.device),
             "indices": batch.indices,
             "prior_distance_m": batch.prior_distance_m.to(self.device),
@@ -325,8 +310,7 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         """Return the table of a split's pixels: the one on disk if it matches, else a new one."""
         cache_dir = self._cache_dir()
         recipe = self._recipe(dataset) if with_prior else None
-        weight = self.config.prior_weight if recipe else 1.0
-        path = cache_dir / "pixels" / f"{_table_key(dataset, recipe, weight)}.npy"
+        path = cache_dir / "pixels" / f"{_table_key(dataset, recipe)}.npy"
         try:
             table = PixelTable(path)
             used(path)
@@ -342,7 +326,7 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
             cache = PriorCache(cache_dir / "prior", recipe.depth_source, recipe.options, recipe.trust)
         most = int((dataset.cameras.width * dataset.cameras.height).sum())
         try:
-            with PixelTableWriter(path, most, prior_weight=weight) as writer:
+            with PixelTableWriter(path, most) as writer:
                 loaded = _load(dataset, recipe, cache, whole_windows=not with_prior)
                 for pixels in track(loaded, f"{description}…", len(dataset), console=CONSOLE, transient=True):
                     writer.add(pixels)
@@ -438,7 +422,7 @@ def _load(
             yield pixels
 
 
-def _table_key(dataset: FisheyeDepthDataset, recipe: PriorRecipe | None, weight: float) -> str:
+def _table_key(dataset: FisheyeDepthDataset, recipe: PriorRecipe | None) -> str:
     """Return a hash of all that a table depends on: files by name, size and date, cameras, the prior's settings."""
     layers = ["image", "mask", *(recipe.layers if recipe else ())]
     files = [picture.files[layer] for layer in layers for picture in dataset.pictures if layer in picture.files]
@@ -447,7 +431,6 @@ def _table_key(dataset: FisheyeDepthDataset, recipe: PriorRecipe | None, weight:
     described = {
         "versions": [TABLE_VERSION, CACHE_VERSION],
         "files": stats,
-        "weight": weight,
         "scene": [scene.theta_max_rad, scene.lidar_metres_per_count, scene.lidar_is_z_depth],
         "lenses": [repr((picture.lens, picture.up_in_camera.tolist())) for picture in dataset.pictures],
         "prior": None if recipe is None else [recipe.depth_source, dataclasses.asdict(recipe.options)],

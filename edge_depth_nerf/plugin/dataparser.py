@@ -7,11 +7,12 @@ in scene units times `metres_per_unit` is metres.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import tyro
 from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
@@ -19,8 +20,8 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, Nerfst
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.plugin.compat import without_undefined_ray
 from edge_depth_nerf.plugin.scale import default_metres_per_unit
-from edge_depth_nerf.scene.format import INTRINSICS, LAYERS, DepthKind, path_keys, pose_of, read_transforms
-from edge_depth_nerf.scene.reader import ScenePicture, scene_of
+from edge_depth_nerf.scene.format import INTRINSICS, DepthKind, path_keys, pose_of, read_transforms
+from edge_depth_nerf.scene.reader import scene_of
 
 SUPPORTED_CAMERA_TYPES = (CameraType.PERSPECTIVE, CameraType.FISHEYE)
 
@@ -34,20 +35,18 @@ class FisheyeDepthDataParserConfig(NerfstudioDataParserConfig):
     metres_per_unit: float | None = None
     """Metres per scene unit. Not set: half of the drive's extent, at least 10 m, and small enough to keep the finest
     hash cell at 0.25 m."""
-    hash_resolution: int = 2048
-    """Cells of the finest hash-grid level along one axis, for the choice above (the model's max_res)."""
-    depth_unit_scale_factor: float | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    depth_unit_scale_factor: tyro.conf.Suppress[float | None] = None  # pyright: ignore[reportIncompatibleVariableOverride]
     """Metres per count of the files under depth_file_path. Not set: what transforms.json says, else nerfstudio's
     0.001."""
     depth_kind: DepthKind = "auto"
     """What the files under depth_file_path contain. auto: distance along the ray in scenes of this project and in
     fisheye scenes, z_depth (nerfstudio's convention) in other people's pinhole scenes."""
-    downscale_factor: int | None = 1
-    """How much to downscale images; other than 1 needs nerfstudio's images_K folders (not in our scenes)."""
-    orientation_method: Literal["pca", "up", "vertical", "none"] = "none"
+    downscale_factor: tyro.conf.Suppress[int | None] = 1
+    """How much smaller pictures nerfstudio reads from folders images_K; maps have one size, so it is 1."""
+    orientation_method: tyro.conf.Suppress[Literal["pca", "up", "vertical", "none"]] = "none"
     """The method to use for orientation; the drive's own axes by default."""
-    auto_scale_poses: bool = False
-    """nerfstudio's scaling of all poses into +-1. Must be off: metres_per_unit sets the scale."""
+    auto_scale_poses: tyro.conf.Suppress[bool] = False
+    """nerfstudio's scaling of all poses into +-1. It is off: metres_per_unit sets the scale."""
     eval_mode: Literal["fraction", "filename", "interval", "all"] = "interval"
     """How a scene without split files is divided. Interval holds out every eval_interval-th picture."""
 
@@ -169,8 +168,6 @@ class FisheyeDepth(Nerfstudio):
         names = {self._get_fname(Path(frame["file_path"]), path.parent): frame["file_path"] for frame in frames}
         by_name = {picture.name: picture for picture in scene.pictures}
         pictures = [by_name[names[image]] for image in outputs.image_filenames]
-        if self.downscale_factor not in (None, 1):
-            pictures = _downscaled(pictures, outputs, self.downscale_factor)
         outputs.metadata.update(
             scene=scene,
             pictures=pictures,
@@ -188,18 +185,10 @@ class FisheyeDepth(Nerfstudio):
         named = [f"{name}_filenames" for name in ("train", "val", "test") if f"{name}_filenames" in meta]
         if named and f"{split}_filenames" not in named:
             raise InputError(f"{path}: has {' and '.join(named)}, but no {split}_filenames. Give all three, or none.")
-        has_maps = any(
-            layer.key in meta["frames"][0] for name, layer in LAYERS.items() if name not in ("image", "mask")
-        )
-        if has_maps and self.config.downscale_factor not in (None, 1):
+        if self.config.downscale_factor != 1:
             raise InputError(
-                f"{path}: downscale_factor is {self.config.downscale_factor}, but the distance maps of this scene "
-                "have one size only. Run `edge-depth-nerf process … --downscale K` instead."
-            )
-        if self.config.auto_scale_poses:
-            raise InputError(
-                "auto_scale_poses would lose the metric scale that near plane, prior and loss need. "
-                "Set the scale with fisheye-depth-data --metres-per-unit M instead."
+                f"{path}: downscale_factor is {self.config.downscale_factor}, but pictures and maps are used in the "
+                "size that the scene has. Run `edge-depth-nerf process … --downscale K` instead."
             )
 
     def _metres_per_unit(self, frames: list[dict[str, Any]]) -> float:
@@ -207,23 +196,7 @@ class FisheyeDepth(Nerfstudio):
         metres_per_unit = self.config.metres_per_unit
         if metres_per_unit is None:
             positions_m = np.array([frame["transform_matrix"] for frame in frames], dtype=np.float64)[:, :3, 3]
-            metres_per_unit = default_metres_per_unit(positions_m, self.config.hash_resolution)
+            metres_per_unit = default_metres_per_unit(positions_m)
         if not (np.isfinite(metres_per_unit) and metres_per_unit > 0):
             raise InputError(f"metres_per_unit is {metres_per_unit}; expected a positive number of metres.")
         return metres_per_unit
-
-
-def _downscaled(pictures: list[ScenePicture], outputs: DataparserOutputs, factor: int) -> list[ScenePicture]:
-    """The pictures of nerfstudio's images_K folders (masks_K, depths_K), with lenses of their size."""
-    folders = {
-        "image": outputs.image_filenames,
-        "mask": outputs.mask_filenames,
-        "lidar": outputs.metadata["depth_filenames"],
-    }
-    found = []
-    for number, picture in enumerate(pictures):
-        size = {"width": int(outputs.cameras.width[number]), "height": int(outputs.cameras.height[number])}
-        pixels = {name: getattr(picture.lens, name) / factor for name in ("fx", "fy", "cx", "cy")}
-        files = {layer: paths[number] for layer, paths in folders.items() if paths}
-        found.append(replace(picture, lens=replace(picture.lens, **size, **pixels), files=files))
-    return found

@@ -11,7 +11,7 @@ from contextlib import nullcontext
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Annotated, Any, Literal, TypeGuard
+from typing import Any, Literal, TypeGuard
 
 import torch
 import tyro
@@ -86,18 +86,18 @@ class EdgeDepthNerfModelConfig(NerfactoModelConfig):
     depth_loss_mult: float = 0.01
     """Weight λ of the loss on the distance prior (not published; how it was chosen: docs/ablation.md). 0: the prior is
     used for surface and sky only."""
-    depth_loss_levels: Annotated[Literal["all", "final"], tyro.conf.Suppress] = "all"
+    depth_loss_levels: tyro.conf.Suppress[Literal["all", "final"]] = "all"
     """Whether the loss applies to the samples of the proposal networks too, or only to the final ones."""
-    depth_loss_final: float = 0.01
+    depth_loss_final: tyro.conf.Suppress[float] = 0.01
     """The share of λ that is left at the end of the training; until then λ decreases exponentially. Early, the prior
     shapes the scene; late, its errors at outlines would hold the pictures back. 1: λ is constant."""
-    sky_loss_mult: float = 0.01
+    sky_loss_mult: tyro.conf.Suppress[float] = 0.01
     """With a depth loss: weight of the penalty on density along rays into the sky (their accumulated weight). 0: no
     penalty."""
-    sky_background: bool = True
+    sky_background: tyro.conf.Suppress[bool] = True
     """With a depth loss: the field at infinity, where the sky is, colours light that no sample stops. False: the last
     sample does, as in nerfacto, wherever it lies."""
-    surface_loss_mult: float = 1.0
+    surface_loss_mult: tyro.conf.Suppress[float] = 1.0
     """With a depth loss: weight of the colour error of the field at the prior's distance, for the datamanager's
     `surface_rays_per_batch` additional pixels, with one sample each."""
     exposure: Literal["gain", "embedding", "none"] = "gain"

@@ -130,7 +130,7 @@ class PixelTable:
         self._with_prior = about["with_prior"]
 
     def __len__(self) -> int:
-        """Number of records: of valid pixels, where each counts once."""
+        """Number of records: of valid pixels."""
         return len(self._records)
 
     @property
@@ -194,21 +194,18 @@ class PixelTableWriter:
         writer.finish()
     """
 
-    def __init__(self, path: Path, most_pixels: int, seed: int = 0, prior_weight: float = 1.0):
+    def __init__(self, path: Path, most_pixels: int, seed: int = 0):
         """Begin.
 
         Args:
             path: the file to be, .npy; its folder is made.
             most_pixels: an upper bound of the pixels that will be added.
             seed: of their order.
-            prior_weight: a pixel with a prior is drawn so many times as often as one without. (It is in the table
-                once or more often: so many times in the mean, or, below 1, one without is.)
 
         """
         self.path = path
         self._rng = np.random.default_rng(seed)
-        self._copies = (max(1.0, 1 / prior_weight), max(1.0, prior_weight))
-        self._most_bytes = int(most_pixels * max(self._copies)) * RECORD.itemsize
+        self._most_bytes = most_pixels * RECORD.itemsize
         self._stack = ExitStack()
         self._buckets: list[IO[bytes]] = []
         self._pictures = self._pixels = self._with_prior = 0
@@ -243,9 +240,6 @@ class PixelTableWriter:
         if sky is not None:
             records["sigma"][sky[rows, columns] & (records["distance"] == 0)] = SKY
         self._pictures += 1
-        if max(self._copies) > 1:
-            copies = np.asarray(self._copies)[(records["distance"] > 0).astype(int)]
-            records = np.repeat(records, (copies + self._rng.random(len(records))).astype(np.int64))
         self._pixels += len(records)
         self._with_prior += int((records["distance"] > 0).sum())
         bucket = self._rng.integers(len(self._buckets), size=len(records))

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import torch
+import tyro
 from jaxtyping import Bool, Float, Int
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer, CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras
@@ -41,7 +42,7 @@ class PoseRefinerConfig(CameraOptimizerConfig):
     """Expected error of the given positions: standard deviation in metres."""
     sigma_deg: float = 0.1
     """Expected error of the given rotations: standard deviation in degrees."""
-    prior_mult: float = 1e-4
+    prior_mult: tyro.conf.Suppress[float] = 1e-4
     """Weight of the mean square of the adjustments, in these standard deviations."""
 
 

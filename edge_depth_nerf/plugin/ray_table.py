@@ -29,8 +29,6 @@ from edge_depth_nerf.plugin.fused.ray_samplers import rays_of
 
 TABLE_VERSION = 2
 """Raised whenever the form of the file changes."""
-PLACE = "place"
-"""Metadata of training rays: column and row of the pixel, 0 to 1 over its picture."""
 KEPT_TABLES = 4
 """So many tables are kept of a scene, those used last: one for each set of lenses that was trained or shown."""
 KEPT_VIEWS = 4

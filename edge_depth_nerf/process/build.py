@@ -261,7 +261,7 @@ class _Builder:
             recording.sweeps,
             recording.trajectory,
             reach=options.sweeps,
-            deskew=options.deskew,
+            deskew=not options.raw_lidar,
             held_out=held_out,
             strict=options.strict,
             holdout_beams=options.holdout_beams,
@@ -354,7 +354,7 @@ class _Builder:
             )
             in_camera = points.reshape(-1, 3).double()
         elif "lidar" in self.layers:
-            hides = self._options.occlusion
+            hides = not self._options.raw_lidar
             around = self._store.around(picture.frame, picture.time_s, camera_to_world, hide=hides)
             in_camera = transform_points(torch.from_numpy(np.linalg.inv(camera_to_world)), around.points_m)
             seen = project_points(
@@ -496,15 +496,15 @@ def _source(recording: Recording, options: ProcessOptions) -> dict[str, Any]:
         "poses": options.poses,
         **({"refine_poses": True} if options.refine_poses else {}),
         "sweeps": options.sweeps,
-        "deskew": options.deskew,
-        "occlusion": options.occlusion,
+        "deskew": not options.raw_lidar,
+        "occlusion": not options.raw_lidar,
         "ego_mask": options.ego_mask is not None,
         "find_ego": options.find_ego,
         "frame_masks": options.frame_masks is not None,
         **({"find_moving": True} if options.find_moving else {}),
         "moving_classes": list(options.moving_classes),
         "mono": options.mono is not None,
-        **({"mono_trained_on": options.mono_trained_on} if any(picture.mono for picture in recording.pictures) else {}),
+        **({"mono_trained_on": "elsewhere"} if any(picture.mono for picture in recording.pictures) else {}),
         "sky": options.sky,
         "theta_max_deg": options.theta_max_deg,
         "holdout_every": options.holdout_every,

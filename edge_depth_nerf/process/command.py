@@ -28,20 +28,11 @@ def process(options: ProcessOptions, console: Console | None = None) -> ProcessR
     """
     console = console or Console()
     options.check()
-    _check_network(options)
     with only_writer(options.output, console):
         report = convert(options, console)
         _add_motion(read_scene(report.scene), options, console)
         _add_mono(read_scene(report.scene), options, console)
         return report
-
-
-def _check_network(options: ProcessOptions) -> None:
-    """Find out before anything long begins whether the weights that are given can be used."""
-    if options.mono_model is not None:
-        from edge_depth_nerf.mono.network import load_network
-
-        load_network(options.mono_model)
 
 
 def _has_motion(scene: SceneFolder) -> bool:
@@ -66,47 +57,21 @@ def _add_motion(scene: SceneFolder, options: ProcessOptions, console: Console) -
         add_motion(scene, console)
 
 
-def _preset_of(scene: SceneFolder) -> str | None:
-    """The preset of the network that was trained on a scene and made its monocular maps; None without one."""
-    source = scene.meta.get("mono")
-    preset = source.get("preset") if scene.has("mono") and isinstance(source, dict) else None
-    return preset if isinstance(preset, str) else None
-
-
 def _add_mono(scene: SceneFolder, options: ProcessOptions, console: Console) -> None:
     """Give the scene monocular maps, if it has none, and the calibration of those it has."""
     lidar = scene.has("lidar")
-    if scene.has("mono") and options.mono_model is not None:
-        source = scene.meta.get("mono")
-        if not isinstance(source, dict) or source.get("weights") != options.mono_model.name:
-            say(
-                console,
-                f"{scene.folder}: has monocular maps already, which are kept. For those of {options.mono_model}: "
-                "`edge-depth-nerf estimate-depth SCENE --model …`.",
-                "yellow",
-            )
-    preset = _preset_of(scene)
-    if options.mono_preset == "full" and preset not in (None, "full"):
-        say(
-            console,
-            f"{scene.folder}: has monocular maps already, of the preset {preset}, which are kept. For those of "
-            "full: `edge-depth-nerf estimate-depth SCENE --preset full`.",
-            "yellow",
-        )
     if not scene.has("mono") and options.estimate_depth:
-        if lidar or options.mono_model is not None:
+        if lidar:
             with console.status("Starting the depth network …"):
                 from edge_depth_nerf.mono.estimate import estimate_depth
                 from edge_depth_nerf.mono.options import EstimateDepthOptions
 
-            estimating = EstimateDepthOptions(
-                (scene.folder,), model=options.mono_model, seconds=options.mono_seconds, preset=options.mono_preset
-            )
-            estimate_depth(estimating, console)
+            estimate_depth(EstimateDepthOptions((scene.folder,)), console)
             return
         say(
             console,
-            "There is no LiDAR to train a network on. Give monocular maps with --mono, or weights with --mono-model.",
+            "There is no LiDAR to train a network on. Give monocular maps with --mono, or weights of another drive's "
+            "network: `edge-depth-nerf estimate-depth SCENE --model …`.",
             "yellow",
         )
     if scene.has("mono") and lidar:

@@ -94,7 +94,7 @@ def _on_cluster(parts: list[ProcessOptions], cluster: str, console: Console) -> 
     tasks = []
     for part in parts:
         scene = part.output.absolute()
-        trains = part.estimate_depth and part.mono is None and part.mono_model is None
+        trains = part.estimate_depth and part.mono is None
         words = own_command(("process", name_of(part)), replace(part, cluster=None))
         log = scene.with_name(f"{scene.name}.log")
         tasks.append(Task(str(part.output), words, log, scene / "transforms.json", trains))

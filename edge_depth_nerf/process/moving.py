@@ -104,7 +104,7 @@ def find_moving(
             recording.sweeps,
             recording.trajectory,
             reach=options.sweeps,
-            deskew=options.deskew,
+            deskew=not options.raw_lidar,
             held_out=held_out,
             strict=options.strict,
             holdout_beams=options.holdout_beams,

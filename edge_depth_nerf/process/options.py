@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import tyro
+
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.jobs.cluster_address import check_address
 
@@ -51,10 +53,9 @@ class ProcessOptions:
     sweeps: int = 3
     """Accumulate this many LiDAR sweeps before and after each picture's own. Training never sees a sweep of a held-out
     frame; a held-out picture uses only its own sweep."""
-    deskew: bool = True
-    """Move each point by the vehicle's pose at the time it was measured; off to compare."""
-    occlusion: bool = True
-    """Remove points that a nearer surface hides from the camera; off to compare."""
+    raw_lidar: bool = False
+    """Project LiDAR points as recorded, as in the paper: they are not moved by the vehicle's pose at the time they were
+    measured, and points that a nearer surface hides from the camera are kept."""
     ego_mask: Path | None = None
     """Mask of pixels that are never used, such as the vehicle itself (255 = use the pixel, 0 = ignore it): a PNG for
     all cameras, or a folder with a PNG named after each camera, in the size of the raw pictures."""
@@ -77,24 +78,15 @@ class ProcessOptions:
     vehicle moves; off saves time: about two seconds per picture of 350×350 px on one core."""
     mono: Path | None = None
     """Monocular distance maps: a folder with CAMERA/0000000123.png, 16 bit, 1/256 m along the ray, 0 = none. In the
-    size of the raw pictures; one for every frame used. `estimate-depth --maps` accepts other formats. Not set: a
-    network trained on the drive makes them."""
-    mono_trained_on: Literal["scene", "elsewhere"] = "elsewhere"
-    """What the network of the given maps was trained on. scene: on LiDAR only, so that it knows nothing beyond the
-    scanner's field of elevation; it then gives a prior there only with distances from motion."""
+    size of the raw pictures; one for every frame used, of a network that was not trained on the drive's LiDAR.
+    `estimate-depth --maps` accepts others. Not set: a network trained on the drive makes them."""
     estimate_depth: bool = True
     """If no monocular maps are given, train a network on the drive's LiDAR, as `edge-depth-nerf estimate-depth` does.
-    Off: the scene gets no maps; you can add those of other networks with that command."""
-    mono_model: Path | None = None
-    """Weights that `estimate-depth` trained on other drives. They are used without further training."""
-    mono_preset: Literal["lite", "full"] = "lite"
-    """Size of the drive's own network; lite: some minutes on a laptop's CPU; full: for a GPU."""
-    mono_seconds: float | None = None
-    """Train the drive's network for at most this many seconds. Not set: all steps of its preset."""
+    Off: the scene gets no maps. With that command you can add those of other networks, or of a larger one."""
     strict: bool = False
     """Stop at the first broken or missing picture, sweep or map. Otherwise up to a tenth of them are left out of the
     scene and named at the end."""
-    sky: bool = True
+    sky: tyro.conf.Suppress[bool] = True
     """Give the sky no monocular distance, instead of a wrong one."""
     cluster: str | None = None
     """Work on a Dask cluster, each scene as a task: local (processes on this machine, one for each GPU or core), or the
@@ -131,11 +123,6 @@ class ProcessOptions:
         require(beams == 0 or 2 <= beams <= 100, "holdout-beams", beams, "2 to 100, or 0 to hold out none")
         require(0 < self.theta_max_deg <= 180, "theta-max-deg", self.theta_max_deg, "degrees above 0, up to 180")
         require(0 <= self.sweeps <= 30, "sweeps", self.sweeps, "0 to 30")
-        seconds = self.mono_seconds
-        require(seconds is None or seconds > 0, "mono-seconds", seconds, "more than 0")
-        if self.mono_model is not None and (self.mono is not None or not self.estimate_depth):
-            other = "--mono" if self.mono is not None else "--no-estimate-depth"
-            raise InputError(f"--mono-model and {other} exclude each other. Give one of them.")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -80,7 +80,7 @@ def _manifest(options: SynthesizeOptions) -> dict[str, Any]:
     for name, only in _ONCE_ONLY.items():
         if fields[name] == only:
             del fields[name]
-    fields["speed_m_s"] = options.mean_speed_m_s
+    fields |= {"speed_m_s": options.mean_speed_m_s, "sequence": options.sequence}
     return {
         "kind": "synthetic drive",
         "version": VERSION,

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
-import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
+
+import tyro
 
 from edge_depth_nerf.base.errors import InputError
 
@@ -15,14 +15,14 @@ SceneName = Literal["street", "parking", "turn", "traffic", "roundabout"]
 SCENES: tuple[SceneName, ...] = ("street", "parking", "turn", "traffic", "roundabout")
 """The scenes that can be synthesised."""
 
-DEFAULT_SPEED_M_S: dict[SceneName, float] = {
+MEAN_SPEED_M_S: dict[SceneName, float] = {
     "street": 8.0,
     "parking": 4.0,
     "turn": 6.0,
     "traffic": 6.0,
     "roundabout": 5.0,
 }
-"""How fast the car drives in each scene unless told otherwise; a frame is 0.1 s."""
+"""How fast the car drives in each scene; a frame is 0.1 s."""
 
 LayoutName = Literal["kitti-360", "jbnu-depth360", "rig"]
 
@@ -41,12 +41,14 @@ BODIES: tuple[BodyName, ...] = ("grey", "ground")
 
 _SIZE_RANGE_PX = (32, 4096)
 _MOVING_MAX = 8
-_SPEED_MAX_M_S = 40.0
 
 
 @dataclass(frozen=True)
 class SynthesizeOptions:
     """A drive with fisheye pictures, LiDAR sweeps, poses and ground truth, in KITTI-360's raw layout or another."""
+
+    sequence: ClassVar[str] = "2013_05_28_drive_0000_sync"
+    """Name of the sequence in the folders of KITTI-360's layout."""
 
     output: Path
     """Folder to write the drive to. It must be new, empty, or an unfinished drive with the same options, which is then
@@ -61,12 +63,8 @@ class SynthesizeOptions:
     """Width and height of the pictures in pixels; KITTI-360's own are 1400."""
     seed: int = 0
     """Seed of everything random: the scene, the motion, noise and drop-outs. Same options, same bytes."""
-    moving: int = 0
+    moving: tyro.conf.Suppress[int] = 0
     """Number of other cars that drive through the scene; their masks are written as truth/<sequence>/moving_masks."""
-    speed_m_s: float | None = None
-    """Mean speed of the car in m/s; none = the scene's own (street 8, parking 4, turn 6, traffic 6, roundabout 5)."""
-    sequence: str = "2013_05_28_drive_0000_sync"
-    """Name of the sequence in the folders (only in KITTI-360's layout)."""
     layout: LayoutName = "kitti-360"
     """kitti-360: two fisheyes, Velodyne; jbnu-depth360: four 183 degree fisheyes, Ouster; rig: two fisheyes to 110
     degrees, a pinhole and a scanner, described by a rig.toml. --size is the width; not all pictures are square."""
@@ -75,7 +73,7 @@ class SynthesizeOptions:
     """plain: exposure drifts by 10 %. automatic: exposure varies by 40 % and white balance by 10 %, depending on the
     brightness of the view; noise grows with the gain, and lenses darken towards their rim."""
 
-    body: BodyName = "grey"
+    body: tyro.conf.Suppress[BodyName] = "grey"
     """Of the recording car. grey: grey paint, with bars, a box and cables on the roof. ground: without these, in matt
     paint of the ground's colour, so that there is no clear outline in the pictures."""
 
@@ -87,7 +85,7 @@ class SynthesizeOptions:
     @property
     def mean_speed_m_s(self) -> float:
         """The mean speed that applies, in m/s."""
-        return DEFAULT_SPEED_M_S[self.scene] if self.speed_m_s is None else self.speed_m_s
+        return MEAN_SPEED_M_S[self.scene]
 
     def check(self) -> None:
         """Check every field's range.
@@ -112,11 +110,3 @@ class SynthesizeOptions:
             raise InputError(f"--seed {self.seed}: expected 0 or more.")
         if not 0 <= self.moving <= _MOVING_MAX:
             raise InputError(f"--moving {self.moving}: expected 0 to {_MOVING_MAX} driving cars.")
-        speed = self.mean_speed_m_s
-        if not (math.isfinite(speed) and 0 < speed <= _SPEED_MAX_M_S):
-            raise InputError(f"--speed-m-s {speed}: expected more than 0 and at most {_SPEED_MAX_M_S} m/s.")
-        if not re.fullmatch(r"[A-Za-z0-9_-]+", self.sequence):
-            raise InputError(
-                f"--sequence {self.sequence!r}: expected a folder name of letters, digits, '_' and '-', "
-                "like 2013_05_28_drive_0000_sync."
-            )
