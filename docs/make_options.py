@@ -27,7 +27,6 @@ from edge_depth_nerf.plugin.config import make_specifications, read_method_file
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModelConfig
-from edge_depth_nerf.plugin.pipeline import EdgeDepthPipelineConfig
 from edge_depth_nerf.plugin.pose_refinement import PoseRefinerConfig
 from edge_depth_nerf.plugin.trainer import EdgeDepthTrainerConfig
 
@@ -221,7 +220,6 @@ def methods() -> str:
             for name, kind in LOSSES.items()
         ),
         ("Poses refined in training", "pipeline.model.camera_optimizer", PoseRefinerConfig),
-        ("Evaluation", "pipeline", EdgeDepthPipelineConfig),
         ("The scene", "pipeline.datamanager.dataparser", FisheyeDepthDataParserConfig),
     )
     places = [place for _, place, _ in groups]
@@ -266,7 +264,6 @@ def presets() -> str:
             EdgeDepthNerfModelConfig,
             *LOSSES.values(),
             PoseRefinerConfig,
-            EdgeDepthPipelineConfig,
             FisheyeDepthDataParserConfig,
         ),
     )

@@ -54,7 +54,7 @@ def test_every_valid_pixel_comes_once_with_its_own_prior(tmp_path, monkeypatch, 
 def test_only_so_many_files_are_open(tmp_path, monkeypatch):
     monkeypatch.setattr(pixel_table, "BUCKET_BYTES", 100)
     monkeypatch.setattr(pixel_table, "MOST_BUCKETS", 3)
-    with PixelTableWriter(tmp_path / "t.npy", 600, 0, 8.0) as writer:
+    with PixelTableWriter(tmp_path / "t.npy", 600) as writer:
         assert len(writer._buckets) == 3
         writer.add(PicturePixels(picture(20, 30), np.ones((20, 30), bool)))
         writer.finish()

@@ -255,7 +255,6 @@ def test_a_folder_with_something_else_is_refused_untouched(parking, tmp_path):
         ({"moving": -1}, "--moving -1"),
         ({"moving": 9}, "--moving 9"),
         ({"body": "red"}, "--body red.*grey, ground"),
-        ({"camera": "phone"}, "--camera phone.*plain, automatic"),
         ({"scene": "moon"}, "--scene moon.*street, parking, turn"),
     ],
 )
@@ -480,37 +479,6 @@ def test_noise_and_exposure_drift(street):
         assert np.ptp(own) > 0.002
         assert np.abs(np.diff(own)).max() < 0.03, "the drift is smooth"
     assert abs(gains["image_02", 0] - gains["image_03", 0]) > 1e-3
-
-
-def test_an_automatic_camera_exposes_balances_and_darkens_towards_the_rim(street, street_model, tmp_path, monkeypatch):
-    """The same drive and the same truth; each picture is the truth times a factor of its own, colour and place."""
-    plain, root = street
-    monkeypatch.setattr(layout_module, "build_scene", lambda _: street_model)
-    options = dataclasses.replace(plain, output=tmp_path / "drive", camera="automatic")
-    automatic = synthesize_drive(options)
-    assert read_json(automatic / "drive.json")["options"]["camera"] == "automatic"
-    assert "camera" not in read_json(root / "drive.json")["options"]
-    same, other = files_of(root), files_of(automatic)
-    assert {name for name in same if same[name] != other[name]} - {"drive.json"} == {
-        str((root / "data_2d_raw" / SEQUENCE / camera / "data_rgb" / f"{frame:010d}.png").relative_to(root))
-        for camera in rig.CAMERAS
-        for frame in range(FRAMES)
-    }
-    gains = []
-    rows, columns = np.mgrid[:SIZE, :SIZE] - (SIZE - 1) / 2
-    from_middle = np.hypot(rows, columns) / (SIZE / 2)
-    for frame in range(FRAMES):
-        clean = read_image(truth(automatic, "image_02", "rgb", frame)).astype(float)
-        taken = picture(automatic, "image_02", frame)
-        fine = ((clean > 60) & (clean < 150) & (taken > 30) & (taken < 240)).all(-1)
-        linear = [((value / 255 + 0.055) / 1.055) ** 2.4 for value in (taken, clean)]
-        ratio = linear[0] / linear[1]
-        middle, rim = fine & (from_middle < 0.4), fine & (from_middle > 0.7) & (from_middle < 0.9)
-        gains.append([float(np.median(ratio[middle, channel])) for channel in range(3)])
-        assert np.median(ratio[rim]) < 0.9 * np.median(ratio[middle])
-    balance = np.array(gains)[:, [0, 2]] / np.array(gains)[:, 1:2]
-    assert np.abs(balance - 1).max() > 0.005
-    assert np.ptp(np.array(gains)[:, 1]) > 0.01
 
 
 def test_a_body_of_the_grounds_colour_hides_as_much_and_has_no_clear_edge(parking, tmp_path):

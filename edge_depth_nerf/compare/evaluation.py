@@ -24,7 +24,6 @@ from edge_depth_nerf.method.metrics import LEAST_SQUARED_ERROR, DepthErrors, mas
 from edge_depth_nerf.plugin.dataset import FisheyeDepthDataset
 from edge_depth_nerf.plugin.detail import detail_shown
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
-from edge_depth_nerf.plugin.pipeline import JudgedViews
 from edge_depth_nerf.scene.format import read_transforms
 
 PIXELS_PER_VIEW = 3000
@@ -262,7 +261,7 @@ class ViewEvaluator:
         return {f"detail_{name}": value for name, value in found.items() if "masked_" in name}
 
     def _held_out_views(self) -> Iterator[EvaluatedView]:
-        loader = JudgedViews(self.pipeline, self.pipeline.datamanager.fixed_indices_eval_dataloader)
+        loader = self.pipeline.datamanager.fixed_indices_eval_dataloader
         return (EvaluatedView(number, camera, batch) for number, (camera, batch) in enumerate(loader))
 
     def shifted(self, views: dict[str, list[Callable[[], EvaluatedView]]]) -> dict[str, float]:

@@ -6,13 +6,11 @@ nerfstudio would average depth errors over pictures.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
-from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -23,7 +21,6 @@ from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManager, FisheyeD
 from edge_depth_nerf.plugin.detail import TrainingDetail
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel, EdgeDepthNerfModelConfig
 from edge_depth_nerf.plugin.plain_errors import say_errors_plainly
-from edge_depth_nerf.plugin.pose_refinement import PoseRefinerConfig, fit_pose, halves
 from edge_depth_nerf.plugin.step_graphs import Step, StepGraphs
 from edge_depth_nerf.plugin.viewer import DrivePanel
 
@@ -43,9 +40,6 @@ class EdgeDepthPipelineConfig(VanillaPipelineConfig):
 
     _target: type = field(default_factory=lambda: EdgeDepthPipeline)
     """Target class to instantiate."""
-    eval_poses: Literal["given", "refined"] = "given"
-    """Poses of evaluated pictures. refined: each pose is fitted to the left half of its picture, with the expected
-    errors of `model.camera_optimizer`. Only the right half, inside the mask, is then evaluated."""
 
     def setup(self, **kwargs: Any) -> Any:
         """Build the pipeline; from here on nerfstudio's commands load its checkpoints, and print our errors plainly."""
@@ -210,32 +204,9 @@ class EdgeDepthPipeline(VanillaPipeline):
         model = self.model
         assert isinstance(model, EdgeDepthNerfModel)
         model.reset_depth_errors()
-        data_loader = JudgedViews(self, data_loader)
         metrics = super().get_average_image_metrics(data_loader, image_prefix, step, output_path, get_std)
         pooled = model.pooled_depth_errors()
         # a spread over pictures says nothing of a pooled figure, and of a single picture it is NaN
         spreads = {f"{name}_std" for name in pooled}
         kept = {name: value for name, value in metrics.items() if name not in spreads and math.isfinite(value)}
         return {**kept, **pooled}
-
-
-class JudgedViews:
-    """A loader of held-out pictures, as the pipeline's configuration wants them judged."""
-
-    def __init__(self, pipeline: Any, loader: Any) -> None:
-        self._pipeline, self._loader = pipeline, loader
-
-    def __len__(self) -> int:
-        return len(self._loader)
-
-    def __iter__(self) -> Iterator[tuple[Cameras, dict[str, Any]]]:
-        model, config = self._pipeline.model, self._pipeline.config
-        assert isinstance(config, EdgeDepthPipelineConfig) and isinstance(model.config, EdgeDepthNerfModelConfig)
-        optimizer = model.config.camera_optimizer
-        for camera, batch in self._loader:
-            if config.eval_poses == "given" or not isinstance(optimizer, PoseRefinerConfig):
-                yield camera, batch
-                continue
-            left, right = halves(batch["mask"])
-            fitted = fit_pose(model, camera, batch["image"][..., :3], left[..., 0], optimizer)
-            yield fitted, {**batch, "mask": right}

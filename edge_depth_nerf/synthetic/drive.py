@@ -69,7 +69,7 @@ def held_out(frame: int) -> bool:
     return frame % 8 == 4
 
 
-_ONCE_ONLY = {"layout": "kitti-360", "camera": "plain", "body": "grey"}
+_ONCE_ONLY = {"layout": "kitti-360", "body": "grey"}
 """What is not written into a drive's options: there was no other choice once."""
 
 

@@ -34,9 +34,6 @@ VEHICLE_TO_POSE = np.diag([1.0, -1.0, -1.0, 1.0])
 """From the vehicle as rigs have it (x forward, y left, z up) to the pose (x forward, y right, z down)."""
 
 _EXPOSURE_DRIFT = 0.10
-_WHITE_BALANCE_DRIFT = 0.06
-_VIGNETTE = 0.35
-_MIDDLE_GREY = 0.42
 _BLACK_LEVEL = 2.0 / 255
 
 
@@ -162,12 +159,9 @@ class DriveLayout(ABC):
         estimate = simulated_estimate(view.distance_m, camera.own_distance_m, camera.lens, frame, seed, number)
         write_distance_png(self.map("mono", name, frame), estimate)
         # as the camera's sensor gives it, with exposure drift and noise
-        gain, noise_share = _gain(seed, number, frame), 1.0
-        if self.options.camera == "automatic":
-            gain, noise_share = _automatic(gain, world.to_picture(view.radiance), seed, number, frame)
-        taken = world.to_picture(view.radiance, gain)
+        taken = world.to_picture(view.radiance, _gain(seed, number, frame))
         rng = np.random.default_rng([seed, 31, number, frame])
-        noise = rng.standard_normal(taken.shape, np.float32) * np.float32(PICTURE_NOISE * noise_share)
+        noise = rng.standard_normal(taken.shape, np.float32) * np.float32(PICTURE_NOISE)
         write_png(self.picture(name, frame), _to_bytes(np.maximum(taken, _BLACK_LEVEL) + noise))
 
 
@@ -178,28 +172,6 @@ def _gain(seed: int, camera: int, frame: int) -> float:
     time_s = frame * FRAME_INTERVAL_S
     waves = np.sin(2 * np.pi * time_s / periods + phases) * (0.7, 0.3)
     return float(1 + _EXPOSURE_DRIFT * waves.sum())
-
-
-def _automatic(
-    drift: float, true: NDArray[np.float32], seed: int, number: int, frame: int
-) -> tuple[NDArray[np.float32], float]:
-    """What an automatic camera multiplies a picture's radiance by, [h, w, 3], and how much more noise that brings.
-
-    Exposure follows the picture's mean brightness, and drifts four times as far as a plain camera's; red and blue
-    follow its mean colour; the lens darkens with the square of the distance from the picture's middle.
-    """
-    rng = np.random.default_rng([seed, 32, number])
-    phases, periods = rng.uniform(0, 2 * np.pi, 2), rng.uniform((3.0, 5.0), (5.0, 9.0))
-    red, blue = _WHITE_BALANCE_DRIFT * np.sin(2 * np.pi * frame * FRAME_INTERVAL_S / periods + phases)
-    seen = true[true.max(-1) > 0].reshape(-1, 3)
-    mean = seen.mean(0) if len(seen) else np.full(3, _MIDDLE_GREY, np.float32)
-    exposure = (1 + 4 * (drift - 1)) * np.clip(_MIDDLE_GREY / max(float(mean.mean()), 1e-3), 0.7, 1.4)
-    towards_grey = np.clip(mean.mean() / np.maximum(mean, 1e-3), 0.9, 1.1)
-    balance = np.array([(1 + red) * towards_grey[0], 1.0, (1 + blue) * towards_grey[2]])
-    rows, columns = np.mgrid[: true.shape[0], : true.shape[1]]
-    from_middle = np.hypot(columns - (true.shape[1] - 1) / 2, rows - (true.shape[0] - 1) / 2) / (true.shape[1] / 2)
-    vignette = 1 - _VIGNETTE * np.minimum(from_middle, 1.2) ** 2
-    return (exposure * vignette[..., None] * balance).astype(np.float32), float(exposure)
 
 
 def _to_bytes(picture: NDArray[np.float32]) -> NDArray[np.uint8]:

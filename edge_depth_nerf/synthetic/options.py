@@ -29,11 +29,6 @@ LayoutName = Literal["kitti-360", "jbnu-depth360", "rig"]
 LAYOUTS: tuple[LayoutName, ...] = ("kitti-360", "jbnu-depth360", "rig")
 """The layouts that a drive can be written in."""
 
-CameraName = Literal["plain", "automatic"]
-
-CAMERAS: tuple[CameraName, ...] = ("plain", "automatic")
-"""How the cameras of a drive can expose."""
-
 BodyName = Literal["grey", "ground"]
 
 BODIES: tuple[BodyName, ...] = ("grey", "ground")
@@ -69,10 +64,6 @@ class SynthesizeOptions:
     """kitti-360: two fisheyes, Velodyne; jbnu-depth360: four 183 degree fisheyes, Ouster; rig: two fisheyes to 110
     degrees, a pinhole and a scanner, described by a rig.toml. --size is the width; not all pictures are square."""
 
-    camera: CameraName = "plain"
-    """plain: exposure drifts by 10 %. automatic: exposure varies by 40 % and white balance by 10 %, depending on the
-    brightness of the view; noise grows with the gain, and lenses darken towards their rim."""
-
     body: tyro.conf.Suppress[BodyName] = "grey"
     """Of the recording car. grey: grey paint, with bars, a box and cables on the roof. ground: without these, in matt
     paint of the ground's colour, so that there is no clear outline in the pictures."""
@@ -98,8 +89,6 @@ class SynthesizeOptions:
             raise InputError(f"--scene {self.scene}: no such scene, expected one of {', '.join(SCENES)}.")
         if self.layout not in LAYOUTS:
             raise InputError(f"--layout {self.layout}: no such layout, expected one of {', '.join(LAYOUTS)}.")
-        if self.camera not in CAMERAS:
-            raise InputError(f"--camera {self.camera}: no such camera, expected one of {', '.join(CAMERAS)}.")
         if self.body not in BODIES:
             raise InputError(f"--body {self.body}: no such body, expected one of {', '.join(BODIES)}.")
         if self.frames < 1:

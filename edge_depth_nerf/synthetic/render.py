@@ -281,7 +281,7 @@ class World:
             result[rows] = np.clip(colour.mean(-1) * LASER_REFLECTANCE[material] * (0.3 + 0.7 * slant), 0, 1)
         return result
 
-    def to_picture(self, radiance: Array, gain: float | Array = 1.0) -> Array:
+    def to_picture(self, radiance: Array, gain: float = 1.0) -> Array:
         """Picture values in 0-1 (sRGB) of linear radiance."""
         linear = np.clip(radiance * np.asarray(self.model.lighting.exposure * gain, np.float32), 0, 1)
         return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055).astype(np.float32)
