@@ -39,7 +39,7 @@ same: `edge-depth-nerf COMMAND --help`, `ns-train METHOD --help`.
 
 ## The command line
 
-`--no-deskew` turns off a switch such as `--deskew`. Separate several values by spaces: `--cameras image_02 image_03`.
+`--no-motion` turns off a switch such as `--motion`. Separate several values by spaces: `--cameras image_02 image_03`.
 Give words in capitals without a name.
 
 """

@@ -221,8 +221,8 @@ def test_render_interpolate(done):
 @pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ns-render camera-path writes films with ffmpeg")
 def test_a_film_of_a_camera_path(killed_run, tmp_path):
     said = call(
-        *("edge-depth-nerf", "camera-path", "--load-config", killed_run / "config.yml", "--camera", "equirectangular"),
-        *("--look", "camera", "--width", 40, "--height", 20, "--fps", 5, "--seconds", 0.4),
+        *("edge-depth-nerf", "camera-path", "--load-config", killed_run / "config.yml", "--camera", "fisheye"),
+        *("--width", 36, "--fps", 5, "--seconds", 0.4),
         *("--output", tmp_path / "path.json"),
     )
     printed = next(line for line in said.splitlines() if line.strip().startswith("ns-render"))
@@ -230,7 +230,7 @@ def test_a_film_of_a_camera_path(killed_run, tmp_path):
     film = cv2.VideoCapture(str(tmp_path / "path.mp4"))
     assert film.get(cv2.CAP_PROP_FRAME_COUNT) == 2 and film.get(cv2.CAP_PROP_FPS) == 5
     pictures = [film.read()[1] for _ in range(2)]
-    assert all(picture.shape == (20, 40, 3) for picture in pictures)
+    assert all(picture.shape == (30, 36, 3) for picture in pictures)
     # it looks elsewhere at the drive's end than at its beginning
     assert np.abs(pictures[0].astype(int) - pictures[1]).mean() > 2
 

@@ -757,7 +757,7 @@ def test_the_command_runs_without_nerfstudio(drive, tmp_path):
     code = (
         "import sys; sys.modules['nerfstudio'] = None; from edge_depth_nerf.entry import main; "
         f"sys.argv = ['edge-depth-nerf', 'inspect', {str(drive)!r}, '--output', {str(tmp_path / 'out')!r}, "
-        "'--frames', '1', '--size', '64']; main()"
+        "'--frames', '1']; main()"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
