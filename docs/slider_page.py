@@ -19,7 +19,7 @@ from edge_depth_nerf.base.files import read_json, write_bytes, write_json
 from edge_depth_nerf.demo.options import DemoOptions
 from edge_depth_nerf.jobs.runs import command_line
 from edge_depth_nerf.report.build import Commands, Facts, Report, build_report
-from edge_depth_nerf.report.views import Drive, ShownView, make_drives
+from edge_depth_nerf.report.views import ShownDrive, ShownView, make_drives
 
 FOLDER = Path(__file__).resolve().parent / "slider"
 CONTENT = "content.json"
@@ -102,7 +102,7 @@ def page(folder: Path = FOLDER) -> str:
             lead=f"The same model was trained twice for {options['steps']} steps on a rendered {options['scene']}: "
             "without depth, and with the edge loss on the integrated prior. This is a short training; the results page "
             "has the figures of longer ones.",
-            drives=[Drive(options["scene"], views, content["note"])],
+            drives=[ShownDrive(options["scene"], views, content["note"])],
             tables=[],
             plots=[],
             facts=[Facts("Drive and training", options), Facts("Versions", content["versions"])],

@@ -21,7 +21,7 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json, write_json
 from edge_depth_nerf.films.command import write_camera_path
 from edge_depth_nerf.films.options import CameraPathOptions
-from edge_depth_nerf.films.paths import Drive, lane_shift, orbit, replay, up_of
+from edge_depth_nerf.films.paths import CameraPath, lane_shift, orbit, replay, up_of
 from edge_depth_nerf.plugin.config import edge_depth_nerf_lite
 from edge_depth_nerf.plugin.dataparser import FisheyeDepth, FisheyeDepthDataParserConfig
 
@@ -49,17 +49,17 @@ def on_circle(time_s: float, mounted: np.ndarray) -> np.ndarray:
 TO_THE_LEFT = looking(np.array([-np.cos(np.radians(20)), -np.sin(np.radians(20)), 0.0]), np.array([0.0, 1.0, 0.0]))
 
 
-def circle(frames: int = 30, mounted: np.ndarray = TO_THE_LEFT) -> Drive:
+def circle(frames: int = 30, mounted: np.ndarray = TO_THE_LEFT) -> CameraPath:
     times_s = np.arange(frames) / 10
-    return Drive(times_s, np.stack([on_circle(time, mounted) for time in times_s]), UP)
+    return CameraPath(times_s, np.stack([on_circle(time, mounted) for time in times_s]), UP)
 
 
-def straight(frames: int = 41) -> Drive:
+def straight(frames: int = 41) -> CameraPath:
     """Along y for 40 m, looking to the left (-x)."""
     poses = np.tile(np.eye(4), (frames, 1, 1))
     poses[:, :3, :3] = looking(np.array([-1.0, 0.0, 0.0]))
     poses[:, 1, 3] = np.arange(frames)
-    return Drive(np.arange(frames) / 10, poses, UP)
+    return CameraPath(np.arange(frames) / 10, poses, UP)
 
 
 def test_a_replay_is_the_drive_and_smooth_between():
@@ -84,7 +84,7 @@ def test_forward_stays_while_the_vehicle_stands_or_backs_up():
     y = straight_on.camera_to_scene[:, 1, 3]
     poses = straight_on.camera_to_scene.copy()
     poses[:, 1, 3] = np.where(y < 20, y, np.where(y < 30, 20, 20 - 0.2 * (y - 30)))
-    drive = Drive(straight_on.times_s, poses, UP)
+    drive = CameraPath(straight_on.times_s, poses, UP)
     assert np.allclose(replay(drive, drive.times_s, forward=True)[:, :3, 2], [0, -1, 0], atol=1e-6)
 
 
@@ -156,7 +156,7 @@ def test_which_way_is_up():
 
 def test_a_camera_that_stands_has_no_forward():
     drive = straight()
-    standing = Drive(drive.times_s, np.tile(drive.camera_to_scene[:1], (41, 1, 1)), UP)
+    standing = CameraPath(drive.times_s, np.tile(drive.camera_to_scene[:1], (41, 1, 1)), UP)
     assert np.allclose(replay(standing, np.array([0.05]), forward=False), drive.camera_to_scene[:1])
     with pytest.raises(InputError, match="does not move"):
         replay(standing, np.array([0.05]), forward=True)
@@ -167,9 +167,9 @@ def test_a_camera_that_stands_has_no_forward():
 def test_a_drive_needs_two_pictures_at_increasing_times():
     drive = straight()
     with pytest.raises(InputError, match="two pictures"):
-        Drive(drive.times_s[:1], drive.camera_to_scene[:1], UP)
+        CameraPath(drive.times_s[:1], drive.camera_to_scene[:1], UP)
     with pytest.raises(InputError, match="increase, but picture 3"):
-        Drive(np.array([0.0, 1.0, 1.0]), drive.camera_to_scene[:3], UP)
+        CameraPath(np.array([0.0, 1.0, 1.0]), drive.camera_to_scene[:3], UP)
 
 
 # -- the files

@@ -11,7 +11,7 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_json, write_distance_png, write_json, write_mask
 from edge_depth_nerf.method.error_model import read_trust
 from edge_depth_nerf.method.integration import IntegrationOptions
-from edge_depth_nerf.method.prior import PriorOptions, make_prior, view_of
+from edge_depth_nerf.method.prior import PriorOptions, make_prior, ray_angles
 from edge_depth_nerf.mono.calibration import calibrate_scene, find_trust
 from edge_depth_nerf.plugin import datamanager as datamanager_module
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
@@ -48,7 +48,7 @@ def test_a_batch_carries_colour_prior_and_rays_of_its_pixels(tmp_path):
             "integrated",
             options,
             trust,
-            view_of(pictures[i].lens, pictures[i].up_in_camera),
+            ray_angles(pictures[i].lens, pictures[i].up_in_camera),
         )
         for i in range(len(dataset))
     ]

@@ -56,8 +56,8 @@ from edge_depth_nerf.inspecting.shown_prior import ShownScene
 from edge_depth_nerf.inspecting.top_view import GAP, GREYS, HELD_OUT, PATH, TRAINING, top_view
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.method.prior import default_source
-from edge_depth_nerf.poses.agreement import compare_paths, write_agreement
-from edge_depth_nerf.poses.matches import Agreement
+from edge_depth_nerf.poses.matches import EpipolarAgreement
+from edge_depth_nerf.poses.path_agreement import compare_paths, write_agreement
 from edge_depth_nerf.scene.put_maps import write_maps
 from edge_depth_nerf.scene.reader import read_scene
 
@@ -131,8 +131,8 @@ def test_a_pose_that_is_off_is_named(sample_drive, tmp_path):
     assert "--refine-poses" in warning["text"]
 
 
-def agreements(medians_px: Sequence[float]) -> list[Agreement]:
-    return [Agreement("left", n, n + 1, 100, median_px, 0.9) for n, median_px in enumerate(medians_px)]
+def agreements(medians_px: Sequence[float]) -> list[EpipolarAgreement]:
+    return [EpipolarAgreement("left", n, n + 1, 100, median_px, 0.9) for n, median_px in enumerate(medians_px)]
 
 
 @pytest.mark.parametrize(

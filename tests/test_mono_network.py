@@ -39,7 +39,7 @@ from edge_depth_nerf.mono.estimate import (
     predicted_maps,
     training_split,
 )
-from edge_depth_nerf.mono.examples import Examples, load_examples, small_lidar, view_of
+from edge_depth_nerf.mono.examples import Examples, load_examples, network_view, small_lidar
 from edge_depth_nerf.mono.network import (
     ARCHITECTURE,
     DepthNetwork,
@@ -274,7 +274,7 @@ def test_the_presets_cut_what_is_said(preset, sides_px):
 def test_of_several_returns_in_a_pixel_the_one_nearest_its_centre_is_learned(small_street):
     scene = read_scene(small_street)
     picture = scene.pictures[0]
-    view = view_of(picture, scene.theta_max_rad, 12)
+    view = network_view(picture, scene.theta_max_rad, 12)
     rows, columns = view.usable.shape
     lidar = read_distance_png(picture.files["lidar"])
     expected = np.zeros((rows, columns), np.float32)
@@ -497,7 +497,7 @@ def test_weights_know_how_they_were_made_and_predict_other_scenes(small_street, 
     network, _ = load_network(model)
     for (name, expected), picture in zip(predicted_maps(network, scene), scene.pictures, strict=True):
         found = read_distance_png(picture.files["mono"])
-        keep = view_of(picture, scene.theta_max_rad, 40).usable
+        keep = network_view(picture, scene.theta_max_rad, 40).usable
         assert name == picture.name
         np.testing.assert_allclose(found[keep], expected[keep], atol=1 / 256)
         assert (found[~keep] == 0).all() and keep.mean() > 0.3

@@ -14,7 +14,7 @@ from scenes import fisheye, write_scene
 from edge_depth_nerf.base.files import read_distance_png, write_distance_png, write_png
 from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.method.error_model import FIELD_MARGIN_DEG, MOTION_KNOTS, fit_error_model, read_trust
-from edge_depth_nerf.method.prior import MotionMap, PriorOptions, View, make_prior, motion_sigma
+from edge_depth_nerf.method.prior import MotionMap, PriorOptions, RayAngles, make_prior, motion_sigma
 from edge_depth_nerf.mono.calibration import MotionErrors, calibrate_scene, combine, measure_beyond, measure_frame
 from edge_depth_nerf.mono.estimate import without_sky
 from edge_depth_nerf.mono.examples import Examples, load_examples
@@ -142,7 +142,7 @@ def beyond_frames(mono_error: float, count: int = 12, seed: int = 0):
     """
     rng = np.random.default_rng(seed)
     elevation = np.broadcast_to(np.linspace(40, -30, SIZE[0], dtype=np.float32)[:, None], SIZE)
-    view = View(np.full(SIZE, 0.5, np.float32), np.radians(elevation))
+    view = RayAngles(np.full(SIZE, 0.5, np.float32), np.radians(elevation))
     beyond = (elevation > FIELD_TOP_DEG + FIELD_MARGIN_DEG) | (elevation < -30 - FIELD_MARGIN_DEG)
     usable, frames, maps = np.ones(SIZE, bool), [], []
     for number in range(count):

@@ -21,9 +21,9 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras import Pinhole
 from edge_depth_nerf.lidar import Sweep, SweepTiming
 from edge_depth_nerf.lidar.trajectory import Trajectory
-from edge_depth_nerf.poses.agreement import PATHS_AGREE, compare_paths, read_agreement, write_agreement
 from edge_depth_nerf.poses.breaks import find_break
 from edge_depth_nerf.poses.odometry import TimedSweep, odometry, steps_of
+from edge_depth_nerf.poses.path_agreement import PATHS_AGREE, compare_paths, read_agreement, write_agreement
 from edge_depth_nerf.process import pose_checks
 from edge_depth_nerf.process.build import process_recording
 from edge_depth_nerf.process.converters import read_drive

@@ -10,7 +10,7 @@ from edge_depth_nerf.method import prior as prior_module
 from edge_depth_nerf.method.alignment import Fit
 from edge_depth_nerf.method.error_model import KNOTS, ErrorModel, MotionTrust, Trust
 from edge_depth_nerf.method.integration import IntegrationOptions, integrate_depth
-from edge_depth_nerf.method.prior import PriorCache, PriorOptions, View, make_prior, sky_of, view_of
+from edge_depth_nerf.method.prior import PriorCache, PriorOptions, RayAngles, make_prior, ray_angles, sky_of
 
 
 def both(lidar: np.ndarray, mono: np.ndarray) -> dict[str, np.ndarray]:
@@ -105,7 +105,7 @@ def a_trust(**changes):
 
 
 def level_view(shape):
-    return View(np.zeros(shape, np.float32), np.zeros(shape, np.float32))
+    return RayAngles(np.zeros(shape, np.float32), np.zeros(shape, np.float32))
 
 
 def test_a_calibrated_prior_is_aligned_and_trusted_by_the_models():
@@ -162,7 +162,7 @@ def test_another_calibration_makes_another_file(tmp_path):
     )
     assert len(list(tmp_path.iterdir())) == 2
     assert not np.array_equal(first.sigma_m, second.sigma_m)
-    turned = View(view.theta_rad, view.elevation_rad + 2)
+    turned = RayAngles(view.theta_rad, view.elevation_rad + 2)
     assert (
         not PriorCache(tmp_path, "integrated", PriorOptions(), a_trust())
         .prior(both(lidar, mono), mask, turned)
@@ -173,13 +173,13 @@ def test_another_calibration_makes_another_file(tmp_path):
 def test_the_angles_of_a_picture():
     camera = KannalaBrandt(41, 41, 12.0, 12.0, 20.5, 20.5, 0.0, 0.0, 0.0, 0.0)
     # upright: up is -y of the camera
-    view = view_of(camera, np.array([0.0, -1.0, 0.0]))
+    view = ray_angles(camera, np.array([0.0, -1.0, 0.0]))
     assert view.theta_rad[20, 20] == pytest.approx(0, abs=1e-3)
     assert view.theta_rad[20, 32] == pytest.approx(1.0, abs=1e-4)
     assert view.elevation_rad[8, 20] == pytest.approx(1.0, abs=1e-4)
     assert view.elevation_rad[32, 20] == pytest.approx(-1.0, abs=1e-4)
     # rolled by 90 degrees: up is +x
-    assert view_of(camera, np.array([1.0, 0.0, 0.0])).elevation_rad[20, 32] == pytest.approx(1.0, abs=1e-4)
+    assert ray_angles(camera, np.array([1.0, 0.0, 0.0])).elevation_rad[20, 32] == pytest.approx(1.0, abs=1e-4)
 
 
 @pytest.mark.parametrize("fields", [{"align": "much"}, {"sigma_mode": "magic"}])
@@ -198,7 +198,7 @@ def test_sky_is_above_the_horizon_without_any_distance():
     mono = np.array([[0, 0, 30], [0, np.nan, 30], [0, 0, 30]], np.float32)
     lidar = np.array([[0, 40, 0], [0, 0, 0], [0, 0, 0]], np.float32)
     elevation = np.radians([[20.0] * 3, [20.0] * 3, [1.0] * 3]).astype(np.float32)
-    view = View(np.zeros((3, 3), np.float32), elevation)
+    view = RayAngles(np.zeros((3, 3), np.float32), elevation)
     picture, mask = np.full((3, 3, 3), 200, np.uint8), np.ones((3, 3), bool)
     assert sky_of(mono, lidar, view, picture, mask).tolist() == [[True, False, False], [True, True, False], [False] * 3]
     assert sky_of(mono, None, view, picture, mask)[0].tolist() == [True, True, False]
@@ -211,7 +211,7 @@ def test_dark_holes_of_a_map_are_no_sky():
     mono = np.full((40, 60), 8, np.float32)
     picture = np.full((40, 60, 3), 60, np.uint8)
     elevation = np.radians(np.linspace(19.5, -19.5, 40, dtype=np.float32))[:, None].repeat(60, 1)
-    view = View(np.zeros((40, 60), np.float32), elevation)
+    view = RayAngles(np.zeros((40, 60), np.float32), elevation)
     sky, crown, border = np.s_[:12, 20:40], np.s_[3:9, 45:55], np.s_[:, :6]
     for hole in (sky, crown, border):
         mono[hole] = 0
@@ -234,7 +234,7 @@ def motion_trust(weight: float = 0.9) -> MotionTrust:
 def field_view(shape):
     """From 57° above the horizon to 57° below; LiDAR's field, 3° wider, ends in the middle."""
     elevation = np.broadcast_to(np.linspace(1, -1, shape[0], dtype=np.float32)[:, None], shape).copy()
-    return View(np.zeros(shape, np.float32), elevation), elevation <= np.radians(3)
+    return RayAngles(np.zeros(shape, np.float32), elevation), elevation <= np.radians(3)
 
 
 def test_above_lidars_field_there_is_a_prior_where_motion_gives_one():

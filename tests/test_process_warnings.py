@@ -20,7 +20,6 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, read_mask, write_png
 from edge_depth_nerf.lidar import Sweep
 from edge_depth_nerf.masks.lens import lens_circle
-from edge_depth_nerf.process.agreement import Agreement, agreement_notices, agreements
 from edge_depth_nerf.process.build import _never_held_out
 from edge_depth_nerf.process.colmap.scale import _scan
 from edge_depth_nerf.process.converters import convert
@@ -29,6 +28,7 @@ from edge_depth_nerf.process.found_path import upright
 from edge_depth_nerf.process.options import RigOptions
 from edge_depth_nerf.process.recording import Recording
 from edge_depth_nerf.process.rig import read_rig_recording
+from edge_depth_nerf.process.transform_checks import ContrastAgreement, agreement_notices, agreements
 from edge_depth_nerf.scene.writer import ProcessReport
 from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
@@ -96,7 +96,7 @@ def recording(drive: Path) -> Recording:
     return read_rig_recording(RigOptions(root=drive, output=drive.parent / "unused"))
 
 
-def found(recording: Recording) -> list[Agreement]:
+def found(recording: Recording) -> list[ContrastAgreement]:
     usable = {}
     for camera in recording.cameras:
         assert camera.ego_mask is not None
@@ -172,7 +172,7 @@ def test_a_transform_of_other_axes_does_not_fit(recording: Recording) -> None:
 
 
 def test_no_fit_is_said_where_the_pictures_could_tell() -> None:
-    unfit = Agreement("front", "roof", 0.1, 0.2, 0.1, 0.15, 0.7)
+    unfit = ContrastAgreement("front", "roof", 0.1, 0.2, 0.1, 0.15, 0.7)
     (said,) = agreement_notices([unfit])
     assert "no inverse of a transform fits, either: front with roof (0.10)" in said
     # noise has no agreement either way

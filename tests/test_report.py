@@ -36,7 +36,7 @@ from edge_depth_nerf.report.build import Commands, Facts, Plot, Report, build_re
 from edge_depth_nerf.report.compared_views import DISTANCE_KEYS, ComparedView, compared_views, held_out_frames
 from edge_depth_nerf.report.points import ShownPoints, show_points
 from edge_depth_nerf.report.tables import Cell, MadeTable, Row
-from edge_depth_nerf.report.views import KINDS, Drive, ShownView, encode, make_drives, show_view, spread
+from edge_depth_nerf.report.views import KINDS, ShownDrive, ShownView, encode, make_drives, show_view, spread
 from edge_depth_nerf.scene.reader import read_scene
 
 NASTY = "</script><script>window.hacked = 1</script><img src=x onerror='window.hacked=1'> & \"quotes\" {{ 1 }} $x$"
@@ -352,8 +352,8 @@ def report(cloud) -> Report:
         lead=NASTY,
         methods=["first", NASTY],
         drives=[
-            Drive("street", [shown_view(number) for number in range(3)], "3 of 10 views.", cloud),
-            Drive(NASTY, [shown_view(5, distances=False)], NASTY),
+            ShownDrive("street", [shown_view(number) for number in range(3)], "3 of 10 views.", cloud),
+            ShownDrive(NASTY, [shown_view(5, distances=False)], NASTY),
         ],
         notes=[NASTY],
         tables=tables,
@@ -633,7 +633,7 @@ def test_methods_kinds_and_drives_switch(opened):
     ticks = page.locator(".ticks span").all_inner_texts()
     assert ticks == ["0", "5", "10", "15", "20", "25 %"]
     page.get_by_role("radio", name="Distance error").check(force=True)
-    page.get_by_label("Drive", exact=True).select_option(index=1)
+    page.get_by_label("ShownDrive", exact=True).select_option(index=1)
     assert page.locator("input[name=view]").count() == 1
     # no distances are known there
     assert page.get_by_role("radio", name="Distance error").is_disabled()
@@ -697,7 +697,7 @@ def test_points_are_seen_in_3d(opened, cloud):
     assert (red(first) != red(space(page))).sum() < 100
 
     # another drive has no points
-    page.get_by_label("Drive", exact=True).select_option(index=1)
+    page.get_by_label("ShownDrive", exact=True).select_option(index=1)
     assert not page.locator("#points").is_visible()
 
 

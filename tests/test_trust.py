@@ -18,7 +18,7 @@ from edge_depth_nerf.method.error_model import (
     pixel_features,
     read_trust,
 )
-from edge_depth_nerf.method.prior import PriorOptions, View, make_prior
+from edge_depth_nerf.method.prior import PriorOptions, RayAngles, make_prior
 from edge_depth_nerf.mono import calibration as trust_module
 from edge_depth_nerf.mono.calibration import calibrate_scene, find_trust, held_out_returns, measure_frame
 from edge_depth_nerf.scene.format import TRUST_FILE
@@ -111,7 +111,7 @@ def test_returns_against_their_neighbours():
 
 def test_what_other_frames_show_above_the_returns_is_judged():
     elevation_deg = np.repeat(np.linspace(10, -30, 80)[:, None], 60, axis=1)
-    view = View(np.full(elevation_deg.shape, 0.5, np.float32), np.radians(elevation_deg).astype(np.float32))
+    view = RayAngles(np.full(elevation_deg.shape, 0.5, np.float32), np.radians(elevation_deg).astype(np.float32))
     usable = np.ones(elevation_deg.shape, bool)
     truth = np.full(elevation_deg.shape, 10, np.float32)
     lidar = np.where(elevation_deg <= 2, truth, 0).astype(np.float32)
@@ -267,7 +267,7 @@ def test_no_prior_beyond_lidars_field_but_from_a_source_trained_elsewhere(tmp_pa
     trust = dataclasses.replace(trust, field_rad=(-0.4, 0.1))
     shape = (28, 32)
     elevation = np.broadcast_to(np.linspace(-1, 1, 28, dtype=np.float32)[:, None], shape)
-    view = View(np.full(shape, 0.5, np.float32), elevation)
+    view = RayAngles(np.full(shape, 0.5, np.float32), elevation)
     mono = np.full(shape, 9, np.float32)
     mono[14, 5] = 230  # far beyond
     lidar = np.where(np.random.default_rng(0).random(shape) < 0.3, np.float32(8), 0).astype(np.float32)

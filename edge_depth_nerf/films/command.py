@@ -23,7 +23,7 @@ from edge_depth_nerf.base.files import read_json_object, write_json
 from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.cameras import KannalaBrandt, Pinhole
 from edge_depth_nerf.films.options import LARGEST_PX, CameraPathOptions
-from edge_depth_nerf.films.paths import Drive, lane_shift, orbit, replay, up_of
+from edge_depth_nerf.films.paths import CameraPath, lane_shift, orbit, replay, up_of
 from edge_depth_nerf.films.training import read_dataparser
 from edge_depth_nerf.plugin.compat import quiet_host
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
@@ -100,7 +100,7 @@ def write_camera_path(options: CameraPathOptions, console: Console | None = None
         scene, to_model = _placed(options)
 
     pictures = _followed(scene, options.follow)
-    drive = Drive(_times_s(pictures), _poses(pictures), up_of(np.stack([p.rotation for p in scene.pictures])))
+    drive = CameraPath(_times_s(pictures), _poses(pictures), up_of(np.stack([p.rotation for p in scene.pictures])))
     lens = film_lens(pictures[0].lens, options)
     fps = options.fps or round(drive.frame_rate_hz, 3)
     frames = _frames(drive, options, fps)
@@ -184,7 +184,7 @@ def _even(length: float) -> int:
     return max(2, 2 * round(length / 2))
 
 
-def _frames(drive: Drive, options: CameraPathOptions, fps: float) -> int:
+def _frames(drive: CameraPath, options: CameraPathOptions, fps: float) -> int:
     seconds = options.seconds or (ORBIT_SECONDS if options.kind == "orbit" else None)
     # the film is as long as the drive, with its first and its last picture
     frames = round(drive.duration_s * fps) + 1 if seconds is None else round(seconds * fps)

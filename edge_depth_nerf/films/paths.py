@@ -34,7 +34,7 @@ Direction = Float64[np.ndarray, "3"]
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
+class CameraPath:
     """The path of one camera through a scene.
 
     Raises:
@@ -126,7 +126,7 @@ def up_of(rotations: Float64[np.ndarray, "poses 3 3"]) -> Direction:
     return mean / length
 
 
-def replay(drive: Drive, times_s: Float64[np.ndarray, "times"], forward: bool) -> Float64[np.ndarray, "times 4 4"]:
+def replay(drive: CameraPath, times_s: Float64[np.ndarray, "times"], forward: bool) -> Float64[np.ndarray, "times 4 4"]:
     """Poses along the recorded path.
 
     Args:
@@ -146,7 +146,7 @@ def replay(drive: Drive, times_s: Float64[np.ndarray, "times"], forward: bool) -
 
 
 def lane_shift(
-    drive: Drive, times_s: Float64[np.ndarray, "times"], forward: bool, shift_m: float
+    drive: CameraPath, times_s: Float64[np.ndarray, "times"], forward: bool, shift_m: float
 ) -> Float64[np.ndarray, "times 4 4"]:
     """Poses beside the recorded path: moving aside in the film's first quarter, and back in its last.
 
@@ -168,7 +168,11 @@ def lane_shift(
 
 
 def orbit(
-    drive: Drive, frames: int, ahead_m: float, largest_radius_m: float, points_m: Float[np.ndarray, "points 3"] | None
+    drive: CameraPath,
+    frames: int,
+    ahead_m: float,
+    largest_radius_m: float,
+    points_m: Float[np.ndarray, "points 3"] | None,
 ) -> tuple[Poses, float]:
     """Poses on a level circle around a point of the drive's path, looking at the point.
 

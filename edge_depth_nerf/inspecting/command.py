@@ -32,7 +32,7 @@ from edge_depth_nerf.inspecting.pose_plot import draw_pose_check
 from edge_depth_nerf.inspecting.sheets import draw_sheet
 from edge_depth_nerf.inspecting.shown_prior import ShownScene
 from edge_depth_nerf.inspecting.top_view import draw_top_view
-from edge_depth_nerf.poses.agreement import read_agreement
+from edge_depth_nerf.poses.path_agreement import read_agreement
 from edge_depth_nerf.scene.reader import ScenePicture, read_scene
 
 SUMMARY = "summary.json"

@@ -11,7 +11,7 @@ import numpy as np
 from edge_depth_nerf.inspecting.figures import PictureFigures, Step, recorded, steps, usual_length_m
 from edge_depth_nerf.inspecting.pose_check import BAD_MEDIAN_PX, bad_steps, pose_figures
 from edge_depth_nerf.masks.ego_files import ego_mask_path, vehicles_unknown
-from edge_depth_nerf.poses.matches import Agreement
+from edge_depth_nerf.poses.matches import EpipolarAgreement
 from edge_depth_nerf.scene.format import REFINED_POSES
 from edge_depth_nerf.scene.reader import SceneFolder
 from edge_depth_nerf.scene.writer import best_holdout
@@ -54,7 +54,9 @@ class Finding:
         return asdict(self)
 
 
-def find(scene: SceneFolder, measured: Sequence[PictureFigures], agreements: Sequence[Agreement] = ()) -> list[Finding]:
+def find(
+    scene: SceneFolder, measured: Sequence[PictureFigures], agreements: Sequence[EpipolarAgreement] = ()
+) -> list[Finding]:
     """Run all checks of this module; the most serious findings come first."""
     return [
         *_layers(scene),
@@ -172,7 +174,7 @@ def _path(scene: SceneFolder) -> Iterator[Finding]:
         )
 
 
-def _poses(scene: SceneFolder, agreements: Sequence[Agreement]) -> Iterator[Finding]:
+def _poses(scene: SceneFolder, agreements: Sequence[EpipolarAgreement]) -> Iterator[Finding]:
     refined = scene.path.with_name(REFINED_POSES).is_file()
     remedy = (
         "find new poses with --poses lidar or --poses colmap, and check the lens and the times of the pictures"

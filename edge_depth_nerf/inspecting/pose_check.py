@@ -12,7 +12,7 @@ from rich.console import Console
 from edge_depth_nerf.base.console import run_jobs
 from edge_depth_nerf.cameras.transforms import opencv_to_opengl
 from edge_depth_nerf.inspecting.figures import MEASURED_PICTURES
-from edge_depth_nerf.poses.matches import Agreement, PosedPicture, along_drive
+from edge_depth_nerf.poses.matches import EpipolarAgreement, PosedPicture, along_drive
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
 
 BAD_MEDIAN_PX = 0.4
@@ -24,7 +24,7 @@ BAD_STEP_FACTOR = 3.0
 _LEAST_MOMENTS = 8
 
 
-def check_poses(scene: SceneFolder, console: Console) -> list[Agreement]:
+def check_poses(scene: SceneFolder, console: Console) -> list[EpipolarAgreement]:
     """Match successive pictures of each camera, at some frames spread over the drive.
 
     Scenes of other makers are skipped: their lengths are unknown, and their pictures may be in any order.
@@ -58,19 +58,19 @@ def _posed(scene: SceneFolder, picture: ScenePicture) -> PosedPicture:
     )
 
 
-def known_steps(agreements: Sequence[Agreement], camera: str | None = None) -> list[Agreement]:
+def known_steps(agreements: Sequence[EpipolarAgreement], camera: str | None = None) -> list[EpipolarAgreement]:
     """Return the steps with enough matches, of one camera or of all."""
     return [one for one in agreements if np.isfinite(one.median_px) and camera in (None, one.camera)]
 
 
-def bad_steps(agreements: Sequence[Agreement], camera: str) -> list[Agreement]:
+def bad_steps(agreements: Sequence[EpipolarAgreement], camera: str) -> list[EpipolarAgreement]:
     """Return the steps of a camera that stand out."""
     known = known_steps(agreements, camera)
     usual_px = float(np.median([one.median_px for one in known])) if known else 0.0
     return [one for one in known if one.median_px > max(BAD_STEP_PX, BAD_STEP_FACTOR * usual_px)]
 
 
-def pose_figures(agreements: Sequence[Agreement], camera: str | None = None) -> dict[str, Any] | None:
+def pose_figures(agreements: Sequence[EpipolarAgreement], camera: str | None = None) -> dict[str, Any] | None:
     """Return the steps' median distances of features to their epipolar lines as JSON; None if nothing was matched."""
     medians = [one.median_px for one in known_steps(agreements, camera)]
     if not medians:

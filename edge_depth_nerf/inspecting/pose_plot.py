@@ -11,18 +11,18 @@ from numpy.typing import NDArray
 from edge_depth_nerf.base.pictures import drawn
 from edge_depth_nerf.inspecting.pose_check import BAD_MEDIAN_PX, known_steps
 from edge_depth_nerf.inspecting.top_view import GAP, VIEWS
-from edge_depth_nerf.poses.matches import Agreement
+from edge_depth_nerf.poses.matches import EpipolarAgreement
 from edge_depth_nerf.scene.reader import SceneFolder
 
 _SIZE_INCHES, _DPI = (10.0, 3.6), 100
 
 
-def draw_pose_check(scene: SceneFolder, agreements: Sequence[Agreement]) -> NDArray[np.uint8]:
+def draw_pose_check(scene: SceneFolder, agreements: Sequence[EpipolarAgreement]) -> NDArray[np.uint8]:
     """Draw the medians along the drive, a line for each camera."""
     return drawn(pose_check_figure(scene, agreements))
 
 
-def pose_check_figure(scene: SceneFolder, agreements: Sequence[Agreement]) -> Figure:
+def pose_check_figure(scene: SceneFolder, agreements: Sequence[EpipolarAgreement]) -> Figure:
     """Make the figure of `draw_pose_check`."""
     figure = Figure(_SIZE_INCHES, dpi=_DPI, layout="constrained")
     axes = figure.add_subplot()

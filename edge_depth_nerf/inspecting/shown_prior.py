@@ -10,7 +10,15 @@ from numpy.typing import NDArray
 
 from edge_depth_nerf.method.error_model import Trust, read_trust
 from edge_depth_nerf.method.integration import INTEGRATED
-from edge_depth_nerf.method.prior import FARTHEST_M, Prior, PriorOptions, View, default_source, make_prior, view_of
+from edge_depth_nerf.method.prior import (
+    FARTHEST_M,
+    Prior,
+    PriorOptions,
+    RayAngles,
+    default_source,
+    make_prior,
+    ray_angles,
+)
 from edge_depth_nerf.mono.calibration import saved_trust
 from edge_depth_nerf.scene.format import TRUST_FILE
 from edge_depth_nerf.scene.reader import PictureMaps, SceneFolder, ScenePicture
@@ -62,13 +70,15 @@ class ShownScene:
         source = default_source(picture.files)
         prior = origin = None
         if source:
-            view = view_of(picture.lens, picture.up_in_camera) if self.trust else None
+            view = ray_angles(picture.lens, picture.up_in_camera) if self.trust else None
             prior = make_prior(maps.distances_m, maps.usable, source, PriorOptions(), self.trust, view)
             origin = _origin(maps, source, prior, self.trust, view)
         return ShownMaps(**vars(maps), source=source, prior=prior, origin=origin)
 
 
-def _origin(maps: PictureMaps, source: str, prior: Prior, trust: Trust | None, view: View | None) -> NDArray[np.int8]:
+def _origin(
+    maps: PictureMaps, source: str, prior: Prior, trust: Trust | None, view: RayAngles | None
+) -> NDArray[np.int8]:
     """Return the source of each pixel's prior, by the rules of `make_prior`."""
 
     def has(name: str) -> NDArray[np.bool_]:

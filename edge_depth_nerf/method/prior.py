@@ -126,7 +126,7 @@ class Prior:
 
 
 @dataclass(frozen=True)
-class View:
+class RayAngles:
     """Where the rays of a picture point."""
 
     theta_rad: Float32[np.ndarray, "h w"]
@@ -135,7 +135,7 @@ class View:
     """Angle above the world's horizon; -pi/2 where there is no ray."""
 
 
-def view_of(camera: Camera, up_in_camera: Float[np.ndarray, "3"]) -> View:
+def ray_angles(camera: Camera, up_in_camera: Float[np.ndarray, "3"]) -> RayAngles:
     """The angles of a picture's rays.
 
     Args:
@@ -148,13 +148,13 @@ def view_of(camera: Camera, up_in_camera: Float[np.ndarray, "3"]) -> View:
     theta = np.arccos(np.clip(found.cos_theta, -1, 1))
     none = ~found.within
     theta[none], elevation[none] = np.pi, -np.pi / 2
-    return View(theta, elevation)
+    return RayAngles(theta, elevation)
 
 
 def sky_of(
     mono_m: Float[np.ndarray, "h w"],
     lidar_m: Float[np.ndarray, "h w"] | None,
-    view: View,
+    view: RayAngles,
     picture: UInt8[np.ndarray, "h w 3"],
     mask: Bool[np.ndarray, "h w"],
 ) -> Bool[np.ndarray, "h w"]:
@@ -284,7 +284,7 @@ def _measured(lidar_m: NDArray[np.float32], motion: MotionMap) -> NDArray[np.flo
 
 
 def sigma_of(
-    frame: IntegratedFrame, trust: Trust, view: View, motion: MotionMap | None, motion_sigma_m: NDArray[np.float32]
+    frame: IntegratedFrame, trust: Trust, view: RayAngles, motion: MotionMap | None, motion_sigma_m: NDArray[np.float32]
 ) -> NDArray[np.float32]:
     """σ̂ of a frame's prior, metres: by the model of LiDAR's field in it, by those of `BeyondField` beyond."""
     features = pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, frame.returns, view.theta_rad)
@@ -304,7 +304,7 @@ def sigma_of(
     return sigma_m
 
 
-def beyond_features(frame: IntegratedFrame, view: View) -> dict[str, NDArray[np.float32]]:
+def beyond_features(frame: IntegratedFrame, view: RayAngles) -> dict[str, NDArray[np.float32]]:
     """Features of a frame's pixels beyond LiDAR's field: the nearest known pixel may be one from motion."""
     known = frame.returns | frame.from_motion
     return pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, known, view.theta_rad)
@@ -317,7 +317,7 @@ def _joined(mono_m: NDArray[np.float32], motion_m: NDArray[np.float32], motion_w
 def motion_map(
     motion_m: NDArray[np.float32],
     trust: Trust,
-    view: View,
+    view: RayAngles,
     lidar_m: NDArray[np.float32] | None,
     around_m: NDArray[np.float32] | None = None,
 ) -> MotionMap:
@@ -362,7 +362,7 @@ def make_prior(
     depth_source: str,
     options: PriorOptions,
     trust: Trust | None = None,
-    view: View | None = None,
+    view: RayAngles | None = None,
 ) -> Prior:
     """Align a frame's monocular map, integrate (Eq. 5-7), and say how far each pixel is trusted.
 
@@ -432,7 +432,7 @@ class PriorCache:
         self,
         maps: Maps,
         mask: NDArray[np.bool_],
-        view: View | None = None,
+        view: RayAngles | None = None,
     ) -> Prior:
         """As `make_prior`, from the cache where it is there."""
         angles = (view.theta_rad, view.elevation_rad) if view is not None else ()

@@ -54,13 +54,13 @@ from edge_depth_nerf.method.prior import (
     CACHE_VERSION,
     MotionMap,
     PriorOptions,
-    View,
+    RayAngles,
     around_or_nothing,
     beyond_features,
     confirmed,
     integrate_frame,
     motion_sigma,
-    view_of,
+    ray_angles,
 )
 from edge_depth_nerf.mono.far_seen import seen_above, static_cloud
 from edge_depth_nerf.mono.motion_seen import left_out_pixels
@@ -335,7 +335,7 @@ def _calibrate(
         number, picture = numbered
         maps = scene.maps(picture)
         assert maps.lidar_m is not None and maps.mono_m is not None
-        view = view_of(picture.lens, picture.up_in_camera)
+        view = ray_angles(picture.lens, picture.up_in_camera)
         motion_m, motion = maps.distances_m.get("motion"), None
         if errors is not None and motion_m is not None:
             around_m = around_or_nothing(motion_m, maps.distances_m.get("motion_around"))
@@ -387,7 +387,7 @@ class MotionErrors:
         return weight_of_errors(self.motion, self.mono)
 
 
-def _within(field_rad: tuple[float, float], view: View) -> NDArray[np.bool_]:
+def _within(field_rad: tuple[float, float], view: RayAngles) -> NDArray[np.bool_]:
     """Rays in LiDAR's field, within its margin: as `Trust.in_field`."""
     return Trust("", None, None, field_rad, everywhere=False, drive_fit=None).in_field(view.elevation_rad)
 
@@ -411,7 +411,7 @@ def _errors_of_both(
     motion_m = maps.distances_m.get("motion")
     if maps.lidar_m is None or maps.mono_m is None or motion_m is None:
         return np.empty((2, 0), np.float32), np.empty(0, np.float32)
-    elevation_rad = view_of(picture.lens, picture.up_in_camera).elevation_rad
+    elevation_rad = ray_angles(picture.lens, picture.up_in_camera).elevation_rad
     left_out, _ = held_out_returns(both(maps.lidar_m, maps.mono_m, maps.usable), elevation_rad, number)
     aligned = align(np.where(left_out, np.float32(0), maps.lidar_m), maps.mono_m, maps.usable, options.align).mono_m
     judged = _some(left_out & (motion_m > 0) & (aligned > 0), _JUDGED_A_FRAME, np.random.default_rng([9, number]))
@@ -435,7 +435,7 @@ def measure_frame(
     lidar_m: NDArray[np.float32],
     mono_m: NDArray[np.float32],
     usable: NDArray[np.bool_],
-    view: View,
+    view: RayAngles,
     options: PriorOptions,
     far_seen_m: NDArray[np.float32] | None = None,
     depth_source: str = INTEGRATED,
@@ -507,7 +507,7 @@ def measure_beyond(
     lidar_m: NDArray[np.float32],
     mono_m: NDArray[np.float32],
     usable: NDArray[np.bool_],
-    view: View,
+    view: RayAngles,
     options: PriorOptions,
     motion: MotionMap,
     motion_sigma_m: NDArray[np.float32],

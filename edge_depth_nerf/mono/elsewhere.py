@@ -15,7 +15,7 @@ from jaxtyping import Float32
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.method.alignment import LEAST_RETURNS
-from edge_depth_nerf.mono.examples import view_of
+from edge_depth_nerf.mono.examples import network_view
 from edge_depth_nerf.mono.relative import (
     WRONG_WAY,
     Kind,
@@ -110,7 +110,7 @@ class FittedMaps:
         return layers, take_samples(layers, lidar_m, usable, _SAMPLES)
 
     def _usable(self, picture: ScenePicture) -> np.ndarray:
-        return view_of(picture, self.scene.theta_max_rad, max(picture.lens.width, picture.lens.height)).usable
+        return network_view(picture, self.scene.theta_max_rad, max(picture.lens.width, picture.lens.height)).usable
 
     def _returns(self, picture: ScenePicture) -> int:
         if "lidar" not in picture.files:

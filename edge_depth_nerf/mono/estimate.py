@@ -39,9 +39,9 @@ from edge_depth_nerf.mono.examples import (
     camera_height_m,
     lens_rays,
     load_examples,
+    network_view,
     room_radius_m,
     small_picture,
-    view_of,
 )
 from edge_depth_nerf.mono.far_seen import field_deg, seen_above, static_cloud
 from edge_depth_nerf.mono.files import find_maps
@@ -533,7 +533,7 @@ def without_sky(
         known_m: a map that can tell a ceiling from the sky; None without.
 
     """
-    usable = view_of(picture, scene.theta_max_rad, max(metres.shape)).usable
+    usable = network_view(picture, scene.theta_max_rad, max(metres.shape)).usable
     lidar_m = scene.lidar_m(picture)
     matched_m = scene.distance_m(picture, "motion")
     if matched_m is not None:
@@ -557,7 +557,7 @@ def predict(
 ) -> Float32[np.ndarray, "h w"]:
     """Predict one picture at its own size, metres along the ray."""
     settings = network.settings
-    view = view_of(picture, scene.theta_max_rad, settings.working_px)
+    view = network_view(picture, scene.theta_max_rad, settings.working_px)
     rows, columns = view.usable.shape
     rgb = small_picture(picture, (columns, rows))
 

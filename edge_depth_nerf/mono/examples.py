@@ -38,7 +38,7 @@ _MIN_GROUND_RETURNS = 100
 
 
 @dataclass(frozen=True)
-class View:
+class NetworkView:
     """One picture at the network's size, without its colours."""
 
     rays: Float32[np.ndarray, "h w 3"]
@@ -86,7 +86,7 @@ def working_size(width: int, height: int, working_px: int) -> tuple[int, int]:
     return max(round(width * working_px / longer), 1), max(round(height * working_px / longer), 1)
 
 
-def view_of(picture: ScenePicture, theta_max_rad: float, working_px: int) -> View:
+def network_view(picture: ScenePicture, theta_max_rad: float, working_px: int) -> NetworkView:
     """Rays and mask of a picture at the network's size."""
     size = working_size(picture.lens.width, picture.lens.height, working_px)
     directions, within = lens_rays(picture.lens, theta_max_rad, size)
@@ -95,7 +95,7 @@ def view_of(picture: ScenePicture, theta_max_rad: float, working_px: int) -> Vie
         check_size(mask, picture, "mask")
         # a pixel that a masked one is mixed into is masked as well
         within = within & (cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999)
-    return View(directions, within, picture.up_in_camera.astype(np.float32))
+    return NetworkView(directions, within, picture.up_in_camera.astype(np.float32))
 
 
 def scaled_lens(lens: KannalaBrandt | Pinhole, size: tuple[int, int]) -> KannalaBrandt | Pinhole:
@@ -154,7 +154,7 @@ def load_examples(
     index = 0
     for number, (scene, pictures, height_m) in enumerate(zip(scenes, chosen, heights_m, strict=True)):
         for picture in pictures:
-            view = view_of(picture, scene.theta_max_rad, working_px)
+            view = network_view(picture, scene.theta_max_rad, working_px)
             rows, columns = view.usable.shape
             part = (index, slice(0, rows), slice(0, columns))
             rgb[part] = small_picture(picture, (columns, rows))
@@ -201,12 +201,12 @@ def small_picture(picture: ScenePicture, size: tuple[int, int]) -> UInt8[np.ndar
     return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def small_lidar(scene: SceneFolder, picture: ScenePicture, view: View) -> Float32[np.ndarray, "h w"]:
+def small_lidar(scene: SceneFolder, picture: ScenePicture, view: NetworkView) -> Float32[np.ndarray, "h w"]:
     """LiDAR at the network's size: of the LiDAR points in a pixel the one nearest to its centre."""
     return _reduced(scene.lidar_m(picture), view)
 
 
-def _reduced(lidar_m: Float32[np.ndarray, "rows columns"], view: View) -> Float32[np.ndarray, "h w"]:
+def _reduced(lidar_m: Float32[np.ndarray, "rows columns"], view: NetworkView) -> Float32[np.ndarray, "h w"]:
     """A sparse map at the size of a view: of the values in a pixel the one nearest to its centre."""
     full_rows, full_columns = lidar_m.shape
     rows, columns = view.usable.shape
@@ -248,7 +248,7 @@ def camera_height_m(scene: SceneFolder, pictures: Sequence[ScenePicture], workin
     depths = []
     for picture in pictures:
         size = working_size(picture.lens.width, picture.lens.height, working_px)
-        view = View(*lens_rays(picture.lens, scene.theta_max_rad, size), picture.up_in_camera.astype(np.float32))
+        view = NetworkView(*lens_rays(picture.lens, scene.theta_max_rad, size), picture.up_in_camera.astype(np.float32))
         lidar_m = small_lidar(scene, picture, view)
         height_sine = view.rays @ view.up_in_camera
         below = (lidar_m > 0) & (height_sine < _GROUND_SINE)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.lidar.projection import project_points
 from edge_depth_nerf.lidar.voxels import first_in_voxel
-from edge_depth_nerf.mono.examples import scaled_lens, view_of
+from edge_depth_nerf.mono.examples import network_view, scaled_lens
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
 
 VOXEL_M = 0.05
@@ -253,7 +253,7 @@ def _tile_number(x: Int64[np.ndarray, "n"], y: Int64[np.ndarray, "n"] | np.int64
 
 def _own(scene: SceneFolder, picture: ScenePicture) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
     """A picture's rays, and its LiDAR map within the mask, at its own size."""
-    view = view_of(picture, scene.theta_max_rad, max(picture.lens.width, picture.lens.height))
+    view = network_view(picture, scene.theta_max_rad, max(picture.lens.width, picture.lens.height))
     return view.rays, np.where(view.usable, scene.lidar_m(picture), np.float32(0))
 
 

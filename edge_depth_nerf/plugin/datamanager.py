@@ -51,8 +51,8 @@ from edge_depth_nerf.method.prior import (
     PriorCache,
     PriorOptions,
     default_source,
+    ray_angles,
     sky_of,
-    view_of,
 )
 from edge_depth_nerf.mono.calibration import field_of_source, find_trust
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
@@ -403,7 +403,7 @@ def _load(
                 # a scene without keeps the priors that it has
                 maps.pop(layer, None)
         picture, mono = dataset.pictures[image_idx], maps.get("mono")
-        view = view_of(picture.lens, picture.up_in_camera) if mono is not None else None
+        view = ray_angles(picture.lens, picture.up_in_camera) if mono is not None else None
         prior = cache.prior(maps, mask, view if recipe.trust is not None else None)
         sky = None if mono is None or view is None else sky_of(mono, maps.get("lidar"), view, rgb, mask)
         if sky is not None and (motion := maps.get("motion")) is not None:

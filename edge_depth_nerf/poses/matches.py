@@ -272,7 +272,7 @@ def _from_curve_px(
 
 
 @dataclass(frozen=True)
-class Agreement:
+class EpipolarAgreement:
     """How well the poses of two pictures of one camera agree with what both see."""
 
     camera: str
@@ -287,14 +287,6 @@ class Agreement:
     """Median of their distances from it; NaN for fewer than twenty."""
     inliers: float
     """Share that lies within 2 px; NaN likewise."""
-
-
-def agreement(camera: str, first: int, second: int, distances_px: Float64[np.ndarray, "m"]) -> Agreement:
-    """Sum up the matches of two pictures."""
-    known = distances_px[np.isfinite(distances_px)]
-    if len(known) < LEAST_MATCHES:
-        return Agreement(camera, first, second, len(known), float("nan"), float("nan"))
-    return Agreement(camera, first, second, len(known), float(np.median(known)), float((known < INLIER_PX).mean()))
 
 
 def successive(
@@ -324,7 +316,7 @@ def successive(
 
 def along_drive(
     pictures: Sequence[PosedPicture], apart: Sequence[int] = (1, 2), most: int = MEASURED_MOMENTS
-) -> list[Agreement]:
+) -> list[EpipolarAgreement]:
     """Hold the poses of a drive against features matched between successive pictures of each camera.
 
     Args:
@@ -343,5 +335,9 @@ def along_drive(
     for matches in match_pictures(pictures, successive(pictures, apart, most)):
         first, second = pictures[matches.first], pictures[matches.second]
         distances_px = epipolar_distance_px(matches, first.camera_to_world, second.camera_to_world)
-        found.append(agreement(first.camera, first.moment, second.moment, distances_px))
+        known = distances_px[np.isfinite(distances_px)]
+        median_px = inliers = float("nan")
+        if len(known) >= LEAST_MATCHES:
+            median_px, inliers = float(np.median(known)), float((known < INLIER_PX).mean())
+        found.append(EpipolarAgreement(first.camera, first.moment, second.moment, len(known), median_px, inliers))
     return found

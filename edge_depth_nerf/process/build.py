@@ -33,7 +33,6 @@ from edge_depth_nerf.masks.lens import lens_circle
 from edge_depth_nerf.masks.semantics import check_classes, keep_static, read_labels
 from edge_depth_nerf.masks.semantics import sky as sky_of_labels
 from edge_depth_nerf.masks.sky import find_sky
-from edge_depth_nerf.process.agreement import agreement_notices, agreements
 from edge_depth_nerf.process.downscale import downscale_distance, downscale_image, downscale_mask
 from edge_depth_nerf.process.moving import find_moving
 from edge_depth_nerf.process.options import ProcessOptions
@@ -41,6 +40,7 @@ from edge_depth_nerf.process.pose_checks import features_say, lidar_says
 from edge_depth_nerf.process.reading import load_distance, load_picture, read_depth
 from edge_depth_nerf.process.recording import RecordedPicture, Recording
 from edge_depth_nerf.process.sweep_store import SweepStore
+from edge_depth_nerf.process.transform_checks import agreement_notices, agreements
 from edge_depth_nerf.process.vehicle import find_vehicle, given_masks
 from edge_depth_nerf.scene.checks import read_camera_mask
 from edge_depth_nerf.scene.format import TRANSFORMS

@@ -70,7 +70,7 @@ def add_motion(scene: SceneFolder, console: Console) -> None:
     if still == len(pictures):
         say(console, f"No distances from motion: {_STANDS}, in all training pictures.", "yellow")
         return
-    store = SweepStore(scene.folder / ".cache" / "motion", scene, pictures, motion)
+    store = SphereSweepCache(scene.folder / ".cache" / "motion", scene, pictures, motion)
     run_jobs([partial(store.make, index) for index in range(len(pictures))], "Sweeping pictures", console)
     run_jobs([partial(store.confirmed, index) for index in range(len(pictures))], "Confirming distances", console)
     numbers = {picture.name: index for index, picture in enumerate(pictures)}
@@ -156,7 +156,7 @@ def enlarged_sigma(found: MotionDistance, factor: int, size: tuple[int, int]) ->
     return np.where(result > 0, np.maximum(result, np.float32(1 / DISTANCE_STEPS_PER_METRE)), result)
 
 
-class SweepStore:
+class SphereSweepCache:
     """The sweeps of a scene's pictures and what is confirmed of them: on disk, the last sweeps in memory too."""
 
     def __init__(self, root: Path, scene: SceneFolder, pictures: list[ScenePicture], motion: Motion) -> None:

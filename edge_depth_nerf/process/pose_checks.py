@@ -11,8 +11,8 @@ from rich.console import Console
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_image
-from edge_depth_nerf.poses.agreement import compare_paths, read_agreement, write_agreement
 from edge_depth_nerf.poses.matches import PosedPicture, along_drive
+from edge_depth_nerf.poses.path_agreement import compare_paths, read_agreement, write_agreement
 from edge_depth_nerf.process.feature_masks import FeatureMasks
 from edge_depth_nerf.process.lidar_poses import check_sweeps, path_of
 from edge_depth_nerf.process.options import ProcessOptions

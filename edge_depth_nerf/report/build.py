@@ -13,7 +13,7 @@ from jinja2 import Environment, StrictUndefined
 
 from edge_depth_nerf.base.files import write_text
 from edge_depth_nerf.report.tables import MadeTable
-from edge_depth_nerf.report.views import KINDS, Drive, data_uri, legend
+from edge_depth_nerf.report.views import KINDS, ShownDrive, data_uri, legend
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Report:
     title: str
     lead: str
     """What was compared, in a sentence or two."""
-    drives: Sequence[Drive]
+    drives: Sequence[ShownDrive]
     tables: Sequence[MadeTable]
     plots: Sequence[Plot]
     facts: Sequence[Facts]

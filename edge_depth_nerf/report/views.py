@@ -103,7 +103,7 @@ class ShownView:
 
 
 @dataclass(frozen=True)
-class Drive:
+class ShownDrive:
     """The pictures of a drive."""
 
     title: str
@@ -119,7 +119,7 @@ def views_of_a_drive(runs: int) -> int:
     return max(MOST_PICTURES // (len(KINDS) * max(runs, 1)), 1)
 
 
-def make_drives(drives: Mapping[str, tuple[Path, Mapping[str, Path]]], console: Console) -> list[Drive]:
+def make_drives(drives: Mapping[str, tuple[Path, Mapping[str, Path]]], console: Console) -> list[ShownDrive]:
     """Make the pictures of all drives, with progress.
 
     Args:
@@ -140,7 +140,7 @@ def make_drives(drives: Mapping[str, tuple[Path, Mapping[str, Path]]], console: 
     jobs = [partial(make, title, index) for title in drives for index in chosen[title]]
     made = iter(run_jobs(jobs, f"Pictures for {REPORT}", console))
     return [
-        Drive(
+        ShownDrive(
             title,
             [next(made) for _ in chosen[title]],
             _note(frames[title], len(chosen[title])),

@@ -361,7 +361,7 @@ class _GroundLight:
 
 
 @dataclass(frozen=True)
-class View:
+class RenderedView:
     """What a camera sees, H×W."""
 
     radiance: Array
@@ -443,7 +443,7 @@ class FisheyeCamera:
 
     def view(
         self, world: World, camera_to_world: NDArray[np.float64], time_s: float, with_own_car: bool = True
-    ) -> View:
+    ) -> RenderedView:
         """Render the world from a 4×4 camera pose."""
         rotation, origin = camera_to_world[:3, :3].T.astype(np.float32), camera_to_world[:3, 3].astype(np.float32)
         count = len(self._pixels)
@@ -466,7 +466,7 @@ class FisheyeCamera:
         colour *= self._transmission
         distance = self._spread(distance)
         keep = self.lens & ~self.own_car if with_own_car else self.lens
-        return View(self._spread(colour), np.where(keep, distance, 0), self._spread(moving))
+        return RenderedView(self._spread(colour), np.where(keep, distance, 0), self._spread(moving))
 
 
 def own_car_world(model: SceneModel, seed: int, body: BodyName = "grey") -> World:

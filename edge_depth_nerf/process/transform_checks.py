@@ -61,7 +61,7 @@ _NO_FIT = 0.3
 
 
 @dataclass(frozen=True)
-class Agreement:
+class ContrastAgreement:
     """How well a scanner's points agree with a camera's pictures; correlations, at most 1."""
 
     camera: str
@@ -133,7 +133,7 @@ class _Pair:
         return np.linalg.inv(second) @ first
 
 
-def agreements(recording: Recording, usable: Mapping[str, Bool[np.ndarray, "h w"]]) -> list[Agreement]:
+def agreements(recording: Recording, usable: Mapping[str, Bool[np.ndarray, "h w"]]) -> list[ContrastAgreement]:
     """Compare each scanner's points with each camera's pictures, a few of them.
 
     Args:
@@ -211,7 +211,7 @@ def _agreement(
     usable: Bool[np.ndarray, "h w"],
     pairs: Sequence[_Pair],
     sweeps: Sequence[RecordedSweep],
-) -> Agreement | None:
+) -> ContrastAgreement | None:
     """Measure one scanner against one camera."""
     assert recording.trajectory is not None
     sums: dict[tuple[bool, bool], _Sums] = {}
@@ -245,7 +245,7 @@ def _agreement(
         sums[key].correlation if sums[key].tells else 0.0
         for key in ((False, False), (False, True), (True, False), (True, True))
     )
-    return Agreement(camera.name, sweeps[0].scanner, given, by_camera, by_scanner, by_both, still.correlation)
+    return ContrastAgreement(camera.name, sweeps[0].scanner, given, by_camera, by_scanner, by_both, still.correlation)
 
 
 def _seen_twice(
@@ -283,7 +283,7 @@ def _sampled(picture: Float32[np.ndarray, "h w"], places: Float32[np.ndarray, "n
     return (upper * (1 - down) + lower * down).astype(np.float32)
 
 
-def agreement_notices(found: Sequence[Agreement]) -> list[str]:
+def agreement_notices(found: Sequence[ContrastAgreement]) -> list[str]:
     """Say which transforms seem to be wrong; nothing for those that fit."""
     notices = []
     for which, whose, fix in (
