@@ -2,8 +2,9 @@
 
 The rules are in docs/prose_rules.toml: patterns that must not occur, with the words to use instead, and the longest
 sentence. Code and addresses are left out. In the package's modules, docstrings are checked like pages, and other
-strings of four words or more are checked as messages; docs/options.md contains the help texts. vale, the usual program
-for this, is not used, because its wheel downloads the program when it first runs.
+strings of four words or more are checked as messages; docs/options.md contains the help texts. The names of modules,
+classes, functions, arguments and attributes must not contain the words of `identifiers`. vale, the usual program for
+this, is not used, because its wheel downloads the program when it first runs.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ PAGES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "data/README.md", "benc
 MODULES = "edge_depth_nerf/**/*.py"
 LEAST_WORDS = 4
 """Strings of a module with fewer words are names and keys, not messages."""
+NAME_WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 LIST_ITEM = re.compile(r" *(?:[-*]|\d+\.) +")
 SENTENCE_END = re.compile(r"[.!?:;][)\"*]*\s+")
 OFF, ON = "<!-- prose: off -->", "<!-- prose: on -->"
@@ -96,6 +98,30 @@ def docstrings(source: str) -> Iterator[Text]:
                 yield Text(node.lineno + text.line - 1, text.words)
 
 
+def identifiers(path: Path) -> Iterator[Text]:
+    """The names that a module defines, and its own; names within a function are left out, except its arguments."""
+    yield Text(1, path.stem)
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            yield Text(node.lineno, node.name)
+        elif isinstance(node, ast.arg):
+            yield Text(node.lineno, node.arg)
+        elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
+            yield Text(node.lineno, node.attr)
+        if isinstance(node, ast.Module | ast.ClassDef):
+            assigned = [one for one in node.body if isinstance(one, ast.Assign | ast.AnnAssign)]
+            names = [one for each in assigned for one in ast.walk(each) if isinstance(one, ast.Name)]
+            yield from (Text(name.lineno, name.id) for name in names if isinstance(name.ctx, ast.Store))
+
+
+def faults_of_name(name: str, rules: dict[str, Any]) -> Iterator[str]:
+    """What the rules have against an identifier: patterns are searched in its words, joined by _."""
+    words = "_".join(NAME_WORD.findall(name)).lower()
+    for rule in rules.get("identifiers", []):
+        if re.search(rf"(?:^|_)(?:{rule['pattern']})(?:_|$)", words) and name not in rule.get("allowed", []):
+            yield f"the name {name}: write {rule['instead']}"
+
+
 def texts(path: Path) -> Iterator[Text]:
     """Everything that people read in a page or module."""
     content = path.read_text(encoding="utf-8")
@@ -128,6 +154,10 @@ def main(root: Path = ROOT) -> int:
             for text in texts(path):
                 for fault in faults(text, rules):
                     print(f"{path.relative_to(root)}:{text.line}: {fault}")
+                    found += 1
+            for name in identifiers(path) if pattern == MODULES else ():
+                for fault in faults_of_name(name.words, rules):
+                    print(f"{path.relative_to(root)}:{name.line}: {fault}")
                     found += 1
     print(f"{found} faults" if found else "The prose is plain.")
     return found

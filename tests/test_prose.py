@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -110,3 +111,33 @@ def test_code_examples_and_long_lists_are_left_alone(prose, tmp_path, capsys):
     page.write_text("A " + "very " * 40 + "long sentence.\n", encoding="utf-8")
     assert prose.main(tmp_path) == 1
     assert "README.md:1: a sentence of 43 words" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("code", "name"),
+    [
+        ("def find_returns(): ...\n", "find_returns"),
+        ("def find(returns): ...\n", "returns"),
+        ("find = lambda at_return: 0\n", "at_return"),
+        ("class NearReturns: ...\n", "NearReturns"),
+        ("LEAST_RETURNS = 4\n", "LEAST_RETURNS"),
+        ("class Scan:\n    returns: int = 3\n", "returns"),
+        ("class Scan:\n    def __init__(self):\n        self.returns = 3\n", "returns"),
+    ],
+)
+def test_a_word_in_a_name_is_refused(prose, monkeypatch, tmp_path, capsys, code, name):
+    rules = tmp_path / "rules.toml"
+    rules.write_text(
+        'rules = []\n[sentences]\nmost_words = 40\n[[identifiers]]\npattern = "returns?"\n'
+        'instead = "points"\nallowed = ["keep_returns"]\n'
+    )
+    monkeypatch.setattr(prose, "RULES", rules)
+    module = tmp_path / "edge_depth_nerf/scan.py"
+    module.parent.mkdir()
+    module.write_text(f"{code}\n\ndef returned(keep_returns):\n    returns = 3\n    return returns\n")
+    assert prose.main(tmp_path) == 1
+    assert f"the name {name}: write points" in capsys.readouterr().out
+    module.write_text(re.sub("(?i)returns?", "points", code))
+    assert prose.main(tmp_path) == 0
+    module.rename(module.with_name("returns.py")).write_text('"""A module."""\n')
+    assert prose.main(tmp_path) == 1
