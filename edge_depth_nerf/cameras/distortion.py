@@ -68,10 +68,7 @@ class Distortion:
         return distorted
 
     def undistort(
-        self,
-        distorted: Float[Tensor, "*batch 2"],
-        radius_max: float,
-        tolerance: Float[Tensor, "*batch"],
+        self, distorted: Float[Tensor, "*batch 2"], radius_max: float, tolerance: Float[Tensor, "*batch"]
     ) -> tuple[Float[Tensor, "*batch 2"], Bool[Tensor, "*batch"]]:
         """Find x with F(x) = distorted, by damped Newton steps, to the precision of the type.
 

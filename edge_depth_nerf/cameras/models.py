@@ -157,9 +157,7 @@ class Camera(ABC):
     def pixel_centres(self, dtype: torch.dtype = torch.float64) -> Float[Tensor, "height width 2"]:
         """The centres (x, y) of all pixels, row by row."""
         y, x = torch.meshgrid(
-            torch.arange(self.height, dtype=dtype) + 0.5,
-            torch.arange(self.width, dtype=dtype) + 0.5,
-            indexing="ij",
+            torch.arange(self.height, dtype=dtype) + 0.5, torch.arange(self.width, dtype=dtype) + 0.5, indexing="ij"
         )
         return torch.stack((x, y), -1)
 

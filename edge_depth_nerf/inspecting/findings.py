@@ -133,10 +133,7 @@ def _split(scene: SceneFolder) -> Iterator[Finding]:
         advice = (
             f"process the drive with --holdout-every {best_holdout(moments)}" if moments > 1 else "take more frames"
         )
-        yield Finding(
-            "no_held_out",
-            f"No frame is held out, so ns-eval would use training pictures. Remedy: {advice}.",
-        )
+        yield Finding("no_held_out", f"No frame is held out, so ns-eval would use training pictures. Remedy: {advice}.")
 
 
 def _path(scene: SceneFolder) -> Iterator[Finding]:

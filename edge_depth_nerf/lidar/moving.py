@@ -173,12 +173,7 @@ def one_stretch(
     return score
 
 
-def loose_returns(
-    sweep: WorldSweep,
-    time_s: float,
-    ground: Ground,
-    others: Sequence[tuple[float, FreeSpace]],
-) -> Loose:
+def loose_returns(sweep: WorldSweep, time_s: float, ground: Ground, others: Sequence[tuple[float, FreeSpace]]) -> Loose:
     """Find the LiDAR points of a sweep that moved, and those of which nothing is known.
 
     Args:

@@ -154,9 +154,7 @@ def read_scan(path: Path, scan: ScanFormat, moment_s: float = 0.0) -> Sweep:
     return usable_returns(path, torch.from_numpy(points_m), torch.from_numpy(intensity), offset_s)
 
 
-def read_cloud(
-    path: Path,
-) -> tuple[Float64[np.ndarray, "points 3"], UInt8[np.ndarray, "points 3"] | None]:
+def read_cloud(path: Path) -> tuple[Float64[np.ndarray, "points 3"], UInt8[np.ndarray, "points 3"] | None]:
     """Read the vertices of a .ply file unchanged, and their colours (RGB) where it has any.
 
     Raises:

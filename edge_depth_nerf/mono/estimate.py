@@ -99,12 +99,7 @@ PRESETS: dict[Preset, PresetValues] = {
         512,
         # no GPU has trained it yet: Muon, measured with the small one, may want other rates here
         TrainingOptions(
-            steps=20000,
-            batch=8,
-            learning_rate=1e-3,
-            hidden_learning_rate=None,
-            evaluate_every=250,
-            patience=20,
+            steps=20000, batch=8, learning_rate=1e-3, hidden_learning_rate=None, evaluate_every=250, patience=20
         ),
     ),
 }
@@ -254,10 +249,7 @@ def _write_fitted(every: Sequence[FittedMaps], source: dict[str, Any], console: 
 
 
 def _train(
-    scenes: Sequence[SceneFolder],
-    options: EstimateDepthOptions,
-    start: DepthNetwork | None,
-    console: Console,
+    scenes: Sequence[SceneFolder], options: EstimateDepthOptions, start: DepthNetwork | None, console: Console
 ) -> tuple[DepthNetwork, Path, dict[str, Any], Trained | None]:
     """Train, or find that it was done; give the network, its file, what is known about it, and the training.
 
@@ -549,11 +541,7 @@ def without_sky(
 
 @torch.no_grad()
 def predict(
-    network: DepthNetwork,
-    scene: SceneFolder,
-    picture: ScenePicture,
-    height_m: float,
-    device: torch.device,
+    network: DepthNetwork, scene: SceneFolder, picture: ScenePicture, height_m: float, device: torch.device
 ) -> Float32[np.ndarray, "h w"]:
     """Predict one picture at its own size, metres along the ray."""
     settings = network.settings

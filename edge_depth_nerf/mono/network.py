@@ -77,10 +77,7 @@ class DepthNetwork(nn.Module):
         nn.init.zeros_(self.head.bias)
 
     def forward(
-        self,
-        picture: Float[Tensor, "n 3 h w"],
-        geometry: Float[Tensor, "n 5 h w"],
-        usable: Bool[Tensor, "n h w"],
+        self, picture: Float[Tensor, "n 3 h w"], geometry: Float[Tensor, "n 5 h w"], usable: Bool[Tensor, "n h w"]
     ) -> Float[Tensor, "n h w"]:
         """Predict.
 

@@ -111,11 +111,7 @@ def _upright(azimuth_deg: float, elevation_deg: float) -> NDArray[np.float64]:
     azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
     right = np.array([math.cos(azimuth), 0.0, -math.sin(azimuth)])
     forward = np.array(
-        [
-            math.sin(azimuth) * math.cos(elevation),
-            -math.sin(elevation),
-            math.cos(azimuth) * math.cos(elevation),
-        ]
+        [math.sin(azimuth) * math.cos(elevation), -math.sin(elevation), math.cos(azimuth) * math.cos(elevation)]
     )
     return np.stack([right, np.cross(forward, right), forward], 1)
 

@@ -460,13 +460,7 @@ def _save(path: Path, state: _State, network: DepthNetwork, optimizer: HiddenMuo
     write_tensors(path, tensors, header)
 
 
-def _resume(
-    path: Path,
-    fresh: _State,
-    network: DepthNetwork,
-    optimizer: HiddenMuon,
-    best: dict[str, Tensor],
-) -> _State:
+def _resume(path: Path, fresh: _State, network: DepthNetwork, optimizer: HiddenMuon, best: dict[str, Tensor]) -> _State:
     """Load a checkpoint into network, optimizer and `best`; one of another training changes nothing."""
     try:
         tensors, header = read_tensors(path)

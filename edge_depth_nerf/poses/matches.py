@@ -220,13 +220,7 @@ def match_pictures(
             if index not in features:
                 features[index] = find_features(pictures[index], most)
         found = match_features(features[first], features[second])
-        yield Matches(
-            first,
-            second,
-            found,
-            features[first].sights[found[:, 0]],
-            features[second].sights[found[:, 1]],
-        )
+        yield Matches(first, second, found, features[first].sights[found[:, 0]], features[second].sights[found[:, 1]])
         for index in {first, second}:
             if last[index] == number:
                 del features[index]

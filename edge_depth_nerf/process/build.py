@@ -246,11 +246,7 @@ class _Builder:
     """Makes the maps of pictures; called from several threads."""
 
     def __init__(
-        self,
-        recording: Recording,
-        options: ProcessOptions,
-        held_out: set[int],
-        masks: dict[str, NDArray[np.bool_]],
+        self, recording: Recording, options: ProcessOptions, held_out: set[int], masks: dict[str, NDArray[np.bool_]]
     ) -> None:
         assert recording.trajectory is not None
         self._options, self._held_out, self._recording = options, held_out, recording

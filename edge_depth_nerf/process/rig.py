@@ -29,13 +29,7 @@ from edge_depth_nerf.lidar.sweeps import usable_returns
 from edge_depth_nerf.lidar.trajectory import MAX_POSE_GAP_S, Trajectory
 from edge_depth_nerf.process.options import JbnuDepth360Options, RigOptions
 from edge_depth_nerf.process.poses import read_kitti, read_nerfstudio, read_times, read_tum
-from edge_depth_nerf.process.recording import (
-    DepthFile,
-    RecordedCamera,
-    RecordedPicture,
-    RecordedSweep,
-    Recording,
-)
+from edge_depth_nerf.process.recording import DepthFile, RecordedCamera, RecordedPicture, RecordedSweep, Recording
 from edge_depth_nerf.process.rig_file import Clock, Rig, RigCamera, RigLidar, RigPoses, read_rig
 from edge_depth_nerf.scene.checks import Tolerance, check_size, size_error
 from edge_depth_nerf.scene.writer import Skipped, summarise

@@ -82,12 +82,7 @@ def build_report(report: Report) -> str:
         f"script-src {' '.join(map(_digest, scripts))}; style-src {_digest(style)}"
     )
     return environment.from_string(template).render(
-        report=report,
-        policy=policy,
-        scripts=scripts,
-        in_3d=bool(in_3d),
-        style=style,
-        data=_pictures(report),
+        report=report, policy=policy, scripts=scripts, in_3d=bool(in_3d), style=style, data=_pictures(report)
     )
 
 

@@ -633,8 +633,7 @@ def _pending(
             frame
             for frame in frames
             if not current(
-                frame,
-                [*_frame_files(frame, layers).values(), *([] if frame.held_out else [_cloud_path(frame)])],
+                frame, [*_frame_files(frame, layers).values(), *([] if frame.held_out else [_cloud_path(frame)])]
             )
         ]
     return _Work(stale, [view for view in shifted if not fresh(_shifted_files(view), view.inputs)], cloud)

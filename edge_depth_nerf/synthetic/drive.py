@@ -34,13 +34,7 @@ from rich.console import Console
 
 from edge_depth_nerf.base.console import progress_bars
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import (
-    check_is_folder,
-    read_json,
-    write_json,
-    write_mask,
-    write_text,
-)
+from edge_depth_nerf.base.files import check_is_folder, read_json, write_json, write_mask, write_text
 from edge_depth_nerf.synthetic import rig
 from edge_depth_nerf.synthetic.layout import WORLD_ORIGIN_M, DriveLayout, MountedCamera
 from edge_depth_nerf.synthetic.lidar import Sweep

@@ -143,14 +143,7 @@ class MeshBuilder:
         normals = np.asarray(mesh.vertex_normals)[mesh.faces] if smooth else None
         self.add_triangles(np.asarray(mesh.triangles), material, tint, normals)
 
-    def add_box(
-        self,
-        centre: Triple,
-        size: Triple,
-        material: Material,
-        tint: Colour,
-        yaw_rad: Real = 0.0,
-    ) -> None:
+    def add_box(self, centre: Triple, size: Triple, material: Material, tint: Colour, yaw_rad: Real = 0.0) -> None:
         """Add a box of `size` (x, y, z) about `centre`, turned about its upright axis."""
         corners = _UNIT_BOX * size
         if yaw_rad:
@@ -177,10 +170,7 @@ class MeshBuilder:
         a, b = start + first * round_, end + last * round_
         walls = np.concatenate((np.stack((a[:-1], a[1:], b[1:]), 1), np.stack((a[:-1], b[1:], b[:-1]), 1)))
         normals = np.concatenate(
-            (
-                np.stack((round_[:-1], round_[1:], round_[1:]), 1),
-                np.stack((round_[:-1], round_[1:], round_[:-1]), 1),
-            )
+            (np.stack((round_[:-1], round_[1:], round_[1:]), 1), np.stack((round_[:-1], round_[1:], round_[:-1]), 1))
         )
         self.add_triangles(walls, material, tint, normals)
         self.add_polygon(a[:-1], material, tint)

@@ -313,13 +313,7 @@ def _wall(
         x, y = start + along * u - outward * depth
         return float(x), float(y), z[0] + v
 
-    def panel(
-        u: Pair,
-        v: Pair,
-        depth: Real | Pair,
-        kind: Material,
-        colour: Colour,
-    ) -> None:
+    def panel(u: Pair, v: Pair, depth: Real | Pair, kind: Material, colour: Colour) -> None:
         near, far = depth if isinstance(depth, tuple) else (depth, depth)
         if u[0] == u[1]:
             corners = [point(u[0], v[0], near), point(u[0], v[0], far), point(u[0], v[1], far), point(u[0], v[1], near)]

@@ -211,14 +211,7 @@ class World:
         return result
 
     def _add_sun(
-        self,
-        sun: Array,
-        irradiance: Array,
-        start: Array,
-        flat: Array,
-        normal: Array,
-        material: NDArray,
-        time_s: float,
+        self, sun: Array, irradiance: Array, start: Array, flat: Array, normal: Array, material: NDArray, time_s: float
     ) -> None:
         facing = normal @ sun
         strength = np.where((flat @ sun > 0) | (TRANSLUCENCY[material] > 0), np.maximum(facing, 0), 0)

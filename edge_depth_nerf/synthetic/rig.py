@@ -122,7 +122,6 @@ def write_calibration(folder: Path, size_px: int) -> None:
             f"   u0: {mei.cx - 0.5:.16e}\n   v0: {mei.cy - 0.5:.16e}\n",
         )
     write_text(
-        folder / "calib_cam_to_pose.txt",
-        "".join(f"{name}: {numbers}\n" for name, numbers in _CAM_TO_POSE.items()),
+        folder / "calib_cam_to_pose.txt", "".join(f"{name}: {numbers}\n" for name, numbers in _CAM_TO_POSE.items())
     )
     write_text(folder / "calib_cam_to_velo.txt", _CAM0_TO_VELO + "\n")

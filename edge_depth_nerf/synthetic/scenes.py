@@ -692,13 +692,7 @@ def _parking(options: SynthesizeOptions) -> SceneModel:
     return _driven_through(options, site, lighting, Route((0.0, -1.1)), Route((0.0, 1.6), np.pi))
 
 
-_BUILDERS = {
-    "street": _street,
-    "traffic": _street,
-    "turn": _turn,
-    "parking": _parking,
-    "roundabout": _roundabout,
-}
+_BUILDERS = {"street": _street, "traffic": _street, "turn": _turn, "parking": _parking, "roundabout": _roundabout}
 
 
 def build_scene(options: SynthesizeOptions) -> SceneModel:

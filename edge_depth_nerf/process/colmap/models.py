@@ -375,10 +375,7 @@ class _Run:
             for chunk in _chunks(pairs, _CHUNK_PAIRS):
                 write_text(pairing.match_list_path, "".join(f"{self.names[a]} {self.names[b]}\n" for a, b in chunk))
                 colmap.match_image_pairs(
-                    self.database,
-                    pairing_options=pairing,
-                    verification_options=geometry,
-                    device=colmap.Device.cpu,
+                    self.database, pairing_options=pairing, verification_options=geometry, device=colmap.Device.cpu
                 )
                 progress.advance(task, len(chunk))
 

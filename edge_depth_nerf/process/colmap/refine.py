@@ -30,22 +30,9 @@ from edge_depth_nerf.base.files import read_image, read_json, write_json
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.poses.matches import Matches, PosedPicture, epipolar_distance_px, match_pictures
-from edge_depth_nerf.poses.tracks import (
-    Tracks,
-    features_joined,
-    join_matches,
-    reprojection_px,
-    spread,
-    triangulate,
-)
+from edge_depth_nerf.poses.tracks import Tracks, features_joined, join_matches, reprojection_px, spread, triangulate
 from edge_depth_nerf.process.colmap.bundle import Shot, Softness, adjust_bundle
-from edge_depth_nerf.process.colmap.models import (
-    THETA_MAX_DEG,
-    ColmapLens,
-    colmap_lens,
-    import_pycolmap,
-    shared_views,
-)
+from edge_depth_nerf.process.colmap.models import THETA_MAX_DEG, ColmapLens, colmap_lens, import_pycolmap, shared_views
 from edge_depth_nerf.process.colmap.scale import moment_times
 from edge_depth_nerf.process.feature_masks import FeatureMasks
 from edge_depth_nerf.process.options import ProcessOptions
@@ -249,11 +236,7 @@ def _shots(recording: Recording, moments: Sequence[int], given: Float64[np.ndarr
     lenses = {camera.name: camera.camera for camera in recording.cameras}
     to_vehicle = np.linalg.inv(given)
     return [
-        Shot(
-            lenses[picture.camera],
-            number[picture.frame],
-            to_vehicle[number[picture.frame]] @ recording.pose(picture),
-        )
+        Shot(lenses[picture.camera], number[picture.frame], to_vehicle[number[picture.frame]] @ recording.pose(picture))
         for picture in recording.pictures
     ]
 
