@@ -36,7 +36,6 @@ from edge_depth_nerf.mono import estimate
 from edge_depth_nerf.mono.calibration import calibrate_scene
 from edge_depth_nerf.mono.network import DepthNetwork, NetworkSettings, read_tensors, write_tensors
 from edge_depth_nerf.mono.options import EstimateDepthOptions
-from edge_depth_nerf.mono.scene_maps import write_mono_maps
 from edge_depth_nerf.mono.training import TrainingOptions
 from edge_depth_nerf.plugin import datamanager
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
@@ -44,6 +43,7 @@ from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
 from edge_depth_nerf.process.command import process
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.scene import put_maps
+from edge_depth_nerf.scene.put_maps import write_maps
 from edge_depth_nerf.scene.reader import read_scene
 
 pytestmark = pytest.mark.slow
@@ -296,7 +296,7 @@ def test_estimate_depth_killed_after_its_weights_were_saved(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(estimate, "write_mono_maps", dying)
+        patch.setattr(estimate, "write_maps", dying)
         with pytest.raises(KeyboardInterrupt):
             estimate.estimate_depth(options, quiet)
     # killed a moment earlier, with the training's own checkpoint still there
@@ -386,7 +386,7 @@ def test_a_full_disk_and_then_a_larger_one(room: RoomDrive, tmp_path: Path, caps
         subprocess.run(["mount", "--bind", str(disk), str(disk)], check=True)
         subprocess.run(["mount", "-o", "remount,bind,ro", str(disk)], check=True)
         with pytest.raises((OSError, InputError), match="scene"):
-            write_mono_maps(disk / "scene", [], {"trained_on": "elsewhere"})
+            write_maps(disk / "scene", "mono", [], {"trained_on": "elsewhere"})
         with pytest.raises(InputError, match="cannot be written"):
             process(options_of(room, disk / "other"), Console(quiet=True))
         assert contents(disk / "scene") == contents(tmp_path / "alone")
@@ -408,7 +408,7 @@ def test_a_disk_that_fills_up_while_maps_are_written(tmp_path: Path, monkeypatch
     monkeypatch.setattr(put_maps, "write_distance_png", filling)
     maps = ((f"images/{number:04d}.png", np.full((28, 32), 3.0)) for number in range(3))
     with pytest.raises(OSError, match="No space"):
-        write_mono_maps(scene, maps, {"trained_on": "elsewhere"})
+        write_maps(scene, "mono", maps, {"trained_on": "elsewhere"})
     assert contents(scene) == before
 
 

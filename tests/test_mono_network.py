@@ -49,7 +49,6 @@ from edge_depth_nerf.mono.network import (
     save_network,
 )
 from edge_depth_nerf.mono.options import EstimateDepthOptions
-from edge_depth_nerf.mono.scene_maps import write_mono_maps
 from edge_depth_nerf.mono.training import (
     Batch,
     TrainingOptions,
@@ -62,6 +61,7 @@ from edge_depth_nerf.mono.training import (
     train,
 )
 from edge_depth_nerf.scene.format import TRUST_FILE
+from edge_depth_nerf.scene.put_maps import write_maps
 from edge_depth_nerf.scene.reader import read_scene
 
 pytestmark = pytest.mark.slow
@@ -710,7 +710,9 @@ def test_maps_are_put_into_a_scene_and_nothing_else_changes(tmp_path):
     metres = np.full((28, 32), 7.25, np.float32)
     metres[10, 10:13] = [np.nan, np.inf, 200.5]
     metres[12, 12] = -1.0
-    write_mono_maps(folder, ((picture.name, metres) for picture in scene.pictures), {"trained_on": "elsewhere", "a": 1})
+    write_maps(
+        folder, "mono", ((picture.name, metres) for picture in scene.pictures), {"trained_on": "elsewhere", "a": 1}
+    )
     after = read_json(folder / "transforms.json")
     assert after.pop("mono") == {"trained_on": "elsewhere", "a": 1}
     for frame in after["frames"]:
@@ -740,7 +742,7 @@ def test_a_run_that_fails_leaves_the_scene_as_it_was(tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_mono_maps(folder, killed(), {"trained_on": "scene"})
+        write_maps(folder, "mono", killed(), {"trained_on": "scene"})
     assert state() == before
     whole = [(name, good) for name in names]
     for maps, match in (
@@ -752,7 +754,7 @@ def test_a_run_that_fails_leaves_the_scene_as_it_was(tmp_path):
         ([*whole[:-1], (names[-1], np.nan * good)], "no distance between"),
     ):
         with pytest.raises(InputError, match=match):
-            write_mono_maps(folder, maps, {"trained_on": "scene"})
+            write_maps(folder, "mono", maps, {"trained_on": "scene"})
         assert state() == before
     with pytest.raises(InputError, match="trained_on"):
-        write_mono_maps(folder, whole, {})
+        write_maps(folder, "mono", whole, {})

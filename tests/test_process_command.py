@@ -15,11 +15,11 @@ from edge_depth_nerf.base.files import read_distance_png, read_json, write_dista
 from edge_depth_nerf.method.error_model import read_trust
 from edge_depth_nerf.mono import estimate
 from edge_depth_nerf.mono.estimate import WEIGHTS, PresetValues
-from edge_depth_nerf.mono.scene_maps import write_mono_maps
 from edge_depth_nerf.mono.training import TrainingOptions
 from edge_depth_nerf.process.command import process
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.scene.format import TRUST_FILE
+from edge_depth_nerf.scene.put_maps import write_maps
 from edge_depth_nerf.scene.reader import read_scene
 
 pytestmark = pytest.mark.slow
@@ -101,7 +101,9 @@ def test_maps_that_came_later_stay(room: RoomDrive, tmp_path: Path) -> None:
     run(options_of(room, scene, estimate_depth=False))
     assert not read_scene(scene).has("mono")
     names = [picture.name for picture in read_scene(scene).pictures]
-    write_mono_maps(scene, ((name, np.full((64, 64), 3.0, np.float32)) for name in names), {"trained_on": "elsewhere"})
+    write_maps(
+        scene, "mono", ((name, np.full((64, 64), 3.0, np.float32)) for name in names), {"trained_on": "elsewhere"}
+    )
     said = run(options_of(room, scene))
     assert "Train" not in said
     meta = read_json(scene / "transforms.json")
@@ -151,7 +153,7 @@ def own_maps(drive: RoomDrive, folder: Path, distance_m: float) -> Path:
 def put_in(scene: Path, distance_m: float) -> None:
     names = [picture.name for picture in read_scene(scene).pictures]
     maps = ((name, np.full((64, 64), distance_m, np.float32)) for name in names)
-    write_mono_maps(scene, maps, {"trained_on": "elsewhere"})
+    write_maps(scene, "mono", maps, {"trained_on": "elsewhere"})
 
 
 def distances(scene: Path) -> set[float]:

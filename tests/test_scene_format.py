@@ -25,10 +25,10 @@ from edge_depth_nerf.method.prior import PriorOptions
 from edge_depth_nerf.mono.calibration import calibrate_scene, find_trust, saved_trust
 from edge_depth_nerf.mono.estimate import estimate_depth
 from edge_depth_nerf.mono.options import EstimateDepthOptions
-from edge_depth_nerf.mono.scene_maps import write_mono_maps
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
 from edge_depth_nerf.scene.format import read_transforms
+from edge_depth_nerf.scene.put_maps import write_maps
 from edge_depth_nerf.scene.reader import read_scene, scene_of
 
 
@@ -62,7 +62,7 @@ def others_scene(folder: Path, npy: bool = False) -> Path:
 def put_in(scene: Path, value: float = 5.0, **source: Any) -> None:
     pictures = read_scene(scene).pictures
     maps = ((p.name, np.full((p.lens.height, p.lens.width), value, np.float32)) for p in pictures)
-    write_mono_maps(scene, maps, {"trained_on": "scene", **source})
+    write_maps(scene, "mono", maps, {"trained_on": "scene", **source})
 
 
 @pytest.mark.parametrize("npy", [False, True])

@@ -120,10 +120,10 @@ def test_what_other_frames_show_above_the_returns_is_judged():
     far_seen = np.where(elevation_deg > 2, truth, 0).astype(np.float32)
     alone = measure_frame("a", 0, lidar, mono, usable, view, PriorOptions())
     more = measure_frame("a", 0, lidar, mono, usable, view, PriorOptions(), far_seen)
-    assert alone.relative_error.max() < 0.05
-    new = len(more.relative_error) - len(alone.relative_error)
+    assert alone.errors.relative.max() < 0.05
+    new = len(more.errors.relative) - len(alone.errors.relative)
     assert new == np.count_nonzero((elevation_deg > 2) & (elevation_deg <= 2 + FIELD_MARGIN_DEG - 0.3))
-    assert np.count_nonzero(more.relative_error > 0.2) > 0.8 * new
+    assert np.count_nonzero(more.errors.relative > 0.2) > 0.8 * new
 
 
 def test_features_of_pixels():

@@ -18,7 +18,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -38,6 +38,7 @@ from edge_depth_nerf.method.error_model import (
     LEAST_JUDGED,
     MOTION_KNOTS,
     BeyondField,
+    ErrorModel,
     Features,
     FrameAlignment,
     MotionTrust,
@@ -89,23 +90,50 @@ _FOR_THE_DRIVE_A_FRAME = 2_000
 
 
 @dataclasses.dataclass(frozen=True)
+class Errors:
+    """Errors at some pixels, and these pixels' features."""
+
+    features: dict[str, NDArray[np.float32]]
+    """See `error_model.pixel_features`; n each."""
+    relative: NDArray[np.float32]
+    """|d̃ - d| / d̃."""
+
+    @staticmethod
+    def of(
+        features: Features, pixels: tuple[NDArray, ...], found_m: NDArray[np.float32], true_m: NDArray[np.float32]
+    ) -> Errors:
+        """Errors of a map at chosen pixels."""
+        chosen = {name: values[pixels] for name, values in features.items()}
+        return Errors(chosen, np.abs(found_m[pixels] - true_m[pixels]) / found_m[pixels])
+
+    @staticmethod
+    def together(every: Sequence[Errors]) -> Errors:
+        """Those of several frames."""
+        names = every[0].features
+        features = {name: np.concatenate([each.features[name] for each in every]) for name in names}
+        return Errors(features, np.concatenate([each.relative for each in every]))
+
+    def where(self, which: NDArray[np.bool_]) -> Errors:
+        """Some of them."""
+        return Errors({name: values[which] for name, values in self.features.items()}, self.relative[which])
+
+    def model(self) -> ErrorModel | None:
+        """Fit a model to them; see `fit_error_model`."""
+        return fit_error_model(self.features, self.relative)
+
+
+@dataclasses.dataclass(frozen=True)
 class MeasuredBeyond:
     """One training frame's part in `BeyondField`."""
 
-    motion_features: dict[str, NDArray[np.float32]]
-    """Of pixels with a LiDAR point and a distance from motion."""
-    motion_error: NDArray[np.float32]
-    """|d̃ - d| / d̃ there, of a prior made of motion alone."""
-    network_features: dict[str, NDArray[np.float32]]
-    """Of pixels beyond LiDAR's field, with a distance from motion that was left out."""
-    network_error: NDArray[np.float32]
-    """|d̃ - d| / d̃ there, of a prior made without it."""
-    field_features: dict[str, NDArray[np.float32]]
-    """Of pixels with a held-out LiDAR point."""
-    field_error: NDArray[np.float32]
-    """|d̃ - d| / d̃ there, of a prior made without motion."""
+    motion: Errors
+    """Of a prior made of motion alone, at pixels with a LiDAR point."""
+    network: Errors
+    """Of a prior made without a distance from motion that was left out, beyond LiDAR's field."""
+    field: Errors
+    """Of a prior made without motion, at held-out LiDAR points."""
     field_matched: NDArray[np.bool_]
-    """Which of them motion has a distance of."""
+    """Which of these motion has a distance of."""
     elevation_rad: NDArray[np.float32]
     """Of all distances from motion, above the horizon."""
 
@@ -116,14 +144,10 @@ class MeasuredFrame:
 
     alignment: FrameAlignment
     """How well its map was fitted."""
-    features: dict[str, NDArray[np.float32]]
-    """Of the pixels of held-out LiDAR points, and of those that other frames' points show."""
-    relative_error: NDArray[np.float32]
-    """|d̃ - d| / d̃ there."""
-    return_features: dict[str, NDArray[np.float32]]
-    """Of pixels that keep their LiDAR point."""
-    return_error: NDArray[np.float32]
-    """Relative error of these LiDAR points against their neighbours."""
+    errors: Errors
+    """At held-out LiDAR points, and at pixels that other frames' points show."""
+    at_points: Errors
+    """Of the LiDAR points of pixels that keep theirs, against their neighbours."""
     elevation_rad: NDArray[np.float32]
     """Of all LiDAR points, above the horizon."""
     lidar_m: NDArray[np.float32]
@@ -131,7 +155,7 @@ class MeasuredFrame:
     mono_m: NDArray[np.float32]
     """The map as it came, at the same pixels."""
     from_motion: NDArray[np.bool_]
-    """Whether motion has a part in each of the pixels of `relative_error`."""
+    """Whether motion has a part in each of the pixels of `errors`."""
     beyond: MeasuredBeyond | None = None
     """Where LiDAR does not reach; None without motion."""
 
@@ -159,12 +183,11 @@ def held_out_returns(
     return left_out, in_blocks
 
 
-def calibrate_scene(scene: Path, options: PriorOptions | None = None, console: Console | None = None) -> Trust:
+def calibrate_scene(scene: Path, console: Console | None = None) -> Trust:
     """Measure a scene's alignment and errors from its training frames, and keep the result as SCENE/mono_trust.json.
 
     Args:
         scene: the folder, or its transforms.json.
-        options: of the prior to be trusted; the default ones by default.
         console: where progress is shown; nowhere by default.
 
     Raises:
@@ -173,7 +196,7 @@ def calibrate_scene(scene: Path, options: PriorOptions | None = None, console: C
 
     """
     read = read_scene(scene)
-    trust = _calibrate(read, _chosen(read), INTEGRATED, options or PriorOptions(), console)
+    trust = _calibrate(read, _chosen(read), INTEGRATED, PriorOptions(), console)
     trust.write(read.folder / TRUST_FILE)
     return trust
 
@@ -468,14 +491,12 @@ def measure_frame(
     aligned = align(kept_m, mono_m, usable, mode)
     frame = integrate_frame(kept_m, mono_m, usable, depth_source, options, motion=motion)
     features = pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, frame.returns, view.theta_rad)
-    has_prior = frame.distance_m > 0
     measured_m, measured = lidar_m, left_out
     if far_seen_m is not None and returns.any():
         highest = np.quantile(view.elevation_rad[returns], FIELD_QUANTILES[1]) + np.radians(FIELD_MARGIN_DEG)
         far_seen = usable & (far_seen_m > 0) & ~returns & (view.elevation_rad <= highest)
         measured_m, measured = np.where(far_seen, far_seen_m, lidar_m), left_out | far_seen
-    judged = _some(measured & has_prior, _JUDGED_A_FRAME, rng)
-    distance = frame.distance_m[judged]
+    judged = _some(measured & (frame.distance_m > 0), _JUDGED_A_FRAME, rng)
     # of a prior that keeps its returns; where none is kept (mono alone), or all are averaged, there is no such pixel
     found, error_by_neighbours = error_of_returns(lidar_m, frame.returns)
     kept = _some(found & options.integration.keep_returns, _JUDGED_A_FRAME, rng)
@@ -491,10 +512,8 @@ def measure_frame(
     fitted = aligned if count >= 2 * LEAST_RETURNS else align(lidar_m, mono_m, usable, mode)
     return MeasuredFrame(
         FrameAlignment(name, count, fitted.fit_of, fitted.fit, error(mono_m), error(aligned.mono_m)),
-        {feature: values[judged] for feature, values in features.items()},
-        np.abs(distance - measured_m[judged]) / distance,
-        {feature: values[kept] for feature, values in features.items()},
-        error_by_neighbours[kept],
+        Errors.of(features, judged, frame.distance_m, measured_m),
+        Errors({feature: values[kept] for feature, values in features.items()}, error_by_neighbours[kept]),
         view.elevation_rad[usable & (lidar_m > 0)],
         lidar_m[for_the_drive],
         mono_m[for_the_drive],
@@ -536,13 +555,10 @@ def measure_beyond(
     features = pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, frame.returns, view.theta_rad)
     of_motion = motion_features(features, motion.distance_m, motion_sigma_m, view.elevation_rad)
     judged = _some(usable & (lidar_m > 0) & frame.from_motion, _JUDGED_A_FRAME, rng)
-    motion_error = np.abs(frame.distance_m[judged] - lidar_m[judged]) / frame.distance_m[judged]
 
     seen = dataclasses.replace(motion, distance_m=np.where(left_out, np.float32(0), motion.distance_m))
     network = integrate_frame(lidar_m, mono_m, usable, INTEGRATED, options, motion=seen)
-    of_network = beyond_features(network, view)
     held_out = _some(usable & left_out & motion.alone & (network.distance_m > 0), _JUDGED_A_FRAME, rng)
-    found_m, true_m = network.distance_m[held_out], motion.distance_m[held_out]
 
     # as in `measure_frame`, but of two sources
     fewer, _ = held_out_returns(both(lidar_m, mono_m, usable), view.elevation_rad, number)
@@ -554,12 +570,9 @@ def measure_beyond(
         found &= confirmed(of_two.mono_m, motion.around_m)
     tried = _some(found, _JUDGED_A_FRAME, rng)
     return MeasuredBeyond(
-        {name: values[judged] for name, values in of_motion.items()},
-        motion_error,
-        {name: values[held_out] for name, values in of_network.items()},
-        np.abs(found_m - true_m) / found_m,
-        {name: values[tried] for name, values in of_field.items()},
-        np.abs(of_two.distance_m[tried] - lidar_m[tried]) / of_two.distance_m[tried],
+        Errors.of(of_motion, judged, frame.distance_m, lidar_m),
+        Errors.of(beyond_features(network, view), held_out, network.distance_m, motion.distance_m),
+        Errors.of(of_field, tried, of_two.distance_m, lidar_m),
         motion.distance_m[tried] > 0,
         view.elevation_rad[usable & (motion.distance_m > 0)],
     )
@@ -592,37 +605,25 @@ def combine(
         motion_errors: by which motion took part in the frames' priors.
 
     """
-
-    def pooled(values: Iterable[NDArray]) -> NDArray:
-        return np.concatenate(list(values))
-
-    field_rad = _field_rad([frame.elevation_rad for frame in frames])
-    lidar_m, mono_m = pooled(frame.lidar_m for frame in frames), pooled(frame.mono_m for frame in frames)
+    lidar_m, mono_m = (np.concatenate([getattr(frame, name) for frame in frames]) for name in ("lidar_m", "mono_m"))
     aligned = options.align != "none" and depth_source == INTEGRATED
     drive_fit = fit_logs(lidar_m, mono_m) if aligned and len(lidar_m) >= LEAST_RETURNS else None
-    names = frames[0].features
-    features = {name: pooled(frame.features[name] for frame in frames) for name in names}
-    relative_error = pooled(frame.relative_error for frame in frames)
+    errors = Errors.together([frame.errors for frame in frames])
     motion = None
     if motion_errors is not None:
-        from_motion = pooled(frame.from_motion for frame in frames)
-        model = fit_error_model(
-            {name: values[from_motion] for name, values in features.items()}, relative_error[from_motion]
-        )
+        from_motion = np.concatenate([frame.from_motion for frame in frames])
+        model = errors.where(from_motion).model()
         # of few pixels without motion nothing would be known
         if np.count_nonzero(~from_motion) >= LEAST_JUDGED:
-            features = {name: values[~from_motion] for name, values in features.items()}
-            relative_error = relative_error[~from_motion]
+            errors = errors.where(~from_motion)
         if model is not None:
             beyond = _combine_beyond([frame.beyond for frame in frames if frame.beyond is not None])
             motion = MotionTrust(motion_errors.weight, motion_errors.motion, motion_errors.mono, model, beyond)
-    return_features = {name: pooled(frame.return_features[name] for frame in frames) for name in names}
-    alignments = (frame.alignment for frame in frames)
     return Trust(
         made_of=made_of,
-        error_model=fit_error_model(features, relative_error),
-        return_model=fit_error_model(return_features, pooled(frame.return_error for frame in frames)),
-        field_rad=field_rad,
+        error_model=errors.model(),
+        return_model=Errors.together([frame.at_points for frame in frames]).model(),
+        field_rad=_field_rad([frame.elevation_rad for frame in frames]),
         everywhere=everywhere,
         drive_fit=drive_fit,
         frames=tuple(
@@ -630,7 +631,7 @@ def combine(
             dataclasses.replace(found, fit_of="drive", fit=drive_fit)
             if drive_fit is not None and found.returns < LEAST_RETURNS
             else found
-            for found in alignments
+            for found in (frame.alignment for frame in frames)
         ),
         motion=motion,
     )
@@ -640,32 +641,26 @@ def _combine_beyond(frames: Sequence[MeasuredBeyond]) -> BeyondField | None:
     """Put the frames' measurements beyond LiDAR's field together; None without any."""
     if not frames:
         return None
-
-    def pooled(name: str) -> NDArray:
-        return np.concatenate([getattr(frame, name) for frame in frames])
-
-    def features(name: str) -> dict[str, NDArray[np.float32]]:
-        every = [getattr(frame, name) for frame in frames]
-        return {feature: np.concatenate([each[feature] for each in every]) for feature in every[0]}
-
-    motion_model = fit_error_model(features("motion_features"), pooled("motion_error"), MOTION_KNOTS, middle=True)
-    of_network = features("network_features")
-    network_model = fit_error_model(of_network, pooled("network_error"))
+    motion, network, field = (
+        Errors.together([getattr(frame, name) for frame in frames]) for name in ("motion", "network", "field")
+    )
+    motion_model = fit_error_model(motion.features, motion.relative, MOTION_KNOTS, middle=True)
+    network_model = network.model()
     reach_px = 0.0
     if network_model is not None:
-        reach_px = float(np.quantile(of_network["nearest_px"], REACH_QUANTILE))
-        worse = _unmatched_factor(features("field_features"), pooled("field_error"), pooled("field_matched"))
+        reach_px = float(np.quantile(network.features["nearest_px"], REACH_QUANTILE))
+        worse = _unmatched_factor(field, np.concatenate([frame.field_matched for frame in frames]))
         network_model = dataclasses.replace(network_model, log_base=network_model.log_base + np.log(worse))
     return BeyondField(motion_model, network_model, _field_rad([frame.elevation_rad for frame in frames]), reach_px)
 
 
-def _unmatched_factor(features: Features, relative_error: NDArray[np.float32], matched: NDArray[np.bool_]) -> float:
+def _unmatched_factor(errors: Errors, matched: NDArray[np.bool_]) -> float:
     """How much more a prior without motion is wrong where motion has no distance, all other features alike; 1 or more.
 
     Not known for few: 1.
     """
-    model = fit_error_model({name: values[matched] for name, values in features.items()}, relative_error[matched])
-    if model is None or np.count_nonzero(~matched) < LEAST_JUDGED:
+    model, unmatched = errors.where(matched).model(), errors.where(~matched)
+    if model is None or len(unmatched.relative) < LEAST_JUDGED:
         return 1.0
-    sigma = np.exp(model.log_sigma({name: values[~matched] for name, values in features.items()}))
-    return max(1.0, float(np.quantile(relative_error[~matched] / sigma, 0.95)) / 2)
+    sigma = np.exp(model.log_sigma(unmatched.features))
+    return max(1.0, float(np.quantile(unmatched.relative / sigma, 0.95)) / 2)

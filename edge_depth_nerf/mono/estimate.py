@@ -60,8 +60,8 @@ from edge_depth_nerf.mono.network import (
 )
 from edge_depth_nerf.mono.options import EstimateDepthOptions, Preset
 from edge_depth_nerf.mono.relative import KIND_SAID, Layer
-from edge_depth_nerf.mono.scene_maps import write_mono_maps
 from edge_depth_nerf.mono.training import Trained, TrainingOptions, as_json, torch_threads, train
+from edge_depth_nerf.scene.put_maps import write_maps
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
 
 Split = tuple[list[ScenePicture], list[ScenePicture]]
@@ -196,7 +196,9 @@ def _write_own(
             frames = about.get("trained_frames", {})
             # weights of before have them by the scenes' names
             seen = frames.get(_key(scene), frames.get(_name(scene), []))
-            write_mono_maps(scene.folder, predicted_maps(network, scene), {**source, "trained_frames": seen}, progress)
+            write_maps(
+                scene.folder, "mono", predicted_maps(network, scene), {**source, "trained_frames": seen}, progress
+            )
 
 
 def _write_predicted(network: ReadyNetwork, scenes: Sequence[SceneFolder], console: Console) -> None:
@@ -235,7 +237,7 @@ def _write_fitted(every: Sequence[FittedMaps], source: dict[str, Any], console: 
     with progress_bars(console) as progress:
         for fitted in every:
             maps = ((picture.name, without_sky(fitted.scene, picture, metres, metres)) for picture, metres in fitted)
-            write_mono_maps(fitted.scene.folder, maps, source, progress)
+            write_maps(fitted.scene.folder, "mono", maps, source, progress)
     for fitted in every:
         if few := fitted.by_the_drive:
             console.print(

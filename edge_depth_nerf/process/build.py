@@ -25,7 +25,7 @@ from torch import Tensor
 from edge_depth_nerf.base.console import say
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, write_json
-from edge_depth_nerf.cameras import Camera, CameraFit
+from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar import project_points, transform_points
@@ -219,9 +219,10 @@ def _posed(recording: Recording, options: ProcessOptions, console: Console) -> t
 
 def _held_out(recording: Recording, options: ProcessOptions) -> set[int]:
     """Numbers of the frames that are kept from training."""
-    moments = sorted({picture.frame for picture in recording.pictures})
-    held_out = held_out_frames(len(moments), options.holdout_every)
-    return {frame for frame, out in zip(moments, held_out, strict=True) if out}
+    frames = sorted({picture.frame for picture in recording.pictures})
+    return {
+        frame for frame, out in zip(frames, held_out_frames(len(frames), options.holdout_every), strict=True) if out
+    }
 
 
 def _scene_cameras(
@@ -248,20 +249,11 @@ class _Builder:
     def __init__(
         self, recording: Recording, options: ProcessOptions, held_out: set[int], masks: dict[str, NDArray[np.bool_]]
     ) -> None:
-        assert recording.trajectory is not None
         self._options, self._held_out, self._recording = options, held_out, recording
         self._pictures = recording.pictures
         self._cameras = {recorded.name: recorded for recorded in recording.cameras}
         self._ego = {name: options.ego_mask_of(name) or recorded.ego_mask for name, recorded in self._cameras.items()}
-        self._store = SweepStore(
-            recording.sweeps,
-            recording.trajectory,
-            reach=options.sweeps,
-            deskew=not options.raw_lidar,
-            held_out=held_out,
-            strict=options.strict,
-            holdout_beams=options.holdout_beams,
-        )
+        self._store = SweepStore.of(recording, options, held_out)
         self._usable: dict[str, NDArray[np.bool_]] = {}
         for scene_camera in _scene_cameras(recording, masks, options):
             usable = lens_circle(scene_camera.original, options.theta_max_deg)
@@ -485,11 +477,7 @@ def _source(recording: Recording, options: ProcessOptions) -> dict[str, Any]:
         digest.update(f"{path.parent.name}/{path.name} {path.stat().st_size}\n".encode())
     return {
         **recording.source,
-        "first": options.first,
-        "frames": options.frames,
-        "stride": options.stride,
-        "downscale": options.downscale,
-        "poses": options.poses,
+        **{name: getattr(options, name) for name in ("first", "frames", "stride", "downscale", "poses")},
         **({"refine_poses": True} if options.refine_poses else {}),
         "sweeps": options.sweeps,
         "deskew": not options.raw_lidar,
@@ -501,9 +489,7 @@ def _source(recording: Recording, options: ProcessOptions) -> dict[str, Any]:
         "moving_classes": list(options.moving_classes),
         "mono": options.mono is not None,
         **({"mono_trained_on": "elsewhere"} if any(picture.mono for picture in recording.pictures) else {}),
-        "sky": options.sky,
-        "theta_max_deg": options.theta_max_deg,
-        "holdout_every": options.holdout_every,
+        **{name: getattr(options, name) for name in ("sky", "theta_max_deg", "holdout_every")},
         **({"holdout_beams": options.holdout_beams} if options.holdout_beams else {}),
         WHOLE: whole_sha256,
         INPUTS: digest.hexdigest(),
@@ -511,19 +497,11 @@ def _source(recording: Recording, options: ProcessOptions) -> dict[str, Any]:
     }
 
 
-def _fit_words(fit: CameraFit) -> str:
-    if fit.max_px < 5e-4:
-        return "is exact"
-    return f"fits within {fit.rms_px:.4f} px rms, {fit.max_px:.3f} px at most"
-
-
 def _show(report: ProcessReport, console: Console) -> None:
     for name, share in report.mask_share.items():
         fit = report.fits[name]
-        say(
-            console,
-            f"{name}: the camera model for nerfstudio {_fit_words(fit)}; the mask keeps {share:.0%} of the picture",
-        )
+        fits = f"fits within {fit.rms_px:.4f} px rms, {fit.max_px:.3f} px at most" if fit.max_px >= 5e-4 else "is exact"
+        say(console, f"{name}: the camera model for nerfstudio {fits}; the mask keeps {share:.0%} of the picture")
     for notice in report.notices:
         say(console, notice, "yellow")
     for item in report.left_out[:MOST_LISTED]:

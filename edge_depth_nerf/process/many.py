@@ -56,7 +56,7 @@ def cut(options: ProcessOptions, console: Console) -> list[ProcessOptions]:
             "--output."
         )
     with console.status("Reading the drive …"):
-        frames = usable_frames(options)
+        frames = sorted({picture.frame for picture in read_drive(options).pictures})
     assert options.frames_per_scene is not None
     count = -(-len(frames) // options.frames_per_scene)
     digits = max(3, len(str(count - 1)))
@@ -75,17 +75,6 @@ def cut(options: ProcessOptions, console: Console) -> list[ProcessOptions]:
         )
     say(console, f"{len(frames)} usable frames, split into {count} scenes.")
     return parts
-
-
-def usable_frames(options: ProcessOptions) -> list[int]:
-    """Numbers of the frames that a drive's scene would have, in order; every file is checked.
-
-    Raises:
-        FileNotFoundError: a file of the drive is missing.
-        InputError: an option or a file of the drive cannot be used.
-
-    """
-    return sorted({picture.frame for picture in read_drive(options).pictures})
 
 
 def _on_cluster(parts: list[ProcessOptions], cluster: str, console: Console) -> None:

@@ -91,7 +91,6 @@ def find_moving(
         InputError: there are no sweeps.
 
     """
-    assert recording.trajectory is not None
     if not recording.sweeps:
         raise InputError(
             "--find-moving: the drive has no LiDAR sweeps, which it needs. Leave it out, or give masks with "
@@ -100,15 +99,7 @@ def find_moving(
     paths = {id(picture): moving_mask_path(options.output, picture) for picture in recording.pictures}
     missing = [picture for picture in recording.pictures if not paths[id(picture)].is_file()]
     if missing:
-        store = SweepStore(
-            recording.sweeps,
-            recording.trajectory,
-            reach=options.sweeps,
-            deskew=not options.raw_lidar,
-            held_out=held_out,
-            strict=options.strict,
-            holdout_beams=options.holdout_beams,
-        )
+        store = SweepStore.of(recording, options, held_out)
         found = [_ScannersThings(scanner, held_out, console) for scanner in store.scanners]
         jobs = [
             partial(

@@ -33,7 +33,8 @@ from edge_depth_nerf.lidar.sweeps import Sweep, without_beams
 from edge_depth_nerf.lidar.trajectory import MAX_POSE_GAP_S, Trajectory
 from edge_depth_nerf.lidar.voxels import first_in_voxel
 from edge_depth_nerf.lidar.world import WorldSweep, above_field, sweep_in_world
-from edge_depth_nerf.process.recording import RecordedSweep
+from edge_depth_nerf.process.options import ProcessOptions
+from edge_depth_nerf.process.recording import RecordedSweep, Recording
 
 VOXEL_M = 0.05
 """Beyond `MAX_POINTS` the points around a picture are thinned to one of each cube of this size, nearest in time
@@ -250,6 +251,19 @@ class SweepStore:
             )
             for found in by_scanner.values()
         ]
+
+    @staticmethod
+    def of(recording: Recording, options: ProcessOptions, held_out: Collection[int]) -> SweepStore:
+        """The sweeps of a recording that has a trajectory, as a converter's options want them."""
+        assert recording.trajectory is not None
+        return SweepStore(
+            *(recording.sweeps, recording.trajectory),
+            reach=options.sweeps,
+            deskew=options.deskew,
+            held_out=held_out,
+            strict=options.strict,
+            holdout_beams=options.holdout_beams,
+        )
 
     def notices(self) -> list[str]:
         """What was left out of the sweeps that were read."""

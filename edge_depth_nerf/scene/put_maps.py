@@ -43,18 +43,24 @@ def write_maps(
         layer: which source of depth, or what is known of its errors: one of `scene.format.later_layers()`.
         maps: `file_path` of a frame in transforms.json, and its H×W metres along the ray. One for every frame, in any
             order; taken one at a time.
-        source: where they come from, as JSON; kept in transforms.json under the layer's name.
+        source: where they come from, as JSON; kept in transforms.json under the layer's name. Monocular maps need
+            "trained_on", what their maker has seen: "scene" for a network that was trained on LiDAR and knows nothing
+            beyond the scanner's field, "elsewhere" for others. They are not aligned to LiDAR.
         progress: where to show how far it is.
         some_empty: a map may have no value at all, as one from motion where nothing moved.
 
     Raises:
         FileNotFoundError: no scene there.
         InputError: no such source; a map has another size than its camera, no value at all, or is of no frame; frames
-            without a map.
+            without a map; "trained_on" is missing.
 
     """
     if layer not in later_layers():
         raise InputError(f"{layer!r} is no source of depth; expected one of {', '.join(later_layers())}.")
+    if layer == "mono" and source.get("trained_on") not in ("scene", "elsewhere"):
+        raise InputError(
+            f"source of the monocular maps: trained_on is {source.get('trained_on')!r}; expected scene or elsewhere."
+        )
     words = "monocular map" if layer == "mono" else f"{layer.replace('_', ' ')} map"
     found = read_scene(scene)
     pictures = {picture.name: picture for picture in found.pictures}
