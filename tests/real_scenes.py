@@ -9,7 +9,7 @@ import numpy as np
 
 from edge_depth_nerf.base.files import read_distance_png, read_image, read_json
 from edge_depth_nerf.cameras import MEI, Pinhole
-from edge_depth_nerf.process.downscale import downscale_image, downscale_mask
+from edge_depth_nerf.process.reading import downscale_image, downscale_mask
 from edge_depth_nerf.scene.writer import FrameContent, SceneCamera, SceneFrame, write_scene
 
 BLOCK_PX = 64

@@ -44,7 +44,7 @@ from edge_depth_nerf.cameras import (
     host_residual,
 )
 from edge_depth_nerf.cameras.transforms import check_rigid, opencv_to_opengl
-from edge_depth_nerf.process.downscale import downscale_distance, downscale_image, downscale_mask
+from edge_depth_nerf.process.reading import downscale_distance, downscale_image, downscale_mask
 from edge_depth_nerf.scene import points as points_module
 from edge_depth_nerf.scene import writer as scene
 from edge_depth_nerf.scene.points import PointCloud

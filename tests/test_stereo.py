@@ -15,13 +15,13 @@ from edge_depth_nerf.cameras import Camera, KannalaBrandt, Pinhole
 from edge_depth_nerf.cameras.projection_series import WRONG_PX, projection_series
 from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.stereo import sphere_sweep
-from edge_depth_nerf.stereo.around import seen_around
 from edge_depth_nerf.stereo.consistency import (
     LEAST_AGREEING,
     LEAST_CONFIDENCE,
     LEAST_PARALLAX_PX,
     MotionDistance,
     confirm,
+    seen_around,
 )
 from edge_depth_nerf.stereo.motion import Motion
 from edge_depth_nerf.stereo.sweep import (

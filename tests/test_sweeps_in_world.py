@@ -14,8 +14,8 @@ from torch import Tensor
 from edge_depth_nerf.cameras import MEI, Camera, KannalaBrandt, Pinhole
 from edge_depth_nerf.lidar import Sweep, SweepTiming, project_points
 from edge_depth_nerf.lidar.free_space import FreeSpace
+from edge_depth_nerf.lidar.sweeps import first_in_voxel
 from edge_depth_nerf.lidar.trajectory import Trajectory
-from edge_depth_nerf.lidar.voxels import first_in_voxel
 from edge_depth_nerf.lidar.world import WorldSweep, above_field, sweep_in_world
 from edge_depth_nerf.process import sweep_store
 from edge_depth_nerf.process.recording import RecordedSweep

@@ -46,7 +46,7 @@ FORGOTTEN_AFTER_S = 24 * 3600.0
 _TEMPORARY = re.compile(r"\..+\.(?P<host>[\w.-]*)~(?P<process>\d+)~\d+(\.\w+)?")
 
 
-def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
+def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Let `write` fill a temporary file beside `path`, then move it into place.
 
     A reader sees the old file or the whole new one, never a part of it.
@@ -128,11 +128,7 @@ def as_people_count(path: Path) -> list[tuple[int, str]]:
 
 def write_bytes(path: Path, content: bytes) -> None:
     """Write bytes atomically."""
-
-    def write(temporary: Path) -> None:
-        temporary.write_bytes(content)
-
-    write_atomically(path, write)
+    write_atomically(path, lambda temporary: temporary.write_bytes(content))
 
 
 def write_text(path: Path, content: str) -> None:

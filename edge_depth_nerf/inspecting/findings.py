@@ -350,14 +350,14 @@ def _mono_shape(measured: Sequence[PictureFigures]) -> Iterator[Finding]:
             )
 
 
-def limited(findings: Sequence[Finding], of_a_kind: int = _NAMED) -> list[str]:
+def limited(findings: Sequence[Finding]) -> list[str]:
     """Return the sentences to print: of each kind at most the first few."""
     counts: dict[str, int] = {}
     lines = []
     for finding in findings:
         counts[finding.kind] = counts.get(finding.kind, 0) + 1
-        if counts[finding.kind] <= of_a_kind:
+        if counts[finding.kind] <= _NAMED:
             lines.append(finding.text)
-    dropped = {kind: count - of_a_kind for kind, count in counts.items() if count > of_a_kind}
+    dropped = {kind: count - _NAMED for kind, count in counts.items() if count > _NAMED}
     lines += [f"{count} more of the kind '{kind}' are in summary.json." for kind, count in dropped.items()]
     return lines

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from edge_depth_nerf.base.bounds import check_bytes
@@ -25,6 +25,8 @@ MAX_RANGE_M = 255.0
 MAX_POINTS = 5_000_000
 """A file of more points is no single scan."""
 _BYTES_PER_POINT = 16
+_CELL_BITS = 21
+"""Bits of a cube's number along one axis."""
 
 
 @dataclass(frozen=True)
@@ -141,3 +143,13 @@ def usable_returns(
         out_of_range=int((finite & ~usable).sum()),
         offset_s=None if offset_s is None else offset_s[usable],
     )
+
+
+def first_in_voxel(points_m: Float[np.ndarray, "points 3"], voxel_m: float) -> Int64[np.ndarray, "kept"]:
+    """Find the first point of each cube of `voxel_m`, in the order given; indices in that order.
+
+    The points are to lie within a million cubes of the origin.
+    """
+    cells = np.floor(points_m / voxel_m).astype(np.int64) + (1 << (_CELL_BITS - 1))
+    keys = (cells[:, 0] << (2 * _CELL_BITS)) | (cells[:, 1] << _CELL_BITS) | cells[:, 2]
+    return np.sort(np.unique(keys, return_index=True)[1])

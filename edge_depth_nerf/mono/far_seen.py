@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.lidar.projection import project_points
-from edge_depth_nerf.lidar.voxels import first_in_voxel
+from edge_depth_nerf.lidar.sweeps import first_in_voxel
 from edge_depth_nerf.mono.examples import network_view, scaled_lens
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
 

@@ -158,32 +158,20 @@ def find_features(picture: PosedPicture, most: int = MOST_FEATURES) -> Features:
     return Features(sights[kept], hellinger.astype(np.float32))
 
 
-def match_features(
-    first: Features, second: Features, allowed: Bool[np.ndarray, "n m"] | None = None, ratio: float = RATIO
-) -> Int[np.ndarray, "k 2"]:
-    """Pair the features of two pictures that are mutually the nearest, and clearly so.
-
-    Args:
-        first: of one picture.
-        second: of the other.
-        allowed: which pairs may be; None = all.
-        ratio: how much nearer the nearest must be than the second, in both directions.
-
-    """
+def match_features(first: Features, second: Features) -> Int[np.ndarray, "k 2"]:
+    """Pair the features of two pictures that are mutually the nearest, and clearly so: in both directions."""
     none = np.zeros((0, 2), np.int64)
     if min(len(first.sights), len(second.sights)) < 2:
         return none
     products = first.descriptors @ second.descriptors.T
-    if allowed is not None:
-        products[~allowed] = -1
-    nearest, clear = _nearest(products, ratio)
-    back, clear_back = _nearest(products.T, ratio)
+    nearest, clear = _nearest(products)
+    back, clear_back = _nearest(products.T)
     rows = np.arange(len(nearest))
     mutual = (back[nearest] == rows) & clear & clear_back[nearest] & (products[rows, nearest] > 0)
     return np.stack((rows[mutual], nearest[mutual]), -1)
 
 
-def _nearest(products: Float32[np.ndarray, "n m"], ratio: float) -> tuple[Int[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
+def _nearest(products: Float32[np.ndarray, "n m"]) -> tuple[Int[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
     """The nearest of each row, and whether it is clearly nearer than the second."""
     two = np.argpartition(products, -2, axis=-1)[:, -2:]
     values = np.take_along_axis(products, two, -1)
@@ -192,7 +180,7 @@ def _nearest(products: Float32[np.ndarray, "n m"], ratio: float) -> tuple[Int[np
     best = 2 - 2 * np.take_along_axis(values, first, -1)[:, 0]
     second = 2 - 2 * np.take_along_axis(values, 1 - first, -1)[:, 0]
     # float32 may see equal ones at slightly different distances, depending on the processor
-    clear = (best < ratio**2 * second) & (second > ROUNDING)
+    clear = (best < RATIO**2 * second) & (second > ROUNDING)
     return np.take_along_axis(two, first, -1)[:, 0], clear
 
 

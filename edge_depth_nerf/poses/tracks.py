@@ -36,10 +36,10 @@ class Tracks:
         """How many points there are."""
         return int(self.track[-1]) + 1 if len(self.track) else 0
 
-    def taken(self, kept: Bool[np.ndarray, "n"], least: int = 2) -> Tracks:
-        """Some of the sightings; tracks with fewer than `least` of them are dropped."""
+    def taken(self, kept: Bool[np.ndarray, "n"]) -> Tracks:
+        """Some of the sightings; tracks with fewer than two of them are dropped."""
         lengths = np.bincount(self.track[kept], minlength=self.count)
-        kept = kept & (lengths >= least)[self.track]
+        kept = kept & (lengths >= 2)[self.track]
         _, numbers = np.unique(self.track[kept], return_inverse=True)
         return Tracks(numbers.astype(np.int64), self.picture[kept], self.sights[kept])
 
@@ -86,11 +86,8 @@ def join_matches(matches: Sequence[Matches]) -> Tracks:
 
 
 def _stacked(parts: Sequence[Sights]) -> Sights:
-    return Sights(
-        np.concatenate([part.pixels for part in parts] or [np.zeros((0, 2))]),
-        np.concatenate([part.rays for part in parts] or [np.zeros((0, 3))]),
-        np.concatenate([part.ray_per_pixel for part in parts] or [np.zeros((0, 3, 2))]),
-    )
+    shapes = {"pixels": (0, 2), "rays": (0, 3), "ray_per_pixel": (0, 3, 2)}
+    return Sights(*(np.concatenate([np.zeros(s), *(getattr(part, n) for part in parts)]) for n, s in shapes.items()))
 
 
 def triangulate(

@@ -33,11 +33,17 @@ from edge_depth_nerf.masks.lens import lens_circle
 from edge_depth_nerf.masks.semantics import check_classes, keep_static, read_labels
 from edge_depth_nerf.masks.semantics import sky as sky_of_labels
 from edge_depth_nerf.masks.sky import find_sky
-from edge_depth_nerf.process.downscale import downscale_distance, downscale_image, downscale_mask
 from edge_depth_nerf.process.moving import find_moving
 from edge_depth_nerf.process.options import ProcessOptions
 from edge_depth_nerf.process.pose_checks import features_say, lidar_says
-from edge_depth_nerf.process.reading import load_distance, load_picture, read_depth
+from edge_depth_nerf.process.reading import (
+    downscale_distance,
+    downscale_image,
+    downscale_mask,
+    load_distance,
+    load_picture,
+    read_depth,
+)
 from edge_depth_nerf.process.recording import RecordedPicture, Recording
 from edge_depth_nerf.process.sweep_store import SweepStore
 from edge_depth_nerf.process.transform_checks import agreement_notices, agreements

@@ -32,8 +32,7 @@ from edge_depth_nerf.cameras.transforms import opencv_to_opengl
 from edge_depth_nerf.scene.format import OWN_MOTION
 from edge_depth_nerf.scene.put_maps import write_maps
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
-from edge_depth_nerf.stereo.around import seen_around
-from edge_depth_nerf.stereo.consistency import LEAST_AGREEING, MotionDistance
+from edge_depth_nerf.stereo.consistency import LEAST_AGREEING, MotionDistance, seen_around
 from edge_depth_nerf.stereo.motion import Motion
 from edge_depth_nerf.stereo.sweep import Swept
 from edge_depth_nerf.stereo.views import View, view_of, working_factor

@@ -39,8 +39,8 @@ from edge_depth_nerf.lidar.moving import (
 from edge_depth_nerf.lidar.world import WorldSweep
 from edge_depth_nerf.masks.lens import lens_circle
 from edge_depth_nerf.masks.moving import clearest_edge, grow_moving, larger_again, smaller, working_factor
-from edge_depth_nerf.process.downscale import downscale_mask
 from edge_depth_nerf.process.options import ProcessOptions
+from edge_depth_nerf.process.reading import downscale_mask
 from edge_depth_nerf.process.recording import RecordedPicture, Recording
 from edge_depth_nerf.process.sweep_store import Scanner, SweepStore
 

@@ -1,20 +1,69 @@
-"""Reads what a drive recorded: depth maps as distance along the ray, pictures and maps at the scene's size."""
+"""Reads what a drive recorded: depth maps as distance along the ray, pictures and maps at the scene's size.
+
+They are made smaller by a whole factor K: one pixel from each block of K×K. Rows and columns that do not fill a block,
+at the bottom and at the right, are cut off, as `Camera.downscaled` does; pixel centres are at +0.5, so a block's centre
+is its pixel's centre.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, UInt8
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_image
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.cameras.rays import distance_from_z_depth, rays
-from edge_depth_nerf.process.downscale import downscale_distance, downscale_image
 from edge_depth_nerf.process.recording import DepthFile
 from edge_depth_nerf.scene.checks import size_error
 from edge_depth_nerf.scene.writer import DistanceMap, Picture
+
+_SAME_SURFACE = 1.1
+"""Two distances whose ratio is below this are taken to lie on one surface."""
+
+
+def _blocks(map_: np.ndarray, factor: int) -> np.ndarray:
+    """H×W to (H/K)×(W/K)×K²."""
+    height, width = map_.shape[0] // factor, map_.shape[1] // factor
+    cut = map_[: height * factor, : width * factor]
+    return cut.reshape(height, factor, width, factor).swapaxes(1, 2).reshape(height, width, factor * factor)
+
+
+def downscale_image(image: UInt8[np.ndarray, "h w 3"], factor: int) -> UInt8[np.ndarray, "h2 w2 3"]:
+    """Average each block of a picture."""
+    if factor == 1:
+        return image
+    height, width = image.shape[0] // factor, image.shape[1] // factor
+    cut = image[: height * factor, : width * factor]
+    return np.asarray(cv2.resize(cut, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def downscale_mask(mask: Bool[np.ndarray, "h w"], factor: int) -> Bool[np.ndarray, "h2 w2"]:
+    """Keep a block only if every pixel of it is kept."""
+    return mask if factor == 1 else _blocks(mask, factor).all(-1)
+
+
+def downscale_distance(distance_m: Float[np.ndarray, "h w"], factor: int) -> Float[np.ndarray, "h2 w2"]:
+    """Take each block's median distance, metres, 0 = none.
+
+    Pixels without a value do not count; a block of which more than half has none gets none. Of an even count the
+    two middle values are averaged where they lie on one surface, which puts the value on the block's centre, and
+    the nearer one is taken where they do not: no distance arises at which there is nothing.
+    """
+    if factor == 1:
+        return distance_m
+    blocks = _blocks(distance_m, factor)
+    # what has no value is sorted to the end
+    ordered = np.sort(np.where(blocks > 0, blocks, np.inf), -1)
+    count = (blocks > 0).sum(-1)
+    low = np.take_along_axis(ordered, np.maximum((count - 1) // 2, 0)[..., None], -1)[..., 0]
+    high = np.take_along_axis(ordered, np.minimum(count // 2, factor**2 - 1)[..., None], -1)[..., 0]
+    has_value = count * 2 >= factor**2
+    low, high = np.where(has_value, low, 0.0), np.where(has_value, high, 0.0)
+    return np.where(high < _SAME_SURFACE * low, (low + high) / 2, low).astype(distance_m.dtype)
 
 
 def read_depth(depth: DepthFile, camera: Camera) -> Float[np.ndarray, "h w"]:

@@ -29,9 +29,8 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar import transform_points
 from edge_depth_nerf.lidar.free_space import FreeSpace
-from edge_depth_nerf.lidar.sweeps import Sweep, without_beams
+from edge_depth_nerf.lidar.sweeps import Sweep, first_in_voxel, without_beams
 from edge_depth_nerf.lidar.trajectory import MAX_POSE_GAP_S, Trajectory
-from edge_depth_nerf.lidar.voxels import first_in_voxel
 from edge_depth_nerf.lidar.world import WorldSweep, above_field, sweep_in_world
 from edge_depth_nerf.process.options import ProcessOptions
 from edge_depth_nerf.process.recording import RecordedSweep, Recording
@@ -259,7 +258,7 @@ class SweepStore:
         return SweepStore(
             *(recording.sweeps, recording.trajectory),
             reach=options.sweeps,
-            deskew=options.deskew,
+            deskew=not options.raw_lidar,
             held_out=held_out,
             strict=options.strict,
             holdout_beams=options.holdout_beams,

@@ -27,7 +27,7 @@ from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar import project_points, transform_points
 from edge_depth_nerf.lidar.world import sweep_in_world
-from edge_depth_nerf.process.downscale import downscale_image, downscale_mask
+from edge_depth_nerf.process.reading import downscale_image, downscale_mask
 from edge_depth_nerf.process.recording import RecordedCamera, RecordedSweep, Recording
 
 _WORKING_PX = 320

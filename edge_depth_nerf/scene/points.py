@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from edge_depth_nerf.base.files import read_npz, write_atomically, write_bytes
-from edge_depth_nerf.lidar.voxels import first_in_voxel
+from edge_depth_nerf.lidar.sweeps import first_in_voxel
 
 MAX_POINTS = 200_000
 """points.ply holds at most so many points."""

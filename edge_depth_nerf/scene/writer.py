@@ -274,7 +274,12 @@ def write_scene(
     for name, mask in masks.items():
         write_mask(output / f"masks/{name}.png", mask)
     tolerance = Tolerance(strict, len(frames))
-    frames = _without_broken_before(output, frames, tolerance)
+    # what an earlier run left out is left out again, as long as none of its files has changed
+    broken = _broken_before(output, frames)
+    for frame in frames:
+        if frame.key in broken:
+            tolerance.add(frame.frame, frame.camera, InputError(broken[frame.key]))
+    frames = [frame for frame in frames if frame.key not in broken]
     later, work, notices = _kept_later_maps(output, frames, shifted, layers)
     jobs = [
         # the cameras of a moment one after another: they share its sweeps
@@ -313,15 +318,6 @@ def write_scene(
         left_out=tolerance.left_out,
         notices=tuple(notices),
     )
-
-
-def _without_broken_before(output: Path, frames: list[SceneFrame], tolerance: Tolerance) -> list[SceneFrame]:
-    """Leave out what an earlier run did, as long as none of its files has changed."""
-    broken = _broken_before(output, frames)
-    for frame in frames:
-        if frame.key in broken:
-            tolerance.add(frame.frame, frame.camera, InputError(broken[frame.key]))
-    return [frame for frame in frames if frame.key not in broken]
 
 
 def _write_cloud(output: Path, frames: Sequence[SceneFrame]) -> None:
@@ -581,19 +577,12 @@ def _cloud_path(frame: SceneFrame) -> str:
     return f"{_PARTIAL}/{frame.camera}/{frame.frame:010d}.npz"
 
 
-def _modified_ns(path: Path) -> int:
-    try:
-        return path.stat().st_mtime_ns
-    except FileNotFoundError:
-        return 0
-
-
-def _changed_ns(path: Path) -> int:
+def _modified_ns(path: Path, or_copied: bool = False) -> int:
     try:
         found = path.stat()
     except FileNotFoundError:
         return 0
-    return max(found.st_mtime_ns, found.st_ctime_ns)
+    return max(found.st_mtime_ns, found.st_ctime_ns) if or_copied else found.st_mtime_ns
 
 
 def _broken_before(output: Path, frames: Sequence[SceneFrame]) -> dict[str, str]:
@@ -608,7 +597,7 @@ def _broken_before(output: Path, frames: Sequence[SceneFrame]) -> dict[str, str]
         if isinstance(found, dict)
         and frame.key in found
         # a copy may keep the date of its content, but not that of its file
-        and max((_changed_ns(file) for file in frame.inputs), default=0) < written_ns
+        and max((_modified_ns(file, or_copied=True) for file in frame.inputs), default=0) < written_ns
     }
 
 
@@ -685,12 +674,9 @@ def _write_frame(
         if lidar.shape != size:
             raise InputError(_size_error(f"{where}: its LiDAR map", lidar.shape, size))
         write_distance_png(files["lidar"], np.where(mask, lidar, 0.0))
-    if "mono" in files and content.mono is not None:
-        _write_distance(files["mono"], content.mono, size, f"{where}: its monocular map")
-    if "beams" in files and content.beams is not None:
-        _write_distance(files["beams"], content.beams, size, f"{where}: its held-out beams")
-    if "truth_distance" in files and content.truth_distance is not None:
-        _write_distance(files["truth_distance"], content.truth_distance, size, f"{where}: its true distance")
+    for layer, what in (("mono", "monocular map"), ("beams", "held-out beams"), ("truth_distance", "true distance")):
+        if layer in files:
+            _write_distance(files[layer], getattr(content, layer), size, f"{where}: its {what}")
     if "truth_rgb" in files and content.truth_rgb is not None:
         _write_picture(files["truth_rgb"], content.truth_rgb, size, f"{where}: its true picture")
     if CLOUD in layers and not frame.held_out:
@@ -773,14 +759,12 @@ def _kept_later_maps(
         if fresh and all(file is not None and (output / file).is_file() for file in files):
             kept[name] = later
             continue
-        remedy = "Add them again."
-        if name == "mono":
-            remedy = (
-                "Those of the drive's own network are made again. Add others again with `edge-depth-nerf "
-                "estimate-depth`."
-            )
-        if name in ("motion", "motion_sigma", "motion_around"):
-            remedy = "They are made again, unless --no-motion is given."
+        by_motion = "They are made again, unless --no-motion is given."
+        remedy = {
+            "mono": "Those of the drive's own network are made again. Add others again with `edge-depth-nerf "
+            "estimate-depth`.",
+            **dict.fromkeys(("motion", "motion_sigma", "motion_around"), by_motion),
+        }.get(name, "Add them again.")
         of_what = "estimated monocular maps" if name == "mono" else f"{LAYERS[name].words} put in later"
         notices.append(
             f"The {of_what} of this scene are removed: one is missing, or pictures or masks are new. {remedy}"

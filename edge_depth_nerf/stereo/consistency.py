@@ -4,6 +4,10 @@ A neighbour has distances of its own, found from other pictures. Where it has th
 wrong in the same way; where it sees through the point, one is wrong. A distance is kept if several neighbours confirm
 it and fewer see through it, if there is enough parallax, and if it is likely to be right (`confidence`). What is kept
 is the mean of what agrees.
+
+Where a picture has no distance of its own, that may have two reasons. Matching failed here, but others matched the
+same surface; or the picture sees something that nobody ever matched, such as a beam that is too near, in front of a
+ceiling. The neighbours' distances, projected into the picture, tell one from the other (`method.prior`).
 """
 
 from __future__ import annotations
@@ -12,8 +16,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float32
 
+from edge_depth_nerf.lidar.projection import project_points
 from edge_depth_nerf.masks.regions import larger
 from edge_depth_nerf.stereo.sweep import Geometry, Swept, padded, rays_of
 from edge_depth_nerf.stereo.views import View
@@ -38,6 +44,8 @@ _LEAST_ERROR = 0.01
 """Of lenses and poses, as a share of the distance."""
 _WRONG_ERROR = 0.2
 """Of a distance that is not right, as a share of it."""
+SPACING_PX = 1.5
+"""Each point stands for a patch as wide as so many pixels of the neighbour's picture: about a pixel's diagonal."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,3 +113,34 @@ def confirm(
     kept = larger(kept, SMALLEST_PX)
     distance_m = np.where(kept, 1 / np.where(kept, mean, 1), 0).astype(np.float32)
     return MotionDistance(distance_m, np.where(kept, confidence, 0), np.where(kept, swept.parallax_px, 0))
+
+
+def seen_around(
+    view: View, neighbours: Sequence[View], theirs: Sequence[Float32[np.ndarray, "_ _"]]
+) -> Float32[np.ndarray, "h w"]:
+    """Project the neighbours' distances into a picture: the median of those that fall into a pixel.
+
+    Args:
+        view: the picture.
+        neighbours: those it is compared with.
+        theirs: their distances from motion, metres, 0 = none.
+
+    Returns:
+        Metres along the picture's own rays, 0 where no neighbour shows anything.
+
+    """
+    found = np.full((len(neighbours), *view.grey.shape), np.nan, np.float32)
+    for number, (neighbour, distance_m) in enumerate(zip(neighbours, theirs, strict=True)):
+        known = distance_m > 0
+        if not known.any():
+            continue
+        to_view = np.linalg.inv(view.camera_to_world) @ neighbour.camera_to_world
+        points_m = neighbour.rays.directions[known].astype(np.float64) * distance_m[known, None]
+        points_m = torch.from_numpy(points_m @ to_view[:3, :3].T + to_view[:3, 3])
+        spacing_m = torch.from_numpy((SPACING_PX / neighbour.focal_px * distance_m[known]).astype(np.float32))
+        projected_m = project_points(points_m, view.camera, spacing_m=spacing_m).distance_m.float().numpy()
+        found[number] = np.where(projected_m > 0, projected_m, np.float32(np.nan))
+    some = np.isfinite(found).any(0) & view.used
+    result = np.zeros(view.grey.shape, np.float32)
+    result[some] = np.nanmedian(found[:, some], axis=0)
+    return result
