@@ -98,6 +98,22 @@ class ProcessOptions:
         given = self.ego_mask
         return given / f"{camera}.png" if given is not None and given.is_dir() else given
 
+    def chosen_frames(self, end: int, what: str) -> range:
+        """Numbers of the frames that are asked for, of a drive that ends with frame `end`.
+
+        Raises:
+            InputError: they reach beyond it; `what` says which frames there are.
+
+        """
+        last = max(end, self.first) if self.frames is None else self.first + (self.frames - 1) * self.stride
+        if last > end:
+            asked = "" if self.frames is None else f" --frames {self.frames} --stride {self.stride}"
+            raise InputError(
+                f"--first {self.first}{asked}: reaches frame {last}, but {what} to {end}. Start earlier, use fewer, or "
+                "leave out --first and --frames to use all."
+            )
+        return range(self.first, last + 1, self.stride)
+
     def check(self) -> None:
         """Check the ranges.
 

@@ -282,18 +282,6 @@ def _moments(files: dict[str, list[_Timed]]) -> list[dict[str, _Timed]]:
     return moments
 
 
-def _select(moments: list[dict[str, _Timed]], options: RigOptions | JbnuDepth360Options) -> range:
-    last = len(moments) - 1
-    end = max(last, options.first) if options.frames is None else options.first + (options.frames - 1) * options.stride
-    if end > last:
-        asked = "" if options.frames is None else f" --frames {options.frames} --stride {options.stride}"
-        raise InputError(
-            f"--first {options.first}{asked}: reaches frame {end}, but the recording has frames 0 to {last}. Start "
-            "earlier, use fewer, or leave out --first and --frames to use all."
-        )
-    return range(options.first, end + 1, options.stride)
-
-
 def _usable(
     moments: list[dict[str, _Timed]],
     options: RigOptions | JbnuDepth360Options,
@@ -304,7 +292,7 @@ def _usable(
     """The requested frames, by number, without frames and pictures that cannot be used; and the latter."""
     kept: dict[int, dict[str, _Timed]] = {}
     skipped: list[Skipped] = []
-    for frame in _select(moments, options):
+    for frame in options.chosen_frames(len(moments) - 1, "the recording has frames 0"):
         pictures = moments[frame]
         if reason := _unusable(pictures, path, scans):
             skipped.append(Skipped(frame, None, reason))

@@ -96,19 +96,10 @@ class Kitti360Drive:
         if not present:
             folders = ", ".join(str(self.image_folder(name)) for name in options.cameras)
             raise InputError(f"{folders}: no pictures with names like 0000000123.png in it.")
-        end = max(present)
-        last = max(end, options.first)
-        if options.frames is not None:
-            last = options.first + (options.frames - 1) * options.stride
-        if last > end:
-            asked = "" if options.frames is None else f" --frames {options.frames} --stride {options.stride}"
-            raise InputError(
-                f"--first {options.first}{asked}: reaches frame {last}, but the pictures of {options.sequence} are of "
-                f"frames {min(present)} to {end}. Start earlier, use fewer, or leave out --first and --frames to "
-                "use all."
-            )
+        there = f"the pictures of {options.sequence} are of frames {min(present)}"
+        frames = options.chosen_frames(max(present), there)
         kept, skipped = [], []
-        for frame in range(options.first, last + 1, options.stride):
+        for frame in frames:
             if posed is not None and frame not in posed:
                 skipped.append(Skipped(frame, None, "no pose"))
             elif frame not in sweeps:
@@ -123,8 +114,8 @@ class Kitti360Drive:
 
             has_poses = "" if posed is None else f"{self.poses} has poses {extent(posed)}, "
             raise InputError(
-                f"none of frames {options.first} to {last} can be used: {summarise(skipped)}. {has_poses}{self.sweeps} "
-                f"has sweeps {extent(sweeps)}."
+                f"none of frames {options.first} to {frames.stop - 1} can be used: {summarise(skipped)}. {has_poses}"
+                f"{self.sweeps} has sweeps {extent(sweeps)}."
             )
         return kept, skipped
 
