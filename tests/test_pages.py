@@ -172,7 +172,8 @@ def test_commands_are_understood(words):
         targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
         assert {word for word in words[1:] if "=" not in word} <= set(targets)
     elif program == "python":
-        assert (ROOT / words[1]).is_file()
+        name = f"{words[2].replace('.', '/')}.py" if words[1] == "-m" else words[1]
+        assert (ROOT / name).is_file()
     else:
         parse(words)
 
