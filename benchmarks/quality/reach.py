@@ -105,11 +105,10 @@ def make_scenes(kind: str, seed: int, options: argparse.Namespace) -> dict[str, 
         *("synthesize", "--output", drive, "--scene", kind, "--seed", seed),
         *("--frames", options.frames, "--size", options.size),
     )
-    seconds = ("--mono-seconds", options.mono_seconds) if options.mono_seconds else ()
     maps = drive / "simulated_mono" / made.sequence
     ways = {
-        "without": ("--no-motion", *seconds),
-        "motion": seconds,
+        "without": ("--no-motion",),
+        "motion": (),
         "everywhere": ("--no-motion", "--mono", maps),
     }
     scenes = {prior: options.output / "scenes" / f"{kind}_{seed}_{prior}" for prior in PRIORS}
@@ -203,7 +202,6 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=40)
     parser.add_argument("--size", type=int, default=350, help="of the pictures, in pixels")
     parser.add_argument("--steps", type=int, help="of each training; the preset's, if not set")
-    parser.add_argument("--mono-seconds", type=float, help="for which the drive's network is trained; all its steps")
     parser.add_argument("--jobs", type=int, default=1, help="trainings at a time")
     options = parser.parse_args()
     seeds = options.seeds or [DRIVES[kind] for kind in options.kinds]
