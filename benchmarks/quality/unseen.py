@@ -193,7 +193,7 @@ def page(parts: dict[str, Results], grid: Results) -> str:
         lines += ["## Equal seconds at 700 px", "", *seconds_table(large, parts["large_seconds"]), ""]
     used = [run for results in (claims, beside) for run in results.runs]
     if used:
-        add("λ and σ", Results(used, {"tuned": dict.fromkeys(METHODS)}), "7")
+        add("λ and σ", Results(used), "7")
     return "\n".join(lines)
 
 

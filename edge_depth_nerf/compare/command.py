@@ -98,7 +98,7 @@ def _opened_runs(options: CompareOptions | SearchOptions, tuned: Mapping[MethodN
     digests = {name: check_scene(folder, methods, options.preset) for name, folder in scenes.items()}
     of_layers = {name: layers_digest(folder) for name, folder in scenes.items()}
     open_output(options, tuned)
-    compared, tried = (options, []) if isinstance(options, CompareOptions) else (None, _tried(options))
+    compared, tried = (options, []) if isinstance(options, CompareOptions) else (None, options.tried)
     runs = [
         Run(
             RunSpecification(
@@ -126,10 +126,6 @@ def _opened_runs(options: CompareOptions | SearchOptions, tuned: Mapping[MethodN
     for run in runs:
         run.open()
     return runs
-
-
-def _tried(options: SearchOptions) -> list[Setting]:
-    return [Setting(weight, sigma_m) for weight in options.lambdas for sigma_m in options.sigmas_m]
 
 
 def read_comparison(output: Path) -> Results:
@@ -283,13 +279,7 @@ def _record(options: CompareOptions | SearchOptions, tuned: Mapping[MethodName, 
     path = options.output / RECORD
     if not path.is_file() and options.output.is_dir() and any(options.output.iterdir()):
         raise InputError(f"{options.output}: contains other files. Choose a new or empty folder for --output.")
-    found = {**record, **(read_json_object(path) if path.is_file() else {})}
-    for name, value in record.items():
-        if value != found[name]:
-            raise InputError(
-                f"{path}: this folder contains a comparison with {name} {found[name]}, not {value}. Choose another "
-                "--output."
-            )
+    found = _same(path, record, "this folder contains a comparison with", "") if path.is_file() else record
     for name in _methods(options) if compared else ():
         _check_setting(options.output, name, tuned.get(name, Setting()))
     if compared and compared.tuned and {*tuned} & {*_methods(options)}:
@@ -297,6 +287,20 @@ def _record(options: CompareOptions | SearchOptions, tuned: Mapping[MethodName, 
         # files of a search of one drive have it as `scene`
         scenes = [*listed(found.get("tuned_on")), *listed(content.get("scenes", content.get("scene")))]
         found["tuned_on"] = [*dict.fromkeys(scenes)]
+    return found
+
+
+def _same(path: Path, wanted: Mapping[str, Any], words: str, remedy: str) -> dict[str, Any]:
+    """Give what a file holds, if it agrees with what is wanted.
+
+    Raises:
+        InputError: it holds another value; one that an earlier version did not write is not known to differ.
+
+    """
+    found = {**wanted, **read_json_object(path)}
+    for name, value in wanted.items():
+        if value != found[name]:
+            raise InputError(f"{path}: {words} {name} {found[name]}, not {value}. Choose another --output{remedy}.")
     return found
 
 
@@ -342,14 +346,7 @@ class Run:
         if not path.is_file():
             write_json(path, wanted)
             return
-        # what an earlier version did not name is not known to differ
-        found = {**wanted, **read_json_object(path)}
-        for name, value in wanted.items():
-            if value != found[name]:
-                raise InputError(
-                    f"{path}: this run was started with {name} {found[name]}, not {value}. Choose another --output, or "
-                    f"remove {self.folder}."
-                )
+        _same(path, wanted, "this run was started with", f", or remove {self.folder}")
 
     @property
     def task(self) -> Task:

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import tyro
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.compare.methods import GRID, METHODS, MethodName, Preset, Sigma, check_name
+from edge_depth_nerf.compare.methods import GRID, METHODS, MethodName, Preset, Setting, Sigma, check_name
 from edge_depth_nerf.jobs.cluster_address import check_address
 
 Implementation = Literal["same", "torch"]
@@ -136,6 +136,11 @@ class SearchOptions(TrainingOptions):
             f"--sigmas-m {_words(self.sigmas_m)}",
             f"at least {LEAST_SIGMAS} of positive metres or own",
         )
+
+    @property
+    def tried(self) -> list[Setting]:
+        """Each λ with each σ."""
+        return [Setting(weight, sigma_m) for weight in self.lambdas for sigma_m in self.sigmas_m]
 
     def _check_methods(self) -> None:
         without = tuple(name for name in self.methods if METHODS[name].loss == "none")
