@@ -93,7 +93,7 @@ def test_code_and_headings_of_a_docstring_are_left_alone(prose, tmp_path):
     module = tmp_path / "edge_depth_nerf/module.py"
     module.parent.mkdir(parents=True)
     module.write_text(
-        '"""Reads `moment`.\n\n    print(moment)\n\nIt is plain.\n"""\n\n\ndef read(moment):\n'
+        '"""Reads `moment`.\n\n    print(moment)\n\nIt is plain.\n"""\n\n\ndef read(time_s):\n'
         '    """Read what `moment_s` holds; the function returns it.\n\n'
         '    Args:\n        moment_s: a time.\n\n    Returns:\n        Seconds.\n    """\n'
     )
