@@ -40,8 +40,8 @@ PARTS = {
     "hash grid": "hash grid",
     "optimisers": "gradient of its table, and Adam",
     "batch": "pixels of the batch, their rays",
-    "samples": "samples: places, positions, weights; rendering, with its losses",
-    "losses": "losses of proposal networks; weighing all losses",
+    "samples": "samples: places, positions, weights; rendering",
+    "losses": "losses",
     "rest": "all else: autograd, nerfstudio",
 }
 """What the table calls the parts."""
