@@ -180,8 +180,8 @@ def losses(edges_m: NDArray, surfaces_m: NDArray, prior_m: float, sigma_m: float
     found = []
     for surface_m in surfaces_m:
         weights = torch.from_numpy(surface_weights(edges_m, surface_m, SOFTNESS_M))[None]
-        form: dict[str, Any] = {"gaussian": "interval", "divide_by_norm": True}
-        (loss,) = edge_loss(weights, edges[:, :-1], edges[:, 1:], prior, torch.full_like(prior, sigma_m), **form)
+        given = weights, edges[:, :-1], edges[:, 1:], prior, torch.full_like(prior, sigma_m)
+        (loss,) = edge_loss(*given, gaussian="interval", divide_by_norm=True)
         found.append(float(loss))
     return np.array(found)
 

@@ -21,6 +21,8 @@ from edge_depth_nerf.base.files import read_json, write_json
 from edge_depth_nerf.compare.grid import grid_tables
 from edge_depth_nerf.compare.results import Results
 from edge_depth_nerf.compare.search import grids
+from edge_depth_nerf.lidar.trajectory import Trajectory
+from edge_depth_nerf.process.recording import Recording
 from edge_depth_nerf.report.tables import page_of_tables
 
 ROOT = Path(__file__).resolve().parent.parent

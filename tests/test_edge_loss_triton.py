@@ -16,10 +16,11 @@ from edge_depth_nerf.method import depth_losses, edge_loss_numba
 from edge_depth_nerf.method.depth_losses import EdgeLoss, Level
 from edge_depth_nerf.method.losses import EDGE_LOSS, EPS, NARROW, Gaussian, edge_loss
 
+Rays = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 FORMS: list[tuple[Gaussian, bool]] = [("point", False), ("point", True), ("interval", False), ("interval", True)]
 
 
-def level_of(rays: int, samples: int, seed: int = 0) -> tuple[torch.Tensor, ...]:
+def level_of(rays: int, samples: int, seed: int = 0) -> Rays:
     """Weights, starts and ends of samples, prior and sigma; some rays without one, and some samples of no length."""
     generator = np.random.default_rng(seed)
     steps = generator.exponential(1, (rays, samples + 1)) * generator.choice([0, 0.01, 1, 5], (rays, samples + 1))
@@ -29,8 +30,8 @@ def level_of(rays: int, samples: int, seed: int = 0) -> tuple[torch.Tensor, ...]
     weights[:, samples // 2] = 0
     prior, sigma = generator.uniform(3, 120, rays), 10 ** generator.uniform(-1.3, 1.3, rays)
     prior[:4], sigma[4:6] = [0, np.nan, np.inf, -2][: len(prior[:4])], [0, np.nan][: len(sigma[4:6])]
-    of_rays = (torch.tensor(each, dtype=torch.float32) for each in (prior, sigma))
-    return weights.requires_grad_(), edges[:, :-1], edges[:, 1:], *of_rays
+    prior, sigma = (torch.tensor(each, dtype=torch.float32) for each in (prior, sigma))
+    return weights.requires_grad_(), edges[:, :-1], edges[:, 1:], prior, sigma
 
 
 def by_kernels(level, gaussian="interval", norm=True, kernels: Any = None) -> torch.Tensor:
@@ -122,10 +123,11 @@ def test_the_kernels_serve_what_they_can_do(monkeypatch):
     monkeypatch.setattr(depth_losses, "EDGE_LOSS", SimpleNamespace(on=lambda device: asked.append(device.type)))
     level = level_of(12, 30)
     expected = EdgeLoss()(Level(*level))
-    EdgeLoss()(Level(*(each.detach().half() for each in level[:3]), *level[3:]))
+    weights, starts, ends, prior, sigma = level
+    EdgeLoss()(Level(weights.detach().half(), starts.half(), ends.half(), prior, sigma))
     assert asked == ["cpu", "cpu"]
-    EdgeLoss()(Level(*(each.double() for each in level)))
-    EdgeLoss()(Level(*level[:4], level[4].clone().requires_grad_()))
+    EdgeLoss()(Level(weights.double(), starts, ends, prior, sigma))
+    EdgeLoss()(Level(weights, starts, ends, prior, sigma.clone().requires_grad_()))
     assert len(asked) == 2
     monkeypatch.undo()
     assert EDGE_LOSS.on(torch.device("cpu")) is edge_loss_numba.edge_loss

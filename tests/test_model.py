@@ -534,8 +534,8 @@ def test_levels_that_do_not_learn_are_left_out_and_the_others_pull_as_before(los
         prior, sigma = batch()["prior_distance_m"][:, 0], batch()["prior_sigma_m"][:, 0]
         levels = []
         for weights, samples in zip(outputs["weights_list"], outputs["ray_samples_list"], strict=True):
-            ends = (each[..., 0] * METRES_PER_UNIT for each in (samples.frustums.starts, samples.frustums.ends))
-            levels.append(Level(weights[..., 0], *ends, prior, sigma))
+            starts, ends = (edge[..., 0] * METRES_PER_UNIT for edge in (samples.frustums.starts, samples.frustums.ends))
+            levels.append(Level(weights[..., 0], starts, ends, prior, sigma))
         object_of = model.step_losses[LOSSES[loss]].loss
         counted = 16 if object_of.over_all_rays else 12
         used = levels[-1:] if rests and loss != "urban-nerf" else levels

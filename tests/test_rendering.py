@@ -244,7 +244,7 @@ def test_rays_that_end_early_have_no_sky(monkeypatch):
     with_sky = model(whole)
     assert whole.fars is None and torch.equal(model(whole)["rgb"], with_sky["rgb"])  # and once more
     colours: list[Any] = []
-    at = model.field.forward_together
+    at: Any = model.field.forward_together
     monkeypatch.setattr(
         model.field, "forward_together", lambda parts: [colours.append(each) or each for each in at(parts)]
     )

@@ -33,7 +33,7 @@ from edge_depth_nerf.compare.command import RUNS
 from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.results import Results, RunResult, read_results
 from edge_depth_nerf.method.integration import INTEGRATED
-from edge_depth_nerf.method.prior import PriorOptions, make_prior, view_of
+from edge_depth_nerf.method.prior import PriorOptions, make_prior, ray_angles
 from edge_depth_nerf.mono.calibration import find_trust
 from edge_depth_nerf.scene.reader import SceneFolder, read_scene
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
@@ -77,7 +77,7 @@ def prior_pixels(scene: SceneFolder, options: PriorOptions) -> NDArray[np.float6
     """
     trust, rows = find_trust(scene, options), []
     for picture in [picture for picture in scene.pictures if not picture.held_out]:
-        maps, view_angles = scene.maps(picture), view_of(picture.lens, picture.up_in_camera)
+        maps, view_angles = scene.maps(picture), ray_angles(picture.lens, picture.up_in_camera)
         prior = make_prior(maps.distances_m, maps.usable, INTEGRATED, options, trust, view_angles)
         outside = ~trust.in_field(view_angles.elevation_rad)
         of_pixels = (maps.distances_m["truth_distance"], prior.distance_m, prior.sigma_m, outside)

@@ -7,15 +7,15 @@ the full preset, because smaller ones time the host's launches; `benchmarks.spee
 
 from __future__ import annotations
 
-import copy
 import statistics
 import time
 from typing import Any
 
 import torch
-from edge_depth_nerf.kernels.fused_hash_grid import use_fused_encodings
 from nerfstudio.field_components.encodings import HashEncoding
 from torch import Tensor
+
+from edge_depth_nerf.plugin.fused.hash_grid import FusedHashEncoding
 
 PAUSE_S = 0.02
 """Before each run: torch's threads spin for some milliseconds after their work, which would be the next form's time."""
@@ -76,10 +76,11 @@ def step_ms(encoding: HashEncoding, x: Tensor, gradient: Tensor) -> float:
 def measure(size: str, repeat: int = 15) -> dict[str, Any]:
     """Run the two forms in turn; a row of the summary, with quartiles of the ratio."""
     levels, log2_rows, count, finest = SIZES[size]
-    torch.manual_seed(0)
-    host = HashEncoding(num_levels=levels, log2_hashmap_size=log2_rows, max_res=finest, implementation="torch")
-    fused = copy.deepcopy(host)
-    use_fused_encodings(fused)
+    made = []
+    for kind in (HashEncoding, FusedHashEncoding):
+        torch.manual_seed(0)
+        made.append(kind(num_levels=levels, log2_hashmap_size=log2_rows, max_res=finest, implementation="torch"))
+    host, fused = made
     x, gradient = make_points(count, along_rays=True), torch.randn(count, host.get_out_dim())
     difference = differences(host, fused, x, gradient)
     torch_ms, fused_ms = zip(

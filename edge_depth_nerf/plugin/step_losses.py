@@ -24,7 +24,12 @@ from edge_depth_nerf.plugin.fused.ray_samplers import edges_of
 register(os.environ.get(VARIABLE, ""))
 if TYPE_CHECKING:
     DepthLossName = str
-    LossOptions = Any
+
+    class LossOptions:
+        """Its fields are the registered losses, which a type checker cannot know."""
+
+        def __init__(self, **losses: DepthLoss) -> None: ...
+        def __getattr__(self, name: str) -> DepthLoss: ...
 else:
     DepthLossName = Literal[(*LOSSES, "none")]
     """Names of losses on the prior."""
