@@ -47,6 +47,8 @@ def trainer_in(folder: Path, name: str, **changes: Any) -> EdgeDepthTrainer:
     changes |= {"max_num_iterations": STEPS}
     trainer = trainer_of(folder / "scene", folder / name, **changes)
     manager: Any = trainer.pipeline.datamanager
+    model: Any = trainer.pipeline.model
+    model._training_steps = STEPS  # of one that is taken up again, too
     manager.next_train = lambda step: manager.batch_of(manager.upload(step))
     for parameter in trainer.pipeline.model.parameters():
         if hasattr(parameter, SUMS_LATER):
@@ -161,7 +163,7 @@ def test_where_it_is_not_possible_training_says_so(folder, capsys):
     assert why_not(model, "cuda:0", 1, False) is None
     assert why_not(model, "cuda:0", 2, False) == "several processes train together"
     assert why_not(model, "cuda:0", 1, True) == "gradients of several steps are added"
-    for name, value, why in (("depth_loss", "urban-nerf-los", "σ"), ("predict_normals", True, "normals")):
+    for name, value, why in (("depth_loss", "urban-nerf-los", "changes"), ("predict_normals", True, "normals")):
         before = getattr(model.config, name)
         setattr(model.config, name, value)
         assert why in str(why_not(model, "cuda:0", 1, False))

@@ -6,6 +6,7 @@ Host-facing; formulas stand in `method.metrics`.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -67,7 +68,7 @@ class ViewEvaluation:
         self,
         rgb: Float[Tensor, "h w 3"],
         distance_m: Float[Tensor, "h w"],
-        batch: Mapping[str, Tensor],
+        batch: Mapping[str, Any],
         lpips: torch.nn.Module | None,
     ) -> dict[str, float]:
         """Give a view's figures, masked_* and, where the picture without noise is known, truth_masked_*.

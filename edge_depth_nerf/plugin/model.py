@@ -58,6 +58,7 @@ from edge_depth_nerf.plugin.step_losses import (
     LossOptions,
     Planes,
     Step,
+    StepLoss,
     distortion_of,
     draw_surface_m,
     interlevel_of,
@@ -135,7 +136,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         metadata = self.kwargs.get("metadata") or {}
         self.metres_per_unit: float = metadata.get("metres_per_unit", 1.0)
         self.planes = Planes(self.config.near_m, self.config.far_m, self.metres_per_unit)
-        self.step_losses = step_losses_of(self.config)
+        step_losses_of(self.config)  # refuses a loss that there is not
         self._settle()
         with lpips_not_built(), fused_forms() if self.fused else nullcontext():
             super().populate_modules()
@@ -207,6 +208,11 @@ class EdgeDepthNerfModel(NerfactoModel):
         # the near plane is not reset at evaluation: nothing was trained in front of it
         near, far = (distance_m / self.metres_per_unit for distance_m in (self.config.near_m, self.config.far_m))
         self.collider = NearFarCollider(near_plane=near, far_plane=far, reset_near_plane=False)
+
+    @property
+    def step_losses(self) -> dict[str, StepLoss]:
+        """The losses of a training step beside nerfacto's, by their names; options may change meanwhile."""
+        return step_losses_of(self.config)
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
@@ -384,8 +390,10 @@ class EdgeDepthNerfModel(NerfactoModel):
             losses = super().get_loss_dict(outputs, batch, metrics_dict)
         if self.training:
             step = Step(outputs, batch, self.planes, self._share_done(), self.depth_weight())
-            reads = self.step_losses if "surface_rgb" in outputs else self.step_losses.keys() - {"surface_loss"}
-            losses |= {name: loss(step) for name, loss in self.step_losses.items() if name in reads}
+            wanted = self.step_losses
+            if "surface_rgb" not in outputs:
+                wanted.pop("surface_loss", None)
+            losses |= {name: loss(step) for name, loss in wanted.items()}
         return losses
 
     def _nerfacto_losses(
