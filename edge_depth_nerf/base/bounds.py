@@ -37,14 +37,9 @@ _MAX_NAME_BYTES = 255
 
 
 def path_inside(folder: Path, name: object, where: str) -> Path:
-    """Resolve a path that a file gives, which may not lead out of `folder`.
+    """Resolve a path that a file gives relative to `folder`, which it may not lead out of; errors name `where`.
 
     Links in the folder are followed: the folder's owner put them there, not the file.
-
-    Args:
-        folder: what the path is relative to.
-        name: what the file says.
-        where: the file, and the place in it, for error messages.
 
     Raises:
         InputError: it is no text, absolute, leads out of the folder, or is no path at all.

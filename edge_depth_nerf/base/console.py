@@ -30,14 +30,7 @@ def say(console: Console, text: str, style: str | None = None) -> None:
 
 
 def progress_bars(console: Console, counted: bool = False, transient: bool = False) -> Progress:
-    """Make bars with a description, the time passed and the time left.
-
-    Args:
-        console: where to.
-        counted: show how many of how many are done, too.
-        transient: take the bars away at the end.
-
-    """
+    """Make bars with a description, the time passed and left, and if `counted` how many of how many are done."""
     count: list[ProgressColumn] = [MofNCompleteColumn()] if counted else []
     return Progress(
         TextColumn("{task.description}"),

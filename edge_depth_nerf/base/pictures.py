@@ -38,9 +38,7 @@ class ColourScale:
     """Which colour stands for which value; values beyond the ends take the colours of the ends."""
 
     low: float
-    """Value of the first colour."""
     high: float
-    """Value of the last colour."""
     colours: NDArray[np.uint8]
     """256×3 RGB, from low to high."""
     ticks: tuple[float, ...]
@@ -64,12 +62,7 @@ class ColourScale:
         return self.low + (self.high - self.low) * positions
 
     def coloured(self, values: NDArray, shown: NDArray[np.bool_]) -> NDArray[np.uint8]:
-        """Colour H×W values where `shown` is True; the others have the colour of no value.
-
-        Returns:
-            H×W×3 uint8 RGB.
-
-        """
+        """Colour H×W values as H×W×3 RGB where `shown` is True; the others have the colour of no value."""
         steps = np.rint(self.position(np.where(shown, values, self.low)) * 255).astype(np.uint8)
         return np.where(shown[..., None], self.colours[steps], np.array(NO_VALUE_RGB, np.uint8)).astype(np.uint8)
 
@@ -112,29 +105,18 @@ def is_distance(distance_m: NDArray) -> NDArray[np.bool_]:
 
 
 def colour_distance(distance_m: NDArray, mask: NDArray[np.bool_] | None = None) -> NDArray[np.uint8]:
-    """Colour a distance map: near is red, far is blue, the same distance always has the same colour.
+    """Colour H×W metres as H×W×3 RGB: near is red, far is blue, the same distance always has the same colour.
 
-    Args:
-        distance_m: H×W metres; not positive or not finite = no value.
-        mask: H×W, True = show; others are drawn as having no value.
-
-    Returns:
-        H×W×3 uint8 RGB.
-
+    What is not positive or not finite, and what `mask` does not show (True = show), has the colour of no value.
     """
     shown = is_distance(distance_m)
     return DISTANCE.coloured(distance_m, shown if mask is None else shown & mask)
 
 
 def distance_of_colours(coloured: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Read a distance map back from its colours, as exactly as these tell: to 1.6 %, and no farther than their ends.
+    """Read H×W metres back from their colours by `colour_distance`; 0 = no value.
 
-    Args:
-        coloured: H×W×3, by `colour_distance`, unharmed but for the last bit.
-
-    Returns:
-        H×W metres, 0 = no value.
-
+    They are as exact as the colours: to 1.6 %, and no farther than their ends; the last bit may be harmed.
     """
     palette = np.vstack((DISTANCE.colours, [NO_VALUE_RGB])).astype(int)
     metres = np.append(DISTANCE.values_at(np.arange(256) / 255), 0.0).astype(np.float32)
@@ -293,15 +275,7 @@ def add_legend_below(
     names: Sequence[str],
     place: Literal["outside lower left", "outside lower center"],
 ) -> None:
-    """Put a legend below a figure's axes, in as many columns as fit, and enlarge the figure by it.
-
-    Args:
-        figure: of matplotlib's, with constrained layout.
-        handles: what the legend explains.
-        names: of each.
-        place: matplotlib's words for it.
-
-    """
+    """Put a legend below a figure's axes, in as many columns as fit, and enlarge the figure by it."""
     if not names:
         return
 
@@ -335,14 +309,7 @@ def _padded(picture: NDArray[np.uint8], rows: tuple[int, int], columns: tuple[in
 
 
 def lay_out(panels: Sequence[NDArray[np.uint8]], columns: int, heading: Sequence[str]) -> NDArray[np.uint8]:
-    """Lay out panels of one size row by row, under lines of text.
-
-    Args:
-        panels: H×W×3 each.
-        columns: how many stand side by side.
-        heading: the lines, the first one large.
-
-    """
+    """Lay out panels of one size row by row, under lines of text, the first of them large."""
     cells = [_padded(one, (7, 7), (7, 7)) for one in panels]
     cells += [np.full_like(cells[0], 255)] * (-len(cells) % columns)
     rows = [np.hstack(cells[first : first + columns]) for first in range(0, len(cells), columns)]
@@ -354,10 +321,7 @@ def lay_out(panels: Sequence[NDArray[np.uint8]], columns: int, heading: Sequence
 def side_by_side(rows: Sequence[Sequence[NDArray[np.uint8]]], titles: Sequence[str]) -> NDArray[np.uint8]:
     """Lay out pictures in rows, with a title above each column and a thin gap between them.
 
-    Args:
-        rows: each with one H×W×3 picture a column, of one size in a row; narrower ones stand in the middle.
-        titles: one a column.
-
+    The pictures of a row have one size; those of narrower rows stand in the middle.
     """
     gap, width = 6, max(row[0].shape[1] for row in rows)
     lines = [[text_bar(title, width, 34 - gap, centred=True) for title in titles], *rows]

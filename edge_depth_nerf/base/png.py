@@ -24,14 +24,11 @@ _COLOUR_TYPES = {0: "grey", 2: "RGB", 3: "palette", 4: "grey and alpha", 6: "RGB
 
 @dataclass(frozen=True)
 class PngHeader:
-    """What a PNG says of itself."""
+    """What a PNG says of itself; sides in pixels, `bit_depth` bits per channel."""
 
     width: int
-    """Pixels."""
     height: int
-    """Pixels."""
     bit_depth: int
-    """Bits per channel."""
     colour: str
     """grey, RGB, palette, grey and alpha, RGBA."""
 

@@ -163,14 +163,8 @@ class Distortion:
     def newton(self, distorted: Float[Tensor, "*batch 2"], steps: int, smallest_determinant: float) -> Tensor:
         """Make undamped Newton steps from the distorted point, as simple solvers do; they may end anywhere.
 
-        Args:
-            distorted: coordinates in the distorted plane.
-            steps: how many.
-            smallest_determinant: a point where the Jacobian's is smaller stays where it is.
-
-        Returns:
-            What is reached; where all is well, the undistorted plane.
-
+        Where all is well, they reach the undistorted plane. A point stays where the Jacobian's determinant is smaller
+        than `smallest_determinant`.
         """
         plane = distorted
         for _ in range(steps):

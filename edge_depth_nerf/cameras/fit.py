@@ -41,7 +41,6 @@ class CameraFit:
     rms_px: float
     """Root mean square, over the picture's area, of the distance between the two pixels of a ray."""
     max_px: float
-    """Largest distance between the two pixels of a ray."""
     theta_max_rad: float
     """The angle from the axis up to which the cameras were compared: at most what the picture sees."""
 

@@ -36,6 +36,8 @@ AnyCamera = TypeVar("AnyCamera", bound="Camera")
 class Camera(ABC):
     """What the models share: a map from rays to a plane, the plane's distortion, and the pixel grid.
 
+    Size, focal lengths and principal point are in pixels, with pixel centres at +0.5.
+
     Raises:
         InputError: a parameter is not finite or out of its range.
 
@@ -45,17 +47,11 @@ class Camera(ABC):
     """The model's name in files."""
 
     width: int
-    """Width of the picture in pixels."""
     height: int
-    """Height of the picture in pixels."""
     fx: float
-    """Focal length along x in pixels."""
     fy: float
-    """Focal length along y in pixels."""
     cx: float
-    """x of the principal point in pixels, pixel centres at +0.5."""
     cy: float
-    """y of the principal point in pixels, pixel centres at +0.5."""
     theta_limit_rad: float = dataclasses.field(default=math.pi, kw_only=True)
     """The angle up to which the parameters were fitted; the model is not valid beyond."""
 
@@ -100,15 +96,9 @@ class Camera(ABC):
         """Points within `_radius_max` of the undistorted plane to unit rays."""
 
     def project(self, points: Float[Tensor, "*batch 3"]) -> tuple[Float[Tensor, "*batch 2"], Bool[Tensor, "*batch"]]:
-        """Project points or directions.
+        """Project points or directions to pixels (NaN where not valid); second, whether θ <= `theta_max_rad`.
 
-        Args:
-            points: in the camera frame; any length but zero.
-
-        Returns:
-            Pixels (NaN where not valid), and whether θ <= `theta_max_rad`. A point at the origin, or with a
-            coordinate that is not finite, is not valid.
-
+        A point at the origin, or with a coordinate that is not finite, is not valid.
         """
         with torch.no_grad():
             largest = points.abs().amax(-1, keepdim=True)
@@ -130,12 +120,9 @@ class Camera(ABC):
         return torch.where(valid[..., None], pixels, math.nan), valid
 
     def unproject(self, pixels: Float[Tensor, "*batch 2"]) -> tuple[Float[Tensor, "*batch 3"], Bool[Tensor, "*batch"]]:
-        """Find the rays of pixels, also of pixels outside the picture.
+        """Find the rays of pixels, also of pixels outside the picture, as unit directions (NaN where not valid).
 
-        Returns:
-            Unit directions (NaN where not valid), and whether the pixel is the image of a ray with
-            θ <= `theta_max_rad`.
-
+        Second, whether the pixel is the image of a ray with θ <= `theta_max_rad`.
         """
         focal, principal = pixels.new_tensor([self.fx, self.fy]), pixels.new_tensor([self.cx, self.cy])
         with torch.no_grad():
@@ -192,7 +179,8 @@ class Camera(ABC):
 class MEI(Camera):
     """The unified model of Mei & Rives (ICRA 2007, eq. 2-7), as in KITTI-360 and cv2.omnidir.
 
-    A unit ray (X, Y, Z) goes to the plane (X, Y)/(Z + ξ), is distorted, and scaled by fx = γ1, fy = γ2.
+    A unit ray (X, Y, Z) goes to the plane (X, Y)/(Z + ξ), is distorted (radially by k1 and k2, tangentially by p1 and
+    p2), and scaled by fx = γ1, fy = γ2.
     """
 
     model: ClassVar[str] = "MEI"
@@ -200,13 +188,9 @@ class MEI(Camera):
     xi: float
     """Shift of the projection centre along the axis, in radii of the unit sphere; more than -1."""
     k1: float
-    """Radial distortion, r²."""
     k2: float
-    """Radial distortion, r⁴."""
     p1: float
-    """Tangential distortion."""
     p2: float
-    """Tangential distortion."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -274,17 +258,11 @@ class KannalaBrandt(Camera):
     model: ClassVar[str] = "KANNALA_BRANDT"
 
     k1: float
-    """Coefficient of θ³."""
     k2: float
-    """Coefficient of θ⁵."""
     k3: float
-    """Coefficient of θ⁷."""
     k4: float
-    """Coefficient of θ⁹."""
     p1: float = 0.0
-    """Tangential distortion."""
     p2: float = 0.0
-    """Tangential distortion."""
 
     @cached_property
     def theta_max_rad(self) -> float:
@@ -320,20 +298,15 @@ class KannalaBrandt(Camera):
 
 @dataclass(frozen=True)
 class Pinhole(Camera):
-    """The pinhole with polynomial distortion: nerfstudio's OPENCV camera, and with k4 = 0 OpenCV's."""
+    """The pinhole with radial (k) and tangential (p) distortion: nerfstudio's OPENCV, and with k4 = 0 OpenCV's."""
 
     model: ClassVar[str] = "PINHOLE"
 
     k1: float = 0.0
-    """Radial distortion, r²."""
     k2: float = 0.0
-    """Radial distortion, r⁴."""
     p1: float = 0.0
-    """Tangential distortion."""
     p2: float = 0.0
-    """Tangential distortion."""
     k3: float = 0.0
-    """Radial distortion, r⁶."""
     k4: float = 0.0
     """Radial distortion, r⁸ (nerfstudio's; OpenCV has a denominator there)."""
 
@@ -366,10 +339,6 @@ _MODELS: dict[str, type[Camera]] = {camera.model: camera for camera in (MEI, Kan
 
 def camera_from_dict(parameters: dict[str, Any], where: str) -> Camera:
     """Build the camera that `Camera.to_dict` described.
-
-    Args:
-        parameters: "model" and the model's fields.
-        where: the file, and the place in it, for error messages.
 
     Raises:
         InputError: the model is unknown, a field is missing, unknown, or not a usable number.

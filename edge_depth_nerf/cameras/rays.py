@@ -39,12 +39,8 @@ def rays(camera: Camera, theta_max_rad: float = math.pi) -> Rays:
     """The rays of a lens's pixel centres, up to an angle from the optical axis.
 
     Pixels are unprojected in float64, and the rim is decided before anything is rounded: a ray is within if
-    cos θ >= cos `theta_max_rad`. So all who ask about a lens and a limit agree about each pixel.
-
-    Args:
-        camera: the lens, at the size of the picture.
-        theta_max_rad: the limit; π leaves the lens model's own.
-
+    cos θ >= cos `theta_max_rad` (π leaves the lens model's own limit). So all who ask about a lens and a limit agree
+    about each pixel.
     """
     directions, within = camera.unproject(camera.pixel_centres())
     if theta_max_rad < math.pi:
@@ -60,12 +56,6 @@ LEAST_COSINE = 0.02
 
 
 def distance_from_z_depth(z_depth_m: Float32[np.ndarray, "h w"], rays: Rays) -> Float32[np.ndarray, "h w"]:
-    """Turn coordinates along the optical axis into distances along the ray; 0 where there is no ray, or none ahead.
-
-    Args:
-        z_depth_m: metres, 0 = none.
-        rays: of the pixels.
-
-    """
+    """Turn metres along the optical axis, 0 = none, into metres along the ray; 0 where there is no ray ahead."""
     ahead = rays.within & (rays.cos_theta >= LEAST_COSINE)
     return np.where(ahead, z_depth_m / np.where(ahead, rays.cos_theta, 1), 0).astype(np.float32)

@@ -75,10 +75,6 @@ class SceneToModel:
 def write_camera_path(options: CameraPathOptions, console: Console | None = None) -> Path:
     """Write a path file, and print the command that renders the film.
 
-    Args:
-        options: the scene and training, the kind of path, the camera.
-        console: for messages.
-
     Returns:
         The file.
 

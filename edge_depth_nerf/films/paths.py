@@ -45,7 +45,6 @@ class CameraPath:
     times_s: Float64[np.ndarray, "poses"]
     """Increasing."""
     camera_to_scene: Poses
-    """The camera's poses at these times."""
     up: Direction
     """Unit vector upwards, in the scene."""
 
@@ -111,12 +110,7 @@ class CameraPath:
 
 
 def up_of(rotations: Float64[np.ndarray, "poses 3 3"]) -> Direction:
-    """The up direction of a scene: z if the cameras agree with it, else the mean up of the cameras.
-
-    Args:
-        rotations: camera to scene (OpenGL's axes), of all cameras.
-
-    """
+    """The up direction of a scene: z if the cameras (OpenGL's axes) agree with it, else their mean up."""
     mean = rotations[:, :, 1].mean(axis=0)
     z = np.array([0.0, 0.0, 1.0])
     length = float(np.linalg.norm(mean))
@@ -127,16 +121,9 @@ def up_of(rotations: Float64[np.ndarray, "poses 3 3"]) -> Direction:
 
 
 def replay(drive: CameraPath, times_s: Float64[np.ndarray, "times"], forward: bool) -> Float64[np.ndarray, "times 4 4"]:
-    """Poses along the recorded path.
+    """Poses along the recorded path at the film's times, camera to scene.
 
-    Args:
-        drive: the camera's path.
-        times_s: the times of the film's pictures.
-        forward: look in the direction of travel, not in that of the drive's camera.
-
-    Returns:
-        Camera to scene.
-
+    `forward` looks in the direction of travel, not in that of the drive's camera.
     """
     poses = drive.at(times_s)
     if forward:
@@ -150,15 +137,7 @@ def lane_shift(
 ) -> Float64[np.ndarray, "times 4 4"]:
     """Poses beside the recorded path: moving aside in the film's first quarter, and back in its last.
 
-    Args:
-        drive: the camera's path.
-        times_s: the times of the film's pictures.
-        forward: as in `replay`.
-        shift_m: the largest offset to the vehicle's left; negative to the right.
-
-    Returns:
-        Camera to scene.
-
+    `shift_m` is the largest offset to the vehicle's left; negative to the right. All else is as in `replay`.
     """
     poses = replay(drive, times_s, forward)
     left = drive.at(times_s)[:, :3, :3] @ drive.vehicle_in_camera[:, 1]

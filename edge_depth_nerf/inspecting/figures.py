@@ -32,10 +32,9 @@ STANDING_M = 0.05
 
 @dataclass(frozen=True)
 class PictureFigures:
-    """Figures of one picture's maps."""
+    """Figures of one picture's maps, and some of their values."""
 
     picture: ScenePicture
-    """The picture."""
     used_share: float
     """Share of the picture that is inside the lens and the mask."""
     hidden_share: float
@@ -49,11 +48,8 @@ class PictureFigures:
     prior_share: float | None
     """Share of the usable pixels with a prior. The others show sky, or are out of reach of all sources."""
     lidar_m: NDArray[np.float32]
-    """Some LiDAR distances."""
     prior_m: NDArray[np.float32]
-    """Some distances of the prior."""
     sigma_m: NDArray[np.float32]
-    """Their standard deviations."""
     mono_over_lidar: NDArray[np.float32]
     """Monocular distance over LiDAR's, at some of the pixels that have both."""
     prior_over_truth: NDArray[np.float32]
@@ -132,13 +128,9 @@ class Step:
     """The step from one picture of a camera to its next."""
 
     before: ScenePicture
-    """The earlier picture."""
     after: ScenePicture
-    """The later picture."""
     length_m: float
-    """Distance between the two camera positions."""
     turn_deg: float
-    """Angle between the two rotations."""
     seconds: float | None
     """Time between the two pictures, if both have a timestamp."""
 

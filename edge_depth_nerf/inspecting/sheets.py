@@ -34,15 +34,7 @@ ORIGIN_RGB: tuple[Colour, ...] = ((20, 20, 20), (150, 150, 150), (240, 170, 40),
 
 
 def draw_sheet(scene: SceneFolder, figures: PictureFigures, maps: ShownMaps, longer_side_px: int) -> NDArray[np.uint8]:
-    """Draw the sheet of one picture. Panels of missing maps are left out.
-
-    Args:
-        scene: the picture's scene.
-        figures: the picture's figures, for the heading.
-        maps: the picture's maps.
-        longer_side_px: longer side of each panel's picture.
-
-    """
+    """Draw the sheet of one picture. Panels of missing maps are left out."""
     height, width = maps.usable.shape
     scale = longer_side_px / max(height, width)
     size = (max(round(width * scale), 1), max(round(height * scale), 1))

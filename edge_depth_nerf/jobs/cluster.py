@@ -56,11 +56,9 @@ class Surroundings:
     """What a task needs of the machine it runs on."""
 
     versions: tuple[tuple[str, str], ...]
-    """Names and versions of packages."""
     witness: str
     """A file that the machine of the command wrote to shared storage."""
     threads: int
-    """Of the task."""
     topic: str
     """Of the events that tell how far it is."""
 

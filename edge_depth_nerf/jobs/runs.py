@@ -140,13 +140,7 @@ def viewer_command(config: Path) -> str:
 
 
 def command_line(words: Sequence[str], options: Any) -> str:
-    """Write the command that gives options: those that are not at their defaults.
-
-    Args:
-        words: the command, such as `edge-depth-nerf demo`.
-        options: its options, a dataclass as tyro reads it; what has no flag comes first.
-
-    """
+    """Write the command that gives those options that are not at their defaults; what has no flag comes first."""
     found = [*words]
     hints = get_type_hints(type(options), include_extras=True)
     for entry in fields(options):

@@ -48,13 +48,7 @@ Options = TypeVar("Options")
 
 
 def own_command(words: Sequence[str], options: Any) -> tuple[str, ...]:
-    """Arguments of Python for one of our commands.
-
-    Args:
-        words: its name, such as `process`, `rig`.
-        options: its options, a dataclass as tyro reads it.
-
-    """
+    """Arguments of Python for one of our commands."""
     return (
         "-m",
         "edge_depth_nerf",

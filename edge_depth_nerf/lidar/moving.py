@@ -176,12 +176,7 @@ def one_stretch(
 def loose_returns(sweep: WorldSweep, time_s: float, ground: Ground, others: Sequence[tuple[float, FreeSpace]]) -> Loose:
     """Find the LiDAR points of a sweep that moved, and those of which nothing is known.
 
-    Args:
-        sweep: the sweep.
-        time_s: its time.
-        ground: of the drive.
-        others: times and free space of sweeps near by, in order of time, without this one.
-
+    `others` are times and free space of sweeps near by, in order of time, without this one.
     """
     in_reach = sweep.points_m - torch.from_numpy(np.linalg.inv(sweep.world_to_scanner)[:3, 3])
     near = in_reach.norm(dim=-1) < FARTHEST_M
@@ -236,14 +231,11 @@ def _neighbours(cells: Int[np.ndarray, "cells 3"], reach: float) -> csr_matrix:
 
 @dataclass(frozen=True)
 class Thing:
-    """LiDAR points of one sweep that move together."""
+    """LiDAR points of one sweep that move together; fields as of `Loose`."""
 
     time_s: float
-    """The sweep's time."""
     rows: Int[np.ndarray, "n"]
-    """Which of the sweep's points they are."""
     points_m: Float[np.ndarray, "n 3"]
-    """World."""
     velocity_m_s: Float[np.ndarray, "2"] = field(default_factory=lambda: np.zeros(2))
     """Along the world's x and y."""
 
@@ -285,15 +277,7 @@ def _connected(points_m: Float[np.ndarray, "n 3"], apart_m: float) -> Int[np.nda
 
 
 def followed(loose: Mapping[int, Loose]) -> dict[int, list[Thing]]:
-    """Find the things that move in a scanner's sweeps.
-
-    Args:
-        loose: of each sweep, by its number, in order of time.
-
-    Returns:
-        The things of each sweep, with their speeds.
-
-    """
+    """Find the things that move in a scanner's sweeps, given by their numbers in order of time, with their speeds."""
     numbers = list(loose)
     found = [things_of(loose[number]) for number in numbers]
     tracks = [_with_speeds(track) for track in _linked(found) if _believed(track)]

@@ -73,7 +73,6 @@ class PointTimes:
     """How a file tells when each of its points was measured."""
 
     column: str
-    """Name of the column."""
     seconds_per_count: float = 1.0
     """What one count of it stands for."""
     absolute: bool = False
@@ -112,7 +111,6 @@ class _Header:
     record: np.dtype
     """One point, field by field."""
     count: int
-    """Number of points."""
     encoding: Encoding
     """Records one after another, lines of text, PCD's compressed columns, an array of NumPy's, one in an archive, or a
     table of Arrow's."""

@@ -34,7 +34,6 @@ class SweepTiming:
     """When a turning scanner measures which direction; it measures its reference azimuth at the sweep's own time."""
 
     turn_s: float
-    """Duration of a turn."""
     clockwise: bool = True
     """Seen from above, from the +z axis."""
     reference_azimuth_rad: float = 0.0

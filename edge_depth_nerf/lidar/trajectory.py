@@ -120,14 +120,10 @@ class Trajectory:
         sine, cosine = torch.sin(angle), 1 - torch.cos(angle)
         first = torch.where(small, angle / 2, (1 - torch.cos(safe)) / safe)
         second = torch.where(small, angle.square() / 6, 1 - torch.sin(safe) / safe)
-        turned = _cross(axis, points)
-        driven = _cross(axis, velocity)
-        moved = points + sine * turned + cosine * _cross(axis, turned)
-        moved = moved + velocity + first * driven + second * _cross(axis, driven)
+        turned = torch.linalg.cross(axis, points)
+        driven = torch.linalg.cross(axis, velocity)
+        moved = points + sine * turned + cosine * torch.linalg.cross(axis, turned)
+        moved = moved + velocity + first * driven + second * torch.linalg.cross(axis, driven)
         start = torch.from_numpy(self.vehicle_to_world)
         rotation, position = start[:, :3, :3][index], start[:, :3, 3][index]
         return (rotation @ moved[:, :, None]).squeeze(-1) + position
-
-
-def _cross(a: Tensor, b: Tensor) -> Tensor:
-    return torch.linalg.cross(a, b)

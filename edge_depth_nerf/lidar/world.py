@@ -102,9 +102,7 @@ def above_field(
 ) -> tuple[Float[Tensor, "points 3"], Float[Tensor, "points"]]:
     """Continue what the sweep's highest beams met, up to the height of a viewpoint above the scanner.
 
-    Returns:
-        Points in the world, and their spacing as of a `WorldSweep`; none where the viewpoint is not above the scanner.
-
+    Gives points in the world and their spacing as of a `WorldSweep`; none where the viewpoint is not above the scanner.
     """
     world_to_scanner = torch.from_numpy(sweep.world_to_scanner)
     height_m = transform_points(world_to_scanner, torch.from_numpy(viewpoint_in_world))[2].item()

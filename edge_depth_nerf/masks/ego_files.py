@@ -23,14 +23,9 @@ def ego_mask_path(scene: Path, camera: str) -> Path:
 
 
 def keep_ego_mask(scene: Path, camera: str, mask: NDArray[np.bool_], could_tell: bool) -> None:
-    """Write a mask that was looked for; one that is there already keeps its time of change.
+    """Write a mask that was looked for (True = use the pixel); one that is there already keeps its time of change.
 
-    Args:
-        scene: the scene folder.
-        camera: its name.
-        mask: H×W, True = use the pixel.
-        could_tell: whether the pictures were enough to find the vehicle.
-
+    `could_tell`: whether the pictures were enough to find the vehicle.
     """
     path = ego_mask_path(scene, camera)
     if not (path.is_file() and np.array_equal(read_mask(path), mask)):

@@ -59,10 +59,8 @@ def dark_rim(pictures: Iterable[UInt8[np.ndarray, "h w 3"]]) -> Bool[np.ndarray,
     """Find the bright lens image inside a rim that stays dark in all pictures.
 
     The rim is where brightness falls to half between the lens image and the dark outside, which is an ellipse; smears,
-    glare and what is dark at the edge of the scene are outliers of its fit.
-
-    Args:
-        pictures: of one camera, all of one size, taken one by one; a few from different places are better than one.
+    glare and what is dark at the edge of the scene are outliers of its fit. Pictures of one camera are taken one by
+    one; a few from different places are better than one.
 
     Returns:
         True inside; None where no such rim is seen: the pictures fill their frame, the circle is cropped to less than

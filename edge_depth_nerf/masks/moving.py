@@ -69,15 +69,9 @@ def grow_moving(
 
 
 def clearest_edge(picture: UInt8[np.ndarray, "h w 3"], lines_px: Sequence[Float[np.ndarray, "_ 2"]]) -> int | None:
-    """Find which of some lines lies on an edge of the picture.
+    """Find which of some lines (column and row of points inside the picture) lies on an edge of the picture.
 
-    Args:
-        picture: RGB.
-        lines_px: points of each line, column and row, inside the picture.
-
-    Returns:
-        Its number, the first of those that are about as clear; None where none stands out.
-
+    It is the first of those that are about as clear; None where none stands out.
     """
     if all(len(line) < _LEAST_POINTS for line in lines_px):
         return None

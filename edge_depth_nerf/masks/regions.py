@@ -33,13 +33,9 @@ def enlarge(where: Bool[np.ndarray, "h w"], factor: int, shape: tuple[int, int])
 def means_within(
     layers: Sequence[Float32[np.ndarray, "h w"]], where: Bool[np.ndarray, "h w"], sigma_px: float
 ) -> tuple[list[Float32[np.ndarray, "h w"]], Float32[np.ndarray, "h w"]]:
-    """Gaussian means of the layers' values at `where` alone.
+    """Gaussian means of the layers' values at `where` alone, and the share of each one's Gaussian that lay there.
 
     Wide ones are worked out at a lower resolution, which they do not show.
-
-    Returns:
-        The means, and the share of each one's Gaussian that lay in `where`.
-
     """
     height, width = where.shape
     step = max(1, int(sigma_px / 3))
@@ -68,9 +64,7 @@ def dilated(where: Bool[np.ndarray, "h w"], radius_px: float) -> Bool[np.ndarray
 
 def eroded(where: Bool[np.ndarray, "h w"], radius_px: float) -> Bool[np.ndarray, "h w"]:
     """Shrink by a radius, at the picture's border as well."""
-    return cv2.erode(where.astype(np.uint8), disc(radius_px), borderType=cv2.BORDER_CONSTANT, borderValue=(0,)).astype(
-        bool
-    )
+    return cv2.erode(where.astype(np.uint8), disc(radius_px), borderType=cv2.BORDER_CONSTANT, borderValue=(0,)) > 0
 
 
 def opened(where: Bool[np.ndarray, "h w"], radius_px: float) -> Bool[np.ndarray, "h w"]:

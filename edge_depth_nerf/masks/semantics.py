@@ -104,10 +104,6 @@ def check_classes(classes: Iterable[str]) -> list[int]:
 def keep_static(labels: UInt8[np.ndarray, "h w"], classes: Iterable[str]) -> Bool[np.ndarray, "h w"]:
     """Mask out things that move, with a margin.
 
-    Args:
-        labels: label ids.
-        classes: names of what moves.
-
     Returns:
         True = use the pixel.
 

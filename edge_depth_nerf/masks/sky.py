@@ -156,13 +156,8 @@ def regions_like_sky(
 ) -> Bool[np.ndarray, "h w"]:
     """Of regions without distance, those that may be sky: on average as bright as `find_sky` wants it.
 
-    A stereo matcher or a depth camera has nothing to say of dark crowns and of what one eye alone sees, either.
-
-    Args:
-        picture: RGB.
-        where: the regions.
-        ground: where the ground is seen, whose brightness counts.
-
+    A stereo matcher or a depth camera has nothing to say of dark crowns and of what one eye alone sees, either. The
+    brightness of what `ground` shows counts.
     """
     brightness = picture.max(-1)
     labels, sizes = components(where)

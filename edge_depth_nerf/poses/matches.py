@@ -51,9 +51,7 @@ class PosedPicture:
     """A picture, where it was taken, and how to read it."""
 
     camera: str
-    """Name of its camera."""
     moment: int
-    """Number of its frame."""
     lens: Camera
     """At the picture's size."""
     camera_to_world: Transform
@@ -88,25 +86,20 @@ class Features:
     """What was found in one picture."""
 
     sights: Sights
-    """Where."""
     descriptors: Float32[np.ndarray, "n 128"]
     """Unit vectors, whose products are Hellinger's."""
 
 
 @dataclass(frozen=True)
 class Matches:
-    """What two pictures have in common."""
+    """What two pictures, given by their indices, have in common."""
 
     first: int
-    """Index of one picture."""
     second: int
-    """Index of the other."""
     index: Int[np.ndarray, "m 2"]
     """Which feature of each."""
     in_first: Sights
-    """Where the first sees them."""
     in_second: Sights
-    """Where the second sees them."""
 
     def __len__(self) -> int:
         return len(self.index)
@@ -192,11 +185,6 @@ def match_pictures(
     Each picture is read once, when its first pair comes; its features are dropped after its last one. So pairs in the
     order of the drive need little memory.
 
-    Args:
-        pictures: some pictures.
-        pairs: indices of those to match.
-        most: so many features of a picture.
-
     Raises:
         InputError: a picture or its mask cannot be read.
 
@@ -219,14 +207,7 @@ def epipolar_distance_px(
 ) -> Float64[np.ndarray, "m"]:
     """How far matched features lie from each other's epipolar curves: the mean of both pictures, pixels.
 
-    Args:
-        matches: of two pictures.
-        first_to_world: the first camera's pose.
-        second_to_world: the second camera's.
-
-    Returns:
-        NaN where the poses say nothing: with a baseline below 5 cm, and within 3° of the epipole.
-
+    NaN where the poses say nothing: with a baseline below 5 cm, and within 3° of the epipole.
     """
     baseline = second_to_world[:3, 3] - first_to_world[:3, 3]
     length = float(np.linalg.norm(baseline))
@@ -258,7 +239,6 @@ class EpipolarAgreement:
     """How well the poses of two pictures of one camera agree with what both see."""
 
     camera: str
-    """Name of the camera."""
     first: int
     """The earlier frame."""
     second: int
@@ -276,17 +256,12 @@ def successive(
 ) -> list[tuple[int, int]]:
     """Pairs of pictures of one camera, so many frames apart, between which the vehicle moved; in order.
 
-    Args:
-        pictures: some pictures.
-        apart: 1 is the next picture of the camera.
-        most: pairs begin at so many frames of each camera, spread over the drive.
-
+    They begin at `most` frames of each camera, spread over the drive.
     """
     pairs = []
     for camera in dict.fromkeys(picture.camera for picture in pictures):
         ordered = sorted((p.moment, i) for i, p in enumerate(pictures) if p.camera == camera)
-        starts = spread_over(len(ordered), most)
-        for start in dict.fromkeys(starts):
+        for start in spread_over(len(ordered), most):
             for later in apart:
                 if start + later < len(ordered):
                     first, second = ordered[start][1], ordered[start + later][1]

@@ -92,14 +92,9 @@ def import_kiss_icp() -> Any:
 
 
 def odometry(sweeps: Sequence[TimedSweep], advance: Callable[[], object] = lambda: None) -> Trajectory:
-    """Find the vehicle's path.
+    """Find the vehicle's poses at the own times of sweeps of one scanner, in order; the first is the identity.
 
-    Args:
-        sweeps: of one scanner, in order of time.
-        advance: called for each sweep that is done, `steps_of(len(sweeps))` times.
-
-    Returns:
-        The vehicle's poses at the sweeps' own times. The first is the identity.
+    `advance` is called `steps_of(len(sweeps))` times.
 
     Raises:
         InputError: KISS-ICP is missing, or there are fewer than five sweeps.
@@ -158,14 +153,9 @@ class _Kiss:
 def _follow(
     kiss: _Kiss, sweeps: Sequence[TimedSweep], start: Trajectory | None, advance: Callable[[], object]
 ) -> Float64[np.ndarray, "sweeps 4 4"]:
-    """Lay each sweep on a map of those before it, in the order given.
+    """Lay each sweep on a map of those before it, in the order given, forwards or backwards in time.
 
-    Args:
-        kiss: KISS-ICP.
-        sweeps: forwards or backwards in time.
-        start: the motion that the first sweep is taken in; None = not known.
-        advance: called for each sweep.
-
+    `start` is the motion that the first sweep is taken in, None = not known; `advance` is called for each sweep.
     """
     new_map, lay, threshold = kiss.parts(_VOXEL_M, _SETTLED)
     known, poses = new_map(), [np.eye(4)]

@@ -23,9 +23,7 @@ class PathAgreement:
     """Distances between two paths that lie on each other as well as they can, without a change of scale."""
 
     mean_m: float
-    """Their mean."""
     max_m: float
-    """The largest."""
     length_m: float
     """How long the path is that was compared."""
     scale: float
@@ -67,13 +65,8 @@ def _sum(path: Trajectory) -> str:
 def compare_paths(first: Trajectory, second: Trajectory) -> PathAgreement | None:
     """Lay a path over another by a rotation and a shift (Kabsch, Acta Crystallographica 1976).
 
-    Args:
-        first: its own times count.
-        second: of the same vehicle's frame; asked where it was at those times.
-
-    Returns:
-        None if the two have fewer than three times in common.
-
+    The second, of the same vehicle's frame, is asked where it was at the times of the first; None if they have fewer
+    than three in common.
     """
     common = np.array([second.outside_s(time) == 0 for time in first.times_s.tolist()])
     if common.sum() < MIN_MOMENTS:

@@ -27,9 +27,7 @@ class Tracks:
     track: Int[np.ndarray, "n"]
     """Which point; 0, 1, … without gaps, rising."""
     picture: Int[np.ndarray, "n"]
-    """Which picture."""
     sights: Sights
-    """Where it sees the point."""
 
     @property
     def count(self) -> int:
@@ -45,12 +43,9 @@ class Tracks:
 
 
 def features_joined(matches: Sequence[Matches]) -> list[Int[np.ndarray, "m"]]:
-    """Which features belong together, over all pictures.
+    """For each of `matches`, the number of the group that each match belongs to, over all pictures.
 
-    Returns:
-        For each of `matches`, the number of the group that each match belongs to; matches that share a feature,
-        directly or through others, have the same number.
-
+    Matches that share a feature, directly or through others, have the same number.
     """
     if not any(len(found) for found in matches):
         return [np.zeros(0, np.int64) for _ in matches]
@@ -95,10 +90,7 @@ def triangulate(
 ) -> Float64[np.ndarray, "points 3"]:
     """Where the rays of each track come nearest to each other; NaN where they differ by less than 1°.
 
-    Args:
-        tracks: what the pictures see.
-        camera_to_world: poses of all pictures, camera axes as OpenCV's.
-
+    Poses are of all pictures, with OpenCV's camera axes.
     """
     poses = camera_to_world[tracks.picture]
     along = np.einsum("nij,nj->ni", poses[:, :3, :3], tracks.sights.rays)

@@ -18,13 +18,11 @@ from edge_depth_nerf.report.views import KINDS, ShownDrive, data_uri, legend
 
 @dataclass(frozen=True)
 class Plot:
-    """A plot in two colour schemes."""
+    """A plot in two colour schemes, as SVG."""
 
     title: str
     light: bytes
-    """SVG for a light page."""
     dark: bytes
-    """SVG for a dark page."""
 
 
 @dataclass(frozen=True)
@@ -60,9 +58,7 @@ class Report:
     methods: Sequence[str]
     """The methods that have pictures; the page starts with the last one."""
     notes: Sequence[str] = field(default_factory=tuple)
-    """Notes on reading the tables."""
     settings: Sequence[MadeTable] = field(default_factory=tuple)
-    """Settings in the form of tables."""
     links: Mapping[str, str] = field(default_factory=dict)
     """Other pages beside this one: their titles, with their addresses."""
 

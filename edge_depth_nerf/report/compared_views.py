@@ -56,14 +56,9 @@ class ComparedView:
 
 
 def compared_view(scene: Path, frame: Mapping[str, Any], index: int, views_of: Mapping[str, Path]) -> ComparedView:
-    """Read a held-out view.
+    """Read the held-out view `frame`, which is number `index` of `held_out_frames`.
 
-    Args:
-        scene: the scene folder.
-        frame: one of its `held_out_frames`.
-        index: its index among these.
-        views_of: for each run the folder of its rendered views, as `ns-eval --render-output-path` writes them.
-
+    `views_of` gives each run's folder of rendered views, as `ns-eval --render-output-path` writes them.
     """
     rgb = read_image(scene / frame["file_path"])
     mask = read_mask(scene / frame["mask_path"]) if "mask_path" in frame else np.ones(rgb.shape[:2], bool)
@@ -88,14 +83,7 @@ def compared_view(scene: Path, frame: Mapping[str, Any], index: int, views_of: M
 
 
 def compared_views(scene: Path, views_of: Mapping[str, Path], most: int | None = None) -> Iterator[ComparedView]:
-    """Read held-out views: all, or some that are spread over the drive.
-
-    Args:
-        scene: the scene folder.
-        views_of: for each run the folder of its rendered views.
-        most: the largest number of views; None: all.
-
-    """
+    """Read held-out views: all, or `most` that are spread over the drive; `views_of` as for `compared_view`."""
     frames = held_out_frames(scene)
     for index in spread_over(len(frames), len(frames) if most is None else most):
         yield compared_view(scene, frames[index], index, views_of)

@@ -35,9 +35,7 @@ class ShownPoints:
     paths_m: list[Float64[np.ndarray, "pictures 3"]]
     """Positions of each camera's pictures, in order."""
     training_m: Float64[np.ndarray, "trained 3"]
-    """Positions of the training pictures."""
     held_out_m: Float64[np.ndarray, "held 3"]
-    """Positions of the held-out pictures."""
     forward: Float64[np.ndarray, "3"]
     """Direction from the first camera's first position to its last, or its viewing direction if it did not move."""
 
@@ -57,10 +55,6 @@ class ShownPoints:
 
 def show_points(scene: SceneFolder, most: int = MOST_POINTS) -> ShownPoints | None:
     """Choose points of a scene at random; None for a scene without points.
-
-    Args:
-        scene: the scene, with its cameras and its point cloud.
-        most: the largest number of points.
 
     Raises:
         InputError: the point cloud cannot be read.

@@ -36,7 +36,6 @@ class Cell:
     words: str | None = None
     """A text instead of a figure."""
     best: bool = False
-    """Whether it is the best of its column."""
 
     def text(self) -> str:
         """Return the text of the cell."""

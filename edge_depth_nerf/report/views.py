@@ -111,7 +111,6 @@ class ShownDrive:
     note: str
     """Which views these are, and what their ground truth is."""
     points: ShownPoints | None = None
-    """LiDAR points in 3D, if the scene has any."""
 
 
 def views_of_a_drive(runs: int) -> int:
@@ -120,12 +119,9 @@ def views_of_a_drive(runs: int) -> int:
 
 
 def make_drives(drives: Mapping[str, tuple[Path, Mapping[str, Path]]], console: Console) -> list[ShownDrive]:
-    """Make the pictures of all drives, with progress.
+    """Make the pictures of all drives.
 
-    Args:
-        drives: by title, the scene folder and the folders of rendered views by method.
-        console: for progress.
-
+    `drives` gives by title the scene folder, and the folders of rendered views by method.
     """
     runs = sum(len(views_of) for _, views_of in drives.values())
     most = views_of_a_drive(runs)
@@ -226,16 +222,9 @@ def show_view(view: ComparedView, allowance: int) -> ShownView:
 def spread(
     values: NDArray[np.float32], known: NDArray[np.bool_], radius: float
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Give pixels around known ones the nearest value, so that single pixels are visible.
+    """Give pixels within `radius` px of known ones the nearest value, so that single pixels are visible.
 
-    Args:
-        values: H×W.
-        known: H×W, True where a value is known.
-        radius: px; 0 changes nothing.
-
-    Returns:
-        The values, and where they are known now.
-
+    Second, where values are known now; a radius of 0 changes nothing.
     """
     if radius <= 0 or not known.any():
         return values, known

@@ -72,11 +72,9 @@ def write_part(
 
 
 def merge_parts(parts: Sequence[Path], ply: Path) -> int:
-    """Merge the frames' points into one PLY file (binary: float x, y, z, uchar red, green, blue).
+    """Merge the frames' points into one PLY file (binary: float x, y, z, uchar red, green, blue); give their number.
 
-    Returns:
-        The number of points; with none, no file is written.
-
+    With none, no file is written.
     """
     voxel_m = VOXEL_M
     pending, count = [_Part(np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8))], 0

@@ -86,7 +86,6 @@ class PictureMaps:
     """All that one picture has, at its own size."""
 
     rgb: UInt8[np.ndarray, "h w 3"]
-    """The picture."""
     lens: Bool[np.ndarray, "h w"]
     """Where the lens model gives a ray within the scene's theta_max_deg."""
     usable: Bool[np.ndarray, "h w"]
@@ -223,9 +222,6 @@ class SceneFolder:
     def maps(self, picture: ScenePicture) -> PictureMaps:
         """Read all that a picture has.
 
-        Args:
-            picture: one of the scene's.
-
         Raises:
             InputError: a file cannot be decoded, or has another size than the camera.
 
@@ -278,10 +274,7 @@ class SceneFolder:
 
 
 def read_scene(scene: Path) -> SceneFolder:
-    """Read transforms.json and check what it says.
-
-    Args:
-        scene: the folder, or the file itself.
+    """Read transforms.json, itself given or by its folder, and check what it says.
 
     Raises:
         FileNotFoundError: no scene there.

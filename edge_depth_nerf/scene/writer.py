@@ -124,9 +124,7 @@ class SceneFrame:
     """One picture of one camera."""
 
     camera: str
-    """Name of its camera."""
     frame: int
-    """Number of its frame."""
     camera_to_world: Transform
     """OpenCV's camera axes, the recording's world, metres."""
     content: FrameContent | Callable[[], FrameContent]
@@ -151,15 +149,12 @@ class ShiftedView:
     metres: int
     """How far from the path."""
     camera: str
-    """Name of the camera."""
     frame: int
-    """Number of the frame."""
     camera_to_world: Transform
     """OpenCV's camera axes, the recording's world, metres."""
     content: Callable[[], tuple[Picture, DistanceMap]]
     """Loads the picture and the true distance."""
     inputs: tuple[Path, ...] = ()
-    """Files that the content comes from."""
 
 
 @dataclass(frozen=True)
@@ -167,11 +162,9 @@ class Skipped:
     """Something that was asked for and cannot be taken."""
 
     frame: int
-    """Number of the frame."""
     camera: str | None
     """The camera, or None for all."""
     reason: str
-    """Why."""
 
 
 @dataclass(frozen=True)
@@ -179,11 +172,8 @@ class ProcessReport:
     """What a converter did."""
 
     scene: Path
-    """The folder written."""
     training: int
-    """Pictures for training."""
     held_out: int
-    """Pictures kept from training."""
     written: int
     """Pictures whose files were written now; the others were there already."""
     fits: dict[str, CameraFit]
@@ -195,7 +185,6 @@ class ProcessReport:
     left_out: tuple[LeftOut, ...] = ()
     """What is broken or missing, and so not in the scene."""
     notices: tuple[str, ...] = ()
-    """What the user should know."""
 
 
 def summarise(skipped: Iterable[Skipped]) -> str:

@@ -118,16 +118,9 @@ def confirm(
 def seen_around(
     view: View, neighbours: Sequence[View], theirs: Sequence[Float32[np.ndarray, "_ _"]]
 ) -> Float32[np.ndarray, "h w"]:
-    """Project the neighbours' distances into a picture: the median of those that fall into a pixel.
+    """Project the neighbours' distances (metres) into a picture: the median of those that fall into a pixel.
 
-    Args:
-        view: the picture.
-        neighbours: those it is compared with.
-        theirs: their distances from motion, metres, 0 = none.
-
-    Returns:
-        Metres along the picture's own rays, 0 where no neighbour shows anything.
-
+    They are metres along the picture's own rays, 0 where no neighbour shows anything.
     """
     found = np.full((len(neighbours), *view.grey.shape), np.nan, np.float32)
     for number, (neighbour, distance_m) in enumerate(zip(neighbours, theirs, strict=True)):

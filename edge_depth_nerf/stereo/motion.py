@@ -22,22 +22,12 @@ class Motion:
     def __init__(
         self, positions_m: Float64[np.ndarray, "views 3"], cameras: Sequence[str], view: Callable[[int], View]
     ) -> None:
-        """Say which pictures there are.
-
-        Args:
-            positions_m: their cameras' centres.
-            cameras: the camera of each, by name.
-            view: gives one of them; asked for again when it has been dropped.
-
-        """
+        """Take the cameras' centres and names, and what gives a picture; it is asked again for one that was dropped."""
         self._positions_m, self._cameras = positions_m, cameras
         self.view = lru_cache(_KEPT_VIEWS)(view)
         """Gives one of the pictures, from memory if it was asked for lately."""
-        self._neighbours = lru_cache(None)(self._choose)
-
-    def neighbours(self, index: int) -> tuple[int, ...]:
-        """Which pictures a picture is compared with, the best first."""
-        return self._neighbours(index)
+        self.neighbours = lru_cache(None)(self._choose)
+        """Gives the pictures that one is compared with, the best first."""
 
     def _choose(self, index: int) -> tuple[int, ...]:
         near = nearest_views(self._positions_m, index, self._cameras)
@@ -49,13 +39,7 @@ class Motion:
         return sweep_view(self.view(index), [self.view(other) for other in self.neighbours(index)])
 
     def confirm(self, index: int, sweeps: Callable[[int], Swept]) -> MotionDistance:
-        """Keep what the neighbours confirm.
-
-        Args:
-            index: which picture.
-            sweeps: gives the sweep of a picture.
-
-        """
+        """Keep what the neighbours confirm."""
         neighbours = self.neighbours(index)
         theirs = []
         for other in neighbours:

@@ -366,17 +366,10 @@ def choose(total, cost, picture, inverses_per_m, apart, place, correlation, marg
 @_compiled
 @no_type_check
 def parallax(rays, inverses_per_m, pictures, turns, shifts, factors, numbers, angle):
-    """Give the largest angle between a point and the infinity behind it, of the neighbours that see the point.
+    """Fill `angle` [h, w] with the largest angle between a point and the infinity behind it, of those that see it.
 
-    Args:
-        rays: [3, h, w] of the reference picture.
-        inverses_per_m: [h, w].
-        pictures: as for `sweep`.
-        turns: as for `sweep`.
-        shifts: as for `sweep`.
-        factors: as for `sweep`.
-        numbers: as for `sweep`.
-        angle: [h, w] gets radians; 0 where no neighbour sees it.
+    It is in radians, and 0 where no neighbour sees the point. `inverses_per_m` [h, w] are the points'; all else is as
+    for `sweep`.
     """
     height, width = inverses_per_m.shape
     work = np.empty((9, width), np.float32)
@@ -401,21 +394,12 @@ def parallax(rays, inverses_per_m, pictures, turns, shifts, factors, numbers, an
 @_compiled
 @no_type_check
 def compare(rays, inverses_per_m, unsure, theirs, turns, shifts, factors, numbers, share, agree, against, mean):
-    """Ask neighbours' maps about a map's points.
+    """Ask neighbours' maps about a map's points; what is not listed is as for `sweep`.
 
-    Args:
-        rays: [3, h, w] of the reference picture.
-        inverses_per_m: [h, w], 0 where there is none.
-        unsure: [h, w] what its inverse distance, and those of neighbours there, may be off by beside a share of it.
-        theirs: [neighbours, h, w] the neighbours' inverse distances, 0 where there is none.
-        turns: as for `sweep`.
-        shifts: as for `sweep`.
-        factors: as for `sweep`.
-        numbers: as for `sweep`.
-        share: of an inverse distance, by which those that agree may differ.
-        agree: [h, w] gets how many neighbours have the point.
-        against: [h, w] gets how many see through it.
-        mean: [h, w] gets the mean of the inverse distances that agree, its own among them.
+    `inverses_per_m` [h, w] is the map, 0 where there is none, and `theirs` [neighbours, h, w] are the neighbours'. They
+    agree if they differ by less than `share` of an inverse distance and `unsure` [h, w] together. `agree` [h, w] gets
+    how many neighbours have the point, `against` [h, w] how many see through it, `mean` [h, w] the mean of the inverse
+    distances that agree, its own among them.
     """
     height, width = inverses_per_m.shape
     work = np.empty((8, width), np.float32)

@@ -106,13 +106,7 @@ def rays_of(view: View) -> Float32[np.ndarray, "3 h w"]:
 
 
 def sweep_view(view: View, neighbours: Sequence[View]) -> Swept:
-    """Find a picture's distances by its neighbours.
-
-    Args:
-        view: the picture.
-        neighbours: from `choose_neighbours`; without any, or where they hardly tell anything, all is 0.
-
-    """
+    """Find a picture's distances by its neighbours; all is 0 without any, or where they hardly tell anything."""
     nothing = Swept(*(np.zeros(view.grey.shape, np.float32) for _ in range(4)))
     if not neighbours:
         return nothing

@@ -75,16 +75,7 @@ def view_of(
     camera_to_world: Float64[np.ndarray, "4 4"],
     theta_max_rad: float = math.pi,
 ) -> View:
-    """Make a view of a picture, smaller if it has more than `MOST_PIXELS`.
-
-    Args:
-        picture: RGB.
-        usable: True where it may be used.
-        camera: the lens, at the picture's size.
-        camera_to_world: pose, camera axes as OpenCV's, metres.
-        theta_max_rad: angle from the optical axis up to which rays are used.
-
-    """
+    """Make a view of a picture and its lens, smaller if it has more than `MOST_PIXELS`; all else as of `View`."""
     factor = working_factor(camera)
     small = camera.downscaled(factor)
     grey = block_mean(np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.float32), factor)
@@ -102,12 +93,6 @@ def nearest_views(positions_m: Float64[np.ndarray, "views 3"], index: int, camer
 
     Of a camera that stands, one view is enough: else a stop of some frames would leave no place for those from where
     things look different.
-
-    Args:
-        positions_m: centres of all views.
-        index: which of them.
-        cameras: of each view, by name.
-
     """
     of_camera = np.asarray(cameras)
     from_view_m = np.linalg.norm(positions_m - positions_m[index], axis=1)
@@ -122,17 +107,7 @@ def nearest_views(positions_m: Float64[np.ndarray, "views 3"], index: int, camer
 
 
 def choose_neighbours(view: View, others: Sequence[View], most: int = 8) -> list[int]:
-    """Which views to compare a view with.
-
-    Args:
-        view: the reference.
-        others: other views near it.
-        most: take no more.
-
-    Returns:
-        Indices of `others`, the best first; none where none tells anything.
-
-    """
+    """Which of the views near a view to compare it with: indices, the best first; none where none tells anything."""
     tried = (slice(_STEP_PX // 2, None, _STEP_PX),) * 2
     directions = view.rays.directions[tried][view.used[tried]].astype(np.float64)
     if not (others and len(directions)):
