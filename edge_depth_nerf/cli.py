@@ -5,8 +5,7 @@ from __future__ import annotations
 import difflib
 import shlex
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Union, get_args
 
@@ -112,13 +111,6 @@ def _check_name(words: list[str], choices: object, what: str) -> None:
     raise InputError(f"{words[0]}: no such {what}.{meant} There are {', '.join(known)}.")
 
 
-@contextmanager
-def _starting() -> Iterator[None]:
-    """Say that something happens while libraries are imported, which takes seconds."""
-    with Console(stderr=True).status("Starting …"):
-        yield
-
-
 def run(command: Command) -> None:
     """Carry out a command.
 
@@ -126,60 +118,45 @@ def run(command: Command) -> None:
         InputError, OSError: what the user can fix.
 
     """
+    # libraries are imported, which takes seconds
+    with Console(stderr=True).status("Starting …"):
+        work = _work_of(command)
+    if isinstance(command, Doctor):
+        sys.exit(work())
+    done = work(command.options if isinstance(command, Process) else command)
     if isinstance(command, SynthesizeOptions):
-        with _starting():
-            from edge_depth_nerf.synthetic.drive import synthesize_drive
-
-        synthesize_drive(command)
         _say_next("Make a scene of it", f"edge-depth-nerf process {_converter(command)} --output SCENE")
     elif isinstance(command, Process):
-        with _starting():
-            from edge_depth_nerf.process.many import process_drive
-
-        scenes = process_drive(command.options)
-        scene = shlex.quote(str(scenes[0]))
+        scene = shlex.quote(str(done[0]))
         _say_next("Look at it", f"edge-depth-nerf inspect {scene}")
         _say_next("Train (-lite: without a GPU)", f"ns-train edge-depth-nerf-lite --data {scene}")
+
+
+def _work_of(command: Command) -> Callable[..., Any]:
+    """Import what carries out a command."""
+    if isinstance(command, SynthesizeOptions):
+        from edge_depth_nerf.synthetic.drive import synthesize_drive as work
+    elif isinstance(command, Process):
+        from edge_depth_nerf.process.many import process_drive as work
+    elif isinstance(command, EstimateDepthOptions) and command.cluster is None:
+        from edge_depth_nerf.mono.estimate import estimate_depth as work
     elif isinstance(command, EstimateDepthOptions):
-        with _starting():
-            from edge_depth_nerf.mono.estimate import estimate_depth
-            from edge_depth_nerf.mono.many import estimate_on_cluster
-
-        estimate_depth(command) if command.cluster is None else estimate_on_cluster(command)
+        from edge_depth_nerf.mono.many import estimate_on_cluster as work
     elif isinstance(command, InspectOptions):
-        with _starting():
-            from edge_depth_nerf.inspecting.command import inspect_scene
-
-        inspect_scene(command)
+        from edge_depth_nerf.inspecting.command import inspect_scene as work
     elif isinstance(command, CameraPathOptions):
-        with _starting():
-            from edge_depth_nerf.films.command import write_camera_path
-
-        write_camera_path(command)
+        from edge_depth_nerf.films.command import write_camera_path as work
     elif isinstance(command, CompareOptions):
-        with _starting():
-            from edge_depth_nerf.compare.command import compare
-
-        compare(command)
+        from edge_depth_nerf.compare.command import compare as work
     elif isinstance(command, GridOptions):
-        with _starting():
-            from edge_depth_nerf.compare.grid import grid
-
-        grid(command)
+        from edge_depth_nerf.compare.grid import grid as work
     elif isinstance(command, SearchOptions):
-        with _starting():
-            from edge_depth_nerf.compare.search import search
-
-        search(command)
+        from edge_depth_nerf.compare.search import search as work
     elif isinstance(command, Doctor):
-        from edge_depth_nerf.doctor import run_doctor
-
-        sys.exit(run_doctor())
+        from edge_depth_nerf.doctor import run_doctor as work
     else:
-        with _starting():
-            from edge_depth_nerf.demo.command import run_demo
-
-        run_demo(command)
+        from edge_depth_nerf.demo.command import run_demo as work
+    return work
 
 
 def _converter(options: SynthesizeOptions) -> str:

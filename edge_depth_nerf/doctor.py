@@ -38,13 +38,16 @@ class Finding:
     """What one check found."""
 
     what: str
-    """What was looked at."""
     state: State
     """ok; note: works, but something could be better or is left out; problem: something does not work."""
     found: str
-    """What is there."""
     remedy: str = ""
     """What to do, for notes and problems."""
+
+
+def _judged(what: str, fine: bool, found: str, remedy: str, otherwise: State = "problem") -> Finding:
+    """Say that something is ok, or else what it is and what to do."""
+    return Finding(what, "ok", found) if fine else Finding(what, otherwise, found, remedy)
 
 
 def check_python() -> Iterator[Finding]:
@@ -53,15 +56,10 @@ def check_python() -> Iterator[Finding]:
     wanted = f"{first[0]}.{first[1]} to {end[0]}.{end[1] - 1}"
     fine = first <= sys.version_info[:2] < end
     found = f"{platform.python_version()} on {platform.system()} {platform.machine()}"
-    yield Finding(
-        "Python",
-        "ok" if fine else "problem",
-        found,
-        ""
-        if fine
-        else f"Create an environment with Python {wanted}: nerfstudio's dependencies "
-        "have wheels only for these versions.",
+    remedy = (
+        f"Create an environment with Python {wanted}: nerfstudio's dependencies have wheels only for these versions."
     )
+    yield _judged("Python", fine, found, remedy)
 
 
 def check_torch() -> Iterator[Finding]:
@@ -76,62 +74,44 @@ def check_torch() -> Iterator[Finding]:
         name, total = torch.cuda.get_device_name(), torch.cuda.get_device_properties(0).total_memory / 2**30
         yield Finding("Device", "ok", f"{name}, {total:.0f} GiB, CUDA {torch.version.cuda}")
         return
-    built = torch.version.cuda
-    gpu = shutil.which("nvidia-smi") is not None
-    yield Finding(
-        "Device",
-        "problem" if gpu else "note",
-        f"CPU, {os.cpu_count()} cores"
-        + (f"; torch is built for CUDA {built}" if built else "; torch is built without CUDA"),
+    built = f"for CUDA {torch.version.cuda}" if torch.version.cuda else "without CUDA"
+    found = f"CPU, {os.cpu_count()} cores; torch is built {built}"
+    if shutil.which("nvidia-smi") is None:
+        yield Finding("Device", "note", found, "Train with edge-depth-nerf-lite; the full preset needs a GPU.")
+        return
+    remedy = (
         "There is an NVIDIA driver, but torch finds no GPU: install a torch with a CUDA version that the driver "
         "supports (https://pytorch.org/get-started)."
-        if gpu
-        else "Train with edge-depth-nerf-lite; the full preset needs a GPU.",
     )
+    yield Finding("Device", "problem", found, remedy)
 
 
 def check_kernels() -> Iterator[Finding]:
     """What computes hash grids."""
     numba, triton = find_spec("numba") is not None, find_spec("triton") is not None
     found = " and ".join(name for name, there in (("Numba (CPU)", numba), ("Triton (CUDA)", triton)) if there)
-    yield Finding(
-        "Hash grids",
-        "ok" if numba else "problem",
-        f"fused kernels: {found or 'none'}; tiny-cuda-nn is not used",
-        "" if numba else "Reinstall edge-depth-nerf: it brings Numba.",
-    )
+    found = f"fused kernels: {found or 'none'}; tiny-cuda-nn is not used"
+    yield _judged("Hash grids", numba, found, "Reinstall edge-depth-nerf: it brings Numba.")
 
 
 def check_nerfstudio() -> Iterator[Finding]:
     """The host, and whether it finds our methods."""
+    remedy = "pip install 'nerfstudio>=1.1.5,<1.2'"
     try:
         found = version("nerfstudio")
     except PackageNotFoundError:
-        yield Finding("nerfstudio", "problem", "not installed", "pip install 'nerfstudio>=1.1.5,<1.2'")
+        yield Finding("nerfstudio", "problem", "not installed", remedy)
         return
-    fine = found.startswith("1.1.")
-    yield Finding(
-        "nerfstudio", "ok" if fine else "problem", found, "" if fine else "pip install 'nerfstudio>=1.1.5,<1.2'"
-    )
+    yield _judged("nerfstudio", found.startswith("1.1."), found, remedy)
     registered = {point.name for point in entry_points(group="nerfstudio.method_configs")}
     missing = [name for name in METHODS if name not in registered]
-    yield Finding(
-        "Methods",
-        "problem" if missing else "ok",
-        f"not registered: {', '.join(missing)}" if missing else ", ".join(METHODS),
-        "Install the package into this environment (`pip install .` in a clone), not only onto the path."
-        if missing
-        else "",
-    )
-    on_path = shutil.which(
-        "ns-train", path=os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
-    )
-    yield Finding(
-        "ns-train",
-        "ok" if on_path else "problem",
-        on_path or "not on the path",
-        "" if on_path else "Activate the environment that nerfstudio is installed in.",
-    )
+    found = f"not registered: {', '.join(missing)}" if missing else ", ".join(METHODS)
+    remedy = "Install the package into this environment (`pip install .` in a clone), not only onto the path."
+    yield _judged("Methods", not missing, found, remedy)
+    folders = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
+    on_path = shutil.which("ns-train", path=folders)
+    remedy = "Activate the environment that nerfstudio is installed in."
+    yield _judged("ns-train", on_path is not None, on_path or "not on the path", remedy)
 
 
 def check_opencv() -> Iterator[Finding]:
@@ -159,12 +139,9 @@ def check_lpips() -> Iterator[Finding]:
         return
     path, url = lpips_weights()
     there = path.is_file()
-    yield Finding(
-        "LPIPS",
-        "ok" if there else "note",
-        str(path) if there else "no weights; LPIPS is left out",
-        "" if there else f"Put the file of {url} at {path}. Nothing is downloaded automatically.",
-    )
+    found = str(path) if there else "no weights; LPIPS is left out"
+    remedy = f"Put the file of {url} at {path}. Nothing is downloaded automatically."
+    yield _judged("LPIPS", there, found, remedy, "note")
 
 
 def _version_of(package: str) -> str:
@@ -184,47 +161,27 @@ def check_extras() -> Iterator[Finding]:
         ("Dask", "distributed", "cluster", "many machines (--cluster)"),
     ):
         there = find_spec(package) is not None
-        yield Finding(
-            name,
-            "ok" if there else "note",
-            _version_of(package) if there else f"not installed; needed only for {what}",
-            "" if there else f"pip install '.[{extra}]'",
-        )
+        found = _version_of(package) if there else f"not installed; needed only for {what}"
+        yield _judged(name, there, found, f"pip install '.[{extra}]'", "note")
     ffmpeg = shutil.which("ffmpeg")
-    yield Finding(
-        "ffmpeg",
-        "ok" if ffmpeg else "note",
-        ffmpeg or "not found; needed only for films (ns-render)",
-        "" if ffmpeg else "apt-get install ffmpeg",
-    )
+    found = ffmpeg or "not found; needed only for films (ns-render)"
+    yield _judged("ffmpeg", ffmpeg is not None, found, "apt-get install ffmpeg", "note")
     usb = ctypes.util.find_library("usb-1.0")
-    yield Finding(
-        "libusb",
-        "ok" if usb or platform.system() != "Linux" else "note",
-        usb or "not found; needed only for meshes and normals (ns-export)",
-        "" if usb else "apt-get install libusb-1.0-0",
-    )
+    found = usb or "not found; needed only for meshes and normals (ns-export)"
+    fine = usb is not None or platform.system() != "Linux"
+    yield _judged("libusb", fine, found, "apt-get install libusb-1.0-0", "note")
 
 
 def check_room() -> Iterator[Finding]:
     """Free memory and disk."""
     free_gb = _free_memory_gb()
     if free_gb is not None:
-        little = free_gb < LEAST_FREE_MEMORY_GB
-        yield Finding(
-            "Free memory",
-            "problem" if little else "ok",
-            f"{free_gb:.1f} GiB",
-            f"A training takes {LEAST_FREE_MEMORY_GB:g} GiB or more: close other programs." if little else "",
-        )
+        remedy = f"A training takes {LEAST_FREE_MEMORY_GB:g} GiB or more: close other programs."
+        yield _judged("Free memory", free_gb >= LEAST_FREE_MEMORY_GB, f"{free_gb:.1f} GiB", remedy)
     disk_gb = shutil.disk_usage(Path.cwd()).free / 2**30
-    little = disk_gb < LEAST_FREE_DISK_GB
-    yield Finding(
-        "Free disk",
-        "note" if little else "ok",
-        f"{disk_gb:.0f} GiB in {Path.cwd()}",
-        "Scenes, tables of pixels and checkpoints need more space: work in a folder with more of it." if little else "",
-    )
+    found = f"{disk_gb:.0f} GiB in {Path.cwd()}"
+    remedy = "Scenes, tables of pixels and checkpoints need more space: work in a folder with more of it."
+    yield _judged("Free disk", disk_gb >= LEAST_FREE_DISK_GB, found, remedy, "note")
 
 
 CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
@@ -240,12 +197,7 @@ CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
 
 
 def run_doctor(console: Console | None = None) -> int:
-    """Run all checks and show them.
-
-    Returns:
-        0 without problems, 1 with: the command's exit status.
-
-    """
+    """Run all checks and show them; give the command's exit status: 0 without problems, 1 with."""
     console = console or Console()
     with console.status("Checking the installation …"):
         findings = [finding for check in CHECKS for finding in check()]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -17,6 +16,7 @@ from edge_depth_nerf import __version__
 from edge_depth_nerf.base.console import run_jobs, say
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import check_is_folder, read_json, write_json, write_png
+from edge_depth_nerf.base.pictures import drawn
 from edge_depth_nerf.inspecting.figures import (
     PictureFigures,
     camera_figures,
@@ -28,10 +28,10 @@ from edge_depth_nerf.inspecting.figures import (
 from edge_depth_nerf.inspecting.findings import find, limited
 from edge_depth_nerf.inspecting.options import InspectOptions
 from edge_depth_nerf.inspecting.pose_check import check_poses, known_steps, pose_figures
-from edge_depth_nerf.inspecting.pose_plot import draw_pose_check
+from edge_depth_nerf.inspecting.pose_plot import pose_check_figure
 from edge_depth_nerf.inspecting.sheets import draw_sheet
 from edge_depth_nerf.inspecting.shown_prior import ShownScene
-from edge_depth_nerf.inspecting.top_view import draw_top_view
+from edge_depth_nerf.inspecting.top_view import top_view
 from edge_depth_nerf.poses.path_agreement import read_agreement
 from edge_depth_nerf.scene.reader import ScenePicture, read_scene
 
@@ -45,10 +45,6 @@ CAPTION = "mean (smallest to largest); coverage: of the pixels used; distances: 
 
 def inspect_scene(options: InspectOptions, console: Console | None = None) -> dict[str, Any]:
     """Inspect a scene: draw sheets of some frames and a view from above, print figures and warnings.
-
-    Args:
-        options: the scene, the output folder, the number of frames.
-        console: for progress, figures and warnings.
 
     Returns:
         The content of summary.json.
@@ -77,9 +73,9 @@ def inspect_scene(options: InspectOptions, console: Console | None = None) -> di
 
     agreements = check_poses(scene, console)
     findings = find(scene, figures, agreements)
-    write_png(output / TOP_VIEW, draw_top_view(scene, points_m, findings, shown))
+    write_png(output / TOP_VIEW, drawn(top_view(scene, points_m, findings, shown)))
     if known_steps(agreements):
-        write_png(output / POSES, draw_pose_check(scene, agreements))
+        write_png(output / POSES, drawn(pose_check_figure(scene, agreements)))
     held_out = sum(picture.held_out for picture in scene.pictures)
     summary = {
         "made_by": f"edge-depth-nerf {__version__}",
@@ -102,7 +98,7 @@ def inspect_scene(options: InspectOptions, console: Console | None = None) -> di
         "warnings": [finding.to_dict() for finding in findings],
         "frames": [one.to_dict() for one in figures],
         "epipolar": pose_figures(agreements),
-        "steps": [dataclasses.asdict(one) for one in known_steps(agreements)],
+        "steps": [asdict(one) for one in known_steps(agreements)],
         "sheets": list(sheets.values()),
     }
     write_json(output / SUMMARY, summary)
@@ -156,16 +152,11 @@ def _number(value: float | int | None, form: str, unit: str = "") -> str:
 
 def _spread(values: dict[str, float] | None, form: str) -> str:
     """Format a mean, with the smallest and largest value in brackets."""
-    return "–" if values is None else "{mean:{0}} ({min:{0}} to {max:{0}})".format(form, **values)
+    return _filled(f"{{mean:{form}}} ({{min:{form}}} to {{max:{form}}})", values)
 
 
-def _quantiles(values: dict[str, float] | None) -> str:
-    return "–" if values is None else "{median:.1f} m ({p5:.1f} to {p95:.1f})".format(**values)
-
-
-def _epipolar(values: dict[str, Any] | None) -> str:
-    """Format a median over the steps, with the smallest and largest value in brackets."""
-    return "–" if values is None else "{median_px:.2f} ({min_px:.2f} to {max_px:.2f})".format(**values)
+def _filled(form: str, values: dict[str, Any] | None) -> str:
+    return "–" if values is None else form.format(**values)
 
 
 def _show(summary: dict[str, Any], console: Console) -> None:
@@ -217,20 +208,21 @@ def _rows(cameras: Sequence[dict[str, Any]]) -> list[tuple[str, list[str]]]:
             return "–"
         return f"{camera['mono_over_lidar_median']:.2f}, {camera['mono_against_lidar_abs_rel']:.2f}"
 
+    quantiles = "{median:.1f} m ({p5:.1f} to {p95:.1f})"
     rows = {
         "pictures (held out)": lambda c: f"{c['pictures']} ({c['held_out']})",
         "lens": lens,
         "size, px": lambda c: "{}×{}".format(*c["size_px"]) + ("" if c["one_lens"] else ", varies"),
         "fit rms / max, px": fit,
-        "to epipolar lines, px": lambda c: _epipolar(c["epipolar"]),
+        "to epipolar lines, px": lambda c: _filled("{median_px:.2f} ({min_px:.2f} to {max_px:.2f})", c["epipolar"]),
         "largest angle off-axis": lambda c: _number(c["angle_limit_deg"], ".0f", "°"),
         "pixels used": lambda c: _spread(c["used_share"], ".0%"),
         "LiDAR coverage": lambda c: _spread(c["lidar_coverage"], ".1%"),
         "mono coverage": lambda c: _spread(c["mono_coverage"], ".0%"),
         "pixels with a prior": lambda c: _spread(c["prior_share"], ".0%"),
         "without a prior (sky, …)": lambda c: _number(c["no_prior_share"], ".0%"),
-        "LiDAR distance": lambda c: _quantiles(c["lidar_distance_m"]),
-        "prior distance": lambda c: _quantiles(c["prior_distance_m"]),
+        "LiDAR distance": lambda c: _filled(quantiles, c["lidar_distance_m"]),
+        "prior distance": lambda c: _filled(quantiles, c["prior_distance_m"]),
         "sigma, median": lambda c: _number(c["sigma_median_m"], ".2f", " m"),
         "mono / LiDAR, AbsRel": mono,
         "prior / ground truth, AbsRel": lambda c: _number(c["prior_against_truth_abs_rel"], ".3f"),

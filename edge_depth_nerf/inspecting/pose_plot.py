@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
-from edge_depth_nerf.base.pictures import drawn
 from edge_depth_nerf.inspecting.pose_check import BAD_MEDIAN_PX, known_steps
 from edge_depth_nerf.inspecting.top_view import GAP, VIEWS
 from edge_depth_nerf.poses.matches import EpipolarAgreement
@@ -17,13 +14,8 @@ from edge_depth_nerf.scene.reader import SceneFolder
 _SIZE_INCHES, _DPI = (10.0, 3.6), 100
 
 
-def draw_pose_check(scene: SceneFolder, agreements: Sequence[EpipolarAgreement]) -> NDArray[np.uint8]:
-    """Draw the medians along the drive, a line for each camera."""
-    return drawn(pose_check_figure(scene, agreements))
-
-
 def pose_check_figure(scene: SceneFolder, agreements: Sequence[EpipolarAgreement]) -> Figure:
-    """Make the figure of `draw_pose_check`."""
+    """Draw the medians along the drive, a line for each camera."""
     figure = Figure(_SIZE_INCHES, dpi=_DPI, layout="constrained")
     axes = figure.add_subplot()
     for number, name in enumerate(scene.cameras()):

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from edge_depth_nerf.base.pictures import INK, add_legend_below, drawn
+from edge_depth_nerf.base.pictures import INK, add_legend_below
 from edge_depth_nerf.inspecting.figures import reference_camera
 from edge_depth_nerf.inspecting.findings import Finding
 from edge_depth_nerf.scene.reader import SceneFolder
@@ -38,10 +38,10 @@ _ARROW = {"units": "dots", "scale_units": "dots", "scale": 1 / 18}
 """Arrows of 18 px for a length of 1."""
 
 
-def draw_top_view(
+def top_view(
     scene: SceneFolder, points_m: NDArray[np.float64] | None, findings: Sequence[Finding], shown: Sequence[int]
-) -> NDArray[np.uint8]:
-    """Draw the scene from above.
+) -> Figure:
+    """Draw the scene from above, with axes in its unit.
 
     Args:
         scene: its poses.
@@ -50,13 +50,6 @@ def draw_top_view(
         shown: frames that have a sheet; their numbers are beside the path.
 
     """
-    return drawn(top_view(scene, points_m, findings, shown))
-
-
-def top_view(
-    scene: SceneFolder, points_m: NDArray[np.float64] | None, findings: Sequence[Finding], shown: Sequence[int]
-) -> Figure:
-    """Make the figure of `draw_top_view`. Its axes are in the scene's unit."""
     figure, axes, pixel_m = _empty_map(scene)
     if points_m is not None:
         _add_points(axes, points_m)
