@@ -122,9 +122,8 @@ def _bug(error: Exception) -> str:
     place = f", in {Path(frames[-1].filename).name}, line {frames[-1].lineno}" if frames else ""
     said = " ".join(str(error).split())
     return (
-        f"a bug in version {__version__}{place}: {type(error).__name__}{': ' if said else ''}{said}. Please report "
-        f"it: run the same command with {DEBUG_OPTION}, and put its output and that of `{PROGRAM} doctor` "
-        "into an issue."
+        f"a bug in version {__version__}{place}: {type(error).__name__}{': ' if said else ''}{said}. Please report it: "
+        f"run the same command with {DEBUG_OPTION}, and put its output and that of `{PROGRAM} doctor` into an issue."
     )
 
 

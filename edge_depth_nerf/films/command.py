@@ -242,12 +242,7 @@ def _placed(options: CameraPathOptions) -> tuple[SceneFolder, SceneToModel]:
 
 
 def _check_unchanged(outputs: Any, saved: Path, scene: SceneFolder) -> None:
-    """Compare the scene's place with the one that the training saved.
-
-    Raises:
-        InputError: they differ.
-
-    """
+    """Compare the scene's place with the one that the training saved; raise an InputError if they differ."""
     if not saved.is_file():
         return
     record = read_json_object(saved, "transform", "scale")

@@ -90,7 +90,7 @@ class CameraPath:
         length = np.linalg.norm(forward)
         if not length > 1e-3 * max(1.0, float(np.abs(position).max())):
             raise InputError(
-                "the drive's camera does not move, so its direction is unknown. Use --kind replay --look camera."
+                "the drive's camera does not move, so its direction is unknown. Use --kind replay --camera fisheye."
             )
         forward /= length
         return np.stack((forward, np.cross(up, forward), up), axis=1)

@@ -95,7 +95,7 @@ def inspect_scene(options: InspectOptions, console: Console | None = None) -> di
             name: {**camera_figures(scene, name, figures), "epipolar": pose_figures(agreements, name)}
             for name in scene.cameras()
         },
-        "warnings": [finding.to_dict() for finding in findings],
+        "warnings": [asdict(finding) for finding in findings],
         "frames": [one.to_dict() for one in figures],
         "epipolar": pose_figures(agreements),
         "steps": [asdict(one) for one in known_steps(agreements)],

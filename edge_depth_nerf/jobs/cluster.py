@@ -162,7 +162,10 @@ class Cluster:
         with self._lock:
             submitted = self._client.submit(do_task, task, key, self._needs, key=key, pure=False, resources=resources)
             self._tasks[key] = task, tell, submitted
-        submitted.add_done_callback(lambda done: self._end(task, done, ended))
+        # Dask calls back in a thread of its own, where the wait for a network disk would hold up other tasks' ends
+        submitted.add_done_callback(
+            lambda done: Thread(target=self._hand_on, args=(task, done, ended), daemon=True).start()
+        )
         return ended
 
     def stop(self) -> None:
@@ -185,12 +188,8 @@ class Cluster:
                 say(self._console, f"{task.title}: worker lost; continuing on {said['machine']}.", "yellow")
         tell(said["share"])
 
-    def _end(self, task: Task, done: Any, ended: Future[None]) -> None:
-        """Hand on how a task ended; Dask calls this in a thread of its own."""
-        # the wait for a network disk would hold up the ends of other tasks
-        Thread(target=self._hand_on, args=(task, done, ended), daemon=True).start()
-
     def _hand_on(self, task: Task, done: Any, ended: Future[None]) -> None:
+        """Hand on how a task ended."""
         from distributed import KilledWorker
 
         try:
@@ -212,8 +211,7 @@ class Cluster:
             ended.set_exception(
                 InputError(
                     f"{task.title}: the cluster did not finish it ({type(error).__name__}: {error}). Check whether "
-                    "scheduler and workers still run; finished work is kept. Run the same command again "
-                    "to resume."
+                    "scheduler and workers still run; finished work is kept. Run the same command again to resume."
                 )
             )
         else:
@@ -261,10 +259,10 @@ def on_cluster(address: str, tasks: Sequence[Task], reads: Sequence[Path], conso
             try:
                 client = Client(address, timeout=CONNECT_S, set_as_default=False)
             except (OSError, asyncio.TimeoutError, ValueError, TypeError) as error:
+                said = (str(error).splitlines() or [type(error).__name__])[0]
                 raise InputError(
-                    f"--cluster {address}: no scheduler answers ({_first_line(error)}). Start one with `dask "
-                    "scheduler` where this machine can reach it; for tls://, Dask's own settings name the "
-                    "keys (docs/cluster.md)."
+                    f"--cluster {address}: no scheduler answers ({said}). Start one with `dask scheduler` where this "
+                    "machine can reach it; for tls://, Dask's own settings name the keys (docs/cluster.md)."
                 ) from None
             stack.enter_context(client)
         _await_workers(client, address, console)
@@ -285,10 +283,6 @@ def on_cluster(address: str, tasks: Sequence[Task], reads: Sequence[Path], conso
 
 def _count(number: int, what: str) -> str:
     return f"{number} {what}{'' if number == 1 else 's'}"
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 def _await_workers(client: Any, address: str, console: Console) -> None:
@@ -341,8 +335,7 @@ def _look_at(
         # one that is lost in this moment gives no answer
         return ((f"{machines.get(address, '')} ({address})", answer) for address, answer in answers.items())
 
-    machines: dict[str, str] = {}
-    machines |= client.run(platform.node)
+    machines: dict[str, str] = client.run(platform.node)
     for address, worker in workers.items():
         if worker["nthreads"] != 1:
             raise InputError(
@@ -355,13 +348,11 @@ def _look_at(
     for name, wanted in versions:
         for where, found in ask(importlib.metadata.version, name):
             _check_version(where, name, found if isinstance(found, str) else "not installed", wanted)
-    for folder in folders:
-        for where, seen in ask(os.path.isdir, str(folder)):
+    looks = [*((os.path.isdir, folder, folder) for folder in folders), (os.path.isfile, witness, witness.parent)]
+    for is_there, path, folder in looks:
+        for where, seen in ask(is_there, str(path)):
             if seen is not True:
                 raise InputError(_not_shared(where, folder))
-    for where, seen in ask(os.path.isfile, str(witness)):
-        if seen is not True:
-            raise InputError(_not_shared(where, witness.parent))
     for where, may in ask(os.access, str(witness.parent), os.W_OK):
         if may is not True:
             raise InputError(
@@ -378,13 +369,11 @@ def _threads(client: Any, machines: Mapping[str, str]) -> int:
         return int(given)
     from dask.system import cpu_count
 
-    shared: Counter[tuple[str, Any]] = Counter()
     cores = client.run(cpu_count)
     # a queue may give the jobs on one machine cores of their own
     own = client.run(os.sched_getaffinity, 0) if hasattr(os, "sched_getaffinity") else {}
     groups = {address: (machines.get(address, ""), frozenset(own.get(address, ()))) for address in cores}
-    for group in groups.values():
-        shared[group] += 1
+    shared = Counter(groups.values())
     return max(1, min((cores[address] // shared[group] for address, group in groups.items()), default=1))
 
 

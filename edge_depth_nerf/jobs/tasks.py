@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from threading import Lock
 from typing import Any, Protocol, TypeVar, runtime_checkable
@@ -182,12 +183,8 @@ def do_tasks(tasks: Sequence[Task], place: Place, console: Console) -> None:
     """
     with progress_bars(console) as progress:
         bars = _Bars(progress, len(tasks))
-
-        def tell_of(task: Task) -> Callable[[float], None]:
-            return lambda share: bars.tell(task, share)
-
         try:
-            futures = {place.start(task, tell_of(task)): task for task in tasks}
+            futures = {place.start(task, partial(bars.tell, task)): task for task in tasks}
             for future in as_completed(futures):
                 future.result()
                 bars.end(futures[future])

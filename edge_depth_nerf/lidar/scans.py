@@ -174,8 +174,7 @@ def read_cloud(path: Path) -> tuple[Float64[np.ndarray, "points 3"], UInt8[np.nd
 
 
 def _read_header(path: Path, scan: ScanFormat, most: int = MAX_POINTS) -> _Header:
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
+    size = check_bytes(path, _MAX_BYTES)
     readers = {
         **{".bin": _bin_header, ".npy": _npy_header, ".npz": _npz_header},
         **{".ply": _ply_header, ".pcd": _pcd_header, ".feather": _feather_header},
@@ -185,7 +184,6 @@ def _read_header(path: Path, scan: ScanFormat, most: int = MAX_POINTS) -> _Heade
         raise InputError(
             f"{path}: a scan of unknown format {suffix or '(no suffix)'}; expected one of {', '.join(SCAN_SUFFIXES)}."
         )
-    size = check_bytes(path, _MAX_BYTES)
     if size == 0:
         raise InputError(f"{path}: an empty file, expected a scan. {_AGAIN}")
     header = readers[suffix](path, size, scan)

@@ -130,10 +130,9 @@ def usable_returns(
     usable = finite & (range_m >= MIN_RANGE_M) & (range_m <= MAX_RANGE_M)
     if not usable.any():
         raise InputError(
-            f"{path}: none of its {len(points_m)} points can be used ({int((~finite).sum())} are NaN or infinite, "
-            f"the others are nearer than {MIN_RANGE_M} m or beyond {MAX_RANGE_M:.0f} m). Copy the file "
-            "again, or delete "
-            "it so that its frame is skipped."
+            f"{path}: none of its {len(points_m)} points can be used ({int((~finite).sum())} are NaN or infinite, the "
+            f"others are nearer than {MIN_RANGE_M} m or beyond {MAX_RANGE_M:.0f} m). Copy the file again, or delete it "
+            "so that its frame is skipped."
         )
     return Sweep(
         points_m=points_m[usable],

@@ -36,7 +36,7 @@ class Break:
 def find_break(path: Trajectory) -> Break | None:
     """Find where a path is furthest from what a vehicle can do; None if it is nowhere beyond it."""
     times, poses = path.times_s, path.vehicle_to_world
-    worst: tuple[float, Break] | None = None
+    found: list[tuple[float, Break]] = []
     for middle in range(1, len(times) - 1):
         first = int(np.searchsorted(times, times[middle] - _WINDOW_S - 1e-9))
         last = int(np.searchsorted(times, times[middle] + _WINDOW_S + 1e-9)) - 1
@@ -47,19 +47,17 @@ def find_break(path: Trajectory) -> Break | None:
         apart_s = (before_s + after_s) / 2
         change = float(np.linalg.norm(after - before))
         excess = change / (MOST_M_S2 * apart_s + 2 * _JITTER_M / min(before_s, after_s))
-        if excess > (1.0 if worst is None else worst[0]):
-            course = _angle_deg(before, after)
-            what = (
-                f"within {apart_s:.2g} s the vehicle would go from {np.linalg.norm(before):.1f} to "
-                f"{np.linalg.norm(after):.1f} m/s and turn its course by {course:.0f}°"
-            )
-            worst = excess, Break(first, last, what)
+        what = (
+            f"within {apart_s:.2g} s the vehicle would go from {np.linalg.norm(before):.1f} to "
+            f"{np.linalg.norm(after):.1f} m/s and turn its course by {_angle_deg(before, after):.0f}°"
+        )
+        found.append((excess, Break(first, last, what)))
         turned = Rotation.from_matrix(poses[first, :3, :3].T @ poses[middle, :3, :3]).magnitude()
         excess = float(turned) / (MOST_RAD_S * before_s + _JITTER_RAD)
-        if excess > (1.0 if worst is None else worst[0]):
-            what = f"within {before_s:.2g} s the vehicle would turn by {math.degrees(turned):.0f}°"
-            worst = excess, Break(first, middle, what)
-    return None if worst is None else worst[1]
+        what = f"within {before_s:.2g} s the vehicle would turn by {math.degrees(turned):.0f}°"
+        found.append((excess, Break(first, middle, what)))
+    excess, worst = max(found, key=lambda each: each[0], default=(0.0, None))
+    return worst if excess > 1 else None
 
 
 def _angle_deg(before: np.ndarray, after: np.ndarray) -> float:

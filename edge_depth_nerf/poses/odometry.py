@@ -104,8 +104,7 @@ def odometry(sweeps: Sequence[TimedSweep], advance: Callable[[], object] = lambd
     if len(sweeps) < MIN_SWEEPS:
         raise InputError(
             f"--poses lidar: {len(sweeps)} sweep{'' if len(sweeps) == 1 else 's'}, expected {MIN_SWEEPS} or more "
-            "consecutive ones: the path is computed from their overlap. Take more frames, or --poses "
-            "colmap."
+            "consecutive ones: the path is computed from their overlap. Take more frames, or --poses colmap."
         )
     some = sweeps[:_SEED_SWEEPS]
     start = None

@@ -115,12 +115,9 @@ def _pictures(report: Report) -> dict[str, object]:
                 "methods": [name for name in report.methods if all(name in view.rendered for view in drive.views)],
                 "views": [
                     {
-                        "title": view.title,
-                        "width": view.width,
-                        "height": view.height,
+                        **vars(view),
                         "truth": addresses(view.truth),
                         "rendered": {name: addresses(pictures) for name, pictures in view.rendered.items()},
-                        "figures": view.figures,
                     }
                     for view in drive.views
                 ],

@@ -64,9 +64,8 @@ def read_camera_mask(path: Path, camera: Camera) -> NDArray[np.bool_]:
 def size_error(path: Path, width: int, height: int, camera: Camera) -> str:
     """Say that a file is not of its camera's size."""
     return (
-        f"{path}: {width}×{height} pixels, but its camera's calibration says {camera.width}×{camera.height}. "
-        "Pictures, masks and maps must have the size of the raw pictures; --downscale then reduces them "
-        "together."
+        f"{path}: {width}×{height} pixels, but its camera's calibration says {camera.width}×{camera.height}. Pictures, "
+        "masks and maps must have the size of the raw pictures; --downscale then reduces them together."
     )
 
 

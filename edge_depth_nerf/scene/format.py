@@ -158,14 +158,14 @@ def number_of(value: Any, where: str) -> float:
     return found
 
 
-def pose_of(frame: Mapping[str, Any], where: str, rows: int = 4) -> Float64[np.ndarray, "rows 4"]:
+def pose_of(frame: Mapping[str, Any], where: str) -> Float64[np.ndarray, "4 4"]:
     """A frame's transform_matrix: camera (OpenGL) to scene.
 
     Raises:
         InputError: it is not 4×4 finite numbers, or lies nowhere near; names `where`.
 
     """
-    return _matrix(frame.get("transform_matrix"), f"{where}: transform_matrix", rows)
+    return _matrix(frame.get("transform_matrix"), f"{where}: transform_matrix", 4)
 
 
 def _matrix(value: Any, where: str, rows: int) -> Float64[np.ndarray, "rows 4"]:

@@ -324,7 +324,6 @@ def scene_of(
         for frame in frames
     ]
     given = Counter(key for frame in frames for key in path_keys() if key in frame)
-    ply = meta.get("ply_file_path")
     if depth_metres_per_count is None:
         declared = meta.get("depth_unit_scale_factor", 1e-3)
         depth_metres_per_count = number_of(declared, f"{path}: depth_unit_scale_factor")
@@ -342,7 +341,7 @@ def scene_of(
         pictures=tuple(sorted(pictures, key=lambda picture: (picture.camera, picture.moment))),
         split_known=split_known,
         incomplete={key: count for key, count in given.items() if count < len(frames)},
-        points_path=path.parent / ply if isinstance(ply, str) else None,
+        points_path=path.parent / meta["ply_file_path"] if meta.get("ply_file_path") else None,
     )
 
 
@@ -350,12 +349,14 @@ def _picture(
     meta: dict[str, Any], frame: dict[str, Any], path: Path, model: str, moment: int, held_out: bool
 ) -> ScenePicture:
     name, time = frame["file_path"], frame.get("timestamp_s")
+    pose = pose_of(frame, f"{path}: {name}")
     return ScenePicture(
         name=name,
         camera=_camera_name(frame),
         moment=moment,
         lens=_lens(meta, frame, model, path),
-        **_pose(frame, path),
+        position_m=pose[:3, 3],
+        rotation=pose[:3, :3],
         held_out=held_out,
         timestamp_s=None if time is None else number_of(time, f"{path}: {name}: timestamp_s"),
         # a scene has one kind of LiDAR maps: its first frame's
@@ -365,24 +366,20 @@ def _picture(
 
 def _held_out(meta: dict[str, Any]) -> tuple[set[str], bool]:
     """Names that are kept from training, and whether the scene has a split at all."""
-    lists: dict[str, set[str]] = {}
-    for split in ("train", "val", "test"):
-        names = meta.get(f"{split}_filenames")
-        lists[split] = {name for name in names if isinstance(name, str)} if isinstance(names, list) else set()
-    if lists["train"]:
+    train, val, test = ({*meta.get(f"{split}_filenames", ())} for split in ("train", "val", "test"))
+    if train:
         # what no list names is not trained on either
-        return {frame["file_path"] for frame in meta["frames"]} - lists["train"], True
-    return lists["val"] | lists["test"], any(lists.values())
+        return {frame["file_path"] for frame in meta["frames"]} - train, True
+    return val | test, bool(val | test)
 
 
 def _camera_name(frame: dict[str, Any]) -> str:
-    name = frame.get("camera")
-    return name if isinstance(name, str) else Path(frame["file_path"]).parent.as_posix()
+    return frame["camera"] if "camera" in frame else Path(frame["file_path"]).parent.as_posix()
 
 
 def _moments(frames: list[dict[str, Any]]) -> dict[str, int]:
     """The frame number of each picture: the given one, else its order within its camera."""
-    if all(isinstance(frame.get("frame"), int) for frame in frames):
+    if all("frame" in frame for frame in frames):
         return {frame["file_path"]: frame["frame"] for frame in frames}
     ordered: dict[str, list[str]] = {}
     for frame in sorted(frames, key=lambda frame: frame["file_path"]):
@@ -408,16 +405,11 @@ def _lens(meta: dict[str, Any], frame: dict[str, Any], model: str, path: Path) -
         raise InputError(f"{where}: {error}") from None
 
 
-def _pose(frame: dict[str, Any], path: Path) -> dict[str, np.ndarray]:
-    pose = pose_of(frame, f"{path}: {frame['file_path']}")
-    return {"position_m": pose[:3, 3], "rotation": pose[:3, :3]}
-
-
 def _files(frame: dict[str, Any], folder: Path, own_lidar: bool) -> dict[str, Path]:
     keys = {name: layer.key for name, layer in LAYERS.items()}
     if not own_lidar:
         keys["lidar"] = DEPTH_KEY
-    return {layer: folder / frame[key] for layer, key in keys.items() if isinstance(frame.get(key), str)}
+    return {layer: folder / frame[key] for layer, key in keys.items() if key in frame}
 
 
 def _check_files(path: Path, pictures: tuple[ScenePicture, ...], points_path: Path | None) -> None:

@@ -87,20 +87,21 @@ Picture = Path | NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class FrameContent:
-    """The maps of one frame, at the scene's size: arrays, or files, which are copied unchanged."""
+    """The maps of one frame, at the scene's size: arrays, or files, which are copied unchanged.
+
+    Distances are metres, 0 = none.
+    """
 
     image: Picture
     """H×W×3 RGB."""
     mask: NDArray[np.bool_] | None = None
     """This frame's own mask, True = use; the camera's mask is applied as well."""
     lidar: DistanceMap | None = None
-    """LiDAR distance in metres, 0 = no LiDAR point; what the mask hides is removed."""
+    """What the mask hides is removed."""
     mono: DistanceMap | None = None
-    """Monocular distance in metres, 0 = none."""
     beams: DistanceMap | None = None
-    """Distance in metres of the LiDAR beams that no training sees, 0 = none."""
+    """Of the LiDAR beams that no training sees."""
     truth_distance: DistanceMap | None = None
-    """True distance in metres, 0 = none."""
     truth_rgb: Picture | None = None
     """The picture without noise."""
     cloud: PointCloud | None = None
@@ -254,7 +255,7 @@ def write_scene(
     by_name = {camera.name: camera for camera in cameras}
     frames = sorted(frames, key=lambda frame: (frame.camera, frame.frame))
     _check(by_name, cameras, frames, shifted, layers, theta_max_deg)
-    scene_cameras, fits = _scene_cameras(cameras, theta_max_deg)
+    fits = _fits(cameras, theta_max_deg)
     masks = {camera.name: _camera_mask(camera, theta_max_deg) for camera in cameras}
     # adding zero turns -0.0 into 0.0
     offset = np.round(np.mean([frame.camera_to_world[:3, 3] for frame in frames], axis=0)) + 0.0
@@ -287,7 +288,7 @@ def write_scene(
     _check_split(frames)
     if work.cloud:
         _write_cloud(output, frames)
-    content = _transforms(cameras, scene_cameras, fits, frames, shifted, layers, offset, theta_max_deg, source)
+    content = _transforms(cameras, fits, frames, shifted, layers, offset, theta_max_deg, source)
     for name, maps in later.items():
         content[name] = maps.entry
         for frame in content["frames"]:
@@ -397,21 +398,19 @@ def open_scene(output: Path, source: Mapping[str, Any]) -> None:
             # as a version before wrote it
             differing = [key for key in differing if key not in (WHOLE, INCOMPLETE)]
         some_left_out = there.get(INCOMPLETE) is True or (output / LEFT_OUT).is_file()
-        if not differing or (WHOLE in there and some_left_out and {*differing} <= {INPUTS, INCOMPLETE}):
-            # what was left out may have been repaired; which pictures that concerns, their own files tell
-            if there != record:
-                write_json(path, record)
-        elif differing and not any(entry.name != RECORD for entry in output.iterdir()):
-            # a run that failed before it wrote anything does not bind the next one
-            write_json(path, record)
-        elif differing:
+        # what was left out may have been repaired; which pictures that concerns, their own files tell
+        repaired = WHOLE in there and some_left_out and {*differing} <= {INPUTS, INCOMPLETE}
+        # a run that failed before it wrote anything does not bind the next one
+        begun = any(entry.name != RECORD for entry in output.iterdir())
+        if differing and begun and not repaired:
             key = differing[0]
             others = f" (also: {', '.join(differing[1:])})" if differing[1:] else ""
             raise InputError(
                 f"{output}: contains another scene: {key} is {there.get(key)!r} there, {record.get(key)!r} "
-                f"now{others}. "
-                "Give another --output, or delete that folder first."
+                f"now{others}. Give another --output, or delete that folder first."
             )
+        if there != record:
+            write_json(path, record)
         return
     if output.is_dir() and (foreign := sorted(entry.name for entry in output.iterdir())):
         raise InputError(
@@ -435,18 +434,15 @@ def check_cameras(cameras: Sequence[SceneCamera], theta_max_deg: float) -> None:
         InputError: nerfstudio has no camera that is near enough to one, or its mask hides everything.
 
     """
-    _scene_cameras(cameras, theta_max_deg)
+    _fits(cameras, theta_max_deg)
     for camera in cameras:
         _camera_mask(camera, theta_max_deg)
 
 
-def _scene_cameras(
-    cameras: Sequence[SceneCamera], theta_max_deg: float
-) -> tuple[dict[str, KannalaBrandt | Pinhole], dict[str, CameraFit]]:
+def _fits(cameras: Sequence[SceneCamera], theta_max_deg: float) -> dict[str, CameraFit]:
     """Find the cameras that nerfstudio knows, and how far they are from the originals."""
     fisheye = any(not isinstance(camera.original, Pinhole) for camera in cameras)
-    fits = {camera.name: _scene_camera(camera, math.radians(theta_max_deg), fisheye) for camera in cameras}
-    return {name: fit.camera for name, fit in fits.items()}, fits
+    return {camera.name: _scene_camera(camera, math.radians(theta_max_deg), fisheye) for camera in cameras}
 
 
 def _scene_camera(camera: SceneCamera, theta_max_rad: float, fisheye: bool) -> CameraFit:
@@ -599,21 +595,17 @@ def _pending(
         newest = max((_modified_ns(path) for path in inputs), default=0)
         return all(_modified_ns(output / file) > newest for file in files)
 
-    def current(frame: SceneFrame, files: Collection[str]) -> bool:
+    def is_stale(frame: SceneFrame, with_cloud: bool) -> bool:
+        files = [*_frame_files(frame, layers).values(), *([_cloud_path(frame)] if with_cloud else [])]
         # content given in memory has no date
-        return callable(frame.content) and fresh(files, frame.inputs)
+        return not (callable(frame.content) and fresh(files, frame.inputs))
 
-    stale = [frame for frame in frames if not current(frame, _frame_files(frame, layers).values())]
-    training_inputs = tuple(path for frame in frames if not frame.held_out for path in frame.inputs)
-    cloud = CLOUD in layers and (not fresh([POINTS], training_inputs) or any(not frame.held_out for frame in stale))
-    if cloud:
-        stale = [
-            frame
-            for frame in frames
-            if not current(
-                frame, [*_frame_files(frame, layers).values(), *([] if frame.held_out else [_cloud_path(frame)])]
-            )
-        ]
+    training = [frame for frame in frames if not frame.held_out]
+    training_inputs = tuple(path for frame in training for path in frame.inputs)
+    cloud = CLOUD in layers and (
+        not fresh([POINTS], training_inputs) or any(is_stale(frame, with_cloud=False) for frame in training)
+    )
+    stale = [frame for frame in frames if is_stale(frame, with_cloud=cloud and not frame.held_out)]
     return _Work(stale, [view for view in shifted if not fresh(_shifted_files(view), view.inputs)], cloud)
 
 
@@ -651,7 +643,7 @@ def _write_frame(
                 f"{where}: has no {layer}, but every other frame of this scene has one. Give it for all or none."
             )
 
-    _write_picture(files["image"], content.image, size, f"{where}: the picture")
+    _write_map(files["image"], content.image, size, f"{where}: the picture", distance=False)
     mask = camera_mask
     if "mask" in files and content.mask is not None:
         if content.mask.shape != size:
@@ -665,9 +657,9 @@ def _write_frame(
         write_distance_png(files["lidar"], np.where(mask, lidar, 0.0))
     for layer, what in (("mono", "monocular map"), ("beams", "held-out beams"), ("truth_distance", "true distance")):
         if layer in files:
-            _write_distance(files[layer], getattr(content, layer), size, f"{where}: its {what}")
+            _write_map(files[layer], getattr(content, layer), size, f"{where}: its {what}", distance=True)
     if "truth_rgb" in files and content.truth_rgb is not None:
-        _write_picture(files["truth_rgb"], content.truth_rgb, size, f"{where}: its true picture")
+        _write_map(files["truth_rgb"], content.truth_rgb, size, f"{where}: its true picture", distance=False)
     if CLOUD in layers and not frame.held_out:
         if content.cloud is None:
             raise InputError(f"{where}: has no cloud, but every other training frame of this scene has one.")
@@ -679,35 +671,23 @@ def _write_shifted(output: Path, view: ShiftedView, camera: Camera) -> None:
     where = f"frame {view.frame} of {view.camera}, shifted by {view.metres} m"
     size = (camera.height, camera.width)
     picture_file, distance_file = _shifted_files(view)
-    _write_picture(output / picture_file, picture, size, where)
-    _write_distance(output / distance_file, distance, size, where)
+    _write_map(output / picture_file, picture, size, where, distance=False)
+    _write_map(output / distance_file, distance, size, where, distance=True)
 
 
-def _write_picture(path: Path, picture: Picture, size: tuple[int, int], what: str) -> None:
-    if isinstance(picture, Path):
-        what = f"{what} {picture}"
-        if picture.suffix.lower() == ".png":
-            header = read_png_header(picture)
-            if (header.height, header.width) == size and header.is_picture:
-                write_bytes(path, read_png_bytes(picture))
+def _write_map(path: Path, content: Picture | DistanceMap, size: tuple[int, int], what: str, *, distance: bool) -> None:
+    """Write a picture or a distance map; a file that is as it must be is copied unchanged."""
+    if isinstance(content, Path):
+        what = f"{what} {content}"
+        if distance or content.suffix.lower() == ".png":
+            header = read_png_header(content)
+            if (header.height, header.width) == size and (header.is_distance if distance else header.is_picture):
+                write_bytes(path, read_png_bytes(content))
                 return
-        picture = read_image(picture)
-    if picture.shape[:2] != size:
-        raise InputError(_size_error(what, picture.shape, size))
-    write_png(path, picture)
-
-
-def _write_distance(path: Path, distance_m: DistanceMap, size: tuple[int, int], what: str) -> None:
-    if isinstance(distance_m, Path):
-        header = read_png_header(distance_m)
-        if (header.height, header.width) == size and header.is_distance:
-            write_bytes(path, read_png_bytes(distance_m))
-            return
-        what = f"{what} {distance_m}"
-        distance_m = read_distance_png(distance_m)
-    if distance_m.shape != size:
-        raise InputError(_size_error(what, distance_m.shape, size))
-    write_distance_png(path, distance_m)
+        content = read_distance_png(content) if distance else read_image(content)
+    if content.shape[:2] != size:
+        raise InputError(_size_error(what, content.shape, size))
+    (write_distance_png if distance else write_png)(path, content)
 
 
 # ---- transforms.json -------------------------------------------------------------------------------------------
@@ -768,7 +748,6 @@ def _kept_later_maps(
 
 def _transforms(
     cameras: Sequence[SceneCamera],
-    scene_cameras: Mapping[str, KannalaBrandt | Pinhole],
     fits: Mapping[str, CameraFit],
     frames: Sequence[SceneFrame],
     shifted: Sequence[ShiftedView],
@@ -777,7 +756,7 @@ def _transforms(
     theta_max_deg: float,
     source: Mapping[str, Any],
 ) -> dict[str, Any]:
-    any_fisheye = any(isinstance(camera, KannalaBrandt) for camera in scene_cameras.values())
+    any_fisheye = any(isinstance(fit.camera, KannalaBrandt) for fit in fits.values())
     images = {held_out: [_frame_files(f, ())["image"] for f in frames if f.held_out == held_out] for held_out in (0, 1)}
     evaluation = images[True] or images[False]
     content: dict[str, Any] = {
@@ -795,7 +774,7 @@ def _transforms(
             }
             for name, fit in fits.items()
         },
-        "frames": [_frame_entry(frame, scene_cameras[frame.camera], layers, offset) for frame in frames],
+        "frames": [_frame_entry(frame, fits[frame.camera].camera, layers, offset) for frame in frames],
         "train_filenames": images[False],
         "val_filenames": evaluation,
         "test_filenames": evaluation,
