@@ -27,6 +27,7 @@ from edge_depth_nerf.plugin.dataparser import FisheyeDepth, FisheyeDepthDataPars
 
 UP = np.array([0.0, 0.0, 1.0])
 RADIUS_M, SPEED_M_S = 20.0, 8.0
+QUIET = Console(quiet=True)
 
 
 def looking(forward: np.ndarray, up: np.ndarray = UP) -> np.ndarray:
@@ -158,10 +159,9 @@ def test_a_camera_that_stands_has_no_forward():
     drive = straight()
     standing = CameraPath(drive.times_s, np.tile(drive.camera_to_scene[:1], (41, 1, 1)), UP)
     assert np.allclose(replay(standing, np.array([0.05]), forward=False), drive.camera_to_scene[:1])
-    with pytest.raises(InputError, match="does not move"):
-        replay(standing, np.array([0.05]), forward=True)
-    with pytest.raises(InputError, match="does not move"):
-        orbit(standing, 8, 5.0, 3.0, None)
+    for move in (lambda: replay(standing, np.array([0.05]), True), lambda: orbit(standing, 8, 5.0, 3.0, None)):
+        with pytest.raises(InputError, match="does not move"):
+            move()
 
 
 def test_a_drive_needs_two_pictures_at_increasing_times():
@@ -232,8 +232,7 @@ def poses_of_training(parser, scene: Path) -> dict[str, np.ndarray]:
 def test_a_replay_has_the_poses_that_the_model_was_trained_with(trained, scene, tmp_path, name, camera):
     folder, parsers = trained
     output = tmp_path / "path.json"
-    options = CameraPathOptions(load_config=folder / f"{name}.yml", follow=camera, output=output)
-    write_camera_path(options, Console(quiet=True))
+    write_camera_path(CameraPathOptions(folder / f"{name}.yml", follow=camera, output=output), QUIET)
     path = read_json(output)
     cameras = get_path_from_json(path)
     poses = poses_of_training(parsers[name], scene)
@@ -254,7 +253,7 @@ def film(scene: Path, tmp_path: Path, **options):
     parser = FisheyeDepthDataParserConfig(metres_per_unit=10.0)
     datamanager = replace(settings.pipeline.datamanager, dataparser=parser, data=scene)  # pyright: ignore
     config.write_text(yaml.dump(replace(settings, pipeline=replace(settings.pipeline, datamanager=datamanager))))
-    write_camera_path(CameraPathOptions(config, output=output, **options), Console(quiet=True))
+    write_camera_path(CameraPathOptions(config, output=output, **options), QUIET)
     path = read_json(output)
     return path, get_path_from_json(path)
 
@@ -347,7 +346,7 @@ def test_it_says_how_the_film_is_made(trained, tmp_path):
 
 def test_by_default_the_path_lies_beside_the_training(trained):
     folder, _ = trained
-    path = write_camera_path(CameraPathOptions(load_config=folder / "ours.yml", kind="lane-shift"), Console(quiet=True))
+    path = write_camera_path(CameraPathOptions(load_config=folder / "ours.yml", kind="lane-shift"), QUIET)
     assert path == folder / "camera_paths" / "lane-shift_fisheye.json" and path.is_file()
 
 
@@ -365,19 +364,17 @@ def test_a_scene_that_changed_since_the_training_is_refused(trained, scene, tmp_
     options = CameraPathOptions(load_config=config, output=tmp_path / "path.json")
     outputs = parsers["host"].setup().get_dataparser_outputs(split="train")
     outputs.save_dataparser_transform(tmp_path / "dataparser_transforms.json")
-    write_camera_path(options, Console(quiet=True))
+    write_camera_path(options, QUIET)
     other = write_scene(tmp_path / "other")
     with pytest.raises(InputError, match="changed after the training"):
-        write_camera_path(replace(options, scene=other), Console(quiet=True))
+        write_camera_path(replace(options, scene=other), QUIET)
 
 
 def test_a_scene_may_have_been_moved(trained, scene, tmp_path):
     folder, _ = trained
     moved = shutil.copytree(scene, tmp_path / "moved")
-    paths = [
-        read_json(write_camera_path(CameraPathOptions(folder / "host.yml", place), Console(quiet=True)))
-        for place in (None, moved, moved / "transforms.json")
-    ]
+    options = [CameraPathOptions(folder / "host.yml", place) for place in (None, moved, moved / "transforms.json")]
+    paths = [read_json(write_camera_path(each, QUIET)) for each in options]
     assert paths[0] == paths[1] == paths[2]
 
 
@@ -397,11 +394,11 @@ def test_a_dataparser_whose_transform_does_not_tell_is_refused(scene, tmp_path, 
 def test_settings_that_are_none(tmp_path):
     config = tmp_path / "config.yml"
     with pytest.raises(FileNotFoundError, match=r"config\.yml that ns-train wrote"):
-        write_camera_path(CameraPathOptions(load_config=config), Console(quiet=True))
+        write_camera_path(CameraPathOptions(load_config=config), QUIET)
     for text in ("a: [1", "a: 1", "!!python/object:no_such_plugin.Config {}"):
         config.write_text(text)
         with pytest.raises(InputError, match=r"config\.yml that ns-train wrote"):
-            write_camera_path(CameraPathOptions(load_config=config), Console(quiet=True))
+            write_camera_path(CameraPathOptions(load_config=config), QUIET)
 
 
 def test_a_camera_that_is_not_there(scene, tmp_path):

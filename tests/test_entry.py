@@ -121,6 +121,12 @@ def test_debug_is_told_of(monkeypatch, capsys):
     assert "--debug" in capsys.readouterr().out
 
 
+def command(run: str, before: str = "") -> str:
+    """Code that begins a command whose work is the function `run`."""
+    call = 'cli.run = run\nsys.argv = ["edge-depth-nerf", "doctor"]\nentry.main()\n'
+    return f"import sys, time\n{before}\nfrom edge_depth_nerf import cli, entry\n{run}\n{call}"
+
+
 def interrupted(code: str, until_s: float, *more_s: float, folder: Path | None = None) -> subprocess.CompletedProcess:
     """Run Python code that prints `go`, and send it Ctrl-C some seconds after that, once or more often."""
     process = subprocess.Popen(
@@ -166,16 +172,7 @@ def test_ctrl_c_waits_for_the_end_of_an_import(tmp_path, ending, import_s, more_
     """Modules turn it into errors of their own, or swallow it. Whoever presses it twice does not wait."""
     lines = ["try:", f"    print('go', flush=True), time.sleep({import_s})", "except BaseException:", f"    {ending}"]
     (tmp_path / "slow.py").write_text("\n".join(["import time", *lines, "print('imported', flush=True)"]))
-    code = """
-import sys, time
-from edge_depth_nerf import cli, entry
-def run(_):
-    import slow
-    time.sleep(60)
-cli.run = run
-sys.argv = ["edge-depth-nerf", "doctor"]
-entry.main()
-"""
+    code = command("def run(_):\n    import slow\n    time.sleep(60)")
     started = time.monotonic()
     done = interrupted(code, 0.2, *more_s, folder=tmp_path)
     assert (done.returncode, done.stderr) == (130, STOPPED)
@@ -195,36 +192,15 @@ def work():
         pass
     print("worked", flush=True)
 """)
-    code = """
-import sys, time
-sys.path.insert(0, "")
-import trimesh
-from edge_depth_nerf import cli, entry
-def run(_):
-    trimesh.work()
-    time.sleep(60)
-cli.run = run
-sys.argv = ["edge-depth-nerf", "doctor"]
-entry.main()
-"""
+    code = command("def run(_):\n    trimesh.work()\n    time.sleep(60)", "sys.path.insert(0, '')\nimport trimesh")
     done = interrupted(code, 0.2, folder=tmp_path)
     assert (done.returncode, done.stderr, done.stdout) == (130, STOPPED, "worked\n")
 
 
 def test_ctrl_c_ends_work_at_once():
-    code = """
-import sys, time
-from edge_depth_nerf import cli, entry
-def run(_):
-    print("go", flush=True)
-    while True:
-        time.sleep(0.01)
-cli.run = run
-sys.argv = ["edge-depth-nerf", "doctor"]
-entry.main()
-"""
+    code = 'def run(_):\n    print("go", flush=True)\n    while True:\n        time.sleep(0.01)'
     started = time.monotonic()
-    done = interrupted(code, 0.1)
+    done = interrupted(command(code), 0.1)
     assert (done.returncode, done.stderr) == (130, STOPPED)
     assert time.monotonic() - started < 20
 
@@ -253,22 +229,15 @@ main()
 @pytest.mark.slow
 def test_ctrl_c_again_and_again_while_threads_finish():
     code = """
-import sys, time
 import torch  # takes its time, in which the first Ctrl-C would meet no threads
 from rich.console import Console
-from edge_depth_nerf import cli, entry
 from edge_depth_nerf.base.console import run_jobs
-def work():
-    time.sleep(1.5)
 def run(_):
     print("go", flush=True)
-    run_jobs([work] * 20, "working", Console(quiet=True))
-cli.run = run
-sys.argv = ["edge-depth-nerf", "doctor"]
-entry.main()
+    run_jobs([lambda: time.sleep(1.5)] * 20, "working", Console(quiet=True))
 """
     started = time.monotonic()
-    done = interrupted(code, 0.3, 0.3, 0.3)
+    done = interrupted(command(code), 0.3, 0.3, 0.3)
     assert (done.returncode, done.stderr) == (130, STOPPED)
     assert time.monotonic() - started < 20  # what had not begun was not begun
 
@@ -346,13 +315,8 @@ def test_the_hook_is_put_in_once(hook):
 @pytest.mark.slow
 def test_ns_train_on_what_is_no_scene(tmp_path):
     call = [Path(sys.executable).with_name("ns-train"), "edge-depth-nerf-lite", "--data", tmp_path / "nowhere"]
-    done = subprocess.run(
-        [*map(str, call), "--vis", "tensorboard", "--output-dir", str(tmp_path / "runs")],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=TIMEOUT_S,
-    )
+    call += ["--vis", "tensorboard", "--output-dir", tmp_path / "runs"]
+    done = subprocess.run(call, capture_output=True, text=True, check=False, timeout=TIMEOUT_S)
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
     assert done.stderr.splitlines()[-1].startswith(

@@ -31,17 +31,8 @@ def test_reads_points_and_reflectance_in_order(tmp_path: Path) -> None:
 
 
 def test_leaves_out_and_counts_what_is_no_return(tmp_path: Path) -> None:
-    nan, inf = math.nan, math.inf
-    rows = [
-        [1, 0, 0, 0],
-        [nan, 0, 0, 0],
-        [0, -inf, 0, 0],
-        [0, 0, 0, 0],
-        [0.2, 0.2, 0.2, 0],
-        [300, 0, 0, 0],
-        [0, 0, 9, 0],
-    ]
-    sweep = read_sweep(write(tmp_path / "a.bin", rows))
+    rows = [[1, 0, 0], [math.nan, 0, 0], [0, -math.inf, 0], [0, 0, 0], [0.2, 0.2, 0.2], [300, 0, 0], [0, 0, 9]]
+    sweep = read_sweep(write(tmp_path / "a.bin", [[*row, 0] for row in rows]))
     assert sweep.points_m.tolist() == [[1, 0, 0], [0, 0, 9]]
     assert (sweep.not_finite, sweep.out_of_range) == (2, 3)
 

@@ -264,12 +264,7 @@ def test_a_broken_cloud_costs_the_view_in_3d_alone(tmp_path, capsys):
         ),
         (
             ("search",),
-            SearchOptions(
-                scenes=(Path("a b"),),
-                output=Path("out"),
-                lambdas=(0.1, 1.0),
-                sigmas_m=("own", 0.5),
-            ),
+            SearchOptions(scenes=(Path("a b"),), output=Path("out"), lambdas=(0.1, 1.0), sigmas_m=("own", 0.5)),
         ),
         (
             ("process", "kitti360"),
@@ -651,7 +646,7 @@ def test_an_error_names_what_stands_beside_it(opened):
     page.get_by_role("radio", name="Distance error").check(force=True)
     assert tags.all_inner_texts() == ["ground truth: distance", f"{NASTY}: distance error"]
     assert page.locator(".scale").evaluate_all("(all) => all.map((each) => each.firstChild.textContent)") == [
-        *("Distance", "Distance error"),
+        *("Distance", "Distance error")
     ]
     assert page.locator(".ticks").all_inner_texts()[0].endswith("60 m")
     page.get_by_label("Left", exact=True).select_option(label="first")

@@ -22,6 +22,7 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
+from scipy.spatial.transform import Rotation
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import (
@@ -77,13 +78,8 @@ _JUDGED_ONCE = functools.cache(host_residual)
 
 
 def pose(index: int) -> np.ndarray:
-    angle = 0.3 * index
     found = np.eye(4)
-    found[:3, :3] = [
-        [math.cos(angle), 0, math.sin(angle)],
-        [0, 1, 0],
-        [-math.sin(angle), 0, math.cos(angle)],
-    ]
+    found[:3, :3] = Rotation.from_euler("y", 0.3 * index).as_matrix()
     found[:3, 3] = [1000.4 + index, -250.0, 116.2]
     return found
 
@@ -555,23 +551,16 @@ BENT = KannalaBrandt(SIZE, SIZE, 7.0, 7.0, 16.4, 16.1, 0.0652, 0.0189, -0.0042, 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("cameras", "theta_max_deg", "message"),
+    ("originals", "theta_max_deg", "message"),
     [
-        (
-            [SceneCamera("wide", WIDE), SceneCamera("round", POLYNOMIAL)],
-            95.0,
-            r"wide: .* PINHOLE.*pinhole cameras only",
-        ),
-        (
-            [SceneCamera("bent", BENT)],
-            105.0,
-            r"bent: .*diverges; at most 0\.5 px rms can be used\. Use --theta-max-deg 90,",
-        ),
+        ({"wide": WIDE, "round": POLYNOMIAL}, 95.0, r"wide: .* PINHOLE.*pinhole cameras only"),
+        ({"bent": BENT}, 105.0, r"bent: .*diverges; at most 0\.5 px rms can be used\. Use --theta-max-deg 90,"),
     ],
 )
 def test_camera_that_nerfstudio_cannot_match_is_an_error(
-    tmp_path: Path, cameras: list[SceneCamera], theta_max_deg: float, message: str
+    tmp_path: Path, originals: dict[str, Camera], theta_max_deg: float, message: str
 ) -> None:
+    cameras = [SceneCamera(name, camera) for name, camera in originals.items()]
     given = [replace(frame, camera=cameras[0].name) for frame in frames()]
     with pytest.raises(InputError, match=message) as error:
         write(tmp_path / "scene", given=given, cameras=cameras, theta_max_deg=theta_max_deg)
@@ -601,10 +590,8 @@ def test_cameras_of_all_models_make_one_scene(tmp_path: Path) -> None:
         name = picture.parent.name
         mask = read_mask(tmp_path / f"scene/masks/{name}.png")
         bundle = outputs.cameras.generate_rays(camera_indices=index)
-        turned = (
-            outputs.cameras.camera_to_worlds[index, :, :3].double()
-            @ torch.diag(torch.tensor([1.0, -1.0, -1.0])).double()
-        )
+        # OpenGL's axes to OpenCV's
+        turned = outputs.cameras.camera_to_worlds[index, :, :3].double() * torch.tensor([1.0, -1.0, -1.0])
         directions = bundle.directions.double() @ turned
         pixels, valid = originals[name].project(directions)
         distance = (pixels - originals[name].pixel_centres()).norm(dim=-1)

@@ -18,13 +18,7 @@ from rich.console import Console
 from edge_depth_nerf.base.console import say
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import check_is_folder, read_json, write_bytes, write_json
-from edge_depth_nerf.compare.command import (
-    RUNS,
-    finished_runs,
-    picture_name,
-    read_comparison,
-    write_comparison,
-)
+from edge_depth_nerf.compare.command import RUNS, finished_runs, picture_name, read_comparison, write_comparison
 from edge_depth_nerf.compare.methods import METHODS, MethodName
 from edge_depth_nerf.compare.options import CompareOptions
 from edge_depth_nerf.compare.specification import FIGURES
