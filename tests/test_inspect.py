@@ -51,9 +51,8 @@ from edge_depth_nerf.inspecting.figures import measured_moments
 from edge_depth_nerf.inspecting.findings import Finding, find, limited
 from edge_depth_nerf.inspecting.options import InspectOptions
 from edge_depth_nerf.inspecting.pose_check import BAD_MEDIAN_PX
-from edge_depth_nerf.inspecting.pose_plot import pose_check_figure
 from edge_depth_nerf.inspecting.shown_prior import ShownScene
-from edge_depth_nerf.inspecting.top_view import GAP, GREYS, HELD_OUT, PATH, TRAINING, top_view
+from edge_depth_nerf.inspecting.top_view import GAP, GREYS, HELD_OUT, PATH, TRAINING, pose_check_figure, top_view
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.method.prior import default_source
 from edge_depth_nerf.poses.matches import EpipolarAgreement

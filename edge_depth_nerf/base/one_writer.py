@@ -94,13 +94,7 @@ def _lock_of(folder: Path) -> Path:
 
 
 def _try_lock(handle: int) -> None:
-    """Lock what was opened.
-
-    Raises:
-        BlockingIOError: somebody else holds it.
-        OSError: it cannot be locked.
-
-    """
+    """Lock what was opened; a BlockingIOError says that somebody else holds it, another OSError that it cannot be."""
     if fcntl is not None:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         return

@@ -28,10 +28,9 @@ from edge_depth_nerf.inspecting.figures import (
 from edge_depth_nerf.inspecting.findings import find, limited
 from edge_depth_nerf.inspecting.options import InspectOptions
 from edge_depth_nerf.inspecting.pose_check import check_poses, known_steps, pose_figures
-from edge_depth_nerf.inspecting.pose_plot import pose_check_figure
 from edge_depth_nerf.inspecting.sheets import draw_sheet
 from edge_depth_nerf.inspecting.shown_prior import ShownScene
-from edge_depth_nerf.inspecting.top_view import top_view
+from edge_depth_nerf.inspecting.top_view import pose_check_figure, top_view
 from edge_depth_nerf.poses.path_agreement import read_agreement
 from edge_depth_nerf.scene.reader import ScenePicture, read_scene
 

@@ -1,7 +1,7 @@
-"""Draws the drive from above: points, path, cameras, gaps.
+"""Draws the drive from above (points, path, cameras, gaps), and the errors of its poses step by step.
 
-The scene's x runs to the right, its y upwards, its z towards the viewer. Lengths are in the scene's unit, which is
-metres in scenes of this project.
+Seen from above, the scene's x runs to the right, its y upwards, its z towards the viewer. Lengths are in the
+scene's unit, which is metres in scenes of this project.
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 from edge_depth_nerf.base.pictures import INK, add_legend_below
 from edge_depth_nerf.inspecting.figures import reference_camera
 from edge_depth_nerf.inspecting.findings import Finding
+from edge_depth_nerf.inspecting.pose_check import BAD_MEDIAN_PX, known_steps
+from edge_depth_nerf.poses.matches import EpipolarAgreement
 from edge_depth_nerf.scene.reader import SceneFolder
 
 LARGEST_PX = (1600, 1100)
-"""Largest width and height of the map."""
 LEAST_PX = 420
 """Least length of each side, so that the legend fits."""
 MARGIN_M = 12.0
@@ -165,3 +166,26 @@ def _add_travel(axes: Axes, path_m: NDArray[np.float64], pixel_m: float) -> None
     head = {"width": 2, "headwidth": 5, "headlength": 9, "headaxislength": 9, "pivot": "mid"}
     axes.quiver(*middles_m.T, *along.T, color=TRAINING, **_ARROW, **head)
     axes.plot([], [], ">", color=TRAINING, label="travel")
+
+
+def pose_check_figure(scene: SceneFolder, agreements: Sequence[EpipolarAgreement]) -> Figure:
+    """Draw the medians along the drive, a line for each camera."""
+    figure = Figure((10.0, 3.6), dpi=_DPI, layout="constrained")
+    axes = figure.add_subplot()
+    for number, name in enumerate(scene.cameras()):
+        known = known_steps(agreements, name)
+        middles = [(one.first + one.second) / 2 for one in known]
+        medians = [one.median_px for one in known]
+        colour = VIEWS[number % len(VIEWS)]
+        axes.plot(middles, medians, "o-", markersize=3.5, linewidth=1, color=colour, label=name)
+    axes.axhline(BAD_MEDIAN_PX, color=GAP, linewidth=1, linestyle="--", label=f"above {BAD_MEDIAN_PX} px: warning")
+    axes.set_ylim(bottom=0)
+    axes.set_xlabel("frame")
+    axes.set_ylabel("px (median)")
+    axes.grid(alpha=0.3)
+    axes.legend(frameon=False, ncols=6)
+    name = scene.path.parent.resolve().name
+    figure.suptitle(
+        f"{name}: distance of matched features from their epipolar lines, each frame and the next", parse_math=False
+    )
+    return figure

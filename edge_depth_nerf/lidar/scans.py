@@ -314,10 +314,6 @@ def _header_lines(path: Path, file: BinaryIO, last: str) -> list[list[str]]:
     raise InputError(f"{path}: the header has no end (a line {last!r} is expected). {_AGAIN}")
 
 
-def _broken(path: Path, line: list[str]) -> InputError:
-    return InputError(f"{path}: the header's line {' '.join(line)!r} cannot be read. {_AGAIN}")
-
-
 def _ply_header(path: Path, size: int, scan: ScanFormat) -> _Header:
     with path.open("rb") as file:
         if file.readline(8).strip() != b"ply":
@@ -338,7 +334,7 @@ def _ply_header(path: Path, size: int, scan: ScanFormat) -> _Header:
             elif line[:1] == ["property"]:
                 elements[-1][2].append((line[2], order + _PLY_TYPES[line[1]]))
         except (IndexError, KeyError, ValueError):
-            raise _broken(path, line) from None
+            raise InputError(f"{path}: the header's line {' '.join(line)!r} cannot be read. {_AGAIN}") from None
     if not elements or elements[0][0] != "vertex" or elements[0][3] or elements[0][1] < 0:
         found = ", ".join(element[0] for element in elements) or "none"
         raise InputError(f"{path}: the first element must be vertex, without lists; found {found}. {_AGAIN}")

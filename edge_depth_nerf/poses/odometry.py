@@ -62,10 +62,8 @@ class TimedSweep:
     time_s: float
     """Its own time, which its pose is to be of."""
     read: Callable[[], tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n"]]]
-    """Points in the vehicle's frame, as recorded, and when each was measured, counted from the sweep's time.
-
-    Those that are to be used: of `RANGE_M` from the scanner.
-    """
+    """Points in the vehicle's frame, as recorded, that are `RANGE_M` from the scanner; and when each was measured,
+    counted from the sweep's time."""
 
 
 def import_kiss_icp() -> Any:

@@ -38,7 +38,6 @@ from edge_depth_nerf.report.points import MOST_POINTS, ShownPoints, show_points
 from edge_depth_nerf.scene.reader import read_scene
 
 REPORT = "report.html"
-"""File name of the page."""
 MOST_PICTURES = 1000
 """Most pictures of a page, over all drives and methods. With more, some held-out views are left out."""
 MOST_WIDTH_PX = 640

@@ -145,14 +145,13 @@ class SceneFrame:
 
 @dataclass(frozen=True)
 class ShiftedView:
-    """A true view from beside the path."""
+    """A true view from beside the path; fields as of a `SceneFrame`."""
 
     metres: int
     """How far from the path."""
     camera: str
     frame: int
     camera_to_world: Transform
-    """OpenCV's camera axes, the recording's world, metres."""
     content: Callable[[], tuple[Picture, DistanceMap]]
     """Loads the picture and the true distance."""
     inputs: tuple[Path, ...] = ()
