@@ -215,15 +215,9 @@ def drawn(figure: Figure) -> NDArray[np.uint8]:
 def text_bar(
     text: str, width: int, height: int = 30, size: float = 19.0, *, centred: bool = False
 ) -> NDArray[np.uint8]:
-    """Write a line of text on white, smaller where it would be wider.
+    """Write a line of text unchanged ($ starts no formula) on white, smaller where it would be wider.
 
-    Args:
-        text: the line, drawn unchanged ($ starts no formula).
-        width: of what is made, px.
-        height: of what is made, px.
-        size: of the letters, points.
-        centred: whether it stands in the middle, or else at the left.
-
+    Width and height are pixels, the size of the letters is points. It stands in the middle, or else at the left.
     """
     figure = _blank(width, height)
     place, align = (0.5, "center") if centred else (2 / width, "left")

@@ -49,11 +49,7 @@ class ProjectionSeries:
 def projection_series(camera: Camera, theta_max_rad: float = math.pi) -> ProjectionSeries:
     """Fit the polynomials of a lens as far as its picture's pixels have rays.
 
-    Args:
-        camera: the lens, at the size of the picture.
-        theta_max_rad: angle from the axis beyond which nothing is projected; π leaves the lens model's own, and
-            150° at most.
-
+    Nothing is projected beyond `theta_max_rad` from the axis; π leaves the lens model's own limit, and 150° at most.
     """
     seen = rays(camera, theta_max_rad)
     furthest = math.acos(max(-1.0, min(1.0, float(seen.cos_theta[seen.within].min())))) if seen.within.any() else 0.0

@@ -132,10 +132,7 @@ def check_scan(path: Path, scan: ScanFormat) -> None:
 def read_scan(path: Path, scan: ScanFormat, moment_s: float = 0.0) -> Sweep:
     """Read a scan and leave out what is not a measured point.
 
-    Args:
-        path: the file.
-        scan: what its columns mean.
-        moment_s: the scan's own time, on the clock of its points' times; `offset_s` is counted from it.
+    `offset_s` is counted from `moment_s`, the scan's own time on the clock of its points' times.
 
     Raises:
         FileNotFoundError: there is no such file.

@@ -254,7 +254,7 @@ class EpipolarAgreement:
 def successive(
     pictures: Sequence[PosedPicture], apart: Sequence[int] = (1, 2), most: int = MEASURED_MOMENTS
 ) -> list[tuple[int, int]]:
-    """Pairs of pictures of one camera, so many frames apart, between which the vehicle moved; in order.
+    """Pairs of pictures of one camera, so many frames apart (1: the next), between which the vehicle moved; in order.
 
     They begin at `most` frames of each camera, spread over the drive.
     """
@@ -274,15 +274,10 @@ def successive(
 def along_drive(
     pictures: Sequence[PosedPicture], apart: Sequence[int] = (1, 2), most: int = MEASURED_MOMENTS
 ) -> list[EpipolarAgreement]:
-    """Hold the poses of a drive against features matched between successive pictures of each camera.
+    """Hold the poses of a drive against features matched between successive pictures of each camera, in any order.
 
-    Args:
-        pictures: of any cameras, in any order.
-        apart: how many frames lie between the two pictures of a pair; 1 is the next.
-        most: so many frames of each camera, spread over the drive, are used.
-
-    Returns:
-        One for each pair between whose pictures the vehicle moved by 5 cm or more, by camera and frame.
+    There is one result for each pair between whose pictures the vehicle moved by 5 cm or more, by camera and frame;
+    pairs are chosen as by `successive`.
 
     Raises:
         InputError: a picture or its mask cannot be read.

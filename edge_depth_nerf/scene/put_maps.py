@@ -114,17 +114,12 @@ def usable_distance(
     words: str = "monocular map",
     may_be_empty: bool = False,
 ) -> Float[np.ndarray, "h w"]:
-    """Leave out of a map what is no distance to anything, or outside the lens and the mask.
+    """Leave out of a map of metres along the ray what is no distance to anything, or outside the lens and the mask.
 
-    Args:
-        scene: whose picture it is.
-        picture: what it is a map of.
-        metres: along the ray.
-        words: what the map is called in errors.
-        may_be_empty: whether nothing may be left.
+    Errors call the map `words`.
 
     Raises:
-        InputError: the map has another size than its camera, or nothing is left.
+        InputError: the map has another size than its camera, or nothing is left and it may not be empty.
 
     """
     size = (picture.lens.width, picture.lens.height)
