@@ -15,12 +15,12 @@ from edge_depth_nerf.base.files import read_distance_png, read_image, read_json,
 from edge_depth_nerf.synthetic import layout as layout_module
 from edge_depth_nerf.synthetic import lidar, rig
 from edge_depth_nerf.synthetic.drive import WORLD_ORIGIN_M, synthesize_drive
+from edge_depth_nerf.synthetic.layout import simulated_estimate
 from edge_depth_nerf.synthetic.materials import Material, Noise
 from edge_depth_nerf.synthetic.motion import Drive, Route, Turn, WindingRoute
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 from edge_depth_nerf.synthetic.render import Caster, World
 from edge_depth_nerf.synthetic.scenes import ISLAND_M, _movers, build_scene, roundabout_route
-from edge_depth_nerf.synthetic.simulated_mono import simulated_estimate
 from edge_depth_nerf.synthetic.traffic import traffic
 
 pytestmark = pytest.mark.slow

@@ -37,7 +37,6 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import check_is_folder, read_json, write_json, write_mask, write_text
 from edge_depth_nerf.synthetic import rig
 from edge_depth_nerf.synthetic.layout import WORLD_ORIGIN_M, DriveLayout, MountedCamera
-from edge_depth_nerf.synthetic.lidar import Sweep
 from edge_depth_nerf.synthetic.motion import FRAME_INTERVAL_S
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 from edge_depth_nerf.synthetic.rig_drive import RIG_FILE_LAYOUTS
@@ -70,10 +69,7 @@ _ONCE_ONLY = {"layout": "kitti-360", "body": "grey"}
 def _manifest(options: SynthesizeOptions) -> dict[str, Any]:
     fields = dataclasses.asdict(options)
     del fields["output"]
-    # as when there was no other
-    for name, only in _ONCE_ONLY.items():
-        if fields[name] == only:
-            del fields[name]
+    fields = {name: value for name, value in fields.items() if _ONCE_ONLY.get(name) != value}
     fields |= {"speed_m_s": options.mean_speed_m_s, "sequence": options.sequence}
     return {
         "kind": "synthetic drive",
@@ -138,17 +134,14 @@ class _Kitti360(DriveLayout):
     """The layout `kitti-360`."""
 
     def __init__(self, options: SynthesizeOptions) -> None:
-        super().__init__(
-            options,
-            {name: MountedCamera(rig.camera(name, options.size), rig.CAMERA_TO_POSE[name]) for name in rig.CAMERAS},
-        )
+        mounted = {
+            name: MountedCamera(rig.camera(name, options.size), rig.CAMERA_TO_POSE[name]) for name in rig.CAMERAS
+        }
+        super().__init__(options, mounted)
         self._pictures = self.root / "data_2d_raw" / options.sequence
         self._scans = self.root / "data_3d_raw" / options.sequence / "velodyne_points"
         self._truth = self.root / "truth" / options.sequence
-
-    @property
-    def last_file(self) -> Path:
-        return self._truth / "shifted.json"
+        self.last_file = self._truth / "shifted.json"
 
     def picture(self, name: str, frame: int) -> Path:
         return self._pictures / name / "data_rgb" / f"{frame:010d}.png"
@@ -171,9 +164,6 @@ class _Kitti360(DriveLayout):
         folders = {metres: self._truth / name / f"shifted_{metres}m" for metres in SHIFTS_M if held_out(frame)}
         file = f"{frame:010d}.png"
         return {metres: (folder / "rgb" / file, folder / "distance" / file) for metres, folder in folders.items()}
-
-    def scan_bytes(self, taken: Sweep) -> bytes:
-        return taken.raw.astype("<f4").tobytes()
 
     def write_once(self) -> None:
         frames = range(self.options.frames)
@@ -206,12 +196,9 @@ class _Kitti360(DriveLayout):
 
 
 def synthesize_drive(options: SynthesizeOptions) -> Path:
-    """Synthesise a drive; a run that was interrupted is continued, file by file.
+    """Synthesise a drive, and give its folder; a run that was interrupted is continued, file by file.
 
     The same options give the same bytes, whether at once or continued.
-
-    Returns:
-        The output folder: the root for `process kitti360`, or for the converter of the layout.
 
     Raises:
         InputError: an option is out of range, or the output folder holds something else.

@@ -7,7 +7,7 @@ sides. `tint` is a linear RGB colour in [0, 1] whose meaning is the material's.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import trimesh
@@ -19,6 +19,7 @@ Real = float | int
 Pair = tuple[Real, Real]
 Triple = tuple[Real, Real, Real]
 Colour = Triple
+Point = NDArray | Triple
 
 _UNIT_BOX = np.asarray(trimesh.creation.box((1, 1, 1)).triangles)
 
@@ -46,22 +47,14 @@ class Geometry:
     def transformed(self, transform: NDArray) -> Geometry:
         """Move by a 4×4 rigid transform, mirrored or not."""
         rotation = transform[:3, :3].T
-        return Geometry(
-            (self.corners.reshape(-1, 3) @ rotation + transform[:3, 3]).reshape(-1, 3, 3),
-            (self.normals.reshape(-1, 3) @ rotation.astype(np.float32)).reshape(-1, 3, 3),
-            self.material,
-            self.tint,
-        )
+        corners = (self.corners.reshape(-1, 3) @ rotation + transform[:3, 3]).reshape(-1, 3, 3)
+        normals = (self.normals.reshape(-1, 3) @ rotation.astype(np.float32)).reshape(-1, 3, 3)
+        return Geometry(corners, normals, self.material, self.tint)
 
     @staticmethod
     def joined(parts: Sequence[Geometry]) -> Geometry:
         """All triangles of several geometries."""
-        return Geometry(
-            np.concatenate([part.corners for part in parts]),
-            np.concatenate([part.normals for part in parts]),
-            np.concatenate([part.material for part in parts]),
-            np.concatenate([part.tint for part in parts]),
-        )
+        return Geometry(*(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(Geometry)))
 
 
 def flat_normals(corners: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -71,6 +64,14 @@ def flat_normals(corners: NDArray[np.float64]) -> NDArray[np.float32]:
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         normal[:, i] = a[:, j] * b[:, k] - a[:, k] * b[:, j]
     return (normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)).astype(np.float32)
+
+
+def _circle(axis: NDArray[np.float64], sections: int) -> NDArray[np.float64]:
+    """Unit vectors across a unit vector, evenly around it, the last one equal to the first: (sections + 1)×3."""
+    side = np.cross(axis, (0.0, 0.0, 1.0) if abs(axis[2]) < 0.9 else (1.0, 0.0, 0.0))
+    side /= np.linalg.norm(side)
+    angles = np.linspace(0, 2 * np.pi, sections + 1)
+    return np.cos(angles)[:, None] * side + np.sin(angles)[:, None] * np.cross(axis, side)
 
 
 class MeshBuilder:
@@ -85,19 +86,14 @@ class MeshBuilder:
 
     def build(self) -> Geometry:
         """All that was added."""
-        parts = list(self._parts)
-        if self._flat:
-            counts = [len(corners) for corners in self._flat]
-            corners = np.concatenate(self._flat)
-            parts.append(
-                Geometry(
-                    corners,
-                    np.repeat(flat_normals(corners)[:, None], 3, axis=1),
-                    np.repeat(np.array(self._flat_material, np.uint8), counts),
-                    np.repeat(np.array(self._flat_tint, np.float32), counts, axis=0),
-                )
-            )
-        return Geometry.joined(parts)
+        if not self._flat:
+            return Geometry.joined(self._parts)
+        counts = [len(corners) for corners in self._flat]
+        corners = np.concatenate(self._flat)
+        normals = np.repeat(flat_normals(corners)[:, None], 3, axis=1)
+        material = np.repeat(np.array(self._flat_material, np.uint8), counts)
+        tint = np.repeat(np.array(self._flat_tint, np.float32), counts, axis=0)
+        return Geometry.joined([*self._parts, Geometry(corners, normals, material, tint)])
 
     def add(self, geometry: Geometry, transform: NDArray | None = None) -> None:
         """Add triangles, moved by a 4×4 transform."""
@@ -112,14 +108,8 @@ class MeshBuilder:
             self._flat_tint.append(tint)
             return
         count = len(corners)
-        self._parts.append(
-            Geometry(
-                corners,
-                normals.astype(np.float32),
-                np.full(count, material, np.uint8),
-                np.broadcast_to(np.asarray(tint, np.float32), (count, 3)),
-            )
-        )
+        tints = np.broadcast_to(np.asarray(tint, np.float32), (count, 3))
+        self._parts.append(Geometry(corners, normals.astype(np.float32), np.full(count, material, np.uint8), tints))
 
     def add_polygon(self, points: NDArray | Sequence, material: Material, tint: Colour) -> None:
         """Add a flat convex polygon, N×3."""
@@ -151,22 +141,12 @@ class MeshBuilder:
         self.add_triangles(corners + centre, material, tint)
 
     def add_rod(
-        self,
-        start: NDArray | Triple,
-        end: NDArray | Triple,
-        radius: Real | Pair,
-        material: Material,
-        tint: Colour,
-        sections: int = 10,
+        self, start: Point, end: Point, radius: Real | Pair, material: Material, tint: Colour, sections: int = 10
     ) -> None:
         """Add a round rod between two points, of one radius or of one at each end; flat ends."""
         start, end = np.asarray(start, np.float64), np.asarray(end, np.float64)
         first, last = (radius, radius) if isinstance(radius, int | float) else radius
-        axis = (end - start) / np.linalg.norm(end - start)
-        side = np.cross(axis, (0.0, 0.0, 1.0) if abs(axis[2]) < 0.9 else (1.0, 0.0, 0.0))
-        side /= np.linalg.norm(side)
-        angles = np.linspace(0, 2 * np.pi, sections + 1)
-        round_ = np.cos(angles)[:, None] * side + np.sin(angles)[:, None] * np.cross(axis, side)
+        round_ = _circle((end - start) / np.linalg.norm(end - start), sections)
         a, b = start + first * round_, end + last * round_
         walls = np.concatenate((np.stack((a[:-1], a[1:], b[1:]), 1), np.stack((a[:-1], b[1:], b[:-1]), 1)))
         normals = np.concatenate(
@@ -177,21 +157,11 @@ class MeshBuilder:
         self.add_polygon(b[:-1], material, tint)
 
     def add_disc(
-        self,
-        centre: NDArray | Triple,
-        axis: NDArray | Triple,
-        radius: Real,
-        material: Material,
-        tint: Colour,
-        sections: int = 20,
+        self, centre: Point, axis: Point, radius: Real, material: Material, tint: Colour, sections: int = 20
     ) -> None:
         """Add a flat disc across `axis` (a unit vector)."""
-        centre, axis = np.asarray(centre, np.float64), np.asarray(axis, np.float64)
-        side = np.cross(axis, (0.0, 0.0, 1.0) if abs(axis[2]) < 0.9 else (1.0, 0.0, 0.0))
-        side /= np.linalg.norm(side)
-        angles = np.linspace(0, 2 * np.pi, sections, endpoint=False)
-        rim = np.cos(angles)[:, None] * side + np.sin(angles)[:, None] * np.cross(axis, side)
-        self.add_polygon(centre + radius * rim, material, tint)
+        rim = _circle(np.asarray(axis, np.float64), sections)[:-1]
+        self.add_polygon(np.asarray(centre, np.float64) + radius * rim, material, tint)
 
     def add_loft(
         self, rings: NDArray, material: Material, tint: Colour, closed: bool = True, smooth: bool = True
@@ -202,9 +172,8 @@ class MeshBuilder:
         following = np.roll(index, -1, axis=1)
         quads = np.stack((index[:-1], following[:-1], following[1:], index[1:]), -1).reshape(-1, 4)
         faces = [quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]
-        vertices = rings.reshape(-1, 3)
-        if closed:
-            for ring in (index[0], index[-1]):
-                faces.append(np.column_stack((np.full(points - 2, ring[0]), ring[1:-1], ring[2:])))
-        mesh = trimesh.Trimesh(vertices, np.concatenate(faces), process=False)
-        self.add_mesh(mesh, material, tint, smooth)
+        for ring in (index[0], index[-1]) if closed else ():
+            faces.append(np.column_stack((np.full(points - 2, ring[0]), ring[1:-1], ring[2:])))
+        self.add_mesh(
+            trimesh.Trimesh(rings.reshape(-1, 3), np.concatenate(faces), process=False), material, tint, smooth
+        )

@@ -11,7 +11,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import NDArray
 
 from edge_depth_nerf.base.files import write_bytes, write_distance_png, write_mask, write_png
@@ -22,7 +24,6 @@ from edge_depth_nerf.synthetic.options import SynthesizeOptions
 from edge_depth_nerf.synthetic.render import LENS_THETA_DEG, FisheyeCamera, World, own_car_world
 from edge_depth_nerf.synthetic.rig import POSE_HEIGHT_M
 from edge_depth_nerf.synthetic.scenes import build_scene
-from edge_depth_nerf.synthetic.simulated_mono import simulated_estimate
 
 WORLD_ORIGIN_M = np.array([1200.0, 3700.0, 115.0])
 """Where the scene's origin lies in the world of the written poses."""
@@ -35,6 +36,16 @@ VEHICLE_TO_POSE = np.diag([1.0, -1.0, -1.0, 1.0])
 
 _EXPOSURE_DRIFT = 0.10
 _BLACK_LEVEL = 2.0 / 255
+
+SCALE_ERROR = 0.10
+"""Standard deviation of the logarithm of the scale error, over pixels and frames."""
+
+_BLUR_SHARE = 0.004
+_SKY_M = 70.0
+_KEYFRAME_INTERVAL = 10
+_GRID = 5
+# a whole frame's error, the part that stays with the camera, and the part that comes and goes
+_PARTS = (0.5, 0.5, 0.7071)
 
 
 @dataclass(frozen=True)
@@ -66,7 +77,7 @@ class DriveLayout(ABC):
         self.drive, self._world = model.drive, World(model, seed)
         own_car = own_car_world(model, seed, self.options.body)
         # that world has z up, its origin on the road below the pose's
-        pose_to_ground = np.diag([1.0, -1.0, -1.0, 1.0])
+        pose_to_ground = VEHICLE_TO_POSE.copy()
         pose_to_ground[2, 3] = POSE_HEIGHT_M
         self.views = {
             name: FisheyeCamera(mounted.camera, own_car, pose_to_ground @ mounted.to_pose, mounted.lens_theta_deg)
@@ -75,10 +86,8 @@ class DriveLayout(ABC):
 
     # ---- where things lie ----------------------------------------------------------------------------------------
 
-    @property
-    @abstractmethod
-    def last_file(self) -> Path:
-        """What `write_once` writes last: where it is, the others are."""
+    last_file: Path
+    """What `write_once` writes last: where it is, the others are."""
 
     @abstractmethod
     def picture(self, name: str, frame: int) -> Path:
@@ -116,9 +125,9 @@ class DriveLayout(ABC):
 
     # ---- what is in them -----------------------------------------------------------------------------------------
 
-    @abstractmethod
     def scan_bytes(self, taken: Sweep) -> bytes:
-        """A scan in the layout's own format."""
+        """A scan in the layout's own format: float32 x, y, z, reflectance."""
+        return taken.raw.astype("<f4").tobytes()
 
     @abstractmethod
     def write_once(self) -> None:
@@ -132,12 +141,9 @@ class DriveLayout(ABC):
 
     def write(self, frame: int, name: str | None) -> None:
         """Render and write a frame's picture by the camera `name` and its maps, or its scan."""
-        if name is None:
-            self._write_scan(frame)
-        else:
+        if name is not None:
             self._write_picture(frame, name)
-
-    def _write_scan(self, frame: int) -> None:
+            return
         rng = np.random.default_rng([self.options.seed, 20, frame])
         taken = sweep(self._world, self.drive, frame * FRAME_INTERVAL_S, rng, self.scanner)
         write_bytes(self.scan(frame), self.scan_bytes(taken))
@@ -177,3 +183,50 @@ def _gain(seed: int, camera: int, frame: int) -> float:
 def _to_bytes(picture: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Picture values of 0-1 as bytes."""
     return np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)
+
+
+# ---- a stand-in for a network's estimate -----------------------------------------------------------------------------
+
+
+def _smooth_field(rng: Generator, height: int, width: int) -> NDArray[np.float32]:
+    """Smooth noise of unit variance at the knots."""
+    knots = rng.standard_normal((_GRID, _GRID)).astype(np.float32)
+    return np.asarray(cv2.resize(knots, (width, height), interpolation=cv2.INTER_CUBIC), np.float32)
+
+
+def simulated_estimate(
+    distance_m: NDArray[np.float32],
+    own_car_m: NDArray[np.float32],
+    lens: NDArray[np.bool_],
+    frame: int,
+    seed: int,
+    camera: int,
+) -> NDArray[np.float32]:
+    """Turn a true distance map, H×W, into an estimate with a depth network's faults; 0 outside the lens.
+
+    The faults: a scale error of some 10 % that varies smoothly over the picture and from frame to frame; edges blurred
+    over a few pixels, so that thin things fade into what is behind; a sky at a finite distance. A network sees the own
+    car as well, whose distances are `own_car_m`.
+    """
+    height, width = distance_m.shape
+    whole = np.where(distance_m > 0, distance_m, own_car_m)
+    log = np.log(np.where(whole > 0, np.minimum(whole, 250.0), _SKY_M)).astype(np.float32)
+    # the blur must not draw in what lies outside the lens: normalised by the blurred lens
+    sigma = max(0.6, _BLUR_SHARE * width)
+    weight = cv2.GaussianBlur(lens.astype(np.float32), (0, 0), sigma)
+    log = cv2.GaussianBlur(np.where(lens, log, 0), (0, 0), sigma) / np.maximum(weight, 1e-6)
+
+    def fields(number: int) -> tuple[float, NDArray[np.float32]]:
+        rng = np.random.default_rng([seed, 40, camera, number])
+        return float(rng.standard_normal()), _smooth_field(rng, height, width)
+
+    position = frame / _KEYFRAME_INTERVAL
+    first = int(position)
+    # both weights on a circle, so that the variance stays the same in between
+    angle = (position - first) * np.pi / 2
+    (scale_a, field_a), (scale_b, field_b) = fields(first), fields(first + 1)
+    scale = np.cos(angle) * scale_a + np.sin(angle) * scale_b
+    changing = np.cos(angle) * field_a + np.sin(angle) * field_b
+    lasting = _smooth_field(np.random.default_rng([seed, 41, camera]), height, width)
+    error = _PARTS[0] * scale + _PARTS[1] * lasting + _PARTS[2] * changing
+    return np.where(lens, np.exp(log + SCALE_ERROR * error), 0).astype(np.float32)

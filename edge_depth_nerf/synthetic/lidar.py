@@ -72,13 +72,10 @@ class Sweep:
 
 def sweep(world: World, drive: Drive, time_s: float, rng: Generator, scanner: Scanner = HDL_64E) -> Sweep:
     """Take the sweep that faces forwards at `time_s`."""
-    offset_s, azimuth = scanner.offset_s, scanner.azimuth_rad
+    offset_s, azimuth = scanner.offset_s, scanner.azimuth_rad[:, None]
     velo_to_world = drive.pose_to_world(time_s + offset_s) @ scanner.to_pose
     cos, sin = np.cos(scanner.elevation_rad), np.sin(scanner.elevation_rad)
-    directions = np.empty((len(azimuth), len(cos), 3))
-    directions[..., 0] = np.cos(azimuth)[:, None] * cos
-    directions[..., 1] = np.sin(azimuth)[:, None] * cos
-    directions[..., 2] = sin
+    directions = np.stack(np.broadcast_arrays(np.cos(azimuth) * cos, np.sin(azimuth) * cos, sin), -1)
     world_directions = np.einsum("fij,fbj->fbi", velo_to_world[:, :3, :3], directions).reshape(-1, 3)
     world_origins = np.repeat(velo_to_world[:, :3, 3], len(cos), axis=0)
     times = np.repeat(time_s + offset_s, len(cos))

@@ -61,6 +61,18 @@ LASER_REFLECTANCE[[Material.LEAF, Material.GRASS, Material.MARKING]] = (3.0, 2.5
 LASER_REFLECTANCE[[Material.GLASS, Material.RUBBER]] = 0.5
 
 
+def read_map(values: Array, x: Array, y: Array, border: int) -> Array:
+    """Values of an H×W map at N points, linear in between; outside by one of OpenCV's ways, a constant being 1."""
+    # cv2 takes at most 2**15 points in a row
+    rows = max(1, -(-len(x) // _REMAP_WIDTH))
+    at = np.zeros((2, rows * _REMAP_WIDTH), np.float32)
+    at[0, : len(x)], at[1, : len(x)] = x, y
+    at = at.reshape(2, rows, _REMAP_WIDTH)
+    return cv2.remap(values, at[0], at[1], cv2.INTER_LINEAR, borderMode=border, borderValue=(1.0,)).reshape(-1)[
+        : len(x)
+    ]
+
+
 class Noise:
     """Smooth, zero-mean noise and random cells, tables made from one seed."""
 
@@ -75,16 +87,10 @@ class Noise:
     def wave(self, u: Array, v: Array, wavelength_m: float | tuple[float, float], layer: int) -> Array:
         """Zero-mean noise of standard deviation 0.5 with features as long as the wavelength (of u and of v)."""
         along_u, along_v = wavelength_m if isinstance(wavelength_m, tuple) else (wavelength_m, wavelength_m)
-        count = len(u)
-        rows = max(1, -(-count // _REMAP_WIDTH))
-        maps = np.zeros((2, rows * _REMAP_WIDTH), np.float32)
         # cv2 takes coordinates up to 2**15 only: wrapped here
-        np.mod(u * (_TEXELS_PER_WAVE / along_u) + 61.7 * layer, _TILE, out=maps[0, :count])
-        np.mod(v * (_TEXELS_PER_WAVE / along_v) + 37.3 * layer, _TILE, out=maps[1, :count])
-        maps = maps.reshape(2, rows, _REMAP_WIDTH)
-        return cv2.remap(self._smooth, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP).reshape(-1)[
-            :count
-        ]
+        x = np.mod(u * (_TEXELS_PER_WAVE / along_u) + 61.7 * layer, _TILE)
+        y = np.mod(v * (_TEXELS_PER_WAVE / along_v) + 37.3 * layer, _TILE)
+        return read_map(self._smooth, x, y, cv2.BORDER_WRAP)
 
     def waves(
         self, u: Array, v: Array, footprint_m: Array, spectrum: Sequence[tuple[float, float]], layer: int = 0
@@ -126,9 +132,8 @@ class Surface:
 
 def _coverage(distance_m: Array, half_width_m: float, footprint_m: Array) -> Array:
     """How much of a footprint a line of that half width covers, at that distance from its middle."""
-    return np.clip((half_width_m - distance_m) / footprint_m + 0.5, 0, 1) * np.minimum(
-        1, 2 * half_width_m / footprint_m
-    )
+    covered = np.clip((half_width_m - distance_m) / footprint_m + 0.5, 0, 1)
+    return covered * np.minimum(1, 2 * half_width_m / footprint_m)
 
 
 def _fade(size_m: float, footprint_m: Array) -> Array:
@@ -208,13 +213,11 @@ def _plaster(noise: Noise, s: Surface) -> Array:
 
 
 def _glass(noise: Noise, s: Surface) -> Array:
-    blur = noise.waves(s.u, s.v, s.footprint_m, ((0.25, 0.2), (0.9, 0.45)), 8)
-    return _scaled(s.tint, 1 + blur)
+    return _scaled(s.tint, 1 + noise.waves(s.u, s.v, s.footprint_m, ((0.25, 0.2), (0.9, 0.45)), 8))
 
 
 def _painted(noise: Noise, s: Surface) -> Array:
-    tone = noise.waves(s.u, s.v, s.footprint_m, ((0.05, 0.05), (0.3, 0.08), (1.5, 0.08)), 9)
-    return _scaled(s.tint, 1 + tone)
+    return _scaled(s.tint, 1 + noise.waves(s.u, s.v, s.footprint_m, ((0.05, 0.05), (0.3, 0.08), (1.5, 0.08)), 9))
 
 
 def _roof(noise: Noise, s: Surface) -> Array:
@@ -237,9 +240,8 @@ def _car_paint(noise: Noise, s: Surface) -> Array:
 def _bark(noise: Noise, s: Surface) -> Array:
     around = np.arctan2(s.u, s.v) * 0.2
     groove = noise.wave(around + s.position[:, 0], s.position[:, 2], (0.05, 0.3), 71) * _fade(0.05, s.footprint_m)
-    tone = noise.waves(
-        s.position[:, 0] + s.position[:, 1], s.position[:, 2], s.footprint_m, ((0.3, 0.2), (1.5, 0.2)), 12
-    )
+    x, y, z = s.position.T
+    tone = noise.waves(x + y, z, s.footprint_m, ((0.3, 0.2), (1.5, 0.2)), 12)
     return _scaled(s.tint, 1 + 0.6 * groove + tone)
 
 
@@ -270,10 +272,6 @@ def _print(noise: Noise, s: Surface) -> Array:
     return _mixed(s.tint, (0.85, 0.85, 0.8), 0.85 * ink)
 
 
-def _plain(noise: Noise, s: Surface) -> Array:
-    return s.tint
-
-
 _COLOURS: dict[Material, Callable[[Noise, Surface], Array]] = {
     Material.ASPHALT: _asphalt,
     Material.PAVING: _paving,
@@ -292,26 +290,16 @@ _COLOURS: dict[Material, Callable[[Noise, Surface], Array]] = {
     Material.LEAF: _leaf,
     Material.CONCRETE: _concrete,
     Material.PRINT: _print,
-    Material.LAMP: _plain,
+    Material.LAMP: lambda noise, s: s.tint,
 }
 
 
 def reflectance(
     noise: Noise, material: NDArray[np.uint8], tint: Array, position: Array, normal: Array, footprint_m: Array
 ) -> Array:
-    """Colour of N points of any materials.
+    """Linear RGB (N×3) of N points of any materials.
 
-    Args:
-        noise: the tables.
-        material: N.
-        tint: N×3.
-        position: N×3, in the frame of the object, so that patterns move with it.
-        normal: N×3, flat normals in the same frame.
-        footprint_m: N.
-
-    Returns:
-        N×3 linear RGB.
-
+    Position and flat normal (N×3) are in the frame of the object, so that patterns move with it.
     """
     horizontal = np.hypot(normal[:, 0], normal[:, 1])
     upright = horizontal > 0.2

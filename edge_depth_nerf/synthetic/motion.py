@@ -20,6 +20,8 @@ FRAME_INTERVAL_S = 0.1
 """Time between frames, and of one turn of the LiDAR."""
 
 _STEP_M = 0.01
+_EASING_M = 3.0
+"""Length over which the curvature of a turn goes from 0 to 1/radius, and back."""
 
 
 class Route:
@@ -27,30 +29,19 @@ class Route:
 
     def __init__(
         self,
-        start: tuple[float | int, float | int],
+        start: Pair,
         heading_rad: float = 0.0,
         turn_rad: float = 0.0,
         turn_at_m: float = 0.0,
         radius_m: float = 8.0,
-        easing_m: float = 3.0,
     ) -> None:
-        """Lay out the route.
-
-        Args:
-            start: x, y where the arc length is 0.
-            heading_rad: heading there.
-            turn_rad: signed angle of the turn, 0 = none.
-            turn_at_m: arc length where the turn begins.
-            radius_m: smallest radius of the turn.
-            easing_m: length over which the curvature goes from 0 to 1/radius, and back.
-
-        """
+        """Lay out the route from x, y where the arc length is 0; the signed turn, 0 = none, has this least radius."""
         self._start, self._heading = np.asarray(start, np.float64), heading_rad
-        self._turn, self._turn_at = turn_rad, turn_at_m
-        self.turn_length_m = abs(turn_rad) * radius_m + easing_m if turn_rad else 0.0
+        self._turn, self._turn_at = turn_rad, turn_at_m if turn_rad else np.inf
+        self.turn_length_m = abs(turn_rad) * radius_m + _EASING_M if turn_rad else 0.0
         """Arc length of the turn with its easing."""
         s = np.arange(0, self.turn_length_m + _STEP_M, _STEP_M)
-        curvature = np.minimum(1, np.minimum(s, self.turn_length_m - s).clip(0) / easing_m) / radius_m
+        curvature = np.minimum(1, np.minimum(s, self.turn_length_m - s).clip(0) / _EASING_M) / radius_m
         # middle of each step, so that the sums are second-order accurate
         turned = np.concatenate(([0.0], np.cumsum((curvature[1:] + curvature[:-1]) / 2 * _STEP_M)))
         turned = np.sign(turn_rad) * turned * (abs(turn_rad) / turned[-1] if turn_rad else 0.0)
@@ -62,9 +53,9 @@ class Route:
     def at(self, s_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Positions (N×2) and headings (N) at N arc lengths, which may lie before the start."""
         s = np.asarray(s_m, np.float64)
-        before = np.minimum(s, self._turn_at) if self._turn else s
-        inside = np.clip(s - self._turn_at, 0, self._turn_s[-1]) if self._turn else np.zeros_like(s)
-        after = np.maximum(s - self._turn_at - self._turn_s[-1], 0) if self._turn else np.zeros_like(s)
+        before = np.minimum(s, self._turn_at)
+        inside = np.clip(s - self._turn_at, 0, self._turn_s[-1])
+        after = np.maximum(s - self._turn_at - self._turn_s[-1], 0)
         turned = np.interp(inside, self._turn_s, self._turned)
         bend = np.stack([np.interp(inside, self._turn_s, self._turn_path[:, axis]) for axis in (0, 1)], -1)
         first = np.array((np.cos(self._heading), np.sin(self._heading)))
@@ -87,7 +78,7 @@ class Turn:
 class WindingRoute:
     """A path on the ground with several turns, one behind the other, as smooth as a `Route`."""
 
-    def __init__(self, start: tuple[float | int, float | int], heading_rad: float, turns: Sequence[Turn]) -> None:
+    def __init__(self, start: Pair, heading_rad: float, turns: Sequence[Turn]) -> None:
         """Lay out the route from where its arc length is 0; behind the last turn it is straight."""
         self._legs: list[Route] = []
         self.ends_m: list[float] = []
@@ -149,8 +140,7 @@ class Drive:
         forward = np.stack((ch * cp, sh * cp, sp), -1)
         left = np.stack((-sh * cr - ch * sp * sr, ch * cr - sh * sp * sr, cp * sr), -1)
         poses = np.zeros((*t.shape, 4, 4))
-        poses[..., :3, 0], poses[..., :3, 1] = forward, -left
-        poses[..., :3, 2] = np.cross(forward, -left)
+        poses[..., :3, :3] = np.stack((forward, -left, np.cross(forward, -left)), -1)
         poses[..., :2, 3], poses[..., 2, 3], poses[..., 3, 3] = position, height, 1
         return poses
 

@@ -22,6 +22,7 @@ from edge_depth_nerf.synthetic.materials import Material
 _DARK: Colour = (0.02, 0.02, 0.022)
 _WHITE: Colour = (0.7, 0.7, 0.68)
 _STEEL: Colour = (0.3, 0.31, 0.32)
+_PANE: Colour = (0.03, 0.035, 0.04)
 
 CAR_COLOURS: tuple[Colour, ...] = (
     (0.55, 0.56, 0.57),
@@ -38,7 +39,8 @@ CAR_COLOURS: tuple[Colour, ...] = (
 """Linear RGB of car paints."""
 
 
-def _choice(rng: Generator, values: tuple):
+def choice(rng: Generator, values: tuple):
+    """One of some values, all equally likely."""
     return values[int(rng.integers(len(values)))]
 
 
@@ -86,31 +88,17 @@ def _body(mesh: MeshBuilder, shape: CarShape, colour: Colour) -> None:
         [0.58, 0.80, deck, belt, belt, belt - 0.03, bonnet - 0.06, bonnet - 0.16, 0.5],
     )(share)
     bottom = np.interp(share, [-1, -0.93, 0.93, 1], [0.36, 0.22, 0.22, 0.30])
-    half = (
-        shape.width
-        / 2
-        * PchipInterpolator([-1, -0.96, -0.82, -0.3, 0.6, 0.86, 0.96, 1], [0.7, 0.88, 0.97, 1, 1, 0.95, 0.82, 0.66])(
-            share
-        )
+    narrowing = PchipInterpolator(
+        [-1, -0.96, -0.82, -0.3, 0.6, 0.86, 0.96, 1], [0.7, 0.88, 0.97, 1, 1, 0.95, 0.82, 0.66]
     )
-    turn = np.linspace(0, 1, 15)
-    outline = [
-        (0, 0, 0.85, 0.95, 1.0, 1.0, 0.985, 0.95, 0.86, 0.6, 0),
-        (0, 0, 0, 0.08, 0.3, 0.55, 0.82, 0.94, 0.99, 1.01, 1.03),
-    ]
-    knots = np.linspace(0, 1, len(outline[0]))
-    across, rise = PchipInterpolator(knots, outline[0])(turn), PchipInterpolator(knots, outline[1])(turn)
-    y = np.concatenate((across, -across[-2:0:-1]))
-    z = np.concatenate((rise, rise[-2:0:-1]))
-    rings = np.stack(
-        (
-            np.repeat(share[:, None] * shape.length / 2, len(y), 1),
-            half[:, None] * y,
-            bottom[:, None] + (top - bottom)[:, None] * z,
-        ),
-        -1,
-    )
-    mesh.add_loft(rings, Material.CAR_PAINT, colour)
+    half = shape.width / 2 * narrowing(share)
+    turn, knots = np.linspace(0, 1, 15), np.linspace(0, 1, 11)
+    across = PchipInterpolator(knots, (0, 0, 0.85, 0.95, 1.0, 1.0, 0.985, 0.95, 0.86, 0.6, 0))(turn)
+    rise = PchipInterpolator(knots, (0, 0, 0, 0.08, 0.3, 0.55, 0.82, 0.94, 0.99, 1.01, 1.03))(turn)
+    y = half[:, None] * np.concatenate((across, -across[-2:0:-1]))
+    z = bottom[:, None] + (top - bottom)[:, None] * np.concatenate((rise, rise[-2:0:-1]))
+    x = np.broadcast_to(share[:, None] * shape.length / 2, y.shape)
+    mesh.add_loft(np.stack((x, y, z), -1), Material.CAR_PAINT, colour)
 
 
 def _cabin(mesh: MeshBuilder, shape: CarShape, colour: Colour) -> None:
@@ -119,9 +107,8 @@ def _cabin(mesh: MeshBuilder, shape: CarShape, colour: Colour) -> None:
     base = (shape.rear_deck[0] * half_length, shape.windscreen[0] * half_length, 0.46 * shape.width)
     roof = (shape.rear_deck[1] * half_length, shape.windscreen[1] * half_length, 0.36 * shape.width)
 
-    def at(share: Real) -> Triple:
-        rear, front, half = (low + (high - low) * share for low, high in zip(base, roof, strict=True))
-        return rear, front, half
+    def at(share: Real) -> list[Real]:
+        return [low + (high - low) * share for low, high in zip(base, roof, strict=True)]
 
     rings = []
     for share, rise, shrink in ((0, 0, 0), (0.9, 0.9, 0), (0.96, 0.965, 0.03), (1, 1, 0.12), (1, 1.025, 0.35)):
@@ -140,10 +127,6 @@ def _cabin(mesh: MeshBuilder, shape: CarShape, colour: Colour) -> None:
         ]
         rings.append([(x, y, low + (high - low) * rise) for x, y in corner])
     mesh.add_loft(np.array(rings), Material.CAR_PAINT, colour)
-
-    def pane(corners: list[Triple]) -> None:
-        mesh.add_polygon(corners, Material.GLASS, (0.03, 0.035, 0.04))
-
     out = 0.012
     bottom_share, top_share = 0.08, 0.86
     for first, last in shape.panes:
@@ -153,13 +136,13 @@ def _cabin(mesh: MeshBuilder, shape: CarShape, colour: Colour) -> None:
                 rear, front, half = at(share)
                 # the outermost panes end upright-ish inside the pillar
                 corners.append((rear + along * (front - rear), side * (half + out), low + (high - low) * share))
-            pane(corners)
+            mesh.add_polygon(corners, Material.GLASS, _PANE)
     for end, sign in ((1, 1), (0, -1)):
         corners = []
         for across, share in ((-1, bottom_share), (1, bottom_share), (1, top_share), (-1, top_share)):
             values = at(share)
             corners.append((values[end] + sign * out, across * (values[2] - 0.13), low + (high - low) * share))
-        pane(corners)
+        mesh.add_polygon(corners, Material.GLASS, _PANE)
 
 
 def _wheels(mesh: MeshBuilder, shape: CarShape) -> None:
@@ -168,15 +151,13 @@ def _wheels(mesh: MeshBuilder, shape: CarShape) -> None:
         for side in (-1, 1):
             outer = side * (shape.width / 2 + 0.004)
             angles = np.linspace(-0.25, np.pi + 0.25, 16)
-            arch = np.column_stack(
-                (x + (radius + 0.055) * np.cos(angles), np.full(16, outer), radius + (radius + 0.055) * np.sin(angles))
-            )
+            around = x + (radius + 0.055) * np.cos(angles), radius + (radius + 0.055) * np.sin(angles)
+            arch = np.column_stack((around[0], np.full(16, outer), around[1]))
             mesh.add_polygon(arch, Material.RUBBER, (0.008, 0.008, 0.008))
             start, end = (x, side * (shape.width / 2 - 0.2), radius), (x, outer + side * 0.012, radius)
             mesh.add_rod(start, end, radius, Material.RUBBER, _DARK, sections=24)
-            mesh.add_disc(
-                (x, outer + side * 0.016, radius), (0, 1, 0), 0.68 * radius, Material.METAL, (0.42, 0.43, 0.44)
-            )
+            hub = (x, outer + side * 0.016, radius)
+            mesh.add_disc(hub, (0, 1, 0), 0.68 * radius, Material.METAL, (0.42, 0.43, 0.44))
             for spoke in range(5):
                 angle = 2 * np.pi * (spoke + 0.3) / 5
                 hole = (x + 0.42 * radius * np.cos(angle), outer + side * 0.019, radius + 0.42 * radius * np.sin(angle))
@@ -188,18 +169,16 @@ def _fittings(mesh: MeshBuilder, shape: CarShape) -> None:
     for side in (-1, 1):
         y = side * 0.62 * half
         mesh.add_box((front * 0.945, y, 0.64), (0.18, 0.30, 0.13), Material.GLASS, (0.55, 0.55, 0.52))
-        mesh.add_box(
-            (-front * 0.955, side * 0.68 * half, 0.74), (0.16, 0.22, 0.17), Material.GLASS, (0.32, 0.015, 0.012)
-        )
+        rear = (-front * 0.955, side * 0.68 * half, 0.74)
+        mesh.add_box(rear, (0.16, 0.22, 0.17), Material.GLASS, (0.32, 0.015, 0.012))
         mirror = (shape.windscreen[0] * front - 0.22, side * (half + 0.07), shape.belt_height + 0.06)
         mesh.add_box(mirror, (0.09, 0.19, 0.13), Material.RUBBER, _DARK)
         # gaps of the doors and the sill, as thin dark strips just proud of the side
         for share in (0.36, -0.06, -0.46) if shape.height < 1.8 else (0.55, 0.1):
             mesh.add_box((share * front, side * (half + 0.001), 0.61), (0.012, 0.008, 0.52), Material.RUBBER, _DARK)
         for share in (0.02, -0.40) if shape.height < 1.8 else (0.16,):
-            mesh.add_box(
-                (share * front, side * (half + 0.004), 0.76), (0.17, 0.03, 0.03), Material.RUBBER, (0.06, 0.06, 0.06)
-            )
+            handle = (share * front, side * (half + 0.004), 0.76)
+            mesh.add_box(handle, (0.17, 0.03, 0.03), Material.RUBBER, (0.06, 0.06, 0.06))
         mesh.add_box((0, side * (half - 0.015), 0.29), (0.58 * shape.length, 0.05, 0.06), Material.RUBBER, _DARK)
     for sign in (1, -1):
         mesh.add_box((sign * front * 0.992, 0, 0.47), (0.05, 0.52, 0.11), Material.PAINTED, _WHITE)
@@ -219,10 +198,16 @@ def car(kind: str, colour: Colour) -> Geometry:
     return mesh.build()
 
 
+def driven_car(rng: Generator) -> Geometry:
+    """A car that is not parked."""
+    kind = str(rng.choice(["hatchback", "saloon", "estate"]))
+    return car(kind, choice(rng, CAR_COLOURS))
+
+
 def random_car(rng: Generator) -> tuple[Geometry, CarShape]:
     """A car of any kind and colour; its shape tells the room it needs."""
     kind = str(rng.choice(["hatchback", "saloon", "estate", "van"], p=[0.36, 0.27, 0.27, 0.10]))
-    return car(kind, _choice(rng, CAR_COLOURS)), CAR_SHAPES[kind]
+    return car(kind, choice(rng, CAR_COLOURS)), CAR_SHAPES[kind]
 
 
 def recording_car() -> Geometry:
@@ -313,20 +298,9 @@ def _wall(
         x, y = start + along * u - outward * depth
         return float(x), float(y), z[0] + v
 
-    def panel(u: Pair, v: Pair, depth: Real | Pair, kind: Material, colour: Colour) -> None:
-        near, far = depth if isinstance(depth, tuple) else (depth, depth)
-        if u[0] == u[1]:
-            corners = [point(u[0], v[0], near), point(u[0], v[0], far), point(u[0], v[1], far), point(u[0], v[1], near)]
-        elif v[0] == v[1]:
-            corners = [point(u[0], v[0], near), point(u[1], v[0], near), point(u[1], v[0], far), point(u[0], v[0], far)]
-        else:
-            corners = [
-                point(u[0], v[0], near),
-                point(u[1], v[0], near),
-                point(u[1], v[1], near),
-                point(u[0], v[1], near),
-            ]
-        mesh.add_polygon(corners, kind, colour)
+    def panel(u: Pair, v: Pair, depth: Real, kind: Material, colour: Colour) -> None:
+        corners = ((u[0], v[0]), (u[1], v[0]), (u[1], v[1]), (u[0], v[1]))
+        mesh.add_polygon([point(*corner, depth) for corner in corners], kind, colour)
 
     us = sorted({0.0, length, *(edge for o in openings for edge in o.u)})
     vs = sorted({0.0, z[1] - z[0], *(edge for o in openings for edge in o.v)})
@@ -336,25 +310,24 @@ def _wall(
             if not any(o.u[0] < middle[0] < o.u[1] and o.v[0] < middle[1] < o.v[1] for o in openings):
                 panel((u0, u1), (v0, v1), 0.0, material, tint)
     for o in openings:
-        depth = 0.16
-        for edge in o.u:
-            panel((edge, edge), o.v, (0.0, depth), Material.PLASTER, tint)
-        for edge in o.v:
-            panel(o.u, (edge, edge), (0.0, depth), Material.PLASTER, tint)
+        depth, (u0, u1), (v0, v1) = 0.16, o.u, o.v
+        for u in o.u:
+            jamb = [point(u, v0, 0.0), point(u, v0, depth), point(u, v1, depth), point(u, v1, 0.0)]
+            mesh.add_polygon(jamb, Material.PLASTER, tint)
+        for v in o.v:
+            reveal = [point(u0, v, 0.0), point(u1, v, 0.0), point(u1, v, depth), point(u0, v, depth)]
+            mesh.add_polygon(reveal, Material.PLASTER, tint)
         if o.is_door:
             panel(o.u, o.v, depth, Material.PAINTED, door)
-            light = (o.v[0] + 0.62 * (o.v[1] - o.v[0]), o.v[1] - 0.15)
-            panel((o.u[0] + 0.15, o.u[1] - 0.15), light, depth - 0.01, Material.GLASS, (0.03, 0.03, 0.035))
+            light = (v0 + 0.62 * (v1 - v0), v1 - 0.15)
+            panel((u0 + 0.15, u1 - 0.15), light, depth - 0.01, Material.GLASS, (0.03, 0.03, 0.035))
             continue
-        panel(
-            o.u, o.v, depth, Material.GLASS, _choice(rng, ((0.02, 0.025, 0.03), (0.05, 0.05, 0.05), (0.12, 0.11, 0.09)))
-        )
+        glass = choice(rng, ((0.02, 0.025, 0.03), (0.05, 0.05, 0.05), (0.12, 0.11, 0.09)))
+        panel(o.u, o.v, depth, Material.GLASS, glass)
         if rng.random() < 0.3:
-            drop = o.v[1] - rng.uniform(0.2, 0.8) * (o.v[1] - o.v[0])
-            panel(o.u, (drop, o.v[1]), depth - 0.015, Material.PAINTED, (0.55, 0.53, 0.48))
-        bar = 0.06
-        (u0, u1), (v0, v1) = o.u, o.v
-        middle = (u0 + u1) / 2
+            drop = v1 - rng.uniform(0.2, 0.8) * (v1 - v0)
+            panel(o.u, (drop, v1), depth - 0.015, Material.PAINTED, (0.55, 0.53, 0.48))
+        bar, middle = 0.06, (u0 + u1) / 2
         bars = [
             ((u0, u0 + bar), (v0, v1)),
             ((u1 - bar, u1), (v0, v1)),
@@ -422,37 +395,27 @@ def house(width: Real, depth: Real, rng: Generator, shop: bool = False) -> Geome
     storeys = int(rng.choice([2, 3, 4], p=[0.4, 0.42, 0.18]))
     storey = rng.uniform(2.8, 3.2)
     height = storeys * storey + 0.4
-    material, tint = _choice(rng, _WALLS)
-    door, frame, roof = _choice(rng, _DOORS), _choice(rng, _FRAMES), _choice(rng, _ROOFS)
+    material, tint = choice(rng, _WALLS)
+    door, frame, roof = choice(rng, _DOORS), choice(rng, _FRAMES), choice(rng, _ROOFS)
     corner = [np.array(p) for p in ((0.0, 0.0), (width, 0.0), (width, depth), (0.0, depth))]
     for side in range(4):
         start, end = corner[side], corner[(side + 1) % 4]
-        length = float(np.linalg.norm(end - start))
-        openings = _openings(length, storeys, storey, side == 0, shop and side == 0, rng)
+        openings = _openings(float(np.linalg.norm(end - start)), storeys, storey, side == 0, shop and side == 0, rng)
         if side % 2 and rng.random() < 0.3:
             openings = []
         _wall(mesh, start, end, (0.0, height), openings, material, tint, door, frame, rng)
     mesh.add_box((width / 2, -0.02, 0.22), (width, 0.08, 0.44), Material.STONE, (0.28, 0.27, 0.25))
     if rng.random() < 0.5:
         for level in range(1, storeys):
-            mesh.add_box(
-                (width / 2, -0.02, level * storey + 0.2), (width, 0.1, 0.14), Material.STONE, (0.5, 0.47, 0.42)
-            )
+            centre = (width / 2, -0.02, level * storey + 0.2)
+            mesh.add_box(centre, (width, 0.1, 0.14), Material.STONE, (0.5, 0.47, 0.42))
     if shop:
-        mesh.add_box(
-            (width / 2, -0.08, 2.85),
-            (0.9 * width, 0.12, 0.5),
-            Material.PRINT,
-            _choice(rng, ((0.4, 0.03, 0.03), (0.03, 0.1, 0.35), (0.05, 0.25, 0.1), (0.5, 0.3, 0.03))),
-        )
+        sign = choice(rng, ((0.4, 0.03, 0.03), (0.03, 0.1, 0.35), (0.05, 0.25, 0.1), (0.5, 0.3, 0.03)))
+        mesh.add_box((width / 2, -0.08, 2.85), (0.9 * width, 0.12, 0.5), Material.PRINT, sign)
         if rng.random() < 0.6:
-            awning = [
-                (0.1 * width, -0.02, 2.6),
-                (0.9 * width, -0.02, 2.6),
-                (0.9 * width, -1.1, 2.25),
-                (0.1 * width, -1.1, 2.25),
-            ]
-            mesh.add_polygon(awning, Material.PRINT, _choice(rng, ((0.5, 0.06, 0.04), (0.1, 0.25, 0.4))))
+            left, right = 0.1 * width, 0.9 * width
+            awning = [(left, -0.02, 2.6), (right, -0.02, 2.6), (right, -1.1, 2.25), (left, -1.1, 2.25)]
+            mesh.add_polygon(awning, Material.PRINT, choice(rng, ((0.5, 0.06, 0.04), (0.1, 0.25, 0.4))))
     _roof(mesh, width, depth, height, roof, (material, tint), rng)
     for x in (0.12, width - 0.12):
         mesh.add_rod((x, -0.07, 0), (x, -0.07, height), 0.045, Material.METAL, (0.2, 0.2, 0.19), 8)
@@ -470,13 +433,10 @@ def _roof(
 ) -> None:
     if rng.random() < 0.25:
         mesh.add_rectangle((0, width), (0, depth), height, Material.CONCRETE, (0.2, 0.2, 0.2))
-        for centre, size in (
-            ((width / 2, 0, height), (width + 0.3, 0.35, 0.5)),
-            ((width / 2, depth, height), (width + 0.3, 0.35, 0.5)),
-            ((0, depth / 2, height), (0.35, depth + 0.3, 0.5)),
-            ((width, depth / 2, height), (0.35, depth + 0.3, 0.5)),
-        ):
-            mesh.add_box(centre, size, Material.STONE, (0.4, 0.38, 0.35))
+        for y in (0, depth):
+            mesh.add_box((width / 2, y, height), (width + 0.3, 0.35, 0.5), Material.STONE, (0.4, 0.38, 0.35))
+        for x in (0, width):
+            mesh.add_box((x, depth / 2, height), (0.35, depth + 0.3, 0.5), Material.STONE, (0.4, 0.38, 0.35))
         return
     rise = rng.uniform(0.32, 0.5) * depth
     over, slope = 0.4, rise / (depth / 2)
@@ -491,14 +451,9 @@ def _roof(
                 at = 0.18 * depth
                 body = (float(x), depth / 2 - sign * (depth / 2 - at - 0.9), height + slope * at + 0.55)
                 mesh.add_box(body, (1.3, 1.8, 1.3), *wall)
-                face = body[1] - sign * 0.905
-                glass = [
-                    (x - 0.45, face, body[2] - 0.3),
-                    (x + 0.45, face, body[2] - 0.3),
-                    (x + 0.45, face, body[2] + 0.5),
-                    (x - 0.45, face, body[2] + 0.5),
-                ]
-                mesh.add_polygon(glass, Material.GLASS, (0.03, 0.03, 0.035))
+                face, low_m, high_m = body[1] - sign * 0.905, body[2] - 0.3, body[2] + 0.5
+                frame = ((x - 0.45, low_m), (x + 0.45, low_m), (x + 0.45, high_m), (x - 0.45, high_m))
+                mesh.add_polygon([(u, face, v) for u, v in frame], Material.GLASS, (0.03, 0.03, 0.035))
                 mesh.add_box((body[0], body[1], body[2] + 0.7), (1.6, 2.1, 0.12), Material.ROOF, roof)
     for x in (0.0, width):
         mesh.add_polygon([(x, 0, height), (x, depth, height), (x, depth / 2, ridge)], *wall)
@@ -568,9 +523,8 @@ def tree(height: Real, rng: Generator, leaves: int = 9000) -> Geometry:
         size = crown * rng.uniform(0.24, 0.46)
         lump = _lump(rng, centre, size * 0.85, 0.12, 2)
         mesh.add_mesh(lump, Material.LEAF, (0.5 * green[0], 0.5 * green[1], 0.5 * green[2]))
-        mesh.add_rod(
-            fork - (0, 0, rng.uniform(0, 0.3) * stem), centre, (0.45 * radius, 0.12 * radius), Material.BARK, bark, 7
-        )
+        start = fork - (0, 0, rng.uniform(0, 0.3) * stem)
+        mesh.add_rod(start, centre, (0.45 * radius, 0.12 * radius), Material.BARK, bark, 7)
         around = rng.normal(size=(leaves // lumps, 3))
         around /= np.linalg.norm(around, axis=1, keepdims=True)
         points = centre + around * size * rng.uniform(0.8, 1.12, (len(around), 1))
@@ -605,9 +559,8 @@ def thicket(length: Real, height: Real, rng: Generator) -> Geometry:
         green = np.array([0.05, 0.095, 0.03]) * rng.uniform(0.7, 1.4)
         size = np.array([0.42, 0.42, 0.55]) * height * rng.uniform(0.75, 1.2)
         centre = np.array([x, rng.uniform(-0.3, 0.3) * height, 0.85 * size[2]])
-        mesh.add_mesh(
-            _lump(rng, centre, size, 0.16, 3), Material.LEAF, (float(green[0]), float(green[1]), float(green[2]))
-        )
+        tint: Colour = (float(green[0]), float(green[1]), float(green[2]))
+        mesh.add_mesh(_lump(rng, centre, size, 0.16, 3), Material.LEAF, tint)
     return mesh.build()
 
 
@@ -668,10 +621,8 @@ def bollard() -> Geometry:
 def bin_on_wheels(colour: Colour) -> Geometry:
     """A household bin."""
     mesh = MeshBuilder()
-    rings = np.array(
-        [[(-h, -h, z), (h, -h, z), (h, h, z), (-h, h, z)] for h, z in ((0.22, 0.06), (0.29, 0.98))], np.float64
-    )
-    mesh.add_loft(rings, Material.PAINTED, (0.05, 0.06, 0.06), smooth=False)
+    rings = [[(-h, -h, z), (h, -h, z), (h, h, z), (-h, h, z)] for h, z in ((0.22, 0.06), (0.29, 0.98))]
+    mesh.add_loft(np.array(rings), Material.PAINTED, (0.05, 0.06, 0.06), smooth=False)
     mesh.add_box((0, 0, 1.02), (0.62, 0.66, 0.09), Material.PAINTED, colour)
     for y in (-0.24, 0.24):
         mesh.add_rod((-0.2, y - 0.03, 0.1), (-0.2, y + 0.03, 0.1), 0.1, Material.RUBBER, _DARK)

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, get_args
 
 import tyro
 
 from edge_depth_nerf.base.errors import InputError
 
 SceneName = Literal["street", "parking", "turn", "traffic", "roundabout"]
-
-SCENES: tuple[SceneName, ...] = ("street", "parking", "turn", "traffic", "roundabout")
-"""The scenes that can be synthesised."""
+LayoutName = Literal["kitti-360", "jbnu-depth360", "rig"]
+BodyName = Literal["grey", "ground"]
 
 MEAN_SPEED_M_S: dict[SceneName, float] = {
     "street": 8.0,
@@ -24,15 +23,6 @@ MEAN_SPEED_M_S: dict[SceneName, float] = {
 }
 """How fast the car drives in each scene; a frame is 0.1 s."""
 
-LayoutName = Literal["kitti-360", "jbnu-depth360", "rig"]
-
-LAYOUTS: tuple[LayoutName, ...] = ("kitti-360", "jbnu-depth360", "rig")
-"""The layouts that a drive can be written in."""
-
-BodyName = Literal["grey", "ground"]
-
-BODIES: tuple[BodyName, ...] = ("grey", "ground")
-"""What the recording car can look like."""
 
 _SIZE_RANGE_PX = (32, 4096)
 _MOVING_MAX = 8
@@ -85,12 +75,10 @@ class SynthesizeOptions:
             InputError: a value cannot be used; names the option, the value and the range.
 
         """
-        if self.scene not in SCENES:
-            raise InputError(f"--scene {self.scene}: no such scene, expected one of {', '.join(SCENES)}.")
-        if self.layout not in LAYOUTS:
-            raise InputError(f"--layout {self.layout}: no such layout, expected one of {', '.join(LAYOUTS)}.")
-        if self.body not in BODIES:
-            raise InputError(f"--body {self.body}: no such body, expected one of {', '.join(BODIES)}.")
+        for name, choices in (("scene", SceneName), ("layout", LayoutName), ("body", BodyName)):
+            if (given := getattr(self, name)) not in get_args(choices):
+                expected = ", ".join(get_args(choices))
+                raise InputError(f"--{name} {given}: no such {name}, expected one of {expected}.")
         if self.frames < 1:
             raise InputError(f"--frames {self.frames}: expected at least 1.")
         if not _SIZE_RANGE_PX[0] <= self.size <= _SIZE_RANGE_PX[1]:

@@ -27,6 +27,7 @@ from edge_depth_nerf.synthetic.materials import (
     TRANSLUCENCY,
     Material,
     Noise,
+    read_map,
     reflectance,
 )
 from edge_depth_nerf.synthetic.motion import Mover
@@ -60,7 +61,9 @@ class Caster:
     def __init__(self, geometry: Geometry) -> None:
         self.geometry = geometry
         self.flat_normals = flat_normals(geometry.corners)
-        self.reach_m = _reach_m(geometry)
+        from_middle = geometry.corners.reshape(-1, 3) - (0.0, 0.0, 0.8)
+        self.reach_m = max(3.0, float(np.linalg.norm(from_middle, axis=-1).max()))
+        """Radius of a ball about a point 0.8 m above the ground that holds all of it; a car's is 3 m."""
         faces = np.arange(3 * len(geometry.corners), dtype=np.int32).reshape(-1, 3)
         self._scene = EmbreeScene()
         # embree's wrapper swallows what is raised while it builds, Ctrl-C included
@@ -121,7 +124,7 @@ class World:
         thing = np.where(triangle >= 0, _STATIC, _NOTHING).astype(np.int32)
         times = np.broadcast_to(np.asarray(time_s, np.float64), (len(origins),))
         for number, (mover, caster) in enumerate(self._movers, start=1):
-            near, its_origins, its_directions, _ = _in_frame_of(mover, caster.reach_m, times, origins, directions)
+            near, its_origins, its_directions = _in_frame_of(mover, caster.reach_m, times, origins, directions)
             its_distance, its_triangle, its_barycentric = caster.first_hits(its_origins, its_directions)
             closer = its_distance < distance[near]
             rows = near[closer]
@@ -134,7 +137,7 @@ class World:
         reach = np.broadcast_to(np.asarray(reach_m, np.float32), (len(origins),))
         times = np.full(len(origins), time_s)
         for mover, caster in self._movers:
-            near, its_origins, its_directions, _ = _in_frame_of(mover, caster.reach_m, times, origins, directions)
+            near, its_origins, its_directions = _in_frame_of(mover, caster.reach_m, times, origins, directions)
             free[near] &= ~caster.blocked(its_origins, its_directions, reach[near])
         return free
 
@@ -160,11 +163,8 @@ class World:
             material[own], tint[own] = geometry.material[triangle], geometry.tint[triangle]
             if number != _STATIC:
                 cos, sin, shift = _pose_of(self._movers[number - 1][0], time_s[rows[own]])
-                local = _rotated_by(local - shift, cos, -sin)
-                ray_local = _rotated_by(ray, cos, -sin)
-            else:
-                ray_local = ray
-            slant = np.abs(np.sum(ray_local * flat_own, -1))
+                local, ray = _rotated_by(local - shift, cos, -sin), _rotated_by(ray, cos, -sin)
+            slant = np.abs(np.sum(ray * flat_own, -1))
             footprint = distance[own, 0] * pixel_rad / np.sqrt(np.maximum(slant, 0.02)) + np.float32(1e-5)
             colour[own] = reflectance(self._noise, material[own], tint[own], local, flat_own, footprint)
             if number != _STATIC:
@@ -284,27 +284,21 @@ def _pose_of(mover: Mover, times: NDArray[np.float64]) -> tuple[Array, Array, Ar
     """Cosine and sine of the heading (N) and the position (N×3) at N times."""
     moments, which = np.unique(times, return_inverse=True)
     place, heading = mover.at(moments)
-    shift = np.column_stack((place, np.full(len(moments), float(mover.ground_m)))).astype(np.float32)
-    return np.cos(heading).astype(np.float32)[which], np.sin(heading).astype(np.float32)[which], shift[which]
-
-
-def _reach_m(geometry: Geometry) -> float:
-    """Radius of a ball about a point 0.8 m above the ground that holds a thing; a car's is 3 m."""
-    from_middle = geometry.corners.reshape(-1, 3) - (0.0, 0.0, 0.8)
-    return max(3.0, float(np.linalg.norm(from_middle, axis=-1).max()))
+    shift = np.column_stack((place, np.full(len(moments), float(mover.ground_m))))
+    return _f32(np.cos(heading))[which], _f32(np.sin(heading))[which], _f32(shift)[which]
 
 
 def _in_frame_of(
     mover: Mover, reach_m: float, times: NDArray[np.float64], origins: Array, directions: Array
-) -> tuple[NDArray[np.int64], Array, Array, Array]:
-    """Rays that pass near a thing, in its frame at each ray's own time: their rows, origins, directions, shifts."""
+) -> tuple[NDArray[np.int64], Array, Array]:
+    """Rays that pass near a thing, in its frame at each ray's own time: their rows, origins and directions."""
     cos, sin, shift = _pose_of(mover, times)
     apart = shift + _f32((0, 0, 0.8)) - origins
     along = np.sum(apart * directions, -1)
     off = np.sum(apart * apart, -1) - along * along
     near = np.flatnonzero((off < reach_m**2) & (along > -reach_m))
     cos, sin, shift = cos[near], sin[near], shift[near]
-    return near, _rotated_by(origins[near] - shift, cos, -sin), _rotated_by(directions[near], cos, -sin), shift
+    return near, _rotated_by(origins[near] - shift, cos, -sin), _rotated_by(directions[near], cos, -sin)
 
 
 class _GroundLight:
@@ -335,21 +329,9 @@ class _GroundLight:
         foot = 1 - 0.30 * np.exp(-np.maximum(position[:, 2], 0) / 0.5)
         level = np.flatnonzero((normal[:, 2] > 0.7) & (position[:, 2] < 0.35))
         factor = np.where(normal[:, 2] > 0.7, 1.0, foot).astype(np.float32)
-        if self._map is not None and len(level):
-            at = ((position[level, :2] - self._low) / self._cell_m - 0.5).astype(np.float32)
-            seen = np.empty(len(level), np.float32)
-            step = 30000
-            for first in range(0, len(level), step):
-                part = at[first : first + step]
-                seen[first : first + step] = cv2.remap(
-                    self._map,
-                    part[:, 0].copy(),
-                    part[:, 1].copy(),
-                    cv2.INTER_LINEAR,
-                    borderMode=cv2.BORDER_CONSTANT,
-                    borderValue=(1.0,),
-                ).reshape(-1)
-            factor[level] = seen
+        if self._map is not None:
+            x, y = ((position[level, :2] - self._low) / self._cell_m - 0.5).astype(np.float32).T
+            factor[level] = read_map(self._map, x, y, cv2.BORDER_CONSTANT)
         return factor
 
 
@@ -380,12 +362,8 @@ class FisheyeCamera:
     ) -> None:
         """Prepare rays and the own car's picture.
 
-        Args:
-            camera: the camera.
-            own_car: a world that holds the own car alone, origin on the road below the pose's origin.
-            camera_to_ground: 4×4, from the camera to that world.
-            lens_theta_deg: half of the lens's field of view.
-
+        `own_car` is a world that holds the own car alone, its origin on the road below the pose's, and
+        `camera_to_ground` (4×4) leads from the camera to it; `lens_theta_deg` is half of the lens's field of view.
         """
         lens_theta_rad = float(np.deg2rad(lens_theta_deg))
         rim_theta_rad = np.deg2rad(lens_theta_deg + _RIM_WIDTH_DEG)
@@ -407,19 +385,16 @@ class FisheyeCamera:
         along_y, along_x = (slope.reshape(-1, 3)[self._pixels] for slope in np.gradient(grid, axis=(0, 1)))
         fine = np.stack([grid.reshape(-1, 3)[self._pixels] + x * along_x + y * along_y for x, y in _SUBSAMPLES], 1)
         self._fine_rays = (fine / np.linalg.norm(fine, axis=-1, keepdims=True)).astype(np.float32)
-        rotation, origin = camera_to_ground[:3, :3].T.astype(np.float32), camera_to_ground[:3, 3].astype(np.float32)
         self._own_hit = np.zeros(self._fine_rays.shape[:2], bool)
         self._own_radiance = np.zeros(self._fine_rays.shape, np.float32)
         for part in self._chunks():
-            directions = np.ascontiguousarray(self._fine_rays[part].reshape(-1, 3) @ rotation)
-            origins = np.tile(origin, (len(directions), 1))
+            origins, directions = _rays_from(camera_to_ground, self._fine_rays[part].reshape(-1, 3))
             hits = own_car.trace(origins, directions, 0.0)
             colour = own_car.radiance(origins, directions, hits, 0.0, self.pixel_rad / 2)
             self._own_hit[part] = np.isfinite(hits.distance_m).reshape(-1, len(_SUBSAMPLES))
             self._own_radiance[part] = colour.reshape(-1, len(_SUBSAMPLES), 3)
-        directions = np.ascontiguousarray(self._centre_rays @ rotation)
-        own_hits = own_car.trace(np.tile(origin, (len(directions), 1)), directions, 0.0)
-        own_distance = np.where(np.isfinite(own_hits.distance_m), own_hits.distance_m, 0)
+        own_m = own_car.trace(*_rays_from(camera_to_ground, self._centre_rays), 0.0).distance_m
+        own_distance = np.where(np.isfinite(own_m), own_m, 0)
         self.own_distance_m = self._spread(own_distance.astype(np.float32))
         """H×W, distance of the own car at pixel centres, 0 elsewhere."""
         own = self._own_hit.any(-1) | (own_distance > 0)
@@ -438,28 +413,31 @@ class FisheyeCamera:
         self, world: World, camera_to_world: NDArray[np.float64], time_s: float, with_own_car: bool = True
     ) -> RenderedView:
         """Render the world from a 4×4 camera pose."""
-        rotation, origin = camera_to_world[:3, :3].T.astype(np.float32), camera_to_world[:3, 3].astype(np.float32)
         count = len(self._pixels)
         colour, distance = np.empty((count, 3), np.float32), np.empty(count, np.float32)
         moving = np.zeros(count, bool)
         for part in self._chunks():
             own = self._own_hit[part] if with_own_car else np.zeros_like(self._own_hit[part])
             samples = self._own_radiance[part].copy()
-            directions = np.ascontiguousarray(self._fine_rays[part][~own] @ rotation)
-            origins = np.tile(origin, (len(directions), 1))
+            origins, directions = _rays_from(camera_to_world, self._fine_rays[part][~own])
             hits = world.trace(origins, directions, time_s)
             samples[~own] = world.radiance(origins, directions, hits, time_s, self.pixel_rad / 2)
             colour[part] = samples.mean(1)
             things = np.full(own.shape, _NOTHING, np.int32)
             things[~own] = hits.thing
             moving[part] = (things > _STATIC).any(-1)
-            directions = np.ascontiguousarray(self._centre_rays[part] @ rotation)
-            hits = world.trace(np.tile(origin, (len(directions), 1)), directions, time_s)
-            distance[part] = np.where(np.isfinite(hits.distance_m), hits.distance_m, 0)
+            seen_m = world.trace(*_rays_from(camera_to_world, self._centre_rays[part]), time_s).distance_m
+            distance[part] = np.where(np.isfinite(seen_m), seen_m, 0)
         colour *= self._transmission
         distance = self._spread(distance)
         keep = self.lens & ~self.own_car if with_own_car else self.lens
         return RenderedView(self._spread(colour), np.where(keep, distance, 0), self._spread(moving))
+
+
+def _rays_from(camera_to_world: NDArray[np.float64], rays: Array) -> tuple[Array, Array]:
+    """Origins and directions in the world of a camera's rays, N×3."""
+    directions = np.ascontiguousarray(rays @ _f32(camera_to_world[:3, :3].T))
+    return np.tile(_f32(camera_to_world[:3, 3]), (len(directions), 1)), directions
 
 
 def own_car_world(model: SceneModel, seed: int, body: BodyName = "grey") -> World:

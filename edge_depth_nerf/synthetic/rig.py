@@ -11,6 +11,7 @@ the fisheye cameras are then 2.0 m and the Velodyne 1.77 m above the road.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -49,30 +50,35 @@ _CAM0_TO_VELO = (
     "-0.01162548558 -0.9960641394 -0.08786966659 -0.1770225824"
 )
 
-_MEI = {
-    "image_02": {
-        "xi": 2.2134047507854890e00,
-        "k1": 1.6798235660113681e-02,
-        "k2": 1.6548773243373522e00,
-        "p1": 4.2223943394772046e-04,
-        "p2": 4.2462134260997584e-04,
-        "gamma1": 1.3363220825849971e03,
-        "gamma2": 1.3357883350012958e03,
-        "u0": 7.1694323510126321e02,
-        "v0": 7.0576498308221585e02,
-    },
-    "image_03": {
-        "xi": 2.5535139132482758e00,
-        "k1": 4.9370396274089505e-02,
-        "k2": 4.5068455478645308e00,
-        "p1": 1.3477698472982495e-03,
-        "p2": -7.0340482615055284e-04,
-        "gamma1": 1.4854388981875156e03,
-        "gamma2": 1.4849477411748708e03,
-        "u0": 6.9888316784030962e02,
-        "v0": 6.9814541887723055e02,
-    },
+_FULL_SIZE = {
+    "image_02": MEI(
+        width=FULL_SIZE_PX,
+        height=FULL_SIZE_PX,
+        fx=1.3363220825849971e03,
+        fy=1.3357883350012958e03,
+        cx=7.1694323510126321e02 + 0.5,
+        cy=7.0576498308221585e02 + 0.5,
+        xi=2.2134047507854890e00,
+        k1=1.6798235660113681e-02,
+        k2=1.6548773243373522e00,
+        p1=4.2223943394772046e-04,
+        p2=4.2462134260997584e-04,
+    ),
+    "image_03": MEI(
+        width=FULL_SIZE_PX,
+        height=FULL_SIZE_PX,
+        fx=1.4854388981875156e03,
+        fy=1.4849477411748708e03,
+        cx=6.9888316784030962e02 + 0.5,
+        cy=6.9814541887723055e02 + 0.5,
+        xi=2.5535139132482758e00,
+        k1=4.9370396274089505e-02,
+        k2=4.5068455478645308e00,
+        p1=1.3477698472982495e-03,
+        p2=-7.0340482615055284e-04,
+    ),
 }
+"""KITTI-360 counts integer pixel centres, hence the halves."""
 
 
 def _matrix(numbers: str) -> NDArray[np.float64]:
@@ -89,22 +95,9 @@ VELO_TO_POSE = CAMERA_TO_POSE["image_00"] @ np.linalg.inv(_matrix(_CAM0_TO_VELO)
 
 def camera(name: str, size_px: int) -> MEI:
     """The MEI camera `name` for pictures of `size_px`×`size_px`, pixel centres at +0.5."""
-    full = _MEI[name]
-    scale = size_px / FULL_SIZE_PX
-    return MEI(
-        width=size_px,
-        height=size_px,
-        fx=full["gamma1"] * scale,
-        fy=full["gamma2"] * scale,
-        # KITTI-360 counts integer pixel centres
-        cx=(full["u0"] + 0.5) * scale,
-        cy=(full["v0"] + 0.5) * scale,
-        xi=full["xi"],
-        k1=full["k1"],
-        k2=full["k2"],
-        p1=full["p1"],
-        p2=full["p2"],
-    )
+    full, scale = _FULL_SIZE[name], size_px / FULL_SIZE_PX
+    focal_and_centre = {key: getattr(full, key) * scale for key in ("fx", "fy", "cx", "cy")}
+    return replace(full, width=size_px, height=size_px, **focal_and_centre)
 
 
 def write_calibration(folder: Path, size_px: int) -> None:

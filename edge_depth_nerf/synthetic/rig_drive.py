@@ -54,9 +54,12 @@ def looking(yaw_deg: float, pitch_deg: float, position_m: tuple[float, float, fl
     yaw, pitch = math.radians(yaw_deg), math.radians(pitch_deg)
     forward = np.array([math.cos(yaw) * math.cos(pitch), math.sin(yaw) * math.cos(pitch), -math.sin(pitch)])
     right = np.array([math.sin(yaw), -math.cos(yaw), 0.0])
+    return _transform(np.stack((right, np.cross(forward, right), forward), -1), position_m)
+
+
+def _transform(rotation: NDArray[np.float64], translation_m: tuple[float, float, float]) -> NDArray[np.float64]:
     transform = np.eye(4)
-    transform[:3, :3] = np.stack((right, np.cross(forward, right), forward), -1)
-    transform[:3, 3] = position_m
+    transform[:3, :3], transform[:3, 3] = rotation, translation_m
     return transform
 
 
@@ -102,10 +105,7 @@ def _filled(camera: Camera, theta_deg: float) -> Camera:
 
 def _scanner_to_vehicle(yaw_deg: float, position_m: tuple[float, float, float]) -> NDArray[np.float64]:
     """Scanner to vehicle, 4×4."""
-    transform = np.eye(4)
-    transform[:3, :3] = Rotation.from_euler("z", yaw_deg, degrees=True).as_matrix()
-    transform[:3, 3] = position_m
-    return transform
+    return _transform(Rotation.from_euler("z", yaw_deg, degrees=True).as_matrix(), position_m)
 
 
 class _RigFileLayout(DriveLayout):
@@ -138,11 +138,7 @@ class _RigFileLayout(DriveLayout):
             numbers = " ".join(f"{value:.9f}" for value in (*position, *quaternion))
             lines.append(f"{self.first_s + time_s:.6f} {numbers}\n")
         write_text(self.root / "poses.txt", "# time x y z qx qy qz qw\n" + "".join(lines))
-        self.write_times()
         write_text(self.last_file, self.description())
-
-    def write_times(self) -> None:
-        """Write when the pictures were taken, if the layout has it."""
 
 
 class _Rig(_RigFileLayout):
@@ -154,10 +150,7 @@ class _Rig(_RigFileLayout):
 
     def __init__(self, options: SynthesizeOptions) -> None:
         super().__init__(options, rig_cameras(options.size))
-
-    @property
-    def last_file(self) -> Path:
-        return self.root / "rig.toml"
+        self.last_file = self.root / "rig.toml"
 
     def picture(self, name: str, frame: int) -> Path:
         return self.root / "images" / name / f"{frame:06d}.png"
@@ -179,11 +172,12 @@ class _Rig(_RigFileLayout):
         )
         return header.encode() + points.tobytes()
 
-    def write_times(self) -> None:
+    def write_once(self) -> None:
         for name, mounted in self.cameras.items():
             moments_s = [frame * FRAME_INTERVAL_S + mounted.delay_s for frame in range(self.options.frames)]
             lines = "".join(f"{self.first_s + moment:.6f}\n" for moment in moments_s)
             write_text(self.root / f"times_{name}.txt", lines)
+        super().write_once()
 
     def description(self) -> str:
         text = '[poses]\nfile = "poses.txt"\nformat = "tum"\n'
@@ -219,19 +213,13 @@ class _JbnuDepth360(_RigFileLayout):
 
     def __init__(self, options: SynthesizeOptions) -> None:
         super().__init__(options, jbnu_cameras(options.size))
-
-    @property
-    def last_file(self) -> Path:
-        return self.root / "calibration.toml"
+        self.last_file = self.root / "calibration.toml"
 
     def picture(self, name: str, frame: int) -> Path:
         return self.root / "image" / name / f"{frame:06d}.png"
 
     def scan(self, frame: int) -> Path:
         return self.root / "bin" / f"{frame:06d}.bin"
-
-    def scan_bytes(self, taken: Sweep) -> bytes:
-        return taken.raw.astype("<f4").tobytes()
 
     def description(self) -> str:
         text = '[poses]\nfile = "poses.txt"\n'

@@ -18,7 +18,7 @@ from edge_depth_nerf.synthetic import objects
 from edge_depth_nerf.synthetic.geometry import Colour, Geometry, MeshBuilder, Pair, Real, Triple, placement
 from edge_depth_nerf.synthetic.materials import Material
 from edge_depth_nerf.synthetic.motion import FRAME_INTERVAL_S, Drive, Mover, Route, Turn, WindingRoute
-from edge_depth_nerf.synthetic.options import SceneName, SynthesizeOptions
+from edge_depth_nerf.synthetic.options import SynthesizeOptions
 from edge_depth_nerf.synthetic.traffic import traffic
 
 LANE_M = 3.5
@@ -96,6 +96,10 @@ def _rectangle(x: Pair, y: Pair) -> list[Pair]:
     return [(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]
 
 
+_POST = _rectangle((-0.14, 0.14), (-0.14, 0.14))
+"""Outline of what is as thin as a post."""
+
+
 def _car_outline(shape: objects.CarShape) -> list[Pair]:
     length, width = shape.length / 2 - 0.1, shape.width / 2 - 0.05
     return _rectangle((-length, length), (-width, width))
@@ -117,26 +121,21 @@ def _parked_row(site: _Site, x: Pair, facing_rad: Real, rng: Generator) -> None:
         at += shape.length + rng.uniform(0.6, 1.3)
 
 
-def _houses(site: _Site, x: Pair, rng: Generator, corner_first: bool) -> None:
+def _houses(site: _Site, x: Pair, rng: Generator, corner_first: bool = False) -> None:
     """A row of houses at the back of the pavement, with gaps, front gardens, hedges and walls."""
     at = x[0]
-    first = True
     while at < x[1]:
         width = rng.uniform(8, 13.5)
-        at_corner = first and corner_first
+        at_corner = at == x[0] and corner_first
         set_back = 0.0 if at_corner or rng.random() < 0.6 else rng.uniform(2.0, 3.5)
         depth = rng.uniform(9, 11) if not at_corner else 10.0
         shop = set_back == 0 and rng.random() < 0.35
         front = HOUSE_Y_M + set_back
-        site.put(
-            objects.house(width, depth, rng, shop),
-            placement(at, front, KERB_HEIGHT_M),
-            _rectangle((0, width), (0, depth)),
-        )
+        house = objects.house(width, depth, rng, shop)
+        site.put(house, placement(at, front, KERB_HEIGHT_M), _rectangle((0, width), (0, depth)))
         if set_back:
-            site.mesh.add_rectangle(
-                (at - 0.3, at + width + 0.3), (HOUSE_Y_M, front), KERB_HEIGHT_M + 0.015, Material.GRASS, _GRASS
-            )
+            garden = (at - 0.3, at + width + 0.3), (HOUSE_Y_M, front)
+            site.mesh.add_rectangle(*garden, KERB_HEIGHT_M + 0.015, Material.GRASS, _GRASS)
             if rng.random() < 0.6:
                 plant = objects.hedge(width - 3.0, rng.uniform(0.8, 1.3), rng)
                 site.put(plant, placement(at, HOUSE_Y_M + 0.35, KERB_HEIGHT_M), _rectangle((0, width - 3), (-0.3, 0.3)))
@@ -145,18 +144,15 @@ def _houses(site: _Site, x: Pair, rng: Generator, corner_first: bool) -> None:
                 centre = (at + size[0] / 2, HOUSE_Y_M + 0.15, KERB_HEIGHT_M + size[2] / 2)
                 site.mesh.add_box(centre, size, Material.BRICK, (0.36, 0.17, 0.11))
         for _ in range(int(rng.integers(0, 3))):
-            colour = ((0.05, 0.06, 0.06), (0.08, 0.18, 0.07), (0.45, 0.35, 0.02))[int(rng.integers(3))]
-            where = placement(
-                at + rng.uniform(0.5, width - 0.5), HOUSE_Y_M - 0.45, KERB_HEIGHT_M, rng.normal(1.57, 0.1)
-            )
+            colour = objects.choice(rng, ((0.05, 0.06, 0.06), (0.08, 0.18, 0.07), (0.45, 0.35, 0.02)))
+            along = at + rng.uniform(0.5, width - 0.5)
+            where = placement(along, HOUSE_Y_M - 0.45, KERB_HEIGHT_M, rng.normal(1.57, 0.1))
             site.put(objects.bin_on_wheels(colour), where, _rectangle((-0.28, 0.28), (-0.28, 0.28)))
         at += width
-        first = False
         if rng.random() < 0.3 and not at_corner:
             gap = rng.uniform(3, 7)
-            site.mesh.add_rectangle(
-                (at, at + gap), (HOUSE_Y_M, HOUSE_Y_M + 25), KERB_HEIGHT_M + 0.01, Material.GRASS, _GRASS
-            )
+            lawn = (at, at + gap), (HOUSE_Y_M, HOUSE_Y_M + 25)
+            site.mesh.add_rectangle(*lawn, KERB_HEIGHT_M + 0.01, Material.GRASS, _GRASS)
             hedge = objects.hedge(gap, rng.uniform(1.0, 1.8), rng)
             site.put(hedge, placement(at, HOUSE_Y_M + 0.5, KERB_HEIGHT_M), _rectangle((0, gap), (-0.3, 0.3)))
             small = objects.tree(rng.uniform(5, 8), rng, leaves=5000)
@@ -167,50 +163,42 @@ def _houses(site: _Site, x: Pair, rng: Generator, corner_first: bool) -> None:
 def _street_side(x: Pair, clear_m: Real, facing_rad: Real, rng: Generator, corner_first: bool = False) -> _Site:
     """One side of a street, y > 0, along x: parked cars, trees, lamps, signs, houses.
 
-    Args:
-        x: where the houses begin and end.
-        clear_m: length at the beginning without cars and trees (a junction).
-        facing_rad: heading of the parked cars.
-        rng: random choices.
-        corner_first: whether the first house stands at a corner.
-
+    The first `clear_m` are without cars and trees: a junction. `facing_rad` is the heading of the parked cars.
     """
     site = _Site()
     begin = x[0] + clear_m
     _parked_row(site, (begin, x[1]), facing_rad, rng)
     _houses(site, x, rng, corner_first)
-    edge = KERB_Y_M + 0.75
-    ground = KERB_HEIGHT_M
-    small = _rectangle((-0.14, 0.14), (-0.14, 0.14))
+    edge, ground = KERB_Y_M + 0.75, KERB_HEIGHT_M
     at = begin + rng.uniform(1, 6)
     while at < x[1]:
         trunk = placement(at, edge + rng.normal(0, 0.05), ground, rng.uniform(0, 6.28))
-        site.put(objects.tree(rng.uniform(6.5, 10.5), rng), trunk, small)
+        site.put(objects.tree(rng.uniform(6.5, 10.5), rng), trunk, _POST)
         bed = (at - 0.65, at + 0.65), (edge - 0.6, edge + 0.6)
         site.mesh.add_rectangle(*bed, ground + 0.004, Material.GRASS, (0.10, 0.09, 0.055))
         at += rng.uniform(8, 17)
     at = begin + rng.uniform(0, 8)
     while at < x[1]:
-        site.put(objects.street_lamp(), placement(at, KERB_Y_M + 0.45, ground), small)
+        site.put(objects.street_lamp(), placement(at, KERB_Y_M + 0.45, ground), _POST)
         at += rng.uniform(22, 28)
     at = begin - 0.5 * clear_m + rng.uniform(0, 4)
     while at < x[1]:
         kind = int(rng.integers(4))
         # signs face the traffic on their own side
         yaw = facing_rad + rng.normal(0, 0.08)
-        site.put(objects.road_sign(kind), placement(at, KERB_Y_M + 0.4, ground, yaw), small)
+        site.put(objects.road_sign(kind), placement(at, KERB_Y_M + 0.4, ground, yaw), _POST)
         at += rng.uniform(9, 20)
     at = begin + rng.uniform(0, 10)
     while at < x[1]:
         choice = rng.random()
         if choice < 0.4:
             for step in range(int(rng.integers(3, 6))):
-                site.put(objects.bollard(), placement(at + 1.5 * step, KERB_Y_M + 0.35, ground), small)
+                site.put(objects.bollard(), placement(at + 1.5 * step, KERB_Y_M + 0.35, ground), _POST)
         elif choice < 0.7:
             where = placement(at, HOUSE_Y_M - 0.3, ground)
             site.put(objects.cabinet(), where, _rectangle((-0.45, 0.45), (-0.17, 0.17)))
         else:
-            colour = ((0.06, 0.25, 0.1), (0.08, 0.15, 0.4), (0.45, 0.12, 0.05))[int(rng.integers(3))]
+            colour = objects.choice(rng, ((0.06, 0.25, 0.1), (0.08, 0.15, 0.4), (0.45, 0.12, 0.05)))
             site.put(objects.billboard(colour), placement(at, HOUSE_Y_M - 0.5, ground))
         at += rng.uniform(14, 28)
     mesh = site.mesh
@@ -241,20 +229,17 @@ def _road_details(mesh: MeshBuilder, x: Pair, rng: Generator) -> None:
 def _block(mesh: MeshBuilder, outline: NDArray[np.float64]) -> None:
     """A raised block of pavement with a kerb, from a convex counter-clockwise outline (N×2)."""
     following = np.roll(outline, -1, axis=0)
-    low, high = np.zeros(len(outline)), np.full(len(outline), KERB_HEIGHT_M)
-    for a, b in zip(np.column_stack((outline, low)), np.column_stack((following, low)), strict=True):
-        up = (0, 0, KERB_HEIGHT_M)
-        mesh.add_polygon([a, b, b + up, a + up], Material.STONE, _KERB)
-    mesh.add_polygon(np.column_stack((outline, high)), Material.PAVING, _PAVING)
+    for a, b in zip(outline, following, strict=True):
+        face = [(*a, 0.0), (*b, 0.0), (*b, KERB_HEIGHT_M), (*a, KERB_HEIGHT_M)]
+        mesh.add_polygon(face, Material.STONE, _KERB)
+    mesh.add_ground_polygon(outline, KERB_HEIGHT_M, Material.PAVING, _PAVING)
     # the kerb stones' tops: a strip along each edge, moved inwards along the mean of the edges' normals
     edge = following - outline
     inward = np.stack((-edge[:, 1], edge[:, 0]), -1) / np.linalg.norm(edge, axis=1, keepdims=True)
     joint = inward + np.roll(inward, 1, axis=0)
     joint = joint / np.sum(joint * inward, axis=1, keepdims=True) * 0.16
     inner = outline + joint
-    for i in range(len(outline)):
-        j = (i + 1) % len(outline)
-        strip = [outline[i], outline[j], inner[j], inner[i]]
+    for strip in zip(outline, following, np.roll(inner, -1, axis=0), inner, strict=True):
         mesh.add_ground_polygon(strip, KERB_HEIGHT_M + 0.002, Material.STONE, _KERB)
 
 
@@ -277,13 +262,10 @@ def _movers(
     route, cars drive by turns behind the recording car and ahead of it.
     """
     movers = []
-    speed = options.mean_speed_m_s
-    duration = options.frames * FRAME_INTERVAL_S
+    speed, duration = options.mean_speed_m_s, options.frames * FRAME_INTERVAL_S
     towards = (options.moving + 1) // 2
     for number in range(options.moving):
-        kind = str(rng.choice(["hatchback", "saloon", "estate"]))
-        colour = objects.CAR_COLOURS[int(rng.integers(len(objects.CAR_COLOURS)))]
-        geometry = objects.car(kind, colour)
+        geometry = objects.driven_car(rng)
         if number % 2 == 0 and oncoming is not None:
             meets_s = duration * (number // 2 + 0.5) / towards
             its_speed = speed * rng.uniform(0.9, 1.1)
@@ -313,9 +295,15 @@ def _driven_through(
     return SceneModel(site.mesh.build(), movers, lighting, site.contacts, drive, ground)
 
 
-def _street(options: SynthesizeOptions) -> SceneModel:
-    rng = np.random.default_rng([options.seed, 1])
-    length = options.mean_speed_m_s * options.frames * FRAME_INTERVAL_S
+def _end(site: _Site, reach: Real, rng: Generator) -> None:
+    """What closes the view along a road on the x axis: houses across it, and a belt of trees."""
+    far = _Site()
+    _houses(far, (-30.0, 26.0), rng)
+    site.put_site(far, placement(reach + 15, 0, 0, -np.pi / 2))
+    site.put(objects.thicket(2 * reach, 12.0, rng), placement(reach + 25, -reach, 0, np.pi / 2))
+
+
+def _street(options: SynthesizeOptions, length: Real, rng: Generator) -> SceneModel:
     x = (-60.0, length + 75.0)
     site = _Site()
     mesh = site.mesh
@@ -331,7 +319,7 @@ def _street(options: SynthesizeOptions) -> SceneModel:
         site.put(back, placement(x[0] - 40, side * 42.0))
     for end, yaw in ((x[0] - 40, np.pi / 2), (x[1] + 40, -np.pi / 2)):
         row = _Site()
-        _houses(row, (-30.0, 26.0), rng, corner_first=False)
+        _houses(row, (-30.0, 26.0), rng)
         site.put_site(row, placement(end, 0, 0, yaw))
     return _driven_through(options, site, _DAYLIGHT, Route((0.0, -1.75)), Route((0.0, 1.75), np.pi))
 
@@ -356,9 +344,7 @@ def _crossing(mesh: MeshBuilder, near: Real) -> None:
     mesh.add_rectangle((near + 3.7, near + 4.15), (0.1, LANE_M), 0.003, Material.MARKING, _LINE)
 
 
-def _turn(options: SynthesizeOptions) -> SceneModel:
-    rng = np.random.default_rng([options.seed, 1])
-    length = options.mean_speed_m_s * options.frames * FRAME_INTERVAL_S
+def _turn(options: SynthesizeOptions, length: Real, rng: Generator) -> SceneModel:
     straight = 15.0
     route = Route((0.0, -1.75), turn_rad=-np.pi / 2, turn_at_m=straight)
     # a drive too short for all of it has the turn in its middle
@@ -369,8 +355,7 @@ def _turn(options: SynthesizeOptions) -> SceneModel:
     mesh = site.mesh
     mesh.add_rectangle((-260, 320), (-320, 260), -0.01, Material.GRASS, _GRASS)
     reach = max(65.0, length + 45.0)
-    for half_x, half_y in ((reach + 60, KERB_Y_M), (KERB_Y_M, reach + 60)):
-        z = 0.0 if half_y == KERB_Y_M else -0.001
+    for half_x, half_y, z in ((reach + 60, KERB_Y_M, 0.0), (KERB_Y_M, reach + 60, -0.001)):
         mesh.add_rectangle((centre_x - half_x, centre_x + half_x), (-half_y, half_y), z, Material.ASPHALT, _ASPHALT)
     # the road's full width at the corners, where the kerb is round
     inner = KERB_Y_M + _CORNER_M
@@ -388,18 +373,12 @@ def _turn(options: SynthesizeOptions) -> SceneModel:
             angles = np.linspace(np.pi, 1.5 * np.pi, 9)
             arc = inner + _CORNER_M * np.column_stack((np.cos(angles), np.sin(angles)))
             if side > 0:
-                _block(
-                    local.mesh,
-                    np.concatenate((arc, [(reach + 60, KERB_Y_M), (reach + 60, reach + 60), (KERB_Y_M, reach + 60)])),
-                )
+                far = [(reach + 60, KERB_Y_M), (reach + 60, reach + 60), (KERB_Y_M, reach + 60)]
+                _block(local.mesh, np.concatenate((arc, far)))
             _traffic_light(local, inner + 3.4, side * (KERB_Y_M + 0.35), np.pi if side > 0 else 0.0)
         _crossing(local.mesh, inner + 0.3)
         _road_details(local.mesh, (inner + 4.5, reach), rng)
-        far = _Site()
-        _houses(far, (-30.0, 26.0), rng, corner_first=False)
-        local.put_site(far, placement(reach + 15, 0, 0, -np.pi / 2))
-        back = objects.thicket(2 * reach, 12.0, rng)
-        local.put(back, placement(reach + 25, -reach, 0, np.pi / 2))
+        _end(local, reach, rng)
         site.put_site(local, placement(centre_x, 0, 0, arm * np.pi / 2))
     return _driven_through(options, site, _DAYLIGHT, route, Route((0.0, 1.75), np.pi), start)
 
@@ -442,14 +421,13 @@ def _island(rng: Generator) -> _Site:
         for radius, height in ((6.2, 0.0), (5.6, 0.12), (4.4, 0.32), (2.8, 0.48), (1.2, 0.55), (0.05, 0.56))
     ]
     site.mesh.add_loft(np.array(rings), Material.GRASS, _GRASS, closed=False)
-    small = _rectangle((-0.14, 0.14), (-0.14, 0.14))
     first, trees = rng.uniform(0, 2 * np.pi), int(rng.integers(5, 7))
     for number in range(trees):
         # one in the middle, the others around it
         angle = first + 2 * np.pi * number / (trees - 1) + rng.normal(0, 0.12)
         away = 0.0 if number == 0 else rng.uniform(3.4, 4.4)
         where = placement(away * np.cos(angle), away * np.sin(angle), KERB_HEIGHT_M + 0.25, rng.uniform(0, 6.28))
-        site.put(objects.tree(rng.uniform(6.0, 9.5), rng, leaves=12000), where, small)
+        site.put(objects.tree(rng.uniform(6.0, 9.5), rng, leaves=12000), where, _POST)
     for number in range(7):
         angle, length = first + 0.4 + 2 * np.pi * number / 7 + rng.normal(0, 0.08), rng.uniform(1.2, 2.6)
         shrub = objects.hedge(length, rng.uniform(0.5, 0.9), rng)
@@ -509,7 +487,8 @@ def _ring_corner(reach: Real, rng: Generator) -> _Site:
         site.put(hedge, placement(x, y, KERB_HEIGHT_M, yaw), _rectangle((0, length), (-0.3, 0.3)))
     # its arm reaches over the road
     put(objects.street_lamp(), 13.6, 0.0, (0.1, 0.1))
-    put(objects.billboard((0.06, 0.25, 0.1)), 18.6, 0.5 * width - 1.6, (1.8, 0.1)) if rng.random() < 0.4 else None
+    if rng.random() < 0.4:
+        put(objects.billboard((0.06, 0.25, 0.1)), 18.6, 0.5 * width - 1.6, (1.8, 0.1))
     for step in range(int(rng.integers(2, 5))):
         put(objects.bollard(), 14.0, 1.2 + 1.2 * step, (0.06, 0.06))
     put(objects.cabinet(), 18.4, -rng.uniform(1.0, 3.0), (0.45, 0.17))
@@ -539,10 +518,9 @@ def _ring_arm(reach: Real, rng: Generator) -> _Site:
         site.put_site(row, placement(0, 0, mirror_y=side < 0))
     # an island between those who come and those who leave
     _block(mesh, np.array([(14.8, -0.55), (18.2, -0.3), (18.2, 0.3), (14.8, 0.55)]))
-    small = _rectangle((-0.14, 0.14), (-0.14, 0.14))
-    site.put(objects.road_sign(2), placement(17.8, 0.0, KERB_HEIGHT_M, np.pi), small)
-    site.put(objects.bollard(), placement(15.2, 0.0, KERB_HEIGHT_M), small)
-    site.put(objects.road_sign(1), placement(19.5, KERB_Y_M + 0.35, KERB_HEIGHT_M, np.pi), small)
+    site.put(objects.road_sign(2), placement(17.8, 0.0, KERB_HEIGHT_M, np.pi), _POST)
+    site.put(objects.bollard(), placement(15.2, 0.0, KERB_HEIGHT_M), _POST)
+    site.put(objects.road_sign(1), placement(19.5, KERB_Y_M + 0.35, KERB_HEIGHT_M, np.pi), _POST)
     _crossing(mesh, 19.0)
     _road_details(mesh, (begin - 2.0, reach), rng)
     # where those who come in give way: short bars across the mouth
@@ -550,24 +528,17 @@ def _ring_arm(reach: Real, rng: Generator) -> _Site:
         bar = [(r, a) for r, a in ((13.1, angle), (13.5, angle), (13.5, angle + 0.03), (13.1, angle + 0.03))]
         corners = [(r * np.cos(a), r * np.sin(a)) for r, a in bar]
         mesh.add_ground_polygon(corners, 0.003, Material.MARKING, _LINE)
-    far = _Site()
-    _houses(far, (-30.0, 26.0), rng, corner_first=False)
-    site.put_site(far, placement(reach + 15, 0, 0, -np.pi / 2))
-    site.put(objects.thicket(2 * reach, 12.0, rng), placement(reach + 25, -reach, 0, np.pi / 2))
+    _end(site, reach, rng)
     return site
 
 
-def _roundabout(options: SynthesizeOptions) -> SceneModel:
-    rng = np.random.default_rng([options.seed, 1])
-    length = options.mean_speed_m_s * options.frames * FRAME_INTERVAL_S
+def _roundabout(options: SynthesizeOptions, length: Real, rng: Generator) -> SceneModel:
     route, centre = roundabout_route()
     # a drive too short for all of it has its middle beside the island
     start = max(0.0, (route.ends_m[0] + route.ends_m[1] - length) / 2)
     reach = max(65.0, length + 45.0)
-    site = _Site()
-    mesh = site.mesh
-    mesh.add_rectangle((-260, 320), (-320, 260), -0.01, Material.GRASS, _GRASS)
-    middle = _Site()
+    site, middle = _Site(), _Site()
+    site.mesh.add_rectangle((-260, 320), (-320, 260), -0.01, Material.GRASS, _GRASS)
     for half_x, half_y, z in ((reach + 60, KERB_Y_M, 0.0), (KERB_Y_M, reach + 60, -0.001)):
         middle.mesh.add_rectangle((-half_x, half_x), (-half_y, half_y), z, Material.ASPHALT, _ASPHALT)
     middle.mesh.add_disc((0, 0, 0.0007), (0, 0, 1), 24.0, Material.ASPHALT, _ASPHALT, 48)
@@ -595,8 +566,8 @@ def _bays(site: _Site, x: Pair, front_y: Real, side: int, share: Real, rng: Gene
     y = (min(front_y, back_y), max(front_y, back_y))
     for start in np.arange(x[0], x[1] - _BAY_M + 0.01, _BAY_M):
         site.mesh.add_rectangle((start - 0.05, start + 0.05), y, 0.003, Material.MARKING, _LINE_COLOUR)
-        number = (start + 0.8, start + 1.7), tuple(sorted((front_y + side * 0.3, front_y + side * 0.7)))
-        site.mesh.add_rectangle(number[0], (number[1][0], number[1][1]), 0.003, Material.PRINT, (0.25, 0.24, 0.22))
+        low, high = sorted((front_y + side * 0.3, front_y + side * 0.7))
+        site.mesh.add_rectangle((start + 0.8, start + 1.7), (low, high), 0.003, Material.PRINT, (0.25, 0.24, 0.22))
         if rng.random() < share:
             geometry, shape = objects.random_car(rng)
             yaw = side * np.pi / 2 * (1 if rng.random() < 0.7 else -1) + rng.normal(0, 0.025)
@@ -617,9 +588,7 @@ def _pillar(site: _Site, x: Real, y: Real, number: int) -> None:
     site.contacts.append(np.array(_rectangle((x - half, x + half), (y - half, y + half))))
 
 
-def _parking(options: SynthesizeOptions) -> SceneModel:
-    rng = np.random.default_rng([options.seed, 1])
-    length = options.mean_speed_m_s * options.frames * FRAME_INTERVAL_S
+def _parking(options: SynthesizeOptions, length: Real, rng: Generator) -> SceneModel:
     bays = 7.5
     x0, x1 = -15.0, bays * np.ceil((length + 18.0) / bays)
     wall_left = _AISLE_HALF_M + _BAY_DEPTH_M + 0.2
@@ -632,33 +601,24 @@ def _parking(options: SynthesizeOptions) -> SceneModel:
     mesh.add_rectangle(*whole, _CEILING_M, Material.CONCRETE, (0.42, 0.41, 0.39))
     corners = [np.array(corner) for corner in _rectangle(*whole)]
     for a, b in zip(corners, [*corners[1:], corners[0]], strict=True):
-
-        def upright(low: Real, high: Real, inset: Real, kind: Material, tint: Colour, a=a, b=b) -> None:
-            inward = np.array([-(b - a)[1], (b - a)[0]]) / np.linalg.norm(b - a) * inset
-            points = [(*(a + inward), low), (*(b + inward), low), (*(b + inward), high), (*(a + inward), high)]
-            mesh.add_polygon(points, kind, tint)
-
-        upright(0.0, _CEILING_M, 0.0, Material.CONCRETE, (0.46, 0.45, 0.43))
-        upright(0.0, 1.1, 0.004, Material.PLASTER, (0.16, 0.27, 0.24))
-        upright(1.1, 1.2, 0.006, Material.PAINTED, (0.50, 0.38, 0.03))
-    for front, side, share in (
-        (_AISLE_HALF_M, 1, 0.62),
-        (-_AISLE_HALF_M, -1, 0.62),
-        (second + _AISLE_HALF_M, 1, 0.5),
-        (second - _AISLE_HALF_M, -1, 0.5),
-    ):
-        _bays(site, (x0, x1), front, side, share, rng)
+        inward = np.array([-(b - a)[1], (b - a)[0]]) / np.linalg.norm(b - a)
+        for low, high, inset, kind, tint in (
+            (0.0, _CEILING_M, 0.0, Material.CONCRETE, (0.46, 0.45, 0.43)),
+            (0.0, 1.1, 0.004, Material.PLASTER, (0.16, 0.27, 0.24)),
+            (1.1, 1.2, 0.006, Material.PAINTED, (0.50, 0.38, 0.03)),
+        ):
+            start, end = a + inward * inset, b + inward * inset
+            mesh.add_polygon([(*start, low), (*end, low), (*end, high), (*start, high)], kind, tint)
+    for middle, share in ((0.0, 0.62), (second, 0.5)):
+        for side in (1, -1):
+            _bays(site, (x0, x1), middle + side * _AISLE_HALF_M, side, share, rng)
     number = 0
     for x in np.arange(x0 + bays, x1 - 0.1, bays):
         for y in (3.9, -3.9, -_AISLE_HALF_M - _BAY_DEPTH_M, second + 3.9, second - 3.9):
             _pillar(site, x, y, number)
             number += 1
-        mesh.add_box(
-            (x, (wall_left + wall_right) / 2, _CEILING_M - 0.14),
-            (0.45, wall_left - wall_right, 0.28),
-            Material.CONCRETE,
-            (0.40, 0.39, 0.37),
-        )
+        beam = (x, (wall_left + wall_right) / 2, _CEILING_M - 0.14)
+        mesh.add_box(beam, (0.45, wall_left - wall_right, 0.28), Material.CONCRETE, (0.40, 0.39, 0.37))
     lamps = []
     for y in (0.0, second):
         for x in np.arange(x0 + bays / 4, x1, bays / 2):
@@ -697,5 +657,5 @@ _BUILDERS = {"street": _street, "traffic": _street, "turn": _turn, "parking": _p
 
 def build_scene(options: SynthesizeOptions) -> SceneModel:
     """Build the scene that the options name, as large as the drive needs; the same for the same options."""
-    name: SceneName = options.scene
-    return _BUILDERS[name](options)
+    length = options.mean_speed_m_s * options.frames * FRAME_INTERVAL_S
+    return _BUILDERS[options.scene](options, length, np.random.default_rng([options.seed, 1]))
