@@ -44,6 +44,17 @@ def view(camera: Camera, camera_to_world: np.ndarray) -> tuple[np.ndarray, np.nd
     return (colours * known[..., None]).astype(np.uint8), np.where(known, distance, 0), z
 
 
+def frame_entry(camera: Camera, camera_to_world: np.ndarray, name: str) -> dict[str, Any]:
+    """What transforms.json says of images/NAME; the pose is OpenCV's."""
+    return {
+        "file_path": f"images/{name}",
+        "transform_matrix": (camera_to_world @ FLIP).tolist(),
+        **{"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy},
+        **{"w": camera.width, "h": camera.height},
+        **{key: value for key, value in camera.to_dict().items() if key in ("k1", "k2", "k3", "k4", "p1", "p2")},
+    }
+
+
 def write_scene(
     folder: Path,
     cameras: list[Camera] | None = None,
@@ -68,13 +79,7 @@ def write_scene(
         colours, distance, _ = view(camera, pose)
         name = f"{index:04d}.png"
         write_png(folder / "images" / name, colours)
-        entry = {
-            "file_path": f"images/{name}",
-            "transform_matrix": (pose @ FLIP).tolist(),
-            **{"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy},
-            **{"w": camera.width, "h": camera.height},
-            **{key: value for key, value in camera.to_dict().items() if key in ("k1", "k2", "k3", "k4", "p1", "p2")},
-        }
+        entry = frame_entry(camera, pose, name)
         if mask:
             keep = np.ones(distance.shape, bool)
             keep[-5:] = False

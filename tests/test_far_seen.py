@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scenes import FLIP
+from scenes import frame_entry
 
 from edge_depth_nerf.base.files import write_distance_png, write_json, write_png
 from edge_depth_nerf.cameras import KannalaBrandt
@@ -63,15 +63,8 @@ def write_drive(folder: Path, extra_m: dict[int, np.ndarray] | None = None, top_
         pose = np.eye(4)
         pose[:3, :3] = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
         pose[:3, 3] = [0.0, position, EYE_M]
-        entries.append(
-            {
-                "file_path": f"images/{name}",
-                "transform_matrix": (pose @ FLIP).tolist(),
-                **{"fl_x": LENS.fx, "fl_y": LENS.fy, "cx": LENS.cx, "cy": LENS.cy, "w": LENS.width, "h": LENS.height},
-                **{"k1": 0.0, "k2": 0.0, "k3": 0.0, "k4": 0.0, "camera": "front", "frame": index},
-                **{"lidar_file_path": f"lidar/{name}", "depth_file_path": f"lidar/{name}"},
-            }
-        )
+        lidar = {"lidar_file_path": f"lidar/{name}", "depth_file_path": f"lidar/{name}"}
+        entries.append({**frame_entry(LENS, pose, name), "camera": "front", "frame": index, **lidar})
     names = [entry["file_path"] for entry in entries]
     meta = {"camera_model": "OPENCV_FISHEYE", "depth_unit_scale_factor": 1 / 256, "theta_max_deg": 85.0}
     split = {"train_filenames": names, "val_filenames": [], "test_filenames": []}
@@ -127,9 +120,8 @@ def test_own_returns_come_first_in_examples(tmp_path):
     scene = write_drive(tmp_path)
     heights = [{"front": EYE_M}]
     alone = load_examples([scene], [scene.pictures[:2]], heights, 60, 4)
-    both = load_examples(
-        [scene], [scene.pictures[:2]], heights, 60, 4, far_seen=[lambda picture, size: np.full(size[::-1], 7.0, "f4")]
-    )
+    seven = [lambda picture, size: np.full(size[::-1], 7.0, "f4")]
+    both = load_examples([scene], [scene.pictures[:2]], heights, 60, 4, far_seen=seven)
     has = alone.lidar_m > 0
     assert 0.1 < has.mean() < 0.9
     np.testing.assert_array_equal(both.lidar_m[has], alone.lidar_m[has])
@@ -171,9 +163,8 @@ def test_a_drive_far_away_changes_nothing(tmp_path):
     assert len(alone.spacing_m) == here.sum() == (~here).sum()
     size = (LENS.width, LENS.height)
     for picture in scene.pictures:
-        np.testing.assert_array_equal(
-            seen_above(both, scene, picture, size), seen_above(alone, scene, picture, size), strict=True
-        )
+        of_both, of_one = (seen_above(cloud, scene, picture, size) for cloud in (both, alone))
+        np.testing.assert_array_equal(of_both, of_one, strict=True)
 
 
 def test_the_work_grows_with_the_length_of_the_drive(tmp_path, monkeypatch):

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scenes import FLIP, RADIUS_M, fisheye, pinhole, write_scene
+from scenes import FLIP, fisheye, pinhole, view, write_scene
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_json, write_distance_png, write_json, write_png
@@ -27,12 +27,10 @@ LENS = fisheye(48, 44)
 
 def true_distance(picture: ScenePicture) -> tuple[np.ndarray, np.ndarray]:
     """Distance inside the ball, and the cosine of each ray to the axis, in float64; 0 outside the lens."""
-    directions, valid = picture.lens.unproject(picture.lens.pixel_centres())
-    rays = np.where(valid.numpy()[..., None], np.nan_to_num(directions.numpy()), 0)
-    world = rays @ (picture.rotation @ FLIP[:3, :3]).T
-    along = world @ picture.position_m
-    distance = -along + np.sqrt(along**2 + RADIUS_M**2 - picture.position_m @ picture.position_m)
-    return np.where(valid.numpy(), distance, 0), rays[..., 2]
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = picture.rotation @ FLIP[:3, :3], picture.position_m
+    _, distance, cosine = view(picture.lens, pose)
+    return distance, cosine
 
 
 def write_maps(scene: Path, folder: Path, make: Any, suffix: str = ".npy", metres_per_count: float = 1 / 256) -> Path:
@@ -76,9 +74,8 @@ def test_metric_distances_are_taken_as_they_are(scene, tmp_path, dtype):
     take(scene, maps)
     assert error(scene).max() < 2e-3
     meta = read_json(scene / "transforms.json")
-    assert meta["mono"] == {
-        **{"kind": "files", "trained_on": "elsewhere", "folder": "maps", "output": "metric", "along": "ray"}
-    }
+    source = {"kind": "files", "trained_on": "elsewhere", "folder": "maps", "output": "metric", "along": "ray"}
+    assert meta["mono"] == source
     assert (scene / "mono_trust.json").is_file()
     for entry, old in zip(meta["frames"], before["frames"], strict=True):
         assert entry.pop("mono_file_path").startswith("mono/images/")
@@ -274,15 +271,17 @@ def test_broken_pngs_are_named_before_any_work(scene, tmp_path):
     maps = write_maps(scene, tmp_path / "maps", lambda p, d, c: d, ".png")
     path = maps / "images/0003.png"
     whole = path.read_bytes()
+
+    def is_refused(expected: str) -> None:
+        with pytest.raises(InputError, match=f"0003.png: {expected}"):
+            take(scene, maps, metres_per_count=1 / 256)
+
     write_png(path, np.zeros((44, 48), np.uint8))
-    with pytest.raises(InputError, match=r"0003.png: 8-bit grey, expected a 16-bit grey PNG"):
-        take(scene, maps, metres_per_count=1 / 256)
+    is_refused("8-bit grey, expected a 16-bit grey PNG")
     write_png(path, np.ones((22, 24), np.uint16))
-    with pytest.raises(InputError, match=r"0003.png: is 24×22 .width × height., its picture images/0003.png 48×44"):
-        take(scene, maps, metres_per_count=1 / 256)
+    is_refused("is 24×22 .width × height., its picture images/0003.png 48×44")
     path.write_bytes(whole[:-30])
-    with pytest.raises(InputError, match=r"0003.png: truncated"):
-        take(scene, maps, metres_per_count=1 / 256)
+    is_refused("truncated")
 
 
 def test_missing_and_double_maps_are_named(scene, tmp_path):
@@ -298,11 +297,17 @@ def test_missing_and_double_maps_are_named(scene, tmp_path):
         take(scene, tmp_path / "nowhere")
 
 
+METRIC_Z = {"maps": Path("m"), "maps_kind": "metric", "maps_along": "z"}
+
+
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
         ({"hf": "x", "maps": Path("m")}, "--hf and --maps: expected one source"),
-        ({"hf": "x", "train_steps": 5, "seed": 1}, "--train-steps, --seed: for a network of our own, .* from --hf"),
+        (
+            {"hf": "x", "train_steps": 5, "seconds": 1.0},
+            "--train-steps, --seconds: for a network of our own, .* from --hf",
+        ),
         ({"hf": "x", "model": Path("w.safetensors")}, "--model: for a network of our own"),
         ({"hf": "x", "preset": "full"}, "--preset: for a network of our own"),
         ({"hf_output": "metric"}, "--hf-output: for --hf, but the maps come from a network of our own"),
@@ -311,14 +316,8 @@ def test_missing_and_double_maps_are_named(scene, tmp_path):
         ({"maps": Path("m")}, "describe its values with --maps-kind"),
         ({"maps": Path("m"), "maps_kind": "metric"}, "--maps-along ray or z"),
         ({"maps": Path("m"), "seconds": 3.0}, "--seconds: for a network of our own, but the maps come from --maps"),
-        (
-            {"maps": Path("m"), "maps_kind": "metric", "maps_along": "z", "metres_per_count": -1.0},
-            "--metres-per-count -1: expected more than 0",
-        ),
-        (
-            {"maps": Path("m"), "maps_kind": "metric", "maps_along": "z", "scenes": (Path("a"), Path("b"))},
-            "contains the maps of one scene, but 2 scenes are given",
-        ),
+        ({**METRIC_Z, "metres_per_count": -1.0}, "--metres-per-count -1: expected more than 0"),
+        ({**METRIC_Z, "scenes": (Path("a"), Path("b"))}, "contains the maps of one scene, but 2 scenes are given"),
     ],
 )
 def test_options_that_do_not_go_together(options, expected):

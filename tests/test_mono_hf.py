@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -14,11 +15,11 @@ from scenes import FLIP, RADIUS_M, fisheye, pinhole, write_scene
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, write_distance_png, write_json
-from edge_depth_nerf.cameras import Camera, KannalaBrandt
+from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.entry import main
 from edge_depth_nerf.mono.elsewhere import FittedMaps
 from edge_depth_nerf.mono.estimate import estimate_depth
-from edge_depth_nerf.mono.examples import lens_rays
+from edge_depth_nerf.mono.examples import scaled_lens
 from edge_depth_nerf.mono.hf import load_ready_network, view_layers
 from edge_depth_nerf.mono.options import EstimateDepthOptions
 from edge_depth_nerf.mono.pinhole_views import PinholeView, pinhole_views
@@ -30,33 +31,27 @@ pytestmark = pytest.mark.slow
 THETA_MAX = np.radians(95.0)
 
 
-def shrunk(lens: KannalaBrandt, side_px: int) -> KannalaBrandt:
-    """The same lens at another resolution."""
-    scale = side_px / lens.width
-    parts = {name: getattr(lens, name) * scale for name in ("fx", "fy", "cx", "cy")}
-    distortion = {name: getattr(lens, name) for name in ("k1", "k2", "k3", "k4", "p1", "p2")}
-    return KannalaBrandt(side_px, side_px, **parts, **distortion)
-
-
-LENS = shrunk(FISHEYE, 200)
-
-
-def size_of(lens: Camera) -> tuple[int, int]:
-    return lens.width, lens.height
+LENS = scaled_lens(FISHEYE, (200, 200))
+WITHIN, RAYS = rays(LENS, THETA_MAX).within, rays(LENS, THETA_MAX).directions
 
 
 def view_rays(view: PinholeView) -> np.ndarray:
     """Unit rays of a view's pixel centres in the camera, written out."""
     x, y = np.meshgrid(np.arange(view.width) + 0.5 - view.width / 2, np.arange(view.height) + 0.5 - view.height / 2)
-    rays = np.stack([x / view.focal_px, y / view.focal_px, np.ones_like(x)], -1)
-    return rays / np.linalg.norm(rays, axis=-1, keepdims=True) @ view.view_to_camera.T
+    found = np.stack([x / view.focal_px, y / view.focal_px, np.ones_like(x)], -1)
+    return found / np.linalg.norm(found, axis=-1, keepdims=True) @ view.view_to_camera.T
 
 
-def in_a_room(rays: np.ndarray) -> np.ndarray:
+def in_a_room(along: np.ndarray) -> np.ndarray:
     """Distance to the nearest of six walls: -4 and 9 m in x, -3.5 and 1.6 m in y, -12 and 20 m in z."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        to_low, to_high = np.array([-4.0, -3.5, -12.0]) / rays, np.array([9.0, 1.6, 20.0]) / rays
-    return np.where(rays > 0, to_high, np.where(rays < 0, to_low, np.inf)).min(-1)
+        to_low, to_high = np.array([-4.0, -3.5, -12.0]) / along, np.array([9.0, 1.6, 20.0]) / along
+    return np.where(along > 0, to_high, np.where(along < 0, to_low, np.inf)).min(-1)
+
+
+def layer_of(view: PinholeView, said: np.ndarray) -> Layer:
+    """What a view says."""
+    return Layer(view.box, view.back(said.astype(np.float32)), view.cosine, view.weight)
 
 
 @pytest.mark.parametrize(
@@ -73,8 +68,7 @@ def test_the_views_see_every_pixel_of_the_lens(lens, theta_deg, count):
     theta_max = np.radians(theta_deg)
     views = pinhole_views(lens, theta_max)
     directions, valid = lens.unproject(lens.pixel_centres())
-    rays = torch.nan_to_num(directions).numpy()
-    within = valid.numpy() & (rays[..., 2] >= np.cos(theta_max))
+    within = valid.numpy() & (torch.nan_to_num(directions[..., 2]).numpy() >= np.cos(theta_max))
     weight = np.zeros(within.shape)
     for view in views:
         np.maximum(weight[view.box], view.weight, out=weight[view.box])
@@ -100,9 +94,8 @@ def test_neighbouring_views_overlap():
 
 
 def test_a_view_shows_upright_what_lies_along_its_rays():
-    rays, within = lens_rays(LENS, THETA_MAX, size_of(LENS))
     # colours say where a ray goes
-    picture = np.where(within[..., None], np.rint(127.5 + 127.5 * rays), 0).astype(np.uint8)
+    picture = np.where(WITHIN[..., None], np.rint(127.5 + 127.5 * RAYS), 0).astype(np.uint8)
     views = pinhole_views(LENS, THETA_MAX)
     assert len(views) == 7
     for view in views:
@@ -119,20 +112,15 @@ def test_a_view_shows_upright_what_lies_along_its_rays():
         assert np.linalg.det(view.view_to_camera) == pytest.approx(1)
 
 
-def lidar_of(truth: np.ndarray, rays: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A tenth of the pixels between 25° below and 3° above the horizon."""
-    elevation = np.degrees(np.arcsin(-rays[..., 1]))
-    hit = (rng.random(truth.shape) < 0.1) & (elevation > -25) & (elevation < 3)
-    return np.where(hit, truth, 0).astype(np.float32)
-
-
 @pytest.mark.parametrize("kind", ["metric", "relative", "inverse"])
 def test_an_exact_network_gives_the_truth(kind):
     """A scale and shift of their own for each view of a map of unknown scale; for a metric one none."""
     rng = np.random.default_rng(3)
-    rays, within = lens_rays(LENS, THETA_MAX, size_of(LENS))
-    truth = np.where(within, in_a_room(rays.astype(np.float64)), 0)
-    lidar = lidar_of(truth, rays, rng)
+    truth = np.where(WITHIN, in_a_room(RAYS.astype(np.float64)), 0)
+    # a tenth of the pixels between 25° below and 3° above the horizon
+    elevation = np.degrees(np.arcsin(-RAYS[..., 1]))
+    hit = (rng.random(truth.shape) < 0.1) & (elevation > -25) & (elevation < 3)
+    lidar = np.where(hit, truth, 0).astype(np.float32)
     assert 400 < (lidar > 0).sum() < 1500
     # one return of twenty is wrong by a factor
     wrong = (lidar > 0) & (rng.random(lidar.shape) < 0.05)
@@ -143,12 +131,12 @@ def test_an_exact_network_gives_the_truth(kind):
         z = in_a_room(seen) * (seen @ view.view_to_camera[:, 2])
         scale, shift = rng.uniform(0.3, 3), rng.uniform(-1, 1)
         said = {"metric": z, "relative": scale * z + 5 * shift, "inverse": scale / z + 0.2 * shift}[kind]
-        layers.append(Layer(view.box, view.back(said.astype(np.float32)), view.cosine, view.weight))
-    samples = take_samples(layers, lidar, within, 3000)
+        layers.append(layer_of(view, said))
+    samples = take_samples(layers, lidar, WITHIN, 3000)
     lines = fit_lines(samples, kind, [Line()] * len(layers) if kind == "metric" else None)
     blended = blend(layers, lines, kind, (LENS.height, LENS.width))
-    assert (blended[~within] == 0).all() and (blended[within] > 0).all()
-    error = np.abs(blended - truth)[within] / truth[within]
+    assert (blended[~WITHIN] == 0).all() and (blended[WITHIN] > 0).all()
+    error = np.abs(blended - truth)[WITHIN] / truth[WITHIN]
     assert error.mean() < 0.002 and np.quantile(error, 0.99) < 0.01
     if kind != "metric":
         # without agreement the views' own lines are far from one another
@@ -160,13 +148,11 @@ def test_metric_views_that_differ_by_factors_meet_in_the_middle():
     rng = np.random.default_rng(0)
     views = pinhole_views(LENS, THETA_MAX)
     factors = np.exp(rng.uniform(-0.2, 0.2, len(views)))
-    _, within = lens_rays(LENS, THETA_MAX, size_of(LENS))
     layers = []
     for view, factor in zip(views, factors, strict=True):
         seen = view_rays(view)
-        z = factor * in_a_room(seen) * (seen @ view.view_to_camera[:, 2])
-        layers.append(Layer(view.box, view.back(z.astype(np.float32)), view.cosine, view.weight))
-    samples = take_samples(layers, np.zeros(within.shape, np.float32), within, 3000)
+        layers.append(layer_of(view, factor * in_a_room(seen) * (seen @ view.view_to_camera[:, 2])))
+    samples = take_samples(layers, np.zeros(WITHIN.shape, np.float32), WITHIN, 3000)
     lines = fit_lines(samples, "metric", [Line()] * len(views))
     left = np.log([line.scale * factor for line, factor in zip(lines, factors, strict=True)])
     assert all(line.shift == 0 for line in lines)
@@ -201,9 +187,9 @@ def test_layers_are_blended_by_weight_in_log_distance():
 # ---- scenes -------------------------------------------------------------------------------------------------------
 
 
-def seen_in_the_ball(picture: ScenePicture, rays: np.ndarray) -> np.ndarray:
+def seen_in_the_ball(picture: ScenePicture, in_camera: np.ndarray) -> np.ndarray:
     """Distance from a picture of `write_scene` to the wall, along rays of the camera."""
-    world = rays @ (picture.rotation @ FLIP[:3, :3]).T
+    world = in_camera @ (picture.rotation @ FLIP[:3, :3]).T
     along = world @ picture.position_m
     return -along + np.sqrt(along**2 + RADIUS_M**2 - picture.position_m @ picture.position_m)
 
@@ -211,7 +197,7 @@ def seen_in_the_ball(picture: ScenePicture, rays: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("kind", ["relative", "inverse"])
 def test_frames_with_few_returns_take_the_drives_fit(tmp_path, kind):
     """Scales differ from view to view, but not from frame to frame, except in the held-out one."""
-    folder = write_scene(tmp_path, [shrunk(FISHEYE, 90)], mono=False)
+    folder = write_scene(tmp_path, [scaled_lens(FISHEYE, (90, 90))], mono=False)
     few = "images/0002.png"
     lidar = read_distance_png(folder / "lidar/0002.png")
     lidar[lidar > 0] *= np.random.default_rng(0).random((lidar > 0).sum()) < 0.005
@@ -226,8 +212,7 @@ def test_frames_with_few_returns_take_the_drives_fit(tmp_path, kind):
             seen = view_rays(view)
             z = seen_in_the_ball(picture, seen) * (seen @ view.view_to_camera[:, 2])
             scale, shift = odd * rng.uniform(0.5, 2), rng.uniform(-0.05, 0.05)
-            values = scale * z + shift if kind == "relative" else scale / z + shift
-            said.append(Layer(view.box, view.back(values.astype(np.float32)), view.cosine, view.weight))
+            said.append(layer_of(view, scale * z + shift if kind == "relative" else scale / z + shift))
         return said
 
     fitted = FittedMaps(scene, kind, layers)
@@ -237,8 +222,7 @@ def test_frames_with_few_returns_take_the_drives_fit(tmp_path, kind):
     assert any(picture.held_out for picture in scene.pictures)
     for picture in scene.pictures:
         truth = read_distance_png(picture.files["truth_distance"])
-        _, within = lens_rays(picture.lens, np.radians(90), size_of(picture.lens))
-        known = within & (truth > 0)
+        known = rays(picture.lens, np.radians(90)).within & (truth > 0)
         error = np.abs(maps[picture.name] - truth)[known] / truth[known]
         assert error.mean() < 0.01, picture.name
 
@@ -257,13 +241,13 @@ def test_maps_of_unknown_scale_need_lidar(tmp_path):
 
 @pytest.mark.parametrize(("is_said", "kind"), [("inverse", "relative"), ("relative", "inverse")])
 def test_a_map_that_runs_the_wrong_way_is_told(tmp_path, is_said, kind):
-    scene = read_scene(write_scene(tmp_path, [shrunk(FISHEYE, 60)], frames=2, mono=False))
+    scene = read_scene(write_scene(tmp_path, [scaled_lens(FISHEYE, (60, 60))], frames=2, mono=False))
 
     def layers(picture: ScenePicture) -> list[Layer]:
-        rays, within = lens_rays(picture.lens, scene.theta_max_rad, size_of(picture.lens))
-        distance = seen_in_the_ball(picture, rays)
+        found = scene.rays(picture)
+        distance = seen_in_the_ball(picture, found.directions)
         values = 1 / distance if is_said == "inverse" else distance
-        return [Layer((slice(0, 60), slice(0, 60)), values, np.ones((60, 60)), within.astype(float))]
+        return [Layer((slice(0, 60), slice(0, 60)), values, np.ones((60, 60)), found.within.astype(float))]
 
     with pytest.raises(InputError, match=rf"rank correlation.*not {kind}. Declare it {is_said}"):
         list(FittedMaps(scene, kind, layers))
@@ -424,34 +408,28 @@ def test_the_maps_in_the_scene_are_those_of_the_network(networks, tmp_path):
     network = load_ready_network(str(networks / "glpn"))
     picture = scene.pictures[0]
     rgb = read_image(picture.files["image"])
-    (layer,) = view_layers(network, picture, rgb, scene.theta_max_rad)
+    (layer,) = view_layers(network, scene, picture)
     (view,) = pinhole_views(picture.lens, scene.theta_max_rad)
     z = network([view.cut(rgb)])[0]
-    rays, _ = lens_rays(picture.lens, scene.theta_max_rad, (48, 44))
-    x = rays[..., 0] / rays[..., 2] * view.focal_px + view.width / 2 - 0.5
-    y = rays[..., 1] / rays[..., 2] * view.focal_px + view.height / 2 - 0.5
-    expected = cv2.remap(z, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR) / rays[..., 2]
+    to_x, to_y, ahead = np.moveaxis(scene.rays(picture).directions, -1, 0)
+    x = to_x / ahead * view.focal_px + view.width / 2 - 0.5
+    y = to_y / ahead * view.focal_px + view.height / 2 - 0.5
+    expected = cv2.remap(z, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR) / ahead
     written = read_distance_png(picture.files["mono"])
     kept = written > 0
     assert kept.mean() > 0.5
     assert np.abs(written - expected)[kept].max() < 0.01
-    assert np.allclose(layer.cosine, rays[..., 2][layer.box])
+    assert np.allclose(layer.cosine, ahead[layer.box])
 
 
 def test_networks_that_cannot_be_used_are_named(networks, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     folder = write_scene(tmp_path / "scene", frames=2, mono=False)
-    truncated = tmp_path / "truncated"
-    truncated.mkdir()
-    for file in (networks / "dpt").iterdir():
-        (truncated / file.name).write_bytes(file.read_bytes()[: -1000 if file.suffix == ".safetensors" else None])
-    unprepared = tmp_path / "unprepared"
-    unprepared.mkdir()
-    for file in (networks / "dpt").iterdir():
-        if file.name != "preprocessor_config.json":
-            (unprepared / file.name).write_bytes(file.read_bytes())
+    truncated, unprepared = (shutil.copytree(networks / "dpt", tmp_path / name) for name in ("truncated", "unprepared"))
+    weights = truncated / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-1000])
+    (unprepared / "preprocessor_config.json").unlink()
     nameless = tmp_path / "nameless"
-    nameless.mkdir()
     write_json(nameless / "config.json", {"model_type": "nothing-known"})
     for name, expected in (
         (str(networks / "trunk"), "misses .* of its network's weights, such as .*head"),
@@ -464,9 +442,8 @@ def test_networks_that_cannot_be_used_are_named(networks, tmp_path, monkeypatch,
     ):
         with pytest.raises(InputError, match=expected):
             load_ready_network(name)
-    monkeypatch.setattr(
-        sys, "argv", ["edge-depth-nerf", "estimate-depth", str(folder), "--hf", "nobody/no-such-network"]
-    )
+    words = ["estimate-depth", str(folder), "--hf", "nobody/no-such-network"]
+    monkeypatch.setattr(sys, "argv", ["edge-depth-nerf", *words])
     with pytest.raises(SystemExit) as stopped:
         main()
     assert stopped.value.code == 2 and "Nothing is downloaded" in capsys.readouterr().err

@@ -15,8 +15,8 @@ import pytest
 import torch
 from rich.console import Console
 from safetensors import safe_open
-from safetensors.torch import load_file, save_file
-from scenes import FLIP, fisheye, write_scene
+from safetensors.torch import load_file, save, save_file
+from scenes import fisheye, frame_entry, write_scene
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import (
@@ -115,10 +115,7 @@ def write_street(folder: Path, frames: int = 10, seed: int = 0, lidar: bool = Tr
         keep[-6:, :9] = False
         write_mask(folder / "mask.png", keep)
         entry = {
-            "file_path": f"images/{name}",
-            "transform_matrix": (pose @ FLIP).tolist(),
-            **{"fl_x": LENS.fx, "fl_y": LENS.fy, "cx": LENS.cx, "cy": LENS.cy, "w": LENS.width, "h": LENS.height},
-            **{key: value for key, value in LENS.to_dict().items() if key in ("k1", "k2", "k3", "k4", "p1", "p2")},
+            **frame_entry(LENS, pose, name),
             **{"mask_path": "mask.png", "truth_distance_file_path": f"truth/{name}", "camera": "front", "frame": index},
         }
         if lidar:
@@ -128,18 +125,10 @@ def write_street(folder: Path, frames: int = 10, seed: int = 0, lidar: bool = Tr
         entries.append(entry)
     names = [entry["file_path"] for entry in entries]
     held_out = [name for number, name in enumerate(names) if number % 8 == 4]
-    write_json(
-        folder / "transforms.json",
-        {
-            "camera_model": "OPENCV_FISHEYE",
-            "depth_unit_scale_factor": 1 / 256,
-            "theta_max_deg": 95.0,
-            "frames": entries,
-            "train_filenames": [name for name in names if name not in held_out],
-            "val_filenames": held_out,
-            "test_filenames": held_out,
-        },
-    )
+    meta = {"camera_model": "OPENCV_FISHEYE", "depth_unit_scale_factor": 1 / 256, "theta_max_deg": 95.0}
+    split = {"train_filenames": [name for name in names if name not in held_out]}
+    split |= {"val_filenames": held_out, "test_filenames": held_out}
+    write_json(folder / "transforms.json", {**meta, **split, "frames": entries})
     return folder
 
 
@@ -159,12 +148,10 @@ def examples_of(scene: Path, held_out: bool = False) -> Examples:
     return load_examples([found], [pictures], [{"front": HEIGHT_M}], TINY.working_px, TINY.multiple_px)
 
 
-def weights_of(network: DepthNetwork) -> dict[str, np.ndarray]:
-    return {name: tensor.numpy().copy() for name, tensor in network.state_dict().items()}
-
-
-def same(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> bool:
-    return one.keys() == other.keys() and all(np.array_equal(one[name], other[name]) for name in one)
+def same(one: DepthNetwork, other: DepthNetwork) -> bool:
+    """Whether two networks have the same weights."""
+    weights, others = one.state_dict(), other.state_dict()
+    return weights.keys() == others.keys() and all(torch.equal(weights[name], others[name]) for name in weights)
 
 
 # ---- losses ----------------------------------------------------------------------------------------------------
@@ -220,7 +207,6 @@ def test_the_room_is_its_floor_and_its_wall():
 
 def test_mirrored_and_cut_pictures_still_show_the_plane_they_showed(small_street):
     """A rendered floor: after any augmentation the ray of each pixel still meets it at the pixel's distance."""
-    found = read_scene(small_street)
     height_m, examples = 1.3, examples_of(small_street)
     for index in range(len(examples)):
         sine = examples.rays[examples.lens[index]] @ examples.up_in_camera[index]
@@ -228,9 +214,7 @@ def test_mirrored_and_cut_pictures_still_show_the_plane_they_showed(small_street
         examples.lidar_m[index] = np.where(on_floor, height_m / np.where(on_floor, -sine, 1), 0)
         # the picture says where each pixel looks: red = right or left, in the camera's frame
         examples.rgb[index, ..., 0] = 127 + 120 * examples.rays[examples.lens[index]][..., 0]
-    assert len(found.cameras()) == 1
-    indices = np.arange(4)
-    plain = make_batch(examples, indices, TINY, CPU)
+    plain = make_batch(examples, np.arange(4), TINY, CPU)
     options = TrainingOptions(steps=1, crop=0.5, jitter=0.0)
     mirrored, cut = 0, 0
     for seed in range(6):
@@ -274,7 +258,7 @@ def test_the_presets_cut_what_is_said(preset, sides_px):
 def test_of_several_returns_in_a_pixel_the_one_nearest_its_centre_is_learned(small_street):
     scene = read_scene(small_street)
     picture = scene.pictures[0]
-    view = network_view(picture, scene.theta_max_rad, 12)
+    view = network_view(scene, picture, 12)
     rows, columns = view.usable.shape
     lidar = read_distance_png(picture.files["lidar"])
     expected = np.zeros((rows, columns), np.float32)
@@ -300,7 +284,7 @@ def test_the_camera_height_is_that_above_the_floor(small_street):
 
 def test_it_learns_what_colours_mean(street):
     """Held-out pictures of a toy street, against truth, beside the best constant and the plain room."""
-    examples, scene = examples_of(street), read_scene(street)
+    scene = read_scene(street)
     settings = dataclasses.replace(TINY, working_px=40, channels=(8, 16, 32))
     pictures = [picture for picture in scene.pictures if not picture.held_out]
     examples = load_examples([scene], [pictures], [{"front": HEIGHT_M}], 40, settings.multiple_px)
@@ -325,18 +309,17 @@ def test_it_learns_what_colours_mean(street):
 
 def test_the_same_seed_gives_the_same_weights_and_another_one_others(small_street):
     examples = examples_of(small_street)
-    runs = [train(examples, None, TINY, TrainingOptions(steps=4, seed=seed)) for seed in (3, 3, 4)]
-    weights = [weights_of(run.network) for run in runs]
-    assert same(weights[0], weights[1]) and not same(weights[0], weights[2])
+    runs = [train(examples, None, TINY, TrainingOptions(steps=4, seed=seed)).network for seed in (3, 3, 4)]
+    assert same(runs[0], runs[1]) and not same(runs[0], runs[2])
 
 
 def test_it_gives_the_same_weights_on_one_thread_and_on_two(small_street):
-    examples, weights = examples_of(small_street), []
+    examples, networks = examples_of(small_street), []
     for threads in (1, 2):
         with torch_threads(threads):
-            weights.append(weights_of(train(examples, None, TINY, TrainingOptions(steps=4)).network))
+            networks.append(train(examples, None, TINY, TrainingOptions(steps=4)).network)
             assert torch.get_num_threads() == threads
-    assert same(*weights)
+    assert same(*networks)
 
 
 def test_the_loss_of_a_batch_is_the_sum_of_its_parts(small_street):
@@ -376,11 +359,10 @@ def test_a_killed_training_goes_on_as_if_nothing_had_been(small_street, tmp_path
     with pytest.raises(KilledError):
         train(examples, kept, TINY, options, checkpoint=checkpoint, checkpoint_seconds=0.0, report=kill)
     shares: list[float] = []
-    again = train(
-        examples, kept, TINY, options, checkpoint=checkpoint, report=lambda share, error: shares.append(share)
-    )
+    noted = {"checkpoint": checkpoint, "report": lambda share, error: shares.append(share)}
+    again = train(examples, kept, TINY, options, **noted)
     assert shares[0] == pytest.approx(8 / 12) and len(shares) == 5
-    assert same(weights_of(whole.network), weights_of(again.network))
+    assert same(whole.network, again.network)
     assert (again.best_step, again.abs_rel) == (whole.best_step, whole.abs_rel)
 
     # one that began with other weights is not taken up
@@ -389,19 +371,15 @@ def test_a_killed_training_goes_on_as_if_nothing_had_been(small_street, tmp_path
     with pytest.raises(KilledError):
         train(examples, kept, TINY, options, start=one, checkpoint=checkpoint, checkpoint_seconds=0.0, report=kill)
     shares.clear()
-    train(examples, kept, TINY, options, start=two, checkpoint=checkpoint, report=lambda share, e: shares.append(share))
+    train(examples, kept, TINY, options, start=two, **noted)
     assert len(shares) == 12
 
     # one of another training, or a broken one, is not taken up
     other = dataclasses.replace(options, seed=1)
     fresh = train(examples, kept, TINY, other)
-    assert same(
-        weights_of(train(examples, kept, TINY, other, checkpoint=checkpoint).network), weights_of(fresh.network)
-    )
+    assert same(train(examples, kept, TINY, other, checkpoint=checkpoint).network, fresh.network)
     checkpoint.write_bytes(b"broken")
-    assert same(
-        weights_of(train(examples, kept, TINY, other, checkpoint=checkpoint).network), weights_of(fresh.network)
-    )
+    assert same(train(examples, kept, TINY, other, checkpoint=checkpoint).network, fresh.network)
 
 
 def test_training_ends_in_time_and_where_nothing_improves(small_street):
@@ -472,9 +450,8 @@ def test_a_network_whose_time_was_up_early_is_told_of(small_street):
 
 def test_weights_know_how_they_were_made_and_predict_other_scenes(small_street, tmp_path, monkeypatch, capsys):
     model = tmp_path / "street.safetensors"
-    monkeypatch.setattr(
-        sys, "argv", ["x", "estimate-depth", str(small_street), "--train-steps", "3", "--output", str(model)]
-    )
+    words = ["estimate-depth", str(small_street), "--train-steps", "3", "--output", str(model)]
+    monkeypatch.setattr(sys, "argv", ["x", *words])
     main()
     with safe_open(model, framework="pt") as file:
         metadata = file.metadata()
@@ -497,7 +474,7 @@ def test_weights_know_how_they_were_made_and_predict_other_scenes(small_street, 
     network, _ = load_network(model)
     for (name, expected), picture in zip(predicted_maps(network, scene), scene.pictures, strict=True):
         found = read_distance_png(picture.files["mono"])
-        keep = network_view(picture, scene.theta_max_rad, 40).usable
+        keep = scene.usable(picture)
         assert name == picture.name
         np.testing.assert_allclose(found[keep], expected[keep], atol=1 / 256)
         assert (found[~keep] == 0).all() and keep.mean() > 0.3
@@ -518,10 +495,9 @@ def test_a_map_has_the_size_of_its_picture_and_begins_as_the_room(small_street):
 
 
 def test_training_goes_on_from_given_weights(small_street, tmp_path, quiet):
-    settings = dataclasses.replace(TINY, camera_height_m=1.0)
-    save_network(tmp_path / "start.safetensors", DepthNetwork(settings), {})
-    options = EstimateDepthOptions((small_street,), model=tmp_path / "start.safetensors", train_steps=2)
-    report = estimate_depth(options, quiet)
+    settings, start = dataclasses.replace(TINY, camera_height_m=1.0), tmp_path / "start.safetensors"
+    save_network(start, DepthNetwork(settings), {})
+    report = estimate_depth(EstimateDepthOptions((small_street,), model=start, train_steps=2), quiet)
     network, _ = load_network(report.weights)
     assert report.weights == small_street / WEIGHTS and network.settings == settings
     assert float(network.head.weight.detach().abs().max()) > 0
@@ -549,18 +525,15 @@ def test_weights_in_the_scene_that_are_of_no_use_are_made_anew(small_street, con
 
 def test_no_file_of_others_is_overwritten(small_street, tmp_path, quiet):
     path = tmp_path / "theirs.safetensors"
-    for write in (
-        lambda: save_file({"a": torch.zeros(2)}, path, {"format": "pt"}),
-        lambda: path.write_bytes(b"no safetensors"),
-    ):
-        write()
-        before = path.read_bytes()
+    options = EstimateDepthOptions((small_street,), train_steps=1, output=path)
+    for content in (save({"a": torch.zeros(2)}, {"format": "pt"}), b"no safetensors"):
+        path.write_bytes(content)
         with pytest.raises(InputError, match="was not written by `estimate-depth`"):
-            estimate_depth(EstimateDepthOptions((small_street,), train_steps=1, output=path), quiet)
-        assert path.read_bytes() == before
+            estimate_depth(options, quiet)
+        assert path.read_bytes() == content
     # what was written by another version of this project may go
     save_file({"a": torch.zeros(2)}, path, {"architecture": "edge-depth-nerf/u-net-0", "header": "{}"})
-    estimate_depth(EstimateDepthOptions((small_street,), train_steps=1, output=path), quiet)
+    estimate_depth(options, quiet)
     assert load_network(path)[1]["steps"] == 1
 
 
@@ -684,15 +657,9 @@ def test_bad_scenes_and_options_are_named(tmp_path, small_street, quiet):
         estimate_depth(EstimateDepthOptions((small_street, small_street)), quiet)
     with pytest.raises(FileNotFoundError):
         estimate_depth(EstimateDepthOptions((tmp_path / "none",)), quiet)
-    good = EstimateDepthOptions((small_street,))
-    for bad in (
-        dataclasses.replace(good, train_steps=0),
-        dataclasses.replace(good, seconds=0.0),
-        dataclasses.replace(good, seconds=float("nan")),
-        dataclasses.replace(good, output=Path("x.pt")),
-    ):
+    for bad in ({"train_steps": 0}, {"seconds": 0.0}, {"seconds": float("nan")}, {"output": Path("x.pt")}):
         with pytest.raises(InputError, match="expected"):
-            bad.check()
+            EstimateDepthOptions((small_street,), **bad).check()
     for lidar in (small_street / "lidar").iterdir():
         write_distance_png(lidar, np.zeros((LENS.height, LENS.width)))
     with pytest.raises(InputError, match="nothing to train on"):
@@ -710,11 +677,10 @@ def test_maps_are_put_into_a_scene_and_nothing_else_changes(tmp_path):
     metres = np.full((28, 32), 7.25, np.float32)
     metres[10, 10:13] = [np.nan, np.inf, 200.5]
     metres[12, 12] = -1.0
-    write_maps(
-        folder, "mono", ((picture.name, metres) for picture in scene.pictures), {"trained_on": "elsewhere", "a": 1}
-    )
+    source = {"trained_on": "elsewhere", "a": 1}
+    write_maps(folder, "mono", ((picture.name, metres) for picture in scene.pictures), source)
     after = read_json(folder / "transforms.json")
-    assert after.pop("mono") == {"trained_on": "elsewhere", "a": 1}
+    assert after.pop("mono") == source
     for frame in after["frames"]:
         assert frame.pop("mono_file_path") == f"mono/images/{Path(frame['file_path']).name}"
     assert after == before

@@ -18,8 +18,9 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -118,7 +119,7 @@ class Errors:
         return Errors({name: values[which] for name, values in self.features.items()}, self.relative[which])
 
     def model(self) -> ErrorModel | None:
-        """Fit a model to them; see `fit_error_model`."""
+        """Fit a model to them."""
         return fit_error_model(self.features, self.relative)
 
 
@@ -163,13 +164,9 @@ class MeasuredFrame:
 def held_out_returns(
     returns: NDArray[np.bool_], elevation_rad: NDArray[np.float32], number: int
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which of a frame's LiDAR points to hold out, and which of these lie in whole blocks.
+    """Which of a frame's LiDAR points (H×W) to hold out, and which of these lie in whole blocks.
 
-    Args:
-        returns: H×W, True at a LiDAR point.
-        elevation_rad: H×W, of each ray.
-        number: of the frame in the calibration; seeds the choice.
-
+    The elevation is that of each ray (H×W); the frame's number in the calibration seeds the choice.
     """
     rng = np.random.default_rng([7, number])
     height, width = returns.shape
@@ -185,10 +182,6 @@ def held_out_returns(
 
 def calibrate_scene(scene: Path, console: Console | None = None) -> Trust:
     """Measure a scene's alignment and errors from its training frames, and keep the result as SCENE/mono_trust.json.
-
-    Args:
-        scene: the folder, or its transforms.json.
-        console: where progress is shown; nowhere by default.
 
     Raises:
         FileNotFoundError: no scene there.
@@ -230,38 +223,30 @@ def find_trust(
     console: Console | None = None,
     depth_source: str = INTEGRATED,
 ) -> Trust:
-    """The scene's calibration for these options; made now and kept in SCENE/.cache where there is none.
+    """The scene's calibration for these options; made now and kept in SCENE/.cache, or in `cache`, where there is none.
 
-    Args:
-        scene: whose maps they are.
-        options: of the prior to be trusted.
-        cache: another folder than SCENE/.cache.
-        training_images: the pictures that are trained on, where the scene does not say so itself.
-        console: where progress is shown; nowhere by default.
-        depth_source: what the prior is made of: integrated, or mono alone.
+    `training_images` are the pictures that are trained on, where the scene does not say so itself; `depth_source` is
+    what the prior is made of: integrated, or mono alone.
 
     Raises:
         InputError: as `calibrate_scene`.
 
     """
-    trust = saved_trust(scene, options, cache, training_images, depth_source)
-    if trust is None:
-        trust = _calibrate(scene, _chosen(scene, training_images), depth_source, options, console)
-        path = _cached(scene, cache, trust.made_of)
-        try:
-            trust.write(path)
-            keep_last(path.parent, "mono_trust_*.json", KEPT_CALIBRATIONS)
-        except OSError:  # a scene that cannot be written: made anew each time
-            pass
+    if (trust := saved_trust(scene, options, cache, training_images, depth_source)) is not None:
+        return trust
+    trust = _calibrate(scene, _chosen(scene, training_images), depth_source, options, console)
+    path = _cached(scene, cache, trust.made_of)
+    # a scene that cannot be written has it made anew each time
+    with suppress(OSError):
+        trust.write(path)
+        keep_last(path.parent, "mono_trust_*.json", KEPT_CALIBRATIONS)
     return trust
 
 
 def field_of_source(scene: SceneFolder) -> Trust | None:
     """What is known of a scene without LiDAR: how far up and down the maps' network was taught by LiDAR elsewhere.
 
-    Returns:
-        A calibration without errors, or None where the maps' source says nothing about its field.
-
+    A calibration without errors, or None where the maps' source says nothing about its field.
     """
     source = scene.meta.get("mono")
     source = source if isinstance(source, dict) else {}
@@ -315,12 +300,7 @@ def _with_motion(scene: SceneFolder, depth_source: str, options: PriorOptions) -
 
 
 def maps_trained_on(meta: Mapping[str, Any]) -> str:
-    """Where the source of the monocular maps was trained: elsewhere only if the source states it, else scene.
-
-    Args:
-        meta: the scene's transforms.json.
-
-    """
+    """Where the source of a scene's monocular maps was trained: elsewhere if transforms.json says so, else scene."""
     later, drive = meta.get("mono"), meta.get("source")
     if isinstance(later, dict):
         found = later.get("trained_on")
@@ -381,18 +361,17 @@ def _calibrate(
     bars = progress_bars(console or Console(quiet=True), transient=True)
     with bars as progress, ThreadPoolExecutor(2) as pool:
         task = progress.add_task("Measuring the prior's error…", total=(4 + with_motion) * len(measurable))
+
+        def counted(work: Callable[[tuple[int, ScenePicture]], Any]) -> Iterator[Any]:
+            for found in pool.map(work, enumerate(measurable)):
+                progress.advance(task)
+                yield found
+
         cloud = static_cloud(scene, measurable, lambda: progress.advance(task))
         if with_motion:
-            found = []
-            for each in pool.map(partial(_errors_of_both, scene, options), enumerate(measurable)):
-                found.append(each)
-                progress.advance(task)
-            errors = _motion_errors([errors_of_both for errors_of_both, _ in found])
-            field_rad = _field_rad([elevation_rad for _, elevation_rad in found])
-        frames = []
-        for frame in pool.map(measure, enumerate(measurable)):
-            frames.append(frame)
-            progress.advance(task)
+            of_both, elevations_rad = zip(*counted(partial(_errors_of_both, scene, options)), strict=True)
+            errors, field_rad = _motion_errors(of_both), _field_rad(elevations_rad)
+        frames = list(counted(measure))
     made_of = _made_of(scene, pictures, depth_source, options)
     return combine(frames, options, made_of, maps_trained_on(scene.meta) == "elsewhere", depth_source, errors)
 
@@ -466,17 +445,9 @@ def measure_frame(
 ) -> MeasuredFrame:
     """Hold out some of a frame's LiDAR points, make its prior of the rest, and compare.
 
-    Args:
-        name: of the frame, for the report.
-        number: of the frame in the calibration: decides what is left out.
-        lidar_m: H×W LiDAR distance, 0 = no LiDAR point.
-        mono_m: H×W monocular distance as it came, 0 = none.
-        usable: H×W, True where the picture may be used.
-        view: the angles of its rays.
-        options: of the prior.
-        far_seen_m: H×W distance that the LiDAR points of other frames show above this one's, 0 = none.
-        depth_source: what the prior is made of: integrated, or mono alone.
-        motion: what is known from motion.
+    Maps are H×W: distances as they came, 0 = none; `usable` is True where the picture may be used. `far_seen_m` is what
+    the LiDAR points of other frames show above this one's. The frame's number in the calibration decides what is left
+    out.
 
     Raises:
         InputError: the maps differ in size.
@@ -534,18 +505,9 @@ def measure_beyond(
 ) -> MeasuredBeyond:
     """Measure a frame's prior in the form used where LiDAR does not reach: from motion alone, and from the network.
 
-    Args:
-        number: of the frame in the calibration: decides which pixels are judged.
-        lidar_m: H×W LiDAR distance, 0 = no LiDAR point.
-        mono_m: H×W monocular distance as it came, 0 = none.
-        usable: H×W, True where the picture may be used.
-        view: the angles of its rays.
-        options: of the prior.
-        motion: distances from motion; beyond LiDAR's field they count alone.
-        motion_sigma_m: their standard deviation by parallax and confidence.
-        left_out: where they lie in places that the network was not taught. Neighbours confirm them nevertheless: that
-            is how it is where the prior is used.
-
+    Maps are as in `measure_frame`. Distances from motion count alone beyond LiDAR's field; `motion_sigma_m` is their
+    standard deviation by parallax and confidence. Where they are `left_out`, the network was not taught; neighbours
+    confirm them nevertheless: that is how it is where the prior is used.
     """
     rng = np.random.default_rng([10, number])
     none = np.zeros_like(lidar_m)
@@ -594,16 +556,10 @@ def combine(
     depth_source: str = INTEGRATED,
     motion_errors: MotionErrors | None = None,
 ) -> Trust:
-    """Put the measurements of a drive's frames together.
+    """Put the measurements of a drive's frames, at least one, together.
 
-    Args:
-        frames: at least one.
-        options: of the prior.
-        made_of: key of what they were made of.
-        everywhere: whether the monocular maps are to be trusted beyond LiDAR's field of elevation.
-        depth_source: what the prior is made of: integrated, or mono alone.
-        motion_errors: by which motion took part in the frames' priors.
-
+    The key `made_of` is kept in the result; `everywhere` says whether the monocular maps are to be trusted beyond
+    LiDAR's field of elevation, and `motion_errors` by which errors motion took part in the frames' priors.
     """
     lidar_m, mono_m = (np.concatenate([getattr(frame, name) for frame in frames]) for name in ("lidar_m", "mono_m"))
     aligned = options.align != "none" and depth_source == INTEGRATED

@@ -8,14 +8,13 @@ points takes scale and shift of the drive, from training pictures. So nothing of
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from jaxtyping import Float32
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.method.alignment import LEAST_RETURNS
-from edge_depth_nerf.mono.examples import network_view
 from edge_depth_nerf.mono.relative import (
     WRONG_WAY,
     Kind,
@@ -63,22 +62,21 @@ class FittedMaps:
         waiting: list[ScenePicture] = []
         drive: dict[str, list[Samples]] = {}
         for picture in self.scene.pictures:
-            if self.kind != "metric" and self._returns(picture) < LEAST_RETURNS:
-                waiting.append(picture)
-                continue
-            layers, samples = self._seen(picture)
-            if self.kind != "metric" and samples.returns < LEAST_RETURNS:
-                waiting.append(picture)
-                continue
             if self.kind == "metric":
+                layers, samples = self._seen(picture)
                 start = [Line()] * len(layers)
                 lines = fit_lines(samples, self.kind, start) if len(layers) > 1 else start
-            else:
-                self._check_direction(picture, samples)
-                lines = fit_lines(samples, self.kind)
-                if not picture.held_out:
-                    drive.setdefault(picture.camera, []).append(_thinned(samples))
-            yield picture, self._blended(picture, layers, lines)
+                yield picture, self._blended(picture, layers, lines)
+                continue
+            seen = self._seen(picture) if self._returns(picture) >= LEAST_RETURNS else None
+            if seen is None or seen[1].returns < LEAST_RETURNS:
+                waiting.append(picture)
+                continue
+            layers, samples = seen
+            self._check_direction(picture, samples)
+            if not picture.held_out:
+                drive.setdefault(picture.camera, []).append(_thinned(samples))
+            yield picture, self._blended(picture, layers, fit_lines(samples, self.kind))
         if waiting and not self.scene.split_known:
             raise InputError(
                 f"{self.scene.path}: {waiting[0].name} has fewer than {LEAST_RETURNS} LiDAR points, so its map "
@@ -105,17 +103,12 @@ class FittedMaps:
 
     def _seen(self, picture: ScenePicture) -> tuple[Sequence[Layer], Samples]:
         layers = self.layers(picture)
-        usable = self._usable(picture)
-        lidar_m = self.scene.lidar_m(picture)
-        return layers, take_samples(layers, lidar_m, usable, _SAMPLES)
-
-    def _usable(self, picture: ScenePicture) -> np.ndarray:
-        return network_view(picture, self.scene.theta_max_rad, max(picture.lens.width, picture.lens.height)).usable
+        return layers, take_samples(layers, self.scene.lidar_m(picture), self.scene.usable(picture), _SAMPLES)
 
     def _returns(self, picture: ScenePicture) -> int:
         if "lidar" not in picture.files:
             return 0
-        return int((self._usable(picture) & (self.scene.lidar_m(picture) > 0)).sum())
+        return int((self.scene.usable(picture) & (self.scene.lidar_m(picture) > 0)).sum())
 
     def _blended(
         self, picture: ScenePicture, layers: Sequence[Layer], lines: Sequence[Line]
@@ -144,6 +137,4 @@ def _thinned(samples: Samples) -> Samples:
     chosen = np.concatenate(
         [rng.permutation(np.flatnonzero(each))[:_SAMPLES_FOR_THE_DRIVE] for each in (has_return, ~has_return)]
     )
-    return Samples(
-        samples.values[:, chosen], samples.cosine[:, chosen], samples.weight[:, chosen], samples.lidar_m[chosen]
-    )
+    return Samples(*(getattr(samples, each.name)[..., chosen] for each in fields(Samples)))

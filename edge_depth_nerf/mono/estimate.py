@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -26,7 +26,6 @@ from rich.progress import Progress
 from edge_depth_nerf import __version__
 from edge_depth_nerf.base.console import progress_bars
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import read_image
 from edge_depth_nerf.base.one_writer import only_writer
 from edge_depth_nerf.masks.sky import find_sky
 from edge_depth_nerf.method.alignment import LEAST_RETURNS
@@ -37,7 +36,6 @@ from edge_depth_nerf.mono.examples import (
     Examples,
     bytes_a_picture,
     camera_height_m,
-    lens_rays,
     load_examples,
     network_view,
     room_radius_m,
@@ -59,7 +57,7 @@ from edge_depth_nerf.mono.network import (
     save_network,
 )
 from edge_depth_nerf.mono.options import EstimateDepthOptions, Preset
-from edge_depth_nerf.mono.relative import KIND_SAID, Layer
+from edge_depth_nerf.mono.relative import KIND_SAID
 from edge_depth_nerf.mono.training import Trained, TrainingOptions, as_json, torch_threads, train
 from edge_depth_nerf.scene.put_maps import write_maps
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
@@ -82,14 +80,11 @@ _EYE_LEVEL_M = 1.6
 
 @dataclass(frozen=True)
 class PresetValues:
-    """What a preset stands for."""
+    """What a preset stands for; see `NetworkSettings` and `TrainingOptions`."""
 
     channels: tuple[int, ...]
-    """See `NetworkSettings`."""
     working_px: int
-    """See `NetworkSettings`."""
     training: TrainingOptions
-    """Steps and rates."""
 
 
 PRESETS: dict[Preset, PresetValues] = {
@@ -126,19 +121,33 @@ def estimate_depth(options: EstimateDepthOptions, console: Console | None = None
 
     """
     console = console or Console()
-    options.check()
     assert options.cluster is None
-    start, about = load_network(options.model) if options.model is not None else (None, {})
-    ready = load_ready_network(options.hf, options.hf_output) if options.hf is not None else None
-    scenes = [read_scene(path) for path in options.scenes]
-    if len({scene.path.resolve() for scene in scenes}) < len(scenes):
-        raise InputError("the scene is given twice. Name each scene once.")
+    start, about, ready, scenes = opened(options)
     with ExitStack() as stack:
         # in one order, lest two wait for each other
         for folder in sorted(scene.folder.resolve() for scene in scenes):
             stack.enter_context(only_writer(folder, console))
         # another process may have written to them meanwhile
         return _estimate(options, [read_scene(path) for path in options.scenes], start, about, ready, console)
+
+
+def opened(
+    options: EstimateDepthOptions,
+) -> tuple[DepthNetwork | None, dict[str, Any], ReadyNetwork | None, list[SceneFolder]]:
+    """Check the options, and open what they name: the network to start from, what is known of it, another, the scenes.
+
+    Raises:
+        FileNotFoundError: a scene or the weights are not there.
+        InputError: an option, a scene or the weights cannot be used.
+
+    """
+    options.check()
+    start, about = load_network(options.model) if options.model is not None else (None, {})
+    ready = load_ready_network(options.hf, options.hf_output) if options.hf is not None else None
+    scenes = [read_scene(path) for path in options.scenes]
+    if len({scene.path.resolve() for scene in scenes}) < len(scenes):
+        raise InputError("the scene is given twice. Name each scene once.")
+    return start, about, ready, scenes
 
 
 def _estimate(
@@ -196,9 +205,8 @@ def _write_own(
             frames = about.get("trained_frames", {})
             # weights of before have them by the scenes' names
             seen = frames.get(_key(scene), frames.get(_name(scene), []))
-            write_maps(
-                scene.folder, "mono", predicted_maps(network, scene), {**source, "trained_frames": seen}, progress
-            )
+            source["trained_frames"] = seen
+            write_maps(scene.folder, "mono", predicted_maps(network, scene), source, progress)
 
 
 def _write_predicted(network: ReadyNetwork, scenes: Sequence[SceneFolder], console: Console) -> None:
@@ -211,12 +219,8 @@ def _write_predicted(network: ReadyNetwork, scenes: Sequence[SceneFolder], conso
         "output": network.kind,
     }
     # all scenes' faults are told before the first one's work
-    fitted = [FittedMaps(scene, network.kind, _layers_by(network, scene)) for scene in scenes]
+    fitted = [FittedMaps(scene, network.kind, functools.partial(view_layers, network, scene)) for scene in scenes]
     _write_fitted(fitted, source, console)
-
-
-def _layers_by(network: ReadyNetwork, scene: SceneFolder) -> Callable[[ScenePicture], Sequence[Layer]]:
-    return lambda picture: view_layers(network, picture, read_image(picture.files["image"]), scene.theta_max_rad)
 
 
 def _write_from_files(options: EstimateDepthOptions, scene: SceneFolder, console: Console) -> None:
@@ -229,8 +233,7 @@ def _write_from_files(options: EstimateDepthOptions, scene: SceneFolder, console
         "output": files.kind,
         "along": files.along,
     }
-    fitted = FittedMaps(scene, files.kind, lambda picture: [files.layer(scene, picture)])
-    _write_fitted([fitted], source, console)
+    _write_fitted([FittedMaps(scene, files.kind, lambda picture: [files.layer(scene, picture)])], source, console)
 
 
 def _write_fitted(every: Sequence[FittedMaps], source: dict[str, Any], console: Console) -> None:
@@ -268,17 +271,11 @@ def _train(
     with progress_bars(console) as progress:
         material = _gather(scenes, settings, console, progress)
         if start is None:
-            settings = replace(
-                settings, camera_height_m=material.mean_height_m, room_radius_m=room_radius_m(material.examples)
-            )
-        identity = as_json(
-            {
-                "training": asdict(training),
-                "settings": asdict(settings),
-                "examples": material.examples.fingerprint(),
-                "start": None if options.model is None else hashlib.sha256(options.model.read_bytes()).hexdigest(),
-            }
-        )
+            radius_m = room_radius_m(material.examples)
+            settings = replace(settings, camera_height_m=material.mean_height_m, room_radius_m=radius_m)
+        began_with = None if options.model is None else hashlib.sha256(options.model.read_bytes()).hexdigest()
+        made_of = {"training": asdict(training), "settings": asdict(settings), "start": began_with}
+        identity = as_json({**made_of, "examples": material.examples.fingerprint()})
         if found is not None and about.get("identity") == identity:
             console.print(f"{weights} is trained already", soft_wrap=True)
             checkpoint.unlink(missing_ok=True)
@@ -299,8 +296,8 @@ def _train(
         "abs_rel": None if material.kept is None else round(trained.abs_rel, 5),
         "scenes": [_name(scene) for scene in scenes],
         "trained_frames": {
-            _key(scene): [picture.name for picture in both[0]]
-            for scene, both in zip(scenes, material.split, strict=True)
+            _key(scene): [picture.name for picture in used]
+            for scene, (used, _) in zip(scenes, material.split, strict=True)
         },
         "field_deg": material.field_deg,
         "identity": identity,
@@ -344,24 +341,15 @@ def _gather(
     fields, far_seen = [], []
     for scene, pictures in zip(scenes, training, strict=True):
         fields.append(field_deg(scene, pictures, lambda: progress.advance(task)))
-    for scene, pictures in zip(scenes, training, strict=True):
         cloud = static_cloud(scene, pictures, lambda: progress.advance(task))
         far_seen.append(functools.partial(seen_above, cloud, scene))
-    task = progress.add_task("Reading pictures", total=sum(len(pictures) for both in split for pictures in both))
-
-    def load(
-        chosen: list[list[ScenePicture]], more: list[Any] | None = None, by_motion: list[Any] | None = None
-    ) -> Examples | None:
-        if not any(chosen):
-            return None
-        size = settings.working_px, settings.multiple_px
-        return load_examples(scenes, chosen, heights, *size, lambda: progress.advance(task), more, by_motion)
-
+    reading = progress.add_task("Reading pictures", total=sum(len(pictures) for both in split for pictures in both))
+    size = settings.working_px, settings.multiple_px, lambda: progress.advance(reading)
     of_motion = [functools.partial(taught_by_motion, scene) if scene.has("motion") else None for scene in scenes]
-    examples = load(training, far_seen, of_motion)
+    examples = load_examples(scenes, training, heights, *size, far_seen, of_motion)
     # what stops the training is what these pictures measured themselves
-    kept = load([pictures for _, pictures in split])
-    assert examples is not None
+    stopping = [pictures for _, pictures in split]
+    kept = load_examples(scenes, stopping, heights, *size) if any(stopping) else None
     if not examples.lidar_m.any():
         raise InputError(
             f"{scenes[0].path}: no LiDAR point lies inside the masks of the training pictures, so there is nothing "
@@ -406,11 +394,7 @@ def _weights_of_before(
 ) -> tuple[DepthNetwork | None, dict[str, Any]]:
     """Load what lies where the weights are to go, after a look whether it may be overwritten.
 
-    Args:
-        weights: where they go.
-        options: of the command.
-        scenes_own: the place of the first scene's weights, which are this project's whatever is in the file.
-        console: where to say that the file is of no use.
+    At the place of the first scene's own weights a file is this project's, whatever is in it.
 
     Raises:
         InputError: the file is what training starts from, or is not this project's.
@@ -465,7 +449,7 @@ def training_split(scene: SceneFolder) -> Split:
         )
     allowed = [picture for picture in scene.pictures if not picture.held_out]
     moments = sorted({picture.moment for picture in allowed})
-    kept = {moment for number, moment in enumerate(moments) if number % KEEP_EVERY == KEEP_EVERY // 2}
+    kept = moments[KEEP_EVERY // 2 :: KEEP_EVERY]
     return (
         [picture for picture in allowed if picture.moment not in kept],
         [picture for picture in allowed if picture.moment in kept],
@@ -518,24 +502,17 @@ def without_sky(
     """Look for the sky in a picture, and leave it out of its map.
 
     A pixel with a LiDAR point is no sky, nor is one that motion matched. Matching puts outlines some pixels off, so a
-    distance beside an outline does not prove that there is no sky around.
-
-    Args:
-        scene: of the picture.
-        picture: one of the scene's.
-        metres: its map.
-        known_m: a map that can tell a ceiling from the sky; None without.
-
+    distance beside an outline does not prove that there is no sky around. Another map (`known_m`) can tell a ceiling
+    from the sky.
     """
-    usable = network_view(picture, scene.theta_max_rad, max(metres.shape)).usable
     lidar_m = scene.lidar_m(picture)
     matched_m = scene.distance_m(picture, "motion")
     if matched_m is not None:
         radius_px = max(1, round(_OUTLINE_SHARE * max(metres.shape)))
         inside = cv2.erode((matched_m > 0).astype(np.uint8), np.ones((2 * radius_px + 1,) * 2, np.uint8)) > 0
         lidar_m = np.where((lidar_m == 0) & inside, matched_m, lidar_m)
-    rgb = read_image(picture.files["image"])
-    sky = find_sky(rgb, usable, picture.up_in_camera, picture.lens, lidar_m, known_m)
+    usable = scene.usable(picture)
+    sky = find_sky(scene.rgb(picture), usable, picture.up_in_camera, picture.lens, lidar_m, known_m)
     if matched_m is not None:
         sky &= matched_m == 0
     return np.where(sky, 0, metres)
@@ -547,9 +524,9 @@ def predict(
 ) -> Float32[np.ndarray, "h w"]:
     """Predict one picture at its own size, metres along the ray."""
     settings = network.settings
-    view = network_view(picture, scene.theta_max_rad, settings.working_px)
+    view = network_view(scene, picture, settings.working_px)
     rows, columns = view.usable.shape
-    rgb = small_picture(picture, (columns, rows))
+    rgb = small_picture(scene, picture, (columns, rows))
 
     def padded(values: np.ndarray) -> torch.Tensor:
         margins = [(0, -side % settings.multiple_px) for side in (rows, columns)]
@@ -561,9 +538,7 @@ def predict(
     seen = padded(rgb).permute(0, 3, 1, 2).float() / 255.0
     log_ratio = network(seen, geometry, padded(view.usable))[0, :rows, :columns].cpu().numpy()
     # the ratio is smooth, the room is known exactly at any size
-    size = (picture.lens.width, picture.lens.height)
-    log_ratio = cv2.resize(log_ratio, size, interpolation=cv2.INTER_LINEAR)
-    rays, _ = lens_rays(picture.lens, scene.theta_max_rad, size)
-    height_sine = torch.from_numpy(rays @ view.up_in_camera).clamp(-1.0, 1.0)
+    log_ratio = cv2.resize(log_ratio, (picture.lens.width, picture.lens.height), interpolation=cv2.INTER_LINEAR)
+    height_sine = torch.from_numpy(scene.rays(picture).directions @ view.up_in_camera).clamp(-1.0, 1.0)
     log_room = log_room_distance(height_sine, height_m, settings.room_radius_m)
     return distance_m(torch.from_numpy(log_ratio), log_room).numpy()

@@ -18,8 +18,6 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 from numpy.typing import NDArray
 
-from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import read_image, read_mask
 from edge_depth_nerf.cameras import KannalaBrandt, Pinhole
 from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
@@ -86,16 +84,15 @@ def working_size(width: int, height: int, working_px: int) -> tuple[int, int]:
     return max(round(width * working_px / longer), 1), max(round(height * working_px / longer), 1)
 
 
-def network_view(picture: ScenePicture, theta_max_rad: float, working_px: int) -> NetworkView:
-    """Rays and mask of a picture at the network's size."""
+def network_view(scene: SceneFolder, picture: ScenePicture, working_px: int, masked: bool = True) -> NetworkView:
+    """Rays and mask of a picture at the network's size; without its mask all that the lens sees is usable."""
     size = working_size(picture.lens.width, picture.lens.height, working_px)
-    directions, within = lens_rays(picture.lens, theta_max_rad, size)
-    if "mask" in picture.files:
-        mask = read_mask(picture.files["mask"])
-        check_size(mask, picture, "mask")
+    found = rays(scaled_lens(picture.lens, size), scene.theta_max_rad)
+    usable, mask = found.within, scene.mask(picture) if masked else None
+    if mask is not None:
         # a pixel that a masked one is mixed into is masked as well
-        within = within & (cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999)
-    return NetworkView(directions, within, picture.up_in_camera.astype(np.float32))
+        usable = usable & (cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999)
+    return NetworkView(found.directions, usable, picture.up_in_camera.astype(np.float32))
 
 
 def scaled_lens(lens: KannalaBrandt | Pinhole, size: tuple[int, int]) -> KannalaBrandt | Pinhole:
@@ -104,14 +101,6 @@ def scaled_lens(lens: KannalaBrandt | Pinhole, size: tuple[int, int]) -> Kannala
     return dataclasses.replace(
         lens, width=size[0], height=size[1], fx=lens.fx * x, fy=lens.fy * y, cx=lens.cx * x, cy=lens.cy * y
     )
-
-
-def lens_rays(
-    lens: KannalaBrandt | Pinhole, theta_max_rad: float, size: tuple[int, int]
-) -> tuple[Float32[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """Rays of the pixels of a picture scaled to (width, height), and which lie within `theta_max_rad` of the axis."""
-    found = rays(scaled_lens(lens, size), theta_max_rad)
-    return found.directions, found.within
 
 
 def load_examples(
@@ -124,19 +113,12 @@ def load_examples(
     far_seen: Sequence[FarSeen] | None = None,
     by_motion: Sequence[Taught | None] | None = None,
 ) -> Examples:
-    """Read pictures into memory.
+    """Read the chosen pictures of each scene into memory, with `advance` called after each.
 
-    Args:
-        scenes: the scenes.
-        chosen: pictures of each.
-        heights_m: of each scene, the height of each of its cameras above the ground.
-        working_px: longer side at the network.
-        multiple_px: what both sides of the arrays are multiples of.
-        advance: called after each picture.
-        far_seen: of each scene, what gives more distances of a picture where it has no LiDAR point; see
-            `mono.far_seen`.
-        by_motion: of each scene, what gives distances from motion, for where there is still none; None for a scene
-            without. See `mono.motion_seen`.
+    The heights are those of each scene's cameras above the ground; `working_px` is the longer side at the network, and
+    both sides of the arrays are multiples of `multiple_px`. Where a picture has no LiDAR point, `far_seen` gives more
+    distances (see `mono.far_seen`), and where there is still none `by_motion` (see `mono.motion_seen`; None for a scene
+    without).
 
     Raises:
         InputError: a file cannot be decoded, or has another size than its camera.
@@ -154,10 +136,10 @@ def load_examples(
     index = 0
     for number, (scene, pictures, height_m) in enumerate(zip(scenes, chosen, heights_m, strict=True)):
         for picture in pictures:
-            view = network_view(picture, scene.theta_max_rad, working_px)
+            view = network_view(scene, picture, working_px)
             rows, columns = view.usable.shape
             part = (index, slice(0, rows), slice(0, columns))
-            rgb[part] = small_picture(picture, (columns, rows))
+            rgb[part] = small_picture(scene, picture, (columns, rows))
             known_m = small_lidar(scene, picture, view)
             if far_seen is not None:
                 # at twice the size it is told better what is hidden
@@ -165,7 +147,9 @@ def load_examples(
                 known_m = np.where(known_m > 0, known_m, _reduced(far_seen[number](picture, twice), view))
             of_motion = by_motion[number] if by_motion is not None else None
             if of_motion is not None and weight is not None and (found := of_motion(picture)) is not None:
-                known_m, weight[part] = _with_motion(known_m, *(_reduced(values, view) for values in found))
+                motion_m, of_each = (_reduced(values, view) for values in found)
+                weight[part] = np.where(known_m > 0, np.float32(1), of_each)
+                known_m = np.where(known_m > 0, known_m, motion_m)
             lidar_m[part] = known_m
             usable[part] = view.usable
             key = (picture.lens, scene.theta_max_rad)
@@ -181,24 +165,15 @@ def load_examples(
     return Examples(rgb, lidar_m, usable, all_rays, lenses, ups, heights, weight)
 
 
-def _with_motion(
-    known_m: Float32[np.ndarray, "h w"], motion_m: Float32[np.ndarray, "h w"], weight: Float32[np.ndarray, "h w"]
-) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-    """Distances from motion where LiDAR has none, and the weights of all."""
-    return np.where(known_m > 0, known_m, motion_m), np.where(known_m > 0, np.float32(1), weight)
-
-
 def bytes_a_picture(pictures: Sequence[ScenePicture], working_px: int, weighted: bool = False) -> int:
     """Memory that one picture takes at most, with or without weights of its distances."""
     largest = max(np.prod(working_size(p.lens.width, p.lens.height, working_px)) for p in pictures)
     return int(largest) * (3 + 4 + 1 + 4 * weighted)
 
 
-def small_picture(picture: ScenePicture, size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
+def small_picture(scene: SceneFolder, picture: ScenePicture, size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
     """The picture averaged down to (width, height)."""
-    pixels = read_image(picture.files["image"])
-    check_size(pixels, picture, "image")
-    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return np.asarray(cv2.resize(scene.rgb(picture), size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def small_lidar(scene: SceneFolder, picture: ScenePicture, view: NetworkView) -> Float32[np.ndarray, "h w"]:
@@ -222,33 +197,11 @@ def _reduced(lidar_m: Float32[np.ndarray, "rows columns"], view: NetworkView) ->
     return small
 
 
-def check_size(pixels: np.ndarray, picture: ScenePicture, layer: str) -> None:
-    """Check that a file has its camera's size.
-
-    Raises:
-        InputError: it has another.
-
-    """
-    width, height = picture.lens.width, picture.lens.height
-    if pixels.shape[:2] != (height, width):
-        raise InputError(
-            f"{picture.files[layer]}: is {pixels.shape[1]}×{pixels.shape[0]} pixels (width × height), but the camera "
-            f"of {picture.name} is {width}×{height}. Pictures, masks and distance maps of a frame must have one size; "
-            "make the file again at that size."
-        )
-
-
 def camera_height_m(scene: SceneFolder, pictures: Sequence[ScenePicture], working_px: int) -> float | None:
-    """Height of the cameras above the ground, from some pictures' LiDAR points below the horizon.
-
-    Returns:
-        Metres; None where too few LiDAR points lie there.
-
-    """
+    """Metres of the cameras above the ground, from some pictures' LiDAR points below the horizon; None for too few."""
     depths = []
     for picture in pictures:
-        size = working_size(picture.lens.width, picture.lens.height, working_px)
-        view = NetworkView(*lens_rays(picture.lens, scene.theta_max_rad, size), picture.up_in_camera.astype(np.float32))
+        view = network_view(scene, picture, working_px, masked=False)
         lidar_m = small_lidar(scene, picture, view)
         height_sine = view.rays @ view.up_in_camera
         below = (lidar_m > 0) & (height_sine < _GROUND_SINE)
@@ -258,12 +211,7 @@ def camera_height_m(scene: SceneFolder, pictures: Sequence[ScenePicture], workin
 
 
 def room_radius_m(examples: Examples) -> float:
-    """Horizontal distance of the room's wall: the geometric mean over LiDAR points near and above the horizon.
-
-    Returns:
-        Metres; 20 where there are no such LiDAR points.
-
-    """
+    """Horizontal metres to the room's wall: the geometric mean over LiDAR points near and above the horizon, or 20."""
     logs = []
     for index in range(len(examples)):
         height_sine = examples.rays[examples.lens[index]] @ examples.up_in_camera[index]

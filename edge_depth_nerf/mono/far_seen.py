@@ -18,13 +18,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
+from jaxtyping import Bool, Float32, Float64, Int32, Int64
 from numpy.typing import NDArray
 
 from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.lidar.projection import project_points
 from edge_depth_nerf.lidar.sweeps import first_in_voxel
-from edge_depth_nerf.mono.examples import network_view, scaled_lens
+from edge_depth_nerf.mono.examples import scaled_lens
+from edge_depth_nerf.mono.motion_seen import to_world
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
 
 VOXEL_M = 0.05
@@ -93,12 +94,7 @@ def static_cloud(
 ) -> Cloud:
     """Put the LiDAR points of some pictures together, if they are above any of these pictures' own.
 
-    What more of the pictures see through than see has moved, and is left out.
-
-    Args:
-        scene: the scene.
-        pictures: those whose LiDAR maps are used.
-        advance: called three times a picture.
+    What more of the pictures see through than see has moved, and is left out; `advance` is called thrice a picture.
 
     Raises:
         InputError: a file cannot be decoded, or has another size than its camera.
@@ -113,7 +109,7 @@ def static_cloud(
     for number, picture in enumerate(pictures):
         rays, lidar_m = _own(scene, picture)
         seen = lidar_m > 0
-        points.append(_to_world(picture, rays[seen] * lidar_m[seen, None]))
+        points.append(to_world(picture, rays[seen] * lidar_m[seen, None]))
         spacings.append((SPACING_RAD * lidar_m[seen]).astype(np.float32))
         collected += int(seen.sum())
         # one that thins as soon as it is full would soon thin at every picture
@@ -141,12 +137,7 @@ def seen_above(
 ) -> Float32[np.ndarray, "h w"]:
     """Project what a cloud has within reach into a picture, above its own points, without what is or may be hidden.
 
-    Args:
-        cloud: from `static_cloud`.
-        scene: the scene.
-        picture: one of it, with LiDAR.
-        size: width and height of the map.
-
+    The picture has LiDAR; the size of the map is width and height.
     """
     field = _field(scene, picture)
     near = cloud.part(cloud.near(picture))
@@ -166,13 +157,8 @@ def field_deg(
 ) -> tuple[float, float] | None:
     """Elevations between which nearly all of some pictures' own LiDAR points lie, within the masks.
 
-    Args:
-        scene: the scene.
-        pictures: those whose LiDAR maps are used.
-        advance: called after each picture.
-
-    Returns:
-        Degrees above the world's horizon, to 0.01°: the `ELEVATION_QUANTILES`; None without LiDAR points.
+    Degrees above the world's horizon, to 0.01°: the `ELEVATION_QUANTILES`; None without LiDAR points. `advance` is
+    called after each picture.
 
     Raises:
         InputError: a file cannot be decoded, or has another size than its camera.
@@ -253,12 +239,8 @@ def _tile_number(x: Int64[np.ndarray, "n"], y: Int64[np.ndarray, "n"] | np.int64
 
 def _own(scene: SceneFolder, picture: ScenePicture) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
     """A picture's rays, and its LiDAR map within the mask, at its own size."""
-    view = network_view(picture, scene.theta_max_rad, max(picture.lens.width, picture.lens.height))
-    return view.rays, np.where(view.usable, scene.lidar_m(picture), np.float32(0))
-
-
-def _to_world(picture: ScenePicture, in_camera: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-    return (in_camera * np.array([1.0, -1.0, -1.0])) @ picture.rotation.T + picture.position_m
+    lidar_m = np.where(scene.usable(picture), scene.lidar_m(picture), np.float32(0))
+    return scene.rays(picture).directions, lidar_m
 
 
 def _to_camera(picture: ScenePicture, points_m: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:

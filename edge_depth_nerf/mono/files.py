@@ -14,7 +14,6 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE, read_array_header, read_distance_png
 from edge_depth_nerf.base.png import read_png_header
 from edge_depth_nerf.cameras.rays import LEAST_COSINE
-from edge_depth_nerf.mono.examples import lens_rays
 from edge_depth_nerf.mono.options import Along
 from edge_depth_nerf.mono.relative import Kind, Layer
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
@@ -46,24 +45,15 @@ class MapFiles:
                 f"{path}: contains no positive number, only zeros, negative numbers, NaN or infinity. "
                 "Make it again, or leave the frame out of the scene."
             )
-        size = (picture.lens.width, picture.lens.height)
-        if self.along == "ray":
-            cosine = np.ones(values.shape, np.float32)
-        else:
-            cosine = lens_rays(picture.lens, scene.theta_max_rad, size)[0][..., 2]
-        whole = slice(0, size[1]), slice(0, size[0])
+        cosine = np.ones(values.shape, np.float32) if self.along == "ray" else scene.rays(picture).cos_theta
+        whole = slice(0, picture.lens.height), slice(0, picture.lens.width)
         return Layer(whole, values, cosine, (cosine >= LEAST_COSINE).astype(np.float32))
 
 
 def find_maps(scene: SceneFolder, folder: Path, kind: Kind, along: Along, metres_per_count: float | None) -> MapFiles:
     """Find a map for every picture of a scene, and check all by their headers.
 
-    Args:
-        scene: whose pictures they are of.
-        folder: holds CAMERA/FRAME.npy or .png, with the names of the scene's cameras and pictures.
-        kind: what the values are.
-        along: whether they count along the ray or along the optical axis.
-        metres_per_count: of PNGs; None where that is not declared.
+    The folder holds CAMERA/FRAME.npy or .png, with the names of the scene's cameras and pictures.
 
     Raises:
         FileNotFoundError: the folder or a map is not there.

@@ -20,7 +20,7 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.mono.options import HfOutput
 from edge_depth_nerf.mono.pinhole_views import pinhole_views
 from edge_depth_nerf.mono.relative import Kind, Layer
-from edge_depth_nerf.scene.reader import ScenePicture
+from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
 
 Predict = Callable[[Sequence[NDArray[np.uint8]]], Sequence[NDArray[np.float32]]]
 """Pictures (H×W×3, RGB) to maps (H×W) of z, of z up to scale and shift, or of its inverse."""
@@ -65,11 +65,7 @@ class ReadyNetwork:
 
 
 def load_ready_network(name: str, output: HfOutput = "auto") -> ReadyNetwork:
-    """Load a network from a folder, or by its name from Hugging Face's cache.
-
-    Args:
-        name: a folder that save_pretrained or a download made, or such as depth-anything/Depth-Anything-V2-Small-hf.
-        output: what its maps are; auto: as its config states.
+    """Load a network from a folder that save_pretrained or a download made, or by name from Hugging Face's cache.
 
     Raises:
         InputError: it is not there, is no depth network, or misses some of its weights.
@@ -144,22 +140,13 @@ def _kind(name: str, config: Any, output: HfOutput) -> Kind:
         return "inverse"
     raise InputError(
         f"{name}: its config ({config.model_type}) does not state the unit of its maps. Give --hf-output metric "
-        "(metres), "
-        "relative (depth up to scale and shift) or inverse (disparity up to scale and shift)."
+        "(metres), relative (depth up to scale and shift) or inverse (disparity up to scale and shift)."
     )
 
 
-def view_layers(predict: Predict, picture: ScenePicture, rgb: NDArray[np.uint8], theta_max_rad: float) -> list[Layer]:
-    """Predict the pinhole views of a picture.
-
-    Args:
-        predict: the network.
-        picture: of a scene.
-        rgb: its pixels, H×W×3.
-        theta_max_rad: rays beyond are not looked at.
-
-    """
-    views = pinhole_views(picture.lens, theta_max_rad)
+def view_layers(predict: Predict, scene: SceneFolder, picture: ScenePicture) -> list[Layer]:
+    """Predict the pinhole views of a scene's picture."""
+    views, rgb = pinhole_views(picture.lens, scene.theta_max_rad), scene.rgb(picture)
     maps = predict([view.cut(rgb) for view in views])
     return [
         Layer(view.box, view.back(found), view.cosine, view.weight) for view, found in zip(views, maps, strict=True)

@@ -8,13 +8,9 @@ from pathlib import Path
 
 from rich.console import Console
 
-from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.jobs.tasks import Task, do_tasks, own_command
-from edge_depth_nerf.mono.estimate import WEIGHTS, training_split
-from edge_depth_nerf.mono.hf import load_ready_network
-from edge_depth_nerf.mono.network import load_network
+from edge_depth_nerf.mono.estimate import WEIGHTS, opened, training_split
 from edge_depth_nerf.mono.options import EstimateDepthOptions
-from edge_depth_nerf.scene.reader import read_scene
 
 LOG = "estimate_depth.log"
 """In a scene: what the task said that made its maps."""
@@ -29,15 +25,8 @@ def estimate_on_cluster(options: EstimateDepthOptions, console: Console | None =
 
     """
     console = console or Console()
-    options.check()
     # faults are told before anything travels
-    if options.model is not None:
-        load_network(options.model)
-    if options.hf is not None:
-        load_ready_network(options.hf, options.hf_output)
-    scenes = [read_scene(path) for path in options.scenes]
-    if len({scene.path.resolve() for scene in scenes}) < len(scenes):
-        raise InputError("the scene is given twice. Name each scene once.")
+    *_, scenes = opened(options)
     folders = [scene.folder.absolute() for scene in scenes]
     here = replace(options, cluster=None)
     if options.hf is not None and Path(options.hf).is_dir():

@@ -11,7 +11,7 @@ Lengths are metres, distances along the ray, 0 = none.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float, Float32, Float64
 
 from edge_depth_nerf.method.prior import motion_sigma
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
@@ -26,12 +26,7 @@ _PRIMES = np.array([73_856_093, 19_349_663, 83_492_791], np.int64)
 
 
 def left_out_places(points_m: Float64[np.ndarray, "*shape 3"]) -> Bool[np.ndarray, "*shape"]:
-    """Which points in the world lie in a place that no training sees: a fixed rule of the place alone.
-
-    Args:
-        points_m: in the scene.
-
-    """
+    """Which points in the world lie in a place that no training sees: a fixed rule of the place alone."""
     x, y, z = np.moveaxis(np.floor(points_m / PLACE_M).astype(np.int64) * _PRIMES, -1, 0)
     number = x ^ y ^ z
     # the low bits of a product are those of its factors
@@ -42,17 +37,14 @@ def left_out_places(points_m: Float64[np.ndarray, "*shape 3"]) -> Bool[np.ndarra
 def left_out_pixels(
     scene: SceneFolder, picture: ScenePicture, distance_m: Float32[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Which of a picture's distances lie in such a place.
-
-    Args:
-        scene: the scene.
-        picture: one of it.
-        distance_m: of the picture, at its size.
-
-    """
-    in_camera = scene.rays(picture).directions * distance_m[..., None]
-    points_m = (in_camera * np.array([1.0, -1.0, -1.0])) @ picture.rotation.T + picture.position_m
+    """Which of a picture's distances, at its size, lie in such a place."""
+    points_m = to_world(picture, scene.rays(picture).directions * distance_m[..., None])
     return left_out_places(points_m) & (distance_m > 0)
+
+
+def to_world(picture: ScenePicture, in_camera: Float[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*shape 3"]:
+    """Move points from a picture's camera (x right, y down, z forward) to the world."""
+    return (in_camera * np.array([1.0, -1.0, -1.0])) @ picture.rotation.T + picture.position_m
 
 
 def taught_by_motion(
@@ -60,9 +52,7 @@ def taught_by_motion(
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]] | None:
     """A picture's distances from motion without those in left-out places, and their weight beside a LiDAR point's 1.
 
-    Returns:
-        Both at the picture's size, 0 = none; None if the picture has no map.
-
+    Both at the picture's size, 0 = none; None if the picture has no map.
     """
     motion_m = scene.distance_m(picture, "motion")
     if motion_m is None:

@@ -79,16 +79,9 @@ class DepthNetwork(nn.Module):
     def forward(
         self, picture: Float[Tensor, "n 3 h w"], geometry: Float[Tensor, "n 5 h w"], usable: Bool[Tensor, "n h w"]
     ) -> Float[Tensor, "n h w"]:
-        """Predict.
+        """Predict log(distance / the room's distance) from RGB (0 to 1) and what `ray_geometry` gives.
 
-        Args:
-            picture: RGB, 0 to 1.
-            geometry: from `ray_geometry`.
-            usable: where the picture may be looked at; elsewhere it is blacked out.
-
-        Returns:
-            log(distance / the room's distance).
-
+        Where the picture is not usable, it is blacked out.
         """
         seen = usable[:, None].to(picture.dtype)
         features = torch.cat(((picture - 0.5) * 4.0 * seen, geometry, seen), 1)
@@ -97,7 +90,7 @@ class DepthNetwork(nn.Module):
         for down, encode in zip(self.down, list(self.encoder)[1:], strict=True):
             features = encode(down(features).relu_())
             skipped.append(features)
-        for level in range(len(self.decoder) - 1, -1, -1):
+        for level in reversed(range(len(self.decoder))):
             finer = skipped[level]
             above = F.interpolate(_pointwise(self.lateral[level], features), size=finer.shape[-2:], mode="nearest")
             features = self.decoder[level](finer + above)
@@ -131,11 +124,7 @@ def log_room_distance(
 ) -> Float[Tensor, "*batch"]:
     """Natural logarithm of the distance, in metres, to the floor or the wall of the plain room.
 
-    Args:
-        height_sine: sine of a ray's elevation above the horizon.
-        camera_height_m: of the camera above the floor.
-        room_radius_m: horizontal distance of the wall.
-
+    `height_sine` is the sine of a ray's elevation above the horizon.
     """
     cosine = (1.0 - height_sine.square()).clamp(min=_STEEPEST_COSINE**2).sqrt()
     wall_m = room_radius_m / cosine
@@ -150,17 +139,10 @@ def ray_geometry(
     camera_height_m: Float[Tensor, "n"],
     settings: NetworkSettings,
 ) -> tuple[Float[Tensor, "n 5 h w"], Float[Tensor, "n h w"]]:
-    """Make what the network sees beside the picture.
+    """Make what the network sees beside the picture, and the room's log distance.
 
-    Args:
-        rays: unit vectors in the camera's frame; zeros where a pixel has none.
-        up_in_camera: unit vector against gravity, in the camera's frame.
-        camera_height_m: of the camera above the ground.
-        settings: the network's.
-
-    Returns:
-        The ray, the sine of its elevation, the room's log distance, centred; and the room's log distance itself.
-
+    The ray, the sine of its elevation, and the room's log distance, centred. Rays are unit vectors, zeros where a pixel
+    has none; `up_in_camera` is the unit vector against gravity.
     """
     height_sine = torch.einsum("nhwc,nc->nhw", rays, up_in_camera).clamp(-1.0, 1.0)
     room = log_room_distance(height_sine, camera_height_m[:, None, None], settings.room_radius_m)
@@ -177,22 +159,12 @@ def distance_m(prediction: Float[Tensor, "*batch"], log_room: Float[Tensor, "*ba
 
 
 def save_network(path: Path, network: DepthNetwork, about: dict[str, Any]) -> None:
-    """Write weights and settings as safetensors, atomically.
-
-    Args:
-        path: the file.
-        network: what is saved.
-        about: JSON that says how it was made: the preset, the scenes, its errors.
-
-    """
+    """Write weights and settings as safetensors, atomically; `about` is JSON that says how the network was made."""
     write_tensors(path, network.state_dict(), {"settings": asdict(network.settings), "about": about})
 
 
 def load_network(path: Path) -> tuple[DepthNetwork, dict[str, Any]]:
-    """Read what `save_network` wrote.
-
-    Returns:
-        The network, on the CPU; and what was said about it.
+    """Read what `save_network` wrote: the network, on the CPU, and what was said about it.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -205,8 +177,7 @@ def load_network(path: Path) -> tuple[DepthNetwork, dict[str, Any]]:
     with torch.device("meta"):
         expected = {name: tuple(tensor.shape) for name, tensor in DepthNetwork(settings).state_dict().items()}
     found = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
-    if expected != found:
-        differing = sorted(name for name in {*expected, *found} if expected.get(name) != found.get(name))
+    if differing := sorted(name for name in {*expected, *found} if expected.get(name) != found.get(name)):
         name = differing[0]
         raise InputError(
             f"{path}: its tensors are not those of the network that its settings describe: {name} is "

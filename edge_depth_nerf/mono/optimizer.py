@@ -35,15 +35,9 @@ class HiddenMuon:
         hidden_learning_rate: float | None,
         weight_decay: float,
     ) -> None:
-        """Take a network's parameters.
+        """Take a network's parameters, with its last convolution, and the highest rates of AdamW and of Muon.
 
-        Args:
-            network: whose.
-            last: its last convolution.
-            learning_rate: AdamW's, at its highest.
-            hidden_learning_rate: Muon's, at its highest; None: AdamW for all.
-            weight_decay: of both.
-
+        Without a hidden rate AdamW has all.
         """
         muon = hidden_learning_rate is not None
         hidden = [m.weight for m in network.modules() if muon and isinstance(m, nn.Conv2d) and m is not last]
@@ -57,13 +51,7 @@ class HiddenMuon:
 
     @torch.no_grad()
     def step(self, share: float, mapped: Mapped = map) -> None:
-        """Change the parameters by their gradients.
-
-        Args:
-            share: of the highest learning rates.
-            mapped: what applies a function to the matrices, `map` or that of a pool of threads.
-
-        """
+        """Change the parameters by their gradients, at a share of the highest rates; `mapped` may have threads."""
         for group in self._adam.param_groups:
             group["lr"] = share * self._rate
         self._adam.step()

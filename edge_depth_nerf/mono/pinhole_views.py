@@ -63,9 +63,7 @@ class PinholeView:
     def back(self, values: Float[np.ndarray, "height width"]) -> Float32[np.ndarray, "rows columns"]:
         """A map of the view, of any scale of its own, read at the pixels of the box.
 
-        Returns:
-            NaN where the view sees nothing, and beside a value that is not finite.
-
+        NaN where the view sees nothing, and beside a value that is not finite.
         """
         found = _read(values.astype(np.float32), self.view_xy)
         return np.where((self.weight > 0) & np.isfinite(found), found, np.float32(np.nan))
@@ -77,15 +75,9 @@ def _read(pixels: NDArray, at_xy: NDArray[np.float32]) -> NDArray:
 
 @lru_cache(maxsize=4)
 def pinhole_views(lens: KannalaBrandt | Pinhole, theta_max_rad: float) -> tuple[PinholeView, ...]:
-    """Views that together see every pixel of a lens within an angle of its axis.
+    """Views, at least one, that together see every pixel of a lens within an angle of its axis.
 
-    Args:
-        lens: of the picture.
-        theta_max_rad: rays beyond are not looked at.
-
-    Returns:
-        At least one. Views that are nowhere the best are left out.
-
+    Views that are nowhere the best are left out.
     """
     found = rays(lens, theta_max_rad)
     directions, within = found.directions, found.within

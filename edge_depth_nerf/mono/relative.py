@@ -116,15 +116,7 @@ class Layer:
 def take_samples(
     layers: Sequence[Layer], lidar_m: Float[np.ndarray, "h w"], usable: Bool[np.ndarray, "h w"], most: int
 ) -> Samples:
-    """Read the layers at LiDAR points, and at other pixels: at most so many of each, drawn evenly.
-
-    Args:
-        layers: of one picture.
-        lidar_m: its LiDAR distance, 0 = no LiDAR point.
-        usable: True where the picture may be used.
-        most: number of pixels of each sort.
-
-    """
+    """Read a picture's layers at LiDAR points, and at other usable pixels: at most so many of each, drawn evenly."""
     rng = np.random.default_rng(0)
     chosen = []
     for pixels in (usable & (lidar_m > 0), usable & (lidar_m == 0)):
@@ -138,12 +130,7 @@ def take_samples(
 def blend(
     layers: Sequence[Layer], lines: Sequence[Line], kind: Kind, shape: tuple[int, int]
 ) -> Float[np.ndarray, "h w"]:
-    """Put the layers together: the mean of log distance, weighted.
-
-    Returns:
-        Metres along the ray, 0 = none.
-
-    """
+    """Put the layers together: the weighted mean of log distance, as metres along the ray, 0 = none."""
     total, logs = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     for layer, line in zip(layers, lines, strict=True):
         metres = line.distance_m(layer.values, layer.cosine, kind)
@@ -154,16 +141,10 @@ def blend(
 
 
 def fit_lines(samples: Samples, kind: Kind, start: Sequence[Line] | None = None) -> list[Line]:
-    """Find scale and shift of each view.
+    """Find scale and shift of each view; metric maps keep a shift of 0.
 
-    Args:
-        samples: what the views say, and LiDAR.
-        kind: metric maps keep a shift of 0.
-        start: lines that the views keep to instead of to LiDAR, of which nothing is taken then.
-
-    Returns:
-        Of each view. One that nothing is known of, neither by LiDAR nor by its neighbours, gets 0 and 0: no value.
-
+    With a start, the views keep to these lines instead of to LiDAR, of which nothing is taken then. A view that nothing
+    is known of, neither by LiDAR nor by its neighbours, gets 0 and 0: no value.
     """
     problem = _Problem(samples, kind, start)
     theta = problem.linear() if start is None else problem.of_lines(start)
@@ -176,9 +157,7 @@ def fit_lines(samples: Samples, kind: Kind, start: Sequence[Line] | None = None)
 def rank_correlation(values: Float[np.ndarray, "n"], others: Float[np.ndarray, "n"]) -> float:
     """Spearman's; 0 where either is constant."""
     ranks = np.stack([scipy.stats.rankdata(each) for each in (values, others)])
-    if np.ptp(ranks, 1).min(initial=np.inf) == 0:
-        return 0.0
-    return float(np.corrcoef(ranks)[0, 1])
+    return float(np.corrcoef(ranks)[0, 1]) if np.ptp(ranks, 1).min() > 0 else 0.0
 
 
 class _Problem:
@@ -225,8 +204,7 @@ class _Problem:
 
     def of_lines(self, lines: Sequence[Line]) -> NDArray[np.float64]:
         """Parameters of lines."""
-        scale = np.array([line.scale for line in lines])
-        shift = np.array([line.shift for line in lines])
+        scale, shift = np.array([(line.scale, line.shift) for line in lines]).T
         if self.metric:
             return np.stack([scale, np.zeros_like(scale)], 1)
         return np.stack([scale * self.centre + shift, scale * self.spread], 1)
@@ -282,12 +260,8 @@ class _Problem:
         off_pair = log_m[first, shared] - log_m[second, shared]
         targets = self._rows(view, slope[view, pixel])
         pairs = self._rows(first, slope[first, shared]) - self._rows(second, slope[second, shared])
-        weight = np.concatenate(
-            [
-                self.target_weight[use_target] * weights_of_targets(off_target),
-                self.pair_weight[use_pair] * _robust(off_pair),
-            ]
-        )
+        of_targets = self.target_weight[use_target] * weights_of_targets(off_target)
+        weight = np.concatenate([of_targets, self.pair_weight[use_pair] * _robust(off_pair)])
         matrix, right = np.concatenate([targets, pairs]), -np.concatenate([off_target, off_pair])
         change = _solve(matrix, right, weight, damping=1e-6).reshape(-1, 2)
         changed = np.abs((slope * change[:, None]).sum(-1)[fine])

@@ -8,6 +8,7 @@ number, so that a killed training resumes as if it had not been interrupted.
 from __future__ import annotations
 
 import functools
+import json
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -115,14 +116,9 @@ def scale_invariant_loss(
 ) -> Float[Tensor, ""]:
     """Scale-invariant log loss (Eigen et al., NIPS 2014, Eq. 4): mean(e²) - balance·mean(e)², over pictures.
 
-    Its square root is taken, so that a few wrong LiDAR points do not dominate it.
-
-    Args:
-        log_error: log(predicted / measured distance).
-        valid: where there is a measurement; pictures without any count for nothing.
-        balance: 0 = plain squared log error, 1 = a picture's scale does not matter.
-        weight: how much each measurement counts in the means.
-
+    Its square root is taken, so that a few wrong LiDAR points do not dominate it. e is log(predicted / measured
+    distance) where `valid`; pictures without a measurement count for nothing. With a balance of 1 a picture's scale
+    does not matter; `weight` is how much each measurement counts in the means.
     """
     weight = valid * weight
     counts = weight.sum((1, 2))
@@ -140,11 +136,8 @@ def smoothness_loss(
 ) -> Float[Tensor, ""]:
     """Edge-aware smoothness: |difference of neighbours| · exp(-10·colour difference), mean over usable pairs.
 
-    Args:
-        log_ratio: log(predicted distance / the room's distance): floors and walls as such cost nothing.
-        rgb: 0 to 1; the colour difference is the mean of the channels' absolute differences.
-        usable: both of a pair must be.
-
+    `log_ratio` is log(predicted distance / the room's distance): floors and walls as such cost nothing. The colour
+    difference is the mean of the channels' absolute differences (RGB 0 to 1).
     """
     total, count = log_ratio.new_zeros(()), log_ratio.new_zeros(())
     for axis, pair in zip((1, 2), _usable_pairs(usable), strict=True):
@@ -164,20 +157,13 @@ def make_batch(examples: Examples, indices: np.ndarray, settings: NetworkSetting
     def on_device(values: np.ndarray) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(values)).to(device)
 
-    rays = on_device(examples.rays[examples.lens[indices]])
-    geometry, log_room = ray_geometry(
-        rays, on_device(examples.up_in_camera[indices]), on_device(examples.camera_height_m[indices]), settings
-    )
-    return Batch(
-        rgb=on_device(examples.rgb[indices]).permute(0, 3, 1, 2).float() / 255.0,
-        geometry=geometry,
-        log_room=log_room,
-        usable=on_device(examples.usable[indices]),
-        lidar_m=on_device(examples.lidar_m[indices]),
-        weight=on_device(
-            np.ones_like(examples.lidar_m[indices]) if examples.weight is None else examples.weight[indices]
-        ),
-    )
+    rays, up = examples.rays[examples.lens[indices]], examples.up_in_camera[indices]
+    lidar_m, height_m = examples.lidar_m[indices], examples.camera_height_m[indices]
+    weight = np.ones_like(lidar_m) if examples.weight is None else examples.weight[indices]
+    rgb = on_device(examples.rgb[indices]).permute(0, 3, 1, 2).float() / 255.0
+    geometry, log_room = ray_geometry(on_device(rays), on_device(up), on_device(height_m), settings)
+    usable, lidar, weights = (on_device(each) for each in (examples.usable[indices], lidar_m, weight))
+    return Batch(rgb, geometry, log_room, usable, lidar, weights)
 
 
 def augmented(batch: Batch, options: TrainingOptions, multiple_px: int, generator: np.random.Generator) -> Batch:
@@ -260,19 +246,11 @@ def train(
     device: torch.device | None = None,
     report: Callable[[float, float], None] = lambda share, abs_rel: None,
 ) -> Trained:
-    """Train a network, or resume an interrupted training.
+    """Train a network, or resume an interrupted training; on the GPU if there is one and no other device is given.
 
-    Args:
-        examples: what is trained on.
-        kept: pictures kept for stopping, with LiDAR points; None to take the last weights.
-        settings: the network's.
-        options: how.
-        start: weights to begin with, of the same settings.
-        checkpoint: file that a killed training resumes from; one of another training is replaced.
-        checkpoint_seconds: how often it is written.
-        device: where; the GPU if there is one.
-        report: called after each step with the share done and the least error so far, infinite before the first look.
-
+    `kept` are pictures kept for stopping, with LiDAR points; None to take the last weights. `start` has the same
+    settings. A killed training resumes from its checkpoint; that of another one is replaced. `report` is called after
+    each step with the share done and the least error so far, infinite before the first look.
     """
     device = device or torch.device("cuda" if torch.cuda.is_available() else "cpu")
     with torch.random.fork_rng(devices=[]):
@@ -481,6 +459,4 @@ def _resume(path: Path, fresh: _State, network: DepthNetwork, optimizer: HiddenM
 
 def as_json(value: Any) -> Any:
     """As read back from a file: tuples become lists."""
-    if isinstance(value, dict):
-        return {key: as_json(entry) for key, entry in value.items()}
-    return [as_json(entry) for entry in value] if isinstance(value, (list, tuple)) else value
+    return json.loads(json.dumps(value))

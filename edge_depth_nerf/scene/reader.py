@@ -180,9 +180,13 @@ class SceneFolder:
 
         """
         # the size in transforms.json may be anything, that of a decoded mask is in memory already
-        mask = self._checked(picture, "mask", read_mask(picture.files["mask"])) if "mask" in picture.files else None
+        mask = self.mask(picture)
         within = self.rays(picture).within
         return within.copy() if mask is None else mask & within
+
+    def mask(self, picture: ScenePicture) -> Bool[np.ndarray, "h w"] | None:
+        """Read a picture's mask, True = use; None if it has none. Raises as `usable`."""
+        return self._checked(picture, "mask", read_mask(picture.files["mask"])) if "mask" in picture.files else None
 
     def distance_m(self, picture: ScenePicture, layer: str) -> Float32[np.ndarray, "h w"] | None:
         """Read a map of a distance layer: metres along the ray, 0 = none; None if the picture has none.
