@@ -61,8 +61,3 @@ def test_looking() -> None:
     # forward is the vehicle's left (y), right is its front (x), down is down
     assert left == pytest.approx(np.array([[1, 0, 0, 1], [0, 0, 1, 2], [0, -1, 0, 3], [0, 0, 0, 1]]), abs=1e-12)
     assert looking(0.0, 90.0, (0.0, 0.0, 0.0))[:3, 2] == pytest.approx([0, 0, -1], abs=1e-12)
-
-
-def test_an_unknown_layout_is_said(unchecked_types: None) -> None:
-    with pytest.raises(InputError, match="--layout kitti: no such layout, expected one of kitti-360"):
-        SynthesizeOptions(Path("x"), layout="kitti").check()  # pyright: ignore[reportArgumentType]
