@@ -137,7 +137,7 @@ def _work_of(command: Command) -> Callable[..., Any]:
     if isinstance(command, SynthesizeOptions):
         from edge_depth_nerf.synthetic.drive import synthesize_drive as work
     elif isinstance(command, Process):
-        from edge_depth_nerf.process.many import process_drive as work
+        from edge_depth_nerf.process.command import process_drive as work
     elif isinstance(command, EstimateDepthOptions) and command.cluster is None:
         from edge_depth_nerf.mono.estimate import estimate_depth as work
     elif isinstance(command, EstimateDepthOptions):

@@ -34,8 +34,7 @@ from edge_depth_nerf.jobs.tasks import Task, do_tasks, own_command
 from edge_depth_nerf.mono.estimate import estimate_depth
 from edge_depth_nerf.mono.many import estimate_on_cluster
 from edge_depth_nerf.mono.options import EstimateDepthOptions
-from edge_depth_nerf.process.command import process
-from edge_depth_nerf.process.many import process_drive
+from edge_depth_nerf.process.command import process, process_drive
 from edge_depth_nerf.process.options import Kitti360Options
 
 dask = pytest.importorskip("dask")

@@ -26,8 +26,7 @@ from edge_depth_nerf.process.colmap.models import ColmapModel, SparseView, colma
 from edge_depth_nerf.process.colmap.poses import NOT_REGISTERED, colmap_poses
 from edge_depth_nerf.process.colmap.refine import refine_poses
 from edge_depth_nerf.process.colmap.scale import find_scale_break, join_models, metric_path
-from edge_depth_nerf.process.converters import convert
-from edge_depth_nerf.process.kitti360.converter import read_kitti360
+from edge_depth_nerf.process.converters import convert, read_drive
 from edge_depth_nerf.process.options import Kitti360Options, ProcessOptions
 from edge_depth_nerf.process.recording import DepthFile, RecordedCamera, RecordedPicture, RecordedSweep, Recording
 from edge_depth_nerf.scene.reader import read_scene
@@ -435,9 +434,11 @@ def test_foreign_files_are_left_alone(tmp_path):
 def test_a_mask_of_another_size_is_named(tmp_path):
     pytest.importorskip("pycolmap")
     write_mask(tmp_path / "ego.png", np.ones((32, 64), bool))
-    options = ProcessOptions(output=tmp_path / "scene", ego_mask=tmp_path / "ego.png")
+    drive = pictured(tmp_path / "raw", 3)
+    masked = [dataclasses.replace(camera, ego_mask=tmp_path / "ego.png") for camera in drive.cameras]
+    drive = dataclasses.replace(drive, cameras=tuple(masked))
     with pytest.raises(InputError, match=r"ego\.png: 64×32 pixels, but its camera.s calibration says 64×64"):
-        colmap_poses(pictured(tmp_path / "raw", 3), options, QUIET)
+        colmap_poses(drive, ProcessOptions(output=tmp_path / "scene"), QUIET)
 
 
 def test_pictures_without_features_are_an_error(tmp_path):
@@ -477,7 +478,7 @@ def found(drive, tmp_path_factory) -> tuple[Kitti360Options, Recording]:
     options = Kitti360Options(
         root=blind, sequence=SynthesizeOptions(drive).sequence, output=blind.parent / "scene", poses="colmap"
     )
-    return options, colmap_poses(read_kitti360(options), options, QUIET)
+    return options, colmap_poses(read_drive(options), options, QUIET)
 
 
 @pytest.mark.slow
@@ -525,7 +526,7 @@ def test_the_same_command_finds_the_work_done(found):
     folder = options.output.with_name(f".{options.output.name}.colmap")
     assert not (folder / "database.db").exists()
     made = (folder / "models").stat().st_mtime_ns
-    again = colmap_poses(read_kitti360(options), options, QUIET)
+    again = colmap_poses(read_drive(options), options, QUIET)
     assert (folder / "models").stat().st_mtime_ns == made
     assert again.trajectory is not None and recording.trajectory is not None
     np.testing.assert_array_equal(again.trajectory.vehicle_to_world, recording.trajectory.vehicle_to_world)
@@ -548,7 +549,7 @@ def test_an_interrupted_run_goes_on(found, tmp_path, monkeypatch):
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(pycolmap, "match_image_pairs", interrupted)
-        colmap_poses(read_kitti360(options), options, QUIET)
+        colmap_poses(read_drive(options), options, QUIET)
     there = features()
     assert min(there) > 20
 
@@ -560,13 +561,13 @@ def test_an_interrupted_run_goes_on(found, tmp_path, monkeypatch):
         seen.append(features())
 
     monkeypatch.setattr(pycolmap, "extract_features", watched)
-    assert len(colmap_poses(read_kitti360(options), options, QUIET).pictures) == 8
+    assert len(colmap_poses(read_drive(options), options, QUIET).pictures) == 8
     assert seen == [there, there]
 
     # other inputs, other work
     write_mask(tmp_path / "ego.png", np.ones((SIZE, SIZE), bool))
     masked = dataclasses.replace(options, ego_mask=tmp_path / "ego.png")
-    colmap_poses(read_kitti360(masked), masked, QUIET)
+    colmap_poses(read_drive(masked), masked, QUIET)
     assert sum(seen[2]) == 0 < sum(seen[3])
 
 
@@ -590,7 +591,7 @@ def test_masked_pixels_have_no_features(drive, tmp_path, monkeypatch):
         sequence, output = SynthesizeOptions(drive).sequence, tmp_path / name
         options = Kitti360Options(root=drive, sequence=sequence, output=output, poses="colmap", frames=2, **masked)
         with pytest.raises(KeyboardInterrupt):
-            colmap_poses(read_kitti360(options), options, QUIET)
+            colmap_poses(read_drive(options), options, QUIET)
         with contextlib.closing(pycolmap.Database.open(tmp_path / f".{name}.colmap" / "database.db")) as opened:
             found = [opened.read_keypoints(image.image_id) for image in opened.read_all_images()]
         assert len(found) == 4
@@ -617,7 +618,7 @@ def five_moments(drive: Path, folder: Path, noise: int) -> tuple[Recording, Kitt
         frames=5,
         ego_mask=half_masked(drive, folder / "ego"),
     )
-    recording = read_kitti360(options)
+    recording = read_drive(options)
     rng = np.random.default_rng(noise)
     pictures = []
     for picture in recording.pictures:
@@ -713,7 +714,7 @@ def test_a_drive_with_disturbed_poses_becomes_a_scene_with_better_ones(drive, tm
     )
     report = convert(options, QUIET)
     assert any(notice.startswith("Poses refined by") for notice in report.notices)
-    to_vehicle = {camera.name: camera.to_vehicle for camera in read_kitti360(options).cameras}
+    to_vehicle = {camera.name: camera.to_vehicle for camera in read_drive(options).cameras}
     scene = read_scene(options.output)
     poses: dict[str, dict[int, np.ndarray]] = {name: {} for name in to_vehicle}
     for picture in scene.pictures:
@@ -740,7 +741,7 @@ def test_a_drive_with_disturbed_poses_becomes_a_scene_with_better_ones(drive, tm
 def test_true_poses_of_a_drive_stay(drive, tmp_path):
     pytest.importorskip("pycolmap")
     options = Kitti360Options(root=drive, sequence=SynthesizeOptions(drive).sequence, output=tmp_path / "scene")
-    recording = read_kitti360(options)
+    recording = read_drive(options)
     refined = refine_poses(recording, options, QUIET)
     assert "given poses are used unchanged" in refined.notices[-1]
     assert refined.pictures == recording.pictures

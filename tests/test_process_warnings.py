@@ -172,7 +172,7 @@ def test_a_transform_of_other_axes_does_not_fit(recording: Recording) -> None:
 
 
 def test_no_fit_is_said_where_the_pictures_could_tell() -> None:
-    unfit = ContrastAgreement("front", "roof", 0.1, 0.2, 0.1, 0.15, 0.7)
+    unfit = ContrastAgreement("front", "roof", 0.1, {"camera": 0.2, "scanner": 0.1, "both": 0.15}, 0.7)
     (said,) = agreement_notices([unfit])
     assert "no inverse of a transform fits, either: front with roof (0.10)" in said
     # noise has no agreement either way

@@ -18,7 +18,8 @@ from edge_depth_nerf.lidar.sweeps import first_in_voxel
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.lidar.world import WorldSweep, above_field, sweep_in_world
 from edge_depth_nerf.process import sweep_store
-from edge_depth_nerf.process.recording import RecordedSweep
+from edge_depth_nerf.process.options import ProcessOptions
+from edge_depth_nerf.process.recording import RecordedSweep, Recording
 from edge_depth_nerf.process.sweep_store import Surroundings, SweepStore, _Gathered, _Shared
 
 FISHEYE = MEI(700, 700, 668.0, 668.0, 350.5, 349.0, 2.2134, 0.0168, 1.6549, 4e-4, 4e-4)
@@ -227,7 +228,8 @@ def stored(worlds: dict[int, np.ndarray], speed_m_s: float = 0.0, interval_s: fl
 
 
 def store(sweeps: list[RecordedSweep], reach: int, held_out: set[int], path: Trajectory | None = None) -> SweepStore:
-    return SweepStore(sweeps, path or straight(0.0), reach=reach, deskew=True, held_out=held_out)
+    recording = Recording((), (), tuple(sweeps), path or straight(0.0), {})
+    return SweepStore(recording, ProcessOptions(output=Path("scene"), sweeps=reach, strict=True), held_out)
 
 
 AT_ORIGIN = np.eye(4)

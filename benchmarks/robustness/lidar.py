@@ -51,12 +51,13 @@ def recording(made: SynthesizeOptions, sweeps: int) -> Recording:
     return read_kitti360(options(made, Path("unused"), sweeps))
 
 
-def options(made: SynthesizeOptions, output: Path, sweeps: int) -> Kitti360Options:
+def options(made: SynthesizeOptions, output: Path, sweeps: int, *, raw_lidar: bool = False) -> Kitti360Options:
     return Kitti360Options(
         root=made.output,
         sequence=made.sequence,
         output=output,
         sweeps=sweeps,
+        raw_lidar=raw_lidar,
         ego_mask=made.output / "truth" / "masks",
         holdout_every=HOLDOUT_EVERY,
     )
@@ -127,10 +128,9 @@ COLUMNS = (*(f"wrong: {kind}" for kind in KINDS), "right ones kept", "cover: all
 def judge(made: SynthesizeOptions, reach: int, every: int, *, free_space: bool = True) -> dict[str, Counts]:
     """Project the sweeps that training pictures get, and compare the maps with the truth."""
     found = recording(made, reach)
-    assert found.trajectory is not None
     held_out = {frame for frame in range(made.frames) if frame % HOLDOUT_EVERY == HOLDOUT_EVERY // 2}
     stores = {
-        kind: SweepStore(found.sweeps, found.trajectory, reach=reach, deskew=kind != "recorded", held_out=held_out)
+        kind: SweepStore(found, options(made, Path("unused"), reach, raw_lidar=kind == "recorded"), held_out)
         for kind in KINDS
     }
     for kind, store in stores.items():

@@ -10,7 +10,7 @@ import dataclasses
 import hashlib
 import threading
 from collections import defaultdict
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -84,12 +84,11 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
 
     """
     console = console or Console()
-    options.check()
     check_classes(options.moving_classes)
     _check_poses(recording, options)
     with console.status("Checking cameras and files …"):
         source = _source(recording, options)
-        masks = given_masks(recording, options)
+        masks = given_masks(recording)
         check_cameras(_scene_cameras(recording, masks, options), options.theta_max_deg)
     open_scene(options.output, source)
     if options.poses == "lidar":
@@ -108,12 +107,13 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
     if options.find_moving:
         recording, more = find_moving(recording, options, held_out, masks, console)
         notices += more
-    builder = _Builder(recording, options, held_out, masks)
+    cameras = _scene_cameras(recording, masks, options)
+    builder = _Builder(recording, options, held_out, cameras)
     frames = [
         SceneFrame(
             camera=picture.camera,
             frame=picture.frame,
-            camera_to_world=builder.pose(picture),
+            camera_to_world=recording.pose(picture),
             content=partial(builder.content, picture),
             timestamp_s=picture.timestamp_s,
             held_out=picture.frame in held_out,
@@ -124,7 +124,7 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
     notices += _disagreements(recording, masks, options, console)
     report = write_scene(
         options.output,
-        _scene_cameras(recording, masks, options),
+        cameras,
         frames,
         layers=builder.layers,
         source=source,
@@ -253,15 +253,13 @@ class _Builder:
     """Makes the maps of pictures; called from several threads."""
 
     def __init__(
-        self, recording: Recording, options: ProcessOptions, held_out: set[int], masks: dict[str, NDArray[np.bool_]]
+        self, recording: Recording, options: ProcessOptions, held_out: set[int], cameras: Sequence[SceneCamera]
     ) -> None:
         self._options, self._held_out, self._recording = options, held_out, recording
-        self._pictures = recording.pictures
         self._cameras = {recorded.name: recorded for recorded in recording.cameras}
-        self._ego = {name: options.ego_mask_of(name) or recorded.ego_mask for name, recorded in self._cameras.items()}
-        self._store = SweepStore.of(recording, options, held_out)
+        self._store = SweepStore(recording, options, held_out)
         self._usable: dict[str, NDArray[np.bool_]] = {}
-        for scene_camera in _scene_cameras(recording, masks, options):
+        for scene_camera in cameras:
             usable = lens_circle(scene_camera.original, options.theta_max_deg)
             self._usable[scene_camera.name] = usable if scene_camera.mask is None else usable & scene_camera.mask
         as_recorded = options.poses == "recorded" and not options.refine_poses
@@ -284,19 +282,16 @@ class _Builder:
     def _keep_poses(self) -> Path:
         """Write down the poses that were found, and what is held out by them: other ones make other maps."""
         path = self._options.output / FOUND_POSES
-        poses = [[p.camera, p.frame, p.frame in self._held_out, self.pose(p).tolist()] for p in self._pictures]
+        pictures, pose = self._recording.pictures, self._recording.pose
+        poses = [[p.camera, p.frame, p.frame in self._held_out, pose(p).tolist()] for p in pictures]
         if not path.is_file() or read_json(path) != poses:
             write_json(path, poses)
         return path
 
-    def pose(self, picture: RecordedPicture) -> Transform:
-        """Where a picture was taken."""
-        return self._recording.pose(picture)
-
     def inputs(self, picture: RecordedPicture) -> tuple[Path, ...]:
         """Files that a picture's maps are made from."""
         sweeps = [sweep.path for sweep in self._store.used(picture.frame, picture.time_s)]
-        ego = self._ego[picture.camera]
+        ego = self._cameras[picture.camera].ego_mask
         return (*picture.inputs, *sweeps, *self._found, *([] if ego is None else [ego]))
 
     def content(self, picture: RecordedPicture) -> FrameContent:
@@ -339,7 +334,7 @@ class _Builder:
     ) -> tuple[Float[np.ndarray, "h w"] | None, PointCloud | None]:
         """LiDAR's map, and the points that it holds."""
         camera = full.downscaled(self._options.downscale)
-        camera_to_world = self.pose(picture)
+        camera_to_world = self._recording.pose(picture)
         if picture.depth is not None:
             distance_m = downscale_distance(read_depth(picture.depth, full), self._options.downscale)
             points = torch.from_numpy(rays(camera).directions * distance_m[..., None])
@@ -373,7 +368,7 @@ class _Builder:
 
     def _beams(self, picture: RecordedPicture, full: Camera) -> Float[np.ndarray, "h w"]:
         """The LiDAR points that are held out of everything, as far as nothing hides them."""
-        camera_to_world = self.pose(picture)
+        camera_to_world = self._recording.pose(picture)
         around = self._store.around(picture.frame, picture.time_s, camera_to_world)
         beams = self._store.beams(picture.frame, picture.time_s)
         points_m = torch.cat((around.points_m, beams))
@@ -411,7 +406,7 @@ class _Builder:
             sky = ~downscale_mask(~sky_of_labels(labels), factor)
         else:
             camera = full.downscaled(factor)
-            up = np.linalg.inv(self.pose(picture))[:3, 2]
+            up = np.linalg.inv(self._recording.pose(picture))[:3, 2]
             lidar = np.zeros(mono.shape, np.float32) if lidar is None else lidar
             sky = find_sky(image, self._usable[picture.camera], up, camera, lidar, mono)
         return np.where(sky, 0, mono).astype(np.float32)
@@ -464,9 +459,7 @@ def _cloud(
 def _source(recording: Recording, options: ProcessOptions) -> dict[str, Any]:
     """Describe what the scene is made of, without the machine's paths."""
     digest = hashlib.sha256()
-    ego_masks = [
-        path for recorded in recording.cameras if (path := options.ego_mask_of(recorded.name) or recorded.ego_mask)
-    ]
+    ego_masks = [recorded.ego_mask for recorded in recording.cameras if recorded.ego_mask is not None]
     for path in (*recording.whole_inputs, *ego_masks):
         if not path.is_file():
             raise FileNotFoundError(

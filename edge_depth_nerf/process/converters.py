@@ -6,7 +6,7 @@ in a module that imports little (`process/options.py`, or the head of the conver
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import TYPE_CHECKING
 
@@ -52,8 +52,16 @@ def read_drive(options: ProcessOptions) -> Recording:
         InputError: an option or a file of the drive cannot be used.
 
     """
-    converter = CONVERTERS[name_of(options)]
-    return getattr(import_module(f"{__package__}.{converter.module}"), converter.reader)(options)
+    converter, given = CONVERTERS[name_of(options)], options.ego_mask
+    recording = getattr(import_module(f"{__package__}.{converter.module}"), converter.reader)(options)
+    if given is None:
+        return recording
+    # the option goes before what the drive brings
+    cameras = tuple(
+        replace(camera, ego_mask=given / f"{camera.name}.png" if given.is_dir() else given)
+        for camera in recording.cameras
+    )
+    return replace(recording, cameras=cameras)
 
 
 def convert(options: ProcessOptions, console: Console | None = None) -> ProcessReport:

@@ -40,8 +40,7 @@ def read_jbnu_depth360(options: JbnuDepth360Options) -> Recording:
     rig = read_rig(options.calibration, options.calibration.parent, _fill_in)
     if len(rig.lidars) != 1:
         raise InputError(f"{rig.path}: {len(rig.lidars)} scanners in [lidars]; the data set has one.")
-    source = {"kind": "jbnu-depth360", "root": options.root.resolve().name, "cameras": list(options.cameras)}
-    return recording_of_rig(rig, options.root, options, source)
+    return recording_of_rig(rig, options, "jbnu-depth360")
 
 
 def _fill_in(content: dict[str, Any]) -> None:

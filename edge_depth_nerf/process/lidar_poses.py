@@ -28,6 +28,7 @@ from edge_depth_nerf.poses.breaks import find_break
 from edge_depth_nerf.poses.odometry import MIN_SWEEPS, RANGE_M, TimedSweep, import_kiss_icp, odometry, steps_of
 from edge_depth_nerf.process.found_path import path_length_m, upright, with_path
 from edge_depth_nerf.process.options import ProcessOptions
+from edge_depth_nerf.process.reading import read_if_whole
 from edge_depth_nerf.process.recording import RecordedPicture, RecordedSweep, Recording
 
 NO_SWEEP = "no sweep near it in time"
@@ -57,7 +58,7 @@ def lidar_poses(recording: Recording, options: ProcessOptions, console: Console)
             read, the vehicle stands or turns on the spot, or the path is none of a vehicle.
 
     """
-    sweeps = [sweep for sweep in check_sweeps(recording) if options.strict or _readable(sweep)]
+    sweeps = [sweep for sweep in check_sweeps(recording) if options.strict or read_if_whole(sweep.read) is not None]
     trajectory = upright(recording, path_of(sweeps, console))
     _check_path(trajectory)
     slack_s = statistics.median(np.diff(trajectory.times_s).tolist())
@@ -144,26 +145,14 @@ def _read(sweep: RecordedSweep) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.
     return in_vehicle.double().numpy(), offset_s[used].double().numpy()
 
 
-def _readable(sweep: RecordedSweep) -> bool:
-    try:
-        sweep.read()
-    except (InputError, FileNotFoundError):
-        return False
-    return True
-
-
 def _usual_returns(sweeps: Sequence[RecordedSweep]) -> float:
     some = [sweeps[index] for index in dict.fromkeys(spread_over(len(sweeps), _LOOKED_AT))]
-    return float(statistics.median([len(sweep.read().points_m) for sweep in some if _readable(sweep)] or [0]))
+    read = [len(sweep.points_m) for one in some if (sweep := read_if_whole(one.read)) is not None]
+    return float(statistics.median(read or [0]))
 
 
 def _check_path(trajectory: Trajectory) -> None:
-    """Whether the path is that of a vehicle that drives.
-
-    Raises:
-        InputError: it is not.
-
-    """
+    """Raise an InputError unless the path is that of a vehicle that drives."""
     poses = trajectory.vehicle_to_world
     reach_m = float(np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=-1).max())
     turned = float(Rotation.from_matrix(poses[0, :3, :3].T @ poses[:, :3, :3]).magnitude().max())

@@ -10,11 +10,10 @@ until all maps are written, so that a stopped run resumes where it stopped.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import io
 import shutil
-import threading
-from collections import OrderedDict
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -138,21 +137,19 @@ def enlarged(found: MotionDistance, factor: int, size: tuple[int, int]) -> Float
     between = np.asarray(cv2.resize(inverse, whole, interpolation=cv2.INTER_LINEAR))
     # comparisons with NaN are false
     inverse = np.where(np.abs(between - nearest) <= _SMOOTH * nearest, between, nearest)
-    result = np.zeros(size, np.float32)
-    result[: whole[1], : whole[0]] = np.nan_to_num(1 / inverse)
-    return result
+    return _padded(np.nan_to_num(1 / inverse), size)
 
 
 def enlarged_sigma(found: MotionDistance, factor: int, size: tuple[int, int]) -> Float32[np.ndarray, "_ _"]:
     """Bring the distances' standard deviations to the size of the picture: the nearest; 0 = none."""
-    sigma_m = found.sigma_m
-    if factor > 1:
-        whole = (sigma_m.shape[1] * factor, sigma_m.shape[0] * factor)
-        sigma_m = np.asarray(cv2.resize(sigma_m, whole, interpolation=cv2.INTER_NEAREST))
-    result = np.zeros(size, np.float32)
-    result[: sigma_m.shape[0], : sigma_m.shape[1]] = sigma_m
+    result = _padded(found.sigma_m.repeat(factor, 0).repeat(factor, 1), size)
     # a file has steps, the least of which still says that there is one
     return np.where(result > 0, np.maximum(result, np.float32(1 / DISTANCE_STEPS_PER_METRE)), result)
+
+
+def _padded(map_: Float32[np.ndarray, "_ _"], size: tuple[int, int]) -> Float32[np.ndarray, "_ _"]:
+    """Add what fills no block at the right and at the bottom, as 0."""
+    return np.pad(map_, [(0, whole - there) for whole, there in zip(size, map_.shape, strict=True)])
 
 
 class SphereSweepCache:
@@ -170,46 +167,37 @@ class SphereSweepCache:
         """
         self.folder = root / _made_of(scene, pictures)
         self._motion = motion
-        self._lock = threading.Lock()
-        self._recent: OrderedDict[int, Swept] = OrderedDict()
+        self._swept = functools.lru_cache(_SWEEPS_IN_MEMORY)(partial(_swept, self.folder, motion))
         for other in root.glob("*"):
             if other != self.folder:
                 shutil.rmtree(other, ignore_errors=True)
 
     def make(self, index: int) -> bool:
         """Sweep a picture, unless that is done; whether it had to be."""
-        path = self._path(index)
+        path = _file(self.folder, index)
         if _read(path, Swept) is not None:
             return False
         _write(path, self._motion.sweep(index))
         return True
 
-    def __call__(self, index: int) -> Swept:
-        """The sweep of a picture."""
-        with self._lock:
-            if index in self._recent:
-                self._recent.move_to_end(index)
-                return self._recent[index]
-        swept = _read(self._path(index), Swept)
-        if swept is None:
-            swept = self._motion.sweep(index)
-        with self._lock:
-            self._recent[index] = swept
-            while len(self._recent) > _SWEEPS_IN_MEMORY:
-                self._recent.popitem(last=False)
-        return swept
-
     def confirmed(self, index: int) -> MotionDistance:
         """What neighbours confirm of a picture's sweep; kept."""
-        path = self._path(index).with_suffix(".confirmed.npz")
+        path = _file(self.folder, index).with_suffix(".confirmed.npz")
         found = _read(path, MotionDistance)
         if found is None:
-            found = self._motion.confirm(index, self)
+            found = self._motion.confirm(index, self._swept)
             _write(path, found)
         return found
 
-    def _path(self, index: int) -> Path:
-        return self.folder / f"{index:06d}.npz"
+
+def _file(folder: Path, index: int) -> Path:
+    return folder / f"{index:06d}.npz"
+
+
+def _swept(folder: Path, motion: Motion, index: int) -> Swept:
+    """The sweep of a picture; one that is lost is made again."""
+    swept = _read(_file(folder, index), Swept)
+    return motion.sweep(index) if swept is None else swept
 
 
 def _read(path: Path, kind: type[Maps]) -> Maps | None:

@@ -40,9 +40,9 @@ from edge_depth_nerf.lidar.world import WorldSweep
 from edge_depth_nerf.masks.lens import lens_circle
 from edge_depth_nerf.masks.moving import clearest_edge, grow_moving, larger_again, smaller, working_factor
 from edge_depth_nerf.process.options import ProcessOptions
-from edge_depth_nerf.process.reading import downscale_mask
+from edge_depth_nerf.process.reading import downscale_mask, read_if_whole
 from edge_depth_nerf.process.recording import RecordedPicture, Recording
-from edge_depth_nerf.process.sweep_store import Scanner, SweepStore
+from edge_depth_nerf.process.sweep_store import Scanner, SweepStore, elevation_rad
 
 MOVING_MASKS = "moving_masks"
 """Folder of the scene with the masks of what moves."""
@@ -99,7 +99,7 @@ def find_moving(
     paths = {id(picture): moving_mask_path(options.output, picture) for picture in recording.pictures}
     missing = [picture for picture in recording.pictures if not paths[id(picture)].is_file()]
     if missing:
-        store = SweepStore.of(recording, options, held_out)
+        store = SweepStore(recording, options, held_out)
         found = [_ScannersThings(scanner, held_out, console) for scanner in store.scanners]
         jobs = [
             partial(
@@ -164,23 +164,14 @@ class _ScannersThings:
         index = self.scanner.own(frame, time_s)
         if index is None or index not in self._things:
             return None
-        if frame in self._held_out:
-            if self.scanner.sweeps[index].frame != frame:
-                return None
-        elif not self.scanner.trains[index]:
-            return None
-        return self.scanner.whole(index), self._things[index], index
+        may = self.scanner.sweeps[index].frame == frame if frame in self._held_out else self.scanner.trains[index]
+        return (self.scanner.whole(index), self._things[index], index) if may else None
 
 
 def _not_alone(things: Sequence[Thing], expected: Sequence[Thing]) -> list[Thing]:
     """Those that share LiDAR points with what was expected: their speed is known."""
-    result = []
-    for thing in things:
-        for other in expected:
-            if len(np.intersect1d(thing.rows, other.rows)):
-                result.append(replace(thing, velocity_m_s=other.velocity_m_s))
-                break
-    return result
+    pairs = [(thing, next((o for o in expected if np.isin(thing.rows, o.rows).any()), None)) for thing in things]
+    return [replace(thing, velocity_m_s=other.velocity_m_s) for thing, other in pairs if other is not None]
 
 
 # ---- in a picture ----------------------------------------------------------------------------------------------
@@ -231,13 +222,11 @@ def _write_mask(
             usable = lens_circle(camera, theta_max_deg)
             if picture.camera in ego:
                 usable &= downscale_mask(ego[picture.camera], factor)
-            try:
-                image = smaller(read_image(picture.path), factor)
-            except (InputError, FileNotFoundError):
-                if strict:
-                    raise
-                # it is told of when its turn comes; once it is mended, it gets a mask
+            image = read_if_whole(partial(read_image, picture.path), strict=strict)
+            if image is None:
+                # once it is mended, it gets a mask
                 return
+            image = smaller(image, factor)
             grown = _moving_pixels(image, camera, usable, recording.pose(picture), picture.time_s, things, seen)
             moving |= larger_again(grown, factor, (full.height, full.width))
     write_mask(path, ~moving)
@@ -295,7 +284,7 @@ def _at_moment(
         points = sweep.points_m.numpy()[of_thing]
         points[:, :2] += (late_s - sweep.offset_s.numpy()[of_thing])[:, None] * thing.velocity_m_s
         returns = _Returns(points, sweep.spacing_m.numpy()[of_thing])
-        elevation = _elevation(sweep, of_thing)
+        elevation = elevation_rad(sweep.points_m[of_thing], sweep).numpy()
         rows.append(of_thing)
         moving.append(returns)
         # below the scanner's field the thing goes on
@@ -317,12 +306,6 @@ def _feet(sweep: WorldSweep, thing: Thing, ground: Ground) -> NDArray[np.int64]:
     near = near[(height > _FOOT_M[0]) & (height <= _FOOT_M[1])]
     away_m, _ = KDTree(thing.points_m[:, :2]).query(points[near, :2], distance_upper_bound=_FOOT_AWAY_M)
     return near[np.isfinite(away_m)]
-
-
-def _elevation(sweep: WorldSweep, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Elevations of some of a sweep's points, as its scanner sees them."""
-    in_scanner = transform_points(torch.from_numpy(sweep.world_to_scanner), sweep.points_m[rows])
-    return torch.atan2(in_scanner[:, 2], in_scanner[:, :2].norm(dim=-1)).numpy()
 
 
 def _in_camera(world_to_camera: NDArray[np.float64], returns: _Returns) -> torch.Tensor:

@@ -93,11 +93,6 @@ class ProcessOptions:
     address of a scheduler, such as tcp://10.0.0.1:8786. Needs `pip install '.[cluster]'`; see
     docs/cluster.md."""
 
-    def ego_mask_of(self, camera: str) -> Path | None:
-        """The mask of the vehicle that is given for a camera, if one is."""
-        given = self.ego_mask
-        return given / f"{camera}.png" if given is not None and given.is_dir() else given
-
     def chosen_frames(self, end: int, what: str) -> range:
         """Numbers of the frames that are asked for, of a drive that ends with frame `end`.
 
@@ -121,24 +116,21 @@ class ProcessOptions:
             InputError: an option is out of its range.
 
         """
-
-        def require(fine: bool, option: str, found: object, expected: str) -> None:
+        frames, scene, holdout, beams = self.frames, self.frames_per_scene, self.holdout_every, self.holdout_beams
+        for fine, option, expected in (
+            (self.first >= 0, "first", "a frame number, 0 or more"),
+            (frames is None or frames > 0, "frames", "1 or more"),
+            (self.stride > 0, "stride", "1 or more"),
+            (scene is None or scene >= 2, "frames_per_scene", "2 or more"),
+            (self.downscale > 0, "downscale", "1 or more"),
+            (holdout == 0 or holdout >= 2, "holdout_every", "2 or more, or 0 to hold out none"),
+            (beams == 0 or 2 <= beams <= 100, "holdout_beams", "2 to 100, or 0 to hold out none"),
+            (0 < self.theta_max_deg <= 180, "theta_max_deg", "degrees above 0, up to 180"),
+            (0 <= self.sweeps <= 30, "sweeps", "0 to 30"),
+        ):
             if not fine:
-                raise InputError(f"--{option} {found}: expected {expected}.")
-
-        require(self.first >= 0, "first", self.first, "a frame number, 0 or more")
-        require(self.frames is None or self.frames > 0, "frames", self.frames, "1 or more")
-        require(self.stride > 0, "stride", self.stride, "1 or more")
-        scene = self.frames_per_scene
-        require(scene is None or scene >= 2, "frames-per-scene", scene, "2 or more")
+                raise InputError(f"--{option.replace('_', '-')} {getattr(self, option)}: expected {expected}.")
         check_address(self.cluster)
-        require(self.downscale > 0, "downscale", self.downscale, "1 or more")
-        holdout = self.holdout_every
-        require(holdout == 0 or holdout >= 2, "holdout-every", holdout, "2 or more, or 0 to hold out none")
-        beams = self.holdout_beams
-        require(beams == 0 or 2 <= beams <= 100, "holdout-beams", beams, "2 to 100, or 0 to hold out none")
-        require(0 < self.theta_max_deg <= 180, "theta-max-deg", self.theta_max_deg, "degrees above 0, up to 180")
-        require(0 <= self.sweeps <= 30, "sweeps", self.sweeps, "0 to 30")
 
 
 @dataclass(frozen=True, kw_only=True)

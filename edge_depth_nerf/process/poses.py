@@ -82,10 +82,7 @@ def read_kitti(path: Path) -> Float64[np.ndarray, "poses 4 4"]:
                 f"{path}, line {line}: {len(values)} numbers{of_tum}, expected 12 (a 3×4 matrix row by row, KITTI's "
                 "format). Check poses.format in the rig file."
             )
-        pose = np.eye(4)
-        pose[:3] = np.reshape(values, (3, 4))
-        check_rigid(pose, f"{path}, line {line}")
-        poses.append(pose)
+        poses.append(transform_of_rows(np.reshape(values, (3, 4)), f"{path}, line {line}"))
     return np.array(poses, np.float64).reshape(-1, 4, 4)
 
 
@@ -134,7 +131,7 @@ def read_times(path: Path) -> list[tuple[str | None, float]]:
     for line, words in _lines(path):
         if len(words) > 2:
             raise InputError(f"{path}, line {line}: {len(words)} words, expected a time, or a file's name and a time.")
-        found.append((words[0] if len(words) == 2 else None, _number(words[-1], path, line)))
+        found.append((words[0] if len(words) == 2 else None, finite_number(words[-1], f"{path}, line {line}")))
         if (found[0][0] is None) != (found[-1][0] is None):
             raise InputError(
                 f"{path}, line {line}: some lines have a file's name and some have none; use one form for all lines."
@@ -190,19 +187,24 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
             yield number, words
 
 
-def _number(word: str, path: Path, line: int) -> float:
+def finite_number(word: str, where: str, remedy: str = "") -> float:
+    """Read a number.
+
+    Raises:
+        InputError: it is none, or infinite; names `where`, and the remedy.
+
+    """
     try:
         value = float(word)
     except ValueError:
         value = np.nan
-    if not np.isfinite(value):
-        remedy = ""
-        if re.search(r"\d:\d", word):
-            remedy = " Write times as seconds: a date becomes seconds since 1970, a time of day seconds since midnight."
-        raise InputError(f"{path}, line {line}: {shown(word)} is not a finite number.{remedy}")
-    return value
+    if np.isfinite(value):
+        return value
+    if not remedy and re.search(r"\d:\d", word):
+        remedy = "Write times as seconds: a date becomes seconds since 1970, a time of day seconds since midnight."
+    raise InputError(f"{where}: {shown(word)} is not a finite number. {remedy}".rstrip())
 
 
 def _number_lines(path: Path) -> Iterator[tuple[int, list[float]]]:
     for number, words in _lines(path):
-        yield number, [_number(word, path, number) for word in words]
+        yield number, [finite_number(word, f"{path}, line {number}") for word in words]

@@ -7,9 +7,10 @@ is its pixel's centre.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
@@ -17,12 +18,24 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_image
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.cameras.rays import distance_from_z_depth, rays
+from edge_depth_nerf.masks.regions import block_mean
 from edge_depth_nerf.process.recording import DepthFile
 from edge_depth_nerf.scene.checks import size_error
 from edge_depth_nerf.scene.writer import DistanceMap, Picture
 
+Content = TypeVar("Content")
 _SAME_SURFACE = 1.1
 """Two distances whose ratio is below this are taken to lie on one surface."""
+
+
+def read_if_whole(read: Callable[[], Content], *, strict: bool = False) -> Content | None:
+    """Read something; None for a missing or broken file, which is reported when its turn comes, unless `strict`."""
+    try:
+        return read()
+    except (InputError, FileNotFoundError):
+        if strict:
+            raise
+        return None
 
 
 def _blocks(map_: np.ndarray, factor: int) -> np.ndarray:
@@ -34,11 +47,7 @@ def _blocks(map_: np.ndarray, factor: int) -> np.ndarray:
 
 def downscale_image(image: UInt8[np.ndarray, "h w 3"], factor: int) -> UInt8[np.ndarray, "h2 w2 3"]:
     """Average each block of a picture."""
-    if factor == 1:
-        return image
-    height, width = image.shape[0] // factor, image.shape[1] // factor
-    cut = image[: height * factor, : width * factor]
-    return np.asarray(cv2.resize(cut, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+    return image if factor == 1 else block_mean(image, factor)
 
 
 def downscale_mask(mask: Bool[np.ndarray, "h w"], factor: int) -> Bool[np.ndarray, "h2 w2"]:

@@ -9,7 +9,7 @@ clock for pictures, sweeps and poses. A frame is what all cameras see at once; i
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -129,7 +129,7 @@ class Recording:
     """What is broken or missing, and so not in here."""
     notices: tuple[str, ...] = ()
     """What the user should know."""
-    shifted: tuple[ShiftedView, ...] = field(default=())
+    shifted: tuple[ShiftedView, ...] = ()
     """True views from beside the path, of synthetic drives."""
 
     def pose(self, picture: RecordedPicture) -> Transform:

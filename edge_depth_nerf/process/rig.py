@@ -91,26 +91,24 @@ def read_rig_recording(options: RigOptions) -> Recording:
             "how), or name it with --rig."
         )
     rig = read_rig(options.rig or there[0], options.root)
-    source = {"kind": "rig", "root": options.root.resolve().name, "cameras": list(options.cameras)}
-    return recording_of_rig(rig, options.root, options, source)
+    return recording_of_rig(rig, options, "rig")
 
 
-def recording_of_rig(rig: Rig, root: Path, options: RigOptions | JbnuDepth360Options, source: dict) -> Recording:
+def recording_of_rig(rig: Rig, options: RigOptions | JbnuDepth360Options, kind: str) -> Recording:
     """Find and check the files that a rig file describes.
 
     Args:
         rig: what the file says.
-        root: the recording's folder.
-        options: which cameras and frames.
-        source: what the scene says that it is made of.
+        options: root, the recording's folder; which cameras and frames.
+        kind: what the scene says that it is made of.
 
     Raises:
         FileNotFoundError: a folder or file of the recording is missing.
         InputError: an option or a file of the recording cannot be used.
 
     """
-    cameras = _chosen(rig, options.cameras)
-    files = {camera.name: _timed(_files(root, camera.images, IMAGE_SUFFIXES), camera.clock) for camera in cameras}
+    root, cameras = options.root, _chosen(rig, options.cameras)
+    files = {camera.name: _timed(_files(root, camera.images, IMAGE_SUFFIXES), camera) for camera in cameras}
     path, camera_poses = None, {}
     if options.poses == "recorded":
         if rig.poses is None:
@@ -119,7 +117,7 @@ def recording_of_rig(rig: Rig, root: Path, options: RigOptions | JbnuDepth360Opt
                 "--poses colmap."
             )
         path, camera_poses = _path(rig, rig.poses, cameras, files)
-    scans = [_Scans(lidar, _timed(_files(root, lidar.scans, SCAN_SUFFIXES), lidar.clock)) for lidar in rig.lidars]
+    scans = [_Scans(lidar, _timed(_files(root, lidar.scans, SCAN_SUFFIXES), lidar)) for lidar in rig.lidars]
     _check_clocks(rig, files, scans, path)
 
     kept, skipped = _usable(_moments(files), options, path, camera_poses, scans)
@@ -127,7 +125,7 @@ def recording_of_rig(rig: Rig, root: Path, options: RigOptions | JbnuDepth360Opt
         raise InputError(f"{root}: none of the chosen frames can be used: {summarise(skipped)}.")
 
     by_name = {camera.name: camera for camera in cameras}
-    companions = _Companions(rig.path, root, cameras, options)
+    companions = _Companions(rig.path, cameras, options)
     tolerance = Tolerance(options.strict, sum(map(len, kept.values())))
     recorded = []
     for frame, pictures in sorted(kept.items()):
@@ -144,7 +142,7 @@ def recording_of_rig(rig: Rig, root: Path, options: RigOptions | JbnuDepth360Opt
         pictures=tuple(recorded),
         sweeps=tuple(sweeps),
         trajectory=path,
-        source=source,
+        source={"kind": kind, "root": root.resolve().name, "cameras": list(options.cameras)},
         whole_inputs=_whole_inputs(rig, cameras, with_poses=path is not None),
         skipped=tuple(skipped),
         left_out=tolerance.left_out,
@@ -159,9 +157,8 @@ def recording_of_rig(rig: Rig, root: Path, options: RigOptions | JbnuDepth360Opt
 def _whole_inputs(rig: Rig, cameras: Sequence[RigCamera], *, with_poses: bool) -> tuple[Path, ...]:
     """The files whose bytes decide about the scene: the rig file, poses, times."""
     poses = [rig.poses] if rig.poses and with_poses else []
-    clocks = [sensor.clock for sensor in (*cameras, *rig.lidars)]
-    clocks += [found.clock for found in poses if found.format == "kitti"]
-    return (rig.path, *(found.file for found in poses), *(clock.file for clock in clocks if clock and clock.file))
+    times = [clock.times_file for clock in (*cameras, *rig.lidars, *poses)]
+    return (rig.path, *(found.file for found in poses), *(path for path in times if path is not None))
 
 
 def _chosen(rig: Rig, names: Sequence[str]) -> list[RigCamera]:
@@ -220,15 +217,8 @@ def _number_in(path: Path) -> float:
 
 def _timed(files: list[Path], clock: Clock) -> list[_Timed]:
     """Files with their times, in the order of time."""
-    if clock.file is not None:
-        counts = _times_of_file(clock.file, files)
-    else:
-        counts = [_number_in(path) for path in files]
-    scale = 1 / clock.rate_hz if clock.rate_hz else clock.seconds_per_count
-    timed = sorted(
-        (_Timed(path, count * scale + clock.offset_s) for path, count in zip(files, counts, strict=True)),
-        key=lambda item: item.time_s,
-    )
+    counts = _times_of_file(clock.times_file, files) if clock.times_file else [_number_in(path) for path in files]
+    timed = sorted(map(_Timed, files, clock.seconds(counts)), key=lambda item: item.time_s)
     for before, after in pairwise(timed):
         if before.time_s == after.time_s:
             raise InputError(
@@ -240,7 +230,7 @@ def _timed(files: list[Path], clock: Clock) -> list[_Timed]:
 def _times_of_file(path: Path, files: list[Path]) -> list[float]:
     lines = read_times(path)
     if lines and lines[0][0] is not None:
-        by_name = {name: time for name, time in lines}
+        by_name = dict(lines)
         found = [by_name.get(file.name, by_name.get(file.stem)) for file in files]
         for file, time in zip(files, found, strict=True):
             if time is None:
@@ -355,15 +345,13 @@ def _path(
 def _pose_list(poses: RigPoses) -> tuple[np.ndarray, np.ndarray]:
     if poses.format == "tum":
         return read_tum(poses.file)
-    matrices, clock = read_kitti(poses.file), poses.clock
-    assert clock is not None
-    if clock.from_names:
+    matrices, times_file = read_kitti(poses.file), poses.times_file
+    if poses.times_from_names:
         raise InputError(f"{poses.file}: KITTI's poses have no names; give poses.times_file or poses.rate_hz.")
-    counts = list(range(len(matrices))) if clock.file is None else [time for _, time in read_times(clock.file)]
+    counts = list(range(len(matrices))) if times_file is None else [time for _, time in read_times(times_file)]
     if len(counts) != len(matrices):
-        raise InputError(f"{clock.file}: {len(counts)} times for the {len(matrices)} poses of {poses.file.name}.")
-    scale = 1 / clock.rate_hz if clock.rate_hz else clock.seconds_per_count
-    return np.array(counts, np.float64) * scale + clock.offset_s, matrices
+        raise InputError(f"{times_file}: {len(counts)} times for the {len(matrices)} poses of {poses.file.name}.")
+    return np.array(poses.seconds(counts), np.float64), matrices
 
 
 def _picture_poses(
@@ -406,11 +394,10 @@ def _picture_poses(
 
 def _upright(up: str) -> Transform:
     """The turn of the world that makes its upward axis z; axes are exchanged, nothing more."""
-    axes = np.eye(3)
-    upward = axes["xyz".index(up[-1])] * (-1.0 if up.startswith("-") else 1.0)
-    forward = axes[(int(np.abs(upward).argmax()) + 1) % 3]
+    axes, axis = np.eye(3), "xyz".index(up[-1])
+    upward, forward = axes[axis] * (-1.0 if up.startswith("-") else 1.0), axes[(axis + 1) % 3]
     turn = np.eye(4)
-    turn[:3, :3] = axes if up == "z" else np.stack((forward, np.cross(upward, forward), upward))
+    turn[:3, :3] = np.stack((forward, np.cross(upward, forward), upward))
     return turn
 
 
@@ -418,12 +405,11 @@ def _check_clocks(rig: Rig, files: dict[str, list[_Timed]], scans: Sequence[_Sca
     """Whether the sensors' times are of one clock, as far as that shows."""
     sensors = files | {scanner.lidar.name: scanner.files for scanner in scans}
     ranges = {name: (timed[0].time_s, timed[-1].time_s) for name, timed in sensors.items()}
-    reference = next(iter(files))
     if path is not None:
         ranges["the poses"] = (float(path.times_s[0]), float(path.times_s[-1]))
+    reference, slack_s = next(iter(files)), 0.5
     first, last = ranges[reference]
     for name, (start, end) in ranges.items():
-        slack_s = 0.5
         if start > last + slack_s or end < first - slack_s:
             raise InputError(
                 f"{rig.path}: the times of {reference} and {name} do not overlap: {reference} has {first:.3f} to "
@@ -457,7 +443,7 @@ def _sweeps(
                 tolerance.add(frame, lidar.name, error)
                 continue
             # points' times of the scanner's own clock are off as its scans' are
-            counted_from_s = middle_s - lidar.clock.offset_s if absolute else lidar.to_middle_s
+            counted_from_s = middle_s - lidar.time_offset_s if absolute else lidar.to_middle_s
             found.append(
                 RecordedSweep(
                     path=item.path,
@@ -498,9 +484,7 @@ class _Companions:
     does.
     """
 
-    def __init__(
-        self, rig: Path, root: Path, cameras: Sequence[RigCamera], options: RigOptions | JbnuDepth360Options
-    ) -> None:
+    def __init__(self, rig: Path, cameras: Sequence[RigCamera], options: RigOptions | JbnuDepth360Options) -> None:
         self._options = options
         keys = ("truth_distance", "truth_rgb") if options.mono else ("mono", "truth_distance", "truth_rgb")
         for key in keys:
@@ -510,7 +494,9 @@ class _Companions:
                     f"{rig}: cameras.{lacking[0]}.{key} is missing; give it for every camera that is used, or for none."
                 )
         self._found = {
-            (camera.name, what): _by_stem(_files(root, given, (".png",)), f"{rig}: cameras.{camera.name}.{what}")
+            (camera.name, what): _by_stem(
+                _files(options.root, given, (".png",)), f"{rig}: cameras.{camera.name}.{what}"
+            )
             for camera in cameras
             for what, given in (
                 ("masks", camera.masks),
@@ -526,16 +512,19 @@ class _Companions:
         self, camera: RigCamera, frame: int, picture: _Timed, camera_to_world: Transform | None
     ) -> RecordedPicture:
         """A picture with all that comes with it."""
-        _check_picture(picture.path, camera)
+        if picture.path.suffix.lower() == ".png":
+            check_size(picture.path, camera.camera)
+        elif (size := picture_size(picture.path)) != (camera.camera.width, camera.camera.height):
+            raise InputError(size_error(picture.path, *size, camera.camera))
         # an option goes before what the rig file names
         mask = self._by_number("frame_masks", camera, frame) or self._by_name(camera, "masks", picture.path)
         mono = self._by_number("mono", camera, frame) or self._by_name(camera, "mono", picture.path)
         depth = self._by_name(camera, "depth.files", picture.path)
-        truth_distance, truth_rgb = (
-            self._by_name(camera, f"truth_{what}", picture.path) for what in ("distance", "rgb")
-        )
+        truth_distance = self._by_name(camera, "truth_distance", picture.path)
+        truth_rgb = self._by_name(camera, "truth_rgb", picture.path)
         steps = 1 / DISTANCE_STEPS_PER_METRE
-        depth_steps = camera.depth.metres_per_count if camera.depth else steps
+        depth_file = depth and camera.depth and DepthFile(depth, camera.depth.metres_per_count, camera.depth.kind)
+        depth_steps = depth_file.metres_per_count if depth_file else steps
         for path, metres in ((mono, steps), (depth, depth_steps), (truth_distance, steps)):
             if path is not None and not check_size(path, camera.camera).is_distance:
                 raise InputError(
@@ -552,9 +541,7 @@ class _Companions:
             time_s=picture.time_s,
             camera_to_world=camera_to_world,
             timestamp_s=picture.time_s,
-            depth=None
-            if depth is None or camera.depth is None
-            else DepthFile(depth, camera.depth.metres_per_count, camera.depth.kind),
+            depth=depth_file,
             mask=mask,
             mono=mono,
             truth_distance=truth_distance,
@@ -584,12 +571,3 @@ class _Companions:
                 "the frame's number."
             )
         return path
-
-
-def _check_picture(path: Path, camera: RigCamera) -> None:
-    if path.suffix.lower() == ".png":
-        check_size(path, camera.camera)
-        return
-    width, height = picture_size(path)
-    if (width, height) != (camera.camera.width, camera.camera.height):
-        raise InputError(size_error(path, width, height, camera.camera))

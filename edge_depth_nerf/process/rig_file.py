@@ -13,7 +13,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -56,10 +56,10 @@ _MAX_DOTS = 1000
 """No line of TOML has more: the parser's time and memory grow with the square of a key's parts."""
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _NAME = r"[A-Za-z0-9_][A-Za-z0-9_-]*"
-_MODEL_KEYS = {
-    "mei": ("xi", "k1", "k2", "p1", "p2"),
-    "kannala-brandt": ("k1", "k2", "k3", "k4"),
-    "pinhole": ("k1", "k2", "p1", "p2", "k3"),
+_MODELS: dict[str, tuple[Any, tuple[str, ...]]] = {
+    "mei": (MEI, ("xi", "k1", "k2", "p1", "p2")),
+    "kannala-brandt": (KannalaBrandt, ("k1", "k2", "k3", "k4")),
+    "pinhole": (Pinhole, ("k1", "k2", "p1", "p2", "k3")),
 }
 """Models, and what they have beside focal lengths and principal point; 0 if it is left out, but for ξ."""
 
@@ -134,9 +134,8 @@ class _Table(BaseModel):
             first = error.errors()[0]
             if first["loc"] or "error" in first.get("ctx", {}):
                 raise
-            expected = _expected(cls.model_fields[str(info.field_name)]) or first["msg"].removeprefix(
-                "Input should be "
-            )
+            ours = _expected(cls.model_fields[str(info.field_name)])
+            expected = ours or first["msg"].removeprefix("Input should be ")
             raise InputError(f" is {shown(value)}, expected {expected}.") from None
 
 
@@ -162,42 +161,34 @@ else:
     ToVehicle = Annotated[_Pose, WrapValidator(_transform), Field(description=_FORMS)]
 
 
-@dataclass(frozen=True)
-class Clock:
+class Clock(_Table):
     """How the files of a sensor tell their times; one of the first three is set."""
 
-    file: Path | None
-    """A text file with a time for each file."""
-    from_names: bool
-    """The last number in a file's name is its time."""
-    rate_hz: float | None
-    """The last number in a file's name, divided by this, is its time in seconds."""
-    seconds_per_count: float
-    """What one count of a time is."""
-    offset_s: float
-    """Added to each time, to bring it to the clock of the poses."""
-
-
-class _Timed(_Table):
     times_file: File | None = None
+    """A text file with a time for each file."""
     times_from_names: Literal[True] | None = None
+    """The last number in a file's name is its time."""
     rate_hz: Positive | None = None
+    """The last number in a file's name, divided by this, is its time in seconds."""
     time_unit: Unit = "s"
     time_offset_s: Number = 0.0
+    """Added to each time, to bring it to the clock of the poses."""
 
-    @cached_property
-    def clock(self) -> Clock:
-        """How its times are told."""
+    def check_clock(self) -> None:
+        """Raise an InputError unless times are told in one way."""
         keys = ("times_file", "times_from_names", "rate_hz")
         given = [name for name in keys if getattr(self, name) is not None]
         if len(given) != 1:
             found = " and ".join(given) or "none"
             raise InputError(f".times_file: expected one of {', '.join(keys)}, found {found}: each file needs a time.")
-        unit = _SECONDS[self.time_unit]
-        return Clock(self.times_file, given == ["times_from_names"], self.rate_hz, unit, self.time_offset_s)
+
+    def seconds(self, counts: Sequence[float]) -> list[float]:
+        """Times of the poses' clock, in seconds, of the numbers in files or names."""
+        scale = 1 / self.rate_hz if self.rate_hz else _SECONDS[self.time_unit]
+        return [count * scale + self.time_offset_s for count in counts]
 
 
-class _Sensor(_Timed):
+class _Sensor(Clock):
     _name: str = PrivateAttr("")
 
     @property
@@ -253,23 +244,23 @@ class RigCamera(_Sensor):
                 raise InputError(f".{key} is {value}, expected a pixel within the picture, 0 to {size}.")
         if self.pixel_centre not in (0, 0.5, 1):
             raise InputError(f".pixel_centre is {self.pixel_centre}, expected one of 0, 0.5, 1.")
-        own = _MODEL_KEYS[self.model]
+        kind, own = _MODELS[self.model]
         if wrong := self.model_fields_set & {"xi", "k1", "k2", "k3", "k4", "p1", "p2"} - {*own}:
             raise InputError(f".{min(wrong)}: unknown key; a camera of model {self.model} has {', '.join(own)}.")
         if "xi" in own and self.xi is None:
             raise InputError(".xi is missing; expected a number.")
         shift = 0.5 - self.pixel_centre
         common = (self.width, self.height, self.fx, self.fy, self.cx + shift, self.cy + shift)
-        kinds: dict[str, Any] = {"mei": MEI, "kannala-brandt": KannalaBrandt, "pinhole": Pinhole}
         limit_rad = min(math.radians(self.theta_max_deg), math.pi)
         try:
-            return kinds[self.model](*common, **{key: getattr(self, key) for key in own}, theta_limit_rad=limit_rad)
+            return kind(*common, **{key: getattr(self, key) for key in own}, theta_limit_rad=limit_rad)
         except InputError as error:
             raise InputError(f".model: {error}") from None
 
     @model_validator(mode="after")
     def _check(self) -> RigCamera:
-        assert self.clock and self.camera
+        self.check_clock()
+        assert self.camera
         return self
 
 
@@ -328,11 +319,9 @@ class RigLidar(_Sensor):
     @property
     def to_pose_s(self) -> float:
         """From a scan's timestamp to the time of the pose that its points belong to: its middle, or another one."""
-        if self.corrected_to in (None, "middle"):
-            return self.to_middle_s
         if self.corrected_to == "timestamp":
             return 0.0
-        return self.to_middle_s + {"start": -0.5, "end": 0.5}[self.corrected_to] * (self.turn_s or 0.0)
+        return self.to_middle_s + {"start": -0.5, "end": 0.5}.get(self.corrected_to or "", 0.0) * (self.turn_s or 0.0)
 
     @cached_property
     def timing(self) -> SweepTiming | None:
@@ -345,7 +334,7 @@ class RigLidar(_Sensor):
 
     @model_validator(mode="after")
     def _check(self) -> RigLidar:
-        assert self.clock
+        self.check_clock()
         without_turn = sorted({"direction", "start_azimuth_deg", "timestamp"} & self.model_fields_set)
         if self.turn_s is None and without_turn:
             raise InputError(f".turn_s is missing; {without_turn[-1]} needs it.")
@@ -363,7 +352,7 @@ class RigLidar(_Sensor):
         return self
 
 
-class RigPoses(_Timed):
+class RigPoses(Clock):
     """Where the poses come from; KITTI's have a clock."""
 
     file: File
@@ -377,8 +366,8 @@ class RigPoses(_Timed):
     @model_validator(mode="after")
     def _check(self) -> RigPoses:
         if self.format == "kitti":
-            assert self.clock
-        elif clock := self.model_fields_set & _Timed.model_fields.keys():
+            self.check_clock()
+        elif clock := self.model_fields_set & Clock.model_fields.keys():
             raise InputError(f".{min(clock)}: unknown key; poses of format {self.format} bring their times.")
         return self
 
@@ -415,14 +404,14 @@ def read_rig(path: Path, root: Path, prepare: Callable[[dict[str, Any]], None] |
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; it describes the cameras and scanners (docs/rig.md).")
-    parse, suffixes = (json.loads, "JSON") if path.suffix.lower() == ".json" else (_parse_toml, "TOML")
+    parse, syntax = (json.loads, "JSON") if path.suffix.lower() == ".json" else (_parse_toml, "TOML")
     try:
         content = parse(read_text(path, MAX_RIG_BYTES))
     except InputError:
         raise
     except (ValueError, RecursionError) as error:
         raise InputError(
-            f"{path}: not valid {suffixes} ({error}). Repair the file; docs/rig.md has an example."
+            f"{path}: not valid {syntax} ({error}). Repair the file; docs/rig.md has an example."
         ) from error
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected tables [cameras.NAME], [lidars.NAME] and [poses].")

@@ -17,6 +17,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -25,7 +26,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar import transform_points
 from edge_depth_nerf.lidar.free_space import FreeSpace
@@ -33,6 +33,7 @@ from edge_depth_nerf.lidar.sweeps import Sweep, first_in_voxel, without_beams
 from edge_depth_nerf.lidar.trajectory import MAX_POSE_GAP_S, Trajectory
 from edge_depth_nerf.lidar.world import WorldSweep, above_field, sweep_in_world
 from edge_depth_nerf.process.options import ProcessOptions
+from edge_depth_nerf.process.reading import read_if_whole
 from edge_depth_nerf.process.recording import RecordedSweep, Recording
 
 VOXEL_M = 0.05
@@ -104,15 +105,12 @@ class Scanner:
         self,
         sweeps: Sequence[RecordedSweep],
         trajectory: Trajectory,
-        count: Callable[[Path, int, int], None],
-        *,
-        reach: int,
-        deskew: bool,
+        options: ProcessOptions,
         held_out: Collection[int],
-        strict: bool,
-        holdout_beams: int,
     ) -> None:
-        self._holdout_beams = holdout_beams
+        self._trajectory, self._options = trajectory, options
+        self.left_out: dict[Path, tuple[int, int]] = {}
+        """Of each sweep that was read, how many points were not finite, and how many out of range."""
         self.sweeps = sorted(sweeps, key=lambda sweep: sweep.time_s)
         self.times_s = np.array([sweep.time_s for sweep in self.sweeps])
         self._of_frame: dict[int | None, list[int]] = {}
@@ -126,27 +124,26 @@ class Scanner:
             trajectory.gap_s(time) <= MAX_POSE_GAP_S or 0 < trajectory.outside_s(time) <= self.half_turn_s
             for time in self.times_s.tolist()
         ]
-        self._reach, self._trajectory, self._deskew, self._count = reach, trajectory, deskew, count
-        self._strict = strict
         # of two pictures in work at once, each with its window and what its window's sweeps are checked against
-        window = 4 * reach + 4
+        window = 4 * options.sweeps + 4
         self._loaded: _Shared[_Loaded] = _Shared(self._load, window)
         self._moved: _Shared[Tensor] = _Shared(self._seen_through, window)
 
     def _load(self, index: int) -> _Loaded:
         recorded = self.sweeps[index]
         sweep = recorded.read()
-        self._count(recorded.path, sweep.not_finite, sweep.out_of_range)
+        self.left_out[recorded.path] = sweep.not_finite, sweep.out_of_range
         beams = None
-        if self._holdout_beams:
-            sweep, held_out = without_beams(sweep, self._holdout_beams)
+        if self._options.holdout_beams:
+            sweep, held_out = without_beams(sweep, self._options.holdout_beams)
             beams = self._in_world(held_out, recorded) if len(held_out.points_m) else None
         world = self._in_world(sweep, recorded)
-        return _Loaded(world, beams, FreeSpace.of(world) if self._reach else None)
+        return _Loaded(world, beams, FreeSpace.of(world) if self._options.sweeps else None)
 
     def _in_world(self, sweep: Sweep, recorded: RecordedSweep) -> WorldSweep:
+        deskew = not self._options.raw_lidar
         return sweep_in_world(
-            sweep, recorded.time_s, recorded.to_vehicle, self._trajectory, recorded.timing, deskew=self._deskew
+            sweep, recorded.time_s, recorded.to_vehicle, self._trajectory, recorded.timing, deskew=deskew
         )
 
     def beams(self, index: int) -> WorldSweep | None:
@@ -155,18 +152,13 @@ class Scanner:
 
     def around(self, index: int) -> list[int]:
         """The sweeps near another that training may see, without it."""
-        first, last = max(index - self._reach, 0), min(index + self._reach, len(self.sweeps) - 1)
-        return [i for i in range(first, last + 1) if i != index and self.trains[i] and self.bridged[i]]
+        reach = self._options.sweeps
+        window = range(max(index - reach, 0), min(index + reach + 1, len(self.sweeps)))
+        return [i for i in window if i != index and self.trains[i] and self.bridged[i]]
 
     def readable(self, index: int) -> bool:
         """Whether a sweep can be read; under `strict` one that cannot is an error."""
-        try:
-            self._loaded.get(index)
-        except (InputError, FileNotFoundError):
-            if self._strict:
-                raise
-            return False
-        return True
+        return read_if_whole(partial(self._loaded.get, index), strict=self._options.strict) is not None
 
     def _seen_through(self, index: int) -> Bool[Tensor, "returns"]:
         """Which points of a sweep another one saw through."""
@@ -204,72 +196,31 @@ class Scanner:
 
 
 class SweepStore:
-    """All sweeps of a drive.
+    """All sweeps of a recording that has a trajectory.
 
     Args:
-        sweeps: of any number of scanners.
-        trajectory: the vehicle's path.
-        reach: how many sweeps before and after a picture are taken.
-        deskew: whether each point is moved by the pose of its own time.
+        recording: with sweeps of any number of scanners.
+        options: sweeps, raw_lidar, holdout_beams; under strict a sweep that cannot be read is an error for all
+            pictures, else only for those of its own frame.
         held_out: numbers of the frames that training must not see.
-        strict: a sweep that cannot be read is an error; otherwise only for the pictures of its own frame.
-        holdout_beams: one band of elevation of so many is kept out of all that is given but `beams`; 0: none.
 
     """
 
-    def __init__(
-        self,
-        sweeps: Sequence[RecordedSweep],
-        trajectory: Trajectory,
-        *,
-        reach: int,
-        deskew: bool,
-        held_out: Collection[int],
-        strict: bool = True,
-        holdout_beams: int = 0,
-    ) -> None:
-        self._left_out: dict[Path, tuple[int, int]] = {}
-        by_scanner: dict[str, list[RecordedSweep]] = {}
-        for sweep in sweeps:
-            by_scanner.setdefault(sweep.scanner, []).append(sweep)
-
-        def count(path: Path, not_finite: int, out_of_range: int) -> None:
-            self._left_out[path] = (not_finite, out_of_range)
-
-        self._held_out = frozenset(held_out)
-        self.scanners = [
-            Scanner(
-                found,
-                trajectory,
-                count,
-                reach=reach,
-                deskew=deskew,
-                held_out=self._held_out,
-                strict=strict,
-                holdout_beams=holdout_beams,
-            )
-            for found in by_scanner.values()
-        ]
-
-    @staticmethod
-    def of(recording: Recording, options: ProcessOptions, held_out: Collection[int]) -> SweepStore:
-        """The sweeps of a recording that has a trajectory, as a converter's options want them."""
+    def __init__(self, recording: Recording, options: ProcessOptions, held_out: Collection[int]) -> None:
         assert recording.trajectory is not None
-        return SweepStore(
-            *(recording.sweeps, recording.trajectory),
-            reach=options.sweeps,
-            deskew=not options.raw_lidar,
-            held_out=held_out,
-            strict=options.strict,
-            holdout_beams=options.holdout_beams,
-        )
+        self._held_out = frozenset(held_out)
+        by_scanner: dict[str, list[RecordedSweep]] = {}
+        for sweep in recording.sweeps:
+            by_scanner.setdefault(sweep.scanner, []).append(sweep)
+        self.scanners = [Scanner(found, recording.trajectory, options, self._held_out) for found in by_scanner.values()]
 
     def notices(self) -> list[str]:
         """What was left out of the sweeps that were read."""
-        not_finite, out_of_range = np.sum([*self._left_out.values(), (0, 0)], axis=0)
+        left_out = [counts for scanner in self.scanners for counts in scanner.left_out.values()]
+        not_finite, out_of_range = np.sum([*left_out, (0, 0)], axis=0)
         found = {"NaN or infinite": not_finite, "zero, nearer than 0.5 m or beyond 255 m": out_of_range}
         return [
-            f"{count} LiDAR points were left out of {len(self._left_out)} sweeps: {why}."
+            f"{count} LiDAR points were left out of {len(left_out)} sweeps: {why}."
             for why, count in found.items()
             if count
         ]
@@ -326,12 +277,12 @@ class SweepStore:
                 else:
                     sweep, first, still = scanner.whole(index), scanner.whole(window[0]), ~scanner.moved(index)
                     points_m, spacing_m = sweep.points_m[still], sweep.spacing_m[still]
-                    low = _elevation(points_m, first) <= first.elevation_rad[1]
+                    low = elevation_rad(points_m, first) <= first.elevation_rad[1]
                     found.add(points_m[low], spacing_m[low], torch.zeros_like(low[low]), age_s)
         return found.together()
 
 
-def _elevation(points_m: Float[Tensor, "points 3"], sweep: WorldSweep) -> Float[Tensor, "points"]:
+def elevation_rad(points_m: Float[Tensor, "points 3"], sweep: WorldSweep) -> Float[Tensor, "points"]:
     """Elevation of points as a sweep's scanner sees them."""
     x, y, z = transform_points(torch.from_numpy(sweep.world_to_scanner), points_m).unbind(-1)
     return torch.atan2(z, torch.hypot(x, y))

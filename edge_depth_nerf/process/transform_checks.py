@@ -12,22 +12,24 @@ pictures' edges shows less: their agreement is one to two standard deviations ab
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, UInt8
+from scipy.ndimage import map_coordinates
 from torch import Tensor
 
-from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_image
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar import project_points, transform_points
 from edge_depth_nerf.lidar.world import sweep_in_world
-from edge_depth_nerf.process.reading import downscale_image, downscale_mask
+from edge_depth_nerf.process.reading import downscale_image, downscale_mask, read_if_whole
 from edge_depth_nerf.process.recording import RecordedCamera, RecordedSweep, Recording
 
 _WORKING_PX = 320
@@ -68,18 +70,16 @@ class ContrastAgreement:
     scanner: str
     given: float
     """With both transforms as given."""
-    camera_inverted: float
-    scanner_inverted: float
-    both_inverted: float
+    inverted: dict[str, float]
+    """With the inverse of what is named: "camera", "scanner" or "both"."""
     still: float
     """Of the pictures with each other, as if nothing moved between them."""
 
     @property
     def better(self) -> str | None:
         """What is to be inverted: "camera", "scanner" or "both"; None if nothing else fits clearly better."""
-        others = {"camera": self.camera_inverted, "scanner": self.scanner_inverted, "both": self.both_inverted}
-        best = max(others, key=lambda name: others[name])
-        clearly = others[best] >= _FITS and 1 - others[best] < _LESS_DOUBT * (1 - self.given)
+        best = max(self.inverted, key=lambda name: self.inverted[name])
+        clearly = self.inverted[best] >= _FITS and 1 - self.inverted[best] < _LESS_DOUBT * (1 - self.given)
         return best if clearly else None
 
     @property
@@ -178,17 +178,14 @@ def _pairs(recording: Recording, camera: RecordedCamera, factor: int) -> list[_P
     found = []
     for index in np.unique(np.linspace(0, len(pairs) - 1, _PAIRS).astype(int)) if pairs else ():
         first, second = pairs[index]
-        try:
-            contrasts = tuple(
-                _contrast(downscale_image(read_image(pictures[one].path), factor)) for one in pairs[index]
-            )
-        except (InputError, FileNotFoundError):
+        both = [read_if_whole(partial(read_image, pictures[one].path)) for one in (first, second)]
+        if both[0] is None or both[1] is None:
             continue
         own = pictures[first].camera_to_world is not None
         found.append(
             _Pair(
                 time_s=pictures[first].time_s,
-                contrasts=(contrasts[0], contrasts[1]),
+                contrasts=(_contrast(downscale_image(both[0], factor)), _contrast(downscale_image(both[1], factor))),
                 vehicle_to_world=(vehicle[first], vehicle[second]),
                 motion=np.linalg.inv(poses[second]) @ poses[first] if own else None,
             )
@@ -214,38 +211,31 @@ def _agreement(
 ) -> ContrastAgreement | None:
     """Measure one scanner against one camera."""
     assert recording.trajectory is not None
-    sums: dict[tuple[bool, bool], _Sums] = {}
+    sums: defaultdict[str, _Sums] = defaultdict(_Sums)
     still = _Sums()
     for pair in pairs:
         recorded = min(sweeps, key=lambda sweep: abs(sweep.time_s - pair.time_s))
-        try:
-            sweep = recorded.read()
-        except (InputError, FileNotFoundError):
+        sweep = read_if_whole(recorded.read) if abs(recorded.time_s - pair.time_s) <= _APART_S else None
+        if sweep is None:
             continue
-        if abs(recorded.time_s - pair.time_s) > _APART_S:
-            continue
-        for turned in (False, True):
+        for turned, named in ((False, ("given", "camera")), (True, ("scanner", "both"))):
             scanner_to_vehicle = np.linalg.inv(recorded.to_vehicle) if turned else recorded.to_vehicle
             world = sweep_in_world(sweep, recorded.time_s, scanner_to_vehicle, recording.trajectory, recorded.timing)
             every = max(1, len(world.points_m) // _MOST_RETURNS)
             world_to_vehicle = torch.from_numpy(np.linalg.inv(pair.vehicle_to_world[0]))
             in_vehicle = transform_points(world_to_vehicle, world.points_m[::every])
-            for inverted in (False, True):
-                to_vehicle = np.linalg.inv(camera.to_vehicle) if inverted else camera.to_vehicle
+            for name, to_vehicle in zip(named, (camera.to_vehicle, np.linalg.inv(camera.to_vehicle)), strict=True):
                 in_first = transform_points(torch.from_numpy(np.linalg.inv(to_vehicle)), in_vehicle)
                 values = _seen_twice(
                     in_first, world.spacing_m[::every], pair.to_second(to_vehicle), small, usable, pair.contrasts
                 )
-                sums.setdefault((inverted, turned), _Sums()).add(values[0], values[1])
-                if not (inverted or turned):
+                sums[name].add(values[0], values[1])
+                if name == "given":
                     still.add(values[0], values[2])
-    if not sums or (not sums[False, False].tells and not any(one.tells for one in sums.values())):
+    if not any(one.tells for one in sums.values()):
         return None
-    given, by_scanner, by_camera, by_both = (
-        sums[key].correlation if sums[key].tells else 0.0
-        for key in ((False, False), (False, True), (True, False), (True, True))
-    )
-    return ContrastAgreement(camera.name, sweeps[0].scanner, given, by_camera, by_scanner, by_both, still.correlation)
+    found = {name: one.correlation if one.tells else 0.0 for name, one in sums.items()}
+    return ContrastAgreement(camera.name, sweeps[0].scanner, found.pop("given"), found, still.correlation)
 
 
 def _seen_twice(
@@ -274,13 +264,7 @@ def _seen_twice(
 
 def _sampled(picture: Float32[np.ndarray, "h w"], places: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n"]:
     """Values of a picture at places (column, row), pixel centres at whole numbers, linearly between them."""
-    row, column = np.floor(places[:, 1]).astype(int), np.floor(places[:, 0]).astype(int)
-    down, right = places[:, 1] - row, places[:, 0] - column
-    low_row, low_column = row.clip(0, picture.shape[0] - 1), column.clip(0, picture.shape[1] - 1)
-    high_row, high_column = (row + 1).clip(0, picture.shape[0] - 1), (column + 1).clip(0, picture.shape[1] - 1)
-    upper = picture[low_row, low_column] * (1 - right) + picture[low_row, high_column] * right
-    lower = picture[high_row, low_column] * (1 - right) + picture[high_row, high_column] * right
-    return (upper * (1 - down) + lower * down).astype(np.float32)
+    return map_coordinates(picture, places.T[::-1], order=1, mode="nearest")
 
 
 def agreement_notices(found: Sequence[ContrastAgreement]) -> list[str]:
@@ -293,9 +277,8 @@ def agreement_notices(found: Sequence[ContrastAgreement]) -> list[str]:
     ):
         wrong = [one for one in found if one.better == which]
         if wrong:
-            inverse = {"camera": "camera_inverted", "scanner": "scanner_inverted", "both": "both_inverted"}[which]
             figures = ", ".join(
-                f"{getattr(one, inverse):.2f} instead of {one.given:.2f} for {one.camera} with {one.scanner}"
+                f"{one.inverted[which]:.2f} instead of {one.given:.2f} for {one.camera} with {one.scanner}"
                 for one in wrong
             )
             names = whose.format(

@@ -21,7 +21,6 @@ from jaxtyping import Bool, Float32
 from numpy.typing import NDArray
 from rich.console import Console
 
-from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_image
 from edge_depth_nerf.lidar import transform_points
 from edge_depth_nerf.masks.ego import MIN_PICTURES, EgoMask, NoEgo, find_ego
@@ -29,6 +28,7 @@ from edge_depth_nerf.masks.ego_files import ego_mask_path, keep_ego_mask, vehicl
 from edge_depth_nerf.masks.lens import dark_rim, lens_circle
 from edge_depth_nerf.masks.regions import eroded
 from edge_depth_nerf.process.options import ProcessOptions
+from edge_depth_nerf.process.reading import read_if_whole
 from edge_depth_nerf.process.recording import RecordedCamera, RecordedPicture, Recording
 from edge_depth_nerf.scene.checks import read_camera_mask
 
@@ -57,7 +57,7 @@ _PAINT = (
 )
 
 
-def given_masks(recording: Recording, options: ProcessOptions) -> dict[str, NDArray[np.bool_]]:
+def given_masks(recording: Recording) -> dict[str, NDArray[np.bool_]]:
     """Read the masks that are given, by camera.
 
     Raises:
@@ -67,9 +67,8 @@ def given_masks(recording: Recording, options: ProcessOptions) -> dict[str, NDAr
     """
     given = {}
     for recorded in recording.cameras:
-        path = options.ego_mask_of(recorded.name) or recorded.ego_mask
-        if path is not None:
-            given[recorded.name] = read_camera_mask(path, recorded.camera)
+        if recorded.ego_mask is not None:
+            given[recorded.name] = read_camera_mask(recorded.ego_mask, recorded.camera)
     return given
 
 
@@ -134,8 +133,7 @@ def _find_mask(
     numbers = np.unique(np.linspace(0, len(pictures) - 1, _PICTURES).astype(int)) if pictures else ()
     spread = [pictures[number] for number in numbers]
     if not options.strict:
-        # those that cannot be read are told of when their turn comes
-        spread = [picture for picture in spread if _readable(picture.path)]
+        spread = [picture for picture in spread if read_if_whole(partial(read_image, picture.path)) is not None]
     with console.status("Searching for the vehicle in the pictures"):
         rim = dark_rim(read_image(picture.path) for picture in spread[:: max(len(spread) // _RIM_PICTURES, 1)])
         mask = np.ones((camera.height, camera.width), bool) if rim is None else rim
@@ -150,14 +148,6 @@ def _find_mask(
     return (mask & found.keep if isinstance(found, EgoMask) else mask), found
 
 
-def _readable(picture: Path) -> bool:
-    try:
-        read_image(picture)
-    except (InputError, FileNotFoundError):
-        return False
-    return True
-
-
 def _returns(
     recording: Recording, recorded: RecordedCamera, pictures: Sequence[RecordedPicture]
 ) -> Float32[np.ndarray, "h w"]:
@@ -166,15 +156,12 @@ def _returns(
     counts = np.zeros((camera.height, camera.width), np.float32)
     frames = [pictures[index].frame for index in np.linspace(0, len(pictures) - 1, _RETURNS_PICTURES).astype(int)]
     for sweep in recording.sweeps:
-        if sweep.frame not in frames:
-            continue
-        try:
-            points_m = sweep.read().points_m
-        except (InputError, FileNotFoundError):
+        read = read_if_whole(sweep.read) if sweep.frame in frames else None
+        if read is None:
             continue
         # on the vehicle itself nothing moves
         to_camera = torch.from_numpy(np.linalg.inv(recorded.to_vehicle) @ sweep.to_vehicle)
-        pixels, valid = camera.project(transform_points(to_camera, points_m).float())
+        pixels, valid = camera.project(transform_points(to_camera, read.points_m).float())
         column, row = pixels[valid & camera.inside(pixels)].floor().long().numpy().T
         np.add.at(counts, (row, column), 1)
     return counts

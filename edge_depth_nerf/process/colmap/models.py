@@ -152,11 +152,8 @@ def import_pycolmap(option: str = "--poses colmap") -> Any:
     try:
         import pycolmap
     except ImportError as error:
-        without = (
-            "leave it out (--no-refine-poses)"
-            if "refine" in option
-            else "use the poses of the recording (--poses recorded)"
-        )
+        recorded = "use the poses of the recording (--poses recorded)"
+        without = "leave it out (--no-refine-poses)" if "refine" in option else recorded
         raise InputError(
             f"{option}: needs COLMAP's Python package, which cannot be imported ({error}). Install it with "
             f"`{INSTALL}`, or {without}."
@@ -205,16 +202,14 @@ def find_models(recording: Recording, options: ProcessOptions, folder: Path, con
         run.match()
         run.map()
     # features and descriptors of a long drive take gigabytes
-    (folder / "database.db").unlink(missing_ok=True)
+    run.database.unlink(missing_ok=True)
     for left in (run.masks, run.pictures):
         shutil.rmtree(left, ignore_errors=True)
-    return run.read_models()
+    return run.read_models(run.models)
 
 
-def file_stamp(path: Path | None) -> list | None:
+def file_stamp(path: Path) -> list:
     """What tells a file from another version of it without reading it: its place, size and time of change."""
-    if path is None:
-        return None
     found = path.stat()
     return [str(path.absolute()), found.st_size, found.st_mtime_ns]
 
@@ -248,9 +243,8 @@ class _Run:
         self.models = folder / "models"
         theta_max_rad = math.radians(min(options.theta_max_deg, THETA_MAX_DEG))
         self.lenses = {camera.name: colmap_lens(camera.camera, theta_max_rad) for camera in recording.cameras}
-        self.feature_masks = FeatureMasks(
-            recording, options, {name: lens.theta_max_rad for name, lens in self.lenses.items()}
-        )
+        limits_rad = {name: lens.theta_max_rad for name, lens in self.lenses.items()}
+        self.feature_masks = FeatureMasks(recording, options, limits_rad)
         self.shared_views = shared_views(recording, self.lenses)
         # COLMAP names pictures by their paths below one folder, and a space ends a name
         self.pictures = folder / "pictures"
@@ -272,11 +266,11 @@ class _Run:
     def _digest(self) -> str:
         """Of everything the models depend on, pictures and masks by size and time of change."""
         cameras = [
-            [c.name, file_stamp(self.feature_masks.ego_masks[c.name]), dataclasses.asdict(self.lenses[c.name])]
+            [c.name, c.ego_mask and file_stamp(c.ego_mask), dataclasses.asdict(self.lenses[c.name])]
             for c in self.recording.cameras
         ]
         pictures = [
-            [p.camera, p.frame, file_stamp(p.path), file_stamp(p.mask), file_stamp(p.semantics)]
+            [p.camera, p.frame, *(path and file_stamp(path) for path in (p.path, p.mask, p.semantics))]
             for p in self.recording.pictures
         ]
         related = [_NEIGHBOURS, sorted(self.shared_views), self.options.moving_classes]
@@ -298,8 +292,9 @@ class _Run:
         with progress_bars(self.console, counted=True) as progress:
             task = progress.add_task("Finding features", total=len(self.names))
             for chunk in _chunks(range(len(self.names)), _CHUNK_PICTURES):
-                self._write_masks(chunk)
-                self._link_pictures(chunk)
+                for index in chunk:
+                    self._write_mask(index)
+                    self._link_picture(index)
                 colmap.extract_features(
                     self.database,
                     self.pictures,
@@ -337,26 +332,23 @@ class _Run:
             database.write_frame(frame, use_frame_id=True)
         database.close()
 
-    def _write_masks(self, chunk: Sequence[int]) -> None:
-        for index in chunk:
-            target = self.masks / f"{self.names[index]}.png"
-            if target.is_file():
-                continue
+    def _write_mask(self, index: int) -> None:
+        target = self.masks / f"{self.names[index]}.png"
+        if not target.is_file():
             mask = self.feature_masks.of(self.recording.pictures[index])
             # a feature at the edge of a mask looks at what is masked
             reach = 1 + 2 * max(1, round(mask.shape[1] / 350))
             write_mask(target, cv2.erode(mask.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0)
 
-    def _link_pictures(self, chunk: Sequence[int]) -> None:
-        for index in chunk:
-            source, target = self.recording.pictures[index].path.absolute(), self.pictures / self.names[index]
-            if not target.is_file():
-                target.parent.mkdir(parents=True, exist_ok=True)
-                try:
-                    target.symlink_to(source)
-                except OSError:
-                    # not every system and disk has links
-                    write_bytes(target, source.read_bytes())
+    def _link_picture(self, index: int) -> None:
+        source, target = self.recording.pictures[index].path.absolute(), self.pictures / self.names[index]
+        if not target.is_file():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                target.symlink_to(source)
+            except OSError:
+                # not every system and disk has links
+                write_bytes(target, source.read_bytes())
 
     def match(self) -> None:
         """Match the pictures that were taken shortly after one another, and check each pair's geometry."""
@@ -400,7 +392,7 @@ class _Run:
         shutil.rmtree(kept, ignore_errors=True)
         for pose_points in _POSE_POINTS:
             unfinished = self._map(pose_points)
-            placed = {index for model in self._read_models(unfinished) for index in model.placed()}
+            placed = {index for model in self.read_models(unfinished) for index in model.placed()}
             if len(placed) > most:
                 shutil.rmtree(kept, ignore_errors=True)
                 os.replace(unfinished, kept)
@@ -462,16 +454,13 @@ class _Run:
             return False
         return read_json(record) == {"sha256": sum_of_files(self.models)}
 
-    def read_models(self) -> list[ColmapModel]:
-        """The models, that with the most pictures first.
+    def read_models(self, models: Path) -> list[ColmapModel]:
+        """The models of a folder, that with the most pictures first.
 
         Raises:
             InputError: a model in the folder is broken, or of other pictures.
 
         """
-        return self._read_models(self.models)
-
-    def _read_models(self, models: Path) -> list[ColmapModel]:
         found = []
         for folder in sorted(models.iterdir()):
             try:
@@ -491,13 +480,10 @@ class _Run:
             if not image.has_pose:
                 continue
             model_to_camera = np.vstack((image.cam_from_world().matrix(), [0.0, 0.0, 0.0, 1.0]))
-            seen = [
-                point
-                for point in image.get_observation_points2D()
-                if model.point3D(point.point3D_id).track.length() >= _MIN_TRACK
-            ]
-            pixels = np.array([point.xy for point in seen]).reshape(-1, 2)
-            points = np.array([model.point3D(point.point3D_id).xyz for point in seen]).reshape(-1, 3)
+            seen = [(point.xy, model.point3D(point.point3D_id)) for point in image.get_observation_points2D()]
+            seen = [(pixel, point) for pixel, point in seen if point.track.length() >= _MIN_TRACK]
+            pixels = np.array([pixel for pixel, _ in seen]).reshape(-1, 2)
+            points = np.array([point.xyz for _, point in seen]).reshape(-1, 3)
             in_camera = points @ model_to_camera[:3, :3].T + model_to_camera[:3, 3]
             index = index_of[image.name]
             poses[index] = np.linalg.inv(model_to_camera)

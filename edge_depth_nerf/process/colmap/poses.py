@@ -109,27 +109,20 @@ def _spans(recording: Recording, model: ColmapModel) -> bool:
 
 
 def _check_path(path: MetricPath, scale: Scale) -> None:
-    """Whether the path hangs together: its scale, and its steps.
-
-    Raises:
-        InputError: it does not; names the frames.
-
-    """
+    """Raise an InputError that names the frames where the path's scale, or its steps, break."""
     frames, found = list(path.moments), scale.broken
     if found is not None:
-        where, why = (
-            (found.first, found.last),
-            (
-                f"LiDAR's scale goes from {found.before:.2f} to {found.after:.2f} m per unit there, and from "
-                f"{found.smallest:.2f} to {found.largest:.2f} along the path"
-            ),
+        first, last = found.first, found.last
+        why = (
+            f"LiDAR's scale goes from {found.before:.2f} to {found.after:.2f} m per unit there, and from "
+            f"{found.smallest:.2f} to {found.largest:.2f} along the path"
         )
     elif (broken := find_break(path.trajectory)) is not None:
-        where, why = (frames[broken.first], frames[broken.last]), broken.what
+        first, last, why = frames[broken.first], frames[broken.last], broken.what
     else:
         return
     raise InputError(
-        f"--poses colmap: COLMAP's path breaks between frames {where[0]} and {where[1]}: {why}. Compute the path "
+        f"--poses colmap: COLMAP's path breaks between frames {first} and {last}: {why}. Compute the path "
         "from LiDAR (--poses lidar). Or give COLMAP more information: frames closer together (--stride "
         "1), all cameras, the right lens calibration, masks of moving objects (--frame-masks). Or use "
         "only the frames before or after the break (--first, --frames)."

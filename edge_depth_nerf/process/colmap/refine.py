@@ -25,17 +25,24 @@ from jaxtyping import Bool, Float64, Int
 from rich.console import Console
 
 from edge_depth_nerf.base.console import progress_bars
-from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_image, read_json, write_json
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.poses.matches import Matches, PosedPicture, epipolar_distance_px, match_pictures
 from edge_depth_nerf.poses.tracks import Tracks, features_joined, join_matches, reprojection_px, spread, triangulate
 from edge_depth_nerf.process.colmap.bundle import Shot, Softness, adjust_bundle
-from edge_depth_nerf.process.colmap.models import THETA_MAX_DEG, ColmapLens, colmap_lens, import_pycolmap, shared_views
+from edge_depth_nerf.process.colmap.models import (
+    THETA_MAX_DEG,
+    ColmapLens,
+    colmap_lens,
+    file_stamp,
+    import_pycolmap,
+    shared_views,
+)
 from edge_depth_nerf.process.colmap.scale import moment_times
 from edge_depth_nerf.process.feature_masks import FeatureMasks
 from edge_depth_nerf.process.options import ProcessOptions
+from edge_depth_nerf.process.reading import read_if_whole
 from edge_depth_nerf.process.recording import RecordedPicture, Recording
 from edge_depth_nerf.scene.format import REFINED_POSES
 
@@ -186,10 +193,7 @@ def _digest(
     version: str, recording: Recording, options: ProcessOptions, given: Float64[np.ndarray, "moments 4 4"]
 ) -> str:
     """Of everything that the refined poses depend on, pictures and masks by size and time of change."""
-    cameras = [
-        [c.name, c.camera.to_dict(), c.to_vehicle.tolist(), _content(options.ego_mask_of(c.name) or c.ego_mask)]
-        for c in recording.cameras
-    ]
+    cameras = [[c.name, c.camera.to_dict(), c.to_vehicle.tolist(), _content(c.ego_mask)] for c in recording.cameras]
     pictures = [
         [p.camera, p.frame, recording.pose(p).tolist(), *map(_stamp, (p.path, p.mask, p.semantics))]
         for p in recording.pictures
@@ -205,10 +209,7 @@ def _content(path: Path | None) -> str | None:
 
 def _stamp(path: Path | None) -> list | None:
     """What tells a file from another version of it, wherever the drive lies."""
-    if path is None:
-        return None
-    found = path.stat()
-    return [path.parent.name, path.name, found.st_size, found.st_mtime_ns]
+    return None if path is None else [path.parent.name, path.name, *file_stamp(path)[1:]]
 
 
 def _read_refinement(path: Path, digest: str) -> Refinement | None:
@@ -275,14 +276,10 @@ def _match(
 
 def _read(picture: RecordedPicture, lens: Camera, strict: bool) -> np.ndarray:
     """A picture; a broken one is black, and is reported when its turn comes."""
-    try:
-        rgb = read_image(picture.path)
-        if rgb.shape[:2] == (lens.height, lens.width):
-            return rgb
-    except (InputError, FileNotFoundError):
-        if strict:
-            raise
-    return np.zeros((lens.height, lens.width, 3), np.uint8)
+    rgb = read_if_whole(partial(read_image, picture.path), strict=strict)
+    if rgb is None or rgb.shape[:2] != (lens.height, lens.width):
+        return np.zeros((lens.height, lens.width, 3), np.uint8)
+    return rgb
 
 
 def _pairs(pictures: Sequence[PosedPicture], shared: set[tuple[str, str]]) -> list[tuple[int, int]]:

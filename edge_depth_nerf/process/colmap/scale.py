@@ -12,6 +12,7 @@ import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -29,7 +30,7 @@ from edge_depth_nerf.lidar import transform_points
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.lidar.world import sweep_in_world
 from edge_depth_nerf.process.colmap.models import ColmapModel
-from edge_depth_nerf.process.reading import read_depth
+from edge_depth_nerf.process.reading import read_depth, read_if_whole
 from edge_depth_nerf.process.recording import RecordedPicture, RecordedSweep, Recording
 
 MIN_PAIRS = 30
@@ -346,11 +347,10 @@ def _ratios(
 def _scan(sweep: RecordedSweep, trajectory: Trajectory | None) -> Float64[np.ndarray, "returns 3"] | None:
     """A sweep's points in the world, each by the vehicle's pose at its time; without a path, in the vehicle's frame.
 
-    None for one that cannot be read: it is reported when its maps are made.
+    None for one that cannot be read.
     """
-    try:
-        read = sweep.read()
-    except (InputError, FileNotFoundError):
+    read = read_if_whole(sweep.read)
+    if read is None:
         return None
     if trajectory is None:
         return transform_points(torch.from_numpy(sweep.to_vehicle), read.points_m).numpy()
@@ -374,15 +374,11 @@ def _returns_in_camera(
 
 def _depth_points(picture: RecordedPicture, camera: Camera) -> Float64[np.ndarray, "values 3"]:
     """The points of a depth map in the camera's frame."""
-    if picture.depth is None:
-        return np.zeros((0, 3))
-    try:
-        distance = read_depth(picture.depth, camera).astype(np.float64)
-    except (InputError, FileNotFoundError):
-        # reported when its map is made
+    distance = picture.depth and read_if_whole(partial(read_depth, picture.depth, camera))
+    if distance is None:
         return np.zeros((0, 3))
     of_pixels = rays(camera)
-    return (of_pixels.directions * distance[..., None])[of_pixels.within & (distance > 0)]
+    return (of_pixels.directions * distance.astype(np.float64)[..., None])[of_pixels.within & (distance > 0)]
 
 
 def _beside(

@@ -18,7 +18,8 @@ import numpy as np
 from edge_depth_nerf.base.bounds import shown, text_lines
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras import MEI
-from edge_depth_nerf.cameras.transforms import Transform, check_rigid
+from edge_depth_nerf.cameras.transforms import Transform
+from edge_depth_nerf.process.poses import finite_number, transform_of_rows
 
 _MEI_FIELDS = {
     "mirror_parameters": ("xi",),
@@ -244,13 +245,7 @@ def _read_yaml(path: Path) -> tuple[dict[str, tuple[int, str]], int]:
 
 
 def _number(text: str, path: Path, line: int) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = np.nan
-    if not np.isfinite(value):
-        raise InputError(f"{path}, line {line}: {shown(text)} is not a finite number. {_DOWNLOAD}")
-    return value
+    return finite_number(text, f"{path}, line {line}", _DOWNLOAD)
 
 
 def _transform(text: str, path: Path, line: int) -> Transform:
@@ -260,7 +255,4 @@ def _transform(text: str, path: Path, line: int) -> Transform:
             f"{path}, line {line}: {len(numbers)} numbers, expected 12 (the 3×4 matrix of rotation and translation, "
             f"row by row). {_DOWNLOAD}"
         )
-    transform = np.eye(4)
-    transform[:3] = np.reshape(numbers, (3, 4))
-    check_rigid(transform, f"{path}, line {line}")
-    return transform
+    return transform_of_rows(np.reshape(numbers, (3, 4)), f"{path}, line {line}")

@@ -11,14 +11,17 @@ Read from the data set's folder, for each frame number f:
 
 Frames: scanner → vehicle by inv(cam_0→velo) and cam_0→pose; camera → vehicle by cam→pose. cam0_to_world.txt is of the
 rectified camera 0 and not used. The cameras fire when the laser faces forward, so frame f's picture and sweep share
-their time; the scanner turns clockwise, once a frame. Everything is checked by sizes and headers.
+their time; the scanner turns clockwise, once a frame. Files are checked by their sizes and headers alone, so that a
+drive of thousands of frames takes seconds.
 """
 
 from __future__ import annotations
 
 import re
 import statistics
+from collections.abc import Collection, Iterable, Sequence
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -27,14 +30,14 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json
 from edge_depth_nerf.lidar import SweepTiming, check_sweep_size, read_sweep
 from edge_depth_nerf.lidar.trajectory import Trajectory
-from edge_depth_nerf.process.kitti360.calibration import Kitti360Rig, read_poses, read_rig
-from edge_depth_nerf.process.kitti360.drive import Kitti360Drive
+from edge_depth_nerf.masks.semantics import check_label_header, label_path
+from edge_depth_nerf.process.kitti360.calibration import Kitti360Rig, read_poses, read_rig, read_timestamps
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.process.poses import transform_of_rows
 from edge_depth_nerf.process.reading import load_distance, load_picture
 from edge_depth_nerf.process.recording import RecordedCamera, RecordedPicture, RecordedSweep, Recording
-from edge_depth_nerf.scene.checks import Tolerance, check_distance, check_size
-from edge_depth_nerf.scene.writer import DistanceMap, Picture, ShiftedView
+from edge_depth_nerf.scene.checks import Tolerance, check_distance, check_size, require_folder
+from edge_depth_nerf.scene.writer import DistanceMap, Picture, ShiftedView, Skipped, ranges, summarise
 
 SCANNER = "velodyne"
 """Name of the scanner."""
@@ -57,7 +60,7 @@ def read_kitti360(options: Kitti360Options) -> Recording:
     tolerance = Tolerance(options.strict, len(kept))
     # a picture's sweeps are checked against those around them, as far again; a path is followed without gaps
     near = partial(_near, reach=2 * options.sweeps, between=options.poses != "recorded")
-    numbers = near(np.array(sorted(drive.sweep_numbers())), np.array(sorted({frame for _, frame in kept})))
+    numbers = near(np.array(sorted(_numbered(drive.sweeps, ".bin"))), np.array(sorted({frame for _, frame in kept})))
     whole = set()
     for number in numbers.tolist():
         with tolerance.of(number, SCANNER):
@@ -67,21 +70,21 @@ def read_kitti360(options: Kitti360Options) -> Recording:
     kept = [(name, frame) for name, frame in kept if frame in whole]
     if not kept:
         raise InputError(f"{tolerance.left_out[0].fault} No other frame is chosen: choose more by --frames.")
-    files = drive.check_files(rig, kept, tolerance)
+    files = {}
+    for name, frame in kept:
+        with tolerance.of(frame, name):
+            files[name, frame] = drive.check_picture(rig, kept, name, frame)
     moments = sorted({frame for _, frame in kept})
     stamps = {name: drive.read_timestamps(name, moments) for name in options.cameras}
     clock = _Clock(next((times for times in stamps.values() if times), []))
 
     pictures = tuple(
-        RecordedPicture(
-            camera=name,
-            frame=frame,
+        picture(
             time_s=clock.time_s(frame),
             camera_to_world=None if poses is None else poses[frame] @ rig.camera_to_pose[name],
             timestamp_s=stamps[name][frame] if stamps[name] else None,
-            **vars(found),
         )
-        for (name, frame), found in files.items()
+        for (name, frame), picture in files.items()
     )
     timing = SweepTiming(clock.interval_s)
     sweeps = [
@@ -200,3 +203,177 @@ def _shifted_views(drive: Kitti360Drive, rig: Kitti360Rig, taken: set[tuple[str,
 
 def _load_shifted(picture: Path, distance: Path, factor: int) -> tuple[Picture, DistanceMap]:
     return load_picture(picture, factor), load_distance(distance, factor)
+
+
+class Kitti360Drive:
+    """The drive that some options name, on disk: which of its frames are complete, and checks of its files.
+
+    Raises:
+        FileNotFoundError: a folder is missing.
+        InputError: an option is out of its range.
+
+    """
+
+    def __init__(self, options: Kitti360Options) -> None:
+        options.check()
+        names = options.cameras
+        if not (len(set(names)) == len(names) > 0 and set(names) <= {"image_02", "image_03"}):
+            raise InputError(f"--cameras {' '.join(names)}: expected image_02, image_03 or both.")
+        root, sequence = options.root, options.sequence
+        self.options = options
+        self.calibration = root / "calibration"
+        self.poses = root / "data_poses" / sequence / "poses.txt"
+        self.sweeps = root / "data_3d_raw" / sequence / "velodyne_points" / "data"
+        self.images = root / "data_2d_raw" / sequence
+        self.truth = root / "truth" / sequence
+        self.has_truth = self.truth.is_dir()
+
+        require_folder(root, "--root takes the data set's folder, which holds calibration, data_2d_raw and so on")
+        of_sequence = ["data_2d_raw", "data_3d_raw", *(["data_poses"] if options.poses == "recorded" else [])]
+        for folder in ("calibration", *of_sequence):
+            require_folder(root / folder, f"--root {root} is not the data set's folder, or a download is missing")
+        for folder in of_sequence:
+            require_folder(root / folder / sequence, "--sequence needs one of these names")
+        for name in options.cameras:
+            require_folder(self.image_folder(name), f"the pictures of {name} belong there; or leave out that camera")
+        require_folder(self.sweeps, "the LiDAR sweeps belong there")
+        for option, folder in (("--mono", options.mono), ("--frame-masks", options.frame_masks)):
+            if folder is not None:
+                for name in options.cameras:
+                    require_folder(folder / name, f"{option} needs a folder with one folder per camera")
+
+    def image_folder(self, camera: str) -> Path:
+        """Where the pictures of a camera lie."""
+        return self.images / camera / "data_rgb"
+
+    def timestamps_file(self, camera: str) -> Path:
+        """Where the times of a camera's pictures are, if anywhere."""
+        return self.images / camera / "timestamps.txt"
+
+    def select(self, posed: Collection[int] | None) -> tuple[list[tuple[str, int]], list[Skipped]]:
+        """Choose the pictures (camera, frame) that have all they need, in order of frames.
+
+        Args:
+            posed: frames that have a pose; None = poses are still to be found.
+
+        Raises:
+            InputError: the options reach beyond the drive, or nothing that they ask for is complete.
+
+        """
+        options = self.options
+        images = {name: _numbered(self.image_folder(name), ".png") for name in options.cameras}
+        sweeps = _numbered(self.sweeps, ".bin")
+        present = set().union(*images.values())
+        if not present:
+            folders = ", ".join(str(self.image_folder(name)) for name in options.cameras)
+            raise InputError(f"{folders}: no pictures with names like 0000000123.png in it.")
+        there = f"the pictures of {options.sequence} are of frames {min(present)}"
+        frames = options.chosen_frames(max(present), there)
+        kept, skipped = [], []
+        for frame in frames:
+            if posed is not None and frame not in posed:
+                skipped.append(Skipped(frame, None, "no pose"))
+            elif frame not in sweeps:
+                skipped.append(Skipped(frame, None, "no sweep"))
+            else:
+                kept += [(name, frame) for name in options.cameras if frame in images[name]]
+                skipped += [Skipped(frame, name, "no picture") for name in options.cameras if frame not in images[name]]
+        if not kept:
+
+            def extent(frames: Collection[int]) -> str:
+                return f"of frames {min(frames)} to {max(frames)}" if frames else "of no frame"
+
+            has_poses = "" if posed is None else f"{self.poses} has poses {extent(posed)}, "
+            raise InputError(
+                f"none of frames {options.first} to {frames.stop - 1} can be used: {summarise(skipped)}. {has_poses}"
+                f"{self.sweeps} has sweeps {extent(sweeps)}."
+            )
+        return kept, skipped
+
+    def sweep_file(self, frame: int) -> Path:
+        """The sweep of a frame."""
+        return self.sweeps / f"{frame:010d}.bin"
+
+    def check_picture(
+        self, rig: Kitti360Rig, kept: Sequence[tuple[str, int]], name: str, frame: int
+    ) -> partial[RecordedPicture]:
+        """Find a picture and what its maps are made from, and check sizes and headers; time and pose are not set.
+
+        Raises:
+            FileNotFoundError: a mask, monocular or true map is missing.
+            InputError: a file is truncated, or not of its camera's size or kind.
+
+        """
+        options, camera, file = self.options, rig.cameras[name], f"{frame:010d}.png"
+        mask = None if options.frame_masks is None else options.frame_masks / name / file
+        mono = None if options.mono is None else options.mono / name / file
+        labels = label_path(options.root, options.sequence, name, frame)
+        truth_distance, truth_rgb = (
+            self.truth / name / kind / file if self.has_truth else None for kind in ("distance", "rgb")
+        )
+        check_size(self.image_folder(name) / file, camera)
+        for option, path in (("--mono", mono), ("--frame-masks", mask)):
+            if path is not None and not path.is_file():
+                frames = ranges([number for other, number in kept if other == name])
+                raise FileNotFoundError(
+                    f"{path}: no such file; {option} needs one for every frame taken ({frames} of {name}). Make "
+                    f"the missing ones, choose other frames, or leave out {option}."
+                )
+        for path in (truth_distance, truth_rgb):
+            if path is not None and not path.is_file():
+                raise FileNotFoundError(
+                    f"{path}: no such file; the drive's ground truth is incomplete. Synthesise the drive again, or "
+                    f"move {self.truth} away to continue without it."
+                )
+        for path in (mask, truth_rgb):
+            if path is not None:
+                check_size(path, camera)
+        if labels.is_file():
+            check_size(labels, camera)
+            check_label_header(labels)
+        for path in (mono, truth_distance):
+            if path is not None:
+                check_distance(path, camera)
+        return partial(
+            RecordedPicture,
+            camera=name,
+            frame=frame,
+            path=self.image_folder(name) / file,
+            mask=mask,
+            semantics=labels if labels.is_file() else None,
+            mono=mono,
+            truth_distance=truth_distance,
+            truth_rgb=truth_rgb,
+        )
+
+    def read_timestamps(self, camera: str, frames: Iterable[int]) -> list[float]:
+        """Read the times of a camera's frames from 0 on, seconds since 1970; empty where the drive has no such file.
+
+        Args:
+            camera: such as image_02.
+            frames: those that must be there.
+
+        Raises:
+            InputError: a line is not a time, or a frame has no line.
+
+        """
+        path = self.timestamps_file(camera)
+        if not path.is_file():
+            return []
+        times = read_timestamps(path)
+        for number, (before, time) in enumerate(pairwise(times), 2):
+            if not time > before:
+                raise InputError(
+                    f"{path}, line {number}: not after the line before. Copy the file again from the data set, or move "
+                    "it away: frames then count as 0.1 s apart."
+                )
+        if missing := [frame for frame in frames if frame >= len(times)]:
+            raise InputError(
+                f"{path}: ends after line {len(times)}, but frame {missing[0]} needs line {missing[0] + 1}. The file "
+                "is truncated; copy it again from the data set."
+            )
+        return times
+
+
+def _numbered(folder: Path, suffix: str) -> set[int]:
+    return {int(entry.stem) for entry in folder.glob(f"*{suffix}") if re.fullmatch(r"\d{10}", entry.stem)}
