@@ -47,7 +47,7 @@ from edge_depth_nerf.process.reading import (
 from edge_depth_nerf.process.recording import RecordedPicture, Recording
 from edge_depth_nerf.process.sweep_store import SweepStore
 from edge_depth_nerf.process.transform_checks import agreement_notices, agreements
-from edge_depth_nerf.process.vehicle import find_vehicle, given_masks
+from edge_depth_nerf.process.vehicle import find_vehicle, vehicle_masks
 from edge_depth_nerf.scene.checks import read_camera_mask
 from edge_depth_nerf.scene.format import TRANSFORMS
 from edge_depth_nerf.scene.points import PointCloud
@@ -88,8 +88,7 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
     _check_poses(recording, options)
     with console.status("Checking cameras and files …"):
         source = _source(recording, options)
-        masks = given_masks(recording)
-        check_cameras(_scene_cameras(recording, masks, options), options.theta_max_deg)
+        check_cameras(_scene_cameras(recording, vehicle_masks(recording), options), options.theta_max_deg)
     open_scene(options.output, source)
     if options.poses == "lidar":
         from edge_depth_nerf.process.lidar_poses import lidar_poses
@@ -98,12 +97,12 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
     notices: list[str] = []
     if options.find_ego:
         training = [picture for picture in recording.pictures if picture.frame not in _held_out(recording, options)]
-        recording, notices = find_vehicle(recording, training, masks, options, console)
+        recording, notices = find_vehicle(recording, training, options, console)
     recording, said = _posed(recording, options, console)
     notices += said
     if recording.skipped:
         say(console, f"Skipped {summarise(recording.skipped)}", "yellow")
-    held_out = _held_out(recording, options)
+    held_out, masks = _held_out(recording, options), vehicle_masks(recording)
     if options.find_moving:
         recording, more = find_moving(recording, options, held_out, masks, console)
         notices += more

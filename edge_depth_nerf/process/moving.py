@@ -96,27 +96,22 @@ def find_moving(
             "--find-moving: the drive has no LiDAR sweeps, which it needs. Leave it out, or give masks with "
             "--frame-masks."
         )
-    paths = {id(picture): moving_mask_path(options.output, picture) for picture in recording.pictures}
-    missing = [picture for picture in recording.pictures if not paths[id(picture)].is_file()]
+    paths = [moving_mask_path(options.output, picture) for picture in recording.pictures]
+    missing = [each for each in zip(paths, recording.pictures, strict=True) if not each[0].is_file()]
     if missing:
         store = SweepStore(recording, options, held_out)
         found = [_ScannersThings(scanner, held_out, console) for scanner in store.scanners]
-        jobs = [
-            partial(
-                _write_mask, paths[id(picture)], recording, picture, found, ego, options.theta_max_deg, options.strict
-            )
-            for picture in missing
-        ]
+        jobs = [partial(_write_mask, path, recording, picture, found, ego, options) for path, picture in missing]
         run_jobs(jobs, "Masking what moves", console)
-    made = {id(picture): paths[id(picture)] for picture in recording.pictures if paths[id(picture)].is_file()}
-    pictures = tuple(replace(picture, moving_mask=made.get(id(picture))) for picture in recording.pictures)
-    shares = [1 - float(read_mask(path).mean()) for path in made.values()]
+    made = [path if path.is_file() else None for path in paths]
+    pictures = [replace(picture, moving_mask=mask) for picture, mask in zip(recording.pictures, made, strict=True)]
+    shares = [1 - float(read_mask(path).mean()) for path in made if path is not None]
     notice = (
         f"Moving objects were found in {sum(share > 0 for share in shares)} of {len(shares)} pictures and hide "
         f"{np.mean(shares):.1%} of them. Look at {options.output / MOVING_MASKS}: correct them there and process "
         "the drive again."
     )
-    return replace(recording, pictures=pictures), [notice]
+    return replace(recording, pictures=tuple(pictures)), [notice]
 
 
 class _ScannersThings:
@@ -185,10 +180,6 @@ class _Returns:
     spacing_m: Float[np.ndarray, "n"]
 
     @staticmethod
-    def none() -> _Returns:
-        return _Returns(np.zeros((0, 3)), np.zeros(0, np.float32))
-
-    @staticmethod
     def joined(parts: Sequence[_Returns]) -> _Returns:
         return _Returns(
             np.concatenate([part.points_m for part in parts]), np.concatenate([part.spacing_m for part in parts])
@@ -208,8 +199,7 @@ def _write_mask(
     picture: RecordedPicture,
     found: Sequence[_ScannersThings],
     ego: Mapping[str, NDArray[np.bool_]],
-    theta_max_deg: float,
-    strict: bool,
+    options: ProcessOptions,
 ) -> None:
     """Find what moves in one picture, and write its mask; none for a picture that cannot be read, unless strict."""
     full = next(camera.camera for camera in recording.cameras if camera.name == picture.camera)
@@ -219,10 +209,10 @@ def _write_mask(
         if seen is not None and seen[1]:
             factor = working_factor(moving.shape)
             camera = full.downscaled(factor)
-            usable = lens_circle(camera, theta_max_deg)
+            usable = lens_circle(camera, options.theta_max_deg)
             if picture.camera in ego:
                 usable &= downscale_mask(ego[picture.camera], factor)
-            image = read_if_whole(partial(read_image, picture.path), strict=strict)
+            image = read_if_whole(partial(read_image, picture.path), strict=options.strict)
             if image is None:
                 # once it is mended, it gets a mask
                 return
@@ -278,7 +268,7 @@ def _at_moment(
         Their points; of each long thing those at the upper edge of the scanner's field; rows of their LiDAR points.
 
     """
-    moving, cut_off, rows = [_Returns.none()], [], [np.zeros(0, np.int64)]
+    moving, cut_off, rows = [_Returns(np.zeros((0, 3)), np.zeros(0, np.float32))], [], [np.zeros(0, np.int64)]
     for thing in things:
         of_thing = np.concatenate((thing.rows, _feet(sweep, thing, ground)))
         points = sweep.points_m.numpy()[of_thing]

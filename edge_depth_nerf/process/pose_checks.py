@@ -37,7 +37,6 @@ def features_say(recording: Recording, options: ProcessOptions, console: Console
 
     """
     lenses = {camera.name: camera.camera for camera in recording.cameras}
-
     masks = FeatureMasks(recording, options, dict.fromkeys(lenses, math.radians(options.theta_max_deg)))
     posed = [
         PosedPicture(

@@ -265,8 +265,8 @@ class SweepStore:
             window = [*window[:1], *filter(scanner.readable, window[1:])]
             for rank, index in enumerate(window):
                 age_s = abs(float(scanner.times_s[index]) - time_s)
+                sweep = scanner.whole(index)
                 if rank == 0 and scanner.is_own(index, frame, time_s):
-                    sweep = scanner.whole(index)
                     # a picture that is held out has no others around it, and nothing lasting is made of it
                     moved = torch.zeros(len(sweep.points_m), dtype=torch.bool)
                     if len(window) > 1:
@@ -275,7 +275,7 @@ class SweepStore:
                     if hide:
                         found.hide(*above_field(sweep, viewpoint_in_world[:3, 3]))
                 else:
-                    sweep, first, still = scanner.whole(index), scanner.whole(window[0]), ~scanner.moved(index)
+                    first, still = scanner.whole(window[0]), ~scanner.moved(index)
                     points_m, spacing_m = sweep.points_m[still], sweep.spacing_m[still]
                     low = elevation_rad(points_m, first) <= first.elevation_rad[1]
                     found.add(points_m[low], spacing_m[low], torch.zeros_like(low[low]), age_s)
@@ -293,8 +293,9 @@ class _Gathered:
 
     def __init__(self, centre_m: np.ndarray) -> None:
         self._centre = torch.from_numpy(centre_m)
-        self._parts: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
-        self._hiding: list[tuple[Tensor, Tensor]] = []
+        points_m, spacing_m = torch.empty(0, 3, dtype=torch.float64), torch.empty(0)
+        self._parts = [(points_m, spacing_m, torch.empty(0, dtype=torch.bool), torch.empty(0))]
+        self._hiding = [(points_m, spacing_m)]
         self._voxel_m = VOXEL_M
 
     def add(self, points_m: Tensor, spacing_m: Tensor, moved: Tensor, age_s: float) -> None:
@@ -311,14 +312,8 @@ class _Gathered:
         self._hiding.append((points_m, spacing_m))
 
     def together(self) -> Surroundings:
-        none = (
-            torch.empty(0, 3, dtype=torch.float64),
-            torch.empty(0),
-            torch.empty(0, dtype=torch.bool),
-            torch.empty(0),
-        )
-        points, spacing, moved, age = (torch.cat(values) for values in zip(none, *self._parts, strict=True))
-        hiding, hiding_spacing = (torch.cat(values) for values in zip(none[:2], *self._hiding, strict=True))
+        points, spacing, moved, age = (torch.cat(values) for values in zip(*self._parts, strict=True))
+        hiding, hiding_spacing = (torch.cat(values) for values in zip(*self._hiding, strict=True))
         return Surroundings(
             points_m=torch.cat((points, hiding)),
             spacing_m=torch.cat((spacing, hiding_spacing)),

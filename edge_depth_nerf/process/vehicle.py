@@ -47,6 +47,7 @@ _RETURNS_PICTURES = 3
 _INNER = 0.01
 """So far inside the outline, as a share of the picture's longer side: scanner and camera do not see quite the same."""
 
+_NOT_FOUND = "nothing is masked as the vehicle."
 _LOOK = "Check {}; if you correct it there, process the drive again."
 _UNSEEN = (
     "That is right if the camera does not see the vehicle. Otherwise paint the vehicle black in {} and process again."
@@ -57,36 +58,25 @@ _PAINT = (
 )
 
 
-def given_masks(recording: Recording) -> dict[str, NDArray[np.bool_]]:
-    """Read the masks that are given, by camera.
+def vehicle_masks(recording: Recording) -> dict[str, NDArray[np.bool_]]:
+    """Read the masks that the cameras have, True = use the pixel.
 
     Raises:
         FileNotFoundError: one is not there.
         InputError: broken, or not of its camera's size.
 
     """
-    given = {}
-    for recorded in recording.cameras:
-        if recorded.ego_mask is not None:
-            given[recorded.name] = read_camera_mask(recorded.ego_mask, recorded.camera)
-    return given
+    with_mask = [(recorded, path) for recorded in recording.cameras if (path := recorded.ego_mask) is not None]
+    return {recorded.name: read_camera_mask(path, recorded.camera) for recorded, path in with_mask}
 
 
 def find_vehicle(
     recording: Recording,
     training: Sequence[RecordedPicture],
-    masks: dict[str, NDArray[np.bool_]],
     options: ProcessOptions,
     console: Console,
 ) -> tuple[Recording, list[str]]:
-    """Find the masks that are not given, add them to `masks`, and write them into the scene.
-
-    Args:
-        recording: whose cameras.
-        training: the pictures to look at.
-        masks: those that are known, by camera; True = use the pixel.
-        options: of the scene.
-        console: where progress is shown.
+    """Find the masks that are not given in the training pictures, and write them into the scene.
 
     Returns:
         The recording with all masks' files, and what the user should know.
@@ -95,7 +85,7 @@ def find_vehicle(
     cameras, notices = [], []
     not_found: dict[str, list[Path]] = defaultdict(list)
     for recorded in recording.cameras:
-        if recorded.name not in masks:
+        if recorded.ego_mask is None:
             path = ego_mask_path(options.output, recorded.name)
             if not path.is_file() or recorded.name in vehicles_unknown(options.output):
                 pictures = [picture for picture in training if picture.camera == recorded.name]
@@ -108,16 +98,12 @@ def find_vehicle(
                     notices.append(f"{recorded.name}: {_NOT_FOUND} {found.reason} {_UNSEEN.format(path)}")
                 else:
                     not_found[found.reason].append(path)
-            masks[recorded.name] = read_camera_mask(path, recorded.camera)
             recorded = dataclasses.replace(recorded, ego_mask=path)
         cameras.append(recorded)
     for reason, paths in not_found.items():
         names = ", ".join(path.stem for path in paths)
         notices.append(f"{names}: {_NOT_FOUND} {reason} {_PAINT.format(', '.join(map(str, paths)))}")
     return dataclasses.replace(recording, cameras=tuple(cameras)), notices
-
-
-_NOT_FOUND = "nothing is masked as the vehicle."
 
 
 def _find_mask(
