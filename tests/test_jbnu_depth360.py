@@ -173,13 +173,7 @@ def test_a_key_in_the_file_replaces_its_assumption_alone(published: Path) -> Non
             lambda root: (root / "bin/000021.bin").write_bytes(bytes(30)),
             r"000021\.bin: 30 bytes, expected a multiple of 16",
         ),
-        (lambda root: (root / "bin/000021.bin").write_bytes(b""), r"000021\.bin: an empty file"),
-        (lambda root: np.full(8, np.nan, "<f4").tofile(root / "bin/000021.bin"), None),
         (lambda root: (root.parents[1] / "calibration.toml").unlink(), r"calibration\.toml: no such file"),
-        (
-            lambda root: (root.parents[1] / "poses.txt").write_text("1 0 0 0 0 0 0 1"),
-            r"poses\.txt: 1 pose, expected at least two",
-        ),
         (
             lambda root: (root.parents[1] / "calibration.toml").write_text("cameras = 3"),
             r"calibration\.toml: cameras is 3, expected tables",
@@ -190,12 +184,7 @@ def test_a_key_in_the_file_replaces_its_assumption_alone(published: Path) -> Non
         ),
     ],
 )
-def test_what_is_wrong_is_said(published: Path, spoil, message: str | None) -> None:
+def test_what_is_wrong_is_said(published: Path, spoil, message: str) -> None:
     spoil(published)
-    if message is None:
-        # NaN is found when the scan is read
-        with pytest.raises(InputError, match=r"000021\.bin: none of its 2 points can be used"):
-            read_jbnu_depth360(given(published)).sweeps[1].read()
-        return
     with pytest.raises((InputError, FileNotFoundError), match=message):
         read_jbnu_depth360(given(published))

@@ -84,6 +84,13 @@ def process(drive: RoomDrive | Path, output: Path, **options: Any) -> ProcessRep
     )
 
 
+def refused(drive: RoomDrive, output: Path, message: str, **options: Any) -> None:
+    """Check that a drive is refused before anything is written."""
+    with pytest.raises((InputError, FileNotFoundError), match=message):
+        process(drive, output, **options)
+    assert not output.exists()
+
+
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> RoomDrive:
     """A drive with all there is; not to be changed."""
@@ -359,9 +366,7 @@ def test_vehicle_mask_is_found_corrected_and_kept(tmp_path: Path) -> None:
 def test_labels_are_checked_before_the_work(drive: RoomDrive, tmp_path: Path) -> None:
     path = drive.root / f"data_2d_semantics/train/{SEQUENCE}/image_02/semantic/0000000002.png"
     write_png(path, np.zeros((32, 32, 3), np.uint8))
-    with pytest.raises(InputError, match=r"semantic/0000000002\.png: found 8-bit RGB, expected an 8-bit PNG"):
-        process(drive, tmp_path / "scene")
-    assert not (tmp_path / "scene").exists()
+    refused(drive, tmp_path / "scene", r"semantic/0000000002\.png: found 8-bit RGB, expected an 8-bit PNG")
 
 
 def test_times_must_increase_and_the_line_is_named(drive: RoomDrive, tmp_path: Path) -> None:
@@ -420,15 +425,12 @@ def test_other_poses_found_make_other_maps(tmp_path: Path, monkeypatch: pytest.M
 def test_the_only_frame_is_without_a_sweep(drive: RoomDrive, tmp_path: Path) -> None:
     path = drive.sweep(drive.frames[0])
     path.write_bytes(path.read_bytes()[:-3])
-    with pytest.raises(InputError, match=r"\.bin: .*expected a multiple of 16.*choose more by --frames"):
-        process(drive, tmp_path / "scene", frames=1, strict=False)
-    assert not (tmp_path / "scene").exists()
+    message = r"\.bin: .*expected a multiple of 16.*choose more by --frames"
+    refused(drive, tmp_path / "scene", message, frames=1, strict=False)
 
 
 def test_a_search_that_cannot_begin_leaves_nothing_behind(drive: RoomDrive, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="2 pictures, expected 3 or more"):
-        process(drive, tmp_path / "scene", poses="colmap", frames=1)
-    assert not (tmp_path / "scene").exists()
+    refused(drive, tmp_path / "scene", "2 pictures, expected 3 or more", poses="colmap", frames=1)
 
 
 # ---- what the scene holds --------------------------------------------------------------------------------------
@@ -636,9 +638,7 @@ def test_first_frames_and_stride(tmp_path: Path) -> None:
     ],
 )
 def test_options_out_of_range(drive: RoomDrive, tmp_path: Path, options: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        process(drive, tmp_path / "scene", **options)
-    assert not (tmp_path / "scene").exists()
+    refused(drive, tmp_path / "scene", message, **options)
 
 
 # ---- bad drives ------------------------------------------------------------------------------------------------
@@ -800,9 +800,7 @@ def _pose_line(frame: int) -> str:
 def test_broken_drive_is_an_error_before_the_work(drive: RoomDrive, tmp_path: Path, case: str) -> None:
     breaking, message = BROKEN[case]
     breaking(drive)
-    with pytest.raises((InputError, FileNotFoundError), match=message):
-        process(drive, tmp_path / "scene")
-    assert not (tmp_path / "scene").exists()
+    refused(drive, tmp_path / "scene", message)
 
 
 def test_wrong_root_or_sequence_says_what_is_there(drive: RoomDrive, tmp_path: Path) -> None:
@@ -822,9 +820,7 @@ def test_maps_beside_the_drive_are_checked(drive: RoomDrive, tmp_path: Path, opt
     name = "--" + option.replace("_", "-")
 
     def refuse(message: str) -> None:
-        with pytest.raises((InputError, FileNotFoundError), match=message):
-            process(drive, tmp_path / "scene", **given)
-        assert not (tmp_path / "scene").exists()
+        refused(drive, tmp_path / "scene", message, **given)
 
     refuse(f"maps/image_02: no such folder; .*{name} needs a folder with one folder per camera")
     for camera in CAMERAS:
@@ -847,9 +843,7 @@ def test_ego_masks_are_checked(drive: RoomDrive, tmp_path: Path) -> None:
     masks = write_masks(tmp_path / "masks", drive)
 
     def refuse(message: str) -> None:
-        with pytest.raises((InputError, FileNotFoundError), match=message):
-            process(drive, tmp_path / "scene", ego_mask=masks)
-        assert not (tmp_path / "scene").exists()
+        refused(drive, tmp_path / "scene", message, ego_mask=masks)
 
     write_mask(masks / "image_03.png", np.ones((32, 33), bool))
     refuse(r"masks/image_03\.png: 33×32 pixels, but its camera's calibration says 32×32")
@@ -866,9 +860,7 @@ def test_truth_is_checked(tmp_path: Path) -> None:
     truth = drive.root / f"truth/{SEQUENCE}"
 
     def refuse(message: str) -> None:
-        with pytest.raises((InputError, FileNotFoundError), match=message):
-            process(drive, tmp_path / "scene")
-        assert not (tmp_path / "scene").exists()
+        refused(drive, tmp_path / "scene", message)
 
     poses = read_json(truth / "shifted.json")
     poses["2"]["image_02"]["4"][0][0] += 0.1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import re
 from collections.abc import Callable
@@ -36,10 +35,10 @@ def drive(tmp_path: Path) -> RoomDrive:
 def run(drive: RoomDrive, scene: str = "scene", **changes) -> tuple[ProcessReport, str]:
     folder = drive.root.parent
     options = {"root": drive.root, "sequence": SEQUENCE, "output": folder / scene, "mono": folder / "mono", "sweeps": 1}
-    console = Console(file=io.StringIO(), width=400)
-    report = process(Kitti360Options(**{**options, "find_ego": False, "sky": False, **changes}), console)
-    assert isinstance(console.file, io.StringIO)
-    return report, console.file.getvalue()
+    console = Console(width=400, force_terminal=False)
+    with console.capture() as said:
+        report = process(Kitti360Options(**{**options, "find_ego": False, "sky": False, **changes}), console)
+    return report, said.get()
 
 
 def contents(folder: Path) -> dict[str, bytes]:

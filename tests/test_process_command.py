@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import Any
 
@@ -42,10 +41,10 @@ def options_of(room: RoomDrive, output: Path, **changes: Any) -> Kitti360Options
 
 
 def run(options: Kitti360Options) -> str:
-    console = Console(file=io.StringIO(), width=200)
-    process(options, console)
-    assert isinstance(console.file, io.StringIO)
-    return console.file.getvalue()
+    console = Console(width=200, force_terminal=False)
+    with console.capture() as said:
+        process(options, console)
+    return said.get()
 
 
 def dates(scene: Path) -> dict[str, int]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from pathlib import Path
 from typing import Any
@@ -74,10 +73,10 @@ def write_ball_scene(folder: Path, steps_m: tuple[float, ...] = STEPS_M) -> Path
 
 
 def add(scene: Path) -> str:
-    console = Console(file=io.StringIO(), width=200)
-    add_motion(read_scene(scene), console)
-    assert isinstance(console.file, io.StringIO)
-    return console.file.getvalue()
+    console = Console(width=200, force_terminal=False)
+    with console.capture() as said:
+        add_motion(read_scene(scene), console)
+    return said.get()
 
 
 def motion_maps(scene: Path) -> list[np.ndarray]:
@@ -229,11 +228,11 @@ def test_process_finds_motion_once_unless_told_not_to(tmp_path: Path) -> None:
     drive = write_room_drive(tmp_path / "drive", frames=6, size=64)
 
     def run(**changes: Any) -> str:
-        console = Console(file=io.StringIO(), width=200)
+        console = Console(width=200, force_terminal=False)
         common: dict[str, Any] = {"estimate_depth": False, "find_ego": False, "sweeps": 1, "output": tmp_path / "scene"}
-        process(Kitti360Options(root=drive.root, sequence=SEQUENCE, **common, **changes), console)
-        assert isinstance(console.file, io.StringIO)
-        return console.file.getvalue()
+        with console.capture() as said:
+            process(Kitti360Options(root=drive.root, sequence=SEQUENCE, **common, **changes), console)
+        return said.get()
 
     assert "from motion" not in run(motion=False)
     assert not read_scene(tmp_path / "scene").has("motion")

@@ -4,7 +4,6 @@ without LiDAR, pictures of any exposure."""
 from __future__ import annotations
 
 import ast
-import io
 import re
 import shutil
 from collections.abc import Callable
@@ -60,10 +59,10 @@ def edit(root: Path, change: Callable[[str], str]) -> None:
 
 def run(root: Path, **changes) -> tuple[ProcessReport, str]:
     given = {"root": root, "output": root.parent / "scene", "sweeps": 1, "holdout_every": 4, **changes}
-    console = Console(file=io.StringIO(), width=10_000)
-    report = convert(RigOptions(**given), console)
-    assert isinstance(console.file, io.StringIO)
-    return report, console.file.getvalue()
+    console = Console(width=10_000, force_terminal=False)
+    with console.capture() as said:
+        report = convert(RigOptions(**given), console)
+    return report, said.get()
 
 
 # ---- broken pictures ---------------------------------------------------------------------------------------------

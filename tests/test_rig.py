@@ -22,6 +22,7 @@ from edge_depth_nerf.base.files import read_distance_png, read_image, read_json,
 from edge_depth_nerf.cameras import MEI, KannalaBrandt, Pinhole
 from edge_depth_nerf.process.converters import convert
 from edge_depth_nerf.process.options import RigOptions
+from edge_depth_nerf.process.recording import Recording
 from edge_depth_nerf.process.rig import read_rig_recording
 from edge_depth_nerf.process.rig_file import read_rig, tomllib
 from edge_depth_nerf.synthetic.drive import synthesize_drive
@@ -63,6 +64,10 @@ def mine(drive: Path, tmp_path: Path) -> Path:
 def options(root: Path, **changes) -> RigOptions:
     given = {"root": root, "output": root.parent / "scene", "theta_max_deg": 110.0, "strict": True, **changes}
     return RigOptions(**given)
+
+
+def read(root: Path, **changes) -> Recording:
+    return read_rig_recording(options(root, **changes))
 
 
 def edit(root: Path, *changes: tuple[str, str], file: str = "rig.toml") -> Path:
@@ -139,10 +144,10 @@ def test_cameras_are_read_as_the_page_says(drive: Path) -> None:
 
 def test_json_says_the_same(mine: Path) -> None:
     content = tomllib.loads((mine / "rig.toml").read_text())
-    of_toml = read_rig_recording(options(mine))
+    of_toml = read(mine)
     (mine / "rig.toml").unlink()
     write_json(mine / "rig.json", content)
-    of_json = read_rig_recording(options(mine))
+    of_json = read(mine)
     assert of_json.pictures == of_toml.pictures
     assert [sweep.time_s for sweep in of_json.sweeps] == [sweep.time_s for sweep in of_toml.sweeps]
 
@@ -155,12 +160,12 @@ def test_pixel_centres(mine: Path, centre: str, cx: float) -> None:
 
 def test_a_camera_ends_where_its_calibration_does(mine: Path) -> None:
     edit(mine, ('model = "mei"', 'model = "mei"\ntheta_max_deg = 80'))
-    cameras = read_rig_recording(options(mine)).cameras
+    cameras = read(mine).cameras
     assert [math.degrees(camera.camera.theta_max_rad) for camera in cameras][1] == pytest.approx(80)
 
 
 def test_moments_and_scans(mine: Path) -> None:
-    recording = read_rig_recording(options(mine))
+    recording = read(mine)
     assert [picture.frame for picture in recording.pictures] == sorted(3 * list(range(FRAMES)))
     delays = {"left": 0.0, "right": 0.004, "front": 0.012}
     for picture in recording.pictures:
@@ -180,11 +185,11 @@ def test_moments_and_scans(mine: Path) -> None:
 
 
 def test_a_turn_says_the_same_as_the_points_own_times(mine: Path) -> None:
-    timed = read_rig_recording(options(mine)).sweeps[2]
+    timed = read(mine).sweeps[2]
     by_point = timed.read()
     line = 'point_times = {column = "t", unit = "ns", counted_from = "timestamp"}'
     edit(mine, (line, 'direction = "clockwise"'))
-    turning = read_rig_recording(options(mine)).sweeps[2]
+    turning = read(mine).sweeps[2]
     assert (turning.time_s, turning.frame) == (timed.time_s, timed.frame)
     by_turn = turning.read()
     assert by_turn.offset_s is None and turning.timing is not None and by_point.offset_s is not None
@@ -201,18 +206,18 @@ def test_a_turn_says_the_same_as_the_points_own_times(mine: Path) -> None:
         np.save(path.with_suffix(".npy"), on_clock)
         path.unlink()
     edit(mine, ('direction = "clockwise"', 'point_times = {column = "stamp", unit = "ns", counted_from = "clock"}'))
-    on_clock = read_rig_recording(options(mine)).sweeps[2].read()
+    on_clock = read(mine).sweeps[2].read()
     assert on_clock.offset_s is not None
     assert (on_clock.offset_s - by_point.offset_s).abs().max() < 1e-6
     # a clock that is off moves points and scans alike
     edit(mine, ('counted_from = "clock"}', 'counted_from = "clock"}\ntime_offset_s = 0.02'))
-    late = read_rig_recording(options(mine)).sweeps[2]
+    late = read(mine).sweeps[2]
     late_points = late.read()
     assert late.time_s - timed.time_s == pytest.approx(0.02, abs=1e-6) and late_points.offset_s is not None
     assert (late_points.offset_s - by_point.offset_s).abs().max() < 1e-6
     edit(mine, ('unit = "ns", counted_from = "clock"', 'unit = "us", counted_from = "clock"'))
     with pytest.raises(InputError, match=r"points' times are .* s from the scan's own \(median\)\. Correct unit or"):
-        read_rig_recording(options(mine)).sweeps[2].read()
+        read(mine).sweeps[2].read()
 
 
 @pytest.mark.parametrize(
@@ -220,9 +225,9 @@ def test_a_turn_says_the_same_as_the_points_own_times(mine: Path) -> None:
 )
 def test_scans_that_are_corrected_already(mine: Path, moment: str, from_start_s: float) -> None:
     """They go to the world by the pose of the moment they are corrected to; the frame they belong to stays."""
-    raw = read_rig_recording(options(mine)).sweeps
+    raw = read(mine).sweeps
     edit(mine, (TIMES, f'corrected_to = "{moment}"'))
-    recording = read_rig_recording(options(mine))
+    recording = read(mine)
     assert not recording.notices
     for one, before in zip(recording.sweeps, raw, strict=True):
         assert one.frame == before.frame and one.timing is None and one.read().offset_s is None
@@ -230,9 +235,9 @@ def test_scans_that_are_corrected_already(mine: Path, moment: str, from_start_s:
 
 
 def test_points_in_the_vehicles_frame(mine: Path) -> None:
-    in_scanner = read_rig_recording(options(mine)).sweeps[1]
+    in_scanner = read(mine).sweeps[1]
     edit(mine, ('timestamp = "start"', 'timestamp = "start"\npoints_in = "vehicle"'))
-    in_vehicle = read_rig_recording(options(mine)).sweeps[1]
+    in_vehicle = read(mine).sweeps[1]
     # the scanner stays where it is, and the numbers of the file are the vehicle's
     assert np.array_equal(in_vehicle.to_vehicle, in_scanner.to_vehicle)
     moved = in_vehicle.read().points_m.numpy() @ in_vehicle.to_vehicle[:3, :3].T + in_vehicle.to_vehicle[:3, 3]
@@ -242,7 +247,7 @@ def test_points_in_the_vehicles_frame(mine: Path) -> None:
 def test_missing_echoes_in_the_vehicles_frame_are_no_points(mine: Path) -> None:
     """A recorder that moves the whole cloud moves them to the scanner's place."""
     edit(mine, ('timestamp = "start"', 'timestamp = "start"\npoints_in = "vehicle"'))
-    sweep = read_rig_recording(options(mine)).sweeps[1]
+    sweep = read(mine).sweeps[1]
     points = sweep.read()
     place = sweep.to_vehicle[:3, 3]
     lines = sweep.path.read_bytes().partition(b"DATA binary\n")
@@ -251,7 +256,7 @@ def test_missing_echoes_in_the_vehicles_frame_are_no_points(mine: Path) -> None:
     for name, number in zip("xyz", place, strict=True):
         values[name][:7] = number
     sweep.path.write_bytes(lines[0] + lines[1] + values.tobytes())
-    without = read_rig_recording(options(mine)).sweeps[1].read()
+    without = read(mine).sweeps[1].read()
     assert without.out_of_range == points.out_of_range + 7
     assert len(without.points_m) == len(points.points_m) - 7 and without.points_m.norm(dim=-1).min() > 0.5
 
@@ -265,17 +270,17 @@ def test_a_folder_for_each_moment(mine: Path) -> None:
     edit(mine, ('images = "images/left"', 'images = "moments/*/left.png"'))
     text = (mine / "rig.toml").read_text()
     (mine / "rig.toml").write_text(re.sub(r"(?m)^mono = .*\n", "", text))
-    pictures = [picture for picture in read_rig_recording(options(mine)).pictures if picture.camera == "left"]
+    pictures = [picture for picture in read(mine).pictures if picture.camera == "left"]
     assert [int(picture.path.parent.name) for picture in pictures] == [*range(7, 7 + FRAMES)]
     assert [picture.time_s for picture in pictures] == sorted(picture.time_s for picture in pictures)
     edit(mine, ("[cameras.left]\n", '[cameras.left]\nmasks = "moments/*/left.png"\n'))
     with pytest.raises(InputError, match=r"cameras\.left\.masks: .*have one name\. Give files of different names"):
-        read_rig_recording(options(mine))
+        read(mine)
 
 
 def test_the_path_is_the_vehicles(mine: Path) -> None:
     """The poses given of the scanner, with its transform, make the same path as those of the vehicle."""
-    trajectory = read_rig_recording(options(mine)).trajectory
+    trajectory = read(mine).trajectory
     assert trajectory is not None
     lines = (mine / "poses.txt").read_text().splitlines()[1:]
     angle = math.radians(3)
@@ -298,14 +303,14 @@ def test_the_path_is_the_vehicles(mine: Path) -> None:
         "times_from_names", "time_offset_s = -3\ntimes_from_names"
     )
     (mine / "rig.toml").write_text(content)
-    again = read_rig_recording(options(mine)).trajectory
+    again = read(mine).trajectory
     assert again is not None
     assert again.times_s + 3 == pytest.approx(trajectory.times_s, abs=1e-5)
     assert again.vehicle_to_world == pytest.approx(trajectory.vehicle_to_world, abs=1e-6)
 
 
 def test_poses_of_kitti_in_a_world_with_y_down(mine: Path) -> None:
-    reference = read_rig_recording(options(mine)).trajectory
+    reference = read(mine).trajectory
     assert reference is not None
     # x right, y down, z forward of x forward, y left, z up
     turned = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1.0]])
@@ -316,7 +321,7 @@ def test_poses_of_kitti_in_a_world_with_y_down(mine: Path) -> None:
     (mine / "kitti_times.txt").write_text("".join(f"{time:.6f}\n" for time in reference.times_s))
     poses_table = 'file = "kitti.txt"\nformat = "kitti"\nup = "-y"\ntimes_file = "kitti_times.txt"'
     edit(mine, ('file = "poses.txt"\nformat = "tum" ', poses_table))
-    found = read_rig_recording(options(mine)).trajectory
+    found = read(mine).trajectory
     assert found is not None
     # the same path but for a turn about the vertical axis: heights and tilts agree
     assert found.vehicle_to_world[:, 2] == pytest.approx(reference.vehicle_to_world[:, 2], abs=1e-5)
@@ -326,7 +331,7 @@ def test_poses_of_kitti_in_a_world_with_y_down(mine: Path) -> None:
 
 def test_poses_of_nerfstudio(mine: Path) -> None:
     """Each picture's own pose, and the vehicle's path made of them."""
-    reference = read_rig_recording(options(mine))
+    reference = read(mine)
     assert reference.trajectory is not None
     to_vehicle = {camera.name: camera.to_vehicle for camera in reference.cameras}
     expected, frames = {}, []
@@ -340,7 +345,7 @@ def test_poses_of_nerfstudio(mine: Path) -> None:
             frames.append({"file_path": name, "transform_matrix": matrix.tolist()})
     write_json(mine / "transforms.json", {"frames": frames})
     edit(mine, ('file = "poses.txt"\nformat = "tum" ', 'file = "transforms.json"\nformat = "nerfstudio" '))
-    found = read_rig_recording(options(mine))
+    found = read(mine)
     assert [(item.frame, item.camera, item.reason) for item in found.skipped] == [(4, "right", "no pose")]
     assert len(found.pictures) == len(reference.pictures) - 1
     for picture in found.pictures:
@@ -354,7 +359,7 @@ def test_poses_of_nerfstudio(mine: Path) -> None:
     write_json(mine / "transforms.json", {"frames": frames[:2]})
     with pytest.raises(InputError, match=r"000000\.?\w* fits .*Write more of the folders"):
         write_json(mine / "transforms.json", {"frames": [{**frame, "file_path": "000000.png"} for frame in frames[:1]]})
-        read_rig_recording(options(mine))
+        read(mine)
 
 
 def test_a_moment_without_pose_or_scan_is_skipped(mine: Path) -> None:
@@ -363,7 +368,7 @@ def test_a_moment_without_pose_or_scan_is_skipped(mine: Path) -> None:
     (mine / "poses.txt").write_text("".join(early))
     sorted((mine / "lidar").iterdir())[0].unlink()
     sorted((mine / "lidar").iterdir())[0].unlink()
-    recording = read_rig_recording(options(mine))
+    recording = read(mine)
     assert [(item.frame, item.camera, item.reason) for item in recording.skipped] == [
         (0, None, "no scan"),
         (4, None, "before the first or after the last pose"),
@@ -389,24 +394,22 @@ def test_a_moment_between_scans_is_a_picture_without_lidar(mine: Path, holdout: 
     assert ("No LiDAR point in 6 pictures" in said) is bool(holdout)
 
 
-def test_a_drive_too_short_to_hold_one_out_is_told_how(mine: Path, capsys) -> None:
-    convert(options(mine, frames=3, holdout_every=8))
+@pytest.mark.parametrize(
+    ("frames", "every", "advice"),
+    [
+        (3, 8, "3 frames are too few for --holdout-every 8: use --holdout-every 5."),
+        (3, 5, None),
+        (3, 0, "Use --holdout-every 5 to hold frames out."),
+        (1, 8, "take a longer stretch"),
+    ],
+)
+def test_a_drive_too_short_to_hold_one_out_is_told_how(
+    mine: Path, capsys, frames: int, every: int, advice: str | None
+) -> None:
+    convert(options(mine, frames=frames, holdout_every=every))
     said = " ".join(capsys.readouterr().out.split())
-    assert said.count("No frame is held out") == 1
-    assert "3 frames are too few for --holdout-every 8: use --holdout-every 5." in said
-    shutil.rmtree(mine.parent / "scene")
-    convert(options(mine, frames=3, holdout_every=5))
-    assert "No frame is held out" not in capsys.readouterr().out
-    shutil.rmtree(mine.parent / "scene")
-    convert(options(mine, frames=3, holdout_every=0))
-    said = " ".join(capsys.readouterr().out.split())
-    assert said.count("No frame is held out") == 1
-    assert "Use --holdout-every 5 to hold frames out." in said
-    shutil.rmtree(mine.parent / "scene")
-    convert(options(mine, frames=1, holdout_every=8))
-    said = " ".join(capsys.readouterr().out.split())
-    assert said.count("No frame is held out") == 1
-    assert "take a longer stretch" in said
+    assert said.count("No frame is held out") == (advice is not None)
+    assert advice is None or advice in said
 
 
 def test_times_of_the_pictures_reach_the_scene(scene: Path) -> None:
@@ -417,7 +420,7 @@ def test_times_of_the_pictures_reach_the_scene(scene: Path) -> None:
 
 
 def test_some_cameras_and_some_moments(mine: Path) -> None:
-    recording = read_rig_recording(options(mine, cameras=("front",), first=1, frames=2, stride=2))
+    recording = read(mine, cameras=("front",), first=1, frames=2, stride=2)
     assert [(picture.camera, picture.frame) for picture in recording.pictures] == [("front", 1), ("front", 3)]
     assert [camera.name for camera in recording.cameras] == ["front"]
     assert [sweep.frame for sweep in recording.sweeps] == [None, 1, None, 3, None]
@@ -430,7 +433,7 @@ def test_cameras_of_different_rates(mine: Path) -> None:
     lines = (mine / "times_front.txt").read_text().splitlines()
     (mine / "times_front.txt").write_text("\n".join(lines[::2]))
     frames = {name: [] for name in ("left", "right", "front")}
-    for picture in read_rig_recording(options(mine)).pictures:
+    for picture in read(mine).pictures:
         frames[picture.camera].append(picture.frame)
     assert frames == {"left": [0, 1, 2, 3, 4], "right": [0, 1, 2, 3, 4], "front": [0, 2, 4]}
 
@@ -440,7 +443,7 @@ def test_times_by_name_and_by_rate(mine: Path) -> None:
     named = [f"{number:06d}.png {time}" for number, time in enumerate(lines)]
     (mine / "times_left.txt").write_text("\n".join(reversed(named)))
     edit(mine, ('times_file = "times_right.txt"', f"rate_hz = 10\ntime_offset_s = {FIRST_S}"))
-    pictures = read_rig_recording(options(mine)).pictures
+    pictures = read(mine).pictures
     assert {picture.camera for picture in pictures} == {"left", "right", "front"}
     for picture in pictures:
         moment = FIRST_S + 0.1 * picture.frame
@@ -457,15 +460,15 @@ def test_options_bring_masks_and_monocular_maps(mine: Path) -> None:
     # they go before what the rig file names
     shutil.copytree(mine / "images/left", mine / "other_masks")
     edit(mine, ("[cameras.left]\n", '[cameras.left]\nmasks = "other_masks"\n'))
-    masks = [picture.mask for picture in read_rig_recording(options(mine)).pictures if picture.camera == "left"]
+    masks = [picture.mask for picture in read(mine).pictures if picture.camera == "left"]
     assert masks[0] == mine / "other_masks/000000.png"
-    recording = read_rig_recording(options(mine, frame_masks=mine / "moving", mono=mine / "depth"))
+    recording = read(mine, frame_masks=mine / "moving", mono=mine / "depth")
     for picture in recording.pictures:
         assert picture.mask == mine / f"moving/{picture.camera}/{picture.frame:010d}.png"
         assert picture.mono == mine / f"depth/{picture.camera}/{picture.frame:010d}.png"
     (mine / "moving/front/0000000003.png").unlink()
     with pytest.raises(FileNotFoundError, match=r"front/0000000003\.png: no such file; --frame-masks needs one"):
-        read_rig_recording(options(mine, frame_masks=mine / "moving"))
+        read(mine, frame_masks=mine / "moving")
 
 
 def test_a_rendered_drive_brings_its_truth(mine: Path, drive: Path) -> None:
@@ -493,10 +496,10 @@ def test_a_rendered_drive_brings_its_truth(mine: Path, drive: Path) -> None:
     eight_bits = mine / "truth/left/distance/000001.png"
     write_png(eight_bits, np.zeros((128, 128), np.uint8))
     with pytest.raises(InputError, match=r"left/distance/000001\.png: expected a 16-bit grey PNG"):
-        read_rig_recording(options(mine))
+        read(mine)
     eight_bits.unlink()
     with pytest.raises(FileNotFoundError, match=r"000001\.png: no such file; cameras\.left\.truth_distance needs one"):
-        read_rig_recording(options(mine))
+        read(mine)
 
 
 @pytest.mark.parametrize("key", ["mono", "truth_rgb"])
@@ -510,13 +513,13 @@ def test_maps_of_some_cameras_alone(mine: Path, drive: Path, key: str) -> None:
         else ("[cameras.left]\n", '[cameras.left]\ntruth_rgb = "truth/left/rgb"\n'),
     )
     with pytest.raises(InputError, match=rf"rig\.toml: cameras\.right\.{key} is missing; give it for every camera"):
-        read_rig_recording(options(mine))
-    assert len(read_rig_recording(options(mine, cameras=("left",))).pictures) == FRAMES
+        read(mine)
+    assert len(read(mine, cameras=("left",)).pictures) == FRAMES
 
 
 def test_z_depth_maps_in_place_of_lidar(mine: Path, drive: Path) -> None:
     """Millimetres along the axis become distance along the ray, here against the true distances."""
-    recording = read_rig_recording(options(mine))
+    recording = read(mine)
     for camera in recording.cameras:
         directions, valid = camera.camera.unproject(camera.camera.pixel_centres())
         cosine = np.where(valid.numpy(), directions[..., 2].numpy(), 0)
@@ -712,7 +715,7 @@ def spoil_scan(content: Callable[[bytes], bytes]) -> Callable[[Path], None]:
 def test_a_wrong_recording_is_named(mine: Path, spoil: Callable[[Path], object], message: str) -> None:
     spoil(mine)
     with pytest.raises((InputError, FileNotFoundError), match=message):
-        read_rig_recording(options(mine))
+        read(mine)
 
 
 def test_a_scan_of_nan_is_an_error_when_it_is_read(mine: Path) -> None:
@@ -748,8 +751,8 @@ def test_without_poses_it_says_what_to_do(mine: Path) -> None:
     content = (mine / "rig.toml").read_text()
     (mine / "rig.toml").write_text(content[content.index("[cameras.left]") :])
     with pytest.raises(InputError, match=r"has no table \[poses\].*--poses colmap"):
-        read_rig_recording(options(mine))
-    recording = read_rig_recording(options(mine, poses="colmap"))
+        read(mine)
+    recording = read(mine, poses="colmap")
     assert recording.trajectory is None and len(recording.pictures) == 15
 
 
@@ -759,8 +762,8 @@ def test_jpegs_and_patterns(mine: Path) -> None:
     for path in sorted((mine / "images/front").iterdir()):
         cv2.imwrite(str(mine / f"front_{int(path.stem)}.jpg"), read_image(path)[..., ::-1])
     edit(mine, ('images = "images/front"', 'images = "front_*.jpg"'), ('mono = "mono/front"\n', ""))
-    recording = read_rig_recording(options(mine, cameras=("front",)))
+    recording = read(mine, cameras=("front",))
     assert [picture.path.name for picture in recording.pictures] == [f"front_{number}.jpg" for number in range(FRAMES)]
     (mine / "front_3.jpg").write_bytes(b"\xff\xd8\xff")
     with pytest.raises(InputError, match=r"front_3\.jpg: cannot be decoded as a picture"):
-        read_rig_recording(options(mine, cameras=("front",)))
+        read(mine, cameras=("front",))
