@@ -26,14 +26,21 @@ from edge_depth_nerf.process.colmap.models import ColmapModel, SparseView, colma
 from edge_depth_nerf.process.colmap.poses import NOT_REGISTERED, colmap_poses
 from edge_depth_nerf.process.colmap.refine import refine_poses
 from edge_depth_nerf.process.colmap.scale import find_scale_break, join_models, metric_path
-from edge_depth_nerf.process.converters import convert, read_drive
+from edge_depth_nerf.process.converters import convert
+from edge_depth_nerf.process.kitti360.converter import read_kitti360
 from edge_depth_nerf.process.options import Kitti360Options, ProcessOptions
 from edge_depth_nerf.process.recording import DepthFile, RecordedCamera, RecordedPicture, RecordedSweep, Recording
+from edge_depth_nerf.process.vehicle import with_given_masks
 from edge_depth_nerf.scene.reader import read_scene
 from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 
 QUIET = Console(quiet=True)
+
+
+def read_drive(options: Kitti360Options) -> Recording:
+    return with_given_masks(read_kitti360(options), options)
+
 
 # ---- lenses ----------------------------------------------------------------------------------------------------
 

@@ -47,7 +47,7 @@ from edge_depth_nerf.process.reading import (
 from edge_depth_nerf.process.recording import RecordedPicture, Recording
 from edge_depth_nerf.process.sweep_store import SweepStore
 from edge_depth_nerf.process.transform_checks import agreement_notices, agreements
-from edge_depth_nerf.process.vehicle import find_vehicle, vehicle_masks
+from edge_depth_nerf.process.vehicle import find_vehicle, vehicle_masks, with_given_masks
 from edge_depth_nerf.scene.checks import read_camera_mask
 from edge_depth_nerf.scene.format import TRANSFORMS
 from edge_depth_nerf.scene.points import PointCloud
@@ -84,7 +84,9 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
 
     """
     console = console or Console()
+    options.check()
     check_classes(options.moving_classes)
+    recording = with_given_masks(recording, options)
     _check_poses(recording, options)
     with console.status("Checking cameras and files …"):
         source = _source(recording, options)

@@ -6,7 +6,7 @@ in a module that imports little (`process/options.py`, or the head of the conver
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING
 
@@ -52,16 +52,8 @@ def read_drive(options: ProcessOptions) -> Recording:
         InputError: an option or a file of the drive cannot be used.
 
     """
-    converter, given = CONVERTERS[name_of(options)], options.ego_mask
-    recording = getattr(import_module(f"{__package__}.{converter.module}"), converter.reader)(options)
-    if given is None:
-        return recording
-    # the option goes before what the drive brings
-    cameras = tuple(
-        replace(camera, ego_mask=given / f"{camera.name}.png" if given.is_dir() else given)
-        for camera in recording.cameras
-    )
-    return replace(recording, cameras=cameras)
+    converter = CONVERTERS[name_of(options)]
+    return getattr(import_module(f"{__package__}.{converter.module}"), converter.reader)(options)
 
 
 def convert(options: ProcessOptions, console: Console | None = None) -> ProcessReport:

@@ -31,7 +31,6 @@ from edge_depth_nerf.process.options import ProcessOptions
 from edge_depth_nerf.process.reading import read_if_whole
 from edge_depth_nerf.process.recording import RecordedPicture, RecordedSweep, Recording
 
-NO_SWEEP = "no sweep near it in time"
 _MIN_WAY_M = 1.0
 """A vehicle that stays within so much of where it begins has no path."""
 _TURNED_RAD = math.radians(20)
@@ -42,12 +41,7 @@ _FEW_RETURNS = 5000
 
 
 def lidar_poses(recording: Recording, options: ProcessOptions, console: Console) -> Recording:
-    """Find the poses of a recording's pictures by LiDAR odometry.
-
-    Args:
-        recording: its trajectory and its pictures' poses, if any, are not used; its sweeps and its rig are.
-        options: strict, for a sweep that cannot be read.
-        console: where the progress is shown.
+    """Find the poses of a recording's pictures by LiDAR odometry, from its sweeps and its rig alone.
 
     Returns:
         The recording with the vehicle's path, and with the pictures that were taken between its sweeps, or within
@@ -64,7 +58,7 @@ def lidar_poses(recording: Recording, options: ProcessOptions, console: Console)
     slack_s = statistics.median(np.diff(trajectory.times_s).tolist())
 
     def lacking(picture: RecordedPicture) -> str | None:
-        return NO_SWEEP if trajectory.outside_s(picture.time_s) > slack_s else None
+        return "no sweep near it in time" if trajectory.outside_s(picture.time_s) > slack_s else None
 
     posed = with_path(recording, trajectory, lacking)
     if not posed.pictures:

@@ -120,14 +120,7 @@ def scene_view(scene: SceneFolder, picture: ScenePicture) -> View:
 
 
 def enlarged(found: MotionDistance, factor: int, size: tuple[int, int]) -> Float32[np.ndarray, "_ _"]:
-    """Bring distances to the size of the picture: interpolated on surfaces, else the nearest; 0 = none.
-
-    Args:
-        found: at the working size.
-        factor: by which the picture was averaged down.
-        size: height and width of the picture; what filled no block has none.
-
-    """
+    """Bring distances to a picture's size (height, width): interpolated on surfaces, else the nearest; 0 = none."""
     if factor == 1:
         return found.distance_m
     kept = found.distance_m > 0
@@ -141,7 +134,7 @@ def enlarged(found: MotionDistance, factor: int, size: tuple[int, int]) -> Float
 
 
 def enlarged_sigma(found: MotionDistance, factor: int, size: tuple[int, int]) -> Float32[np.ndarray, "_ _"]:
-    """Bring the distances' standard deviations to the size of the picture: the nearest; 0 = none."""
+    """Bring the distances' standard deviations to a picture's size (height, width): the nearest; 0 = none."""
     result = _padded(found.sigma_m.repeat(factor, 0).repeat(factor, 1), size)
     # a file has steps, the least of which still says that there is one
     return np.where(result > 0, np.maximum(result, np.float32(1 / DISTANCE_STEPS_PER_METRE)), result)
@@ -156,15 +149,7 @@ class SphereSweepCache:
     """The sweeps of a scene's pictures and what is confirmed of them: on disk, the last sweeps in memory too."""
 
     def __init__(self, root: Path, scene: SceneFolder, pictures: list[ScenePicture], motion: Motion) -> None:
-        """Say whose sweeps they are.
-
-        Args:
-            root: gets a folder for these pictures, masks, lenses and poses; those of others are removed.
-            scene: whose pictures they are.
-            pictures: those that take part, in `motion`'s order.
-            motion: makes them.
-
-        """
+        """Make a folder in `root` for these pictures, in `motion`'s order, and remove those of other ones."""
         self.folder = root / _made_of(scene, pictures)
         self._motion = motion
         self._swept = functools.lru_cache(_SWEEPS_IN_MEMORY)(partial(_swept, self.folder, motion))

@@ -77,12 +77,8 @@ def find_moving(
 ) -> tuple[Recording, list[str]]:
     """Find what moves, write the masks that are not there yet, and give them to the recording's pictures.
 
-    Args:
-        recording: with a trajectory.
-        options: the converter's.
-        held_out: numbers of the frames that training must not see.
-        ego: the vehicle's masks, by camera, in the size of the raw pictures.
-        console: where progress is shown.
+    The recording has a trajectory. `held_out` are numbers of the frames that training must not see, `ego` the vehicle's
+    masks by camera, in the size of the raw pictures.
 
     Returns:
         The recording, and what the user should know.

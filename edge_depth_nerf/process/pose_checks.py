@@ -27,11 +27,6 @@ _WARN_APART = 0.02
 def features_say(recording: Recording, options: ProcessOptions, console: Console) -> list[str]:
     """Say how far features of successive pictures lie from their epipolar curves, in pixels of the raw pictures.
 
-    Args:
-        recording: with the poses of its pictures, and the masks of its cameras.
-        options: theta_max_deg, and the masks that are not in the recording.
-        console: where a message reports that this takes a while.
-
     Raises:
         InputError: under `strict`, a picture or a mask cannot be read.
 
@@ -77,12 +72,7 @@ def features_say(recording: Recording, options: ProcessOptions, console: Console
 def lidar_says(recording: Recording, scene: Path, console: Console) -> list[str]:
     """Hold poses that were found from pictures against LiDAR odometry, and write down in the scene how far they agree.
 
-    Says nothing where KISS-ICP is not installed, or the recording's sweeps cannot be followed.
-
-    Args:
-        recording: with its path.
-        scene: its folder.
-        console: where the progress is shown.
+    Says nothing where KISS-ICP is not installed, or the sweeps of the recording, which has a path, cannot be followed.
 
     Raises:
         InputError: what an earlier run wrote down is broken.

@@ -270,21 +270,18 @@ def _sampled(picture: Float32[np.ndarray, "h w"], places: Float32[np.ndarray, "n
 def agreement_notices(found: Sequence[ContrastAgreement]) -> list[str]:
     """Say which transforms seem to be wrong; nothing for those that fit."""
     notices = []
-    for which, whose, fix in (
-        ("camera", "{cameras}", "that camera's transform to the vehicle"),
-        ("scanner", "{scanners}", "that scanner's transform to the vehicle"),
-        ("both", "{cameras} and {scanners}", "each of these transforms to the vehicle"),
+    for which, fix in (
+        ("camera", "that camera's transform to the vehicle"),
+        ("scanner", "that scanner's transform to the vehicle"),
+        ("both", "each of these transforms to the vehicle"),
     ):
-        wrong = [one for one in found if one.better == which]
-        if wrong:
+        if wrong := [one for one in found if one.better == which]:
             figures = ", ".join(
                 f"{one.inverted[which]:.2f} instead of {one.given:.2f} for {one.camera} with {one.scanner}"
                 for one in wrong
             )
-            names = whose.format(
-                cameras=", ".join(dict.fromkeys(one.camera for one in wrong)),
-                scanners=", ".join(dict.fromkeys(one.scanner for one in wrong)),
-            )
+            kinds = ("camera", "scanner") if which == "both" else (which,)
+            names = " and ".join(", ".join(dict.fromkeys(getattr(one, kind) for one in wrong)) for kind in kinds)
             notices.append(
                 f"LiDAR points do not lie on the objects in the pictures. With the inverse of {fix} ({names}) the "
                 f"pictures agree better at the LiDAR points (correlation {figures}). Is to_vehicle "

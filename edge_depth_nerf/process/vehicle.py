@@ -58,6 +58,18 @@ _PAINT = (
 )
 
 
+def with_given_masks(recording: Recording, options: ProcessOptions) -> Recording:
+    """Let the option --ego-mask, if it is given, go before the masks that the drive brings."""
+    given = options.ego_mask
+    if given is None:
+        return recording
+    cameras = [
+        dataclasses.replace(camera, ego_mask=given / f"{camera.name}.png" if given.is_dir() else given)
+        for camera in recording.cameras
+    ]
+    return dataclasses.replace(recording, cameras=tuple(cameras))
+
+
 def vehicle_masks(recording: Recording) -> dict[str, NDArray[np.bool_]]:
     """Read the masks that the cameras have, True = use the pixel.
 

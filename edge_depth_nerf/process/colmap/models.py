@@ -139,6 +139,17 @@ def colmap_lens(camera: Camera, theta_max_rad: float = math.radians(THETA_MAX_DE
     return ColmapLens("THIN_PRISM_FISHEYE", parameters, limit, rms)
 
 
+def colmap_lenses(recording: Recording, options: ProcessOptions) -> dict[str, ColmapLens]:
+    """A recording's cameras in COLMAP's models, by name.
+
+    Raises:
+        InputError: one has no counterpart.
+
+    """
+    limit = math.radians(min(options.theta_max_deg, THETA_MAX_DEG))
+    return {camera.name: colmap_lens(camera.camera, limit) for camera in recording.cameras}
+
+
 def import_pycolmap(option: str = "--poses colmap") -> Any:
     """The module pycolmap.
 
@@ -180,13 +191,7 @@ def check_folder(folder: Path) -> None:
 
 
 def find_models(recording: Recording, options: ProcessOptions, folder: Path, console: Console) -> list[ColmapModel]:
-    """Let COLMAP find the pictures' poses.
-
-    Args:
-        recording: with at least three pictures; its pictures are in the order of their frames.
-        options: theta_max_deg and the masks that are not in the recording.
-        folder: the folder to work in, ours alone.
-        console: where the progress is shown.
+    """Let COLMAP find the poses of three pictures or more, in the order of their frames, in a folder of its own.
 
     Returns:
         The models, that with the most pictures first; none if no two pictures could be related.
@@ -241,8 +246,7 @@ class _Run:
         self.database = folder / "database.db"
         self.masks = folder / "masks"
         self.models = folder / "models"
-        theta_max_rad = math.radians(min(options.theta_max_deg, THETA_MAX_DEG))
-        self.lenses = {camera.name: colmap_lens(camera.camera, theta_max_rad) for camera in recording.cameras}
+        self.lenses = colmap_lenses(recording, options)
         limits_rad = {name: lens.theta_max_rad for name, lens in self.lenses.items()}
         self.feature_masks = FeatureMasks(recording, options, limits_rad)
         self.shared_views = shared_views(recording, self.lenses)

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +14,9 @@ from rich.console import Console
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.poses.breaks import find_break
 from edge_depth_nerf.process.colmap.models import (
-    THETA_MAX_DEG,
     ColmapModel,
     check_folder,
-    colmap_lens,
+    colmap_lenses,
     find_models,
     import_pycolmap,
 )
@@ -37,11 +35,8 @@ _WARN_APART_M = 0.2
 def colmap_poses(recording: Recording, options: ProcessOptions, console: Console) -> Recording:
     """Find the poses of a recording's pictures.
 
-    Args:
-        recording: its trajectory and its pictures' poses, if any, are not used; its rig, lenses, masks, and the sweeps
-            or depth maps of its frames are.
-        options: output, beside which COLMAP works in the folder `.NAME.colmap`, and theta_max_deg.
-        console: where the progress is shown.
+    They come from its rig, lenses, masks, and the sweeps or depth maps of its frames alone. COLMAP works in the folder
+    `.NAME.colmap` beside the scene.
 
     Returns:
         The recording with the vehicle's path in metres and with the pictures whose pose was found; the others are
@@ -86,8 +81,7 @@ def check_colmap(recording: Recording, options: ProcessOptions) -> None:
     """
     import_pycolmap()
     check_folder(_folder(options))
-    for camera in recording.cameras:
-        colmap_lens(camera.camera, math.radians(min(options.theta_max_deg, THETA_MAX_DEG)))
+    colmap_lenses(recording, options)
     found = len(recording.pictures)
     if found < _MIN_PICTURES:
         raise InputError(

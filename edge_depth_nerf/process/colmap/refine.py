@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int
 from rich.console import Console
 
+from edge_depth_nerf.base.bounds import finite
 from edge_depth_nerf.base.console import progress_bars
 from edge_depth_nerf.base.files import read_image, read_json, write_json
 from edge_depth_nerf.cameras import Camera
@@ -31,14 +32,7 @@ from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.poses.matches import Matches, PosedPicture, epipolar_distance_px, match_pictures
 from edge_depth_nerf.poses.tracks import Tracks, features_joined, join_matches, reprojection_px, spread, triangulate
 from edge_depth_nerf.process.colmap.bundle import Shot, Softness, adjust_bundle
-from edge_depth_nerf.process.colmap.models import (
-    THETA_MAX_DEG,
-    ColmapLens,
-    colmap_lens,
-    file_stamp,
-    import_pycolmap,
-    shared_views,
-)
+from edge_depth_nerf.process.colmap.models import colmap_lenses, file_stamp, import_pycolmap, shared_views
 from edge_depth_nerf.process.colmap.scale import moment_times
 from edge_depth_nerf.process.feature_masks import FeatureMasks
 from edge_depth_nerf.process.options import ProcessOptions
@@ -96,23 +90,15 @@ class Refinement:
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON; a median that is not known is null."""
-        medians = {"before_px": self.before_px, "after_px": self.after_px}
-        return {
-            "vehicle_to_world": self.vehicle_to_world.tolist(),
-            "supported": self.supported.tolist(),
-            "points": self.points,
-            "judges": self.judges,
-            **{key: None if math.isnan(value) else value for key, value in medians.items()},
-        }
+        arrays = {"vehicle_to_world": self.vehicle_to_world.tolist(), "supported": self.supported.tolist()}
+        medians = {"before_px": finite(self.before_px), "after_px": finite(self.after_px)}
+        return {**arrays, "points": self.points, "judges": self.judges, **medians}
 
 
 def refine_poses(recording: Recording, options: ProcessOptions, console: Console) -> Recording:
     """Move the poses of a recording to where its pictures agree with them, and with each other, best.
 
-    Args:
-        recording: with a path.
-        options: output, where what was found is kept for the next run; masks, theta_max_deg, strict.
-        console: where the progress is shown.
+    What was found is kept in the scene for the next run.
 
     Returns:
         The recording with the refined path, pictures' and shifted views' poses moved with it; or unchanged, if that
@@ -177,12 +163,7 @@ def check_refining(recording: Recording, options: ProcessOptions) -> None:
 
     """
     import_pycolmap(OPTION)
-    _lenses(recording, options)
-
-
-def _lenses(recording: Recording, options: ProcessOptions) -> dict[str, ColmapLens]:
-    limit = math.radians(min(options.theta_max_deg, THETA_MAX_DEG))
-    return {camera.name: colmap_lens(camera.camera, limit) for camera in recording.cameras}
+    colmap_lenses(recording, options)
 
 
 def _kept(recording: Recording, why: str) -> Recording:
@@ -250,7 +231,7 @@ def _match(
     console: Console,
 ) -> list[Matches]:
     """Match the pictures that were taken shortly after one another."""
-    lenses = _lenses(recording, options)
+    lenses = colmap_lenses(recording, options)
     masks = FeatureMasks(recording, options, {name: lens.theta_max_rad for name, lens in lenses.items()})
     posed = [
         PosedPicture(
@@ -315,7 +296,6 @@ def refine(
     shots: Sequence[Shot],
     matches: Sequence[Matches],
     given: Float64[np.ndarray, "moments 4 4"],
-    softness: Softness = SOFTNESS,
     reshoot: Callable[[Float64[np.ndarray, "moments 4 4"], Bool[np.ndarray, "moments"]], Sequence[Shot]] | None = None,
 ) -> Refinement:
     """Refine poses by matched features, and judge both by those that take no part.
@@ -325,7 +305,6 @@ def refine(
         shots: the pictures.
         matches: what pairs of them have in common; they count `shots`.
         given: vehicle to world of each frame.
-        softness: how softly these are held.
         reshoot: from refined poses, and which frames features moved, to the pictures on the rig: cameras that fire at
             other times than the frame's stand where the path has the vehicle then. None = they stay.
 
@@ -345,7 +324,7 @@ def refine(
         count = len(points)
         if not supported.any():
             break
-        refined = adjust_bundle(pycolmap, shots, tracks, points, refined, given, softness)
+        refined = adjust_bundle(pycolmap, shots, tracks, points, refined, given, SOFTNESS)
         if reshoot is not None and supported.sum() > 1:
             shots = reshoot(refined, supported)
     before, after = _median_px(given_shots, judges, given), _median_px(shots, judges, refined)
