@@ -7,6 +7,7 @@ cameras, projection or conventions is used, so that a mistake there cannot cance
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -298,6 +299,15 @@ def _write_shifted(drive: RoomDrive, cameras: tuple[str, ...]) -> None:
             write_distance_png(folder / "distance/0000000004.png", distance)
             write_png(folder / "rgb/0000000004.png", colours)
     write_json(drive.root / f"truth/{SEQUENCE}/shifted.json", poses)
+
+
+def write_mono(folder: Path, drive: RoomDrive, distance_m: Callable[[str, int], float] | float) -> Path:
+    """Monocular maps of the same distance in all pixels, or of one for each camera and frame."""
+    for name in ("image_02", "image_03"):
+        for frame in drive.frames:
+            value = distance_m(name, frame) if callable(distance_m) else distance_m
+            write_distance_png(folder / f"{name}/{frame:010d}.png", np.full((drive.size, drive.size), value))
+    return folder
 
 
 def write_masks(folder: Path, drive: RoomDrive, cameras: tuple[str, ...] = ("image_02", "image_03")) -> Path:

@@ -27,6 +27,7 @@ from drives import (
     pose,
     wall_distance,
     write_masks,
+    write_mono,
     write_points,
     write_room_drive,
 )
@@ -523,8 +524,8 @@ def test_frame_masks_and_mono(drive: RoomDrive, tmp_path: Path) -> None:
             keep = np.ones((32, 32), bool)
             keep[:, : 10 + frame] = False
             write_mask(tmp_path / f"moving/{name}/{frame:010d}.png", keep)
-            write_distance_png(tmp_path / f"mono/{name}/{frame:010d}.png", np.full((32, 32), 3.0 + frame))
-    process(drive, tmp_path / "scene", frame_masks=tmp_path / "moving", mono=tmp_path / "mono")
+    mono = write_mono(tmp_path / "mono", drive, lambda _, frame: 3.0 + frame)
+    process(drive, tmp_path / "scene", frame_masks=tmp_path / "moving", mono=mono)
     for frame in read_json(tmp_path / "scene/transforms.json")["frames"]:
         mask = read_mask(tmp_path / "scene" / frame["mask_path"])
         assert not mask[:, : 10 + frame["frame"]].any() and mask[16, 14 + frame["frame"]]
@@ -535,19 +536,13 @@ def test_frame_masks_and_mono(drive: RoomDrive, tmp_path: Path) -> None:
 
 
 def test_maps_that_are_brought_count_beyond_lidar(drive: RoomDrive, tmp_path: Path) -> None:
-    for name in CAMERAS:
-        for frame in drive.frames:
-            write_distance_png(tmp_path / f"mono/{name}/{frame:010d}.png", np.full((32, 32), 3.0))
-    process(drive, tmp_path / "scene", mono=tmp_path / "mono")
+    process(drive, tmp_path / "scene", mono=write_mono(tmp_path / "mono", drive, 3.0))
     assert calibrate_scene(tmp_path / "scene").everywhere
 
 
 @pytest.mark.parametrize("sky", [True, False])
 def test_an_empty_monocular_map_is_named(sky: bool, drive: RoomDrive, tmp_path: Path) -> None:
-    for name in CAMERAS:
-        for frame in drive.frames:
-            empty = name == "image_03" and frame == 1
-            write_distance_png(tmp_path / f"mono/{name}/{frame:010d}.png", np.full((32, 32), 0.0 if empty else 3.0))
+    write_mono(tmp_path / "mono", drive, lambda *picture: 0.0 if picture == ("image_03", 1) else 3.0)
     with pytest.raises(InputError, match=r"image_03/0000000001\.png: its monocular map contains no distance"):
         process(drive, tmp_path / "scene", mono=tmp_path / "mono", sky=sky)
     assert not (tmp_path / "scene/transforms.json").exists()
@@ -823,9 +818,7 @@ def test_maps_beside_the_drive_are_checked(drive: RoomDrive, tmp_path: Path, opt
         refused(drive, tmp_path / "scene", message, **given)
 
     refuse(f"maps/image_02: no such folder; .*{name} needs a folder with one folder per camera")
-    for camera in CAMERAS:
-        for frame in drive.frames:
-            write_distance_png(tmp_path / f"maps/{camera}/{frame:010d}.png", np.full((32, 32), 4.0))
+    write_mono(tmp_path / "maps", drive, 4.0)
     path = tmp_path / "maps/image_03/0000000002.png"
     path.unlink()
     refuse(rf"maps/image_03/0000000002\.png: no such file; {name} needs one for every frame taken \(0-2 of image_03\)")

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drives import SEQUENCE, RoomDrive, write_points, write_room_drive
+from drives import SEQUENCE, RoomDrive, write_mono, write_points, write_room_drive
 from rich.console import Console
+from test_scene import tree as contents
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json, write_distance_png
@@ -26,9 +27,7 @@ CAMERAS = ("image_02", "image_03")
 @pytest.fixture
 def drive(tmp_path: Path) -> RoomDrive:
     room = write_room_drive(tmp_path / "drive", frames=12, beams=400, size=32)
-    for name in CAMERAS:
-        for frame in room.frames:
-            write_distance_png(tmp_path / f"mono/{name}/{frame:010d}.png", np.full((32, 32), 3.0 + frame))
+    write_mono(tmp_path / "mono", room, lambda _, frame: 3.0 + frame)
     return room
 
 
@@ -39,10 +38,6 @@ def run(drive: RoomDrive, scene: str = "scene", **changes) -> tuple[ProcessRepor
     with console.capture() as said:
         report = process(Kitti360Options(**{**options, "find_ego": False, "sky": False, **changes}), console)
     return report, said.get()
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
 def halve(path: Path) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drives import SEQUENCE, RoomDrive, write_room_drive
+from drives import SEQUENCE, RoomDrive, write_mono, write_room_drive
 from rich.console import Console
 
 from edge_depth_nerf.base.files import read_distance_png, read_json, write_distance_png, write_json
@@ -122,10 +122,7 @@ def test_maps_of_pictures_that_have_changed_are_made_anew(room: RoomDrive, tmp_p
 
 
 def test_maps_that_are_given_are_calibrated(room: RoomDrive, tmp_path: Path) -> None:
-    for camera in ("image_02", "image_03"):
-        for frame in room.frames:
-            write_distance_png(tmp_path / f"mono/{camera}/{frame:010d}.png", np.full((64, 64), 4.0))
-    said = run(options_of(room, tmp_path / "scene", mono=tmp_path / "mono"))
+    said = run(options_of(room, tmp_path / "scene", mono=write_mono(tmp_path / "mono", room, 4.0)))
     assert read_trust(tmp_path / "scene" / TRUST_FILE).error_model is not None
     assert not (tmp_path / "scene" / WEIGHTS).exists() and "Error of the monocular maps" in said
 
@@ -142,13 +139,6 @@ def test_without_lidar_it_says_what_to_do(room: RoomDrive, tmp_path: Path, monke
     assert not read_scene(scene).has("mono")
 
 
-def own_maps(drive: RoomDrive, folder: Path, distance_m: float) -> Path:
-    for camera in ("image_02", "image_03"):
-        for frame in drive.frames:
-            write_distance_png(folder / f"{camera}/{frame:010d}.png", np.full((64, 64), distance_m))
-    return folder
-
-
 def put_in(scene: Path, distance_m: float) -> None:
     names = [picture.name for picture in read_scene(scene).pictures]
     maps = ((name, np.full((64, 64), distance_m, np.float32)) for name in names)
@@ -162,7 +152,7 @@ def distances(scene: Path) -> set[float]:
 
 def test_maps_put_in_over_those_of_the_drive_stay_with_their_source(tmp_path: Path) -> None:
     drive = write_room_drive(tmp_path / "drive", frames=6, size=64)
-    scene, mono = tmp_path / "scene", own_maps(drive, tmp_path / "mono", 9.0)
+    scene, mono = tmp_path / "scene", write_mono(tmp_path / "mono", drive, 9.0)
     options = options_of(drive, scene, mono=mono, sky=False)
     run(options)
     assert distances(scene) == {9.0} and "mono" not in read_json(scene / "transforms.json")
@@ -179,7 +169,7 @@ def test_maps_put_in_over_those_of_the_drive_stay_with_their_source(tmp_path: Pa
 def test_maps_that_were_being_put_in_are_not_taken_for_the_drives(tmp_path: Path) -> None:
     drive = write_room_drive(tmp_path / "drive", frames=6, size=64)
     scene = tmp_path / "scene"
-    options = options_of(drive, scene, mono=own_maps(drive, tmp_path / "mono", 9.0), sky=False)
+    options = options_of(drive, scene, mono=write_mono(tmp_path / "mono", drive, 9.0), sky=False)
     run(options)
     # killed while the new maps were moved in
     meta = read_json(scene / "transforms.json")
