@@ -301,6 +301,10 @@ def _write_shifted(drive: RoomDrive, cameras: tuple[str, ...]) -> None:
     write_json(drive.root / f"truth/{SEQUENCE}/shifted.json", poses)
 
 
+def halve(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
 def write_mono(folder: Path, drive: RoomDrive, distance_m: Callable[[str, int], float] | float) -> Path:
     """Monocular maps of the same distance in all pixels, or of one for each camera and frame."""
     for name in ("image_02", "image_03"):

@@ -539,6 +539,10 @@ def test_the_same_command_finds_the_work_done(found):
     np.testing.assert_array_equal(again.trajectory.vehicle_to_world, recording.trajectory.vehicle_to_world)
 
 
+def interrupted(*_, **__):
+    raise KeyboardInterrupt
+
+
 @pytest.mark.slow
 def test_an_interrupted_run_goes_on(found, tmp_path, monkeypatch):
     import pycolmap
@@ -546,9 +550,6 @@ def test_an_interrupted_run_goes_on(found, tmp_path, monkeypatch):
     options, _ = found
     options = dataclasses.replace(options, output=tmp_path / "scene", frames=4)
     database = tmp_path / ".scene.colmap" / "database.db"
-
-    def interrupted(*_, **__):
-        raise KeyboardInterrupt
 
     def features() -> list[int]:
         with contextlib.closing(pycolmap.Database.open(database)) as opened:
@@ -590,9 +591,6 @@ def half_masked(drive: Path, folder: Path) -> Path:
 @pytest.mark.slow
 def test_masked_pixels_have_no_features(drive, tmp_path, monkeypatch):
     pycolmap = pytest.importorskip("pycolmap")
-
-    def interrupted(*_, **__):
-        raise KeyboardInterrupt
 
     def features(name: str, **masked) -> np.ndarray:
         sequence, output = SynthesizeOptions(drive).sequence, tmp_path / name

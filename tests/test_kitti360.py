@@ -23,6 +23,7 @@ from drives import (
     SEQUENCE,
     RoomDrive,
     aimed_points,
+    halve,
     matrix,
     pose,
     wall_distance,
@@ -648,10 +649,6 @@ def change(path: Path, old: str, new: str) -> None:
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new, 1))
-
-
-def halve(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
 def sweeps(drive: RoomDrive) -> Path:

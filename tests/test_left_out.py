@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drives import SEQUENCE, RoomDrive, write_mono, write_points, write_room_drive
+from drives import SEQUENCE, RoomDrive, halve, write_mono, write_points, write_room_drive
 from rich.console import Console
 from test_scene import tree as contents
 
@@ -38,10 +38,6 @@ def run(drive: RoomDrive, scene: str = "scene", **changes) -> tuple[ProcessRepor
     with console.capture() as said:
         report = process(Kitti360Options(**{**options, "find_ego": False, "sky": False, **changes}), console)
     return report, said.get()
-
-
-def halve(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
 def damage(path: Path) -> None:

@@ -378,9 +378,7 @@ def test_true_poses_stay(colmap: Any, refined: Refined) -> None:
 
 
 @pytest.mark.slow
-def test_poses_that_are_far_off_are_not_trusted_to_features(
-    colmap: Any, refined: Refined, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_poses_that_are_far_off_are_not_trusted_to_features(colmap: Any, refined: Refined) -> None:
     rng = np.random.default_rng(9)
     given = world(rng)
     refined.monkeypatch.setattr(refining, "FURTHEST_M", 0.02)
@@ -399,9 +397,7 @@ def test_few_features_change_nothing(colmap: Any, refined: Refined) -> None:
 
 
 @pytest.mark.slow
-def test_a_moment_without_features_moves_with_its_neighbours(
-    colmap: Any, refined: Refined, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_moment_without_features_moves_with_its_neighbours(colmap: Any, refined: Refined) -> None:
     rng = np.random.default_rng(11)
     given = world(rng)
     wanted = pose((0, 0.1, 0), (0.05, 0, 0.02))

@@ -98,7 +98,8 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
         recording = lidar_poses(recording, options, console)
     notices: list[str] = []
     if options.find_ego:
-        training = [picture for picture in recording.pictures if picture.frame not in _held_out(recording, options)]
+        held_out = _held_out(recording, options)
+        training = [picture for picture in recording.pictures if picture.frame not in held_out]
         recording, notices = find_vehicle(recording, training, options, console)
     recording, said = _posed(recording, options, console)
     notices += said

@@ -499,11 +499,8 @@ class _Companions:
             )
             for camera in cameras
             for what, given in (
-                ("masks", camera.masks),
-                ("mono", camera.mono),
+                *((key, getattr(camera, key)) for key in ("masks", "mono", "truth_distance", "truth_rgb")),
                 ("depth.files", camera.depth and camera.depth.files),
-                ("truth_distance", camera.truth_distance),
-                ("truth_rgb", camera.truth_rgb),
             )
             if given is not None
         }
