@@ -59,13 +59,11 @@ class _Shared(Generic[Value]):
 
     def get(self, key: int) -> Value:
         with self._lock:
-            future = self._made.get(key)
-            mine = future is None
-            if future is None:
-                future = self._made[key] = Future()
-                while len(self._made) > self._size:
-                    self._made.popitem(last=False)
+            mine = key not in self._made
+            future = self._made.setdefault(key, Future())
             self._made.move_to_end(key)
+            while len(self._made) > self._size:
+                self._made.popitem(last=False)
         if mine:
             try:
                 future.set_result(self._make(key))

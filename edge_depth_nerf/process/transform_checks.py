@@ -88,32 +88,6 @@ class ContrastAgreement:
         return self.given >= _NO_FIT or self.still < _FITS
 
 
-@dataclass
-class _Sums:
-    """Sums for the correlation of two contrasts."""
-
-    count: int = 0
-    products: float = 0.0
-    first: float = 0.0
-    second: float = 0.0
-
-    def add(self, first: Float32[np.ndarray, "returns"], second: Float32[np.ndarray, "returns"]) -> None:
-        self.count += len(first)
-        self.products += float(first @ second)
-        self.first += float(first @ first)
-        self.second += float(second @ second)
-
-    @property
-    def tells(self) -> bool:
-        """Whether there are enough LiDAR points, on things with contrast."""
-        return self.count >= _FEWEST and min(self.first, self.second) > self.count * _FAINTEST**2
-
-    @property
-    def correlation(self) -> float:
-        """Without the means: contrast has none. 0 without LiDAR points."""
-        return self.products / max(math.sqrt(self.first * self.second), 1e-9)
-
-
 @dataclass(frozen=True)
 class _Pair:
     """Two pictures of a camera from different places."""
@@ -211,8 +185,7 @@ def _agreement(
 ) -> ContrastAgreement | None:
     """Measure one scanner against one camera."""
     assert recording.trajectory is not None
-    sums: defaultdict[str, _Sums] = defaultdict(_Sums)
-    still = _Sums()
+    contrasts: defaultdict[str, list[tuple[np.ndarray, np.ndarray]]] = defaultdict(list)
     for pair in pairs:
         recorded = min(sweeps, key=lambda sweep: abs(sweep.time_s - pair.time_s))
         sweep = read_if_whole(recorded.read) if abs(recorded.time_s - pair.time_s) <= _APART_S else None
@@ -229,13 +202,26 @@ def _agreement(
                 values = _seen_twice(
                     in_first, world.spacing_m[::every], pair.to_second(to_vehicle), small, usable, pair.contrasts
                 )
-                sums[name].add(values[0], values[1])
+                contrasts[name].append((values[0], values[1]))
                 if name == "given":
-                    still.add(values[0], values[2])
-    if not any(one.tells for one in sums.values()):
+                    contrasts["still"].append((values[0], values[2]))
+    measured = {name: _correlation(values) for name, values in contrasts.items()}
+    still, _ = measured.pop("still", (0.0, False))
+    if not any(tells for _, tells in measured.values()):
         return None
-    found = {name: one.correlation if one.tells else 0.0 for name, one in sums.items()}
-    return ContrastAgreement(camera.name, sweeps[0].scanner, found.pop("given"), found, still.correlation)
+    found = {name: correlation if tells else 0.0 for name, (correlation, tells) in measured.items()}
+    return ContrastAgreement(camera.name, sweeps[0].scanner, found.pop("given"), found, still)
+
+
+def _correlation(values: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[float, bool]:
+    """Correlation of two contrasts, without the means: contrast has none. 0 without LiDAR points.
+
+    Also whether it tells something: there are enough LiDAR points, on things with contrast.
+    """
+    first, second = (np.concatenate(parts).astype(np.float64) for parts in zip(*values, strict=True))
+    squares = float(first @ first), float(second @ second)
+    tells = len(first) >= _FEWEST and min(squares) > len(first) * _FAINTEST**2
+    return float(first @ second) / max(math.sqrt(squares[0] * squares[1]), 1e-9), tells
 
 
 def _seen_twice(
