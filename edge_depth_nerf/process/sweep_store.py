@@ -248,15 +248,7 @@ class SweepStore:
         return torch.cat(found)
 
     def around(self, frame: int, time_s: float, viewpoint_in_world: Transform, *, hide: bool = True) -> Surroundings:
-        """Gather the points around a picture.
-
-        Args:
-            frame: number of its frame.
-            time_s: when it was taken.
-            viewpoint_in_world: the camera's pose, camera to world.
-            hide: also give the points that only hide others.
-
-        """
+        """Gather the points around a picture with its pose, camera to world; with `hide`, also what only hides others."""
         found = _Gathered(viewpoint_in_world[:3, 3])
         for scanner in self.scanners:
             window = self._window(scanner, frame, time_s)

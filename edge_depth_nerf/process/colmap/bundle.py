@@ -61,20 +61,9 @@ def adjust_bundle(
     given: Float64[np.ndarray, "moments 4 4"],
     softness: Softness,
 ) -> Float64[np.ndarray, "moments 4 4"]:
-    """Find the poses and points that agree best with the features and the given poses.
+    """Find the poses, vehicle to world, that agree best with the features and softly with the given poses.
 
-    Args:
-        pycolmap: the module.
-        shots: the pictures.
-        tracks: what they see; `picture` counts `shots`.
-        points: where it is, to begin with.
-        start: vehicle to world, to begin with.
-        given: the poses that are held softly.
-        softness: how softly.
-
-    Returns:
-        Vehicle to world, of each frame.
-
+    The search begins with the poses `start`, and with `points`, the places of what `tracks` see. Tracks count `shots`.
     """
     # COLMAP works best near the origin
     origin = np.eye(4)

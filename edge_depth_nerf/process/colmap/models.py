@@ -151,10 +151,7 @@ def colmap_lenses(recording: Recording, options: ProcessOptions) -> dict[str, Co
 
 
 def import_pycolmap(option: str = "--poses colmap") -> Any:
-    """The module pycolmap.
-
-    Args:
-        option: what needs it.
+    """The module pycolmap, for an option that needs it.
 
     Raises:
         InputError: it is not installed, or too old.

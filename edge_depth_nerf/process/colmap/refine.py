@@ -300,14 +300,9 @@ def refine(
 ) -> Refinement:
     """Refine poses by matched features, and judge both by those that take no part.
 
-    Args:
-        pycolmap: the module.
-        shots: the pictures.
-        matches: what pairs of them have in common; they count `shots`.
-        given: vehicle to world of each frame.
-        reshoot: from refined poses, and which frames features moved, to the pictures on the rig: cameras that fire at
-            other times than the frame's stand where the path has the vehicle then. None = they stay.
-
+    Matches count `shots`; `given` is vehicle to world of each frame. `reshoot` makes the pictures on the rig of refined
+    poses, and of which frames features moved: cameras that fire at other times than the frame's stand where the path
+    has the vehicle then. None = they stay.
     """
     groups = features_joined(matches)
     judging = [np.asarray(_judges(numbers)) for numbers in groups]

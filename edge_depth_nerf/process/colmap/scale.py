@@ -115,10 +115,8 @@ def moment_times(recording: Recording) -> dict[int, float]:
 def join_models(recording: Recording, models: Sequence[ColmapModel], scales: ArrayLike) -> MetricPath:
     """Lay the models over one another and average where they put the vehicle.
 
-    Args:
-        recording: whose pictures and rig the models are of.
-        models: that with the most frames comes first.
-        scales: metres per unit of each. Those of joined models are made to agree with the first's.
+    The model with the most frames comes first. `scales` are metres per unit of each; those of joined models are made to
+    agree with the first's.
 
     Raises:
         InputError: the first model has fewer than two frames.
@@ -216,10 +214,6 @@ def _similarity(
 def metric_path(recording: Recording, models: Sequence[ColmapModel]) -> tuple[MetricPath, Scale]:
     """Find the scale from LiDAR, or from the depth maps instead, and the path in metres.
 
-    Args:
-        recording: with the sweeps, or the depth maps, of the pictures' frames.
-        models: that with the most frames comes first.
-
     Returns:
         The path; and the scale as metres per unit of the first model, with its spread.
 
@@ -255,10 +249,7 @@ def metric_path(recording: Recording, models: Sequence[ColmapModel]) -> tuple[Me
 
 
 def find_scale_break(along: Mapping[int, Float64[np.ndarray, "_"]]) -> ScaleBreak | None:
-    """Find where the scale changes along the path, window by window.
-
-    Args:
-        along: by number of frame, in order, LiDAR's distances over the reconstruction's.
+    """Find where LiDAR's distances over the reconstruction's, by number of frame in order, change along the path.
 
     Returns:
         Where it changes most, if it is nowhere near one scale; None if it is, or too few frames have LiDAR.
@@ -311,13 +302,7 @@ def _ratios(
 ) -> dict[int, Float64[np.ndarray, "_"]]:
     """LiDAR's distance over the models' scaled ones, by number of frame, for every feature with LiDAR points beside it.
 
-    Args:
-        recording: whose sweeps are used.
-        models: some models.
-        scales: of each.
-        trajectory: the vehicle's path in metres, to de-skew by; None = as if each sweep were taken all at once, at the
-            picture's time.
-
+    Sweeps are de-skewed by the vehicle's path in metres; None = as if each were taken at once, at the picture's time.
     """
     registered: dict[int, list[tuple[int, int]]] = defaultdict(list)
     for number, model in enumerate(models):

@@ -253,8 +253,7 @@ class Kitti360Drive:
     def select(self, posed: Collection[int] | None) -> tuple[list[tuple[str, int]], list[Skipped]]:
         """Choose the pictures (camera, frame) that have all they need, in order of frames.
 
-        Args:
-            posed: frames that have a pose; None = poses are still to be found.
+        `posed` are frames that have a pose; None = poses are still to be found.
 
         Raises:
             InputError: the options reach beyond the drive, or nothing that they ask for is complete.
@@ -349,12 +348,8 @@ class Kitti360Drive:
     def read_timestamps(self, camera: str, frames: Iterable[int]) -> list[float]:
         """Read the times of a camera's frames from 0 on, seconds since 1970; empty where the drive has no such file.
 
-        Args:
-            camera: such as image_02.
-            frames: those that must be there.
-
         Raises:
-            InputError: a line is not a time, or a frame has no line.
+            InputError: a line is not a time, or one of the `frames` has no line.
 
         """
         path = self.timestamps_file(camera)
