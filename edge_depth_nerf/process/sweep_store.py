@@ -248,7 +248,7 @@ class SweepStore:
         return torch.cat(found)
 
     def around(self, frame: int, time_s: float, viewpoint_in_world: Transform, *, hide: bool = True) -> Surroundings:
-        """Gather the points around a picture with its pose, camera to world; with `hide`, also what only hides others."""
+        """Gather the points around a picture at a pose, camera to world; `hide` adds those that only hide others."""
         found = _Gathered(viewpoint_in_world[:3, 3])
         for scanner in self.scanners:
             window = self._window(scanner, frame, time_s)
