@@ -6,7 +6,7 @@ from typing import Any
 
 import interpreted
 import torch
-from torch.utils._pytree import tree_leaves, tree_map_only
+from torch.utils._pytree import tree_map_only
 
 from edge_depth_nerf.kernels import triton_launch
 
@@ -23,7 +23,7 @@ def launch_on(device: str) -> None:
         interpreted.slack = SLACK
     launch = triton_launch.launch
 
-    def launched(kernel: Any, grid: tuple[int, ...], _: torch.Tensor, *arguments: Any, **constants: Any) -> None:
+    def launched(kernel: Any, grid: tuple[int, ...], *arguments: Any, **constants: Any) -> None:
         memory: dict[int, tuple[torch.UntypedStorage, torch.UntypedStorage]] = {}
 
         def moved(tensor: torch.Tensor) -> torch.Tensor:
@@ -35,8 +35,7 @@ def launch_on(device: str) -> None:
             return torch.empty(0, dtype=tensor.dtype, device=device).set_(there, at, tensor.shape, tensor.stride())
 
         given = tree_map_only(torch.Tensor, moved, arguments)
-        some = next(each for each in tree_leaves(given) if isinstance(each, torch.Tensor))
-        launch(kernel, grid, some, *given, **constants)
+        launch(kernel, grid, *given, **constants)
         for here, there in memory.values():
             here.copy_(there)
 

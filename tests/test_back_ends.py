@@ -145,10 +145,12 @@ def check_that_trials_run_each_kernel() -> None:
 
     back_ends._tried.clear()
 
-    def doubled(ctx: Any, *gradients: torch.Tensor) -> tuple[None, torch.Tensor]:
-        return None, 2 * gradients[0] * ctx.saved_tensors[0]
+    right = modules[2].distortion_loss
 
-    modules[2]._DistortionLoss.backward = staticmethod(torch.autograd.function.once_differentiable(doubled))
+    def off(edges: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+        return right(edges, weights) + (weights - weights.detach()).sum()
+
+    modules[2].distortion_loss = off
     with pytest.warns(UserWarning, match="fused distortion loss does not work .*gradient") as said:
         found = {form.name: tried_out(form, CPU) for form in EVERY}
     assert len(said) == 1 and [name for name, each in found.items() if each is None] == ["distortion loss"]

@@ -6,9 +6,9 @@ Modules of Numba and of Triton are imported when one of their functions is asked
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from types import SimpleNamespace
 
 import torch
 from torch import Tensor
@@ -18,46 +18,20 @@ from edge_depth_nerf.kernels.back_ends import Example, Function, GpuForm
 from edge_depth_nerf.kernels.hash_grid import hash_grid
 
 
-def _ray_numba() -> Any:
-    from edge_depth_nerf.kernels import ray_numba
+def _numba() -> SimpleNamespace:
+    """Import the modules of the CPU."""
+    from edge_depth_nerf.kernels import contraction_numba, hash_grid_numba, pointwise_numba, ray_numba
 
-    return ray_numba
-
-
-def _ray_triton() -> Any:
-    from edge_depth_nerf.kernels import ray_triton
-
-    return ray_triton
+    return SimpleNamespace(
+        contraction=contraction_numba, hash_grid=hash_grid_numba, pointwise=pointwise_numba, ray=ray_numba
+    )
 
 
-def _pointwise_numba() -> Any:
-    from edge_depth_nerf.kernels import pointwise_numba
+def _triton() -> SimpleNamespace:
+    """Import the modules of a GPU."""
+    from edge_depth_nerf.kernels import hash_grid_triton, pointwise_triton, ray_triton
 
-    return pointwise_numba
-
-
-def _pointwise_triton() -> Any:
-    from edge_depth_nerf.kernels import pointwise_triton
-
-    return pointwise_triton
-
-
-def _contraction_numba() -> Callable[..., Any]:
-    from edge_depth_nerf.kernels.contraction_numba import contract
-
-    return contract
-
-
-def _hash_grid_numba() -> Callable[..., Tensor]:
-    from edge_depth_nerf.kernels import hash_grid_numba
-
-    return partial(hash_grid, work=hash_grid_numba)
-
-
-def _hash_grid_triton() -> Callable[..., Tensor]:
-    from edge_depth_nerf.kernels import hash_grid_triton
-
-    return partial(hash_grid, work=hash_grid_triton)
+    return SimpleNamespace(hash_grid=hash_grid_triton, pointwise=pointwise_triton, ray=ray_triton)
 
 
 def spread(device: torch.device, *shape: int, seed: int = 2) -> Tensor:
@@ -117,38 +91,41 @@ MOST = 2048
 """So many samples of a ray stay on a GPU's chip."""
 
 HASH_GRID = Function(
-    _hash_grid_numba, GpuForm("hash grid", _hash_grid_triton, formulas.hash_grid, _points, tolerance=2e-5)
+    lambda: partial(hash_grid, work=_numba().hash_grid),
+    GpuForm(
+        "hash grid", lambda: partial(hash_grid, work=_triton().hash_grid), formulas.hash_grid, _points, tolerance=2e-5
+    ),
 )
 CONTRACT = Function(
-    _contraction_numba,
-    GpuForm("contraction", lambda: _pointwise_triton().contract, formulas.contract, _positions, tolerance=1e-5),
+    lambda: _numba().contraction.contract,
+    GpuForm("contraction", lambda: _triton().pointwise.contract, formulas.contract, _positions, tolerance=1e-5),
     follows=False,
 )
 DISTANCES = Function(
-    lambda: _pointwise_numba().distances,
-    GpuForm("distances", lambda: _pointwise_triton().distances, formulas.distances, _places, tolerance=1e-4),
+    lambda: _numba().pointwise.distances,
+    GpuForm("distances", lambda: _triton().pointwise.distances, formulas.distances, _places, tolerance=1e-4),
     follows=False,
 )
 HARMONICS = Function(
-    lambda: _pointwise_numba().harmonics,
-    GpuForm("directions", lambda: _pointwise_triton().harmonics, formulas.harmonics, _directions, tolerance=1e-5),
+    lambda: _numba().pointwise.harmonics,
+    GpuForm("directions", lambda: _triton().pointwise.harmonics, formulas.harmonics, _directions, tolerance=1e-5),
     follows=False,
 )
 PLACE_SAMPLES = Function(
-    lambda: _ray_numba().place_samples,
-    GpuForm("placing of samples", lambda: _ray_triton().place_samples, formulas.place_samples, _wanted, 1e-4, MOST),
+    lambda: _numba().ray.place_samples,
+    GpuForm("placing of samples", lambda: _triton().ray.place_samples, formulas.place_samples, _wanted, 1e-4, MOST),
 )
 BOUND_LOSS = Function(
-    lambda: _ray_numba().bound_loss,
-    GpuForm("proposal loss", lambda: _ray_triton().bound_loss, formulas.bound_loss, _proposals, 1e-4, MOST),
+    lambda: _numba().ray.bound_loss,
+    GpuForm("proposal loss", lambda: _triton().ray.bound_loss, formulas.bound_loss, _proposals, 1e-4, MOST),
 )
 DISTORTION_LOSS = Function(
-    lambda: _ray_numba().distortion_loss,
-    GpuForm("distortion loss", lambda: _ray_triton().distortion_loss, formulas.distortion_loss, _samples, 1e-4, MOST),
+    lambda: _numba().ray.distortion_loss,
+    GpuForm("distortion loss", lambda: _triton().ray.distortion_loss, formulas.distortion_loss, _samples, 1e-4, MOST),
 )
-POSITIONS = Function(lambda: _pointwise_numba().middles, follows=False)
-DENSITY = Function(lambda: _pointwise_numba().density)
-WEIGHTS = Function(lambda: _ray_numba().weights_from_densities)
+POSITIONS = Function(lambda: _numba().pointwise.middles, follows=False)
+DENSITY = Function(lambda: _numba().pointwise.density)
+WEIGHTS = Function(lambda: _numba().ray.weights_from_densities)
 
 ON_GPU: tuple[GpuForm, ...] = tuple(
     each.on_gpu

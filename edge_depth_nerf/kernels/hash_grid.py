@@ -24,6 +24,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from edge_depth_nerf.kernels.gradients import once
 from edge_depth_nerf.kernels.table_adam import SUMS_LATER, TablePart, keep_part
 
 
@@ -41,38 +42,20 @@ class _HashGrid(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        gradient = gradients[0]
         positions, table, scalings = ctx.saved_tensors
         rows = ctx.rows if ctx.needs_input_grad[1] else None
         if rows is not None and ctx.table is not None:
-            kept = keep_part(ctx.table, TablePart(positions, gradients[0], scalings))
+            kept = keep_part(ctx.table, TablePart(positions, gradient, scalings))
             rows = None if kept else rows
-        return *_Gradients.apply(gradients[0], positions, table, scalings, rows, ctx.work), None, None, None
 
+        def compute() -> tuple[Tensor | None, Tensor | None]:
+            return (
+                None if table is None else ctx.work.position_gradient(positions, table, gradient, scalings),
+                None if rows is None else ctx.work.table_gradient(positions, gradient, scalings, rows),
+            )
 
-class _Gradients(torch.autograd.Function):
-    """The gradients, as a step of its own that refuses to be differentiated once more."""
-
-    @staticmethod
-    def forward(
-        ctx: Any,
-        gradient: Tensor,
-        positions: Tensor,
-        table: Tensor | None,
-        scalings: Tensor,
-        rows: int | None,
-        work: ModuleType,
-    ) -> tuple[Tensor | None, Tensor | None]:
-        return (
-            None if table is None else work.position_gradient(positions, table, gradient, scalings),
-            None if rows is None else work.table_gradient(positions, gradient, scalings, rows),
-        )
-
-    @staticmethod
-    def backward(ctx: Any, *_: Any) -> Any:
-        raise NotImplementedError(
-            "The fused hash grid has no second derivative. For a loss on gradients (normals that are trained by "
-            "differentiating the density, say) choose --pipeline.model.implementation torch."
-        )
+        return *once("The fused hash grid", compute, gradient, positions, table), None, None, None
 
 
 def hash_grid(

@@ -68,15 +68,7 @@ def _interpolated(grid, inside, at0, at1, at2, at3, at4, at5, at6, at7, x, y, z)
 @triton.jit
 @no_type_check
 def _encode_kernel(
-    positions,
-    table,
-    scalings,
-    encoded,
-    points,
-    size,
-    width,
-    FEATURES: tl.constexpr,
-    POINTS: tl.constexpr,
+    positions, table, scalings, encoded, points, size, width, FEATURES: tl.constexpr, POINTS: tl.constexpr
 ):
     point = tl.program_id(0).to(tl.int64) * POINTS + tl.arange(0, POINTS)
     level = tl.program_id(1).to(tl.int64)
@@ -94,18 +86,9 @@ def _encode_kernel(
 @triton.jit
 @no_type_check
 def _table_gradient_kernel(
-    positions,
-    gradient,
-    scalings,
-    to_table,
-    points,
-    size,
-    point_stride,
-    feature_stride,
-    FEATURES: tl.constexpr,
-    BLOCK: tl.constexpr,
-    POINTS: tl.constexpr,
-):
+    positions, gradient, scalings, to_table, points, size, point_stride, feature_stride, FEATURES: tl.constexpr,
+    BLOCK: tl.constexpr, POINTS: tl.constexpr,
+):  # fmt: skip
     local = tl.arange(0, POINTS)[:, None]
     point = tl.program_id(0).to(tl.int64) * POINTS + local
     level = tl.program_id(1).to(tl.int64)
@@ -135,19 +118,9 @@ def _table_gradient_kernel(
 @triton.jit
 @no_type_check
 def _position_gradient_kernel(
-    positions,
-    table,
-    gradient,
-    scalings,
-    to_positions,
-    points,
-    size,
-    point_stride,
-    feature_stride,
-    LEVELS: tl.constexpr,
-    FEATURES: tl.constexpr,
-    POINTS: tl.constexpr,
-):
+    positions, table, gradient, scalings, to_positions, points, size, point_stride, feature_stride,
+    LEVELS: tl.constexpr, FEATURES: tl.constexpr, POINTS: tl.constexpr,
+):  # fmt: skip
     point = tl.program_id(0).to(tl.int64) * POINTS + tl.arange(0, POINTS)
     inside = point < points
     to_x = tl.zeros((POINTS,), tl.float32)
@@ -188,20 +161,8 @@ def encode(
     positions, table = positions.detach().contiguous(), table.detach().contiguous()
     points, (rows, features), levels = len(positions), table.shape, len(scalings)
     encoded = positions.new_empty((points, levels * features), dtype=dtype)
-    launch(
-        _encode_kernel,
-        (triton.cdiv(points, POINTS), levels),
-        positions,
-        positions,
-        table,
-        scalings,
-        encoded,
-        points,
-        rows // levels,
-        levels * features,
-        FEATURES=features,
-        POINTS=POINTS,
-    )
+    arguments = positions, table, scalings, encoded, points, rows // levels, levels * features
+    launch(_encode_kernel, (triton.cdiv(points, POINTS), levels), *arguments, FEATURES=features, POINTS=POINTS)
     return encoded
 
 
@@ -216,21 +177,9 @@ def table_gradient(
     points, levels = len(positions), len(scalings)
     features = gradient.shape[1] // levels
     result = positions.new_zeros(rows, features)
-    launch(
-        _table_gradient_kernel,
-        (triton.cdiv(points, POINTS), levels),
-        positions,
-        positions,
-        gradient,
-        scalings,
-        result,
-        points,
-        rows // levels,
-        *gradient.stride(),
-        FEATURES=features,
-        BLOCK=triton.next_power_of_2(features),
-        POINTS=POINTS,
-    )
+    arguments = positions, gradient, scalings, result, points, rows // levels, *gradient.stride()
+    constants = {"FEATURES": features, "BLOCK": triton.next_power_of_2(features), "POINTS": POINTS}
+    launch(_table_gradient_kernel, (triton.cdiv(points, POINTS), levels), *arguments, **constants)
     return result
 
 
@@ -244,20 +193,7 @@ def position_gradient(
     positions, table, gradient = positions.detach().contiguous(), table.detach().contiguous(), gradient.detach()
     points, (rows, features), levels = len(positions), table.shape, len(scalings)
     result = torch.empty_like(positions)
-    launch(
-        _position_gradient_kernel,
-        (triton.cdiv(points, POINTS),),
-        positions,
-        positions,
-        table,
-        gradient,
-        scalings,
-        result,
-        points,
-        rows // levels,
-        *gradient.stride(),
-        LEVELS=levels,
-        FEATURES=features,
-        POINTS=POINTS,
-    )
+    arguments = positions, table, gradient, scalings, result, points, rows // levels, *gradient.stride()
+    constants = {"LEVELS": levels, "FEATURES": features, "POINTS": POINTS}
+    launch(_position_gradient_kernel, (triton.cdiv(points, POINTS),), *arguments, **constants)
     return result

@@ -19,6 +19,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from edge_depth_nerf.kernels.gradients import once
+
 
 class _Network(torch.autograd.Function):
     @staticmethod
@@ -32,26 +34,14 @@ class _Network(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        # saved_tensors finds out if one was changed since
-        return _Gradients.apply(gradients[0], ctx.needs_input_grad[0], ctx.arrays, *ctx.saved_tensors)
-
-
-class _Gradients(torch.autograd.Function):
-    """The gradients, as a step of its own that refuses to be differentiated once more."""
-
-    @staticmethod
-    def forward(ctx: Any, gradient: Tensor, follow_x: bool, arrays: Any, *_: Tensor) -> tuple[Any, ...]:
         from edge_depth_nerf.kernels import network_numba
 
-        to_x, to_weights, to_biases = network_numba.backward(arrays, gradient, follow_x)
-        return to_x, *(each for pair in zip(to_weights, to_biases, strict=True) for each in pair)
+        def compute() -> tuple[Tensor | None, ...]:
+            found = network_numba.backward(ctx.arrays, gradients[0], ctx.needs_input_grad[0])
+            return found[0], *(each for pair in zip(*found[1:], strict=True) for each in pair)
 
-    @staticmethod
-    def backward(ctx: Any, *_: Any) -> Any:
-        raise NotImplementedError(
-            "The network in tiles has no second derivative. For a loss on gradients (normals that are trained by "
-            "differentiating the density, say) choose --pipeline.model.implementation torch."
-        )
+        # saved_tensors finds out if one was changed since
+        return once("The network in tiles", compute, gradients[0], *ctx.saved_tensors)
 
 
 def _layer_by_layer(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tensor:

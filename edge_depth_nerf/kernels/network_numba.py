@@ -337,12 +337,7 @@ class Arrays:
     """
 
     def __init__(
-        self,
-        x: Tensor,
-        weights: Sequence[Tensor],
-        biases: Sequence[Tensor],
-        joint: int = 0,
-        more: Tensor | None = None,
+        self, x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], joint: int = 0, more: Tensor | None = None
     ) -> None:
         """Arrange what a network is given.
 

@@ -53,7 +53,7 @@ def distances(
     found = torch.empty(places.shape, device=places.device)
     programs = triton.cdiv(places.numel(), NUMBERS)
     arguments = places, nears, fars, found, places.numel(), stride, places.shape[1]
-    launch(_distance_kernel, (programs,), places, *arguments, NUMBERS=NUMBERS)
+    launch(_distance_kernel, (programs,), *arguments, NUMBERS=NUMBERS)
     return found
 
 
@@ -90,7 +90,7 @@ def contract(positions: Float[Tensor, "points 3"]) -> tuple[Float[Tensor, "point
     positions = positions.detach().contiguous()
     places, inside = torch.empty_like(positions), positions.new_empty(len(positions))
     programs = triton.cdiv(len(positions), NUMBERS)
-    launch(_contract_kernel, (programs,), positions, positions, places, inside, len(positions), NUMBERS=NUMBERS)
+    launch(_contract_kernel, (programs,), positions, places, inside, len(positions), NUMBERS=NUMBERS)
     return places, inside
 
 
@@ -136,5 +136,5 @@ def harmonics(directions: Float[Tensor, "rays 3"], dtype: torch.dtype) -> Float[
     directions, stride = rows_of(directions)
     encoded = torch.empty(len(directions), HARMONICS, dtype=dtype, device=directions.device)
     programs = triton.cdiv(len(directions), NUMBERS)
-    launch(_harmonics_kernel, (programs,), encoded, directions, encoded, len(directions), stride, NUMBERS=NUMBERS)
+    launch(_harmonics_kernel, (programs,), directions, encoded, len(directions), stride, NUMBERS=NUMBERS)
     return encoded

@@ -17,8 +17,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from edge_depth_nerf.kernels.compiled import compiled
+from edge_depth_nerf.kernels.compiled import compiled, flat
 from edge_depth_nerf.kernels.exponential_numba import exp
+from edge_depth_nerf.kernels.gradients import sloped
 from edge_depth_nerf.kernels.pointwise_numba import flat_rows
 from edge_depth_nerf.kernels.threads import in_parts
 
@@ -215,30 +216,6 @@ def _bound_loss(edges, weights, outer_edges, outer_weights, to_outer, follow, be
     return loss
 
 
-class _BoundLoss(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, edges: Tensor, weights: Tensor, outer_edges: Tensor, outer_weights: Tensor) -> Tensor:
-        follow = ctx.needs_input_grad[3]
-        slope = torch.empty(outer_weights.shape if follow else (0, 0))
-        arrays = [each.detach().contiguous().numpy() for each in (edges, weights, outer_edges, outer_weights)]
-        # in the order of the rays, whichever thread was ready first: the same sum each time
-        of_parts: dict[int, float] = {}
-
-        def work(first: int, last: int) -> None:
-            of_parts[first] = _bound_loss(*arrays, slope.numpy(), follow, first, last)
-
-        in_parts(work, len(weights), LEAST_WALKED // max(1, weights.shape[1] + outer_weights.shape[1]))
-        loss = sum(of_parts[first] for first in sorted(of_parts)) / max(1, weights.numel())
-        if follow:
-            ctx.save_for_backward(slope / weights.numel())
-        return torch.tensor(loss, dtype=torch.float32)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        return None, None, None, gradients[0] * ctx.saved_tensors[0]
-
-
 def bound_loss(
     edges: Float[Tensor, "rays edges"],
     weights: Float[Tensor, "rays samples"],
@@ -250,9 +227,21 @@ def bound_loss(
     Mean over all samples of max(0, w - bound)² / (w + 1e-7), where the bound sums the outer weights of all intervals
     that a sample touches. Differentiable once, by `outer_weights` alone. float32.
     """
-    loss = _BoundLoss.apply(edges, weights, outer_edges, outer_weights)
-    assert isinstance(loss, Tensor)
-    return loss
+    arrays = [each.detach().contiguous().numpy() for each in (edges, weights, outer_edges, outer_weights)]
+
+    def compute(follow: bool) -> tuple[Tensor, Tensor]:
+        slope = torch.empty(outer_weights.shape if follow else (0, 0))
+        # in the order of the rays, whichever thread was ready first: the same sum each time
+        of_parts: dict[int, float] = {}
+
+        def work(first: int, last: int) -> None:
+            of_parts[first] = _bound_loss(*arrays, slope.numpy(), follow, first, last)
+
+        in_parts(work, len(weights), LEAST_WALKED // max(1, weights.shape[1] + outer_weights.shape[1]))
+        loss = sum(of_parts[first] for first in sorted(of_parts)) / max(1, weights.numel())
+        return torch.tensor(loss, dtype=torch.float32), slope / max(1, weights.numel())
+
+    return sloped(outer_weights, compute)
 
 
 @compiled()
@@ -292,25 +281,6 @@ def _distortion_loss(edges, edge_stride, weights, slopes, samples, follow):
     return loss
 
 
-class _DistortionLoss(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, edges: Tensor, weights: Tensor) -> Tensor:
-        rays, samples = weights.shape
-        follow = ctx.needs_input_grad[1]
-        slopes = torch.empty(weights.shape if follow else (0, 0))
-        given = weights.detach().contiguous().view(-1).numpy()
-        loss = _distortion_loss(*flat_rows(edges), given, slopes.view(-1).numpy(), samples, follow)
-        if follow:
-            ctx.save_for_backward(slopes)
-        ctx.rays = max(1, rays)
-        return torch.tensor(loss / ctx.rays, dtype=torch.float32)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[None, Tensor]:
-        return None, ctx.saved_tensors[0] * (gradients[0] / ctx.rays)
-
-
 def distortion_loss(edges: Float[Tensor, "rays edges"], weights: Float[Tensor, "rays samples"]) -> Float[Tensor, ""]:
     """Compute mip-NeRF 360's distortion loss (Eq. 15), mean over the rays; differentiable once, by the weights alone.
 
@@ -321,6 +291,11 @@ def distortion_loss(edges: Float[Tensor, "rays edges"], weights: Float[Tensor, "
         weights: rendering weights, float32.
 
     """
-    loss = _DistortionLoss.apply(edges, weights)
-    assert isinstance(loss, Tensor)
-    return loss
+    rays, samples = weights.shape
+
+    def compute(follow: bool) -> tuple[Tensor, Tensor]:
+        slopes = torch.empty(weights.shape if follow else (0, 0))
+        loss = _distortion_loss(*flat_rows(edges), flat(weights), slopes.view(-1).numpy(), samples, follow)
+        return torch.tensor(loss / max(1, rays), dtype=torch.float32), slopes
+
+    return sloped(weights, compute, max(1, rays))

@@ -8,7 +8,7 @@ float64 as on the CPU. With TRITON_INTERPRET=1 set before the import the kernels
 
 from __future__ import annotations
 
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import torch
 import triton
@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from edge_depth_nerf.kernels.formulas import EPS
+from edge_depth_nerf.kernels.gradients import sloped
 from edge_depth_nerf.kernels.triton_launch import launch, rows_of
 
 TOGETHER = 8
@@ -37,16 +38,7 @@ def _is_finite(x):
 @triton.jit
 @no_type_check
 def _place_kernel(
-    weights,
-    edges,
-    wanted,
-    placed,
-    samples,
-    places,
-    padding,
-    least,
-    SAMPLES: tl.constexpr,
-    TOGETHER: tl.constexpr,
+    weights, edges, wanted, placed, samples, places, padding, least, SAMPLES: tl.constexpr, TOGETHER: tl.constexpr
 ):
     ray = tl.program_id(0).to(tl.int64)
     sample = tl.arange(0, SAMPLES)
@@ -87,43 +79,17 @@ def place_samples(
     places = wanted.shape[1]
     weights, edges, wanted = (each.detach().contiguous() for each in (weights, edges, wanted))
     placed = torch.empty_like(wanted)
-    launch(
-        _place_kernel,
-        (rays,),
-        weights,
-        weights,
-        edges,
-        wanted,
-        placed,
-        samples,
-        places,
-        float(padding),
-        float(least),
-        SAMPLES=_block(samples),
-        TOGETHER=TOGETHER,
-    )
+    arguments = weights, edges, wanted, placed, samples, places, float(padding), float(least)
+    launch(_place_kernel, (rays,), *arguments, SAMPLES=_block(samples), TOGETHER=TOGETHER)
     return placed
 
 
 @triton.jit
 @no_type_check
 def _bound_kernel(
-    edges,
-    weights,
-    outer_edges,
-    outer_weights,
-    losses,
-    slopes,
-    stride,
-    outer_stride,
-    samples,
-    intervals,
-    share,
-    eps,
-    INTERVALS: tl.constexpr,
-    FOLLOW: tl.constexpr,
-    TOGETHER: tl.constexpr,
-):
+    edges, weights, outer_edges, outer_weights, losses, slopes, stride, outer_stride, samples, intervals, share, eps,
+    INTERVALS: tl.constexpr, FOLLOW: tl.constexpr, TOGETHER: tl.constexpr,
+):  # fmt: skip
     ray = tl.program_id(0).to(tl.int64)
     interval = tl.arange(0, INTERVALS)
     inside = interval < intervals
@@ -152,44 +118,6 @@ def _bound_kernel(
         tl.store(slopes + ray * intervals + interval, slope * share, inside)
 
 
-class _BoundLoss(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, edges: Tensor, weights: Tensor, outer_edges: Tensor, outer_weights: Tensor) -> Tensor:
-        (rays, samples), intervals = weights.shape, outer_weights.shape[1]
-        follow = ctx.needs_input_grad[3]
-        losses, slopes = weights.new_empty(rays), outer_weights.new_empty(outer_weights.shape)
-        edges, stride = rows_of(edges)
-        outer_edges, outer_stride = rows_of(outer_edges)
-        launch(
-            _bound_kernel,
-            (rays,),
-            weights,
-            edges,
-            weights.detach().contiguous(),
-            outer_edges,
-            outer_weights.detach().contiguous(),
-            losses,
-            slopes,
-            stride,
-            outer_stride,
-            samples,
-            intervals,
-            1 / max(1, weights.numel()),
-            EPS,
-            INTERVALS=_block(intervals),
-            FOLLOW=follow,
-            TOGETHER=TOGETHER,
-        )
-        if follow:
-            ctx.save_for_backward(slopes)
-        return losses.sum()
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        return None, None, None, gradients[0] * ctx.saved_tensors[0]
-
-
 def bound_loss(
     edges: Float[Tensor, "rays edges"],
     weights: Float[Tensor, "rays samples"],
@@ -197,25 +125,26 @@ def bound_loss(
     outer_weights: Float[Tensor, "rays outer_samples"],
 ) -> Float[Tensor, ""]:
     """Compute the proposal loss of mip-NeRF 360 (Eq. 13); as `ray_numba.bound_loss`, edges ascending."""
-    loss = _BoundLoss.apply(edges, weights, outer_edges, outer_weights)
-    assert isinstance(loss, Tensor)
-    return loss
+    (rays, samples), intervals = weights.shape, outer_weights.shape[1]
+    (of_edges, stride), (of_outer, outer_stride) = rows_of(edges), rows_of(outer_edges)
+    given = of_edges, weights.detach().contiguous(), of_outer, outer_weights.detach().contiguous()
+    numbers = stride, outer_stride, samples, intervals, 1 / max(1, weights.numel()), EPS
+
+    def compute(follow: bool) -> tuple[Tensor, Tensor]:
+        losses, slopes = weights.new_empty(rays), outer_weights.new_empty(outer_weights.shape)
+        constants = {"INTERVALS": _block(intervals), "FOLLOW": follow, "TOGETHER": TOGETHER}
+        launch(_bound_kernel, (rays,), *given, losses, slopes, *numbers, **constants)
+        return losses.sum(), slopes
+
+    return sloped(outer_weights, compute)
 
 
 @triton.jit
 @no_type_check
 def _distortion_kernel(
-    edges,
-    weights,
-    losses,
-    slopes,
-    stride,
-    samples,
-    share,
-    SAMPLES: tl.constexpr,
-    FOLLOW: tl.constexpr,
+    edges, weights, losses, slopes, stride, samples, share, SAMPLES: tl.constexpr, FOLLOW: tl.constexpr,
     TOGETHER: tl.constexpr,
-):
+):  # fmt: skip
     ray = tl.program_id(0).to(tl.int64)
     sample = tl.arange(0, SAMPLES)
     inside = sample < samples
@@ -238,38 +167,6 @@ def _distortion_kernel(
         tl.store(slopes + ray * samples + sample, 2 * (away + w * length / 3) * share, inside)
 
 
-class _DistortionLoss(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, edges: Tensor, weights: Tensor) -> Tensor:
-        rays, samples = weights.shape
-        follow = ctx.needs_input_grad[1]
-        losses, slopes = weights.new_empty(rays), weights.new_empty(weights.shape)
-        edges, stride = rows_of(edges)
-        launch(
-            _distortion_kernel,
-            (rays,),
-            weights,
-            edges,
-            weights.detach().contiguous(),
-            losses,
-            slopes,
-            stride,
-            samples,
-            1 / max(1, rays),
-            SAMPLES=_block(samples),
-            FOLLOW=follow,
-            TOGETHER=TOGETHER,
-        )
-        if follow:
-            ctx.save_for_backward(slopes)
-        return losses.sum()
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[None, Tensor]:
-        return None, gradients[0] * ctx.saved_tensors[0]
-
-
 def distortion_loss(edges: Float[Tensor, "rays edges"], weights: Float[Tensor, "rays samples"]) -> Float[Tensor, ""]:
     """Compute mip-NeRF 360's distortion loss (Eq. 15), mean over the rays; differentiable once, by the weights alone.
 
@@ -280,6 +177,13 @@ def distortion_loss(edges: Float[Tensor, "rays edges"], weights: Float[Tensor, "
         weights: rendering weights, float32.
 
     """
-    loss = _DistortionLoss.apply(edges, weights)
-    assert isinstance(loss, Tensor)
-    return loss
+    (rays, samples), (of_edges, stride) = weights.shape, rows_of(edges)
+
+    def compute(follow: bool) -> tuple[Tensor, Tensor]:
+        losses, slopes = weights.new_empty(rays), weights.new_empty(weights.shape)
+        arguments = of_edges, weights.detach().contiguous(), losses, slopes, stride, samples, 1 / max(1, rays)
+        constants = {"SAMPLES": _block(samples), "FOLLOW": follow, "TOGETHER": TOGETHER}
+        launch(_distortion_kernel, (rays,), *arguments, **constants)
+        return losses.sum(), slopes
+
+    return sloped(weights, compute)

@@ -9,21 +9,20 @@ from jaxtyping import Float
 from torch import Tensor
 
 
-def launch(kernel: Any, grid: tuple[int, ...], device_of: Tensor, *arguments: Any, **constants: Any) -> None:
-    """Launch a kernel where a tensor lies; nothing if there is no program to run.
+def launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, **constants: Any) -> None:
+    """Launch a kernel where its first argument lies; nothing if there is no program to run.
 
     A product and a sum stay two roundings, as in torch: where a point lies in its cell must not depend on the compiler.
 
     Args:
         kernel: of Triton.
         grid: programs along each axis.
-        device_of: the tensor.
-        arguments: the kernel's.
+        arguments: the kernel's, a tensor first.
         constants: what it is compiled for, and options of the compiler.
 
     """
     if 0 not in grid:
-        with torch.cuda.device_of(device_of):
+        with torch.cuda.device_of(arguments[0]):
             kernel[grid](*arguments, **constants, enable_fp_fusion=False)
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.method.integration import check_choice
 
 Align = Literal["none", "global", "local"]
 
@@ -148,8 +149,7 @@ def align(
         InputError: the maps differ in size, or the mode is unknown.
 
     """
-    if mode not in get_args(Align):
-        raise InputError(f"align is {mode!r}; expected one of {', '.join(map(repr, get_args(Align)))}.")
+    check_choice("align", mode, Align)
     returns = both(lidar_m, mono_m, valid)
     count = int(returns.sum())
     if mode == "none":

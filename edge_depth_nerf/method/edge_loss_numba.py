@@ -7,7 +7,7 @@ float32 but for the sum over a ray's samples. Importing this module imports Numb
 from __future__ import annotations
 
 import math
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from edge_depth_nerf.kernels.compiled import compiled, flat
+from edge_depth_nerf.kernels.gradients import sloped
 from edge_depth_nerf.kernels.pointwise_numba import flat_rows
 from edge_depth_nerf.kernels.threads import in_parts
 
@@ -72,27 +73,6 @@ def _edge_loss(
         losses[ray] = loss
 
 
-class _EdgeLoss(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, weights: Tensor, starts: Tensor, ends: Tensor, prior: Tensor, sigma: Tensor, options: tuple[Any, ...]
-    ) -> Tensor:
-        follow = ctx.needs_input_grad[0]
-        (rays, samples), losses = weights.shape, torch.empty(len(weights))
-        slopes = torch.zeros(weights.shape if follow else (0, 0))
-        matrices = [each for matrix in (weights, starts, ends) for each in flat_rows(matrix)]
-        arrays = *matrices, *map(flat, (prior, sigma, losses, slopes)), samples, *options, follow
-        in_parts(lambda first, last: _edge_loss(*arrays, first, last), rays, LEAST_SHARE // max(1, samples))
-        if follow:
-            ctx.save_for_backward(slopes)
-        return losses
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        return ctx.saved_tensors[0] * gradients[0][:, None], None, None, None, None, None
-
-
 def edge_loss(
     weights: Float[Tensor, "rays samples"],
     starts_m: Float[Tensor, "rays samples"],
@@ -107,6 +87,13 @@ def edge_loss(
 ) -> Float[Tensor, "rays"]:
     """Compute Eq. 4 of each ray, as `edge_loss_triton` does."""
     options = np.float32(eps), np.float32(narrow), interval, divide_by_norm
-    losses = _EdgeLoss.apply(*(each.float() for each in (weights, starts_m, ends_m, prior_m, sigma_m)), options)
-    assert isinstance(losses, Tensor)
-    return losses
+    (rays, samples), weights = weights.shape, weights.float()
+
+    def compute(follow: bool) -> tuple[Tensor, Tensor]:
+        losses, slopes = torch.empty(rays), torch.zeros(weights.shape if follow else (0, 0))
+        matrices = [each for matrix in (weights, starts_m, ends_m) for each in flat_rows(matrix.float())]
+        arrays = *matrices, *map(flat, (prior_m.float(), sigma_m.float(), losses, slopes)), samples, *options, follow
+        in_parts(lambda first, last: _edge_loss(*arrays, first, last), rays, LEAST_SHARE // max(1, samples))
+        return losses, slopes
+
+    return sloped(weights, compute)

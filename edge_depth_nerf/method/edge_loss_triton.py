@@ -7,7 +7,7 @@ scales. All arithmetic is float32. With TRITON_INTERPRET=1 set before the import
 from __future__ import annotations
 
 import math
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import torch
 import triton
@@ -15,6 +15,7 @@ import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 
+from edge_depth_nerf.kernels.gradients import sloped
 from edge_depth_nerf.kernels.triton_launch import launch, rows_of
 
 RAYS = 8
@@ -30,25 +31,9 @@ SQRT_TWO_PI = tl.constexpr(math.sqrt(2 * math.pi))
 @triton.jit
 @no_type_check  # the tests' type checker would wrap what Triton has to read
 def _loss_kernel(
-    weights,
-    weight_stride,
-    starts,
-    start_stride,
-    ends,
-    end_stride,
-    priors,
-    sigmas,
-    losses,
-    slopes,
-    rays,
-    samples,
-    eps,
-    narrow,
-    INTERVAL: tl.constexpr,
-    NORM: tl.constexpr,
-    FOLLOW: tl.constexpr,
-    RAYS: tl.constexpr,
-):
+    weights, weight_stride, starts, start_stride, ends, end_stride, priors, sigmas, losses, slopes, rays, samples, eps,
+    narrow, INTERVAL: tl.constexpr, NORM: tl.constexpr, FOLLOW: tl.constexpr, RAYS: tl.constexpr,
+):  # fmt: skip
     ray = tl.program_id(0).to(tl.int64) * RAYS + tl.arange(0, RAYS)
     prior, sigma = tl.load(priors + ray, ray < rays, 0.0), tl.load(sigmas + ray, ray < rays, 0.0)
     has_prior = (prior > 0) & (prior < float("inf")) & (sigma > 0) & (sigma < float("inf"))
@@ -82,29 +67,6 @@ def _loss_kernel(
     tl.store(losses + ray, tl.sum(loss, 1), ray < rays)
 
 
-class _EdgeLoss(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, weights: Tensor, starts: Tensor, ends: Tensor, prior: Tensor, sigma: Tensor, options: dict[str, Any]
-    ) -> Tensor:
-        follow = ctx.needs_input_grad[0]
-        (rays, samples), losses = weights.shape, torch.empty_like(prior, memory_format=torch.contiguous_format)
-        slopes = torch.empty_like(weights, memory_format=torch.contiguous_format)
-        matrices = [each for matrix in (weights, starts, ends) for each in rows_of(matrix)]
-        of_rays = prior.contiguous(), sigma.contiguous(), losses, slopes, rays, samples
-        launch(
-            _loss_kernel, (triton.cdiv(rays, RAYS),), prior, *matrices, *of_rays, **options, FOLLOW=follow, RAYS=RAYS
-        )
-        if follow:
-            ctx.save_for_backward(slopes)
-        return losses
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        return ctx.saved_tensors[0] * gradients[0][:, None], None, None, None, None, None
-
-
 def edge_loss(
     weights: Float[Tensor, "rays samples"],
     starts_m: Float[Tensor, "rays samples"],
@@ -131,7 +93,15 @@ def edge_loss(
         narrow: below this length, in units of σ̂, an interval's mass comes from its midpoint.
 
     """
-    options = {"eps": eps, "narrow": narrow, "INTERVAL": interval, "NORM": divide_by_norm}
-    losses = _EdgeLoss.apply(*(each.float() for each in (weights, starts_m, ends_m, prior_m, sigma_m)), options)
-    assert isinstance(losses, Tensor)
-    return losses
+    options = {"eps": eps, "narrow": narrow, "INTERVAL": interval, "NORM": divide_by_norm, "RAYS": RAYS}
+    (rays, samples), weights = weights.shape, weights.float()
+    matrices = [each for matrix in (weights, starts_m, ends_m) for each in rows_of(matrix.float())]
+    prior, sigma = prior_m.float().contiguous(), sigma_m.float().contiguous()
+
+    def compute(follow: bool) -> tuple[Tensor, Tensor]:
+        losses, slopes = torch.empty_like(prior), torch.empty_like(weights, memory_format=torch.contiguous_format)
+        arguments = *matrices, prior, sigma, losses, slopes, rays, samples
+        launch(_loss_kernel, (triton.cdiv(rays, RAYS),), *arguments, **options, FOLLOW=follow)
+        return losses, slopes
+
+    return sloped(weights, compute)

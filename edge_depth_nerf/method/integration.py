@@ -43,6 +43,8 @@ INTEGRATED = "integrated"
 the name of one source alone."""
 MOTION_RELATIVE_ERROR, MONO_RELATIVE_ERROR = 0.03, 0.1
 """Standard deviations of estimates as parts of the distance, where nothing was measured."""
+FLOOR_M = 0.05
+"""Standard deviation that LiDAR, its calibration and its alignment leave of a prior, metres."""
 Kernel = Literal["edge-aware", "spatial-gaussian"]
 Normalise = Literal["pooled", "per-source"]
 SigmaMode = Literal["constant", "combined"]
@@ -55,7 +57,7 @@ LOWEST_EXPONENT = -700.0
 """Distance factors (Eq. 7) of lower exponents are 0: float64 ends at -745, the last of it with few digits."""
 
 
-def _check_choice(where: str, value: str, choices: object) -> None:
+def check_choice(where: str, value: str, choices: object) -> None:
     """Refuse a value that the Literal type `choices` does not list.
 
     Raises:
@@ -113,8 +115,8 @@ class IntegrationOptions:
         if not (self.kernel_size >= 1 and self.kernel_size % 2 == 1):
             raise InputError(f"kernel_size is {self.kernel_size}; expected an odd whole number of pixels from 1.")
         _check_number("least_returns", self.least_returns, 0.0)
-        _check_choice("kernel", self.kernel, Kernel)
-        _check_choice("normalise", self.normalise, Normalise)
+        check_choice("kernel", self.kernel, Kernel)
+        check_choice("normalise", self.normalise, Normalise)
 
 
 @dataclass(frozen=True)
@@ -377,21 +379,17 @@ def sigma_m(
     *,
     mono_m: Float[Tensor, "*batch h w"] | None = None,
     constant_m: float = 1.0,
-    mono_relative_error: float = MONO_RELATIVE_ERROR,
-    floor_m: float = 0.05,
 ) -> Float[Tensor, "*batch h w"]:
     """Give σ̂, the standard deviation that Eq. 4 grants the prior, for every pixel.
 
     constant   `constant_m`.
-    combined   σ̂² = spread² + (mono_relative_error · d̂ · monocular share)² + floor_m².
+    combined   σ̂² = spread² + (MONO_RELATIVE_ERROR · d̂ · monocular share)² + FLOOR_M².
 
     Args:
         prior: what `integrate_depth` or `select_prior` gave.
         mode: see above.
         mono_m: D̂, for `combined`; may be None for a prior of LiDAR alone.
         constant_m: metres.
-        mono_relative_error: standard deviation of d̂ as a part of d̂.
-        floor_m: metres; about what LiDAR, its calibration and its alignment leave.
 
     Returns:
         Metres, positive where there is a prior and 0 where there is none.
@@ -401,10 +399,8 @@ def sigma_m(
             monocular share.
 
     """
-    _check_choice("sigma mode", mode, SigmaMode)
+    check_choice("sigma mode", mode, SigmaMode)
     _check_number("constant_m", constant_m, 1e-3)
-    _check_number("mono_relative_error", mono_relative_error, 0.0)
-    _check_number("floor_m", floor_m, 1e-3)
     distance = prior.distance_m
     exists = distance > 0
     if mode == "constant":
@@ -416,6 +412,6 @@ def sigma_m(
             mono_m = torch.zeros_like(distance)
         _check_maps("sigma_m", mono_m=mono_m, distance_m=distance)
         # d̂ may be NaN where there is no prior
-        mono_error = torch.where(exists, mono_m.detach(), 0) * prior.mono_share * mono_relative_error
-        sigma = (prior.spread_m.square() + mono_error.square() + floor_m**2).sqrt()
+        mono_error = torch.where(exists, mono_m.detach(), 0) * prior.mono_share * MONO_RELATIVE_ERROR
+        sigma = (prior.spread_m.square() + mono_error.square() + FLOOR_M**2).sqrt()
     return torch.where(exists, sigma, 0)

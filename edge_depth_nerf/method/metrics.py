@@ -174,10 +174,7 @@ class DepthErrors:
         self._close = 0
 
     def update(
-        self,
-        pred_distance_m: Float[Tensor, "h w"],
-        true_distance_m: Float[Tensor, "h w"],
-        mask: Bool[Tensor, "h w"],
+        self, pred_distance_m: Float[Tensor, "h w"], true_distance_m: Float[Tensor, "h w"], mask: Bool[Tensor, "h w"]
     ) -> None:
         """Add a picture; one without any judged pixel adds nothing.
 

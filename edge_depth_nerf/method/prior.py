@@ -15,7 +15,7 @@ import math
 from collections.abc import Container, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 import torch
@@ -23,7 +23,6 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from numpy.typing import NDArray
 
 from edge_depth_nerf.base.checked_cache import content_of, keep_last, used, write_checked
-from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.masks.sky import regions_like_sky
@@ -35,6 +34,7 @@ from edge_depth_nerf.method.integration import (
     MOTION_RELATIVE_ERROR,
     IntegrationOptions,
     SigmaMode,
+    check_choice,
     join_estimates,
     select_prior,
     sigma_m,
@@ -102,10 +102,8 @@ class PriorOptions:
     """Eq. 5-7 and their variants; the default is what measures best (docs/prior.md)."""
 
     def __post_init__(self) -> None:
-        for name, choices in (("align", Align), ("sigma_mode", PriorSigma)):
-            value, allowed = getattr(self, name), get_args(choices)
-            if value not in allowed:
-                raise InputError(f"{name} is {value!r}; expected one of {', '.join(map(repr, allowed))}.")
+        check_choice("align", self.align, Align)
+        check_choice("sigma_mode", self.sigma_mode, PriorSigma)
 
     def wants_trust(self, depth_source: str) -> bool:
         """Whether a calibration of the drive has a part in the prior made of a source."""
@@ -428,12 +426,7 @@ class PriorCache:
         }
         self._options_key = json.dumps(described, sort_keys=True).encode()
 
-    def prior(
-        self,
-        maps: Maps,
-        mask: NDArray[np.bool_],
-        view: RayAngles | None = None,
-    ) -> Prior:
+    def prior(self, maps: Maps, mask: NDArray[np.bool_], view: RayAngles | None = None) -> Prior:
         """As `make_prior`, from the cache where it is there."""
         angles = (view.theta_rad, view.elevation_rad) if view is not None else ()
         of_sources = [pixels for _, pixels in sorted(maps.items())]

@@ -76,8 +76,7 @@ def base_config(method_name: str) -> TrainerConfig:
         # nerfstudio's default is cuda, also where there is none
         machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
         pipeline=EdgeDepthPipelineConfig(
-            datamanager=FisheyeDepthDataManagerConfig(),
-            model=EdgeDepthNerfModelConfig(eval_num_rays_per_chunk=1 << 15),
+            datamanager=FisheyeDepthDataManagerConfig(), model=EdgeDepthNerfModelConfig(eval_num_rays_per_chunk=1 << 15)
         ),
         optimizers={name: optimiser() for name in ("proposal_networks", "fields", "camera_opt")},
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15, websocket_host="127.0.0.1"),

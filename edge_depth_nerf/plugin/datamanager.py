@@ -302,7 +302,7 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         elif self.config.depth_source == "auto" and source == "lidar":
             CONSOLE.log(
                 f"[yellow]Depth prior: LiDAR alone, because the scene has no monocular maps, or not all of them. To "
-                f"make them, run `edge-depth-nerf estimate-depth {escape(str(self.config.dataparser.data))}`.",
+                f"make them, run `edge-depth-nerf estimate-depth {escape(str(self.config.dataparser.data))}`."
             )
         return PriorRecipe(source, options, trust)
 

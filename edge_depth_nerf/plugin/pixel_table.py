@@ -37,14 +37,7 @@ BUCKET_BYTES = 64 << 20
 MOST_BUCKETS = 128
 """Open at a time; a process may have 256 files or more."""
 RECORD = np.dtype(
-    [
-        ("rgb", "u1", 3),
-        ("distance", "<u2"),
-        ("sigma", "<u2"),
-        ("picture", "<u4"),
-        ("row", "<u2"),
-        ("column", "<u2"),
-    ]
+    [("rgb", "u1", 3), ("distance", "<u2"), ("sigma", "<u2"), ("picture", "<u4"), ("row", "<u2"), ("column", "<u2")]
 )
 """One pixel, packed."""
 SKY = 65535

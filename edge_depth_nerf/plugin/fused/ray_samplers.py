@@ -11,11 +11,7 @@ from typing import Any
 import torch
 from jaxtyping import Float, Int
 from nerfstudio.cameras.rays import Frustums, RayBundle, RaySamples
-from nerfstudio.model_components.ray_samplers import (
-    PDFSampler,
-    ProposalNetworkSampler,
-    UniformLinDispPiecewiseSampler,
-)
+from nerfstudio.model_components.ray_samplers import PDFSampler, ProposalNetworkSampler, UniformLinDispPiecewiseSampler
 from torch import Tensor
 
 from edge_depth_nerf.kernels.functions import DISTANCES, PLACE_SAMPLES, POSITIONS, WEIGHTS
@@ -202,10 +198,7 @@ def rays_of(
 
 
 def samples_along(
-    rays: RayBundle,
-    starts: Float[Tensor, "*rays samples 1"],
-    ends: Float[Tensor, "*rays samples 1"],
-    **more: Any,
+    rays: RayBundle, starts: Float[Tensor, "*rays samples 1"], ends: Float[Tensor, "*rays samples 1"], **more: Any
 ) -> RaySamples:
     """Make samples in the fused form, as `RayBundle.get_ray_samples` makes nerfstudio's.
 

@@ -1,0 +1,68 @@
+"""Gradients of kernels that are differentiated once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+class _Sloped(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, followed: Tensor, compute: Callable[[bool], tuple[Tensor, Tensor]], divisor: int) -> Tensor:
+        loss, slopes = compute(ctx.needs_input_grad[0])
+        if ctx.needs_input_grad[0]:
+            ctx.save_for_backward(slopes)
+            ctx.divisor = divisor
+        return loss
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
+        gradient = gradients[0] if ctx.divisor == 1 else gradients[0] / ctx.divisor
+        return ctx.saved_tensors[0] * gradient.reshape(-1, 1), None, None
+
+
+def sloped(followed: Tensor, compute: Callable[[bool], tuple[Tensor, Tensor]], divisor: int = 1) -> Tensor:
+    """Make a loss differentiable once by one matrix, with the gradient that its kernel gives beside it.
+
+    Args:
+        followed: the matrix, [rays, n].
+        compute: gives the loss, a number or one for each ray, and its slope at each number of the matrix times
+            `divisor`. Its argument says whether slopes are asked for.
+        divisor: of the slopes.
+
+    """
+    loss = _Sloped.apply(followed, compute, divisor)
+    assert isinstance(loss, Tensor)
+    return loss
+
+
+class _Once(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, kernel: str, compute: Callable[[], tuple[Tensor | None, ...]], *_: Tensor | None
+    ) -> tuple[Tensor | None, ...]:
+        ctx.kernel = kernel
+        return compute()
+
+    @staticmethod
+    def backward(ctx: Any, *_: Any) -> Any:
+        raise NotImplementedError(
+            f"{ctx.kernel} has no second derivative. For a loss on gradients (normals that are trained by "
+            "differentiating the density, say) choose --pipeline.model.implementation torch."
+        )
+
+
+def once(kernel: str, compute: Callable[[], tuple[Tensor | None, ...]], *made_of: Tensor | None) -> Any:
+    """Give gradients that refuse to be differentiated once more.
+
+    Args:
+        kernel: as an error names it.
+        compute: gives the gradients.
+        made_of: tensors that they are computed from.
+
+    """
+    return _Once.apply(kernel, compute, *made_of)
