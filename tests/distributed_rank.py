@@ -56,7 +56,7 @@ def main() -> None:
     barrier = dist.barrier
     dist.barrier = lambda device_ids=None: barrier()
     made: dict[str, int] = {}
-    counted(datamanager.PixelTableWriter, "finish", made)
+    counted(datamanager, "write_table", made)
     counted(ray_table, "_make", made)
     barrier()
     trainer = trainer_of(

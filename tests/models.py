@@ -1,11 +1,14 @@
-"""Small models for tests."""
+"""Small models for tests, and what they are trained with."""
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import torch
+from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.data.scene_box import SceneBox
 
@@ -29,3 +32,45 @@ def build(**options) -> EdgeDepthNerfModel:
     config = replace(config, camera_optimizer=camera_optimizer, **options)
     box = SceneBox(aabb=torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
     return config.setup(scene_box=box, num_train_data=3, metadata={"metres_per_unit": 20.0}, device="cpu")
+
+
+def pipeline_config(scene: Path, poses: str = "off", **model: Any) -> Any:
+    """edge-depth-nerf-lite's pipeline of a scene, small, with other options of the model."""
+    config = deepcopy(all_methods["edge-depth-nerf-lite"].pipeline)
+    config.datamanager.data = scene
+    shrink(config.model, 2, 8)
+    config.model.camera_optimizer.mode = poses
+    for name, value in model.items():
+        setattr(config.model, name, value)
+    return config
+
+
+def pipeline_of(scene: Path, test_mode: str = "val", **options: Any) -> Any:
+    """The same, set up."""
+    return pipeline_config(scene, **options).setup(device="cpu", test_mode=test_mode)
+
+
+def bundle(count: int = 40, seed: int = 1, planes: bool = False) -> RayBundle:
+    """Rays of three pictures, with near and far planes of their own or without."""
+    generator = torch.Generator().manual_seed(seed)
+    return RayBundle(
+        origins=torch.rand(count, 3, generator=generator) - 0.5,
+        directions=torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1),
+        pixel_area=torch.full((count, 1), 1e-4),
+        camera_indices=torch.arange(count)[:, None] % 3,
+        nears=torch.full((count, 1), 0.01) if planes else None,
+        fars=torch.full((count, 1), 50.0) if planes else None,
+    )
+
+
+def supervision(count: int, seed: int) -> dict[str, torch.Tensor]:
+    """What a batch holds beside its rays; a quarter of them without a prior, a seventh of sky."""
+    generator = torch.Generator().manual_seed(seed)
+    prior = 3 + 10 * torch.rand(count, 1, generator=generator)
+    prior[::4] = 0
+    return {
+        "image": torch.rand(count, 3, generator=generator),
+        "prior_distance_m": prior,
+        "prior_sigma_m": 0.1 * prior + 0.01,
+        "sky": (torch.arange(count) % 7 == 0)[:, None],
+    }

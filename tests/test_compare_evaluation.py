@@ -29,7 +29,7 @@ from edge_depth_nerf.plugin.config import make_specifications, read_method_file
 
 def test_evaluation_leaves_no_trace_in_a_training(tmp_path):
     pipeline, _ = build(write_scene(tmp_path), depth_loss="edge", num_proposal_samples_per_ray=(8, 8))
-    pipeline.datamanager.train_pixel_sampler.set_num_rays_per_batch(32)
+    pipeline.datamanager.train_pixel_sampler.num_rays_per_batch = 32
     start = deepcopy(pipeline.state_dict())
     chosen = choose_pixels(pipeline.datamanager.eval_dataset)
     trained_on = choose_pixels(pipeline.datamanager.train_dataset)

@@ -16,8 +16,7 @@ from edge_depth_nerf.method.depth_losses import EdgeLoss
 from edge_depth_nerf.method.integration import IntegrationOptions
 from edge_depth_nerf.method.prior import PriorOptions
 from edge_depth_nerf.plugin import config
-from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
-from edge_depth_nerf.plugin.scale import LARGEST_METRES_PER_UNIT
+from edge_depth_nerf.plugin.dataparser import LARGEST_METRES_PER_UNIT, FisheyeDepthDataParserConfig
 
 ROOT = Path(__file__).parents[1]
 DECLARED = config.read_method_file()

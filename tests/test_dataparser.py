@@ -10,9 +10,8 @@ from scenes import fisheye, pinhole, write_scene
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json, write_distance_png, write_json, write_mask, write_png
 from edge_depth_nerf.cameras import Pinhole
-from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
+from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig, default_metres_per_unit
 from edge_depth_nerf.plugin.dataset import FisheyeDepthDataset
-from edge_depth_nerf.plugin.scale import default_metres_per_unit
 
 
 def parse(folder, split="train", **options):

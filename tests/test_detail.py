@@ -7,8 +7,7 @@ from copy import deepcopy
 import numpy as np
 import pytest
 import torch
-from models import shrink
-from nerfstudio.configs.method_configs import all_methods
+from models import pipeline_of
 from nerfstudio.model_components.renderers import background_color_override_context
 from scenes import RADIUS_M, fisheye, pinhole, view, write_scene
 
@@ -165,16 +164,6 @@ def test_a_picture_that_is_its_rendering_exposed_shows_nothing_beyond():
 # ---- in the model ---------------------------------------------------------------------------------------------------
 
 
-def build(scene, poses="off", **model):
-    config = deepcopy(all_methods["edge-depth-nerf-lite"].pipeline)
-    config.datamanager.data = scene
-    shrink(config.model, 2, 8)
-    config.model.camera_optimizer.mode = poses
-    for name, value in model.items():
-        setattr(config.model, name, value)
-    return config.setup(device="cpu", test_mode="val")
-
-
 def grey_ball(pipeline, monkeypatch):
     """Let a model render the scene's ball in grey, at its true distance; give the numbers of rays that it rendered."""
     model, dataset, rendered = pipeline.model, pipeline.datamanager.train_dataset, []
@@ -215,7 +204,7 @@ def errors(pipeline, number: int = 0) -> tuple[float, float]:
 
 @pytest.mark.parametrize("lenses", LENSES)
 def test_a_grey_model_shows_the_colours_of_its_training_pictures(tmp_path, monkeypatch, lenses):
-    pipeline = build(write_scene(tmp_path, LENSES[lenses], frames=17))
+    pipeline = pipeline_of(write_scene(tmp_path, LENSES[lenses], frames=17))
     grey_ball(pipeline, monkeypatch)
     before, after = errors(pipeline)
     assert before > 0.15 and after < 0.25 * before
@@ -224,7 +213,7 @@ def test_a_grey_model_shows_the_colours_of_its_training_pictures(tmp_path, monke
 def test_the_option_shows_it_and_is_off_by_default(tmp_path, monkeypatch):
     scene = write_scene(tmp_path)
     for option in (False, True):
-        pipeline = build(scene, detail=True) if option else build(scene)
+        pipeline = pipeline_of(scene, detail=True) if option else pipeline_of(scene)
         grey_ball(pipeline, monkeypatch)
         assert pipeline.model.config.detail is option and pipeline.detail.is_shown is option
         camera = pipeline.datamanager.eval_dataset.cameras[:1]
@@ -238,7 +227,7 @@ def test_the_option_shows_it_and_is_off_by_default(tmp_path, monkeypatch):
 
 
 def test_training_never_shows_it_and_cut_views_do_not(tmp_path, monkeypatch):
-    pipeline = build(write_scene(tmp_path), detail=True)
+    pipeline = pipeline_of(write_scene(tmp_path), detail=True)
     rendered = grey_ball(pipeline, monkeypatch)
     model, camera = pipeline.model, pipeline.datamanager.eval_dataset.cameras[:1]
     model.train()
@@ -249,7 +238,7 @@ def test_training_never_shows_it_and_cut_views_do_not(tmp_path, monkeypatch):
 
 
 def test_training_pictures_are_rendered_once_until_the_model_changes(tmp_path, monkeypatch):
-    pipeline = build(write_scene(tmp_path))
+    pipeline = pipeline_of(write_scene(tmp_path))
     trained_step = pipeline.get_train_loss_dict
     state = deepcopy(pipeline.state_dict())
     original = pipeline.model.forward
@@ -275,7 +264,7 @@ def test_training_pictures_are_rendered_once_until_the_model_changes(tmp_path, m
 
 
 def test_few_are_kept_where_pictures_are_large(tmp_path, monkeypatch):
-    pipeline = build(write_scene(tmp_path))
+    pipeline = pipeline_of(write_scene(tmp_path))
     dataset = pipeline.datamanager.train_dataset
     assert TrainingDetail(pipeline.model, dataset).kept == plugin_detail.MOST_BYTES // (8 * 28 * 32)
     monkeypatch.setattr(plugin_detail, "MOST_BYTES", 1)
@@ -288,7 +277,7 @@ def test_few_are_kept_where_pictures_are_large(tmp_path, monkeypatch):
 
 
 def test_detail_is_without_the_pictures_exposure(tmp_path, monkeypatch):
-    pipeline = build(write_scene(tmp_path))
+    pipeline = pipeline_of(write_scene(tmp_path))
     grey_ball(pipeline, monkeypatch)
     straight = errors(pipeline)[1]
     gains = pipeline.model.exposure.log_gains
@@ -304,7 +293,7 @@ def test_detail_is_without_the_pictures_exposure(tmp_path, monkeypatch):
 
 
 def test_overexposed_pixels_do_not_darken_what_is_bright(tmp_path, monkeypatch):
-    pipeline = build(write_scene(tmp_path))
+    pipeline = pipeline_of(write_scene(tmp_path))
     grey_ball(pipeline, monkeypatch)
     dataset, gains = pipeline.datamanager.train_dataset, pipeline.model.exposure.log_gains
     gains.data[0] = 1.5
@@ -324,7 +313,7 @@ def test_overexposed_pixels_do_not_darken_what_is_bright(tmp_path, monkeypatch):
 
 def test_detail_is_seen_from_where_training_has_moved_the_cameras(tmp_path, monkeypatch):
     scene = write_scene(tmp_path)
-    right = build(scene)
+    right = pipeline_of(scene)
     grey_ball(right, monkeypatch)
     straight = errors(right)[1]
     meta = read_json(scene / "transforms.json")
@@ -335,7 +324,7 @@ def test_detail_is_seen_from_where_training_has_moved_the_cameras(tmp_path, monk
     for frame in meta["frames"]:
         frame["transform_matrix"][1][3] += 0.8 * moved.get(frame["file_path"], 0.0)
     write_json(scene / "transforms.json", meta)
-    wrong = build(scene, poses="SO3xR3")
+    wrong = pipeline_of(scene, poses="SO3xR3")
     grey_ball(wrong, monkeypatch)
     assert errors(wrong)[1] > 1.3 * straight
     optimizer = wrong.model.camera_optimizer
@@ -350,7 +339,9 @@ def test_detail_is_seen_from_where_training_has_moved_the_cameras(tmp_path, monk
 
 @pytest.mark.parametrize("implementation", ["fused", "torch"])
 def test_with_an_embedding_a_picture_is_rendered_as_it_looks(tmp_path, implementation):
-    pipeline = build(write_scene(tmp_path), exposure="embedding", depth_loss="none", implementation=implementation)
+    pipeline = pipeline_of(
+        write_scene(tmp_path), exposure="embedding", depth_loss="none", implementation=implementation
+    )
     model, camera = pipeline.model, pipeline.datamanager.train_dataset.cameras[:1]
     with torch.no_grad():
         model.field.embedding_appearance.embedding.weight.normal_(0, 20.0)
@@ -381,7 +372,7 @@ def test_views_are_evaluated_with_detail_beside_those_without(tmp_path, monkeypa
     files = {key: held_out[key] for key in ("truth_rgb_file_path", "truth_distance_file_path")}
     meta["shifted_views"] = {"1": [{"camera": "only", "transform_matrix": held_out["transform_matrix"], **files}]}
     write_json(scene / "transforms.json", meta)
-    pipeline = build(scene)
+    pipeline = pipeline_of(scene)
     grey_ball(pipeline, monkeypatch)
     told: list[int] = []
     evaluator = ViewEvaluator(pipeline, lambda: told.append(1))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import subprocess
 import sys
@@ -10,7 +11,7 @@ from typing import Any
 
 import pytest
 import torch
-from models import build
+from models import build, bundle, supervision
 from nerfstudio.cameras.rays import Frustums, RayBundle, RaySamples
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.field_components.encodings import HashEncoding
@@ -67,16 +68,18 @@ def straight(x: torch.Tensor, weights: list[torch.Tensor], biases: list[torch.Te
     return x
 
 
-@pytest.mark.parametrize("threads", [1, 2])
-@pytest.mark.parametrize("widths", [(16, 64, 16), (15, 64, 64, 3), (10, 16, 1), (4, 2)], ids=str)
-@pytest.mark.parametrize("groups", [0, 1, 25, 600])
-def test_the_network_in_tiles(widths, groups, threads):
+NETWORKS = list(itertools.product([600], [(16, 64, 16), (15, 64, 64, 3), (10, 16, 1), (4, 2)], [0, 1, 25, 600], [1, 2]))
+NOT_FULL = [(points, (5, 33, 7), 0, 1) for points in (1, 63, 64, 95, 96, 97, 129)]
+
+
+@pytest.mark.parametrize(("points", "widths", "groups", "threads"), [*NETWORKS, *NOT_FULL], ids=str)
+def test_the_network_in_tiles(points, widths, groups, threads):
     torch.manual_seed(0)
     torch.set_num_threads(threads)
     weights, biases = layers(*widths)
     if groups:
         biases[0] = torch.randn(groups, widths[1], requires_grad=True)
-    x = torch.randn(600, 20)[:, 1 : widths[0] + 1].requires_grad_()
+    x = torch.randn(points, 20)[:, 1 : widths[0] + 1].requires_grad_()
     leaves = [x, *weights, *biases]
     found = network(x, weights, biases)
     gradient = torch.randn(found.shape)
@@ -94,22 +97,6 @@ def test_the_network_in_tiles(widths, groups, threads):
     torch.testing.assert_close(by_layer.double(), expected, rtol=1e-5, atol=1e-4)
     for each, other in zip(torch.autograd.grad(by_layer, leaves, gradient), gradients, strict=True):
         torch.testing.assert_close(each, other, rtol=1e-4, atol=1e-5 * float(other.abs().max()))
-
-
-@pytest.mark.parametrize("points", [1, 63, 64, 129])
-def test_tiles_that_are_not_full(points):
-    torch.manual_seed(1)
-    weights, biases = layers(5, 33, 7)
-    x = torch.randn(points, 5, requires_grad=True)
-    found = network(x, weights, biases)
-    expected = straight(x.double(), [each.double() for each in weights], [each.double() for each in biases])
-    torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=1e-4)
-    for slope, exact in zip(
-        torch.autograd.grad(found.sum(), [x, *weights, *biases]),
-        torch.autograd.grad(expected.sum(), [x, *weights, *biases]),
-        strict=True,
-    ):
-        torch.testing.assert_close(slope, exact, rtol=1e-4, atol=1e-5 * float(exact.abs().max()))
 
 
 NARROW = """
@@ -188,19 +175,6 @@ def test_the_contraction_is_nerfactos():
     places, marked = contract(x)
     assert torch.equal(marked, inside.float())
     assert torch.equal(places, expected * inside[:, None])
-
-
-def bundle(count: int = 40, seed: int = 1, planes: bool = False) -> RayBundle:
-    """Rays, with near and far planes of their own or without."""
-    generator = torch.Generator().manual_seed(seed)
-    return RayBundle(
-        origins=torch.rand(count, 3, generator=generator) - 0.5,
-        directions=torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1),
-        pixel_area=torch.full((count, 1), 1e-4),
-        camera_indices=torch.arange(count)[:, None] % 3,
-        nears=torch.full((count, 1), 0.01) if planes else None,
-        fars=torch.full((count, 1), 50.0) if planes else None,
-    )
 
 
 @pytest.mark.parametrize("training", [True, False])
@@ -320,30 +294,21 @@ def histograms(seed: int = 0, rays: int = 50) -> tuple[torch.Tensor, ...]:
     )
 
 
-def test_the_proposal_loss_is_nerfstudios():
-    edges, weights, outer_edges, outer = histograms()
-    outers = [outer.clone().requires_grad_() for _ in range(2)]
-    expected = lossfun_outer(edges, weights, outer_edges, outers[0]).mean()
-    found = interlevel_loss(edges, weights, outer_edges, outers[1])
-    assert float(found) == pytest.approx(float(expected), rel=1e-5)
-    assert expected > 0
-    expected.backward()
-    found.backward()
-    assert outers[0].grad is not None and outers[1].grad is not None
-    torch.testing.assert_close(outers[1].grad, outers[0].grad, rtol=1e-4, atol=1e-7)
-    assert not interlevel_loss(edges, weights, outer_edges, outer).requires_grad
-
-
-def test_the_distortion_loss_is_nerfstudios():
-    edges, weights, _, _ = histograms()
+@pytest.mark.parametrize(
+    ("form", "of_nerfstudio"), [(interlevel_loss, lossfun_outer), (distortion_loss, lossfun_distortion)]
+)
+def test_the_losses_of_samples_are_nerfstudios(form, of_nerfstudio):
+    """The one by the weights of proposals, the other by those of the samples."""
+    *given, outer = histograms()
+    given, weights = (given, outer) if form is interlevel_loss else (given[:1], given[1])
     both = [weights.clone().requires_grad_() for _ in range(2)]
-    expected = lossfun_distortion(edges, both[0]).mean()
-    found = distortion_loss(edges, both[1])
-    assert float(found) == pytest.approx(float(expected), rel=1e-5)
+    expected, found = of_nerfstudio(*given, both[0]).mean(), form(*given, both[1])
+    assert float(found) == pytest.approx(float(expected), rel=1e-5) and expected > 0
     expected.backward()
     found.backward()
     assert both[0].grad is not None and both[1].grad is not None
     torch.testing.assert_close(both[1].grad, both[0].grad, rtol=1e-4, atol=1e-7)
+    assert not form(*given, weights).requires_grad
 
 
 def train(model: EdgeDepthNerfModel, optimiser: AdamOptimizerConfig, steps: int) -> list[dict[str, float]]:
@@ -352,16 +317,7 @@ def train(model: EdgeDepthNerfModel, optimiser: AdamOptimizerConfig, steps: int)
     steps_of = optimiser.setup([p for group in model.get_param_groups().values() for p in group])
     history = []
     for step in range(steps):
-        rays = bundle(64, seed=step)
-        generator = torch.Generator().manual_seed(step)
-        prior = 3 + 10 * torch.rand(64, 1, generator=generator)
-        prior[::4] = 0
-        batch = {
-            "image": torch.rand(64, 3, generator=generator),
-            "prior_distance_m": prior,
-            "prior_sigma_m": 0.1 * prior + 0.01,
-            "sky": (torch.arange(len(prior)) % 7 == 0)[:, None],
-        }
+        rays, batch = bundle(64, seed=step), supervision(64, step)
         torch.manual_seed(step)
         outputs = model(rays)
         losses = model.get_loss_dict(outputs, batch, model.get_metrics_dict(outputs, batch))

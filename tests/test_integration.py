@@ -56,6 +56,13 @@ def assert_same(a: IntegratedDepth, b: IntegratedDepth, atol: float = 1e-5) -> N
         torch.testing.assert_close(getattr(a, field.name), getattr(b, field.name), rtol=0, atol=atol, msg=field.name)
 
 
+def assert_twin(result: IntegratedDepth, twin: tuple[np.ndarray, ...], atol: float) -> None:
+    np.testing.assert_allclose(result.distance_m, twin[0], rtol=0, atol=atol)
+    # a root near 0 has half the digits; the sums' x is at most some 80 m
+    np.testing.assert_allclose(result.spread_m**2, twin[1] ** 2, rtol=1e-5, atol=atol)
+    np.testing.assert_allclose(result.mono_share, twin[2], rtol=0, atol=atol / 10)
+
+
 CHOICES = list(
     itertools.product(["edge-aware", "spatial-gaussian"], ["pooled", "per-source"], [False, True], [0.7, 0.0, 1.0])
 )
@@ -67,16 +74,10 @@ def test_equals_twin(kind, normalise, keep_returns, alpha, dtype):
     options = IntegrationOptions(alpha=alpha, kernel=kind, normalise=normalise, keep_returns=keep_returns)
     lidar, mono, valid = random_maps(CHOICES.index((kind, normalise, keep_returns, alpha)), dtype=dtype)
     result = integrate_depth(lidar, mono, valid, options)
-    distance, spread, share = reference.integrate_depth(
-        lidar.numpy(), mono.numpy(), valid.numpy(), **dataclasses.asdict(options)
-    )
+    twin = reference.integrate_depth(lidar.numpy(), mono.numpy(), valid.numpy(), **dataclasses.asdict(options))
     assert result.distance_m.dtype == dtype
-    atol = 1e-4 if dtype == torch.float32 else 1e-9
-    np.testing.assert_allclose(result.distance_m, distance, rtol=0, atol=atol)
-    # a root near 0 has half the digits; the sums' x is at most some 80 m
-    np.testing.assert_allclose(result.spread_m**2, spread**2, rtol=1e-5, atol=atol)
-    np.testing.assert_allclose(result.mono_share, share, rtol=0, atol=atol / 10)
-    assert 0 < (distance > 0).mean() < 1
+    assert_twin(result, twin, 1e-4 if dtype == torch.float32 else 1e-9)
+    assert 0 < (twin[0] > 0).mean() < 1
 
 
 @pytest.mark.parametrize(
@@ -98,9 +99,7 @@ def test_equals_twin_with_other_kernels(fields):
     lidar, mono, valid = random_maps(5)
     result = integrate_depth(lidar, mono, valid, IntegrationOptions(**fields))
     twin = reference.integrate_depth(lidar.numpy(), mono.numpy(), valid.numpy(), **fields)
-    np.testing.assert_allclose(result.distance_m, twin[0], rtol=0, atol=1e-4)
-    np.testing.assert_allclose(result.spread_m**2, twin[1] ** 2, rtol=1e-5, atol=1e-4)
-    np.testing.assert_allclose(result.mono_share, twin[2], rtol=0, atol=1e-5)
+    assert_twin(result, twin, 1e-4)
 
 
 def test_one_return_by_hand():
@@ -338,8 +337,7 @@ def test_wide_maps_equal_twin(width, normalise):
     fields = {"kernel_size": 5, "normalise": normalise}
     result = integrate_depth(lidar, mono, valid, IntegrationOptions(**fields))
     twin = reference.integrate_depth(lidar.numpy(), mono.numpy(), valid.numpy(), **fields)
-    np.testing.assert_allclose(result.distance_m, twin[0], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(result.mono_share, twin[2], rtol=0, atol=1e-9)
+    assert_twin(result, twin, 1e-9)
 
 
 def test_distance_factor_is_exact_down_to_the_smallest():
@@ -456,9 +454,8 @@ def test_a_missing_source_is_named(source, missing):
 
 
 def test_sigma_by_hand():
-    prior = IntegratedDepth(
-        torch.tensor([[0.0, 10.0, 14.0]]), torch.tensor([[0.0, 0.3, 0.01]]), torch.tensor([[0.0, 0.5, 1.0]])
-    )
+    maps = [0.0, 10.0, 14.0], [0.0, 0.3, 0.01], [0.0, 0.5, 1.0]
+    prior = IntegratedDepth(*(torch.tensor([row]) for row in maps))
     mono = torch.tensor([[float("nan"), 12.0, 14.0]])
     # σ̂² = spread² + (0.1 · d̂ · share)² + 0.05²
     #   0.09 + (0.1 · 12 · 0.5)² + 0.0025   = 0.4525    root 0.672681
@@ -509,8 +506,7 @@ def test_three_sources_equal_their_twin(fields, weight):
     twin = reference.integrate_depth(
         lidar.numpy(), mono.numpy(), valid.numpy(), **fields, motion_m=motion.numpy(), motion_weight=weight
     )
-    np.testing.assert_allclose(result.distance_m, twin[0], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(result.mono_share, twin[2], rtol=0, atol=1e-9)
+    assert_twin(result, twin, 1e-9)
     two = integrate_depth(lidar, mono, valid, IntegrationOptions(**fields))
     assert (result.distance_m > 0).sum() > (two.distance_m > 0).sum()  # motion fills holes of mono
     assert not torch.equal(torch.where(two.distance_m > 0, result.distance_m, 0), two.distance_m)

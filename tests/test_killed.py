@@ -418,7 +418,7 @@ def test_no_room_for_the_table_of_pixels(tmp_path: Path, monkeypatch: pytest.Mon
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(datamanager.PixelTableWriter, "add", full)
+    monkeypatch.setattr(datamanager, "write_table", full)
     config = FisheyeDepthDataManagerConfig(dataparser=FisheyeDepthDataParserConfig(data=scene))
     with pytest.raises(InputError, match=r"pixels: the table of pixels cannot be written \(No space.*cache-dir"):
         config.setup(test_mode="val")

@@ -4,9 +4,8 @@ from typing import Any
 
 import pytest
 import torch
+from models import build
 from nerfstudio.cameras.rays import Frustums, RayBundle, RaySamples
-from nerfstudio.configs.method_configs import all_methods
-from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.model_components.losses import ds_nerf_depth_loss, urban_radiance_field_depth_loss
@@ -22,21 +21,13 @@ from edge_depth_nerf.method.depth_losses import (
 )
 from edge_depth_nerf.method.losses import edge_loss, urban_nerf_loss
 from edge_depth_nerf.plugin.compat import lpips_not_built
-from edge_depth_nerf.plugin.model import EdgeDepthNerfModel, LossOptions
+from edge_depth_nerf.plugin.model import LossOptions
 from edge_depth_nerf.plugin.renderers import DepthInEvaluation
 from edge_depth_nerf.plugin.step_losses import Planes, Step, draw_surface_m
 
 METRES_PER_UNIT = 20.0
 LOSSES = {name: f"{name.replace('-', '_')}_loss" for name in ("edge", "ds-nerf", "urban-nerf", "urban-nerf-los")}
 NO_EXTRAS = {"sky_loss_mult": 0.0, "sky_background": False, "surface_loss_mult": 0.0, "depth_loss_final": 1.0}
-
-
-def build(**options) -> EdgeDepthNerfModel:
-    torch.manual_seed(0)
-    config = replace(all_methods["edge-depth-nerf-lite"].pipeline.model, **options)
-    box = SceneBox(aabb=torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
-    model = config.setup(scene_box=box, num_train_data=3, metadata={"metres_per_unit": METRES_PER_UNIT}, device="cpu")
-    return model
 
 
 def rays(count=16) -> RayBundle:

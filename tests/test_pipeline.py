@@ -1,42 +1,31 @@
-from copy import deepcopy
-
 import numpy as np
 import pytest
 import torch
-from models import shrink
-from nerfstudio.configs.method_configs import all_methods
+from models import pipeline_config, pipeline_of
 from scenes import write_scene
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.plugin.pipeline import NotFiniteError
 
 
-def build(scene, **model):
-    config = deepcopy(all_methods["edge-depth-nerf-lite"].pipeline)
-    config.datamanager.data = scene
-    shrink(config.model, 2, 8)
-    for name, value in model.items():
-        setattr(config.model, name, value)
-    return config.setup(device="cpu", test_mode="val"), config
-
-
 def test_a_depth_loss_without_any_prior_is_an_error(tmp_path):
     scene = write_scene(tmp_path, lidar=False, mono=False)
     with pytest.raises(InputError, match=r"no training pixel has a depth prior.*estimate-depth.*depth-loss none"):
-        build(scene)
-    pipeline, _ = build(scene, depth_loss="none")
+        pipeline_of(scene)
+    pipeline = pipeline_of(scene, depth_loss="none")
     assert np.isfinite(float(pipeline.get_train_loss_dict(0)[1]["rgb_loss"].detach()))
 
 
 def test_nothing_is_integrated_for_a_model_without_depth_loss(tmp_path, monkeypatch):
     monkeypatch.setattr("edge_depth_nerf.plugin.datamanager.PriorCache", lambda *_: pytest.fail("integrated"))
-    pipeline, config = build(write_scene(tmp_path), depth_loss="none")
+    config = pipeline_config(write_scene(tmp_path), depth_loss="none")
+    pipeline = config.setup(device="cpu", test_mode="val")
     assert pipeline.datamanager.config.depth_source == "none"
     assert config.datamanager.depth_source == "auto"  # what the user gave is left as it was
 
 
 def test_depth_errors_are_pooled_and_every_figure_is_finite(tmp_path):
-    pipeline, _ = build(write_scene(tmp_path))
+    pipeline = pipeline_of(write_scene(tmp_path))
     for metrics in (
         pipeline.get_average_eval_image_metrics(get_std=True),
         pipeline.get_eval_image_metrics_and_images(0)[0],
@@ -47,7 +36,7 @@ def test_depth_errors_are_pooled_and_every_figure_is_finite(tmp_path):
 
 
 def test_a_checkpoint_of_tiny_cuda_nn_is_refused(tmp_path):
-    pipeline, _ = build(write_scene(tmp_path))
+    pipeline = pipeline_of(write_scene(tmp_path))
     state = pipeline.state_dict()
     assert any(name.endswith("hash_table") for name in state)
     pipeline.load_pipeline(state, 0)
@@ -65,7 +54,7 @@ def counted(pipeline, steps, odd):
 
 
 def test_on_a_gpu_several_losses_that_are_not_finite_end_a_training(tmp_path, capsys):
-    pipeline, _ = build(write_scene(tmp_path))
+    pipeline = pipeline_of(write_scene(tmp_path))
     counted(pipeline, (1, 2, 50), {1, 50})
     assert "In 2 of the last 50 steps a loss was not finite" in " ".join(capsys.readouterr().out.split())
     counted(pipeline, (99, 100), set())  # counted anew

@@ -7,7 +7,7 @@ import torch
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json, write_json
 from edge_depth_nerf.plugin import pixel_table
-from edge_depth_nerf.plugin.pixel_table import RECORD, PicturePixels, PixelTable, PixelTableWriter, decode, to_steps
+from edge_depth_nerf.plugin.pixel_table import RECORD, PicturePixels, PixelTable, decode, to_steps, write_table
 
 
 def picture(height, width):
@@ -17,10 +17,9 @@ def picture(height, width):
 
 
 def table_of(path: Path, masks, priors=None, seed=0) -> PixelTable:
-    with PixelTableWriter(path, sum(mask.size for mask in masks), seed) as writer:
-        for number, mask in enumerate(masks):
-            writer.add(PicturePixels(picture(*mask.shape), mask, *(priors[number] if priors else ())))
-        writer.finish()
+    given = zip(masks, priors or [()] * len(masks), strict=True)
+    pictures = [PicturePixels(picture(*mask.shape), mask, *maps) for mask, maps in given]
+    write_table(path, sum(mask.size for mask in masks), pictures, seed)
     return PixelTable(path)
 
 
@@ -54,11 +53,16 @@ def test_every_valid_pixel_comes_once_with_its_own_prior(tmp_path, monkeypatch, 
 def test_only_so_many_files_are_open(tmp_path, monkeypatch):
     monkeypatch.setattr(pixel_table, "BUCKET_BYTES", 100)
     monkeypatch.setattr(pixel_table, "MOST_BUCKETS", 3)
-    with PixelTableWriter(tmp_path / "t.npy", 600) as writer:
-        assert len(writer._buckets) == 3
-        writer.add(PicturePixels(picture(20, 30), np.ones((20, 30), bool)))
-        writer.finish()
-    assert len({*map(tuple, PixelTable(tmp_path / "t.npy").batch(0, 600).indices.tolist())}) == 600
+    opened, made = [], pixel_table.tempfile.TemporaryFile
+
+    def making(**given):
+        opened.append(made(**given))
+        return opened[-1]
+
+    monkeypatch.setattr(pixel_table.tempfile, "TemporaryFile", making)
+    table = table_of(tmp_path / "t.npy", [np.ones((20, 30), bool)])
+    assert len(opened) == 3 and all(file.closed for file in opened)
+    assert len({*map(tuple, table.batch(0, 600).indices.tolist())}) == 600
 
 
 def test_after_the_last_pixel_comes_the_first(tmp_path):
@@ -144,10 +148,7 @@ def test_what_16_bits_cannot_hold_is_no_prior_and_no_sky(tmp_path):
     assert torch.equal(batch.prior_sigma_m[:, 0], torch.where((column == 0) | (column == 4), 65535 / 256, 0.0))
     assert table.share_with_prior == pytest.approx(2 / 7)
     # where the sky is known it stays known
-    with PixelTableWriter(tmp_path / "sky.npy", 7) as writer:
-        writer.add(PicturePixels(picture(1, 7), mask, distance, sigma, np.arange(7)[None] == 2))
-        writer.finish()
-    batch = PixelTable(tmp_path / "sky.npy").batch(0, 7)
+    batch = table_of(tmp_path / "sky.npy", [mask], [(distance, sigma, np.arange(7)[None] == 2)]).batch(0, 7)
     assert torch.equal(batch.sky[:, 0], batch.indices[:, 2] == 2)
 
 
@@ -175,19 +176,19 @@ def test_what_is_not_whole_does_not_open(tmp_path):
 
 
 def test_an_interrupted_writer_leaves_nothing(tmp_path):
-    with pytest.raises(KeyboardInterrupt), PixelTableWriter(tmp_path / "t.npy", 64) as writer:
-        writer.add(PicturePixels(picture(8, 8), np.ones((8, 8), bool)))
+    def pictures():
+        yield PicturePixels(picture(8, 8), np.ones((8, 8), bool))
         raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_table(tmp_path / "t.npy", 64, pictures())
     assert not list(tmp_path.iterdir())
 
 
 def test_the_sky_is_known_where_there_is_no_prior(tmp_path):
     distance, sky = np.zeros((6, 7), np.float32), np.zeros((6, 7), bool)
     distance[3:], sky[:4] = 5.0, True
-    with PixelTableWriter(tmp_path / "t.npy", 42) as writer:
-        writer.add(PicturePixels(picture(6, 7), np.ones((6, 7), bool), distance, distance / 10, sky))
-        writer.finish()
-    table = PixelTable(tmp_path / "t.npy")
+    table = table_of(tmp_path / "t.npy", [np.ones((6, 7), bool)], [(distance, distance / 10, sky)])
     batch = table.batch(0, 42)
     rows = batch.indices[:, 1]
     assert table.share_with_prior == 0.5

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from models import build
+from models import build, bundle
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.model_components import renderers
@@ -173,16 +173,6 @@ def test_a_density_that_is_not_a_number_weighs_nothing_and_shows():
     assert rendered.weights[1, 1:].tolist() == [0, 0] and rendered.weights[0].min() > 0
     rendered.rgb.sum().backward()
     assert values.grad is not None and values.grad[:, :3].isfinite().all() and values.grad[0, 3:6].isnan().any()
-
-
-def bundle(count: int = 40) -> RayBundle:
-    generator = torch.Generator().manual_seed(1)
-    return RayBundle(
-        origins=torch.rand(count, 3, generator=generator) - 0.5,
-        directions=torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1),
-        pixel_area=torch.full((count, 1), 1e-4),
-        camera_indices=torch.arange(count)[:, None] % 3,
-    )
 
 
 def outputs_both_ways(model: Any, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:

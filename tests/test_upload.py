@@ -54,7 +54,7 @@ def test_the_next_batch_is_read_before_it_is_asked_for(tables, monkeypatch):
     assert reads == [[0], [10], [20]]
     # the exporter asks for other numbers of rays
     uploads._reader = type(uploads._reader)(max_workers=1)
-    sampler.set_num_rays_per_batch(5)
+    sampler.num_rays_per_batch = 5
     assert torch.equal(indices(uploads.upload([sampler.draw()])), tables[0].batch(20, 5).indices)
     uploads._reader.shutdown(wait=True)
     assert reads == [[0], [10], [20], [20], [25]]

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import torch
 from browser import SOFTWARE_WEBGL
-from models import shrink
+from models import pipeline_of, shrink
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.viewer.render_state_machine import RenderAction, RenderStateMachine
@@ -41,15 +41,6 @@ pytestmark = pytest.mark.slow
 METHOD = "edge-depth-nerf-lite"
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 TIMEOUT_S = 120
-
-
-def pipeline_of(scene: Path, **model):
-    config = deepcopy(all_methods[METHOD].pipeline)
-    config.datamanager.data = scene
-    shrink(config.model, 2, 8)
-    for name, value in model.items():
-        setattr(config.model, name, value)
-    return config.setup(device="cpu", test_mode="test")
 
 
 def until(condition: Callable[[], bool], wait: Callable[[float], None] = time.sleep) -> None:
@@ -118,7 +109,7 @@ def scene(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def pipeline(scene):
-    return pipeline_of(scene)
+    return pipeline_of(scene, "test")
 
 
 def view_of(pipeline) -> Cameras:
@@ -189,7 +180,7 @@ def test_training_has_neither(pipeline):
 @pytest.mark.parametrize("implementation", ["fused", "torch"])
 def test_previews_of_any_size_are_whole(scene, kind, implementation):
     """An odd fisheye picture has its principal point on a pixel's centre, where nerfstudio's ray is 0/0."""
-    pipeline = pipeline_of(scene, implementation=implementation)
+    pipeline = pipeline_of(scene, "test", implementation=implementation)
     pipeline.eval()
     pose = view_of(pipeline).camera_to_worlds[0]
     camera = get_camera(CameraState(fov=1.5, aspect=1.0, c2w=pose, camera_type=kind), 9, 9)
@@ -251,7 +242,7 @@ def test_nerfstudio_finds_the_layers(pipeline):
 
 
 def test_what_is_not_there_cannot_be_switched_on(tmp_path):
-    pipeline = pipeline_of(write_scene(tmp_path, lidar=False, mono=False), depth_loss="none")
+    pipeline = pipeline_of(write_scene(tmp_path, lidar=False, mono=False), "test", depth_loss="none")
     switches = pipeline.drive.layers.switches
     assert {name: switch.disabled for name, switch in switches.items()} == {
         **{"lenses": False, "path": False, "lidar": True, "prior": True},
@@ -261,7 +252,7 @@ def test_what_is_not_there_cannot_be_switched_on(tmp_path):
 def test_nothing_is_made_without_a_viewer(scene, monkeypatch):
     for name in ("_lidar", "_prior", "_draw_lenses", "_draw_path"):
         monkeypatch.setattr(DriveLayers, name, lambda *_: pytest.fail("made"))
-    pipeline_of(scene)
+    pipeline_of(scene, "test")
 
 
 # ---- from coarse to fine ---------------------------------------------------------------------------------------------
@@ -363,7 +354,7 @@ def test_complete_pictures_alone_have_detail_and_none_during_a_training(machine,
 
 
 def test_the_switch_of_detail_begins_as_the_training_has_it(scene):
-    assert [pipeline_of(scene, detail=on).drive.layers.detail.value for on in (False, True)] == [False, True]
+    assert [pipeline_of(scene, "test", detail=on).drive.layers.detail.value for on in (False, True)] == [False, True]
 
 
 def test_a_movement_ends_a_fine_picture_and_no_other(machine):

@@ -1,8 +1,7 @@
-"""What the C library's allocator does with large tensors on the CPU.
+"""Makes the C library keep the memory of large tensors on the CPU for the next ones.
 
 By default glibc takes memory for each tensor above 32 MB from the system and gives it back when the tensor dies, many
-times a step: every page is cleared and mapped again each time. Kept, it is there for the next one after the first
-few steps.
+times a step, and the system clears every page each time.
 """
 
 from __future__ import annotations

@@ -1,15 +1,13 @@
 """The hash grid on the CPU: loops compiled by Numba, shared out to threads; meaning and shapes as in `hash_grid`.
 
-A level is worked on tile by tile: first the table rows and offsets of a whole tile, in a loop that the compiler turns
-into vector instructions. Then all its rows are called into the cache, so that the reads or additions, which follow, do
-not wait for memory one by one: half the time forward, two thirds backward. The kernels get the number of a row's
-features as the length of a tuple. To the compiler that is a constant, so it writes out the loops over them: a third
-less time. The encoding has the order of nerfstudio's torch form and no fused multiply-add: the same to the last bit.
+A level is worked on tile by tile. First the table rows and offsets of a whole tile are computed, in a loop of vector
+instructions. Then all its rows are called into the cache, so that the reads or additions do not wait for memory one by
+one: half the time forward, two thirds backward. The kernels get the number of a row's features as the length of a
+tuple, which is a constant to the compiler, so it writes out the loops over them: a third less time. The encoding has
+the order of nerfstudio's torch form and no fused multiply-add: the same to the last bit.
 
 Threads are Python's own: they wait for each other without spinning, and unlike Numba's they allow concurrent callers
-and forked processes. There are as many as torch may use, and none where a call is small.
-
-Importing this module imports Numba.
+and forked processes. There are as many as torch may use. Importing this module imports Numba.
 """
 
 from __future__ import annotations

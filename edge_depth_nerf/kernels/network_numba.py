@@ -1,13 +1,11 @@
 """A small network on the CPU, a tile of points at a time: meaning and shapes as in `network`.
 
 The points of a tile pass all layers, forward and backward, and stay in the nearest caches. Backward computes the layers
-again: that is faster than writing them to memory and reading them. All three products of a layer (values, gradient to
+again, which is faster than writing them to memory and reading them. All three products of a layer (values, gradient to
 the inputs, gradient to the weights) are the same sum of products with other strides. Its function keeps the sums in
-registers. LLVM is told the vectors' length, because it makes no vectors of loops that keep more than one sum.
+registers; LLVM is told the vectors' length, because it makes no vectors of loops that keep more than one sum.
 
-Rows of layers and weights are filled up to a multiple of 16; what stands there is 0.
-
-Importing this module imports Numba.
+Rows of layers and weights are filled up with zeros to a multiple of 16. Importing this module imports Numba.
 """
 
 from __future__ import annotations

@@ -1,14 +1,12 @@
-"""What OpenMP's threads do on the CPU while they have nothing to do.
+"""Lets OpenMP's threads sleep on the CPU while they have nothing to do.
 
-GNU's OpenMP, which torch brings, lets a thread that is done with its part turn in a loop for some milliseconds, in case
-that more is to come. Rendering here goes back and forth between torch's threads and the kernels', and those that turn
-take the cores from those that work. (In a training step torch has one thread, see `threads`. Before that a step took a
-sixth longer with threads that turn, and five times as long beside one busy process.)
+A thread of GNU's OpenMP, which torch brings, that is done with its part turns in a loop for some milliseconds. When a
+picture is rendered, torch's threads and the kernels' take turns, so those that turn take the cores from those that
+work. (In a training step torch has one thread, see `threads`.)
 
-`OMP_WAIT_POLICY=passive` lets them sleep, but is read when the library is loaded; in `ns-train` that is before this
-package is. The library also lets threads turn only briefly before they sleep, once it has created more threads than
-there are cores (`gomp_throttled_spin_count_var`, libgomp's config/linux/wait.h). So some threads are created that sleep
-forever.
+`OMP_WAIT_POLICY=passive` would let them sleep, but is read when the library is loaded: `ns-train` has loaded it before
+it imports this package. The library also lets threads sleep sooner once it has created more threads than there are
+cores (`gomp_throttled_spin_count_var`, libgomp's config/linux/wait.h). So this module creates some that sleep forever.
 """
 
 from __future__ import annotations

@@ -3,11 +3,10 @@
 Of each sample the networks give four numbers: one for the density, three for the colour. The density is
 d = scale exp(first) inside the scene and 0 outside, and the weights are w_k = (1 - exp(-d_k δ_k)) exp(-Σ_j<k d_j δ_j).
 The colours c_k are the sigmoid of the other numbers. A pixel is Σ w_k c_k, plus (1 - Σ w_k) times its background.
-The gradient comes from a second pass, along the rays and back through the networks, which computes densities, colours
-and layers again: that is faster than to write them to memory and read them. A tile of points passes all layers of both
-networks, so that what stands between them is never in memory; a thread takes the points of its rays through all of it.
+A thread takes a tile of its rays' points through both networks at once. A second pass gives the gradient and computes
+densities, colours and layers again: both are faster than writing to memory and reading.
 
-Pure. Importing this module imports Numba.
+Importing this module imports Numba.
 """
 
 from __future__ import annotations

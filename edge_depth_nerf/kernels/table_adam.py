@@ -10,15 +10,12 @@ Importing this module does not import Numba; the first step does.
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import torch
 import torch.distributed as dist
 from jaxtyping import Float
 from torch import Tensor
-
-from edge_depth_nerf.kernels.threads import kernel_threads
 
 SUMS_LATER = "gradient_is_summed_later"
 """Attribute of a table's parameter: whether backward gives its optimiser no gradient, but what makes it."""
@@ -116,16 +113,7 @@ class TableAdam(torch.optim.Adam):
             state["step"] = torch.zeros(())
             state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(table), torch.zeros_like(table)
         state["step"] += 1
-        step, (beta1, beta2) = float(state["step"]), group["betas"]
-        step_levels(
-            *(table, state["exp_avg"], state["exp_avg_sq"], parts),
-            beta1=beta1,
-            beta2=beta2,
-            rate=float(group["lr"]) / (1 - beta1**step),
-            spread=math.sqrt(1 - beta2**step),
-            eps=group["eps"],
-            threads=kernel_threads(),
-        )
+        step_levels(table, state, parts, group)
 
     def zero_grad(self, set_to_none: bool = True) -> None:
         """Clear gradients, and what was kept for them."""

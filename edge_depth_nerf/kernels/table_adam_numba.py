@@ -5,15 +5,16 @@ Importing this module imports Numba.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import no_type_check
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, no_type_check
 
 import numpy as np
 from torch import Tensor
 
 from edge_depth_nerf.kernels.compiled import compiled
 from edge_depth_nerf.kernels.hash_grid_numba import add_to_level, prepared
-from edge_depth_nerf.kernels.threads import share_out
+from edge_depth_nerf.kernels.threads import kernel_threads, share_out
 
 LEAST_SHARE = 1 << 18
 """A thread gets at least so many numbers of a table."""
@@ -38,34 +39,25 @@ def _adam(values, gradient, mean, square, beta1, beta2, rate, spread, eps):
 
 def step_levels(
     table: Tensor,
-    mean: Tensor,
-    square: Tensor,
+    state: Mapping[str, Tensor],
     parts: Sequence[tuple[Tensor, Tensor, Tensor]],
-    *,
-    beta1: float,
-    beta2: float,
-    rate: float,
-    spread: float,
-    eps: float,
-    threads: int,
+    options: Mapping[str, Any],
 ) -> None:
     """Do Adam's step of a table in place, level by level; a thread has whole levels, so sums have one order.
 
     Args:
         table: [levels * rows, features], float32.
-        mean: m, the running mean of gradients, of the same shape.
-        square: v, that of their squares.
+        state: torch's: the step's number, and the running means of gradients and of their squares.
         parts: what the gradient is the sum of: positions, gradient to their encoded values and scalings of each pass.
-        beta1: how much of m is kept.
-        beta2: how much of v is kept.
-        rate: learning rate over 1 - beta1^t.
-        spread: √(1 - beta2^t).
-        eps: added to √v / spread.
-        threads: as many at most.
+        options: torch's, of the table's group.
 
     """
+    step, (beta1, beta2) = float(state["step"]), options["betas"]
+    rate, spread = float(options["lr"]) / (1 - beta1**step), math.sqrt(1 - beta2**step)
+    numbers = beta1, beta2, rate, spread, options["eps"]
     levels = len(parts[0][2])
-    values, means, squares = (each.detach().view(levels, -1).numpy() for each in (table, mean, square))
+    tensors = table, state["exp_avg"], state["exp_avg_sq"]
+    values, means, squares = (each.detach().view(levels, -1).numpy() for each in tensors)
     given = [prepared(*part) for part in parts]
     features = table.shape[1]
     # fine levels first, which take longer; who is ready takes the next one
@@ -76,6 +68,6 @@ def step_levels(
         for level in remaining:
             for part in given:
                 add_to_level(part, level, features, gradient)
-            _adam(values[level], gradient, means[level], squares[level], beta1, beta2, rate, spread, eps)
+            _adam(values[level], gradient, means[level], squares[level], *numbers)
 
-    share_out(work, list(range(max(1, min(threads, levels, values.size // LEAST_SHARE)))))
+    share_out(work, list(range(max(1, min(kernel_threads(), levels, values.size // LEAST_SHARE)))))

@@ -175,7 +175,7 @@ def carried(
     """
     details = list(details)
     parts = [each.split(POINTS_AT_ONCE) for each in (origins, directions, distance)]
-    return torch.cat([_carried(*part, details) for part in zip(parts[0], parts[1], parts[2], strict=True)])
+    return torch.cat([_carried(*part, details) for part in zip(*parts, strict=True)])
 
 
 def _carried(origins: Tensor, directions: Tensor, distance: Tensor, details: list[Detail]) -> Tensor:

@@ -414,10 +414,7 @@ class PriorCache:
     """
 
     def __init__(self, folder: Path, depth_source: str, options: PriorOptions, trust: Trust | None = None):
-        self.folder = folder
-        self.depth_source = depth_source
-        self.options = options
-        self.trust = trust
+        self.folder, self.depth_source, self.options, self.trust = folder, depth_source, options, trust
         described = {
             "version": CACHE_VERSION,
             "depth_source": depth_source,
@@ -443,6 +440,13 @@ class PriorCache:
         except OSError:
             pass
         return prior
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """The layers that are read: the source's own, and those that show where the sky is."""
+        if self.depth_source == INTEGRATED and self.options.motion:
+            return ("lidar", "mono", "motion", *BESIDE_MOTION)
+        return ("lidar", "mono") if self.depth_source in CALIBRATED else (self.depth_source,)
 
     def remove_old(self, pictures: int) -> None:
         """Keep the last `KEPT_SETS` priors of so many pictures."""

@@ -1,12 +1,11 @@
 """Serves training rays with colour and depth prior.
 
-Host-facing. `setup_train` integrates the prior of each training picture once, so ns-render and the viewer's thumbnails
-never wait for it. The prior uses the frame's own maps: no training frame contains a sweep of a held-out frame. The
-prior's calibration (`mono.calibration`) is measured on training frames alone, unless the scene has one.
+Host-facing. `setup_train` integrates the prior of each training picture once; ns-render and the viewer's thumbnails
+never wait for it. The prior uses the frame's own maps: no training frame contains a sweep of a held-out frame. Its
+calibration (`mono.calibration`) is measured on training frames alone, unless the scene has one.
 
-Batches are read from a table of all valid pixels of all training pictures (see `pixel_table`). This works for scenes of
-one picture, of mixed sizes, with and without masks; nerfstudio's own pixel sampler fails on some of these. The table is
-kept on disk, so the next training of the same scene with the same prior reads no picture.
+Batches are read from a table of all valid pixels of all training pictures (`pixel_table`), which serves scenes of one
+picture, of mixed sizes, with and without masks. It is kept on disk for the next training of the scene.
 """
 
 from __future__ import annotations
@@ -63,8 +62,8 @@ from edge_depth_nerf.plugin.pixel_table import (
     PicturePixels,
     PixelBatch,
     PixelTable,
-    PixelTableWriter,
     decode,
+    write_table,
 )
 from edge_depth_nerf.plugin.ray_table import TableRayGenerator
 from edge_depth_nerf.plugin.upload import Stretch, Uploads
@@ -147,10 +146,6 @@ class TablePixelSampler:
             dist.broadcast(first, src=0)
         self._first = int(first)
         self._drawn = 0
-
-    def set_num_rays_per_batch(self, num_rays_per_batch: int) -> None:
-        """Set the rays of a batch (nerfstudio's interface)."""
-        self.num_rays_per_batch = num_rays_per_batch
 
     def sample(self, step: int = 0, keep: Callable[..., Any] | None = None) -> PixelBatch:
         """Read the next batch, or what `PixelTable.batch` keeps of it; at a later step, the batch of that step."""
@@ -286,8 +281,8 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
             "sky": batch.sky.to(self.device),
         }
 
-    def _recipe(self, dataset: FisheyeDepthDataset) -> PriorRecipe | None:
-        """Return how the prior of a split's pictures is made; None without a prior."""
+    def _priors(self, dataset: FisheyeDepthDataset) -> PriorCache | None:
+        """Return what makes the priors of a split's pictures; None without a prior."""
         options, scene = self.config.prior, dataset.scene
         sources = dataset.sources()
         source = self.config.source_of_prior(sources)
@@ -304,13 +299,12 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
                 f"[yellow]Depth prior: LiDAR alone, because the scene has no monocular maps, or not all of them. To "
                 f"make them, run `edge-depth-nerf estimate-depth {escape(str(self.config.dataparser.data))}`."
             )
-        return PriorRecipe(source, options, trust)
+        return PriorCache(self._cache_dir() / "prior", source, options, trust)
 
     def _table(self, dataset: FisheyeDepthDataset, description: str, with_prior: bool) -> PixelTable:
         """Return the table of a split's pixels: the one on disk if it matches, else a new one."""
-        cache_dir = self._cache_dir()
-        recipe = self._recipe(dataset) if with_prior else None
-        path = cache_dir / "pixels" / f"{_table_key(dataset, recipe)}.npy"
+        cache = self._priors(dataset) if with_prior else None
+        path = self._cache_dir() / "pixels" / f"{_table_key(dataset, cache)}.npy"
         try:
             table = PixelTable(path)
             used(path)
@@ -321,16 +315,11 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
             # the scene folder is read-only: the table is deleted with this object
             self._temporary.append(tempfile.TemporaryDirectory(prefix="edge-depth-nerf-"))
             path = Path(self._temporary[-1].name) / path.name
-        cache = None
-        if recipe is not None:
-            cache = PriorCache(cache_dir / "prior", recipe.depth_source, recipe.options, recipe.trust)
         most = int((dataset.cameras.width * dataset.cameras.height).sum())
         try:
-            with PixelTableWriter(path, most) as writer:
-                loaded = _load(dataset, recipe, cache, whole_windows=not with_prior)
-                for pixels in track(loaded, f"{description}…", len(dataset), console=CONSOLE, transient=True):
-                    writer.add(pixels)
-                writer.finish()
+            loaded = _load(dataset, cache, whole_windows=not with_prior)
+            bar = track(loaded, f"{description}…", len(dataset), console=CONSOLE, transient=True)
+            write_table(path, most, bar)
         except OSError as error:
             if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
                 raise
@@ -357,28 +346,7 @@ def _of_surface(values: dict[str, Tensor]) -> dict[str, Tensor]:
     return {f"surface_{names.get(name, name)}": value for name, value in values.items()}
 
 
-@dataclass(frozen=True)
-class PriorRecipe:
-    """The source and options of a prior."""
-
-    depth_source: str
-    """integrated, or the name of a source."""
-    options: PriorOptions
-    """How the prior is computed from its maps."""
-    trust: Trust | None
-    """The drive's calibration, if the source uses one."""
-
-    @property
-    def layers(self) -> tuple[str, ...]:
-        """The layers that are read: the source's own, and those that show where the sky is."""
-        if self.depth_source == INTEGRATED and self.options.motion:
-            return ("lidar", "mono", "motion", *BESIDE_MOTION)
-        return ("lidar", "mono") if self.depth_source in CALIBRATED else (self.depth_source,)
-
-
-def _load(
-    dataset: FisheyeDepthDataset, recipe: PriorRecipe | None, cache: PriorCache | None, whole_windows: bool
-) -> Iterator[PicturePixels]:
+def _load(dataset: FisheyeDepthDataset, cache: PriorCache | None, whole_windows: bool) -> Iterator[PicturePixels]:
     """Yield colours, mask, prior with sigma, and sky of each picture.
 
     Raises:
@@ -390,21 +358,22 @@ def _load(
         rgb = dataset.rgb(image_idx)
         mask = dataset.mask(image_idx)
         if whole_windows and not has_whole_window(torch.from_numpy(mask)):
+            image = dataset.image_filenames[image_idx]
             raise InputError(
-                f"{dataset.mask_key(image_idx)[0] or dataset.image_filenames[image_idx]}: the mask of the held-out "
-                f"picture {dataset.image_filenames[image_idx].name} leaves too few pixels for evaluation (no window "
-                "of SSIM, 11×11 px). Correct the mask (255 = use the pixel), or do not hold out this picture."
+                f"{dataset.pictures[image_idx].files.get('mask', image)}: the mask of the held-out picture "
+                f"{image.name} leaves too few pixels for evaluation (no window of SSIM, 11×11 px). Correct the mask "
+                "(255 = use the pixel), or do not hold out this picture."
             )
-        if recipe is None or cache is None:
+        if cache is None:
             return PicturePixels(rgb, mask)
-        maps = {layer: dataset.distance_m(image_idx, layer) for layer in recipe.layers}
+        maps = {layer: dataset.distance_m(image_idx, layer) for layer in cache.layers}
         for layer in BESIDE_MOTION:
             if maps.get(layer) is None:
                 # a scene without keeps the priors that it has
                 maps.pop(layer, None)
         picture, mono = dataset.pictures[image_idx], maps.get("mono")
         view = ray_angles(picture.lens, picture.up_in_camera) if mono is not None else None
-        prior = cache.prior(maps, mask, view if recipe.trust is not None else None)
+        prior = cache.prior(maps, mask, view if cache.trust is not None else None)
         sky = None if mono is None or view is None else sky_of(mono, maps.get("lidar"), view, rgb, mask)
         if sky is not None and (motion := maps.get("motion")) is not None:
             # a pixel that was matched between pictures is not sky
@@ -422,9 +391,9 @@ def _load(
             yield pixels
 
 
-def _table_key(dataset: FisheyeDepthDataset, recipe: PriorRecipe | None) -> str:
+def _table_key(dataset: FisheyeDepthDataset, cache: PriorCache | None) -> str:
     """Return a hash of all that a table depends on: files by name, size and date, cameras, the prior's settings."""
-    layers = ["image", "mask", *(recipe.layers if recipe else ())]
+    layers = ["image", "mask", *(cache.layers if cache else ())]
     files = [picture.files[layer] for layer in layers for picture in dataset.pictures if layer in picture.files]
     stats = [(str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in files]
     scene = dataset.scene
@@ -433,8 +402,8 @@ def _table_key(dataset: FisheyeDepthDataset, recipe: PriorRecipe | None) -> str:
         "files": stats,
         "scene": [scene.theta_max_rad, scene.lidar_metres_per_count, scene.lidar_is_z_depth],
         "lenses": [repr((picture.lens, picture.up_in_camera.tolist())) for picture in dataset.pictures],
-        "prior": None if recipe is None else [recipe.depth_source, dataclasses.asdict(recipe.options)],
-        "trust": None if recipe is None or recipe.trust is None else recipe.trust.to_dict(),
+        "prior": None if cache is None else [cache.depth_source, dataclasses.asdict(cache.options)],
+        "trust": None if cache is None or cache.trust is None else cache.trust.to_dict(),
     }
     return hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()[:32]
 

@@ -16,14 +16,33 @@ import tyro
 from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
+from numpy.typing import NDArray
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.plugin.compat import without_undefined_ray
-from edge_depth_nerf.plugin.scale import default_metres_per_unit
 from edge_depth_nerf.scene.format import INTRINSICS, DepthKind, path_keys, pose_of, read_transforms
 from edge_depth_nerf.scene.reader import scene_of
 
 SUPPORTED_CAMERA_TYPES = (CameraType.PERSPECTIVE, CameraType.FISHEYE)
+SMALLEST_METRES_PER_UNIT = 10.0
+"""What stands around the road is some 10 m away, however short the drive."""
+LARGEST_METRES_PER_UNIT = 128.0
+"""The finest of 2048 cells is then 0.25 m: larger ones would blur kerbs and poles. The drive's ends are squeezed."""
+
+
+def default_metres_per_unit(camera_positions_m: NDArray) -> float:
+    """Give half of a drive's extent along its longest axis, within the limits above: metres for one unit of the scene.
+
+    nerfacto's scene contraction keeps the cube |x|_inf <= 1 unit and squeezes the rest into 1..2, its hash grid spans
+    the contracted -2..2, and its sampler spends half of its samples below 1 unit. The drive should lie inside the
+    cube: beyond r units, cells grow with r². The finest cell, 4 · metres_per_unit / resolution, should stay small.
+
+    Args:
+        camera_positions_m: N×3 camera centres, metres.
+
+    """
+    half_extent_m = float(np.ptp(camera_positions_m, axis=0).max()) / 2
+    return float(np.clip(half_extent_m, SMALLEST_METRES_PER_UNIT, LARGEST_METRES_PER_UNIT))
 
 
 @dataclass

@@ -7,7 +7,6 @@ validity, or beyond the scene's theta_max) is never valid, whether the scene bri
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -56,10 +55,6 @@ class FisheyeDepthDataset(InputDataset):
     def rays(self, image_idx: int) -> Rays:
         """The rays of a picture's pixels, within the scene's theta_max."""
         return self.scene.rays(self.pictures[image_idx])
-
-    def mask_key(self, image_idx: int) -> tuple[Path | None, Camera]:
-        """Pictures with the same key have the same mask."""
-        return self.pictures[image_idx].files.get("mask"), self.camera(image_idx)
 
     def mask(self, image_idx: int) -> NDArray[np.bool_]:
         """H×W, True where the picture may be used: the scene's mask within the validity of the lens."""

@@ -10,11 +10,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Float
-from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
@@ -23,24 +22,7 @@ from edge_depth_nerf.plugin.pose_refinement import moved_pose
 
 if TYPE_CHECKING:
     from edge_depth_nerf.plugin.dataset import FisheyeDepthDataset
-
-    class Renders(Protocol):
-        """What is asked of a model."""
-
-        config: Any
-        camera_optimizer: Any
-        field: Any
-        exposure: Any
-
-        @property
-        def device(self) -> Any:
-            """Where it is."""
-            ...
-
-        def rendered_alone(self, camera: Cameras) -> dict[str, Tensor]:
-            """Outputs of a whole view without detail."""
-            ...
-
+    from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
 
 PICTURES = 8
 """So many training pictures, those that see most of a view, add their detail to it."""
@@ -83,7 +65,7 @@ def detail_shown(shown: bool) -> Iterator[None]:
 class TrainingDetail:
     """The detail of a model's training pictures."""
 
-    def __init__(self, model: Renders, dataset: FisheyeDepthDataset) -> None:
+    def __init__(self, model: EdgeDepthNerfModel, dataset: FisheyeDepthDataset) -> None:
         self.model, self.dataset = model, dataset
         pixels = int((dataset.cameras.width * dataset.cameras.height).max())
         self.kept = max(PICTURES + 1, MOST_BYTES // (BYTES_A_PIXEL * pixels))

@@ -56,6 +56,8 @@ class NotFiniteError(InputError):
 class EdgeDepthPipeline(VanillaPipeline):
     """nerfstudio's pipeline with pooled depth errors."""
 
+    datamanager: FisheyeDepthDataManager  # pyright: ignore[reportIncompatibleVariableOverride]
+
     def __init__(self, config: EdgeDepthPipelineConfig, device: str | torch.device, *args: Any, **kwargs: Any) -> None:
         """Build both parts; a model gets neither a prior nor further pixels that it would not use.
 
@@ -71,7 +73,6 @@ class EdgeDepthPipeline(VanillaPipeline):
             config = replace(config, datamanager=replace(data, surface_rays_per_batch=0))
         super().__init__(config, str(device), *args, **kwargs)
         manager = self.datamanager
-        assert isinstance(manager, FisheyeDepthDataManager)
         metres_per_unit = manager.train_dataset.metadata["metres_per_unit"]
         if model.far_m / metres_per_unit > FARTHEST_UNITS:
             raise InputError(
@@ -118,7 +119,6 @@ class EdgeDepthPipeline(VanillaPipeline):
 
         """
         manager = self.datamanager
-        assert isinstance(manager, FisheyeDepthDataManager)
         self.detail.forget()
         if self.graphs is None:
             found = self._computed(*manager.next_train(step))
@@ -167,7 +167,6 @@ class EdgeDepthPipeline(VanillaPipeline):
     def _not_finite(self, step: int, outputs: dict[str, Any], losses: dict[str, Any]) -> str:
         """Say which losses are not finite, and in which pictures."""
         manager = self.datamanager
-        assert isinstance(manager, FisheyeDepthDataManager)
         odd = [
             f"{name} is {value}" for name, loss in losses.items() if not math.isfinite(value := float(loss.detach()))
         ]

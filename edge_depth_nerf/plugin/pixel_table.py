@@ -1,10 +1,10 @@
 """The training pixels that count, on disk in a random order.
 
-Pure. Only valid pixels of each picture are kept, as records of 15 bytes: colour as uint8, prior distance and sigma as
-uint16 in 1/256 m (0 = no prior; the sky has no distance and the largest sigma), and where the pixel is. A prior that 16
-bits cannot hold, beyond 255.996 m or below 2 mm, is none; a sigma beyond is kept as 255.996 m. Their order is random,
-so that a batch is one contiguous read of a memory-mapped file: any number of pictures needs next to no memory of the
-process's own. A batch holds each pixel at most once, and all pixels are passed before one comes again.
+Pure. Each valid pixel is a record of 15 bytes: colour as uint8, prior distance and sigma as uint16 in 1/256 m (0 = no
+prior; the sky has no distance and the largest sigma), and where the pixel is. A prior that 16 bits cannot hold, beyond
+255.996 m or below 2 mm, is none; a sigma beyond is kept as 255.996 m. As the order is random, a batch is one
+contiguous read of a memory-mapped file, which needs next to no memory of the process's own. All pixels are passed
+before one comes again.
 
 The order is made in two passes: each pixel goes to one of several files, drawn at random; then each file, small enough
 for memory, is shuffled and appended to the whole. That is a uniformly random permutation.
@@ -13,11 +13,10 @@ for memory, is shuffled and appended to the whole. That is a uniformly random pe
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass, fields
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Any
 
 import numpy as np
@@ -104,7 +103,7 @@ class PixelTable:
     """All valid pixels of some pictures, in a random order, memory-mapped."""
 
     def __init__(self, path: Path):
-        """Open a table that `PixelTableWriter` wrote; all of it is read once, to check that it is unchanged.
+        """Open a table that `write_table` wrote; all of it is read once, to check that it is unchanged.
 
         Raises:
             InputError, OSError, ValueError: it is not there, of another version, or not whole.
@@ -179,94 +178,71 @@ class PicturePixels:
     """Where it is known to show the sky; None: nowhere."""
 
 
-class PixelTableWriter:
-    """Writes a table, picture by picture; a context in which temporary files live.
+def write_table(path: Path, most_pixels: int, pictures: Iterable[PicturePixels], seed: int = 0) -> None:
+    """Write a table of pictures.
 
-    with PixelTableWriter(path, most_pixels) as writer:
-        writer.add(PicturePixels(rgb, mask, distance_m, sigma_m))
-        writer.finish()
+    Args:
+        path: the file to be, .npy; its folder is made.
+        most_pixels: an upper bound of the pixels.
+        pictures: read one after the other.
+        seed: of the pixels' order.
+
+    Raises:
+        InputError: no valid pixel in any picture.
+
     """
-
-    def __init__(self, path: Path, most_pixels: int, seed: int = 0):
-        """Begin.
-
-        Args:
-            path: the file to be, .npy; its folder is made.
-            most_pixels: an upper bound of the pixels that will be added.
-            seed: of their order.
-
-        """
-        self.path = path
-        self._rng = np.random.default_rng(seed)
-        self._most_bytes = most_pixels * RECORD.itemsize
-        self._stack = ExitStack()
-        self._buckets: list[IO[bytes]] = []
-        self._pictures = self._pixels = self._with_prior = 0
-
-    def __enter__(self) -> PixelTableWriter:
-        """Open the temporary files."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        for _ in range(min(MOST_BUCKETS, max(1, -(-self._most_bytes // BUCKET_BYTES)))):
-            file = tempfile.TemporaryFile(dir=self.path.parent, prefix=".pixels.")
-            self._buckets.append(self._stack.enter_context(file))
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Remove the temporary files."""
-        self._stack.close()
-
-    def add(self, pixels: PicturePixels) -> None:
-        """Add the next picture."""
-        rgb, mask = pixels.rgb, pixels.mask
-        prior_distance_m, prior_sigma_m, sky = pixels.prior_distance_m, pixels.prior_sigma_m, pixels.sky
-        assert max(mask.shape) < LARGEST_SIDE_PX
-        rows, columns = np.nonzero(mask)
-        records = np.zeros(len(rows), RECORD)
-        records["rgb"] = rgb[rows, columns]
-        records["row"], records["column"], records["picture"] = rows, columns, self._pictures
-        if prior_distance_m is not None and prior_sigma_m is not None:
-            records["distance"] = to_steps(prior_distance_m[rows, columns])
-            # without a distance a large sigma would say "sky"
-            records["sigma"] = np.where(records["distance"] > 0, _sigma_steps(prior_sigma_m[rows, columns]), 0)
-        if sky is not None:
-            records["sigma"][sky[rows, columns] & (records["distance"] == 0)] = SKY
-        self._pictures += 1
-        self._pixels += len(records)
-        self._with_prior += int((records["distance"] > 0).sum())
-        bucket = self._rng.integers(len(self._buckets), size=len(records))
-        ordered = records[np.argsort(bucket, kind="stable")]
-        ends = np.cumsum(np.bincount(bucket, minlength=len(self._buckets)))
-        for file, part in zip(self._buckets, np.split(ordered, ends[:-1]), strict=True):
-            file.write(part.tobytes())
-
-    def finish(self) -> None:
-        """Put the pixels into their order and the file into its final path.
-
-        Raises:
-            InputError: no valid pixel in any picture.
-
-        """
-        if not self._pixels:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rng, number, pixels, with_prior = np.random.default_rng(seed), 0, 0, 0
+    with ExitStack() as stack:
+        buckets: list[IO[bytes]] = [
+            stack.enter_context(tempfile.TemporaryFile(dir=path.parent, prefix=".pixels."))
+            for _ in range(min(MOST_BUCKETS, max(1, -(-most_pixels * RECORD.itemsize // BUCKET_BYTES))))
+        ]
+        for number, picture in enumerate(pictures, 1):
+            records = _records(picture, number - 1)
+            pixels += len(records)
+            with_prior += int((records["distance"] > 0).sum())
+            bucket = rng.integers(len(buckets), size=len(records))
+            ordered = records[np.argsort(bucket, kind="stable")]
+            ends = np.cumsum(np.bincount(bucket, minlength=len(buckets)))
+            for file, part in zip(buckets, np.split(ordered, ends[:-1]), strict=True):
+                file.write(part.tobytes())
+        if not pixels:
             raise InputError(
-                f"None of the {self._pictures} pictures has a valid pixel: the masks exclude everything. "
+                f"None of the {number} pictures has a valid pixel: the masks exclude everything. "
                 "Masks are 255 where a pixel may be used; check that they are not inverted."
             )
 
         def write(out: Any) -> None:
             header = {"descr": np.lib.format.dtype_to_descr(RECORD), "fortran_order": False}
-            np.lib.format.write_array_header_1_0(out, {**header, "shape": (self._pixels,)})
-            for file in self._buckets:
+            np.lib.format.write_array_header_1_0(out, {**header, "shape": (pixels,)})
+            for file in buckets:
                 file.seek(0)
                 records = np.frombuffer(file.read(), RECORD)
-                out.write(records[self._rng.permutation(len(records))].tobytes())
+                out.write(records[rng.permutation(len(records))].tobytes())
                 file.seek(0)
                 file.truncate()
 
-        write_checked(self.path, TABLE_VERSION, write)
-        about = {"version": TABLE_VERSION, "pixels": self._pixels, "with_prior": self._with_prior}
-        write_json(_about(self.path), {**about, "pictures": self._pictures})
+        write_checked(path, TABLE_VERSION, write)
+    about = {"version": TABLE_VERSION, "pixels": pixels, "with_prior": with_prior}
+    write_json(_about(path), {**about, "pictures": number})
+
+
+def _records(picture: PicturePixels, number: int) -> NDArray:
+    """Pack a picture's valid pixels."""
+    assert max(picture.mask.shape) < LARGEST_SIDE_PX
+    rows, columns = np.nonzero(picture.mask)
+    records = np.zeros(len(rows), RECORD)
+    records["rgb"] = picture.rgb[rows, columns]
+    records["row"], records["column"], records["picture"] = rows, columns, number
+    if picture.prior_distance_m is not None and picture.prior_sigma_m is not None:
+        records["distance"] = to_steps(picture.prior_distance_m[rows, columns])
+        # without a distance a large sigma would say "sky"
+        sigma = _sigma_steps(picture.prior_sigma_m[rows, columns])
+        records["sigma"] = np.where(records["distance"] > 0, sigma, 0)
+    if picture.sky is not None:
+        records["sigma"][picture.sky[rows, columns] & (records["distance"] == 0)] = SKY
+    return records
 
 
 def _about(path: Path) -> Path:

@@ -1,9 +1,9 @@
 """Camera poses that training corrects; a cost keeps them near the given ones.
 
-Host-facing: nerfstudio's camera optimiser in other units. Its own learns scene units and radians for each picture, at
-the fields' learning rate and with next to nothing that holds them. Here an adjustment is the vehicle's, shared by the
-pictures of a frame. Its unit is the standard deviation that is expected of the given poses, and each frame pays for its
-adjustment. The drive's mean adjustment is kept at zero: it would move the scene, not correct it.
+Host-facing: nerfstudio's camera optimiser in other units. Its own learns scene units and radians for each picture, and
+hardly anything holds them. Here an adjustment is the vehicle's, shared by the pictures of a frame, in standard
+deviations that are expected of the given poses. The drive's mean adjustment is kept at zero: it would move the scene,
+not correct it.
 """
 
 from __future__ import annotations

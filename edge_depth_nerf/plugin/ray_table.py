@@ -1,10 +1,9 @@
 """Training rays read from a table of each lens, instead of nerfstudio's undistortion of every batch.
 
 Host-facing. nerfstudio inverts a lens's polynomial by ten iterations for each pixel of each batch, and twice more for
-its neighbours. The table holds what comes out, made once by nerfstudio's own `generate_rays` from a camera that is not
+its neighbours. The table holds the result, made once by nerfstudio's own `generate_rays` from a camera that is not
 turned: the numbers are the same but for the rounding of one rotation. It lies in the scene's cache and is mapped into
-memory; a lens of 1400×1400 px takes 39 MB there, and five seconds once. Whole views keep the tables of the lenses that
-were rendered last in the process's own memory.
+memory (39 MB and five seconds for a lens of 1400×1400 px). Whole views keep the lenses rendered last in memory.
 """
 
 from __future__ import annotations

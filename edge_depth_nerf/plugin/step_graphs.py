@@ -1,16 +1,16 @@
 """A training step as one launch: CUDA graphs of what lies between a batch's upload and its gradients.
 
 Host-facing. **No GPU has run this; it is off unless it is asked for** (`--cuda-graphs True`). The host needs longer to
-launch the kernels of a step than a fast GPU to run them. A graph is recorded once and launched as a whole. There are
-two, as there are two kinds of steps: proposal networks are updated, or rest.
+launch the kernels of a step than a fast GPU to run them, so a graph is recorded once and launched as a whole: one of
+the steps that update the proposal networks, one of those that do not.
 
-The graph records decoding, rays, forward, losses and backward. Optimisers, the scaler and schedulers stay unchanged. A
-graph reads where it read when it was recorded, so everything that differs between steps is put there before: the packed
-batch, λ, and how far the sampler's weights are annealed. All shapes are the same at each step. What a graph has not
-seen (other rays, parameters or options) ends this, with one line that says why, and training continues without.
+A graph records decoding, rays, forward, losses and backward, but not optimisers, scaler and schedulers. It reads where
+it read when it was recorded, so everything that differs between steps is put there before: the packed batch, λ, and how
+far the sampler's weights are annealed. Anything else that changes (rays, parameters or options) ends this, with one
+line that says why, and training continues without.
 
-What it does follows torch's notes on CUDA graphs: warm-up on a stream of its own, gradients by `torch.autograd.grad`
-and kept in the graph's memory, no cast that autocast kept from before.
+As torch's notes on CUDA graphs ask, it warms up on a stream of its own, takes gradients by `torch.autograd.grad` into
+the graph's memory, and uses no cast that autocast kept from before.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """nerfacto's field and proposal networks with their arithmetic fused.
 
 Host-facing. Parameters, their names and initial values stay nerfstudio's, and results are nerfstudio's to float32's
-noise. What a fused form does not cover (a gradient to the positions, for normals or poses; transients; semantics;
-positions in a box) is left to nerfstudio's.
+noise. nerfstudio computes what no fused form covers: a gradient to the positions (for normals or poses), transients,
+semantics, and positions in a box.
 """
 
 from __future__ import annotations

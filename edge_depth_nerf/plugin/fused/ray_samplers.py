@@ -5,6 +5,7 @@ Host-facing; the numbers are nerfstudio's to float32's noise, from the same rand
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields
 from typing import Any
 
@@ -46,15 +47,7 @@ class FirstSampler(UniformLinDispPiecewiseSampler):
                 return compute(places, nears, fars)
             return self.spacing_fn_inv(torch.lerp(self.spacing_fn(nears), self.spacing_fn(fars), places))
 
-        distances, edges = to_euclidean(edges)[..., None], edges[..., None]
-        return samples_along(
-            ray_bundle,
-            distances[:, :-1],
-            distances[:, 1:],
-            spacing_starts=edges[:, :-1],
-            spacing_ends=edges[:, 1:],
-            spacing_to_euclidean_fn=to_euclidean,
-        )
+        return _samples_between(ray_bundle, edges, to_euclidean)
 
     def _between(self, count: int, device: torch.device) -> tuple[Tensor, Tensor]:
         """Where each edge may lie: the middles beside its even place, the lower one and how far it is to the upper."""
@@ -97,19 +90,24 @@ class FusedPDFSampler(PDFSampler):
             wanted = torch.add(wanted, drawn, alpha=1 / places)
         else:
             wanted = wanted + 1 / (2 * places)
-        edges = edges_of(ray_samples)
-        placed = place(weights[..., 0].float(), edges, wanted, self.histogram_padding, eps)[..., None]
-        to_euclidean = ray_samples.spacing_to_euclidean_fn
-        assert to_euclidean is not None
-        distances = to_euclidean(placed[..., 0])[..., None]
-        return samples_along(
-            ray_bundle,
-            distances[:, :-1],
-            distances[:, 1:],
-            spacing_starts=placed[:, :-1],
-            spacing_ends=placed[:, 1:],
-            spacing_to_euclidean_fn=to_euclidean,
-        )
+        placed = place(weights[..., 0].float(), edges_of(ray_samples), wanted, self.histogram_padding, eps)
+        assert ray_samples.spacing_to_euclidean_fn is not None
+        return _samples_between(ray_bundle, placed, ray_samples.spacing_to_euclidean_fn)
+
+
+def _samples_between(
+    rays: RayBundle, edges: Float[Tensor, "rays edges"], to_euclidean: Callable[[Tensor], Tensor]
+) -> RaySamples:
+    """Make samples between edges in the spacing of 0..1, which a function turns into distances."""
+    distances, edges = to_euclidean(edges)[..., None], edges[..., None]
+    return samples_along(
+        rays,
+        distances[:, :-1],
+        distances[:, 1:],
+        spacing_starts=edges[:, :-1],
+        spacing_ends=edges[:, 1:],
+        spacing_to_euclidean_fn=to_euclidean,
+    )
 
 
 class FusedProposalSampler(ProposalNetworkSampler):
@@ -188,13 +186,8 @@ def rays_of(
     metadata: dict[str, Any] | None = None,
 ) -> RayBundle:
     """Make rays of fields of one shape, as nerfstudio's constructor does without looking it up."""
-    fields_of_rays = {
-        "origins": origins,
-        "directions": directions,
-        "pixel_area": pixel_area,
-        "camera_indices": camera_indices,
-    }
-    return _whole(RayBundle, (len(origins),), **fields_of_rays, metadata=metadata or {})
+    given = {"origins": origins, "directions": directions, "pixel_area": pixel_area, "camera_indices": camera_indices}
+    return _whole(RayBundle, (len(origins),), **given, metadata=metadata or {})
 
 
 def samples_along(
