@@ -12,8 +12,8 @@ import torch
 from interpreted import NEEDS_A_GPU, in_interpreter
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from edge_depth_nerf.kernels import back_ends, formulas, pointwise_numba, ray_numba
-from edge_depth_nerf.kernels.back_ends import GpuForm, tried_out
+from edge_depth_nerf.kernels import back_ends, formulas, functions, pointwise_numba, ray_numba
+from edge_depth_nerf.kernels.back_ends import Function, GpuForm, tried_out
 from edge_depth_nerf.kernels.functions import (
     BOUND_LOSS,
     CONTRACT,
@@ -23,7 +23,6 @@ from edge_depth_nerf.kernels.functions import (
     HARMONICS,
     HASH_GRID,
     MOST,
-    ON_GPU,
     PLACE_SAMPLES,
     POSITIONS,
     WEIGHTS,
@@ -33,7 +32,8 @@ from edge_depth_nerf.plugin.fused.nerfacto_losses import distortion_loss
 
 CPU = torch.device("cpu")
 FUNCTIONS = PLACE_SAMPLES, BOUND_LOSS, DISTORTION_LOSS, CONTRACT, DISTANCES, HARMONICS
-EVERY: tuple[Any, ...] = (*ON_GPU, EDGE_LOSS.on_gpu)
+ALL = (*(each for each in vars(functions).values() if isinstance(each, Function)), EDGE_LOSS)
+EVERY: tuple[Any, ...] = tuple(each.on_gpu for each in ALL if each.on_gpu is not None)
 
 
 @pytest.fixture(autouse=True)

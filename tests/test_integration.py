@@ -352,19 +352,6 @@ def test_distance_factor_is_exact_down_to_the_smallest():
     np.testing.assert_allclose(spread[:, 0, 0] ** 2, moved**2 * part * (1 - part), rtol=1e-11, atol=0)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
-@pytest.mark.parametrize(("kind", "normalise", "keep_returns", "alpha"), CHOICES)
-def test_operations_for_gpus_equal_compiled_loops(kind, normalise, keep_returns, alpha, dtype, monkeypatch):
-    monkeypatch.setattr(integration, "CUDA_STRIP_PIXELS", 40)  # three rows
-    options = IntegrationOptions(alpha=alpha, kernel=kind, normalise=normalise, keep_returns=keep_returns)
-    lidar, mono, valid = random_maps(15, dtype=dtype)
-    out = torch.full((3, *mono.shape), torch.nan, dtype=dtype)
-    integration._integrate_with_torch(lidar, mono, valid, options, out)
-    expected = integrate_depth(lidar, mono, valid, options)
-    assert_same(IntegratedDepth(out[0], out[1], out[2]), expected, atol=1e-5 if dtype == torch.float32 else 1e-7)
-    torch.testing.assert_close(out[0], expected.distance_m, rtol=0, atol=1e-5 if dtype == torch.float32 else 1e-10)
-
-
 def test_compiles_where_nothing_can_be_kept():
     # a function without a file is one that Numba has no folder for
     names: dict = {}

@@ -56,10 +56,10 @@ def _forget_older(compiled_in: Path, sources: Path) -> None:
 
 
 def flat(values: Tensor) -> np.ndarray:
-    """A tensor's numbers in a row, for a kernel; of a contiguous one the same memory."""
+    """Give a tensor's numbers in a row, for a kernel; a contiguous tensor is not copied."""
     return values.detach().contiguous().view(-1).numpy()
 
 
 def all_on_disk() -> bool:
-    """Whether something lies compiled in each folder of the modules of kernels that were imported so far."""
+    """Say whether the folder of each imported module of kernels holds compiled code."""
     return bool(_folders) and all(any(folder.glob("*.nbi")) for folder in _folders)

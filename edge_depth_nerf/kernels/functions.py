@@ -126,10 +126,3 @@ DISTORTION_LOSS = Function(
 POSITIONS = Function(lambda: _numba().pointwise.middles, follows=False)
 DENSITY = Function(lambda: _numba().pointwise.density)
 WEIGHTS = Function(lambda: _numba().ray.weights_from_densities)
-
-ON_GPU: tuple[GpuForm, ...] = tuple(
-    each.on_gpu
-    for each in (HASH_GRID, CONTRACT, DISTANCES, HARMONICS, PLACE_SAMPLES, BOUND_LOSS, DISTORTION_LOSS)
-    if each.on_gpu is not None
-)
-"""The kernels of a GPU, with what each is compared with; that of the edge loss is in `method.losses`."""

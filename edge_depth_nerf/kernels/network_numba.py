@@ -143,7 +143,7 @@ def _multiply(a, at_a, a_row, a_term, b, at_b, b_term, terms, start, at_start, s
 @compiled()
 @no_type_check
 def _filled(width):
-    """A layer's width, filled up."""
+    """Fill a layer's width up."""
     return (width + FULL - 1) // FULL * FULL
 
 
@@ -365,7 +365,7 @@ class Arrays:
         self.of_groups = self.biases, self.shared, joined, group
 
     def parts(self) -> list[tuple[int, int]]:
-        """Equal parts of the points for the threads, of whole groups."""
+        """Share the points out to threads, whole groups each."""
         threads = max(1, min(kernel_threads(), self.points // LEAST_SHARE))
         return [(first * self.step, last * self.step) for first, last in stretches(self.points // self.step, threads)]
 

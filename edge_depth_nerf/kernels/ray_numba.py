@@ -222,7 +222,7 @@ def bound_loss(
     outer_edges: Float[Tensor, "rays outer_edges"],
     outer_weights: Float[Tensor, "rays outer_samples"],
 ) -> Float[Tensor, ""]:
-    """Proposal loss of mip-NeRF 360 (Eq. 13): how far an outer histogram fails to bound another one from above.
+    """Measure how far an outer histogram fails to bound another one from above: mip-NeRF 360's proposal loss (Eq. 13).
 
     Mean over all samples of max(0, w - bound)² / (w + 1e-7), where the bound sums the outer weights of all intervals
     that a sample touches. Differentiable once, by `outer_weights` alone. float32.

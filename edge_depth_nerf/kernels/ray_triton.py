@@ -25,7 +25,7 @@ TOGETHER = 8
 
 
 def _block(samples: int) -> int:
-    """A power of two for all samples of a ray."""
+    """Give a power of two that has room for all samples of a ray."""
     return max(16, triton.next_power_of_2(samples))
 
 

@@ -349,7 +349,7 @@ def _to_networks(
 
 
 def _least_rays(given: _Given) -> int:
-    """How many rays a thread gets at least."""
+    """Say how many rays a thread gets at least."""
     return max(1, LEAST_SHARE * given.rays // (given.rays * given.samples + given.single))
 
 

@@ -73,11 +73,11 @@ class TableAdam(torch.optim.Adam):
             setattr(table, SUMS_LATER, self._may_sum(group))
 
     def _tables(self, group: dict[str, Any]) -> list[Tensor]:
-        """The tables of a group whose gradients this class may sum up itself."""
+        """List the tables of a group whose gradients this class may sum up itself."""
         return [table for table in group["params"] if hasattr(table, SUMS_LATER) and table.device.type == "cpu"]
 
     def _may_sum(self, group: dict[str, Any]) -> bool:
-        """Whether it does the steps of a group's tables itself."""
+        """Say whether this class does the steps of a group's tables itself."""
         plain = not (group["amsgrad"] or group["maximize"] or group["weight_decay"] or group["differentiable"])
         # torch's hooks, by which processes share their gradients, are not called for what is summed up later
         alone = not (dist.is_available() and dist.is_initialized())

@@ -23,7 +23,7 @@ _trained: tuple[int, int] | None = None
 
 
 def kernel_threads() -> int:
-    """Threads for a kernel: torch's number, or what that was before `torch_on_one_thread`."""
+    """Give the threads for a kernel: torch's number, or what that was before `torch_on_one_thread`."""
     return torch.get_num_threads() if _kept is None else _kept
 
 
@@ -56,7 +56,7 @@ def take_all_threads() -> None:
 
 @functools.lru_cache(maxsize=1)
 def _pool(process: int) -> ThreadPoolExecutor:
-    """Threads that stay for the next call; a forked process (another `process` id) has to start its own."""
+    """Start threads that stay for the next call; a forked process (another `process` id) starts its own."""
     return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="kernels")
 
 

@@ -64,7 +64,7 @@ class Fit:
     """The same of the largest."""
 
     def apply(self, mono_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Fitted distances; what is not a positive number becomes 0."""
+        """Apply the fit to distances; what is not a positive number becomes 0."""
         known = np.isfinite(mono_m) & (mono_m > 0)
         if self == Fit():
             return np.where(known, mono_m, 0).astype(np.float32)
@@ -90,7 +90,7 @@ class Aligned:
 def both(
     lidar_m: Float[np.ndarray, "h w"], mono_m: Float[np.ndarray, "h w"], valid: Bool[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
-    """Where both maps have a distance and the picture may be used.
+    """Find where both maps have a distance and the picture may be used.
 
     Raises:
         InputError: the maps differ in size.
@@ -207,7 +207,7 @@ class _Pyramid:
         self.shape = [block * (math.floor(size / block) + 1) for size, block in zip(sizes, blocks, strict=True)]
 
     def places(self, pixels: NDArray[np.bool_], log_m: NDArray[np.float32]) -> Float[torch.Tensor, "3 n"]:
-        """Log m, row, column of some pixels (H×W, True; log m of each) in the finest grid, in cells."""
+        """Place some pixels (H×W, True; log m of each) in the finest grid: log m, row, column, in cells."""
         row, column = np.nonzero(pixels)
         place = np.empty((3, len(row)), np.float32)
         place[0] = (log_m - self.least_log) / FINEST_CELL_LOG
@@ -218,7 +218,7 @@ class _Pyramid:
     def grid(
         self, places: torch.Tensor, value: NDArray, weight: NDArray, imagined: float
     ) -> Float[torch.Tensor, "1 1 z y x"]:
-        """Corrections of the finest grid's cells."""
+        """Compute corrections of the finest grid's cells."""
         z, y, x = places.long().numpy()
         cell = (z * self.shape[1] + y) * self.shape[2] + x
         sums = np.stack([np.bincount(cell, part, math.prod(self.shape)) for part in (weight * value, weight)])

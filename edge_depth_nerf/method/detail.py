@@ -98,7 +98,7 @@ def _counts(
     to_points: Float[Tensor, "points 3"],
     from_picture: Float[Tensor, "points"],
 ) -> Float[Tensor, "points"]:
-    """How much a picture counts that sees a place: more from a similar direction, and less from further away."""
+    """Weigh pictures that see a place: more from a similar direction, and less from further away."""
     turned = torch.exp(((to_points * directions).sum(-1) - 1) / TURN)
     return turned * (distance / from_picture.clamp(min=1e-9)).clamp(max=1)
 
@@ -193,6 +193,6 @@ def _carried(origins: Tensor, directions: Tensor, distance: Tensor, details: lis
 
 
 def _looked_up(values: Float[Tensor, "channels h w"], place: Float[Tensor, "points 2"], mode: str) -> Tensor:
-    """Values of a picture at places between its pixels, [points, channels]; 0 beyond its border."""
+    """Look up values of a picture between its pixels, [points, channels]; 0 beyond its border."""
     found = F.grid_sample(values[None].float(), place[None, None], mode=mode, align_corners=False)
     return found[0, :, 0].t()

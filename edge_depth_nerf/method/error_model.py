@@ -80,7 +80,7 @@ def pixel_features(
     returns: Bool[np.ndarray, "h w"],
     theta_rad: Float[np.ndarray, "h w"],
 ) -> dict[str, NDArray[np.float32]]:
-    """The features of every pixel of a prior, H×W each; where there is no prior they mean nothing.
+    """Compute the features of every pixel of a prior, H×W each; where there is no prior they mean nothing.
 
     Args:
         distance_m: d̃, 0 = none.
@@ -110,7 +110,7 @@ def motion_features(
     sigma_m: Float[np.ndarray, "h w"],
     elevation_rad: Float[np.ndarray, "h w"],
 ) -> dict[str, NDArray[np.float32]]:
-    """The features of pixels whose prior is from motion alone, H×W each.
+    """Compute the features of pixels whose prior is from motion alone, H×W each.
 
     elevation_deg angle of the ray above the horizon
     by_matching   the distance's standard deviation by parallax and confidence, as a part of it
@@ -151,25 +151,25 @@ class ErrorModel:
     """For each feature one number a knot."""
 
     def log_sigma(self, features: Features) -> NDArray[np.float64]:
-        """Logarithm of σ̂ / d̃."""
+        """Give the logarithm of σ̂ / d̃."""
         total = np.float64(self.log_base)
         for name, factors in self.log_factors.items():
             total = total + np.interp(_scaled(name, features[name]), _scaled(name, np.array(_ALL_KNOTS[name])), factors)
         return np.asarray(total)
 
     def sigma_m(self, features: Features) -> NDArray[np.float32]:
-        """σ̂, metres."""
+        """Give σ̂, metres."""
         sigma = features["distance_m"] * np.exp(self.log_sigma(features))
         return np.maximum(sigma, LEAST_SIGMA_M).astype(np.float32)
 
 
 def _log_scale(scaled_error: NDArray) -> float:
-    """Logarithm of half of what 95 % of the errors are within."""
+    """Give the logarithm of half of what 95 % of the errors are within."""
     return float(np.log(max(np.quantile(scaled_error, 0.95) / 2, 1e-6)))
 
 
 def _log_middle_scale(scaled_error: NDArray) -> float:
-    """Mean of that and of the logarithm of what 68.3 % are within: between one sigma and two."""
+    """Average that with the logarithm of what 68.3 % are within: between one sigma and two."""
     return 0.5 * (_log_scale(scaled_error) + float(np.log(max(np.quantile(scaled_error, 0.683), 1e-6))))
 
 
@@ -224,7 +224,7 @@ def fit_error_model(
 def error_of_returns(
     lidar_m: Float[np.ndarray, "h w"], returns: Bool[np.ndarray, "h w"]
 ) -> tuple[Bool[np.ndarray, "h w"], NDArray[np.float32]]:
-    """How far LiDAR points lie from a line through their two neighbours, in the row or the column, whichever is worse.
+    """Measure how far LiDAR points lie from a line through their two neighbours, the worse of row and column.
 
     On a plane inverse distance is linear in the picture, nearly so for a fisheye over three pixels. What is left is the
     noise of three LiDAR points, that of one after division by √1.5, with what poses, sweeps of other frames and edges
@@ -281,7 +281,7 @@ class BeyondField:
     def network_reaches(
         self, elevation_rad: Float[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]
     ) -> Bool[np.ndarray, "h w"]:
-        """Where the monocular map's error is known.
+        """Find where the monocular map's error is known.
 
         Args:
             elevation_rad: of each ray.
@@ -333,12 +333,12 @@ class Trust:
     """Of distances from motion; None where the scene has none, or too few to measure: then they take no part."""
 
     def in_field(self, elevation_rad: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-        """Whether each ray points where LiDAR reaches, within the margin."""
+        """Say whether each ray points where LiDAR reaches, within the margin."""
         margin = np.radians(FIELD_MARGIN_DEG)
         return (elevation_rad >= self.field_rad[0] - margin) & (elevation_rad <= self.field_rad[1] + margin)
 
     def sigma_m(self, features: Features, from_motion: Bool[np.ndarray, "*shape"] | None = None) -> NDArray[np.float32]:
-        """σ̂, metres, by the models; there must be an error_model.
+        """Give σ̂, metres, by the models; there must be an error_model.
 
         Args:
             features: of pixels.
@@ -357,7 +357,7 @@ class Trust:
         return sigma
 
     def summary(self) -> str:
-        """Some sentences for the user."""
+        """Sum up the calibration in some sentences for the user."""
         judged = [f for f in self.frames if f.held_out_before is not None and f.held_out_after is not None]
         parts = []
         if judged:
@@ -391,7 +391,7 @@ class Trust:
         return " ".join(parts)
 
     def _beyond_said(self) -> str:
-        """Where else there is a prior."""
+        """Say where else there is a prior."""
         if self.motion is None:
             return ""
         beyond = self.motion.beyond
@@ -417,7 +417,7 @@ class Trust:
 
 
 def _checksum(content: dict[str, Any]) -> str:
-    """Of what a file holds beside it, as JSON."""
+    """Hash what a file holds beside its checksum."""
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 

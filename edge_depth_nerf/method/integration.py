@@ -17,9 +17,8 @@ weight ρ that the measured errors of both give:
 where a pixel has both, and the one it has elsewhere. This d̂, of both, is also what g compares. Without motion nothing
 changes.
 
-Nothing here is differentiated: the prior is data. CPU tensors are integrated by compiled loops
-(`integration_numba`), CUDA tensors by torch; both compute in float64, which keeps the ratios of weights up to
-37 sigma_depth_m.
+Nothing here is differentiated: the prior is data. Compiled loops (`integration_numba`) integrate on the CPU, in
+float64, which keeps the ratios of weights up to 37 sigma_depth_m.
 """
 
 from __future__ import annotations
@@ -50,9 +49,7 @@ Normalise = Literal["pooled", "per-source"]
 SigmaMode = Literal["constant", "combined"]
 
 CPU_STRIP_PIXELS = 1 << 16
-"""On the CPU a map is integrated in strips of about so many pixels: the work that a thread takes at a time."""
-CUDA_STRIP_PIXELS = 1 << 18
-"""The same on a GPU, where strips bound the memory: some twenty float64 numbers a pixel."""
+"""A map is integrated in strips of about so many pixels: the work that a thread takes at a time."""
 LOWEST_EXPONENT = -700.0
 """Distance factors (Eq. 7) of lower exponents are 0: float64 ends at -745, the last of it with few digits."""
 
@@ -164,7 +161,7 @@ def join_estimates(
 
 
 def weight_of_errors(motion_error: float, mono_error: float) -> float:
-    """ρ of `join_estimates` that makes the mean's error least, as far as the errors of both are independent.
+    """Give the ρ of `join_estimates` that makes the mean's error least, if the errors of both are independent.
 
     Args:
         motion_error: relative standard deviation of distances from motion.
@@ -207,30 +204,18 @@ def integrate_depth(
     _check_maps("integrate_depth", lidar_m=lidar_m, mono_m=mono_m, valid=valid)
     dtype = _work_dtype(lidar_m, mono_m)
     flat = (math.prod(mono_m.shape[:-2]), *mono_m.shape[-2:])
-    lidar, mono = (maps.detach().reshape(flat).to(dtype) for maps in (lidar_m, mono_m))
-    usable = valid.reshape(flat)
+    lidar, mono = (maps.detach().reshape(flat).to("cpu", dtype) for maps in (lidar_m, mono_m))
+    usable = valid.reshape(flat).cpu()
     # empty, not zeros: torch's own threads, once they have filled so many, spin for a while beside ours
-    result = torch.empty(3, *flat, dtype=dtype, device=mono.device)
-    integrate = _integrate_on_cpu if mono.device.type == "cpu" else _integrate_with_torch
+    result = torch.empty(3, *flat, dtype=dtype)
     for i in range(flat[0]):
-        integrate(lidar[i], mono[i], usable[i], options, result[:, i])
-    distance_m, spread_m, mono_share = result.reshape(3, *mono_m.shape)
+        _integrate_on_cpu(lidar[i], mono[i], usable[i], options, result[:, i])
+    distance_m, spread_m, mono_share = result.reshape(3, *mono_m.shape).to(mono_m.device)
     return IntegratedDepth(distance_m, spread_m, mono_share)
 
 
 def _work_dtype(*maps: Tensor) -> torch.dtype:
     return torch.float64 if any(tensor.dtype == torch.float64 for tensor in maps) else torch.float32
-
-
-def _axis_weights(options: IntegrationOptions) -> list[float]:
-    """List the spatial weights along one axis; Eq. 7's first factor is the product of two of them."""
-    radius = int(options.kernel_size) // 2
-    return [math.exp(-0.5 * (k / options.sigma_space_px) ** 2) for k in range(-radius, radius + 1)]
-
-
-def _inverse_variance(options: IntegrationOptions) -> float:
-    """Give 1 / σ_d² in 1/m²; 0 makes Eq. 7's second factor 1."""
-    return options.sigma_depth_m**-2 if options.kernel == "edge-aware" else 0.0
 
 
 def _integrate_on_cpu(lidar: Tensor, mono: Tensor, valid: Tensor, options: IntegrationOptions, out: Tensor) -> None:
@@ -243,12 +228,16 @@ def _integrate_on_cpu(lidar: Tensor, mono: Tensor, valid: Tensor, options: Integ
     from edge_depth_nerf.method.integration_numba import TILE, integrate_rows
 
     height, width = mono.shape
+    radius = int(options.kernel_size) // 2
+    # Eq. 7's first factor is the product of two of these; an inverse variance of 0 makes the second one 1
+    along_axis = [math.exp(-0.5 * (k / options.sigma_space_px) ** 2) for k in range(-radius, radius + 1)]
+    inverse_variance_per_m2 = options.sigma_depth_m**-2 if options.kernel == "edge-aware" else 0.0
     integrate = functools.partial(
         integrate_rows,
         *(tensor.contiguous().numpy() for tensor in (lidar, mono, valid)),
         *(tensor.numpy() for tensor in out),
-        np.array(_axis_weights(options)),
-        _inverse_variance(options),
+        np.array(along_axis),
+        inverse_variance_per_m2,
         float(options.sigma_depth_growth_per_m),
         LOWEST_EXPONENT,
         float(options.alpha),
@@ -265,74 +254,6 @@ def _integrate_on_cpu(lidar: Tensor, mono: Tensor, valid: Tensor, options: Integ
             list(pool.map(integrate, tops, bottoms))
     else:
         list(map(integrate, tops, bottoms))
-
-
-def _integrate_with_torch(lidar: Tensor, mono: Tensor, valid: Tensor, options: IntegrationOptions, out: Tensor) -> None:
-    """As `_integrate_on_cpu`, on any device, strip by strip."""
-    height, width = mono.shape
-    radius = int(options.kernel_size) // 2
-    strip = max(1, CUDA_STRIP_PIXELS // max(1, width))
-    for top in range(0, height, strip):
-        first, bottom = max(0, top - radius), min(top + strip, height)
-        rows = slice(first, bottom + radius)
-        integrated = _integrate_strip(lidar[rows], mono[rows], valid[rows], options)
-        out[:, top:bottom] = integrated[:, top - first : bottom - first]
-
-
-def _integrate_strip(lidar: Tensor, mono: Tensor, valid: Tensor, options: IntegrationOptions) -> Tensor:
-    """Integrate a map by operations on all of it, one for each shift of the window: [h, w] each to [3, h, w]."""
-    usable = valid & _is_distance(mono)
-    returns = usable & _is_distance(lidar)
-    mono = torch.where(usable, mono, 0).double()
-    value = torch.where(returns, lidar.double(), mono)
-    inverse_variance = torch.full_like(mono, _inverse_variance(options))
-    if options.sigma_depth_growth_per_m > 0:
-        # where the estimate is 0 there is no prior
-        widest = (options.sigma_depth_growth_per_m * mono.square()).clamp(min=1e-100)
-        inverse_variance = torch.minimum(inverse_variance, widest.pow(-2))
-    height, width = mono.shape
-    weights = _axis_weights(options)
-    padded = torch.nn.functional.pad(
-        torch.stack([mono, value, (usable & ~returns).double(), returns.double()]), (len(weights) // 2,) * 4
-    )
-    shifted = [
-        (spatial_k * spatial_l, padded[:, k : k + height, l : l + width])
-        for k, spatial_k in enumerate(weights)
-        for l, spatial_l in enumerate(weights)
-    ]
-
-    factors: list[float] | list[Tensor] = [1 - options.alpha, options.alpha]
-    if options.normalise == "per-source":
-        spatial_sums = torch.zeros(2, height, width, dtype=torch.float64, device=mono.device)
-        for spatial, window in shifted:
-            spatial_sums.add_(window[2:], alpha=spatial)
-        tiny = torch.finfo(torch.float64).tiny
-        factors = [
-            torch.where(sums > 0, factor / sums.clamp(min=max(least, tiny)), 0)
-            for factor, sums, least in zip(factors, spatial_sums, (0.0, options.least_returns), strict=True)
-        ]
-
-    eta, first, second, eta_mono = torch.zeros(4, height, width, dtype=torch.float64, device=mono.device)
-    for spatial, (mono_there, value_there, is_mono, is_lidar) in shifted:
-        exponent = (mono_there - mono).square_().mul_(inverse_variance).mul_(-0.5)
-        g = torch.where(exponent > LOWEST_EXPONENT, exponent.exp().mul_(spatial), 0)
-        from_mono = (g * is_mono).mul_(factors[0])
-        weight = g.mul_(is_lidar).mul_(factors[1]).add_(from_mono)
-        x = value_there - mono
-        eta.add_(weight)
-        eta_mono.add_(from_mono)
-        first.add_(weight.mul_(x))
-        second.add_(weight.mul_(x))
-
-    exists = usable & (eta > 0)
-    eta = torch.where(exists, eta, 1)
-    mean = first / eta
-    spread = (second / eta - mean.square()).clamp_(min=0).sqrt_()
-    result = torch.stack([mono + mean, spread, eta_mono / eta]) * exists
-    if options.keep_returns:
-        result[0] = torch.where(returns, lidar.double(), result[0])
-        result[1:] *= ~returns
-    return result
 
 
 def select_prior(

@@ -136,7 +136,7 @@ def _say_once(message: str) -> None:
 
 
 def lpips_weights() -> tuple[Path, str]:
-    """Where AlexNet's weights lie if they are on this machine, and the address they come from."""
+    """Say where AlexNet's weights lie if they are on this machine, and the address they come from."""
     url = AlexNet_Weights.IMAGENET1K_V1.url
     return Path(torch.hub.get_dir()) / "checkpoints" / Path(urlparse(url).path).name, url
 

@@ -64,7 +64,7 @@ CALIBRATED = (INTEGRATED, "mono")
 
 
 def default_source(sources: Container[str]) -> str | None:
-    """What a prior is made of where nobody says: LiDAR and monocular maps, or what there is of them."""
+    """Choose what a prior is made of: LiDAR and monocular maps, or what there is of them."""
     if "lidar" in sources:
         return INTEGRATED if "mono" in sources else "lidar"
     return next((source for source in ("mono", "motion") if source in sources), None)
@@ -106,7 +106,7 @@ class PriorOptions:
         check_choice("sigma_mode", self.sigma_mode, PriorSigma)
 
     def wants_trust(self, depth_source: str) -> bool:
-        """Whether a calibration of the drive has a part in the prior made of a source."""
+        """Say whether a calibration of the drive has a part in the prior made of a source."""
         calibrated = self.sigma_mode == "calibrated" and depth_source in CALIBRATED
         return calibrated or (self.align != "none" and depth_source == INTEGRATED)
 
@@ -134,7 +134,7 @@ class RayAngles:
 
 
 def ray_angles(camera: Camera, up_in_camera: Float[np.ndarray, "3"]) -> RayAngles:
-    """The angles of a picture's rays.
+    """Compute the angles of a picture's rays.
 
     Args:
         camera: its lens.
@@ -156,7 +156,7 @@ def sky_of(
     picture: UInt8[np.ndarray, "h w 3"],
     mask: Bool[np.ndarray, "h w"],
 ) -> Bool[np.ndarray, "h w"]:
-    """Where a monocular map says that nothing is there: no distance, above the horizon, bright, and no LiDAR point.
+    """Find the sky: bright, above the horizon, without a monocular distance or a LiDAR point.
 
     `process` and `estimate-depth` take the sky out of the maps; maps of one's own may lack a distance elsewhere, too.
     """
@@ -262,7 +262,7 @@ def integrate_frame(
 
 
 def confirmed(mono_m: NDArray[np.float32], around_m: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Where neighbouring pictures show the same distance, at a pixel or at one of the eight beside it.
+    """Find where neighbouring pictures show the same distance, at a pixel or at one of the eight beside it.
 
     Args:
         mono_m: H×W, the aligned monocular map, 0 = none.
@@ -277,7 +277,7 @@ def confirmed(mono_m: NDArray[np.float32], around_m: NDArray[np.float32]) -> NDA
 
 
 def _measured(lidar_m: NDArray[np.float32], motion: MotionMap) -> NDArray[np.float32]:
-    """What a monocular map is fitted to: LiDAR, and beyond its field motion."""
+    """Give what a monocular map is fitted to: LiDAR, and beyond its field motion."""
     return np.where(np.nan_to_num(lidar_m) > 0, lidar_m, np.where(motion.alone, motion.distance_m, np.float32(0)))
 
 
@@ -303,7 +303,7 @@ def sigma_of(
 
 
 def beyond_features(frame: IntegratedFrame, view: RayAngles) -> dict[str, NDArray[np.float32]]:
-    """Features of a frame's pixels beyond LiDAR's field: the nearest known pixel may be one from motion."""
+    """Compute features beyond LiDAR's field, where the nearest known pixel may be one from motion."""
     known = frame.returns | frame.from_motion
     return pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, known, view.theta_rad)
 
@@ -319,7 +319,7 @@ def motion_map(
     lidar_m: NDArray[np.float32] | None,
     around_m: NDArray[np.float32] | None = None,
 ) -> MotionMap:
-    """How a picture's distances from motion take part under a calibration that measured them.
+    """Say how a picture's distances from motion take part under a calibration that measured them.
 
     Args:
         motion_m: H×W, 0 = none.
@@ -344,12 +344,12 @@ def motion_map(
 
 
 def around_or_nothing(motion_m: NDArray[np.float32], around_m: NDArray[np.float32] | None) -> NDArray[np.float32]:
-    """What neighbours show: as it came, or nothing for scenes without."""
+    """Give what neighbours show, or nothing for scenes without."""
     return np.zeros_like(motion_m) if around_m is None else around_m
 
 
 def motion_sigma(motion_m: NDArray[np.float32], sigma_m: NDArray[np.float32] | None) -> NDArray[np.float32]:
-    """Standard deviation of distances from motion: as they came, or a usual share where nothing came with them."""
+    """Give the standard deviation of distances from motion: as it came, or a usual share of the distance."""
     usual_m = np.float32(MOTION_RELATIVE_ERROR) * motion_m
     return usual_m if sigma_m is None else np.where(sigma_m > 0, sigma_m, usual_m)
 
@@ -424,7 +424,7 @@ class PriorCache:
         self._options_key = json.dumps(described, sort_keys=True).encode()
 
     def prior(self, maps: Maps, mask: NDArray[np.bool_], view: RayAngles | None = None) -> Prior:
-        """As `make_prior`, from the cache where it is there."""
+        """Do as `make_prior`, or read the prior from the cache."""
         angles = (view.theta_rad, view.elevation_rad) if view is not None else ()
         of_sources = [pixels for _, pixels in sorted(maps.items())]
         path = self.folder / f"{self._key(*of_sources, mask, *angles)}.npz"
@@ -443,7 +443,7 @@ class PriorCache:
 
     @property
     def layers(self) -> tuple[str, ...]:
-        """The layers that are read: the source's own, and those that show where the sky is."""
+        """List the layers that are read: the source's own, and those that show where the sky is."""
         if self.depth_source == INTEGRATED and self.options.motion:
             return ("lidar", "mono", "motion", *BESIDE_MOTION)
         return ("lidar", "mono") if self.depth_source in CALIBRATED else (self.depth_source,)

@@ -16,7 +16,7 @@ SMALLEST_WEIGHT = 1e-8
 def termination_std(
     weights: Float[Tensor, "rays samples"], starts: Float[Tensor, "rays samples"], ends: Float[Tensor, "rays samples"]
 ) -> Float[Tensor, "rays"]:
-    """Standard deviation of a ray's termination distribution.
+    """Compute the standard deviation of a ray's termination distribution.
 
     The distribution is even within each sample's interval (h_k = w_k / Δt_k of Eq. 4), and normalised: what passes all
     samples does not count. Where nothing stops the ray, every place on it is as likely as any other.

@@ -15,7 +15,7 @@ from edge_depth_nerf.base.pictures import NO_VALUE_RGB, ColourScale
 
 @functools.lru_cache
 def _table(scale: ColourScale, device: torch.device) -> Tensor:
-    """The colours of a scale and, last, that of no value, [257, 3] in 0..1."""
+    """Give the colours of a scale and, last, that of no value, [257, 3] in 0..1."""
     rows = np.concatenate([scale.colours, np.array([NO_VALUE_RGB], np.uint8)])
     return torch.from_numpy(rows).to(device).float() / 255
 

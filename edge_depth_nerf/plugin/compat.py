@@ -111,7 +111,7 @@ def ignore_deprecations_of_host() -> None:
 
 
 def total_steps(trainer: Trainer) -> int:
-    """All steps of a training, those before it was resumed included; its `max_num_iterations` are those to come.
+    """Count all steps of a training, also those before it was resumed; `max_num_iterations` are those to come.
 
     Works around: https://github.com/nerfstudio-project/nerfstudio/issues/3096.
     Ends with: a nerfstudio that has its pull request 3526, where `max_num_iterations` are all steps.

@@ -58,12 +58,12 @@ METHOD_FILE = "nerfstudio_method.toml"
 
 
 def read_method_file() -> dict[str, Any]:
-    """The shipped nerfstudio_method.toml as nested dictionaries."""
+    """Read the shipped nerfstudio_method.toml as nested dictionaries."""
     return tomllib.loads((resources.files("edge_depth_nerf") / METHOD_FILE).read_text(encoding="utf-8"))
 
 
 def base_config(method_name: str) -> TrainerConfig:
-    """What all methods share: nerfacto's optimisers, no pose refinement, a viewer that listens on this machine only."""
+    """Give what all methods share: nerfacto's optimisers, fixed poses, a viewer that listens on this machine only."""
 
     def optimiser() -> dict[str, Any]:
         return {

@@ -335,7 +335,7 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
 
 
 def _of_use(distance_m: Any, sigma_m: Any, sky: Any) -> Any:
-    """Whether a pixel's surface is known: it is sky, or its prior is not too vague. Arrays or tensors."""
+    """Say whether a pixel shows the sky, or a surface whose prior is not too vague. Arrays or tensors."""
     vague = sigma_m > SURFACE_SIGMA_M + SURFACE_SIGMA_SHARE * distance_m
     return sky | (distance_m > 0) & ~vague
 

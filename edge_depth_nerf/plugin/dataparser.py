@@ -137,7 +137,7 @@ def check_split(meta: dict[str, Any], path: Path) -> None:
 
 
 def transforms_path(data: Path) -> Path:
-    """The transforms.json that `--data` means: a scene folder's, or the file itself.
+    """Find the transforms.json that `--data` means: a scene folder's, or the file itself.
 
     Raises:
         FileNotFoundError: no scene there.
@@ -211,7 +211,7 @@ class FisheyeDepth(Nerfstudio):
             )
 
     def _metres_per_unit(self, frames: list[dict[str, Any]]) -> float:
-        """The scale that was asked for, or the one that suits the drive."""
+        """Give the scale that was asked for, or the one that suits the drive."""
         metres_per_unit = self.config.metres_per_unit
         if metres_per_unit is None:
             positions_m = np.array([frame["transform_matrix"] for frame in frames], dtype=np.float64)[:, :3, 3]

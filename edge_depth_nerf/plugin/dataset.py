@@ -49,19 +49,19 @@ class FisheyeDepthDataset(InputDataset):
         self.scene, self.pictures = self.metadata.pop("scene"), self.metadata.pop("pictures")
 
     def camera(self, image_idx: int) -> Camera:
-        """The lens of a picture, as one of the project's own camera models."""
+        """Give the lens of a picture, as one of the project's own camera models."""
         return self.pictures[image_idx].lens
 
     def rays(self, image_idx: int) -> Rays:
-        """The rays of a picture's pixels, within the scene's theta_max."""
+        """Give the rays of a picture's pixels, within the scene's theta_max."""
         return self.scene.rays(self.pictures[image_idx])
 
     def mask(self, image_idx: int) -> NDArray[np.bool_]:
-        """H×W, True where the picture may be used: the scene's mask within the validity of the lens."""
+        """Give H×W, True where the picture may be used: the scene's mask within the validity of the lens."""
         return self.scene.usable(self.pictures[image_idx])
 
     def rgb(self, image_idx: int) -> NDArray[np.uint8]:
-        """H×W×3 colours; an alpha channel is left away."""
+        """Read H×W×3 colours, without an alpha channel."""
         return self.scene.rgb(self.pictures[image_idx])
 
     def distance_m(self, image_idx: int, layer: str) -> NDArray[np.float32] | None:
@@ -73,7 +73,7 @@ class FisheyeDepthDataset(InputDataset):
         return set.intersection(*(set(picture.files) for picture in self.pictures))
 
     def get_data(self, image_idx: int, image_type: str = "float32") -> dict[str, Any]:
-        """Picture, mask and maps of judgement of one frame.
+        """Give the picture, the mask and the maps that judge a rendered view.
 
         Returns:
             nerfstudio's image_idx, image and mask (H×W×1), and where the scene has them: lidar_distance_m and
@@ -90,7 +90,7 @@ class FisheyeDepthDataset(InputDataset):
         return data
 
     def get_metadata(self, data: dict[str, Any]) -> dict[str, Tensor]:
-        """The maps that judge a rendered view."""
+        """Give the maps that judge a rendered view."""
         image_idx = data["image_idx"]
         found: dict[str, Tensor] = {}
         for layer in JUDGED_DISTANCES:

@@ -36,7 +36,7 @@ _shown: ContextVar[bool | None] = ContextVar("detail_shown", default=None)
 
 @contextmanager
 def with_appearance_of(field: Any, picture: int) -> Iterator[None]:
-    """With nerfacto's appearance embedding, let a field look as a training picture; else nothing changes."""
+    """Let a field that has nerfacto's appearance embedding look as a training picture."""
     embedding: Any = field.embedding_appearance
     if embedding is None:
         yield
@@ -74,7 +74,7 @@ class TrainingDetail:
 
     @property
     def is_shown(self) -> bool:
-        """Whether views are rendered with it: as the configuration says, or `detail_shown`."""
+        """Say whether views are rendered with detail, by `detail_shown` or the configuration."""
         shown = _shown.get()
         return self.model.config.detail if shown is None else shown
 
@@ -106,7 +106,7 @@ class TrainingDetail:
         return found.view(*distance.shape[:-1], 3).to(distance)
 
     def _poses(self) -> Float[Tensor, "pictures 3 4"]:
-        """The poses of the training pictures, as training has moved them."""
+        """Give the poses of the training pictures, as training has moved them."""
         poses = self.dataset.cameras.camera_to_worlds.to(self.model.device)
         optimizer = self.model.camera_optimizer
         if optimizer.config.mode == "off":

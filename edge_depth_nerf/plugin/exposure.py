@@ -19,16 +19,16 @@ class Gains(nn.Module):
 
     @property
     def gains(self) -> Float[Tensor, "pictures 3"]:
-        """The factors."""
+        """Give the factors."""
         return (self.log_gains - self.log_gains.mean(dim=0)).exp()
 
     def forward(self, colours: Float[Tensor, "rays 3"], picture: Int[Tensor, "rays"]) -> Float[Tensor, "rays 3"]:
-        """Colours as the pictures have them."""
+        """Give colours the exposure of their pictures."""
         # faster than an index, forward and backward
         return colours * self.gains.index_select(0, picture)
 
     def beyond(
         self, image: Float[Tensor, "h w 3"], rendered: Float[Tensor, "h w 3"], picture: int
     ) -> Float[Tensor, "h w 3"]:
-        """What a picture shows beyond its neutral rendering, in neutral colours."""
+        """Subtract a neutral rendering from a picture, in neutral colours."""
         return image / self.gains[picture] - rendered

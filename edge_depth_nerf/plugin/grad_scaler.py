@@ -23,7 +23,7 @@ class PatientGradScaler(torch.amp.GradScaler):
         self._updates = 0
 
     def get_scale(self) -> float:
-        """The scale when it was last read."""
+        """Give the scale as it was last read."""
         return self._seen
 
     def update(self, new_scale: Any = None) -> None:
@@ -39,11 +39,11 @@ class PatientGradScaler(torch.amp.GradScaler):
             self._seen = super().get_scale()
 
     def _some_stepped(self) -> bool:
-        """Whether an optimiser's gradients were looked at since the last update."""
+        """Say whether an optimiser's gradients were looked at since the last update."""
         return any(state["found_inf_per_device"] for state in self._per_optimizer_states.values())
 
     def state_dict(self) -> dict[str, Any]:
-        """What a checkpoint keeps, the present scale included."""
+        """Give what a checkpoint keeps, with the present scale."""
         self._seen = super().get_scale()
         return super().state_dict()
 

@@ -199,7 +199,7 @@ class EdgeDepthPipeline(VanillaPipeline):
         output_path: Path | None = None,
         get_std: bool = False,
     ) -> dict[str, Any]:
-        """Nerfstudio's averages over pictures; AbsRel, RMSE and δ are over all their pixels together."""
+        """Average figures over pictures as nerfstudio does, but AbsRel, RMSE and δ over all their pixels together."""
         model = self.model
         assert isinstance(model, EdgeDepthNerfModel)
         model.reset_depth_errors()

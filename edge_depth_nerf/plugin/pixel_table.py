@@ -46,13 +46,13 @@ LARGEST_SIDE_PX = 1 << 16
 
 
 def to_steps(distance_m: NDArray) -> NDArray[np.uint16]:
-    """Metres as counts of 1/256 m; what is beyond the range of 16 bits or not positive becomes 0 (none)."""
+    """Turn metres into counts of 1/256 m; what is not positive or beyond 16 bits becomes 0 (none)."""
     steps = np.rint(np.nan_to_num(distance_m, nan=0.0, posinf=0.0, neginf=0.0) * DISTANCE_STEPS_PER_METRE)
     return np.where((steps > 0) & (steps <= 65535), steps, 0).astype(np.uint16)
 
 
 def _sigma_steps(sigma_m: NDArray) -> NDArray[np.uint16]:
-    """As `to_steps`, but what is too small or too large for 16 bits stays a standard deviation."""
+    """Do as `to_steps`, but what is too small or too large for 16 bits stays a standard deviation."""
     usable = np.isfinite(sigma_m) & (sigma_m > 0)
     steps = np.clip(np.rint(np.where(usable, sigma_m, 0) * DISTANCE_STEPS_PER_METRE), 1, 65535)
     return np.where(usable, steps, 0).astype(np.uint16)
@@ -74,7 +74,7 @@ class PixelBatch:
     """Whether the pixel is known to show the sky."""
 
     def __getitem__(self, chosen: Bool[Tensor, "n"] | slice) -> PixelBatch:
-        """Some of the pixels."""
+        """Choose some of the pixels."""
         return PixelBatch(**{entry.name: getattr(self, entry.name)[chosen] for entry in fields(self)})
 
 
@@ -122,12 +122,12 @@ class PixelTable:
         self._with_prior = about["with_prior"]
 
     def __len__(self) -> int:
-        """Number of records: of valid pixels."""
+        """Count the records: the valid pixels."""
         return len(self._records)
 
     @property
     def share_with_prior(self) -> float:
-        """Share of the records that have a prior."""
+        """Give the share of the records that have a prior."""
         return self._with_prior / len(self)
 
     def records(self, start: int, count: int) -> NDArray:
@@ -178,21 +178,20 @@ class PicturePixels:
     """Where it is known to show the sky; None: nowhere."""
 
 
-def write_table(path: Path, most_pixels: int, pictures: Iterable[PicturePixels], seed: int = 0) -> None:
+def write_table(path: Path, most_pixels: int, pictures: Iterable[PicturePixels]) -> None:
     """Write a table of pictures.
 
     Args:
         path: the file to be, .npy; its folder is made.
         most_pixels: an upper bound of the pixels.
         pictures: read one after the other.
-        seed: of the pixels' order.
 
     Raises:
         InputError: no valid pixel in any picture.
 
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    rng, number, pixels, with_prior = np.random.default_rng(seed), 0, 0, 0
+    rng, number, pixels, with_prior = np.random.default_rng(0), 0, 0, 0
     with ExitStack() as stack:
         buckets: list[IO[bytes]] = [
             stack.enter_context(tempfile.TemporaryFile(dir=path.parent, prefix=".pixels."))
@@ -246,5 +245,5 @@ def _records(picture: PicturePixels, number: int) -> NDArray:
 
 
 def _about(path: Path) -> Path:
-    """The file that tells that a table is whole."""
+    """Name the file that tells that a table is whole."""
     return path.with_suffix(".json")

@@ -37,7 +37,7 @@ def say_errors_plainly() -> None:
 
 
 def _own_words(error: BaseException, trace: TracebackType | None) -> str | None:
-    """One paragraph for the user: an `InputError`, or a missing file in our own words; else None."""
+    """Give one paragraph for the user: an `InputError`, or a missing file in our own words; else None."""
     if isinstance(error, InputError):
         return str(error)
     frames = traceback.extract_tb(trace)

@@ -62,7 +62,7 @@ class PoseRefiner(CameraOptimizer):
             self.pose_adjustment = torch.nn.Parameter(rows)
 
     def forward(self, indices: Int[Tensor, "rays"]) -> Float[Tensor, "rays 3 4"]:
-        """What is to be done to the rays of pictures, in the world: a turn about the camera, and a shift."""
+        """Give the correction of the rays of pictures, in the world: a turn about the camera, and a shift."""
         if self.config.mode == "off":
             # the viewer asks also then
             return super().forward(indices)
@@ -103,6 +103,6 @@ def _sigmas(config: PoseRefinerConfig, metres_per_unit: float, like: Tensor) -> 
 def moved_pose(
     poses: Float[Tensor, "pictures 3 4"], correction: Float[Tensor, "*pictures 3 4"]
 ) -> Float[Tensor, "pictures 3 4"]:
-    """Camera poses after a correction of their rays: a turn about each camera, and a shift, both in the world."""
+    """Correct camera poses as their rays: turn about each camera, and shift, both in the world."""
     turned = correction[..., :3] @ poses[..., :3]
     return torch.cat([turned, poses[..., 3:] + correction[..., 3:]], dim=-1)

@@ -42,7 +42,7 @@ of the direction before it was normalised."""
 
 
 def _lenses(cameras: Cameras) -> tuple[Float[Tensor, "lenses 13"], Int[Tensor, "cameras"]]:
-    """What tells lenses apart, and the lens of each camera."""
+    """List the different lenses, and the number of each camera's."""
     count = len(cameras)
     distortion = cameras.distortion_params
     values = [cameras.width, cameras.height, cameras.camera_type, cameras.fx, cameras.fy, cameras.cx, cameras.cy]
@@ -52,7 +52,7 @@ def _lenses(cameras: Cameras) -> tuple[Float[Tensor, "lenses 13"], Int[Tensor, "
 
 
 def _make(lenses: Tensor, advance: Callable[[int], object]) -> np.ndarray:
-    """The table of some lenses, one after the other, each row by row; `advance` gets the number of finished pixels."""
+    """Make the table of some lenses, each row by row; `advance` gets the number of finished pixels."""
     parts = []
     for lens in lenses.float():
         width, height = int(lens[0]), int(lens[1])
@@ -132,7 +132,7 @@ class TableRayGenerator(RayGenerator):
 
     @staticmethod
     def suits(cameras: Cameras) -> bool:
-        """Whether a table can stand for these cameras: few lenses, no times, no metadata of a camera's own."""
+        """Say whether a table can serve these cameras: few lenses, no times, no metadata of a camera's own."""
         kinds = (CameraType.PERSPECTIVE.value, CameraType.FISHEYE.value)
         if cameras.times is not None or cameras.metadata or cameras.camera_to_worlds.requires_grad:
             return False
@@ -142,7 +142,7 @@ class TableRayGenerator(RayGenerator):
         )
 
     def forward(self, ray_indices: Int[Tensor, "num_rays 3"]) -> RayBundle:
-        """Rays of pixels, given by picture, row and column."""
+        """Give the rays of pixels: picture, row and column."""
         picture, row, column = ray_indices.unbind(-1)
         if ray_indices.device.type == "cpu":
             # imported here, because Numba takes half a second to load
@@ -173,7 +173,7 @@ class ViewRays:
         self._of_lens = lru_cache(KEPT_VIEWS)(_make_in_memory)
 
     def of(self, camera: Cameras) -> RayBundle:
-        """Rays of a camera of shape [1], as [height, width]."""
+        """Give the rays of a camera of shape [1], as [height, width]."""
         if camera.shape != (1,) or not TableRayGenerator.suits(camera):
             return camera.generate_rays(camera_indices=0, keep_shape=True)
         lenses, _ = _lenses(camera)
@@ -190,7 +190,7 @@ class ViewRays:
 
 
 def _make_in_memory(lens: tuple[float, ...]) -> tuple[Tensor, Tensor, Tensor]:
-    """Directions as the camera has them, areas, and lengths of a lens's rays; [pixels, 3 or 1]."""
+    """Make directions in the camera's frame, areas, and lengths of a lens's rays; [pixels, 3 or 1]."""
     table = torch.from_numpy(_make(torch.tensor([lens], dtype=torch.float64), lambda _: None))
     directions, areas, lengths = (part.contiguous() for part in table.split((3, 1, 1), dim=1))
     return directions, areas, lengths

@@ -10,7 +10,7 @@ SAID_ANYWAY = ("data", "pipeline.datamanager.data", "timestamp", "experiment_nam
 
 
 def flattened(config: Any, prefix: str = "") -> dict[str, Any]:
-    """A configuration as dotted names and values."""
+    """Turn a configuration into dotted names and values."""
     if is_dataclass(config) and not isinstance(config, type):
         children = {entry.name: getattr(config, entry.name) for entry in fields(config)}
     elif isinstance(config, dict):

@@ -110,12 +110,12 @@ def scheduled_by(model: EdgeDepthNerfModel, numbers: Float[Tensor, "2"]) -> Iter
 
 
 def updates_proposals(sampler: ProposalNetworkSampler) -> bool:
-    """Whether the next step trains the proposal networks, as nerfstudio's sampler decides it."""
+    """Say whether the next step trains the proposal networks, as nerfstudio's sampler decides it."""
     return sampler._steps_since_update > sampler.update_sched(sampler._step) or sampler._step < 10
 
 
 def why_not(model: EdgeDepthNerfModel, device: str, world_size: int, accumulates: bool) -> str | None:
-    """Why the steps of a training cannot be recorded; None where they can.
+    """Say why the steps of a training cannot be recorded; None where they can.
 
     Args:
         model: what is trained.
@@ -159,7 +159,7 @@ class StepGraphs:
 
     @property
     def recorded(self) -> int:
-        """How many kinds of steps are replayed; 0 before the first recording, and once something has ended this."""
+        """Count the kinds of steps that are replayed; 0 before the first recording and after this has ended."""
         return len(self._recorded)
 
     def replayed(self, packed: Tensor, step: int) -> Step | None:
@@ -220,7 +220,7 @@ class StepGraphs:
         return recorded.outputs, dict(zip(recorded.names, losses.unbind(), strict=True)), recorded.metrics
 
     def _state(self, packed: Tensor) -> tuple[Any, ...]:
-        """What must not change after a step was recorded."""
+        """Collect what must not change after a step was recorded."""
         pipeline = self._pipeline
         return (
             packed.shape,

@@ -30,16 +30,16 @@ class Stretch:
     """From their start to that of the stretch which is read after them."""
 
     def following(self) -> Stretch:
-        """The stretch that is read after them."""
+        """Give the stretch that is read after these records."""
         return replace(self, start=self.start + self.to_next)
 
     def same(self, other: Stretch) -> bool:
-        """Whether they are the same records."""
+        """Say whether these are the same records."""
         return self.table is other.table and (self.start, self.count) == (other.start, other.count)
 
 
 def read(stretches: Sequence[Stretch]) -> UInt8[np.ndarray, "n 15"]:
-    """The bytes of their records, one stretch after the other, in memory of their own."""
+    """Copy the bytes of stretches, one after the other."""
     records = np.empty((sum(each.count for each in stretches), RECORD.itemsize), np.uint8)
     first = 0
     for each in stretches:
@@ -62,7 +62,7 @@ class Uploads:
         self._ahead: tuple[list[Stretch], Future[NDArray[np.uint8]]] | None = None
 
     def upload(self, stretches: Sequence[Stretch]) -> UInt8[Tensor, "n 15"]:
-        """The bytes of some records, on the device; the copy is asked for, and may not have been made yet."""
+        """Start to copy the bytes of some records to the device."""
         records = self._read(stretches)
         following = [each.following() for each in stretches]
         self._ahead = following, self._reader.submit(read, following)

@@ -42,17 +42,17 @@ class CubeContraction(SceneContraction):
 
 
 def _in_parts(x: Tensor) -> bool:
-    """Whether `network` takes it in parts."""
+    """Say whether `network` takes these inputs in tiles."""
     return x.device.type == "cpu" and x.dtype == torch.float32 and not torch.is_autocast_enabled("cpu")
 
 
 def _by_network(x: Tensor) -> bool:
-    """Whether `network` is for it, which takes once a ray what the samples of a ray share."""
+    """Say whether `network` serves these inputs; it computes once a ray what the samples of a ray share."""
     return x.device.type == "cuda" or _in_parts(x)
 
 
 def _one_a_ray(directions: Tensor) -> bool:
-    """Whether all samples of a ray have one direction."""
+    """Say whether all samples of a ray have one direction."""
     return directions.ndim == 3 and (directions.shape[1] == 1 or directions.stride(1) == 0)
 
 
@@ -66,7 +66,7 @@ class FusedMLP(MLP):
 
     @property
     def is_plain(self) -> bool:
-        """Whether it is layers with ReLU between them, in torch."""
+        """Say whether it consists of torch's layers with ReLU between them."""
         return self.tcnn_encoding is None and not self.skip_connections and isinstance(self.activation, nn.ReLU)
 
     def forward(self, in_tensor: Float[Tensor, "*bs in_dim"]) -> Float[Tensor, "*bs out_dim"]:
@@ -79,7 +79,7 @@ class FusedMLP(MLP):
 
 
 def _unit_cube(positions: Float[Tensor, "*bs 3"]) -> tuple[Tensor, Tensor]:
-    """Positions in scene units to 0..1, flat, and 1 for those strictly inside (else 0), of shape [*bs, 1]."""
+    """Map positions in scene units to 0..1, flat; also give 1 for those strictly inside, else 0, [*bs, 1]."""
     flat = positions.reshape(-1, 3)
     plain = flat.dtype == torch.float32 and not flat.requires_grad
     places, inside = ((CONTRACT.on(flat.device) if plain else None) or formulas.contract)(flat)
@@ -87,7 +87,7 @@ def _unit_cube(positions: Float[Tensor, "*bs 3"]) -> tuple[Tensor, Tensor]:
 
 
 def _densities(before: Float[Tensor, "*bs 1"], inside: Float[Tensor, "*bs 1"], scale: float) -> Float[Tensor, "*bs 1"]:
-    """Densities from a network's outputs; 0 where a point is not inside."""
+    """Compute densities from a network's outputs; 0 where a point is not inside."""
     compute = DENSITY.compiled_for(before, inside)
     if compute is None:
         return scale * trunc_exp(before.to(inside)) * inside
@@ -98,7 +98,7 @@ class FusedDensityField(HashMLPDensityField):
     """nerfstudio's proposal network."""
 
     def density_fn(self, positions: Float[Tensor, "*bs 3"], times: Tensor | None = None) -> Float[Tensor, "*bs 1"]:
-        """Density at positions in scene units."""
+        """Compute the density at positions in scene units."""
         if not isinstance(self.spatial_distortion, CubeContraction) or self.use_linear or positions.requires_grad:
             return super().density_fn(positions, times)
         places, inside = _unit_cube(positions)
@@ -113,7 +113,7 @@ class FusedNerfactoField(NerfactoField):
     """False: no gradient to the positions in training, where nobody asks for it but nerfstudio's form prepares it."""
 
     def get_density(self, ray_samples: RaySamples) -> tuple[Tensor, Tensor]:
-        """Density and features of samples."""
+        """Compute density and features of samples."""
         follows = torch.is_grad_enabled() and (self.follows_positions or not self.training)
         if follows or not isinstance(self.spatial_distortion, CubeContraction):
             return super().get_density(ray_samples)
@@ -123,7 +123,7 @@ class FusedNerfactoField(NerfactoField):
         return self._density(features, inside)
 
     def _density(self, features: Tensor, inside: Tensor) -> tuple[Tensor, Tensor]:
-        """Density and what colours are made of, from the first network's outputs."""
+        """Split the first network's outputs into density and what colours are made of."""
         before, embedding = torch.split(features, [1, self.geo_feat_dim], dim=-1)
         return _densities(before, inside, self.average_init_density), embedding
 
@@ -189,7 +189,7 @@ class FusedNerfactoField(NerfactoField):
         return render(encoding(places), of_rays, networks, inside[:, 0], *pixels)
 
     def may_render(self, samples: RaySamples, points: RaySamples | None) -> bool:
-        """Whether `render` covers what this field has, for these samples."""
+        """Say whether `render` serves this field and these samples."""
         parts, deltas = [samples, *([] if points is None else [points])], samples.deltas
         more_heads = self.use_transient_embedding or self.use_semantics or self.use_pred_normals
         if more_heads or not isinstance(self.spatial_distortion, CubeContraction) or deltas is None:
@@ -204,7 +204,7 @@ class FusedNerfactoField(NerfactoField):
         return plain and cameras and one_a_ray and given and deltas.numel() > 0 and not deltas.requires_grad
 
     def _appearance(self, parts: Sequence[RaySamples]) -> Tensor:
-        """The appearance of each ray's picture; at evaluation the mean of all, or none, as nerfstudio has it."""
+        """Give the appearance of each ray's picture; at evaluation the mean of all, or none, as nerfstudio has it."""
         assert self.embedding_appearance is not None
         if self.training:
             return self.embedding_appearance(torch.cat([each.camera_indices[:, 0, 0] for each in parts]))  # pyright: ignore[reportOptionalSubscript]
@@ -213,7 +213,7 @@ class FusedNerfactoField(NerfactoField):
         return shown.expand(sum(len(each) for each in parts), -1)
 
     def _encoded_directions(self, parts: Sequence[RaySamples]) -> Sequence[Tensor | None]:
-        """The directions of the rays of each part, encoded together; None where samples have their own."""
+        """Encode the directions of the rays of all parts together; None where samples have their own."""
         directions = [samples.frustums.directions for samples in parts]
         if not all(map(_one_a_ray, directions)):
             return [None] * len(parts)
@@ -221,7 +221,7 @@ class FusedNerfactoField(NerfactoField):
         return self._encoded(every).split([len(each) for each in directions])
 
     def _encoded(self, directions: Float[Tensor, "rays 3"]) -> Float[Tensor, "rays encoded"]:
-        """Directions in spherical harmonics, without a gradient, as nerfstudio has them."""
+        """Encode directions in nerfstudio's spherical harmonics, without a gradient."""
         encoding = self.direction_encoding
         plain = isinstance(encoding, SHEncoding) and encoding.get_out_dim() == formulas.HARMONICS
         compute = HARMONICS.compiled_for(directions.detach()) if plain else None
@@ -235,7 +235,7 @@ class FusedNerfactoField(NerfactoField):
         density_embedding: Tensor | None = None,
         encoded: Float[Tensor, "rays encoded"] | None = None,
     ) -> dict[FieldHeadNames, Tensor]:
-        """Colours of samples; `encoded`: their rays' directions, where they are encoded already."""
+        """Compute colours of samples; `encoded` are their rays' directions if these are encoded already."""
         directions, cameras = ray_samples.frustums.directions, ray_samples.camera_indices
         assert density_embedding is not None
         more_heads = self.use_transient_embedding or self.use_semantics or self.use_pred_normals

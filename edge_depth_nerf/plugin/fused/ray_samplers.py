@@ -50,7 +50,7 @@ class FirstSampler(UniformLinDispPiecewiseSampler):
         return _samples_between(ray_bundle, edges, to_euclidean)
 
     def _between(self, count: int, device: torch.device) -> tuple[Tensor, Tensor]:
-        """Where each edge may lie: the middles beside its even place, the lower one and how far it is to the upper."""
+        """Give where each edge may lie: the middle before its even place, and how far it is to the middle after it."""
         key = count, device
         if key not in self._intervals:
             even = torch.linspace(0, 1, count + 1)
@@ -122,7 +122,7 @@ class FusedProposalSampler(ProposalNetworkSampler):
 
 
 def edges_of(samples: RaySamples) -> Tensor:
-    """Where a ray's samples begin and the last one ends, in the spacing of 0..1, [rays, samples + 1]."""
+    """Give where a ray's samples begin and the last one ends, in the spacing of 0..1, [rays, samples + 1]."""
     starts: Any = samples.spacing_starts
     ends: Any = samples.spacing_ends
     rays, count = starts.shape[:2]
@@ -157,7 +157,7 @@ class FusedFrustums(Frustums):
     """nerfstudio's `Frustums`; positions without a gradient come from one kernel."""
 
     def get_positions(self) -> Float[Tensor, "*batch 3"]:
-        """Positions in the middle of the samples."""
+        """Give the positions in the middle of the samples."""
         given = self.origins, self.directions, self.starts, self.ends
         of_rays = self.origins.ndim == 3 and all(each.shape[1] == 1 or each.stride(1) == 0 for each in given[:2])
         compute = POSITIONS.compiled_for(*given) if of_rays and self.offsets is None else None
