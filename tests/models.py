@@ -74,3 +74,9 @@ def supervision(count: int, seed: int) -> dict[str, torch.Tensor]:
         "prior_sigma_m": 0.1 * prior + 0.01,
         "sky": (torch.arange(count) % 7 == 0)[:, None],
     }
+
+
+def layers(*widths: int) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+    """Weights and biases of a network that follows gradients."""
+    shapes = list(zip(widths[1:], widths, strict=False))
+    return [torch.randn(s, requires_grad=True) for s in shapes], [torch.randn(s[0], requires_grad=True) for s in shapes]

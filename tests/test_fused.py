@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import torch
-from models import build, bundle, supervision
+from models import build, bundle, layers, supervision
 from nerfstudio.cameras.rays import Frustums, RayBundle, RaySamples
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.field_components.encodings import HashEncoding
@@ -51,11 +51,6 @@ def small_shares(monkeypatch):
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
-
-
-def layers(*widths: int) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
-    shapes = list(zip(widths[1:], widths, strict=False))
-    return [torch.randn(s, requires_grad=True) for s in shapes], [torch.randn(s[0], requires_grad=True) for s in shapes]
 
 
 def straight(x: torch.Tensor, weights: list[torch.Tensor], biases: list[torch.Tensor]) -> torch.Tensor:

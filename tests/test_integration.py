@@ -192,11 +192,7 @@ def test_moves_and_flips_with_the_picture():
     def changed(change) -> IntegratedDepth:
         return IntegratedDepth(*(change(getattr(expected, f.name)) for f in dataclasses.fields(expected)))
 
-    for change in (
-        lambda t: torch.nn.functional.pad(t, (3, 6, 5, 2)),
-        lambda t: t.flip(0).contiguous(),
-        lambda t: t.T,
-    ):
+    for change in (lambda t: torch.nn.functional.pad(t, (3, 6, 5, 2)), lambda t: t.flip(0).contiguous(), lambda t: t.T):
         assert_same(integrate_depth(change(lidar), change(mono), change(valid)), changed(change))
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from models import build, bundle
+from models import build, bundle, layers
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.model_components import renderers
@@ -28,11 +28,6 @@ def threads(request, monkeypatch):
     torch.set_num_threads(request.param)
     yield
     torch.set_num_threads(before)
-
-
-def layers(*widths: int) -> tuple[list[Tensor], list[Tensor]]:
-    shapes = list(zip(widths[1:], widths, strict=False))
-    return [torch.randn(s, requires_grad=True) for s in shapes], [torch.randn(s[0], requires_grad=True) for s in shapes]
 
 
 def straight_networks(x: Tensor, of_points: Tensor, first: Any, second: Any, by_ray: Tensor) -> Tensor:
@@ -97,13 +92,7 @@ def test_positions_that_nobody_follows_cost_no_gradient():
     assert all(each.grad is not None for part in (*first, *second) for each in part)
 
 
-def render_values(
-    values: Tensor,
-    inside: Tensor,
-    deltas: Tensor,
-    scale: float,
-    background: Background,
-) -> Rendered:
+def render_values(values: Tensor, inside: Tensor, deltas: Tensor, scale: float, background: Background) -> Rendered:
     """Render what networks give, [4, points]: behind networks that pass it on."""
     networks = Networks(([torch.eye(4)], [torch.zeros(4)]), ([torch.eye(3)], [torch.zeros(3)]), torch.zeros(3, 1))
     singles = values.shape[1] - deltas.numel()
@@ -175,13 +164,10 @@ def test_a_density_that_is_not_a_number_weighs_nothing_and_shows():
     assert values.grad is not None and values.grad[:, :3].isfinite().all() and values.grad[0, 3:6].isnan().any()
 
 
-def outputs_both_ways(model: Any, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+def both_ways(
+    model: Any, monkeypatch: pytest.MonkeyPatch, rays: Callable[[], RayBundle] = bundle
+) -> list[dict[str, Any]]:
     """The model's outputs as rendered at once, and step by step from the same samples."""
-    return both_ways(model, monkeypatch, bundle)
-
-
-def both_ways(model: Any, monkeypatch: pytest.MonkeyPatch, rays: Callable[[], RayBundle]) -> list[dict[str, Any]]:
-    """The same of other rays."""
     found = []
     for at_once in (True, False):
         if not at_once:
@@ -210,7 +196,7 @@ def test_a_model_renders_the_same_at_once_and_step_by_step(options, training, mo
             for parameter in network.parameters():
                 if parameter.shape[-1] == 2:
                     parameter.uniform_(-0.5, 0.5)
-    at_once, by_steps = outputs_both_ways(model, monkeypatch)
+    at_once, by_steps = both_ways(model, monkeypatch)
     assert set(at_once) == set(by_steps)
     for name in ("rgb", "accumulation"):
         torch.testing.assert_close(at_once[name], by_steps[name], rtol=1e-4, atol=1e-5)

@@ -16,7 +16,7 @@ from edge_depth_nerf.plugin.upload import Stretch, Uploads
 @pytest.fixture
 def tables(tmp_path) -> list[PixelTable]:
     masks = [[np.ones((7, 9), bool)], [np.ones((5, 5), bool), np.ones((4, 4), bool)]]
-    return [table_of(tmp_path / f"{number}.npy", each, seed=number) for number, each in enumerate(masks)]
+    return [table_of(tmp_path / f"{number}.npy", each) for number, each in enumerate(masks)]
 
 
 def indices(packed: torch.Tensor) -> torch.Tensor:

@@ -245,7 +245,7 @@ def test_what_is_not_there_cannot_be_switched_on(tmp_path):
     pipeline = pipeline_of(write_scene(tmp_path, lidar=False, mono=False), "test", depth_loss="none")
     switches = pipeline.drive.layers.switches
     assert {name: switch.disabled for name, switch in switches.items()} == {
-        **{"lenses": False, "path": False, "lidar": True, "prior": True},
+        **{"lenses": False, "path": False, "lidar": True, "prior": True}
     }
 
 
@@ -689,8 +689,7 @@ def test_a_browser_begins_at_a_training_camera(browser, page, training):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("label", "layer"),
-    [("LiDAR points", "lidar"), ("Depth prior", "prior"), ("Path", "path"), ("Lenses", "lenses")],
+    ("label", "layer"), [("LiDAR points", "lidar"), ("Depth prior", "prior"), ("Path", "path"), ("Lenses", "lenses")]
 )
 def test_switches_work(page, training, label, layer):
     box = page.get_by_label(label)
