@@ -61,6 +61,17 @@ def _compiling_for(architecture: int) -> Iterator[dict[str, bytes]]:
         triton.runtime.driver._active = None
 
 
+def check_registers(
+    call: Callable[[], Any], architecture: int, folder: Path, names: set[str], most: int
+) -> list[Kernel]:
+    """Compile what a call launches: kernels of these names, without spills, of at most so many registers a thread."""
+    kernels = compiled(call, architecture, folder)
+    assert {kernel.name.split()[0] for kernel in kernels} == names
+    assert {kernel.spilled for kernel in kernels} == {0}
+    assert max(kernel.registers for kernel in kernels) <= most
+    return kernels
+
+
 def compiled(call: Callable[[], Any], architecture: int, folder: Path) -> list[Kernel]:
     """Compile what a call launches."""
     import triton

@@ -61,12 +61,13 @@ def surface(count=6) -> dict:
     }
 
 
-def trained_step(model):
-    """Outputs and losses of one training step; the same samples for every model of the same seed."""
+def trained_step(model, more: dict | None = None):
+    """Outputs and losses of one training step, which may bring more; the same samples for every model of one seed."""
     model.train()
     torch.manual_seed(3)
-    outputs = model(rays())
-    return outputs, model.get_loss_dict(outputs, batch(), model.get_metrics_dict(outputs, batch()))
+    supervision = batch() | (more or {})
+    outputs = model(rays(), supervision)
+    return outputs, model.get_loss_dict(outputs, supervision, model.get_metrics_dict(outputs, supervision))
 
 
 def test_near_and_far_are_metres_and_are_not_reset():
@@ -171,14 +172,11 @@ def test_without_a_depth_loss_it_is_nerfacto():
 
 def step_with_surface(model):
     """Outputs and losses of a training step that brings further pixels."""
-    model.train()
     torch.manual_seed(3)
     with torch.no_grad():
         for parameter in model.field.parameters():
             parameter.normal_(0, 0.3)  # a new field has one colour everywhere
-    supervision = batch() | surface()
-    outputs = model(rays(), supervision)
-    return outputs, model.get_loss_dict(outputs, supervision, model.get_metrics_dict(outputs, supervision))
+    return trained_step(model, surface())
 
 
 @pytest.mark.parametrize("kind", LOSSES)
@@ -277,12 +275,8 @@ def test_the_sky_loss_is_what_rays_into_the_sky_hit():
 
 
 def test_the_surface_loss_is_the_field_colour_error_at_the_prior():
-    model = build(surface_loss_mult=0.5).train()
-    given = surface()
-    torch.manual_seed(3)
-    supervision = batch() | given
-    outputs = model(rays(), supervision)
-    losses = model.get_loss_dict(outputs, supervision, model.get_metrics_dict(outputs, supervision))
+    model, given = build(surface_loss_mult=0.5), surface()
+    _, losses = trained_step(model, given)
     where = torch.where(given["surface_sky"], 1e4, given["surface_distance_m"] / METRES_PER_UNIT)[:, 0]
     colours = colours_at(model, given["surface_rays"], where)
     expected = 0.5 * (colours - given["surface_image"]).square().mean()
@@ -302,19 +296,14 @@ def test_further_pixels_that_do_not_count_change_no_loss():
             given = {name: value[chosen] for name, value in given.items()}
         else:
             given["surface_counts"] = counts
-        supervision = batch() | given
-        torch.manual_seed(3)
-        outputs = model(rays(), supervision)
-        loss = model.get_loss_dict(outputs, supervision, model.get_metrics_dict(outputs, supervision))["surface_loss"]
+        loss = trained_step(model, given)[1]["surface_loss"]
         loss.backward()
         found.append((loss.detach(), [each.grad for each in model.field.mlp_head.parameters()]))
     assert float(found[1][0]) == pytest.approx(float(found[0][0]), rel=1e-4) and found[0][0] > 0
     for one, other in zip(found[0][1], found[1][1], strict=True):
         torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-6)
     nowhere = surface() | {"surface_counts": torch.zeros(6, 1, dtype=torch.bool)}
-    supervision = batch() | nowhere
-    outputs = model(rays(), supervision)
-    losses = model.get_loss_dict(outputs, supervision, model.get_metrics_dict(outputs, supervision))
+    _, losses = trained_step(model, nowhere)
     assert losses["surface_loss"] == 0 and losses["surface_loss"].requires_grad
 
 
@@ -359,11 +348,7 @@ def test_a_surface_that_is_not_between_the_planes_says_nothing(distance_m):
     image = given["surface_image"].clone()
 
     def loss() -> float:
-        torch.manual_seed(3)
-        supervision = batch() | given
-        outputs = model(rays(), supervision)
-        found = model.get_loss_dict(outputs, supervision, model.get_metrics_dict(outputs, supervision))
-        return float(found["surface_loss"])
+        return float(trained_step(model, given)[1]["surface_loss"])
 
     losses = []
     for red in (0.0, 1.0):

@@ -7,7 +7,7 @@ from typing import Any
 import interpreted
 import pytest
 import torch
-from ahead_of_time import ARCHITECTURES, compiled
+from ahead_of_time import ARCHITECTURES, check_registers
 from interpreted import NEEDS_A_GPU, assert_near, in_interpreter, on_a_gpu
 
 from edge_depth_nerf.kernels import formulas, ray_numba, threads
@@ -197,7 +197,4 @@ def test_the_same_on_a_gpu():
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
 def test_compiled_without_spills(architecture, tmp_path):
     pytest.importorskip("triton")
-    kernels = compiled(step, architecture, tmp_path)
-    assert {kernel.name for kernel in kernels} == {"_place_kernel", "_bound_kernel", "_distortion_kernel"}
-    assert {kernel.spilled for kernel in kernels} == {0}
-    assert max(kernel.registers for kernel in kernels) <= 96
+    check_registers(step, architecture, tmp_path, {"_place_kernel", "_bound_kernel", "_distortion_kernel"}, 96)

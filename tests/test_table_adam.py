@@ -22,6 +22,16 @@ def grid() -> HashEncoding:
     return encoding
 
 
+def pair(**options: Any) -> tuple[HashEncoding, HashEncoding, TableAdam, torch.optim.Adam]:
+    """Two encodings with one table, an optimiser of ours for the one and torch's for the other."""
+    ours, others, options = grid(), grid(), {**SETTINGS, **options}
+    return ours, others, TableAdam(ours.parameters(), **options), torch.optim.Adam(others.parameters(), **options)
+
+
+def assert_near(found: torch.Tensor, expected: torch.Tensor) -> None:
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-7)
+
+
 def loss(encoding: HashEncoding, step: int) -> torch.Tensor:
     """Of two calls, as proposals and samples make them; not all rows are met in a step."""
     points = torch.rand(2, 30, 3, generator=torch.Generator().manual_seed(step))
@@ -46,14 +56,13 @@ def test_its_steps_are_torchs(threads, betas, monkeypatch):
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
-        ours, others = grid(), grid()
-        found = train(ours, TableAdam(ours.parameters(), **SETTINGS, betas=betas), range(12))
-        expected = train(others, torch.optim.Adam(others.parameters(), **SETTINGS, betas=betas), range(12))
+        ours, others, adam, of_torch = pair(betas=betas)
+        found, expected = train(ours, adam, range(12)), train(others, of_torch, range(12))
     finally:
         torch.set_num_threads(before)
     assert not torch.equal(expected[-1], expected[0])
     for each, other in zip(found, expected, strict=True):
-        torch.testing.assert_close(each, other, rtol=1e-5, atol=1e-7)
+        assert_near(each, other)
 
 
 def whole_gradient(encoding: HashEncoding) -> torch.Tensor:
@@ -78,8 +87,7 @@ def test_no_gradient_of_the_tables_size_is_made():
 
 
 def test_gradients_of_several_passes_add_up():
-    ours, others = grid(), grid()
-    optimizer = TableAdam(ours.parameters(), **SETTINGS)
+    ours, others, optimizer, _ = pair()
     train(ours, optimizer, range(1))
     others.load_state_dict(ours.state_dict())
     optimizer.zero_grad()
@@ -97,8 +105,7 @@ def test_gradients_of_several_passes_add_up():
 
 def test_a_whole_gradient_beside_parts_is_not_lost():
     """As where one pass of a step is nerfstudio's own."""
-    ours, others = grid(), grid()
-    optimizer, of_torch = TableAdam(ours.parameters(), **SETTINGS), torch.optim.Adam(others.parameters(), **SETTINGS)
+    ours, others, optimizer, of_torch = pair()
     train(ours, optimizer, range(1))
     train(others, of_torch, range(1))
     for encoding, adam in ((ours, optimizer), (others, of_torch)):
@@ -107,12 +114,11 @@ def test_a_whole_gradient_beside_parts_is_not_lost():
         more = torch.full_like(encoding.hash_table, 1e-3)
         encoding.hash_table.grad = more if encoding.hash_table.grad is None else encoding.hash_table.grad + more
         adam.step()
-    torch.testing.assert_close(ours.hash_table, others.hash_table, rtol=1e-5, atol=1e-7)
+    assert_near(ours.hash_table, others.hash_table)
 
 
 def test_a_closure_computes_the_gradients_of_its_step():
-    ours, others = grid(), grid()
-    optimizers = TableAdam(ours.parameters(), **SETTINGS), torch.optim.Adam(others.parameters(), **SETTINGS)
+    ours, others, *optimizers = pair()
 
     def closure(encoding: HashEncoding, adam: torch.optim.Optimizer, step: int) -> torch.Tensor:
         adam.zero_grad()
@@ -126,7 +132,7 @@ def test_a_closure_computes_the_gradients_of_its_step():
             for encoding, adam in zip((ours, others), optimizers, strict=True)
         ]
         torch.testing.assert_close(values[0], values[1])
-    torch.testing.assert_close(ours.hash_table, others.hash_table, rtol=1e-5, atol=1e-7)
+    assert_near(ours.hash_table, others.hash_table)
 
 
 @pytest.mark.parametrize("alike", [True, False])
@@ -172,27 +178,24 @@ def test_a_table_without_gradient_is_left_alone():
 
 
 def test_checkpoints_go_back_and_forth():
-    ours, others = grid(), grid()
-    optimizer, of_torch = TableAdam(ours.parameters(), **SETTINGS), torch.optim.Adam(others.parameters(), **SETTINGS)
+    ours, others, optimizer, of_torch = pair()
     train(ours, optimizer, range(3))
     others.load_state_dict(ours.state_dict())
     of_torch.load_state_dict(deepcopy(optimizer.state_dict()))
     expected = train(others, of_torch, range(3, 6))[-1]
-    torch.testing.assert_close(train(ours, optimizer, range(3, 6))[-1], expected, rtol=1e-5, atol=1e-7)
+    assert_near(train(ours, optimizer, range(3, 6))[-1], expected)
     again = grid()
     again.load_state_dict(others.state_dict())
     back = TableAdam(again.parameters(), **SETTINGS)
     back.load_state_dict(deepcopy(of_torch.state_dict()))
     expected = train(others, of_torch, range(6, 8))[-1]
-    torch.testing.assert_close(train(again, back, range(6, 8))[-1], expected, rtol=1e-5, atol=1e-7)
+    assert_near(train(again, back, range(6, 8))[-1], expected)
 
 
 @pytest.mark.parametrize("options", [{"weight_decay": 0.1}, {"amsgrad": True}, {"maximize": True}], ids=str)
 def test_other_forms_of_adam_are_torchs(options):
-    ours, others = grid(), grid()
-    found = train(ours, TableAdam(ours.parameters(), **SETTINGS, **options), range(3))[-1]
-    expected = train(others, torch.optim.Adam(others.parameters(), **SETTINGS, **options), range(3))[-1]
-    assert torch.equal(found, expected)
+    ours, others, optimizer, of_torch = pair(**options)
+    assert torch.equal(train(ours, optimizer, range(3))[-1], train(others, of_torch, range(3))[-1])
     assert getattr(ours.hash_table, SUMS_LATER) is False
 
 

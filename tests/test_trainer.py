@@ -216,18 +216,12 @@ def test_checkpoints_may_go_to_another_place(tmp_path):
     assert [path.name for path in folder.iterdir()] == ["step-000000000.ckpt"]
 
 
-def test_ctrl_c_before_the_first_step(trainer, monkeypatch, capsys):
-    monkeypatch.setattr(trainer, "_init_viewer_state", lambda: signal.raise_signal(signal.SIGINT))
+@pytest.mark.parametrize(("work", "within"), [("train", "_init_viewer_state"), ("setup", "setup_optimizers")])
+def test_ctrl_c_before_the_first_step(trainer, monkeypatch, capsys, work, within):
+    monkeypatch.setattr(trainer, within, lambda: signal.raise_signal(signal.SIGINT))
     with pytest.raises(SystemExit) as ended:
-        trainer.train()
-    assert ended.value.code == 130 and "Stopped before the first step." in capsys.readouterr().out
+        getattr(trainer, work)()
     assert newest_checkpoint(trainer.checkpoint_dir) is None
-
-
-def test_ctrl_c_while_it_is_set_up(trainer, monkeypatch, capsys):
-    monkeypatch.setattr(trainer, "setup_optimizers", lambda: signal.raise_signal(signal.SIGINT))
-    with pytest.raises(SystemExit) as ended:
-        trainer.setup()
     assert ended.value.code == 130 and "Stopped before the first step." in capsys.readouterr().out
 
 

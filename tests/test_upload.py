@@ -66,7 +66,7 @@ def test_of_several_processes_each_reads_its_part_ahead(tables):
         sampler, uploads = TablePixelSampler(tables[0], 10), Uploads("cpu")
         sampler._first, sampler._rank, sampler._world_size = 3, rank, 2
         found.append([indices(uploads.upload([sampler.draw(step)])) for step in range(2)])
-        assert uploads._ahead is not None and uploads._ahead[0][0].same(sampler.draw(2))
+        assert uploads._ahead is not None and uploads._ahead[0][0] == sampler.draw(2)
     every = torch.cat([found[rank][step] for step in range(2) for rank in range(2)])
     assert torch.equal(every, tables[0].batch(3, 40).indices)
 

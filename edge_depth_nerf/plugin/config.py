@@ -71,7 +71,7 @@ def base_config(method_name: str) -> TrainerConfig:
             "scheduler": ExponentialDecaySchedulerConfig(lr_final=1e-4, max_steps=200000),
         }
 
-    config = EdgeDepthTrainerConfig(
+    return EdgeDepthTrainerConfig(
         method_name=method_name,
         # nerfstudio's default is cuda, also where there is none
         machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
@@ -82,7 +82,6 @@ def base_config(method_name: str) -> TrainerConfig:
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15, websocket_host="127.0.0.1"),
         vis="viewer",
     )
-    return config
 
 
 def _children(node: Any) -> list[str]:

@@ -23,7 +23,7 @@ class PatientGradScaler(torch.amp.GradScaler):
         self._updates = 0
 
     def get_scale(self) -> float:
-        """Give the scale as it was last read."""
+        """Give the scale that was read last."""
         return self._seen
 
     def update(self, new_scale: Any = None) -> None:

@@ -56,8 +56,8 @@ class EdgeDepthTrainerConfig(TrainerConfig):
 
         scene = self.pipeline.datamanager.data
         lines = [f"{self.method_name}: {self.max_num_iterations} steps on {self.machine.device_type}, scene {scene}"]
-        changed = changed_settings(self, all_methods.get(self.method_name))
-        lines += [f"  --{name.replace('_', '-')} {_word(value)}" for name, value in changed.items()]
+        for name, value in changed_settings(self, all_methods.get(self.method_name)).items():
+            lines.append(f"  --{name.replace('_', '-')} {value.__qualname__ if isinstance(value, type) else value}")
         CONSOLE.print("\n".join(lines), soft_wrap=True, highlight=False, markup=False)
 
     def save_config(self) -> None:
@@ -260,7 +260,7 @@ class EdgeDepthTrainer(Trainer):
         if newest != every[-1]:
             CONSOLE.print(f"[bold yellow]{every[-1]} is incomplete; resuming from {newest.name}.")
         given = self.config
-        self.config = dataclasses.replace(given, load_step=_step_of(newest))
+        self.config = dataclasses.replace(given, load_step=int(newest.stem.removeprefix("step-")))
         try:
             super()._load_checkpoint()
         finally:
@@ -308,12 +308,3 @@ class _Interruption:
         if not self._busy:
             raise KeyboardInterrupt
         self._asked = True
-
-
-def _word(value: object) -> str:
-    """Return a setting's value as one types it."""
-    return value.__qualname__ if isinstance(value, type) else str(value)
-
-
-def _step_of(checkpoint: Path) -> int:
-    return int(checkpoint.stem.removeprefix("step-"))

@@ -19,7 +19,7 @@ from torch import Tensor
 from edge_depth_nerf.plugin.pixel_table import RECORD, PixelTable
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Stretch:
     """Neighbouring records of a table."""
 
@@ -29,24 +29,11 @@ class Stretch:
     to_next: int
     """From their start to that of the stretch which is read after them."""
 
-    def following(self) -> Stretch:
-        """Give the stretch that is read after these records."""
-        return replace(self, start=self.start + self.to_next)
-
-    def same(self, other: Stretch) -> bool:
-        """Say whether these are the same records."""
-        return self.table is other.table and (self.start, self.count) == (other.start, other.count)
-
 
 def read(stretches: Sequence[Stretch]) -> UInt8[np.ndarray, "n 15"]:
     """Copy the bytes of stretches, one after the other."""
-    records = np.empty((sum(each.count for each in stretches), RECORD.itemsize), np.uint8)
-    first = 0
-    for each in stretches:
-        rows = each.table.records(each.start, each.count).view(np.uint8).reshape(each.count, RECORD.itemsize)
-        records[first : first + each.count] = rows
-        first += each.count
-    return records
+    records = [np.asarray(each.table.records(each.start, each.count)) for each in stretches]
+    return np.concatenate([each.view(np.uint8).reshape(-1, RECORD.itemsize) for each in records])
 
 
 class Uploads:
@@ -64,7 +51,7 @@ class Uploads:
     def upload(self, stretches: Sequence[Stretch]) -> UInt8[Tensor, "n 15"]:
         """Start to copy the bytes of some records to the device."""
         records = self._read(stretches)
-        following = [each.following() for each in stretches]
+        following = [replace(each, start=each.start + each.to_next) for each in stretches]
         self._ahead = following, self._reader.submit(read, following)
         packed = torch.from_numpy(records)
         if self._device.type == "cuda":
@@ -74,6 +61,6 @@ class Uploads:
     def _read(self, stretches: Sequence[Stretch]) -> NDArray[np.uint8]:
         if self._ahead is not None:
             expected, records = self._ahead
-            if len(expected) == len(stretches) and all(map(Stretch.same, expected, stretches)):
+            if expected == list(stretches):
                 return records.result()
         return read(stretches)
