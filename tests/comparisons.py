@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import os
 import shutil
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
 from scenes import FLIP, fisheye, view, write_scene
 
 from edge_depth_nerf.base.files import read_json, write_distance_png, write_json, write_png
+from edge_depth_nerf.compare.methods import MethodName, Preset
 from edge_depth_nerf.compare.options import CompareOptions
 from edge_depth_nerf.compare.results import RunResult
+from edge_depth_nerf.compare.specification import RunSpecification
 
 QUIET = Console(quiet=True)
 
@@ -38,6 +43,20 @@ def fake(scene, method, seed, psnr=20.0, steps=100, seconds=10.0, named=(), **mo
         "curve": curve,
     }
     return RunResult(Path(f"/runs/{scene}/{method}_seed-{seed}"), content["run"], content)
+
+
+@cache
+def resolved(method: MethodName, preset: Preset = "lite", folder: Path | None = None, **changes: Any) -> dict[str, Any]:
+    """A run's whole configuration, by dotted names."""
+    from edge_depth_nerf.compare.configuration import configuration, flattened  # not before: it imports nerfstudio
+
+    run = RunSpecification("/scenes/a", "", preset, method, 0, 10)
+    return flattened(configuration(replace(run, **changes), folder)[0])
+
+
+def differing(one: dict[str, Any], other: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """Both values of the fields in which configurations differ."""
+    return {name: (one[name], other[name]) for name in one if repr(one[name]) != repr(other[name])}
 
 
 def copied(output: Path, folder: Path) -> Path:

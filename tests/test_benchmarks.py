@@ -8,7 +8,9 @@ import lzma
 import re
 import sys
 import threading
+from collections.abc import Mapping
 from pathlib import Path
+from types import ModuleType
 from xml.etree import ElementTree
 
 import numpy as np
@@ -69,6 +71,26 @@ def report(benchmark_module):
     return benchmark_module("speed.report")
 
 
+@pytest.fixture
+def kept(benchmark_module):
+    """Gives the runs of a result file of benchmarks/quality/."""
+    module = benchmark_module("kept_runs")
+    return lambda name: module.results_of(QUALITY / f"{name}.json.xz")
+
+
+@pytest.fixture
+def pages(benchmark_module) -> ModuleType:
+    return benchmark_module("pages")
+
+
+def assert_page_has(pages: ModuleType, page: str, parts: Mapping[str, str], made: str) -> None:
+    """Each part of a page is what stands under a heading of a generated page."""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    for name, heading in parts.items():
+        assert f"<!-- {name} -->" in text
+        assert pages.with_part(text, name, pages.under(made, heading)) == text, name
+
+
 def test_the_page_has_the_tables_of_the_results(report):
     text = (ROOT / "docs/speed.md").read_text(encoding="utf-8")
     assert "<!-- speed: summary -->" in text
@@ -110,8 +132,7 @@ def test_tables_of_a_run_that_has_not_all_parts(report, tmp_path):
     assert ElementTree.parse(tmp_path / "curves.svg").getroot().tag.endswith("svg")
 
 
-def test_a_part_of_a_page_is_replaced_and_nothing_else(benchmark_module, tmp_path, monkeypatch):
-    pages = benchmark_module("pages")
+def test_a_part_of_a_page_is_replaced_and_nothing_else(pages, tmp_path, monkeypatch):
     page, written = tmp_path / "page.md", tmp_path / "tables.md"
     page.write_text("# Page\n<!-- a -->\nold\n<!-- end -->\nbetween\n<!-- b -->\nstays\n<!-- end -->\n")
     written.write_text("# Comparison\n\nwords\n\n## Table 1\n\n| # |\n\n## Table 2\n\n| no |\n")
@@ -209,117 +230,69 @@ def test_the_real_drives_table_and_margins(benchmark_module, tmp_path):
     assert (tmp_path / "lambda.svg").stat().st_size > 5000
 
 
-def test_the_real_drives_tables_are_those_of_its_runs(benchmark_module):
-    real, kept, pages = (benchmark_module(name) for name in ("quality.real_drive", "kept_runs", "pages"))
+def test_the_real_drives_tables_are_those_of_its_runs(benchmark_module, kept, pages):
     compared, longer, cells, full, curves = (
-        kept.results_of(QUALITY / f"real_drive{part}.json.xz")
-        for part in ("", "_seconds", "_cells", "_full", "_lambda")
+        kept(f"real_drive{part}") for part in ("", "_seconds", "_cells", "_full", "_lambda")
     )
-    made = real.page(Results([*compared.runs, *full.runs]), {"half": longer}, cells, curves.runs)
-    for page, name, heading in (
-        ("docs/real_drive.md", "real: table", "kitti360_half"),
-        (
-            "docs/real_drive.md",
-            "real: seconds",
-            "The best rival after as many processor seconds as ours: kitti360_half",
-        ),
-        ("docs/real_drive.md", "real: margins", "Ours against the best rival after as many steps: kitti360_half"),
-        ("docs/real_drive.md", "real: cells", "One change at a time: kitti360_half"),
-        ("docs/real_drive.md", "real: full", "kitti360_full"),
-        ("docs/real_drive.md", "real: lambda", "PSNR and AbsRel over λ: kitti360_half"),
-    ):
-        text = (ROOT / page).read_text(encoding="utf-8")
-        assert f"<!-- {name} -->" in text
-        assert pages.with_part(text, name, pages.under(made, heading)) == text, name
+    runs = Results([*compared.runs, *full.runs])
+    made = benchmark_module("quality.real_drive").page(runs, {"half": longer}, cells, curves.runs)
+    parts = {
+        "real: table": "kitti360_half",
+        "real: seconds": "The best rival after as many processor seconds as ours: kitti360_half",
+        "real: margins": "Ours against the best rival after as many steps: kitti360_half",
+        "real: cells": "One change at a time: kitti360_half",
+        "real: full": "kitti360_full",
+        "real: lambda": "PSNR and AbsRel over λ: kitti360_half",
+    }
+    assert_page_has(pages, "docs/real_drive.md", parts, made)
 
 
-def test_the_pages_tables_of_motion_are_those_of_its_runs(benchmark_module):
-    reach, kept, pages = (benchmark_module(name) for name in ("quality.reach", "kept_runs", "pages"))
+def test_the_pages_tables_of_motion_are_those_of_its_runs(benchmark_module, kept, pages):
+    reach = benchmark_module("quality.reach")
     priors = {
         drive: {"motion": {place: reach.PriorFigures(**figures) for place, figures in by_place.items()}}
         for drive, by_place in read_json(QUALITY / "reach_priors.json").items()
     }
-    made = reach.page(kept.results_of(QUALITY / "reach.json.xz"), priors, reach.DRIVES)
-    text = (ROOT / "docs" / "prior.md").read_text(encoding="utf-8")
-    for name, heading, rows in (
-        ("reach: prior", "The prior", 8),
-        ("reach: models", "The trained models", 20),
-        ("reach: way", "From no motion to a prior everywhere", 4),
-    ):
-        part = pages.under(made, heading)
-        assert len(part.strip().splitlines()) == 2 + rows
-        assert pages.with_part(text, name, part) == text, name
-        assert f"<!-- {name} -->" in text
+    made = reach.page(kept("reach"), priors, reach.DRIVES)
+    parts = {
+        "reach: prior": "The prior",
+        "reach: models": "The trained models",
+        "reach: way": "From no motion to a prior everywhere",
+    }
+    rows = [len(pages.under(made, heading).strip().splitlines()) for heading in parts.values()]
+    assert rows == [2 + 8, 2 + 20, 2 + 4]
+    assert_page_has(pages, "docs/prior.md", parts, made)
 
 
-def test_the_pages_grid_is_that_of_its_runs(benchmark_module):
-    kept, pages = (benchmark_module(name) for name in ("kept_runs", "pages"))
-    results = kept.results_of(QUALITY / "grid.json.xz")
-    searches = grids(kept.results_of(QUALITY / "grid_search.json.xz"))
+def test_the_pages_grid_is_that_of_its_runs(kept, pages):
+    results, searches = kept("grid"), grids(kept("grid_search"))
     assert {len(search.psnr) for search in searches} == {16}
     # nothing that a table shows was chosen on the drives it shows
     assert not set(results.scenes()) & {"tune_street"}
-    made = page_of_tables("Grid", [], grid_tables(results, searches))
-    text = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
-    for name, heading in GRID_PARTS.items():
-        assert f"<!-- {name} -->" in text
-        assert pages.with_part(text, name, pages.under(made, heading)) == text, name
+    assert_page_has(pages, "docs/results.md", GRID_PARTS, page_of_tables("Grid", [], grid_tables(results, searches)))
 
 
-def test_the_pages_unseen_drives_are_those_of_its_runs(benchmark_module):
-    unseen, kept, pages = (benchmark_module(name) for name in ("quality.unseen", "kept_runs", "pages"))
-    runs = kept.results_of(QUALITY / "unseen.json.xz").runs
+def test_the_pages_unseen_drives_are_those_of_its_runs(benchmark_module, kept, pages):
+    """That all were trained alike, and with what their searches found, is for test_fair_results.py."""
+    unseen, grid, runs = benchmark_module("quality.unseen"), kept("grid"), kept("unseen").runs
     parts = {folder: Results([run for run in runs if run.folder.parts[0] == folder]) for folder in unseen.FOLDERS}
-    claims = parts["claims"]
-    # every claim has the same seeds of each method and drive
-    grid = kept.results_of(QUALITY / "grid.json.xz")
-    assert set(claims.methods()) == {*unseen.claimed(grid)}
-    assert len(claims.runs) == len(unseen.claimed(grid)) * len(unseen.DRIVES) * len(claims.seeds())
-    keys = [{(run.scene, run.method, run.seed) for run in parts[name].runs} for name in ("claims", "simulated")]
-    assert keys[0] == keys[1]
+    assert set(parts["claims"].methods()) == {*unseen.claimed(grid)}
     assert parts["seconds"].methods() == [unseen.without_extras(grid)]
     made = unseen.page(parts, grid)
-    for page, parts_of_page in (("docs/results.md", UNSEEN_PARTS), ("README.md", {"unseen: short": "Claims: short"})):
-        text = (ROOT / page).read_text(encoding="utf-8")
-        for name, heading in parts_of_page.items():
-            assert f"<!-- {name} -->" in text
-            assert pages.with_part(text, name, pages.under(made, heading)) == text, name
-    searches = [kept.results_of(QUALITY / f"{name}_search.json.xz") for name in ("grid", "unseen")]
-    # each was trained with what its search found, or that of the method that it has one thing changed of
-    best = {grid.method: grid.best for results in searches for grid in grids(results)}
-    assert {len(grid.psnr) for grid in grids(searches[1])} == {16}
-    for run in runs:
-        if run.method != "nerfacto":
-            wanted = best[unseen.SETTINGS_OF.get(run.method, run.method)]
-            assert (run.specification["weight"], run.specification["sigma_m"]) == wanted, run.folder
-    assert not set(searches[1].scenes()) & {run.scene for run in runs}
+    assert_page_has(pages, "docs/results.md", UNSEEN_PARTS, made)
+    assert_page_has(pages, "README.md", {"unseen: short": "Claims: short"}, made)
+    assert not set(kept("unseen_search").scenes()) & {run.scene for run in runs}
 
 
-def test_the_pages_curves_are_those_of_their_runs(benchmark_module):
-    curves, pages = benchmark_module("speed.curves"), benchmark_module("pages")
+def test_the_pages_curves_are_those_of_their_runs(benchmark_module, pages):
+    curves = benchmark_module("speed.curves")
     text = curves.PAGE.read_text(encoding="utf-8")
     assert f"<!-- {curves.PART} -->" in text
     assert pages.with_part(text, curves.PART, "\n".join(curves.table(curves.kept()))) == text
 
 
-def test_the_parts_of_a_step_are_the_whole(benchmark_module):
-    threads = read_json(benchmark_module("speed.step_parts").RESULTS)["threads"]
-    assert threads
-    for each in threads.values():
-        # what is left out of no part is the whole, but for the measuring itself
-        assert sum(each["parts"].values()) == pytest.approx(each["ms"], rel=0.15)
-
-
-PAGES_OF_DETAIL = {
-    "results": "docs/results.md",
-    "real": "docs/real_drive.md",
-    "readme": "README.md",
-    "changelog": "CHANGELOG.md",
-}
-
-
-def test_the_pages_detail_is_that_of_its_runs(benchmark_module):
-    detail, pages = benchmark_module("quality.detail"), benchmark_module("pages")
+def test_the_pages_detail_is_that_of_its_runs(benchmark_module, pages):
+    detail = benchmark_module("quality.detail")
     tables = detail.tables()
     for name, page in (("pictures", "results"), ("beside", "results"), ("real", "real_drive")):
         part = f"detail_{name}" if page == "real_drive" else f"detail: {name}"
@@ -346,60 +319,58 @@ def test_what_the_pages_say_of_detail_follows_from_its_runs(benchmark_module):
         return f"{mean(runs, 'edge', name) - mean(runs, method, name, steps):.2f}"
 
     true, recorded, longer, best = detail.TRUE, detail.RECORDED, "urban-nerf-integrated", "ds-nerf-integrated-extras"
-    pages = {
-        name: " ".join((ROOT / file).read_text(encoding="utf-8").split()) for name, file in PAGES_OF_DETAIL.items()
-    }
-    gains = sorted(run.figures[f"detail_{true}"] - run.figures[true] for run in rendered)
-    assert f"with each seed: {gains[0]:.2f} to {gains[-1]:.2f} dB." in pages["results"]
-    assert f"{gains[0]:.2f} to {gains[-1]:.2f} dB on rendered drives" in pages["changelog"]
+    both = (true, f"detail_{true}")
+    gains = sorted(run.figures[both[1]] - run.figures[true] for run in rendered)
     of = {method: gain(rendered, method, true) for method in (*detail.CLAIMS, longer)}
-    assert (
-        f"Ours gains {of['edge']} dB, nerfacto {of['nerfacto']} dB, the others {of[best]} and {of[longer]} dB"
-        in (pages["results"])
-    )
-    assert f"gains {of['edge']} dB" in pages["readme"] and f"[gains {of['edge']} dB]" in pages["results"]
     others = sorted(value for method, value in of.items() if method != "edge")
-    assert f"{others[0]} to {others[-1]} dB with the other methods" in pages["results"]
-    with_detail = f"detail_{true}"
-    for method, words in (
-        ("nerfacto", "over nerfacto {} dB without and {} dB with detail"),
-        (best, "{} and {} dB (ahead"),
-    ):
-        assert words.format(lead(rendered, true, method), lead(rendered, with_detail, method)) in pages["results"]
-    both = [f"{lead(rendered, name, longer)}" for name in (true, with_detail)]
-    assert f"at equal seconds of training, {both[0]} and {both[1]} dB" in pages["results"]
-    alone = mean(rendered, "edge", with_detail) - mean(rendered, longer, true)
-    assert f"and this rival has none, it is {alone:.2f} dB" in pages["results"]
+    over = {method: [lead(rendered, name, method) for name in both] for method in ("nerfacto", best, longer)}
+    alone = mean(rendered, "edge", both[1]) - mean(rendered, longer, true)
     pairs = {(run.scene, run.seed): run for run in rendered if run.method == best}
     ahead = [
         sum(run.figures[name] > pairs[run.scene, run.seed].figures[name] for run in rendered if run.method == "edge")
-        for name in (true, with_detail)
+        for name in both
     ]
-    assert f"(ahead in {ahead[0]} and in {ahead[1]} of {len(pairs)} pairs)" in pages["results"]
     beside = sorted(gain(rendered, method, "shifted_1m_masked_psnr") for method in of)
-    assert f"gain {beside[0]} to {beside[-1]} dB" in pages["results"]
     steps = [gain(real, "ds-nerf", recorded, count) for count in (1000, 1330)]
-    assert (
-        f"Ours gains {gain(real, 'edge', recorded)} dB, the DS-NeRF loss {steps[0]} dB ({steps[1]} dB" in pages["real"]
-    )
-    assert abs(float(gain(real, "nerfacto", recorded))) < 0.05
     seconds = [lead(real, name, "ds-nerf", 1330) for name in (f"detail_{recorded}", recorded)]
-    assert f"by {seconds[0]} dB with detail and by {seconds[1]} dB without" in pages["real"]
+    assert abs(float(gain(real, "nerfacto", recorded))) < 0.05
+    said = {
+        "docs/results.md": [
+            f"with each seed: {gains[0]:.2f} to {gains[-1]:.2f} dB.",
+            f"Ours gains {of['edge']} dB, nerfacto {of['nerfacto']} dB, the others {of[best]} and {of[longer]} dB",
+            f"[gains {of['edge']} dB]",
+            f"{others[0]} to {others[-1]} dB with the other methods",
+            "over nerfacto {} dB without and {} dB with detail".format(*over["nerfacto"]),
+            "{} and {} dB (ahead in {} and in {} of {} pairs)".format(*over[best], *ahead, len(pairs)),
+            "at equal seconds of training, {} and {} dB".format(*over[longer]),
+            f"and this rival has none, it is {alone:.2f} dB",
+            f"gain {beside[0]} to {beside[-1]} dB",
+        ],
+        "docs/real_drive.md": [
+            f"Ours gains {gain(real, 'edge', recorded)} dB, the DS-NeRF loss {steps[0]} dB ({steps[1]} dB",
+            f"by {seconds[0]} dB with detail and by {seconds[1]} dB without",
+        ],
+        "README.md": [f"gains {of['edge']} dB"],
+        "CHANGELOG.md": [f"{gains[0]:.2f} to {gains[-1]:.2f} dB on rendered drives"],
+    }
+    for page, sentences in said.items():
+        text = " ".join((ROOT / page).read_text(encoding="utf-8").split())
+        assert [words for words in sentences if words not in text] == [], page
 
 
-def test_the_page_has_the_parts_of_a_step_that_were_measured(benchmark_module):
-    step_parts, pages = benchmark_module("speed.step_parts"), benchmark_module("pages")
-    table = step_parts.table(read_json(step_parts.RESULTS))
+def test_the_page_has_the_parts_of_a_step_that_were_measured(benchmark_module, pages):
+    step_parts = benchmark_module("speed.step_parts")
+    measured = read_json(step_parts.RESULTS)
+    for each in measured["threads"].values():
+        # what is left out of no part is the whole, but for the measuring itself
+        assert sum(each["parts"].values()) == pytest.approx(each["ms"], rel=0.15)
+    table = step_parts.table(measured)
     text = (ROOT / "docs" / "speed.md").read_text(encoding="utf-8")
     assert f"<!-- {step_parts.PART} -->" in text and table.count("\n") > 5
     assert pages.with_part(text, step_parts.PART, table) == text
-
-
-def test_the_page_says_how_small_a_part_of_a_step_losses_are(benchmark_module):
-    of_two = read_json(benchmark_module("speed.step_parts").RESULTS)["threads"]["2"]
+    of_two = measured["threads"]["2"]
     share = round(100 * of_two["parts"]["losses"] / of_two["ms"])
-    text = " ".join((ROOT / "docs" / "speed.md").read_text(encoding="utf-8").split())
-    assert f"the table's row of losses, which is {share} % of a step on two threads" in text
+    assert f"the table's row of losses, which is {share} % of a step on two threads" in " ".join(text.split())
 
 
 def test_a_part_of_a_step_is_without_what_it_contains(benchmark_module, monkeypatch):
@@ -428,8 +399,8 @@ def test_a_part_of_a_step_is_without_what_it_contains(benchmark_module, monkeypa
     assert now[0] == 7 and clock.seconds == {"networks": 4, "rest": 1}
 
 
-def test_the_page_of_unseen_drives_by_hand(benchmark_module, tmp_path):
-    unseen, pages = benchmark_module("quality.unseen"), benchmark_module("pages")
+def test_the_page_of_unseen_drives_by_hand(benchmark_module, pages, tmp_path):
+    unseen = benchmark_module("quality.unseen")
     drives = ("street", "turn")
     rival, with_extras = "urban-nerf-integrated", "ds-nerf-integrated-extras"
     # ours takes 90 s for what the rival does in 60: 3,000 steps in the seconds of 2,000, and a little more

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
 import pytest
-from comparisons import fake
+from comparisons import differing, fake, resolved
 
 from edge_depth_nerf.compare.configuration import (
     REGISTERED,
@@ -23,7 +22,6 @@ from edge_depth_nerf.compare.methods import (
     WITHOUT_EXTRAS,
     Method,
     MethodName,
-    Preset,
     default_methods,
 )
 from edge_depth_nerf.compare.protocol import departures
@@ -31,16 +29,6 @@ from edge_depth_nerf.compare.results import Results
 from edge_depth_nerf.compare.specification import OF_A_RUN, RunSpecification
 from edge_depth_nerf.compare.tables import fields_table
 from edge_depth_nerf.plugin.config import make_specifications, read_method_file
-
-
-def resolved(method, preset: Preset = "lite", **changes):
-    run = RunSpecification(scene="/scenes/a", scene_sha256="", preset=preset, method=method, seed=0, steps=10)
-    return flattened(configuration(replace(run, **changes))[0])
-
-
-def differing(one, other):
-    return {name: (one[name], other[name]) for name in one if repr(one[name]) != repr(other[name])}
-
 
 LOSS, SOURCE = "pipeline.model.depth_loss", "pipeline.datamanager.depth_source"
 PRIOR = "pipeline.datamanager.prior."
@@ -52,7 +40,7 @@ EXTRAS = {
     "pipeline.model.sky_background",
     "pipeline.model.depth_loss_final",
 }
-LAMBDA, KERNEL = "pipeline.model.depth_loss_mult", "pipeline.datamanager.prior.integration.kernel"
+LAMBDA, KERNEL = LOSS + "_mult", PRIOR + "integration.kernel"
 PAPER = {
     LAMBDA,
     "pipeline.model.depth_loss_levels",
@@ -81,30 +69,12 @@ def allowed(method: Method) -> set[str]:
     }
 
 
-def unstated(method, preset: Preset = "lite"):
-    """The fields in which a method differs from `edge` though nobody says so."""
-    return set(differing(resolved("edge", preset), resolved(method, preset))) - allowed(METHODS[method])
-
-
 @pytest.mark.parametrize("preset", ["lite", "full", "paper"])
 @pytest.mark.parametrize("method", METHODS)
 def test_configurations_differ_in_the_named_fields_alone(preset, method):
     ours, other = resolved("edge", preset), resolved(method, preset)
     assert set(ours) == set(other) and len(ours) > 100
-    assert unstated(method, preset) == set()
-
-
-def test_another_exposure_of_the_literal_method_is_found(monkeypatch):
-    """It had nerfacto's embedding, alone of all that the tables hold against each other."""
-    literal = METHODS["edge-paper"]
-    monkeypatch.setitem(METHODS, "edge-paper", replace(literal, variant="embedding"))
-    assert differing(resolved("edge"), resolved("edge-paper")).keys() - allowed(literal) == {EXPOSURE}
-
-
-@pytest.mark.parametrize("preset", ["lite", "full", "paper"])
-def test_all_methods_of_the_tables_have_one_exposure(preset):
-    others = {name: resolved(name, preset)[EXPOSURE] for name in METHODS if name != "nerfacto-embedding"}
-    assert set(others.values()) == {"gain"} and "edge-paper" in others
+    assert set(differing(ours, other)) <= allowed(METHODS[method])
 
 
 @pytest.mark.parametrize(
@@ -167,28 +137,18 @@ def test_names_follow_from_loss_prior_and_extras():
 
 
 def test_each_method_is_what_its_name_says():
-    def loss_and_source(method):
-        found = resolved(method)
-        return found[LOSS], found[SOURCE], found["pipeline.datamanager.prior.integration.kernel"]
-
-    assert loss_and_source("nerfacto")[0] == loss_and_source("nerfacto-embedding")[0] == "none"
-    exposures = {method: resolved(method)[EXPOSURE] for method in METHODS}
-    assert {name for name, exposure in exposures.items() if exposure == "embedding"} == {"nerfacto-embedding"}
-    assert loss_and_source("urban-nerf") == ("urban-nerf", "lidar", "edge-aware")
-    assert loss_and_source("urban-nerf-los") == ("urban-nerf-los", "lidar", "edge-aware")
-    assert loss_and_source("ds-nerf") == ("ds-nerf", "lidar", "edge-aware")
-    assert loss_and_source("edge-lidar") == ("edge", "lidar", "edge-aware")
-    assert loss_and_source("edge-mono") == ("edge", "mono", "edge-aware")
-    assert loss_and_source("edge-gaussian") == ("edge", "integrated", "spatial-gaussian")
-    assert loss_and_source("edge") == loss_and_source("edge-paper") == ("edge", "integrated", "edge-aware")
-    kernel = "pipeline.datamanager.prior.integration.kernel"
-    for name, field, value in (
-        ("edge-paper-lidar", SOURCE, "lidar"),
-        ("edge-paper-mono", SOURCE, "mono"),
-        ("edge-paper-gaussian", kernel, "spatial-gaussian"),
-    ):
-        changed = differing(resolved("edge-paper"), resolved(name))
-        assert {**changed} == {field: (resolved("edge-paper")[field], value)}, name
+    for name, method in METHODS.items():
+        found = resolved(name)
+        assert found[LOSS] == method.loss or method.loss == "none", name
+        assert found[EXPOSURE] == ("embedding" if name == "nerfacto-embedding" else "gain"), name
+        if method.prior is not None:
+            source, kernel = (
+                ("integrated", "spatial-gaussian") if method.prior == "gaussian" else (method.prior, "edge-aware")
+            )
+            assert (found[SOURCE], found[KERNEL]) == (source, kernel), name
+    assert resolved("nerfacto")[LOSS] == resolved("nerfacto-embedding")[LOSS] == "none"
+    for name, field in (("lidar", SOURCE), ("mono", SOURCE), ("gaussian", KERNEL)):
+        assert {*differing(resolved("edge-paper"), resolved(f"edge-paper-{name}"))} == {field}, name
 
 
 @pytest.mark.parametrize("steps", [1000, 4000])
@@ -206,7 +166,7 @@ def test_the_literal_method_is_the_registered_one_in_another_size(preset):
     ours, literal = resolved("edge", preset), resolved("edge-paper", preset)
     paper = flattened(make_specifications(read_method_file())[REGISTERED["paper"]].config)
     changed = differing(ours, literal)
-    assert {PRIOR + "sigma_mode", PRIOR + "align", LOSS + "_mult"} <= set(changed)
+    assert {PRIOR + "sigma_mode", PRIOR + "align", LAMBDA} <= set(changed)
     assert set(changed) <= {*literal_form()}
     for name in changed:
         assert literal[name] == paper[name], name
@@ -225,8 +185,10 @@ def test_under_the_preset_paper_edge_is_the_literal_method():
 
 
 def test_only_seed_scene_and_folder_are_a_runs_own():
-    one = flattened(configuration(RunSpecification("/s/a", "", "lite", "edge", 0, 9), Path("/o/a/edge_seed-0"))[0])
-    two = flattened(configuration(RunSpecification("/s/b", "", "lite", "edge", 1, 9), Path("/o/b/edge_seed-1"))[0])
+    one, two = (
+        resolved("edge", folder=Path(f"/o/{scene}/edge_seed-{seed}"), scene=f"/s/{scene}", seed=seed)
+        for seed, scene in enumerate("ab")
+    )
     assert set(differing(one, two)) == {*OF_A_RUN}
 
 
@@ -243,7 +205,7 @@ def test_lambda_and_sigma_go_where_each_method_has_them():
     ours = resolved("edge", weight=0.07, sigma_m=0.2)
     assert (ours[PRIOR + "sigma_mode"], ours[PRIOR + "sigma_constant_m"]) == ("constant", 0.2)
     own = resolved("edge", weight=0.07, sigma_m="own")
-    assert set(differing(own, resolved("edge"))) == {LOSS + "_mult"}
+    assert set(differing(own, resolved("edge"))) == {LAMBDA}
 
     def setting(method, **changes):
         run = RunSpecification("/s/a", "", "lite", method, 0, 9, **changes)

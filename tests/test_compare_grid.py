@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import cache
 from itertools import combinations
 from pathlib import Path
 
 import pytest
-from comparisons import QUIET, fake
+from comparisons import QUIET, differing, fake, resolved
 from scenes import write_scene
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json, write_json
 from edge_depth_nerf.compare import command
-from edge_depth_nerf.compare.configuration import configuration, flattened
 from edge_depth_nerf.compare.grid import grid, grid_tables
 from edge_depth_nerf.compare.methods import (
     GRID,
@@ -32,21 +30,11 @@ from edge_depth_nerf.compare.methods import (
 from edge_depth_nerf.compare.options import GridOptions
 from edge_depth_nerf.compare.results import Results
 from edge_depth_nerf.compare.search import Grid
-from edge_depth_nerf.compare.specification import RunSpecification
 
 SOURCE, LOSS = "pipeline.datamanager.depth_source", "pipeline.model.depth_loss"
 WITH_LOSS: list[MethodName] = [name for cell, name in GRID.items() if cell.loss != "none"]
 LAMBDAS = (0.001, 0.01, 0.1, 1.0)
 SIGMAS_M: tuple[Sigma, ...] = ("own", 0.1, 2.0)
-
-
-@cache
-def resolved(name):
-    return flattened(configuration(RunSpecification("/s/a", "", "lite", name, 0, 10))[0])
-
-
-def differing(one, other):
-    return {name for name, value in resolved(one).items() if repr(value) != repr(resolved(other)[name])}
 
 
 def test_the_grid_has_each_loss_with_each_prior_without_and_with_extras():
@@ -66,7 +54,7 @@ def test_cells_that_differ_in_one_thing_differ_in_its_fields_alone():
     settings = {"pipeline.model.depth_loss_mult", *(SIGMA_FIELDS[loss] for loss in RIVALS)}
     seen = {"prior": 0, "extras": 0, "loss": 0}
     for (one, first), (other, second) in combinations(GRID.items(), 2):
-        found = differing(first, second)
+        found = {*differing(resolved(first), resolved(second))}
         if (one.loss, one.extras) == (other.loss, other.extras):
             assert found == {SOURCE}
             seen["prior"] += 1
@@ -83,7 +71,8 @@ def test_cells_that_differ_in_one_thing_differ_in_its_fields_alone():
 
 
 def test_nerfacto_stands_for_the_grid_without_loss_and_extras():
-    assert differing("nerfacto", "ds-nerf") <= {LOSS, SOURCE, "pipeline.model.depth_loss_mult"}
+    found = differing(resolved("nerfacto"), resolved("ds-nerf"))
+    assert {*found} <= {LOSS, SOURCE, "pipeline.model.depth_loss_mult"}
     values = resolved("nerfacto-lidar-extras")
     assert values["pipeline.model.depth_loss_mult"] == 0.0 and values[SOURCE] == "lidar"
 

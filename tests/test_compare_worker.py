@@ -22,6 +22,8 @@ from nerfstudio.utils.eval_utils import eval_setup
 from edge_depth_nerf.base.files import read_image, read_json, write_json
 from edge_depth_nerf.compare import command, tables
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
@@ -31,7 +33,6 @@ def finished(tmp_path_factory):
     return asked, command.compare(asked, QUIET)
 
 
-@pytest.mark.slow
 def test_it_leaves_figures_tables_and_pictures(finished):
     asked, results = finished
     with (asked.output / "results.csv").open() as file:
@@ -53,10 +54,8 @@ def test_it_leaves_figures_tables_and_pictures(finished):
     assert all(one > other for one, other in zip(fitted, plain, strict=True))
     text = (asked.output / "tables.md").read_text()
     assert "## Table 1." in text and "## Table 5" in text and "| ours |" in text
-    assert (
-        "## Table 8. Fields in which the methods differ" in text
-        and "| pipeline.model.depth_loss | none | edge |" in text
-    )
+    assert "## Table 8. Fields in which the methods differ" in text
+    assert "| pipeline.model.depth_loss | none | edge |" in text
     assert "| pipeline.model.exposure |" not in text
     assert " with detail ↑ |" in text and " 1 m beside, with detail ↑ |" in text
     assert r"\bottomrule" in (asked.output / "tables.tex").read_text()
@@ -78,7 +77,6 @@ def test_it_leaves_figures_tables_and_pictures(finished):
         assert sum(entry["pixels"] for entry in run.content["by_angle_deg"]) > 1000
 
 
-@pytest.mark.slow
 def test_the_page_shows_what_is_there(finished):
     asked, results = finished
     page = (asked.output / "report.html").read_text(encoding="utf-8").replace("&#39;", "&#x27;")
@@ -99,25 +97,6 @@ def test_the_page_shows_what_is_there(finished):
         assert f"<dt>{name}</dt><dd>{value}</dd>" in page
 
 
-@pytest.mark.slow
-def test_trained_configurations_differ_in_the_named_fields_alone(finished):
-    _, results = finished
-    nerfacto, ours = (next(run for run in results.runs if run.method == name) for name in ("nerfacto", "edge"))
-    texts = [next(run.folder.rglob("config.yml")).read_text().splitlines() for run in (nerfacto, ours)]
-    different = {(a.strip(), b.strip()) for a, b in zip(*texts, strict=True) if a != b}
-    assert different == {
-        ("experiment_name: nerfacto_seed-0", "experiment_name: edge_seed-0"),
-        ("depth_loss: none", "depth_loss: edge"),
-        ("depth_source: none", "depth_source: integrated"),
-        ("depth_loss_final: 1.0", "depth_loss_final: 0.01"),
-        ("sky_loss_mult: 0.0", "sky_loss_mult: 0.01"),
-        ("sky_background: false", "sky_background: true"),
-        ("surface_loss_mult: 0.0", "surface_loss_mult: 1.0"),
-        ("surface_rays_per_batch: 0", "surface_rays_per_batch: 16384"),
-    }
-
-
-@pytest.mark.slow
 def test_evaluation_gives_the_figures_of_ns_eval(finished):
     _, results = finished
     run = next(run for run in results.runs if run.method == "edge")
@@ -129,7 +108,6 @@ def test_evaluation_gives_the_figures_of_ns_eval(finished):
             assert run.figures[name] == pytest.approx(value, rel=1e-4, abs=1e-4), name
 
 
-@pytest.mark.slow
 def test_a_finished_training_gets_detail_by_a_line_of_its_configuration(finished, tmp_path):
     """As docs/method.md says."""
     asked, results = finished
@@ -145,14 +123,12 @@ def test_a_finished_training_gets_detail_by_a_line_of_its_configuration(finished
     assert found["truth_masked_psnr"] == pytest.approx(run.figures["detail_truth_masked_psnr"], abs=1e-3)
 
 
-@pytest.mark.slow
 def test_what_is_there_is_not_done_again(finished, monkeypatch):
     asked, results = finished
     monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: pytest.fail("started a command"))
     assert command.compare(asked, QUIET).rows() == results.rows()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kept", [(), ("edge",)])
 def test_runs_of_which_only_the_figures_are_left_count_in_the_tables(finished, tmp_path, monkeypatch, kept):
     asked, results = finished
@@ -173,7 +149,6 @@ def test_runs_of_which_only_the_figures_are_left_count_in_the_tables(finished, t
     assert page.count('"distance-error": "data:image/webp') == 2 * len(kept)
 
 
-@pytest.mark.slow
 def test_an_interrupted_run_goes_on_at_its_checkpoint(finished, tmp_path):
     """As if it had been killed after four of ours' twelve steps."""
     asked, results = finished

@@ -13,6 +13,8 @@ import torch
 from scenes import copy_sample_drive, write_scene
 from trainings import trainer_of
 
+pytestmark = pytest.mark.slow
+
 HERE = Path(__file__).parent
 WORLD_SIZE = 2
 
@@ -32,7 +34,6 @@ def ranks(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
     return [torch.load(folder / f"{rank}.pt", weights_only=True) for rank in range(WORLD_SIZE)]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("which", ["drawn", "further"])
 def test_no_ray_is_drawn_twice(ranks: list[dict[str, Any]], which: str) -> None:
     """Of two processes and four steps: 512 of 5888 pixels, and 2048 further ones for the surface."""
@@ -42,7 +43,6 @@ def test_no_ray_is_drawn_twice(ranks: list[dict[str, Any]], which: str) -> None:
     assert len(set(pixels)) == len(pixels)
 
 
-@pytest.mark.slow
 def test_what_is_kept_on_disk_is_made_once(ranks: list[dict[str, Any]]) -> None:
     made = [found["made"] for found in ranks]
     # a table of pixels for training and one to judge by; their pictures share the one lens
@@ -50,7 +50,6 @@ def test_what_is_kept_on_disk_is_made_once(ranks: list[dict[str, Any]]) -> None:
     assert sum(found.get("_make", 0) for found in made) == 1
 
 
-@pytest.mark.slow
 def test_gradients_are_averaged(ranks: list[dict[str, Any]]) -> None:
     assert {"rgb_loss", "edge_loss", "sky_loss", "surface_loss"} <= set(ranks[0]["losses"])
     one, two = ranks
@@ -62,7 +61,6 @@ def test_gradients_are_averaged(ranks: list[dict[str, Any]]) -> None:
     assert one["averaged"]["exposure.log_gains"].any(dim=1).all()  # every picture is in some batch
 
 
-@pytest.mark.slow
 def test_parameters_stay_equal(ranks: list[dict[str, Any]]) -> None:
     one, two = ranks
     assert one["after"]
@@ -72,7 +70,6 @@ def test_parameters_stay_equal(ranks: list[dict[str, Any]]) -> None:
         assert not torch.equal(value, one["before"][name]), name
 
 
-@pytest.mark.slow
 def test_the_first_process_saves_what_one_alone_reads(ranks: list[dict[str, Any]], tmp_path: Path) -> None:
     (checkpoint,) = ranks[0]["checkpoints"]
     scene = Path(checkpoint).parents[5] / "scene"
@@ -83,7 +80,6 @@ def test_the_first_process_saves_what_one_alone_reads(ranks: list[dict[str, Any]
         assert torch.equal(alone[name], value), name
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="wants two GPUs")
 def test_two_gpus_train_together(tmp_path: Path) -> None:
     command = ["ns-train", "edge-depth-nerf-lite", "--data", str(copy_sample_drive(tmp_path / "scene"))]

@@ -48,18 +48,10 @@ def urban_nerf_loss(weights, starts_m, ends_m, prior_m, sigma_m, expected=0.01, 
     return per_ray.sum() / has_prior.sum().clamp(min=1)
 
 
-def one_ray(weights, edges, prior: float, sigma: float, **form) -> float:
+def one_ray(weights, edges, prior: float, sigma: float, loss_of=edge_loss, **form) -> float:
     edges = torch.tensor(edges, dtype=torch.float64)[None]
-    return float(
-        edge_loss(
-            torch.tensor(weights, dtype=torch.float64)[None],
-            edges[:, :-1],
-            edges[:, 1:],
-            torch.tensor([prior], dtype=torch.float64),
-            sigma,
-            **form,
-        )
-    )
+    given = torch.tensor(weights, dtype=torch.float64)[None]
+    return float(loss_of(given, edges[:, :-1], edges[:, 1:], torch.tensor([prior]).double(), sigma, **form))
 
 
 @pytest.mark.parametrize(("dtype", "rtol"), [(torch.float64, 1e-6), (torch.float32, 1e-4)], ids=str)
@@ -90,11 +82,7 @@ def test_value_by_hand():
     #   interval: Φ(-1) - Φ(-2) = 0.135905, Φ(1) - Φ(-1) = 0.682689
     #             1.609438 · 0.135905 + 0.223144 · 0.682689 = 0.218731 + 0.152338 =  0.371068
     #   without the norm, times 2.506628:                                            0.930130
-    values = {("point", False): 0.968795, ("point", True): 0.386493} | {
-        ("interval", False): 0.930130,
-        ("interval", True): 0.371068,
-    }
-    for (gaussian, norm), value in values.items():
+    for (gaussian, norm), value in zip(FORMS, (0.968795, 0.386493, 0.930130, 0.371068), strict=True):
         loss = one_ray([0.2, 0.8], [1.0, 2.0, 4.0], 3.0, 1.0, gaussian=gaussian, divide_by_norm=norm)
         assert loss == pytest.approx(value, abs=3e-6)
 
@@ -119,7 +107,6 @@ def test_longer_units(gaussian, norm):
 
 def test_weight_at_the_prior_is_best():
     edges = [float(t) for t in range(1, 42)]
-    assert len(FORMS) == 4
     for gaussian, norm in FORMS:
         losses = []
         for sample in (10, 19, 30):  # 19 spans 20 to 21 m
@@ -210,31 +197,13 @@ def test_samples_that_are_none_give_nothing(gaussian):
 
 @pytest.mark.parametrize(("gaussian", "norm"), FORMS)
 def test_no_prior_is_a_connected_zero(gaussian, norm):
-    rays = {name: tensor[:6] for name, tensor in random_rays(4).items()}
-    rays["weights"].requires_grad_()
-    loss = edge_loss(**rays, gaussian=gaussian, divide_by_norm=norm)
-    assert loss.item() == 0
-    loss.backward()
-    assert torch.equal(rays["weights"].grad, torch.zeros(6, 30, dtype=torch.float64))
-    nothing = {name: tensor[:0] for name, tensor in random_rays(4).items()}
-    assert float(edge_loss(**nothing)) == 0
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64], ids=str)
-@pytest.mark.parametrize(("gaussian", "norm"), FORMS)
-def test_finite_everywhere(gaussian, norm, dtype):
-    rays = {name: tensor.to(dtype) for name, tensor in random_rays(5, rays=200).items()}
-    rays["weights"][:, ::2] = 0
-    rays["ends_m"][:, -1] = math.inf if dtype == torch.float16 else 1e30
-    rays["weights"].requires_grad_()
-    loss = edge_loss(**rays, gaussian=gaussian, divide_by_norm=norm)
-    assert loss.dtype == (torch.float64 if dtype == torch.float64 else torch.float32)
-    assert torch.isfinite(loss)
-    loss.backward()
-    gradient = rays["weights"].grad
-    assert gradient is not None
-    if dtype != torch.float16:  # 1 / EPS is beyond float16
-        assert torch.isfinite(gradient).all() and gradient.any()
+    for count in (6, 0):
+        rays = {name: tensor[:count] for name, tensor in random_rays(4).items()}
+        rays["weights"].requires_grad_()
+        loss = edge_loss(**rays, gaussian=gaussian, divide_by_norm=norm)
+        assert loss.item() == 0
+        loss.backward()
+        assert torch.equal(rays["weights"].grad, torch.zeros(count, 30, dtype=torch.float64))
 
 
 def test_gradient_at_weight_zero():
@@ -308,16 +277,10 @@ def test_urban_nerfs_gradient_equals_finite_differences(terms):
     assert torch.autograd.gradcheck(lambda w: urban_nerf_loss(w, **rays, sigma_m=4.0, **terms), (weights,))
 
 
-def urban_ray(weights, edges, prior: float, sigma: float, terms: dict[str, float]) -> float:
-    edges = torch.tensor(edges, dtype=torch.float64)[None]
-    given = torch.tensor(weights, dtype=torch.float64)[None]
-    return float(urban_nerf_loss(given, edges[:, :-1], edges[:, 1:], torch.tensor([prior]).double(), sigma, **terms))
-
-
 def test_urban_nerfs_terms_by_hand():
     # samples [1, 2], [2, 5], [5, 9] m, weights 0.2, 0.3, 0.4; prior 4 m, σ = 1/3 m, so ε = 1 m
     weights, edges = [0.2, 0.3, 0.4], [1.0, 2.0, 5.0, 9.0]
-    found = [urban_ray(weights, edges, 4.0, 1 / 3, terms) for terms in TERMS[:3]]
+    found = [one_ray(weights, edges, 4.0, 1 / 3, urban_nerf_loss, **terms) for terms in TERMS[:3]]
     # expected 0.2 · 1.5 + 0.3 · 3.5 + 0.4 · 7 = 4.15, less 4 m
     assert found[0] == pytest.approx(0.15**2)
     # up to 3 m: 0.2² · 1 + 0.1² · 1
@@ -334,7 +297,7 @@ def test_urban_nerfs_loss_is_least_where_light_ends_as_the_kernel_says():
     for at in (4.0, 5.0, 6.0):
         for width in (0.1, 0.3, 0.9):
             weights = np.exp(-((middles - at) ** 2) / (2 * width**2))
-            losses[at, width] = urban_ray(weights / weights.sum(), edges.tolist(), 5.0, 0.3, {})
+            losses[at, width] = one_ray(weights / weights.sum(), edges.tolist(), 5.0, 0.3, urban_nerf_loss)
     assert min(losses, key=lambda key: losses[key]) == (5.0, 0.3)
     # the kernel itself, but for its cut ends: nothing is left
     assert losses[5.0, 0.3] == pytest.approx(0, abs=1e-2)
@@ -343,8 +306,8 @@ def test_urban_nerfs_loss_is_least_where_light_ends_as_the_kernel_says():
 
 def test_urban_nerfs_loss_does_not_depend_on_how_a_ray_is_cut_into_samples():
     """nerfstudio's does: its target grows with no sample's length."""
-    coarse = urban_ray([0.2, 0.3, 0.4], [1.0, 2.0, 5.0, 9.0], 4.2, 0.2, {})
-    fine = urban_ray([0.1, 0.1, 0.1, 0.2, 0.4], [1.0, 1.5, 2.0, 3.0, 5.0, 9.0], 4.2, 0.2, {})
+    coarse = one_ray([0.2, 0.3, 0.4], [1.0, 2.0, 5.0, 9.0], 4.2, 0.2, urban_nerf_loss)
+    fine = one_ray([0.1, 0.1, 0.1, 0.2, 0.4], [1.0, 1.5, 2.0, 3.0, 5.0, 9.0], 4.2, 0.2, urban_nerf_loss)
     assert fine == pytest.approx(coarse, rel=1e-9)
 
 
@@ -365,8 +328,6 @@ def test_urban_nerfs_rays_without_a_prior_do_not_count():
     ("change", "words"),
     [
         ({"starts_m": torch.ones(12, 29)}, r"urban_nerf_loss: starts_m \(12, 29\) does not fit weights \(12, 30\)"),
-        ({"prior_m": torch.ones(12, 1)}, r"urban_nerf_loss: prior_m \(12, 1\) does not fit"),
-        ({"weights": torch.ones(12, 30, 1)}, r"weights \(12, 30, 1\); expected two dimensions"),
         ({"sigma_m": 0.0}, "urban_nerf_loss: sigma_m is 0.0; expected a positive number"),
         ({"sigma_m": math.nan}, "sigma_m is nan"),
     ],

@@ -12,7 +12,13 @@ from nerfstudio.model_components.losses import ds_nerf_depth_loss, urban_radianc
 from nerfstudio.model_components.renderers import DepthRenderer
 from nerfstudio.models.nerfacto import NerfactoModel
 
-from edge_depth_nerf.method.depth_losses import DsNerfLoss, EdgeLoss, Level, UrbanNerfLoss, UrbanNerfSightLoss
+from edge_depth_nerf.method.depth_losses import (
+    DsNerfLoss,
+    EdgeLoss,
+    Level,
+    UrbanNerfLoss,
+    UrbanNerfSightLoss,
+)
 from edge_depth_nerf.method.losses import edge_loss, urban_nerf_loss
 from edge_depth_nerf.plugin.compat import lpips_not_built
 from edge_depth_nerf.plugin.model import LossOptions
@@ -61,13 +67,28 @@ def surface(count=6) -> dict:
     }
 
 
-def trained_step(model, more: dict | None = None):
-    """Outputs and losses of one training step, which may bring more; the same samples for every model of one seed."""
+def trained_step(model, further=None):
+    """Outputs and losses of one training step; the same samples for every model of the same seed."""
+    supervision = batch() | (further or {})
     model.train()
     torch.manual_seed(3)
-    supervision = batch() | (more or {})
     outputs = model(rays(), supervision)
     return outputs, model.get_loss_dict(outputs, supervision, model.get_metrics_dict(outputs, supervision))
+
+
+def are_taught(parameters) -> bool:
+    """Whether any of them has a gradient."""
+    return any(each.grad is not None and bool(each.grad.any()) for each in parameters)
+
+
+def levels_of(outputs) -> list[Level]:
+    """All samples along the rays of a batch, in metres, with its prior."""
+    prior, sigma = batch()["prior_distance_m"][:, 0], batch()["prior_sigma_m"][:, 0]
+    found = []
+    for weights, samples in zip(outputs["weights_list"], outputs["ray_samples_list"], strict=True):
+        starts, ends = (each[..., 0] * METRES_PER_UNIT for each in (samples.frustums.starts, samples.frustums.ends))
+        found.append(Level(weights[..., 0], starts, ends, prior, sigma))
+    return found
 
 
 def test_near_and_far_are_metres_and_are_not_reset():
@@ -92,16 +113,13 @@ def test_the_edge_loss_is_eq_4_in_metres():
     literal = LossOptions(edge=EdgeLoss(gaussian="point", divide_by_norm=False))
     model = build(depth_loss_mult=0.25, depth_loss_levels="final", losses=literal)
     outputs, losses = trained_step(model)
-    weights, samples = outputs["weights_list"][-1], outputs["ray_samples_list"][-1]
-    starts, ends = (edge[..., 0] * METRES_PER_UNIT for edge in (samples.frustums.starts, samples.frustums.ends))
-    supervision = batch()
-    prior, sigma = supervision["prior_distance_m"][:, 0], supervision["prior_sigma_m"][:, 0]
-    per_ray = edge_loss(weights[..., 0], starts, ends, prior, sigma, gaussian="point", divide_by_norm=False)
+    final = levels_of(outputs)[-1]
+    along = (final.weights, final.starts_m, final.ends_m)
+    per_ray = edge_loss(*along, final.prior_m, final.sigma_m, gaussian="point", divide_by_norm=False)
     assert torch.allclose(losses["edge_loss"], 0.25 * per_ray.sum() / 12)
     assert losses["edge_loss"] > 0
     losses["edge_loss"].backward()
-    gradients = [p.grad for p in model.field.mlp_base.parameters()]
-    assert any(g is not None and g.abs().sum() > 0 for g in gradients)
+    assert are_taught(model.field.mlp_base.parameters())
 
 
 def test_all_levels_reach_the_proposal_networks():
@@ -109,8 +127,7 @@ def test_all_levels_reach_the_proposal_networks():
         model = build(depth_loss_levels=levels)
         _, losses = trained_step(model)
         losses["edge_loss"].backward()
-        gradients = [p.grad for p in model.proposal_networks.parameters()]
-        assert any(g is not None and bool(g.abs().sum() > 0) for g in gradients) == reached
+        assert are_taught(model.proposal_networks.parameters()) == reached
 
 
 @pytest.mark.parametrize("kind", ["ds-nerf", "urban-nerf"])
@@ -141,14 +158,12 @@ def test_urban_nerf_of_its_authors_is_in_metres_and_narrows():
         model._step = step
         outputs, losses = trained_step(model)
         total = torch.zeros(())
-        for weights, samples in zip(outputs["weights_list"], outputs["ray_samples_list"], strict=True):
-            starts, ends = (edge[..., 0] * METRES_PER_UNIT for edge in (samples.frustums.starts, samples.frustums.ends))
-            prior_m = batch()["prior_distance_m"][:, 0]
-            total += urban_nerf_loss(weights[..., 0], starts, ends, prior_m, sigma_m, **terms).sum() / 12
+        for each in levels_of(outputs):
+            per_ray = urban_nerf_loss(each.weights, each.starts_m, each.ends_m, each.prior_m, sigma_m, **terms)
+            total += per_ray.sum() / 12
         assert torch.allclose(losses["urban_nerf_los_loss"], 0.5 * total / 3)
     losses["urban_nerf_los_loss"].backward()
-    gradients = [p.grad for p in model.field.mlp_base.parameters()]
-    assert any(g is not None and bool(g.abs().sum() > 0) for g in gradients)
+    assert are_taught(model.field.mlp_base.parameters())
 
 
 def test_sigma_of_ds_nerf_is_a_standard_deviation_in_metres():
@@ -259,7 +274,7 @@ def test_views_have_the_geometric_mean_of_the_pictures_gains():
     # they are learned, and kept with the rest
     assert any(parameter is gains.log_gains for parameter in model.get_param_groups()["fields"])
     torch.stack(list(trained_step(model)[1].values())).sum().backward()
-    assert gains.log_gains.grad is not None and bool(gains.log_gains.grad.abs().sum() > 0)
+    assert are_taught([gains.log_gains])
     assert "exposure.log_gains" in model.state_dict() and model.field.embedding_appearance is None
     embedded = build(exposure="embedding")
     assert embedded.exposure is None and embedded.field.embedding_appearance is not None
@@ -282,15 +297,14 @@ def test_the_surface_loss_is_the_field_colour_error_at_the_prior():
     expected = 0.5 * (colours - given["surface_image"]).square().mean()
     assert float(losses["surface_loss"]) == pytest.approx(float(expected), rel=1e-3)
     losses["surface_loss"].backward()
-    assert any(p.grad is not None and bool(p.grad.abs().sum() > 0) for p in model.field.mlp_base.parameters())
+    assert are_taught(model.field.mlp_base.parameters())
 
 
 def test_further_pixels_that_do_not_count_change_no_loss():
     """On a GPU all of them are served, and which are of use; on the CPU these alone."""
     found = []
     for counts in (None, torch.tensor([True, False, True, True, False, True])[:, None]):
-        model = build(surface_loss_mult=0.5).train()
-        given = surface()
+        model, given = build(surface_loss_mult=0.5), surface()
         if counts is None:
             chosen = torch.tensor([0, 2, 3, 5])
             given = {name: value[chosen] for name, value in given.items()}
@@ -303,8 +317,8 @@ def test_further_pixels_that_do_not_count_change_no_loss():
     for one, other in zip(found[0][1], found[1][1], strict=True):
         torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-6)
     nowhere = surface() | {"surface_counts": torch.zeros(6, 1, dtype=torch.bool)}
-    _, losses = trained_step(model, nowhere)
-    assert losses["surface_loss"] == 0 and losses["surface_loss"].requires_grad
+    loss = trained_step(model, nowhere)[1]["surface_loss"]
+    assert loss == 0 and loss.requires_grad
 
 
 def test_losses_of_final_samples_alone():
@@ -342,31 +356,22 @@ def test_the_surface_is_drawn_between_the_planes():
 
 @pytest.mark.parametrize("distance_m", [0.1, 60.0])
 def test_a_surface_that_is_not_between_the_planes_says_nothing(distance_m):
-    model = build(near_m=0.2, far_m=50.0).train()
-    given = surface()
+    model, given = build(near_m=0.2, far_m=50.0), surface()
     given["surface_distance_m"][0] = distance_m
-    image = given["surface_image"].clone()
-
-    def loss() -> float:
-        return float(trained_step(model, given)[1]["surface_loss"])
-
     losses = []
-    for red in (0.0, 1.0):
-        given["surface_image"][0] = red
-        losses.append(loss())
-    assert losses[0] == pytest.approx(losses[1], rel=1e-5) and losses[0] > 0
     # another pixel's colour does matter
-    given["surface_image"][1] = 1 - image[1].round()
-    assert loss() != pytest.approx(losses[0], rel=1e-3)
+    for pixel, colour in ((0, 0.0), (0, 1.0), (1, 1 - given["surface_image"][1].round())):
+        given["surface_image"][pixel] = colour
+        losses.append(float(trained_step(model, given)[1]["surface_loss"].detach()))
+    assert losses[0] == pytest.approx(losses[1], rel=1e-5) and losses[0] > 0
+    assert losses[2] != pytest.approx(losses[0], rel=1e-3)
 
 
 @pytest.mark.parametrize("kind", LOSSES)
 @pytest.mark.parametrize("distance_m", [0.05, 0.199, 51.0, 255.9])
 def test_a_prior_that_is_not_between_the_planes_is_none(kind, distance_m):
-    model = build(depth_loss=kind, near_m=0.2, far_m=50.0).train()
-    torch.manual_seed(3)
-    outputs = model(rays())
-    name = LOSSES[kind]
+    model, name = build(depth_loss=kind, near_m=0.2, far_m=50.0), LOSSES[kind]
+    outputs, _ = trained_step(model)
     found = []
     for value in (0.0, distance_m):
         supervision = batch()
@@ -392,15 +397,6 @@ def test_distance_is_that_of_what_a_ray_hits():
     weights = torch.tensor([[0.0, 0.3, 0.0, 0.0], [0.0, 0.0, 0.8, 0.2], [0.01, 0.0, 0.0, 0.0]])[..., None]
     renderer = DepthInEvaluation(method="median").eval()
     assert renderer(weights, samples)[:, 0].tolist() == [1.5, 2.5, 3.5]
-
-
-def test_rays_without_prior_add_nothing():
-    model = build()
-    outputs, _ = trained_step(model)
-    supervision = batch()
-    supervision["prior_distance_m"] = torch.zeros(16, 1)
-    losses = model.get_loss_dict(outputs, supervision, model.get_metrics_dict(outputs, supervision))
-    assert losses["edge_loss"] == 0
 
 
 def test_no_download_and_no_lpips_in_the_checkpoint(monkeypatch, tmp_path):
@@ -438,7 +434,9 @@ def test_views_are_judged_inside_the_mask(monkeypatch, tmp_path):
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     model, outputs, truth = judged_view()
     metrics, images = model.get_image_metrics_and_images(outputs, truth)
-    assert set(metrics) == {*("psnr", "ssim", "masked_psnr", "masked_ssim", "truth_masked_psnr", "truth_masked_ssim")}
+    assert set(metrics) == {
+        *("psnr", "ssim", "masked_psnr", "masked_ssim", "truth_masked_psnr", "truth_masked_ssim"),
+    }
     inside = ((outputs["rgb"] - truth["image"])[:, 4:] ** 2).mean()
     assert metrics["masked_psnr"] == pytest.approx(-10 * math.log10(inside), abs=1e-4)
     assert metrics["truth_masked_ssim"] == pytest.approx(1)
@@ -495,15 +493,9 @@ def test_levels_that_do_not_learn_are_left_out_and_the_others_pull_as_before(los
         model = build(depth_loss=loss, depth_loss_mult=1.0).train()
         if rests:
             model.proposal_sampler._step, model.proposal_sampler._steps_since_update = 1000, 1
-        torch.manual_seed(3)
-        outputs = model(rays(), batch())
+        outputs, losses = trained_step(model)
         assert [weights.requires_grad for weights in outputs["weights_list"]] == [not rests] * 2 + [True]
-        losses = model.get_loss_dict(outputs, batch(), model.get_metrics_dict(outputs, batch()))
-        prior, sigma = batch()["prior_distance_m"][:, 0], batch()["prior_sigma_m"][:, 0]
-        levels = []
-        for weights, samples in zip(outputs["weights_list"], outputs["ray_samples_list"], strict=True):
-            starts, ends = (edge[..., 0] * METRES_PER_UNIT for edge in (samples.frustums.starts, samples.frustums.ends))
-            levels.append(Level(weights[..., 0], starts, ends, prior, sigma))
+        levels = levels_of(outputs)
         object_of = model.step_losses[LOSSES[loss]].loss
         counted = 16 if object_of.over_all_rays else 12
         used = levels[-1:] if rests and loss != "urban-nerf" else levels
