@@ -17,7 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 from drives import CAM0_TO_VELO, CAM_TO_POSE, MeiTwin
-from scenes import write_scene
+from scenes import SAMPLE_DRIVE, write_scene
 
 from edge_depth_nerf.base.files import (
     read_distance_png,
@@ -32,11 +32,15 @@ from edge_depth_nerf.base.files import (
     write_png,
 )
 from edge_depth_nerf.base.png import read_png_bytes
+from edge_depth_nerf.compare.command import read_tuned
+from edge_depth_nerf.compare.results import check_fair, read_results
+from edge_depth_nerf.compare.specification import RunSpecification
 from edge_depth_nerf.lidar.scans import ScanFormat, check_scan, read_cloud, read_scan
 from edge_depth_nerf.lidar.sweeps import read_sweep
 from edge_depth_nerf.masks.semantics import read_labels
 from edge_depth_nerf.method.error_model import read_trust
 from edge_depth_nerf.mono.files import read_npy as read_map
+from edge_depth_nerf.mono.network import DepthNetwork, NetworkSettings, load_network, save_network
 from edge_depth_nerf.process.kitti360.calibration import (
     read_cam_to_pose,
     read_cam_to_velo,
@@ -44,11 +48,12 @@ from edge_depth_nerf.process.kitti360.calibration import (
     read_poses,
     read_timestamps,
 )
+from edge_depth_nerf.process.options import RigOptions
 from edge_depth_nerf.process.poses import read_kitti, read_nerfstudio, read_times, read_tum
-from edge_depth_nerf.process.rig_file import read_rig
+from edge_depth_nerf.process.rig import read_rig_recording
+from edge_depth_nerf.process.rig_file import read_rig, tomllib
 from edge_depth_nerf.scene.reader import read_scene
 
-ROOT = Path(__file__).resolve().parents[1]
 IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0"
 RIG = """
 [poses]
@@ -159,17 +164,6 @@ def read_whole_scene(path: Path) -> None:
     found.points_m()
 
 
-def rig(folder: Path) -> Path:
-    return named("rig.toml", RIG)(folder)
-
-
-def rig_json(folder: Path) -> Path:
-    from edge_depth_nerf.process.rig_file import tomllib
-
-    write_json(folder / "rig.json", tomllib.loads(RIG))
-    return folder / "rig.json"
-
-
 def recording(folder: Path) -> Path:
     """A whole small recording; its rig file is what is spoilt."""
     for number in range(4):
@@ -179,38 +173,19 @@ def recording(folder: Path) -> Path:
         (folder / f"lidar/{number:06d}.bin").write_bytes(points().tobytes())
     (folder / "times.txt").write_text("0.0\n0.1\n0.2\n0.3\n")
     (folder / "poses.txt").write_text("".join(f"{t / 10} {t} 0 0 0 0 0 1\n" for t in range(-1, 6)))
-    return rig(folder)
+    return named("rig.toml", RIG)(folder)
 
 
 def read_recording(path: Path) -> None:
-    from edge_depth_nerf.process.options import RigOptions
-    from edge_depth_nerf.process.rig import read_rig_recording
-
     read_rig_recording(RigOptions(root=path.parent, rig=path, output=path.parent / "scene"))
 
 
 def weights(folder: Path) -> Path:
-    from edge_depth_nerf.mono.network import DepthNetwork, NetworkSettings, save_network
-
     save_network(folder / "a.safetensors", DepthNetwork(NetworkSettings((8, 8), 32, 1.5, 20.0)), {"preset": "none"})
     return folder / "a.safetensors"
 
 
-def read_weights(path: Path) -> None:
-    from edge_depth_nerf.mono.network import load_network
-
-    load_network(path)
-
-
-def tuned(path: Path) -> None:
-    from edge_depth_nerf.compare.command import read_tuned
-
-    read_tuned(path)
-
-
 def figures(folder: Path) -> Path:
-    from edge_depth_nerf.compare.specification import RunSpecification
-
     run = RunSpecification("scene", "0" * 64, "lite", "edge", 0, None).to_dict()
     write_json(
         folder / "scene/edge_seed-0/figures.json",
@@ -223,18 +198,9 @@ def figures(folder: Path) -> Path:
 
 
 def read_figures(path: Path) -> None:
-    from edge_depth_nerf.compare.results import check_fair, read_results
-
     results = read_results(path.parents[2])
     check_fair(results)
     results.rows()
-
-
-def copied(name: str) -> Callable[[Path], Path]:
-    def make(folder: Path) -> Path:
-        return Path(shutil.copy(ROOT / name, folder))
-
-    return make
 
 
 def tables(path: Path) -> None:
@@ -258,8 +224,8 @@ OURS: dict[str, Reader] = {
     "poses of 12 numbers": Reader(named("a.txt", f"{IDENTITY}\n" * 5), read_kitti),
     "poses of nerfstudio": Reader(named("a.json", json.dumps(FRAMES)), read_nerfstudio, "json"),
     "times": Reader(named("a.txt", "".join(f"a{n}.png {n}.5\n" for n in range(9))), read_times),
-    "rig toml": Reader(rig, tables),
-    "rig json": Reader(rig_json, tables, "json"),
+    "rig toml": Reader(named("rig.toml", RIG), tables),
+    "rig json": Reader(named("rig.json", json.dumps(tomllib.loads(RIG))), tables, "json"),
 }
 """Parsers that are written out in this project: those of the coverage-guided fuzzer."""
 
@@ -293,10 +259,10 @@ READERS: dict[str, Reader] = {
     ),
     "json": Reader(named("a.json", json.dumps(FRAMES)), read_json, "json"),
     "scene": Reader(scene, read_whole_scene, "json"),
-    "trust": Reader(copied("data/sample_drive/mono_trust.json"), read_trust, "json"),
-    "weights": Reader(weights, read_weights, "binary"),
+    "trust": Reader(lambda folder: Path(shutil.copy(SAMPLE_DRIVE / "mono_trust.json", folder)), read_trust, "json"),
+    "weights": Reader(weights, load_network, "binary"),
     "tuned": Reader(
-        named("a.json", json.dumps({"methods": {"ds-nerf": {"lambda": 0.01, "sigma_m": 0.5}}})), tuned, "json"
+        named("a.json", json.dumps({"methods": {"ds-nerf": {"lambda": 0.01, "sigma_m": 0.5}}})), read_tuned, "json"
     ),
     "figures": Reader(figures, read_figures, "json"),
 }
@@ -458,6 +424,3 @@ def _number(content: bytes, rng: Random) -> bytes:
 def describe(path: Path) -> str:
     """For messages of failures."""
     return f"{path.name}: {path.read_bytes()[:400]!r}"
-
-
-__all__ = ["OURS", "READERS", "Reader", "describe", "spoilt"]

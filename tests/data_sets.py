@@ -79,12 +79,15 @@ def picture(name: str, moment: int) -> NDArray[np.uint8]:
     return np.stack((shade, 255 - shade, shade // 2), -1).astype(np.uint8)
 
 
+def beams(azimuth: NDArray, elevation: NDArray) -> NDArray:
+    """Unit directions in a scanner, N×3, of angles in radians."""
+    flat = np.cos(elevation)
+    return np.stack((flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)), -1).reshape(-1, 3)
+
+
 def points(time_s: float, frame: NDArray) -> NDArray:
     """What the scanner hits at a time, in a frame given by its pose on the vehicle."""
-    azimuth, elevation = np.meshgrid(np.linspace(0, 2 * np.pi, 500, endpoint=False), np.linspace(-0.5, 0.3, 40))
-    rays = np.stack(
-        (np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)), -1
-    ).reshape(-1, 3)
+    rays = beams(*np.meshgrid(np.linspace(0, 2 * np.pi, 500, endpoint=False), np.linspace(-0.5, 0.3, 40)))
     to_world = vehicle(time_s) @ to_vehicle("scanner")
     in_world = rays @ to_world[:3, :3].T
     hits = to_world[:3, 3] + in_world * reach(to_world[:3, 3], in_world)[:, None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -27,15 +28,14 @@ def nearest_of_blocks(distance_m: np.ndarray, factor: int) -> np.ndarray:
     return np.where(np.isfinite(nearest), nearest, 0)
 
 
-def held_out_blocks(shape: tuple[int, int], block_px: int, share: float, seed: int = 0) -> np.ndarray:
-    """True in whole blocks of block_px, drawn at random, `share` of all."""
-    rows, columns = -(-shape[0] // block_px), -(-shape[1] // block_px)
-    chosen = np.random.default_rng(seed).permutation(rows * columns) < round(share * rows * columns)
-    blocks = chosen.reshape(rows, columns)
-    return np.kron(blocks, np.ones((block_px, block_px), bool))[: shape[0], : shape[1]]
+def held_out_blocks(size_px: int) -> np.ndarray:
+    """True in whole blocks of a square map, drawn at random."""
+    count = -(-size_px // BLOCK_PX)
+    chosen = np.random.default_rng(0).permutation(count**2) < round(HELD_OUT_SHARE * count**2)
+    return np.kron(chosen.reshape(count, count), np.ones((BLOCK_PX, BLOCK_PX), bool))[:size_px, :size_px]
 
 
-def fisheye_frame_scene(real_data: Path, output: Path, downscale: int = 4) -> Path:
+def fisheye_frame_scene(real_data: Path, output: Path, downscale: int) -> Path:
     """The one real fisheye frame as a scene: trained with nine tenths of its LiDAR, judged on the rest.
 
     LiDAR is held out in whole blocks of 64 px. The frame stands twice in the scene: once for training, once, with the
@@ -55,7 +55,7 @@ def fisheye_frame_scene(real_data: Path, output: Path, downscale: int = 4) -> Pa
     )
     hidden = np.load(folder / "mask_left_fisheye.npy")
     lidar = read_distance_png(folder / "kitti360_depth.png")
-    judged = held_out_blocks((1400, 1400), BLOCK_PX, HELD_OUT_SHARE)
+    judged = held_out_blocks(1400)
     image = downscale_image(read_image(folder / "kitti360_rgb.png"), downscale)
     frames = [
         SceneFrame(
@@ -86,7 +86,7 @@ def stereo_distance(left: np.ndarray, right: np.ndarray, camera: Pinhole, baseli
     return z_depth / directions[..., 2].numpy()
 
 
-def stereo_scene(real_data: Path, output: Path, downscale: int = 4, held_out: int = HELD_OUT_STEREO_FRAME) -> Path:
+def stereo_scene(real_data: Path, output: Path, downscale: int) -> Path:
     """Ten real rectified pictures with poses; distance of the left ones by stereo matching, as a monocular source.
 
     Both pictures of one frame are held out. The right pictures get theirs by matching mirrored pictures.
@@ -101,26 +101,21 @@ def stereo_scene(real_data: Path, output: Path, downscale: int = 4, held_out: in
         pictures = [read_image(folder / f"{moment}_{side}.png") for side in ("00", "01")]
         baseline_m = float(np.linalg.norm(poses[f"{moment}_00"][:3, 3] - poses[f"{moment}_01"][:3, 3]))
         mirrored = [np.ascontiguousarray(picture[:, ::-1]) for picture in pictures]
-        mirrored_camera = Pinhole(
-            camera.width, camera.height, camera.fx, camera.fy, camera.width - camera.cx, camera.cy
-        )
+        mirrored_camera = replace(camera, cx=camera.width - camera.cx)
         distances = [
             stereo_distance(pictures[0], pictures[1], camera, baseline_m),
             stereo_distance(mirrored[1], mirrored[0], mirrored_camera, baseline_m)[:, ::-1],
         ]
         for side, (picture, distance) in enumerate(zip(pictures, distances, strict=True)):
-            offset = downscale // 2
-            content = FrameContent(
-                image=downscale_image(picture, downscale),
-                mono=distance[offset::downscale, offset::downscale].copy(),
-            )
+            middles = distance[downscale // 2 :: downscale, downscale // 2 :: downscale].copy()
+            content = FrameContent(image=downscale_image(picture, downscale), mono=middles)
             frames.append(
                 SceneFrame(
                     camera=f"image_0{side}",
                     frame=int(moment),
                     camera_to_world=UPRIGHT @ poses[f"{moment}_0{side}"] @ opengl_to_opencv,
                     content=content,
-                    held_out=int(moment) == held_out,
+                    held_out=int(moment) == HELD_OUT_STEREO_FRAME,
                 )
             )
     cameras = [SceneCamera(f"image_0{side}", camera.downscaled(downscale)) for side in (0, 1)]

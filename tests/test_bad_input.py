@@ -19,12 +19,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from bad_input import READERS, describe, named, npy, npz, pcd, spoilt
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from edge_depth_nerf.base.errors import LONGEST_MESSAGE, InputError
 from edge_depth_nerf.cameras import Pinhole
+from edge_depth_nerf.mono.network import load_network, write_tensors
+from edge_depth_nerf.process.colmap.models import sum_of_files
+from edge_depth_nerf.process.rig import _files, _number_in
 
 INPUTS = int(os.environ.get("BAD_INPUTS", "40"))
 MOST_SECONDS = 1.0
@@ -204,10 +208,6 @@ def test_what_was_found(name, tmp_path, tmp_path_factory):
 
 
 def test_a_network_far_larger_than_its_file(tmp_path):
-    import torch
-
-    from edge_depth_nerf.mono.network import load_network, write_tensors
-
     settings_of_it = {"channels": [1024] * 8, "working_px": 4096, "camera_height_m": 1.5, "room_radius_m": 20.0}
     write_tensors(tmp_path / "a.safetensors", {"weight": torch.ones(1)}, {"settings": settings_of_it})
     throw(load_network, tmp_path / "a.safetensors")
@@ -216,8 +216,6 @@ def test_a_network_far_larger_than_its_file(tmp_path):
 
 
 def test_digits_that_are_no_numbers(tmp_path):
-    from edge_depth_nerf.process.rig import _files, _number_in
-
     for name in ("12²34.png", "١٢.png", "7.png"):
         (tmp_path / name).write_bytes(b"")
     assert len(_files(tmp_path, "*.png", (".png",))) == 3
@@ -227,8 +225,6 @@ def test_digits_that_are_no_numbers(tmp_path):
 
 def test_a_damaged_model_of_colmaps_is_told_from_a_whole_one(tmp_path):
     """COLMAP's own reader ends the process at one."""
-    from edge_depth_nerf.process.colmap.models import sum_of_files
-
     for name in ("cameras.bin", "images.bin"):
         (tmp_path / name).write_bytes(bytes(range(99)))
     whole = sum_of_files(tmp_path)

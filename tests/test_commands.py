@@ -5,7 +5,6 @@ from __future__ import annotations
 import gzip
 import json
 import os
-import shlex
 import shutil
 import signal
 import socket
@@ -40,20 +39,6 @@ SMALL = (
 def command(*arguments) -> list[str]:
     words = [str(word) for word in arguments]
     return [str(Path(sys.executable).with_name(words[0])), *words[1:]]
-
-
-def call(*arguments, **environment) -> str:
-    done = subprocess.run(
-        command(*arguments),
-        env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        timeout=TIMEOUT_S,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout[-4000:]
-    return done.stdout
 
 
 @pytest.fixture(scope="module")
@@ -108,6 +93,14 @@ def commands_of(killed_run: Path, scene: Path, outputs: Path) -> dict[str, list[
         "interpolate": [
             *("ns-render", "interpolate", *load, "--interpolation-steps", 2, "--pose-source", "train"),
             *("--output-path", outputs / "interpolate" / "film.mp4"),
+        ],
+        "path": [
+            *("edge-depth-nerf", "camera-path", *load, "--camera", "fisheye", "--width", 36, "--fps", 5),
+            *("--seconds", 0.4, "--output", outputs / "path" / "path.json"),
+        ],
+        "film": [
+            *("ns-render", "camera-path", *load, "--camera-path-filename", outputs / "path" / "path.json"),
+            *("--output-path", outputs / "film" / "film.mp4"),
         ],
         "pointcloud": [
             *("ns-export", "pointcloud", *load, "--output-dir", outputs / "pointcloud", "--num-points", 500),
@@ -217,17 +210,11 @@ def test_render_interpolate(done):
     assert film.get(cv2.CAP_PROP_FRAME_COUNT) > 2
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ns-render camera-path writes films with ffmpeg")
-def test_a_film_of_a_camera_path(killed_run, tmp_path):
-    said = call(
-        *("edge-depth-nerf", "camera-path", "--load-config", killed_run / "config.yml", "--camera", "fisheye"),
-        *("--width", 36, "--fps", 5, "--seconds", 0.4),
-        *("--output", tmp_path / "path.json"),
-    )
-    printed = next(line for line in said.splitlines() if line.strip().startswith("ns-render"))
-    call(*shlex.split(printed))
-    film = cv2.VideoCapture(str(tmp_path / "path.mp4"))
+def test_a_film_of_a_camera_path(done):
+    done("path")
+    _, output = done("film")
+    film = cv2.VideoCapture(str(output / "film.mp4"))
     assert film.get(cv2.CAP_PROP_FRAME_COUNT) == 2 and film.get(cv2.CAP_PROP_FPS) == 5
     pictures = [film.read()[1] for _ in range(2)]
     assert all(picture.shape == (30, 36, 3) for picture in pictures)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import io
 import os
 import threading
 import time
@@ -13,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bad_input import npy
 from rich.console import Console
 
 from edge_depth_nerf.base import bounds, files, one_writer
@@ -106,12 +106,6 @@ def test_json_that_is_to_be_an_object(tmp_path: Path) -> None:
         read_json_object(path)
 
 
-def array_bytes(array: np.ndarray) -> bytes:
-    file = io.BytesIO()
-    np.save(file, array)
-    return file.getvalue()
-
-
 def test_arrays_of_an_archive_come_back(tmp_path: Path) -> None:
     given = {"a": np.arange(6.0).reshape(2, 3), "b": np.asfortranarray(np.arange(6).reshape(2, 3))}
     np.savez_compressed(tmp_path / "a.npz", **given)
@@ -124,10 +118,10 @@ def test_arrays_of_an_archive_come_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "compression", "said"),
     [
-        (array_bytes(np.arange(3.0)), zipfile.ZIP_BZIP2, "a uses an unsupported compression"),
-        (array_bytes(np.array(["words"])), zipfile.ZIP_STORED, "a holds <U5"),
-        (array_bytes(np.arange(126.0)), zipfile.ZIP_STORED, r"a has the shape \(126,\) of float64, more than 1000"),
-        (array_bytes(np.arange(9.0))[:-8], zipfile.ZIP_STORED, "cannot be read as arrays"),
+        (npy(np.arange(3.0)), zipfile.ZIP_BZIP2, "a uses an unsupported compression"),
+        (npy(np.array(["words"])), zipfile.ZIP_STORED, "a holds <U5"),
+        (npy(np.arange(126.0)), zipfile.ZIP_STORED, r"a has the shape \(126,\) of float64, more than 1000"),
+        (npy(np.arange(9.0))[:-8], zipfile.ZIP_STORED, "cannot be read as arrays"),
         (b"no array", zipfile.ZIP_STORED, "a.npz: a"),
     ],
 )
@@ -239,6 +233,10 @@ VIEW = {"camera": "a", "transform_matrix": POSE, "truth_rgb_file_path": "a", "tr
         (transforms(shifted_views={"1": [{**VIEW, "camera": 1}]}), "shifted_views are none"),
         (transforms(shifted_views={"1": [{**VIEW, "transform_matrix": 1}]}), "1 m, view 0: transform_matrix must be"),
         (transforms(shifted_views={"1": [VIEW, {**VIEW, "truth_rgb_file_path": 1}]}), "view 1: truth_rgb_file_path"),
+        (
+            transforms(shifted_views={"1": [{**VIEW, "truth_distance_file_path": "../../a.png"}]}),
+            r"view 0: truth_distance_file_path is .*not leading out",
+        ),
     ],
 )
 def test_each_fault_of_a_scene_is_said(tmp_path: Path, content: Any, said: str) -> None:

@@ -19,6 +19,7 @@ from typing import Any
 from unittest import mock
 
 import cv2
+import data_sets
 import numpy as np
 import pytest
 import torch
@@ -421,6 +422,10 @@ def is_elsewhere(reference: str) -> bool:
     return bool(re.match(r"\s*([a-z]+:)?//", reference))
 
 
+LOADED_ELSEWHERE = r"(url\(|@import)\s*['\"]?\s*(https?:)?//"
+"""In a style."""
+
+
 def test_the_site_needs_no_network(site):
     pages = sorted(site.rglob("*.html"))
     assert len(pages) > 15
@@ -429,12 +434,11 @@ def test_the_site_needs_no_network(site):
         # the slider page contains all that it shows
         assert len(found.loads) > 3 or page.name == "slider.html", page
         assert not [each for each in found.loads if is_elsewhere(each)], page
-        assert not re.search(r"(url\(|@import)\s*['\"]?\s*(https?:)?//", found.styles), page
+        assert not re.search(LOADED_ELSEWHERE, found.styles), page
         # Material fetches its program for diagrams where there are any
         assert "mermaid" not in page.read_text(encoding="utf-8"), page
     for style in site.rglob("*.css"):
-        text = style.read_text(encoding="utf-8")
-        assert not re.search(r"(url\(|@import)\s*['\"]?\s*(https?:)?//", text), style
+        assert not re.search(LOADED_ELSEWHERE, style.read_text(encoding="utf-8")), style
 
 
 def test_what_loads_elsewhere_is_noticed(tmp_path):
@@ -697,7 +701,7 @@ def test_the_example_of_a_network(sample_drive):
 def test_the_example_of_a_data_set(tmp_path):
     """A car that drives through an empty hall, askew, so that each wall shows whether points are de-skewed."""
     module = load("examples/new_data_set")
-    root, hall = tmp_path / "drive", np.array([[-30.0, -12, 0], [40, 9, 6]])
+    root = tmp_path / "drive"
     (root / "pictures").mkdir(parents=True)
     (root / "scans").mkdir()
     heading = 0.6
@@ -706,21 +710,14 @@ def test_the_example_of_a_data_set(tmp_path):
     along = np.arange(12)[:, None] * 0.8 * ahead
     np.savetxt(root / "poses.txt", np.column_stack((along[:, :2], np.full(12, heading))))
 
-    def distances(origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            along_ray = (np.where(rays > 0, hall[1], hall[0]) - origin) / rays
-        return np.where(rays == 0, np.inf, along_ray).min(-1)
-
     azimuth, elevation = np.meshgrid(np.radians(np.arange(0, 360, 0.5)), np.radians(np.linspace(-24, 4, 48)))
-    beams = np.stack(
-        (np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)), -1
-    ).reshape(-1, 3)
+    beams = data_sets.beams(azimuth, elevation)
     # clockwise, a turn in 0.1 s, ahead in its middle: the car goes 0.8 m meanwhile
     turned = -(((azimuth + np.pi) % (2 * np.pi)) - np.pi) / (2 * np.pi)
     generator = np.random.default_rng(0)
     for frame, place in enumerate(along):
         origins = place + 0.8 * turned.reshape(-1, 1) * ahead + [0, 0, 1.8]
-        points = beams * distances(origins, beams @ to_world.T)[:, None]
+        points = beams * data_sets.reach(origins, beams @ to_world.T)[:, None]
         np.save(root / f"scans/{frame:06d}.npy", points.astype(np.float32))
         picture = generator.integers(0, 255, (96, 128, 3), dtype=np.uint8)
         cv2.imwrite(str(root / f"pictures/{frame:06d}.png"), picture)
@@ -734,7 +731,7 @@ def test_the_example_of_a_data_set(tmp_path):
     for frame in meta["frames"]:
         lidar = read_distance_png(tmp_path / "scene" / frame["lidar_file_path"])
         origin = along[int(Path(frame["file_path"]).stem)] + to_world @ module.CAMERA_TO_VEHICLE[:3, 3]
-        true = distances(origin, directions)
+        true = data_sets.reach(origin, directions)
         found = (lidar > 0) & np.isfinite(true)
         assert found.sum() > 300
         # a pixel holds the nearest of the returns that fall into it

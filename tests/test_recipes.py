@@ -29,24 +29,21 @@ NEEDS_PYARROW = pytest.mark.skipif(
 RECIPES = ["nuscenes", pytest.param("argoverse2", marks=NEEDS_PYARROW), "ddad"]
 
 
-def rig_of(name: str, tmp_path: Path) -> Path:
+@pytest.fixture(scope="module", params=RECIPES)
+def rig(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write the data set, and run the recipe as the page types it, with other folders."""
-    (typed,) = re.findall(rf"^    python (docs/examples/{name}_to_rig\.py) (.+)$", PAGE.read_text(), re.M)
+    folder = tmp_path_factory.mktemp(request.param)
+    (typed,) = re.findall(rf"^    python (docs/examples/{request.param}_to_rig\.py) (.+)$", PAGE.read_text(), re.M)
     first, *middle, _ = typed[1].split()
-    given = getattr(data_sets, name)(tmp_path / "data")
-    done = subprocess.run(
-        [sys.executable, str(ROOT / typed[0]), str(given), *middle, str(tmp_path / "rig")],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    given = getattr(data_sets, request.param)(folder / "data")
+    command = [sys.executable, str(ROOT / typed[0]), str(given), *middle, str(folder / "rig")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert first.startswith("/") and done.returncode == 0, done.stderr
-    return tmp_path / "rig"
+    return folder / "rig"
 
 
-@pytest.mark.parametrize("name", RECIPES)
-def test_lidar_lies_on_the_walls(name: str, tmp_path: Path) -> None:
-    options = RigOptions(root=rig_of(name, tmp_path), output=tmp_path / "scene", find_ego=False, sky=False, strict=True)
+def test_lidar_lies_on_the_walls(rig: Path, tmp_path: Path) -> None:
+    options = RigOptions(root=rig, output=tmp_path / "scene", find_ego=False, sky=False, strict=True)
     report = convert(options, Console(quiet=True))
     assert (report.training, report.held_out) == (10, 2)
     assert not any("points of a scan get one time" in notice for notice in report.notices)
@@ -62,10 +59,8 @@ def test_lidar_lies_on_the_walls(name: str, tmp_path: Path) -> None:
             assert abs(np.median(errors)) < 0.002 and np.mean(np.abs(errors) < 0.04) > 0.9
 
 
-@pytest.mark.parametrize("name", RECIPES)
-def test_each_reading_has_its_own_pose(name: str, tmp_path: Path) -> None:
-    root = rig_of(name, tmp_path)
-    recording = read_rig_recording(RigOptions(root=root, output=tmp_path / "scene"))
+def test_each_reading_has_its_own_pose(rig: Path, tmp_path: Path) -> None:
+    recording = read_rig_recording(RigOptions(root=rig, output=tmp_path / "scene"))
     assert recording.trajectory is not None and len(recording.pictures) == 12 and len(recording.sweeps) >= 6
     first = min(sweep.time_s for sweep in recording.sweeps)
     for one in (*recording.pictures, *recording.sweeps):
