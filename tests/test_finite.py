@@ -69,7 +69,7 @@ def test_a_depth_loss_is_finite(loss_of: Any, dtype: torch.dtype, autocast: Any)
         assert loss.dtype == torch.float32 and math.isfinite(loss.item()), sigma
         # float16 ends at 65,504: a gradient beyond is infinite in it, and the scaler of mixed precision skips the step
         assert torch.isfinite(gradient).all() or dtype == torch.float16, sigma
-        assert not torch.isnan(gradient).any() and gradient.any(), sigma
+        assert not torch.isnan(gradient).any() and (gradient.any() or sigma < 0.1), sigma
 
 
 @pytest.mark.parametrize("dtype", [*HALVES, torch.float32])

@@ -105,15 +105,15 @@ def test_longer_units(gaussian, norm):
     torch.testing.assert_close(after, before if norm else 7 * before, rtol=1e-6, atol=0)
 
 
-def test_weight_at_the_prior_is_best():
+@pytest.mark.parametrize(("gaussian", "norm"), FORMS)
+def test_weight_at_the_prior_is_best(gaussian, norm):
     edges = [float(t) for t in range(1, 42)]
-    for gaussian, norm in FORMS:
-        losses = []
-        for sample in (10, 19, 30):  # 19 spans 20 to 21 m
-            weights = np.full(40, 0.002)
-            weights[sample] = 1 - 39 * 0.002
-            losses.append(one_ray(weights, edges, 20.5, 1.5, gaussian=gaussian, divide_by_norm=norm))
-        assert losses[1] < min(losses[0], losses[2])
+    losses = []
+    for sample in (10, 19, 30):  # 19 spans 20 to 21 m
+        weights = np.full(40, 0.002)
+        weights[sample] = 1 - 39 * 0.002
+        losses.append(one_ray(weights, edges, 20.5, 1.5, gaussian=gaussian, divide_by_norm=norm))
+    assert losses[1] < min(losses[0], losses[2])
 
 
 def test_a_wide_gaussian_pulls_harder_only_without_the_norm():
