@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -26,6 +26,7 @@ from edge_depth_nerf.plugin.config import make_specifications, read_method_file
 
 ROOT = Path(__file__).resolve().parent.parent
 LOSS, SOURCE = "pipeline.model.depth_loss", "pipeline.datamanager.depth_source"
+EXPOSURE = "pipeline.model.exposure"
 PRIOR = "pipeline.datamanager.prior."
 KERNEL = PRIOR + "integration.kernel"
 SEARCHED = {LOSS + "_mult", "pipeline.model.depth_sigma", PRIOR + "sigma_mode", PRIOR + "sigma_constant_m"}
@@ -74,13 +75,13 @@ def changed(one: RunResult, other: RunResult) -> set[str]:
     return {name for name in {*ours, *theirs} - {*OF_A_RUN} if ours.get(name) != theirs.get(name)}
 
 
-def with_fields(run: RunResult, **fields: object) -> RunResult:
-    """A copy of a run that was trained with other values of some fields; their dots are double underscores."""
-    found = copy.deepcopy(run)
-    for name, value in fields.items():
-        dotted = name.replace("__", ".")
-        assert dotted in found.content["configuration"], dotted
-        found.content["configuration"][dotted] = str(value)
+def with_fields(runs: list[RunResult], method: MethodName, fields: Mapping[str, object]) -> list[RunResult]:
+    """The runs, those of one method as if they had been trained with other values of some fields."""
+    found = [copy.deepcopy(run) if run.method == method else run for run in runs]
+    for run in found:
+        if run.method == method:
+            assert fields.keys() <= run.content["configuration"].keys()
+            run.content["configuration"] |= {name: str(value) for name, value in fields.items()}
     return found
 
 
@@ -164,27 +165,26 @@ TABLES_3_AND_4 = (
 )
 
 
+FIELDS = {"loss": {LOSS}, "prior": {SOURCE}, "extras": {*WITHOUT_EXTRAS}}
+
+
 def of_cells() -> list[Pair]:
     """Cells of the grid that differ in loss, prior or extras alone."""
     found = []
     for one, other in combinations(GRID, 2):
-        different = {name for name in ("loss", "prior", "extras") if getattr(one, name) != getattr(other, name)}
+        different = [name for name in FIELDS if getattr(one, name) != getattr(other, name)]
         if len(different) == 1 and None not in (one.prior, other.prior):
-            fields = {"loss": {LOSS}, "prior": {SOURCE}, "extras": {*WITHOUT_EXTRAS}}[different.pop()]
-            found.append(Pair(GRID[one], GRID[other], frozenset(fields | SEARCHED)))
+            found.append(Pair(GRID[one], GRID[other], frozenset(FIELDS[different[0]] | SEARCHED)))
     return found
 
 
 def unfair(runs: list[RunResult], pair: Pair) -> set[str]:
     """The fields beyond those of the pair in which its rows differ, on any drive that has both."""
-    rows = {(run.scene, run.seed, run.method): run for run in runs}
-    both = [
-        (run, rows[scene, seed, pair.other])
-        for (scene, seed, method), run in rows.items()
-        if method == pair.one and (scene, seed, pair.other) in rows
-    ]
+    names = (pair.one, pair.other)
+    ones, others = ({(run.scene, run.seed): run for run in runs if run.method == name} for name in names)
+    both = ones.keys() & others.keys()
     assert both, pair
-    return {name for one, other in both for name in changed(one, other) - pair.fields}
+    return {name for key in both for name in changed(ones[key], others[key]) - pair.fields}
 
 
 def first_seeds(kept: dict[str, list[RunResult]]) -> list[RunResult]:
@@ -203,9 +203,8 @@ def test_rows_of_tables_3_and_4_differ_in_one_thing(pair, kept):
         "pipeline.model.sky_loss_mult": 0.5,
         **({} if pair.fields & SEARCHED else {f"{PRIOR}sigma_constant_m": 7.0}),
     }
-    fields = {name.replace(".", "__"): value for name, value in former.items()}
-    others = [with_fields(run, **fields) if run.method == pair.other else run for run in runs]
-    assert unfair(others, pair) >= {*former} - ({f"{PRIOR}align"} if "paper" in pair.other else set())
+    found = unfair(with_fields(runs, pair.other, former), pair)
+    assert found >= {*former} - ({f"{PRIOR}align"} if "paper" in pair.other else set())
 
 
 def test_cells_of_the_grid_differ_in_one_thing(kept):
@@ -219,8 +218,7 @@ def test_cells_of_the_grid_differ_in_one_thing(kept):
         for prior in ("lidar", "integrated"):
             assert {GRID[Method(loss, prior, extras)] for extras in (False, True)} <= trained
     # as it was: the row with extras goes without them
-    bound = {name.replace(".", "__"): value for name, value in WITHOUT_EXTRAS.items()}
-    former = [with_fields(run, **bound) if run.method == "ds-nerf-integrated-extras" else run for run in kept["grid"]]
+    former = with_fields(kept["grid"], "ds-nerf-integrated-extras", WITHOUT_EXTRAS)
     pair = next(pair for pair in pairs if {pair.one, pair.other} == {"ds-nerf-integrated-extras", "edge"})
     assert unfair(former, pair) == {*WITHOUT_EXTRAS}
 
@@ -249,50 +247,30 @@ def test_urban_nerf_is_compared_in_both_forms(kept):
     for pair in FORMS_OF_URBAN_NERF:
         assert unfair(beside, pair) == set()
     assert under_one_weight(beside) == set()
-    fields = {EXPECTED.replace(".", "__"): 1.0}
-    former = [with_fields(run, **fields) if run.method == "urban-nerf-los" else run for run in beside]
-    assert under_one_weight(former) == {"urban-nerf-los"}
+    assert under_one_weight(with_fields(beside, "urban-nerf-los", {EXPECTED: 1.0})) == {"urban-nerf-los"}
 
 
 def other_exposures(runs: list[RunResult]) -> set[MethodName]:
     """Methods whose exposure model is not that of ours."""
-    ours = {run.content["configuration"]["pipeline.model.exposure"] for run in runs if run.method == "edge"}
-    return {run.method for run in runs if run.content["configuration"]["pipeline.model.exposure"] not in ours}
+    ours = {run.content["configuration"][EXPOSURE] for run in runs if run.method == "edge"}
+    return {run.method for run in runs if run.content["configuration"][EXPOSURE] not in ours}
 
 
 def test_all_rows_have_one_exposure_model(kept):
     runs = [*kept["grid"], *kept["unseen"], *kept["detail"]]
     assert other_exposures(runs) == set()
-    former = [
-        with_fields(run, pipeline__model__exposure="embedding") if run.method == "edge-paper" else run for run in runs
-    ]
-    assert other_exposures(former) == {"edge-paper"}
+    assert other_exposures(with_fields(runs, "edge-paper", {EXPOSURE: "embedding"})) == {"edge-paper"}
 
 
 # --- the searches -----------------------------------------------------------------------------------------------------
 
 
-def shape_of_search(runs: list[RunResult]) -> dict[MethodName, tuple[object, ...]]:
-    """For each method, what it was searched with: drives, seeds, steps, λ and σ."""
-    found = {}
-    for method in {run.method for run in runs}:
-        of_it = [run for run in runs if run.method == method]
-        found[method] = tuple(
-            tuple(sorted({str(value) for value in values}))
-            for values in (
-                (run.scene for run in of_it),
-                (run.specification["scene_sha256"] for run in of_it),
-                (run.seed for run in of_it),
-                (run.content["steps"] for run in of_it),
-                ((run.specification["weight"], run.specification["sigma_m"]) for run in of_it),
-            )
-        )
-    return found
-
-
 def of_another_length(runs: list[RunResult]) -> set[MethodName]:
-    """Methods whose search is not that of ours."""
-    shapes = shape_of_search(runs)
+    """Methods whose search is not that of ours: the same drives, seeds, steps, λ and σ."""
+    shapes: dict[MethodName, set[tuple[object, ...]]] = {}
+    for run in runs:
+        specified = (run.specification[name] for name in ("scene", "scene_sha256", "seed", "weight", "sigma_m"))
+        shapes.setdefault(run.method, set()).add((*specified, run.content["steps"]))
     return {method for method, shape in shapes.items() if shape != shapes["edge"]}
 
 
@@ -355,13 +333,11 @@ def test_the_preset_paper_is_the_method_of_the_tables(kept):
 
 def gain_db(runs: list[RunResult], one: MethodName, other: MethodName, others: list[RunResult] | None = None) -> float:
     """Mean of the differences in PSNR over the drives and seeds that both have."""
-    psnr = {(run.scene, run.seed, run.method): run.figures["truth_masked_psnr"] for run in runs}
-    theirs = {
-        (run.scene, run.seed): run.figures["truth_masked_psnr"]
-        for run in (runs if others is None else others)
-        if run.method == other
-    }
-    differences = [psnr[(*key, one)] - value for key, value in theirs.items() if (*key, one) in psnr]
+    psnr, theirs = (
+        {(run.scene, run.seed): run.figures["truth_masked_psnr"] for run in each if run.method == method}
+        for each, method in ((runs, one), (others or runs, other))
+    )
+    differences = [psnr[key] - theirs[key] for key in psnr.keys() & theirs.keys()]
     assert len(differences) >= 4
     return sum(differences) / len(differences)
 
