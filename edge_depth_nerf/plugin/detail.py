@@ -22,7 +22,6 @@ from edge_depth_nerf.plugin.pose_refinement import moved_pose
 
 if TYPE_CHECKING:
     from edge_depth_nerf.plugin.dataset import FisheyeDepthDataset
-    from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
 
 PICTURES = 8
 """So many training pictures, those that see most of a view, add their detail to it."""
@@ -65,7 +64,7 @@ def detail_shown(shown: bool) -> Iterator[None]:
 class TrainingDetail:
     """The detail of a model's training pictures."""
 
-    def __init__(self, model: EdgeDepthNerfModel, dataset: FisheyeDepthDataset) -> None:
+    def __init__(self, model: Any, dataset: FisheyeDepthDataset) -> None:
         self.model, self.dataset = model, dataset
         pixels = int((dataset.cameras.width * dataset.cameras.height).max())
         self.kept = max(PICTURES + 1, MOST_BYTES // (BYTES_A_PIXEL * pixels))
