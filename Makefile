@@ -69,8 +69,8 @@ coverage: setup
 # The modules that need no nerfstudio, whose dependencies still pin NumPy 1.26 (its issue 3747), under NumPy 2. Tests that
 # compare with nerfstudio have its name in theirs.
 PURE := build/pure
-PURE_TESTS := alignment bad_input camera_fit cameras faults files integration kitti360 lidar losses masks mono_files \
-	pixel_table poses prior rays scans scene sweeps_in_world trajectory trust
+PURE_TESTS := alignment bad_input calibration camera_fit cameras faults files integration kitti360 lidar losses masks mono_files \
+	pixel_table poses prior rays scans scene sweeps_in_world trajectory
 test-pure:
 	rm -rf $(PURE)
 	$(PYTHON) -m venv $(PURE)

@@ -37,12 +37,12 @@ from edge_depth_nerf.inspecting.shown_prior import ShownMaps, ShownScene
 from edge_depth_nerf.method.alignment import align
 from edge_depth_nerf.method.integration import IntegrationOptions, integrate_depth
 from edge_depth_nerf.method.losses import edge_loss
-from edge_depth_nerf.scene.format import TRUST_FILE
+from edge_depth_nerf.scene.format import CALIBRATION_FILE
 from edge_depth_nerf.scene.reader import PictureMaps, read_scene
 
 ROOT = Path(__file__).resolve().parents[1]
 SAMPLE = ROOT / "data" / "sample_drive"
-MOMENT, CAMERA = 6, "image_02"
+FRAME, CAMERA = 6, "image_02"
 """The picture that is shown, one of those trained on."""
 PANEL_PX = 360
 CELL_PX = 32
@@ -61,9 +61,9 @@ def read_sample(folder: Path) -> ShownScene:
     """
     copied = shutil.copytree(SAMPLE, folder / SAMPLE.name, ignore=shutil.ignore_patterns(".cache"))
     scene = ShownScene(read_scene(Path(copied)))
-    if scene.trust is None:
+    if scene.calibration is None:
         raise InputError(
-            f"{SAMPLE / TRUST_FILE}: was not made of the maps beside it by the present rules, so the pictures would "
+            f"{SAMPLE / CALIBRATION_FILE}: was not made of the maps beside it by today's rules, so the pictures would "
             "show a prior without its calibration. Make the sample drive anew (data/README.md)."
         )
     return scene
@@ -94,25 +94,27 @@ def draw_maps(scene: ShownScene, maps: ShownMaps) -> NDArray[np.uint8]:
 def aligned(scene: ShownScene, maps: PictureMaps) -> NDArray[np.float32]:
     """The monocular map after alignment, as the prior has it."""
     assert maps.lidar_m is not None and maps.mono_m is not None
-    trust = scene.trust
-    return align(maps.lidar_m, maps.mono_m, maps.usable, "local", trust.drive_fit if trust else None).mono_m
+    calibration = scene.calibration
+    return align(maps.lidar_m, maps.mono_m, maps.usable, "local", calibration.drive_fit if calibration else None).mono_m
 
 
 def find_edge(mono_m: NDArray[np.float32], maps: PictureMaps, radius: int) -> tuple[int, int]:
     """The pixel, without a return, in whose window two surfaces share the returns most evenly and lie far apart."""
     assert maps.lidar_m is not None and maps.truth_m is not None
     known = is_distance(mono_m) & maps.usable & is_distance(maps.truth_m)
-    returns = is_distance(maps.lidar_m) & maps.usable
+    lidar_points = is_distance(maps.lidar_m) & maps.usable
     best, found = 0.0, (0, 0)
     height, width = known.shape
     for i in range(radius, height - radius):
         for j in range(radius, width - radius):
             window = slice(i - radius, i + radius + 1), slice(j - radius, j + radius + 1)
-            if returns[i, j] or not known[window].all() or not 4 <= maps.truth_m[i, j] <= 20:
+            if lidar_points[i, j] or not known[window].all() or not 4 <= maps.truth_m[i, j] <= 20:
                 continue
             ratio = np.log(mono_m[window] / maps.truth_m[i, j])
             near, far = np.abs(ratio) < 0.1, ratio > 0.4
-            score = min((near & returns[window]).sum(), (far & returns[window]).sum()) * min(near.mean(), far.mean())
+            score = min((near & lidar_points[window]).sum(), (far & lidar_points[window]).sum()) * min(
+                near.mean(), far.mean()
+            )
             # the monocular map has to be right at the pixel itself
             if near[radius, radius] and score > best:
                 best, found = float(score), (i, j)
@@ -190,11 +192,11 @@ def draw_ray(path: Path) -> None:
     """Along one ray: where it ends before and after training, the prior, and the loss over the surface's distance."""
     prior_m, sigma_m = 8.0, 0.6
     edges_m = np.geomspace(2, 20, 57)
-    middles_m = (edges_m[:-1] + edges_m[1:]) / 2
+    midpoints_m = (edges_m[:-1] + edges_m[1:]) / 2
     figure = Figure(figsize=FIGURE_SIZE_IN, layout="constrained")
     left, right = figure.subplots(1, 2)
-    target = np.exp(-((middles_m - prior_m) ** 2) / (2 * sigma_m**2))
-    left.fill_between(middles_m, target, color="#f2c36b", alpha=0.6, label="prior: 8 m, σ̂ = 0.6 m")
+    target = np.exp(-((midpoints_m - prior_m) ** 2) / (2 * sigma_m**2))
+    left.fill_between(midpoints_m, target, color="#f2c36b", alpha=0.6, label="prior: 8 m, σ̂ = 0.6 m")
     for surface_m, softness_m, colour, name in (
         (11.0, 1.2, "#8a8a8a", "a ray early in training"),
         (8.0, SOFTNESS_M, "#2458a6", "the same ray later"),
@@ -224,7 +226,7 @@ def make_pictures(output: Path) -> dict[str, float]:
     """
     with tempfile.TemporaryDirectory() as folder:
         scene = read_sample(Path(folder))
-        picture = next(each for each in scene.scene.pictures if each.moment == MOMENT and each.camera == CAMERA)
+        picture = next(each for each in scene.scene.pictures if each.frame == FRAME and each.camera == CAMERA)
         maps = scene.maps(picture)
         write_png(output / "method_maps.png", draw_maps(scene, maps))
         kernel, figures = draw_kernel(scene, maps)

@@ -45,7 +45,7 @@ class Finding:
     """What to do, for notes and problems."""
 
 
-def _judged(what: str, fine: bool, found: str, remedy: str, otherwise: State = "problem") -> Finding:
+def _finding(what: str, fine: bool, found: str, remedy: str, otherwise: State = "problem") -> Finding:
     """Say that something is ok, or else what it is and what to do."""
     return Finding(what, "ok", found) if fine else Finding(what, otherwise, found, remedy)
 
@@ -59,7 +59,7 @@ def check_python() -> Iterator[Finding]:
     remedy = (
         f"Create an environment with Python {wanted}: nerfstudio's dependencies have wheels only for these versions."
     )
-    yield _judged("Python", fine, found, remedy)
+    yield _finding("Python", fine, found, remedy)
 
 
 def check_torch() -> Iterator[Finding]:
@@ -91,7 +91,7 @@ def check_kernels() -> Iterator[Finding]:
     numba, triton = find_spec("numba") is not None, find_spec("triton") is not None
     found = " and ".join(name for name, there in (("Numba (CPU)", numba), ("Triton (CUDA)", triton)) if there)
     found = f"fused kernels: {found or 'none'}; tiny-cuda-nn is not used"
-    yield _judged("Hash grids", numba, found, "Reinstall edge-depth-nerf: it brings Numba.")
+    yield _finding("Hash grids", numba, found, "Reinstall edge-depth-nerf: it brings Numba.")
 
 
 def check_nerfstudio() -> Iterator[Finding]:
@@ -102,16 +102,16 @@ def check_nerfstudio() -> Iterator[Finding]:
     except PackageNotFoundError:
         yield Finding("nerfstudio", "problem", "not installed", remedy)
         return
-    yield _judged("nerfstudio", found.startswith("1.1."), found, remedy)
+    yield _finding("nerfstudio", found.startswith("1.1."), found, remedy)
     registered = {point.name for point in entry_points(group="nerfstudio.method_configs")}
     missing = [name for name in METHODS if name not in registered]
     found = f"not registered: {', '.join(missing)}" if missing else ", ".join(METHODS)
     remedy = "Install the package into this environment (`pip install .` in a clone), not only onto the path."
-    yield _judged("Methods", not missing, found, remedy)
+    yield _finding("Methods", not missing, found, remedy)
     folders = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
     on_path = shutil.which("ns-train", path=folders)
     remedy = "Activate the environment that nerfstudio is installed in."
-    yield _judged("ns-train", on_path is not None, on_path or "not on the path", remedy)
+    yield _finding("ns-train", on_path is not None, on_path or "not on the path", remedy)
 
 
 def check_opencv() -> Iterator[Finding]:
@@ -141,7 +141,7 @@ def check_lpips() -> Iterator[Finding]:
     there = path.is_file()
     found = str(path) if there else "no weights; LPIPS is left out"
     remedy = f"Put the file of {url} at {path}. Nothing is downloaded automatically."
-    yield _judged("LPIPS", there, found, remedy, "note")
+    yield _finding("LPIPS", there, found, remedy, "note")
 
 
 def _version_of(package: str) -> str:
@@ -162,14 +162,14 @@ def check_extras() -> Iterator[Finding]:
     ):
         there = find_spec(package) is not None
         found = _version_of(package) if there else f"not installed; needed only for {what}"
-        yield _judged(name, there, found, f"pip install '.[{extra}]'", "note")
+        yield _finding(name, there, found, f"pip install '.[{extra}]'", "note")
     ffmpeg = shutil.which("ffmpeg")
     found = ffmpeg or "not found; needed only for films (ns-render)"
-    yield _judged("ffmpeg", ffmpeg is not None, found, "apt-get install ffmpeg", "note")
+    yield _finding("ffmpeg", ffmpeg is not None, found, "apt-get install ffmpeg", "note")
     usb = ctypes.util.find_library("usb-1.0")
     found = usb or "not found; needed only for meshes and normals (ns-export)"
     fine = usb is not None or platform.system() != "Linux"
-    yield _judged("libusb", fine, found, "apt-get install libusb-1.0-0", "note")
+    yield _finding("libusb", fine, found, "apt-get install libusb-1.0-0", "note")
 
 
 def check_room() -> Iterator[Finding]:
@@ -177,11 +177,11 @@ def check_room() -> Iterator[Finding]:
     free_gb = _free_memory_gb()
     if free_gb is not None:
         remedy = f"A training takes {LEAST_FREE_MEMORY_GB:g} GiB or more: close other programs."
-        yield _judged("Free memory", free_gb >= LEAST_FREE_MEMORY_GB, f"{free_gb:.1f} GiB", remedy)
+        yield _finding("Free memory", free_gb >= LEAST_FREE_MEMORY_GB, f"{free_gb:.1f} GiB", remedy)
     disk_gb = shutil.disk_usage(Path.cwd()).free / 2**30
     found = f"{disk_gb:.0f} GiB in {Path.cwd()}"
     remedy = "Scenes, tables of pixels and checkpoints need more space: work in a folder with more of it."
-    yield _judged("Free disk", disk_gb >= LEAST_FREE_DISK_GB, found, remedy, "note")
+    yield _finding("Free disk", disk_gb >= LEAST_FREE_DISK_GB, found, remedy, "note")
 
 
 CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (

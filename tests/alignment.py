@@ -1,4 +1,4 @@
-"""The similarity between two sets of points, for judging poses that have a world of their own."""
+"""The similarity between two sets of points, for evaluating poses that have a world of their own."""
 
 from __future__ import annotations
 

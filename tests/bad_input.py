@@ -38,7 +38,7 @@ from edge_depth_nerf.compare.specification import RunSpecification
 from edge_depth_nerf.lidar.scans import ScanFormat, check_scan, read_cloud, read_scan
 from edge_depth_nerf.lidar.sweeps import read_sweep
 from edge_depth_nerf.masks.semantics import read_labels
-from edge_depth_nerf.method.error_model import read_trust
+from edge_depth_nerf.method.error_model import read_calibration
 from edge_depth_nerf.mono.files import read_npy as read_map
 from edge_depth_nerf.mono.network import DepthNetwork, NetworkSettings, load_network, save_network
 from edge_depth_nerf.process.kitti360.calibration import (
@@ -259,7 +259,9 @@ READERS: dict[str, Reader] = {
     ),
     "json": Reader(named("a.json", json.dumps(FRAMES)), read_json, "json"),
     "scene": Reader(scene, read_whole_scene, "json"),
-    "trust": Reader(lambda folder: Path(shutil.copy(SAMPLE_DRIVE / "mono_trust.json", folder)), read_trust, "json"),
+    "trust": Reader(
+        lambda folder: Path(shutil.copy(SAMPLE_DRIVE / "mono_trust.json", folder)), read_calibration, "json"
+    ),
     "weights": Reader(weights, load_network, "binary"),
     "tuned": Reader(
         named("a.json", json.dumps({"methods": {"ds-nerf": {"lambda": 0.01, "sigma_m": 0.5}}})), read_tuned, "json"

@@ -1,7 +1,7 @@
 """A drive through an empty hall in the layouts of nuScenes, Argoverse 2 and DDAD, with every distance in closed form.
 
 The vehicle (x forward, y left, z up) drives at 10 m/s and turns, so that a wrong time or a wrong pose shows. Cameras
-are pinholes without distortion; sweeps are corrected to the moment that their data set says.
+are pinholes without distortion; sweeps are corrected to the frame that their data set says.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 HALL = np.array([[-25.0, -9.0, -0.3], [45.0, 12.0, 5.0]])
 FIRST_S = 1_532_402_927
-MOMENTS = 6
+FRAMES = 6
 INTERVAL_S = 0.1
 WIDTH, HEIGHT, FOCAL = 96, 64, 50.0
 CENTRE = (47.0, 31.5)
@@ -61,21 +61,21 @@ def reach(origin: NDArray, rays: NDArray) -> NDArray:
     return np.where(rays == 0, np.inf, along).min(-1)
 
 
-def camera_time(name: str, moment: int) -> float:
-    return moment * INTERVAL_S + CAMERA_DELAY_S[name]
+def camera_time(name: str, number: int) -> float:
+    return number * INTERVAL_S + CAMERA_DELAY_S[name]
 
 
-def true_distance(name: str, moment: int) -> NDArray:
+def true_distance(name: str, number: int) -> NDArray:
     """Of each pixel's centre."""
     column, row = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
     rays = np.stack(((column - CENTRE[0]) / FOCAL, (row - CENTRE[1]) / FOCAL, np.ones((HEIGHT, WIDTH))), -1)
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    to_world = vehicle(camera_time(name, moment)) @ to_vehicle(name)
+    to_world = vehicle(camera_time(name, number)) @ to_vehicle(name)
     return reach(to_world[:3, 3], rays @ to_world[:3, :3].T)
 
 
-def picture(name: str, moment: int) -> NDArray[np.uint8]:
-    shade = np.clip(true_distance(name, moment) * 8, 0, 255).astype(np.uint8)
+def picture(name: str, number: int) -> NDArray[np.uint8]:
+    shade = np.clip(true_distance(name, number) * 8, 0, 255).astype(np.uint8)
     return np.stack((shade, 255 - shade, shade // 2), -1).astype(np.uint8)
 
 
@@ -100,15 +100,15 @@ def quaternion_w_first(pose: NDArray) -> list[float]:
     return [w, x, y, z]
 
 
-def write_picture(path: Path, name: str, moment: int) -> None:
+def write_picture(path: Path, name: str, number: int) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), picture(name, moment)[..., ::-1])
+    assert cv2.imwrite(str(path), picture(name, number)[..., ::-1])
 
 
 def readings(turn_s: float = INTERVAL_S) -> list[tuple[str, int, float]]:
     """Sensor, number, seconds from the first."""
-    taken = [(name, moment, camera_time(name, moment)) for name in CAMERAS for moment in range(MOMENTS)]
-    turns = round(MOMENTS * INTERVAL_S / turn_s)
+    taken = [(name, number, camera_time(name, number)) for name in CAMERAS for number in range(FRAMES)]
+    turns = round(FRAMES * INTERVAL_S / turn_s)
     return taken + [("scanner", number, number * turn_s) for number in range(turns)]
 
 
@@ -147,10 +147,10 @@ def nuscenes(root: Path) -> Path:
     for scene_name in ("scene-0001", "scene-0061"):
         scene = tables.add("scene", name=scene_name, description="")
         samples = [
-            tables.add("sample", timestamp=FIRST_S * 10**6 + moment * 10**5, scene_token=scene)
-            for moment in range(MOMENTS)
+            tables.add("sample", timestamp=FIRST_S * 10**6 + number * 10**5, scene_token=scene)
+            for number in range(FRAMES)
         ]
-        for name, moment, seconds in [*readings(0.05), ("radar", 0, 0.0)]:
+        for name, number, seconds in [*readings(0.05), ("radar", 0, 0.0)]:
             time_us = FIRST_S * 10**6 + round(seconds * 1e6)
             if scene_name == "scene-0001":
                 time_us -= 10**9
@@ -161,14 +161,14 @@ def nuscenes(root: Path) -> Path:
                 rotation=quaternion_w_first(pose),
                 translation=(pose[:3, 3] + OFF).tolist(),
             )
-            folder = "samples" if moment % 2 == 0 else "sweeps"
+            folder = "samples" if number % 2 == 0 else "sweeps"
             channel = channels.get(name, "RADAR_FRONT")
             suffix = "jpg" if name in CAMERAS else "pcd.bin"
             file = f"{folder}/{channel}/n015-2018-07-24-11-22-45+0800__{channel}__{time_us}.{suffix}"
             tables.add(
                 "sample_data",
                 **{
-                    "sample_token": samples[moment % MOMENTS],
+                    "sample_token": samples[number % FRAMES],
                     "ego_pose_token": ego,
                     "timestamp": time_us,
                     "filename": file,
@@ -177,7 +177,7 @@ def nuscenes(root: Path) -> Path:
                 **{"width": WIDTH if name in CAMERAS else 0, "height": HEIGHT if name in CAMERAS else 0},
             )
             if name in CAMERAS:
-                write_picture(root / file, name, moment)
+                write_picture(root / file, name, number)
             elif name == "scanner":
                 hits = points(seconds, to_vehicle("scanner"))
                 record = np.column_stack((hits, np.full((len(hits), 2), 7.0))).astype("<f4")
@@ -233,10 +233,10 @@ def argoverse2(root: Path) -> Path:
         timestamp_ns=stamps[order],
         **pose_columns([twice[index] for index in order]),
     )
-    for name, moment, seconds in readings():
+    for name, number, seconds in readings():
         stamp = first_ns + round(seconds * 1e9)
         if name in CAMERAS:
-            write_picture(log / f"sensors/cameras/{names[name]}/{stamp}.jpg", name, moment)
+            write_picture(log / f"sensors/cameras/{names[name]}/{stamp}.jpg", name, number)
             continue
         hits = points(seconds, np.eye(4)).astype(np.float16)
         write(
@@ -264,7 +264,7 @@ def ddad(root: Path) -> Path:
         }
 
     data = []
-    for name, moment, seconds in readings():
+    for name, number, seconds in readings():
         world = vehicle(seconds) @ to_vehicle(name)
         world[:3, 3] += OFF
         time_us = FIRST_S * 10**6 + round(seconds * 1e6)
@@ -273,7 +273,7 @@ def ddad(root: Path) -> Path:
         datum: dict[str, Any] = {"annotations": {}, "metadata": {}, "pose": pose_entry(world)}
         if name in CAMERAS:
             datum |= {"filename": f"rgb/{names[name]}/{time_us}.png", "width": WIDTH, "height": HEIGHT, "channels": 3}
-            write_picture(scene / datum["filename"], name, moment)
+            write_picture(scene / datum["filename"], name, number)
             data.append({"id": identity, "key": "", "datum": {"image": datum}})
             continue
         datum |= {"filename": f"point_cloud/LIDAR/{time_us}.npz", "point_format": ["X", "Y", "Z", "INTENSITY"]}

@@ -81,9 +81,9 @@ def main() -> None:
         gradient /= world_size
     manager.train_pixel_sampler._drawn = manager._surface_sampler._drawn = 0
 
-    drawn, further = [], []
+    drawn, surface = [], []
     serve = manager._serve
-    manager._serve = lambda pixels, generator: (further.append(pixels.indices), serve(pixels, generator))[1]
+    manager._serve = lambda pixels, generator: (surface.append(pixels.indices), serve(pixels, generator))[1]
     before = {name: p.detach().clone() for name, p in parameters(pipeline.model).items()}
     torch.manual_seed(100 + rank)
     averaged: dict[str, torch.Tensor] = {}
@@ -101,7 +101,7 @@ def main() -> None:
             "mean": mean,
             "averaged": averaged,
             "drawn": drawn,
-            "further": further[1::2],
+            "further": surface[1::2],
             "before": before,
             "after": {name: p.detach().clone() for name, p in parameters(pipeline.model).items()},
             "checkpoints": [str(path) for path in trainer.checkpoint_dir.glob("*.ckpt")],

@@ -137,8 +137,8 @@ class RoomDrive:
     size: int
     frames: tuple[int, ...]
     poses: dict[int, NDArray]
-    returns: dict[int, NDArray] = field(default_factory=dict)
-    """Points of each sweep in the scanner's frame at the frame's moment; the files hold them `as_measured`."""
+    points_m: dict[int, NDArray] = field(default_factory=dict)
+    """Points of each sweep in the scanner's frame at the frame's time; the files hold them `as_measured`."""
 
     def camera(self, name: str) -> MeiTwin:
         return MeiTwin.kitti360(name, self.size)
@@ -151,9 +151,9 @@ class RoomDrive:
         return pose(frame) @ matrix(CAM_TO_POSE["image_00"]) @ np.linalg.inv(matrix(CAM0_TO_VELO))
 
     def as_measured(self, points: NDArray, frame: int) -> NDArray:
-        """Points of the scanner's frame at the frame's moment, as the turning scanner measures them on the way.
+        """Points of the scanner's frame at the frame's time, as the turning scanner measures them on the way.
 
-        It turns clockwise, once a frame, and faces forward at the frame's moment.
+        It turns clockwise, once a frame, and faces forward at the frame's time.
         """
         to_world = self.velo_to_world(frame)
         world = points @ to_world[:3, :3].T + to_world[:3, 3]
@@ -263,7 +263,7 @@ def write_room_drive(
             points = rays * distance[:, None]
         else:
             points = aimed_points(drive, aim, frame, rng)[0]
-        drive.returns[frame] = points
+        drive.points_m[frame] = points
         write_points(drive.sweep(frame), drive.as_measured(points, frame))
     if truth:
         _write_shifted(drive, cameras)

@@ -36,10 +36,10 @@ def held_out_blocks(size_px: int) -> np.ndarray:
 
 
 def fisheye_frame_scene(real_data: Path, output: Path, downscale: int) -> Path:
-    """The one real fisheye frame as a scene: trained with nine tenths of its LiDAR, judged on the rest.
+    """The one real fisheye frame as a scene: trained with nine tenths of its LiDAR, evaluated on the rest.
 
     LiDAR is held out in whole blocks of 64 px. The frame stands twice in the scene: once for training, once, with the
-    other returns, for judging.
+    other returns, for evaluation.
     """
     folder = real_data / "kitti360_fisheye_frame"
     sample = read_json(folder / "kitti360_sample.json")["cam_params"]
@@ -55,7 +55,7 @@ def fisheye_frame_scene(real_data: Path, output: Path, downscale: int) -> Path:
     )
     hidden = np.load(folder / "mask_left_fisheye.npy")
     lidar = read_distance_png(folder / "kitti360_depth.png")
-    judged = held_out_blocks(1400)
+    evaluated = held_out_blocks(1400)
     image = downscale_image(read_image(folder / "kitti360_rgb.png"), downscale)
     frames = [
         SceneFrame(
@@ -65,7 +65,7 @@ def fisheye_frame_scene(real_data: Path, output: Path, downscale: int) -> Path:
             content=FrameContent(image=image, lidar=nearest_of_blocks(lidar * kept, downscale)),
             held_out=number == 1,
         )
-        for number, kept in enumerate((~judged, judged))
+        for number, kept in enumerate((~evaluated, evaluated))
     ]
     cameras = [SceneCamera("image_02", camera.downscaled(downscale), downscale_mask(~hidden, downscale))]
     source = {"recording": "KITTI-360, one fisheye frame", "downscale": downscale}
@@ -97,9 +97,9 @@ def stereo_scene(real_data: Path, output: Path, downscale: int) -> Path:
     poses = {Path(frame["file_path"]).stem: np.array(frame["transform_matrix"]) for frame in meta["frames"]}
     opengl_to_opencv = np.diag([1.0, -1.0, -1.0, 1.0])
     frames = []
-    for moment in sorted({name.split("_")[0] for name in poses}):
-        pictures = [read_image(folder / f"{moment}_{side}.png") for side in ("00", "01")]
-        baseline_m = float(np.linalg.norm(poses[f"{moment}_00"][:3, 3] - poses[f"{moment}_01"][:3, 3]))
+    for number in sorted({name.split("_")[0] for name in poses}):
+        pictures = [read_image(folder / f"{number}_{side}.png") for side in ("00", "01")]
+        baseline_m = float(np.linalg.norm(poses[f"{number}_00"][:3, 3] - poses[f"{number}_01"][:3, 3]))
         mirrored = [np.ascontiguousarray(picture[:, ::-1]) for picture in pictures]
         mirrored_camera = replace(camera, cx=camera.width - camera.cx)
         distances = [
@@ -107,15 +107,15 @@ def stereo_scene(real_data: Path, output: Path, downscale: int) -> Path:
             stereo_distance(mirrored[1], mirrored[0], mirrored_camera, baseline_m)[:, ::-1],
         ]
         for side, (picture, distance) in enumerate(zip(pictures, distances, strict=True)):
-            middles = distance[downscale // 2 :: downscale, downscale // 2 :: downscale].copy()
-            content = FrameContent(image=downscale_image(picture, downscale), mono=middles)
+            midpoints = distance[downscale // 2 :: downscale, downscale // 2 :: downscale].copy()
+            content = FrameContent(image=downscale_image(picture, downscale), mono=midpoints)
             frames.append(
                 SceneFrame(
                     camera=f"image_0{side}",
-                    frame=int(moment),
-                    camera_to_world=UPRIGHT @ poses[f"{moment}_0{side}"] @ opengl_to_opencv,
+                    frame=int(number),
+                    camera_to_world=UPRIGHT @ poses[f"{number}_0{side}"] @ opengl_to_opencv,
                     content=content,
-                    held_out=int(moment) == HELD_OUT_STEREO_FRAME,
+                    held_out=int(number) == HELD_OUT_STEREO_FRAME,
                 )
             )
     cameras = [SceneCamera(f"image_0{side}", camera.downscaled(downscale)) for side in (0, 1)]

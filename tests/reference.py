@@ -43,14 +43,14 @@ def integrate_depth(
     def usable(i, j):
         return bool(valid[i, j]) and math.isfinite(mono[i, j]) and mono[i, j] > 0
 
-    def has_return(i, j):
+    def has_lidar(i, j):
         return math.isfinite(lidar[i, j]) and lidar[i, j] > 0
 
     for i in range(height):
         for j in range(width):
             if not usable(i, j):
                 continue
-            if keep_returns and has_return(i, j):
+            if keep_returns and has_lidar(i, j):
                 distance[i, j] = lidar[i, j]
                 continue
             centre = mono[i, j]
@@ -65,7 +65,7 @@ def integrate_depth(
                     if kernel == "edge-aware":
                         sigma_m = max(sigma_depth_m, sigma_depth_growth_per_m * centre**2)
                         g *= math.exp(-((centre - mono[y, x]) ** 2) / (2 * sigma_m**2))
-                    is_lidar = has_return(y, x)
+                    is_lidar = has_lidar(y, x)
                     entries.append((is_lidar, lidar[y, x] if is_lidar else mono[y, x], g, spatial))
             weights = []
             for is_lidar, _, g, _ in entries:

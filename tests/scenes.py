@@ -86,8 +86,8 @@ def write_scene(
             write_mask(folder / f"masks/{camera.width}.png", keep)
             entry["mask_path"] = f"masks/{camera.width}.png"
         if lidar:
-            returns = distance * (rng.random(distance.shape) < 0.3)
-            write_distance_png(folder / "lidar" / name, returns)
+            lidar_points = distance * (rng.random(distance.shape) < 0.3)
+            write_distance_png(folder / "lidar" / name, lidar_points)
             entry["lidar_file_path"] = entry["depth_file_path"] = f"lidar/{name}"
         if mono:
             write_distance_png(folder / "mono" / name, distance * 1.1)

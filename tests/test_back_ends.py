@@ -15,23 +15,23 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from edge_depth_nerf.kernels import back_ends, formulas, functions, pointwise_numba, ray_numba
 from edge_depth_nerf.kernels.back_ends import Function, GpuForm, tried_out
 from edge_depth_nerf.kernels.functions import (
-    BOUND_LOSS,
     CONTRACT,
     DENSITY,
     DISTANCES,
     DISTORTION_LOSS,
     HARMONICS,
     HASH_GRID,
+    INTERLEVEL_LOSS,
     MOST,
-    PLACE_SAMPLES,
     POSITIONS,
+    SAMPLE_PDF,
     WEIGHTS,
 )
 from edge_depth_nerf.method.losses import EDGE_LOSS
 from edge_depth_nerf.plugin.fused.nerfacto_losses import distortion_loss
 
 CPU = torch.device("cpu")
-FUNCTIONS = PLACE_SAMPLES, BOUND_LOSS, DISTORTION_LOSS, CONTRACT, DISTANCES, HARMONICS
+FUNCTIONS = SAMPLE_PDF, INTERLEVEL_LOSS, DISTORTION_LOSS, CONTRACT, DISTANCES, HARMONICS
 ALL = (*(each for each in vars(functions).values() if isinstance(each, Function)), EDGE_LOSS)
 EVERY: tuple[Any, ...] = tuple(each.on_gpu for each in ALL if each.on_gpu is not None)
 
@@ -267,7 +267,7 @@ def test_formulas_are_nerfstudios():
     # beyond the outermost intervals nerfstudio's differs by nothing here
     outer_edges[:, 0], outer_edges[:, -1] = 0, 1
     exact = lossfun_outer(edges, weights, outer_edges, outer).mean()
-    torch.testing.assert_close(formulas.bound_loss(edges, weights, outer_edges, outer), exact)
+    torch.testing.assert_close(formulas.interlevel_loss(edges, weights, outer_edges, outer), exact)
     directions = torch.nn.functional.normalize(torch.randn(50, 3, generator=generator).double(), dim=1)
     exact = components_from_spherical_harmonics(4, (directions + 1) / 2)
     torch.testing.assert_close(formulas.harmonics(directions), exact.double(), rtol=1e-6, atol=1e-6)

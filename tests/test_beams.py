@@ -1,4 +1,4 @@
-"""LiDAR beams that are held out of everything: which, from what, and that training views are judged by them."""
+"""LiDAR beams that are held out of everything: which, from what, and that training views are evaluated by them."""
 
 from __future__ import annotations
 
@@ -68,21 +68,21 @@ def test_a_scene_keeps_them_apart_and_a_scene_without_is_as_before(scenes: dict[
     assert all("beams_file_path" not in frame for frame in meta[0]["frames"])
     assert "holdout_beams" not in meta[0]["source"] and meta[10]["source"]["holdout_beams"] == 10
     plain, split = (read_scene(scenes[beams]) for beams in (0, 10))
-    returns = {"plain": 0, "kept": 0, "held out": 0}
+    counts = {"plain": 0, "kept": 0, "held out": 0}
     for one, other in zip(plain.pictures, split.pictures, strict=True):
         lidar = plain.distance_m(one, "lidar")
         kept, beams = split.distance_m(other, "lidar"), split.distance_m(other, "beams")
         assert lidar is not None and kept is not None and beams is not None
-        returns = {
-            "plain": returns["plain"] + int((lidar > 0).sum()),
-            "kept": returns["kept"] + int((kept > 0).sum()),
-            "held out": returns["held out"] + int((beams > 0).sum()),
+        counts = {
+            "plain": counts["plain"] + int((lidar > 0).sum()),
+            "kept": counts["kept"] + int((kept > 0).sum()),
+            "held out": counts["held out"] + int((beams > 0).sum()),
         }
         # a room without anything in it: where both know a pixel they mean the same wall
         both = (lidar > 0) & (beams > 0)
         assert float(np.median(np.abs(lidar - beams)[both] / lidar[both])) < 0.03
-    assert 0 < returns["held out"] < 0.12 * returns["plain"]
-    assert 0.8 * returns["plain"] < returns["kept"] < returns["plain"]
+    assert 0 < counts["held out"] < 0.12 * counts["plain"]
+    assert 0.8 * counts["plain"] < counts["kept"] < counts["plain"]
 
 
 def test_no_training_takes_them_for_a_source_of_depth(scenes: dict[int, Path]):

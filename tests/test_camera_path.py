@@ -184,12 +184,12 @@ def scene(tmp_path_factory) -> Path:
     folder = write_scene(tmp_path_factory.mktemp("scene"), [fisheye(32, 28)], frames=18)
     meta = read_json(folder / "transforms.json")
     for index, frame in enumerate(meta["frames"]):
-        moment, side = divmod(index, 2)
+        number, side = divmod(index, 2)
         pose = np.eye(4)
         pose[:3, :3] = looking(np.array([0.0, -1.0 if side else 1.0, 0.0]))
-        pose[:3, 3] = 100 + moment, 0.3 - 0.6 * side, 0.1 * np.sin(moment)
+        pose[:3, 3] = 100 + number, 0.3 - 0.6 * side, 0.1 * np.sin(number)
         frame["transform_matrix"] = pose.tolist()
-        frame |= {"camera": ("left", "right")[side], "frame": moment, "timestamp_s": 1.3e9 + 0.25 * moment}
+        frame |= {"camera": ("left", "right")[side], "frame": number, "timestamp_s": 1.3e9 + 0.25 * number}
     names = [frame["file_path"] for frame in meta["frames"]]
     meta["val_filenames"] = meta["test_filenames"] = names[8:10]
     meta["train_filenames"] = names[:8] + names[10:]

@@ -355,9 +355,9 @@ def test_a_drive_is_cut_as_by_hand(room: RoomDrive, tmp_path: Path) -> None:
         for name in by_hand
         for frame in read_json(tmp_path / "there" / name / "transforms.json")["frames"]
     ]
-    moments = {number: {name for path, name in frames if f"{number:010d}" in path} for number in range(10)}
-    assert {number for number, scenes in moments.items() if scenes} == {1, 2, 4, 5, 6, 7, 8, 9}
-    assert all(len(scenes) <= 1 for scenes in moments.values())
+    scenes_of = {number: {name for path, name in frames if f"{number:010d}" in path} for number in range(10)}
+    assert {number for number, scenes in scenes_of.items() if scenes} == {1, 2, 4, 5, 6, 7, 8, 9}
+    assert all(len(scenes) <= 1 for scenes in scenes_of.values())
     with pytest.raises(InputError, match="is a scene; --frames-per-scene would write other scenes into it"):
         process_drive(options_of(room, tmp_path / "here" / "000", frames_per_scene=5), QUIET)
 

@@ -125,14 +125,14 @@ def true_pose(time_s: np.ndarray | float) -> np.ndarray:
     return pose
 
 
-def recording(moments: int, cameras=("left", "right"), sweeps=()) -> Recording:
+def recording(frames: int, cameras=("left", "right"), sweeps=()) -> Recording:
     lens = KannalaBrandt(300, 300, 90.0, 90.0, 150.0, 150.0, 0.0, 0.0, 0.0, 0.0)
     return Recording(
         cameras=tuple(RecordedCamera(name, lens, looking(name)) for name in cameras),
         # the right camera fires 4 ms after the left
         pictures=tuple(
             RecordedPicture(name, frame, Path(f"{name}/{frame}.png"), 0.1 * frame + 0.004 * number)
-            for frame in range(moments)
+            for frame in range(frames)
             for number, name in enumerate(cameras)
         ),
         sweeps=tuple(sweeps),
@@ -176,7 +176,7 @@ def test_models_without_a_common_view_are_joined_by_the_rig():
     drive = recording(20)
     left = [i for i, picture in enumerate(drive.pictures) if picture.camera == "left"]
     right = [i for i, picture in enumerate(drive.pictures) if picture.camera == "right"]
-    # the right camera is lost halfway, and what is seen then has two moments in common: too few
+    # the right camera is lost halfway, and what is seen then has two frames in common: too few
     models = [
         model_of(drive, left[:16], 2.5, seed=1),
         model_of(drive, right[:12], 0.4, seed=2),
@@ -184,7 +184,7 @@ def test_models_without_a_common_view_are_joined_by_the_rig():
     ]
     # the second one's scale is off by 1 %: the first one's counts
     path = join_models(drive, models, [2.5, 0.404, 7.0])
-    assert sorted(path.moments) == list(range(16))
+    assert sorted(path.vehicle_poses) == list(range(16))
     assert path.scales == pytest.approx((2.5, 0.4), rel=2e-4)
     # 10 m/s for 4 ms are 4 cm
     assert worst_deviation_m(path, drive) < 1e-2
@@ -193,14 +193,14 @@ def test_models_without_a_common_view_are_joined_by_the_rig():
     # joined, where the third has more in common
     models[2] = model_of(drive, right[12:], 7.0, seed=3)
     path = join_models(drive, models, [2.5, 0.4, 7.0])
-    assert sorted(path.moments) == list(range(20))
+    assert sorted(path.vehicle_poses) == list(range(20))
     assert worst_deviation_m(path, drive) < 1e-2
 
 
 def test_cameras_of_one_model_are_averaged():
     drive = recording(12)
     model = model_of(drive, range(24), 3.0, seed=4)
-    wrong = 11  # the right camera at moment 5, moved by 10 cm
+    wrong = 11  # the right camera at frame 5, moved by 10 cm
     model.camera_to_model[wrong] = model.camera_to_model[wrong].copy()
     model.camera_to_model[wrong][:3, 3] += np.array([0.1, 0, 0]) / 3.0
     path = join_models(drive, [model], [3.0])
@@ -277,7 +277,7 @@ def test_the_scale_is_that_of_lidar_moved_by_the_path():
     assert metric_path(still, exact)[1].spread > 5 * metric_path(drive, exact)[1].spread
 
 
-def test_returns_that_see_past_an_edge_do_not_count():
+def test_points_that_see_past_an_edge_do_not_count():
     features = wall_points(150, seed=5)
     # a fifth of the returns lie behind what the feature is on
     sweeps = [turning_scanner(frame, cloud_around(features, seed=6), behind=0.2) for frame in range(12)]
@@ -316,7 +316,7 @@ def test_the_scale_can_come_from_depth_maps(tmp_path):
 
 
 def broken_at(model: ColmapModel, recording: Recording, first: int, scale: float, bend_deg: float) -> ColmapModel:
-    """The model with all moments from one on scaled and turned about the place that they begin at."""
+    """The model with all frames from one on scaled and turned about the place that they begin at."""
     index = next(i for i, picture in enumerate(recording.pictures) if picture.frame == first)
     pivot = model.camera_to_model[index].copy()
     turn = Rotation.from_euler("y", bend_deg, degrees=True).as_matrix()
@@ -386,7 +386,7 @@ def test_a_window_needs_features():
     assert find_scale_break({frame: 1 + 0.4 * rng.standard_normal(50) for frame in range(40)}) is None
 
 
-def test_too_few_returns_beside_points_are_an_error():
+def test_too_few_points_beside_points_are_an_error():
     features = wall_points(4, seed=5)
     drive = recording(6, cameras=("left",), sweeps=[turning_scanner(f, cloud_around(features, 6)) for f in range(6)])
     with pytest.raises(InputError, match=r"only \d+ of COLMAP's points have a LiDAR point next to them, expected 30"):
@@ -396,9 +396,9 @@ def test_too_few_returns_beside_points_are_an_error():
 # ---- errors before the work ------------------------------------------------------------------------------------
 
 
-def pictured(folder: Path, moments: int, size: int = 64) -> Recording:
+def pictured(folder: Path, frames: int, size: int = 64) -> Recording:
     """Black pictures with a sweep each."""
-    drive = recording(moments, sweeps=[turning_scanner(f, wall_points(50, f)) for f in range(moments)])
+    drive = recording(frames, sweeps=[turning_scanner(f, wall_points(50, f)) for f in range(frames)])
     lens = KannalaBrandt(size, size, 20.0, 20.0, size / 2, size / 2, 0.0, 0.0, 0.0, 0.0)
     pictures = []
     for picture in drive.pictures:
@@ -462,7 +462,7 @@ SIZE = 256
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory) -> Path:
-    """A street; at moment 4 the right camera sees nothing, at the last one neither does."""
+    """A street; at frame 4 the right camera sees nothing, at the last one neither does."""
     folder = tmp_path_factory.mktemp("colmap") / "street"
     synthesize_drive(SynthesizeOptions(folder, "street", frames=FRAMES, size=SIZE))
     pictures = folder / "data_2d_raw" / SynthesizeOptions(folder).sequence
@@ -520,7 +520,7 @@ def test_pictures_that_cannot_be_registered_are_listed(found):
         (FRAMES - 1, "image_02", NOT_REGISTERED),
         (FRAMES - 1, "image_03", NOT_REGISTERED),
     ]
-    # the other camera of the moment was registered, and the rig is known
+    # the other camera of the frame was registered, and the rig is known
     assert ("image_03", 4) in {(picture.camera, picture.frame) for picture in recording.pictures}
     notices = " ".join(recording.notices)
     assert f"COLMAP registered {2 * FRAMES - 3} of {2 * FRAMES} pictures, 1 more get their pose from the rig" in notices
@@ -613,7 +613,7 @@ def test_masked_pixels_have_no_features(drive, tmp_path, monkeypatch):
 # ---- short recordings of small pictures ------------------------------------------------------------------------
 
 
-def five_moments(drive: Path, folder: Path, noise: int) -> tuple[Recording, Kitti360Options]:
+def five_frames(drive: Path, folder: Path, noise: int) -> tuple[Recording, Kitti360Options]:
     """Half of each picture masked, and with other noise of one grey value, as if taken again."""
     options = Kitti360Options(
         root=drive,
@@ -636,10 +636,10 @@ def five_moments(drive: Path, folder: Path, noise: int) -> tuple[Recording, Kitt
 
 @pytest.mark.slow
 @pytest.mark.parametrize("noise", [2, 3, 5, 7])
-def test_five_moments_are_enough(drive, tmp_path, noise):
+def test_five_frames_are_enough(drive, tmp_path, noise):
     """With COLMAP's own demands on a picture all four of these end with a model of two pictures."""
     pytest.importorskip("pycolmap")
-    found = colmap_poses(*five_moments(drive, tmp_path, noise), QUIET)
+    found = colmap_poses(*five_frames(drive, tmp_path, noise), QUIET)
     assert found.trajectory is not None
     truth = true_poses(drive)
     assert sorted({picture.frame for picture in found.pictures}) == list(range(5))
@@ -656,14 +656,14 @@ def test_a_model_of_two_pictures_is_not_the_end(drive, tmp_path, monkeypatch):
     paths = []
     for number, pose_points in enumerate(((10_000, 15), (15,))):
         monkeypatch.setattr(colmap_models, "_POSE_POINTS", pose_points)
-        found = colmap_poses(*five_moments(drive, tmp_path / str(number), 1), QUIET)
+        found = colmap_poses(*five_frames(drive, tmp_path / str(number), 1), QUIET)
         assert found.trajectory is not None
         paths.append(found.trajectory.vehicle_to_world)
     np.testing.assert_array_equal(*paths)
     # such a model alone says so, and not that LiDAR saw nothing
     monkeypatch.setattr(colmap_models, "_POSE_POINTS", (10_000,))
     with pytest.raises(InputError, match="COLMAP found no poses for the 10 pictures"):
-        colmap_poses(*five_moments(drive, tmp_path / "two", 1), QUIET)
+        colmap_poses(*five_frames(drive, tmp_path / "two", 1), QUIET)
 
 
 @pytest.mark.slow
@@ -672,7 +672,7 @@ def test_most_pictures_decide_which_models_are_kept(drive, tmp_path, monkeypatch
     pytest.importorskip("pycolmap")
     monkeypatch.setattr(colmap_models, "_POSE_POINTS", (15, 10_000))
     monkeypatch.setattr(colmap_models, "_ENOUGH", 2.0)
-    found = colmap_poses(*five_moments(drive, tmp_path, 1), QUIET)
+    found = colmap_poses(*five_frames(drive, tmp_path, 1), QUIET)
     assert len({picture.frame for picture in found.pictures}) == 5
     assert sorted(path.name for path in (tmp_path / ".scene.colmap").iterdir()) == [
         "inputs.json",
@@ -726,14 +726,14 @@ def test_a_drive_with_disturbed_poses_becomes_a_scene_with_better_ones(drive, tm
         camera_to_world = np.eye(4)
         camera_to_world[:3, :3], camera_to_world[:3, 3] = picture.rotation, picture.position_m
         at = opencv_to_opengl(camera_to_world) @ np.linalg.inv(to_vehicle[picture.camera])
-        poses[picture.camera][picture.moment] = at
+        poses[picture.camera][picture.frame] = at
     given = true_poses(disturbed)
     before, after = steps_off(given, truth), steps_off(poses["image_02"], truth)
     assert after[0] < 0.5 * before[0] and after[1] < 0.3 * before[1]
     # the rig is rigid
     for frame, at in poses["image_02"].items():
         np.testing.assert_allclose(at, poses["image_03"][frame], atol=1e-5)
-    # the last moment's pictures are black: it moves as the one before
+    # the last frame's pictures are black: it moves as the one before
     last = [np.linalg.inv(path[FRAMES - 2]) @ path[FRAMES - 1] for path in (given, poses["image_02"])]
     assert np.linalg.norm(last[0][:3, 3]) == pytest.approx(np.linalg.norm(last[1][:3, 3]), abs=0.005)
     # the same command takes up what it found, and leaves the scene as it is

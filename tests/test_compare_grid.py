@@ -92,7 +92,7 @@ def finished(scene, name, seed=0):
 EVERY_CELL = tuple(GRID.values())
 
 
-def judged(names=EVERY_CELL, scenes=("street", "turn")):
+def evaluated(names=EVERY_CELL, scenes=("street", "turn")):
     return Results([finished(scene, name) for scene in scenes for name in names])
 
 
@@ -104,7 +104,7 @@ def searched(count=12):
 
 
 def test_the_tables_say_what_each_is_worth_by_hand():
-    made = {table.label: table for table in grid_tables(judged(), searched())}
+    made = {table.label: table for table in grid_tables(evaluated(), searched())}
     assert [*made] == ["G1", "G2", "G3", "G4", "G5"]
     assert [group for group, _ in made["G1"].headings()][::2] == ["street", "turn", "average"]
 
@@ -134,7 +134,7 @@ def test_the_tables_say_what_each_is_worth_by_hand():
 
 
 def test_a_part_of_the_grid_has_the_tables_that_it_is_enough_for():
-    made = grid_tables(judged(("nerfacto", "ds-nerf", "edge-lidar-plain"), ("street",)), searched())
+    made = grid_tables(evaluated(("nerfacto", "ds-nerf", "edge-lidar-plain"), ("street",)), searched())
     assert [table.label for table in made] == ["G2", "G5"]
     assert [row.title.partition(": ")[2] for row in made[0].rows] == [
         "DS-NeRF loss over none",
@@ -146,7 +146,7 @@ def test_a_part_of_the_grid_has_the_tables_that_it_is_enough_for():
 def test_searches_of_unequal_length_are_said_to_be():
     searches = searched()
     searches[0] = searched(15)[0]
-    assert "have different sizes" in grid_tables(judged(), searches)[-1].caption
+    assert "have different sizes" in grid_tables(evaluated(), searches)[-1].caption
 
 
 @pytest.fixture
@@ -204,7 +204,7 @@ def asked(folder: Path, **changes):
 def test_a_grid_searches_every_cell_alike_and_goes_on_where_it_was(tmp_path, made_up):
     done, stops = made_up
     options = asked(tmp_path, search_steps=3)
-    searches, judgements = len(WITH_LOSS) * len(LAMBDAS) * len(SIGMAS_M) * 2, len(GRID) * 2
+    searches, evaluations = len(WITH_LOSS) * len(LAMBDAS) * len(SIGMAS_M) * 2, len(GRID) * 2
     # stopped in the search, and in the comparison
     stops.add(50)
     with pytest.raises(KeyboardInterrupt):
@@ -214,10 +214,10 @@ def test_a_grid_searches_every_cell_alike_and_goes_on_where_it_was(tmp_path, mad
     with pytest.raises(KeyboardInterrupt):
         grid(options, QUIET)
     results = grid(options, QUIET)
-    assert len(done) == searches + judgements == len({run.folder for run in done})
-    assert len(results.runs) == judgements and results.scenes() == ["street", "turn"]
+    assert len(done) == searches + evaluations == len({run.folder for run in done})
+    assert len(results.runs) == evaluations and results.scenes() == ["street", "turn"]
     grid(options, QUIET)
-    assert len(done) == searches + judgements
+    assert len(done) == searches + evaluations
 
     tries: dict[str, set] = {name: set() for name in WITH_LOSS}
     for run in done:
@@ -236,17 +236,17 @@ def test_a_grid_searches_every_cell_alike_and_goes_on_where_it_was(tmp_path, mad
     assert tuned["methods"]["edge"] == {"lambda": 0.1, "sigma_m": "own", "psnr": 30.0}
     # one drive alone would have 2 m, at 30 dB; of both that is 29.25, and 0.5 m is 28.61
     assert tuned["methods"]["edge-plain"] == {"lambda": 0.01, "sigma_m": 2.0, "psnr": 29.25}
-    judged_with = {run.specification.method: run.specification for run in done if run.specification.whole_views}
+    evaluated_with = {run.specification.method: run.specification for run in done if run.specification.whole_views}
     for name in WITH_LOSS:
         found = tuned["methods"][name]
-        assert (judged_with[name].weight, judged_with[name].sigma_m) == (found["lambda"], found["sigma_m"])
-    assert judged_with["nerfacto"].weight is None and judged_with["nerfacto-lidar-extras"].weight is None
+        assert (evaluated_with[name].weight, evaluated_with[name].sigma_m) == (found["lambda"], found["sigma_m"])
+    assert evaluated_with["nerfacto"].weight is None and evaluated_with["nerfacto-lidar-extras"].weight is None
 
     text = (options.output / "grid.md").read_text(encoding="utf-8")
     places = [text.index(f"What {words} worth") for words in ("the prior is", "the loss is", "the extras are")]
     assert places == sorted(places) and places[-1] < text.index("What the whole is worth")
     assert "on tune_a and tune_b" in text and "tune_a" in (options.output / "comparison" / "tables.md").read_text()
-    # a finer search comes too late for what was judged with another
+    # a finer search comes too late for what was evaluated with another
     with pytest.raises(InputError, match="this run was started with"):
         grid(replace(options, sigmas_m=(1.5, *SIGMAS_M)), QUIET)
 

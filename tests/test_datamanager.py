@@ -9,10 +9,10 @@ from scenes import fisheye, pinhole, write_scene
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_json, write_distance_png, write_json, write_mask
-from edge_depth_nerf.method.error_model import read_trust
+from edge_depth_nerf.method.error_model import read_calibration
 from edge_depth_nerf.method.integration import IntegrationOptions
 from edge_depth_nerf.method.prior import PriorOptions, make_prior, ray_angles
-from edge_depth_nerf.mono.calibration import calibrate_scene, find_trust
+from edge_depth_nerf.mono.calibration import calibrate_scene, find_calibration
 from edge_depth_nerf.plugin import datamanager as datamanager_module
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
@@ -40,14 +40,14 @@ def test_a_batch_carries_colour_prior_and_rays_of_its_pixels(tmp_path):
     scene = read_scene(tmp_path)
     by_name = {picture.files["image"].name: picture for picture in scene.pictures}
     pictures = [by_name[path.name] for path in dataset.image_filenames]
-    trust = find_trust(scene, options)
+    calibration = find_calibration(scene, options)
     priors = [
         make_prior(
             {layer: dataset.distance_m(i, layer) for layer in ("lidar", "mono")},
             dataset.mask(i),
             "integrated",
             options,
-            trust,
+            calibration,
             ray_angles(pictures[i].lens, pictures[i].up_in_camera),
         )
         for i in range(len(dataset))
@@ -68,7 +68,7 @@ def test_a_batch_carries_colour_prior_and_rays_of_its_pixels(tmp_path):
     assert torch.isfinite(rays.directions).all()
 
 
-def test_further_pixels_come_for_the_surface_where_the_prior_is_good(tmp_path):
+def test_surface_pixels_come_for_the_surface_where_the_prior_is_good(tmp_path):
     scene = write_scene(tmp_path)
     mono = scene / "mono" / "0000.png"
     distance = read_distance_png(mono)
@@ -94,7 +94,7 @@ def test_further_pixels_come_for_the_surface_where_the_prior_is_good(tmp_path):
     assert "surface_rays" not in manager(scene, surface_rays_per_batch=0).next_train(0)[1]
 
 
-def test_on_a_gpu_a_batch_is_the_same_with_all_further_pixels_and_which_are_of_use(tmp_path, monkeypatch):
+def test_on_a_gpu_a_batch_is_the_same_with_all_surface_pixels_and_which_are_of_use(tmp_path, monkeypatch):
     scene = write_scene(tmp_path)
     data, other = (manager(scene, train_num_rays_per_batch=100, surface_rays_per_batch=400) for _ in range(2))
     for name in ("train_pixel_sampler", "_surface_sampler"):
@@ -118,7 +118,7 @@ def test_on_a_gpu_a_batch_is_the_same_with_all_further_pixels_and_which_are_of_u
         assert other.pictures_of(torch.tensor([0])) == data.pictures_of(torch.tensor([0]))
 
 
-def test_no_further_pixels_come_where_every_prior_is_vague(tmp_path):
+def test_no_surface_pixels_come_where_every_prior_is_vague(tmp_path):
     data = manager(write_scene(tmp_path), prior=PriorOptions(sigma_mode="constant", sigma_constant_m=100.0))
     assert data._surface_sampler is not None
     _, batch = data.next_train(0)
@@ -255,11 +255,11 @@ def test_the_calibration_of_training_pictures_is_found_or_made(tmp_path):
     assert not list((scene / ".cache").glob("mono_trust_*"))
     manager(scene, prior=PriorOptions(align="global"))
     (other,) = (scene / ".cache").glob("mono_trust_*")
-    assert read_trust(other).made_of != made.made_of
+    assert read_calibration(other).made_of != made.made_of
 
 
 def test_the_literal_form_measures_nothing(tmp_path, monkeypatch):
-    monkeypatch.setattr("edge_depth_nerf.plugin.datamanager.find_trust", lambda *_: pytest.fail("measured"))
+    monkeypatch.setattr("edge_depth_nerf.plugin.datamanager.find_calibration", lambda *_: pytest.fail("measured"))
     scene = write_scene(tmp_path)
     data = manager(scene, prior=PriorOptions("none", "constant", integration=IntegrationOptions()))
     _, batch = data.next_train(0)

@@ -108,7 +108,7 @@ def test_the_scene_mask_is_within_the_lens(tmp_path):
     assert np.array_equal(mask[:-5], dataset.rays(0).within[:-5])
 
 
-def test_an_item_judges(tmp_path):
+def test_an_item_evaluates(tmp_path):
     item = FisheyeDepthDataset(parse(write_scene(tmp_path), "test"))[0]
     height, width = fisheye().height, fisheye().width
     assert {key: tuple(value.shape) for key, value in item.items() if key != "image_idx"} == {
@@ -118,8 +118,8 @@ def test_an_item_judges(tmp_path):
         "truth_distance_m": (height, width, 1),
         "truth_rgb": (height, width, 3),
     }
-    returns = item["lidar_distance_m"] > 0
-    assert torch.allclose(item["lidar_distance_m"][returns], item["truth_distance_m"][returns])
+    lidar_points = item["lidar_distance_m"] > 0
+    assert torch.allclose(item["lidar_distance_m"][lidar_points], item["truth_distance_m"][lidar_points])
 
 
 @pytest.mark.parametrize("what", ["images", "lidar", "masks", "mono", "truth/distance"])
@@ -245,8 +245,8 @@ def test_a_plain_scene_of_one_picture(tmp_path):
         assert len(parse(scene, split).image_filenames) == 1
 
 
-def test_a_moment_is_trained_on_or_held_out_with_all_its_cameras(tmp_path):
-    """Two cameras a moment: what `process` writes is taken, a split through a moment is not."""
+def test_a_frame_is_trained_on_or_held_out_with_all_its_cameras(tmp_path):
+    """Two cameras a frame: what `process` writes is taken, a split through a frame is not."""
     scene = write_scene(tmp_path, frames=10)
 
     def pair(meta):

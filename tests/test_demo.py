@@ -69,7 +69,7 @@ def test_it_leaves_figures_and_a_picture(finished):
     assert set(results["seconds"]) == {"synthesize", "process", "compare"} and min(results["seconds"].values()) > 0
     assert set(results["versions"]) == {"edge-depth-nerf", "nerfstudio", "torch", "numpy", "python"}
     picture = read_image(options.output / "comparison.png")
-    # two moments of two cameras are held out (4 and 12), of which three views are shown: each has a row of colours and
+    # two frames of two cameras are held out (4 and 12), of which three views are shown: each has a row of colours and
     # one of distances, of three pictures 220 px wide
     assert picture.shape == (34 + 6 * 226 - 6 + 40, 3 * 226 - 6, 3), "with the scale of distances below"
     page = (options.output / "report.html").read_text(encoding="utf-8")

@@ -360,7 +360,7 @@ def test_with_an_embedding_a_picture_is_rendered_as_it_looks(tmp_path, implement
     assert float((third - usual).abs().max()) > 0.01 and float((third - fourth).abs().max()) > 0.01
 
 
-# ---- judged ---------------------------------------------------------------------------------------------------------
+# ---- evaluated ------------------------------------------------------------------------------------------------------
 
 
 def test_views_are_evaluated_with_detail_beside_those_without(tmp_path, monkeypatch):

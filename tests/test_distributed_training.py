@@ -45,7 +45,7 @@ def test_no_ray_is_drawn_twice(ranks: list[dict[str, Any]], which: str) -> None:
 
 def test_what_is_kept_on_disk_is_made_once(ranks: list[dict[str, Any]]) -> None:
     made = [found["made"] for found in ranks]
-    # a table of pixels for training and one to judge by; their pictures share the one lens
+    # a table of pixels for training and one to evaluate on; their pictures share the one lens
     assert sum(found.get("write_table", 0) for found in made) == 2
     assert sum(found.get("_make", 0) for found in made) == 1
 

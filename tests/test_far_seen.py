@@ -1,4 +1,4 @@
-"""What the LiDAR of other moments shows of a picture, above its own returns."""
+"""What the LiDAR of other frames shows of a picture, above its own returns."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def test_what_other_pictures_see_through_has_moved(tmp_path, monkeypatch):
     assert (lorry := shown(scene, 4))[lorry > 0].min() < 5.5
 
 
-def test_own_returns_come_first_in_examples(tmp_path):
+def test_own_points_come_first_in_examples(tmp_path):
     scene = write_drive(tmp_path)
     heights = [{"front": EYE_M}]
     alone = load_examples([scene], [scene.pictures[:2]], heights, 60, 4)
@@ -211,7 +211,7 @@ def test_near_points_are_those_within_reach(monkeypatch):
 
 
 @pytest.mark.parametrize("top_deg", [2.0, -3.0])
-def test_the_field_is_where_the_returns_are(tmp_path, top_deg):
+def test_the_field_is_where_the_points_are(tmp_path, top_deg):
     scene = write_drive(tmp_path, top_deg=top_deg)
     up = [elevation_deg()[far_seen._own(scene, picture)[1] > 0] for picture in scene.pictures]
     expected = np.quantile(np.concatenate(up), [0.001, 0.999])

@@ -125,11 +125,11 @@ def test_maps_of_next_to_nothing(shape: tuple[int, ...]) -> None:
 # ---- hostile scenes --------------------------------------------------------------------------------------------
 
 
-def copied(folder: Path, moments: int = 6) -> Path:
-    """A camera's first moments of the sample drive."""
+def copied(folder: Path, frames: int = 6) -> Path:
+    """A camera's first frames of the sample drive."""
     copy_sample_drive(folder)
     meta = read_json(folder / "transforms.json")
-    kept = [f for f in meta["frames"] if f["camera"] == "image_02" and f["frame"] < moments]
+    kept = [f for f in meta["frames"] if f["camera"] == "image_02" and f["frame"] < frames]
     for frame in kept:
         for key in [key for key in frame if key.startswith("truth")]:
             del frame[key]
@@ -163,7 +163,7 @@ def paint(value: float | None) -> Callable[[Path], None]:
     return change
 
 
-def one_return(scene: Path) -> None:
+def one_lidar_point(scene: Path) -> None:
     fill("lidar", 0.0)(scene)
     single = np.zeros((128, 128))
     single[64, 70] = 5.0
@@ -222,7 +222,7 @@ def same(scene: Path) -> None:
 
 HOSTILE: dict[str, tuple[Callable[[Path], Any], dict[str, Any]]] = {
     "no LiDAR return": (fill("lidar", 0.0), {}),
-    "one LiDAR return": (one_return, {}),
+    "one LiDAR return": (one_lidar_point, {}),
     "mono of nothing": (fill("mono", 0.0), {}),
     "mono far": (fill("mono", 255.9), {}),
     "mono near": (fill("mono", 1 / 256), {}),

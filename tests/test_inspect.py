@@ -47,7 +47,7 @@ from edge_depth_nerf.base.pictures import (
     tinted,
 )
 from edge_depth_nerf.inspecting.command import inspect_scene
-from edge_depth_nerf.inspecting.figures import measured_moments
+from edge_depth_nerf.inspecting.figures import measured_frames
 from edge_depth_nerf.inspecting.findings import Finding, find, limited
 from edge_depth_nerf.inspecting.options import InspectOptions
 from edge_depth_nerf.inspecting.pose_check import BAD_MEDIAN_PX
@@ -110,7 +110,7 @@ def test_its_poses_agree_with_its_pictures(sample):
 
 
 def test_a_pose_that_is_off_is_named(sample_drive, tmp_path):
-    """One moment turned by 3°: 2 px at this size."""
+    """One frame turned by 3°: 2 px at this size."""
     shutil.copytree(sample_drive, tmp_path / "drive", ignore=shutil.ignore_patterns(".cache"))
     turned = frames_of(sample_drive, "image_02")[6]["frame"]
     cosine, sine = math.cos(math.radians(3)), math.sin(math.radians(3))
@@ -266,7 +266,7 @@ def test_the_figures_in_the_terminal(sample_drive, tmp_path):
 SIZE = (16, 12)
 
 
-def write_drive(folder: Path, moments: int = 12, cameras: tuple[str, ...] = ("left",)) -> Path:
+def write_drive(folder: Path, numbers: int = 12, cameras: tuple[str, ...] = ("left",)) -> Path:
     """A straight drive along x, a step of 0.5 m every 0.1 s, whose every figure is known.
 
     The mask hides the lower two of twelve rows; every other usable pixel has a return at 8 m; mono says 8.4 m but for
@@ -280,17 +280,17 @@ def write_drive(folder: Path, moments: int = 12, cameras: tuple[str, ...] = ("le
     frames = []
     for camera in cameras:
         write_mask(folder / f"masks/{camera}.png", mask)
-        for moment in range(moments):
-            file = f"{camera}/{moment:010d}.png"
+        for number in range(numbers):
+            file = f"{camera}/{number:010d}.png"
             write_png(folder / "images" / file, np.full((*mask.shape, 3), 100, np.uint8))
             write_distance_png(folder / "lidar" / file, lidar)
             write_distance_png(folder / "mono" / file, mono)
             pose = np.eye(4)
-            pose[:3, 3] = 0.5 * moment, 1.0 * cameras.index(camera), 0
+            pose[:3, 3] = 0.5 * number, 1.0 * cameras.index(camera), 0
             maps = {f"{layer}_file_path": f"{layer}/{file}" for layer in ("lidar", "mono")}
             frame = {"file_path": f"images/{file}", "transform_matrix": pose.tolist(), **maps}
-            frame |= {"mask_path": f"masks/{camera}.png", "camera": camera, "frame": moment}
-            frames.append({**frame, "timestamp_s": 50.0 + 0.1 * moment})
+            frame |= {"mask_path": f"masks/{camera}.png", "camera": camera, "frame": number}
+            frames.append({**frame, "timestamp_s": 50.0 + 0.1 * number})
     names = {held: [f["file_path"] for f in frames if (f["frame"] % 8 == 4) == held] for held in (False, True)}
     (folder / "points.ply").write_text(
         "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
@@ -340,20 +340,20 @@ def test_a_drive_without_fault(drive, tmp_path):
     assert summary["frames"][0]["brightness"] == 100
 
 
-def shift_from(moment: int, metres: float):
+def shift_from(number: int, metres: float):
     def mend(meta):
         for frame in meta["frames"]:
-            if frame["frame"] >= moment:
+            if frame["frame"] >= number:
                 frame["transform_matrix"][0][3] += metres
 
     return mend
 
 
-def turn_from(moment: int, degrees: float):
+def turn_from(number: int, degrees: float):
     def mend(meta):
         cosine, sine = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
         for frame in meta["frames"]:
-            if frame["frame"] >= moment:
+            if frame["frame"] >= number:
                 frame["transform_matrix"][0][:2] = [cosine, -sine]
                 frame["transform_matrix"][1][:2] = [sine, cosine]
 
@@ -436,9 +436,9 @@ def test_two_cameras_share_a_gap(tmp_path):
     assert gap.cameras == ("left", "right")
 
 
-def rewrite(folder: Path, layer: str, moments: tuple[int, ...], alter: Callable[[np.ndarray], np.ndarray]) -> None:
-    for moment in moments:
-        path = folder / layer / "left" / f"{moment:010d}.png"
+def rewrite(folder: Path, layer: str, numbers: tuple[int, ...], alter: Callable[[np.ndarray], np.ndarray]) -> None:
+    for number in numbers:
+        path = folder / layer / "left" / f"{number:010d}.png"
         if layer == "images":
             write_png(path, alter(read_image(path)))
         else:
@@ -468,9 +468,9 @@ CONTENTS = [
 ]
 
 
-@pytest.mark.parametrize(("layer", "moments", "alter", "kind", "frames", "words"), CONTENTS, ids=lambda v: str(v)[:12])
-def test_maps_out_of_the_ordinary(drive, tmp_path, layer, moments, alter, kind, frames, words):
-    rewrite(drive, layer, moments, alter)
+@pytest.mark.parametrize(("layer", "numbers", "alter", "kind", "frames", "words"), CONTENTS, ids=lambda v: str(v)[:12])
+def test_maps_out_of_the_ordinary(drive, tmp_path, layer, numbers, alter, kind, frames, words):
+    rewrite(drive, layer, numbers, alter)
     summary = look(drive, tmp_path / "out", frames=1)
     assert [(w["kind"], tuple(w["frames"])) for w in summary["warnings"]] == [(kind, frames)]
     assert words in summary["warnings"][0]["text"]
@@ -478,7 +478,7 @@ def test_maps_out_of_the_ordinary(drive, tmp_path, layer, moments, alter, kind, 
 
 def test_held_out_pictures_have_less_lidar_than_others(drive, tmp_path):
     """Their maps are of their own sweep alone: few points there are no fault, unless other held-out ones have more."""
-    held_out = tuple(picture.moment for picture in read_scene(drive).pictures if picture.held_out)
+    held_out = tuple(picture.frame for picture in read_scene(drive).pictures if picture.held_out)
     assert 0 < len(held_out) < 6
     rewrite(drive, "lidar", held_out, sparse)
     assert look(drive, tmp_path / "out", frames=1)["warnings"] == []
@@ -496,8 +496,8 @@ def test_an_inverted_mask(drive, tmp_path):
     mask = np.zeros(SIZE[::-1], bool)
     mask[-2:] = True
     write_mask(drive / "masks/left.png", mask)
-    for moment in range(12):
-        write_distance_png(drive / f"lidar/left/{moment:010d}.png", np.where(mask, 8.0, 0))
+    for number in range(12):
+        write_distance_png(drive / f"lidar/left/{number:010d}.png", np.where(mask, 8.0, 0))
     (warning,) = look(drive, tmp_path / "out", frames=1)["warnings"]
     assert warning["kind"] == "mask" and "hides 83% of the lens" in warning["text"]
 
@@ -512,16 +512,16 @@ def test_of_many_warnings_of_a_kind_some_are_printed():
 # ---- what is measured and shown --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("moments", "cameras", "measured"), [(200, 1, 64), (100, 2, 32), (12, 2, 12)])
-def test_long_drives_are_sampled_evenly(tmp_path, moments, cameras, measured):
-    scene = read_scene(write_drive(tmp_path / "drive", moments, ("left", "right")[:cameras]))
-    chosen, shown = measured_moments(scene, 4)
+@pytest.mark.parametrize(("numbers", "cameras", "measured"), [(200, 1, 64), (100, 2, 32), (12, 2, 12)])
+def test_long_drives_are_sampled_evenly(tmp_path, numbers, cameras, measured):
+    scene = read_scene(write_drive(tmp_path / "drive", numbers, ("left", "right")[:cameras]))
+    chosen, shown = measured_frames(scene, 4)
     assert len(chosen) == measured
-    assert chosen[0] == 0 and chosen[-1] == moments - 1
+    assert chosen[0] == 0 and chosen[-1] == numbers - 1
     steps = np.diff(chosen)
     assert steps.max() - steps.min() <= 1
     assert len(shown) == 4 and set(shown) <= set(chosen)
-    assert np.allclose(shown, moments * np.array([1, 3, 5, 7]) / 8, atol=0.03 * moments + 1)
+    assert np.allclose(shown, numbers * np.array([1, 3, 5, 7]) / 8, atol=0.03 * numbers + 1)
 
 
 def test_the_summary_says_that_it_is_of_a_sample(tmp_path):
@@ -636,12 +636,12 @@ def test_z_depth_of_a_pinhole_scene_becomes_distance(tmp_path):
     assert {warning["kind"] for warning in summary["warnings"]} == {"no_mono", "no_mask", "no_points", "no_split"}
 
 
-def test_cameras_and_moments_without_names(drive):
-    """Cameras are then told by the folders of their pictures, moments by the order of the names."""
+def test_cameras_and_frames_without_names(drive):
+    """Cameras are then told by the folders of their pictures, frames by the order of the names."""
     change(drive, without("camera", "frame"))
     pictures = read_scene(drive / "transforms.json").pictures
     assert {picture.camera for picture in pictures} == {"images/left"}
-    assert [picture.moment for picture in pictures] == list(range(12))
+    assert [picture.frame for picture in pictures] == list(range(12))
 
 
 # ---- bad input -------------------------------------------------------------------------------------------------
@@ -835,7 +835,7 @@ def test_the_top_view_is_to_scale(drive):
     assert words == {"points, higher ones darker", "view of left", "travel", "training", "held out"}
 
 
-def test_the_top_view_names_moments_with_a_sheet(drive):
+def test_the_top_view_names_frames_with_a_sheet(drive):
     figure = top_view(read_scene(drive), None, [], shown=[1, 9])
     assert [text.get_text() for text in figure.axes[0].texts] == ["1", "9"]
     assert "frame with a sheet" in {text.get_text() for text in figure.legends[0].get_texts()}

@@ -102,7 +102,7 @@ def test_equals_twin_with_other_kernels(fields):
     assert_twin(result, twin, 1e-4)
 
 
-def test_one_return_by_hand():
+def test_one_point_by_hand():
     # 3×3 window, σ_s = 3: sides weigh a = exp(-1/18) = 0.945959, corners b = exp(-2/18) = 0.894839.
     # mono is 10 everywhere (distance factor 1); the right neighbour has a return of 12.
     #   LiDAR's weight  0.7 · a              = 0.662171
@@ -127,7 +127,7 @@ def test_one_return_by_hand():
     assert float(result.distance_m[1, 0]) == pytest.approx(10.0, abs=1e-6)
 
 
-def test_a_lone_return_makes_no_square():
+def test_a_lone_point_makes_no_square():
     # one return of 12 among 10: with its whole share all of its 9×9 window is 11.4 and what lies beyond is 10;
     # with least_returns it has the weight s = exp(-(k² + l²)/18) · 0.7 / 4 against 0.3, if less than all of 0.7
     mono = torch.full((15, 15), 10.0)
@@ -179,8 +179,8 @@ def test_adding_a_distance_adds_it_to_the_prior():
     lidar, mono, valid = random_maps(3, dtype=torch.float64)
     before = integrate_depth(lidar, mono, valid)
     usable = torch.isfinite(mono) & (mono > 0)
-    returns = torch.isfinite(lidar) & (lidar > 0)
-    after = integrate_depth(torch.where(returns, lidar + 7, 0), torch.where(usable, mono + 7, 0), valid)
+    lidar_points = torch.isfinite(lidar) & (lidar > 0)
+    after = integrate_depth(torch.where(lidar_points, lidar + 7, 0), torch.where(usable, mono + 7, 0), valid)
     exists = (before.distance_m > 0).double()
     assert_same(after, IntegratedDepth(before.distance_m + 7 * exists, before.spread_m, before.mono_share))
 
@@ -227,7 +227,7 @@ def test_a_masked_pixel_gives_nothing_and_gets_nothing():
         )
 
 
-def test_a_return_without_estimate_gives_nothing():
+def test_a_point_without_estimate_gives_nothing():
     mono = torch.full((9, 9), 10.0)
     mono[4, 4] = 0
     lidar = torch.zeros(9, 9)
@@ -276,14 +276,14 @@ def test_far_from_every_estimate_the_nearest_counts():
     assert result.distance_m[0, 1] == 0
 
 
-def test_keep_returns():
+def test_keep_points():
     lidar, mono, valid = random_maps(8, ragged=False)
     kept = integrate_depth(lidar, mono, valid, IntegrationOptions(keep_returns=True))
     averaged = integrate_depth(lidar, mono, valid)
-    returns = lidar > 0
-    assert torch.equal(kept.distance_m[returns], lidar[returns])
-    assert (kept.spread_m[returns] == 0).all() and (kept.mono_share[returns] == 0).all()
-    assert torch.equal(kept.distance_m[~returns], averaged.distance_m[~returns])
+    lidar_points = lidar > 0
+    assert torch.equal(kept.distance_m[lidar_points], lidar[lidar_points])
+    assert (kept.spread_m[lidar_points] == 0).all() and (kept.mono_share[lidar_points] == 0).all()
+    assert torch.equal(kept.distance_m[~lidar_points], averaged.distance_m[~lidar_points])
 
 
 def test_batch_and_strips_change_nothing(monkeypatch):
@@ -418,8 +418,8 @@ def test_wrong_shapes(unchecked_types):
 def test_sources_alone():
     lidar, mono, valid = random_maps(11)
     only_lidar = select_prior("lidar", {"lidar": lidar}, valid)
-    returns = valid & torch.isfinite(lidar) & (lidar > 0)
-    assert torch.equal(only_lidar.distance_m, torch.where(returns, lidar, 0))
+    lidar_points = valid & torch.isfinite(lidar) & (lidar > 0)
+    assert torch.equal(only_lidar.distance_m, torch.where(lidar_points, lidar, 0))
     assert not only_lidar.spread_m.any() and not only_lidar.mono_share.any()
     only_mono = select_prior("mono", {"mono": mono}, valid)
     usable = valid & torch.isfinite(mono) & (mono > 0)

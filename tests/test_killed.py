@@ -29,7 +29,7 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import explain, remove_leftovers, write_bytes, write_text
 from edge_depth_nerf.base.one_writer import only_writer
 from edge_depth_nerf.jobs.runs import newest_checkpoint, steps_done
-from edge_depth_nerf.method.error_model import read_trust
+from edge_depth_nerf.method.error_model import read_calibration
 from edge_depth_nerf.method.integration import IntegrationOptions
 from edge_depth_nerf.method.prior import PriorOptions
 from edge_depth_nerf.mono import estimate
@@ -125,12 +125,12 @@ def test_a_changed_calibration_is_not_believed(tmp_path: Path) -> None:
     calibrate_scene(scene)
     path = scene / "mono_trust.json"
     text = path.read_text()
-    read_trust(path)
+    read_calibration(path)
     place = text.index('"field_rad"') + 20
     digit = next(i for i in range(place, len(text)) if text[i].isdigit())
     path.write_text(text[:digit] + str((int(text[digit]) + 1) % 10) + text[digit + 1 :])
     with pytest.raises(InputError, match="checksum"):
-        read_trust(path)
+        read_calibration(path)
 
 
 def test_caches_do_not_grow_without_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -143,7 +143,7 @@ def test_lidar_is_at_the_walls_of_the_room(room: RoomDrive, scene: Path) -> None
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
-def test_returns_aimed_at_pixels_land_in_them(tmp_path: Path, camera: str) -> None:
+def test_points_aimed_at_pixels_land_in_them(tmp_path: Path, camera: str) -> None:
     """Half a pixel of error, in either direction, would move half of them to a neighbour."""
     drive = write_room_drive(tmp_path / "drive", frames=2, aim=camera)
     process(drive, tmp_path / "scene")
@@ -234,9 +234,9 @@ def test_cloud_lies_on_the_walls_in_their_colours(room: RoomDrive, scene: Path) 
     assert (colours == expected).all(-1).mean() > 0.9
 
 
-def test_cloud_has_nothing_of_held_out_moments(tmp_path: Path, drive: RoomDrive) -> None:
-    # only the sweep of moment 1, held out of every 2, reaches beyond the room
-    far = drive.returns[1] * 3
+def test_cloud_has_nothing_of_held_out_frames(tmp_path: Path, drive: RoomDrive) -> None:
+    # only the sweep of frame 1, held out of every 2, reaches beyond the room
+    far = drive.points_m[1] * 3
     write_points(drive.sweep(1), far)
     process(drive, tmp_path / "scene", holdout_every=2)
     meta = read_json(tmp_path / "scene/transforms.json")
@@ -283,11 +283,11 @@ def test_sweeps_around_add_to_each_picture_but_for_those_held_out(tmp_path: Path
 
 
 def test_training_maps_do_not_depend_on_held_out_sweeps(tmp_path: Path) -> None:
-    """Another sweep at the moment held out: not a byte of what training reads changes."""
+    """Another sweep at the frame held out: not a byte of what training reads changes."""
     scenes = []
     for nearer in (1.0, 0.5):
         drive = write_room_drive(tmp_path / f"drive_{nearer}", beams=1000, size=48)
-        write_points(drive.sweep(4), drive.as_measured(drive.returns[4] * nearer, 4))
+        write_points(drive.sweep(4), drive.as_measured(drive.points_m[4] * nearer, 4))
         scenes.append(tmp_path / f"scene_{nearer}")
         process(drive, scenes[-1], sweeps=3)
     trained = [f"lidar/{name}/{frame:010d}.png" for name in CAMERAS for frame in (0, 1, 2, 3, 5, 6, 7, 8)]
@@ -393,7 +393,7 @@ def test_the_vehicle_is_looked_for_in_training_pictures_alone(tmp_path: Path, mo
 
 
 def found_by(options: dict[int, float], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the search for poses keep some moments, each shifted along the world's x axis."""
+    """Let the search for poses keep some frames, each shifted along the world's x axis."""
 
     def found(recording: Recording, _options: ProcessOptions, _console: Console) -> Recording:
         kept = []
@@ -566,7 +566,7 @@ def test_one_camera_alone(drive: RoomDrive, tmp_path: Path) -> None:
 
 
 def test_points_that_are_none_are_counted(drive: RoomDrive, tmp_path: Path) -> None:
-    points = drive.returns[1].copy()
+    points = drive.points_m[1].copy()
     points[:5], points[5:12] = np.nan, 0
     write_points(drive.sweep(1), points)
     report = process(drive, tmp_path / "scene")
@@ -863,12 +863,12 @@ def test_truth_is_checked(tmp_path: Path) -> None:
     refuse(r"image_03/rgb/0000000003\.png: no such file; the drive's ground truth is incomplete")
 
 
-def test_sweep_without_returns_is_an_error(drive: RoomDrive, tmp_path: Path) -> None:
+def test_sweep_without_points_is_an_error(drive: RoomDrive, tmp_path: Path) -> None:
     write_points(drive.sweep(1), np.full((50, 3), np.nan))
     with pytest.raises(InputError, match=r"0000000001\.bin: none of its 50 points can be used \(50 are NaN"):
         process(drive, tmp_path / "scene")
     # mended, the same command goes on
-    write_points(drive.sweep(1), drive.returns[1][:50])
+    write_points(drive.sweep(1), drive.points_m[1][:50])
     process(drive, tmp_path / "again")
     shutil.rmtree(tmp_path / "scene")
     process(drive, tmp_path / "scene")

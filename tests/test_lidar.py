@@ -30,7 +30,7 @@ def test_reads_points_and_reflectance_in_order(tmp_path: Path) -> None:
     assert (sweep.not_finite, sweep.out_of_range) == (0, 0)
 
 
-def test_leaves_out_and_counts_what_is_no_return(tmp_path: Path) -> None:
+def test_leaves_out_and_counts_what_is_no_point(tmp_path: Path) -> None:
     rows = [[1, 0, 0], [math.nan, 0, 0], [0, -math.inf, 0], [0, 0, 0], [0.2, 0.2, 0.2], [300, 0, 0], [0, 0, 9]]
     sweep = read_sweep(write(tmp_path / "a.bin", [[*row, 0] for row in rows]))
     assert sweep.points_m.tolist() == [[1, 0, 0], [0, 0, 9]]
@@ -72,20 +72,20 @@ def test_projects_to_the_pixel_that_holds_the_point() -> None:
     assert (seen.point_index >= 0).sum() == 1
 
 
-def test_nearest_surface_wins_and_on_it_the_return_nearest_to_the_centre() -> None:
+def test_nearest_surface_wins_and_on_it_the_point_nearest_to_the_centre() -> None:
     generator = torch.Generator().manual_seed(0)
     directions = torch.randn(4000, 3, generator=generator, dtype=torch.float64)
     points = directions * (4.0 + 2 * torch.rand(4000, 1, generator=generator, dtype=torch.float64))
     seen = project_points(points, FISHEYE)
     # the same by plain loops
-    returns: dict[tuple[int, int], list[tuple[float, float]]] = {}
+    lidar_points: dict[tuple[int, int], list[tuple[float, float]]] = {}
     pixels, valid = FISHEYE.project(points)
     for (x, y), point, usable in zip(pixels.tolist(), points.tolist(), valid.tolist(), strict=True):
         if usable and 0 <= x < 70 and 0 <= y < 70:
             off_centre = math.hypot(x % 1 - 0.5, y % 1 - 0.5)
-            returns.setdefault((int(y), int(x)), []).append((off_centre, math.hypot(*point)))
+            lidar_points.setdefault((int(y), int(x)), []).append((off_centre, math.hypot(*point)))
     expected = np.zeros((70, 70))
-    for pixel, found in returns.items():
+    for pixel, found in lidar_points.items():
         limit = 1.1 * min(distance for _, distance in found)
         expected[pixel] = min(entry for entry in found if entry[1] <= limit)[1]
     assert np.count_nonzero(expected) > 500
@@ -142,7 +142,7 @@ def test_sees_beside_and_behind_but_nothing_folds_back() -> None:
     assert seen(120) == seen(150) == seen(179) == 0
 
 
-def test_no_points_no_returns() -> None:
+def test_no_points_no_points() -> None:
     seen = project_points(torch.empty(0, 3, dtype=torch.float64), PINHOLE)
     assert seen.distance_m.shape == (10, 20)
     assert not seen.distance_m.any()

@@ -292,11 +292,11 @@ def test_urban_nerfs_terms_by_hand():
 
 def test_urban_nerfs_loss_is_least_where_light_ends_as_the_kernel_says():
     edges = np.linspace(1, 9, 801)
-    middles = (edges[:-1] + edges[1:]) / 2
+    midpoints = (edges[:-1] + edges[1:]) / 2
     losses = {}
     for at in (4.0, 5.0, 6.0):
         for width in (0.1, 0.3, 0.9):
-            weights = np.exp(-((middles - at) ** 2) / (2 * width**2))
+            weights = np.exp(-((midpoints - at) ** 2) / (2 * width**2))
             losses[at, width] = one_ray(weights / weights.sum(), edges.tolist(), 5.0, 0.3, urban_nerf_loss)
     assert min(losses, key=lambda key: losses[key]) == (5.0, 0.3)
     # the kernel itself, but for its cut ends: nothing is left

@@ -343,7 +343,7 @@ CAMERA = Pinhole(SIZE, SIZE, FOCAL_PX, FOCAL_PX, SIZE / 2, SIZE / 2)
 UP = np.array([0.0, -1.0, 0.0])
 """Of a level camera."""
 USE = np.ones((SIZE, SIZE), bool)
-NO_RETURNS = np.zeros((SIZE, SIZE), np.float32)
+NO_LIDAR = np.zeros((SIZE, SIZE), np.float32)
 
 
 def outdoors() -> tuple[Picture, Mask]:
@@ -360,7 +360,7 @@ def outdoors() -> tuple[Picture, Mask]:
 
 def test_sky_is_found_above_the_horizon() -> None:
     picture, true = outdoors()
-    found = sky.find_sky(picture, USE, UP, CAMERA, NO_RETURNS)
+    found = sky.find_sky(picture, USE, UP, CAMERA, NO_LIDAR)
     assert not (found & ~true).any()
     _, y = pixels()
     # the lowest degree is left out
@@ -368,7 +368,7 @@ def test_sky_is_found_above_the_horizon() -> None:
 
 
 def test_sky_ends_at_the_horizon_though_the_ground_is_as_bright() -> None:
-    found = sky.find_sky(as_picture(np.full((SIZE, SIZE), 230.0), 0), USE, UP, CAMERA, NO_RETURNS)
+    found = sky.find_sky(as_picture(np.full((SIZE, SIZE), 230.0), 0), USE, UP, CAMERA, NO_LIDAR)
     _, y = pixels()
     elevation_deg = np.degrees(np.arctan2(SIZE / 2 - y, np.hypot(FOCAL_PX, pixels()[0] - SIZE / 2)))
     assert found[elevation_deg > 2].all()
@@ -378,19 +378,19 @@ def test_sky_ends_at_the_horizon_though_the_ground_is_as_bright() -> None:
 def test_up_decides_where_the_horizon_is() -> None:
     picture, true = outdoors()
     turned = np.ascontiguousarray(np.rot90(picture, -1))
-    found = sky.find_sky(turned, USE, np.array([1.0, 0.0, 0.0]), CAMERA, NO_RETURNS)
+    found = sky.find_sky(turned, USE, np.array([1.0, 0.0, 0.0]), CAMERA, NO_LIDAR)
     assert found.sum() > 0.9 * true.sum()
     assert not (found & ~np.rot90(true, -1)).any()
     # upside down: the bright half is ground
-    assert not sky.find_sky(picture, USE, -UP, CAMERA, NO_RETURNS).any()
+    assert not sky.find_sky(picture, USE, -UP, CAMERA, NO_LIDAR).any()
 
 
 def test_a_white_van_beside_the_camera_does_not_hide_the_sky() -> None:
     picture, _ = outdoors()
     x, y = pixels()
     picture[(y > SIZE / 2) & (x > 80)] = 210
-    alone = sky.find_sky(outdoors()[0], USE, UP, CAMERA, NO_RETURNS)
-    assert sky.find_sky(picture, USE, UP, CAMERA, NO_RETURNS).sum() > 0.99 * alone.sum()
+    alone = sky.find_sky(outdoors()[0], USE, UP, CAMERA, NO_LIDAR)
+    assert sky.find_sky(picture, USE, UP, CAMERA, NO_LIDAR).sum() > 0.99 * alone.sum()
 
 
 def test_what_is_known_to_be_near_is_not_sky() -> None:
@@ -398,9 +398,9 @@ def test_what_is_known_to_be_near_is_not_sky() -> None:
     x, y = pixels()
     crown = (np.hypot(x - 170, y - 40) < 20) & true
     mono = np.where(crown, 5.0, np.where(true, 70.0, 15.0)).astype(np.float32)
-    returns = NO_RETURNS.copy()
-    returns[20, 100] = 60.0
-    found = sky.find_sky(picture, USE, UP, CAMERA, returns, mono)
+    lidar_points = NO_LIDAR.copy()
+    lidar_points[20, 100] = 60.0
+    found = sky.find_sky(picture, USE, UP, CAMERA, lidar_points, mono)
     assert not found[crown].any()
     assert not found[19:22, 100].any()
     assert not found[20, 99:102].any()
@@ -409,7 +409,7 @@ def test_what_is_known_to_be_near_is_not_sky() -> None:
     )
     masked = USE.copy()
     masked[:, 120:] = False
-    assert not sky.find_sky(picture, masked, UP, CAMERA, NO_RETURNS)[:, 120:].any()
+    assert not sky.find_sky(picture, masked, UP, CAMERA, NO_LIDAR)[:, 120:].any()
 
 
 def test_ceilings_are_not_sky() -> None:
@@ -417,18 +417,18 @@ def test_ceilings_are_not_sky() -> None:
     ceiling = as_picture(np.where(y < SIZE / 2, 115.0, 90.0), 0)
     # a lamp
     ceiling[(np.abs(x - 120) < 40) & (np.abs(y - 30) < 3)] = 255
-    assert not sky.find_sky(ceiling, USE, UP, CAMERA, NO_RETURNS).any()
+    assert not sky.find_sky(ceiling, USE, UP, CAMERA, NO_LIDAR).any()
     # a beam with light on it in a dark place
     beam = as_picture(np.where(np.abs(y - 50) < 15, 125.0, 75.0), 0)
-    assert not sky.find_sky(beam, USE, UP, CAMERA, NO_RETURNS).any()
+    assert not sky.find_sky(beam, USE, UP, CAMERA, NO_LIDAR).any()
     room = as_picture(np.where(y < SIZE / 2, 185.0, 150.0), 0)
-    assert not sky.find_sky(room, USE, UP, CAMERA, NO_RETURNS).any()
+    assert not sky.find_sky(room, USE, UP, CAMERA, NO_LIDAR).any()
     white = as_picture(np.where(y < SIZE / 2, 230.0, 90.0), 0)
     distance = np.where(y < SIZE / 2, 2.0 / np.maximum(np.sin(np.arctan2(SIZE / 2 - y, FOCAL_PX)), 1e-3), 3.0)
     near = np.minimum(distance, 250).astype(np.float32)
-    assert not sky.find_sky(white, USE, UP, CAMERA, NO_RETURNS, near).any()
+    assert not sky.find_sky(white, USE, UP, CAMERA, NO_LIDAR, near).any()
     night = (outdoors()[0] * 0.3).astype(np.uint8)
-    assert not sky.find_sky(night, USE, UP, CAMERA, NO_RETURNS).any()
+    assert not sky.find_sky(night, USE, UP, CAMERA, NO_LIDAR).any()
 
 
 def test_incomplete_blocks_of_large_pictures() -> None:
@@ -463,8 +463,10 @@ def test_masks_of_the_sample_drive(sample_drive: Path, name: str) -> None:
         # the camera's axes are OpenGL's, the world's z points up
         up = np.array(frame["transform_matrix"])[2, :3] * (1, -1, -1)
         truth = read_distance_png(sample_drive / frame["truth_distance_file_path"])
-        returns, mono = (read_distance_png(sample_drive / frame[f"{kind}_file_path"]) for kind in ("lidar", "mono"))
-        found_sky = sky.find_sky(read_image(sample_drive / frame["file_path"]), used, up, camera, returns, mono)
+        lidar_points, mono = (
+            read_distance_png(sample_drive / frame[f"{kind}_file_path"]) for kind in ("lidar", "mono")
+        )
+        found_sky = sky.find_sky(read_image(sample_drive / frame["file_path"]), used, up, camera, lidar_points, mono)
         true = used & (truth == 0)
         assert (found_sky & true).sum() > 0.95 * true.sum()
         assert (found_sky & (truth > 0) & (truth < 80)).sum() < 0.02 * found_sky.sum()
@@ -482,10 +484,10 @@ def test_the_real_frame(real_data: Path) -> None:
     assert hidden[1000:][~rim[1000:]].all()
     circle = lens.lens_circle(model, 95.0)
     up = read_cam_to_pose(real_data / "kitti360_calibration/calib_cam_to_pose.txt")["image_02"][:3, :3].T @ (0, 0, -1.0)
-    returns = read_distance_png(folder / "kitti360_depth.png")
-    found = sky.find_sky(picture, circle & ~hidden, up, model, returns)
+    lidar_points = read_distance_png(folder / "kitti360_depth.png")
+    found = sky.find_sky(picture, circle & ~hidden, up, model, lidar_points)
     assert found[:440][circle[:440]].mean() > 0.8
     assert not found[700:].any()
-    assert not found[returns > 0].any()
+    assert not found[lidar_points > 0].any()
     for path in (real_data / "kitti360_stereo").glob("*.png"):
         assert lens.dark_rim([read_image(path)]) is None

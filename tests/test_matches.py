@@ -145,7 +145,7 @@ def test_along_a_drive_right_poses_are_told_from_wrong_ones() -> None:
         assert found.inliers > 0.9
     wrong = [*poses[:2], poses[2] @ pose((0.5, 0, 0), (0, 0, 0))]
     given = pictures(poses)
-    placed = [PosedPicture(p.camera, p.moment, p.lens, at, p.read_rgb) for p, at in zip(given, wrong, strict=True)]
+    placed = [PosedPicture(p.camera, p.frame, p.lens, at, p.read_rgb) for p, at in zip(given, wrong, strict=True)]
     first, *others = along_drive(placed)
     assert first.median_px < 0.2
     for found in others:

@@ -54,7 +54,7 @@ def test_what_lies_inside_counts(metric):
 
 
 def test_psnr_by_hand():
-    # two of four pixels judged, errors 0.1 (all channels) and 0: mean square 0.005, 10 · log10(200) = 23.0103 dB
+    # two of four pixels evaluated, errors 0.1 (all channels) and 0: mean square 0.005, 10 · log10(200) = 23.0103 dB
     pred, target = torch.zeros(2, 2, 3), torch.zeros(2, 2, 3)
     pred[0, 0], pred[1, 1] = 0.1, 0.9
     mask = torch.tensor([[True, True], [False, False]])
@@ -155,7 +155,7 @@ def test_lpips_with_weights(hub):
 
 
 def test_depth_errors_by_hand():
-    # judged: 10 → 11 (+10 %), 20 → 15 (-25 %), 50 → 50, 30 → 40 (+33 %);   20/15 and 40/30 are not within 1.25
+    # evaluated: 10 → 11 (+10 %), 20 → 15 (-25 %), 50 → 50, 30 → 40 (+33 %);   20/15 and 40/30 are not within 1.25
     #   abs_rel (0.1 + 0.25 + 0 + 1/3) / 4 = 0.170833,  rmse sqrt((1 + 25 + 0 + 100) / 4) = 5.612486,  delta 2 / 4
     # left out: true 0 (none), 0.9 and 61 (range), the masked one, NaN truth
     true = torch.tensor([[10.0, 20.0, 50.0, 30.0, 0.0, 0.9, 61.0, 30.0, math.nan]])
@@ -191,7 +191,7 @@ def test_depth_errors_of_nothing_are_left_out():
 
 def test_depth_errors_of_wrong_input(unchecked_types):
     ones, mask = torch.ones(2, 3), torch.ones(2, 3, dtype=torch.bool)
-    with pytest.raises(InputError, match="1 of 6 judged pixels have a predicted distance that is not finite"):
+    with pytest.raises(InputError, match="1 of 6 evaluated pixels have a prediction that is not finite"):
         DepthErrors().update(torch.where(torch.arange(6).reshape(2, 3) == 4, math.nan, ones), ones, mask)
     with pytest.raises(InputError, match=r"pred_distance_m \(3, 2\), true_distance_m \(2, 3\)"):
         DepthErrors().update(ones.T, ones, mask)

@@ -139,13 +139,13 @@ def test_baselines_are_the_host_own_losses_in_metres(kind):
     prior, sigma = batch()["prior_distance_m"], torch.tensor([0.3])
     for weights, samples in zip(outputs["weights_list"], outputs["ray_samples_list"], strict=True):
         starts, ends = samples.frustums.starts * METRES_PER_UNIT, samples.frustums.ends * METRES_PER_UNIT
-        middles = (starts + ends) / 2
+        midpoints = (starts + ends) / 2
         if kind == "ds-nerf":
-            total += ds_nerf_depth_loss(weights, prior, middles, ends - starts, sigma**2)
+            total += ds_nerf_depth_loss(weights, prior, midpoints, ends - starts, sigma**2)
         else:
             final = outputs["weights_list"][-1], outputs["ray_samples_list"][-1]
             rendered = DepthRenderer(method="expected")(*final) * METRES_PER_UNIT
-            total += urban_radiance_field_depth_loss(weights, prior, rendered, middles, sigma)
+            total += urban_radiance_field_depth_loss(weights, prior, rendered, midpoints, sigma)
     assert torch.allclose(losses[LOSSES[kind]], 0.5 * total / 3)
     assert "edge_loss" not in losses
 
@@ -300,7 +300,7 @@ def test_the_surface_loss_is_the_field_colour_error_at_the_prior():
     assert are_taught(model.field.mlp_base.parameters())
 
 
-def test_further_pixels_that_do_not_count_change_no_loss():
+def test_surface_pixels_that_do_not_count_change_no_loss():
     """On a GPU all of them are served, and which are of use; on the CPU these alone."""
     found = []
     for counts in (None, torch.tensor([True, False, True, True, False, True])[:, None]):
@@ -407,7 +407,7 @@ def test_no_download_and_no_lpips_in_the_checkpoint(monkeypatch, tmp_path):
     assert math.isnan(model.lpips(torch.zeros(1, 3, 8, 8), torch.zeros(1, 3, 8, 8)))
 
 
-def judged_view(height=24, width=20):
+def evaluated_view(height=24, width=20):
     generator = torch.Generator().manual_seed(4)
     model = build().eval()
     distance = 2 + 3 * torch.rand(height, width, 1, generator=generator)
@@ -430,9 +430,9 @@ def judged_view(height=24, width=20):
     return model, outputs, truth
 
 
-def test_views_are_judged_inside_the_mask(monkeypatch, tmp_path):
+def test_views_are_evaluated_inside_the_mask(monkeypatch, tmp_path):
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    model, outputs, truth = judged_view()
+    model, outputs, truth = evaluated_view()
     metrics, images = model.get_image_metrics_and_images(outputs, truth)
     assert set(metrics) == {
         *("psnr", "ssim", "masked_psnr", "masked_ssim", "truth_masked_psnr", "truth_masked_ssim"),
@@ -457,7 +457,7 @@ def test_views_are_judged_inside_the_mask(monkeypatch, tmp_path):
 
 
 def test_lpips_is_used_where_its_weights_are(monkeypatch):
-    model, outputs, truth = judged_view()
+    model, outputs, truth = evaluated_view()
     monkeypatch.setattr("edge_depth_nerf.plugin.evaluation.load_lpips", lambda: _MeanDifference())
     metrics, _ = model.get_image_metrics_and_images(outputs, truth)
     difference = (outputs["rgb"] - truth["image"]).abs()

@@ -134,7 +134,7 @@ def test_z_needs_the_cameras_intrinsics(scene, tmp_path):
 @pytest.mark.parametrize("kind", ["relative", "inverse"])
 def test_maps_of_unknown_scale_are_fitted_to_the_frames_own_lidar(scene, tmp_path, kind, along):
     def make(picture, distance, cosine):
-        rng = np.random.default_rng(picture.moment)
+        rng = np.random.default_rng(picture.frame)
         depth = np.maximum(distance * cosine, 1e-3) if along == "z" else np.maximum(distance, 1e-3)
         scale, shift = rng.uniform(0.1, 10), rng.uniform(0.5, 2)
         return scale * depth + shift if kind == "relative" else scale / depth + 0.1 * shift
@@ -142,7 +142,7 @@ def test_maps_of_unknown_scale_are_fitted_to_the_frames_own_lidar(scene, tmp_pat
     # a tenth of the returns is wrong
     for picture in read_scene(scene).pictures:
         lidar = read_distance_png(picture.files["lidar"])
-        rng = np.random.default_rng(100 + picture.moment)
+        rng = np.random.default_rng(100 + picture.frame)
         wrong = (lidar > 0) & (rng.random(lidar.shape) < 0.1)
         lidar[wrong] *= rng.uniform(0.2, 5, wrong.sum())
         write_distance_png(picture.files["lidar"], lidar)
@@ -156,7 +156,7 @@ def test_pngs_of_unknown_scale_need_no_unit(scene, tmp_path):
     assert error(scene).max() < 0.02
 
 
-def test_frames_with_few_returns_take_the_drives_fit_and_it_is_said(scene, tmp_path, monkeypatch, capsys):
+def test_frames_with_few_points_take_the_drives_fit_and_it_is_said(scene, tmp_path, monkeypatch, capsys):
     # 0004 is held out
     odd = {"0002": 0, "0006": 30}
     for stem, count in odd.items():

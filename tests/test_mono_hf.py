@@ -195,7 +195,7 @@ def seen_in_the_ball(picture: ScenePicture, in_camera: np.ndarray) -> np.ndarray
 
 
 @pytest.mark.parametrize("kind", ["relative", "inverse"])
-def test_frames_with_few_returns_take_the_drives_fit(tmp_path, kind):
+def test_frames_with_few_points_take_the_drives_fit(tmp_path, kind):
     """Scales differ from view to view, but not from frame to frame, except in the held-out one."""
     folder = write_scene(tmp_path, [scaled_lens(FISHEYE, (90, 90))], mono=False)
     few = "images/0002.png"

@@ -60,7 +60,7 @@ from edge_depth_nerf.mono.training import (
     torch_threads,
     train,
 )
-from edge_depth_nerf.scene.format import TRUST_FILE
+from edge_depth_nerf.scene.format import CALIBRATION_FILE
 from edge_depth_nerf.scene.put_maps import write_maps
 from edge_depth_nerf.scene.reader import read_scene
 
@@ -119,8 +119,8 @@ def write_street(folder: Path, frames: int = 10, seed: int = 0, lidar: bool = Tr
             **{"mask_path": "mask.png", "truth_distance_file_path": f"truth/{name}", "camera": "front", "frame": index},
         }
         if lidar:
-            returns = distance * (rng.random(distance.shape) < 0.4) * (np.abs(world[..., 2]) < 0.6)
-            write_distance_png(folder / "lidar" / name, returns)
+            lidar_points = distance * (rng.random(distance.shape) < 0.4) * (np.abs(world[..., 2]) < 0.6)
+            write_distance_png(folder / "lidar" / name, lidar_points)
             entry["lidar_file_path"] = entry["depth_file_path"] = f"lidar/{name}"
         entries.append(entry)
     names = [entry["file_path"] for entry in entries]
@@ -255,7 +255,7 @@ def test_the_presets_cut_what_is_said(preset, sides_px):
     assert shapes == {(height, width) for height in sides_px for width in sides_px}
 
 
-def test_of_several_returns_in_a_pixel_the_one_nearest_its_centre_is_learned(small_street):
+def test_of_several_points_in_a_pixel_the_one_nearest_its_centre_is_learned(small_street):
     scene = read_scene(small_street)
     picture = scene.pictures[0]
     view = network_view(scene, picture, 12)
@@ -295,13 +295,13 @@ def test_it_learns_what_colours_mean(street):
     for picture in scene.pictures:
         if picture.held_out:
             truth = read_distance_png(picture.files["truth_distance"])
-            judged = read_mask(picture.files["mask"]) & (read_distance_png(picture.files["lidar"]) > 0)
+            evaluated = read_mask(picture.files["mask"]) & (read_distance_png(picture.files["lidar"]) > 0)
             for name, found in {
                 "network": predict(trained.network, scene, picture, HEIGHT_M, CPU),
                 "room": predict(room, scene, picture, HEIGHT_M, CPU),
                 "constant": np.full(truth.shape, np.exp(np.median(logs)), np.float32),
             }.items():
-                errors[name].append((np.abs(found - truth) / np.maximum(truth, 0.1))[judged])
+                errors[name].append((np.abs(found - truth) / np.maximum(truth, 0.1))[evaluated])
     abs_rel = {name: float(np.concatenate(values).mean()) for name, values in errors.items()}
     assert abs_rel["network"] < 0.2, abs_rel
     assert abs_rel["network"] < 0.5 * min(abs_rel["room"], abs_rel["constant"]), abs_rel
@@ -394,7 +394,7 @@ def test_training_ends_in_time_and_where_nothing_improves(small_street):
     assert stopped.steps <= stopped.best_step + 6 < 200 and stopped.stopped_early
 
 
-def test_what_is_kept_for_stopping_are_whole_training_moments(tmp_path):
+def test_what_is_kept_for_stopping_are_whole_training_frames(tmp_path):
     folder = write_street(tmp_path / "two", frames=20)
     meta = read_json(folder / "transforms.json")
     for frame in meta["frames"]:
@@ -404,8 +404,8 @@ def test_what_is_kept_for_stopping_are_whole_training_moments(tmp_path):
     meta["train_filenames"] = [f["file_path"] for f in meta["frames"] if f["file_path"] not in held_out]
     write_json(folder / "transforms.json", meta)
     used, kept = training_split(read_scene(folder))
-    assert {picture.moment for picture in kept} == {5}
-    assert {picture.moment for picture in used} == set(range(10)) - {4, 5}
+    assert {picture.frame for picture in kept} == {5}
+    assert {picture.frame for picture in used} == set(range(10)) - {4, 5}
     assert len(used) == 16 and len(kept) == 2
 
     for name in ("train", "val", "test"):
@@ -430,7 +430,7 @@ def test_held_out_pictures_have_no_say_and_the_command_continues(small_street, t
     assert reports[0].trained is not None and reports[0].trained.steps == 6 and reports[0].predicted == 10
     assert not list(small_street.glob("*.checkpoint"))
     entry = read_json(small_street / "transforms.json")["mono"]
-    # frame 4 is held out, moment 5 kept for stopping
+    # frame 4 is held out, frame 5 kept for stopping
     assert entry["trained_frames"] == [f"images/{number:04d}.png" for number in (0, 1, 2, 3, 6, 7, 8, 9)]
 
     # what is trained is not trained again, until something is asked for differently
@@ -552,8 +552,8 @@ def test_training_never_writes_over_the_weights_it_starts_from(small_street, tmp
     assert path.read_bytes() == before
 
 
-def test_pictures_kept_for_stopping_without_returns(small_street):
-    # moment 5 is kept
+def test_pictures_kept_for_stopping_without_points(small_street):
+    # frame 5 is kept
     write_distance_png(small_street / "lidar" / "0005.png", np.zeros((LENS.height, LENS.width)))
     said = said_by(EstimateDepthOptions((small_street,), train_steps=2))
     assert "its error is unknown" in said
@@ -577,7 +577,7 @@ def test_scenes_of_one_name_keep_their_own_trained_frames(tmp_path, quiet):
     assert frames(unseen) == []
 
 
-def test_the_field_of_the_training_returns_goes_with_weights_and_maps(tmp_path, quiet):
+def test_the_field_of_the_training_points_goes_with_weights_and_maps(tmp_path, quiet):
     low, high = (write_street(tmp_path / name, seed=seed) for seed, name in enumerate(("low", "high")))
     expected = []
     for folder, sign in ((low, 1), (high, -1)):
@@ -671,7 +671,7 @@ def test_bad_scenes_and_options_are_named(tmp_path, small_street, quiet):
 
 def test_maps_are_put_into_a_scene_and_nothing_else_changes(tmp_path):
     folder = write_scene(tmp_path / "scene", [fisheye()], frames=4, mono=False, theta_max_deg=60.0)
-    (folder / TRUST_FILE).write_text("{}")
+    (folder / CALIBRATION_FILE).write_text("{}")
     before = read_json(folder / "transforms.json")
     scene = read_scene(folder)
     metres = np.full((28, 32), 7.25, np.float32)
@@ -684,7 +684,7 @@ def test_maps_are_put_into_a_scene_and_nothing_else_changes(tmp_path):
     for frame in after["frames"]:
         assert frame.pop("mono_file_path") == f"mono/images/{Path(frame['file_path']).name}"
     assert after == before
-    assert not (folder / TRUST_FILE).exists() and not (folder / ".mono.partial").exists()
+    assert not (folder / CALIBRATION_FILE).exists() and not (folder / ".mono.partial").exists()
     picture = read_scene(folder).pictures[1]
     found = read_distance_png(picture.files["mono"])
     directions, valid = picture.lens.unproject(picture.lens.pixel_centres())

@@ -1,4 +1,4 @@
-"""What motion teaches the depth network, what is left out of it, and the trust beyond LiDAR's field that follows."""
+"""What motion teaches the depth network, what is left out of it, and the calibration beyond its field that follows."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scenes import fisheye, write_scene
 
 from edge_depth_nerf.base.files import read_distance_png, write_distance_png, write_png
 from edge_depth_nerf.cameras.rays import rays
-from edge_depth_nerf.method.error_model import FIELD_MARGIN_DEG, MOTION_KNOTS, fit_error_model, read_trust
+from edge_depth_nerf.method.error_model import FIELD_MARGIN_DEG, MOTION_KNOTS, fit_error_model, read_calibration
 from edge_depth_nerf.method.prior import MotionMap, PriorOptions, RayAngles, make_prior, motion_sigma
 from edge_depth_nerf.mono.calibration import MotionErrors, calibrate_scene, combine, measure_beyond, measure_frame
 from edge_depth_nerf.mono.estimate import without_sky
@@ -27,7 +27,7 @@ from edge_depth_nerf.mono.motion_seen import (
     taught_by_motion,
 )
 from edge_depth_nerf.mono.training import scale_invariant_loss
-from edge_depth_nerf.scene.format import TRUST_FILE
+from edge_depth_nerf.scene.format import CALIBRATION_FILE
 from edge_depth_nerf.scene.put_maps import write_maps
 from edge_depth_nerf.scene.reader import SceneFolder, read_scene
 from edge_depth_nerf.stereo.consistency import MotionDistance
@@ -83,15 +83,15 @@ def test_what_is_left_out_teaches_no_picture(tmp_path: Path):
     assert examples_of(scene).fingerprint() != before.fingerprint()
 
 
-def test_motion_teaches_where_no_return_fell_and_counts_by_its_error(tmp_path: Path):
+def test_motion_teaches_where_no_point_fell_and_counts_by_its_error(tmp_path: Path):
     scene = with_motion(write_scene(tmp_path / "a"), sigma_share=NETWORK_ERROR)
     without, found = examples_of(scene, motion=False), examples_of(scene)
     assert without.weight is None and found.weight is not None
-    returns = without.lidar_m > 0
-    np.testing.assert_array_equal(found.lidar_m[returns], without.lidar_m[returns])
-    assert (found.weight[returns] == 1).all()
-    new = (found.lidar_m > 0) & ~returns
-    assert new.sum() > returns.sum()
+    lidar_points = without.lidar_m > 0
+    np.testing.assert_array_equal(found.lidar_m[lidar_points], without.lidar_m[lidar_points])
+    assert (found.weight[lidar_points] == 1).all()
+    new = (found.lidar_m > 0) & ~lidar_points
+    assert new.sum() > lidar_points.sum()
     # as exact as the network: half; steps of the files matter a little
     np.testing.assert_allclose(found.weight[new], 0.5, atol=0.02)
     exact = examples_of(with_motion(write_scene(tmp_path / "b"), sigma_share=0.01))
@@ -128,7 +128,7 @@ def test_sigma_falls_with_parallax_and_confidence():
     assert motion_sigma(found.distance_m, None)[0, 0] == pytest.approx(0.3)
 
 
-# ---- trust beyond LiDAR's field ----------------------------------------------------------------------------------
+# ---- beyond LiDAR's field ----------------------------------------------------------------------------------------
 
 SIZE = (80, 120)
 FIELD_TOP_DEG = 2.0
@@ -150,8 +150,8 @@ def beyond_frames(mono_error: float, count: int = 12, seed: int = 0):
         smooth = np.kron(rng.normal(0, 1, (8, 12)), np.ones((10, 10)))
         mono = truth * np.exp(np.where(beyond, mono_error * smooth, 0.02 * smooth)).astype(np.float32)
         moved = truth * (1 + rng.normal(0, 0.01, SIZE)).astype(np.float32)
-        returns = (elevation <= FIELD_TOP_DEG) & (rng.random(SIZE) < 0.2)
-        lidar = np.where(returns, truth, 0).astype(np.float32)
+        lidar_points = (elevation <= FIELD_TOP_DEG) & (rng.random(SIZE) < 0.2)
+        lidar = np.where(lidar_points, truth, 0).astype(np.float32)
         blocks = np.kron(rng.random((8, 12)) < 0.25, np.ones((10, 10))) > 0
         around = truth * (1 + rng.normal(0, 0.01, SIZE)).astype(np.float32)
         motion = MotionMap(moved, 0.8, usable, beyond, around)
@@ -166,30 +166,30 @@ def beyond_frames(mono_error: float, count: int = 12, seed: int = 0):
     return frames, maps, view, beyond
 
 
-def covered(trust, maps, view, where) -> tuple[float, float]:
+def covered(calibration, maps, view, where) -> tuple[float, float]:
     """Shares within one and two sigma of pixels beyond the field, of what motion says nothing of or of the rest."""
     scaled = []
     for truth, of_source in maps:
-        prior = make_prior(of_source, np.ones(SIZE, bool), "integrated", PriorOptions(), trust, view)
+        prior = make_prior(of_source, np.ones(SIZE, bool), "integrated", PriorOptions(), calibration, view)
         missing = where & (of_source["motion"] == 0)
-        judged = missing & (prior.distance_m > 0)
+        evaluated = missing & (prior.distance_m > 0)
         # but for what lies farther from all that is known than was measured, or is wrong by more than a tenth
-        assert judged.sum() > 0.65 * missing.sum()
-        scaled.append((np.abs(prior.distance_m - truth) / prior.sigma_m)[judged])
+        assert evaluated.sum() > 0.65 * missing.sum()
+        scaled.append((np.abs(prior.distance_m - truth) / prior.sigma_m)[evaluated])
     every = np.concatenate(scaled)
     return float(np.mean(every < 1)), float(np.mean(every < 2))
 
 
 def test_sigma_of_the_network_beyond_the_field_is_its_own():
     frames, _, _, _ = beyond_frames(0.06)
-    trust = combine(frames, PriorOptions(), "key", False, motion_errors=MotionErrors(0.01, 0.02))
+    calibration = combine(frames, PriorOptions(), "key", False, motion_errors=MotionErrors(0.01, 0.02))
     _, maps, view, beyond = beyond_frames(0.06, seed=1)
-    one, two = covered(trust, maps, view, beyond)
+    one, two = covered(calibration, maps, view, beyond)
     assert one == pytest.approx(0.68, abs=0.12) and two == pytest.approx(0.95, abs=0.05)
     # that of the field, where the network is right to 2 %, is too small, and it shows
-    assert trust.motion is not None and trust.motion.beyond is not None
-    of_field = dataclasses.replace(trust.motion.beyond, network_model=trust.error_model)
-    extrapolated = dataclasses.replace(trust, motion=dataclasses.replace(trust.motion, beyond=of_field))
+    assert calibration.motion is not None and calibration.motion.beyond is not None
+    of_field = dataclasses.replace(calibration.motion.beyond, network_model=calibration.error_model)
+    extrapolated = dataclasses.replace(calibration, motion=dataclasses.replace(calibration.motion, beyond=of_field))
     one, two = covered(extrapolated, maps, view, beyond)
     assert one < 0.5 and two < 0.8
 
@@ -203,8 +203,8 @@ def test_without_a_measurement_beyond_there_is_no_prior():
 
     def has_prior(**changes) -> np.ndarray:
         changed = dataclasses.replace(beyond_field, **{"reach_px": 1e3, **changes})
-        trust = dataclasses.replace(whole, motion=dataclasses.replace(motion, beyond=changed))
-        prior = make_prior(maps[0][1], np.ones(SIZE, bool), "integrated", PriorOptions(), trust, view)
+        calibration = dataclasses.replace(whole, motion=dataclasses.replace(motion, beyond=changed))
+        prior = make_prior(maps[0][1], np.ones(SIZE, bool), "integrated", PriorOptions(), calibration, view)
         np.testing.assert_array_equal(prior.distance_m > 0, prior.sigma_m > 0)
         return prior.distance_m > 0
 
@@ -225,7 +225,7 @@ def test_without_a_measurement_beyond_there_is_no_prior():
 
 def test_beyond_the_field_a_monocular_distance_counts_only_where_neighbours_confirm_it():
     frames, maps, view, beyond = beyond_frames(0.03)
-    trust = combine(frames, PriorOptions(), "key", False, motion_errors=MotionErrors(0.01, 0.02))
+    calibration = combine(frames, PriorOptions(), "key", False, motion_errors=MotionErrors(0.01, 0.02))
     rng = np.random.default_rng(2)
     usable = np.ones(SIZE, bool)
     assert len(maps) >= 4
@@ -234,8 +234,10 @@ def test_beyond_the_field_a_monocular_distance_counts_only_where_neighbours_conf
         shown = np.kron(rng.choice([0.0, 0.5, 1.0], (8, 12)), np.ones((10, 10)))
         around = truth * np.where(shown == 1, rng.random(SIZE) < 0.3, shown).astype(np.float32)
         of_source = {**of_source, "motion_around": around}
-        prior = make_prior(of_source, usable, "integrated", PriorOptions(), trust, view)
-        whole = make_prior({**of_source, "motion_around": truth}, usable, "integrated", PriorOptions(), trust, view)
+        prior = make_prior(of_source, usable, "integrated", PriorOptions(), calibration, view)
+        whole = make_prior(
+            {**of_source, "motion_around": truth}, usable, "integrated", PriorOptions(), calibration, view
+        )
         expected = whole.distance_m > 0
         for row, column in np.argwhere(beyond & (of_source["motion"] == 0)):
             beside = around[max(0, row - 1) : row + 2, max(0, column - 1) : column + 2]
@@ -247,10 +249,10 @@ def test_beyond_the_field_a_monocular_distance_counts_only_where_neighbours_conf
         assert 0.2 < expected[missing].mean() < 0.6
         # what a scene of before cannot confirm is not used
         del of_source["motion_around"]
-        before = make_prior(of_source, usable, "integrated", PriorOptions(), trust, view)
+        before = make_prior(of_source, usable, "integrated", PriorOptions(), calibration, view)
         np.testing.assert_array_equal(before.distance_m > 0, ~beyond | (of_source["motion"] > 0))
         # maps of a network that was trained elsewhere need nobody
-        elsewhere = dataclasses.replace(trust, everywhere=True)
+        elsewhere = dataclasses.replace(calibration, everywhere=True)
         assert make_prior(of_source, usable, "integrated", PriorOptions(), elsewhere, view).distance_m.all()
 
 
@@ -281,10 +283,10 @@ def test_sigma_above_the_field_is_not_that_of_the_road():
 
 def test_sigma_of_motion_beyond_the_field_is_that_measured_in_it():
     frames, maps, view, beyond = beyond_frames(0.15)
-    trust = combine(frames, PriorOptions(), "key", False, motion_errors=MotionErrors(0.01, 0.02))
+    calibration = combine(frames, PriorOptions(), "key", False, motion_errors=MotionErrors(0.01, 0.02))
     scaled = []
     for truth, of_source in maps:
-        prior = make_prior(of_source, np.ones(SIZE, bool), "integrated", PriorOptions(), trust, view)
+        prior = make_prior(of_source, np.ones(SIZE, bool), "integrated", PriorOptions(), calibration, view)
         inner = beyond & (of_source["motion"] > 0)
         scaled.append((np.abs(prior.distance_m - truth) / prior.sigma_m)[inner])
         assert (prior.sigma_m[inner] >= 0.02).all()
@@ -301,12 +303,12 @@ def test_a_scene_keeps_what_was_measured_beyond(tmp_path: Path):
         sine = rays(picture.lens).directions @ picture.up_in_camera
         write_distance_png(picture.files["lidar"], np.where(np.abs(sine) < 0.2, truth, 0))
     found = with_motion(scene)
-    trust = calibrate_scene(found.path)
-    assert trust.motion is not None and trust.motion.beyond is not None
-    assert trust.motion.beyond.motion_model is not None and trust.motion.beyond.network_model is not None
-    assert read_trust(scene / TRUST_FILE) == trust
-    low, high = trust.motion.beyond.reach_rad
-    assert low < trust.field_rad[0] and high > trust.field_rad[1]
+    calibration = calibrate_scene(found.path)
+    assert calibration.motion is not None and calibration.motion.beyond is not None
+    assert calibration.motion.beyond.motion_model is not None and calibration.motion.beyond.network_model is not None
+    assert read_calibration(scene / CALIBRATION_FILE) == calibration
+    low, high = calibration.motion.beyond.reach_rad
+    assert low < calibration.field_rad[0] and high > calibration.field_rad[1]
 
 
 # ---- sky ---------------------------------------------------------------------------------------------------------

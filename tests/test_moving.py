@@ -17,7 +17,7 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json, read_mask, write_mask
 from edge_depth_nerf.lidar import Sweep
 from edge_depth_nerf.lidar.free_space import FreeSpace
-from edge_depth_nerf.lidar.moving import Ground, Lowest, Thing, followed, loose_returns, nearby, one_stretch
+from edge_depth_nerf.lidar.moving import Ground, Lowest, Thing, followed, loose_points, nearby, one_stretch
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.lidar.world import WorldSweep, sweep_in_world
 from edge_depth_nerf.masks.lens import lens_circle
@@ -85,7 +85,7 @@ def found_in(sweeps: list[WorldSweep]) -> dict[int, list[Thing]]:
     loose = {}
     for number, sweep in enumerate(sweeps):
         others = [free[other] for other in nearby(number, centres, [True] * len(sweeps))]
-        loose[number] = loose_returns(sweep, 0.1 * number, ground, others)
+        loose[number] = loose_points(sweep, 0.1 * number, ground, others)
     return followed(loose)
 
 
@@ -160,7 +160,7 @@ def test_poses_that_are_off_make_nothing_move() -> None:
     assert not any(found.values())
 
 
-def test_a_sweep_is_judged_by_those_near_by_and_by_the_whole_drive() -> None:
+def test_a_sweep_is_evaluated_by_those_near_by_and_by_the_whole_drive() -> None:
     centres = np.column_stack((np.arange(200) * 0.5, np.zeros(200), np.zeros(200)))
     may = np.arange(200) % 8 != 4
     chosen = nearby(100, centres, may.tolist())
@@ -173,18 +173,18 @@ def test_a_sweep_is_judged_by_those_near_by_and_by_the_whole_drive() -> None:
 # ---- in a picture ----------------------------------------------------------------------------------------------
 
 
-def test_returns_grow_to_the_outline_that_the_picture_shows() -> None:
+def test_points_grow_to_the_outline_that_the_picture_shows() -> None:
     rng = np.random.default_rng(0)
     true = np.zeros((120, 160), bool)
     true[40:80, 50:110] = True
     picture = np.where(true[..., None], (170, 60, 50), (90, 95, 100)) + rng.normal(0, 4, (120, 160, 3))
     picture = np.clip(picture, 0, 255).astype(np.uint8)
     row, column = np.mgrid[43:77:6, 53:107:4]
-    returns = np.stack((column.ravel(), row.ravel()), -1) + 0.5
+    lidar_points = np.stack((column.ravel(), row.ravel()), -1) + 0.5
     still = np.zeros_like(true)
     still[2::6, 2::4] = True
     still &= ~true
-    found = grow_moving(picture, returns, np.full(len(returns), 6.0), still)
+    found = grow_moving(picture, lidar_points, np.full(len(lidar_points), 6.0), still)
     assert (found & true).sum() / true.sum() > 0.99
     assert (found & ~true).sum() / true.sum() < 0.15
     none = grow_moving(picture, np.zeros((0, 2)), np.zeros(0), still)

@@ -187,7 +187,7 @@ def test_pictures_away_from_the_sweeps_are_listed():
     short = dataclasses.replace(recording, sweeps=recording.sweeps[:8])
     found = lidar_poses(short, OPTIONS, QUIET)
     assert [picture.frame for picture in found.pictures] == list(range(8)) and len(found.skipped) == FRAMES - 8
-    # the last sweep's turn reaches half a moment further
+    # the last sweep's turn reaches half a frame further
     assert found.skipped[-1].frame == FRAMES - 1 and found.skipped[-1].reason == "no sweep near it in time"
 
 
@@ -224,7 +224,7 @@ def test_a_drive_without_poses_becomes_a_scene(blind):
     assert "epipolar curves" in notices or "Too few features match" in notices
     assert not report.skipped
     scene = read_scene(blind.output)
-    assert len(scene.moments()) == 4
+    assert len(scene.frames()) == 4
     assert scene.has("lidar")
 
 
@@ -299,8 +299,8 @@ def test_a_missing_package_is_named_with_the_command(monkeypatch):
         check_sweeps(Recording((), (), (), None, {}))
 
 
-def sweeps_at(times_s: list[float], returns: int = 6000, scanner: str = "roof") -> list[RecordedSweep]:
-    points = torch.rand(returns, 3, dtype=torch.float64) + 5
+def sweeps_at(times_s: list[float], points_of_sweep: int = 6000, scanner: str = "roof") -> list[RecordedSweep]:
+    points = torch.rand(points_of_sweep, 3, dtype=torch.float64) + 5
     read = Sweep(points, points[:, 0], 0, 0)
     return [
         RecordedSweep(Path(f"lidar/{scanner}_{number}.bin"), time, number, scanner, np.eye(4), lambda: read)
@@ -314,7 +314,7 @@ def sweeps_at(times_s: list[float], returns: int = 6000, scanner: str = "roof") 
         ([], False, "the recording has no LiDAR sweeps"),
         ([], True, "depth maps instead of LiDAR sweeps.*--poses colmap"),
         (sweeps_at([0.0, 0.1, 0.2, 0.3]), False, "4 sweeps of roof, expected 5 or more"),
-        (sweeps_at([0.1 * n for n in range(9)], 900), False, "900 returns a sweep.*expected 5000 or more"),
+        (sweeps_at([0.1 * n for n in range(9)], 900), False, "900 points a sweep.*expected 5000 or more"),
         (sweeps_at([0.0, 0.1, 0.2, 2.3, 2.4]), False, "no sweep for 2.1 s after lidar/roof_2.bin"),
     ],
 )
@@ -326,7 +326,7 @@ def test_what_cannot_be_followed_is_said_at_once(sweeps, depth, message):
         check_sweeps(Recording((), (picture,), tuple(sweeps), None, {}))
 
 
-def test_the_scanner_with_most_returns_is_followed():
+def test_the_scanner_with_most_points_is_followed():
     pytest.importorskip("kiss_icp")
     times = [0.1 * number for number in range(6)]
     sweeps = [*sweeps_at(times, 6000, "front"), *sweeps_at(times, 9000, "roof"), *sweeps_at(times[:3], 10_000, "rear")]

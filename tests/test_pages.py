@@ -345,7 +345,7 @@ def test_the_pictures_do_not_depend_on_what_trainings_left(sample_drive, tmp_pat
     stale = {**read_json(shipped), "made_of": "0"}
     del stale["sha256"]
     write_json(shipped, stale)
-    assert module.ShownScene(module.read_scene(scene)).trust is not None
+    assert module.ShownScene(module.read_scene(scene)).calibration is not None
     with pytest.raises(InputError, match="was not made of the maps beside it"):
         module.make_pictures(tmp_path)
 
@@ -354,9 +354,7 @@ def test_the_kernel_picture_is_of_eq_7(sample_drive):
     """The two averages again, Eq. 5 to 7 written out."""
     module = load("make_pictures")
     scene = module.ShownScene(module.read_scene(sample_drive))
-    picture = next(
-        each for each in scene.scene.pictures if each.moment == module.MOMENT and each.camera == module.CAMERA
-    )
+    picture = next(each for each in scene.scene.pictures if each.frame == module.FRAME and each.camera == module.CAMERA)
     maps = scene.maps(picture)
     mono = module.aligned(scene, maps).astype(float)
     i, j = module.find_edge(module.aligned(scene, maps), maps, 4)

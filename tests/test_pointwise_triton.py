@@ -54,11 +54,11 @@ def check_positions(kernels: Any) -> None:
         torch.manual_seed(rays)
         origins, directions = torch.randn(rays, 3, 4)[..., 0], torch.randn(2 * rays, 3)[::2]
         edges = torch.rand(rays, count + 1).cumsum(1)
-        found = kernels.middles(origins.contiguous(), directions, edges[:, :-1], edges[:, 1:])
-        middles = (edges[:, :-1].double() + edges[:, 1:]) / 2
-        assert_near(found, origins[:, None].double() + directions[:, None] * middles[..., None], 3e-7)
-        assert torch.equal(found, kernels.middles(origins, directions, edges[:, :-1], edges[:, 1:]))
-    assert kernels.middles(origins[:0], directions[:0], edges[:0], edges[:0]).shape == (0, count + 1, 3)
+        found = kernels.midpoints(origins.contiguous(), directions, edges[:, :-1], edges[:, 1:])
+        midpoints = (edges[:, :-1].double() + edges[:, 1:]) / 2
+        assert_near(found, origins[:, None].double() + directions[:, None] * midpoints[..., None], 3e-7)
+        assert torch.equal(found, kernels.midpoints(origins, directions, edges[:, :-1], edges[:, 1:]))
+    assert kernels.midpoints(origins[:0], directions[:0], edges[:0], edges[:0]).shape == (0, count + 1, 3)
 
 
 def check_densities(kernels: Any) -> None:

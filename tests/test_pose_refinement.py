@@ -1,4 +1,4 @@
-"""Poses that training mends: shared by a moment, in metres, without drift."""
+"""Poses that training mends: shared by a frame, in metres, without drift."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ METRES_PER_UNIT = 4.0
 CONFIG = PoseRefinerConfig(mode="SO3xR3", sigma_m=0.05, sigma_deg=0.2)
 
 
-def refiner(moments=(7, 7, 9, 9)) -> PoseRefiner:
-    found = PoseRefiner(CONFIG, len(moments), "cpu")
-    found.settle(list(moments), METRES_PER_UNIT)
+def refiner(frames=(7, 7, 9, 9)) -> PoseRefiner:
+    found = PoseRefiner(CONFIG, len(frames), "cpu")
+    found.settle(list(frames), METRES_PER_UNIT)
     return found
 
 
@@ -28,7 +28,7 @@ def bundle(pictures) -> RayBundle:
     )
 
 
-def test_the_pictures_of_a_moment_move_together_by_metres_and_degrees():
+def test_the_pictures_of_a_frame_move_together_by_metres_and_degrees():
     found = refiner()
     assert found.pose_adjustment.shape == (2, 6)
     with torch.no_grad():

@@ -8,7 +8,7 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras import KannalaBrandt
 from edge_depth_nerf.method import prior as prior_module
 from edge_depth_nerf.method.alignment import Fit
-from edge_depth_nerf.method.error_model import KNOTS, ErrorModel, MotionTrust, Trust
+from edge_depth_nerf.method.error_model import KNOTS, Calibration, ErrorModel, MotionCalibration
 from edge_depth_nerf.method.integration import IntegrationOptions, integrate_depth
 from edge_depth_nerf.method.prior import PriorCache, PriorOptions, RayAngles, make_prior, ray_angles, sky_of
 
@@ -94,14 +94,14 @@ def test_a_folder_that_cannot_be_made_is_no_error(tmp_path):
     assert (prior.distance_m > 0).any()
 
 
-def a_trust(**changes):
+def a_calibration(**changes):
     """Sigma is 1 % of the distance at a return, 10 % elsewhere."""
     flat = {name: [0.0] * len(knots) for name, knots in KNOTS.items()}
     models = {
         name: ErrorModel(float(np.log(part)), flat) for name, part in (("error_model", 0.1), ("return_model", 0.01))
     }
     fields = {"made_of": "", "field_rad": (-1.0, 1.0), "everywhere": False, "drive_fit": None, **models, **changes}
-    return Trust(**fields)
+    return Calibration(**fields)
 
 
 def level_view(shape):
@@ -111,25 +111,25 @@ def level_view(shape):
 def test_a_calibrated_prior_is_aligned_and_trusted_by_the_models():
     lidar, mono, mask = maps(60, 50)
     lidar = np.where(lidar > 0, mono * 1.5, 0).astype(np.float32)
-    prior = make_prior(both(lidar, mono), mask, "integrated", PriorOptions(), a_trust(), level_view(mask.shape))
-    returns = mask & (lidar > 0)
-    np.testing.assert_array_equal(prior.distance_m[returns], lidar[returns])
-    elsewhere = mask & ~returns
+    prior = make_prior(both(lidar, mono), mask, "integrated", PriorOptions(), a_calibration(), level_view(mask.shape))
+    lidar_points = mask & (lidar > 0)
+    np.testing.assert_array_equal(prior.distance_m[lidar_points], lidar[lidar_points])
+    elsewhere = mask & ~lidar_points
     # mono was half too near; window averages of values that lie within 1 m
     assert np.abs(prior.distance_m[elsewhere] - 1.5 * mono[elsewhere]).max() < 1.5
     assert np.mean(prior.distance_m[elsewhere]) == pytest.approx(1.5 * np.mean(mono[elsewhere]), rel=0.02)
-    np.testing.assert_allclose(prior.sigma_m[returns], 0.01 * lidar[returns], rtol=1e-5)
+    np.testing.assert_allclose(prior.sigma_m[lidar_points], 0.01 * lidar[lidar_points], rtol=1e-5)
     np.testing.assert_allclose(prior.sigma_m[elsewhere], 0.1 * prior.distance_m[elsewhere], rtol=1e-5)
 
 
 @pytest.mark.parametrize("sigma_mode", ["calibrated", "combined"])
-def test_a_frame_with_few_returns_takes_the_drives_fit(sigma_mode):
+def test_a_frame_with_few_points_takes_the_drives_fit(sigma_mode):
     _, mono, mask = maps(60, 50)
     lidar = np.zeros_like(mono)
     lidar[3, 3:20] = 1
-    trust = a_trust(drive_fit=Fit(float(np.log(3)), 1.0))
+    calibration = a_calibration(drive_fit=Fit(float(np.log(3)), 1.0))
     options = PriorOptions(sigma_mode=sigma_mode)
-    prior = make_prior(both(lidar, mono), mask, "integrated", options, trust, level_view(mask.shape))
+    prior = make_prior(both(lidar, mono), mask, "integrated", options, calibration, level_view(mask.shape))
     assert np.mean(prior.distance_m[20:][mask[20:]]) == pytest.approx(3 * np.mean(mono[20:][mask[20:]]), rel=0.01)
 
 
@@ -138,7 +138,7 @@ def test_without_alignment_and_calibration_it_is_the_literal_form():
     ramp = np.arange(mask.size, dtype=np.float32).reshape(mask.shape) / 4
     mono, lidar = mono + ramp, np.where(lidar > 0, lidar + ramp, 0).astype(np.float32)
     options = PriorOptions("none", "constant", sigma_constant_m=0.3, integration=IntegrationOptions())
-    assert not options.wants_trust("integrated")
+    assert not options.wants_calibration("integrated")
     literal = make_prior(both(lidar, mono), mask, "integrated", options)
     expected = integrate_depth(torch.from_numpy(lidar), torch.from_numpy(mono), torch.from_numpy(mask))
     np.testing.assert_array_equal(literal.distance_m, expected.distance_m.numpy())
@@ -147,8 +147,8 @@ def test_without_alignment_and_calibration_it_is_the_literal_form():
 
 def test_mono_alone_never_sees_lidar():
     lidar, mono, mask = maps(60, 50)
-    trust, view = a_trust(return_model=None), level_view(mask.shape)
-    prior = make_prior(both(lidar * 2, mono), mask, "mono", PriorOptions(), trust, view)
+    calibration, view = a_calibration(return_model=None), level_view(mask.shape)
+    prior = make_prior(both(lidar * 2, mono), mask, "mono", PriorOptions(), calibration, view)
     np.testing.assert_array_equal(prior.distance_m, mono * mask)
     np.testing.assert_allclose(prior.sigma_m[mask], 0.1 * mono[mask], rtol=1e-5)
 
@@ -156,15 +156,15 @@ def test_mono_alone_never_sees_lidar():
 def test_another_calibration_makes_another_file(tmp_path):
     lidar, mono, mask = maps()
     view = level_view(mask.shape)
-    first = PriorCache(tmp_path, "integrated", PriorOptions(), a_trust()).prior(both(lidar, mono), mask, view)
-    second = PriorCache(tmp_path, "integrated", PriorOptions(), a_trust(error_model=None)).prior(
+    first = PriorCache(tmp_path, "integrated", PriorOptions(), a_calibration()).prior(both(lidar, mono), mask, view)
+    second = PriorCache(tmp_path, "integrated", PriorOptions(), a_calibration(error_model=None)).prior(
         both(lidar, mono), mask, view
     )
     assert len(list(tmp_path.iterdir())) == 2
     assert not np.array_equal(first.sigma_m, second.sigma_m)
     turned = RayAngles(view.theta_rad, view.elevation_rad + 2)
     assert (
-        not PriorCache(tmp_path, "integrated", PriorOptions(), a_trust())
+        not PriorCache(tmp_path, "integrated", PriorOptions(), a_calibration())
         .prior(both(lidar, mono), mask, turned)
         .distance_m.any()
     )
@@ -225,10 +225,10 @@ def test_dark_holes_of_a_map_are_no_sky():
 # ---- distances from motion -------------------------------------------------------------------------------------
 
 
-def motion_trust(weight: float = 0.9) -> MotionTrust:
+def motion_calibration(weight: float = 0.9) -> MotionCalibration:
     """Sigma is 3 % of the distance."""
     flat = {name: [0.0] * len(knots) for name, knots in KNOTS.items()}
-    return MotionTrust(weight, 0.01, 0.03, ErrorModel(float(np.log(0.03)), flat))
+    return MotionCalibration(weight, 0.01, 0.03, ErrorModel(float(np.log(0.03)), flat))
 
 
 def field_view(shape):
@@ -242,8 +242,8 @@ def test_above_lidars_field_there_is_a_prior_where_motion_gives_one():
     view, in_field = field_view(mask.shape)
     lidar = np.where(in_field, lidar, 0).astype(np.float32)
     motion = np.where(np.random.default_rng(6).random(mask.shape) < 0.5, np.float32(7), 0).astype(np.float32)
-    trust = a_trust(field_rad=(-1.0, 0.0), motion=motion_trust())
-    prior = make_prior({**both(lidar, mono), "motion": motion}, mask, "integrated", PriorOptions(), trust, view)
+    calibration = a_calibration(field_rad=(-1.0, 0.0), motion=motion_calibration())
+    prior = make_prior({**both(lidar, mono), "motion": motion}, mask, "integrated", PriorOptions(), calibration, view)
     np.testing.assert_array_equal((prior.distance_m > 0)[~in_field], (mask & (motion > 0))[~in_field])
     np.testing.assert_array_equal((prior.distance_m > 0)[in_field], mask[in_field])
     above = ~in_field & (prior.distance_m > 0)
@@ -251,10 +251,10 @@ def test_above_lidars_field_there_is_a_prior_where_motion_gives_one():
     far_up = above & (view.elevation_rad > 0.3)
     np.testing.assert_allclose(prior.distance_m[far_up], 7, rtol=1e-5)
     np.testing.assert_allclose(prior.sigma_m[above], 0.03 * prior.distance_m[above], rtol=1e-5)
-    returns = mask & (lidar > 0)
-    np.testing.assert_array_equal(prior.distance_m[returns], lidar[returns])
-    np.testing.assert_allclose(prior.sigma_m[returns], 0.01 * lidar[returns], rtol=1e-5)
-    mono_alone = mask & in_field & ~returns & (motion == 0)
+    lidar_points = mask & (lidar > 0)
+    np.testing.assert_array_equal(prior.distance_m[lidar_points], lidar[lidar_points])
+    np.testing.assert_allclose(prior.sigma_m[lidar_points], 0.01 * lidar[lidar_points], rtol=1e-5)
+    mono_alone = mask & in_field & ~lidar_points & (motion == 0)
     np.testing.assert_allclose(prior.sigma_m[mono_alone], 0.1 * prior.distance_m[mono_alone], rtol=1e-5)
 
 
@@ -263,29 +263,29 @@ def test_motion_moves_the_prior_by_its_weight():
     mask[:], mono[:] = True, 10
     nothing, motion = np.zeros_like(mono), np.full_like(mono, 10.5)
     for weight in (0.0, 0.4, 1.0):
-        trust = a_trust(motion=motion_trust(weight))
+        calibration = a_calibration(motion=motion_calibration(weight))
         found = make_prior(
-            *({"lidar": nothing, "mono": mono, "motion": motion}, mask, "integrated", PriorOptions(), trust),
+            *({"lidar": nothing, "mono": mono, "motion": motion}, mask, "integrated", PriorOptions(), calibration),
             level_view(mask.shape),
         )
         np.testing.assert_allclose(found.distance_m, 10 + 0.5 * weight, rtol=1e-5)
 
 
 @pytest.mark.parametrize(
-    ("options", "trust"),
+    ("options", "calibration"),
     [
-        (PriorOptions(motion=False), a_trust(motion=motion_trust())),
-        (PriorOptions(), a_trust()),  # its error could not be measured
-        (PriorOptions(), a_trust(error_model=None)),
+        (PriorOptions(motion=False), a_calibration(motion=motion_calibration())),
+        (PriorOptions(), a_calibration()),  # its error could not be measured
+        (PriorOptions(), a_calibration(error_model=None)),
         (PriorOptions(sigma_mode="combined", motion=False), None),
     ],
 )
-def test_without_its_part_the_prior_is_that_of_two_sources_bit_for_bit(options, trust):
+def test_without_its_part_the_prior_is_that_of_two_sources_bit_for_bit(options, calibration):
     lidar, mono, mask = maps(60, 50)
-    view = field_view(mask.shape)[0] if trust else None
+    view = field_view(mask.shape)[0] if calibration else None
     motion = np.full_like(mono, 7)
     two, three = (
-        make_prior(found, mask, "integrated", options, trust, view)
+        make_prior(found, mask, "integrated", options, calibration, view)
         for found in (both(lidar, mono), {**both(lidar, mono), "motion": motion})
     )
     assert (two.distance_m > 0).any()

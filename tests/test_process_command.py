@@ -11,13 +11,13 @@ from drives import SEQUENCE, RoomDrive, write_mono, write_room_drive
 from rich.console import Console
 
 from edge_depth_nerf.base.files import read_distance_png, read_json, write_distance_png, write_json
-from edge_depth_nerf.method.error_model import read_trust
+from edge_depth_nerf.method.error_model import read_calibration
 from edge_depth_nerf.mono import estimate
 from edge_depth_nerf.mono.estimate import WEIGHTS, PresetValues
 from edge_depth_nerf.mono.training import TrainingOptions
 from edge_depth_nerf.process.command import process
 from edge_depth_nerf.process.options import Kitti360Options
-from edge_depth_nerf.scene.format import TRUST_FILE
+from edge_depth_nerf.scene.format import CALIBRATION_FILE
 from edge_depth_nerf.scene.put_maps import write_maps
 from edge_depth_nerf.scene.reader import read_scene
 
@@ -60,11 +60,11 @@ def test_one_command_gives_lidar_mono_and_its_calibration(room: RoomDrive, tmp_p
     for frame in meta["frames"]:
         mono = read_distance_png(scene / frame["mono_file_path"])
         assert mono.shape == (64, 64) and (mono > 0).mean() > 0.2
-    # moment 4 is held out: no network saw it
+    # frame 4 is held out: no network saw it
     trained = meta["mono"]["trained_frames"]
     assert trained and not any("0000000004" in name for name in trained)
-    trust = read_trust(scene / TRUST_FILE)
-    assert trust.error_model is not None and len(trust.frames) == 10
+    calibration = read_calibration(scene / CALIBRATION_FILE)
+    assert calibration.error_model is not None and len(calibration.frames) == 10
     assert (scene / WEIGHTS).is_file()
     assert "12 pictures got a monocular map" in said
 
@@ -74,7 +74,7 @@ def test_one_command_gives_lidar_mono_and_its_calibration(room: RoomDrive, tmp_p
     assert "all of them were there" in again and "Train" not in again and "monocular map" not in again
     assert (scene / "transforms.json").read_bytes() == transforms
     changed = {name for name, date in dates(scene).items() if before[name] != date}
-    assert not {name for name in changed if name.startswith(("mono/", "lidar/")) or name in (WEIGHTS, TRUST_FILE)}
+    assert not {name for name in changed if name.startswith(("mono/", "lidar/")) or name in (WEIGHTS, CALIBRATION_FILE)}
 
 
 @pytest.mark.parametrize("stage", ["estimate_depth", "calibrate_scene"])
@@ -89,9 +89,9 @@ def test_a_run_stopped_between_its_stages_is_finished(
         patch.setattr(estimate, stage, stop)
         with pytest.raises(KeyboardInterrupt):
             run(options_of(room, scene))
-    assert not (scene / TRUST_FILE).exists()
+    assert not (scene / CALIBRATION_FILE).exists()
     said = run(options_of(room, scene))
-    assert (scene / TRUST_FILE).is_file() and read_scene(scene).has("mono")
+    assert (scene / CALIBRATION_FILE).is_file() and read_scene(scene).has("mono")
     assert ("Trained" in said) == (stage == "estimate_depth")
 
 
@@ -109,7 +109,7 @@ def test_maps_that_came_later_stay(room: RoomDrive, tmp_path: Path) -> None:
     assert meta["mono"] == {"trained_on": "elsewhere"}
     assert set(np.unique(read_distance_png(scene / meta["frames"][0]["mono_file_path"]))) == {0.0, 3.0}
     # these are calibrated, too
-    assert read_trust(scene / TRUST_FILE).everywhere
+    assert read_calibration(scene / CALIBRATION_FILE).everywhere
 
 
 def test_maps_of_pictures_that_have_changed_are_made_anew(room: RoomDrive, tmp_path: Path) -> None:
@@ -123,7 +123,7 @@ def test_maps_of_pictures_that_have_changed_are_made_anew(room: RoomDrive, tmp_p
 
 def test_maps_that_are_given_are_calibrated(room: RoomDrive, tmp_path: Path) -> None:
     said = run(options_of(room, tmp_path / "scene", mono=write_mono(tmp_path / "mono", room, 4.0)))
-    assert read_trust(tmp_path / "scene" / TRUST_FILE).error_model is not None
+    assert read_calibration(tmp_path / "scene" / CALIBRATION_FILE).error_model is not None
     assert not (tmp_path / "scene" / WEIGHTS).exists() and "Error of the monocular maps" in said
 
 
@@ -188,7 +188,7 @@ def test_a_map_that_is_lost_is_made_again(room: RoomDrive, tmp_path: Path) -> No
     next((scene / "mono").rglob("*.png")).unlink()
     said = run(options_of(room, scene))
     assert "of this scene are removed" in said and "is trained already" in said
-    assert read_scene(scene).has("mono") and (scene / TRUST_FILE).is_file()
+    assert read_scene(scene).has("mono") and (scene / CALIBRATION_FILE).is_file()
 
 
 def test_options_that_come_too_late_are_told(room: RoomDrive, tmp_path: Path) -> None:

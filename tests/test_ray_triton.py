@@ -89,29 +89,29 @@ def check_places() -> None:
             weights[-1] = torch.arange(samples) == samples // 3
             wanted = torch.rand(rays, places).sort(dim=1)[0]
             wanted[0, 0], wanted[-1, -1] = 0, 1
-            placed = ray_triton.place_samples(weights, edges, wanted, padding, 1e-5)
-            expected = ray_numba.place_samples(weights, edges, wanted, padding, 1e-5)
+            placed = ray_triton.sample_pdf(weights, edges, wanted, padding, 1e-5)
+            expected = ray_numba.sample_pdf(weights, edges, wanted, padding, 1e-5)
             assert_near(placed, expected, 1e-6)
             # in the same order, but for rounding
             assert not bool((placed.diff() < -1e-6).any())
-    assert ray_triton.place_samples(weights[:0], edges[:0], wanted[:0], 0.01, 1e-5).shape == (0, places)
+    assert ray_triton.sample_pdf(weights[:0], edges[:0], wanted[:0], 0.01, 1e-5).shape == (0, places)
     weights[1, 3], wanted[:, -1] = float("nan"), 0.5
-    placed = ray_triton.place_samples(weights, edges, wanted, 0.01, 1e-5)
+    placed = ray_triton.sample_pdf(weights, edges, wanted, 0.01, 1e-5)
     assert placed[1].isnan().all() and placed[0].isfinite().all()
 
 
-def exact_bound_loss(*given: torch.Tensor) -> torch.Tensor:
+def exact_interlevel_loss(*given: torch.Tensor) -> torch.Tensor:
     """The formula in float64."""
-    return formulas.bound_loss(*(each.double() for each in given))
+    return formulas.interlevel_loss(*(each.double() for each in given))
 
 
-def check_the_proposal_loss() -> None:
+def check_the_interlevel_loss() -> None:
     from edge_depth_nerf.kernels import ray_triton
 
     for (rays, samples), intervals in zip(SIZES, (1, 7, 64, 96, 257, 31), strict=True):
         edges, weights, outer_edges, outer_weights = histograms(rays, samples, intervals)
         outer_weights.requires_grad_()
-        forms = exact_bound_loss, ray_triton.bound_loss, ray_numba.bound_loss
+        forms = exact_interlevel_loss, ray_triton.interlevel_loss, ray_numba.interlevel_loss
         losses = [form(edges, weights, outer_edges, outer_weights) for form in forms]
         gradients = [torch.autograd.grad(3 * loss, outer_weights)[0] for loss in losses]
         # the CPU's takes differences of cumulative sums, which have lost digits
@@ -120,15 +120,15 @@ def check_the_proposal_loss() -> None:
             assert (gradient - gradients[0]).abs().max() <= tolerance * gradients[0].abs().max()
         assert gradients[0].any() or samples == 1
         wide = torch.cat([edges, edges], 1).t().contiguous().t()[:, : samples + 1]  # other strides, the same numbers
-        assert torch.equal(ray_triton.bound_loss(wide, weights, outer_edges, outer_weights), losses[1])
+        assert torch.equal(ray_triton.interlevel_loss(wide, weights, outer_edges, outer_weights), losses[1])
         column_major = outer_weights.detach().t().contiguous().t().requires_grad_()
-        loss = ray_triton.bound_loss(edges, weights, outer_edges, column_major)
+        loss = ray_triton.interlevel_loss(edges, weights, outer_edges, column_major)
         assert torch.equal(torch.autograd.grad(3 * loss, column_major)[0], gradients[1])
     weights[1] = float("nan")  # of such a ray neither form adds anything
-    losses = [module.bound_loss(edges, weights, outer_edges, outer_weights) for module in (ray_numba, ray_triton)]
+    losses = [module.interlevel_loss(edges, weights, outer_edges, outer_weights) for module in (ray_numba, ray_triton)]
     assert float(losses[0].detach()) > 0
     assert float(losses[1].detach()) == pytest.approx(float(losses[0].detach()), rel=1e-5)
-    nothing = ray_triton.bound_loss(edges[:0], weights[:0], outer_edges[:0], outer_weights[:0])
+    nothing = ray_triton.interlevel_loss(edges[:0], weights[:0], outer_edges[:0], outer_weights[:0])
     assert float(nothing.detach()) == 0 and torch.autograd.grad(nothing, outer_weights)[0].shape == outer_weights.shape
 
 
@@ -139,8 +139,8 @@ def check_the_distortion_loss(kernels: Any = None) -> None:
         weights.requires_grad_()
         found = kernels.distortion_loss(edges, weights)
         (gradient,) = torch.autograd.grad(3 * found, weights)
-        exact, middles = weights.detach().double().requires_grad_(), (edges[:, 1:] + edges[:, :-1]).double() / 2
-        pairs = exact[:, :, None] * exact[:, None] * (middles[:, :, None] - middles[:, None]).abs()
+        exact, midpoints = weights.detach().double().requires_grad_(), (edges[:, 1:] + edges[:, :-1]).double() / 2
+        pairs = exact[:, :, None] * exact[:, None] * (midpoints[:, :, None] - midpoints[:, None]).abs()
         expected = (pairs.sum((1, 2)) + (exact.square() * edges.diff().double()).sum(1) / 3).mean()
         assert float(found.detach()) == pytest.approx(float(expected.detach()), rel=1e-6, abs=1e-9)
         to_weights = torch.autograd.grad(3 * expected, exact)[0]
@@ -156,7 +156,7 @@ def check_the_distortion_loss(kernels: Any = None) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("check", [check_places, check_the_proposal_loss, check_the_distortion_loss])
+@pytest.mark.parametrize("check", [check_places, check_the_interlevel_loss, check_the_distortion_loss])
 def test_in_the_interpreter(check):
     pytest.importorskip("triton")
     in_interpreter(check)
@@ -183,14 +183,14 @@ def step(samples: int = 48, intervals: int = 256) -> None:
     edges, weights, outer_edges, outer_weights = (
         torch.rand(16, each) for each in (samples + 1, samples, intervals + 1, intervals)
     )
-    ray_triton.place_samples(outer_weights, outer_edges, edges, 0.01, 1e-5)
-    ray_triton.bound_loss(edges, weights, outer_edges, outer_weights.requires_grad_())
+    ray_triton.sample_pdf(outer_weights, outer_edges, edges, 0.01, 1e-5)
+    ray_triton.interlevel_loss(edges, weights, outer_edges, outer_weights.requires_grad_())
     ray_triton.distortion_loss(edges, weights.requires_grad_())
 
 
 @NEEDS_A_GPU
 def test_the_same_on_a_gpu():
-    on_a_gpu(check_places, check_the_proposal_loss, check_the_distortion_loss)
+    on_a_gpu(check_places, check_the_interlevel_loss, check_the_distortion_loss)
 
 
 @pytest.mark.slow

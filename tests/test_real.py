@@ -41,9 +41,9 @@ def test_the_real_fisheye_frame(real_data, tmp_path):
     scene = fisheye_frame_scene(real_data, tmp_path, downscale=10)
     frames = read_json(scene / "transforms.json")["frames"]
     mask = read_mask(scene / frames[0]["mask_path"])
-    trained, judged = (read_distance_png(scene / frame["lidar_file_path"]) for frame in frames)
-    assert not (trained > 0)[~mask].any() and not (judged > 0)[~mask].any()
-    share = (judged > 0).sum() / ((judged > 0).sum() + (trained > 0).sum())
+    trained, evaluated = (read_distance_png(scene / frame["lidar_file_path"]) for frame in frames)
+    assert not (trained > 0)[~mask].any() and not (evaluated > 0)[~mask].any()
+    share = (evaluated > 0).sum() / ((evaluated > 0).sum() + (trained > 0).sum())
     assert 0.03 < share < 0.25  # a tenth of the blocks; blocks differ in returns
     hidden = np.load(real_data / "kitti360_fisheye_frame" / "mask_left_fisheye.npy")
     assert mask.mean() < 1 - hidden.mean()  # the real mask keeps more than the lens circle

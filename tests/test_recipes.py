@@ -50,11 +50,11 @@ def test_lidar_lies_on_the_walls(rig: Path, tmp_path: Path) -> None:
     cameras = {frame["camera"] for frame in read_json(report.scene / "transforms.json")["frames"]}
     assert len(cameras) == 2
     for camera, truth in zip(sorted(cameras), ("front", "side"), strict=True):
-        for moment in range(data_sets.MOMENTS):
-            lidar = read_distance_png(report.scene / f"lidar/{camera}/{moment:010d}.png")
+        for number in range(data_sets.FRAMES):
+            lidar = read_distance_png(report.scene / f"lidar/{camera}/{number:010d}.png")
             there = lidar > 0
             assert there.mean() > 0.1
-            errors = (lidar / data_sets.true_distance(truth, moment) - 1)[there]
+            errors = (lidar / data_sets.true_distance(truth, number) - 1)[there]
             # a return lies anywhere in its pixel, 1.1° wide, and the floor is flat: on the whole that cancels
             assert abs(np.median(errors)) < 0.002 and np.mean(np.abs(errors) < 0.04) > 0.9
 

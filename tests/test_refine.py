@@ -28,13 +28,13 @@ from edge_depth_nerf.poses.tracks import (
 )
 from edge_depth_nerf.process.colmap import refine as refining
 from edge_depth_nerf.process.colmap.bundle import Shot, Softness, _Bundle, adjust_bundle
-from edge_depth_nerf.process.colmap.refine import Refinement, _judges, refine
+from edge_depth_nerf.process.colmap.refine import Refinement, _is_check, refine
 from edge_depth_nerf.process.options import ProcessOptions
 from edge_depth_nerf.process.recording import RecordedCamera, RecordedPicture, Recording
 
 PINHOLE = Pinhole(640, 480, 400.0, 405.0, 318.0, 243.0, -0.05, 0.01, 1e-3, -5e-4)
 FISHEYE = KannalaBrandt(700, 700, 210.0, 210.0, 350.0, 350.0, -0.01, 0.01, -0.002, -0.0002)
-MOMENTS = 12
+FRAMES = 12
 
 
 def pose(turn_deg: Sequence[float], position_m: Sequence[float]) -> np.ndarray:
@@ -56,11 +56,11 @@ class World:
     @property
     def shots(self) -> list[tuple[int, int]]:
         """Camera and moment of each picture."""
-        return [(camera, moment) for moment in range(len(self.path)) for camera in range(len(self.lenses))]
+        return [(camera, frame) for frame in range(len(self.path)) for camera in range(len(self.lenses))]
 
     def poses(self, path: np.ndarray | None = None) -> np.ndarray:
         path = self.path if path is None else path
-        return np.stack([path[moment] @ self.to_vehicle[camera] for camera, moment in self.shots])
+        return np.stack([path[frame] @ self.to_vehicle[camera] for camera, frame in self.shots])
 
     def pixels(self, shot: int) -> np.ndarray:
         """Of all points; NaN where one is not seen."""
@@ -76,11 +76,11 @@ class World:
         seen = [self.pixels(shot) for shot in range(len(self.shots))]
         seen = [pixels + rng.normal(0, noise_px, pixels.shape) for pixels in seen]
         found = []
-        for first, (camera, moment) in enumerate(self.shots):
+        for first, (camera, frame) in enumerate(self.shots):
             for apart in (1, 2, 3, 5):
-                if (camera, moment + apart) not in self.shots:
+                if (camera, frame + apart) not in self.shots:
                     continue
-                second = self.shots.index((camera, moment + apart))
+                second = self.shots.index((camera, frame + apart))
                 both = np.flatnonzero(np.isfinite(seen[first] + seen[second]).all(-1))
                 other = both.copy()
                 swapped = rng.random(len(both)) < wrong
@@ -94,7 +94,7 @@ class World:
 
 
 def world(rng: np.random.Generator, points: int = 500) -> World:
-    path = np.stack([pose((0, 2.0 * n, 0), (0.03 * n**2 + 4000, 20, 0.9 * n - 7000)) for n in range(MOMENTS)])
+    path = np.stack([pose((0, 2.0 * n, 0), (0.03 * n**2 + 4000, 20, 0.9 * n - 7000)) for n in range(FRAMES)])
     left = np.eye(4)
     left[:3, :3] = Rotation.from_euler("y", -80, degrees=True).as_matrix()
     left[:3, 3] = (-0.6, -0.2, 0.4)
@@ -204,7 +204,7 @@ def colmap() -> Any:
 
 
 def shots_of(given: World) -> list[Shot]:
-    return [Shot(given.lenses[camera], moment, given.to_vehicle[camera]) for camera, moment in given.shots]
+    return [Shot(given.lenses[camera], frame, given.to_vehicle[camera]) for camera, frame in given.shots]
 
 
 @pytest.mark.slow
@@ -220,21 +220,21 @@ def test_disturbed_poses_come_back(colmap: Any) -> None:
     assert after_m < 0.1 * before_m
     assert after_deg < 0.1 * before_deg
     assert found.supported.all()
-    assert found.judges > 500
+    assert found.checks > 500
     assert found.after_px < 0.35 < 1 < found.before_px
     # the path as a whole stays where it was given
     assert np.linalg.norm((found.vehicle_to_world - path)[:, :3, 3].mean(0)) < 0.02
 
 
 @pytest.mark.slow
-def test_what_judges_takes_no_part(colmap: Any) -> None:
-    """Features that judge are not moved by: with them far off, the refined path is the same."""
+def test_what_evaluates_takes_no_part(colmap: Any) -> None:
+    """Features that check are not moved by: with them far off, the refined path is the same."""
     rng = np.random.default_rng(5)
     given = world(rng, points=250)
     matches = given.matches(0.2, rng)
     path = disturbed(given.path, rng)
-    judging = [_judges(groups) for groups in features_joined(matches)]
-    assert 0.1 < np.concatenate(judging).mean() < 0.3
+    is_check = [_is_check(groups) for groups in features_joined(matches)]
+    assert 0.1 < np.concatenate(is_check).mean() < 0.3
 
     def displaced(found: Matches, chosen: np.ndarray) -> Matches:
         pixels = found.in_second.pixels + 5.0 * chosen[:, None]
@@ -242,7 +242,7 @@ def test_what_judges_takes_no_part(colmap: Any) -> None:
         return dataclasses.replace(found, in_second=sights_of(given.lenses[camera], pixels)[0])
 
     usual = refine(colmap, shots_of(given), matches, path)
-    off = [displaced(found, chosen) for found, chosen in zip(matches, judging, strict=True)]
+    off = [displaced(found, chosen) for found, chosen in zip(matches, is_check, strict=True)]
     other = refine(colmap, shots_of(given), off, path)
     np.testing.assert_array_equal(other.vehicle_to_world, usual.vehicle_to_world)
     assert other.after_px > usual.after_px + 1
@@ -309,8 +309,8 @@ def recorded(given: World, path: np.ndarray, poses_s: float = 0.1, shutter_s: fl
         for name, lens, at in zip(("front", "left"), given.lenses, given.to_vehicle, strict=True)
     )
     pictures = tuple(
-        RecordedPicture(cameras[camera].name, 100 + moment, Path("none.png"), times_s[moment] + camera * shutter_s)
-        for camera, moment in given.shots
+        RecordedPicture(cameras[camera].name, 100 + frame, Path("none.png"), times_s[frame] + camera * shutter_s)
+        for camera, frame in given.shots
     )
     return Recording(cameras, pictures, (), trajectory, {})
 
@@ -345,8 +345,8 @@ def test_a_recording_moves_as_a_whole(colmap: Any, refined: Refined) -> None:
     assert moved.trajectory is not None
     poses = np.stack([moved.pose(picture) for picture in moved.pictures])
     # path and pictures are one rig
-    for (camera, moment), at in zip(given.shots, poses, strict=True):
-        on_rig = moved.trajectory.vehicle_to_world[moment] @ given.to_vehicle[camera]
+    for (camera, frame), at in zip(given.shots, poses, strict=True):
+        on_rig = moved.trajectory.vehicle_to_world[frame] @ given.to_vehicle[camera]
         np.testing.assert_allclose(on_rig, at, atol=1e-6)
     before, after = (step_errors(one, given.path) for one in (path, moved.trajectory.vehicle_to_world))
     assert after[0] < 0.1 * before[0] and after[1] < 0.1 * before[1]
@@ -397,22 +397,22 @@ def test_few_features_change_nothing(colmap: Any, refined: Refined) -> None:
 
 
 @pytest.mark.slow
-def test_a_moment_without_features_moves_with_its_neighbours(colmap: Any, refined: Refined) -> None:
+def test_a_frame_without_features_moves_with_its_neighbours(colmap: Any, refined: Refined) -> None:
     rng = np.random.default_rng(11)
     given = world(rng)
     wanted = pose((0, 0.1, 0), (0.05, 0, 0.02))
     path = given.path @ np.linalg.inv(wanted)
     matches = given.matches(0.2, rng)
     dark = 5
-    found = Refinement(given.path.copy(), np.arange(MOMENTS) != dark, 100, 1.0, 0.1, 1000)
+    found = Refinement(given.path.copy(), np.arange(FRAMES) != dark, 100, 1.0, 0.1, 1000)
     found.vehicle_to_world[dark] = path[dark]
     refined.monkeypatch.setattr(refining, "refine", lambda *_, **__: found)
     moved = refined(recorded(given, path, shutter_s=0.0), matches)
     assert moved.trajectory is not None
     np.testing.assert_allclose(moved.trajectory.at(np.array([0.1 * dark]))[0], given.path[dark], atol=1e-6)
-    # between the moments, too, and beyond them by no more than at their ends
+    # between the frames, too, and beyond them by no more than at their ends
     for time_s in (0.33, -0.5, 2.0):
-        before = Trajectory(0.1 * np.arange(MOMENTS), path).at(np.array([time_s]))[0]
+        before = Trajectory(0.1 * np.arange(FRAMES), path).at(np.array([time_s]))[0]
         after = moved.trajectory.at(np.array([time_s]))[0]
         assert np.linalg.norm((np.linalg.inv(before) @ after)[:3, 3]) < 0.06
 

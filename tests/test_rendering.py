@@ -46,13 +46,13 @@ def straight_networks(x: Tensor, of_points: Tensor, first: Any, second: Any, by_
 @pytest.mark.parametrize("of_pictures", [False, True], ids=["directions", "appearance"])
 def test_both_networks_and_the_rays_in_one_pass(widths, shape, of_pictures):
     torch.manual_seed(0)
-    rays, samples, singles = shape
-    background = Background.POINT if singles >= rays else Background.LAST_SAMPLE
+    rays, samples, single_points = shape
+    background = Background.POINT if single_points >= rays else Background.LAST_SAMPLE
     first = layers(*widths[0])
     second = layers(widths[0][-1] - 1, *widths[1])
     by_ray = torch.randn(widths[1][0], 9, requires_grad=True)
-    of_rays = torch.randn(rays + singles, 9, requires_grad=of_pictures)
-    points = rays * samples + singles
+    of_rays = torch.randn(rays + single_points, 9, requires_grad=of_pictures)
+    points = rays * samples + single_points
     x = (0.3 * torch.randn(points, widths[0][0])).requires_grad_()
     with torch.no_grad():
         for weight in (*first[0], *second[0], by_ray):
@@ -95,8 +95,8 @@ def test_positions_that_nobody_follows_cost_no_gradient():
 def render_values(values: Tensor, inside: Tensor, deltas: Tensor, scale: float, background: Background) -> Rendered:
     """Render what networks give, [4, points]: behind networks that pass it on."""
     networks = Networks(([torch.eye(4)], [torch.zeros(4)]), ([torch.eye(3)], [torch.zeros(3)]), torch.zeros(3, 1))
-    singles = values.shape[1] - deltas.numel()
-    nothing = torch.zeros(len(deltas) + singles, 1)
+    single_points = values.shape[1] - deltas.numel()
+    nothing = torch.zeros(len(deltas) + single_points, 1)
     return render(values.t(), nothing, networks, inside, deltas, scale, background)
 
 
@@ -113,22 +113,22 @@ def straight_pixels(
     weights = (1 - torch.exp(-depths)) * torch.exp(-reached)
     weights = torch.nan_to_num(weights, nan=0.0)
     colours = torch.sigmoid(values[1:].T)
-    of_samples, singles = colours[: rays * samples].view(rays, samples, 3), colours[rays * samples :]
+    of_samples, single_points = colours[: rays * samples].view(rays, samples, 3), colours[rays * samples :]
     hit = weights.sum(1, keepdim=True)
     rgb = (weights[..., None] * of_samples).sum(1)
     if background == Background.LAST_SAMPLE:
         rgb = rgb + (1 - hit) * of_samples[:, -1]
     elif background == Background.POINT:
-        rgb, singles = rgb + (1 - hit) * singles[:rays], singles[rays:]
-    return [rgb, hit, weights, singles]
+        rgb, single_points = rgb + (1 - hit) * single_points[:rays], single_points[rays:]
+    return [rgb, hit, weights, single_points]
 
 
 @pytest.mark.parametrize("background", list(Background))
 @pytest.mark.parametrize("shape", [(37, 24, 100), (5, 1, 8), (1, 13, 1), (70, 7, 70)], ids=str)
 def test_pixels_and_their_gradients(background, shape):
     torch.manual_seed(1)
-    rays, samples, singles = shape
-    points = rays * samples + singles
+    rays, samples, single_points = shape
+    points = rays * samples + single_points
     values = (2 * torch.randn(4, points)).requires_grad_()
     with torch.no_grad():
         values[0, ::11] = 16

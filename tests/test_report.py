@@ -116,7 +116,7 @@ def test_a_view_without_distances_has_no_errors_of_them():
     assert list(shown.figures["m"]) == ["PSNR, dB"]
 
 
-def test_lidar_returns_are_spread_so_that_they_can_be_seen():
+def test_lidar_points_are_spread_so_that_they_can_be_seen():
     values = np.zeros((30, 40), np.float32)
     values[10, 10], values[10, 14], values[25, 35] = 3, 7, 9
     found, known = spread(values, values > 0, 2.0)
@@ -196,9 +196,9 @@ def test_views_come_in_the_order_of_the_evaluation(tmp_path):
     meta |= {f"{split}_filenames": names for split in ("train", "val", "test")}
     write_json(scene / "transforms.json", meta)
     parser = FisheyeDepthDataParserConfig(data=scene).setup()
-    judged = [str(path.relative_to(scene)) for path in parser.get_dataparser_outputs("test").image_filenames]
-    assert judged == names != sorted(names)
-    assert [frame["file_path"] for frame in held_out_frames(scene)] == judged
+    evaluated = [str(path.relative_to(scene)) for path in parser.get_dataparser_outputs("test").image_filenames]
+    assert evaluated == names != sorted(names)
+    assert [frame["file_path"] for frame in held_out_frames(scene)] == evaluated
 
 
 # --- points -----------------------------------------------------------------------------------------------------------

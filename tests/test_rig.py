@@ -107,14 +107,14 @@ def test_the_pages_example_is_a_scene(scene: Path) -> None:
 def test_lidar_lies_on_what_the_cameras_see(scene: Path, drive: Path) -> None:
     """Models, transforms, clocks and point times together: the distances are the true ones of the pixels."""
     for name in ("left", "right", "front"):
-        errors, returns = [], 0
+        errors, point_count = [], 0
         for frame in range(FRAMES):
             lidar = read_distance_png(scene / f"lidar/{name}/{frame:010d}.png")
             truth = read_distance_png(drive / f"truth/{name}/distance/{frame:06d}.png")
             both = (lidar > 0) & (truth > 0)
-            returns += both.sum()
+            point_count += both.sum()
             errors.append(np.abs(lidar[both] / truth[both] - 1))
-        assert returns > 5000
+        assert point_count > 5000
         # a pixel is 1.5° wide; a return lies anywhere in it
         assert np.median(np.concatenate(errors)) < 0.015
         assert np.mean(np.concatenate(errors) < 0.05) > 0.8
@@ -164,13 +164,13 @@ def test_a_camera_ends_where_its_calibration_does(mine: Path) -> None:
     assert [math.degrees(camera.camera.theta_max_rad) for camera in cameras][1] == pytest.approx(80)
 
 
-def test_moments_and_scans(mine: Path) -> None:
+def test_frames_and_scans(mine: Path) -> None:
     recording = read(mine)
     assert [picture.frame for picture in recording.pictures] == sorted(3 * list(range(FRAMES)))
     delays = {"left": 0.0, "right": 0.004, "front": 0.012}
     for picture in recording.pictures:
-        moment = FIRST_S + 0.1 * int(picture.path.stem) + delays[picture.camera]
-        assert picture.time_s == pytest.approx(moment, abs=2e-6)
+        time_s = FIRST_S + 0.1 * int(picture.path.stem) + delays[picture.camera]
+        assert picture.time_s == pytest.approx(time_s, abs=2e-6)
         assert picture.mono is not None and picture.mono.stem == picture.path.stem
     # the name is the start of the turn; the middle of it is the pictures' moment
     assert [(sweep.frame, sweep.path.name) for sweep in recording.sweeps][:2] == [
@@ -221,12 +221,12 @@ def test_a_turn_says_the_same_as_the_points_own_times(mine: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("moment", "from_start_s"), [("timestamp", 0.0), ("start", 0.0), ("middle", 0.05), ("end", 0.1)]
+    ("time_s", "from_start_s"), [("timestamp", 0.0), ("start", 0.0), ("middle", 0.05), ("end", 0.1)]
 )
-def test_scans_that_are_corrected_already(mine: Path, moment: str, from_start_s: float) -> None:
-    """They go to the world by the pose of the moment they are corrected to; the frame they belong to stays."""
+def test_scans_that_are_corrected_already(mine: Path, time_s: str, from_start_s: float) -> None:
+    """They go to the world by the pose of the time they are corrected to; the frame they belong to stays."""
     raw = read(mine).sweeps
-    edit(mine, (TIMES, f'corrected_to = "{moment}"'))
+    edit(mine, (TIMES, f'corrected_to = "{time_s}"'))
     recording = read(mine)
     assert not recording.notices
     for one, before in zip(recording.sweeps, raw, strict=True):
@@ -261,7 +261,7 @@ def test_missing_echoes_in_the_vehicles_frame_are_no_points(mine: Path) -> None:
     assert len(without.points_m) == len(points.points_m) - 7 and without.points_m.norm(dim=-1).min() > 0.5
 
 
-def test_a_folder_for_each_moment(mine: Path) -> None:
+def test_a_folder_for_each_frame(mine: Path) -> None:
     """Names are alike then; folders are in the order of their numbers, and of maps none may take another's place."""
     for number in reversed(range(FRAMES)):
         folder = mine / f"moments/{number + 7}"
@@ -362,7 +362,7 @@ def test_poses_of_nerfstudio(mine: Path) -> None:
         read(mine)
 
 
-def test_a_moment_without_pose_or_scan_is_skipped(mine: Path) -> None:
+def test_a_frame_without_pose_or_scan_is_skipped(mine: Path) -> None:
     lines = (mine / "poses.txt").read_text().splitlines(keepends=True)
     early = [line for line in lines[1:] if float(line.split()[0]) < FIRST_S + 0.33]
     (mine / "poses.txt").write_text("".join(early))
@@ -377,7 +377,7 @@ def test_a_moment_without_pose_or_scan_is_skipped(mine: Path) -> None:
 
 
 @pytest.mark.parametrize("holdout", [0, 2])
-def test_a_moment_between_scans_is_a_picture_without_lidar(mine: Path, holdout: int, capsys) -> None:
+def test_a_frame_between_scans_is_a_picture_without_lidar(mine: Path, holdout: int, capsys) -> None:
     """A LiDAR of half the cameras' rate: who is held out there gets no scan of its neighbours, which are trained on."""
     scans = sorted((mine / "lidar").iterdir())
     for scan in scans[1::2]:
@@ -385,11 +385,11 @@ def test_a_moment_between_scans_is_a_picture_without_lidar(mine: Path, holdout: 
     convert(options(mine, holdout_every=holdout))
     said = " ".join(capsys.readouterr().out.split())
     meta = read_json(mine.parent / "scene" / "transforms.json")
-    has_return = {
+    has_lidar = {
         frame["frame"]: bool(read_distance_png(mine.parent / "scene" / frame["lidar_file_path"]).any())
         for frame in meta["frames"]
     }
-    without = {number for number, has in has_return.items() if not has}
+    without = {number for number, has in has_lidar.items() if not has}
     assert without == ({1, 3} if holdout else set())
     assert ("No LiDAR point in 6 pictures" in said) is bool(holdout)
 
@@ -419,7 +419,7 @@ def test_times_of_the_pictures_reach_the_scene(scene: Path) -> None:
     )
 
 
-def test_some_cameras_and_some_moments(mine: Path) -> None:
+def test_some_cameras_and_some_frames(mine: Path) -> None:
     recording = read(mine, cameras=("front",), first=1, frames=2, stride=2)
     assert [(picture.camera, picture.frame) for picture in recording.pictures] == [("front", 1), ("front", 3)]
     assert [camera.name for camera in recording.cameras] == ["front"]
@@ -427,7 +427,7 @@ def test_some_cameras_and_some_moments(mine: Path) -> None:
 
 
 def test_cameras_of_different_rates(mine: Path) -> None:
-    """A camera of half the rate is in every other moment."""
+    """A camera of half the rate is in every other frame."""
     for number in (1, 3):
         (mine / f"images/front/{number:06d}.png").unlink()
     lines = (mine / "times_front.txt").read_text().splitlines()
@@ -446,8 +446,8 @@ def test_times_by_name_and_by_rate(mine: Path) -> None:
     pictures = read(mine).pictures
     assert {picture.camera for picture in pictures} == {"left", "right", "front"}
     for picture in pictures:
-        moment = FIRST_S + 0.1 * picture.frame
-        assert abs(picture.time_s - moment) < 0.0121
+        time_s = FIRST_S + 0.1 * picture.frame
+        assert abs(picture.time_s - time_s) < 0.0121
 
 
 def test_options_bring_masks_and_monocular_maps(mine: Path) -> None:
@@ -472,7 +472,7 @@ def test_options_bring_masks_and_monocular_maps(mine: Path) -> None:
 
 
 def test_a_rendered_drive_brings_its_truth(mine: Path, drive: Path) -> None:
-    """As the generator writes it: true distances and clean pictures reach the scene, to judge by."""
+    """As the generator writes it: true distances and clean pictures reach the scene, to evaluate on."""
     shutil.copytree(drive / "truth", mine / "truth")
     edit(
         mine,

@@ -212,7 +212,7 @@ def test_times_on_the_clock_keep_their_digits(tmp_path: Path) -> None:
     assert found.reflectance.tolist() == [0, 0]  # there is no intensity
 
 
-def test_what_is_no_return_is_left_out_and_counted(tmp_path: Path) -> None:
+def test_what_is_no_point_is_left_out_and_counted(tmp_path: Path) -> None:
     nan = math.nan
     rows = np.array(
         [[nan, 0, 0, 1], [0, 0, 0, 1], [0.1, 0.2, 0, 1], [3, 4, 0, 0.5], [0, 999, 0, 1], [1, math.inf, 0, 1]]

@@ -70,11 +70,11 @@ QUIET = Console(quiet=True)
 @pytest.fixture(autouse=True)
 def fit_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scene, "fit_kannala_brandt", _FIT_ONCE)
-    monkeypatch.setattr(scene, "host_residual", _JUDGED_ONCE)
+    monkeypatch.setattr(scene, "host_residual", _RESIDUAL_ONCE)
 
 
 _FIT_ONCE = functools.cache(fit_kannala_brandt)
-_JUDGED_ONCE = functools.cache(host_residual)
+_RESIDUAL_ONCE = functools.cache(host_residual)
 
 
 def pose(index: int) -> np.ndarray:

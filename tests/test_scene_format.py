@@ -22,7 +22,7 @@ from edge_depth_nerf.base.files import (
 )
 from edge_depth_nerf.inspecting.shown_prior import ShownScene
 from edge_depth_nerf.method.prior import PriorOptions
-from edge_depth_nerf.mono.calibration import calibrate_scene, find_trust, saved_trust
+from edge_depth_nerf.mono.calibration import calibrate_scene, find_calibration, saved_calibration
 from edge_depth_nerf.mono.estimate import estimate_depth
 from edge_depth_nerf.mono.options import EstimateDepthOptions
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
@@ -95,8 +95,8 @@ def test_what_the_host_says_of_the_unit_is_calibrated_by(tmp_path: Path) -> None
     put_in(folder)
     options = PriorOptions()
     path = folder / "transforms.json"
-    read = find_trust(read_scene(folder), options)
-    told = find_trust(scene_of(read_transforms(path), path, depth_metres_per_count=2e-3), options)
+    read = find_calibration(read_scene(folder), options)
+    told = find_calibration(scene_of(read_transforms(path), path, depth_metres_per_count=2e-3), options)
     assert read.drive_fit is not None and told.drive_fit is not None
     assert told.drive_fit.log_scale == pytest.approx(read.drive_fit.log_scale + np.log(2), abs=0.01)
     assert told.made_of != read.made_of
@@ -118,13 +118,13 @@ def test_what_the_host_says_of_the_unit_is_calibrated_by(tmp_path: Path) -> None
 def test_another_geometry_makes_a_calibration_stale(tmp_path: Path, change) -> None:
     scene = write_scene(tmp_path)
     calibrate_scene(scene)
-    assert saved_trust(read_scene(scene), PriorOptions()) is not None
+    assert saved_calibration(read_scene(scene), PriorOptions()) is not None
     meta = read_json(scene / "transforms.json")
     change(meta)
     write_json(scene / "transforms.json", meta)
-    assert saved_trust(read_scene(scene), PriorOptions()) is None
+    assert saved_calibration(read_scene(scene), PriorOptions()) is None
     # what inspect draws is never made by a stale one
-    assert ShownScene(read_scene(scene)).trust is None
+    assert ShownScene(read_scene(scene)).calibration is None
 
 
 def test_another_map_of_the_same_size_makes_a_calibration_stale(tmp_path: Path) -> None:
@@ -134,7 +134,7 @@ def test_another_map_of_the_same_size_makes_a_calibration_stale(tmp_path: Path) 
     content = path.read_bytes()
     # a text chunk's letter: another file of the same length would do as well
     path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
-    assert saved_trust(read_scene(scene), PriorOptions()) is None
+    assert saved_calibration(read_scene(scene), PriorOptions()) is None
 
 
 def test_pictures_that_no_list_names_are_not_trained_on(tmp_path: Path) -> None:
@@ -171,7 +171,7 @@ def test_without_lidar_a_network_is_believed_where_it_was_taught(tmp_path: Path)
     assert 0.1 < below < 0.6
 
 
-def test_a_frame_near_the_least_number_of_returns_is_reported_as_the_prior_has_it(tmp_path: Path) -> None:
+def test_a_frame_near_the_least_number_of_points_is_reported_as_the_prior_has_it(tmp_path: Path) -> None:
     scene = write_scene(tmp_path)
     picture = read_scene(scene).pictures[0]
     lidar = read_scene(scene).lidar_m(picture)

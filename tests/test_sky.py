@@ -22,7 +22,7 @@ UP = np.array([0.0, -1.0, 0.0])
 ROWS, COLUMNS = np.indices((HEIGHT, WIDTH))
 HORIZON = HEIGHT // 2
 USE = np.ones((HEIGHT, WIDTH), bool)
-NO_RETURNS = np.zeros((HEIGHT, WIDTH), np.float32)
+NO_LIDAR = np.zeros((HEIGHT, WIDTH), np.float32)
 WHITE = (252, 251, 252)
 
 
@@ -65,15 +65,15 @@ def box(left: int, right: int, top: int, bottom: int) -> Mask:
     return (COLUMNS >= left) & (COLUMNS < right) & (ROWS >= top) & (ROWS < bottom)
 
 
-def returns_of(where: Mask, top: int) -> NDArray[np.float32]:
+def points_of(where: Mask, top: int) -> NDArray[np.float32]:
     """A scanner's returns at 9 m, every third row and second column below a row."""
     grid = (ROWS % 3 == 0) & (COLUMNS % 2 == 0) & (top <= ROWS)
     return np.where(grid & where, 9, 0).astype(np.float32)
 
 
-def found_in(colours: NDArray[np.float64], returns: NDArray[np.float32] = NO_RETURNS) -> Mask:
+def found_in(colours: NDArray[np.float64], lidar_points: NDArray[np.float32] = NO_LIDAR) -> Mask:
     """The sky in a picture of the level camera."""
-    return find_sky(taken(colours), USE, UP, CAMERA, returns)
+    return find_sky(taken(colours), USE, UP, CAMERA, lidar_points)
 
 
 @pytest.mark.parametrize("kind", ["blue", "clouds", "overcast", "blown out"])
@@ -115,8 +115,8 @@ def test_a_white_van_below_the_sky(kind: str) -> None:
     colours[box(117, 203, HORIZON - 53, HORIZON + 33)] = 60
     # what stands upright sees half of a grey sky at best, and sends back less
     colours[van] = 185 if kind == "overcast" else WHITE
-    for returns in (NO_RETURNS, returns_of(van, HORIZON - 10)):
-        found = found_in(colours, returns)
+    for lidar_points in (NO_LIDAR, points_of(van, HORIZON - 10)):
+        found = found_in(colours, lidar_points)
         assert not found[van].any()
         assert found[sky & (ROWS < HORIZON - 56)].mean() > 0.9
 
@@ -126,10 +126,10 @@ def test_a_white_lorry_up_to_the_rim() -> None:
     lorry = box(60, 320, 0, HORIZON + 40)
     colours[lorry] = WHITE
     assert not found_in(colours)[lorry].any()
-    assert not found_in(colours, returns_of(lorry, HORIZON - 10))[lorry].any()
+    assert not found_in(colours, points_of(lorry, HORIZON - 10))[lorry].any()
     # its lower half hidden by a hedge: returns from a strip above it tell
     colours[HORIZON - 25 :] = foliage()[HORIZON - 25 :]
-    assert not found_in(colours, returns_of(USE, HORIZON - 40))[lorry].any()
+    assert not found_in(colours, points_of(USE, HORIZON - 40))[lorry].any()
 
 
 def test_a_white_house_beside_the_blue_sky() -> None:
@@ -166,14 +166,14 @@ def test_pictures_without_a_sky() -> None:
     for colours in (tunnel, bridge, ceiling, np.zeros_like(tunnel), np.full_like(tunnel, 300.0), 0.25 * street()[0]):
         assert not found_in(colours).any()
     down = np.array([0.0, -0.2, -0.98])
-    assert not find_sky(taken(street()[0]), USE, down, CAMERA, NO_RETURNS).any()
-    assert not find_sky(taken(street()[0]), ~USE, UP, CAMERA, NO_RETURNS).any()
+    assert not find_sky(taken(street()[0]), USE, down, CAMERA, NO_LIDAR).any()
+    assert not find_sky(taken(street()[0]), ~USE, UP, CAMERA, NO_LIDAR).any()
 
 
 def test_a_monocular_map_keeps_what_is_near() -> None:
     colours, sky = street("overcast")
-    assert not find_sky(taken(colours), USE, UP, CAMERA, NO_RETURNS, NO_RETURNS + 8).any()
-    found = find_sky(taken(colours), USE, UP, CAMERA, NO_RETURNS, NO_RETURNS + 60)
+    assert not find_sky(taken(colours), USE, UP, CAMERA, NO_LIDAR, NO_LIDAR + 8).any()
+    found = find_sky(taken(colours), USE, UP, CAMERA, NO_LIDAR, NO_LIDAR + 60)
     assert found[sky].mean() > 0.95
 
 

@@ -273,7 +273,7 @@ def test_distances_of_a_slanted_wall_are_right():
     assert np.quantile(error, 0.95) < 0.05
 
 
-def test_cameras_of_one_moment_measure_as_moments_do():
+def test_cameras_of_one_frame_measure_as_frames_do():
     places = [pose(0.0), pose(0.5, 0.2), pose(-0.4, -0.3)]
     views = [of_wall(WALL, place) for place in places]
     error = errors(found([view for view, _ in views], 0), views[0][1])

@@ -143,7 +143,7 @@ def test_points_that_only_hide_are_never_chosen() -> None:
     assert found.point_index[found.point_index >= 0].tolist() == [2]
 
 
-def test_of_one_surface_the_newest_return_wins() -> None:
+def test_of_one_surface_the_newest_point_wins() -> None:
     camera = Pinhole(100, 100, 100.0, 100.0, 50.0, 50.0)
     points = torch.tensor([[0.01, 0.01, 10.0], [0.045, 0.045, 10.2], [0.05, 0.05, 30.0]])
     newest_off_centre = project_points(points, camera, age_s=torch.tensor([0.0, 0.3, 0.0]))
@@ -353,7 +353,7 @@ def test_thinned_points_hide_as_much_as_before(monkeypatch: pytest.MonkeyPatch) 
     assert not (covered & (shown[:, 2] > 3)).any()
 
 
-def test_a_stray_return_is_not_the_edge_of_the_field() -> None:
+def test_a_stray_point_is_not_the_edge_of_the_field() -> None:
     clean = sweep_in_world(as_sweep(circle(20.0)), 0.0, np.eye(4), straight(0.0), None)
     stray = np.concatenate((circle(20.0), [[5.0, 0, 3.0], [5.0, 0, -4.0]]))
     found = sweep_in_world(as_sweep(stray), 0.0, np.eye(4), straight(0.0), None)

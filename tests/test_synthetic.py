@@ -205,10 +205,10 @@ def test_same_options_same_bytes_and_interrupted_runs_are_continued(parking, tmp
     # what a killed process leaves of a file that it was writing
     (other.output / "truth" / SEQUENCE / "points" / ".0000000001.123.bin").write_bytes(b"half")
     kept = other.output / "data_2d_raw" / SEQUENCE / "image_02" / "data_rgb" / "0000000000.png"
-    moment = kept.stat().st_mtime_ns
+    changed_ns = kept.stat().st_mtime_ns
     synthesize_drive(other)
     assert files_of(other.output) == reference
-    assert kept.stat().st_mtime_ns == moment, "a finished frame was made again"
+    assert kept.stat().st_mtime_ns == changed_ns, "a finished frame was made again"
     with monkeypatch.context() as patch:
         patch.setattr(layout_module, "build_scene", None)
         assert synthesize_drive(other) == other.output, "a complete drive needs no scene"
@@ -342,8 +342,8 @@ def test_raw_points_are_skewed_by_the_cars_motion(street):
     azimuth = np.degrees(np.arctan2(raw[:, 1], raw[:, 0]))
     speed = np.linalg.norm(poses_of(root)[3][:3, 3] - poses_of(root)[1][:3, 3]) / 0.2
     moved = true[:, 0] - raw[:, 0]
-    # clockwise: the left (+90°) a quarter of a turn (25 ms) before the frame's moment, the right after it;
-    # a point seen while the car was still behind is nearer at the frame's moment
+    # clockwise: the left (+90°) a quarter of a turn (25 ms) before the frame's time, the right after it;
+    # a point seen while the car was still behind is nearer at the frame's time
     for side, quarter_turns in ((90, -1), (0, 0), (-90, 1)):
         chosen = (np.abs(azimuth - side) < 2) & (np.linalg.norm(raw[:, :3], axis=1) < 15)
         assert chosen.sum() > 200
@@ -358,8 +358,8 @@ def test_range_noise_beams_and_azimuths(street, street_world):
     length = np.linalg.norm(raw, axis=1)
     azimuth = np.arctan2(raw[:, 1], raw[:, 0])
     # exactly the pose of each firing's own moment: undone, only noise along the ray is left
-    moments = 0.1 - azimuth / (2 * np.pi) * 0.1
-    firing = model.drive.pose_to_world(moments) @ rig.VELO_TO_POSE
+    fired_s = 0.1 - azimuth / (2 * np.pi) * 0.1
+    firing = model.drive.pose_to_world(fired_s) @ rig.VELO_TO_POSE
     frame = model.drive.pose_to_world(np.array([0.1]))[0] @ rig.VELO_TO_POSE
     world = true @ frame[:3, :3].T + frame[:3, 3]
     at_firing = np.einsum("nji,nj->ni", firing[:, :3, :3], world - firing[:, :3, 3])
@@ -384,7 +384,7 @@ def test_range_noise_beams_and_azimuths(street, street_world):
     assert np.median(along[np.rint(beam) == 63]) == pytest.approx(4.2, abs=0.25)
 
 
-def test_five_percent_of_returns_are_lost(street, street_world, monkeypatch):
+def test_five_percent_of_points_are_lost(street, street_world, monkeypatch):
     _, root = street
     model, world = street_world
     some = len(points_of(root, 0))
@@ -776,7 +776,7 @@ def test_turn_drives_straight_turns_and_drives_on():
     assert poses[-1, 1, 3] < -15
 
 
-def test_pose_is_a_rotation_at_every_moment():
+def test_pose_is_a_rotation_at_every_time():
     route = Route((0.0, 0.0), turn_rad=np.pi / 2, turn_at_m=3.0)
     drive = Drive.random(route, 0.0, 7.0, np.random.default_rng(5))
     poses = drive.pose_to_world(np.linspace(0, 4, 81))

@@ -73,13 +73,13 @@ def test_a_viewer_that_begins_during_a_step_renders_on_all_threads():
 
 def places() -> torch.Tensor:
     edges, weights = torch.rand(7, 10).sort(dim=1)[0], torch.rand(7, 9)
-    return ray_numba.place_samples(weights, edges, torch.rand(7, 5).sort(dim=1)[0], 0.01, 1e-5)
+    return ray_numba.sample_pdf(weights, edges, torch.rand(7, 5).sort(dim=1)[0], 0.01, 1e-5)
 
 
-def proposal_loss() -> tuple[torch.Tensor, torch.Tensor]:
+def interlevel_loss() -> tuple[torch.Tensor, torch.Tensor]:
     edges, outer_edges = (torch.rand(7, count).sort(dim=1)[0] for count in (6, 9))
     outer_weights = (torch.rand(7, 8) / 50).requires_grad_()
-    loss = ray_numba.bound_loss(edges, torch.rand(7, 5), outer_edges, outer_weights)
+    loss = ray_numba.interlevel_loss(edges, torch.rand(7, 5), outer_edges, outer_weights)
     return loss.detach(), torch.autograd.grad(loss, outer_weights)[0]
 
 
@@ -97,7 +97,7 @@ def turned() -> tuple[torch.Tensor, ...]:
     return table_rays_numba.turned(torch.rand(24, 5), begins, widths, indices, torch.rand(2, 3, 4))
 
 
-@pytest.mark.parametrize("work", [places, proposal_loss, contracted, unpacked, turned])
+@pytest.mark.parametrize("work", [places, interlevel_loss, contracted, unpacked, turned])
 def test_the_same_on_three_threads(work: Callable[[], torch.Tensor | tuple[torch.Tensor, ...]], monkeypatch):
     def once() -> list[np.ndarray]:
         torch.manual_seed(3)

@@ -162,10 +162,10 @@ def main() -> None:
     arguments = parser.parse_args()
     console = Console(width=160)
     table = Table("drive", *COLUMNS[arguments.what], title=f"Poses against the truth: {arguments.what}")
-    judge = {"odometry": odometry, "colmap": colmap, "refined": refined}[arguments.what]
+    evaluate = {"odometry": odometry, "colmap": colmap, "refined": refined}[arguments.what]
     for drive in arguments.drives:
         with tempfile.TemporaryDirectory() as folder:
-            for row in judge(options_of(drive, Path(folder) / "scene", arguments.frames), console):
+            for row in evaluate(options_of(drive, Path(folder) / "scene", arguments.frames), console):
                 table.add_row(drive.name, *row)
     console.print(table)
 

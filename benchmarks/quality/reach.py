@@ -34,7 +34,7 @@ from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.results import Results, RunResult, read_results
 from edge_depth_nerf.method.integration import INTEGRATED
 from edge_depth_nerf.method.prior import PriorOptions, make_prior, ray_angles
-from edge_depth_nerf.mono.calibration import find_trust
+from edge_depth_nerf.mono.calibration import find_calibration
 from edge_depth_nerf.scene.reader import SceneFolder, read_scene
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 
@@ -67,7 +67,7 @@ class PriorFigures:
     within_2: float
 
 
-Judged = Mapping[str, PriorFigures | None]
+Evaluated = Mapping[str, PriorFigures | None]
 """How good a prior is, by place."""
 
 
@@ -75,11 +75,11 @@ def prior_pixels(scene: SceneFolder, options: PriorOptions) -> NDArray[np.float6
     """Each used pixel of the training pictures: the true distance (0: sky), the prior's and its sigma (metres), and
     whether it lies outside LiDAR's field; 4×N.
     """
-    trust, rows = find_trust(scene, options), []
+    calibration, rows = find_calibration(scene, options), []
     for picture in [picture for picture in scene.pictures if not picture.held_out]:
         maps, view_angles = scene.maps(picture), ray_angles(picture.lens, picture.up_in_camera)
-        prior = make_prior(maps.distances_m, maps.usable, INTEGRATED, options, trust, view_angles)
-        outside = ~trust.in_field(view_angles.elevation_rad)
+        prior = make_prior(maps.distances_m, maps.usable, INTEGRATED, options, calibration, view_angles)
+        outside = ~calibration.in_field(view_angles.elevation_rad)
         of_pixels = (maps.distances_m["truth_distance"], prior.distance_m, prior.sigma_m, outside)
         rows.append(np.stack([each[maps.usable] for each in of_pixels], -1))
     return np.concatenate(rows).T
@@ -117,22 +117,22 @@ def make_scenes(kind: str, seed: int, options: argparse.Namespace) -> dict[str, 
     return scenes
 
 
-def read_judged(kept: Path) -> Judged:
-    """Read what `judged` wrote."""
+def read_evaluated(kept: Path) -> Evaluated:
+    """Read what `evaluated` wrote."""
     return {name: figures and PriorFigures(**figures) for name, figures in read_json(kept).items()}
 
 
-def judged(scene: Path, kept: Path) -> Judged:
+def evaluated(scene: Path, kept: Path) -> Evaluated:
     """How good a scene's default prior is; read from `kept` if it is there."""
     if not kept.is_file():
         pixels = prior_pixels(read_scene(scene), PriorOptions())
         parts = {"everywhere": pixels, **{name: pixels[:, pixels[3] == i] for i, name in enumerate(list(PLACES)[1:])}}
         found = {name: prior_figures(part) for name, part in parts.items()}
         write_json(kept, {name: figures and dataclasses.asdict(figures) for name, figures in found.items()})
-    return read_judged(kept)
+    return read_evaluated(kept)
 
 
-def prior_table(priors: Mapping[str, Mapping[str, Judged]]) -> Iterator[str]:
+def prior_table(priors: Mapping[str, Mapping[str, Evaluated]]) -> Iterator[str]:
     """All priors of all drives, as Markdown."""
     yield "| drive | prior | pixels | have one | AbsRel | median | within σ̂ | within 2 σ̂ |"
     yield "|---|---|---|---|---|---|---|---|"
@@ -186,7 +186,7 @@ def way_table(results: Results, drives: Mapping[str, int]) -> Iterator[str]:
         yield "| " + " | ".join((f"{kind}_{seed}", *cells)) + " |"
 
 
-def page(results: Results, priors: Mapping[str, Mapping[str, Judged]], drives: Mapping[str, int]) -> str:
+def page(results: Results, priors: Mapping[str, Mapping[str, Evaluated]], drives: Mapping[str, int]) -> str:
     """All tables, as Markdown."""
     lines = ["# What a prior beyond LiDAR's field is worth", "", "## The prior", "", *prior_table(priors)]
     lines += ["", "## The trained models", "", *model_table(results, drives)]
@@ -211,12 +211,12 @@ def main() -> None:
     compared = options.output / "compared"
     steps = ("--steps", options.steps) if options.steps else ()
     common = ("--tuned", TUNED, "--output", compared, "--jobs", options.jobs, *steps)
-    priors: dict[str, dict[str, Judged]] = {}
+    priors: dict[str, dict[str, Evaluated]] = {}
     for kind, seed in drives.items():
         scenes = make_scenes(kind, seed, options)
         name = f"{kind}_{seed}"
         priors[name] = {
-            prior: judged(scene, options.output / "priors" / f"{scene.name}.json") for prior, scene in scenes.items()
+            prior: evaluated(scene, options.output / "priors" / f"{scene.name}.json") for prior, scene in scenes.items()
         }
         ours("compare", scenes["without"], "--methods", *RIVALS, *common)
         ours("compare", *scenes.values(), "--methods", "edge", *common)

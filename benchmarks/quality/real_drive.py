@@ -296,7 +296,7 @@ def main() -> None:
             common = ("--methods", rival, "--tuned", TUNED, "--steps", length, *jobs)
             longer[size] = options.output / "equal_seconds" / f"{size}_{rival}_{length}"
             ours("compare", scenes[size], "--seeds", *options.seeds, *common, "--output", longer[size])
-    judged = {size: read_results(path / RUNS) for size, path in longer.items()}
+    evaluated = {size: read_results(path / RUNS) for size, path in longer.items()}
     cells = options.output / "cells"
     if options.cells:
         scene = scenes.get("half", next(iter(scenes.values())))
@@ -304,7 +304,7 @@ def main() -> None:
         common = ("--tuned", given, "--output", cells, *jobs, *steps)
         ours("compare", scene, "--methods", *CELLS, "--seeds", options.seeds[0], *common)
     of_cells = read_results(cells / RUNS)
-    write_text(options.output / "table.md", page(results, judged, of_cells))
+    write_text(options.output / "table.md", page(results, evaluated, of_cells))
     for scene in results.scenes():
         draw_views(results, scene, options.output / f"views_{scene}.png")
     write_json(options.output / "table.json", results.rows())
@@ -318,7 +318,7 @@ def main() -> None:
         ours("compare", scene, "--methods", *WITH_LAMBDA, *common)
         curves += read_results(folder / RUNS).runs
         draw_lambdas(curves, options.output / "lambda.svg")
-        write_text(options.output / "table.md", page(results, judged, of_cells, curves))
+        write_text(options.output / "table.md", page(results, evaluated, of_cells, curves))
 
 
 if __name__ == "__main__":

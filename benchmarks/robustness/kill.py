@@ -247,16 +247,18 @@ def one_round(name: str, part: Part, folder: Path, reference: dict[str, Any], ki
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     part.prepare(folder)
-    moments: list[float] = []
+    killed_s: list[float] = []
     fault, began = None, time.monotonic()
     try:
         while (command := part.command(folder)) is not None:
             began = time.monotonic()
-            seconds = chance.uniform(0.8 * reference["first_s"], reference["seconds"]) if len(moments) < kills else None
+            seconds = (
+                chance.uniform(0.8 * reference["first_s"], reference["seconds"]) if len(killed_s) < kills else None
+            )
             if not run_for(command, folder / "log.txt", seconds, worker=name == "compare" and chance.random() < 0.5):
                 break
             assert seconds is not None
-            moments.append(round(seconds, 2))
+            killed_s.append(round(seconds, 2))
         found = json.loads(json.dumps(part.result(folder)))
         if found != reference["result"]:
             different = differences(found, reference["result"])
@@ -264,7 +266,7 @@ def one_round(name: str, part: Part, folder: Path, reference: dict[str, Any], ki
     except (RuntimeError, OSError, KeyError, ValueError) as error:
         fault = repr(error)
     ended_s = round(time.monotonic() - began, 2)
-    return {"seed": seed, "kills": len(moments), "moments_s": moments, "ended_s": ended_s, "fault": fault}
+    return {"seed": seed, "kills": len(killed_s), "moments_s": killed_s, "ended_s": ended_s, "fault": fault}
 
 
 def differences(found: Any, expected: Any, where: str = "") -> list[str]:

@@ -105,27 +105,27 @@ class Counts:
     """Returns of many pictures, by kind."""
 
     def __init__(self) -> None:
-        self.returns, self.right, self.both, self.usable = Counter(), Counter(), 0, 0
+        self.lidar_points, self.right, self.both, self.usable = Counter(), Counter(), 0, 0
 
     def add(self, maps: dict[str, NDArray], truth: NDArray, mask: NDArray[np.bool_]) -> None:
         good = {kind: right(distance_m, truth) & mask for kind, distance_m in maps.items()}
-        self.returns.update({kind: int(((distance_m > 0) & mask).sum()) for kind, distance_m in maps.items()})
+        self.lidar_points.update({kind: int(((distance_m > 0) & mask).sum()) for kind, distance_m in maps.items()})
         self.right.update({kind: int(where.sum()) for kind, where in good.items()})
         self.both += int((good["de-skewed"] & good["kept"]).sum())
         self.usable += int(mask.sum())
 
     def row(self) -> tuple[str, ...]:
         return (
-            *(f"{1 - self.right[kind] / self.returns[kind]:.2%}" for kind in KINDS),
+            *(f"{1 - self.right[kind] / self.lidar_points[kind]:.2%}" for kind in KINDS),
             f"{self.both / self.right['de-skewed']:.1%}",
-            *(f"{self.returns[kind] / self.usable:.1%}" for kind in ("de-skewed", "kept")),
+            *(f"{self.lidar_points[kind] / self.usable:.1%}" for kind in ("de-skewed", "kept")),
         )
 
 
 COLUMNS = (*(f"wrong: {kind}" for kind in KINDS), "right ones kept", "cover: all", "kept")
 
 
-def judge(made: SynthesizeOptions, reach: int, every: int, *, free_space: bool = True) -> dict[str, Counts]:
+def evaluate(made: SynthesizeOptions, reach: int, every: int, *, free_space: bool = True) -> dict[str, Counts]:
     """Project the sweeps that training pictures get, and compare the maps with the truth."""
     found = recording(made, reach)
     held_out = {frame for frame in range(made.frames) if frame % HOLDOUT_EVERY == HOLDOUT_EVERY // 2}
@@ -161,7 +161,7 @@ def project(picture: RecordedPicture, found: Recording, store: SweepStore, *, ev
 def projection(made: SynthesizeOptions) -> Table:
     table = Table("K", "camera", *COLUMNS, title=f"Projection at {made.size}×{made.size} px")
     for reach in (0, 3, 5):
-        for name, counts in judge(made, reach, 2).items():
+        for name, counts in evaluate(made, reach, 2).items():
             table.add_row(str(reach), name, *counts.row())
     return table
 
@@ -171,7 +171,7 @@ def moving(made: SynthesizeOptions) -> Table:
     table = Table("K", "free space", "camera", *COLUMNS, title=title)
     for reach in (3, 5):
         for free_space in (True, False):
-            for name, counts in judge(made, reach, 1, free_space=free_space).items():
+            for name, counts in evaluate(made, reach, 1, free_space=free_space).items():
                 table.add_row(str(reach), "checked" if free_space else "not checked", name, *counts.row())
     return table
 

@@ -40,7 +40,7 @@ trainer.train()
 """
 
 
-def lengthened(drive: Path, folder: Path, moments: int) -> str:
+def lengthened(drive: Path, folder: Path, frames: int) -> str:
     """Write a drive of so many moments, linked from a short one; give its sequence."""
     (images,) = (drive / "data_2d_raw").iterdir()
     sequence = images.name
@@ -56,11 +56,11 @@ def lengthened(drive: Path, folder: Path, moments: int) -> str:
     places[f"data_3d_raw/{sequence}/velodyne_points/data"] = ".bin"
     for place, suffix in places.items():
         (folder / place).mkdir(parents=True)
-        for number in range(moments):
+        for number in range(frames):
             source = drive / place / f"{originals[number % len(originals)]:010d}{suffix}"
             os.symlink(source.resolve(), folder / place / f"{number:010d}{suffix}")
     written = []
-    for number in range(moments):
+    for number in range(frames):
         pose = poses[originals[number % len(originals)]].copy()
         pose[:, 3] += number // len(originals) * length
         written.append(f"{number} " + " ".join(f"{value!r}" for value in pose.ravel().tolist()))
@@ -70,9 +70,9 @@ def lengthened(drive: Path, folder: Path, moments: int) -> str:
     return sequence
 
 
-def spoil(folder: Path, sequence: str, moments: int) -> None:
+def spoil(folder: Path, sequence: str, frames: int) -> None:
     """Break a picture, a sweep and a monocular map in the middle."""
-    middle = moments // 2
+    middle = frames // 2
     for place, number, suffix in (
         (f"data_2d_raw/{sequence}/image_02/data_rgb", middle, ".png"),
         (f"simulated_mono/{sequence}/image_03", middle + 1, ".png"),

@@ -261,9 +261,9 @@ def work_along_rays(rays: int, samples: int, settings: Settings) -> dict[str, Pa
         return followed(torch.stack([edge_loss(*level, **form).sum() for level in levels]), outer, weights)
 
     return {
-        "placing samples": (lambda: ray_triton.place_samples(outer, outer_edges, wanted, 0.01, 1e-5), placed),
+        "placing samples": (lambda: ray_triton.sample_pdf(outer, outer_edges, wanted, 0.01, 1e-5), placed),
         "proposal loss": (
-            lambda: followed(ray_triton.bound_loss(edges, weights.detach(), outer_edges, outer), outer),
+            lambda: followed(ray_triton.interlevel_loss(edges, weights.detach(), outer_edges, outer), outer),
             lambda: followed(lossfun_outer(edges, weights.detach(), outer_edges, outer).mean(), outer),
         ),
         "distortion loss": (

@@ -18,7 +18,7 @@ import tyro
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras import KannalaBrandt
 from edge_depth_nerf.lidar import Sweep, SweepTiming
-from edge_depth_nerf.lidar.sweeps import usable_returns
+from edge_depth_nerf.lidar.sweeps import usable_points
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.process.build import process_recording
 from edge_depth_nerf.process.options import ProcessOptions
@@ -42,9 +42,9 @@ class MyDriveOptions(ProcessOptions):
 
 
 def read_scan(path: Path) -> Sweep:
-    """One turn of the scanner; what is no return is left out."""
+    """One turn of the scanner; what is no LiDAR point is left out."""
     points_m = torch.from_numpy(np.load(path, allow_pickle=False).astype(np.float64))
-    return usable_returns(path, points_m, torch.zeros(len(points_m), dtype=torch.float64))
+    return usable_points(path, points_m, torch.zeros(len(points_m), dtype=torch.float64))
 
 
 def read_poses(path: Path) -> np.ndarray:

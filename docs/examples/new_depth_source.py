@@ -31,7 +31,7 @@ STEP_M = 0.2
 def measure(scene: SceneFolder, picture: ScenePicture) -> NDArray[np.float32]:
     """Metres along each pixel's ray, H×W; 0 = none."""
     lidar_m = scene.lidar_m(picture)
-    kept = np.random.default_rng(picture.moment).random(lidar_m.shape) < SHARE
+    kept = np.random.default_rng(picture.frame).random(lidar_m.shape) < SHARE
     return np.where(kept, np.round(lidar_m / STEP_M) * STEP_M, 0).astype(np.float32)
 
 

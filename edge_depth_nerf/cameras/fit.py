@@ -24,7 +24,7 @@ from edge_depth_nerf.cameras.models import Camera, KannalaBrandt, Pinhole
 
 _FIT_GRID = 150
 """Rays along each side of the grid that is fitted; more change nothing within 1e-3 px."""
-_JUDGE_GRID = 401
+_CHECK_GRID = 401
 """Rays along each side of the grid over which the residual is reported; odd against the other."""
 _HOST_STEPS = 10
 """Newton steps of nerfstudio's radial_and_tangential_undistort."""
@@ -107,7 +107,7 @@ def fit_kannala_brandt(source: Camera, theta_max_rad: float = math.radians(95)) 
     found = least_squares(residual, start, jacobian, method="lm", x_scale="jac", xtol=1e-14, ftol=1e-14)  # pyright: ignore[reportArgumentType]
     camera = KannalaBrandt(source.width, source.height, *found.x.tolist(), theta_limit_rad=limit)
 
-    directions, pixels = _rays(source, limit, _JUDGE_GRID)
+    directions, pixels = _rays(source, limit, _CHECK_GRID)
     fitted, valid = camera.project(torch.from_numpy(directions))
     if not valid.all():
         raise InputError(
@@ -137,8 +137,8 @@ def host_residual(
 
     """
     limit = min(theta_max_rad, 0.999 * source.theta_max_rad)
-    directions, pixels = _rays(source, limit, _JUDGE_GRID)
-    limit = _seen_limit(directions, limit, _JUDGE_GRID)
+    directions, pixels = _rays(source, limit, _CHECK_GRID)
+    limit = _seen_limit(directions, limit, _CHECK_GRID)
     wanted = torch.from_numpy(pixels)
     focal = wanted.new_tensor([replacement.fx, replacement.fy])
     principal = wanted.new_tensor([replacement.cx, replacement.cy])

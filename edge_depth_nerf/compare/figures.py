@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from edge_depth_nerf.method.metrics import JUDGED_RANGE_M, LEAST_SQUARED_ERROR
+from edge_depth_nerf.method.metrics import EVALUATED_RANGE_M, LEAST_SQUARED_ERROR
 
 ANGLE_EDGES_DEG = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0, 90.0, 100.0, 120.0)
 """Bins of the angle from the optical axis."""
@@ -79,7 +79,7 @@ class BinnedErrors:
         if true_m is None:
             return
         true = true_m[counted].double()
-        known = (true >= JUDGED_RANGE_M[0]) & (true <= JUDGED_RANGE_M[1])
+        known = (true >= EVALUATED_RANGE_M[0]) & (true <= EVALUATED_RANGE_M[1])
         pred_there, true, where = pred_m[counted].double()[known], true[known], where[known]
         self._add("with distance", where)
         self._add("abs_rel", where, (pred_there - true).abs() / true)

@@ -16,11 +16,11 @@ def departures(meta: dict[str, Any]) -> list[str]:
 
     """
     source = meta.get("source", {})
-    moments = {split: _moments(meta, split) for split in ("train", "test")}
+    frames = {split: _frames(meta, split) for split in ("train", "test")}
     found = []
-    if moments["train"] != TRAINING_FRAMES:
-        found.append(f"{moments['train']} training frames, not {TRAINING_FRAMES}")
-    share = moments["test"] / (moments["train"] + moments["test"])
+    if frames["train"] != TRAINING_FRAMES:
+        found.append(f"{frames['train']} training frames, not {TRAINING_FRAMES}")
+    share = frames["test"] / (frames["train"] + frames["test"])
     if abs(share - HELD_OUT_SHARE) > 0.02:
         found.append(f"{share:.0%} held out, not {HELD_OUT_SHARE:.0%}")
     if source.get("sweeps", 0) != 0:
@@ -36,6 +36,6 @@ def departures(meta: dict[str, Any]) -> list[str]:
     return found
 
 
-def _moments(meta: dict[str, Any], split: str) -> int:
+def _frames(meta: dict[str, Any], split: str) -> int:
     names = set(meta[f"{split}_filenames"])
     return len({frame.get("frame", frame["file_path"]) for frame in meta["frames"] if frame["file_path"] in names})

@@ -204,7 +204,7 @@ def _followed(scene: SceneFolder, name: str | None) -> tuple[ScenePicture, ...]:
 def _times_s(pictures: tuple[ScenePicture, ...]) -> Float64[np.ndarray, "n"]:
     known = [picture.timestamp_s for picture in pictures]
     if any(time is None for time in known):
-        return np.array([picture.moment / DEFAULT_RATE_HZ for picture in pictures])
+        return np.array([picture.frame / DEFAULT_RATE_HZ for picture in pictures])
     times_s = np.array(known, dtype=np.float64)
     return times_s - times_s[0]
 

@@ -26,7 +26,7 @@ CLEARANCE_M = 1.0
 """An orbit keeps this distance from LiDAR points."""
 OBSTACLE_BAND_M = 1.0
 """Only points within this height above and below the camera block an orbit: not the road, and not the treetops."""
-STRAY_RETURNS = 4
+STRAY_POINTS = 4
 """This many nearest points are ignored as outliers."""
 
 Poses = Float64[np.ndarray, "poses 4 4"]
@@ -201,9 +201,9 @@ def _free_radius_m(centre: Direction, up: Direction, points_m: Float[np.ndarray,
     height = offset @ up
     level = offset[np.abs(height) <= OBSTACLE_BAND_M]
     distance = np.linalg.norm(level - (level @ up)[:, None] * up, axis=1)
-    if len(distance) <= STRAY_RETURNS:
-        return float("inf") if len(points_m) > STRAY_RETURNS else 0.0
-    return float(np.partition(distance, STRAY_RETURNS)[STRAY_RETURNS])
+    if len(distance) <= STRAY_POINTS:
+        return float("inf") if len(points_m) > STRAY_POINTS else 0.0
+    return float(np.partition(distance, STRAY_POINTS)[STRAY_POINTS])
 
 
 def _ease(share: np.ndarray) -> np.ndarray:

@@ -22,7 +22,7 @@ from edge_depth_nerf.inspecting.figures import (
     camera_figures,
     map_figures,
     measure,
-    measured_moments,
+    measured_frames,
     path_figures,
 )
 from edge_depth_nerf.inspecting.findings import find, limited
@@ -62,9 +62,9 @@ def inspect_scene(options: InspectOptions, console: Console | None = None) -> di
     agreement = read_agreement(folder)
     _open_output(output)
 
-    measured, shown = measured_moments(scene, options.frames)
-    chosen = [picture for picture in scene.pictures if picture.moment in set(measured)]
-    sheets = {picture.name: _sheet_name(picture) for picture in chosen if picture.moment in shown}
+    measured, shown = measured_frames(scene, options.frames)
+    chosen = [picture for picture in scene.pictures if picture.frame in set(measured)]
+    sheets = {picture.name: _sheet_name(picture) for picture in chosen if picture.frame in shown}
     shown_scene = ShownScene(scene)
     sheet_of = {name: output / sheet for name, sheet in sheets.items()}
     jobs = [partial(_look_at, shown_scene, picture, sheet_of.get(picture.name), options) for picture in chosen]
@@ -81,7 +81,7 @@ def inspect_scene(options: InspectOptions, console: Console | None = None) -> di
         "scene": str(folder),
         "camera_model": scene.camera_model,
         "lengths_are_metres": scene.own,
-        "moments": len(scene.moments()),
+        "moments": len(scene.frames()),
         "pictures": len(scene.pictures),
         "training": len(scene.pictures) - held_out if scene.split_known else None,
         "held_out": held_out if scene.split_known else None,
@@ -130,7 +130,7 @@ def _open_output(output: Path) -> None:
 
 
 def _sheet_name(picture: ScenePicture) -> str:
-    return f"{re.sub(r'[^A-Za-z0-9_-]+', '_', picture.camera)}_{picture.moment:010d}.png"
+    return f"{re.sub(r'[^A-Za-z0-9_-]+', '_', picture.camera)}_{picture.frame:010d}.png"
 
 
 def _look_at(shown: ShownScene, picture: ScenePicture, sheet: Path | None, options: InspectOptions) -> PictureFigures:

@@ -60,7 +60,7 @@ class PictureFigures:
         return {
             "file_path": self.picture.name,
             "camera": self.picture.camera,
-            "frame": self.picture.moment,
+            "frame": self.picture.frame,
             "used_share": _rounded(self.used_share),
             "brightness": _rounded(self.brightness),
             "lidar_coverage": _rounded(self.lidar_coverage),
@@ -114,11 +114,11 @@ def measure(picture: ScenePicture, maps: ShownMaps) -> PictureFigures:
     )
 
 
-def measured_moments(scene: SceneFolder, shown: int) -> tuple[list[int], list[int]]:
+def measured_frames(scene: SceneFolder, shown: int) -> tuple[list[int], list[int]]:
     """Choose the frames to measure, and those of them to show. Both are spread evenly over the drive."""
-    moments = scene.moments()
+    frames = scene.frames()
     wanted = max(MEASURED_PICTURES // len(scene.cameras()), shown, 1)
-    measured = [moments[index] for index in spread_over(len(moments), wanted)]
+    measured = [frames[index] for index in spread_over(len(frames), wanted)]
     parts = min(shown, len(measured))
     return measured, [measured[(2 * part + 1) * len(measured) // (2 * parts)] for part in range(parts)]
 

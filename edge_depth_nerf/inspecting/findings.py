@@ -124,10 +124,8 @@ def _split(scene: SceneFolder) -> Iterator[Finding]:
             "frames. Add train_filenames and test_filenames to transforms.json to hold out whole frames.",
         )
     elif not any(picture.held_out for picture in scene.pictures):
-        moments = len({picture.moment for picture in scene.pictures})
-        advice = (
-            f"process the drive with --holdout-every {best_holdout(moments)}" if moments > 1 else "take more frames"
-        )
+        frames = len({picture.frame for picture in scene.pictures})
+        advice = f"process the drive with --holdout-every {best_holdout(frames)}" if frames > 1 else "take more frames"
         yield Finding("no_held_out", f"No frame is held out, so ns-eval would use training pictures. Remedy: {advice}.")
 
 
@@ -139,7 +137,7 @@ def _path(scene: SceneFolder) -> Iterator[Finding]:
         usual_m = usual_length_m(found, scene.own)
         usual_deg = float(np.median([step.turn_deg for step in found])) if found else 0.0
         for step in found:
-            between = (step.before.moment, step.after.moment)
+            between = (step.before.frame, step.after.frame)
             if usual_m > 0 and step.length_m > GAP_FACTOR * usual_m:
                 gaps.setdefault(between, []).append((step, usual_m))
             elif step.turn_deg > max(LARGEST_TURN_DEG, GAP_FACTOR * usual_deg):
@@ -192,13 +190,13 @@ def _poses(scene: SceneFolder, agreements: Sequence[EpipolarAgreement]) -> Itera
                 + f" features are {worst.median_px:.1f} px from their epipolar lines; {figures['median_px']:.2f} px "
                 f"are usual. Remedy: {remedy}.",
                 (name,),
-                tuple(sorted({moment for one in bad for moment in (one.first, one.second)})),
+                tuple(sorted({frame for one in bad for frame in (one.first, one.second)})),
             )
 
 
 def _timestamps(scene: SceneFolder) -> Iterator[Finding]:
     for name, pictures in scene.cameras().items():
-        wrong = [step.after.moment for step in steps(pictures) if step.seconds is not None and step.seconds <= 0]
+        wrong = [step.after.frame for step in steps(pictures) if step.seconds is not None and step.seconds <= 0]
         if wrong:
             yield Finding(
                 "timestamps",
@@ -242,7 +240,7 @@ def _vehicles(scene: SceneFolder) -> Iterator[Finding]:
 
 def _masks(measured: Sequence[PictureFigures]) -> Iterator[Finding]:
     for name, figures in _by_camera(measured).items():
-        hidden = {one.picture.moment: one.hidden_share for one in figures if one.hidden_share > LARGEST_HIDDEN_SHARE}
+        hidden = {one.picture.frame: one.hidden_share for one in figures if one.hidden_share > LARGEST_HIDDEN_SHARE}
         if not hidden:
             continue
         which = f"The mask of {name}" if len(hidden) == len(figures) else f"The mask of {_frames(hidden)} of {name}"
@@ -259,17 +257,17 @@ def _little_lidar(camera: str, measured: Sequence[PictureFigures]) -> Iterator[F
     """Find pictures with far less LiDAR than the others of their camera; held-out ones may have one sweep alone."""
     for held_out in (False, True):
         shares = {
-            one.picture.moment: one.lidar_coverage
+            one.picture.frame: one.lidar_coverage
             for one in measured
             if one.lidar_coverage is not None and one.picture.held_out == held_out
         }
         usual = float(np.median(list(shares.values()))) if shares else 0.0
-        little = [moment for moment, share in shares.items() if share < LITTLE_LIDAR * usual]
+        little = [frame for frame, share in shares.items() if share < LITTLE_LIDAR * usual]
         if little:
             of_split = "held-out pictures" if held_out else "training pictures"
             yield Finding(
                 "lidar",
-                f"LiDAR covers {min(shares[moment] for moment in little):.2%} of {_frames(little)} of {camera}; "
+                f"LiDAR covers {min(shares[frame] for frame in little):.2%} of {_frames(little)} of {camera}; "
                 f"{usual:.2%} is usual for {of_split}. Check that the sweep is complete and the pose is right.",
                 (camera,),
                 tuple(little),
@@ -279,7 +277,7 @@ def _little_lidar(camera: str, measured: Sequence[PictureFigures]) -> Iterator[F
 def _outliers(measured: Sequence[PictureFigures]) -> Iterator[Finding]:
     """Find pictures with far less LiDAR, or far darker or brighter, than the others of their camera."""
     for name, figures in _by_camera(measured).items():
-        coverage = {one.picture.moment: one.lidar_coverage for one in figures if one.lidar_coverage is not None}
+        coverage = {one.picture.frame: one.lidar_coverage for one in figures if one.lidar_coverage is not None}
         usual = float(np.median(list(coverage.values()))) if coverage else 0.0
         if coverage and usual == 0:
             yield Finding(
@@ -288,20 +286,20 @@ def _outliers(measured: Sequence[PictureFigures]) -> Iterator[Finding]:
                 (name,),
             )
         yield from _little_lidar(name, figures)
-        brightness = {one.picture.moment: one.brightness for one in figures}
+        brightness = {one.picture.frame: one.brightness for one in figures}
         usual = float(np.median(list(brightness.values())))
         strange = {
-            "dark": [moment for moment, grey in brightness.items() if grey * BRIGHTNESS_FACTOR < usual],
-            "bright": [moment for moment, grey in brightness.items() if grey > BRIGHTNESS_FACTOR * usual],
+            "dark": [frame for frame, grey in brightness.items() if grey * BRIGHTNESS_FACTOR < usual],
+            "bright": [frame for frame, grey in brightness.items() if grey > BRIGHTNESS_FACTOR * usual],
         }
-        for word, moments in strange.items():
-            if moments:
+        for word, frames in strange.items():
+            if frames:
                 yield Finding(
                     word,
-                    f"The picture of {_frames(moments)} of {name} is {word}: mean grey {brightness[moments[0]]:.0f}, "
+                    f"The picture of {_frames(frames)} of {name} is {word}: mean grey {brightness[frames[0]]:.0f}, "
                     f"{usual:.0f} is usual. Leave it out if it is badly exposed.",
                     (name,),
-                    tuple(moments),
+                    tuple(frames),
                 )
 
 
@@ -311,9 +309,9 @@ def _mono_scale(measured: Sequence[PictureFigures]) -> Iterator[Finding]:
 
     for name, figures in _by_camera(measured).items():
         ratios = {
-            one.picture.moment: float(np.median(one.mono_over_lidar)) for one in figures if len(one.mono_over_lidar)
+            one.picture.frame: float(np.median(one.mono_over_lidar)) for one in figures if len(one.mono_over_lidar)
         }
-        wrong = {moment: ratio for moment, ratio in ratios.items() if off(ratio)}
+        wrong = {frame: ratio for frame, ratio in ratios.items() if off(ratio)}
         if not wrong:
             continue
         every = len(wrong) * 2 > len(ratios)

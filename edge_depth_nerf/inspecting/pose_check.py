@@ -21,7 +21,7 @@ ended 0.7 dB below one with poses of 0.13 px."""
 BAD_STEP_PX = 1.0
 """A single step is reported if it is off by more than this, and by three times the usual."""
 BAD_STEP_FACTOR = 3.0
-_LEAST_MOMENTS = 8
+_LEAST_FRAMES = 8
 
 
 def check_poses(scene: SceneFolder, console: Console) -> list[EpipolarAgreement]:
@@ -36,7 +36,7 @@ def check_poses(scene: SceneFolder, console: Console) -> list[EpipolarAgreement]
     if not scene.own:
         return []
     cameras = scene.cameras()
-    most = max(MEASURED_PICTURES // len(cameras), _LEAST_MOMENTS)
+    most = max(MEASURED_PICTURES // len(cameras), _LEAST_FRAMES)
     jobs = [
         partial(along_drive, [_posed(scene, picture) for picture in pictures], (1,), most)
         for pictures in cameras.values()
@@ -49,7 +49,7 @@ def _posed(scene: SceneFolder, picture: ScenePicture) -> PosedPicture:
     camera_to_world[:3, :3], camera_to_world[:3, 3] = picture.rotation, picture.position_m
     return PosedPicture(
         camera=picture.camera,
-        moment=picture.moment,
+        frame=picture.frame,
         lens=picture.lens,
         # the change of axes is its own inverse
         camera_to_world=opencv_to_opengl(camera_to_world),

@@ -108,6 +108,6 @@ def _heading(scene: SceneFolder, figures: PictureFigures) -> list[str]:
     if len(figures.prior_over_truth):
         facts.append(f"prior / ground truth: AbsRel {np.abs(figures.prior_over_truth - 1).mean():.3f}")
     return [
-        f"{picture.camera}, frame {picture.moment} ({split})",
+        f"{picture.camera}, frame {picture.frame} ({split})",
         f"{picture.lens.width}×{picture.lens.height} px; " + "; ".join(facts),
     ]

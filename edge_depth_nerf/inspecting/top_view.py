@@ -55,13 +55,13 @@ def top_view(
     if points_m is not None:
         _add_points(axes, points_m)
     path = scene.cameras()[reference_camera(scene)]
-    at_m = {picture.moment: picture.position_m for picture in path}
+    at_m = {picture.frame: picture.position_m for picture in path}
     path_m = np.array(list(at_m.values()))[:, :2]
     axes.plot(*path_m.T, color=PATH, linewidth=1.5, zorder=0.8)
     gaps = {finding.frames for finding in findings if finding.kind == "gap"}
     for step in pairwise(at_m):
         if step in gaps:
-            ends_m = np.array([at_m[moment] for moment in step])
+            ends_m = np.array([at_m[frame] for frame in step])
             axes.plot(*ends_m.T[:2], color=GAP, linewidth=3, zorder=0.9)
             _write(axes, f"{np.linalg.norm(np.diff(ends_m, axis=0)):.3g} {_unit(scene)}", ends_m.mean(0)[:2], GAP)
     # viewing directions have no arrow heads, because they are close to each other
@@ -77,7 +77,7 @@ def top_view(
     _add_dots(axes, path_m[~held_out], 6.0, pixel_m, TRAINING, "training" if scene.split_known else "pictures")
     _add_dots(axes, path_m[held_out], 10.0, pixel_m, HELD_OUT, "held out")
     if named := sorted({*shown} & at_m.keys()):
-        rings_m = np.array([at_m[moment][:2] for moment in named])
+        rings_m = np.array([at_m[frame][:2] for frame in named])
         axes.plot(*rings_m.T, "o", markersize=10, markerfacecolor="none", color=INK, label="frame with a sheet")
         for index in _apart(rings_m, 40 * pixel_m):
             _write(axes, str(named[index]), rings_m[index], INK)
@@ -109,7 +109,7 @@ def _empty_map(scene: SceneFolder) -> tuple[Figure, Axes, float]:
     axes.set_xlabel(f"x{' (east)' if mapped else ''}, {_unit(scene)}")
     axes.set_ylabel(f"y{' (north)' if mapped else ''}, {_unit(scene)}")
     name = scene.path.parent.resolve().name
-    title = f"{name} from above: {len(scene.moments())} frames, path of {reference_camera(scene)}"
+    title = f"{name} from above: {len(scene.frames())} frames, path of {reference_camera(scene)}"
     figure.suptitle(title, parse_math=False)
     return figure, axes, pixel_m
 
@@ -162,9 +162,9 @@ def _add_travel(axes: Axes, path_m: NDArray[np.float64], pixel_m: float) -> None
     lengths_m = np.linalg.norm(steps_m, axis=1)
     passed = np.floor(lengths_m.cumsum() / (90 * pixel_m) + 0.5)
     here = np.diff(passed, prepend=0) > 0
-    along, middles_m = steps_m[here] / lengths_m[here, None], (path_m[:-1] + steps_m / 2)[here]
+    along, midpoints_m = steps_m[here] / lengths_m[here, None], (path_m[:-1] + steps_m / 2)[here]
     head = {"width": 2, "headwidth": 5, "headlength": 9, "headaxislength": 9, "pivot": "mid"}
-    axes.quiver(*middles_m.T, *along.T, color=TRAINING, **_ARROW, **head)
+    axes.quiver(*midpoints_m.T, *along.T, color=TRAINING, **_ARROW, **head)
     axes.plot([], [], ">", color=TRAINING, label="travel")
 
 
@@ -174,10 +174,10 @@ def pose_check_figure(scene: SceneFolder, agreements: Sequence[EpipolarAgreement
     axes = figure.add_subplot()
     for number, name in enumerate(scene.cameras()):
         known = known_steps(agreements, name)
-        middles = [(one.first + one.second) / 2 for one in known]
+        midpoints = [(one.first + one.second) / 2 for one in known]
         medians = [one.median_px for one in known]
         colour = VIEWS[number % len(VIEWS)]
-        axes.plot(middles, medians, "o-", markersize=3.5, linewidth=1, color=colour, label=name)
+        axes.plot(midpoints, medians, "o-", markersize=3.5, linewidth=1, color=colour, label=name)
     axes.axhline(BAD_MEDIAN_PX, color=GAP, linewidth=1, linestyle="--", label=f"above {BAD_MEDIAN_PX} px: warning")
     axes.set_ylim(bottom=0)
     axes.set_xlabel("frame")

@@ -16,7 +16,7 @@ from torch import Tensor
 HARMONICS = 16
 """Spherical harmonics of four degrees."""
 EPS = 1e-7
-"""nerfstudio's, in the proposal loss."""
+"""nerfstudio's, in the interlevel loss."""
 
 
 def cube(positions: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
@@ -57,14 +57,14 @@ def harmonics(directions: Float[Tensor, "rays 3"], dtype: torch.dtype | None = N
     return torch.stack(every, dim=1).to(dtype or directions.dtype)
 
 
-def place_samples(
+def sample_pdf(
     weights: Float[Tensor, "rays intervals"],
     edges: Float[Tensor, "rays edges"],
     wanted: Float[Tensor, "rays places"],
     padding: float,
     least: float,
 ) -> Float[Tensor, "rays places"]:
-    """Invert the cumulative distribution of a histogram over each ray; arguments as in `ray_numba.place_samples`."""
+    """Invert the cumulative distribution of a histogram over each ray; arguments as in `ray_numba.sample_pdf`."""
     intervals, weights = weights.shape[1], weights + padding
     total = weights.sum(1, keepdim=True)
     share = (weights + (least - total).clamp(min=0) / intervals) / total.clamp(min=least)
@@ -75,13 +75,13 @@ def place_samples(
     return start + torch.nan_to_num((wanted - low) / (high - low), 0.0).clamp(0, 1) * (end - start)
 
 
-def bound_loss(
+def interlevel_loss(
     edges: Float[Tensor, "rays edges"],
     weights: Float[Tensor, "rays samples"],
     outer_edges: Float[Tensor, "rays outer_edges"],
     outer_weights: Float[Tensor, "rays outer_samples"],
 ) -> Float[Tensor, ""]:
-    """Compute the proposal loss of mip-NeRF 360 (Eq. 13), mean over the samples; `weights` are taken as given.
+    """Compute the interlevel loss of mip-NeRF 360 (Eq. 13), mean over the samples; `weights` are taken as given.
 
     The outermost intervals stand for what lies beyond them.
     """
@@ -95,13 +95,13 @@ def bound_loss(
 def distortion_loss(edges: Float[Tensor, "rays edges"], weights: Float[Tensor, "rays samples"]) -> Float[Tensor, ""]:
     """Compute mip-NeRF 360's distortion loss (Eq. 15), mean over the rays.
 
-    Σ_ij w_i w_j |m_i - m_j| + 1/3 Σ_i w_i² Δ_i, with middles m and lengths Δ of the samples. As the middles ascend, the
-    double sum is 2 Σ_i w_i (m_i Σ_j<i w_j - Σ_j<i w_j m_j): two cumulative sums instead of samples² terms.
+    Σ_ij w_i w_j |m_i - m_j| + 1/3 Σ_i w_i² Δ_i, with midpoints m and lengths Δ of the samples. As the midpoints ascend,
+    the double sum is 2 Σ_i w_i (m_i Σ_j<i w_j - Σ_j<i w_j m_j): two cumulative sums instead of samples² terms.
     """
-    middles = (edges[:, 1:] + edges[:, :-1]) / 2
+    midpoints = (edges[:, 1:] + edges[:, :-1]) / 2
     # the sums up to and including i: what i itself adds cancels
-    before, before_middles = weights.cumsum(dim=-1), (weights * middles).cumsum(dim=-1)
-    between = 2 * (weights * (middles * before - before_middles)).sum(dim=-1)
+    before, before_midpoints = weights.cumsum(dim=-1), (weights * midpoints).cumsum(dim=-1)
+    between = 2 * (weights * (midpoints * before - before_midpoints)).sum(dim=-1)
     within = (weights**2 * (edges[:, 1:] - edges[:, :-1])).sum(dim=-1) / 3
     return (between + within).mean()
 

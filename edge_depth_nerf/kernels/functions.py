@@ -111,18 +111,18 @@ HARMONICS = Function(
     GpuForm("directions", lambda: _triton().pointwise.harmonics, formulas.harmonics, _directions, tolerance=1e-5),
     follows=False,
 )
-PLACE_SAMPLES = Function(
-    lambda: _numba().ray.place_samples,
-    GpuForm("placing of samples", lambda: _triton().ray.place_samples, formulas.place_samples, _wanted, 1e-4, MOST),
+SAMPLE_PDF = Function(
+    lambda: _numba().ray.sample_pdf,
+    GpuForm("placing of samples", lambda: _triton().ray.sample_pdf, formulas.sample_pdf, _wanted, 1e-4, MOST),
 )
-BOUND_LOSS = Function(
-    lambda: _numba().ray.bound_loss,
-    GpuForm("proposal loss", lambda: _triton().ray.bound_loss, formulas.bound_loss, _proposals, 1e-4, MOST),
+INTERLEVEL_LOSS = Function(
+    lambda: _numba().ray.interlevel_loss,
+    GpuForm("proposal loss", lambda: _triton().ray.interlevel_loss, formulas.interlevel_loss, _proposals, 1e-4, MOST),
 )
 DISTORTION_LOSS = Function(
     lambda: _numba().ray.distortion_loss,
     GpuForm("distortion loss", lambda: _triton().ray.distortion_loss, formulas.distortion_loss, _samples, 1e-4, MOST),
 )
-POSITIONS = Function(lambda: _numba().pointwise.middles, follows=False)
+POSITIONS = Function(lambda: _numba().pointwise.midpoints, follows=False)
 DENSITY = Function(lambda: _numba().pointwise.density)
 WEIGHTS = Function(lambda: _numba().ray.weights_from_densities)

@@ -79,7 +79,7 @@ def distances(
 
 @compiled()
 @no_type_check
-def find_middles(
+def find_midpoints(
     origins, origin_stride, directions, direction_stride, starts, start_stride, ends, end_stride, positions, columns,
     first, last,
 ):  # fmt: skip
@@ -96,7 +96,7 @@ def find_middles(
             into[3 * k + 2] = z + to_z * both / TWO
 
 
-def middles(
+def midpoints(
     origins: Float[Tensor, "rays 3"],
     directions: Float[Tensor, "rays 3"],
     starts: Float[Tensor, "rays samples"],
@@ -107,7 +107,7 @@ def middles(
     positions = torch.empty(rays, columns, 3)
     matrices = [each for matrix in (origins, directions, starts, ends) for each in flat_rows(matrix)]
     arrays = *matrices, positions.view(-1).numpy(), columns
-    in_parts(lambda first, last: find_middles(*arrays, first, last), rays, LEAST_SHARE // max(1, columns))
+    in_parts(lambda first, last: find_midpoints(*arrays, first, last), rays, LEAST_SHARE // max(1, columns))
     return positions
 
 

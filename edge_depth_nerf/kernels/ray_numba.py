@@ -29,7 +29,7 @@ LEAST_SHARE = 1 << 16
 LEAST_WALKED = 1 << 15
 """The same where lists are walked, which takes longer."""
 EPS = np.float32(1e-7)
-"""nerfstudio's, in the proposal loss."""
+"""nerfstudio's, in the interlevel loss."""
 
 
 @compiled()
@@ -122,7 +122,7 @@ def weights_from_densities(
 
 @compiled()
 @no_type_check
-def _place_samples(weights, edges, wanted, padding, least, placed, first, last):
+def _sample_pdf(weights, edges, wanted, padding, least, placed, first, last):
     samples = weights.shape[1]
     cumulative = np.empty(samples + 1, np.float32)
     for ray in range(first, last):
@@ -151,7 +151,7 @@ def _place_samples(weights, edges, wanted, padding, least, placed, first, last):
                 placed[ray, k] = start + (u - low) / (high - low) * (end - start)
 
 
-def place_samples(
+def sample_pdf(
     weights: Float[Tensor, "rays intervals"],
     edges: Float[Tensor, "rays edges"],
     wanted: Float[Tensor, "rays places"],
@@ -175,13 +175,13 @@ def place_samples(
     arrays = [each.detach().contiguous().numpy() for each in (weights, edges, wanted)]
     arguments = *arrays, np.float32(padding), np.float32(least), placed.numpy()
     numbers = weights.shape[1] + wanted.shape[1]
-    in_parts(lambda first, last: _place_samples(*arguments, first, last), len(weights), LEAST_WALKED // numbers)
+    in_parts(lambda first, last: _sample_pdf(*arguments, first, last), len(weights), LEAST_WALKED // numbers)
     return placed
 
 
 @compiled()
 @no_type_check
-def _bound_loss(edges, weights, outer_edges, outer_weights, to_outer, follow, begin, end):
+def _interlevel_loss(edges, weights, outer_edges, outer_weights, to_outer, follow, begin, end):
     """Give the sum of the loss; what each outer weight would change it by goes to `to_outer`, if wanted."""
     samples, intervals = weights.shape[1], outer_weights.shape[1]
     cumulative = np.empty(intervals + 1, np.float32)
@@ -216,13 +216,13 @@ def _bound_loss(edges, weights, outer_edges, outer_weights, to_outer, follow, be
     return loss
 
 
-def bound_loss(
+def interlevel_loss(
     edges: Float[Tensor, "rays edges"],
     weights: Float[Tensor, "rays samples"],
     outer_edges: Float[Tensor, "rays outer_edges"],
     outer_weights: Float[Tensor, "rays outer_samples"],
 ) -> Float[Tensor, ""]:
-    """Measure how far an outer histogram fails to bound another one from above: mip-NeRF 360's proposal loss (Eq. 13).
+    """Measure how far an outer histogram fails to bound another one: mip-NeRF 360's interlevel loss (Eq. 13).
 
     Mean over all samples of max(0, w - bound)² / (w + 1e-7), where the bound sums the outer weights of all intervals
     that a sample touches. Differentiable once, by `outer_weights` alone. float32.
@@ -235,7 +235,7 @@ def bound_loss(
         of_parts: dict[int, float] = {}
 
         def work(first: int, last: int) -> None:
-            of_parts[first] = _bound_loss(*arrays, slope.numpy(), follow, first, last)
+            of_parts[first] = _interlevel_loss(*arrays, slope.numpy(), follow, first, last)
 
         in_parts(work, len(weights), LEAST_WALKED // max(1, weights.shape[1] + outer_weights.shape[1]))
         loss = sum(of_parts[first] for first in sorted(of_parts)) / max(1, weights.numel())
@@ -284,7 +284,7 @@ def _distortion_loss(edges, edge_stride, weights, slopes, samples, follow):
 def distortion_loss(edges: Float[Tensor, "rays edges"], weights: Float[Tensor, "rays samples"]) -> Float[Tensor, ""]:
     """Compute mip-NeRF 360's distortion loss (Eq. 15), mean over the rays; differentiable once, by the weights alone.
 
-    Σ_ij w_i w_j |m_i - m_j| + 1/3 Σ_i w_i² Δ_i, with middles m and lengths Δ of the samples.
+    Σ_ij w_i w_j |m_i - m_j| + 1/3 Σ_i w_i² Δ_i, with midpoints m and lengths Δ of the samples.
 
     Args:
         edges: of the samples, ascending, in the spacing of 0..1, float32.

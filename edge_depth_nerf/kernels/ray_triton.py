@@ -67,14 +67,14 @@ def _place_kernel(
         tl.store(placed + ray * places + place, found, place < places)
 
 
-def place_samples(
+def sample_pdf(
     weights: Float[Tensor, "rays intervals"],
     edges: Float[Tensor, "rays edges"],
     wanted: Float[Tensor, "rays places"],
     padding: float,
     least: float,
 ) -> Float[Tensor, "rays places"]:
-    """Invert the cumulative distribution of a histogram over each ray; arguments as in `ray_numba.place_samples`."""
+    """Invert the cumulative distribution of a histogram over each ray; arguments as in `ray_numba.sample_pdf`."""
     rays, samples = weights.shape
     places = wanted.shape[1]
     weights, edges, wanted = (each.detach().contiguous() for each in (weights, edges, wanted))
@@ -118,13 +118,13 @@ def _bound_kernel(
         tl.store(slopes + ray * intervals + interval, slope * share, inside)
 
 
-def bound_loss(
+def interlevel_loss(
     edges: Float[Tensor, "rays edges"],
     weights: Float[Tensor, "rays samples"],
     outer_edges: Float[Tensor, "rays outer_edges"],
     outer_weights: Float[Tensor, "rays outer_samples"],
 ) -> Float[Tensor, ""]:
-    """Compute the proposal loss of mip-NeRF 360 (Eq. 13); as `ray_numba.bound_loss`, edges ascending."""
+    """Compute the interlevel loss of mip-NeRF 360 (Eq. 13); as `ray_numba.interlevel_loss`, edges ascending."""
     (rays, samples), intervals = weights.shape, outer_weights.shape[1]
     (of_edges, stride), (of_outer, outer_stride) = rows_of(edges), rows_of(outer_edges)
     given = of_edges, weights.detach().contiguous(), of_outer, outer_weights.detach().contiguous()
@@ -170,7 +170,7 @@ def _distortion_kernel(
 def distortion_loss(edges: Float[Tensor, "rays edges"], weights: Float[Tensor, "rays samples"]) -> Float[Tensor, ""]:
     """Compute mip-NeRF 360's distortion loss (Eq. 15), mean over the rays; differentiable once, by the weights alone.
 
-    Σ_ij w_i w_j |m_i - m_j| + 1/3 Σ_i w_i² Δ_i, with middles m and lengths Δ of the samples.
+    Σ_ij w_i w_j |m_i - m_j| + 1/3 Σ_i w_i² Δ_i, with midpoints m and lengths Δ of the samples.
 
     Args:
         edges: of the samples, in the spacing of 0..1, float32.

@@ -355,7 +355,7 @@ def _least_rays(given: _Given) -> int:
 
 def render(
     x: Float[Tensor, "points in"],
-    of_rays: Float[Tensor, "rays_and_singles shared"],
+    of_rays: Float[Tensor, "rays_and_single_points shared"],
     networks: Networks,
     inside: Float[Tensor, "points"],
     deltas: Float[Tensor, "rays samples"],

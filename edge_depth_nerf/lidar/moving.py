@@ -1,9 +1,9 @@
 """Things that move, found in sweeps: what was there for one stretch of a drive, and gone before or after.
 
-1. *Judged.* Each LiDAR point above the ground is checked against all sweeps near by, of any time of the drive: they see
-   through its place, or meet something there. At a moving thing's place, sweeps meet nothing at first, then the thing
-   for one stretch, then nothing again. At a still thing's place, hits and passes are mixed, above all in a crown of
-   leaves.
+1. *Checked.* Each LiDAR point above the ground is checked against all sweeps near by, of any time of the drive: they
+   see through its place, or meet something there. At a moving thing's place, sweeps meet nothing at first, then the
+   thing for one stretch, then nothing again. At a still thing's place, hits and passes are mixed, above all in a crown
+   of leaves.
 2. *Gathered.* Points that moved are joined to things. Unknown points beside them are added, such as those of a car's
    roof with only sky behind it.
 3. *Followed.* A thing of one sweep is the thing of the next that lies where its speed takes it. Where the evidence
@@ -31,7 +31,7 @@ from edge_depth_nerf.lidar.free_space import FreeSpace
 from edge_depth_nerf.lidar.world import WorldSweep
 
 FARTHEST_M = 60.0
-"""LiDAR points beyond this are not judged: beams are too far apart there."""
+"""LiDAR points beyond this are not checked: beams are too far apart there."""
 _ABOVE_GROUND_M = 0.3
 """What lies lower is ground, or the foot of something."""
 _GROUND_CELL_M = 1.0
@@ -53,7 +53,7 @@ _JOIN_M = 0.4
 _JOIN_ROUNDS = 3
 _APART_M = 0.9
 """What lies further apart is two things."""
-_MIN_RETURNS = 5
+_MIN_POINTS = 5
 
 _GATE_M, _GATE_M_S, _GATE_CHANGE_M_S = 0.7, 14.0, 5.0
 """How far a thing may lie from where it is expected in the next sweep: by this, and with time by the speed that one may
@@ -126,7 +126,7 @@ def _by_cell(
     return cells, height_m, first, np.diff(np.r_[first, len(cells)])
 
 
-# ---- judging returns -------------------------------------------------------------------------------------------
+# ---- points that move ------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,7 @@ def one_stretch(
     return score
 
 
-def loose_returns(sweep: WorldSweep, time_s: float, ground: Ground, others: Sequence[tuple[float, FreeSpace]]) -> Loose:
+def loose_points(sweep: WorldSweep, time_s: float, ground: Ground, others: Sequence[tuple[float, FreeSpace]]) -> Loose:
     """Find the LiDAR points of a sweep that moved, and those of which nothing is known.
 
     `others` are times and free space of sweeps near by, in order of time, without this one.
@@ -189,11 +189,11 @@ def loose_returns(sweep: WorldSweep, time_s: float, ground: Ground, others: Sequ
     for number, (_, free_space) in enumerate(others):
         passed, ended = free_space.observed(torch.from_numpy(points))
         seen_through[number], met[number] = passed.numpy(), ended.numpy()
-    moments_s = np.array([moment_s for moment_s, _ in others])
-    score = one_stretch(seen_through, met, int(np.searchsorted(moments_s, time_s)))
+    times_s = np.array([other_s for other_s, _ in others])
+    score = one_stretch(seen_through, met, int(np.searchsorted(times_s, time_s)))
     moved = score >= _MIN_SCORE
     held = ~moved & (met.sum(0) >= _HELD_MET) & (score <= 0)
-    lasting = held & (met[np.abs(moments_s - time_s) >= _LASTING_S].sum(0) >= _LASTING_MET)
+    lasting = held & (met[np.abs(times_s - time_s) >= _LASTING_S].sum(0) >= _LASTING_MET)
     if len(points):
         moved = _outvoted(points, moved, held)
     kept = ~lasting
@@ -263,7 +263,7 @@ def things_of(loose: Loose) -> list[Thing]:
     return [
         Thing(loose.time_s, loose.rows[group], loose.points_m[group])
         for group in found
-        if loose.moved[group].sum() >= _MIN_RETURNS
+        if loose.moved[group].sum() >= _MIN_POINTS
     ]
 
 
@@ -375,7 +375,7 @@ def expected_at(thing: Thing, loose: Loose) -> Thing | None:
         return None
     away_m, _ = KDTree(expected).query(loose.points_m[near], distance_upper_bound=_JOIN_M)
     near = near[np.isfinite(away_m)]
-    enough = max(_COAST_SHARE * len(expected), _MIN_RETURNS)
+    enough = max(_COAST_SHARE * len(expected), _MIN_POINTS)
     members = near[~loose.held[near]]
     if len(members) < enough:
         members = near
@@ -385,7 +385,7 @@ def expected_at(thing: Thing, loose: Loose) -> Thing | None:
 
 
 def nearby(number: int, centres_m: Float[np.ndarray, "sweeps 3"], may: Sequence[bool], most: int = 40) -> list[int]:
-    """Choose the sweeps that judge one: those taken near by, those nearest in time first, the rest spread."""
+    """Choose the sweeps that check one: those taken near by, those nearest in time first, the rest spread."""
     away_m = np.linalg.norm(centres_m - centres_m[number], axis=1)
     possible = [
         other for other in range(len(centres_m)) if other != number and may[other] and away_m[other] < FARTHEST_M

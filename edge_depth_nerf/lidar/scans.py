@@ -35,7 +35,7 @@ from jaxtyping import Float64, Shaped, UInt8
 from edge_depth_nerf.base.bounds import check_bytes, shown
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import ARRAY_ERRORS, read_array_header, read_npz
-from edge_depth_nerf.lidar.sweeps import MAX_POINTS, Sweep, usable_returns
+from edge_depth_nerf.lidar.sweeps import MAX_POINTS, Sweep, usable_points
 
 Encoding = Literal["records", "text", "lzf", "matrix", "archive", "table"]
 
@@ -129,10 +129,10 @@ def check_scan(path: Path, scan: ScanFormat) -> None:
     _read_header(path, scan)
 
 
-def read_scan(path: Path, scan: ScanFormat, moment_s: float = 0.0) -> Sweep:
+def read_scan(path: Path, scan: ScanFormat, time_s: float = 0.0) -> Sweep:
     """Read a scan and leave out what is not a measured point.
 
-    `offset_s` is counted from `moment_s`, the scan's own time on the clock of its points' times.
+    `offset_s` is counted from `time_s`, the scan's own time on the clock of its points' times.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -145,8 +145,8 @@ def read_scan(path: Path, scan: ScanFormat, moment_s: float = 0.0) -> Sweep:
     intensity = columns.get(scan.name("intensity"), np.zeros(len(points_m)))
     offset_s = None
     if scan.times is not None:
-        offset_s = torch.from_numpy(columns[scan.times.column] * scan.times.seconds_per_count - moment_s)
-    return usable_returns(path, torch.from_numpy(points_m), torch.from_numpy(intensity), offset_s)
+        offset_s = torch.from_numpy(columns[scan.times.column] * scan.times.seconds_per_count - time_s)
+    return usable_points(path, torch.from_numpy(points_m), torch.from_numpy(intensity), offset_s)
 
 
 def read_cloud(path: Path) -> tuple[Float64[np.ndarray, "points 3"], UInt8[np.ndarray, "points 3"] | None]:

@@ -39,7 +39,7 @@ class SweepTiming:
     reference_azimuth_rad: float = 0.0
     """Counter-clockwise from x. Half a turn from it the sweep begins and ends."""
 
-    def offsets_s(self, points_m: Float[Tensor, "returns 3"]) -> Float[Tensor, "returns"]:
+    def offsets_s(self, points_m: Float[Tensor, "points 3"]) -> Float[Tensor, "points"]:
         """When each point was measured, counted from the sweep's own time: -turn_s/2 to turn_s/2."""
         azimuth = torch.atan2(points_m[:, 1], points_m[:, 0]) - self.reference_azimuth_rad
         turns = torch.remainder(azimuth / (2 * math.pi) + 0.5, 1.0) - 0.5
@@ -50,15 +50,15 @@ class SweepTiming:
 class Sweep:
     """The usable points of one turn of the scanner."""
 
-    points_m: Float[Tensor, "returns 3"]
+    points_m: Float[Tensor, "points 3"]
     """Scanner frame, float64, in the file's order."""
-    reflectance: Float[Tensor, "returns"]
+    reflectance: Float[Tensor, "points"]
     """0 to 1."""
     not_finite: int
     """How many points were left out because a coordinate is NaN or infinite."""
     out_of_range: int
     """How many points were left out because they lie nearer than 0.5 m (zeros among them) or beyond 255 m."""
-    offset_s: Float[Tensor, "returns"] | None = None
+    offset_s: Float[Tensor, "points"] | None = None
     """When each point was measured, counted from the sweep's own time, if the file gives it; float64."""
 
 
@@ -107,10 +107,10 @@ def read_sweep(path: Path) -> Sweep:
     """
     check_sweep_size(path)
     values = torch.from_numpy(np.fromfile(path, "<f4").reshape(-1, 4).astype(np.float64))
-    return usable_returns(path, values[:, :3], values[:, 3])
+    return usable_points(path, values[:, :3], values[:, 3])
 
 
-def usable_returns(
+def usable_points(
     path: Path,
     points_m: Float[Tensor, "points 3"],
     reflectance: Float[Tensor, "points"],

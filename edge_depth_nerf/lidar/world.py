@@ -39,9 +39,9 @@ _STEPS_UP = 6
 class WorldSweep:
     """A sweep's points in the world."""
 
-    points_m: Float[Tensor, "returns 3"]
+    points_m: Float[Tensor, "points 3"]
     """World, float64."""
-    spacing_m: Float[Tensor, "returns"]
+    spacing_m: Float[Tensor, "points"]
     """How far apart neighbouring points are where each point was measured, across its beam; float32."""
     spacing_rad: float
     """The same as an angle at the scanner."""
@@ -49,7 +49,7 @@ class WorldSweep:
     """At the sweep's own time."""
     elevation_rad: tuple[float, float]
     """Lowest and highest direction of the points, from the scanner's horizontal plane."""
-    offset_s: Float[Tensor, "returns"]
+    offset_s: Float[Tensor, "points"]
     """When each was measured, counted from the sweep's own time; 0 where that is unknown or not requested."""
 
 
@@ -83,7 +83,7 @@ def sweep_in_world(
 
     range_m = sweep.points_m.norm(dim=-1)
     sine = sweep.points_m[:, 2] / range_m
-    # a stray return, off drops or dust, is not the edge of the scanner's field
+    # a stray point, off drops or dust, is not the edge of the scanner's field
     low, high = (float(limit) for limit in np.quantile(sine.numpy(), (_STRAY, 1 - _STRAY)))
     # the directions between two elevations fill 2π·(sin high - sin low) steradians
     spacing_rad = _SPACING * math.sqrt(2 * math.pi * max(high - low, 1e-3) / len(range_m))

@@ -3,7 +3,7 @@
 Brightness alone does not tell: exposure drifts, light moves over the vehicle's paint, and sky and asphalt hardly
 change either. What tells is contrast, a pixel's brightness against its surroundings: exposure and shading cancel in
 it, on the vehicle it stays the same to the noise of the pictures, and over passing asphalt it does not, however
-faint. It is judged first against all that surrounds a pixel, then against the vehicle found so far, which makes the
+faint. It is evaluated first against all that surrounds a pixel, then against the vehicle found so far, which makes the
 outline sharp. Of what stays the same only what reaches the lower rim of the lens (or of the picture) is the vehicle;
 a sky that never changes is not. Smooth road stays the same as well: what is found must have an edge along its outline
 that stays, or a texture at it that is the same in two halves of the pictures. Pictures are taken to stand upright.

@@ -36,7 +36,7 @@ _MARGIN = 1 / 400
 
 def grow_moving(
     picture: UInt8[np.ndarray, "h w 3"],
-    returns_px: Float[np.ndarray, "n 2"],
+    points_px: Float[np.ndarray, "n 2"],
     reach_px: Float[np.ndarray, "n"],
     still: Bool[np.ndarray, "h w"],
 ) -> Bool[np.ndarray, "h w"]:
@@ -44,7 +44,7 @@ def grow_moving(
 
     Args:
         picture: RGB.
-        returns_px: where LiDAR points on moving things are seen, column and row.
+        points_px: where LiDAR points on moving things are seen, column and row.
         reach_px: how far apart LiDAR points are there.
         still: pixels with a LiDAR point on a still thing, and those that are not used.
 
@@ -53,11 +53,11 @@ def grow_moving(
 
     """
     shape = still.shape
-    if not len(returns_px):
+    if not len(points_px):
         return np.zeros(shape, bool)
     longest_px = float(np.quantile(reach_px, 0.9))
-    core = closed(_discs(shape, returns_px, 0.5 * reach_px), longest_px)
-    seeds = _discs(shape, returns_px, np.zeros(len(returns_px)))
+    core = closed(_discs(shape, points_px, 0.5 * reach_px), longest_px)
+    seeds = _discs(shape, points_px, np.zeros(len(points_px)))
     possible = dilated(core, _FREE_REACH * longest_px + _FREE_PX)
     inner = eroded(core, 1.0) | seeds
     against = (still & ~inner) | ~possible

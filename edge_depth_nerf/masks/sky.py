@@ -5,9 +5,9 @@ the horizon, is far by all that is known, is brighter than the ground, never red
 smooth bright part that is high up or reaches the picture's upper rim. In doubt a pixel is not sky: a prior that is kept
 can be weighed down later, one that was removed is lost.
 
-The search has three steps. First, whole smooth regions are judged: those that continue below the horizon, contain LiDAR
-points, or are whiter than a bluer sky beside them are house fronts and vans. Then the remaining regions grow to all
-that is connected with them and alike. Last come the small holes close by, as between twigs.
+The search has three steps. First, whole smooth regions are evaluated: those that continue below the horizon, contain
+LiDAR points, or are whiter than a bluer sky beside them are house fronts and vans. Then the remaining regions grow to
+all that is connected with them and alike. Last come the small holes close by, as between twigs.
 """
 
 from __future__ import annotations
@@ -76,10 +76,10 @@ _ROUNDS = 3
 """How often what was found is grown, a distance of some `_AROUND` each time."""
 _MOST_BELOW = 0.25
 """A region goes on below the horizon if so much lies there, as a share of what lies above."""
-_MOST_RETURNS = 0.3
+_MOST_POINTS = 0.3
 """LiDAR points in a region, as a share of those to be expected: the sky has none, but for where it runs into a car's
 roof or twigs."""
-_FEWEST_RETURNS = 8
+_FEWEST_POINTS = 8
 _NARROWEST = 1 / 60
 """Radius of the disc, as a share of the longer side, that fills most of a grey or white sky."""
 _NARROWEST_BLUE = 1 / 120
@@ -132,15 +132,15 @@ def find_sky(
     usable = whole_blocks(mask, factor)
     seen = rays(camera.downscaled(factor))
     far = lidar_m == 0
-    returns = ~whole_blocks(far, factor)
+    lidar_points = ~whole_blocks(far, factor)
     if mono_m is not None:
         far &= (mono_m == 0) | (mono_m >= NEAR_M)
-    possible = usable & ~dilated(returns, 1.0) & (block_mean(far.astype(np.float32), factor) > 0.5)
+    possible = usable & ~dilated(lidar_points, 1.0) & (block_mean(far.astype(np.float32), factor) > 0.5)
     blocks = _Blocks(
         colour=block_mean(picture, factor).astype(np.float32),
         usable=usable & seen.within,
         possible=possible,
-        returns=returns,
+        lidar_points=lidar_points,
         directions=seen.directions,
         height_sine=seen.directions @ up_in_camera.astype(np.float32),
     )
@@ -181,12 +181,17 @@ class _Blocks:
         colour: Float32[np.ndarray, "h w 3"],
         usable: Bool[np.ndarray, "h w"],
         possible: Bool[np.ndarray, "h w"],
-        returns: Bool[np.ndarray, "h w"],
+        lidar_points: Bool[np.ndarray, "h w"],
         directions: Float32[np.ndarray, "h w 3"],
         height_sine: Float[np.ndarray, "h w"],
     ) -> None:
         """Work out what the steps share."""
-        self.usable, self.returns, self.directions, self.height_sine = usable, returns, directions, height_sine
+        self.usable, self.lidar_points, self.directions, self.height_sine = (
+            usable,
+            lidar_points,
+            directions,
+            height_sine,
+        )
         self.side = max(usable.shape)
         self.brightness = colour.max(-1)
         self.blue = np.log((colour[..., 2] + 8) / (colour[..., 0] + 8))
@@ -289,9 +294,9 @@ def _surfaces(blocks: _Blocks) -> Bool[np.ndarray, "h w"]:
     # as many as one would have at these elevations where no sky can be
     bins = np.clip((90 + np.degrees(np.arcsin(np.clip(blocks.height_sine, -1, 1)))).astype(np.int64), 0, 179)
     others = blocks.usable & ~blocks.like_sky
-    there, returned = (np.bincount(bins[where], minlength=180) for where in (others, others & blocks.returns))
+    there, returned = (np.bincount(bins[where], minlength=180) for where in (others, others & blocks.lidar_points))
     expected = sums((returned / np.maximum(there, 1))[bins])
-    surface = goes_on | (sums(blocks.returns) > np.maximum(_MOST_RETURNS * expected, _FEWEST_RETURNS))
+    surface = goes_on | (sums(blocks.lidar_points) > np.maximum(_MOST_POINTS * expected, _FEWEST_POINTS))
     surface[0] = False
     return surface[labels]
 
@@ -334,7 +339,7 @@ def _with_gaps(blocks: _Blocks, sky: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray
     reach_px = max(1.0, _LARGEST_GAP_DEG / blocks.degrees_per_px)
     for _ in range(_ROUNDS):
         others = _alike(blocks, sky) & ~sky
-        # a van with returns on it is one thing, of which they leave pieces
+        # a van with LiDAR points on it is one thing, of which they leave pieces
         gaps = blocks.possible & others & ~larger(others, reach_px**2)
         sky = sky | touching(gaps, gaps & _near(sky, reach_px))
     return sky

@@ -25,7 +25,7 @@ from edge_depth_nerf.method.integration import check_choice
 
 Align = Literal["none", "global", "local"]
 
-LEAST_RETURNS = 50
+LEAST_POINTS = 50
 """With fewer LiDAR points a frame takes the drive's fit."""
 EXPONENT_RANGE = (0.5, 2.0)
 """The exponent stays within: beyond, the map has nothing to do with the distances."""
@@ -40,10 +40,10 @@ FINEST_CELL_LOG = 0.07
 """Depth of the finest cells in log m; that of all coarser ones is twice as much, a factor of 1.15 in distance."""
 LEVELS = 6
 """Grids of the pyramid; each has cells of twice the side of the one below, the coarsest of a fifth of the picture."""
-IMAGINED_RETURNS = 0.2
+IMAGINED_POINTS = 0.2
 """So many imagined LiDAR points with the coarser cell's value are added to each cell."""
-JUDGING_RETURNS = 0.5
-"""The same in the search for outliers: a LiDAR point alone in its cell is judged by those around."""
+IMAGINED_FOR_OUTLIERS = 0.5
+"""The same in the search for outliers: a LiDAR point alone in its cell is compared with those around."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Aligned:
     """The picture's curve, before the local correction."""
     fit_of: Literal["none", "frame", "drive"]
     """Whose LiDAR points made it. drive: the frame has fewer than LEAST_RETURNS; there is no local correction then."""
-    returns: int
+    lidar_points: int
     """Pixels that have both LiDAR and mono."""
 
 
@@ -150,17 +150,17 @@ def align(
 
     """
     check_choice("align", mode, Align)
-    returns = both(lidar_m, mono_m, valid)
-    count = int(returns.sum())
+    lidar_points = both(lidar_m, mono_m, valid)
+    count = int(lidar_points.sum())
     if mode == "none":
         return Aligned(Fit().apply(mono_m), Fit(), "none", count)
-    if count < LEAST_RETURNS:
+    if count < LEAST_POINTS:
         fit = drive_fit or Fit()
         return Aligned(fit.apply(mono_m), fit, "none" if drive_fit is None else "drive", count)
-    fit = fit_logs(lidar_m[returns], mono_m[returns])
+    fit = fit_logs(lidar_m[lidar_points], mono_m[lidar_points])
     aligned = fit.apply(mono_m)
     if mode == "local":
-        aligned = _correct(aligned, lidar_m, returns, valid)
+        aligned = _correct(aligned, lidar_m, lidar_points, valid)
     return Aligned(aligned, fit, "frame", count)
 
 
@@ -173,22 +173,22 @@ def robust_weights(residual: NDArray, least_spread: float) -> NDArray:
 
 
 def _correct(
-    mono_m: NDArray[np.float32], lidar_m: NDArray[np.float32], returns: NDArray[np.bool_], valid: NDArray[np.bool_]
+    mono_m: NDArray[np.float32], lidar_m: NDArray[np.float32], lidar_points: NDArray[np.bool_], valid: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
     """Add the local correction to a fitted map."""
     wanted = valid & (mono_m > 0)
     log_m = np.log(np.where(wanted, mono_m, 1))
     pyramid = _Pyramid(mono_m.shape, float(log_m[wanted].min()), float(log_m[wanted].max()))
-    log_of_returns = log_m[returns]
-    residual = np.log(lidar_m[returns]) - log_of_returns
-    places = pyramid.places(returns, log_of_returns)
+    log_at_points = log_m[lidar_points]
+    residual = np.log(lidar_m[lidar_points]) - log_at_points
+    places = pyramid.places(lidar_points, log_at_points)
     # an outlier is one against its neighbours, not against the picture: twice weighted anew
     weight = robust_weights(residual, least_spread=0.1)
     for _ in range(2):
-        left = residual - pyramid.read(pyramid.grid(places, residual, weight, JUDGING_RETURNS), places)
+        left = residual - pyramid.read(pyramid.grid(places, residual, weight, IMAGINED_FOR_OUTLIERS), places)
         weight = robust_weights(left, least_spread=1e-3)
     correction = pyramid.read(
-        pyramid.grid(places, residual, weight, IMAGINED_RETURNS), pyramid.places(wanted, log_m[wanted])
+        pyramid.grid(places, residual, weight, IMAGINED_POINTS), pyramid.places(wanted, log_m[wanted])
     )
     corrected = mono_m.copy()
     corrected[wanted] *= np.exp(correction)

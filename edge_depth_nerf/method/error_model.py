@@ -58,7 +58,7 @@ _LOGARITHMIC = ("distance_m", "spread", "step", "by_matching")
 RIM_STEP = 0.1
 """Neighbours in a map from motion whose logarithms differ by more are of two surfaces."""
 
-LEAST_JUDGED = 300
+LEAST_EVALUATED = 300
 """With fewer errors there is no error model."""
 LEAST_IN_BIN = 100
 """A bin with fewer takes its neighbours' factor."""
@@ -77,7 +77,7 @@ def pixel_features(
     distance_m: Float[np.ndarray, "h w"],
     spread_m: Float[np.ndarray, "h w"],
     mono_m: Float[np.ndarray, "h w"],
-    returns: Bool[np.ndarray, "h w"],
+    lidar_points: Bool[np.ndarray, "h w"],
     theta_rad: Float[np.ndarray, "h w"],
 ) -> dict[str, NDArray[np.float32]]:
     """Compute the features of every pixel of a prior, H×W each; where there is no prior they mean nothing.
@@ -86,7 +86,7 @@ def pixel_features(
         distance_m: d̃, 0 = none.
         spread_m: of what was averaged into it, whether or not a LiDAR point was kept.
         mono_m: the aligned monocular map, 0 = none.
-        returns: the LiDAR points that the prior was made of.
+        lidar_points: the LiDAR points that the prior was made of.
         theta_rad: angle of each ray from the optical axis.
 
     """
@@ -98,7 +98,7 @@ def pixel_features(
     return {
         "distance_m": distance_m,
         "theta_deg": np.degrees(theta_rad).astype(np.float32),
-        "nearest_px": np.asarray(cv2.distanceTransform((~returns).astype(np.uint8), cv2.DIST_L2, 5), np.float32),
+        "nearest_px": np.asarray(cv2.distanceTransform((~lidar_points).astype(np.uint8), cv2.DIST_L2, 5), np.float32),
         "spread": spread_m / np.maximum(distance_m, 1e-3),
         "step": np.maximum(highest - lowest, 0),
     }
@@ -192,7 +192,7 @@ def fit_error_model(
             one.
 
     """
-    if len(relative_error) < LEAST_JUDGED:
+    if len(relative_error) < LEAST_EVALUATED:
         return None
     bins = {}
     for name, knots in knots_of.items():
@@ -221,8 +221,8 @@ def fit_error_model(
     return ErrorModel(log_base, {name: factors.tolist() for name, factors in log_factors.items()})
 
 
-def error_of_returns(
-    lidar_m: Float[np.ndarray, "h w"], returns: Bool[np.ndarray, "h w"]
+def error_of_lidar_points(
+    lidar_m: Float[np.ndarray, "h w"], lidar_points: Bool[np.ndarray, "h w"]
 ) -> tuple[Bool[np.ndarray, "h w"], NDArray[np.float32]]:
     """Measure how far LiDAR points lie from a line through their two neighbours, the worse of row and column.
 
@@ -234,12 +234,12 @@ def error_of_returns(
         Which LiDAR points have neighbours, and their relative errors (0 elsewhere).
 
     """
-    inverse = np.where(returns, 1 / np.where(returns, lidar_m, 1), 0).astype(np.float32)
+    inverse = np.where(lidar_points, 1 / np.where(lidar_points, lidar_m, 1), 0).astype(np.float32)
     padded = np.pad(inverse, 1)
-    found = np.zeros(returns.shape, bool)
-    error = np.zeros(returns.shape, np.float32)
+    found = np.zeros(lidar_points.shape, bool)
+    error = np.zeros(lidar_points.shape, np.float32)
     for before, after in ((padded[1:-1, :-2], padded[1:-1, 2:]), (padded[:-2, 1:-1], padded[2:, 1:-1])):
-        has = returns & (before > 0) & (after > 0)
+        has = lidar_points & (before > 0) & (after > 0)
         off = np.abs(inverse - (before + after) / 2) * lidar_m / np.sqrt(1.5)
         error = np.where(has, np.maximum(error, off), error).astype(np.float32)
         found |= has
@@ -295,7 +295,7 @@ class BeyondField:
 
 
 @dataclass(frozen=True)
-class MotionTrust:
+class MotionCalibration:
     """What a drive's training frames say about its distances from motion."""
 
     weight: float
@@ -311,7 +311,7 @@ class MotionTrust:
 
 
 @dataclass(frozen=True)
-class Trust:
+class Calibration:
     """What a drive's training frames say about its prior."""
 
     made_of: str
@@ -329,7 +329,7 @@ class Trust:
     """Curve of all frames together, for those with few LiDAR points."""
     frames: tuple[FrameAlignment, ...] = field(default=())
     """The training frames it was made from."""
-    motion: MotionTrust | None = None
+    motion: MotionCalibration | None = None
     """Of distances from motion; None where the scene has none, or too few to measure: then they take no part."""
 
     def in_field(self, elevation_rad: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
@@ -352,21 +352,23 @@ class Trust:
             sigma[from_motion] = self.motion.error_model.sigma_m(of_motion)
         if self.return_model is None:
             return sigma
-        at_return = features["nearest_px"] == 0
-        sigma[at_return] = self.return_model.sigma_m({name: values[at_return] for name, values in features.items()})
+        at_lidar_point = features["nearest_px"] == 0
+        sigma[at_lidar_point] = self.return_model.sigma_m(
+            {name: values[at_lidar_point] for name, values in features.items()}
+        )
         return sigma
 
     def summary(self) -> str:
         """Sum up the calibration in some sentences for the user."""
-        judged = [f for f in self.frames if f.held_out_before is not None and f.held_out_after is not None]
+        evaluated = [f for f in self.frames if f.held_out_before is not None and f.held_out_after is not None]
         parts = []
-        if judged:
+        if evaluated:
             before, after = (
-                np.median([getattr(f, name) for f in judged]) for name in ("held_out_before", "held_out_after")
+                np.median([getattr(f, name) for f in evaluated]) for name in ("held_out_before", "held_out_after")
             )
             parts.append(
                 f"Error of the monocular maps, at LiDAR points left out of their alignment: {before:.1%} before it, "
-                f"{after:.1%} after it (mean relative error, median of {len(judged)} training pictures)."
+                f"{after:.1%} after it (mean relative error, median of {len(evaluated)} training pictures)."
             )
         poor = [f.frame for f in self.frames if f.fit_of == "drive"]
         if poor:
@@ -421,8 +423,8 @@ def _checksum(content: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
-def read_trust(path: Path) -> Trust:
-    """Read what `Trust.write` wrote.
+def read_calibration(path: Path) -> Calibration:
+    """Read what `Calibration.write` wrote.
 
     Raises:
         FileNotFoundError: no such file.
@@ -438,9 +440,9 @@ def read_trust(path: Path) -> Trust:
         # files of before have none
         if content.get("sha256") not in (None, _checksum({k: v for k, v in content.items() if k != "sha256"})):
             raise ValueError("its checksum does not fit")
-        trust = TypeAdapter(Trust).validate_json(json.dumps(content), strict=True)
-        _check(trust)
-        return trust
+        calibration = TypeAdapter(Calibration).validate_json(json.dumps(content), strict=True)
+        _check(calibration)
+        return calibration
     except ValidationError as error:
         first = error.errors()[0]
         problem = f"{'.'.join(map(str, first['loc']))} is {shown(first['input'])}: {first['msg']}"
@@ -452,7 +454,7 @@ def read_trust(path: Path) -> Trust:
     )
 
 
-def _check(trust: Trust) -> None:
+def _check(calibration: Calibration) -> None:
     """Check what the types of a calibration do not say.
 
     Raises:
@@ -460,16 +462,16 @@ def _check(trust: Trust) -> None:
             are kept), or a model has other features.
 
     """
-    for number in _floats(asdict(trust)):
+    for number in _floats(asdict(calibration)):
         if not abs(number) <= _MAX_NUMBER:
             raise ValueError(f"{shown(number)} for a number")
-    models = [(trust.error_model, KNOTS), (trust.return_model, KNOTS)]
-    if trust.motion is not None:
-        if not 0 <= trust.motion.weight <= 1:
-            raise ValueError(f"{trust.motion.weight} for a weight")
-        models.append((trust.motion.error_model, KNOTS))
-        if trust.motion.beyond is not None:
-            beyond = trust.motion.beyond
+    models = [(calibration.error_model, KNOTS), (calibration.return_model, KNOTS)]
+    if calibration.motion is not None:
+        if not 0 <= calibration.motion.weight <= 1:
+            raise ValueError(f"{calibration.motion.weight} for a weight")
+        models.append((calibration.motion.error_model, KNOTS))
+        if calibration.motion.beyond is not None:
+            beyond = calibration.motion.beyond
             models += [(beyond.motion_model, MOTION_KNOTS), (beyond.network_model, KNOTS)]
     for model, knots in models:
         if model and {n: len(f) for n, f in model.log_factors.items()} != {n: len(k) for n, k in knots.items()}:

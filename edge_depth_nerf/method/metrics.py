@@ -1,8 +1,8 @@
-"""What a rendered view is judged by: pictures inside a mask, and distances.
+"""What a rendered view is evaluated by: pictures inside a mask, and distances.
 
-Pictures are `[h, w, 3]` in 0 to 1, masks `[h, w]` (True = judge the pixel), distances `[h, w]` in metres along the
+Pictures are `[h, w, 3]` in 0 to 1, masks `[h, w]` (True = evaluate the pixel), distances `[h, w]` in metres along the
 ray. What lies outside the mask never counts, be it NaN. Each picture metric is one number a picture, always finite;
-a mask that leaves nothing to judge is an error, not a number: check masks before a run, not in the middle of one.
+a mask that leaves nothing to evaluate is an error, not a number: check masks before a run, not in the middle of one.
 nerfstudio's `psnr`, `ssim` and `lpips` are of the full frame; these are not.
 """
 
@@ -32,7 +32,7 @@ SSIM_SIZE_PX = 2 * SSIM_RADIUS_PX + 1
 LEAST_SQUARED_ERROR = 1e-10
 """Below this mean squared error PSNR stays at 100 dB, so that equal pictures have a finite figure."""
 
-JUDGED_RANGE_M = (1.0, 60.0)
+EVALUATED_RANGE_M = (1.0, 60.0)
 """Depth errors are taken where the true distance lies in this range, metres."""
 
 
@@ -117,7 +117,7 @@ def masked_lpips(
     Args:
         pred: rendered picture; clipped to 0 to 1, as the network refuses anything else.
         target: true picture; likewise.
-        mask: True = judge.
+        mask: True = evaluate.
         network: what `load_lpips` gave.
 
     Raises:
@@ -163,8 +163,8 @@ def load_lpips() -> torch.nn.Module | None:
 class DepthErrors:
     """Errors of rendered distances, pooled over the pixels of all pictures given (not averaged over pictures).
 
-    A pixel is judged where its mask is True and its *true* distance lies in `JUDGED_RANGE_M`; the prediction may be
-    anything finite.
+    A pixel is evaluated where its mask is True and its *true* distance lies in `EVALUATED_RANGE_M`; the prediction may
+    be anything finite.
     """
 
     def __init__(self) -> None:
@@ -176,15 +176,15 @@ class DepthErrors:
     def update(
         self, pred_distance_m: Float[Tensor, "h w"], true_distance_m: Float[Tensor, "h w"], mask: Bool[Tensor, "h w"]
     ) -> None:
-        """Add a picture; one without any judged pixel adds nothing.
+        """Add a picture; one without any evaluated pixel adds nothing.
 
         Args:
             pred_distance_m: rendered distance, metres along the ray.
             true_distance_m: LiDAR or truth, metres along the ray, 0 = none.
-            mask: True = judge.
+            mask: True = evaluate.
 
         Raises:
-            InputError: shapes that do not fit, or a prediction that is not finite at a judged pixel.
+            InputError: shapes that do not fit, or a prediction that is not finite at a evaluated pixel.
 
         """
         if not pred_distance_m.shape == true_distance_m.shape == mask.shape:
@@ -192,13 +192,13 @@ class DepthErrors:
                 f"DepthErrors.update: found pred_distance_m {tuple(pred_distance_m.shape)}, true_distance_m "
                 f"{tuple(true_distance_m.shape)}, mask {tuple(mask.shape)}; expected one shape."
             )
-        low, high = JUDGED_RANGE_M
-        judged = mask & (true_distance_m >= low) & (true_distance_m <= high)
-        pred, true = pred_distance_m[judged].double(), true_distance_m[judged].double()
+        low, high = EVALUATED_RANGE_M
+        evaluated = mask & (true_distance_m >= low) & (true_distance_m <= high)
+        pred, true = pred_distance_m[evaluated].double(), true_distance_m[evaluated].double()
         broken = int((~torch.isfinite(pred)).sum())
         if broken:
             raise InputError(
-                f"DepthErrors.update: {broken} of {pred.numel()} judged pixels have a predicted distance that is not "
+                f"DepthErrors.update: {broken} of {pred.numel()} evaluated pixels have a prediction that is not "
                 "finite; expected metres. Mask out rays that cannot be rendered."
             )
         difference = pred - true
@@ -213,7 +213,7 @@ class DepthErrors:
         Returns:
             `abs_rel` (mean of |pred - true| / true), `rmse_m` (metres), `delta_1_25` (the part, 0 to 1, of pixels
             with max(pred / true, true / pred) < 1.25) and `pixels`, all finite; nothing at all if no pixel was
-            judged, so that no figure stands for an absent measurement.
+            evaluated, so that no figure stands for an absent measurement.
 
         """
         if not self.pixels:

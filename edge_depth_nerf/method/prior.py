@@ -27,7 +27,7 @@ from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.masks.sky import regions_like_sky
 from edge_depth_nerf.method.alignment import Align, align
-from edge_depth_nerf.method.error_model import Trust, motion_features, pixel_features
+from edge_depth_nerf.method.error_model import Calibration, motion_features, pixel_features
 from edge_depth_nerf.method.integration import (
     INTEGRATED,
     MONO_RELATIVE_ERROR,
@@ -105,7 +105,7 @@ class PriorOptions:
         check_choice("align", self.align, Align)
         check_choice("sigma_mode", self.sigma_mode, PriorSigma)
 
-    def wants_trust(self, depth_source: str) -> bool:
+    def wants_calibration(self, depth_source: str) -> bool:
         """Say whether a calibration of the drive has a part in the prior made of a source."""
         calibrated = self.sigma_mode == "calibrated" and depth_source in CALIBRATED
         return calibrated or (self.align != "none" and depth_source == INTEGRATED)
@@ -176,7 +176,7 @@ class IntegratedFrame:
     """Of what was averaged, also where a LiDAR point was kept."""
     mono_m: NDArray[np.float32]
     """The aligned monocular map, with what motion adds to it."""
-    returns: NDArray[np.bool_]
+    lidar_points: NDArray[np.bool_]
     """The LiDAR points that entered."""
     from_motion: NDArray[np.bool_]
     """Where motion has a part, except at LiDAR points."""
@@ -206,10 +206,10 @@ def integrate_frame(
     mask: NDArray[np.bool_],
     depth_source: str,
     options: PriorOptions,
-    trust: Trust | None = None,
+    calibration: Calibration | None = None,
     motion: MotionMap | None = None,
 ) -> IntegratedFrame:
-    """Align and integrate a frame under a calibration: the prior whose error `Trust` describes.
+    """Align and integrate a frame under a calibration: the prior whose error `Calibration` describes.
 
     Args:
         lidar_m: H×W LiDAR distance, 0 = no LiDAR point.
@@ -217,7 +217,7 @@ def integrate_frame(
         mask: H×W, True where the picture may be used.
         depth_source: integrated, or mono alone.
         options: what is made of them.
-        trust: the drive's calibration, for its fit.
+        calibration: the drive's calibration, for its fit.
         motion: what is known from motion; for the integrated source.
 
     Raises:
@@ -225,23 +225,23 @@ def integrate_frame(
 
     """
     anywhere, mask = mask, mask & ~(mono_m > FARTHEST_M)
-    returns = mask & np.isfinite(lidar_m) & (lidar_m > 0)
+    lidar_points = mask & np.isfinite(lidar_m) & (lidar_m > 0)
     if depth_source == "mono":
-        returns = np.zeros_like(mask)
+        lidar_points = np.zeros_like(mask)
     else:
         fitted_to_m = lidar_m if motion is None else _measured(lidar_m, motion)
-        mono_m = align(fitted_to_m, mono_m, mask, options.align, trust.drive_fit if trust else None).mono_m
+        mono_m = align(fitted_to_m, mono_m, mask, options.align, calibration.drive_fit if calibration else None).mono_m
     from_motion = np.zeros_like(mask)
     if motion is not None:
-        from_motion = anywhere & (motion.distance_m > 0) & ~returns
-        # where the monocular map means "far" a return takes no part, with motion or without
+        from_motion = anywhere & (motion.distance_m > 0) & ~lidar_points
+        # where the monocular map means "far" a LiDAR point takes no part, with motion or without
         lidar_m = np.where(mask, lidar_m, np.float32(0))
         mono_counts = mask & motion.mono_counts & ~(motion.alone & (motion.distance_m > 0))
         if motion.around_m is not None:
             mono_counts &= ~motion.alone | confirmed(mono_m, motion.around_m)
         mono_m = _joined(np.where(mono_counts, mono_m, np.float32(0)), motion.distance_m, motion.weight)
         mask = anywhere
-    # the spread is wanted at returns, too, so they are kept afterwards
+    # the spread is wanted at LiDAR points, too, so they are kept afterwards
     integration = dataclasses.replace(options.integration, keep_returns=False)
 
     def integrated(lidar_m: NDArray[np.float32], mono_m: NDArray[np.float32]) -> tuple[NDArray, NDArray]:
@@ -254,11 +254,11 @@ def integrate_frame(
         # a monocular map that is worse takes no part in the windows of these pixels, either
         by_motion = integrated(np.zeros_like(mono_m), np.where(motion.alone, motion.distance_m, np.float32(0)))
         distance, spread = (np.where(alone, *both) for both in zip(by_motion, (distance, spread), strict=True))
-    returns &= distance > 0
+    lidar_points &= distance > 0
     if options.integration.keep_returns:
-        distance = np.where(returns, lidar_m, distance)
+        distance = np.where(lidar_points, lidar_m, distance)
     known = np.where(np.isfinite(mono_m), mono_m, 0)
-    return IntegratedFrame(distance, spread, known, returns, from_motion)
+    return IntegratedFrame(distance, spread, known, lidar_points, from_motion)
 
 
 def confirmed(mono_m: NDArray[np.float32], around_m: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -282,15 +282,19 @@ def _measured(lidar_m: NDArray[np.float32], motion: MotionMap) -> NDArray[np.flo
 
 
 def sigma_of(
-    frame: IntegratedFrame, trust: Trust, view: RayAngles, motion: MotionMap | None, motion_sigma_m: NDArray[np.float32]
+    frame: IntegratedFrame,
+    calibration: Calibration,
+    view: RayAngles,
+    motion: MotionMap | None,
+    motion_sigma_m: NDArray[np.float32],
 ) -> NDArray[np.float32]:
     """σ̂ of a frame's prior, metres: by the model of LiDAR's field in it, by those of `BeyondField` beyond."""
-    features = pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, frame.returns, view.theta_rad)
-    sigma_m = trust.sigma_m(features, frame.from_motion)
-    beyond = trust.motion.beyond if trust.motion is not None else None
+    features = pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, frame.lidar_points, view.theta_rad)
+    sigma_m = calibration.sigma_m(features, frame.from_motion)
+    beyond = calibration.motion.beyond if calibration.motion is not None else None
     if motion is None or beyond is None:
         return sigma_m
-    outside = motion.alone & ~frame.returns
+    outside = motion.alone & ~frame.lidar_points
     if beyond.network_model is not None:
         where = outside & ~frame.from_motion
         of_network = beyond_features(frame, view)
@@ -304,7 +308,7 @@ def sigma_of(
 
 def beyond_features(frame: IntegratedFrame, view: RayAngles) -> dict[str, NDArray[np.float32]]:
     """Compute features beyond LiDAR's field, where the nearest known pixel may be one from motion."""
-    known = frame.returns | frame.from_motion
+    known = frame.lidar_points | frame.from_motion
     return pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, known, view.theta_rad)
 
 
@@ -314,7 +318,7 @@ def _joined(mono_m: NDArray[np.float32], motion_m: NDArray[np.float32], motion_w
 
 def motion_map(
     motion_m: NDArray[np.float32],
-    trust: Trust,
+    calibration: Calibration,
     view: RayAngles,
     lidar_m: NDArray[np.float32] | None,
     around_m: NDArray[np.float32] | None = None,
@@ -323,24 +327,24 @@ def motion_map(
 
     Args:
         motion_m: H×W, 0 = none.
-        trust: the drive's calibration, with what it says of motion.
+        calibration: the drive's calibration, with what it says of motion.
         view: of the picture.
         lidar_m: its LiDAR, 0 = no LiDAR point; None without.
         around_m: what the neighbours' distances from motion show, 0 = nothing; None where that is not known.
 
     """
-    assert trust.motion is not None
-    in_field, beyond = trust.in_field(view.elevation_rad), trust.motion.beyond
+    assert calibration.motion is not None
+    in_field, beyond = calibration.in_field(view.elevation_rad), calibration.motion.beyond
     if beyond is None:
-        counts = np.full_like(in_field, True) if trust.everywhere else in_field
-        return MotionMap(motion_m, trust.motion.weight, counts, np.zeros_like(in_field))
+        counts = np.full_like(in_field, True) if calibration.everywhere else in_field
+        return MotionMap(motion_m, calibration.motion.weight, counts, np.zeros_like(in_field))
     if beyond.motion_model is None:
         motion_m = np.where(in_field, motion_m, np.float32(0))
     known = motion_m > 0 if lidar_m is None else (motion_m > 0) | (np.nan_to_num(lidar_m) > 0)
-    counts = in_field | trust.everywhere | beyond.network_reaches(view.elevation_rad, known)
-    if trust.everywhere:
-        return MotionMap(motion_m, trust.motion.weight, counts, ~in_field)
-    return MotionMap(motion_m, trust.motion.weight, counts, ~in_field, around_or_nothing(motion_m, around_m))
+    counts = in_field | calibration.everywhere | beyond.network_reaches(view.elevation_rad, known)
+    if calibration.everywhere:
+        return MotionMap(motion_m, calibration.motion.weight, counts, ~in_field)
+    return MotionMap(motion_m, calibration.motion.weight, counts, ~in_field, around_or_nothing(motion_m, around_m))
 
 
 def around_or_nothing(motion_m: NDArray[np.float32], around_m: NDArray[np.float32] | None) -> NDArray[np.float32]:
@@ -359,7 +363,7 @@ def make_prior(
     mask: NDArray[np.bool_],
     depth_source: str,
     options: PriorOptions,
-    trust: Trust | None = None,
+    calibration: Calibration | None = None,
     view: RayAngles | None = None,
 ) -> Prior:
     """Align a frame's monocular map, integrate (Eq. 5-7), and say how far each pixel is trusted.
@@ -369,8 +373,8 @@ def make_prior(
         mask: H×W, True where the picture may be used.
         depth_source: integrated (LiDAR and mono, and motion where it is given), or the name of a source.
         options: what is made of them.
-        trust: the drive's calibration; used for the drive's fit, and under sigma_mode calibrated.
-        view: of the picture; under sigma_mode calibrated a trust wants it.
+        calibration: the drive's calibration; used for the drive's fit, and under sigma_mode calibrated.
+        view: of the picture; under sigma_mode calibrated a calibration wants it.
 
     Raises:
         InputError: there is no map of a source that is needed, or the maps differ in size.
@@ -378,23 +382,28 @@ def make_prior(
     """
     lidar_m, mono_m = maps.get("lidar"), maps.get("mono")
     motion_m = maps.get("motion") if options.motion and depth_source == INTEGRATED else None
-    if options.sigma_mode == "calibrated" and depth_source in CALIBRATED and trust is not None and mono_m is not None:
+    if (
+        options.sigma_mode == "calibrated"
+        and depth_source in CALIBRATED
+        and calibration is not None
+        and mono_m is not None
+    ):
         assert view is not None
         motion, motion_sigma_m = None, np.zeros(mask.shape, np.float32)
-        if motion_m is not None and trust.motion is not None:
-            motion = motion_map(motion_m, trust, view, lidar_m, maps.get("motion_around"))
+        if motion_m is not None and calibration.motion is not None:
+            motion = motion_map(motion_m, calibration, view, lidar_m, maps.get("motion_around"))
             motion_sigma_m = motion_sigma(motion_m, maps.get("motion_sigma"))
         else:
-            mask = mask if trust.everywhere else mask & trust.in_field(view.elevation_rad)
-        if trust.error_model is not None and (lidar_m is not None or depth_source == "mono"):
+            mask = mask if calibration.everywhere else mask & calibration.in_field(view.elevation_rad)
+        if calibration.error_model is not None and (lidar_m is not None or depth_source == "mono"):
             lidar_m = np.zeros_like(mono_m) if lidar_m is None else lidar_m
-            frame = integrate_frame(lidar_m, mono_m, mask, depth_source, options, trust, motion)
-            sigma = sigma_of(frame, trust, view, motion, motion_sigma_m)
+            frame = integrate_frame(lidar_m, mono_m, mask, depth_source, options, calibration, motion)
+            sigma = sigma_of(frame, calibration, view, motion, motion_sigma_m)
             return Prior(frame.distance_m, np.where(frame.distance_m > 0, sigma, np.float32(0)))
         # what could not be measured takes no part
         motion_m = None
     if depth_source == INTEGRATED and lidar_m is not None and mono_m is not None:
-        aligned = align(lidar_m, mono_m, mask, options.align, trust.drive_fit if trust else None).mono_m
+        aligned = align(lidar_m, mono_m, mask, options.align, calibration.drive_fit if calibration else None).mono_m
         if motion_m is not None:
             aligned = _joined(aligned, motion_m, weight_of_errors(MOTION_RELATIVE_ERROR, MONO_RELATIVE_ERROR))
         maps = {**maps, "mono": aligned}
@@ -413,13 +422,13 @@ class PriorCache:
     A folder that cannot be written (a read-only scene) is not an error: the prior is then made each time.
     """
 
-    def __init__(self, folder: Path, depth_source: str, options: PriorOptions, trust: Trust | None = None):
-        self.folder, self.depth_source, self.options, self.trust = folder, depth_source, options, trust
+    def __init__(self, folder: Path, depth_source: str, options: PriorOptions, calibration: Calibration | None = None):
+        self.folder, self.depth_source, self.options, self.calibration = folder, depth_source, options, calibration
         described = {
             "version": CACHE_VERSION,
             "depth_source": depth_source,
             **dataclasses.asdict(options),
-            "trust": None if trust is None else trust.to_dict(),
+            "trust": None if calibration is None else calibration.to_dict(),
         }
         self._options_key = json.dumps(described, sort_keys=True).encode()
 
@@ -431,7 +440,7 @@ class PriorCache:
         cached = _read(path, mask.shape)
         if cached is not None:
             return cached
-        prior = make_prior(maps, mask, self.depth_source, self.options, self.trust, view)
+        prior = make_prior(maps, mask, self.depth_source, self.options, self.calibration, view)
 
         archive = io.BytesIO()
         np.savez_compressed(archive, distance_m=prior.distance_m, sigma_m=prior.sigma_m)

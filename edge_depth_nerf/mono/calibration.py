@@ -1,4 +1,4 @@
-"""A drive's calibration of trust: how well its monocular maps fit LiDAR, and how wrong its priors are.
+"""A drive's calibration: how well its monocular maps fit LiDAR, and how wrong its priors are.
 
 It is made only from training frames. In each frame some LiDAR points are held out, the prior is made of the rest, and
 compared with the held-out points: whole blocks of 64 px (of 1400), single points, and in every second frame LiDAR's
@@ -33,22 +33,22 @@ from edge_depth_nerf.base.checked_cache import keep_last, used
 from edge_depth_nerf.base.console import progress_bars
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.numbers import spread_over
-from edge_depth_nerf.method.alignment import LEAST_RETURNS, align, both, fit_logs
+from edge_depth_nerf.method.alignment import LEAST_POINTS, align, both, fit_logs
 from edge_depth_nerf.method.error_model import (
     FIELD_MARGIN_DEG,
-    LEAST_JUDGED,
+    LEAST_EVALUATED,
     MOTION_KNOTS,
     BeyondField,
+    Calibration,
     ErrorModel,
     Features,
     FrameAlignment,
-    MotionTrust,
-    Trust,
-    error_of_returns,
+    MotionCalibration,
+    error_of_lidar_points,
     fit_error_model,
     motion_features,
     pixel_features,
-    read_trust,
+    read_calibration,
 )
 from edge_depth_nerf.method.integration import INTEGRATED, weight_of_errors
 from edge_depth_nerf.method.prior import (
@@ -66,7 +66,7 @@ from edge_depth_nerf.method.prior import (
 )
 from edge_depth_nerf.mono.far_seen import seen_above, static_cloud
 from edge_depth_nerf.mono.motion_seen import left_out_pixels
-from edge_depth_nerf.scene.format import TRUST_FILE
+from edge_depth_nerf.scene.format import CALIBRATION_FILE
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
 
 KEPT_CALIBRATIONS = 16
@@ -85,7 +85,7 @@ _BEYOND_VERSION = 2
 """Part of the key of calibrations with motion: raised when they measure otherwise beyond LiDAR's field."""
 REACH_QUANTILE = 0.95
 """Of how far left-out distances from motion lie from the nearest that is known: beyond, nothing is measured."""
-_JUDGED_A_FRAME = 5_000
+_EVALUATED_A_FRAME = 5_000
 _FOR_THE_DRIVE_A_FRAME = 2_000
 """So many LiDAR points of a frame are used; more tell nothing new."""
 
@@ -161,26 +161,26 @@ class MeasuredFrame:
     """Where LiDAR does not reach; None without motion."""
 
 
-def held_out_returns(
-    returns: NDArray[np.bool_], elevation_rad: NDArray[np.float32], number: int
+def held_out_points(
+    lidar_points: NDArray[np.bool_], elevation_rad: NDArray[np.float32], number: int
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which of a frame's LiDAR points (H×W) to hold out, and which of these lie in whole blocks.
 
     The elevation is that of each ray (H×W); the frame's number in the calibration seeds the choice.
     """
     rng = np.random.default_rng([7, number])
-    height, width = returns.shape
+    height, width = lidar_points.shape
     side = max(4, round(HELD_OUT_BLOCK_SHARE * width))
     chosen = rng.random((height // side + 1, width // side + 1)) < HELD_OUT_PART
-    in_blocks = np.kron(chosen, np.ones((side, side), bool))[:height, :width] & returns
-    left_out = in_blocks | ((rng.random(returns.shape) < HELD_OUT_PART) & returns)
-    if number % 2 and returns.any():
-        low, high = np.quantile(elevation_rad[returns], HELD_OUT_ROWS)
-        left_out |= returns & ((elevation_rad < low) | (elevation_rad > high))
+    in_blocks = np.kron(chosen, np.ones((side, side), bool))[:height, :width] & lidar_points
+    left_out = in_blocks | ((rng.random(lidar_points.shape) < HELD_OUT_PART) & lidar_points)
+    if number % 2 and lidar_points.any():
+        low, high = np.quantile(elevation_rad[lidar_points], HELD_OUT_ROWS)
+        left_out |= lidar_points & ((elevation_rad < low) | (elevation_rad > high))
     return left_out, in_blocks
 
 
-def calibrate_scene(scene: Path, console: Console | None = None) -> Trust:
+def calibrate_scene(scene: Path, console: Console | None = None) -> Calibration:
     """Measure a scene's alignment and errors from its training frames, and keep the result as SCENE/mono_trust.json.
 
     Raises:
@@ -189,40 +189,40 @@ def calibrate_scene(scene: Path, console: Console | None = None) -> Trust:
 
     """
     read = read_scene(scene)
-    trust = _calibrate(read, _chosen(read), INTEGRATED, PriorOptions(), console)
-    trust.write(read.folder / TRUST_FILE)
-    return trust
+    calibration = _calibrate(read, _chosen(read), INTEGRATED, PriorOptions(), console)
+    calibration.write(read.folder / CALIBRATION_FILE)
+    return calibration
 
 
-def saved_trust(
+def saved_calibration(
     scene: SceneFolder,
     options: PriorOptions,
     cache: Path | None = None,
     training_images: Collection[Path] | None = None,
     depth_source: str = INTEGRATED,
-) -> Trust | None:
+) -> Calibration | None:
     """The scene's calibration, if there is one made of the present files and for these options."""
     made_of = _made_of(scene, _chosen(scene, training_images), depth_source, options)
-    for path in (scene.folder / TRUST_FILE, _cached(scene, cache, made_of)):
+    for path in (scene.folder / CALIBRATION_FILE, _cached(scene, cache, made_of)):
         try:
-            trust = read_trust(path)
+            calibration = read_calibration(path)
         except (OSError, InputError):
             continue
-        if trust.made_of == made_of:
-            if path.name != TRUST_FILE:
+        if calibration.made_of == made_of:
+            if path.name != CALIBRATION_FILE:
                 used(path)
-            return trust
+            return calibration
     return None
 
 
-def find_trust(
+def find_calibration(
     scene: SceneFolder,
     options: PriorOptions,
     cache: Path | None = None,
     training_images: Collection[Path] | None = None,
     console: Console | None = None,
     depth_source: str = INTEGRATED,
-) -> Trust:
+) -> Calibration:
     """The scene's calibration for these options; made now and kept in SCENE/.cache, or in `cache`, where there is none.
 
     `training_images` are the pictures that are trained on, where the scene does not say so itself; `depth_source` is
@@ -232,18 +232,18 @@ def find_trust(
         InputError: as `calibrate_scene`.
 
     """
-    if (trust := saved_trust(scene, options, cache, training_images, depth_source)) is not None:
-        return trust
-    trust = _calibrate(scene, _chosen(scene, training_images), depth_source, options, console)
-    path = _cached(scene, cache, trust.made_of)
+    if (calibration := saved_calibration(scene, options, cache, training_images, depth_source)) is not None:
+        return calibration
+    calibration = _calibrate(scene, _chosen(scene, training_images), depth_source, options, console)
+    path = _cached(scene, cache, calibration.made_of)
     # a scene that cannot be written has it made anew each time
     with suppress(OSError):
-        trust.write(path)
+        calibration.write(path)
         keep_last(path.parent, "mono_trust_*.json", KEPT_CALIBRATIONS)
-    return trust
+    return calibration
 
 
-def field_of_source(scene: SceneFolder) -> Trust | None:
+def field_of_source(scene: SceneFolder) -> Calibration | None:
     """What is known of a scene without LiDAR: how far up and down the maps' network was taught by LiDAR elsewhere.
 
     A calibration without errors, or None where the maps' source says nothing about its field.
@@ -254,7 +254,7 @@ def field_of_source(scene: SceneFolder) -> Trust | None:
     if not isinstance(field_deg, list) or len(field_deg) != 2 or source.get("trained_on") == "elsewhere":
         return None
     low, high = (float(np.radians(value)) for value in field_deg)
-    return Trust("", None, None, (low, high), everywhere=False, drive_fit=None)
+    return Calibration("", None, None, (low, high), everywhere=False, drive_fit=None)
 
 
 def _cached(scene: SceneFolder, cache: Path | None, made_of: str) -> Path:
@@ -300,7 +300,7 @@ def _with_motion(scene: SceneFolder, depth_source: str, options: PriorOptions) -
 
 
 def maps_trained_on(meta: Mapping[str, Any]) -> str:
-    """Where the source of a scene's monocular maps was trained: elsewhere if transforms.json says so, else scene."""
+    """Where the source of a scene's monocular maps was trained: as transforms.json states it, or in the scene."""
     later, drive = meta.get("mono"), meta.get("source")
     if isinstance(later, dict):
         found = later.get("trained_on")
@@ -315,7 +315,7 @@ def _calibrate(
     depth_source: str,
     options: PriorOptions,
     console: Console | None,
-) -> Trust:
+) -> Calibration:
     missing = [word for layer, word in (("lidar", "LiDAR"), ("mono", "monocular")) if not scene.has(layer)]
     if missing:
         raise InputError(
@@ -390,8 +390,8 @@ class MotionErrors:
 
 
 def _within(field_rad: tuple[float, float], view: RayAngles) -> NDArray[np.bool_]:
-    """Rays in LiDAR's field, within its margin: as `Trust.in_field`."""
-    return Trust("", None, None, field_rad, everywhere=False, drive_fit=None).in_field(view.elevation_rad)
+    """Rays in LiDAR's field, within its margin: as `Calibration.in_field`."""
+    return Calibration("", None, None, field_rad, everywhere=False, drive_fit=None).in_field(view.elevation_rad)
 
 
 def _field_rad(elevations_rad: Sequence[NDArray[np.float32]]) -> tuple[float, float]:
@@ -414,18 +414,18 @@ def _errors_of_both(
     if maps.lidar_m is None or maps.mono_m is None or motion_m is None:
         return np.empty((2, 0), np.float32), np.empty(0, np.float32)
     elevation_rad = ray_angles(picture.lens, picture.up_in_camera).elevation_rad
-    left_out, _ = held_out_returns(both(maps.lidar_m, maps.mono_m, maps.usable), elevation_rad, number)
+    left_out, _ = held_out_points(both(maps.lidar_m, maps.mono_m, maps.usable), elevation_rad, number)
     aligned = align(np.where(left_out, np.float32(0), maps.lidar_m), maps.mono_m, maps.usable, options.align).mono_m
-    judged = _some(left_out & (motion_m > 0) & (aligned > 0), _JUDGED_A_FRAME, np.random.default_rng([9, number]))
-    true_m = maps.lidar_m[judged]
-    errors = np.stack([np.abs(found[judged] - true_m) / true_m for found in (motion_m, aligned)])
+    evaluated = _some(left_out & (motion_m > 0) & (aligned > 0), _EVALUATED_A_FRAME, np.random.default_rng([9, number]))
+    true_m = maps.lidar_m[evaluated]
+    errors = np.stack([np.abs(found[evaluated] - true_m) / true_m for found in (motion_m, aligned)])
     return errors, elevation_rad[maps.usable & (maps.lidar_m > 0)]
 
 
 def _motion_errors(of_frames: Sequence[NDArray[np.float32]]) -> MotionErrors | None:
-    """Errors of both sources over all frames; None where too little was judged."""
+    """Errors of both sources over all frames; None where too little was evaluated."""
     found = np.concatenate(of_frames, 1)
-    if found.shape[1] < LEAST_JUDGED:
+    if found.shape[1] < LEAST_EVALUATED:
         return None
     motion, mono = np.quantile(found, 0.95, axis=1) / 2
     return MotionErrors(float(motion), float(mono))
@@ -453,42 +453,42 @@ def measure_frame(
         InputError: the maps differ in size.
 
     """
-    returns = both(lidar_m, mono_m, usable)
+    lidar_points = both(lidar_m, mono_m, usable)
     rng = np.random.default_rng([8, number])
-    left_out, in_blocks = held_out_returns(returns, view.elevation_rad, number)
+    left_out, in_blocks = held_out_points(lidar_points, view.elevation_rad, number)
     kept_m = np.where(left_out, np.float32(0), lidar_m)
     # a source alone is not aligned, in the prior either
     mode = "none" if depth_source == "mono" else options.align
     aligned = align(kept_m, mono_m, usable, mode)
     frame = integrate_frame(kept_m, mono_m, usable, depth_source, options, motion=motion)
-    features = pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, frame.returns, view.theta_rad)
+    features = pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, frame.lidar_points, view.theta_rad)
     measured_m, measured = lidar_m, left_out
-    if far_seen_m is not None and returns.any():
-        highest = np.quantile(view.elevation_rad[returns], FIELD_QUANTILES[1]) + np.radians(FIELD_MARGIN_DEG)
-        far_seen = usable & (far_seen_m > 0) & ~returns & (view.elevation_rad <= highest)
+    if far_seen_m is not None and lidar_points.any():
+        highest = np.quantile(view.elevation_rad[lidar_points], FIELD_QUANTILES[1]) + np.radians(FIELD_MARGIN_DEG)
+        far_seen = usable & (far_seen_m > 0) & ~lidar_points & (view.elevation_rad <= highest)
         measured_m, measured = np.where(far_seen, far_seen_m, lidar_m), left_out | far_seen
-    judged = _some(measured & (frame.distance_m > 0), _JUDGED_A_FRAME, rng)
-    # of a prior that keeps its returns; where none is kept (mono alone), or all are averaged, there is no such pixel
-    found, error_by_neighbours = error_of_returns(lidar_m, frame.returns)
-    kept = _some(found & options.integration.keep_returns, _JUDGED_A_FRAME, rng)
-    for_the_drive = _some(returns, _FOR_THE_DRIVE_A_FRAME, rng)
+    evaluated = _some(measured & (frame.distance_m > 0), _EVALUATED_A_FRAME, rng)
+    # of a prior that keeps its points; where none is kept (mono alone), or all are averaged, there is no such pixel
+    found, error_by_neighbours = error_of_lidar_points(lidar_m, frame.lidar_points)
+    kept = _some(found & options.integration.keep_returns, _EVALUATED_A_FRAME, rng)
+    for_the_drive = _some(lidar_points, _FOR_THE_DRIVE_A_FRAME, rng)
 
     def error(estimate_m: NDArray[np.float32]) -> float | None:
         if not in_blocks.any():
             return None
         return float(np.mean(np.abs(estimate_m[in_blocks] - lidar_m[in_blocks]) / lidar_m[in_blocks]))
 
-    count = int(returns.sum())
+    count = int(lidar_points.sum())
     # near the least number those left out decide whose fit it is; the prior has all of them
-    fitted = aligned if count >= 2 * LEAST_RETURNS else align(lidar_m, mono_m, usable, mode)
+    fitted = aligned if count >= 2 * LEAST_POINTS else align(lidar_m, mono_m, usable, mode)
     return MeasuredFrame(
         FrameAlignment(name, count, fitted.fit_of, fitted.fit, error(mono_m), error(aligned.mono_m)),
-        Errors.of(features, judged, frame.distance_m, measured_m),
+        Errors.of(features, evaluated, frame.distance_m, measured_m),
         Errors({feature: values[kept] for feature, values in features.items()}, error_by_neighbours[kept]),
         view.elevation_rad[usable & (lidar_m > 0)],
         lidar_m[for_the_drive],
         mono_m[for_the_drive],
-        frame.from_motion[judged],
+        frame.from_motion[evaluated],
     )
 
 
@@ -514,25 +514,25 @@ def measure_beyond(
     nowhere, everywhere = np.zeros_like(usable), np.ones_like(usable)
     by_motion = dataclasses.replace(motion, mono_counts=nowhere, alone=everywhere, around_m=None)
     frame = integrate_frame(none, none, usable, INTEGRATED, options, motion=by_motion)
-    features = pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, frame.returns, view.theta_rad)
+    features = pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, frame.lidar_points, view.theta_rad)
     of_motion = motion_features(features, motion.distance_m, motion_sigma_m, view.elevation_rad)
-    judged = _some(usable & (lidar_m > 0) & frame.from_motion, _JUDGED_A_FRAME, rng)
+    evaluated = _some(usable & (lidar_m > 0) & frame.from_motion, _EVALUATED_A_FRAME, rng)
 
     seen = dataclasses.replace(motion, distance_m=np.where(left_out, np.float32(0), motion.distance_m))
     network = integrate_frame(lidar_m, mono_m, usable, INTEGRATED, options, motion=seen)
-    held_out = _some(usable & left_out & motion.alone & (network.distance_m > 0), _JUDGED_A_FRAME, rng)
+    held_out = _some(usable & left_out & motion.alone & (network.distance_m > 0), _EVALUATED_A_FRAME, rng)
 
     # as in `measure_frame`, but of two sources
-    fewer, _ = held_out_returns(both(lidar_m, mono_m, usable), view.elevation_rad, number)
+    fewer, _ = held_out_points(both(lidar_m, mono_m, usable), view.elevation_rad, number)
     of_two = integrate_frame(np.where(fewer, np.float32(0), lidar_m), mono_m, usable, INTEGRATED, options)
-    of_field = pixel_features(of_two.distance_m, of_two.spread_m, of_two.mono_m, of_two.returns, view.theta_rad)
+    of_field = pixel_features(of_two.distance_m, of_two.spread_m, of_two.mono_m, of_two.lidar_points, view.theta_rad)
     found = fewer & (of_two.distance_m > 0)
     if motion.around_m is not None:
         # beyond, no other is used
         found &= confirmed(of_two.mono_m, motion.around_m)
-    tried = _some(found, _JUDGED_A_FRAME, rng)
+    tried = _some(found, _EVALUATED_A_FRAME, rng)
     return MeasuredBeyond(
-        Errors.of(of_motion, judged, frame.distance_m, lidar_m),
+        Errors.of(of_motion, evaluated, frame.distance_m, lidar_m),
         Errors.of(beyond_features(network, view), held_out, network.distance_m, motion.distance_m),
         Errors.of(of_field, tried, of_two.distance_m, lidar_m),
         motion.distance_m[tried] > 0,
@@ -555,7 +555,7 @@ def combine(
     everywhere: bool,
     depth_source: str = INTEGRATED,
     motion_errors: MotionErrors | None = None,
-) -> Trust:
+) -> Calibration:
     """Put the measurements of a drive's frames, at least one, together.
 
     The key `made_of` is kept in the result; `everywhere` says whether the monocular maps are to be trusted beyond
@@ -563,19 +563,19 @@ def combine(
     """
     lidar_m, mono_m = (np.concatenate([getattr(frame, name) for frame in frames]) for name in ("lidar_m", "mono_m"))
     aligned = options.align != "none" and depth_source == INTEGRATED
-    drive_fit = fit_logs(lidar_m, mono_m) if aligned and len(lidar_m) >= LEAST_RETURNS else None
+    drive_fit = fit_logs(lidar_m, mono_m) if aligned and len(lidar_m) >= LEAST_POINTS else None
     errors = Errors.together([frame.errors for frame in frames])
     motion = None
     if motion_errors is not None:
         from_motion = np.concatenate([frame.from_motion for frame in frames])
         model = errors.where(from_motion).model()
         # of few pixels without motion nothing would be known
-        if np.count_nonzero(~from_motion) >= LEAST_JUDGED:
+        if np.count_nonzero(~from_motion) >= LEAST_EVALUATED:
             errors = errors.where(~from_motion)
         if model is not None:
             beyond = _combine_beyond([frame.beyond for frame in frames if frame.beyond is not None])
-            motion = MotionTrust(motion_errors.weight, motion_errors.motion, motion_errors.mono, model, beyond)
-    return Trust(
+            motion = MotionCalibration(motion_errors.weight, motion_errors.motion, motion_errors.mono, model, beyond)
+    return Calibration(
         made_of=made_of,
         error_model=errors.model(),
         return_model=Errors.together([frame.at_points for frame in frames]).model(),
@@ -585,7 +585,7 @@ def combine(
         frames=tuple(
             # what the prior of a frame with few returns will take
             dataclasses.replace(found, fit_of="drive", fit=drive_fit)
-            if drive_fit is not None and found.returns < LEAST_RETURNS
+            if drive_fit is not None and found.returns < LEAST_POINTS
             else found
             for found in (frame.alignment for frame in frames)
         ),
@@ -616,7 +616,7 @@ def _unmatched_factor(errors: Errors, matched: NDArray[np.bool_]) -> float:
     Not known for few: 1.
     """
     model, unmatched = errors.where(matched).model(), errors.where(~matched)
-    if model is None or len(unmatched.relative) < LEAST_JUDGED:
+    if model is None or len(unmatched.relative) < LEAST_EVALUATED:
         return 1.0
     sigma = np.exp(model.log_sigma(unmatched.features))
     return max(1.0, float(np.quantile(unmatched.relative / sigma, 0.95)) / 2)

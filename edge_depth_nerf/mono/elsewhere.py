@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.method.alignment import LEAST_RETURNS
+from edge_depth_nerf.method.alignment import LEAST_POINTS
 from edge_depth_nerf.mono.relative import (
     WRONG_WAY,
     Kind,
@@ -54,7 +54,7 @@ class FittedMaps:
             return
         for camera, pictures in self.scene.cameras().items():
             # most often the first will do
-            if not any(not picture.held_out and self._returns(picture) >= LEAST_RETURNS for picture in pictures):
+            if not any(not picture.held_out and self._lidar_points(picture) >= LEAST_POINTS for picture in pictures):
                 raise self._no_lidar(camera)
 
     def __iter__(self) -> Iterator[tuple[ScenePicture, Float32[np.ndarray, "h w"]]]:
@@ -68,8 +68,8 @@ class FittedMaps:
                 lines = fit_lines(samples, self.kind, start) if len(layers) > 1 else start
                 yield picture, self._blended(picture, layers, lines)
                 continue
-            seen = self._seen(picture) if self._returns(picture) >= LEAST_RETURNS else None
-            if seen is None or seen[1].returns < LEAST_RETURNS:
+            seen = self._seen(picture) if self._lidar_points(picture) >= LEAST_POINTS else None
+            if seen is None or seen[1].lidar_points < LEAST_POINTS:
                 waiting.append(picture)
                 continue
             layers, samples = seen
@@ -79,7 +79,7 @@ class FittedMaps:
             yield picture, self._blended(picture, layers, fit_lines(samples, self.kind))
         if waiting and not self.scene.split_known:
             raise InputError(
-                f"{self.scene.path}: {waiting[0].name} has fewer than {LEAST_RETURNS} LiDAR points, so its map "
+                f"{self.scene.path}: {waiting[0].name} has fewer than {LEAST_POINTS} LiDAR points, so its map "
                 "needs the fit of training pictures; but the scene does not say which these are. Add "
                 "train_filenames, val_filenames and test_filenames, or use a source of metric maps."
             )
@@ -96,7 +96,7 @@ class FittedMaps:
 
     def _no_lidar(self, camera: str) -> InputError:
         return InputError(
-            f"{self.scene.path}: no training picture of {camera} has {LEAST_RETURNS} LiDAR points where its map has "
+            f"{self.scene.path}: no training picture of {camera} has {LEAST_POINTS} LiDAR points where its map has "
             f"values, so {self.kind} maps, of unknown scale, cannot be made metric. Process the drive with "
             "its sweeps, or use a source of metric maps."
         )
@@ -105,7 +105,7 @@ class FittedMaps:
         layers = self.layers(picture)
         return layers, take_samples(layers, self.scene.lidar_m(picture), self.scene.usable(picture), _SAMPLES)
 
-    def _returns(self, picture: ScenePicture) -> int:
+    def _lidar_points(self, picture: ScenePicture) -> int:
         if "lidar" not in picture.files:
             return 0
         return int((self.scene.usable(picture) & (self.scene.lidar_m(picture) > 0)).sum())
@@ -117,11 +117,11 @@ class FittedMaps:
 
     def _check_direction(self, picture: ScenePicture, samples: Samples) -> None:
         """Find depth that is declared disparity, or the other way round."""
-        returns = np.flatnonzero(samples.lidar_m > 0)
-        best = np.where(samples.seen, samples.weight, -1)[:, returns].argmax(0)
-        values, cosine = samples.values[best, returns], samples.cosine[best, returns]
+        lidar_points = np.flatnonzero(samples.lidar_m > 0)
+        best = np.where(samples.seen, samples.weight, -1)[:, lidar_points].argmax(0)
+        values, cosine = samples.values[best, lidar_points], samples.cosine[best, lidar_points]
         known = np.isfinite(values)
-        z = (samples.lidar_m[returns] * cosine)[known]
+        z = (samples.lidar_m[lidar_points] * cosine)[known]
         found = rank_correlation(values[known], z) * (-1 if self.kind == "inverse" else 1)
         if found < WRONG_WAY:
             other = "relative (or metric)" if self.kind == "inverse" else "inverse"
@@ -133,8 +133,8 @@ class FittedMaps:
 
 def _thinned(samples: Samples) -> Samples:
     rng = np.random.default_rng(0)
-    has_return = samples.lidar_m > 0
+    has_lidar = samples.lidar_m > 0
     chosen = np.concatenate(
-        [rng.permutation(np.flatnonzero(each))[:_SAMPLES_FOR_THE_DRIVE] for each in (has_return, ~has_return)]
+        [rng.permutation(np.flatnonzero(each))[:_SAMPLES_FOR_THE_DRIVE] for each in (has_lidar, ~has_lidar)]
     )
     return Samples(*(getattr(samples, each.name)[..., chosen] for each in fields(Samples)))

@@ -28,7 +28,7 @@ from edge_depth_nerf.base.console import progress_bars
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.one_writer import only_writer
 from edge_depth_nerf.masks.sky import find_sky
-from edge_depth_nerf.method.alignment import LEAST_RETURNS
+from edge_depth_nerf.method.alignment import LEAST_POINTS
 from edge_depth_nerf.mono.calibration import calibrate_scene
 from edge_depth_nerf.mono.elsewhere import FittedMaps
 from edge_depth_nerf.mono.examples import (
@@ -179,8 +179,8 @@ def _estimate(
     console.print(f"{count} pictures got a monocular map, from {weights}", soft_wrap=True)
     for scene in scenes:
         if scene.has("lidar"):
-            trust = calibrate_scene(scene.path, console=console)
-            console.print(f"{scene.folder}: {trust.summary()}", soft_wrap=True)
+            calibration = calibrate_scene(scene.path, console=console)
+            console.print(f"{scene.folder}: {calibration.summary()}", soft_wrap=True)
     return EstimateReport(weights, trained, count)
 
 
@@ -245,7 +245,7 @@ def _write_fitted(every: Sequence[FittedMaps], source: dict[str, Any], console: 
         if few := fitted.by_the_drive:
             console.print(
                 f"{fitted.scene.folder}: {len(few)} of {len(fitted.scene.pictures)} pictures have fewer than "
-                f"{LEAST_RETURNS} LiDAR points to fit to, such as {few[0]}; they use the drive's fit",
+                f"{LEAST_POINTS} LiDAR points to fit to, such as {few[0]}; they use the drive's fit",
                 soft_wrap=True,
             )
 
@@ -374,11 +374,11 @@ def _say_trained(trained: Trained, training: TrainingOptions, material: _Materia
     early = ", where it stopped early" if trained.stopped_early else ""
     if short:
         early = f" of {training.steps:,}, where the time limit was reached,"
-    judged = ""
+    error = ""
     if material.kept is not None:
-        judged = f"; error on the {len(material.kept)} pictures set aside for early stopping: {trained.abs_rel:.1%}"
+        error = f"; error on the {len(material.kept)} pictures set aside for early stopping: {trained.abs_rel:.1%}"
     console.print(
-        f"Trained {trained.steps} steps{early} in {trained.seconds:.0f} s on {len(material.examples)} pictures{judged}",
+        f"Trained {trained.steps} steps{early} in {trained.seconds:.0f} s on {len(material.examples)} pictures{error}",
         soft_wrap=True,
     )
     if short and trained.steps < _FEW_STEPS:
@@ -448,11 +448,11 @@ def training_split(scene: SceneFolder) -> Split:
             "evaluation."
         )
     allowed = [picture for picture in scene.pictures if not picture.held_out]
-    moments = sorted({picture.moment for picture in allowed})
-    kept = moments[KEEP_EVERY // 2 :: KEEP_EVERY]
+    frames = sorted({picture.frame for picture in allowed})
+    kept = frames[KEEP_EVERY // 2 :: KEEP_EVERY]
     return (
-        [picture for picture in allowed if picture.moment not in kept],
-        [picture for picture in allowed if picture.moment in kept],
+        [picture for picture in allowed if picture.frame not in kept],
+        [picture for picture in allowed if picture.frame in kept],
     )
 
 

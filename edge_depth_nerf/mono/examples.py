@@ -32,7 +32,7 @@ _GROUND_SINE = -math.sin(math.radians(12.0))
 """LiDAR points below this elevation are mostly of the ground."""
 _GROUND_QUANTILE = 0.8
 """Of how far LiDAR points lie below the camera: kerbs and parked cars lie less deep, nothing much deeper."""
-_MIN_GROUND_RETURNS = 100
+_MIN_GROUND_POINTS = 100
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class NetworkView:
 
 @dataclass(frozen=True)
 class Examples:
-    """Pictures to train on or to judge by."""
+    """Pictures to train on or to evaluate on."""
 
     rgb: UInt8[np.ndarray, "n h w 3"]
     lidar_m: Float32[np.ndarray, "n h w"]
@@ -207,7 +207,7 @@ def camera_height_m(scene: SceneFolder, pictures: Sequence[ScenePicture], workin
         below = (lidar_m > 0) & (height_sine < _GROUND_SINE)
         depths.append((-lidar_m * height_sine)[below])
     below_m = np.concatenate(depths) if depths else np.empty(0)
-    return float(np.quantile(below_m, _GROUND_QUANTILE)) if below_m.size >= _MIN_GROUND_RETURNS else None
+    return float(np.quantile(below_m, _GROUND_QUANTILE)) if below_m.size >= _MIN_GROUND_POINTS else None
 
 
 def room_radius_m(examples: Examples) -> float:

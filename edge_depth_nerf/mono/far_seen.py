@@ -35,7 +35,7 @@ SPACING_RAD = 0.0075
 FIELD_QUANTILE = 0.99
 """Above this quantile of its own LiDAR points' elevation a picture has next to none of its own."""
 REACH_M = 86.0
-"""Horizontally: what is judged ends at 60 m; and farther off than this the ground, too, is so little below a camera
+"""Horizontally: what is evaluated ends at 60 m; and farther off than this the ground, too, is so little below a camera
 1.7 m up that `_BELOW_SINE` lets it through."""
 ELEVATION_QUANTILES = (0.001, 0.999)
 """Between these quantiles of its points' elevations lies a scanner's field, except for strays."""

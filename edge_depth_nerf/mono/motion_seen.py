@@ -1,4 +1,4 @@
-"""What distances from motion teach the depth network, and which of them are left out to judge it by.
+"""What distances from motion teach the depth network, and which of them are left out to evaluate it.
 
 Where no LiDAR point ever fell, neither a picture's own nor one of others seen from afar, only consistent distances from
 motion are known. They count less the less exact they are. Some places in the world are left out of all pictures'

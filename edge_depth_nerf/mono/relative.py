@@ -81,7 +81,7 @@ class Samples:
         return Samples(**{name: np.concatenate([getattr(part, name) for part in parts], -1) for name in names})
 
     @property
-    def returns(self) -> int:
+    def lidar_points(self) -> int:
         """How many LiDAR points some view has a value for."""
         return int((self.seen.any(0) & (self.lidar_m > 0)).sum())
 

@@ -40,7 +40,7 @@ from torch import Tensor
 from edge_depth_nerf.base.checked_cache import keep_last, used
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.one_writer import only_writer
-from edge_depth_nerf.method.error_model import Trust
+from edge_depth_nerf.method.error_model import Calibration
 from edge_depth_nerf.method.integration import INTEGRATED
 from edge_depth_nerf.method.metrics import has_whole_window
 from edge_depth_nerf.method.prior import (
@@ -53,7 +53,7 @@ from edge_depth_nerf.method.prior import (
     ray_angles,
     sky_of,
 )
-from edge_depth_nerf.mono.calibration import field_of_source, find_trust
+from edge_depth_nerf.mono.calibration import field_of_source, find_calibration
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
 from edge_depth_nerf.plugin.dataset import FisheyeDepthDataset
 from edge_depth_nerf.plugin.pixel_table import (
@@ -219,10 +219,10 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         self.trained_on = pixels.indices
         rays, batch = self._serve(pixels, self.train_ray_generator)
         if self._surface_sampler is not None:
-            further = self._surface_sampler.sample(step, keep=_of_use)
+            surface_pixels = self._surface_sampler.sample(step, keep=_of_use)
             # the mean over no pixels would be NaN
-            if len(further.sky):
-                batch["surface_rays"], surface = self._serve(further, self.train_ray_generator)
+            if len(surface_pixels.sky):
+                batch["surface_rays"], surface = self._serve(surface_pixels, self.train_ray_generator)
                 batch |= _of_surface(surface)
         return rays, batch
 
@@ -243,8 +243,10 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         if self._surface_sampler is not None:
             batch["surface_rays"] = every[count:]
             batch |= _of_surface({name: value[count:] for name, value in values.items()})
-            further = pixels[count:]
-            batch["surface_counts"] = _of_use(further.prior_distance_m, further.prior_sigma_m, further.sky)
+            surface_pixels = pixels[count:]
+            batch["surface_counts"] = _of_use(
+                surface_pixels.prior_distance_m, surface_pixels.prior_sigma_m, surface_pixels.sky
+            )
         return every[:count], batch
 
     def pictures_of(self, rays: Tensor | None = None) -> list[str]:
@@ -288,18 +290,18 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         source = self.config.source_of_prior(sources)
         if source is None:
             return None
-        trust: Trust | None = None
-        if source in CALIBRATED and {"lidar", "mono"} <= sources and options.wants_trust(source):
-            trust = find_trust(scene, options, self._cache_dir(), dataset.image_filenames, CONSOLE, source)
-            CONSOLE.log(f"Depth prior: {trust.summary()}")
+        calibration: Calibration | None = None
+        if source in CALIBRATED and {"lidar", "mono"} <= sources and options.wants_calibration(source):
+            calibration = find_calibration(scene, options, self._cache_dir(), dataset.image_filenames, CONSOLE, source)
+            CONSOLE.log(f"Depth prior: {calibration.summary()}")
         elif source == "mono" and options.sigma_mode == "calibrated":
-            trust = field_of_source(scene)
+            calibration = field_of_source(scene)
         elif self.config.depth_source == "auto" and source == "lidar":
             CONSOLE.log(
                 f"[yellow]Depth prior: LiDAR alone, because the scene has no monocular maps, or not all of them. To "
                 f"make them, run `edge-depth-nerf estimate-depth {escape(str(self.config.dataparser.data))}`."
             )
-        return PriorCache(self._cache_dir() / "prior", source, options, trust)
+        return PriorCache(self._cache_dir() / "prior", source, options, calibration)
 
     def _table(self, dataset: FisheyeDepthDataset, description: str, with_prior: bool) -> PixelTable:
         """Return the table of a split's pixels: the one on disk if it matches, else a new one."""
@@ -373,7 +375,7 @@ def _load(dataset: FisheyeDepthDataset, cache: PriorCache | None, whole_windows:
                 maps.pop(layer, None)
         picture, mono = dataset.pictures[image_idx], maps.get("mono")
         view = ray_angles(picture.lens, picture.up_in_camera) if mono is not None else None
-        prior = cache.prior(maps, mask, view if cache.trust is not None else None)
+        prior = cache.prior(maps, mask, view if cache.calibration is not None else None)
         sky = None if mono is None or view is None else sky_of(mono, maps.get("lidar"), view, rgb, mask)
         if sky is not None and (motion := maps.get("motion")) is not None:
             # a pixel that was matched between pictures is not sky
@@ -403,7 +405,7 @@ def _table_key(dataset: FisheyeDepthDataset, cache: PriorCache | None) -> str:
         "scene": [scene.theta_max_rad, scene.lidar_metres_per_count, scene.lidar_is_z_depth],
         "lenses": [repr((picture.lens, picture.up_in_camera.tolist())) for picture in dataset.pictures],
         "prior": None if cache is None else [cache.depth_source, dataclasses.asdict(cache.options)],
-        "trust": None if cache is None or cache.trust is None else cache.trust.to_dict(),
+        "trust": None if cache is None or cache.calibration is None else cache.calibration.to_dict(),
     }
     return hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()[:32]
 

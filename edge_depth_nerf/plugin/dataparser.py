@@ -126,8 +126,8 @@ def check_split(meta: dict[str, Any], path: Path) -> None:
         held_out = lists.get(split, [])
         if set(held_out) == set(lists["train"]):
             continue
-        moments = [{by_name[name].get("frame", name) for name in names} for names in (lists["train"], held_out)]
-        shared = sorted(moments[0] & moments[1], key=str)
+        of_split = [{by_name[name].get("frame", name) for name in names} for names in (lists["train"], held_out)]
+        shared = sorted(of_split[0] & of_split[1], key=str)
         if shared:
             raise InputError(
                 f"{path}: frame {shared[0]} is in train_filenames and in {split}_filenames. All cameras of a frame "
@@ -175,7 +175,7 @@ class FisheyeDepth(Nerfstudio):
         self._check_config(meta, path, split)
         metres_per_unit = self._metres_per_unit(frames)
         if len(frames) == 1 and "train_filenames" not in meta:
-            self.config.eval_mode = "all"  # the one picture is for training and for judging
+            self.config.eval_mode = "all"  # the one picture is for training and for evaluation
         # nerfstudio's parser takes the scale from its config
         self.config.scale_factor = 1.0 / metres_per_unit
         outputs = super()._generate_dataparser_outputs(split)
@@ -191,7 +191,7 @@ class FisheyeDepth(Nerfstudio):
             scene=scene,
             pictures=pictures,
             metres_per_unit=metres_per_unit,
-            moments=[picture.moment for picture in pictures],
+            of_split=[picture.frame for picture in pictures],
             depth_unit_scale_factor=scene.lidar_metres_per_count,
         )
         for file in dict.fromkeys(file for picture in pictures for file in picture.files.values()):

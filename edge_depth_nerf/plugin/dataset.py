@@ -21,8 +21,8 @@ from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.cameras.rays import Rays
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
 
-JUDGED_DISTANCES = ("lidar", "truth_distance")
-"""Layers of distances that a rendered view is judged by."""
+EVALUATED_DISTANCES = ("lidar", "truth_distance")
+"""Layers of distances that a rendered view is evaluated by."""
 
 
 class FisheyeDepthDataset(InputDataset):
@@ -73,7 +73,7 @@ class FisheyeDepthDataset(InputDataset):
         return set.intersection(*(set(picture.files) for picture in self.pictures))
 
     def get_data(self, image_idx: int, image_type: str = "float32") -> dict[str, Any]:
-        """Give the picture, the mask and the maps that judge a rendered view.
+        """Give the picture, the mask and the maps that evaluate a rendered view.
 
         Returns:
             nerfstudio's image_idx, image and mask (H×W×1), and where the scene has them: lidar_distance_m and
@@ -90,10 +90,10 @@ class FisheyeDepthDataset(InputDataset):
         return data
 
     def get_metadata(self, data: dict[str, Any]) -> dict[str, Tensor]:
-        """Give the maps that judge a rendered view."""
+        """Give the maps that evaluate a rendered view."""
         image_idx = data["image_idx"]
         found: dict[str, Tensor] = {}
-        for layer in JUDGED_DISTANCES:
+        for layer in EVALUATED_DISTANCES:
             distance_m = self.distance_m(image_idx, layer)
             if distance_m is not None:
                 found[f"{layer.removesuffix('_distance')}_distance_m"] = torch.from_numpy(distance_m)[..., None]

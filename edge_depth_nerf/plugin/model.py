@@ -40,7 +40,7 @@ from edge_depth_nerf.plugin.exposure import Gains
 from edge_depth_nerf.plugin.fused.build import compiled_before, fused_forms
 from edge_depth_nerf.plugin.fused.fields import CubeContraction, FusedNerfactoField
 from edge_depth_nerf.plugin.fused.hash_grid import sum_tables_later
-from edge_depth_nerf.plugin.pose_refinement import MOMENTS, PoseRefiner, PoseRefinerConfig
+from edge_depth_nerf.plugin.pose_refinement import FRAMES, PoseRefiner, PoseRefinerConfig
 from edge_depth_nerf.plugin.ray_table import ViewRays
 from edge_depth_nerf.plugin.renderers import (
     INFINITELY_FAR,
@@ -195,8 +195,8 @@ class EdgeDepthNerfModel(NerfactoModel):
     def _refine_poses(self, metadata: dict[str, Any]) -> None:
         """Let poses be learned from what the field shows, not from where the proposals put their samples."""
         if isinstance(self.camera_optimizer, PoseRefiner):
-            moments = metadata.get(MOMENTS, list(range(self.num_train_data)))
-            self.camera_optimizer.settle(moments, self.metres_per_unit)
+            frames = metadata.get(FRAMES, list(range(self.num_train_data)))
+            self.camera_optimizer.settle(frames, self.metres_per_unit)
         self.density_fns = [partial(_density_at, density_fn) for density_fn in self.density_fns]
 
     def _set_renderers(self) -> None:

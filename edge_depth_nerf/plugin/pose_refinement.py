@@ -19,7 +19,7 @@ from nerfstudio.cameras.lie_groups import exp_map_SO3xR3
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
-MOMENTS = "moments"
+FRAMES = "frames"
 """Metadata of the training dataset: the number of each picture's frame."""
 PRIOR_MULT = 1e-4
 """Weight of the mean square of the adjustments, in the standard deviations that are expected."""
@@ -43,22 +43,22 @@ class PoseRefiner(CameraOptimizer):
     """Adjusts the vehicle's pose at each frame."""
 
     config: PoseRefinerConfig
-    moment: Int[Tensor, "pictures"]
+    frame: Int[Tensor, "pictures"]
     sigmas: Float[Tensor, "6"]
     """What one means of an adjustment: scene units of translation, radians of rotation."""
 
     def __init__(self, config: PoseRefinerConfig, num_cameras: int, device: torch.device | str, **kwargs: Any) -> None:
         super().__init__(config, num_cameras, device, **kwargs)
-        self.register_buffer("moment", torch.arange(num_cameras), persistent=False)
+        self.register_buffer("frame", torch.arange(num_cameras), persistent=False)
         self.register_buffer("sigmas", _sigmas(config, 1.0, torch.empty(0)), persistent=False)
 
-    def settle(self, moments: list[int], metres_per_unit: float) -> None:
+    def settle(self, frames: list[int], metres_per_unit: float) -> None:
         """Set which pictures share a frame and how long the scene's unit is; before any step."""
-        _, moment = torch.unique(torch.tensor(moments), return_inverse=True)
-        self.moment = moment.to(self.moment)
+        _, frame = torch.unique(torch.tensor(frames), return_inverse=True)
+        self.frame = frame.to(self.frame)
         self.sigmas = _sigmas(self.config, metres_per_unit, self.sigmas)
         if self.config.mode != "off":
-            rows = self.pose_adjustment.new_zeros(int(moment.max()) + 1, 6)
+            rows = self.pose_adjustment.new_zeros(int(frame.max()) + 1, 6)
             self.pose_adjustment = torch.nn.Parameter(rows)
 
     def forward(self, indices: Int[Tensor, "rays"]) -> Float[Tensor, "rays 3 4"]:
@@ -67,7 +67,7 @@ class PoseRefiner(CameraOptimizer):
             # the viewer asks also then
             return super().forward(indices)
         centred = self.pose_adjustment - self.pose_adjustment.mean(dim=0)
-        return exp_map_SO3xR3(centred * self.sigmas)[self.moment[indices]]
+        return exp_map_SO3xR3(centred * self.sigmas)[self.frame[indices]]
 
     def apply_to_raybundle(self, raybundle: RayBundle) -> None:
         """Move rays, in place."""

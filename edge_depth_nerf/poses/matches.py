@@ -42,7 +42,7 @@ LEAST_MATCHES = 20
 """The median of fewer matches says nothing."""
 _BORDER_PX = 4
 """Features nearer to the edge of a mask look at what is masked."""
-MEASURED_MOMENTS = 100
+MEASURED_FRAMES = 100
 """So many frames of each camera, spread over the drive, are used."""
 
 
@@ -51,7 +51,7 @@ class PosedPicture:
     """A picture, where it was taken, and how to read it."""
 
     camera: str
-    moment: int
+    frame: int
     lens: Camera
     """At the picture's size."""
     camera_to_world: Transform
@@ -252,7 +252,7 @@ class EpipolarAgreement:
 
 
 def successive(
-    pictures: Sequence[PosedPicture], apart: Sequence[int] = (1, 2), most: int = MEASURED_MOMENTS
+    pictures: Sequence[PosedPicture], apart: Sequence[int] = (1, 2), most: int = MEASURED_FRAMES
 ) -> list[tuple[int, int]]:
     """Pairs of pictures of one camera, so many frames apart (1: the next), between which the vehicle moved; in order.
 
@@ -260,7 +260,7 @@ def successive(
     """
     pairs = []
     for camera in dict.fromkeys(picture.camera for picture in pictures):
-        ordered = sorted((p.moment, i) for i, p in enumerate(pictures) if p.camera == camera)
+        ordered = sorted((p.frame, i) for i, p in enumerate(pictures) if p.camera == camera)
         for start in spread_over(len(ordered), most):
             for later in apart:
                 if start + later < len(ordered):
@@ -272,7 +272,7 @@ def successive(
 
 
 def along_drive(
-    pictures: Sequence[PosedPicture], apart: Sequence[int] = (1, 2), most: int = MEASURED_MOMENTS
+    pictures: Sequence[PosedPicture], apart: Sequence[int] = (1, 2), most: int = MEASURED_FRAMES
 ) -> list[EpipolarAgreement]:
     """Hold the poses of a drive against features matched between successive pictures of each camera, in any order.
 
@@ -291,5 +291,5 @@ def along_drive(
         median_px = inliers = float("nan")
         if len(known) >= LEAST_MATCHES:
             median_px, inliers = float(np.median(known)), float((known < INLIER_PX).mean())
-        found.append(EpipolarAgreement(first.camera, first.moment, second.moment, len(known), median_px, inliers))
+        found.append(EpipolarAgreement(first.camera, first.frame, second.frame, len(known), median_px, inliers))
     return found

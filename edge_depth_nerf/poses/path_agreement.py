@@ -14,7 +14,7 @@ from edge_depth_nerf.lidar.trajectory import Trajectory
 
 PATHS_AGREE = "paths_agree.json"
 """File of a scene whose path was found in two ways: a `PathAgreement`, and the checksum of the first path."""
-MIN_MOMENTS = 3
+MIN_COMMON_TIMES = 3
 """Fewer in common say nothing."""
 
 
@@ -69,7 +69,7 @@ def compare_paths(first: Trajectory, second: Trajectory) -> PathAgreement | None
     than three in common.
     """
     common = np.array([second.outside_s(time) == 0 for time in first.times_s.tolist()])
-    if common.sum() < MIN_MOMENTS:
+    if common.sum() < MIN_COMMON_TIMES:
         return None
     places = first.vehicle_to_world[common, :3, 3]
     others = second.at(first.times_s[common])[:, :3, 3]

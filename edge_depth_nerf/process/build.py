@@ -361,10 +361,10 @@ class _Builder:
             index = torch.where(moved[index], -1, index)
         else:
             return None, None
-        has_return = distance_m[self._usable[picture.camera]] > 0
+        has_lidar = distance_m[self._usable[picture.camera]] > 0
         with self._lock:
-            self._coverage[picture.camera].append(float(has_return.mean()))
-            if not has_return.any():
+            self._coverage[picture.camera].append(float(has_lidar.mean()))
+            if not has_lidar.any():
                 self._without.append(f"{picture.frame} of {picture.camera}")
         return distance_m, _cloud(index, in_camera, camera_to_world, image)
 

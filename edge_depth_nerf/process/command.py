@@ -158,8 +158,8 @@ def _add_mono(scene: SceneFolder, options: ProcessOptions, console: Console) -> 
         )
     if scene.has("mono") and lidar:
         from edge_depth_nerf.method.prior import PriorOptions
-        from edge_depth_nerf.mono.calibration import calibrate_scene, saved_trust
+        from edge_depth_nerf.mono.calibration import calibrate_scene, saved_calibration
 
-        if saved_trust(scene, PriorOptions()) is None:
-            trust = calibrate_scene(scene.path, console=console)
-            say(console, trust.summary())
+        if saved_calibration(scene, PriorOptions()) is None:
+            calibration = calibrate_scene(scene.path, console=console)
+            say(console, calibration.summary())

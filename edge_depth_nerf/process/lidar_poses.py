@@ -36,7 +36,7 @@ _MIN_WAY_M = 1.0
 _TURNED_RAD = math.radians(20)
 _LOOKED_AT = 5
 """The number of a scanner's LiDAR points is counted in so many of its sweeps."""
-_FEW_RETURNS = 5000
+_FEW_POINTS = 5000
 """Fewer a sweep say too little of the vehicle's roll and pitch; a scanner of 16 rings has some 25,000."""
 
 
@@ -87,8 +87,8 @@ def check_sweeps(recording: Recording) -> list[RecordedSweep]:
     scanners: dict[str, list[RecordedSweep]] = defaultdict(list)
     for sweep in recording.sweeps:
         scanners[sweep.scanner].append(sweep)
-    returns = {name: _usual_returns(sweeps) for name, sweeps in scanners.items()}
-    name = max(scanners, key=lambda name: returns[name] * len(scanners[name]))
+    usual = {name: _usual_points(sweeps) for name, sweeps in scanners.items()}
+    name = max(scanners, key=lambda name: usual[name] * len(scanners[name]))
     sweeps = sorted(scanners[name], key=lambda sweep: sweep.time_s)
     if len(sweeps) < MIN_SWEEPS:
         raise InputError(
@@ -96,10 +96,10 @@ def check_sweeps(recording: Recording) -> list[RecordedSweep]:
             "or more consecutive ones: the path is computed from their overlap. Take more frames "
             "(--frames), or compute the path from the pictures (--poses colmap)."
         )
-    if returns[name] < _FEW_RETURNS:
+    if usual[name] < _FEW_POINTS:
         raise InputError(
-            f"--poses lidar: {sweeps[0].path.parent}: {returns[name]:.0f} returns a sweep (median), expected "
-            f"{_FEW_RETURNS} or more: roll and pitch cannot be computed from fewer. Use --poses colmap."
+            f"--poses lidar: {sweeps[0].path.parent}: {usual[name]:.0f} points a sweep (median), expected "
+            f"{_FEW_POINTS} or more: roll and pitch cannot be computed from fewer. Use --poses colmap."
         )
     times = np.array([sweep.time_s for sweep in sweeps])
     widest = int(np.diff(times).argmax())
@@ -139,7 +139,7 @@ def _read(sweep: RecordedSweep) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.
     return in_vehicle.double().numpy(), offset_s[used].double().numpy()
 
 
-def _usual_returns(sweeps: Sequence[RecordedSweep]) -> float:
+def _usual_points(sweeps: Sequence[RecordedSweep]) -> float:
     some = [sweeps[index] for index in dict.fromkeys(spread_over(len(sweeps), _LOOKED_AT))]
     read = [len(sweep.points_m) for one in some if (sweep := read_if_whole(one.read)) is not None]
     return float(statistics.median(read or [0]))

@@ -2,7 +2,7 @@
 
 They have the size of the raw pictures, so that the folder can be given as --frame-masks. An existing mask stays
 unchanged: it may have been corrected. Masks of training pictures use nothing from the sweeps of held-out frames. A
-held-out picture gets a mask from its own sweep: it decides which pixels are judged.
+held-out picture gets a mask from its own sweep: it decides which pixels are evaluated.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from edge_depth_nerf.lidar.moving import (
     Thing,
     expected_at,
     followed,
-    loose_returns,
+    loose_points,
     nearby,
     things_of,
 )
@@ -123,13 +123,13 @@ class _ScannersThings:
         centres_m = np.array([np.linalg.inv(free_spaces[i].world_to_scanner.numpy())[:3, 3] for i in usable])
         trains = [scanner.trains[index] for index in usable]
 
-        def judge(place: int) -> Loose:
+        def evaluate(place: int) -> Loose:
             others = [usable[other] for other in nearby(place, centres_m, trains)]
-            moment_s, sweep = scanner.times_s[usable[place]], scanner.whole(usable[place])
+            time_s, sweep = scanner.times_s[usable[place]], scanner.whole(usable[place])
             seen_by = [(float(scanner.times_s[other]), free_spaces[other]) for other in others]
-            return loose_returns(sweep, float(moment_s), self.ground, seen_by)
+            return loose_points(sweep, float(time_s), self.ground, seen_by)
 
-        jobs = [partial(judge, place) for place in range(len(usable))]
+        jobs = [partial(evaluate, place) for place in range(len(usable))]
         loose = dict(zip(usable, run_jobs(jobs, "Finding what moves", console), strict=True))
         self._things = followed({index: loose[index] for index in self._trained})
         for index in usable:
@@ -169,24 +169,24 @@ def _not_alone(things: Sequence[Thing], expected: Sequence[Thing]) -> list[Thing
 
 
 @dataclass(frozen=True)
-class _Returns:
+class _Points:
     """Points that a scanner says something of at a picture's time."""
 
     points_m: Float[np.ndarray, "n 3"]
     spacing_m: Float[np.ndarray, "n"]
 
     @staticmethod
-    def joined(parts: Sequence[_Returns]) -> _Returns:
-        return _Returns(
+    def joined(parts: Sequence[_Points]) -> _Points:
+        return _Points(
             np.concatenate([part.points_m for part in parts]), np.concatenate([part.spacing_m for part in parts])
         )
 
-    def chosen(self, which: NDArray[np.bool_] | NDArray[np.int64]) -> _Returns:
-        return _Returns(self.points_m[which], self.spacing_m[which])
+    def chosen(self, which: NDArray[np.bool_] | NDArray[np.int64]) -> _Points:
+        return _Points(self.points_m[which], self.spacing_m[which])
 
-    def raised(self, by_m: float) -> _Returns:
+    def raised(self, by_m: float) -> _Points:
         """The same higher up, in steps that are no wider than the points are apart."""
-        return _Returns(self.points_m + np.array((0.0, 0.0, by_m)), np.maximum(self.spacing_m, np.float32(_STEP_M)))
+        return _Points(self.points_m + np.array((0.0, 0.0, by_m)), np.maximum(self.spacing_m, np.float32(_STEP_M)))
 
 
 def _write_mask(
@@ -231,21 +231,21 @@ def _moving_pixels(
     sweep, things, index = seen
     late_s = time_s - float(scanner.scanner.times_s[index])
     world_to_camera = np.linalg.inv(camera_to_world)
-    moving, cut_off, taken = _at_moment(sweep, things, late_s, scanner.ground)
+    moving, cut_off, taken = _at_time(sweep, things, late_s, scanner.ground)
     for highest in cut_off:
         lines = [highest.chosen(up) for up in _heights(scanner.ground.above_m(highest.points_m))]
         steps = [line.raised((number + 1) * _STEP_M) for number, line in enumerate(lines)]
         roof = clearest_edge(image, [_pixels(_in_camera(world_to_camera, step), step, camera)[0] for step in steps])
-        moving = _Returns.joined([moving, *steps[: 0 if roof is None else roof + 1]])
+        moving = _Points.joined([moving, *steps[: 0 if roof is None else roof + 1]])
     rest = np.ones(len(sweep.points_m), bool)
     rest[taken] = False
-    every = _Returns.joined([moving, _Returns(sweep.points_m.numpy()[rest], sweep.spacing_m.numpy()[rest])])
+    every = _Points.joined([moving, _Points(sweep.points_m.numpy()[rest], sweep.spacing_m.numpy()[rest])])
     in_camera = _in_camera(world_to_camera, every)
     chosen = project_points(in_camera.float(), camera, spacing_m=torch.from_numpy(every.spacing_m)).point_index.numpy()
     shown = chosen[(chosen >= 0) & (chosen < len(moving.points_m))]
-    returns_px, reach_px = _pixels(in_camera[shown], every.chosen(shown), camera)
+    points_px, reach_px = _pixels(in_camera[shown], every.chosen(shown), camera)
     holds_still = ~usable | (chosen >= len(moving.points_m))
-    return grow_moving(image, returns_px, reach_px, holds_still) & usable
+    return grow_moving(image, points_px, reach_px, holds_still) & usable
 
 
 def _heights(height_m: NDArray[np.float64]) -> Iterator[NDArray[np.bool_]]:
@@ -255,32 +255,32 @@ def _heights(height_m: NDArray[np.float64]) -> Iterator[NDArray[np.bool_]]:
         yield height_m + step_m < _TALLEST_M
 
 
-def _at_moment(
+def _at_time(
     sweep: WorldSweep, things: Sequence[Thing], late_s: float, ground: Ground
-) -> tuple[_Returns, list[_Returns], NDArray[np.int64]]:
+) -> tuple[_Points, list[_Points], NDArray[np.int64]]:
     """Where things are some time after a sweep's time.
 
     Returns:
         Their points; of each long thing those at the upper edge of the scanner's field; rows of their LiDAR points.
 
     """
-    moving, cut_off, rows = [_Returns(np.zeros((0, 3)), np.zeros(0, np.float32))], [], [np.zeros(0, np.int64)]
+    moving, cut_off, rows = [_Points(np.zeros((0, 3)), np.zeros(0, np.float32))], [], [np.zeros(0, np.int64)]
     for thing in things:
         of_thing = np.concatenate((thing.rows, _feet(sweep, thing, ground)))
         points = sweep.points_m.numpy()[of_thing]
         points[:, :2] += (late_s - sweep.offset_s.numpy()[of_thing])[:, None] * thing.velocity_m_s
-        returns = _Returns(points, sweep.spacing_m.numpy()[of_thing])
+        points_of_thing = _Points(points, sweep.spacing_m.numpy()[of_thing])
         elevation = elevation_rad(sweep.points_m[of_thing], sweep).numpy()
         rows.append(of_thing)
-        moving.append(returns)
+        moving.append(points_of_thing)
         # below the scanner's field the thing goes on
-        lowest = returns.chosen(elevation < sweep.elevation_rad[0] + _EDGE_RAD)
+        lowest = points_of_thing.chosen(elevation < sweep.elevation_rad[0] + _EDGE_RAD)
         height = ground.above_m(lowest.points_m)
         for step_m in np.arange(_STEP_M, float(height.max(initial=0)) - _BODY_ENDS_M, _STEP_M):
             moving.append(lowest.chosen(height - step_m > _BODY_ENDS_M).raised(-step_m))
         if np.ptp(thing.points_m[:, :2], axis=0).max() > _LONG_M:
-            cut_off.append(returns.chosen(elevation > sweep.elevation_rad[1] - _EDGE_RAD))
-    return _Returns.joined(moving), cut_off, np.concatenate(rows)
+            cut_off.append(points_of_thing.chosen(elevation > sweep.elevation_rad[1] - _EDGE_RAD))
+    return _Points.joined(moving), cut_off, np.concatenate(rows)
 
 
 def _feet(sweep: WorldSweep, thing: Thing, ground: Ground) -> NDArray[np.int64]:
@@ -294,17 +294,19 @@ def _feet(sweep: WorldSweep, thing: Thing, ground: Ground) -> NDArray[np.int64]:
     return near[np.isfinite(away_m)]
 
 
-def _in_camera(world_to_camera: NDArray[np.float64], returns: _Returns) -> torch.Tensor:
-    return transform_points(torch.from_numpy(world_to_camera), torch.from_numpy(returns.points_m))
+def _in_camera(world_to_camera: NDArray[np.float64], points_of_thing: _Points) -> torch.Tensor:
+    return transform_points(torch.from_numpy(world_to_camera), torch.from_numpy(points_of_thing.points_m))
 
 
 def _pixels(
-    points_in_camera: torch.Tensor, returns: _Returns, camera: Camera
+    points_in_camera: torch.Tensor, points_of_thing: _Points, camera: Camera
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Where points are seen, and how many pixels their spacing is; those out of view are left out."""
     across = torch.linalg.cross(points_in_camera, points_in_camera.roll(1, dims=-1))
     across = across / across.norm(dim=-1, keepdim=True).clamp(min=1e-9)
     pixels, valid = camera.project(points_in_camera)
-    beside, valid_beside = camera.project(points_in_camera + across * torch.from_numpy(returns.spacing_m)[:, None])
+    beside, valid_beside = camera.project(
+        points_in_camera + across * torch.from_numpy(points_of_thing.spacing_m)[:, None]
+    )
     seen = valid & valid_beside & camera.inside(pixels)
     return pixels[seen].numpy(), (beside - pixels)[seen].norm(dim=-1).numpy()

@@ -36,7 +36,7 @@ def features_say(recording: Recording, options: ProcessOptions, console: Console
     posed = [
         PosedPicture(
             camera=picture.camera,
-            moment=picture.frame,
+            frame=picture.frame,
             lens=lenses[picture.camera],
             camera_to_world=picture.camera_to_world,
             read_rgb=partial(read_image, picture.path),

@@ -25,7 +25,7 @@ from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE, as_people_count
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar import Sweep, transform_points
 from edge_depth_nerf.lidar.scans import SCAN_SUFFIXES, check_scan, read_scan
-from edge_depth_nerf.lidar.sweeps import usable_returns
+from edge_depth_nerf.lidar.sweeps import usable_points
 from edge_depth_nerf.lidar.trajectory import MAX_POSE_GAP_S, Trajectory
 from edge_depth_nerf.process.options import JbnuDepth360Options, RigOptions
 from edge_depth_nerf.process.poses import read_kitti, read_nerfstudio, read_times, read_tum
@@ -57,7 +57,7 @@ class _Scans:
     files: list[_Timed]
 
     @cached_property
-    def middles_s(self) -> np.ndarray:
+    def midpoints_s(self) -> np.ndarray:
         """The middle of each one's turn."""
         return np.array([item.time_s for item in self.files]) + self.lidar.to_middle_s
 
@@ -68,7 +68,7 @@ class _Scans:
 
     def nearest(self, time_s: float) -> tuple[int, float]:
         """The scan whose middle is nearest to a time, and how far it is."""
-        apart = np.abs(self.middles_s - time_s)
+        apart = np.abs(self.midpoints_s - time_s)
         return int(apart.argmin()), float(apart.min())
 
 
@@ -120,7 +120,7 @@ def recording_of_rig(rig: Rig, options: RigOptions | JbnuDepth360Options, kind: 
     scans = [_Scans(lidar, _timed(_files(root, lidar.scans, SCAN_SUFFIXES), lidar)) for lidar in rig.lidars]
     _check_clocks(rig, files, scans, path)
 
-    kept, skipped = _usable(_moments(files), options, path, camera_poses, scans)
+    kept, skipped = _usable(_frames(files), options, path, camera_poses, scans)
     if not kept:
         raise InputError(f"{root}: none of the chosen frames can be used: {summarise(skipped)}.")
 
@@ -132,8 +132,8 @@ def recording_of_rig(rig: Rig, options: RigOptions | JbnuDepth360Options, kind: 
         for name, picture in sorted(pictures.items()):
             with tolerance.of(frame, name):
                 recorded.append(companions.picture(by_name[name], frame, picture, camera_poses.get(picture.path)))
-    moments_s = {frame: _time(pictures) for frame, pictures in kept.items()}
-    sweeps = _sweeps(scans, moments_s, path, options.sweeps, tolerance)
+    frame_times_s = {frame: _time(pictures) for frame, pictures in kept.items()}
+    sweeps = _sweeps(scans, frame_times_s, path, options.sweeps, tolerance)
     for camera in cameras:
         if camera.ego_mask:
             check_size(camera.ego_mask, camera.camera)
@@ -244,7 +244,7 @@ def _times_of_file(path: Path, files: list[Path]) -> list[float]:
     return [time for _, time in lines]
 
 
-# ---- moments ---------------------------------------------------------------------------------------------------
+# ---- frames ----------------------------------------------------------------------------------------------------
 
 
 def _time(pictures: dict[str, _Timed]) -> float:
@@ -258,22 +258,22 @@ def _interval(times: list[float]) -> float:
     return statistics.median(np.diff(times).tolist()) if len(times) > 1 else float("inf")
 
 
-def _moments(files: dict[str, list[_Timed]]) -> list[dict[str, _Timed]]:
+def _frames(files: dict[str, list[_Timed]]) -> list[dict[str, _Timed]]:
     """Pictures that belong together, by camera, in order of time."""
     interval = min(_interval([item.time_s for item in timed]) for timed in files.values())
     every = sorted(((item, name) for name, timed in files.items() for item in timed), key=lambda pair: pair[0].time_s)
-    moments: list[dict[str, _Timed]] = []
+    frames: list[dict[str, _Timed]] = []
     begun = -float("inf")
     for item, name in every:
-        if not moments or name in moments[-1] or item.time_s - begun >= interval / 2:
-            moments.append({})
+        if not frames or name in frames[-1] or item.time_s - begun >= interval / 2:
+            frames.append({})
             begun = item.time_s
-        moments[-1][name] = item
-    return moments
+        frames[-1][name] = item
+    return frames
 
 
 def _usable(
-    moments: list[dict[str, _Timed]],
+    frames: list[dict[str, _Timed]],
     options: RigOptions | JbnuDepth360Options,
     path: Trajectory | None,
     camera_poses: dict[Path, Transform],
@@ -282,8 +282,8 @@ def _usable(
     """The requested frames, by number, without frames and pictures that cannot be used; and the latter."""
     kept: dict[int, dict[str, _Timed]] = {}
     skipped: list[Skipped] = []
-    for frame in options.chosen_frames(len(moments) - 1, "the recording has frames 0"):
-        pictures = moments[frame]
+    for frame in options.chosen_frames(len(frames) - 1, "the recording has frames 0"):
+        pictures = frames[frame]
         if reason := _unusable(pictures, path, scans):
             skipped.append(Skipped(frame, None, reason))
             continue
@@ -419,19 +419,19 @@ def _check_clocks(rig: Rig, files: dict[str, list[_Timed]], scans: Sequence[_Sca
 
 
 def _sweeps(
-    scans: Sequence[_Scans], moments_s: dict[int, float], path: Trajectory | None, reach: int, tolerance: Tolerance
+    scans: Sequence[_Scans], frame_times_s: dict[int, float], path: Trajectory | None, reach: int, tolerance: Tolerance
 ) -> list[RecordedSweep]:
     """The scans that the chosen frames can use, checked by their headers, each with the frame it belongs to."""
-    frames, times_s = np.array(list(moments_s)), np.array(list(moments_s.values()))
+    frames, times_s = np.array(list(frame_times_s)), np.array(list(frame_times_s.values()))
     found = []
     for scanner in scans:
         lidar = scanner.lidar
         absolute = lidar.format.times is not None and lidar.format.times.absolute
-        # around each moment's scan, those that are accumulated, and those that tell what moved in them
+        # around each frame's scan, those that are accumulated, and those that tell what moved in them
         margin = 2 * reach + 1
         first = max(0, scanner.nearest(float(times_s.min()))[0] - margin)
         last = scanner.nearest(float(times_s.max()))[0] + margin
-        for item, middle_s in list(zip(scanner.files, scanner.middles_s.tolist(), strict=True))[first : last + 1]:
+        for item, middle_s in list(zip(scanner.files, scanner.midpoints_s.tolist(), strict=True))[first : last + 1]:
             if path is not None and path.outside_s(middle_s) > scanner.turn_s:
                 continue
             apart = np.abs(times_s - middle_s)
@@ -470,7 +470,7 @@ def _read(path: Path, lidar: RigLidar, counted_from_s: float) -> Sweep:
         return sweep
     to_scanner = torch.from_numpy(np.linalg.inv(lidar.to_vehicle))
     # echoes that are missing lie at the scanner's own place
-    again = usable_returns(path, transform_points(to_scanner, sweep.points_m), sweep.reflectance, sweep.offset_s)
+    again = usable_points(path, transform_points(to_scanner, sweep.points_m), sweep.reflectance, sweep.offset_s)
     return replace(again, not_finite=sweep.not_finite, out_of_range=sweep.out_of_range + again.out_of_range)
 
 

@@ -158,7 +158,7 @@ class Scanner:
         """Whether a sweep can be read; under `strict` one that cannot is an error."""
         return read_if_whole(partial(self._loaded.get, index), strict=self._options.strict) is not None
 
-    def _seen_through(self, index: int) -> Bool[Tensor, "returns"]:
+    def _seen_through(self, index: int) -> Bool[Tensor, "points"]:
         """Which points of a sweep another one saw through."""
         world = self._loaded.get(index).world
         passed = torch.zeros(len(world.points_m), dtype=torch.bool)
@@ -188,7 +188,7 @@ class Scanner:
         """A sweep with all its points."""
         return self._loaded.get(index).world
 
-    def moved(self, index: int) -> Bool[Tensor, "returns"]:
+    def moved(self, index: int) -> Bool[Tensor, "points"]:
         """Which of them another sweep, that training may see, saw through."""
         return self._moved.get(index)
 

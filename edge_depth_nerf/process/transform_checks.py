@@ -42,7 +42,7 @@ _MOVED_M = 0.5
 """How far the camera has moved at least between the pictures of a pair."""
 _APART_S = 0.2
 """A scan further in time from a picture does not belong to it."""
-_MOST_RETURNS = 40_000
+_MOST_POINTS = 40_000
 """So many points of a scan are used."""
 _SURROUNDINGS_PX = 4.0
 """Scale of what contrast is measured against."""
@@ -194,7 +194,7 @@ def _agreement(
         for turned, named in ((False, ("given", "camera")), (True, ("scanner", "both"))):
             scanner_to_vehicle = np.linalg.inv(recorded.to_vehicle) if turned else recorded.to_vehicle
             world = sweep_in_world(sweep, recorded.time_s, scanner_to_vehicle, recording.trajectory, recorded.timing)
-            every = max(1, len(world.points_m) // _MOST_RETURNS)
+            every = max(1, len(world.points_m) // _MOST_POINTS)
             world_to_vehicle = torch.from_numpy(np.linalg.inv(pair.vehicle_to_world[0]))
             in_vehicle = transform_points(world_to_vehicle, world.points_m[::every])
             for name, to_vehicle in zip(named, (camera.to_vehicle, np.linalg.inv(camera.to_vehicle)), strict=True):
@@ -231,7 +231,7 @@ def _seen_twice(
     camera: Camera,
     usable: Bool[np.ndarray, "h w"],
     contrasts: tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]],
-) -> tuple[Float32[np.ndarray, "returns"], ...]:
+) -> tuple[Float32[np.ndarray, "seen"], ...]:
     """Contrast at LiDAR points that both see: in the first, in the second, in the second where the first has them."""
     visible = project_points(in_first.float(), camera, spacing_m=spacing_m).point_index
     points = in_first[visible[visible >= 0]]

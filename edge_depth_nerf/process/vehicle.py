@@ -40,9 +40,9 @@ _FEWEST = 5
 """Pictures that it can be found in with LiDAR's help."""
 _FEW_CERTAINTY = 0.9
 """Its outline must be so clear then."""
-_FEW_RETURNS = 0.15
+_FEW_POINTS = 0.15
 """And it may have so many LiDAR points a pixel, as a share of what lies around it."""
-_RETURNS_PICTURES = 3
+_LIDAR_PICTURES = 3
 """The LiDAR points of so many pictures are counted."""
 _INNER = 0.01
 """So far inside the outline, as a share of the picture's longer side: scanner and camera do not see quite the same."""
@@ -141,18 +141,18 @@ def _find_mask(
         if isinstance(found, NoEgo) and not found.could_tell and _FEWEST <= len(spread) and recording.sweeps:
             few = find_ego(loaders, lens, fewest=_FEWEST)
             if isinstance(few, EgoMask) and few.pictures < MIN_PICTURES and few.certainty >= _FEW_CERTAINTY:
-                returns = _returns(recording, recorded, spread)
-                found = few if _has_few(returns, ~few.keep & lens, few.keep & lens) else found
+                points_of_pixels = _points_of_pixels(recording, recorded, spread)
+                found = few if _has_few(points_of_pixels, ~few.keep & lens, few.keep & lens) else found
     return (mask & found.keep if isinstance(found, EgoMask) else mask), found
 
 
-def _returns(
+def _points_of_pixels(
     recording: Recording, recorded: RecordedCamera, pictures: Sequence[RecordedPicture]
 ) -> Float32[np.ndarray, "h w"]:
     """How many LiDAR points of their own frames' sweeps fall into each pixel of some pictures."""
     camera = recorded.camera
     counts = np.zeros((camera.height, camera.width), np.float32)
-    frames = [pictures[index].frame for index in np.linspace(0, len(pictures) - 1, _RETURNS_PICTURES).astype(int)]
+    frames = [pictures[index].frame for index in np.linspace(0, len(pictures) - 1, _LIDAR_PICTURES).astype(int)]
     for sweep in recording.sweeps:
         read = read_if_whole(sweep.read) if sweep.frame in frames else None
         if read is None:
@@ -166,13 +166,13 @@ def _returns(
 
 
 def _has_few(
-    returns: Float32[np.ndarray, "h w"], vehicle: Bool[np.ndarray, "h w"], around: Bool[np.ndarray, "h w"]
+    points_of_pixels: Float32[np.ndarray, "h w"], vehicle: Bool[np.ndarray, "h w"], around: Bool[np.ndarray, "h w"]
 ) -> bool:
     """Whether the vehicle has far fewer LiDAR points a pixel than the lower half of what lies around it."""
     inner = eroded(vehicle, _INNER * max(vehicle.shape))
     rows = np.flatnonzero((vehicle | around).any(1))
     below = around.copy()
     below[: int(rows.mean())] = False
-    if not inner.any() or not returns[below].any():
+    if not inner.any() or not points_of_pixels[below].any():
         return False
-    return bool(returns[inner].mean() <= _FEW_RETURNS * returns[below].mean())
+    return bool(points_of_pixels[inner].mean() <= _FEW_POINTS * points_of_pixels[below].mean())

@@ -181,7 +181,7 @@ def show_view(view: ComparedView, allowance: int) -> ShownView:
     sparse = view.distance_key == "lidar_file_path"
     target = view.rgb if view.clean_rgb is None else view.clean_rgb
     usual = is_distance(view.distance_m) & view.mask
-    judged = usual & (view.distance_m >= ERROR_RANGE_M[0]) & (view.distance_m <= ERROR_RANGE_M[1])
+    compared = usual & (view.distance_m >= ERROR_RANGE_M[0]) & (view.distance_m <= ERROR_RANGE_M[1])
     radius = SPREAD_PX * width / shown if sparse else 0.0
 
     def picture(pixels: NDArray[np.uint8]) -> bytes:
@@ -209,10 +209,10 @@ def show_view(view: ComparedView, allowance: int) -> ShownView:
         }
         squared = float(np.square(error[view.mask] / 255).mean())
         figures[name] = {"PSNR, dB": f"{-10 * math.log10(max(squared, LEAST_SQUARED_ERROR)):.2f}"}
-        if judged.any():
-            ratio = np.where(judged, distance_m / np.where(judged, view.distance_m, 1), 1).astype(np.float32)
-            rendered[name]["distance-error"] = map_of(100 * (ratio - 1), judged, RELATIVE_ERROR, radius)
-            ratio = ratio[judged]
+        if compared.any():
+            ratio = np.where(compared, distance_m / np.where(compared, view.distance_m, 1), 1).astype(np.float32)
+            rendered[name]["distance-error"] = map_of(100 * (ratio - 1), compared, RELATIVE_ERROR, radius)
+            ratio = ratio[compared]
             close = float(((ratio < WITHIN) & (ratio > 1 / WITHIN)).mean())
             figures[name]["δ<{:g}, {:g}-{:g} m".format(WITHIN, *ERROR_RANGE_M)] = f"{close:.3f}"
     return ShownView(view.name, *size, truth, rendered, figures)

@@ -22,7 +22,7 @@ from edge_depth_nerf.base.files import read_json
 
 TRANSFORMS = "transforms.json"
 POINTS = "points.ply"
-TRUST_FILE = "mono_trust.json"
+CALIBRATION_FILE = "mono_trust.json"
 """The calibration of the prior, beside the maps that it was measured on."""
 REFINED_POSES = "refined_poses.json"
 """What refining the poses by the pictures found; the next `process` reads it."""
@@ -47,7 +47,7 @@ class Layer:
     words: str
     """What messages call it."""
     is_truth: bool = False
-    """Whether it is what is really there: for judging alone, no training reads it."""
+    """Whether it is what is really there: for evaluation alone, no training reads it."""
 
 
 LAYERS: dict[str, Layer] = {
@@ -191,9 +191,9 @@ def _check_frame(frame: Mapping[str, Any], where: str, folder: Path) -> None:
     _check_distortion(frame, where)
     if "transform_matrix" in frame:
         pose_of(frame, where)
-    moment = frame.get("frame", 0)
-    if isinstance(moment, bool) or not isinstance(moment, int) or not 0 <= moment < 10**10:
-        raise InputError(f"{where}: frame is {shown(moment)}, expected a frame number. Repair the file.")
+    number = frame.get("frame", 0)
+    if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number < 10**10:
+        raise InputError(f"{where}: frame is {shown(number)}, expected a frame number. Repair the file.")
     if "camera" in frame:
         # maps lie in folders of cameras' names
         path_inside(folder, frame["camera"], f"{where}: camera")

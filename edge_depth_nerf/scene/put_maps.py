@@ -18,7 +18,7 @@ from rich.progress import Progress
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import write_distance_png, write_json
-from edge_depth_nerf.scene.format import LAYERS, TRUST_FILE, later_layers, read_transforms
+from edge_depth_nerf.scene.format import CALIBRATION_FILE, LAYERS, later_layers, read_transforms
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
 
 FARTHEST_M = 200.0
@@ -95,7 +95,7 @@ def write_maps(
         # `process` then knows that what lies there is not what it wrote
         write_json(found.path, {**meta, layer: {"unfinished": True}})
         # what was measured about the errors of the maps before
-        (found.folder / TRUST_FILE).unlink(missing_ok=True)
+        (found.folder / CALIBRATION_FILE).unlink(missing_ok=True)
         for target in targets.values():
             (found.folder / target).parent.mkdir(parents=True, exist_ok=True)
             (partial / target).replace(found.folder / target)

@@ -51,7 +51,7 @@ class ScenePicture:
     """Its file_path in transforms.json."""
     camera: str
     """The frame's own word, or the folder of its pictures."""
-    moment: int
+    frame: int
     """Number of the frame in the drive; in other people's scenes its place in the order of names."""
     lens: KannalaBrandt | Pinhole
     """The camera that nerfstudio sees."""
@@ -151,9 +151,9 @@ class SceneFolder:
         names = dict.fromkeys(picture.camera for picture in self.pictures)
         return {name: tuple(picture for picture in self.pictures if picture.camera == name) for name in names}
 
-    def moments(self) -> list[int]:
+    def frames(self) -> list[int]:
         """The numbers of all frames that any camera has, in order."""
-        return sorted({picture.moment for picture in self.pictures})
+        return sorted({picture.frame for picture in self.pictures})
 
     def has(self, layer: str) -> bool:
         """Whether any picture has this layer."""
@@ -322,9 +322,9 @@ def scene_of(
     own = is_own_scene(meta)
     own_lidar = LAYERS["lidar"].key in frames[0]
     held_out, split_known = _held_out(meta)
-    moments = _moments(frames)
+    numbers = _frame_numbers(frames)
     pictures = [
-        _picture(meta, frame, path, model, moments[frame["file_path"]], frame["file_path"] in held_out)
+        _picture(meta, frame, path, model, numbers[frame["file_path"]], frame["file_path"] in held_out)
         for frame in frames
     ]
     given = Counter(key for frame in frames for key in path_keys() if key in frame)
@@ -342,7 +342,7 @@ def scene_of(
         # of this project's own key both are known
         lidar_metres_per_count=1 / DISTANCE_STEPS_PER_METRE if own_lidar else depth_metres_per_count,
         lidar_is_z_depth=not own_lidar and depth_kind == "z_depth",
-        pictures=tuple(sorted(pictures, key=lambda picture: (picture.camera, picture.moment))),
+        pictures=tuple(sorted(pictures, key=lambda picture: (picture.camera, picture.frame))),
         split_known=split_known,
         incomplete={key: count for key, count in given.items() if count < len(frames)},
         points_path=path.parent / meta["ply_file_path"] if meta.get("ply_file_path") else None,
@@ -350,14 +350,14 @@ def scene_of(
 
 
 def _picture(
-    meta: dict[str, Any], frame: dict[str, Any], path: Path, model: str, moment: int, held_out: bool
+    meta: dict[str, Any], frame: dict[str, Any], path: Path, model: str, number: int, held_out: bool
 ) -> ScenePicture:
     name, time = frame["file_path"], frame.get("timestamp_s")
     pose = pose_of(frame, f"{path}: {name}")
     return ScenePicture(
         name=name,
         camera=_camera_name(frame),
-        moment=moment,
+        frame=number,
         lens=_lens(meta, frame, model, path),
         position_m=pose[:3, 3],
         rotation=pose[:3, :3],
@@ -381,14 +381,14 @@ def _camera_name(frame: dict[str, Any]) -> str:
     return frame["camera"] if "camera" in frame else Path(frame["file_path"]).parent.as_posix()
 
 
-def _moments(frames: list[dict[str, Any]]) -> dict[str, int]:
+def _frame_numbers(frames: list[dict[str, Any]]) -> dict[str, int]:
     """The frame number of each picture: the given one, else its order within its camera."""
     if all("frame" in frame for frame in frames):
         return {frame["file_path"]: frame["frame"] for frame in frames}
     ordered: dict[str, list[str]] = {}
     for frame in sorted(frames, key=lambda frame: frame["file_path"]):
         ordered.setdefault(_camera_name(frame), []).append(frame["file_path"])
-    return {name: moment for names in ordered.values() for moment, name in enumerate(names)}
+    return {name: number for names in ordered.values() for number, name in enumerate(names)}
 
 
 def _lens(meta: dict[str, Any], frame: dict[str, Any], model: str, path: Path) -> KannalaBrandt | Pinhole:

@@ -8,7 +8,7 @@
     masks/image_02/0000000123.png         the same for one frame, where frames have masks of their own
     lidar/image_02/0000000123.png         LiDAR distance map
     mono/image_02/0000000123.png          monocular distance map
-    truth/image_02/{distance,rgb}/…       what is really there, in synthetic drives, for judging alone
+    truth/image_02/{distance,rgb}/…       what is really there, in synthetic drives, for evaluation alone
     truth/image_02/shifted_1m/{distance,rgb}/…   the same from beside the path
 
 Distances are metres along the ray, in 16-bit PNGs of 1/256 m, 0 = none. In memory, poses are camera-to-world with
@@ -271,7 +271,7 @@ def write_scene(
     frames = [frame for frame in frames if frame.key not in broken]
     later, work, notices = _kept_later_maps(output, frames, shifted, layers)
     jobs = [
-        # the cameras of a moment one after another: they share its sweeps
+        # the cameras of a frame one after another: they share its sweeps
         *(
             partial(_try_frame, tolerance, output, frame, masks[frame.camera], layers, offset)
             for frame in sorted(work.frames, key=lambda frame: (frame.frame, frame.camera))

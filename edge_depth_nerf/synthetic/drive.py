@@ -10,7 +10,7 @@ Under the output folder, with SEQ the sequence, k = 2 (left), 3 (right) and ten-
     truth/masks/image_0k{_lens,_ego,}.png         255 = keep: inside the lens, not the own car, both
     truth/SEQ/image_0k/distance/*.png             metres along the ray in 1/256 m; 0 = sky, own car, outside the lens
     truth/SEQ/image_0k/rgb/*.png                  pictures without exposure drift and noise
-    truth/SEQ/points/*.bin                        the sweep without noise, moved to the frame's moment
+    truth/SEQ/points/*.bin                        the sweep without noise, moved to the frame's time
     truth/SEQ/shifted.json                        camera-to-world poses 1 m and 2 m to the car's left, held-out frames
     truth/SEQ/image_0k/shifted_{1,2}m/{rgb,distance}/*.png   what is seen there, without the own car
     truth/SEQ/moving_masks/image_0k/*.png         255 = keep: nothing that moves; only where something does
@@ -48,7 +48,7 @@ SHIFTS_M = (1, 2)
 """How far the held-out views are moved to the car's left."""
 
 _MANIFEST = "drive.json"
-_FIRST_MOMENT = datetime(2013, 5, 28, 8, 46, 2)
+_FIRST_TIME = datetime(2013, 5, 28, 8, 46, 2)
 _FIRST_NANOSECONDS = 123_456_789
 
 Job = tuple[int, str | None]
@@ -58,7 +58,7 @@ _log = logging.getLogger(__name__)
 
 
 def held_out(frame: int) -> bool:
-    """Whether a frame is for judging, not for training."""
+    """Whether a frame is for evaluation, not for training."""
     return frame % 8 == 4
 
 
@@ -121,8 +121,8 @@ def _timestamps(frames: int) -> str:
     lines = []
     for frame in range(frames):
         nanoseconds = _FIRST_NANOSECONDS + frame * round(FRAME_INTERVAL_S * 1e9)
-        moment = _FIRST_MOMENT + timedelta(seconds=nanoseconds // 10**9)
-        lines.append(f"{moment:%Y-%m-%d %H:%M:%S}.{nanoseconds % 10**9:09d}\n")
+        stamp = _FIRST_TIME + timedelta(seconds=nanoseconds // 10**9)
+        lines.append(f"{stamp:%Y-%m-%d %H:%M:%S}.{nanoseconds % 10**9:09d}\n")
     return "".join(lines)
 
 

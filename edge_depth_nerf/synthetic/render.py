@@ -282,9 +282,9 @@ class World:
 
 def _pose_of(mover: Mover, times: NDArray[np.float64]) -> tuple[Array, Array, Array]:
     """Cosine and sine of the heading (N) and the position (N×3) at N times."""
-    moments, which = np.unique(times, return_inverse=True)
-    place, heading = mover.at(moments)
-    shift = np.column_stack((place, np.full(len(moments), float(mover.ground_m))))
+    distinct_s, which = np.unique(times, return_inverse=True)
+    place, heading = mover.at(distinct_s)
+    shift = np.column_stack((place, np.full(len(distinct_s), float(mover.ground_m))))
     return _f32(np.cos(heading))[which], _f32(np.sin(heading))[which], _f32(shift)[which]
 
 

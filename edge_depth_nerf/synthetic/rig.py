@@ -78,7 +78,7 @@ _FULL_SIZE = {
         p2=-7.0340482615055284e-04,
     ),
 }
-"""KITTI-360 counts integer pixel centres, hence the halves."""
+"""KITTI-360 counts integer pixel centres, so a half is added."""
 
 
 def _matrix(numbers: str) -> NDArray[np.float64]:

@@ -174,8 +174,8 @@ class _Rig(_RigFileLayout):
 
     def write_once(self) -> None:
         for name, mounted in self.cameras.items():
-            moments_s = [frame * FRAME_INTERVAL_S + mounted.delay_s for frame in range(self.options.frames)]
-            lines = "".join(f"{self.first_s + moment:.6f}\n" for moment in moments_s)
+            times_s = [frame * FRAME_INTERVAL_S + mounted.delay_s for frame in range(self.options.frames)]
+            lines = "".join(f"{self.first_s + time_s:.6f}\n" for time_s in times_s)
             write_text(self.root / f"times_{name}.txt", lines)
         super().write_once()
 

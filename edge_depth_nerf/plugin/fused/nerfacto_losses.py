@@ -10,7 +10,7 @@ from nerfstudio.model_components.losses import lossfun_outer
 from torch import Tensor
 
 from edge_depth_nerf.kernels import formulas
-from edge_depth_nerf.kernels.functions import BOUND_LOSS, DISTORTION_LOSS
+from edge_depth_nerf.kernels.functions import DISTORTION_LOSS, INTERLEVEL_LOSS
 
 
 def distortion_loss(edges: Float[Tensor, "rays edges"], weights: Float[Tensor, "rays samples"]) -> Float[Tensor, ""]:
@@ -31,11 +31,11 @@ def interlevel_loss(
     proposal_edges: Float[Tensor, "rays proposal_edges"],
     proposal_weights: Float[Tensor, "rays proposal_samples"],
 ) -> Float[Tensor, ""]:
-    """Compute mip-NeRF 360's proposal loss (its Eq. 13) of one proposal network, mean over the samples.
+    """Compute mip-NeRF 360's interlevel loss (its Eq. 13) of one proposal network, mean over the samples.
 
     `weights` are taken as given: the gradient goes to `proposal_weights` alone.
     """
-    compute = BOUND_LOSS.compiled_for(edges, weights, proposal_edges, proposal_weights)
+    compute = INTERLEVEL_LOSS.compiled_for(edges, weights, proposal_edges, proposal_weights)
     if compute is not None:
         return compute(edges, weights, proposal_edges, proposal_weights)
     return lossfun_outer(edges, weights.detach(), proposal_edges, proposal_weights).mean()

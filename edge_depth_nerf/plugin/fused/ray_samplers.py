@@ -15,7 +15,7 @@ from nerfstudio.cameras.rays import Frustums, RayBundle, RaySamples
 from nerfstudio.model_components.ray_samplers import PDFSampler, ProposalNetworkSampler, UniformLinDispPiecewiseSampler
 from torch import Tensor
 
-from edge_depth_nerf.kernels.functions import DISTANCES, PLACE_SAMPLES, POSITIONS, WEIGHTS
+from edge_depth_nerf.kernels.functions import DISTANCES, POSITIONS, SAMPLE_PDF, WEIGHTS
 
 
 class FirstSampler(UniformLinDispPiecewiseSampler):
@@ -54,8 +54,8 @@ class FirstSampler(UniformLinDispPiecewiseSampler):
         key = count, device
         if key not in self._intervals:
             even = torch.linspace(0, 1, count + 1)
-            middles = (even[1:] + even[:-1]) / 2
-            lower, upper = torch.cat([even[:1], middles]), torch.cat([middles, even[-1:]])
+            midpoints = (even[1:] + even[:-1]) / 2
+            lower, upper = torch.cat([even[:1], midpoints]), torch.cat([midpoints, even[-1:]])
             self._intervals[key] = lower[None].to(device), (upper - lower)[None].to(device)
         return self._intervals[key]
 
@@ -78,7 +78,7 @@ class FusedPDFSampler(PDFSampler):
         """Place samples by the weights of earlier ones."""
         assert ray_bundle is not None and ray_samples is not None and weights is not None
         count = num_samples or self.num_samples
-        place = None if self.include_original or weights.ndim != 3 else PLACE_SAMPLES.compiled_for(weights[..., 0])
+        place = None if self.include_original or weights.ndim != 3 else SAMPLE_PDF.compiled_for(weights[..., 0])
         if place is None or not count:
             return super().generate_ray_samples(ray_bundle, ray_samples, weights, num_samples, eps)
         places, device = count + 1, weights.device

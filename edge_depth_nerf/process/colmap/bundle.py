@@ -46,7 +46,7 @@ class Shot:
 
     lens: Camera
     """At the picture's size."""
-    moment: int
+    frame: int
     """Index of the frame."""
     to_vehicle: Transform
     """From its camera to the vehicle's pose at the frame's time."""
@@ -57,10 +57,10 @@ def adjust_bundle(
     shots: Sequence[Shot],
     tracks: Tracks,
     points: Float64[np.ndarray, "points 3"],
-    start: Float64[np.ndarray, "moments 4 4"],
-    given: Float64[np.ndarray, "moments 4 4"],
+    start: Float64[np.ndarray, "frames 4 4"],
+    given: Float64[np.ndarray, "frames 4 4"],
     softness: Softness,
-) -> Float64[np.ndarray, "moments 4 4"]:
+) -> Float64[np.ndarray, "frames 4 4"]:
     """Find the poses, vehicle to world, that agree best with the features and softly with the given poses.
 
     The search begins with the poses `start`, and with `points`, the places of what `tracks` see. Tracks count `shots`.
@@ -80,14 +80,14 @@ class _Bundle:
         self,
         pycolmap: Any,
         shots: Sequence[Shot],
-        start: Float64[np.ndarray, "moments 4 4"],
-        given: Float64[np.ndarray, "moments 4 4"],
+        start: Float64[np.ndarray, "frames 4 4"],
+        given: Float64[np.ndarray, "frames 4 4"],
         softness: Softness,
     ) -> None:
         self.pycolmap = pycolmap
         self.model = pycolmap.Reconstruction()
         self.config = pycolmap.BundleAdjustmentConfig()
-        self.moments = len(given)
+        self.frame_count = len(given)
         self.reach_m = softness.position_m / softness.turn_rad
         focal = 1 / (softness.turn_rad * math.sqrt(_SIGHTS_ACROSS * _ANCHOR_SIGHTS))
         self.shots, self.pixels = shots, [np.zeros((0, 2))] * len(shots)
@@ -104,11 +104,11 @@ class _Bundle:
         for index, rows in enumerate(by_picture):
             self.pixels[index] = tracks.sights.pixels[rows]
             numbers[rows] = np.arange(len(rows))
-        of_moment: list[list[int]] = [[] for _ in range(self.moments)]
+        of_frame: list[list[int]] = [[] for _ in range(self.frame_count)]
         for index, shot in enumerate(self.shots):
-            of_moment[shot.moment].append(index)
-        for moment in range(self.moments):
-            self._add_moment(moment, of_moment[moment])
+            of_frame[shot.frame].append(index)
+        for frame_number in range(self.frame_count):
+            self._add_frame(frame_number, of_frame[frame_number])
         ends = np.concatenate([[0], np.cumsum(np.bincount(tracks.track, minlength=len(points)))])
         for number, point in enumerate(points):
             track = colmap.Track()
@@ -116,12 +116,12 @@ class _Bundle:
             track.add_elements([colmap.TrackElement(int(tracks.picture[r]) + 1, int(numbers[r])) for r in rows])
             self.model.add_point3D(point, track)
 
-    def _add_moment(self, moment: int, pictures: Sequence[int]) -> None:
+    def _add_frame(self, frame_number: int, pictures: Sequence[int]) -> None:
         """Add a rig, its pictures, and what holds it."""
         colmap, model = self.pycolmap, self.model
-        rig = colmap.Rig(rig_id=moment + 1)
+        rig = colmap.Rig(rig_id=frame_number + 1)
         images, anchors = [], []
-        first = len(self.shots) + 1 + moment * len(_AXES)
+        first = len(self.shots) + 1 + frame_number * len(_AXES)
         for number, axis in enumerate(_AXES):
             camera = colmap.Camera(
                 camera_id=first + number, model="SIMPLE_PINHOLE", width=2, height=2, params=[self.focal, 1, 1]
@@ -132,8 +132,8 @@ class _Bundle:
             else:
                 self._add_sensor(rig, camera, _looking_along(axis) @ np.linalg.inv(self.to_rig))
             seen = np.ones((_ANCHOR_SIGHTS, 2))
-            images.append(self._image(f"axis {moment} {number}", seen, camera, moment))
-            anchors.append(self.given[moment][:3, :3] @ axis * self.reach_m + self.given[moment][:3, 3])
+            images.append(self._image(f"axis {frame_number} {number}", seen, camera, frame_number))
+            anchors.append(self.given[frame_number][:3, :3] @ axis * self.reach_m + self.given[frame_number][:3, 3])
         for index in pictures:
             shot, lens = self.shots[index], colmap_lens(self.shots[index].lens)
             camera = colmap.Camera(
@@ -145,9 +145,9 @@ class _Bundle:
             )
             model.add_camera(camera)
             self._add_sensor(rig, camera, np.linalg.inv(self.to_rig @ shot.to_vehicle))
-            images.append(self._image(f"picture {index}", self.pixels[index], camera, moment))
+            images.append(self._image(f"picture {index}", self.pixels[index], camera, frame_number))
         model.add_rig(rig)
-        frame = colmap.Frame(frame_id=moment + 1, rig_id=moment + 1)
+        frame = colmap.Frame(frame_id=frame_number + 1, rig_id=frame_number + 1)
         for image in images:
             frame.add_data_id(image.data_id)
         model.add_frame(frame)
@@ -155,9 +155,9 @@ class _Bundle:
             model.add_image(image)
             self.config.add_image(image.image_id)
             self.config.set_constant_cam_intrinsics(image.camera_id)
-        rig_from_world = self.to_rig @ np.linalg.inv(self.start[moment])
-        model.frame(moment + 1).rig_from_world = colmap.Rigid3d(rig_from_world[:3])
-        model.register_frame(moment + 1)
+        rig_from_world = self.to_rig @ np.linalg.inv(self.start[frame_number])
+        model.frame(frame_number + 1).rig_from_world = colmap.Rigid3d(rig_from_world[:3])
+        model.register_frame(frame_number + 1)
         for number, anchor in enumerate(anchors):
             track = colmap.Track()
             track.add_elements([colmap.TrackElement(first + number, sight) for sight in range(_ANCHOR_SIGHTS)])
@@ -167,9 +167,9 @@ class _Bundle:
         rig.add_sensor(camera.sensor_id, self.pycolmap.Rigid3d(from_rig[:3]))
         self.config.set_constant_sensor_from_rig_pose(camera.sensor_id)
 
-    def _image(self, name: str, pixels: Float64[np.ndarray, "n 2"], camera: Any, moment: int) -> Any:
+    def _image(self, name: str, pixels: Float64[np.ndarray, "n 2"], camera: Any, frame_number: int) -> Any:
         image = self.pycolmap.Image(name=name, keypoints=pixels, camera_id=camera.camera_id, image_id=camera.camera_id)
-        image.frame_id = moment + 1
+        image.frame_id = frame_number + 1
         return image
 
     def solve(self) -> None:
@@ -186,11 +186,11 @@ class _Bundle:
         options.ceres.solver_options.function_tolerance = 1e-6
         colmap.create_default_bundle_adjuster(options, self.config, self.model).solve()
 
-    def vehicle_to_world(self) -> Float64[np.ndarray, "moments 4 4"]:
+    def vehicle_to_world(self) -> Float64[np.ndarray, "frames 4 4"]:
         """The present poses."""
-        poses = np.tile(np.eye(4), (self.moments, 1, 1))
-        for moment in range(self.moments):
-            poses[moment, :3] = self.model.frame(moment + 1).rig_from_world.matrix()
+        poses = np.tile(np.eye(4), (self.frame_count, 1, 1))
+        for frame_number in range(self.frame_count):
+            poses[frame_number, :3] = self.model.frame(frame_number + 1).rig_from_world.matrix()
         return np.linalg.inv(poses) @ self.to_rig
 
 

@@ -375,14 +375,14 @@ class _Run:
     def _pairs(self) -> list[tuple[int, int]]:
         """Pictures to match, as indices."""
         pictures, shared = self.recording.pictures, self.shared_views
-        moments = {frame: number for number, frame in enumerate(sorted({p.frame for p in pictures}))}
-        seen: dict[tuple[str, int], int] = {(p.camera, moments[p.frame]): i for i, p in enumerate(pictures)}
+        number_of = {frame: number for number, frame in enumerate(sorted({p.frame for p in pictures}))}
+        seen: dict[tuple[str, int], int] = {(p.camera, number_of[p.frame]): i for i, p in enumerate(pictures)}
         pairs = []
-        for (camera, moment), index in seen.items():
+        for (camera, frame), index in seen.items():
             for offset in (0, *_NEIGHBOURS):
                 for other in self.recording.cameras:
                     related = other.name == camera or bool({(camera, other.name), (other.name, camera)} & shared)
-                    later = seen.get((other.name, moment + offset))
+                    later = seen.get((other.name, frame + offset))
                     if related and later is not None and (offset > 0 or later > index):
                         pairs.append((index, later))
         return pairs

@@ -60,7 +60,7 @@ def colmap_poses(recording: Recording, options: ProcessOptions, console: Console
     path, scale = metric_path(recording, models)
     _check_path(path, scale)
     trajectory = upright(recording, path.trajectory)
-    posed = with_path(recording, trajectory, lambda p: None if p.frame in path.moments else NOT_REGISTERED)
+    posed = with_path(recording, trajectory, lambda p: None if p.frame in path.vehicle_poses else NOT_REGISTERED)
     notices = _notices(recording, models, path, scale, len(posed.pictures))
     return dataclasses.replace(posed, notices=(*posed.notices, *notices))
 
@@ -104,7 +104,7 @@ def _spans(recording: Recording, model: ColmapModel) -> bool:
 
 def _check_path(path: MetricPath, scale: Scale) -> None:
     """Raise an InputError that names the frames where the path's scale, or its steps, break."""
-    frames, found = list(path.moments), scale.broken
+    frames, found = list(path.vehicle_poses), scale.broken
     if found is not None:
         first, last = found.first, found.last
         why = (

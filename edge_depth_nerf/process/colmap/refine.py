@@ -4,7 +4,7 @@ The given path, of LiDAR odometry, a file or COLMAP, is held softly (`bundle.Sof
 step, where they are good to hundredths of a degree; scale and drift, of which they know little, stay the given path's.
 All cameras of a frame move with the vehicle as one.
 
-A fifth of the tracks takes no part. By them the path is judged before and after: unless their features come nearer to
+A fifth of the tracks takes no part. By them the path is checked before and after: unless their features come nearer to
 their epipolar curves, and nothing has moved further than the given poses can be off, the given path stays.
 """
 
@@ -33,7 +33,7 @@ from edge_depth_nerf.poses.matches import Matches, PosedPicture, epipolar_distan
 from edge_depth_nerf.poses.tracks import Tracks, features_joined, join_matches, reprojection_px, spread, triangulate
 from edge_depth_nerf.process.colmap.bundle import Shot, Softness, adjust_bundle
 from edge_depth_nerf.process.colmap.models import colmap_lenses, file_stamp, import_pycolmap, shared_views
-from edge_depth_nerf.process.colmap.scale import moment_times
+from edge_depth_nerf.process.colmap.scale import frame_times
 from edge_depth_nerf.process.feature_masks import FeatureMasks
 from edge_depth_nerf.process.options import ProcessOptions
 from edge_depth_nerf.process.reading import read_if_whole
@@ -65,9 +65,9 @@ _ROUNDS_LEAST_PX = (3.0, 1.5, 1.0, 1.0)
 """Features are found to some tenths of a pixel, however coarse the picture."""
 _LEAST_SIGHTS = 30
 """A frame whose pictures see fewer points moves as the frames around it do."""
-_LEAST_JUDGES = 100
+_LEAST_CHECKS = 100
 """So many matches that took no part tell whether a path is better."""
-_JUDGING_SHARE = 5
+_CHECK_SHARE = 5
 """One track of so many takes no part in the bundle."""
 
 
@@ -75,9 +75,9 @@ _JUDGING_SHARE = 5
 class Refinement:
     """What became of the given poses."""
 
-    vehicle_to_world: Float64[np.ndarray, "moments 4 4"]
+    vehicle_to_world: Float64[np.ndarray, "frames 4 4"]
     """Of each frame, refined."""
-    supported: Bool[np.ndarray, "moments"]
+    supported: Bool[np.ndarray, "frames"]
     """Which frames were moved by features; the others move as those around them do."""
     points: int
     """Points in the bundle."""
@@ -85,14 +85,14 @@ class Refinement:
     """Median distance to the epipolar curves of features that took no part, with the given poses; NaN for too few."""
     after_px: float
     """The same with the refined ones."""
-    judges: int
+    checks: int
     """How many matches these medians are of."""
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON; a median that is not known is null."""
         arrays = {"vehicle_to_world": self.vehicle_to_world.tolist(), "supported": self.supported.tolist()}
         medians = {"before_px": finite(self.before_px), "after_px": finite(self.after_px)}
-        return {**arrays, "points": self.points, "judges": self.judges, **medians}
+        return {**arrays, "points": self.points, "judges": self.checks, **medians}
 
 
 def refine_poses(recording: Recording, options: ProcessOptions, console: Console) -> Recording:
@@ -111,17 +111,17 @@ def refine_poses(recording: Recording, options: ProcessOptions, console: Console
     pycolmap = import_pycolmap(OPTION)
     trajectory = recording.trajectory
     assert trajectory is not None
-    times = moment_times(recording)
-    moments, times_s = list(times), np.array(list(times.values()))
-    if len(moments) < 2 or not (np.diff(times_s) > 0).all():
+    times = frame_times(recording)
+    frames, times_s = list(times), np.array(list(times.values()))
+    if len(frames) < 2 or not (np.diff(times_s) > 0).all():
         return _kept(recording, "the pictures are not of two or more consecutive frames")
     given = trajectory.at(times_s)
-    shots = _shots(recording, moments, given)
+    shots = _shots(recording, frames, given)
 
-    def reshoot(refined: Float64[np.ndarray, "moments 4 4"], supported: Bool[np.ndarray, "moments"]) -> list[Shot]:
+    def reshoot(refined: Float64[np.ndarray, "frames 4 4"], supported: Bool[np.ndarray, "frames"]) -> list[Shot]:
         """The pictures on the rig, by the present path."""
-        moved, change = _moved(recording, times_s, moments, given, refined, supported)
-        return _shots(moved, moments, given @ change)
+        moved, change = _moved(recording, times_s, frames, given, refined, supported)
+        return _shots(moved, frames, given @ change)
 
     digest = _digest(pycolmap.__version__, recording, options, given)
     found = _read_refinement(options.output / REFINED_POSES, digest)
@@ -130,14 +130,14 @@ def refine_poses(recording: Recording, options: ProcessOptions, console: Console
         with console.status("Refining the poses …"):
             found = refine(pycolmap, shots, matches, given, reshoot=reshoot)
         write_json(options.output / REFINED_POSES, {"digest": digest, **found.to_dict()})
-    if found.judges < _LEAST_JUDGES:
-        return _kept(recording, f"only {found.judges} features could be matched for the check")
+    if found.checks < _LEAST_CHECKS:
+        return _kept(recording, f"only {found.checks} features could be matched for the check")
     distances = f"{found.before_px:.2f} px before, {found.after_px:.2f} px after"
     if not found.after_px <= (1 - LEAST_GAIN) * found.before_px:
         return _kept(recording, f"features agree with them as well as with the refined ones ({distances})")
     if found.supported.sum() < 2:
         return _kept(recording, "the pictures of too few frames show features")
-    refined, change = _moved(recording, times_s, moments, given, found.vehicle_to_world, found.supported)
+    refined, change = _moved(recording, times_s, frames, given, found.vehicle_to_world, found.supported)
     cosine = ((np.trace(change[:, :3, :3], axis1=1, axis2=2) - 1) / 2).clip(-1, 1)
     furthest_m = float(np.linalg.norm(change[:, :3, 3], axis=-1).max())
     furthest_deg = float(np.degrees(np.arccos(cosine)).max())
@@ -149,7 +149,7 @@ def refine_poses(recording: Recording, options: ProcessOptions, console: Console
         )
     notice = (
         f"Poses refined by {found.points} points that the pictures share. The poses moved by up to "
-        f"{100 * furthest_m:.0f} cm and {furthest_deg:.2f}°. Check with {found.judges} other matches: the median "
+        f"{100 * furthest_m:.0f} cm and {furthest_deg:.2f}°. Check with {found.checks} other matches: the median "
         f"distance of features to their epipolar lines is {distances}."
     )
     return dataclasses.replace(refined, notices=(*recording.notices, notice))
@@ -171,7 +171,7 @@ def _kept(recording: Recording, why: str) -> Recording:
 
 
 def _digest(
-    version: str, recording: Recording, options: ProcessOptions, given: Float64[np.ndarray, "moments 4 4"]
+    version: str, recording: Recording, options: ProcessOptions, given: Float64[np.ndarray, "frames 4 4"]
 ) -> str:
     """Of everything that the refined poses depend on, pictures and masks by size and time of change."""
     cameras = [[c.name, c.camera.to_dict(), c.to_vehicle.tolist(), _content(c.ego_mask)] for c in recording.cameras]
@@ -205,16 +205,16 @@ def _read_refinement(path: Path, digest: str) -> Refinement | None:
         points=found["points"],
         before_px=before_px,
         after_px=after_px,
-        judges=found["judges"],
+        checks=found["judges"],
     )
 
 
 # ---- what the pictures share -----------------------------------------------------------------------------------
 
 
-def _shots(recording: Recording, moments: Sequence[int], given: Float64[np.ndarray, "moments 4 4"]) -> list[Shot]:
+def _shots(recording: Recording, frames: Sequence[int], given: Float64[np.ndarray, "frames 4 4"]) -> list[Shot]:
     """The pictures on the rig of their frame: with the vehicle's motion between the frame's time and the picture's."""
-    number = {frame: index for index, frame in enumerate(moments)}
+    number = {frame: index for index, frame in enumerate(frames)}
     lenses = {camera.name: camera.camera for camera in recording.cameras}
     to_vehicle = np.linalg.inv(given)
     return [
@@ -226,7 +226,7 @@ def _shots(recording: Recording, moments: Sequence[int], given: Float64[np.ndarr
 def _match(
     recording: Recording,
     shots: Sequence[Shot],
-    given: Float64[np.ndarray, "moments 4 4"],
+    given: Float64[np.ndarray, "frames 4 4"],
     options: ProcessOptions,
     console: Console,
 ) -> list[Matches]:
@@ -236,7 +236,7 @@ def _match(
     posed = [
         PosedPicture(
             camera=picture.camera,
-            moment=shot.moment,
+            frame=shot.frame,
             lens=shot.lens,
             camera_to_world=pose,
             read_rgb=partial(_read, picture, shot.lens, options.strict),
@@ -265,9 +265,9 @@ def _read(picture: RecordedPicture, lens: Camera, strict: bool) -> np.ndarray:
 
 def _pairs(pictures: Sequence[PosedPicture], shared: set[tuple[str, str]]) -> list[tuple[int, int]]:
     """Pictures to match, as indices, in the order of the drive."""
-    seen = {(picture.camera, picture.moment): index for index, picture in enumerate(pictures)}
+    seen = {(picture.camera, picture.frame): index for index, picture in enumerate(pictures)}
     pairs = []
-    for (camera, moment), index in sorted(seen.items(), key=lambda item: item[0][1]):
+    for (camera, frame), index in sorted(seen.items(), key=lambda item: item[0][1]):
         for other in dict.fromkeys(picture.camera for picture in pictures):
             if other == camera:
                 offsets: Sequence[int] = _APART
@@ -276,7 +276,7 @@ def _pairs(pictures: Sequence[PosedPicture], shared: set[tuple[str, str]]) -> li
             else:
                 continue
             for offset in offsets:
-                later = seen.get((other, moment + offset))
+                later = seen.get((other, frame + offset))
                 if later is not None and (offset > 0 or later > index):
                     pairs.append((index, later))
     return pairs
@@ -286,58 +286,58 @@ def _pairs(pictures: Sequence[PosedPicture], shared: set[tuple[str, str]]) -> li
 
 
 def _camera_poses(
-    shots: Sequence[Shot], vehicle_to_world: Float64[np.ndarray, "moments 4 4"]
+    shots: Sequence[Shot], vehicle_to_world: Float64[np.ndarray, "frames 4 4"]
 ) -> Float64[np.ndarray, "pictures 4 4"]:
-    return np.stack([vehicle_to_world[shot.moment] @ shot.to_vehicle for shot in shots])
+    return np.stack([vehicle_to_world[shot.frame] @ shot.to_vehicle for shot in shots])
 
 
 def refine(
     pycolmap: object,
     shots: Sequence[Shot],
     matches: Sequence[Matches],
-    given: Float64[np.ndarray, "moments 4 4"],
-    reshoot: Callable[[Float64[np.ndarray, "moments 4 4"], Bool[np.ndarray, "moments"]], Sequence[Shot]] | None = None,
+    given: Float64[np.ndarray, "frames 4 4"],
+    reshoot: Callable[[Float64[np.ndarray, "frames 4 4"], Bool[np.ndarray, "frames"]], Sequence[Shot]] | None = None,
 ) -> Refinement:
-    """Refine poses by matched features, and judge both by those that take no part.
+    """Refine poses by matched features, and check both by those that take no part.
 
     Matches count `shots`; `given` is vehicle to world of each frame. `reshoot` makes the pictures on the rig of refined
     poses, and of which frames features moved: cameras that fire at other times than the frame's stand where the path
     has the vehicle then. None = they stay.
     """
     groups = features_joined(matches)
-    judging = [np.asarray(_judges(numbers)) for numbers in groups]
-    judges = [found.taken(chosen) for found, chosen in zip(matches, judging, strict=True)]
-    matches = [found.taken(~chosen) for found, chosen in zip(matches, judging, strict=True)]
+    is_check = [np.asarray(_is_check(numbers)) for numbers in groups]
+    checks = [found.taken(chosen) for found, chosen in zip(matches, is_check, strict=True)]
+    matches = [found.taken(~chosen) for found, chosen in zip(matches, is_check, strict=True)]
     focal_px = float(np.median([(shot.lens.fx + shot.lens.fy) / 2 for shot in shots]))
     refined, count, given_shots = given, 0, shots
     supported = np.zeros(len(given), bool)
     for limit_deg, least_px in zip(_ROUNDS_DEG, _ROUNDS_LEAST_PX, strict=True):
         limit_px = max(math.radians(limit_deg) * focal_px, least_px)
         tracks, points = _tracks(matches, _camera_poses(shots, refined), limit_px)
-        of_moment = np.array([shot.moment for shot in shots])[tracks.picture]
-        supported = np.bincount(of_moment, minlength=len(given)) >= _LEAST_SIGHTS
+        of_frame = np.array([shot.frame for shot in shots])[tracks.picture]
+        supported = np.bincount(of_frame, minlength=len(given)) >= _LEAST_SIGHTS
         count = len(points)
         if not supported.any():
             break
         refined = adjust_bundle(pycolmap, shots, tracks, points, refined, given, SOFTNESS)
         if reshoot is not None and supported.sum() > 1:
             shots = reshoot(refined, supported)
-    before, after = _median_px(given_shots, judges, given), _median_px(shots, judges, refined)
+    before, after = _median_px(given_shots, checks, given), _median_px(shots, checks, refined)
     return Refinement(refined, supported, count, before[0], after[0], min(before[1], after[1]))
 
 
-def _judges(groups: Int[np.ndarray, "m"]) -> Bool[np.ndarray, "m"]:
+def _is_check(groups: Int[np.ndarray, "m"]) -> Bool[np.ndarray, "m"]:
     """Which matches take no part: all of one group, or none."""
     # a multiplication that scatters, so that neighbours do not go together
-    return (groups * 2654435761) % (1 << 32) < (1 << 32) // _JUDGING_SHARE
+    return (groups * 2654435761) % (1 << 32) < (1 << 32) // _CHECK_SHARE
 
 
 def _median_px(
-    shots: Sequence[Shot], judges: Sequence[Matches], vehicle_to_world: Float64[np.ndarray, "moments 4 4"]
+    shots: Sequence[Shot], checks: Sequence[Matches], vehicle_to_world: Float64[np.ndarray, "frames 4 4"]
 ) -> tuple[float, int]:
     """Median distance of matched features to their epipolar curves, and of how many."""
     poses = _camera_poses(shots, vehicle_to_world)
-    distances = [epipolar_distance_px(found, poses[found.first], poses[found.second]) for found in judges]
+    distances = [epipolar_distance_px(found, poses[found.first], poses[found.second]) for found in checks]
     known = np.concatenate([np.zeros(0), *distances])
     known = known[np.isfinite(known)]
     return (float(np.median(known)) if len(known) else math.nan), len(known)
@@ -367,12 +367,12 @@ def _tracks(
 
 def _moved(
     recording: Recording,
-    times_s: Float64[np.ndarray, "moments"],
-    moments: Sequence[int],
-    given: Float64[np.ndarray, "moments 4 4"],
-    refined: Float64[np.ndarray, "moments 4 4"],
-    supported: Bool[np.ndarray, "moments"],
-) -> tuple[Recording, Float64[np.ndarray, "moments 4 4"]]:
+    times_s: Float64[np.ndarray, "frames"],
+    frames: Sequence[int],
+    given: Float64[np.ndarray, "frames 4 4"],
+    refined: Float64[np.ndarray, "frames 4 4"],
+    supported: Bool[np.ndarray, "frames"],
+) -> tuple[Recording, Float64[np.ndarray, "frames 4 4"]]:
     """Move the path, and all that lies on it; also how each frame moved, in the vehicle's coordinates.
 
     A change passes evenly into that of the next frame; before the first frame and after the last it stays. A picture
@@ -386,12 +386,12 @@ def _moved(
     def changed_at(at_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 4 4"]:
         return changes.at(at_s.clip(known_s[0], known_s[-1]))
 
-    # the moments' own poses stand in the path, too
+    # the frames' own poses stand in the path, too
     path_s = np.union1d(trajectory.times_s, times_s)
     path_s = path_s[np.concatenate([[True], np.diff(path_s) > 1e-6])]
     path = Trajectory(path_s, trajectory.at(path_s) @ changed_at(path_s))
     change = changed_at(times_s)
-    to_new = {frame: new @ np.linalg.inv(old) for frame, old, new in zip(moments, given, given @ change, strict=True)}
+    to_new = {frame: new @ np.linalg.inv(old) for frame, old, new in zip(frames, given, given @ change, strict=True)}
     pictures = tuple(
         picture
         if picture.camera_to_world is None

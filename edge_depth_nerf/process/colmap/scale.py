@@ -35,7 +35,7 @@ from edge_depth_nerf.process.recording import RecordedPicture, RecordedSweep, Re
 
 MIN_PAIRS = 30
 """Fewer features than this with LiDAR beside them give no scale."""
-MIN_COMMON_MOMENTS = 3
+MIN_COMMON_FRAMES = 3
 """Models with fewer frames in common are not joined."""
 
 _WINDOW_PAIRS = 100
@@ -44,7 +44,7 @@ _STEADY = 1.15
 """The scale is broken where windows differ by more than this factor, and what their spread explains."""
 _DOUBTS = 3.0
 """So many standard errors of both windows are explained."""
-_MOMENTS = 40
+_MOST_FRAMES = 40
 """LiDAR of at most so many frames, spread over the drive, is used."""
 _WINDOW_RAD = math.radians(0.4)
 """LiDAR points this near to a feature's ray count; the rings of a 64-beam scanner are 0.42° apart."""
@@ -92,7 +92,7 @@ class Scale:
 class MetricPath:
     """The vehicle's path in metres, in the world of the first model."""
 
-    moments: dict[int, Transform]
+    vehicle_poses: dict[int, Transform]
     """Vehicle to world, by number of frame."""
     trajectory: Trajectory
     """The same over time."""
@@ -104,7 +104,7 @@ class MetricPath:
     """Median distance of where the cameras of one frame put the vehicle, from their mean; NaN for one camera."""
 
 
-def moment_times(recording: Recording) -> dict[int, float]:
+def frame_times(recording: Recording) -> dict[int, float]:
     """When each frame was taken: the median of its pictures' times."""
     times = defaultdict(list)
     for picture in recording.pictures:
@@ -122,7 +122,7 @@ def join_models(recording: Recording, models: Sequence[ColmapModel], scales: Arr
         InputError: the first model has fewer than two frames.
 
     """
-    times = moment_times(recording)
+    times = frame_times(recording)
     scales = np.array(scales, np.float64)
     found = _vehicle_poses(recording, models[0], scales[0], times)
     members, waiting = [0], list(range(1, len(models)))
@@ -130,7 +130,7 @@ def join_models(recording: Recording, models: Sequence[ColmapModel], scales: Arr
         # the one with the most in common goes next
         common = {i: found.keys() & _vehicle_poses(recording, models[i], scales[i], times).keys() for i in waiting}
         best = max(waiting, key=lambda i: len(common[i]))
-        if len(common[best]) < MIN_COMMON_MOMENTS:
+        if len(common[best]) < MIN_COMMON_FRAMES:
             break
         target = {frame: _mean_pose(found[frame]) for frame in sorted(common[best])}
         # the rig's lever arms are in metres whatever the scale, so the poses depend on it a little beyond a factor
@@ -145,16 +145,16 @@ def join_models(recording: Recording, models: Sequence[ColmapModel], scales: Arr
         members.append(best)
         waiting.remove(best)
     frames = sorted(found)
-    moments = {frame: _mean_pose(found[frame]) for frame in frames}
+    vehicle_poses = {frame: _mean_pose(found[frame]) for frame in frames}
     apart = [
-        float(np.linalg.norm(pose[:3, 3] - moments[frame][:3, 3]))
+        float(np.linalg.norm(pose[:3, 3] - vehicle_poses[frame][:3, 3]))
         for frame in frames
         for pose in found[frame]
         if len(found[frame]) > 1
     ]
     return MetricPath(
-        moments=moments,
-        trajectory=Trajectory(np.array([times[f] for f in frames]), np.stack([moments[f] for f in frames])),
+        vehicle_poses=vehicle_poses,
+        trajectory=Trajectory(np.array([times[f] for f in frames]), np.stack([vehicle_poses[f] for f in frames])),
         members=tuple(models[i] for i in members),
         scales=tuple(float(scales[i]) for i in members),
         disagreement_m=float(np.median(apart)) if apart else math.nan,
@@ -308,8 +308,8 @@ def _ratios(
     for number, model in enumerate(models):
         for index in model.views:
             registered[recording.pictures[index].frame].append((number, index))
-    moments = sorted(registered)
-    frames = [moments[index] for index in spread_over(len(moments), _MOMENTS)]
+    vehicle_poses = sorted(registered)
+    frames = [vehicle_poses[index] for index in spread_over(len(vehicle_poses), _MOST_FRAMES)]
     sweeps: dict[int, list[RecordedSweep]] = defaultdict(list)
     for sweep in recording.sweeps:
         if sweep.frame is not None:
@@ -320,16 +320,16 @@ def _ratios(
         scans = [scan for sweep in sweeps[frame] if (scan := _scan(sweep, trajectory)) is not None]
         for number, index in sorted(registered[frame]):
             picture = recording.pictures[index]
-            returns = _returns_in_camera(recording, picture, scans, trajectory)
+            points_m = _points_in_camera(recording, picture, scans, trajectory)
             view = models[number].views[index]
-            lidar = _beside(view.rays, returns)
+            lidar = _beside(view.rays, points_m)
             fine = np.isfinite(lidar)
             found.append(lidar[fine] / (scales[number] * view.distance[fine]))
         along[frame] = np.concatenate(found)
     return along
 
 
-def _scan(sweep: RecordedSweep, trajectory: Trajectory | None) -> Float64[np.ndarray, "returns 3"] | None:
+def _scan(sweep: RecordedSweep, trajectory: Trajectory | None) -> Float64[np.ndarray, "points 3"] | None:
     """A sweep's points in the world, each by the vehicle's pose at its time; without a path, in the vehicle's frame.
 
     None for one that cannot be read.
@@ -342,12 +342,12 @@ def _scan(sweep: RecordedSweep, trajectory: Trajectory | None) -> Float64[np.nda
     return sweep_in_world(read, sweep.time_s, sweep.to_vehicle, trajectory, sweep.timing).points_m.numpy()
 
 
-def _returns_in_camera(
+def _points_in_camera(
     recording: Recording,
     picture: RecordedPicture,
     scans: Sequence[Float64[np.ndarray, "_ 3"]],
     trajectory: Trajectory | None,
-) -> Float64[np.ndarray, "returns 3"]:
+) -> Float64[np.ndarray, "points 3"]:
     camera = next(camera for camera in recording.cameras if camera.name == picture.camera)
     if not scans:
         return _depth_points(picture, camera.camera)
@@ -367,16 +367,16 @@ def _depth_points(picture: RecordedPicture, camera: Camera) -> Float64[np.ndarra
 
 
 def _beside(
-    rays: Float64[np.ndarray, "features 3"], returns: Float64[np.ndarray, "returns 3"]
+    rays: Float64[np.ndarray, "features 3"], points_m: Float64[np.ndarray, "points 3"]
 ) -> Float64[np.ndarray, "features"]:
     """LiDAR's distance along some rays, from the LiDAR points beside each; NaN where there are none that agree."""
-    distance = np.linalg.norm(returns, axis=-1)
+    distance = np.linalg.norm(points_m, axis=-1)
     away = distance > 0
-    returns, distance = returns[away], distance[away]
-    if len(returns) < 2 or not len(rays):
+    points_m, distance = points_m[away], distance[away]
+    if len(points_m) < 2 or not len(rays):
         return np.full(len(rays), np.nan)
     # the tree is asked a few hundred times, so it pays to build it fast
-    tree = KDTree(returns / distance[:, None], compact_nodes=False, balanced_tree=False)
+    tree = KDTree(points_m / distance[:, None], compact_nodes=False, balanced_tree=False)
     apart, index = tree.query(rays, _NEIGHBOURS, distance_upper_bound=_WINDOW_RAD)
     near = np.isfinite(apart)
     values = np.where(near, distance[np.where(near, index, 0)], np.nan)

@@ -195,10 +195,10 @@ def read_timestamps(path: Path) -> list[float]:
         # datetime stops at microseconds
         whole, _, fraction = line.partition(".")
         try:
-            moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc)
+            stamp = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc)
             if not re.fullmatch(r"[0-9]*", fraction):
                 raise ValueError
-            times.append(moment.timestamp() + float(f"0.{fraction or 0}"))
+            times.append(stamp.timestamp() + float(f"0.{fraction or 0}"))
         except ValueError:
             raise InputError(
                 f"{path}, line {number}: {shown(line)} is not a time like 2013-05-28 08:46:02.123456789. {_DOWNLOAD}"

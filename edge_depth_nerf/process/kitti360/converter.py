@@ -66,7 +66,7 @@ def read_kitti360(options: Kitti360Options) -> Recording:
         with tolerance.of(number, SCANNER):
             check_sweep_size(drive.sweep_file(number))
             whole.add(number)
-    # a moment needs a sweep of its own
+    # a frame needs a sweep of its own
     kept = [(name, frame) for name, frame in kept if frame in whole]
     if not kept:
         raise InputError(f"{tolerance.left_out[0].fault} No other frame is chosen: choose more by --frames.")
@@ -74,8 +74,8 @@ def read_kitti360(options: Kitti360Options) -> Recording:
     for name, frame in kept:
         with tolerance.of(frame, name):
             files[name, frame] = drive.check_picture(rig, kept, name, frame)
-    moments = sorted({frame for _, frame in kept})
-    stamps = {name: drive.read_timestamps(name, moments) for name in options.cameras}
+    frames = sorted({frame for _, frame in kept})
+    stamps = {name: drive.read_timestamps(name, frames) for name in options.cameras}
     clock = _Clock(next((times for times in stamps.values() if times), []))
 
     pictures = tuple(
@@ -97,7 +97,7 @@ def read_kitti360(options: Kitti360Options) -> Recording:
             read=partial(read_sweep, drive.sweep_file(number)),
             timing=timing,
         )
-        for number in near(np.array(sorted(whole)), np.array(moments)).tolist()
+        for number in near(np.array(sorted(whole)), np.array(frames)).tolist()
     ]
     return Recording(
         cameras=tuple(RecordedCamera(name, rig.cameras[name], rig.camera_to_pose[name]) for name in options.cameras),
@@ -152,12 +152,12 @@ def _trajectory(poses: dict[int, np.ndarray], clock: _Clock, path: Path) -> Traj
         raise InputError(f"{path}: {error}") from error
 
 
-def _near(numbers: np.ndarray, moments: np.ndarray, reach: int, between: bool) -> np.ndarray:
+def _near(numbers: np.ndarray, frames: np.ndarray, reach: int, between: bool) -> np.ndarray:
     """Those numbers that are at most so far from a frame, or also all between the first frame and the last."""
-    after = np.searchsorted(moments, numbers).clip(max=len(moments) - 1)
+    after = np.searchsorted(frames, numbers).clip(max=len(frames) - 1)
     before = (after - 1).clip(min=0)
-    apart = np.minimum(np.abs(moments[after] - numbers), np.abs(moments[before] - numbers))
-    inside = (numbers >= moments[0]) & (numbers <= moments[-1])
+    apart = np.minimum(np.abs(frames[after] - numbers), np.abs(frames[before] - numbers))
+    inside = (numbers >= frames[0]) & (numbers <= frames[-1])
     return numbers[(apart <= reach) | (inside & between)]
 
 

@@ -12,16 +12,16 @@ from edge_depth_nerf.base.files import read_distance_png, read_json, write_dista
 from edge_depth_nerf.method.error_model import (
     FIELD_MARGIN_DEG,
     KNOTS,
-    LEAST_JUDGED,
-    error_of_returns,
+    LEAST_EVALUATED,
+    error_of_lidar_points,
     fit_error_model,
     pixel_features,
-    read_trust,
+    read_calibration,
 )
 from edge_depth_nerf.method.prior import PriorOptions, RayAngles, make_prior
-from edge_depth_nerf.mono import calibration as trust_module
-from edge_depth_nerf.mono.calibration import calibrate_scene, find_trust, held_out_returns, measure_frame
-from edge_depth_nerf.scene.format import TRUST_FILE
+from edge_depth_nerf.mono import calibration as calibration_module
+from edge_depth_nerf.mono.calibration import calibrate_scene, find_calibration, held_out_points, measure_frame
+from edge_depth_nerf.scene.format import CALIBRATION_FILE
 from edge_depth_nerf.scene.put_maps import write_maps
 from edge_depth_nerf.scene.reader import read_scene
 
@@ -48,23 +48,23 @@ def known_sigma(features):
 
 
 def test_a_known_error_is_covered_in_every_part():
-    features, judged = random_features(60_000), random_features(60_000, seed=1)
+    features, evaluated = random_features(60_000), random_features(60_000, seed=1)
     rng = np.random.default_rng(2)
     model = fit_error_model(features, np.abs(rng.normal(0, known_sigma(features))))
     assert model is not None
-    error_m = np.abs(rng.normal(0, known_sigma(judged))) * judged["distance_m"]
-    scaled = error_m / model.sigma_m(judged)
+    error_m = np.abs(rng.normal(0, known_sigma(evaluated))) * evaluated["distance_m"]
+    scaled = error_m / model.sigma_m(evaluated)
     parts = {
         "all": np.ones(len(scaled), bool),
-        "near": judged["nearest_px"] < 2,
-        "far": judged["nearest_px"] > 12,
-        "disagreeing": judged["spread"] > 0.1,
-        "agreeing": judged["spread"] < 0.003,
-        "wide": judged["theta_deg"] > 80,
+        "near": evaluated["nearest_px"] < 2,
+        "far": evaluated["nearest_px"] > 12,
+        "disagreeing": evaluated["spread"] > 0.1,
+        "agreeing": evaluated["spread"] < 0.003,
+        "wide": evaluated["theta_deg"] > 80,
     }
     for name, part in parts.items():
         # where the floor of 2 cm counts, sigma is too large on purpose
-        part &= judged["distance_m"] > 5
+        part &= evaluated["distance_m"] > 5
         assert np.mean(scaled[part] < 1) == pytest.approx(0.683, abs=0.05), name
         assert np.mean(scaled[part] < 2) == pytest.approx(0.954, abs=0.03), name
 
@@ -81,11 +81,11 @@ def test_heavy_tails_still_have_95_percent_within_two():
 
 
 def test_too_few_errors_give_no_model():
-    features = random_features(LEAST_JUDGED - 1)
+    features = random_features(LEAST_EVALUATED - 1)
     assert fit_error_model(features, known_sigma(features)) is None
 
 
-def test_at_a_return_half_of_the_variance_is_left():
+def test_at_a_point_half_of_the_variance_is_left():
     features = random_features(5_000)
     model = fit_error_model(features, np.abs(np.random.default_rng(0).normal(0, 0.02, 5_000)))
     assert model is not None
@@ -93,23 +93,23 @@ def test_at_a_return_half_of_the_variance_is_left():
     assert np.exp(2 * (factors[1] - factors[0])) == pytest.approx(2)
 
 
-def test_returns_against_their_neighbours():
+def test_points_against_their_neighbours():
     y, x = np.mgrid[:50, :60]
     # a plane seen by a pinhole: inverse z is linear
     plane = (1 / (0.1 + 0.001 * x + 0.002 * y)).astype(np.float32)
-    returns = np.ones(plane.shape, bool)
-    returns[10] = False
-    found, error = error_of_returns(np.where(returns, plane, 0), returns)
+    lidar_points = np.ones(plane.shape, bool)
+    lidar_points[10] = False
+    found, error = error_of_lidar_points(np.where(lidar_points, plane, 0), lidar_points)
     assert not found[10].any() and found[20, 20] and not found[0, 0]
     assert error.max() < 1e-5
     noisy = (plane * (1 + np.random.default_rng(0).normal(0, 0.01, plane.shape))).astype(np.float32)
-    _, error = error_of_returns(noisy, np.ones(plane.shape, bool))
+    _, error = error_of_lidar_points(noisy, np.ones(plane.shape, bool))
     inner = error[1:-1, 1:-1]
     # the larger of two that share the middle value: a fifth to two fifths more than one alone
     assert 1.1 < np.sqrt(np.mean(inner**2)) / 0.01 < 1.5
 
 
-def test_what_other_frames_show_above_the_returns_is_judged():
+def test_what_other_frames_show_above_the_points_is_evaluated():
     elevation_deg = np.repeat(np.linspace(10, -30, 80)[:, None], 60, axis=1)
     view = RayAngles(np.full(elevation_deg.shape, 0.5, np.float32), np.radians(elevation_deg).astype(np.float32))
     usable = np.ones(elevation_deg.shape, bool)
@@ -130,10 +130,10 @@ def test_features_of_pixels():
     mono = np.full((20, 30), 10, np.float32)
     mono[:, 20:] = 30
     mono[0] = 0
-    returns = np.zeros(mono.shape, bool)
-    returns[10, 5] = True
+    lidar_points = np.zeros(mono.shape, bool)
+    lidar_points[10, 5] = True
     spread = np.full(mono.shape, 0.5, np.float32)
-    found = pixel_features(mono, spread, mono, returns, np.full(mono.shape, np.pi / 4, np.float32))
+    found = pixel_features(mono, spread, mono, lidar_points, np.full(mono.shape, np.pi / 4, np.float32))
     assert set(found) == set(KNOTS)
     assert found["nearest_px"][10, 5] == 0
     assert found["nearest_px"][10, 8] == pytest.approx(3, abs=0.1)
@@ -145,16 +145,16 @@ def test_features_of_pixels():
     assert found["theta_deg"][3, 3] == pytest.approx(45)
 
 
-def test_blocks_rows_and_single_returns_are_left_out():
-    returns = np.random.default_rng(0).random((350, 350)) < 0.5
-    elevation = np.broadcast_to(np.linspace(0.2, -0.5, 350)[:, None], returns.shape).astype(np.float32)
+def test_blocks_rows_and_single_points_are_left_out():
+    lidar_points = np.random.default_rng(0).random((350, 350)) < 0.5
+    elevation = np.broadcast_to(np.linspace(0.2, -0.5, 350)[:, None], lidar_points.shape).astype(np.float32)
     for number in (0, 1):
-        left_out, in_blocks = held_out_returns(returns, elevation, number)
-        assert not (left_out & ~returns).any() and not (in_blocks & ~left_out).any()
-        assert 0.06 < in_blocks.sum() / returns.sum() < 0.14
-        rows = left_out[:10].sum() / returns[:10].sum()
+        left_out, in_blocks = held_out_points(lidar_points, elevation, number)
+        assert not (left_out & ~lidar_points).any() and not (in_blocks & ~left_out).any()
+        assert 0.06 < in_blocks.sum() / lidar_points.sum() < 0.14
+        rows = left_out[:10].sum() / lidar_points[:10].sum()
         assert rows == 1 if number else rows < 0.5
-        again, _ = held_out_returns(returns, elevation, number)
+        again, _ = held_out_points(lidar_points, elevation, number)
         np.testing.assert_array_equal(left_out, again)
 
 
@@ -169,17 +169,17 @@ def change_map(scene, key, frame, change):
 
 def test_a_scene_is_calibrated_and_the_file_read_again(tmp_path):
     scene = write_scene(tmp_path)
-    trust = calibrate_scene(scene)
-    assert read_trust(scene / TRUST_FILE) == trust
-    assert len(trust.frames) == 8
-    for frame in trust.frames:
+    calibration = calibrate_scene(scene)
+    assert read_calibration(scene / CALIBRATION_FILE) == calibration
+    assert len(calibration.frames) == 8
+    for frame in calibration.frames:
         # mono is a tenth too far, the same everywhere
         assert frame.fit_of == "frame" and frame.fit.exponent == pytest.approx(1, abs=0.05)
         assert frame.held_out_before == pytest.approx(0.1, abs=0.01)
         assert frame.held_out_after is not None and frame.held_out_after < 0.01
-    assert trust.drive_fit is not None
-    assert trust.drive_fit.apply(np.array([[11.0]], np.float32))[0, 0] == pytest.approx(10, rel=0.02)
-    assert "10.0% before" in trust.summary()
+    assert calibration.drive_fit is not None
+    assert calibration.drive_fit.apply(np.array([[11.0]], np.float32))[0, 0] == pytest.approx(10, rel=0.02)
+    assert "10.0% before" in calibration.summary()
 
 
 @pytest.mark.parametrize("key", ["lidar_file_path", "mono_file_path"])
@@ -195,34 +195,34 @@ def test_held_out_frames_change_nothing(tmp_path, key):
 def test_the_host_says_which_pictures_are_for_training(tmp_path):
     scene = write_scene(tmp_path, split=False)
     images = [scene / "images" / f"{i:04d}.png" for i in (0, 2, 3)]
-    trust = find_trust(read_scene(scene), PriorOptions(), training_images=images)
-    assert [frame.frame for frame in trust.frames] == [f"images/{i:04d}.png" for i in (0, 2, 3)]
+    calibration = find_calibration(read_scene(scene), PriorOptions(), training_images=images)
+    assert [frame.frame for frame in calibration.frames] == [f"images/{i:04d}.png" for i in (0, 2, 3)]
 
 
-def test_few_returns_are_named(tmp_path):
+def test_few_points_are_named(tmp_path):
     scene = write_scene(tmp_path)
     change_map(scene, "lidar_file_path", 2, lambda metres: metres * (np.arange(metres.size) < 90).reshape(metres.shape))
-    trust = calibrate_scene(scene)
-    (poor,) = [frame for frame in trust.frames if frame.fit_of == "drive"]
-    assert poor.frame == "images/0002.png" and poor.returns < 50 and poor.fit == trust.drive_fit
-    assert "use that of the whole drive: images/0002.png." in trust.summary()
+    calibration = calibrate_scene(scene)
+    (poor,) = [frame for frame in calibration.frames if frame.fit_of == "drive"]
+    assert poor.frame == "images/0002.png" and poor.returns < 50 and poor.fit == calibration.drive_fit
+    assert "use that of the whole drive: images/0002.png." in calibration.summary()
 
 
 def test_a_calibration_is_found_until_its_files_change(tmp_path, monkeypatch):
     scene = write_scene(tmp_path)
     options = PriorOptions()
-    made = find_trust(read_scene(scene), options)
+    made = find_calibration(read_scene(scene), options)
     (kept,) = (scene / ".cache").iterdir()
-    monkeypatch.setattr(trust_module, "_calibrate", lambda *_: pytest.fail("made again"))
-    assert find_trust(read_scene(scene), options) == made
+    monkeypatch.setattr(calibration_module, "_calibrate", lambda *_: pytest.fail("made again"))
+    assert find_calibration(read_scene(scene), options) == made
     # sigma's own options have no part in it
-    assert find_trust(read_scene(scene), dataclasses.replace(options, sigma_mode="combined")) == made
-    shutil.move(kept, scene / TRUST_FILE)
-    assert find_trust(read_scene(scene), options) == made
+    assert find_calibration(read_scene(scene), dataclasses.replace(options, sigma_mode="combined")) == made
+    shutil.move(kept, scene / CALIBRATION_FILE)
+    assert find_calibration(read_scene(scene), options) == made
     monkeypatch.undo()
     change_map(scene, "mono_file_path", 0, lambda metres: metres + np.arange(metres.size).reshape(metres.shape) % 7)
-    assert find_trust(read_scene(scene), options) != made
-    assert find_trust(read_scene(scene), PriorOptions(align="none")).made_of != made.made_of
+    assert find_calibration(read_scene(scene), options) != made
+    assert find_calibration(read_scene(scene), PriorOptions(align="none")).made_of != made.made_of
 
 
 @pytest.mark.parametrize(
@@ -231,10 +231,10 @@ def test_a_calibration_is_found_until_its_files_change(tmp_path, monkeypatch):
 def test_a_broken_calibration_is_named_and_made_anew(tmp_path, content):
     scene = write_scene(tmp_path)
     made = calibrate_scene(scene)
-    (scene / TRUST_FILE).write_text(content)
-    with pytest.raises(InputError, match=TRUST_FILE):
-        read_trust(scene / TRUST_FILE)
-    assert find_trust(read_scene(scene), PriorOptions()) == made
+    (scene / CALIBRATION_FILE).write_text(content)
+    with pytest.raises(InputError, match=CALIBRATION_FILE):
+        read_calibration(scene / CALIBRATION_FILE)
+    assert find_calibration(read_scene(scene), PriorOptions()) == made
 
 
 def test_a_scene_without_maps_to_measure_by(tmp_path):
@@ -255,16 +255,16 @@ def test_maps_of_zeros_give_no_model_but_no_error(tmp_path):
     scene = write_scene(tmp_path)
     for frame in range(9):
         change_map(scene, "mono_file_path", frame, lambda metres: metres * 0)
-    trust = calibrate_scene(scene)
-    assert trust.error_model is None and trust.drive_fit is None
-    assert "LiDAR points are too few" in trust.summary()
+    calibration = calibrate_scene(scene)
+    assert calibration.error_model is None and calibration.drive_fit is None
+    assert "LiDAR points are too few" in calibration.summary()
 
 
 def test_no_prior_beyond_lidars_field_but_from_a_source_trained_elsewhere(tmp_path):
     scene = write_scene(tmp_path)
-    trust = calibrate_scene(scene)
-    assert not trust.everywhere
-    trust = dataclasses.replace(trust, field_rad=(-0.4, 0.1))
+    calibration = calibrate_scene(scene)
+    assert not calibration.everywhere
+    calibration = dataclasses.replace(calibration, field_rad=(-0.4, 0.1))
     shape = (28, 32)
     elevation = np.broadcast_to(np.linspace(-1, 1, 28, dtype=np.float32)[:, None], shape)
     view = RayAngles(np.full(shape, 0.5, np.float32), elevation)
@@ -272,7 +272,7 @@ def test_no_prior_beyond_lidars_field_but_from_a_source_trained_elsewhere(tmp_pa
     mono[14, 5] = 230  # far beyond
     lidar = np.where(np.random.default_rng(0).random(shape) < 0.3, np.float32(8), 0).astype(np.float32)
     mask = np.ones(shape, bool)
-    prior = make_prior(both(lidar, mono), mask, "integrated", PriorOptions(), trust, view)
+    prior = make_prior(both(lidar, mono), mask, "integrated", PriorOptions(), calibration, view)
     margin = np.radians(FIELD_MARGIN_DEG)
     expected = (elevation > -0.4 - margin) & (elevation < 0.1 + margin)
     expected[14, 5] = False
@@ -280,7 +280,7 @@ def test_no_prior_beyond_lidars_field_but_from_a_source_trained_elsewhere(tmp_pa
     np.testing.assert_array_equal(prior.sigma_m > 0, expected)
     # other modes keep to what was asked for
     literal = make_prior(
-        both(lidar, mono), mask, "integrated", PriorOptions(align="none", sigma_mode="constant"), trust, view
+        both(lidar, mono), mask, "integrated", PriorOptions(align="none", sigma_mode="constant"), calibration, view
     )
     assert (literal.distance_m > 0).all()
 
@@ -314,29 +314,29 @@ def test_motion_counts_by_its_error_beside_monos(tmp_path):
         for frame in range(9):
             change_map(scene, "mono_file_path", frame, lambda metres: metres * (1 + rng.normal(0, 0.02, metres.shape)))
     right, wrong = (with_motion(tmp_path / name, factor) for name, factor in (("a", 1.0), ("b", 1.2)))
-    assert not (right / TRUST_FILE).exists()
-    trusted, doubted = calibrate_scene(right), calibrate_scene(wrong)
-    assert trusted.motion is not None and doubted.motion is not None
+    assert not (right / CALIBRATION_FILE).exists()
+    calibrated, doubted = calibrate_scene(right), calibrate_scene(wrong)
+    assert calibrated.motion is not None and doubted.motion is not None
     # motion is wrong by half a per cent, or by a fifth; mono by two
-    assert trusted.motion.relative_error == pytest.approx(0.005, rel=0.25)
+    assert calibrated.motion.relative_error == pytest.approx(0.005, rel=0.25)
     assert doubted.motion.relative_error == pytest.approx(0.105, rel=0.1)
-    assert trusted.motion.mono_relative_error == pytest.approx(0.02, rel=0.25)
-    assert trusted.motion.weight == pytest.approx(16 / 17, abs=0.04)
+    assert calibrated.motion.mono_relative_error == pytest.approx(0.02, rel=0.25)
+    assert calibrated.motion.weight == pytest.approx(16 / 17, abs=0.04)
     assert doubted.motion.weight < 0.06
-    assert "95 % of the distances from motion are within" in trusted.summary()
-    assert read_trust(right / TRUST_FILE) == trusted
-    assert find_trust(read_scene(right), PriorOptions()) == trusted
+    assert "95 % of the distances from motion are within" in calibrated.summary()
+    assert read_calibration(right / CALIBRATION_FILE) == calibrated
+    assert find_calibration(read_scene(right), PriorOptions()) == calibrated
     # other files, another calibration
-    assert find_trust(read_scene(right), PriorOptions(motion=False)).motion is None
+    assert find_calibration(read_scene(right), PriorOptions(motion=False)).motion is None
 
 
 def test_without_motion_a_calibration_says_nothing_of_it(tmp_path):
     scene = write_scene(tmp_path / "a")
-    trust = calibrate_scene(scene)
-    assert trust.motion is None and "motion" not in read_json(scene / TRUST_FILE)
-    assert "motion" not in trust.summary()
+    calibration = calibrate_scene(scene)
+    assert calibration.motion is None and "motion" not in read_json(scene / CALIBRATION_FILE)
+    assert "motion" not in calibration.summary()
     same = with_motion(write_scene(tmp_path / "b"), 1.0)
-    assert find_trust(read_scene(same), PriorOptions(motion=False)) == trust
+    assert find_calibration(read_scene(same), PriorOptions(motion=False)) == calibration
     empty = with_motion(write_scene(tmp_path / "c"), 0.0)
     assert calibrate_scene(empty).motion is None
 
@@ -344,11 +344,11 @@ def test_without_motion_a_calibration_says_nothing_of_it(tmp_path):
 def test_a_broken_weight_of_motion_is_named(tmp_path):
     scene = with_motion(write_scene(tmp_path), 1.0)
     made = calibrate_scene(scene)
-    content = read_json(scene / TRUST_FILE)
+    content = read_json(scene / CALIBRATION_FILE)
     del content["sha256"]
     for broken in (1.5, -0.1, None):
         content["motion"]["weight"] = broken
-        write_json(scene / TRUST_FILE, content)
-        with pytest.raises(InputError, match=TRUST_FILE):
-            read_trust(scene / TRUST_FILE)
-    assert find_trust(read_scene(scene), PriorOptions()) == made
+        write_json(scene / CALIBRATION_FILE, content)
+        with pytest.raises(InputError, match=CALIBRATION_FILE):
+            read_calibration(scene / CALIBRATION_FILE)
+    assert find_calibration(read_scene(scene), PriorOptions()) == made
