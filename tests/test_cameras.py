@@ -310,7 +310,7 @@ def test_mei_agrees_with_cv2_omnidir(camera: MEI) -> None:
     # OpenCV's pixel centres are whole numbers
     matrix = np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]])
     bent = np.array([camera.k1, camera.k2, camera.p1, camera.p2])
-    theirs, _ = cv2.omnidir.projectPoints(points.numpy()[:, None], *np.zeros((2, 3)), matrix, camera.xi, bent)
+    theirs, _ = cv2.omnidir.projectPoints(points.numpy()[:, None], np.zeros(3), np.zeros(3), matrix, camera.xi, bent)
     ours, valid = camera.project(points)
     assert valid.all()
     assert np.abs(ours.numpy() - 0.5 - theirs.reshape(-1, 2)).max() < 1e-9

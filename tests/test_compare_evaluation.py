@@ -9,9 +9,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from models import pipeline_of
 from nerfstudio.engine.optimizers import Optimizers
 from scenes import write_scene
-from test_pipeline import build
 
 from edge_depth_nerf.base.files import read_json, write_json, write_mask
 from edge_depth_nerf.compare.evaluation import (
@@ -28,7 +28,7 @@ from edge_depth_nerf.plugin.config import make_specifications, read_method_file
 
 
 def test_evaluation_leaves_no_trace_in_a_training(tmp_path):
-    pipeline, _ = build(write_scene(tmp_path), depth_loss="edge", num_proposal_samples_per_ray=(8, 8))
+    pipeline = pipeline_of(write_scene(tmp_path), depth_loss="edge", num_proposal_samples_per_ray=(8, 8))
     pipeline.datamanager.train_pixel_sampler.num_rays_per_batch = 32
     start = deepcopy(pipeline.state_dict())
     chosen = choose_pixels(pipeline.datamanager.eval_dataset)
@@ -61,7 +61,7 @@ def test_evaluation_leaves_no_trace_in_a_training(tmp_path):
 
 
 def test_pixels_of_a_few_views_are_spread_evenly(tmp_path):
-    pipeline, _ = build(write_scene(tmp_path))
+    pipeline = pipeline_of(write_scene(tmp_path))
     dataset = pipeline.datamanager.train_dataset
     every = [int(view.indices[0, 0]) for view in choose_pixels(dataset, per_view=2)]
     assert every == [*range(len(dataset))]
@@ -79,14 +79,14 @@ def test_a_view_without_a_usable_pixel_is_passed_over(tmp_path):
         if frame["file_path"] == meta["train_filenames"][2]:
             frame["mask_path"] = "masks/none.png"
     write_json(scene / "transforms.json", meta)
-    pipeline, _ = build(scene)
+    pipeline = pipeline_of(scene)
     chosen = choose_pixels(pipeline.datamanager.train_dataset)
     assert [int(view.indices[0, 0]) for view in chosen] == [0, 1, 3, 4, 5, 6, 7]
     assert math.isfinite(evaluate_pixels(pipeline, chosen, trained_on=True)["psnr"])
 
 
 def test_the_pixels_are_always_the_same_and_inside_the_mask(tmp_path):
-    pipeline, _ = build(write_scene(tmp_path))
+    pipeline = pipeline_of(write_scene(tmp_path))
     dataset = pipeline.datamanager.eval_dataset
     one, other = choose_pixels(dataset, most=40), choose_pixels(dataset, most=40)
     assert torch.equal(one[0].indices, other[0].indices)
@@ -119,7 +119,7 @@ def with_shifted_views(scene):
 
 def test_shifted_views_stand_where_the_scene_says(tmp_path):
     scene = with_shifted_views(write_scene(tmp_path))
-    pipeline, _ = build(scene)
+    pipeline = pipeline_of(scene)
     dataset = pipeline.datamanager.eval_dataset
     views = shifted_views(scene, dataset)
     assert [len(views[metres]) for metres in ("0", "1")] == [1, 1]
@@ -135,7 +135,7 @@ def test_shifted_views_stand_where_the_scene_says(tmp_path):
 def test_shifted_views_have_the_figures_of_the_whole_picture(tmp_path):
     """Only what lies inside the mask is rendered: the figures are those of a rendering of everything."""
     scene = with_shifted_views(write_scene(tmp_path))
-    pipeline, _ = build(scene)
+    pipeline = pipeline_of(scene)
     model, dataset = pipeline.model, pipeline.datamanager.eval_dataset
     rendered, original = [], model.forward
     model.forward = lambda ray_bundle: (rendered.append(len(ray_bundle)), original(ray_bundle))[1]
@@ -169,7 +169,7 @@ def test_training_views_are_evaluated_by_the_beams_that_were_held_out(tmp_path, 
     for frame in meta["frames"]:
         frame["beams_file_path"] = frame["truth_distance_file_path"]
     write_json(scene / "transforms.json", meta)
-    pipeline, _ = build(scene)
+    pipeline = pipeline_of(scene)
     found = evaluate_beams(pipeline, most=200)
     count = len(pipeline.datamanager.train_dataset)
     assert found["beams_pixels"] <= 200 and found["beams_pixels"] > 0.5 * (200 // count) * count

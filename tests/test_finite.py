@@ -6,6 +6,7 @@ import math
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -249,7 +250,10 @@ HOSTILE: dict[str, tuple[Callable[[Path], Any], dict[str, Any]]] = {
     **{
         f"{name} at the limit": (
             same,
-            {"model__depth_loss": name, f"losses__{name.replace('-', '_')}": depth_losses.LOSSES[name](sigma_m=1e-3)},
+            {
+                "model__depth_loss": name,
+                f"losses__{name.replace('-', '_')}": replace(depth_losses.LOSSES[name](), sigma_m=1e-3),
+            },
         )
         for name in ("ds-nerf", "urban-nerf", "urban-nerf-los")
     },

@@ -9,6 +9,7 @@ import shutil
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -657,7 +658,8 @@ def test_bad_scenes_and_options_are_named(tmp_path, small_street, quiet):
         estimate_depth(EstimateDepthOptions((small_street, small_street)), quiet)
     with pytest.raises(FileNotFoundError):
         estimate_depth(EstimateDepthOptions((tmp_path / "none",)), quiet)
-    for bad in ({"train_steps": 0}, {"seconds": 0.0}, {"seconds": float("nan")}, {"output": Path("x.pt")}):
+    wrong: list[dict[str, Any]] = [{"train_steps": 0}, {"seconds": 0.0}, {"seconds": float("nan")}]
+    for bad in [*wrong, {"output": Path("x.pt")}]:
         with pytest.raises(InputError, match="expected"):
             EstimateDepthOptions((small_street,), **bad).check()
     for lidar in (small_street / "lidar").iterdir():

@@ -10,7 +10,7 @@ import pytest
 
 from edge_depth_nerf import cli
 from edge_depth_nerf.inspecting.options import InspectOptions
-from edge_depth_nerf.process import many
+from edge_depth_nerf.process import command as process_command
 from edge_depth_nerf.process.options import JbnuDepth360Options, Kitti360Options, RigOptions
 from edge_depth_nerf.synthetic import drive
 
@@ -34,7 +34,7 @@ def test_after_a_drive_comes_its_converter(monkeypatch, capsys, tmp_path, layout
 
 def test_after_a_scene_comes_its_training(monkeypatch, capsys, tmp_path):
     scene = tmp_path / "a scene"
-    monkeypatch.setattr(many, "process_drive", lambda _: [scene])
+    monkeypatch.setattr(process_command, "process_drive", lambda _: [scene])
     cli.run(cli.parse(["process", "rig", "--root", "x", "--output", str(scene)]))
     inspect, train = (line.rsplit(": ", 1)[1] for line in capsys.readouterr().out.splitlines())
     looking = cli.parse(shlex.split(inspect)[1:])

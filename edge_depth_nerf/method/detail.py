@@ -174,8 +174,8 @@ def carried(
 
     """
     details = list(details)
-    parts = [each.split(POINTS_AT_ONCE) for each in (origins, directions, distance)]
-    return torch.cat([_carried(*part, details) for part in zip(*parts, strict=True)])
+    parts = zip(*(each.split(POINTS_AT_ONCE) for each in (origins, directions, distance)), strict=True)
+    return torch.cat([_carried(at, along, far, details) for at, along, far in parts])
 
 
 def _carried(origins: Tensor, directions: Tensor, distance: Tensor, details: list[Detail]) -> Tensor:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum, auto
+from typing import Any
 
 import cv2
 import numpy as np
@@ -68,9 +69,8 @@ def read_map(values: Array, x: Array, y: Array, border: int) -> Array:
     at = np.zeros((2, rows * _REMAP_WIDTH), np.float32)
     at[0, : len(x)], at[1, : len(x)] = x, y
     at = at.reshape(2, rows, _REMAP_WIDTH)
-    return cv2.remap(values, at[0], at[1], cv2.INTER_LINEAR, borderMode=border, borderValue=(1.0,)).reshape(-1)[
-        : len(x)
-    ]
+    found: Any = cv2.remap(values, at[0], at[1], cv2.INTER_LINEAR, borderMode=border, borderValue=(1.0,))
+    return found.reshape(-1)[: len(x)]
 
 
 class Noise:
