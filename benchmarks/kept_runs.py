@@ -23,7 +23,6 @@ def keep(file: Path, *comparisons: Path) -> int:
 
     Returns:
         How many.
-
     """
     runs = {}
     for comparison in comparisons:

@@ -32,7 +32,6 @@ def under(markdown: str, heading: str) -> str:
 
     Raises:
         InputError: there is none.
-
     """
     parts = re.split(r"^#+ (.*)\n", markdown, flags=re.MULTILINE)
     for title, content in zip(parts[1::2], parts[2::2], strict=True):

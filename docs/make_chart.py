@@ -63,7 +63,6 @@ def results(chart: Chart, page: str) -> list[Result]:
 
     Raises:
         InputError: a table has no rows.
-
     """
     found: list[Result] = []
     for mark, added in chart.tables.items():

@@ -57,7 +57,6 @@ def read_sample(folder: Path) -> ShownScene:
 
     Raises:
         InputError: its calibration was made by other rules, or of other maps.
-
     """
     copied = shutil.copytree(SAMPLE, folder / SAMPLE.name, ignore=shutil.ignore_patterns(".cache"))
     scene = ShownScene(read_scene(Path(copied)))
@@ -222,7 +221,6 @@ def make_pictures(output: Path) -> dict[str, float]:
 
     Raises:
         InputError: the sample drive's calibration is not that of its maps.
-
     """
     with tempfile.TemporaryDirectory() as folder:
         scene = read_sample(Path(folder))

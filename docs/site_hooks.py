@@ -29,7 +29,6 @@ def in_site(page: str, link: str) -> str:
 
     Returns:
         The link from the page's place in the site.
-
     """
     folder = (ROOT / page).parent
     target = (folder / link).resolve()

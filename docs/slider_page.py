@@ -38,7 +38,6 @@ def store(demo: Path, folder: Path = FOLDER) -> None:
 
     Raises:
         InputError: the pictures are too large.
-
     """
     results = read_json(demo / "results.json")
     options = results["options"]

@@ -61,7 +61,6 @@ def parse(arguments: list[str]) -> Command:
 
     Raises:
         InputError: there is no such command, or one of its options has another name.
-
     """
     _check_name(arguments, Command, "command")
     if arguments[:1] == ["process"]:
@@ -116,7 +115,6 @@ def run(command: Command) -> None:
 
     Raises:
         InputError, OSError: what the user can fix.
-
     """
     # libraries are imported, which takes seconds
     with Console(stderr=True).status("Starting …"):

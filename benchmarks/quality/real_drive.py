@@ -196,7 +196,6 @@ def page(results: Results, longer: Mapping[str, Results], cells: Results, curves
         longer: of the best rival in ours' seconds, by size.
         cells: of `CELLS`.
         curves: with other λ.
-
     """
     parts = ["# A real drive, by all methods"]
     for scene in results.scenes():

@@ -152,7 +152,6 @@ def page(parts: dict[str, Results], grid: Results) -> str:
     Args:
         parts: by folder.
         grid: the runs of the grid, for Tables 3 and 4.
-
     """
     lines = ["# Unseen drives", ""]
 

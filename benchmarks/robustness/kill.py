@@ -202,7 +202,6 @@ def run_for(command: list[str], log: Path, seconds: float | None, worker: bool) 
 
     Raises:
         RuntimeError: it failed by itself.
-
     """
     with log.open("a", encoding="utf-8") as sink:
         sink.write(f"$ {' '.join(command)}\n")

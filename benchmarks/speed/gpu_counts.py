@@ -364,7 +364,6 @@ def in_a_process(cases: list[str], scene: Path, folder: Path, timeout_s: float =
 
     Raises:
         RuntimeError: the process failed; it says how.
-
     """
     folder.mkdir(parents=True, exist_ok=True)
     source, library, found = folder / "devices.c", folder / "devices.so", folder / "counts.json"

@@ -231,7 +231,6 @@ def race(
     Returns:
         Of each: rays_per_second (median), seconds of a step and of the rows of a view in each round, and the
         reference's seconds over its own.
-
     """
     some = next(iter(configs.values()))
     rays, schedule = some.pipeline.datamanager.train_num_rays_per_batch, some.max_num_iterations

@@ -43,7 +43,6 @@ def path_inside(folder: Path, name: object, where: str) -> Path:
 
     Raises:
         InputError: it is no text, absolute, leads out of the folder, or is no path at all.
-
     """
     if isinstance(name, str) and name and "\0" not in name:
         # no Path: a long drive's transforms.json has hundreds of thousands of names
@@ -66,7 +65,6 @@ def check_pixels(width: int, height: int, where: str) -> None:
 
     Raises:
         InputError: it has more than `MAX_PIXELS`, or none; names `where`.
-
     """
     if not (width >= 1 and height >= 1 and width * height <= MAX_PIXELS):
         raise InputError(
@@ -81,7 +79,6 @@ def check_bytes(path: Path, most: int) -> int:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: it has more than `most` bytes.
-
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
@@ -97,7 +94,6 @@ def read_text(path: Path, most_bytes: int) -> str:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: it is larger than `most_bytes`, or no text.
-
     """
     check_bytes(path, most_bytes)
     try:
@@ -112,7 +108,6 @@ def text_lines(path: Path) -> Iterator[tuple[int, str]]:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: too large, too many or too long lines, or no text.
-
     """
     check_bytes(path, MAX_TEXT_BYTES)
     found = 0

@@ -39,7 +39,6 @@ def write_checked(path: Path, version: int, write: Callable[[_Summed], object]) 
 
     Raises:
         OSError: it cannot be written.
-
     """
 
     def sealed(temporary: Path) -> None:

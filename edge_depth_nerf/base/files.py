@@ -53,7 +53,6 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
 
     Raises:
         OSError: it cannot be written; with the file's name, which the system leaves out for a full disk.
-
     """
     # two threads, processes or machines may write one file
     writer = f"{platform.node()}~{os.getpid()}~{threading.get_native_id()}"
@@ -147,7 +146,6 @@ def read_json(path: Path) -> Any:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: the file is not JSON, or far too large.
-
     """
     text = read_text(path, MAX_JSON_BYTES)
     if text.count(",") + text.count("[") + text.count("{") > MAX_JSON_VALUES:
@@ -164,7 +162,6 @@ def read_json_object(path: Path, *keys: str) -> dict[str, Any]:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: the file is not JSON, no object, or lacks a key.
-
     """
     content = read_json(path)
     if not isinstance(content, dict):
@@ -189,7 +186,6 @@ def picture_size(path: Path) -> tuple[int, int]:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: not such a picture, or larger than any picture is.
-
     """
     from PIL import Image  # not every command reads pictures
 
@@ -246,7 +242,6 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: truncated or not a picture.
-
     """
     return np.ascontiguousarray(_decode(path, cv2.IMREAD_COLOR)[..., ::-1])
 
@@ -256,7 +251,6 @@ def check_is_folder(output: Path) -> None:
 
     Raises:
         InputError: there is a file of that name.
-
     """
     if output.exists() and not output.is_dir():
         raise InputError(f"{output}: is a file; --output needs a folder.")
@@ -268,7 +262,6 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: truncated or not a picture.
-
     """
     return _decode(path, cv2.IMREAD_GRAYSCALE) > 0
 
@@ -298,7 +291,6 @@ def read_distance_png(path: Path, metres_per_step: float = 1 / DISTANCE_STEPS_PE
     Raises:
         FileNotFoundError: there is no such file.
         InputError: truncated, or not a 16-bit single-channel PNG.
-
     """
     image = _decode(path, cv2.IMREAD_UNCHANGED)
     if image.dtype != np.uint16 or image.ndim != 2:
@@ -327,7 +319,6 @@ def read_array_header(file: Any, where: str) -> tuple[tuple[int, ...], bool, np.
 
     Raises:
         InputError: no such header, or of anything but numbers; names `where`.
-
     """
     try:
         version = np.lib.format.read_magic(file)
@@ -347,7 +338,6 @@ def read_npy(path: Path) -> NDArray:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: not such a file, truncated, of other things than numbers, or of more than `MAX_PIXELS` of them.
-
     """
     size = check_bytes(path, 9 * MAX_PIXELS)
     with path.open("rb") as file:
@@ -368,7 +358,6 @@ def read_npz(path: Path, names: Iterable[str], most_bytes: int) -> dict[str, NDA
     Raises:
         FileNotFoundError: there is no such file.
         InputError: broken, an array is not there, or larger than that.
-
     """
     check_bytes(path, 4 * most_bytes + (1 << 20))
     found = {}

@@ -16,7 +16,6 @@ def ctrl_c_put_off() -> Iterator[None]:
 
     Raises:
         KeyboardInterrupt: it was asked for meanwhile; or whatever the handler before raises.
-
     """
     before = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or not callable(before):

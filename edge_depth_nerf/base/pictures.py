@@ -153,7 +153,6 @@ def draw_points(
         picture: H×W×3; shown paler, so that the colours of the discs stand out.
         distance_m: H×W metres; not positive or not finite = no value.
         size: width and height of what is made, px.
-
     """
     height, width = distance_m.shape
     canvas = resize(picture, size)

@@ -53,7 +53,6 @@ def read_png_header(path: Path) -> PngHeader:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: not a PNG, truncated, or larger than any picture is.
-
     """
     check_bytes(path, MAX_PICTURE_BYTES)
     with path.open("rb") as file:
@@ -76,7 +75,6 @@ def read_png_bytes(path: Path) -> bytes:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: not a PNG, truncated, or damaged.
-
     """
     read_png_header(path)
     content = path.read_bytes()

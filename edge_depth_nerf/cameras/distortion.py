@@ -82,7 +82,6 @@ class Distortion:
 
         Returns:
             x, and whether there is one. Where there is none, x is some point of the disc.
-
         """
         with torch.no_grad():
             target = distorted.detach().reshape(-1, 2)

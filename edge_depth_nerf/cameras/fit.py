@@ -56,7 +56,6 @@ def fit_kannala_brandt(source: Camera, theta_max_rad: float = math.radians(95)) 
     Raises:
         InputError: the angle is not positive, the picture sees too little within it, or no such camera with
             a rising polynomial comes near.
-
     """
     limit = min(theta_max_rad, source.theta_max_rad)
     if not limit > 0:
@@ -134,7 +133,6 @@ def host_residual(
         The distances between each pixel and the one where the source sees nerfstudio's ray of it; infinite where that
         ray goes astray. Second, the smallest angle from the axis of a ray that is off by half a pixel or more;
         infinite if none is.
-
     """
     limit = min(theta_max_rad, 0.999 * source.theta_max_rad)
     directions, pixels = _rays(source, limit, _CHECK_GRID)

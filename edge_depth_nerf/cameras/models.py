@@ -40,7 +40,6 @@ class Camera(ABC):
 
     Raises:
         InputError: a parameter is not finite or out of its range.
-
     """
 
     model: ClassVar[str]
@@ -153,7 +152,6 @@ class Camera(ABC):
 
         Raises:
             InputError: the factor is below 1 or leaves no pixel.
-
         """
         if not 1 <= factor <= min(self.width, self.height):
             raise InputError(
@@ -342,7 +340,6 @@ def camera_from_dict(parameters: dict[str, Any], where: str) -> Camera:
 
     Raises:
         InputError: the model is unknown, a field is missing, unknown, or not a usable number.
-
     """
     name = parameters.get("model")
     if not isinstance(name, str) or name not in _MODELS:

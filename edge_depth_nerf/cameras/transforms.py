@@ -19,7 +19,6 @@ def check_rigid(transform: Transform, where: str) -> None:
 
     Raises:
         InputError: with `where` and the deviation.
-
     """
     rotation = transform[:3, :3]
     # huge numbers are a deviation like others

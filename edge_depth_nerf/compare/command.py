@@ -51,7 +51,6 @@ def compare(options: CompareOptions, console: Console | None = None) -> Results:
 
     Raises:
         InputError: options, scenes or the output folder cannot be used, or a run failed (its log is named).
-
     """
     console = console or Console()
     with finished_runs(options, console) as results:
@@ -68,7 +67,6 @@ def finished_runs(options: CompareOptions | SearchOptions, console: Console) -> 
 
     Raises:
         InputError: options, scenes or the output folder cannot be used, or a run failed (its log is named).
-
     """
     options.check()
     check_is_folder(options.output)
@@ -133,7 +131,6 @@ def read_comparison(output: Path) -> Results:
 
     Raises:
         InputError: runs differ in what they should share, or a file is broken.
-
     """
     results = read_results(output / RUNS)
     results.options = read_json_object(output / RECORD)
@@ -166,7 +163,6 @@ def layers_digest(folder: Path) -> str:
 
     Raises:
         FileNotFoundError: one of them is missing.
-
     """
     keys = [*(layer.key for name, layer in LAYERS.items() if name != "image"), DEPTH_KEY]
     transforms = folder / "transforms.json"
@@ -190,7 +186,6 @@ def check_scene(folder: Path, methods: Sequence[MethodName], preset: str) -> str
     Raises:
         FileNotFoundError: there is no scene.
         InputError: it has no split, or lacks the maps that a method needs.
-
     """
     path = folder / "transforms.json"
     if not path.is_file():
@@ -222,7 +217,6 @@ def read_tuned(path: Path) -> dict[MethodName, Setting]:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: it does not have that form.
-
     """
     methods = read_json_object(path).get("methods")
     form = 'expected {"methods": {"ds-nerf": {"lambda": 0.01, "sigma_m": 0.5}}}, with sigma_m metres or "own"'
@@ -251,7 +245,6 @@ def open_output(options: CompareOptions | SearchOptions, tuned: Mapping[MethodNa
 
     Raises:
         InputError: it holds another comparison, or something else.
-
     """
     word = "search" if isinstance(options, SearchOptions) else "compare"
     path, command = options.output / RECORD, command_line(["edge-depth-nerf", word], options)
@@ -266,7 +259,6 @@ def _record(options: CompareOptions | SearchOptions, tuned: Mapping[MethodName, 
 
     Raises:
         InputError: the folder holds something else, another comparison, or runs of a method with another λ or σ.
-
     """
     compared = options if isinstance(options, CompareOptions) else None
     record: dict[str, Any] = {
@@ -295,7 +287,6 @@ def _same(path: Path, wanted: Mapping[str, Any], words: str, remedy: str) -> dic
 
     Raises:
         InputError: it holds another value; one that an earlier version did not write is not known to differ.
-
     """
     found = {**wanted, **read_json_object(path)}
     for name, value in wanted.items():
@@ -309,7 +300,6 @@ def _check_setting(output: Path, name: MethodName, setting: Setting) -> None:
 
     Raises:
         InputError: one has others.
-
     """
     for path in sorted(output.glob(f"{RUNS}/*/{name}_seed-*/{SPECIFICATION}")):
         run = read_json_object(path)
@@ -340,7 +330,6 @@ class Run:
 
         Raises:
             InputError: the folder holds the run of another scene or of other settings.
-
         """
         path, wanted = self.folder / SPECIFICATION, self.specification.to_dict()
         if not path.is_file():
@@ -360,7 +349,6 @@ def do_runs(runs: Sequence[Run], options: TrainingOptions, console: Console) -> 
 
     Raises:
         InputError: a run failed; its log is named. Or the cluster cannot be used.
-
     """
     tasks = [run.task for run in runs]
     if not tasks:

@@ -59,7 +59,6 @@ def configuration(run: RunSpecification, folder: Path | None = None) -> tuple[Tr
 
     Returns:
         The configuration, and the dotted names in which its method may differ from others.
-
     """
     config = make_specifications(read_method_file())[REGISTERED[run.preset]].config
     method = METHODS[run.method]

@@ -112,7 +112,6 @@ def evaluate_beams(pipeline: Any, most: int = MOST_PIXELS) -> dict[str, float]:
     Returns:
         The depth errors beams_abs_rel and so on, pooled over random LiDAR points of all training views, rendered from
         the poses that training ended with; nothing for a scene without such beams.
-
     """
     dataset = pipeline.datamanager.train_dataset
     if "beams" not in dataset.sources():
@@ -134,7 +133,6 @@ def evaluate_pixels(pipeline: Any, chosen: list[ChosenPixels], trained_on: bool 
     Returns:
         psnr and, where it is known, truth_psnr against the picture without noise: means over views, dB; and the
         depth errors against LiDAR and truth, pooled over pixels.
-
     """
     model, manager = pipeline.model, pipeline.datamanager
     generator = manager.train_ray_generator if trained_on else manager.eval_ray_generator
@@ -168,7 +166,6 @@ def shifted_views(scene: Path, dataset: FisheyeDepthDataset) -> dict[str, list[C
     Returns:
         By the metres that they lie sideways, what loads each. They have lens and mask of the first held-out picture
         of their camera.
-
     """
     meta = read_transforms(scene / "transforms.json")
     outputs = dataset._dataparser_outputs
@@ -217,7 +214,6 @@ class ViewEvaluator:
         Returns:
             The figures of `ns-eval` and, under affine_… and truth_affine_…, those after a colour fit; and the bins
             by_angle_deg and by_distance_m, against ground truth where it is known, else against picture and LiDAR.
-
         """
         dataset = self.pipeline.datamanager.eval_dataset
         by_angle, by_distance = BinnedErrors(ANGLE_EDGES_DEG), BinnedErrors(DISTANCE_EDGES_M)
@@ -250,7 +246,6 @@ class ViewEvaluator:
         Returns:
             The figures of colours inside the mask: detail_masked_psnr, detail_truth_masked_psnr,
             detail_shifted_1m_masked_psnr, and so on. Distances are the same as without.
-
         """
 
         def look(view: EvaluatedView, outputs: dict[str, Tensor], images: dict[str, Tensor]) -> None:

@@ -29,7 +29,6 @@ def affine_fitted(
 
     Returns:
         pred under the 3×4 map that brings it nearest to target, clamped to 0..1.
-
     """
 
     def with_one(colours: Tensor) -> Tensor:
@@ -69,7 +68,6 @@ class BinnedErrors:
             target: true colours.
             pred_m: rendered distance, metres.
             true_m: true distance, metres; counted from 1 to 60 m, the range of all distance errors.
-
         """
         values = values.double()
         counted = mask & (values >= self.edges[0]) & (values < self.edges[-1])

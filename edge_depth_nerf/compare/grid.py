@@ -58,7 +58,6 @@ def grid(options: GridOptions, console: Console | None = None) -> Results:
 
     Raises:
         InputError: options, scenes or the output folder cannot be used, or a run failed (its log is named).
-
     """
     console = console or Console()
     options.check()

@@ -174,7 +174,6 @@ def check_name(name: str) -> None:
 
     Raises:
         InputError: no method has it.
-
     """
     if name not in METHODS:
         usual = ", ".join(known for known, method in METHODS.items() if method == method._usual)

@@ -59,7 +59,6 @@ class TrainingOptions:
 
         Raises:
             InputError: an option is out of its range, or two do not go together.
-
         """
         _require(len(self.scenes) > 0, "no scene", "at least one scene folder")
         _require(self.steps is None or self.steps >= 1, f"--steps {self.steps}", "1 or more")

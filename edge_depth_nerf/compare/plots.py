@@ -80,7 +80,6 @@ def plot_lines(
         label: what is drawn to the right, with its unit.
         rows: name of a figure and its label; errors are drawn logarithmically.
         logarithmic_x: whether equal ratios are equally far apart.
-
     """
 
     def draw(dark: bool) -> bytes:
@@ -176,7 +175,6 @@ def draw_plots(output: Path, results: Results) -> list[Plot]:
 
     Returns:
         For the page: each plot of each drive.
-
     """
     clock, scenes = clock_metric(results), results.scenes()
     kinds: dict[str, Callable[[Sequence[str], str], Plot]] = {

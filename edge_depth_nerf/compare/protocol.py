@@ -13,7 +13,6 @@ def departures(meta: dict[str, Any]) -> list[str]:
 
     Args:
         meta: its transforms.json.
-
     """
     source = meta.get("source", {})
     frames = {split: _frames(meta, split) for split in ("train", "test")}

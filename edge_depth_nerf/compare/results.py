@@ -112,7 +112,6 @@ def read_results(runs: Path) -> Results:
 
     Raises:
         InputError: a file of a run is broken, or of another form.
-
     """
     found = []
     for path in sorted(runs.glob(f"*/*/{FIGURES}")):
@@ -153,7 +152,6 @@ def check_fair(results: Results) -> None:
 
     Raises:
         InputError: two runs differ otherwise: one is of another version of the program, or was tampered with.
-
     """
     reference = results.runs[0]
     of_method: dict[MethodName, RunResult] = {}

@@ -79,7 +79,6 @@ def search(options: SearchOptions, console: Console | None = None) -> Results:
 
     Raises:
         InputError: options, scenes or the output folder cannot be used, or a run failed (its log is named).
-
     """
     console = console or Console()
     with finished_runs(options, console) as results:

@@ -143,7 +143,6 @@ def read_specification(path: Path) -> RunSpecification:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: it is not of this form.
-
     """
     try:
         return RunSpecification(**read_json_object(path))

@@ -81,7 +81,6 @@ def run_demo(options: DemoOptions, console: Console | None = None) -> dict[str, 
 
     Raises:
         InputError: the output folder holds a demo of other options, or a training failed (its log is named).
-
     """
     console = console or Console()
     output, stages = options.output, stages_of(options)

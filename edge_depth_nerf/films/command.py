@@ -81,7 +81,6 @@ def write_camera_path(options: CameraPathOptions, console: Console | None = None
     Raises:
         FileNotFoundError: there is no scene, or no config.yml, at the given path.
         InputError: an option, the scene or the training cannot be used.
-
     """
     options.check()
     console = console or Console()
@@ -130,7 +129,6 @@ def film_lens(lens: KannalaBrandt | Pinhole, options: CameraPathOptions) -> Film
 
     Raises:
         InputError: the computed height is out of range.
-
     """
     aspect = {"fisheye": lens.width / lens.height, "perspective": 16 / 9, "equirectangular": 2.0}[options.camera]
     width = options.width or _even(2.0 * lens.height if options.camera == "equirectangular" else float(lens.width))

@@ -59,7 +59,6 @@ class CameraPathOptions:
 
         Raises:
             InputError: an option is out of its range, or contradicts another one.
-
         """
         width = self.width
         if width is not None and not (SMALLEST_PX <= width <= LARGEST_PX and width % 2 == 0):

@@ -39,7 +39,6 @@ class CameraPath:
 
     Raises:
         InputError: fewer than two poses, or times that do not increase.
-
     """
 
     times_s: Float64[np.ndarray, "poses"]
@@ -79,7 +78,6 @@ class CameraPath:
 
         Raises:
             InputError: the camera does not move.
-
         """
         rotation, position = self.camera_to_scene[:, :3, :3], self.camera_to_scene[:, :3, 3]
         up = np.einsum("nji,j->i", rotation, self.up)
@@ -171,7 +169,6 @@ def orbit(
 
     Raises:
         InputError: the camera does not move.
-
     """
     position = drive.camera_to_scene[:, :3, 3]
     driven_m = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=1))))

@@ -35,7 +35,6 @@ def read_dataparser(path: Path) -> Any:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: the file is not YAML, is not a training's config.yml, or has another dataparser.
-
     """
     from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
     from yaml import YAMLError

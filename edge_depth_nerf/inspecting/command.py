@@ -51,7 +51,6 @@ def inspect_scene(options: InspectOptions, console: Console | None = None) -> di
     Raises:
         FileNotFoundError: there is no scene.
         InputError: the scene, one of its files, an option or the output folder cannot be used.
-
     """
     options.check()
     console = console or Console()

@@ -30,7 +30,6 @@ class InspectOptions:
 
         Raises:
             InputError: an option is out of its range.
-
         """
         if self.frames < 1:
             raise InputError(f"--frames {self.frames}: expected 1 or more frames.")

@@ -31,7 +31,6 @@ def check_poses(scene: SceneFolder, console: Console) -> list[EpipolarAgreement]
 
     Raises:
         InputError: a picture or a mask cannot be read.
-
     """
     if not scene.own:
         return []

@@ -51,7 +51,6 @@ class ShownScene:
 
         Raises:
             InputError: the file is broken.
-
         """
         path = self.scene.folder / CALIBRATION_FILE
         if not path.is_file():
@@ -64,7 +63,6 @@ class ShownScene:
 
         Raises:
             InputError: a file cannot be decoded, or its size differs from the camera's.
-
         """
         maps = self.scene.maps(picture)
         source = default_source(picture.files)

@@ -49,7 +49,6 @@ def top_view(
         points_m: N×3 points in the scene; higher ones are drawn darker.
         findings: the gaps among them are marked.
         shown: frames that have a sheet; their numbers are beside the path.
-
     """
     figure, axes, pixel_m = _empty_map(scene)
     if points_m is not None:

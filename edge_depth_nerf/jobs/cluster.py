@@ -74,7 +74,6 @@ def do_task(task: Task, key: str, needs: Surroundings) -> str:
 
     Raises:
         InputError: the machine is not as it must be, or the command failed.
-
     """
     from distributed import get_worker
 
@@ -243,7 +242,6 @@ def on_cluster(address: str, tasks: Sequence[Task], reads: Sequence[Path], conso
 
     Raises:
         InputError: Dask is not installed, nobody answers, no worker comes, or one is not as it must be.
-
     """
     check_address(address)
     try:

@@ -13,7 +13,6 @@ def check_address(given: str | None) -> None:
 
     Raises:
         InputError: neither local nor an address.
-
     """
     if given is not None and given != LOCAL and not given.startswith(("tcp://", "tls://")):
         raise InputError(

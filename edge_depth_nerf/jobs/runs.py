@@ -49,7 +49,6 @@ class LoggedCommands:
 
         Raises:
             InputError: it ended with another status than 0; names the log, the command and the last line.
-
         """
         log.parent.mkdir(parents=True, exist_ok=True)
         words = [str(word) for word in command]

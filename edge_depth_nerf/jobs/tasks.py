@@ -179,7 +179,6 @@ def do_tasks(tasks: Sequence[Task], place: Place, console: Console) -> None:
 
     Raises:
         InputError: a task failed; its log is named.
-
     """
     with progress_bars(console) as progress:
         bars = _Bars(progress, len(tasks))

@@ -20,7 +20,6 @@ def keep_freed_memory() -> bool:
 
     Returns:
         Whether the allocator does: glibc's alone has the settings.
-
     """
     if platform.libc_ver()[0] != "glibc":
         return False

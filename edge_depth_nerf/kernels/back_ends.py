@@ -63,7 +63,6 @@ class GpuForm:
         Raises:
             KernelDiffersError: they are not.
             Exception: whatever keeps it from working.
-
         """
         kernel = self.load()
         for example in self.examples(device):
@@ -92,7 +91,6 @@ def _outcome(
         function: takes the example's arguments.
         example: is not changed.
         dtype: that of tensors of floats; None: their own.
-
     """
     leaves: list[Tensor] = []
 

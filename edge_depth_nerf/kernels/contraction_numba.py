@@ -47,7 +47,6 @@ def contract(positions: Float[Tensor, "points 3"]) -> tuple[Float[Tensor, "point
     Returns:
         The positions in 0..1, coordinate after coordinate in memory (as the hash grid wants them); 1 where a point is
         inside, else 0.
-
     """
     axes, inside = torch.empty(3, len(positions)), torch.empty(len(positions))
     arrays = positions.detach().numpy(), axes.numpy(), inside.numpy()

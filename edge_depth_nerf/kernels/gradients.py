@@ -33,7 +33,6 @@ def sloped(followed: Tensor, compute: Callable[[bool], tuple[Tensor, Tensor]], d
         compute: gives the loss, a number or one for each ray, and its slope at each number of the matrix times
             `divisor`. Its argument says whether slopes are asked for.
         divisor: of the slopes.
-
     """
     loss = _Sloped.apply(followed, compute, divisor)
     assert isinstance(loss, Tensor)
@@ -63,6 +62,5 @@ def once(kernel: str, compute: Callable[[], tuple[Tensor | None, ...]], *made_of
         kernel: as an error names it.
         compute: gives the gradients.
         made_of: tensors that they are computed from.
-
     """
     return _Once.apply(kernel, compute, *made_of)

@@ -76,7 +76,6 @@ def hash_grid(
 
     Returns:
         The features of each point, level after level.
-
     """
     encoded = _HashGrid.apply(positions, table, scalings, work, dtype)
     assert isinstance(encoded, Tensor)

@@ -68,7 +68,6 @@ def network(
 
     Returns:
         The last layer, without activation.
-
     """
     if x.device.type != "cpu":
         return _layer_by_layer(x, weights, biases)

@@ -346,7 +346,6 @@ class Arrays:
             joint: a layer that gets what the one before gives without ReLU. The first number of that, which it leaves
                 out (its weights there are 0), is also a result. 0: none.
             more: further inputs of that layer, [points, more], without a gradient.
-
         """
         self.points, self.groups = len(x), len(biases[joint])
         self.weights = [weight.detach().numpy() for weight in weights]
@@ -420,7 +419,6 @@ class Slopes:
             gradient: to what `writes_forward` writes.
             to_number: as there.
             to_x: gets the gradient to the inputs, unless it is empty; with a joint, it has a row for each input.
-
         """
         self.net, (up, self.begins) = net, _packed(net.weights)
         self.to_shared = np.zeros_like(net.shared)

@@ -30,7 +30,6 @@ def let_idle_threads_sleep() -> bool:
     Returns:
         Whether that was for this function to do: not with other libraries than GNU's, with one thread, or where the
         environment says how threads wait.
-
     """
     threads, cores = torch.get_num_threads(), len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 0
     if threads < 2 or not cores or any(name in os.environ for name in _CHOSEN_BY):

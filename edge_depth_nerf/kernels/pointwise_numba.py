@@ -165,7 +165,6 @@ def density(before: Float[Tensor, "points"], inside: Float[Tensor, "points"], sc
         before: a network's outputs, any stride. Differentiable once, by them alone.
         inside: 1 where a point is inside, else 0.
         scale: the density of what a new network gives.
-
     """
     found = _Density.apply(before, inside, scale)
     assert isinstance(found, Tensor)
@@ -205,7 +204,6 @@ def harmonics(directions: Float[Tensor, "rays 3"], dtype: torch.dtype) -> Float[
     Args:
         directions: of length 1.
         dtype: of what is given.
-
     """
     encoded = torch.empty(len(directions), HARMONICS)
     arrays = *flat_rows(directions), encoded.view(-1).numpy()

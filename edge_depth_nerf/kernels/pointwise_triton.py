@@ -85,7 +85,6 @@ def contract(positions: Float[Tensor, "points 3"]) -> tuple[Float[Tensor, "point
 
     Returns:
         The positions in 0..1; 1 where a point is inside, else 0.
-
     """
     positions = positions.detach().contiguous()
     places, inside = torch.empty_like(positions), positions.new_empty(len(positions))
@@ -131,7 +130,6 @@ def harmonics(directions: Float[Tensor, "rays 3"], dtype: torch.dtype) -> Float[
     Args:
         directions: of length 1, float32.
         dtype: of what is given.
-
     """
     directions, stride = rows_of(directions)
     encoded = torch.empty(len(directions), HARMONICS, dtype=dtype, device=directions.device)

@@ -113,7 +113,6 @@ def weights_from_densities(
     Args:
         densities: σ, 0 or more, float32. Differentiable once, by them alone.
         deltas: δ, the samples' lengths, float32.
-
     """
     weights = _Weights.apply(densities, deltas)
     assert isinstance(weights, Tensor)
@@ -169,7 +168,6 @@ def sample_pdf(
 
     Returns:
         Where these shares are reached, linear within an interval.
-
     """
     placed = torch.empty(wanted.shape)
     arrays = [each.detach().contiguous().numpy() for each in (weights, edges, wanted)]
@@ -289,7 +287,6 @@ def distortion_loss(edges: Float[Tensor, "rays edges"], weights: Float[Tensor, "
     Args:
         edges: of the samples, ascending, in the spacing of 0..1, float32.
         weights: rendering weights, float32.
-
     """
     rays, samples = weights.shape
 

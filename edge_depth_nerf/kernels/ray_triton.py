@@ -175,7 +175,6 @@ def distortion_loss(edges: Float[Tensor, "rays edges"], weights: Float[Tensor, "
     Args:
         edges: of the samples, in the spacing of 0..1, float32.
         weights: rendering weights, float32.
-
     """
     (rays, samples), (of_edges, stride) = weights.shape, rows_of(edges)
 

@@ -214,7 +214,6 @@ def _parts(
         by_ray: its weights for the further inputs.
         parameters: weights and biases of both networks, in turns.
         follow: whether a gradient to the further inputs is asked for.
-
     """
     weights, biases = list(parameters[::2]), [bias.view(1, -1) for bias in parameters[1::2]]
     rays, points = shape[0], shape.numel()
@@ -377,7 +376,6 @@ def render(
 
     Returns:
         Weights that are not a number are 0, as in nerfstudio. Differentiable once, by x, of_rays and the networks.
-
     """
     layers, biases = ([*networks.first[k], *networks.second[k]] for k in range(2))
     parameters = [each for pair in zip(layers, biases, strict=True) for each in pair]

@@ -50,7 +50,6 @@ def step_levels(
         state: torch's: the step's number, and the running means of gradients and of their squares.
         parts: what the gradient is the sum of: positions, gradient to their encoded values and scalings of each pass.
         options: torch's, of the table's group.
-
     """
     step, (beta1, beta2) = float(state["step"]), options["betas"]
     rate, spread = float(options["lr"]) / (1 - beta1**step), math.sqrt(1 - beta2**step)

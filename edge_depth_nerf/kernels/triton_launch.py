@@ -19,7 +19,6 @@ def launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, **constants: Any
         grid: programs along each axis.
         arguments: the kernel's, a tensor first.
         constants: what it is compiled for, and options of the compiler.
-
     """
     if 0 not in grid:
         with torch.cuda.device_of(arguments[0]):

@@ -160,7 +160,6 @@ def one_stretch(
 
     Returns:
         Sweeps for it less sweeps against it.
-
     """
     score = np.zeros(seen_through.shape[1])
     for side in (slice(None, own), slice(None, own - 1 if own else None, -1)):

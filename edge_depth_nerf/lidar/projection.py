@@ -72,7 +72,6 @@ def project_points(
             None keeps them.
         age_s: how far in time from the picture each point was measured; None = all at once.
         only_hides: points that hide others and are never chosen; None = all may be chosen.
-
     """
     pixels, valid = camera.project(points_in_camera)
     seen = torch.nonzero(valid & camera.inside(pixels)).squeeze(-1)

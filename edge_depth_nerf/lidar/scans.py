@@ -124,7 +124,6 @@ def check_scan(path: Path, scan: ScanFormat) -> None:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: of an unknown format, truncated, without points or without a column.
-
     """
     _read_header(path, scan)
 
@@ -137,7 +136,6 @@ def read_scan(path: Path, scan: ScanFormat, time_s: float = 0.0) -> Sweep:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: of an unknown format, broken, without a column needed, or without a single usable point.
-
     """
     header = _read_header(path, scan)
     columns = _read_columns(path, header, [*scan.needed, scan.name("intensity")], scan)
@@ -155,7 +153,6 @@ def read_cloud(path: Path) -> tuple[Float64[np.ndarray, "points 3"], UInt8[np.nd
     Raises:
         FileNotFoundError: there is no such file.
         InputError: another format, broken, or of more than `MAX_CLOUD_POINTS`.
-
     """
     if path.suffix.lower() != ".ply":
         raise InputError(f"{path}: a point cloud of unknown format; expected .ply.")

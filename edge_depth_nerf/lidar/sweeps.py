@@ -87,7 +87,6 @@ def check_sweep_size(path: Path) -> None:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: the file is empty, truncated, or far larger than a sweep.
-
     """
     size = check_bytes(path, MAX_POINTS * _BYTES_PER_POINT)
     if size == 0 or size % _BYTES_PER_POINT:
@@ -103,7 +102,6 @@ def read_sweep(path: Path) -> Sweep:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: the file is truncated, or nothing in it is a usable point.
-
     """
     check_sweep_size(path)
     values = torch.from_numpy(np.fromfile(path, "<f4").reshape(-1, 4).astype(np.float64))
@@ -120,7 +118,6 @@ def usable_points(
 
     Raises:
         InputError: nothing is left; names `path`.
-
     """
     finite = torch.isfinite(points_m).all(-1)
     if offset_s is not None:

@@ -40,7 +40,6 @@ class Trajectory:
 
     Raises:
         InputError: fewer than two poses, or times that do not increase.
-
     """
 
     times_s: Float64[np.ndarray, "poses"]

@@ -71,7 +71,6 @@ def sweep_in_world(
         trajectory: where the vehicle is.
         timing: when which azimuth is measured; times from the file come first. None and no times = all at once.
         deskew: False takes all points as measured at the sweep's own time.
-
     """
     offset_s = torch.zeros(len(sweep.points_m), dtype=torch.float64)
     if deskew and sweep.offset_s is not None:

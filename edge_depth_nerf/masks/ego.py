@@ -146,7 +146,6 @@ def find_ego(
 
     Raises:
         ValueError: a picture has another size than the lens.
-
     """
     factor = math.ceil(max(lens.shape) / WORKING_PX)
     small_lens = whole_blocks(lens, factor)

@@ -68,7 +68,6 @@ def dark_rim(pictures: Iterable[UInt8[np.ndarray, "h w 3"]]) -> Bool[np.ndarray,
 
     Raises:
         ValueError: the pictures differ in size.
-
     """
     brightest: Float[np.ndarray, "h w"] | None = None
     shape, factor = (0, 0), 1

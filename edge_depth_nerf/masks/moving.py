@@ -50,7 +50,6 @@ def grow_moving(
 
     Returns:
         True = a thing that moves.
-
     """
     shape = still.shape
     if not len(points_px):

@@ -52,7 +52,6 @@ def check_label_header(path: Path) -> None:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: not a whole 8-bit PNG of one channel.
-
     """
     header = read_png_header(path)
     if header.bit_depth != 8 or header.colour != "grey":
@@ -71,7 +70,6 @@ def read_labels(path: Path) -> UInt8[np.ndarray, "h w"]:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: not a whole 8-bit PNG of one channel, or with ids that no class has.
-
     """
     check_label_header(path)
     labels = cv2.imdecode(np.frombuffer(read_png_bytes(path), np.uint8), cv2.IMREAD_UNCHANGED)
@@ -91,7 +89,6 @@ def check_classes(classes: Iterable[str]) -> list[int]:
 
     Raises:
         InputError: there is no such class; lists those there are.
-
     """
     ids = []
     for name in classes:
@@ -109,7 +106,6 @@ def keep_static(labels: UInt8[np.ndarray, "h w"], classes: Iterable[str]) -> Boo
 
     Raises:
         InputError: there is no such class.
-
     """
     return ~dilated(np.isin(labels, check_classes(classes)), MARGIN * max(labels.shape))
 

@@ -126,7 +126,6 @@ def find_sky(
 
     Returns:
         True = sky.
-
     """
     factor = math.ceil(math.sqrt(mask.size) / WORKING_PX)
     usable = whole_blocks(mask, factor)

@@ -94,7 +94,6 @@ def both(
 
     Raises:
         InputError: the maps differ in size.
-
     """
     shapes = {"lidar_m": lidar_m.shape, "mono_m": mono_m.shape, "valid": valid.shape}
     if len(set(shapes.values())) > 1:
@@ -109,7 +108,6 @@ def fit_logs(lidar_m: Float[np.ndarray, "n"], mono_m: Float[np.ndarray, "n"]) ->
     Args:
         lidar_m: distances of LiDAR points, all positive, at least one.
         mono_m: the map at the same pixels, all positive.
-
     """
     x, y = np.log(mono_m.astype(np.float64)), np.log(lidar_m.astype(np.float64))
     middle = float(np.median(x))
@@ -147,7 +145,6 @@ def align(
 
     Raises:
         InputError: the maps differ in size, or the mode is unknown.
-
     """
     check_choice("align", mode, Align)
     lidar_points = both(lidar_m, mono_m, valid)

@@ -169,7 +169,6 @@ def register(named: str) -> None:
 
     Args:
         named: the variable's value.
-
     """
     words = [word.partition("=") for word in named.split(",") if word.strip()]
     further = [EntryPoint(name.strip(), value.strip(), VARIABLE) for name, _, value in words]
@@ -196,7 +195,6 @@ def depth_loss(loss: DepthLoss, levels: Sequence[Level], learns: Sequence[bool])
         levels: of the same rays and prior.
         learns: which of them have a gradient. Others would only add a number and are left out, unless the loss wants
             them or none has one.
-
     """
     used = [level for level, own in zip(levels, learns, strict=True) if own or loss.of_resting_levels] or levels
     prior_m = levels[0].prior_m

@@ -61,7 +61,6 @@ def detail_of(
         beyond: its colours less its rendering's; more than 1 counts as 1.
         distance: rendered, in the scene's unit.
         usable: which pixels count.
-
     """
     beyond = torch.where(image >= OVEREXPOSED, beyond.clamp(min=0), beyond)
     # half the memory; rounding is 0.05 %, much less than AGREEMENT
@@ -82,7 +81,6 @@ def seen_from(
     Returns:
         Where they are in the picture, -1 to 1 over its width and height, and beyond where it does not see them; the
         unit vectors to them; and their distances.
-
     """
     ahead = points - pose[:, 3]
     distance = ahead.norm(dim=-1)
@@ -124,7 +122,6 @@ def pictures_that_see(
 
     Returns:
         Their numbers, in the order of choice; fewer if fewer see anything.
-
     """
     count = min(SOME_POINTS, len(distance))
     some = torch.arange(count, device=distance.device) * len(distance) // max(1, count)
@@ -171,7 +168,6 @@ def carried(
 
     Returns:
         What is to be added to the colours of the rays: the weighted mean of the pictures' detail, less where few count.
-
     """
     details = list(details)
     parts = zip(*(each.split(POINTS_AT_ONCE) for each in (origins, directions, distance)), strict=True)

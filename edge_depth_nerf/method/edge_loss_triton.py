@@ -91,7 +91,6 @@ def edge_loss(
         divide_by_norm: divide by σ̂ √(2π).
         eps: added to the weights inside the logarithm.
         narrow: below this length, in units of σ̂, an interval's mass comes from its midpoint.
-
     """
     options = {"eps": eps, "narrow": narrow, "INTERVAL": interval, "NORM": divide_by_norm, "RAYS": RAYS}
     (rays, samples), weights = weights.shape, weights.float()

@@ -88,7 +88,6 @@ def pixel_features(
         mono_m: the aligned monocular map, 0 = none.
         lidar_points: the LiDAR points that the prior was made of.
         theta_rad: angle of each ray from the optical axis.
-
     """
     kernel = np.ones((3, 3), np.uint8)
     known = mono_m > 0
@@ -122,7 +121,6 @@ def motion_features(
         motion_m: distances from motion, 0 = none.
         sigma_m: their standard deviation.
         elevation_rad: of each ray.
-
     """
     known = (motion_m > 0).astype(np.uint8)
     logs = np.log(np.where(motion_m > 0, motion_m, 1)).astype(np.float32)
@@ -190,7 +188,6 @@ def fit_error_model(
         knots_of: which features, and where their factors are kept.
         middle: fit one sigma and two alike, where tails are so heavy that 95 % within two would leave too many within
             one.
-
     """
     if len(relative_error) < LEAST_EVALUATED:
         return None
@@ -232,7 +229,6 @@ def error_of_lidar_points(
 
     Returns:
         Which LiDAR points have neighbours, and their relative errors (0 elsewhere).
-
     """
     inverse = np.where(lidar_points, 1 / np.where(lidar_points, lidar_m, 1), 0).astype(np.float32)
     padded = np.pad(inverse, 1)
@@ -286,7 +282,6 @@ class BeyondField:
         Args:
             elevation_rad: of each ray.
             known: pixels with a LiDAR point or a distance from motion.
-
         """
         if self.network_model is None:
             return np.zeros(elevation_rad.shape, bool)
@@ -343,7 +338,6 @@ class Calibration:
         Args:
             features: of pixels.
             from_motion: whether motion has a part in each.
-
         """
         assert self.error_model is not None
         sigma = self.error_model.sigma_m(features)
@@ -429,7 +423,6 @@ def read_calibration(path: Path) -> Calibration:
     Raises:
         FileNotFoundError: no such file.
         InputError: the file is no calibration of this version.
-
     """
     from pydantic import TypeAdapter, ValidationError  # takes 0.14 s
 
@@ -460,7 +453,6 @@ def _check(calibration: Calibration) -> None:
     Raises:
         ValueError: a number is not finite or not of moderate size (logarithms, angles, exponents and relative errors
             are kept), or a model has other features.
-
     """
     for number in _floats(asdict(calibration)):
         if not abs(number) <= _MAX_NUMBER:

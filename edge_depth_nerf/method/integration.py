@@ -59,7 +59,6 @@ def check_choice(where: str, value: str, choices: object) -> None:
 
     Raises:
         InputError: names `where`, the value and what is allowed.
-
     """
     allowed = get_args(choices)
     if value not in allowed:
@@ -78,7 +77,6 @@ class IntegrationOptions:
 
     Raises:
         InputError: a field is out of its range; the message names field, value and what was expected.
-
     """
 
     alpha: float = 0.7
@@ -151,7 +149,6 @@ def join_estimates(
 
     Raises:
         InputError: the maps differ in shape, or the weight is out of its range.
-
     """
     _check_maps("join_estimates", mono_m=mono_m, motion_m=motion_m)
     _check_number("motion_weight", motion_weight, 0.0, 1.0)
@@ -166,7 +163,6 @@ def weight_of_errors(motion_error: float, mono_error: float) -> float:
     Args:
         motion_error: relative standard deviation of distances from motion.
         mono_error: of monocular ones.
-
     """
     return mono_error**2 / max(motion_error**2 + mono_error**2, 1e-12)
 
@@ -198,7 +194,6 @@ def integrate_depth(
 
     Raises:
         InputError: the maps differ in shape.
-
     """
     options = options or IntegrationOptions()
     _check_maps("integrate_depth", lidar_m=lidar_m, mono_m=mono_m, valid=valid)
@@ -275,7 +270,6 @@ def select_prior(
 
     Raises:
         InputError: the source needs a map that is not there, or the maps differ in shape.
-
     """
     needed = ("lidar", "mono") if depth_source == INTEGRATED else (depth_source,)
     found = {name: pixels for name, pixels in maps.items() if name in needed and pixels is not None}
@@ -318,7 +312,6 @@ def sigma_m(
     Raises:
         InputError: an unknown mode, a constant out of range, or `combined` without mono_m for a prior with a
             monocular share.
-
     """
     check_choice("sigma mode", mode, SigmaMode)
     _check_number("constant_m", constant_m, 1e-3)

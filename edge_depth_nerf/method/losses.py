@@ -65,7 +65,6 @@ def edge_loss(
 
     Raises:
         InputError: shapes that do not fit, or an unknown `gaussian`.
-
     """
     if gaussian not in get_args(Gaussian):
         raise InputError(f"edge_loss: gaussian is {gaussian!r}; expected one of {get_args(Gaussian)}.")
@@ -138,7 +137,6 @@ def ds_nerf_loss(
         ends_m: where it ends.
         prior_m: z.
         sigma_m: σ.
-
     """
     return edge_loss(weights, starts_m, ends_m, prior_m, torch.full_like(prior_m, _positive("ds_nerf_loss", sigma_m)))
 
@@ -167,7 +165,6 @@ def urban_nerf_loss_of_nerfstudio(
         prior_m: z.
         expected_m: E, the expected distance of the ray's final samples.
         sigma_m: σ.
-
     """
     _check_shapes(
         "urban_nerf_loss_of_nerfstudio",
@@ -225,7 +222,6 @@ def urban_nerf_loss(
 
     Raises:
         InputError: shapes that do not fit, or a σ that is not positive.
-
     """
     _check_shapes("urban_nerf_loss", weights, {"starts_m": starts_m, "ends_m": ends_m}, {"prior_m": prior_m})
     _positive("urban_nerf_loss", sigma_m)
@@ -264,7 +260,6 @@ def sky_loss(weights: Float[Tensor, "rays samples"], sky: Bool[Tensor, "rays"]) 
 
     Returns:
         0 where all of them reach the background, 1 where none does; 0, still connected to `weights`, without such rays.
-
     """
     hit = weights.sum(dim=1, dtype=torch.promote_types(weights.dtype, torch.float32))
     return (hit * (sky / sky.sum().clamp(min=1))).sum()
@@ -277,7 +272,6 @@ def _check_shapes(
 
     Raises:
         InputError: they do not.
-
     """
     if weights.ndim != 2:
         raise InputError(f"{caller}: weights {tuple(weights.shape)}; expected two dimensions, (rays, samples).")
@@ -295,7 +289,6 @@ def _positive(caller: str, sigma_m: float) -> float:
 
     Raises:
         InputError: it is no positive number.
-
     """
     if not (math.isfinite(sigma_m) and sigma_m > 0):
         raise InputError(f"{caller}: sigma_m is {sigma_m}; expected a positive number of metres.")

@@ -58,7 +58,6 @@ def masked_psnr(
 
     Raises:
         InputError: shapes that do not fit, or an empty mask.
-
     """
     _check_pictures("masked_psnr", pred, target, mask)
     return -10 * torch.log10((pred[mask] - target[mask]).square().mean().clamp(min=LEAST_SQUARED_ERROR))
@@ -87,7 +86,6 @@ def masked_ssim(
 
     Raises:
         InputError: shapes that do not fit, or a mask that is empty or nowhere as wide as the window.
-
     """
     _check_pictures("masked_ssim", pred, target, mask)
     fits = _whole_windows(mask)
@@ -122,7 +120,6 @@ def masked_lpips(
 
     Raises:
         InputError: shapes that do not fit, or an empty mask.
-
     """
     _check_pictures("masked_lpips", pred, target, mask)
     pictures = (_blacked_out(picture, mask).clamp(0, 1) for picture in (pred, target))
@@ -185,7 +182,6 @@ class DepthErrors:
 
         Raises:
             InputError: shapes that do not fit, or a prediction that is not finite at a evaluated pixel.
-
         """
         if not pred_distance_m.shape == true_distance_m.shape == mask.shape:
             raise InputError(
@@ -214,7 +210,6 @@ class DepthErrors:
             `abs_rel` (mean of |pred - true| / true), `rmse_m` (metres), `delta_1_25` (the part, 0 to 1, of pixels
             with max(pred / true, true / pred) < 1.25) and `pixels`, all finite; nothing at all if no pixel was
             evaluated, so that no figure stands for an absent measurement.
-
         """
         if not self.pixels:
             return {}

@@ -79,7 +79,6 @@ class PriorOptions:
 
     Raises:
         InputError: a field is not one of its choices.
-
     """
 
     align: Align = "local"
@@ -139,7 +138,6 @@ def ray_angles(camera: Camera, up_in_camera: Float[np.ndarray, "3"]) -> RayAngle
     Args:
         camera: its lens.
         up_in_camera: the world's upward unit vector in the camera's axes (OpenCV).
-
     """
     found = rays(camera)
     elevation = np.arcsin(np.clip(found.directions @ up_in_camera.astype(np.float32), -1, 1))
@@ -222,7 +220,6 @@ def integrate_frame(
 
     Raises:
         InputError: the maps differ in size.
-
     """
     anywhere, mask = mask, mask & ~(mono_m > FARTHEST_M)
     lidar_points = mask & np.isfinite(lidar_m) & (lidar_m > 0)
@@ -267,7 +264,6 @@ def confirmed(mono_m: NDArray[np.float32], around_m: NDArray[np.float32]) -> NDA
     Args:
         mono_m: H×W, the aligned monocular map, 0 = none.
         around_m: H×W, what the neighbours' distances from motion show, 0 = nothing.
-
     """
     height, width = mono_m.shape
     padded = np.pad(around_m, 1)
@@ -331,7 +327,6 @@ def motion_map(
         view: of the picture.
         lidar_m: its LiDAR, 0 = no LiDAR point; None without.
         around_m: what the neighbours' distances from motion show, 0 = nothing; None where that is not known.
-
     """
     assert calibration.motion is not None
     in_field, beyond = calibration.in_field(view.elevation_rad), calibration.motion.beyond
@@ -378,7 +373,6 @@ def make_prior(
 
     Raises:
         InputError: there is no map of a source that is needed, or the maps differ in size.
-
     """
     lidar_m, mono_m = maps.get("lidar"), maps.get("mono")
     motion_m = maps.get("motion") if options.motion and depth_source == INTEGRATED else None

@@ -25,7 +25,6 @@ def termination_std(
         weights: rendering weights w_k, not negative.
         starts: distance at which each sample's interval begins.
         ends: distance at which it ends.
-
     """
     lengths = ends - starts
     stopped = weights.sum(-1, keepdim=True)

@@ -186,7 +186,6 @@ def calibrate_scene(scene: Path, console: Console | None = None) -> Calibration:
     Raises:
         FileNotFoundError: no scene there.
         InputError: the scene has no LiDAR or no monocular maps, or one of its files is broken.
-
     """
     read = read_scene(scene)
     calibration = _calibrate(read, _chosen(read), INTEGRATED, PriorOptions(), console)
@@ -230,7 +229,6 @@ def find_calibration(
 
     Raises:
         InputError: as `calibrate_scene`.
-
     """
     if (calibration := saved_calibration(scene, options, cache, training_images, depth_source)) is not None:
         return calibration
@@ -451,7 +449,6 @@ def measure_frame(
 
     Raises:
         InputError: the maps differ in size.
-
     """
     lidar_points = both(lidar_m, mono_m, usable)
     rng = np.random.default_rng([8, number])

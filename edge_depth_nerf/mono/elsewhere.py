@@ -39,7 +39,6 @@ class FittedMaps:
 
     Raises:
         InputError: maps of unknown scale, and a camera without LiDAR to fit them to.
-
     """
 
     scene: SceneFolder

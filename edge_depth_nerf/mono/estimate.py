@@ -118,7 +118,6 @@ def estimate_depth(options: EstimateDepthOptions, console: Console | None = None
     Raises:
         FileNotFoundError: a scene, the weights or a map are not there.
         InputError: an option, a scene, the weights or a map cannot be used.
-
     """
     console = console or Console()
     assert options.cluster is None
@@ -139,7 +138,6 @@ def opened(
     Raises:
         FileNotFoundError: a scene or the weights are not there.
         InputError: an option, a scene or the weights cannot be used.
-
     """
     options.check()
     start, about = load_network(options.model) if options.model is not None else (None, {})
@@ -260,7 +258,6 @@ def _train(
 
     Raises:
         InputError: the weights' file is not to be overwritten; a scene cannot be trained on.
-
     """
     preset = PRESETS[options.preset]
     training = replace(preset.training, steps=options.train_steps or preset.training.steps, seconds=options.seconds)
@@ -331,7 +328,6 @@ def _gather(
 
     Raises:
         InputError: no LiDAR point lies in any training picture.
-
     """
     weighted = any(scene.has("motion") for scene in scenes)
     split = _thinned([training_split(scene) for scene in scenes], settings.working_px, weighted, console)
@@ -398,7 +394,6 @@ def _weights_of_before(
 
     Raises:
         InputError: the file is what training starts from, or is not this project's.
-
     """
     if options.model is not None and weights.resolve() == options.model.resolve():
         raise InputError(
@@ -434,7 +429,6 @@ def training_split(scene: SceneFolder) -> Split:
 
     Raises:
         InputError: it has no LiDAR, or does not say what is held out.
-
     """
     if not all("lidar" in picture.files for picture in scene.pictures):
         raise InputError(

@@ -122,7 +122,6 @@ def load_examples(
 
     Raises:
         InputError: a file cannot be decoded, or has another size than its camera.
-
     """
     sizes = [working_size(p.lens.width, p.lens.height, working_px) for pictures in chosen for p in pictures]
     width, height = (-(-max(side) // multiple_px) * multiple_px for side in zip(*sizes, strict=True))

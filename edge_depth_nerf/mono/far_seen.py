@@ -98,7 +98,6 @@ def static_cloud(
 
     Raises:
         InputError: a file cannot be decoded, or has another size than its camera.
-
     """
     tops = []
     for picture in pictures:
@@ -162,7 +161,6 @@ def field_deg(
 
     Raises:
         InputError: a file cannot be decoded, or has another size than its camera.
-
     """
     edges = np.arange(-9000, 9001) * _ELEVATION_STEP_DEG
     counts = np.zeros(len(edges) - 1, np.int64)

@@ -35,7 +35,6 @@ class MapFiles:
 
         Raises:
             InputError: it cannot be read, or holds no positive number.
-
         """
         path = self.by_picture[picture.name]
         values = read_npy(path) if path.suffix == ".npy" else read_distance_png(path, self.metres_per_count)
@@ -58,7 +57,6 @@ def find_maps(scene: SceneFolder, folder: Path, kind: Kind, along: Along, metres
     Raises:
         FileNotFoundError: the folder or a map is not there.
         InputError: a map is of another size than its picture, or of a kind that is not read.
-
     """
     if not folder.is_dir():
         raise FileNotFoundError(
@@ -118,7 +116,6 @@ def npy_shape(path: Path) -> tuple[int, int]:
 
     Raises:
         InputError: not a .npy file, truncated, or not one map of floating-point numbers.
-
     """
     broken = "Save the map with numpy.save, as H×W floating-point numbers."
     with path.open("rb") as file:
@@ -142,7 +139,6 @@ def read_npy(path: Path) -> NDArray[np.float32]:
 
     Raises:
         InputError: as `npy_shape`.
-
     """
     shape = npy_shape(path)
     # beyond float32's range is infinity, which is no distance

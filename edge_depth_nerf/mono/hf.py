@@ -69,7 +69,6 @@ def load_ready_network(name: str, output: HfOutput = "auto") -> ReadyNetwork:
 
     Raises:
         InputError: it is not there, is no depth network, or misses some of its weights.
-
     """
     try:
         import transformers

@@ -22,7 +22,6 @@ def estimate_on_cluster(options: EstimateDepthOptions, console: Console | None =
     Raises:
         FileNotFoundError: a scene, the weights or a map are not there.
         InputError: an option, a scene, the weights, a map or the cluster cannot be used.
-
     """
     console = console or Console()
     # faults are told before anything travels

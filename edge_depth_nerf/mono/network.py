@@ -169,7 +169,6 @@ def load_network(path: Path) -> tuple[DepthNetwork, dict[str, Any]]:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: the file is broken, or holds another architecture.
-
     """
     tensors, header = read_tensors(path)
     settings = settings_from(header.get("settings"), path)
@@ -217,7 +216,6 @@ def settings_from(found: Any, path: Path) -> NetworkSettings:
 
     Raises:
         InputError: they describe no network of bounded size.
-
     """
     found = found if isinstance(found, dict) else {}
     channels, working_px = found.get("channels"), found.get("working_px")
@@ -258,7 +256,6 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: it is not such a file, or of another architecture.
-
     """
     from safetensors import SafetensorError, safe_open
 

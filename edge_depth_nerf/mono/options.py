@@ -72,7 +72,6 @@ class EstimateDepthOptions:
 
         Raises:
             InputError: an option is out of its range.
-
         """
         if not self.scenes:
             raise InputError("no scene is given; `estimate-depth` takes one or more scene folders.")

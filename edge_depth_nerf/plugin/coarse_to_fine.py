@@ -52,7 +52,6 @@ class CoarseToFine(RenderStateMachine):
             viewer: nerfstudio's.
             client: the browser.
             shows_detail: whether complete pictures are to have the detail of training pictures.
-
         """
         super().__init__(viewer, VISER_NERFSTUDIO_SCALE_RATIO, client)
         self._moves: dict[str, dict[str, str]] = self.transitions  # pyright: ignore[reportAttributeAccessIssue]
@@ -71,7 +70,6 @@ class CoarseToFine(RenderStateMachine):
 
         Args:
             first: The browser's own view, which it reports some more times before it goes where it was sent.
-
         """
         self._first, self._first_until_s = first, time.monotonic() + LONGEST_START_S
         self._requested = self.viewer.get_camera_state(self.client)

@@ -107,7 +107,6 @@ def apply_overrides(config: Any, overrides: dict[str, Any], where: str) -> None:
 
     Raises:
         InputError: names that do not exist or values of another type, all of them in one message.
-
     """
     problems = []
     for name, value in overrides.items():
@@ -138,7 +137,6 @@ def make_specifications(declared: dict[str, Any]) -> dict[str, MethodSpecificati
 
     Raises:
         InputError: an unknown preset, name or type; the message says where.
-
     """
     constants = {name: entry["value"] for name, entry in declared["constants"].items()}
     specifications = {}

@@ -106,7 +106,6 @@ class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig):
 
         Raises:
             InputError: the depth source is unknown, or is not in the scene.
-
         """
         if self.depth_source == "none":
             return None
@@ -353,7 +352,6 @@ def _load(dataset: FisheyeDepthDataset, cache: PriorCache | None, whole_windows:
 
     Raises:
         InputError: a file cannot be used. With `whole_windows`, also: a mask leaves too few pixels for evaluation.
-
     """
 
     def load(image_idx: int) -> PicturePixels:

@@ -39,7 +39,6 @@ def default_metres_per_unit(camera_positions_m: NDArray) -> float:
 
     Args:
         camera_positions_m: N×3 camera centres, metres.
-
     """
     half_extent_m = float(np.ptp(camera_positions_m, axis=0).max()) / 2
     return float(np.clip(half_extent_m, SMALLEST_METRES_PER_UNIT, LARGEST_METRES_PER_UNIT))
@@ -75,7 +74,6 @@ def check_meta(meta: dict[str, Any], path: Path) -> list[dict[str, Any]]:
 
     Raises:
         InputError: an unknown camera model, a frame without pose or intrinsics, a map that only some frames have.
-
     """
     model = meta.get("camera_model", "PINHOLE")
     supported = [name for name, kind in CAMERA_MODEL_TO_TYPE.items() if kind in SUPPORTED_CAMERA_TYPES]
@@ -166,7 +164,6 @@ class FisheyeDepth(Nerfstudio):
         Raises:
             FileNotFoundError: no scene there, or a file it names is missing.
             InputError: the scene cannot be used.
-
         """
         path = transforms_path(Path(self.config.data))
         meta = read_transforms(path)

@@ -78,7 +78,6 @@ class FisheyeDepthDataset(InputDataset):
         Returns:
             nerfstudio's image_idx, image and mask (H×W×1), and where the scene has them: lidar_distance_m and
             truth_distance_m (H×W×1 float32), truth_rgb (H×W×3 float32).
-
         """
         rgb = torch.from_numpy(self.rgb(image_idx))
         data: dict[str, Any] = {

@@ -91,7 +91,6 @@ class TrainingDetail:
 
         Returns:
             What is to be added to its colours, on the distance's device.
-
         """
         device = self.model.device
         origins, directions = (each.reshape(-1, 3).to(device) for each in (rays.origins, rays.directions))

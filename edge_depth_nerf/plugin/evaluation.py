@@ -78,7 +78,6 @@ class ViewEvaluation:
             distance_m: rendered distances.
             batch: the datamanager's: mask, image and what else is known.
             lpips: its network; None where its weights are missing.
-
         """
         mask = batch["mask"][..., 0].to(rgb.device)
         metrics = {}

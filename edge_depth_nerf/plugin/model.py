@@ -131,7 +131,6 @@ class EdgeDepthNerfModel(NerfactoModel):
 
         Raises:
             InputError: the loss on the prior is not registered.
-
         """
         metadata = self.kwargs.get("metadata") or {}
         self.metres_per_unit: float = metadata.get("metres_per_unit", 1.0)
@@ -244,7 +243,6 @@ class EdgeDepthNerfModel(NerfactoModel):
             ray_bundle: the rays.
             batch: in training what the datamanager serves beside them; of its surface pixels, where it has any, the
                 outputs hold the colours that the field has at their surfaces, `surface_rgb`.
-
         """
         bounded = ray_bundle.fars is not None
         if self.collider is not None:
@@ -440,7 +438,6 @@ class EdgeDepthNerfModel(NerfactoModel):
             against the picture without noise where it is known. The pictures hold `distance`, the median distance
             in metric colours, besides nerfacto's. The errors of the median distance (1-60 m) against LiDAR and
             truth, where there are any, are in `pooled_depth_errors`: a view without them has no figure of its own.
-
         """
         metrics, images = super().get_image_metrics_and_images(outputs, batch)
         lpips = self.lpips.load(self.device)

@@ -63,7 +63,6 @@ class EdgeDepthPipeline(VanillaPipeline):
 
         Raises:
             InputError: the model has a depth loss, but no training pixel has a prior; or its far plane is out of range.
-
         """
         model, data = config.model, config.datamanager
         assert isinstance(model, EdgeDepthNerfModelConfig) and isinstance(data, FisheyeDepthDataManagerConfig)
@@ -100,7 +99,6 @@ class EdgeDepthPipeline(VanillaPipeline):
 
         Raises:
             InputError: it is of tiny-cuda-nn; nerfstudio would load what fits, and say nothing of the rest.
-
         """
         # tiny-cuda-nn keeps table and network in one parameter
         if not any(key.endswith(".hash_table") for key in loaded_state):
@@ -116,7 +114,6 @@ class EdgeDepthPipeline(VanillaPipeline):
         Raises:
             NotFiniteError: a loss is not finite; before the step is taken. On a GPU, which would have to be waited for,
                 such steps are counted, and several end the training.
-
         """
         manager = self.datamanager
         self.detail.forget()
@@ -146,7 +143,6 @@ class EdgeDepthPipeline(VanillaPipeline):
 
         Raises:
             NotFiniteError: there were several since the last look.
-
         """
         total = torch.stack([loss.detach() for loss in losses.values()]).sum()
         # what is not finite, less itself, is NaN

@@ -56,7 +56,6 @@ def unpacked(
     Returns:
         Picture, row and column, int64 [n, 3]; colours in 0..1, [n, 3]; distances and sigmas in metres, and whether a
         pixel shows the sky, [n, 1] each.
-
     """
     count = len(packed) // BYTES
     indices, rgb = torch.empty(count, 3, dtype=torch.int64), torch.empty(count, 3)

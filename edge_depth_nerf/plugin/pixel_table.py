@@ -83,7 +83,6 @@ def decode(packed: UInt8[Tensor, "n 15"]) -> PixelBatch:
 
     Args:
         packed: the bytes of `PixelTable.records`.
-
     """
     # distance, sigma, low and high half of the picture's number, row, column
     words = packed[:, 3:].contiguous().view(torch.int16).int() & 0xFFFF
@@ -107,7 +106,6 @@ class PixelTable:
 
         Raises:
             InputError, OSError, ValueError: it is not there, of another version, or not whole.
-
         """
         if not is_whole(path, TABLE_VERSION):
             raise InputError(f"{path}: missing, changed, or of another version")
@@ -148,7 +146,6 @@ class PixelTable:
             count: of pixels.
             keep: whether a pixel is in the batch, by its distance and sigma in metres and whether it shows the sky, [n]
                 each. None: all are.
-
         """
         # imported here, because Numba takes half a second to load
         from edge_depth_nerf.plugin.pixel_records_numba import unpacked
@@ -188,7 +185,6 @@ def write_table(path: Path, most_pixels: int, pictures: Iterable[PicturePixels])
 
     Raises:
         InputError: no valid pixel in any picture.
-
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     rng, number, pixels, with_prior = np.random.default_rng(0), 0, 0, 0

@@ -84,7 +84,6 @@ def points_on(bundles: Sequence[RayBundle], distances: Sequence[Tensor], fused: 
         bundles: the rays, one set after the other.
         distances: of each set, [rays], scene units.
         fused: whether the samples are of our form.
-
     """
     origins, directions, areas, pictures = (
         torch.cat([getattr(bundle, name) for bundle in bundles])
@@ -131,7 +130,6 @@ def render(
 
     Returns:
         Pixels with their background; at evaluation in 0..1.
-
     """
     plain = not scales_gradients and renderers.BACKGROUND_COLOR_OVERRIDE is None
     if plain and background is not None and isinstance(field, FusedNerfactoField) and field.may_render(samples, points):

@@ -122,7 +122,6 @@ def why_not(model: EdgeDepthNerfModel, device: str, world_size: int, accumulates
         device: where.
         world_size: processes that train together.
         accumulates: whether gradients of several steps are added.
-
     """
     if torch.device(device).type != "cuda":
         return "there is no GPU"
@@ -147,7 +146,6 @@ class StepGraphs:
             pipeline: an EdgeDepthPipeline.
             scale: of mixed precision, applied to the loss.
             capture: records a function.
-
         """
         self._pipeline, self._scale, self._capture = pipeline, scale, capture
         self._parameters: list[Tensor] = [each for group in pipeline.get_param_groups().values() for each in group]
@@ -171,7 +169,6 @@ class StepGraphs:
 
         Returns:
             Outputs, losses and metrics, until the next replay; None where the caller has to compute them.
-
         """
         if self._is_off:
             return None

@@ -146,7 +146,6 @@ def step_losses_of(config: Any) -> dict[str, StepLoss]:
 
     Raises:
         InputError: the loss on the prior is not registered.
-
     """
     name = config.depth_loss
     if name == "none":

@@ -59,7 +59,6 @@ def turned(
 
     Raises:
         IndexError: a camera, or a place in the table, that there is none of.
-
     """
     count = len(indices)
     origins, directions, rest = torch.empty(count, 3), torch.empty(count, 3), torch.empty(count, 2)

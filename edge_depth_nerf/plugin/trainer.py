@@ -65,7 +65,6 @@ class EdgeDepthTrainerConfig(TrainerConfig):
 
         Raises:
             FileNotFoundError: there is no scene at `--data`; then nothing is written.
-
         """
         say_errors_plainly()
         ignore_deprecations_of_host()
@@ -133,7 +132,6 @@ class EdgeDepthTrainer(Trainer):
         Raises:
             SystemExit: after Ctrl-C, with status 130 and a checkpoint of the last step. After a completed training
                 Ctrl-C only closes the viewer, and is no error.
-
         """
         if self.world_size > 1 or threading.current_thread() is not threading.main_thread():
             super().train()  # nerfstudio ends the processes of its ranks; only the main thread receives signals
@@ -177,7 +175,6 @@ class EdgeDepthTrainer(Trainer):
 
         Raises:
             InputError: a loss was not finite. The message names the pictures and the last checkpoint.
-
         """
         try:
             with self._interruption.put_off(), self._threads():
@@ -201,7 +198,6 @@ class EdgeDepthTrainer(Trainer):
 
         Raises:
             InputError: a parameter is not finite, or the file cannot be written. The checkpoint before is kept.
-
         """
         for name, parameter in self.pipeline.model.named_parameters():
             # a sum is not finite if one of its terms is not
@@ -243,7 +239,6 @@ class EdgeDepthTrainer(Trainer):
 
         Raises:
             InputError: there is none.
-
         """
         folder = self.config.load_dir
         if folder is None or self.config.load_step is not None:

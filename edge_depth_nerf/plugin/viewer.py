@@ -114,7 +114,6 @@ def lens_cap(
 
     Returns:
         Corners, ring by ring from the axis to the rim; the pixel (x, y) of each; triangles.
-
     """
     ring = torch.linspace(0, 1, RINGS + 1, dtype=torch.float64)
     theta = ring[:, None] * torch.from_numpy(rim_rad(camera, theta_max_rad))

@@ -124,7 +124,6 @@ def find_features(picture: PosedPicture, most: int = MOST_FEATURES) -> Features:
 
     Raises:
         InputError: the picture or its mask cannot be read.
-
     """
     rgb = picture.read_rgb()
     height, width = rgb.shape[:2]
@@ -187,7 +186,6 @@ def match_pictures(
 
     Raises:
         InputError: a picture or its mask cannot be read.
-
     """
     last = {index: number for number, pair in enumerate(pairs) for index in pair}
     features: dict[int, Features] = {}
@@ -281,7 +279,6 @@ def along_drive(
 
     Raises:
         InputError: a picture or its mask cannot be read.
-
     """
     found = []
     for matches in match_pictures(pictures, successive(pictures, apart, most)):

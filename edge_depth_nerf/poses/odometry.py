@@ -71,7 +71,6 @@ def import_kiss_icp() -> Any:
 
     Raises:
         InputError: it is not installed, or too old.
-
     """
     try:
         import kiss_icp
@@ -96,7 +95,6 @@ def odometry(sweeps: Sequence[TimedSweep], advance: Callable[[], object] = lambd
 
     Raises:
         InputError: KISS-ICP is missing, or there are fewer than five sweeps.
-
     """
     kiss = import_kiss_icp()
     if len(sweeps) < MIN_SWEEPS:

@@ -44,7 +44,6 @@ def read_agreement(scene: Path, first: Trajectory | None = None) -> PathAgreemen
 
     Raises:
         InputError: the file holds something else.
-
     """
     path = scene / PATHS_AGREE
     if not path.is_file():

@@ -81,7 +81,6 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
     Raises:
         FileNotFoundError: a file is missing.
         InputError: an option, a file of the drive, or the output folder cannot be used.
-
     """
     console = console or Console()
     options.check()

@@ -31,7 +31,6 @@ def process_drive(options: ProcessOptions, console: Console | None = None) -> li
     Raises:
         FileNotFoundError: a file is missing.
         InputError: an option, a file of the drive, an output folder or the cluster cannot be used.
-
     """
     console = console or Console()
     options.check()
@@ -55,7 +54,6 @@ def cut(options: ProcessOptions, console: Console) -> list[ProcessOptions]:
     Raises:
         FileNotFoundError: a file of the drive is missing.
         InputError: a file of the drive cannot be used, or the output folder is a scene itself.
-
     """
     if (options.output / "transforms.json").exists():
         raise InputError(
@@ -106,7 +104,6 @@ def process(options: ProcessOptions, console: Console | None = None) -> ProcessR
     Raises:
         FileNotFoundError: a file is missing.
         InputError: an option, a file of the drive, or the output folder cannot be used.
-
     """
     console = console or Console()
     options.check()

@@ -50,7 +50,6 @@ def read_drive(options: ProcessOptions) -> Recording:
     Raises:
         FileNotFoundError: a folder or file of the drive is missing.
         InputError: an option or a file of the drive cannot be used.
-
     """
     converter = CONVERTERS[name_of(options)]
     return getattr(import_module(f"{__package__}.{converter.module}"), converter.reader)(options)
@@ -62,7 +61,6 @@ def convert(options: ProcessOptions, console: Console | None = None) -> ProcessR
     Raises:
         FileNotFoundError: a folder or file of the drive is missing.
         InputError: an option, a file of the drive, or the output folder cannot be used.
-
     """
     from edge_depth_nerf.process.build import process_recording
 

@@ -31,7 +31,6 @@ class FeatureMasks:
 
         Raises:
             InputError: a camera's mask cannot be read, or has another size; with --strict, a picture's.
-
         """
         recorded = self._cameras[picture.camera]
         if recorded.name not in self._shared:

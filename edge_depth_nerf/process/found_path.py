@@ -29,7 +29,6 @@ def with_path(
         recording: its trajectory and its pictures' poses, if any, are replaced.
         trajectory: the vehicle's path.
         lacking: why a picture has no place on it; None = it has. The others are listed in `skipped`.
-
     """
     to_vehicle = {camera.name: camera.to_vehicle for camera in recording.cameras}
     kept, skipped = [], []
@@ -62,7 +61,6 @@ def upright(recording: Recording, trajectory: Trajectory) -> Trajectory:
     Args:
         recording: whose scanners, or cameras where it has none, say which way is up.
         trajectory: the vehicle's path in any world, in metres.
-
     """
     rotations = trajectory.vehicle_to_world[:, :3, :3]
     up = (rotations @ _up_in_vehicle(recording)).mean(0)

@@ -32,7 +32,6 @@ def read_jbnu_depth360(options: JbnuDepth360Options) -> Recording:
     Raises:
         FileNotFoundError: a folder or file of the data set is missing.
         InputError: an option or a file of the data set cannot be used.
-
     """
     options.check()
     for folder in ("image", "bin"):

@@ -50,7 +50,6 @@ def lidar_poses(recording: Recording, options: ProcessOptions, console: Console)
     Raises:
         InputError: KISS-ICP is not installed, there are too few sweeps or a gap between them, a sweep cannot be
             read, the vehicle stands or turns on the spot, or the path is none of a vehicle.
-
     """
     sweeps = [sweep for sweep in check_sweeps(recording) if options.strict or read_if_whole(sweep.read) is not None]
     trajectory = upright(recording, path_of(sweeps, console))
@@ -74,7 +73,6 @@ def check_sweeps(recording: Recording) -> list[RecordedSweep]:
 
     Raises:
         InputError: KISS-ICP is missing, there are no sweeps, too few, too thin ones, or a gap between them.
-
     """
     import_kiss_icp()
     if not recording.sweeps:
@@ -117,7 +115,6 @@ def path_of(sweeps: Sequence[RecordedSweep], console: Console) -> Trajectory:
 
     Raises:
         InputError: there are too few sweeps, or one cannot be read.
-
     """
     timed = [TimedSweep(sweep.time_s, partial(_read, sweep)) for sweep in sweeps]
     with progress_bars(console, counted=True) as progress:

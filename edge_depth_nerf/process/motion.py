@@ -52,7 +52,6 @@ def add_motion(scene: SceneFolder, console: Console) -> None:
 
     Raises:
         InputError: a picture or a mask cannot be used.
-
     """
     pictures = [picture for picture in scene.pictures if not picture.held_out]
     if len(pictures) < FEWEST_PICTURES:

@@ -85,7 +85,6 @@ def find_moving(
 
     Raises:
         InputError: there are no sweeps.
-
     """
     if not recording.sweeps:
         raise InputError(
@@ -262,7 +261,6 @@ def _at_time(
 
     Returns:
         Their points; of each long thing those at the upper edge of the scanner's field; rows of their LiDAR points.
-
     """
     moving, cut_off, rows = [_Points(np.zeros((0, 3)), np.zeros(0, np.float32))], [], [np.zeros(0, np.int64)]
     for thing in things:

@@ -98,7 +98,6 @@ class ProcessOptions:
 
         Raises:
             InputError: they reach beyond it; `what` says which frames there are.
-
         """
         last = max(end, self.first) if self.frames is None else self.first + (self.frames - 1) * self.stride
         if last > end:
@@ -114,7 +113,6 @@ class ProcessOptions:
 
         Raises:
             InputError: an option is out of its range.
-
         """
         frames, scene, holdout, beams = self.frames, self.frames_per_scene, self.holdout_every, self.holdout_beams
         for fine, option, expected in (

@@ -29,7 +29,6 @@ def features_say(recording: Recording, options: ProcessOptions, console: Console
 
     Raises:
         InputError: under `strict`, a picture or a mask cannot be read.
-
     """
     lenses = {camera.name: camera.camera for camera in recording.cameras}
     masks = FeatureMasks(recording, options, dict.fromkeys(lenses, math.radians(options.theta_max_deg)))
@@ -76,7 +75,6 @@ def lidar_says(recording: Recording, scene: Path, console: Console) -> list[str]
 
     Raises:
         InputError: what an earlier run wrote down is broken.
-
     """
     assert recording.trajectory is not None
     # a run that goes on does not begin again

@@ -36,7 +36,6 @@ def read_tum(path: Path) -> tuple[Float64[np.ndarray, "poses"], Float64[np.ndarr
     Raises:
         FileNotFoundError: there is no such file.
         InputError: a line is not such a pose, or the times do not increase.
-
     """
     times, poses = [], []
     for line, values in _number_lines(path):
@@ -72,7 +71,6 @@ def read_kitti(path: Path) -> Float64[np.ndarray, "poses 4 4"]:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: a line is not such a pose.
-
     """
     poses = []
     for line, values in _number_lines(path):
@@ -95,7 +93,6 @@ def read_nerfstudio(path: Path) -> dict[str, Transform]:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: no frames, or a frame without name or pose.
-
     """
     content = read_json(path)
     frames = content.get("frames") if isinstance(content, dict) else None
@@ -125,7 +122,6 @@ def read_times(path: Path) -> list[tuple[str | None, float]]:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: a line is neither, or some have names and some have none.
-
     """
     found: list[tuple[str | None, float]] = []
     for line, words in _lines(path):
@@ -144,7 +140,6 @@ def pose_of_quaternion(translation: list[float], quaternion: list[float], where:
 
     Raises:
         InputError: the quaternion's length is not 1; names `where`.
-
     """
     length = float(np.linalg.norm(quaternion))
     if not abs(length - 1) <= QUATERNION_TOLERANCE:
@@ -164,7 +159,6 @@ def transform_of_rows(rows: object, where: str) -> Transform:
 
     Raises:
         InputError: they are something else, or no rotation and translation; names `where`.
-
     """
     try:
         values = np.array(rows, np.float64)
@@ -192,7 +186,6 @@ def finite_number(word: str, where: str, remedy: str = "") -> float:
 
     Raises:
         InputError: it is none, or infinite; names `where`, and the remedy.
-
     """
     try:
         value = float(word)

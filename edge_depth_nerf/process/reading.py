@@ -80,7 +80,6 @@ def read_depth(depth: DepthFile, camera: Camera) -> Float[np.ndarray, "h w"]:
 
     Raises:
         InputError: broken, or not of the camera's size.
-
     """
     distance_m = read_distance_png(depth.path, depth.metres_per_count)
     if distance_m.shape != (camera.height, camera.width):

@@ -78,7 +78,6 @@ def read_rig_recording(options: RigOptions) -> Recording:
     Raises:
         FileNotFoundError: a folder or file of the recording is missing.
         InputError: an option or a file of the recording cannot be used.
-
     """
     options.check()
     if not options.root.is_dir():
@@ -105,7 +104,6 @@ def recording_of_rig(rig: Rig, options: RigOptions | JbnuDepth360Options, kind: 
     Raises:
         FileNotFoundError: a folder or file of the recording is missing.
         InputError: an option or a file of the recording cannot be used.
-
     """
     root, cameras = options.root, _chosen(rig, options.cameras)
     files = {camera.name: _timed(_files(root, camera.images, IMAGE_SUFFIXES), camera) for camera in cameras}

@@ -400,7 +400,6 @@ def read_rig(path: Path, root: Path, prepare: Callable[[dict[str, Any]], None] |
     Raises:
         FileNotFoundError: there is no such file.
         InputError: not TOML or JSON; a key is missing, unknown or wrong.
-
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; it describes the cameras and scanners (docs/rig.md).")

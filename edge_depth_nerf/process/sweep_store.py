@@ -201,7 +201,6 @@ class SweepStore:
         options: sweeps, raw_lidar, holdout_beams; under strict a sweep that cannot be read is an error for all
             pictures, else only for those of its own frame.
         held_out: numbers of the frames that training must not see.
-
     """
 
     def __init__(self, recording: Recording, options: ProcessOptions, held_out: Collection[int]) -> None:

@@ -116,7 +116,6 @@ def agreements(recording: Recording, usable: Mapping[str, Bool[np.ndarray, "h w"
 
     Returns:
         Those that can be told: of cameras that move, of pictures with contrast.
-
     """
     found = []
     scanners = dict.fromkeys(sweep.scanner for sweep in recording.sweeps)

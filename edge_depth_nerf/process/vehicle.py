@@ -76,7 +76,6 @@ def vehicle_masks(recording: Recording) -> dict[str, NDArray[np.bool_]]:
     Raises:
         FileNotFoundError: one is not there.
         InputError: broken, or not of its camera's size.
-
     """
     with_mask = [(recorded, path) for recorded in recording.cameras if (path := recorded.ego_mask) is not None]
     return {recorded.name: read_camera_mask(path, recorded.camera) for recorded, path in with_mask}
@@ -92,7 +91,6 @@ def find_vehicle(
 
     Returns:
         The recording with all masks' files, and what the user should know.
-
     """
     cameras, notices = [], []
     not_found: dict[str, list[Path]] = defaultdict(list)

@@ -58,7 +58,6 @@ def show_points(scene: SceneFolder, most: int = MOST_POINTS) -> ShownPoints | No
 
     Raises:
         InputError: the point cloud cannot be read.
-
     """
     cloud = scene.cloud()
     if cloud is None:

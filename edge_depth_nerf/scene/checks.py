@@ -23,7 +23,6 @@ def check_size(path: Path, camera: Camera) -> PngHeader:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: it is not.
-
     """
     header = read_png_header(path)
     if (header.width, header.height) != (camera.width, camera.height):
@@ -37,7 +36,6 @@ def check_distance(path: Path, camera: Camera) -> None:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: it is not, or not a distance map.
-
     """
     header = check_size(path, camera)
     if not header.is_distance:
@@ -53,7 +51,6 @@ def read_camera_mask(path: Path, camera: Camera) -> NDArray[np.bool_]:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: broken, or not of the camera's size.
-
     """
     mask = read_mask(path)
     if mask.shape != (camera.height, camera.width):
@@ -74,7 +71,6 @@ def require_folder(folder: Path, remedy: str) -> None:
 
     Raises:
         FileNotFoundError: it is not; with what is there instead, and the remedy.
-
     """
     if folder.is_dir():
         return
@@ -114,7 +110,6 @@ class Tolerance:
     Args:
         strict: nothing may be left out.
         pictures: how many there are in all.
-
     """
 
     def __init__(self, strict: bool, pictures: int) -> None:
@@ -135,7 +130,6 @@ class Tolerance:
 
         Raises:
             InputError, FileNotFoundError: `error`, where nothing more can be left out.
-
         """
         with self._lock:
             if self.strict:

@@ -122,7 +122,6 @@ def read_transforms(path: Path) -> dict[str, Any]:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: the file is broken, has no frames, a number is none, or a path leads out of the scene's folder.
-
     """
     meta = read_json(path)
     if not isinstance(meta, dict) or not isinstance(meta.get("frames"), list) or not meta["frames"]:
@@ -150,7 +149,6 @@ def number_of(value: Any, where: str) -> float:
 
     Raises:
         InputError: it is none, or not finite; names `where`.
-
     """
     found = finite(value)
     if found is None:
@@ -163,7 +161,6 @@ def pose_of(frame: Mapping[str, Any], where: str) -> Float64[np.ndarray, "4 4"]:
 
     Raises:
         InputError: it is not 4×4 finite numbers, or lies nowhere near; names `where`.
-
     """
     return _matrix(frame.get("transform_matrix"), f"{where}: transform_matrix", 4)
 

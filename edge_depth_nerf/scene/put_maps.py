@@ -53,7 +53,6 @@ def write_maps(
         FileNotFoundError: no scene there.
         InputError: no such source; a map has another size than its camera, no value at all, or is of no frame; frames
             without a map; "trained_on" is missing.
-
     """
     if layer not in later_layers():
         raise InputError(f"{layer!r} is no source of depth; expected one of {', '.join(later_layers())}.")
@@ -120,7 +119,6 @@ def usable_distance(
 
     Raises:
         InputError: the map has another size than its camera, or nothing is left and it may not be empty.
-
     """
     size = (picture.lens.width, picture.lens.height)
     if metres.shape != size[::-1]:

@@ -168,7 +168,6 @@ class SceneFolder:
 
         Raises:
             InputError: it cannot be decoded, or has another size than the camera.
-
         """
         return self._checked(picture, layer, read_image(picture.files[layer]))
 
@@ -177,7 +176,6 @@ class SceneFolder:
 
         Raises:
             InputError: the mask cannot be decoded, or has another size than the camera.
-
         """
         # the size in transforms.json may be anything, that of a decoded mask is in memory already
         mask = self.mask(picture)
@@ -193,7 +191,6 @@ class SceneFolder:
 
         Raises:
             InputError: it cannot be decoded, or has another size than the camera.
-
         """
         path = picture.files.get(layer)
         if path is None:
@@ -218,7 +215,6 @@ class SceneFolder:
 
         Raises:
             InputError: it cannot be decoded, or has another size than the camera.
-
         """
         found = self.distance_m(picture, "lidar")
         return np.zeros((picture.lens.height, picture.lens.width), np.float32) if found is None else found
@@ -228,7 +224,6 @@ class SceneFolder:
 
         Raises:
             InputError: a file cannot be decoded, or has another size than the camera.
-
         """
         rgb = self.rgb(picture)
         usable = self.usable(picture)
@@ -252,7 +247,6 @@ class SceneFolder:
 
         Raises:
             InputError: it cannot be read.
-
         """
         cloud = self.cloud()
         return None if cloud is None else cloud[0]
@@ -262,7 +256,6 @@ class SceneFolder:
 
         Raises:
             InputError: it cannot be read.
-
         """
         if self.points_path is None:
             return None
@@ -283,7 +276,6 @@ def read_scene(scene: Path) -> SceneFolder:
     Raises:
         FileNotFoundError: no scene there.
         InputError: the file is broken, or names a file that is missing.
-
     """
     path = scene if scene.suffix == ".json" else scene / TRANSFORMS
     if not path.is_file():
@@ -310,7 +302,6 @@ def scene_of(
 
     Raises:
         InputError: a camera model that is not known, or a value that cannot be used.
-
     """
     frames = meta["frames"]
     model = meta.get("camera_model", "PINHOLE")

@@ -248,7 +248,6 @@ def write_scene(
 
     Raises:
         InputError: the cameras, frames or maps cannot make a scene, or the folder holds something else.
-
     """
     console = console or Console()
     by_name = {camera.name: camera for camera in cameras}
@@ -383,7 +382,6 @@ def open_scene(output: Path, source: Mapping[str, Any]) -> None:
 
     Raises:
         InputError: it holds something else, or cannot be written.
-
     """
     record = {"made_by": f"edge-depth-nerf {__version__}", **source}
     path = output / RECORD
@@ -431,7 +429,6 @@ def check_cameras(cameras: Sequence[SceneCamera], theta_max_deg: float) -> None:
 
     Raises:
         InputError: nerfstudio has no camera that is near enough to one, or its mask hides everything.
-
     """
     _fits(cameras, theta_max_deg)
     for camera in cameras:

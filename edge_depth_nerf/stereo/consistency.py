@@ -86,7 +86,6 @@ def confirm(
         swept: its sweep.
         neighbours: pictures with sweeps of their own.
         theirs: the inverse distances of these, 0 where they are not `worth_asking`.
-
     """
     # imported here, because Numba takes half a second to load
     from edge_depth_nerf.stereo import sphere_sweep

@@ -85,7 +85,6 @@ def _open_folder(options: SynthesizeOptions) -> None:
 
     Raises:
         InputError: it holds something else.
-
     """
     folder, manifest = options.output, _manifest(options)
     check_is_folder(folder)
@@ -202,7 +201,6 @@ def synthesize_drive(options: SynthesizeOptions) -> Path:
 
     Raises:
         InputError: an option is out of range, or the output folder holds something else.
-
     """
     options.check()
     _open_folder(options)

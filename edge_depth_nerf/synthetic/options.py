@@ -73,7 +73,6 @@ class SynthesizeOptions:
 
         Raises:
             InputError: a value cannot be used; names the option, the value and the range.
-
         """
         for name, choices in (("scene", SceneName), ("layout", LayoutName), ("body", BodyName)):
             if (given := getattr(self, name)) not in get_args(choices):

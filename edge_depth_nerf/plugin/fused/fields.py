@@ -137,7 +137,6 @@ class FusedNerfactoField(NerfactoField):
 
         Returns:
             What `forward` gives for each, without normals; densities of the first alone.
-
         """
         if not isinstance(self.spatial_distortion, CubeContraction) or self.use_pred_normals:
             return [self.forward(samples) for samples in parts]
@@ -166,7 +165,6 @@ class FusedNerfactoField(NerfactoField):
 
         Returns:
             What `forward_together`, weights and nerfstudio's renderer give.
-
         """
         from edge_depth_nerf.kernels.rendering_numba import render
 

@@ -19,7 +19,6 @@ def distortion_loss(edges: Float[Tensor, "rays edges"], weights: Float[Tensor, "
     Args:
         edges: of the samples, ascending, in the spacing of 0..1.
         weights: rendering weights.
-
     """
     compute = None if edges.requires_grad else DISTORTION_LOSS.compiled_for(edges, weights)
     return (compute or formulas.distortion_loss)(edges, weights)

@@ -202,7 +202,6 @@ def samples_along(
         starts: distances along the rays, scene units.
         ends: likewise.
         more: other fields of the samples, of their shape.
-
     """
     if rays.origins.ndim != 2 or any(isinstance(each, dict) for each in rays.metadata.values()):
         return rays.get_ray_samples(bin_starts=starts, bin_ends=ends, **more)

@@ -123,7 +123,6 @@ def colmap_lens(camera: Camera, theta_max_rad: float = math.radians(THETA_MAX_DE
 
     Raises:
         InputError: no Kannala-Brandt camera comes near.
-
     """
     limit = min(theta_max_rad, camera.theta_max_rad)
     if isinstance(camera, Pinhole) and not camera.k4:
@@ -144,7 +143,6 @@ def colmap_lenses(recording: Recording, options: ProcessOptions) -> dict[str, Co
 
     Raises:
         InputError: one has no counterpart.
-
     """
     limit = math.radians(min(options.theta_max_deg, THETA_MAX_DEG))
     return {camera.name: colmap_lens(camera.camera, limit) for camera in recording.cameras}
@@ -155,7 +153,6 @@ def import_pycolmap(option: str = "--poses colmap") -> Any:
 
     Raises:
         InputError: it is not installed, or too old.
-
     """
     try:
         import pycolmap
@@ -178,7 +175,6 @@ def check_folder(folder: Path) -> None:
 
     Raises:
         InputError: it holds something else.
-
     """
     if folder.is_dir() and any(folder.iterdir()) and not (folder / _RECORD).is_file():
         raise InputError(
@@ -195,7 +191,6 @@ def find_models(recording: Recording, options: ProcessOptions, folder: Path, con
 
     Raises:
         InputError: pycolmap is missing, or `folder` holds something else.
-
     """
     run = _Run(import_pycolmap(), recording, options, folder, console)
     run.prepare()
@@ -460,7 +455,6 @@ class _Run:
 
         Raises:
             InputError: a model in the folder is broken, or of other pictures.
-
         """
         found = []
         for folder in sorted(models.iterdir()):

@@ -45,7 +45,6 @@ def colmap_poses(recording: Recording, options: ProcessOptions, console: Console
     Raises:
         InputError: pycolmap is not installed, there are fewer than three pictures, no LiDAR, nothing could be
             related, LiDAR and the reconstruction share too little for a scale, or the path breaks.
-
     """
     check_colmap(recording, options)
     models = find_models(recording, options, _folder(options), console)
@@ -77,7 +76,6 @@ def check_colmap(recording: Recording, options: ProcessOptions) -> None:
     Raises:
         InputError: pycolmap is missing, there are too few pictures or none with LiDAR, a lens has no counterpart in
             COLMAP, or the folder to work in holds something else.
-
     """
     import_pycolmap()
     check_folder(_folder(options))

@@ -106,7 +106,6 @@ def refine_poses(recording: Recording, options: ProcessOptions, console: Console
 
     Raises:
         InputError: pycolmap is missing or too old, the recording has no path; with --strict, a picture is broken.
-
     """
     pycolmap = import_pycolmap(OPTION)
     trajectory = recording.trajectory
@@ -160,7 +159,6 @@ def check_refining(recording: Recording, options: ProcessOptions) -> None:
 
     Raises:
         InputError: pycolmap is missing, or a lens has no counterpart in COLMAP.
-
     """
     import_pycolmap(OPTION)
     colmap_lenses(recording, options)

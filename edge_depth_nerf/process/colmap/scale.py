@@ -120,7 +120,6 @@ def join_models(recording: Recording, models: Sequence[ColmapModel], scales: Arr
 
     Raises:
         InputError: the first model has fewer than two frames.
-
     """
     times = frame_times(recording)
     scales = np.array(scales, np.float64)
@@ -219,7 +218,6 @@ def metric_path(recording: Recording, models: Sequence[ColmapModel]) -> tuple[Me
 
     Raises:
         InputError: too few features have LiDAR beside them.
-
     """
     # as if each sweep were taken all at once, for a first scale of each model alone
     first = [_together(_ratios(recording, [model], [1.0], None)) for model in models]
@@ -253,7 +251,6 @@ def find_scale_break(along: Mapping[int, Float64[np.ndarray, "_"]]) -> ScaleBrea
 
     Returns:
         Where it changes most, if it is nowhere near one scale; None if it is, or too few frames have LiDAR.
-
     """
     frames = [frame for frame, found in along.items() if len(found)]
     counts = np.cumsum([0] + [len(along[frame]) for frame in frames])

@@ -50,7 +50,6 @@ def read_rig(calibration: Path, cameras: tuple[str, ...]) -> Kitti360Rig:
     Raises:
         FileNotFoundError: a file is missing.
         InputError: a file is truncated or holds something else.
-
     """
     pose_file = calibration / "calib_cam_to_pose.txt"
     camera_to_pose = read_cam_to_pose(pose_file)
@@ -76,7 +75,6 @@ def read_mei_camera(path: Path) -> MEI:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: broken, truncated, or another camera model.
-
     """
     values, lines = _read_yaml(path)
 
@@ -130,7 +128,6 @@ def read_cam_to_pose(path: Path) -> dict[str, Transform]:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: a line is not a name and 12 numbers that are a rotation and a translation.
-
     """
     transforms = {}
     for number, line in _lines(path):
@@ -149,7 +146,6 @@ def read_cam_to_velo(path: Path) -> Transform:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: not one line of 12 numbers that are a rotation and a translation.
-
     """
     lines = list(_lines(path))
     if len(lines) != 1:
@@ -163,7 +159,6 @@ def read_poses(path: Path) -> dict[int, Transform]:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: a line is not a frame and 12 numbers, or a frame has two poses.
-
     """
     poses: dict[int, Transform] = {}
     for number, line in _lines(path):
@@ -188,7 +183,6 @@ def read_timestamps(path: Path) -> list[float]:
     Raises:
         FileNotFoundError: there is no such file.
         InputError: a line is not a time.
-
     """
     times = []
     for number, line in _lines(path):
@@ -220,7 +214,6 @@ def _read_yaml(path: Path) -> tuple[dict[str, tuple[int, str]], int]:
 
     Returns:
         Line and text of each value by its dotted name; and the number of the last line.
-
     """
     values: dict[str, tuple[int, str]] = {}
     group, last = "", 0

@@ -51,7 +51,6 @@ def read_kitti360(options: Kitti360Options) -> Recording:
     Raises:
         FileNotFoundError: a folder or file of the drive is missing.
         InputError: an option or a file of the drive cannot be used.
-
     """
     drive = Kitti360Drive(options)
     rig = read_rig(drive.calibration, options.cameras)
@@ -211,7 +210,6 @@ class Kitti360Drive:
     Raises:
         FileNotFoundError: a folder is missing.
         InputError: an option is out of its range.
-
     """
 
     def __init__(self, options: Kitti360Options) -> None:
@@ -257,7 +255,6 @@ class Kitti360Drive:
 
         Raises:
             InputError: the options reach beyond the drive, or nothing that they ask for is complete.
-
         """
         options = self.options
         images = {name: _numbered(self.image_folder(name), ".png") for name in options.cameras}
@@ -301,7 +298,6 @@ class Kitti360Drive:
         Raises:
             FileNotFoundError: a mask, monocular or true map is missing.
             InputError: a file is truncated, or not of its camera's size or kind.
-
         """
         options, camera, file = self.options, rig.cameras[name], f"{frame:010d}.png"
         mask = None if options.frame_masks is None else options.frame_masks / name / file
@@ -350,7 +346,6 @@ class Kitti360Drive:
 
         Raises:
             InputError: a line is not a time, or one of the `frames` has no line.
-
         """
         path = self.timestamps_file(camera)
         if not path.is_file():
