@@ -225,9 +225,7 @@ def methods() -> str:
     places = [place for _, place, _ in groups]
     text = METHODS_HEADER
     for title, place, cls in groups:
-        text += f"### {title}\n\n"
         is_parser = cls is FisheyeDepthDataParserConfig
-        text += DATAPARSER if is_parser else ""
         docs, hints = field_docs(cls), get_type_hints(cls, include_extras=True)
         rows = []
         for entry in dataclasses.fields(cls):
@@ -244,7 +242,9 @@ def methods() -> str:
                     default += f"; {name.removeprefix('edge-depth-nerf-')}: {shown(value)}"
             option = f"`--{dashed(entry.name)}`" if is_parser else f"`--{dashed(full)}`"
             rows.append((option, kind_of(hints[entry.name]), default, cell(docs[entry.name])))
-        text += table(rows, ("option", "values", "default", "what"))
+        if rows:
+            text += f"### {title}\n\n" + (DATAPARSER if is_parser else "")
+            text += table(rows, ("option", "values", "default", "what"))
     return text + presets()
 
 
