@@ -577,6 +577,14 @@ def test_the_examples_as_they_are_typed(clone):
     assert meta["mono"]["trained_on"] == "elsewhere"
     assert len(list((clone / "maps").rglob("*.npy"))) == len(meta["frames"]) == 24
     assert "mean relative error" in said
+    # the scene's maps are the network's, not those that it had
+    for frame in meta["frames"]:
+        picture = Path(frame["file_path"])
+        mono_m = read_distance_png(clone / "scenes/flat_road" / frame["mono_file_path"])
+        predicted_m = np.load(clone / "maps" / picture.parent.name / f"{picture.stem}.npy")
+        near = (mono_m > 0) & (predicted_m < 40)
+        assert near.mean() > 0.1
+        np.testing.assert_allclose(mono_m[near], predicted_m[near], atol=0.003)
     # a method of its own, of which the option is kept
     (config,) = (clone / "outputs/radar_drive/radar").glob("*/config.yml")
     assert "depth_source: radar" in config.read_text()
