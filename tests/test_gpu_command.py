@@ -93,7 +93,7 @@ def test_the_tests_of_a_gpu_are_found(gpu):
         for path in (ROOT / "tests").glob("test_*.py")
         if "@NEEDS_A_GPU" in (text := path.read_text(encoding="utf-8")) or "skipif(not torch.cuda" in text
     } - {Path(__file__).name}
-    assert found >= needing and len(needing) > 6
+    assert found >= needing and len(needing) == 6
 
 
 def test_a_trainer_that_fails_ends_no_other(gpu, monkeypatch):

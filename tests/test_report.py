@@ -628,7 +628,7 @@ def test_methods_kinds_and_drives_switch(opened):
     ticks = page.locator(".ticks span").all_inner_texts()
     assert ticks == ["0", "5", "10", "15", "20", "25 %"]
     page.get_by_role("radio", name="Distance error").check(force=True)
-    page.get_by_label("ShownDrive", exact=True).select_option(index=1)
+    page.get_by_label("Drive", exact=True).select_option(index=1)
     assert page.locator("input[name=view]").count() == 1
     # no distances are known there
     assert page.get_by_role("radio", name="Distance error").is_disabled()
@@ -692,7 +692,7 @@ def test_points_are_seen_in_3d(opened, cloud):
     assert (red(first) != red(space(page))).sum() < 100
 
     # another drive has no points
-    page.get_by_label("ShownDrive", exact=True).select_option(index=1)
+    page.get_by_label("Drive", exact=True).select_option(index=1)
     assert not page.locator("#points").is_visible()
 
 

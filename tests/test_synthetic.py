@@ -305,6 +305,7 @@ def agreement(points_in_camera: np.ndarray, camera: str, distance_m: np.ndarray)
 
 def test_deskewed_points_agree_with_the_distance_maps(street):
     _, root = street
+    assert len(rig.CAMERAS) == 2
     for camera in rig.CAMERAS:
         distance = read_distance_png(truth(root, camera, "distance", 1))
         share, in_front, count = agreement(in_camera(root, camera), camera, distance)
