@@ -164,7 +164,7 @@ def test_shifted_views_have_the_figures_of_the_whole_picture(tmp_path):
 def test_training_views_are_evaluated_by_the_beams_that_were_held_out(tmp_path, monkeypatch):
     scene = write_scene(tmp_path)
     meta = read_json(scene / "transforms.json")
-    plain, _ = build(scene)
+    plain = pipeline_of(scene)
     assert evaluate_beams(plain) == {}
     for frame in meta["frames"]:
         frame["beams_file_path"] = frame["truth_distance_file_path"]
