@@ -105,7 +105,8 @@ def test_on_a_gpu_a_batch_is_the_same_with_all_surface_pixels_and_which_are_of_u
     monkeypatch.setattr(datamanager_module, "SURFACE_SIGMA_M", float(sigma_m.median()))
     for step in range(3):
         rays, expected = data.next_train(step)
-        found_rays, found = other.batch_of(other.upload(step))
+        other.set_next(step)
+        found_rays, found = other.batch_of(other.packed())
         counts = found.pop("surface_counts")[:, 0]
         assert len(counts) == 400 and 0 < counts.sum() < 400
         pairs = [(rays, found_rays), (expected.pop("surface_rays"), found.pop("surface_rays")[counts])]

@@ -1,76 +1,89 @@
-"""Batches read ahead: the same ones in the same order, whatever is asked for."""
+"""Batches of a GPU: the same ones in the same order, from a table there or read ahead, whatever is asked for."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from test_pixel_table import table_of
 
-from edge_depth_nerf.plugin import upload
 from edge_depth_nerf.plugin.datamanager import TablePixelSampler
 from edge_depth_nerf.plugin.pixel_table import PixelTable, decode
-from edge_depth_nerf.plugin.upload import Stretch, Uploads
+from edge_depth_nerf.plugin.upload import SHARE_OF_MEMORY, Batches, TableOnDevice, Uploads, batches_on
 
 
 @pytest.fixture
-def tables(tmp_path) -> list[PixelTable]:
-    masks = [[np.ones((7, 9), bool)], [np.ones((5, 5), bool), np.ones((4, 4), bool)]]
-    return [table_of(tmp_path / f"{number}.npy", each) for number, each in enumerate(masks)]
+def table(tmp_path) -> PixelTable:
+    return table_of(tmp_path / "table.npy", [np.ones((7, 9), bool), np.ones((5, 5), bool)])
 
 
-def indices(packed: torch.Tensor) -> torch.Tensor:
-    return decode(packed).indices
+def next_indices(batches: Batches, samplers: list[TablePixelSampler], step: int = 0) -> torch.Tensor:
+    batches.set_next([sampler.draw(step) for sampler in samplers])
+    return decode(batches.packed()).indices
 
 
-def test_batches_of_two_tables_come_in_one_piece_and_in_order(tables):
-    samplers, others = ([TablePixelSampler(table, 10) for table in tables] for _ in range(2))
+@pytest.mark.parametrize("kind", [TableOnDevice, Uploads])
+def test_batches_of_two_samplers_come_in_one_piece_and_in_order(table, kind):
+    samplers, others = ([TablePixelSampler(table, count) for count in (10, 24)] for _ in range(2))
     for sampler, other in zip(samplers, others, strict=True):
         other._first = sampler._first
-    uploads = Uploads("cpu")
+    batches = kind(table, "cpu")
     for step in (0, 1, 2, 3, 7, 8, 20):  # a training is taken up again, and the end of the table is passed
-        found = indices(uploads.upload([sampler.draw(step) for sampler in samplers]))
+        found = next_indices(batches, samplers, step)
         expected = [other.sample(step).indices for other in others]
         assert torch.equal(found, torch.cat(expected)), step
-
-
-def test_the_next_batch_is_read_before_it_is_asked_for(tables, monkeypatch):
-    reads = []
-
-    def read(stretches):
-        reads.append([each.start for each in stretches])
-        return given(stretches)
-
-    given = upload.read
-    monkeypatch.setattr(upload, "read", read)
-    uploads, sampler = Uploads("cpu"), TablePixelSampler(tables[0], 10)
-    sampler._first = 0
-    uploads.upload([sampler.draw()])
-    uploads._reader.shutdown(wait=True)
-    assert reads == [[0], [10]]
-    uploads._reader = type(uploads._reader)(max_workers=1)
-    uploads.upload([sampler.draw()])
-    uploads._reader.shutdown(wait=True)
-    assert reads == [[0], [10], [20]]
     # the exporter asks for other numbers of rays
-    uploads._reader = type(uploads._reader)(max_workers=1)
-    sampler.num_rays_per_batch = 5
-    assert torch.equal(indices(uploads.upload([sampler.draw()])), tables[0].batch(20, 5).indices)
-    uploads._reader.shutdown(wait=True)
-    assert reads == [[0], [10], [20], [20], [25]]
+    for each in (samplers[0], others[0]):
+        each.num_rays_per_batch = 5
+    for _ in range(2):
+        assert torch.equal(next_indices(batches, samplers), torch.cat([other.sample().indices for other in others]))
 
 
-def test_of_several_processes_each_reads_its_part_ahead(tables):
+@pytest.mark.parametrize("kind", [TableOnDevice, Uploads])
+def test_of_several_processes_each_gets_its_part(table, kind):
     found = []
     for rank in range(2):
-        sampler, uploads = TablePixelSampler(tables[0], 10), Uploads("cpu")
+        sampler, batches = TablePixelSampler(table, 10), kind(table, "cpu")
         sampler._first, sampler._rank, sampler._world_size = 3, rank, 2
-        found.append([indices(uploads.upload([sampler.draw(step)])) for step in range(2)])
-        assert uploads._ahead is not None and uploads._ahead[0][0] == sampler.draw(2)
+        found.append([next_indices(batches, [sampler], step) for step in range(2)])
     every = torch.cat([found[rank][step] for step in range(2) for rank in range(2)])
-    assert torch.equal(every, tables[0].batch(3, 40).indices)
+    assert torch.equal(every, table.batch(3, 40).indices)
 
 
-def test_what_is_read_is_memory_of_its_own(tables):
-    first = upload.read([Stretch(tables[0], 0, 4, 4), Stretch(tables[1], 39, 4, 4)])
-    assert first.shape == (8, 15) and first.flags.owndata and first.flags.writeable
+def test_a_table_on_the_device_goes_on_by_itself(table):
+    """A recorded step takes the batch after the last one without a word of the host."""
+    batches, sampler = TableOnDevice(table, "cpu"), TablePixelSampler(table, 10)
+    sampler._first = 0
+    batches.set_next([sampler.draw()])
+    found = [decode(batches.packed()).indices for _ in range(3)]
+    assert torch.equal(torch.cat(found), table.batch(0, 30).indices)
+
+
+def test_the_next_batch_is_read_before_it_is_asked_for(table, monkeypatch):
+    reads: list[int] = []
+    given = PixelTable.records
+
+    def records(self: PixelTable, start: int, count: int) -> Any:
+        reads.append(start)
+        return given(self, start, count)
+
+    monkeypatch.setattr(PixelTable, "records", records)
+    uploads, sampler = Uploads(table, "cpu"), TablePixelSampler(table, 10)
+    sampler._first = 0
+    for step, expected in enumerate(([0, 10], [0, 10, 20])):
+        next_indices(uploads, [sampler], step)
+        assert uploads._ahead is not None
+        uploads._ahead[1].result()
+        assert reads == expected
+    # what was read ahead is not what is asked for
+    assert torch.equal(next_indices(uploads, [sampler], 7), table.batch(70, 10).indices)
+
+
+def test_a_table_lies_on_a_gpu_if_it_takes_a_quarter_of_its_free_memory(table, monkeypatch):
+    size = table.packed.nbytes
+    monkeypatch.setattr(TableOnDevice, "__init__", lambda self, table, device: None)
+    for free, expected in ((size / SHARE_OF_MEMORY, TableOnDevice), (size / SHARE_OF_MEMORY - 1, Uploads)):
+        monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _, free=free: (free, 2 * free))
+        assert type(batches_on("cuda:0", table)) is expected

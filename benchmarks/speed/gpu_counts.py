@@ -32,6 +32,7 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -144,7 +145,8 @@ class Counter(TorchDispatchMode):
         if on_device and name == "_local_scalar_dense":
             self._waits(name)
             return True if given[0].dtype == torch.bool else 1.0 if given[0].dtype.is_floating_point else 1
-        result = func(*args, **(kwargs or {}))
+        # torch has no fake form of it, and it returns nothing
+        result = None if name == "_fused_adam_" else func(*args, **(kwargs or {}))
         made = [each for each in tree_leaves(result) if isinstance(each, torch.Tensor)]
         kinds = {each.device.type for each in (*given, *made)}
         size = sum(each.numel() * each.element_size() for each in made)
@@ -209,6 +211,14 @@ def replaced(*changes: tuple[Any, str, Any]) -> Iterator[None]:
             setattr(holder, name, value)
 
 
+class NoCapture:
+    """Takes steps as those that are recorded, and records none."""
+
+    def stream(self) -> contextlib.AbstractContextManager[None]:
+        """The present one."""
+        return contextlib.nullcontext()
+
+
 class FakeGpu:
     """Fake tensors of a GPU, and what stands in for what only a driver could do."""
 
@@ -234,12 +244,12 @@ class FakeGpu:
                 if buffer is not None:
                     part._buffers[name] = self.tensor(buffer)
 
-    def backward(self, tensor: torch.Tensor) -> None:
-        """What `Tensor.backward` does here."""
+    def backward(self, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        """What torch's functions for gradients do here."""
         with self.counter.during("backward"), torch.autograd.set_multithreading_enabled(False):
             self._shim.pretend_devices(64)
             try:
-                torch.autograd.backward(tensor)
+                return function(*args, **kwargs)
             finally:
                 self._shim.pretend_devices(0)
 
@@ -255,7 +265,8 @@ class FakeGpu:
             replaced(
                 (torch.cuda.amp.common, "amp_definitely_not_available", lambda: False),
                 (torch.cuda, "device_of", lambda _: contextlib.nullcontext()),
-                (torch.Tensor, "backward", lambda tensor, *a, **k: self.backward(tensor)),
+                (torch.autograd, "grad", partial(self.backward, torch.autograd.grad)),
+                (torch.Tensor, "backward", lambda tensor, *a, **k: self.backward(torch.autograd.backward, tensor)),
                 (torch.Tensor, "pin_memory", lambda tensor: counter.pin(tensor)),
                 (JITFunction, "run", lambda kernel, *a, grid, warmup, **k: counter.launch(kernel, *a, **k)),
             ),
@@ -270,7 +281,8 @@ def fake_trainer(gpu: FakeGpu, method: str, scene: Path, folder: Path, **changes
     import torch.cuda.amp.common
 
     from edge_depth_nerf.plugin import config as methods
-    from edge_depth_nerf.plugin.upload import Uploads
+    from edge_depth_nerf.plugin.step_graphs import StepGraphs, why_not
+    from edge_depth_nerf.plugin.upload import TableOnDevice
 
     config: Any = copy.deepcopy(getattr(methods, method).config)
     config.machine.device_type, config.vis = "cuda", "tensorboard"
@@ -291,8 +303,13 @@ def fake_trainer(gpu: FakeGpu, method: str, scene: Path, folder: Path, **changes
     for module in (model, manager.train_ray_generator, manager.eval_ray_generator):
         gpu.move(module)
     manager.device = DEVICE
-    manager._uploads = Uploads(DEVICE)
+    trainer.pipeline._odd_steps = gpu.tensor(trainer.pipeline._odd_steps)
+    manager._batches = TableOnDevice(manager.train_pixel_sampler.table, "cpu")
+    manager._batches._records = gpu.tensor(manager._batches._records)
     trainer.optimizers = trainer.setup_optimizers()
+    if why_not(trainer) is None:
+        with gpu.mode:
+            trainer.graphs = StepGraphs(trainer, NoCapture())
     sampler = model.proposal_sampler
     sampler._step, sampler._steps_since_update = STEP, 100 if changes.get("updated", True) else 0
     return trainer
@@ -303,7 +320,10 @@ def counted_step(gpu: FakeGpu, trainer: Any) -> Counts:
     from nerfstudio.engine.callbacks import TrainingCallbackLocation as At
 
     model, manager, counter = trainer.pipeline.model, trainer.pipeline.datamanager, gpu.counter
-    manager.next_train = counter.named("data", manager.next_train)
+    for name in ("next_train", "batch_of", "packed"):
+        setattr(manager, name, counter.named("data", getattr(manager, name)))
+    if trainer.graphs is not None:
+        trainer.graphs._work = counter.named("scaler and optimisers", trainer.graphs._work)
     model.forward = counter.named("forward", model.forward)
     for name in ("get_metrics_dict", "get_loss_dict"):
         setattr(model, name, counter.named("metrics and losses", getattr(model, name)))
@@ -311,7 +331,7 @@ def counted_step(gpu: FakeGpu, trainer: Any) -> Counts:
     rest = sampler._steps_since_update
     for step in (STEP, STEP + 1):
         sampler._steps_since_update = rest
-        with gpu.counting(), counter.during("scaler and optimisers"):
+        with gpu.counting(), counter.during("scaler and optimisers" if trainer.graphs is None else "beside the graph"):
             for callback in trainer.callbacks:
                 callback.run_callback_at_location(step, location=At.BEFORE_TRAIN_ITERATION)
             trainer.train_iteration(step)

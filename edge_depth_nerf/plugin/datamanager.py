@@ -66,7 +66,7 @@ from edge_depth_nerf.plugin.pixel_table import (
     write_table,
 )
 from edge_depth_nerf.plugin.ray_table import TableRayGenerator
-from edge_depth_nerf.plugin.upload import Stretch, Uploads
+from edge_depth_nerf.plugin.upload import Batches, Stretch, batches_on
 from edge_depth_nerf.scene.format import LAYERS, depth_sources
 
 KEPT_TABLES = 8
@@ -157,7 +157,7 @@ class TablePixelSampler:
         self._drawn = max(self._drawn, step * self.num_rays_per_batch)
         start = self._first + self._drawn * self._world_size + self._rank * self.num_rays_per_batch
         self._drawn += self.num_rays_per_batch
-        return Stretch(self.table, start, self.num_rays_per_batch, self.num_rays_per_batch * self._world_size)
+        return Stretch(start, self.num_rays_per_batch, self.num_rays_per_batch * self._world_size)
 
 
 class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
@@ -188,7 +188,7 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
             table = self._table(self.train_dataset, "Integrating depth", with_prior=True)
             self.train_ray_generator = self._ray_generator(self.train_dataset)
         self.train_pixel_sampler = TablePixelSampler(table, self.config.train_num_rays_per_batch, self.device)
-        self._uploads = Uploads(self.device)
+        self._batches: Batches = batches_on(self.device, table)
         self._surface_sampler = None
         if self.config.surface_rays_per_batch > 0 and table.share_with_prior > 0:
             self._surface_sampler = TablePixelSampler(table, self.config.surface_rays_per_batch, self.device)
@@ -212,7 +212,8 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         """Return the rays of the next training batch and their supervision; surface_…: additional pixels, if any."""
         assert self.train_pixel_sampler is not None
         if torch.device(self.device).type != "cpu":
-            return self.batch_of(self.upload(step))
+            self.set_next(step)
+            return self.batch_of(self.packed())
         self.train_count += 1
         pixels = self.train_pixel_sampler.sample(step)
         self.trained_on = pixels.indices
@@ -225,14 +226,24 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
                 batch |= _of_surface(surface)
         return rays, batch
 
-    def upload(self, step: int) -> UInt8[Tensor, "n 15"]:
-        """Copy the packed records of the next training batch and all additional pixels to the device, at once."""
+    def _samplers(self) -> list[TablePixelSampler]:
+        return [sampler for sampler in (self.train_pixel_sampler, self._surface_sampler) if sampler is not None]
+
+    def rays_of_a_step(self) -> list[int]:
+        """Count the rays of a training batch, and its additional pixels."""
+        return [sampler.num_rays_per_batch for sampler in self._samplers()]
+
+    def set_next(self, step: int) -> None:
+        """Say which pixels `packed` gives next: those after the last ones, or of a later step."""
         self.train_count += 1
-        samplers = [sampler for sampler in (self.train_pixel_sampler, self._surface_sampler) if sampler is not None]
-        return self._uploads.upload([sampler.draw(step) for sampler in samplers])
+        self._batches.set_next([sampler.draw(step) for sampler in self._samplers()])
+
+    def packed(self) -> UInt8[Tensor, "n 15"]:
+        """Give the packed records of the training batch and of all additional pixels on the device, at once."""
+        return self._batches.packed()
 
     def batch_of(self, packed: UInt8[Tensor, "n 15"]) -> tuple[RayBundle, dict[str, Any]]:
-        """Return the rays of an uploaded batch and their supervision, like `next_train`, with all additional pixels."""
+        """Return the rays of a packed batch and their supervision, like `next_train`, with all additional pixels."""
         assert self.train_pixel_sampler is not None
         pixels = decode(packed)
         every, values = self._serve(pixels, self.train_ray_generator)

@@ -34,9 +34,18 @@ class PatientGradScaler(torch.amp.GradScaler):
         if self._enabled and new_scale is None and not self._some_stepped():
             return
         super().update(new_scale)
+        self.look()
+
+    def look(self) -> None:
+        """Look at the scale, if it is time; after a step whose scale was adapted by `torch.amp.GradScaler.update`."""
         self._updates += 1
         if self._updates % STEPS_PER_LOOK == 0:
             self._seen = super().get_scale()
+
+    def forget(self) -> None:
+        """Drop what an interrupted step has left."""
+        if self._enabled:
+            self._per_optimizer_states.clear()
 
     def _some_stepped(self) -> bool:
         """Say whether an optimiser's gradients were looked at since the last update."""

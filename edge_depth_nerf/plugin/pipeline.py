@@ -21,7 +21,6 @@ from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManager, FisheyeD
 from edge_depth_nerf.plugin.detail import TrainingDetail
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel, EdgeDepthNerfModelConfig
 from edge_depth_nerf.plugin.plain_errors import say_errors_plainly
-from edge_depth_nerf.plugin.step_graphs import Step, StepGraphs
 from edge_depth_nerf.plugin.viewer import DrivePanel
 
 FARTHEST_UNITS = 1e6
@@ -91,8 +90,7 @@ class EdgeDepthPipeline(VanillaPipeline):
         self.detail = self.model.detail = TrainingDetail(self.model, manager.train_dataset)
         self.model.register_load_state_dict_post_hook(lambda *_: self.detail.forget())
         self.drive = DrivePanel(manager, model.detail)
-        self._odd_steps: torch.Tensor | None = None
-        self.graphs: StepGraphs | None = None
+        self._odd_steps = torch.zeros((), dtype=torch.long, device=device)
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load a checkpoint as nerfstudio does.
@@ -115,22 +113,18 @@ class EdgeDepthPipeline(VanillaPipeline):
             NotFiniteError: a loss is not finite; before the step is taken. On a GPU, which would have to be waited for,
                 such steps are counted, and several end the training.
         """
-        manager = self.datamanager
         self.detail.forget()
-        if self.graphs is None:
-            found = self._computed(*manager.next_train(step))
-        else:
-            packed = manager.upload(step)
-            found = self.graphs.replayed(packed, step) or self._computed(*manager.batch_of(packed))
-        outputs, losses, _ = found
+        outputs, losses, metrics = self.computed(*self.datamanager.next_train(step))
+        total = torch.stack([loss.detach() for loss in losses.values()]).sum()
         if torch.device(self.device).type == "cpu":
-            if not bool(torch.stack([loss.detach() for loss in losses.values()]).isfinite().all()):
+            if not bool(total.isfinite()):
                 raise NotFiniteError(self._not_finite(step, outputs, losses))
         else:
-            self._count_not_finite(step, outputs, losses)
-        return found
+            self.count_not_finite(total)
+            self.look_for_not_finite(step, outputs, losses)
+        return outputs, losses, metrics
 
-    def _computed(self, rays: RayBundle, batch: dict[str, Any]) -> Step:
+    def computed(self, rays: RayBundle, batch: dict[str, Any]) -> tuple[dict[str, Any], Any, dict[str, Any]]:
         """Outputs, losses and metrics of a batch."""
         # the wrapped model, where several processes train; nerfstudio gives it the rays alone
         outputs = self._model(rays, batch)
@@ -138,21 +132,24 @@ class EdgeDepthPipeline(VanillaPipeline):
         losses: Any = self.model.get_loss_dict(outputs, batch, metrics)
         return outputs, losses, metrics
 
-    def _count_not_finite(self, step: int, outputs: dict[str, Any], losses: dict[str, Any]) -> None:
-        """Count this step, if a loss is not finite, where the losses are; now and then look at the count.
+    def count_not_finite(self, total: torch.Tensor) -> None:
+        """Count a step, if the sum of its losses is not finite, where it is."""
+        # what is not finite, less itself, is NaN
+        self._odd_steps += total - total != 0
+
+    def look_for_not_finite(self, step: int, outputs: dict[str, Any], losses: dict[str, Any]) -> None:
+        """Look at the count of such steps, if it is time.
 
         Raises:
             NotFiniteError: there were several since the last look.
         """
-        total = torch.stack([loss.detach() for loss in losses.values()]).sum()
-        # what is not finite, less itself, is NaN
-        odd = total - total != 0
-        self._odd_steps = odd.long() if self._odd_steps is None else self._odd_steps + odd
         if step % STEPS_PER_CHECK:
             return
-        count, self._odd_steps = int(self._odd_steps), None
+        count = int(self._odd_steps)
+        self._odd_steps.zero_()
         if count > MOST_NOT_FINITE:
-            found = self._not_finite(step, outputs, losses) if bool(odd) else f"Step {step}: all losses are finite."
+            odd = not all(math.isfinite(float(loss.detach())) for loss in losses.values())
+            found = self._not_finite(step, outputs, losses) if odd else f"Step {step}: all losses are finite."
             raise NotFiniteError(f"{found} In {count} of the last {STEPS_PER_CHECK} steps a loss was not finite.")
         if count:
             CONSOLE.print(

@@ -128,6 +128,11 @@ class PixelTable:
         """Give the share of the records that have a prior."""
         return self._with_prior / len(self)
 
+    @property
+    def packed(self) -> UInt8[np.ndarray, "n 15"]:
+        """Give the bytes of all records, in the file's order."""
+        return self._records.view(np.uint8).reshape(-1, RECORD.itemsize)
+
     def records(self, start: int, count: int) -> NDArray:
         """Give `count` records from number `start` on, in the file's order; the first comes after the last."""
         first = start % len(self)

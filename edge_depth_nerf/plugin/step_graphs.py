@@ -1,29 +1,28 @@
-"""A training step as one launch: CUDA graphs of what lies between a batch's upload and its gradients.
+"""A whole training step as one launch on a GPU: batch, forward, losses, backward, unscaling, optimisers and scale.
 
-Host-facing. **No GPU has run this; it is off unless it is asked for** (`--cuda-graphs True`). The host needs longer to
-launch the kernels of a step than a fast GPU to run them, so a graph is recorded once and launched as a whole: one of
-the steps that update the proposal networks, one of those that do not.
+Host-facing. The host needs several times longer to launch the kernels of a step than a GPU to run them. So each of the
+two kinds of steps, with and without an update of the proposal networks, is recorded once as a CUDA graph and replayed.
 
-A graph records decoding, rays, forward, losses and backward, but not optimisers, scaler and schedulers. It reads where
-it read when it was recorded, so everything that differs between steps is put there before: the packed batch, λ, and how
-far the sampler's weights are annealed. Anything else that changes (rays, parameters or options) ends this, with one
-line that says why, and training continues without.
+A graph reads where it read when it was recorded. What differs between steps is put there before: the batch (on a table
+that lies on the device the graph advances by itself), λ, how far the sampler's weights are annealed, and the learning
+rates. Anything else that changes (rays, parameters or options) ends this with one line that says why.
 
-As torch's notes on CUDA graphs ask, it warms up on a stream of its own, takes gradients by `torch.autograd.grad` into
-the graph's memory, and uses no cast that autocast kept from before.
+Nothing may be compiled, loaded or tried out in a recording. So the first steps run unrecorded, by the same function, on
+the stream that records; a kind of step is recorded after it has run that way. If a recording fails, nothing is lost:
+its step is done already. What torch leaves in the state of recording is restored, and it is tried again later.
 """
 
 from __future__ import annotations
 
 import copy
 import functools
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float
 from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
@@ -31,36 +30,70 @@ from torch import Tensor
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
 from edge_depth_nerf.plugin.step_losses import PriorLoss
 
-EAGER_STEPS = 20
-"""So many steps are taken first without a graph: kernels are compiled and measured, the scaler is made."""
-WARM_UPS = 3
-"""Runs before the recording, on the stream that torch's notes ask for."""
+if TYPE_CHECKING:
+    from nerfstudio.engine.trainer import Trainer
 
-Capture = Callable[[Callable[[], Any]], tuple[Any, Callable[[], None]]]
-"""Records a function; gives what it has returned, and what runs it again with its results in the same places."""
-Step = tuple[dict[str, Any], dict[str, Tensor], dict[str, Tensor]]
-"""Outputs, losses and metrics."""
+RECORD_AT = (20, 200, 1000)
+"""Steps of this process from which on a recording is tried, after no, one and two failures."""
+UNRECORDED = 3
+"""A kind of step has run so often before it is recorded."""
+
+Step = tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]
+"""Sum of the losses, losses and metrics, as nerfstudio's `train_iteration` returns them."""
+
+
+@runtime_checkable
+class Capture(Protocol):
+    """What records functions."""
+
+    def stream(self) -> AbstractContextManager[None]:
+        """Work on the stream that records."""
+        ...
+
+    def record(self, work: Callable[[], Any]) -> tuple[Any, Callable[[], None]]:
+        """Record a function; give what it has returned, and what runs it again with its results in the same places."""
+        ...
+
+    def recover(self) -> None:
+        """Restore what a failed recording leaves behind."""
+        ...
 
 
 class GpuCapture:
     """Records functions as CUDA graphs, which share their memory."""
 
-    def __init__(self) -> None:
+    def __init__(self, device: torch.device | str) -> None:
+        self._device = torch.device(device)
+        self._stream = torch.cuda.Stream(self._device)
         self._pool = torch.cuda.graph_pool_handle()
+        self._random_state = torch.empty(0)
 
-    def __call__(self, work: Callable[[], Any]) -> tuple[Any, Callable[[], None]]:
+    @contextmanager
+    def stream(self) -> Iterator[None]:
+        """Work on the stream that records; what is before it and after it on the present stream waits."""
+        self._stream.wait_stream(torch.cuda.current_stream(self._device))
+        with torch.cuda.stream(self._stream):
+            yield
+        torch.cuda.current_stream(self._device).wait_stream(self._stream)
+
+    def record(self, work: Callable[[], Any]) -> tuple[Any, Callable[[], None]]:
         """Record a function."""
-        stream = torch.cuda.Stream()
-        stream.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(stream):
-            for _ in range(WARM_UPS):
-                work()
-        torch.cuda.current_stream().wait_stream(stream)
+        self._random_state = torch.cuda.get_rng_state(self._device)
         graph = torch.cuda.CUDAGraph()
         # the viewer's thread may use the GPU meanwhile, on its own stream
-        with torch.cuda.graph(graph, pool=self._pool, capture_error_mode="thread_local"):
+        with torch.cuda.graph(graph, pool=self._pool, stream=self._stream, capture_error_mode="thread_local"):
             found = work()
         return found, graph.replay
+
+    def recover(self) -> None:
+        """Give the generator a state that does not record.
+
+        A recording that was cut short leaves it in one that refuses to draw.
+        """
+        index = torch.cuda.current_device() if self._device.index is None else self._device.index
+        generator = torch.cuda.default_generators[index]
+        generator.graphsafe_set_state(generator.clone_state())
+        generator.set_state(self._random_state)
 
 
 @dataclass(frozen=True)
@@ -68,45 +101,24 @@ class _Recorded:
     """A recorded step; the tensors are where each replay writes."""
 
     replay: Callable[[], None]
+    result: Step
     outputs: dict[str, Any]
-    names: list[str]
-    losses: Tensor
-    metrics: dict[str, Tensor]
-    gradients: list[Tensor | None]
     trained_on: Tensor
 
 
-class _Gradients(torch.autograd.Function):
-    """Losses of a replay; backward hands over the gradients that the replay has made, already scaled."""
+class Numbers:
+    """Numbers of a step where a graph reads them: λ, the exponent of annealed weights, and learning rates."""
 
-    @staticmethod
-    def forward(ctx: Any, start: Tensor, losses: Tensor, parameters: list[Tensor], gradients: list[Any]) -> Tensor:
-        ctx.parameters, ctx.gradients = parameters, gradients
-        return losses.clone()
+    def __init__(self, count: int, device: torch.device | str) -> None:
+        self.places = torch.zeros(count, device=device)
+        self._held: list[float | None] = [None] * count
 
-    @staticmethod
-    def backward(ctx: Any, *_: Tensor) -> tuple[None, ...]:
-        # torch would copy them, as the graph keeps them
-        for parameter, gradient in zip(ctx.parameters, ctx.gradients, strict=True):
-            parameter.grad = gradient
-        return None, None, None, None
-
-
-def schedule(model: EdgeDepthNerfModel) -> tuple[float, float]:
-    """Give what differs between steps: λ, and the exponent by which the sampler's weights are annealed."""
-    return float(model.depth_weight()), float(model.proposal_sampler._anneal)
-
-
-@contextmanager
-def scheduled_by(model: EdgeDepthNerfModel, numbers: Float[Tensor, "2"]) -> Iterator[None]:
-    """Let a model take what `schedule` gives from a tensor, where it can change without the host."""
-    sampler: Any = model.proposal_sampler
-    before = sampler._anneal
-    model.scheduled_weight, sampler._anneal = numbers[0], numbers[1]
-    try:
-        yield
-    finally:
-        model.scheduled_weight, sampler._anneal = None, before
+    def hold(self, numbers: Sequence[float]) -> None:
+        """Write those that have changed; a number goes with its kernel's launch, no copy has to be waited for."""
+        for place, (held, number) in enumerate(zip(self._held, numbers, strict=True)):
+            if held != number:
+                self.places[place].fill_(number)
+        self._held = [*numbers]
 
 
 def updates_proposals(sampler: ProposalNetworkSampler) -> bool:
@@ -114,21 +126,18 @@ def updates_proposals(sampler: ProposalNetworkSampler) -> bool:
     return sampler._steps_since_update > sampler.update_sched(sampler._step) or sampler._step < 10
 
 
-def why_not(model: EdgeDepthNerfModel, device: str, world_size: int, accumulates: bool) -> str | None:
-    """Say why the steps of a training cannot be recorded; None where they can.
-
-    Args:
-        model: what is trained.
-        device: where.
-        world_size: processes that train together.
-        accumulates: whether gradients of several steps are added.
-    """
-    if torch.device(device).type != "cuda":
-        return "there is no GPU"
-    if world_size > 1:
+def why_not(trainer: Trainer) -> str | None:
+    """Say why the steps of a training cannot be recorded; None where they can."""
+    pipeline: Any = trainer.pipeline
+    model: EdgeDepthNerfModel = pipeline.model
+    if not model.fused:
+        return "nerfstudio's own code (--pipeline.model.implementation torch) copies from the host"
+    if trainer.world_size > 1:
         return "several processes train together"
-    if accumulates:
+    if any(steps > 1 for steps in trainer.gradient_accumulation_steps.values()):
         return "gradients of several steps are added"
+    if trainer.config.log_gradients:
+        return "gradients are logged"
     if any(isinstance(loss, PriorLoss) and loss.loss.varies for loss in model.step_losses.values()):
         return f"the loss {model.config.depth_loss} changes at each step"
     if model.config.predict_normals:
@@ -137,120 +146,176 @@ def why_not(model: EdgeDepthNerfModel, device: str, world_size: int, accumulates
 
 
 class StepGraphs:
-    """Replays training steps of a pipeline."""
+    """Takes the training steps of a trainer, after the first ones by replaying them."""
 
-    def __init__(self, pipeline: Any, scale: Callable[[Tensor], Tensor], capture: Capture) -> None:
+    def __init__(self, trainer: Trainer, capture: Capture) -> None:
         """Record nothing yet.
 
         Args:
-            pipeline: an EdgeDepthPipeline.
-            scale: of mixed precision, applied to the loss.
+            trainer: of an EdgeDepthPipeline, set up.
             capture: records a function.
         """
-        self._pipeline, self._scale, self._capture = pipeline, scale, capture
-        self._parameters: list[Tensor] = [each for group in pipeline.get_param_groups().values() for each in group]
+        self._trainer, self._capture = trainer, capture
+        self._pipeline: Any = trainer.pipeline
+        self._optimizers = list(trainer.optimizers.optimizers.values())
+        self._parameters = [each for group in trainer.optimizers.parameters.values() for each in group]
+        self._groups = [group for optimizer in self._optimizers for group in optimizer.param_groups]
+        self._numbers = Numbers(2 + len(self._groups), trainer.device)
         self._recorded: dict[bool, _Recorded] = {}
-        self._is_off = False
-        self._eager_steps = 0
+        self._taken: Counter[bool] = Counter()
+        self._failures = 0
         self._seen: tuple[Any, ...] = ()
-        self._packed = self._schedule = self._start = torch.empty(0)
 
     @property
     def recorded(self) -> int:
-        """Count the kinds of steps that are replayed; 0 before the first recording and after this has ended."""
+        """Count the kinds of steps that are replayed; 0 before the first recording and after a failure."""
         return len(self._recorded)
 
-    def replayed(self, packed: Tensor, step: int) -> Step | None:
-        """Take a step with a batch by a graph, but for the optimisers.
+    @property
+    def has_ended(self) -> bool:
+        """Whether no step will be recorded or replayed any more."""
+        return self._failures >= len(RECORD_AT)
+
+    def step(self, step: int) -> Step | None:
+        """Take a training step.
 
         Args:
-            packed: the uploaded batch.
-            step: its number, for what is printed.
+            step: its number.
 
         Returns:
-            Outputs, losses and metrics, until the next replay; None where the caller has to compute them.
+            Sum of the losses, losses and metrics, until the next replay; None where this has ended: the caller has to
+            take the step.
         """
-        if self._is_off:
+        if self._recorded and self._state() != self._seen:
+            self._failures = len(RECORD_AT)
+            self._say(step, "the rays of a batch, the parameters or the model's options have changed")
+            self._forget()
+        if self.has_ended:
             return None
-        if self._eager_steps < EAGER_STEPS:
-            self._eager_steps += 1
-            return None
-        try:
-            return self._replayed(packed)
-        except Exception as error:  # whatever keeps steps from being recorded here
-            self._is_off = True
-            self._recorded.clear()
-            CONSOLE.print(
-                f"Step {step}: training continues without CUDA graphs ({type(error).__name__}: {error}).",
-                style="yellow",
-                soft_wrap=True,
-                highlight=False,
-                markup=False,
-            )
-            return None
+        sampler = self._pipeline.model.proposal_sampler
+        updates, since = updates_proposals(sampler), sampler._steps_since_update
+        self._pipeline.detail.forget()
+        self._pipeline.datamanager.set_next(step)
+        self._numbers.hold(self._numbers_now())
+        if (recorded := self._recorded.get(updates)) is not None:
+            recorded.replay()
+            # nerfstudio's sampler counts steps itself, where it is asked
+            sampler._steps_since_update = 0 if updates else since
+            self._pipeline.datamanager.trained_on = recorded.trained_on
+            result, outputs = recorded.result, recorded.outputs
+        else:
+            with self._capture.stream():
+                result, outputs, _ = self._work()
+            self._taken[updates] += 1
+            if self._taken.total() >= RECORD_AT[self._failures] and self._taken[updates] >= UNRECORDED:
+                self._try_to_record(step, updates, since)
+        self._pipeline.look_for_not_finite(step, outputs, result[1])
+        self._step_schedulers(step)
+        return result
 
-    def _replayed(self, packed: Tensor) -> Step:
-        model: EdgeDepthNerfModel = self._pipeline.model
-        seen = self._state(packed)
-        if not self._seen:
-            self._seen = copy.deepcopy(seen)  # options may be changed in place
-            self._packed = torch.empty_like(packed)
-            self._schedule = torch.empty(2, device=packed.device)
-            self._start = torch.zeros((), device=packed.device, requires_grad=True)
-        if seen != self._seen:
-            raise RuntimeError("the rays of a batch, the parameters or the model's options have changed")
-        self._packed.copy_(packed)
-        # numbers of the host, which a kernel's launch takes with it: no copy that has to be waited for
-        for place, number in enumerate(schedule(model)):
-            self._schedule[place].fill_(number)
-        updated = updates_proposals(model.proposal_sampler)
-        if updated not in self._recorded:
-            self._recorded[updated] = self._record(model)
-        recorded, sampler = self._recorded[updated], model.proposal_sampler
-        since = sampler._steps_since_update
-        recorded.replay()
-        # nerfstudio's sampler counts steps itself, where it is asked
-        sampler._steps_since_update = 0 if updated else since
-        self._pipeline.datamanager.trained_on = recorded.trained_on
-        losses = _Gradients.apply(self._start, recorded.losses, self._parameters, recorded.gradients)
-        assert isinstance(losses, Tensor)
-        return recorded.outputs, dict(zip(recorded.names, losses.unbind(), strict=True)), recorded.metrics
+    def _numbers_now(self) -> list[float]:
+        """Give what differs between steps."""
+        model = self._pipeline.model
+        rates = [float(group["lr"]) for group in self._groups]
+        return [float(model.depth_weight()), float(model.proposal_sampler._anneal), *rates]
 
-    def _state(self, packed: Tensor) -> tuple[Any, ...]:
+    def _step_schedulers(self, step: int) -> None:
+        """Go on with the learning rates, as nerfstudio's trainer does where the scale has not fallen."""
+        scaler: Any = self._trainer.grad_scaler
+        before = scaler.get_scale()
+        scaler.look()
+        if before <= scaler.get_scale():
+            self._trainer.optimizers.scheduler_step_all(step)
+
+    def _state(self) -> tuple[Any, ...]:
         """Collect what must not change after a step was recorded."""
         pipeline = self._pipeline
         return (
-            packed.shape,
-            pipeline.datamanager.train_pixel_sampler.num_rays_per_batch,
+            pipeline.datamanager.rays_of_a_step(),
             pipeline.training,
             pipeline.model.config,
             tuple((each.data_ptr(), each.requires_grad) for each in self._parameters),
         )
 
-    def _record(self, model: EdgeDepthNerfModel) -> _Recorded:
-        pipeline, manager = self._pipeline, self._pipeline.datamanager
-        before = model.proposal_sampler._steps_since_update
-
-        def work() -> tuple[Any, ...]:
-            # each run is of one kind
-            model.proposal_sampler._steps_since_update = before
-            torch.clear_autocast_cache()
-            with scheduled_by(model, self._schedule):
-                rays, batch = manager.batch_of(self._packed)
-                outputs = pipeline._model(rays, batch)
-                metrics = model.get_metrics_dict(outputs, batch)
-                losses = model.get_loss_dict(outputs, batch, metrics)
-            total = functools.reduce(torch.add, losses.values())
-            with torch.autocast(self._packed.device.type, enabled=False):
-                gradients = torch.autograd.grad(self._scale(total), self._parameters, allow_unused=True)
-            torch.clear_autocast_cache()
-            every = torch.stack([loss.detach() for loss in losses.values()])
-            outputs = {name: each.detach() if isinstance(each, Tensor) else each for name, each in outputs.items()}
-            metrics = {name: each.detach() for name, each in metrics.items()}
-            return outputs, list(losses), every, metrics, list(gradients), manager.trained_on
-
+    def _try_to_record(self, step: int, updates: bool, since: int) -> None:
+        """Record a kind of step that has just been taken."""
+        sampler = self._pipeline.model.proposal_sampler
+        after, trained_on = sampler._steps_since_update, self._pipeline.datamanager.trained_on
+        # so that it is of the same kind
+        sampler._steps_since_update = since
         try:
-            found, replay = self._capture(work)
+            (result, outputs, of_rays), replay = self._capture.record(self._work)
+            self._recorded[updates] = _Recorded(replay, result, outputs, of_rays)
+            self._seen = copy.deepcopy(self._state())  # options may be changed in place
+        except Exception as error:  # whatever keeps steps from being recorded here
+            self._failures += 1
+            if self._failures == 1:
+                self._say(step, f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}")
+            self._forget()
+            self._capture.recover()
         finally:
-            model.proposal_sampler._steps_since_update = before
-        return _Recorded(replay, *found)
+            sampler._steps_since_update = after
+            self._pipeline.datamanager.trained_on = trained_on
+
+    def _say(self, step: int, why: str) -> None:
+        CONSOLE.print(
+            f"Step {step}: training continues without CUDA graphs, slower but with the same results ({why}).",
+            style="yellow",
+            soft_wrap=True,
+            highlight=False,
+            markup=False,
+        )
+
+    def _forget(self) -> None:
+        """Drop all graphs and what an interrupted step may have left."""
+        self._recorded.clear()
+        torch.clear_autocast_cache()
+        scaler: Any = self._trainer.grad_scaler
+        scaler.forget()
+        for optimizer in self._optimizers:
+            optimizer.zero_grad(set_to_none=True)
+            for name in ("grad_scale", "found_inf"):
+                vars(optimizer).pop(name, None)
+
+    def _work(self) -> tuple[Step, dict[str, Any], Tensor]:
+        """Take a step from reading the batch to the scale of mixed precision; all that is recorded.
+
+        Returns:
+            Sum of the losses, losses and metrics; the model's outputs; which pixels were trained on.
+        """
+        trainer, pipeline = self._trainer, self._pipeline
+        device_type = torch.device(trainer.device).type
+        # a cast that autocast has kept from before would not be part of a recording
+        torch.clear_autocast_cache()
+        with self._on_device(), torch.autocast(device_type, enabled=trainer.mixed_precision):
+            manager = pipeline.datamanager
+            outputs, losses, metrics = pipeline.computed(*manager.batch_of(manager.packed()))
+            loss = functools.reduce(torch.add, losses.values())
+            with torch.autocast(device_type, enabled=False):
+                gradients = torch.autograd.grad(trainer.grad_scaler.scale(loss), self._parameters, allow_unused=True)
+                for parameter, gradient in zip(self._parameters, gradients, strict=True):
+                    parameter.grad = gradient
+                trainer.optimizers.optimizer_scaler_step_all(trainer.grad_scaler)
+                pipeline.count_not_finite(loss)
+                torch.amp.GradScaler.update(trainer.grad_scaler)
+        torch.clear_autocast_cache()
+        outputs = {name: each.detach() if isinstance(each, Tensor) else each for name, each in outputs.items()}
+        losses, metrics = ({name: each.detach() for name, each in named.items()} for named in (losses, metrics))
+        return (loss.detach(), losses, metrics), outputs, manager.trained_on
+
+    @contextmanager
+    def _on_device(self) -> Iterator[None]:
+        """Let model and optimisers read their numbers from the device, where they can change without the host."""
+        model = self._pipeline.model
+        sampler: Any = model.proposal_sampler
+        weight, anneal, *rates = self._numbers.places.unbind()
+        before = sampler._anneal, [(group["lr"], group["capturable"]) for group in self._groups]
+        model.scheduled_weight, sampler._anneal = weight, anneal
+        for group, rate in zip(self._groups, rates, strict=True):
+            group["lr"], group["capturable"] = rate, True
+        try:
+            yield
+        finally:
+            model.scheduled_weight, sampler._anneal = None, before[0]
+            for group, (rate, capturable) in zip(self._groups, before[1], strict=True):
+                group["lr"], group["capturable"] = rate, capturable

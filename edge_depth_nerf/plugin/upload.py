@@ -1,7 +1,6 @@
-"""Batches on their way to a GPU: read ahead, packed, from pinned memory, so that neither host nor device waits.
+"""Batches on a GPU: from a table that lies there, or read ahead into pinned memory, so that nothing waits.
 
-Host-facing. The records of a batch are 15 bytes a pixel; they are copied unchanged from the file and unpacked on the
-device. While a step is computed, a thread reads those of the next.
+Host-facing. The records of a batch are 15 bytes a pixel; they are unpacked on the device.
 """
 
 from __future__ import annotations
@@ -9,58 +8,132 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from jaxtyping import UInt8
-from numpy.typing import NDArray
 from torch import Tensor
 
 from edge_depth_nerf.plugin.pixel_table import RECORD, PixelTable
+
+SHARE_OF_MEMORY = 0.25
+"""A table lies on a GPU if it takes at most this share of the memory that is free there."""
 
 
 @dataclass(frozen=True)
 class Stretch:
     """Neighbouring records of a table."""
 
-    table: PixelTable
     start: int
     count: int
     to_next: int
     """From their start to that of the stretch which is read after them."""
 
 
-def read(stretches: Sequence[Stretch]) -> UInt8[np.ndarray, "n 15"]:
-    """Copy the bytes of stretches, one after the other."""
-    records = [np.asarray(each.table.records(each.start, each.count)) for each in stretches]
-    return np.concatenate([each.view(np.uint8).reshape(-1, RECORD.itemsize) for each in records])
+@runtime_checkable
+class Batches(Protocol):
+    """Gives batches on a device."""
+
+    def set_next(self, stretches: Sequence[Stretch]) -> None:
+        """Say of which records the next batch consists."""
+        ...
+
+    def packed(self) -> UInt8[Tensor, "n 15"]:
+        """Give the bytes of the next batch, one stretch after the other; once after each `set_next`.
+
+        It does nothing on the host, so that it can be recorded: then each replay gives the batch that is next.
+        """
+        ...
+
+
+class TableOnDevice:
+    """Batches of a table that lies on the device."""
+
+    def __init__(self, table: PixelTable, device: torch.device | str) -> None:
+        """Copy all of the table."""
+        # torch warns of memory that must not be written to
+        self._records = torch.from_numpy(np.array(table.packed)).to(device)
+        self._form: tuple[list[int], list[int]] = [], []
+        self._next: list[int] = []
+        self._starts = self._steps = self._of = self._places = torch.empty(0, dtype=torch.long)
+
+    def set_next(self, stretches: Sequence[Stretch]) -> None:
+        """Say of which records the next batch consists; nothing is launched if they follow those of the last one."""
+        device, starts = self._records.device, [each.start for each in stretches]
+        counts, steps = ([getattr(each, name) for each in stretches] for name in ("count", "to_next"))
+        if (counts, steps) != self._form:
+            self._form = counts, steps
+            self._starts, self._steps = (torch.tensor(each, device=device) for each in (starts, steps))
+            self._of = torch.from_numpy(np.repeat(np.arange(len(counts)), counts)).to(device)
+            self._places = torch.cat([torch.arange(count) for count in counts]).to(device)
+        elif starts != self._next:
+            for place, start in zip(self._starts, starts, strict=True):
+                place.fill_(start)
+        self._next = [start + step for start, step in zip(starts, steps, strict=True)]
+
+    def packed(self) -> UInt8[Tensor, "n 15"]:
+        """Give the bytes of the next batch, and go on to the one after it."""
+        rows = (self._starts[self._of] + self._places) % len(self._records)
+        self._starts += self._steps
+        return self._records[rows]
 
 
 class Uploads:
-    """Copies batches to a device, the next already read.
+    """Batches of a table in a file, the next one already read.
 
-    What is read ahead is what follows in the tables; where something else is requested (another number of rays, a
+    What is read ahead is what follows in the table; where something else is requested (another number of rays, a
     resumed training), that is read instead. So batches are the same with a thread as without one.
     """
 
-    def __init__(self, device: torch.device | str) -> None:
-        self._device = torch.device(device)
+    def __init__(self, table: PixelTable, device: torch.device | str) -> None:
+        self._table, self._device = table, torch.device(device)
         self._reader = ThreadPoolExecutor(max_workers=1, thread_name_prefix="reads batches")
-        self._ahead: tuple[list[Stretch], Future[NDArray[np.uint8]]] | None = None
+        self._ahead: tuple[list[Stretch], Future[None]] | None = None
+        self._batch = torch.empty(0, RECORD.itemsize, dtype=torch.uint8)
+        self._buffers: list[Tensor] = []
+        self._copied: list[torch.cuda.Event | None] = []
 
-    def upload(self, stretches: Sequence[Stretch]) -> UInt8[Tensor, "n 15"]:
-        """Start to copy the bytes of some records to the device."""
-        records = self._read(stretches)
-        following = [replace(each, start=each.start + each.to_next) for each in stretches]
-        self._ahead = following, self._reader.submit(read, following)
-        packed = torch.from_numpy(records)
+    def set_next(self, stretches: Sequence[Stretch]) -> None:
+        """Start to copy the next batch to the device, and to read the one after it."""
+        expected, read = self._ahead or ([], None)
+        if read is not None:
+            read.result()
+        count = sum(each.count for each in stretches)
+        if len(self._batch) != count:
+            on_gpu = self._device.type == "cuda"
+            self._batch = self._batch.new_empty(count, RECORD.itemsize, device=self._device)
+            self._buffers = [torch.empty(count, RECORD.itemsize, dtype=torch.uint8, pin_memory=on_gpu) for _ in "12"]
+            self._copied = [None, None]
+        if expected != list(stretches):
+            self._read(stretches)
+        self._batch.copy_(self._buffers[0], non_blocking=True)
         if self._device.type == "cuda":
-            packed = packed.pin_memory()
-        return packed.to(self._device, non_blocking=True)
+            self._copied[0] = torch.cuda.Event()
+            self._copied[0].record()
+        # they take turns: the first one is read next
+        self._buffers.reverse()
+        self._copied.reverse()
+        following = [replace(each, start=each.start + each.to_next) for each in stretches]
+        self._ahead = following, self._reader.submit(self._read, following)
 
-    def _read(self, stretches: Sequence[Stretch]) -> NDArray[np.uint8]:
-        if self._ahead is not None:
-            expected, records = self._ahead
-            if expected == list(stretches):
-                return records.result()
-        return read(stretches)
+    def packed(self) -> UInt8[Tensor, "n 15"]:
+        """Give the bytes of the next batch."""
+        return self._batch
+
+    def _read(self, stretches: Sequence[Stretch]) -> None:
+        """Read stretches into the first buffer, once its last content is on the device."""
+        if (copied := self._copied[0]) is not None:
+            copied.synchronize()
+        records = [np.asarray(self._table.records(each.start, each.count)) for each in stretches]
+        packed = [each.view(np.uint8).reshape(-1, RECORD.itemsize) for each in records]
+        np.concatenate(packed, out=self._buffers[0].numpy())
+
+
+def batches_on(device: torch.device | str, table: PixelTable) -> Batches:
+    """Give what serves a table's batches on a device."""
+    if torch.device(device).type == "cuda":
+        free, _ = torch.cuda.mem_get_info(torch.device(device))
+        if table.packed.nbytes <= SHARE_OF_MEMORY * free:
+            return TableOnDevice(table, device)
+    return Uploads(table, device)
