@@ -1,9 +1,9 @@
 """Sums along rays on a GPU: where samples go, the proposal and the distortion loss with their gradients.
 
-A program holds a ray on the chip, so a ray has at most `functions.MOST` samples. What the CPU finds by walking two
-sorted lists (`ray_numba`) is found here by comparing each of one with each of the other: more comparisons, none of
-which waits. Sums of a ray are of float32, but for the cumulative distribution that samples are placed by, which is of
-float64 as on the CPU. With TRITON_INTERPRET=1 set before the import the kernels run on CPU tensors.
+A program holds a ray on the chip, so a ray has at most `functions.MOST` samples. The losses find what the CPU finds by
+walking two sorted lists (`ray_numba`) by comparing each of one with each of the other: more comparisons, none of which
+waits. Sums of a ray are of float32, but for the cumulative distribution that samples are placed by, which is of float64
+as on the CPU. With TRITON_INTERPRET=1 set before the import the kernels run on CPU tensors.
 """
 
 from __future__ import annotations
@@ -38,8 +38,9 @@ def _is_finite(x):
 @triton.jit
 @no_type_check
 def _place_kernel(
-    weights, edges, wanted, placed, samples, places, padding, least, SAMPLES: tl.constexpr, TOGETHER: tl.constexpr
-):
+    weights, edges, wanted, placed, cumulatives, samples, places, padding, least, SAMPLES: tl.constexpr,
+    PLACES: tl.constexpr, STEPS: tl.constexpr,
+):  # fmt: skip
     ray = tl.program_id(0).to(tl.int64)
     sample = tl.arange(0, SAMPLES)
     inside = sample < samples
@@ -48,23 +49,28 @@ def _place_kernel(
     lacking = tl.maximum(least - total, 0.0)
     total = total + lacking
     share = tl.where(inside, (weight + lacking / samples) / total, 0.0)
-    # of each interval the share of all that lies before its end, and its end
+    # of each interval the share of all that lies before its end
     cumulative = tl.minimum(tl.cumsum(share.to(tl.float64), 0).to(tl.float32), 1.0)
-    edge = tl.load(edges + ray * (samples + 1) + sample + 1, inside, float("inf"))
-    first_edge = tl.load(edges + ray * (samples + 1))
-    for first in range(0, places, TOGETHER):
-        place = first + tl.arange(0, TOGETHER)
-        u = tl.load(wanted + ray * places + place, place < places, 0.0)
-        passed = (cumulative[None] <= u[:, None]) & inside[None]
-        low = tl.max(tl.where(passed, cumulative[None], 0.0), 1)
-        start = tl.max(tl.where(passed, edge[None], first_edge), 1)
-        ahead = inside[None] & (passed == 0)
-        high = tl.min(tl.where(ahead, cumulative[None], float("inf")), 1)
-        end = tl.min(tl.where(ahead, edge[None], float("inf")), 1)
-        # behind the last interval it is the last edge; a sum that is no number gives no place
-        found = tl.where(_is_finite(high), start + (u - low) / (high - low) * (end - start), start)
-        found = tl.where(_is_finite(total), found, float("nan"))
-        tl.store(placed + ray * places + place, found, place < places)
+    tl.store(cumulatives + ray * samples + sample, cumulative, inside)
+    # each thread reads what others have written
+    tl.debug_barrier()
+    place = tl.arange(0, PLACES)
+    given = place < places
+    u = tl.load(wanted + ray * places + place, given, 0.0)
+    # a binary search for how many intervals end at or before each
+    passed = tl.zeros((PLACES,), tl.int32)
+    for step in tl.static_range(STEPS):
+        further = passed + (SAMPLES >> step)
+        ahead = tl.load(cumulatives + ray * samples + further - 1, further <= samples, float("inf"))
+        passed = tl.where(ahead <= u, further, passed)
+    low = tl.load(cumulatives + ray * samples + passed - 1, passed > 0, 0.0)
+    high = tl.load(cumulatives + ray * samples + passed, passed < samples, float("inf"))
+    start = tl.load(edges + ray * (samples + 1) + passed)
+    end = tl.load(edges + ray * (samples + 1) + passed + 1, passed < samples, 0.0)
+    # behind the last interval it is the last edge; a sum that is no number gives no place
+    found = tl.where(_is_finite(high), start + (u - low) / (high - low) * (end - start), start)
+    found = tl.where(_is_finite(total), found, float("nan"))
+    tl.store(placed + ray * places + place, found, given)
 
 
 def sample_pdf(
@@ -78,9 +84,12 @@ def sample_pdf(
     rays, samples = weights.shape
     places = wanted.shape[1]
     weights, edges, wanted = (each.detach().contiguous() for each in (weights, edges, wanted))
-    placed = torch.empty_like(wanted)
-    arguments = weights, edges, wanted, placed, samples, places, float(padding), float(least)
-    launch(_place_kernel, (rays,), *arguments, SAMPLES=_block(samples), TOGETHER=TOGETHER)
+    placed, cumulatives = torch.empty_like(wanted), torch.empty_like(weights)
+    arguments = weights, edges, wanted, placed, cumulatives, samples, places, float(padding), float(least)
+    block = _block(samples)
+    constants = {"SAMPLES": block, "PLACES": _block(places), "STEPS": block.bit_length()}
+    # one warp, as each step of the search waits for the one before
+    launch(_place_kernel, (rays,), *arguments, **constants, num_warps=1)
     return placed
 
 
