@@ -48,7 +48,8 @@ def by_triton() -> Any:
     return ray_triton
 
 
-def check_weights(kernels: Any) -> None:
+def check_weights(kernels: Any = None) -> None:
+    kernels = kernels or by_triton()
     for rays, samples in SIZES:
         densities = 10 ** (4 * torch.rand(rays, samples) - 2)
         densities[0] = 0
@@ -67,7 +68,8 @@ def check_weights(kernels: Any) -> None:
         assert found.shape == shape and torch.autograd.grad(found.sum(), empty)[0].shape == shape
 
 
-def check_weights_of_what_is_not_finite(kernels: Any) -> None:
+def check_weights_of_what_is_not_finite(kernels: Any = None) -> None:
+    kernels = kernels or by_triton()
     densities, deltas, gradient = torch.rand(4, 10), torch.rand(4, 10), torch.randn(4, 10)
     densities[1, 4], densities[2, 3] = float("inf"), float("nan")
     densities.requires_grad_()
@@ -178,17 +180,18 @@ def check_the_distortion_loss(kernels: Any = None) -> None:
     assert kernels.distortion_loss(edges, weights).isnan()
 
 
+BY_TRITON = (check_places, check_the_interlevel_loss, check_the_distortion_loss)
+OF_WEIGHTS = (check_weights, check_weights_of_what_is_not_finite)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("check", [check_places, check_the_interlevel_loss, check_the_distortion_loss])
-def test_in_the_interpreter(check):
+@pytest.mark.parametrize("checks", [OF_WEIGHTS, *((each,) for each in BY_TRITON)])
+def test_in_the_interpreter(checks):
     pytest.importorskip("triton")
-    in_interpreter(check)
+    in_interpreter(*checks)
 
 
-ON_THE_CPU = [check_weights, check_weights_of_what_is_not_finite, check_the_distortion_loss]
-
-
-@pytest.mark.parametrize("check", ON_THE_CPU)
+@pytest.mark.parametrize("check", [*OF_WEIGHTS, check_the_distortion_loss])
 def test_the_same_on_the_cpu(check):
     check(ray_numba)
 
@@ -209,18 +212,21 @@ def step(samples: int = 48, intervals: int = 256) -> None:
     ray_triton.sample_pdf(outer_weights, outer_edges, edges, 0.01, 1e-5)
     ray_triton.interlevel_loss(edges, weights, outer_edges, outer_weights.requires_grad_())
     ray_triton.distortion_loss(edges, weights.requires_grad_())
+    for densities in (outer_weights.detach().requires_grad_(), weights):
+        ray_triton.weights_from_densities(densities, torch.rand(densities.shape)).sum().backward()
 
 
 @NEEDS_A_GPU
 def test_the_same_on_a_gpu():
-    on_a_gpu(check_places, check_the_interlevel_loss, check_the_distortion_loss)
+    on_a_gpu(*OF_WEIGHTS, *BY_TRITON)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
 def test_compiled_without_spills(architecture, tmp_path):
     pytest.importorskip("triton")
-    check_registers(step, architecture, tmp_path, {"_place_kernel", "_bound_kernel", "_distortion_kernel"}, 96)
+    along_rays = {"_place_kernel", "_bound_kernel", "_distortion_kernel", "_weight_kernel", "_density_gradient_kernel"}
+    check_registers(step, architecture, tmp_path, along_rays, 96)
 
 
 @pytest.mark.slow
