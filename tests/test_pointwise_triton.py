@@ -61,20 +61,24 @@ def check_positions(kernels: Any) -> None:
     assert kernels.midpoints(origins[:0], directions[:0], edges[:0], edges[:0]).shape == (0, count + 1, 3)
 
 
-def check_densities(kernels: Any) -> None:
+def check_densities(kernels: Any = None) -> None:
+    kernels = kernels or by_triton()
+    # what autocast makes of a network's outputs is read by Triton's alone
+    dtypes = ((torch.float32, 1e-6), (torch.float16, 1e-3))[: 1 if kernels is pointwise_numba else 2]
     for count in (1, 255, 700):
         torch.manual_seed(count)
-        features = 12 * torch.randn(count, 5)
-        features[-1, 0] = 20  # steeper than the gradient follows
-        before = features[:, 0].detach().requires_grad_()
-        inside, gradient = (torch.arange(count) % 3 != 1).float(), torch.randn(count) * 1e-3
-        found = kernels.density(before, inside, 0.01)
-        exact = before.detach().double()
-        assert_near(found.detach(), 0.01 * exact.exp() * inside, 1e-6)
-        (to_before,) = torch.autograd.grad(found, before, gradient)
-        expected = 0.01 * exact.clamp(-15, 15).exp() * inside * gradient
-        assert to_before.dtype == found.dtype == torch.float32
-        assert_near(to_before, expected, 1e-6)
+        for dtype, tolerance in dtypes:
+            features = (12 * torch.randn(count, 5)).to(dtype)
+            features[-1, 0] = 20  # steeper than the gradient follows
+            before = features[:, 0].detach().requires_grad_()
+            inside, gradient = (torch.arange(count) % 3 != 1).float(), torch.randn(count) * 1e-3
+            found = kernels.density(before, inside, 0.01)
+            exact = before.detach().double()
+            assert_near(found.detach(), 0.01 * exact.exp() * inside, 1e-6)
+            (to_before,) = torch.autograd.grad(found, before, gradient)
+            expected = 0.01 * exact.clamp(-15, 15).exp() * inside * gradient
+            assert to_before.dtype == dtype and found.dtype == torch.float32
+            assert_near(to_before, expected, tolerance)
     with torch.no_grad():
         before[3] = float("nan")
     assert kernels.density(before, inside, 1.0).isnan().nonzero().tolist() == [[3]]
@@ -117,7 +121,7 @@ def check_contraction() -> None:
 @pytest.mark.slow
 def test_in_the_interpreter():
     pytest.importorskip("triton")
-    in_interpreter(check_distances, check_contraction, check_harmonics)
+    in_interpreter(check_distances, check_contraction, check_densities, check_harmonics)
 
 
 @njit
@@ -154,13 +158,13 @@ def test_the_same_on_three_threads(check, monkeypatch):
 
 @NEEDS_A_GPU
 def test_the_same_on_a_gpu():
-    on_a_gpu(check_distances, check_contraction, check_harmonics)
+    on_a_gpu(check_distances, check_contraction, check_densities, check_harmonics)
 
 
 @pytest.mark.slow
 def test_memory_goes_there_and_back_as_it_lies():
     pytest.importorskip("triton")
-    moved_in_interpreter(check_distances, check_harmonics)
+    moved_in_interpreter(check_distances, check_densities, check_harmonics)
 
 
 @pytest.mark.slow
@@ -174,6 +178,9 @@ def test_compiled_without_spills(architecture, tmp_path):
         kernels.contract(rays)
         for dtype in (torch.float16, torch.float32):
             kernels.harmonics(rays, dtype)
+            outputs = torch.rand(300, 16, dtype=dtype)[:, 0].requires_grad_()
+            kernels.density(outputs, rays[:, 0], 0.01).sum().backward()
 
-    names = {"_contract_kernel", "_distance_kernel", "_harmonics_kernel"}
+    of_densities = {"_density_kernel", "_before_gradient_kernel"}
+    names = {"_contract_kernel", "_distance_kernel", "_harmonics_kernel", *of_densities}
     check_registers(step, architecture, tmp_path, names, 64)

@@ -7,7 +7,7 @@ from typing import Any
 import interpreted
 import pytest
 import torch
-from ahead_of_time import ARCHITECTURES, check_registers
+from ahead_of_time import ARCHITECTURES, check_registers, compiled
 from interpreted import NEEDS_A_GPU, assert_near, in_interpreter, on_a_gpu
 
 from edge_depth_nerf.kernels import formulas, ray_numba, threads
@@ -48,7 +48,8 @@ def by_triton() -> Any:
     return ray_triton
 
 
-def check_weights(kernels: Any) -> None:
+def check_weights(kernels: Any = None) -> None:
+    kernels = kernels or by_triton()
     for rays, samples in SIZES:
         densities = 10 ** (4 * torch.rand(rays, samples) - 2)
         densities[0] = 0
@@ -67,7 +68,8 @@ def check_weights(kernels: Any) -> None:
         assert found.shape == shape and torch.autograd.grad(found.sum(), empty)[0].shape == shape
 
 
-def check_weights_of_what_is_not_finite(kernels: Any) -> None:
+def check_weights_of_what_is_not_finite(kernels: Any = None) -> None:
+    kernels = kernels or by_triton()
     densities, deltas, gradient = torch.rand(4, 10), torch.rand(4, 10), torch.randn(4, 10)
     densities[1, 4], densities[2, 3] = float("inf"), float("nan")
     densities.requires_grad_()
@@ -77,6 +79,27 @@ def check_weights_of_what_is_not_finite(kernels: Any) -> None:
     gradients = [torch.autograd.grad(each, densities, gradient)[0] for each in (found, expected)]
     assert gradients[1][2].isnan().any() and not gradients[1][[0, 3]].isnan().any()
     assert_near(gradients[0], gradients[1], 1e-6)
+
+
+def exact_shares(weights: torch.Tensor, edges: torch.Tensor, placed: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Which share of the weights lies before places, and up to them, in float64; what rounds to one counts for both.
+
+    Of a ray without weights they are spread evenly over its samples.
+    """
+    weights, edges, placed = weights.double(), edges.double(), placed.double()
+    weights = torch.where(weights.sum(1, keepdim=True) > 0, weights, 1)
+    cumulative = torch.nn.functional.pad((weights / weights.sum(1, keepdim=True)).cumsum(1), (1, 0))
+    last = edges.shape[1] - 1
+    lower, upper = placed - 2e-7, placed + 2e-7
+    to = torch.searchsorted(edges, lower).clamp(max=last)
+    at = (torch.searchsorted(edges, upper, right=True) - 1).clamp(min=0)
+
+    def between(start: torch.Tensor, end: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+        start_x, end_x = edges.gather(1, start), edges.gather(1, end)
+        share = ((x - start_x) / (end_x - start_x)).nan_to_num(0.0).clamp(0, 1)
+        return torch.lerp(cumulative.gather(1, start), cumulative.gather(1, end), share)
+
+    return between((to - 1).clamp(min=0), to, lower), between(at, (at + 1).clamp(max=last), upper)
 
 
 def check_places() -> None:
@@ -92,6 +115,8 @@ def check_places() -> None:
             placed = ray_triton.sample_pdf(weights, edges, wanted, padding, 1e-5)
             expected = ray_numba.sample_pdf(weights, edges, wanted, padding, 1e-5)
             assert_near(placed, expected, 1e-6)
+            before, behind = exact_shares(weights + padding, edges, placed)
+            assert ((before - 1e-6 <= wanted) & (wanted <= behind + 1e-6)).all()
             # in the same order, but for rounding
             assert not bool((placed.diff() < -1e-6).any())
     assert ray_triton.sample_pdf(weights[:0], edges[:0], wanted[:0], 0.01, 1e-5).shape == (0, places)
@@ -155,17 +180,18 @@ def check_the_distortion_loss(kernels: Any = None) -> None:
     assert kernels.distortion_loss(edges, weights).isnan()
 
 
+BY_TRITON = (check_places, check_the_interlevel_loss, check_the_distortion_loss)
+OF_WEIGHTS = (check_weights, check_weights_of_what_is_not_finite)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("check", [check_places, check_the_interlevel_loss, check_the_distortion_loss])
-def test_in_the_interpreter(check):
+@pytest.mark.parametrize("checks", [OF_WEIGHTS, *((each,) for each in BY_TRITON)])
+def test_in_the_interpreter(checks):
     pytest.importorskip("triton")
-    in_interpreter(check)
+    in_interpreter(*checks)
 
 
-ON_THE_CPU = [check_weights, check_weights_of_what_is_not_finite, check_the_distortion_loss]
-
-
-@pytest.mark.parametrize("check", ON_THE_CPU)
+@pytest.mark.parametrize("check", [*OF_WEIGHTS, check_the_distortion_loss])
 def test_the_same_on_the_cpu(check):
     check(ray_numba)
 
@@ -186,15 +212,32 @@ def step(samples: int = 48, intervals: int = 256) -> None:
     ray_triton.sample_pdf(outer_weights, outer_edges, edges, 0.01, 1e-5)
     ray_triton.interlevel_loss(edges, weights, outer_edges, outer_weights.requires_grad_())
     ray_triton.distortion_loss(edges, weights.requires_grad_())
+    for densities in (outer_weights.detach().requires_grad_(), weights):
+        ray_triton.weights_from_densities(densities, torch.rand(densities.shape)).sum().backward()
 
 
 @NEEDS_A_GPU
 def test_the_same_on_a_gpu():
-    on_a_gpu(check_places, check_the_interlevel_loss, check_the_distortion_loss)
+    on_a_gpu(*OF_WEIGHTS, *BY_TRITON)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
 def test_compiled_without_spills(architecture, tmp_path):
     pytest.importorskip("triton")
-    check_registers(step, architecture, tmp_path, {"_place_kernel", "_bound_kernel", "_distortion_kernel"}, 96)
+    along_rays = {"_place_kernel", "_bound_kernel", "_distortion_kernel", "_weight_kernel", "_density_gradient_kernel"}
+    check_registers(step, architecture, tmp_path, along_rays, 96)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("architecture", ARCHITECTURES)
+def test_placing_compares_no_sample_with_each_place(architecture, tmp_path):
+    """Its code has no loop, and the 776 pairs that each thread would compare do not fit into it with their sums."""
+    pytest.importorskip("triton")
+    from edge_depth_nerf.kernels import ray_triton
+
+    edges, wanted = torch.rand(2, 257), torch.rand(2, 97)
+    (kernel,) = compiled(lambda: ray_triton.sample_pdf(edges[:, 1:], edges, wanted, 0.01, 1e-5), architecture, tmp_path)
+    # what follows the end of a program jumps to itself
+    assert sum(count for name, count in kernel.instructions.items() if name.startswith("BRA")) == 1
+    assert sum(kernel.instructions.values()) < 800

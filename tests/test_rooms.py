@@ -20,7 +20,7 @@ MOST_LINES = {
     "edge_depth_nerf/films": 730,
     "edge_depth_nerf/inspecting": 1_440,
     "edge_depth_nerf/jobs": 840,
-    "edge_depth_nerf/kernels": 3_670,
+    "edge_depth_nerf/kernels": 3_690,
     "edge_depth_nerf/lidar": 1_590,
     "edge_depth_nerf/masks": 1_380,
     "edge_depth_nerf/method": 3_050,

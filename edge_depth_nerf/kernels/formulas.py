@@ -57,6 +57,20 @@ def harmonics(directions: Float[Tensor, "rays 3"], dtype: torch.dtype | None = N
     return torch.stack(every, dim=1).to(dtype or directions.dtype)
 
 
+def density(before: Float[Tensor, "points"], inside: Float[Tensor, "points"], scale: float) -> Float[Tensor, "points"]:
+    """Compute densities of a network's outputs, in the type of `inside`; 0 where a point is not inside."""
+    return scale * before.to(inside).exp() * inside
+
+
+def weights_from_densities(
+    densities: Float[Tensor, "rays samples"], deltas: Float[Tensor, "rays samples"]
+) -> Float[Tensor, "rays samples"]:
+    """Compute rendering weights of samples of these lengths; what is not a number weighs nothing."""
+    depth = densities * deltas
+    before = F.pad(depth[:, :-1].cumsum(1), (1, 0))
+    return torch.nan_to_num((1 - (-depth).exp()) * (-before).exp())
+
+
 def sample_pdf(
     weights: Float[Tensor, "rays intervals"],
     edges: Float[Tensor, "rays edges"],

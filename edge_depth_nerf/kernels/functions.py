@@ -79,6 +79,18 @@ def _samples(device: torch.device) -> Sequence[Example]:
     return [{"edges": edges, "weights": weights.requires_grad_()}]
 
 
+def _outputs(device: torch.device) -> Sequence[Example]:
+    # a network's, under autocast in half precision
+    outputs = ((8 * spread(device, 151) - 4).to(dtype) for dtype in (torch.float32, torch.float16))
+    inside = (spread(device, 151, seed=3) < 0.7).float()
+    return [{"before": each.requires_grad_(), "inside": inside, "scale": 0.01} for each in outputs]
+
+
+def _optical(device: torch.device) -> Sequence[Example]:
+    densities = 20 * spread(device, 7, 43) ** 4
+    return [{"densities": densities.requires_grad_(), "deltas": spread(device, 7, 43, seed=3)}]
+
+
 def _points(device: torch.device) -> Sequence[Example]:
     scalings = torch.tensor([4.0, 23.0, 64.0], device=device)
     points = {"positions": spread(device, 151, 3).requires_grad_(), "scalings": scalings}
@@ -124,5 +136,13 @@ DISTORTION_LOSS = Function(
     GpuForm("distortion loss", lambda: _triton().ray.distortion_loss, formulas.distortion_loss, _samples, 1e-4, MOST),
 )
 POSITIONS = Function(lambda: _numba().pointwise.midpoints, follows=False)
-DENSITY = Function(lambda: _numba().pointwise.density)
-WEIGHTS = Function(lambda: _numba().ray.weights_from_densities)
+DENSITY = Function(
+    lambda: _numba().pointwise.density,
+    GpuForm("density", lambda: _triton().pointwise.density, formulas.density, _outputs, tolerance=1e-5),
+)
+WEIGHTS = Function(
+    lambda: _numba().ray.weights_from_densities,
+    GpuForm(
+        "weights", lambda: _triton().ray.weights_from_densities, formulas.weights_from_densities, _optical, 1e-5, MOST
+    ),
+)

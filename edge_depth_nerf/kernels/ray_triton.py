@@ -1,14 +1,14 @@
-"""Sums along rays on a GPU: where samples go, the proposal and the distortion loss with their gradients.
+"""Sums along rays on a GPU: weights, where samples go, the proposal and the distortion loss with their gradients.
 
-A program holds a ray on the chip, so a ray has at most `functions.MOST` samples. What the CPU finds by walking two
-sorted lists (`ray_numba`) is found here by comparing each of one with each of the other: more comparisons, none of
-which waits. Sums of a ray are of float32, but for the cumulative distribution that samples are placed by, which is of
-float64 as on the CPU. With TRITON_INTERPRET=1 set before the import the kernels run on CPU tensors.
+A program holds a ray or a few on the chip, so a ray has at most `functions.MOST` samples. The losses find what the CPU
+finds by walking two sorted lists (`ray_numba`) by comparing each of one with each of the other: more comparisons, none
+of which waits. Sums of a ray are of float32, but for the cumulative distribution that samples are placed by, which is
+of float64 as on the CPU. With TRITON_INTERPRET=1 set before the import the kernels run on CPU tensors.
 """
 
 from __future__ import annotations
 
-from typing import no_type_check
+from typing import Any, no_type_check
 
 import torch
 import triton
@@ -20,6 +20,8 @@ from edge_depth_nerf.kernels.formulas import EPS
 from edge_depth_nerf.kernels.gradients import sloped
 from edge_depth_nerf.kernels.triton_launch import launch, rows_of
 
+NUMBERS = 1024
+"""Numbers that a program works on where it works on several rays."""
 TOGETHER = 8
 """Places, or samples, that are compared with all samples of a ray at a time."""
 
@@ -37,9 +39,98 @@ def _is_finite(x):
 
 @triton.jit
 @no_type_check
-def _place_kernel(
-    weights, edges, wanted, placed, samples, places, padding, least, SAMPLES: tl.constexpr, TOGETHER: tl.constexpr
+def _optical_depths(densities, deltas, ray, sample, rays, samples):
+    """Give the optical depth of some samples and their lengths, 0 outside."""
+    inside = (ray < rays) & (sample >= 0) & (sample < samples)
+    delta = tl.load(deltas + ray * samples + sample, inside, 0.0)
+    return delta * tl.load(densities + ray * samples + sample, inside, 0.0), delta
+
+
+@triton.jit
+@no_type_check
+def _weight_kernel(densities, deltas, weights, rays, samples, RAYS: tl.constexpr, SAMPLES: tl.constexpr):
+    ray = (tl.program_id(0).to(tl.int64) * RAYS + tl.arange(0, RAYS))[:, None]
+    sample = tl.arange(0, SAMPLES)[None]
+    depth, _ = _optical_depths(densities, deltas, ray, sample, rays, samples)
+    before, _ = _optical_depths(densities, deltas, ray, sample - 1, rays, samples)
+    weight = (1 - tl.exp(-depth)) * tl.exp(-tl.cumsum(before, 1))
+    # as nerfstudio: what is not a number weighs nothing
+    tl.store(
+        weights + ray * samples + sample, tl.where(weight == weight, weight, 0.0), (ray < rays) & (sample < samples)
+    )
+
+
+@triton.jit
+@no_type_check
+def _density_gradient_kernel(
+    densities, deltas, gradient, to_densities, rays, samples, RAYS: tl.constexpr, SAMPLES: tl.constexpr
 ):
+    ray = (tl.program_id(0).to(tl.int64) * RAYS + tl.arange(0, RAYS))[:, None]
+    sample = tl.arange(0, SAMPLES)[None]
+    depth, delta = _optical_depths(densities, deltas, ray, sample, rays, samples)
+    before, _ = _optical_depths(densities, deltas, ray, sample - 1, rays, samples)
+    after, _ = _optical_depths(densities, deltas, ray, sample + 1, rays, samples)
+    reached = tl.cumsum(before, 1)
+    inside, has_next = (ray < rays) & (sample < samples), (ray < rays) & (sample + 1 < samples)
+    left, seen = tl.exp(-depth), tl.exp(-reached)
+    g = tl.load(gradient + ray * samples + sample, inside, 0.0)
+    g = tl.where(_is_finite((1 - left) * seen), g, 0.0)
+    # Σ_j>k g_j w_j, of what lies behind each sample: the next one's share, summed up from the far end
+    next_weight = (1 - tl.exp(-after)) * tl.exp(-(reached + depth))
+    next_g = tl.load(gradient + ray * samples + sample + 1, has_next, 0.0)
+    share = tl.where(_is_finite(next_weight), next_g, 0.0) * next_weight
+    behind = tl.cumsum(tl.where(has_next, share, 0.0), 1, reverse=True)
+    tl.store(to_densities + ray * samples + sample, delta * (g * left * seen - behind), inside)
+
+
+class _Weights(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, densities: Tensor, deltas: Tensor) -> Tensor:
+        densities, deltas = densities.detach().contiguous(), deltas.detach().contiguous()
+        weights = torch.empty_like(densities)
+        _along_rays(_weight_kernel, densities, deltas, weights)
+        if ctx.needs_input_grad[0]:
+            ctx.save_for_backward(densities, deltas)
+        return weights
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        densities, deltas = ctx.saved_tensors
+        to_densities = torch.empty_like(densities)
+        _along_rays(_density_gradient_kernel, densities, deltas, gradients[0].contiguous(), to_densities)
+        return to_densities, None
+
+
+def _along_rays(kernel: Any, *tensors: Tensor) -> None:
+    """Launch a kernel that works on several rays at a time, all samples of each."""
+    rays, samples = tensors[0].shape
+    block = _block(samples)
+    together = max(1, NUMBERS // block)
+    programs = triton.cdiv(rays, together) if samples > 0 else 0
+    launch(kernel, (programs,), *tensors, rays, samples, RAYS=together, SAMPLES=block)
+
+
+def weights_from_densities(
+    densities: Float[Tensor, "rays samples"], deltas: Float[Tensor, "rays samples"]
+) -> Float[Tensor, "rays samples"]:
+    """Compute rendering weights, w_k = (1 - exp(-σ_k δ_k)) exp(-Σ_j<k σ_j δ_j); NaN becomes 0.
+
+    Args:
+        densities: σ, 0 or more, float32. Differentiable once, by them alone.
+        deltas: δ, the samples' lengths, float32.
+    """
+    weights = _Weights.apply(densities, deltas)
+    assert isinstance(weights, Tensor)
+    return weights
+
+
+@triton.jit
+@no_type_check
+def _place_kernel(
+    weights, edges, wanted, placed, cumulatives, samples, places, padding, least, SAMPLES: tl.constexpr,
+    PLACES: tl.constexpr, STEPS: tl.constexpr,
+):  # fmt: skip
     ray = tl.program_id(0).to(tl.int64)
     sample = tl.arange(0, SAMPLES)
     inside = sample < samples
@@ -48,23 +139,28 @@ def _place_kernel(
     lacking = tl.maximum(least - total, 0.0)
     total = total + lacking
     share = tl.where(inside, (weight + lacking / samples) / total, 0.0)
-    # of each interval the share of all that lies before its end, and its end
+    # of each interval the share of all that lies before its end
     cumulative = tl.minimum(tl.cumsum(share.to(tl.float64), 0).to(tl.float32), 1.0)
-    edge = tl.load(edges + ray * (samples + 1) + sample + 1, inside, float("inf"))
-    first_edge = tl.load(edges + ray * (samples + 1))
-    for first in range(0, places, TOGETHER):
-        place = first + tl.arange(0, TOGETHER)
-        u = tl.load(wanted + ray * places + place, place < places, 0.0)
-        passed = (cumulative[None] <= u[:, None]) & inside[None]
-        low = tl.max(tl.where(passed, cumulative[None], 0.0), 1)
-        start = tl.max(tl.where(passed, edge[None], first_edge), 1)
-        ahead = inside[None] & (passed == 0)
-        high = tl.min(tl.where(ahead, cumulative[None], float("inf")), 1)
-        end = tl.min(tl.where(ahead, edge[None], float("inf")), 1)
-        # behind the last interval it is the last edge; a sum that is no number gives no place
-        found = tl.where(_is_finite(high), start + (u - low) / (high - low) * (end - start), start)
-        found = tl.where(_is_finite(total), found, float("nan"))
-        tl.store(placed + ray * places + place, found, place < places)
+    tl.store(cumulatives + ray * samples + sample, cumulative, inside)
+    # each thread reads what others have written
+    tl.debug_barrier()
+    place = tl.arange(0, PLACES)
+    given = place < places
+    u = tl.load(wanted + ray * places + place, given, 0.0)
+    # a binary search for how many intervals end at or before each
+    passed = tl.zeros((PLACES,), tl.int32)
+    for step in tl.static_range(STEPS):
+        further = passed + (SAMPLES >> step)
+        ahead = tl.load(cumulatives + ray * samples + further - 1, further <= samples, float("inf"))
+        passed = tl.where(ahead <= u, further, passed)
+    low = tl.load(cumulatives + ray * samples + passed - 1, passed > 0, 0.0)
+    high = tl.load(cumulatives + ray * samples + passed, passed < samples, float("inf"))
+    start = tl.load(edges + ray * (samples + 1) + passed)
+    end = tl.load(edges + ray * (samples + 1) + passed + 1, passed < samples, 0.0)
+    # behind the last interval it is the last edge; a sum that is no number gives no place
+    found = tl.where(_is_finite(high), start + (u - low) / (high - low) * (end - start), start)
+    found = tl.where(_is_finite(total), found, float("nan"))
+    tl.store(placed + ray * places + place, found, given)
 
 
 def sample_pdf(
@@ -78,9 +174,12 @@ def sample_pdf(
     rays, samples = weights.shape
     places = wanted.shape[1]
     weights, edges, wanted = (each.detach().contiguous() for each in (weights, edges, wanted))
-    placed = torch.empty_like(wanted)
-    arguments = weights, edges, wanted, placed, samples, places, float(padding), float(least)
-    launch(_place_kernel, (rays,), *arguments, SAMPLES=_block(samples), TOGETHER=TOGETHER)
+    placed, cumulatives = torch.empty_like(wanted), torch.empty_like(weights)
+    arguments = weights, edges, wanted, placed, cumulatives, samples, places, float(padding), float(least)
+    block = _block(samples)
+    constants = {"SAMPLES": block, "PLACES": _block(places), "STEPS": block.bit_length()}
+    # one warp, as each step of the search waits for the one before
+    launch(_place_kernel, (rays,), *arguments, **constants, num_warps=1)
     return placed
 
 

@@ -88,7 +88,9 @@ def _unit_cube(positions: Float[Tensor, "*bs 3"]) -> tuple[Tensor, Tensor]:
 
 def _densities(before: Float[Tensor, "*bs 1"], inside: Float[Tensor, "*bs 1"], scale: float) -> Float[Tensor, "*bs 1"]:
     """Compute densities from a network's outputs; 0 where a point is not inside."""
-    compute = DENSITY.compiled_for(before, inside)
+    # what autocast has made of them is read as it is
+    plain = before.dtype == made_by_autocast(before.device) and inside.dtype == torch.float32
+    compute = DENSITY.on(before.device) if plain else None
     if compute is None:
         return scale * trunc_exp(before.to(inside)) * inside
     return compute(before.reshape(-1), inside.reshape(-1), scale).view(inside.shape)
