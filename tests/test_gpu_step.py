@@ -50,6 +50,11 @@ def test_it_runs_without_waiting_and_in_so_many_kernels(counts, case):
 
 
 @pytest.mark.parametrize("case", MOST)
+def test_no_kernel_of_the_cpu_is_imported(counts, case):
+    assert counts[case]["numba"] == []
+
+
+@pytest.mark.parametrize("case", MOST)
 def test_torchs_operations_move_so_much(counts, case):
     assert 0 < counts[case]["gigabytes"] <= MOST[case][1], counts[case]["parts"]
 

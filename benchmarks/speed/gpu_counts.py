@@ -108,6 +108,8 @@ class Counts:
     """What makes the host wait, or the device, and the line that asks for it."""
     without_gradient: list[str] = field(default_factory=list)
     """Parameters that backward left without one."""
+    numba: list[str] = field(default_factory=list)
+    """Modules of the CPU's kernels that were imported."""
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON, with the sums."""
@@ -121,6 +123,7 @@ class Counts:
             "parts": parts,
             "names": dict(self.names.most_common()),
             "without_gradient": self.without_gradient,
+            "numba": self.numba,
         }
 
 
@@ -367,6 +370,14 @@ def counted_view(gpu: FakeGpu, trainer: Any) -> Counts:
     return gpu.counter.counts
 
 
+def forget_numba() -> None:
+    """Forget the modules of the CPU's kernels, which the set-up on the CPU has imported."""
+    for name in [each for each in sys.modules if each.endswith("_numba")]:
+        parent, _, child = name.rpartition(".")
+        del sys.modules[name]
+        vars(sys.modules[parent]).pop(child, None)
+
+
 def counted(case: str, scene: Path, folder: Path) -> dict[str, Any]:
     """Count a case, in a process that was started by `in_a_process`."""
     from edge_depth_nerf.kernels import back_ends
@@ -375,7 +386,9 @@ def counted(case: str, scene: Path, folder: Path) -> dict[str, Any]:
     method, changes = CASES[case]
     gpu = FakeGpu()
     trainer = fake_trainer(gpu, method, scene, folder, **changes)
+    forget_numba()
     found = counted_view(gpu, trainer) if changes.get("view") else counted_step(gpu, trainer)
+    found.numba = sorted(name for name in sys.modules if name.endswith("_numba"))
     return found.to_dict()
 
 

@@ -17,8 +17,9 @@ weight ρ that the measured errors of both give:
 where a pixel has both, and the one it has elsewhere. This d̂, of both, is also what g compares. Without motion nothing
 changes.
 
-Nothing here is differentiated: the prior is data. Compiled loops (`integration_numba`) integrate on the CPU, in
-float64, which keeps the ratios of weights up to 37 sigma_depth_m.
+Nothing here is differentiated: the prior is data. Compiled loops (`integration_numba`) integrate on the CPU, torch on a
+GPU (`integrate_by_torch`, which tests compare the loops with); both in float64, which keeps the ratios of weights up to
+37 sigma_depth_m.
 """
 
 from __future__ import annotations
@@ -49,7 +50,10 @@ Normalise = Literal["pooled", "per-source"]
 SigmaMode = Literal["constant", "combined"]
 
 CPU_STRIP_PIXELS = 1 << 16
-"""A map is integrated in strips of about so many pixels: the work that a thread takes at a time."""
+"""On the CPU a map is integrated in strips of about so many pixels: the work that a thread takes at a time."""
+WINDOW_NUMBERS = 1 << 22
+"""torch integrates as many rows at a time as have about so many pixels in their windows: 34 MB for each of some seven
+numbers of theirs."""
 LOWEST_EXPONENT = -700.0
 """Distance factors (Eq. 7) of lower exponents are 0: float64 ends at -745, the last of it with few digits."""
 
@@ -172,6 +176,7 @@ def integrate_depth(
     mono_m: Float[Tensor, "*batch h w"],
     valid: Bool[Tensor, "*batch h w"],
     options: IntegrationOptions | None = None,
+    device: torch.device | str | None = None,
 ) -> IntegratedDepth:
     """Average LiDAR and monocular distances over an edge-aware window (Eq. 5 to 7).
 
@@ -188,9 +193,10 @@ def integrate_depth(
         mono_m: D̂, metres along the ray, 0 = no estimate.
         valid: True where the pixel may be used.
         options: the defaults are the paper's.
+        device: what computes; None: the maps' own.
 
     Returns:
-        Three maps in float32, or in float64 if either input was; 0 where there is no prior.
+        Three maps in float32, or in float64 if either input was, where the maps are; 0 where there is no prior.
 
     Raises:
         InputError: the maps differ in shape.
@@ -198,19 +204,27 @@ def integrate_depth(
     options = options or IntegrationOptions()
     _check_maps("integrate_depth", lidar_m=lidar_m, mono_m=mono_m, valid=valid)
     dtype = _work_dtype(lidar_m, mono_m)
+    device = mono_m.device if device is None else torch.device(device)
     flat = (math.prod(mono_m.shape[:-2]), *mono_m.shape[-2:])
-    lidar, mono = (maps.detach().reshape(flat).to("cpu", dtype) for maps in (lidar_m, mono_m))
-    usable = valid.reshape(flat).cpu()
+    lidar, mono = (maps.detach().reshape(flat).to(device, dtype) for maps in (lidar_m, mono_m))
+    usable = valid.reshape(flat).to(device)
     # empty, not zeros: torch's own threads, once they have filled so many, spin for a while beside ours
-    result = torch.empty(3, *flat, dtype=dtype)
+    result = mono.new_empty(3, *flat)
+    integrate = _integrate_on_cpu if device.type == "cpu" else integrate_by_torch
     for i in range(flat[0]):
-        _integrate_on_cpu(lidar[i], mono[i], usable[i], options, result[:, i])
+        integrate(lidar[i], mono[i], usable[i], options, result[:, i])
     distance_m, spread_m, mono_share = result.reshape(3, *mono_m.shape).to(mono_m.device)
     return IntegratedDepth(distance_m, spread_m, mono_share)
 
 
 def _work_dtype(*maps: Tensor) -> torch.dtype:
     return torch.float64 if any(tensor.dtype == torch.float64 for tensor in maps) else torch.float32
+
+
+def _along_axis(options: IntegrationOptions) -> list[float]:
+    """List the spatial weights along one axis: Eq. 7's first factor is the product of two of them."""
+    radius = int(options.kernel_size) // 2
+    return [math.exp(-0.5 * (k / options.sigma_space_px) ** 2) for k in range(-radius, radius + 1)]
 
 
 def _integrate_on_cpu(lidar: Tensor, mono: Tensor, valid: Tensor, options: IntegrationOptions, out: Tensor) -> None:
@@ -223,16 +237,13 @@ def _integrate_on_cpu(lidar: Tensor, mono: Tensor, valid: Tensor, options: Integ
     from edge_depth_nerf.method.integration_numba import TILE, integrate_rows
 
     height, width = mono.shape
-    radius = int(options.kernel_size) // 2
-    # Eq. 7's first factor is the product of two of these; an inverse variance of 0 makes the second one 1
-    along_axis = [math.exp(-0.5 * (k / options.sigma_space_px) ** 2) for k in range(-radius, radius + 1)]
-    inverse_variance_per_m2 = options.sigma_depth_m**-2 if options.kernel == "edge-aware" else 0.0
     integrate = functools.partial(
         integrate_rows,
         *(tensor.contiguous().numpy() for tensor in (lidar, mono, valid)),
         *(tensor.numpy() for tensor in out),
-        np.array(along_axis),
-        inverse_variance_per_m2,
+        np.array(_along_axis(options)),
+        # 0 makes Eq. 7's second factor 1
+        options.sigma_depth_m**-2 if options.kernel == "edge-aware" else 0.0,
         float(options.sigma_depth_growth_per_m),
         LOWEST_EXPONENT,
         float(options.alpha),
@@ -251,11 +262,81 @@ def _integrate_on_cpu(lidar: Tensor, mono: Tensor, valid: Tensor, options: Integ
         list(map(integrate, tops, bottoms))
 
 
+def integrate_by_torch(
+    lidar: Float[Tensor, "h w"],
+    mono: Float[Tensor, "h w"],
+    valid: Bool[Tensor, "h w"],
+    options: IntegrationOptions,
+    out: Float[Tensor, "3 h w"],
+) -> None:
+    """Integrate one map on any device, some rows at a time.
+
+    Args:
+        lidar: D, metres along the ray.
+        mono: D̂, likewise.
+        valid: True where the pixel may be used.
+        options: of the integration.
+        out: gets the fields of IntegratedDepth, one after the other.
+    """
+    if not out.numel():
+        return
+    usable = valid & _is_distance(mono)
+    points = usable & _is_distance(lidar)
+    centres = torch.where(usable, mono, 0).double()
+    values = torch.where(points, lidar.double(), centres)
+    size = int(options.kernel_size)
+    maps = torch.stack([centres, values, (usable & ~points).double(), points.double()])
+    # of each pixel its window, without a copy: [4, h, w, kernel, kernel]
+    windows = torch.nn.functional.pad(maps, (size // 2,) * 4).unfold(1, size, 1).unfold(2, size, 1)
+    rows = max(1, WINDOW_NUMBERS // max(1, size * size * mono.shape[1]))
+    averaged = [
+        _averaged(some, centre, options)
+        for some, centre in zip(windows.split(rows, 1), centres.split(rows), strict=True)
+    ]
+    result = torch.cat(averaged, 1) * usable
+    if options.keep_returns:
+        kept = torch.stack([lidar.double(), torch.zeros_like(centres), torch.zeros_like(centres)])
+        result = torch.where(points, kept, result)
+    out.copy_(result)
+
+
+def _averaged(
+    windows: Float[Tensor, "4 h w k k"], centres: Float[Tensor, "h w"], options: IntegrationOptions
+) -> Float[Tensor, "3 h w"]:
+    """Give d̃, spread and monocular share of pixels, by Eq. 5 to 7; 0 where η is."""
+    mono, values, is_mono, is_lidar = windows
+    along_axis = centres.new_tensor(_along_axis(options))
+    space = along_axis[:, None] * along_axis
+    centre = centres[..., None, None]
+    g = space
+    if options.kernel == "edge-aware":
+        sigma_m = (options.sigma_depth_growth_per_m * centre.square()).clamp(min=options.sigma_depth_m)
+        exponent = -0.5 * ((mono - centre) / sigma_m).square()
+        g = torch.where(exponent > LOWEST_EXPONENT, exponent.exp() * space, 0)
+    mono_factor, lidar_factor = centres.new_tensor([1 - options.alpha, options.alpha])
+    if options.normalise == "per-source":
+        tiny = torch.finfo(torch.float64).tiny
+        mono_factor = mono_factor / (space * is_mono).sum((-2, -1), keepdim=True).clamp(min=tiny)
+        lidar_points = (space * is_lidar).sum((-2, -1), keepdim=True)
+        lidar_factor = lidar_factor / lidar_points.clamp(min=max(options.least_returns, tiny))
+    of_mono = g * is_mono * mono_factor
+    weights = of_mono + g * is_lidar * lidar_factor
+    eta = weights.sum((-2, -1))
+    some = eta > 0
+    share = weights / torch.where(some, eta, 1)[..., None, None]
+    # from the centre, so that 80 m do not swallow 8 cm
+    mean = (share * (values - centre)).sum((-2, -1))
+    variance = (share * (values - centre - mean[..., None, None]).square()).sum((-2, -1))
+    mono_share = of_mono.sum((-2, -1)) / torch.where(some, eta, 1)
+    return torch.stack([centres + mean, variance.sqrt(), mono_share]) * some
+
+
 def select_prior(
     depth_source: str,
     maps: Mapping[str, Float[Tensor, "*batch h w"] | None],
     valid: Bool[Tensor, "*batch h w"],
     options: IntegrationOptions | None = None,
+    device: torch.device | str | None = None,
 ) -> IntegratedDepth:
     """Give the prior made of LiDAR and monocular distance (`integrate_depth`) or of one source alone (Table 3).
 
@@ -267,6 +348,7 @@ def select_prior(
         maps: distance in metres by source, 0 = none; those that are not needed may be missing or None.
         valid: where the picture may be used.
         options: of the integration.
+        device: what integrates; None: the maps' own.
 
     Raises:
         InputError: the source needs a map that is not there, or the maps differ in shape.
@@ -279,7 +361,7 @@ def select_prior(
             "have; add them, or choose a depth_source that the scene has."
         )
     if depth_source == INTEGRATED:
-        return integrate_depth(found["lidar"], found["mono"], valid, options)
+        return integrate_depth(found["lidar"], found["mono"], valid, options, device)
     source = found[depth_source]
     _check_maps("select_prior", source=source, valid=valid)
     exists = valid & _is_distance(source)

@@ -206,6 +206,7 @@ def integrate_frame(
     options: PriorOptions,
     calibration: Calibration | None = None,
     motion: MotionMap | None = None,
+    device: torch.device | str = "cpu",
 ) -> IntegratedFrame:
     """Align and integrate a frame under a calibration: the prior whose error `Calibration` describes.
 
@@ -217,6 +218,7 @@ def integrate_frame(
         options: what is made of them.
         calibration: the drive's calibration, for its fit.
         motion: what is known from motion; for the integrated source.
+        device: what integrates.
 
     Raises:
         InputError: the maps differ in size.
@@ -243,7 +245,7 @@ def integrate_frame(
 
     def integrated(lidar_m: NDArray[np.float32], mono_m: NDArray[np.float32]) -> tuple[NDArray, NDArray]:
         lidar, mono, valid = (torch.from_numpy(pixels) for pixels in (lidar_m, mono_m, mask))
-        found = select_prior(depth_source, {"lidar": lidar, "mono": mono}, valid, integration)
+        found = select_prior(depth_source, {"lidar": lidar, "mono": mono}, valid, integration, device)
         return found.distance_m.float().numpy(), found.spread_m.float().numpy()
 
     distance, spread = integrated(lidar_m, mono_m)
@@ -360,6 +362,7 @@ def make_prior(
     options: PriorOptions,
     calibration: Calibration | None = None,
     view: RayAngles | None = None,
+    device: torch.device | str = "cpu",
 ) -> Prior:
     """Align a frame's monocular map, integrate (Eq. 5-7), and say how far each pixel is trusted.
 
@@ -370,6 +373,7 @@ def make_prior(
         options: what is made of them.
         calibration: the drive's calibration; used for the drive's fit, and under sigma_mode calibrated.
         view: of the picture; under sigma_mode calibrated a calibration wants it.
+        device: what integrates.
 
     Raises:
         InputError: there is no map of a source that is needed, or the maps differ in size.
@@ -391,7 +395,7 @@ def make_prior(
             mask = mask if calibration.everywhere else mask & calibration.in_field(view.elevation_rad)
         if calibration.error_model is not None and (lidar_m is not None or depth_source == "mono"):
             lidar_m = np.zeros_like(mono_m) if lidar_m is None else lidar_m
-            frame = integrate_frame(lidar_m, mono_m, mask, depth_source, options, calibration, motion)
+            frame = integrate_frame(lidar_m, mono_m, mask, depth_source, options, calibration, motion, device)
             sigma = sigma_of(frame, calibration, view, motion, motion_sigma_m)
             return Prior(frame.distance_m, np.where(frame.distance_m > 0, sigma, np.float32(0)))
         # what could not be measured takes no part
@@ -402,7 +406,7 @@ def make_prior(
             aligned = _joined(aligned, motion_m, weight_of_errors(MOTION_RELATIVE_ERROR, MONO_RELATIVE_ERROR))
         maps = {**maps, "mono": aligned}
     of_source = {name: torch.from_numpy(pixels) for name, pixels in maps.items() if pixels is not None}
-    integrated = select_prior(depth_source, of_source, torch.from_numpy(mask), options.integration)
+    integrated = select_prior(depth_source, of_source, torch.from_numpy(mask), options.integration, device)
     mode: SigmaMode = "combined" if options.sigma_mode == "calibrated" else options.sigma_mode
     # beside LiDAR any source is an estimate, whose error grows with the distance
     estimate = of_source.get("mono" if depth_source in (INTEGRATED, "lidar") else depth_source)
@@ -416,8 +420,16 @@ class PriorCache:
     A folder that cannot be written (a read-only scene) is not an error: the prior is then made each time.
     """
 
-    def __init__(self, folder: Path, depth_source: str, options: PriorOptions, calibration: Calibration | None = None):
+    def __init__(
+        self,
+        folder: Path,
+        depth_source: str,
+        options: PriorOptions,
+        calibration: Calibration | None = None,
+        device: torch.device | str = "cpu",
+    ):
         self.folder, self.depth_source, self.options, self.calibration = folder, depth_source, options, calibration
+        self._device = device
         described = {
             "version": CACHE_VERSION,
             "depth_source": depth_source,
@@ -434,7 +446,7 @@ class PriorCache:
         cached = _read(path, mask.shape)
         if cached is not None:
             return cached
-        prior = make_prior(maps, mask, self.depth_source, self.options, self.calibration, view)
+        prior = make_prior(maps, mask, self.depth_source, self.options, self.calibration, view, self._device)
 
         archive = io.BytesIO()
         np.savez_compressed(archive, distance_m=prior.distance_m, sigma_m=prior.sigma_m)

@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from rich.console import Console
 
@@ -221,18 +222,19 @@ def find_calibration(
     training_images: Collection[Path] | None = None,
     console: Console | None = None,
     depth_source: str = INTEGRATED,
+    device: torch.device | str = "cpu",
 ) -> Calibration:
     """The scene's calibration for these options; made now and kept in SCENE/.cache, or in `cache`, where there is none.
 
     `training_images` are the pictures that are trained on, where the scene does not say so itself; `depth_source` is
-    what the prior is made of: integrated, or mono alone.
+    what the prior is made of: integrated, or mono alone; `device` is what integrates.
 
     Raises:
         InputError: as `calibrate_scene`.
     """
     if (calibration := saved_calibration(scene, options, cache, training_images, depth_source)) is not None:
         return calibration
-    calibration = _calibrate(scene, _chosen(scene, training_images), depth_source, options, console)
+    calibration = _calibrate(scene, _chosen(scene, training_images), depth_source, options, console, device)
     path = _cached(scene, cache, calibration.made_of)
     # a scene that cannot be written has it made anew each time
     with suppress(OSError):
@@ -313,6 +315,7 @@ def _calibrate(
     depth_source: str,
     options: PriorOptions,
     console: Console | None,
+    device: torch.device | str = "cpu",
 ) -> Calibration:
     missing = [word for layer, word in (("lidar", "LiDAR"), ("mono", "monocular")) if not scene.has(layer)]
     if missing:
@@ -346,13 +349,14 @@ def _calibrate(
         measured = measure_frame(
             *(picture.name, number, maps.lidar_m, maps.mono_m, maps.usable, view, options, far_seen_m, depth_source),
             motion=motion,
+            device=device,
         )
         if motion is None:
             return measured
         left_out = left_out_pixels(scene, picture, motion.distance_m)
         sigma_m = motion_sigma(motion.distance_m, maps.distances_m.get("motion_sigma"))
         measured_beyond = measure_beyond(
-            *(number, maps.lidar_m, maps.mono_m, maps.usable, view, options), motion, sigma_m, left_out
+            *(number, maps.lidar_m, maps.mono_m, maps.usable, view, options), motion, sigma_m, left_out, device
         )
         return dataclasses.replace(measured, beyond=measured_beyond)
 
@@ -440,6 +444,7 @@ def measure_frame(
     far_seen_m: NDArray[np.float32] | None = None,
     depth_source: str = INTEGRATED,
     motion: MotionMap | None = None,
+    device: torch.device | str = "cpu",
 ) -> MeasuredFrame:
     """Hold out some of a frame's LiDAR points, make its prior of the rest, and compare.
 
@@ -457,7 +462,7 @@ def measure_frame(
     # a source alone is not aligned, in the prior either
     mode = "none" if depth_source == "mono" else options.align
     aligned = align(kept_m, mono_m, usable, mode)
-    frame = integrate_frame(kept_m, mono_m, usable, depth_source, options, motion=motion)
+    frame = integrate_frame(kept_m, mono_m, usable, depth_source, options, motion=motion, device=device)
     features = pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, frame.lidar_points, view.theta_rad)
     measured_m, measured = lidar_m, left_out
     if far_seen_m is not None and lidar_points.any():
@@ -499,6 +504,7 @@ def measure_beyond(
     motion: MotionMap,
     motion_sigma_m: NDArray[np.float32],
     left_out: NDArray[np.bool_],
+    device: torch.device | str = "cpu",
 ) -> MeasuredBeyond:
     """Measure a frame's prior in the form used where LiDAR does not reach: from motion alone, and from the network.
 
@@ -510,18 +516,19 @@ def measure_beyond(
     none = np.zeros_like(lidar_m)
     nowhere, everywhere = np.zeros_like(usable), np.ones_like(usable)
     by_motion = dataclasses.replace(motion, mono_counts=nowhere, alone=everywhere, around_m=None)
-    frame = integrate_frame(none, none, usable, INTEGRATED, options, motion=by_motion)
+    integrate = partial(integrate_frame, mask=usable, depth_source=INTEGRATED, options=options, device=device)
+    frame = integrate(none, none, motion=by_motion)
     features = pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, frame.lidar_points, view.theta_rad)
     of_motion = motion_features(features, motion.distance_m, motion_sigma_m, view.elevation_rad)
     evaluated = _some(usable & (lidar_m > 0) & frame.from_motion, _EVALUATED_A_FRAME, rng)
 
     seen = dataclasses.replace(motion, distance_m=np.where(left_out, np.float32(0), motion.distance_m))
-    network = integrate_frame(lidar_m, mono_m, usable, INTEGRATED, options, motion=seen)
+    network = integrate(lidar_m, mono_m, motion=seen)
     held_out = _some(usable & left_out & motion.alone & (network.distance_m > 0), _EVALUATED_A_FRAME, rng)
 
     # as in `measure_frame`, but of two sources
     fewer, _ = held_out_points(both(lidar_m, mono_m, usable), view.elevation_rad, number)
-    of_two = integrate_frame(np.where(fewer, np.float32(0), lidar_m), mono_m, usable, INTEGRATED, options)
+    of_two = integrate(np.where(fewer, np.float32(0), lidar_m), mono_m)
     of_field = pixel_features(of_two.distance_m, of_two.spread_m, of_two.mono_m, of_two.lidar_points, view.theta_rad)
     found = fewer & (of_two.distance_m > 0)
     if motion.around_m is not None:

@@ -269,7 +269,12 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         """Return the rays of a batch of held-out pixels, and their colours."""
         self.eval_count += 1
         assert self.eval_pixel_sampler is not None
-        return self._serve(self.eval_pixel_sampler.sample(), self.eval_ray_generator)
+        if torch.device(self.device).type == "cpu":
+            pixels = self.eval_pixel_sampler.sample()
+        else:
+            stretch = self.eval_pixel_sampler.draw()
+            pixels = decode(stretch.table.packed(stretch.start, stretch.count).to(self.device))
+        return self._serve(pixels, self.eval_ray_generator)
 
     def _ray_generator(self, dataset: FisheyeDepthDataset) -> RayGenerator:
         """Return the table of rays if the cameras allow one, else nerfstudio's generator."""
@@ -302,7 +307,9 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
             return None
         calibration: Calibration | None = None
         if source in CALIBRATED and {"lidar", "mono"} <= sources and options.wants_calibration(source):
-            calibration = find_calibration(scene, options, self._cache_dir(), dataset.image_filenames, CONSOLE, source)
+            calibration = find_calibration(
+                scene, options, self._cache_dir(), dataset.image_filenames, CONSOLE, source, self.device
+            )
             CONSOLE.log(f"Depth prior: {calibration.summary()}")
         elif source == "mono" and options.sigma_mode == "calibrated":
             calibration = field_of_source(scene)
@@ -311,7 +318,7 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
                 f"[yellow]Depth prior: LiDAR alone, because the scene has no monocular maps, or not all of them. To "
                 f"make them, run `edge-depth-nerf estimate-depth {escape(str(self.config.dataparser.data))}`."
             )
-        return PriorCache(self._cache_dir() / "prior", source, options, calibration)
+        return PriorCache(self._cache_dir() / "prior", source, options, calibration, self.device)
 
     def _table(self, dataset: FisheyeDepthDataset, description: str, with_prior: bool) -> PixelTable:
         """Return the table of a split's pixels: the one on disk if it matches, else a new one."""

@@ -141,6 +141,11 @@ class PixelTable:
             records = self._records[np.arange(first, first + count) % len(self)]
         return records
 
+    def packed(self, start: int, count: int) -> UInt8[Tensor, "n 15"]:
+        """Give the bytes of `count` records from number `start` on, for `decode`."""
+        records = np.array(self.records(start, count))
+        return torch.from_numpy(records.view(np.uint8).reshape(-1, RECORD.itemsize))
+
     def batch(
         self, start: int, count: int, keep: Callable[[NDArray, NDArray, NDArray], NDArray] | None = None
     ) -> PixelBatch:
