@@ -60,7 +60,15 @@ PRESETS = """### What each method sets of nerfstudio's own
 
 These are from [nerfstudio_method.toml](../nerfstudio_method.toml). – means nerfstudio's default.
 
+Learning rates reach `--optimizers.….scheduler.lr-final` at the end of the training, whatever `--max-num-iterations` is;
+`--optimizers.….scheduler.max-steps` sets another end. `--pipeline.model.proposal-warmup`,
+`--pipeline.model.proposal-weights-anneal-max-num-iters` and `--optimizers.….scheduler.warmup-steps` below 1 are shares
+of the training. From 1 on they are steps, as in nerfstudio.
+
 """
+
+HOSTS = ("proposal_warmup", "proposal_weights_anneal_max_num_iters")
+"""nerfstudio's options that our model declares again, to take shares."""
 
 SHARED = "Options of all of them:\n\n"
 
@@ -232,7 +240,7 @@ def methods() -> str:
             # a group of options has a table of its own
             full = f"{place}.{entry.name}".removeprefix(".")
             hidden = is_marked(hints[entry.name], tyro.conf.Suppress)
-            if hidden or entry.name not in docs or entry.name in ("_target", "losses") or full in places:
+            if hidden or entry.name not in docs or entry.name in ("_target", "losses", *HOSTS) or full in places:
                 continue
             values = {name: at(config, full) for name, config in configs.items()}
             first = next(iter(values.values()))
@@ -267,7 +275,7 @@ def presets() -> str:
             FisheyeDepthDataParserConfig,
         ),
     )
-    known = {name for cls in ours for name in field_docs(cls)}
+    known = {name for cls in ours for name in field_docs(cls)} - {*HOSTS}
     values = {name: declared["presets"][method["preset"]] for name, method in declared["methods"].items()}
     names = dict.fromkeys(name for preset in values.values() for name in preset if name.split(".")[-1] not in known)
     rows = [

@@ -151,14 +151,17 @@ def test_each_method_is_what_its_name_says():
         assert {*differing(resolved("edge-paper"), resolved(f"edge-paper-{name}"))} == {field}, name
 
 
-@pytest.mark.parametrize("steps", [1000, 4000])
-def test_learning_rates_fall_over_the_steps_asked_for(steps):
-    """As they do over the preset's: the last step's rate is the preset's last, at any length."""
-    whole, other = resolved("edge", steps=None), resolved("edge", steps=steps)
-    lengths = [name for name in whole if name.endswith((".scheduler.max_steps", ".scheduler.warmup_steps"))]
-    assert len(lengths) == 6 and whole["max_num_iterations"] == 2000
-    assert {name: other[name] for name in lengths} == {name: whole[name] * steps // 2000 for name in lengths}
-    assert {*differing(whole, other)} <= {*lengths, "max_num_iterations"}
+@pytest.mark.parametrize("preset", ["lite", "full"])
+def test_schedules_of_every_method_follow_the_steps_asked_for(preset):
+    """By one rule: nothing but the number of steps is set, and lengths are shares of it."""
+    shares = {f"pipeline.model.proposal_{name}" for name in ("warmup", "weights_anneal_max_num_iters")}
+    for name in METHODS:
+        whole, other = (resolved(name, preset, steps=steps) for steps in (None, 700))
+        assert {*differing(whole, other)} == {"max_num_iterations"}
+        assert {
+            other[f"optimizers.{group}.scheduler.max_steps"] for group in ("fields", "proposal_networks", "camera_opt")
+        } == {None}
+        assert all(0 < other[share] < 1 for share in shares)
 
 
 @pytest.mark.parametrize("preset", ["lite", "full"])

@@ -36,20 +36,6 @@ def literal_form() -> dict[str, Any]:
     return {name: value for name, value in presets["paper"].items() if presets["full"].get(name) != value}
 
 
-def _schedules_over(config: TrainerConfig, steps: int) -> dict[str, int]:
-    """The lengths of the learning rates' schedules, in steps: the preset's, stretched as the training is.
-
-    A short training would end at a high learning rate otherwise, and a long one stand still at the lowest.
-    """
-    stretch = steps / config.max_num_iterations
-    return {
-        f"optimizers.{group}.scheduler.{name}": max(round(getattr(optimiser["scheduler"], name) * stretch), least)
-        for group, optimiser in config.optimizers.items()
-        if optimiser["scheduler"] is not None
-        for name, least in (("max_steps", 1), ("warmup_steps", 0))
-    }
-
-
 def configuration(run: RunSpecification, folder: Path | None = None) -> tuple[TrainerConfig, set[str]]:
     """Resolve the configuration of a run.
 
@@ -66,7 +52,7 @@ def configuration(run: RunSpecification, folder: Path | None = None) -> tuple[Tr
         **COMMON,
         "machine.seed": run.seed,
         "pipeline.datamanager.data": Path(run.scene),
-        **({} if run.steps is None else {"max_num_iterations": run.steps, **_schedules_over(config, run.steps)}),
+        **({} if run.steps is None else {"max_num_iterations": run.steps}),
         **({} if folder is None else {"output_dir": folder.parent, "experiment_name": folder.name}),
     }
     named = {

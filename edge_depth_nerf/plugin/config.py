@@ -18,7 +18,6 @@ from typing import Any
 import torch
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
-from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
@@ -27,6 +26,7 @@ from edge_depth_nerf.kernels.table_adam import TableAdam
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModelConfig
 from edge_depth_nerf.plugin.pipeline import EdgeDepthPipelineConfig
+from edge_depth_nerf.plugin.schedules import TrainingScheduleConfig
 from edge_depth_nerf.plugin.trainer import EdgeDepthTrainerConfig
 
 if sys.version_info >= (3, 11):
@@ -63,12 +63,12 @@ def read_method_file() -> dict[str, Any]:
 
 
 def base_config(method_name: str) -> TrainerConfig:
-    """Give what all methods share: nerfacto's optimisers, fixed poses, a viewer that listens on this machine only."""
+    """Give what all methods share: Adam over the training, fixed poses, a viewer that listens on this machine only."""
 
-    def optimiser() -> dict[str, Any]:
+    def optimiser(warmup: float = 0.0) -> dict[str, Any]:
         return {
             "optimizer": FusedAdamConfig(lr=1e-2, eps=1e-15),
-            "scheduler": ExponentialDecaySchedulerConfig(lr_final=1e-4, max_steps=200000),
+            "scheduler": TrainingScheduleConfig(lr_final=1e-4, warmup_steps=warmup),
         }
 
     return EdgeDepthTrainerConfig(
@@ -78,7 +78,7 @@ def base_config(method_name: str) -> TrainerConfig:
         pipeline=EdgeDepthPipelineConfig(
             datamanager=FisheyeDepthDataManagerConfig(), model=EdgeDepthNerfModelConfig(eval_num_rays_per_chunk=1 << 15)
         ),
-        optimizers={name: optimiser() for name in ("proposal_networks", "fields", "camera_opt")},
+        optimizers={"proposal_networks": optimiser(), "fields": optimiser(), "camera_opt": optimiser(warmup=0.1)},
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15, websocket_host="127.0.0.1"),
         vis="viewer",
     )

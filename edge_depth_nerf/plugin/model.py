@@ -53,6 +53,7 @@ from edge_depth_nerf.plugin.renderers import (
     render,
     with_sky,
 )
+from edge_depth_nerf.plugin.schedules import USUAL_STEPS, follow_training, in_steps
 from edge_depth_nerf.plugin.step_losses import (
     DepthLossName,
     LossOptions,
@@ -107,6 +108,10 @@ class EdgeDepthNerfModelConfig(NerfactoModelConfig):
     mean of all pictures, which does not give their mean colour. none: not modelled."""
     camera_optimizer: CameraOptimizerConfig = field(default_factory=PoseRefinerConfig)
     """Poses that training refines."""
+    proposal_warmup: float = 1 / 6  # pyright: ignore[reportIncompatibleVariableOverride]
+    """How long the proposal networks are trained less and less often: below 1 a share of the training, else steps."""
+    proposal_weights_anneal_max_num_iters: float = 1 / 30  # pyright: ignore[reportIncompatibleVariableOverride]
+    """How long the proposals' weights count less than later: below 1 a share of the training, else steps."""
     detail: bool = False
     """Add to rendered views what the training pictures that see most of them show beyond their own renderings. A view
     from a new place then takes longer: up to eight training pictures are rendered first. Training stays the same."""
@@ -151,7 +156,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         self.psnr = Psnr()
         self.exposure = Gains(self.num_train_data) if self.config.exposure == "gain" else None
         self._step = 0
-        self._training_steps = 30_000
+        self._training_steps = USUAL_STEPS
         self.scheduled_weight: Tensor | None = None
         """λ where it is a tensor, which can change without the host."""
         self.detail: TrainingDetail | None = None
@@ -216,10 +221,14 @@ class EdgeDepthNerfModel(NerfactoModel):
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Nerfacto's callbacks, and one that tells the step."""
+        """Nerfacto's callbacks, and one that tells the step. All schedules then end with the training."""
         trainer = training_callback_attributes.trainer
         if trainer is not None:
             self._training_steps = total_steps(trainer)
+            follow_training(training_callback_attributes.optimizers, self._training_steps)
+        # nerfacto reads both in steps
+        for name in ("proposal_warmup", "proposal_weights_anneal_max_num_iters"):
+            setattr(self.config, name, max(1, in_steps(getattr(self.config, name), self._training_steps)))
 
         def remember(step: int) -> None:
             self._step = step
@@ -416,7 +425,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         return self.config.depth_loss_mult * self.config.depth_loss_final ** self._share_done()
 
     def _share_done(self) -> float:
-        """The share of the training that is behind; of 30,000 steps if no trainer states them."""
+        """The share of the training that is behind; of `USUAL_STEPS` if no trainer states them."""
         return min(1.0, self._step / max(1, self._training_steps))
 
     def reset_depth_errors(self) -> None:
