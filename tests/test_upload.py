@@ -82,7 +82,7 @@ def test_the_next_batch_is_read_before_it_is_asked_for(table, monkeypatch):
 
 
 def test_a_table_lies_on_a_gpu_if_it_takes_a_quarter_of_its_free_memory(table, monkeypatch):
-    size = table.packed.nbytes
+    size = table.nbytes
     monkeypatch.setattr(TableOnDevice, "__init__", lambda self, table, device: None)
     for free, expected in ((size / SHARE_OF_MEMORY, TableOnDevice), (size / SHARE_OF_MEMORY - 1, Uploads)):
         monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _, free=free: (free, 2 * free))

@@ -273,7 +273,7 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
             pixels = self.eval_pixel_sampler.sample()
         else:
             stretch = self.eval_pixel_sampler.draw()
-            pixels = decode(stretch.table.packed(stretch.start, stretch.count).to(self.device))
+            pixels = decode(self.eval_pixel_sampler.table.packed(stretch.start, stretch.count).to(self.device))
         return self._serve(pixels, self.eval_ray_generator)
 
     def _ray_generator(self, dataset: FisheyeDepthDataset) -> RayGenerator:

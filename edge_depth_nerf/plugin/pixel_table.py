@@ -13,6 +13,7 @@ for memory, is shuffled and appended to the whole. That is a uniformly random pe
 from __future__ import annotations
 
 import tempfile
+import warnings
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass, fields
@@ -129,9 +130,9 @@ class PixelTable:
         return self._with_prior / len(self)
 
     @property
-    def packed(self) -> UInt8[np.ndarray, "n 15"]:
-        """Give the bytes of all records, in the file's order."""
-        return self._records.view(np.uint8).reshape(-1, RECORD.itemsize)
+    def nbytes(self) -> int:
+        """Count the bytes of all records."""
+        return len(self) * RECORD.itemsize
 
     def records(self, start: int, count: int) -> NDArray:
         """Give `count` records from number `start` on, in the file's order; the first comes after the last."""
@@ -142,9 +143,12 @@ class PixelTable:
         return records
 
     def packed(self, start: int, count: int) -> UInt8[Tensor, "n 15"]:
-        """Give the bytes of `count` records from number `start` on, for `decode`."""
-        records = np.array(self.records(start, count))
-        return torch.from_numpy(records.view(np.uint8).reshape(-1, RECORD.itemsize))
+        """Give the bytes of `count` records from number `start` on, for `decode`; memory of its own."""
+        return _bytes_of(np.array(self.records(start, count)))
+
+    def read_into(self, place: UInt8[Tensor, "n 15"], start: int) -> None:
+        """Read as many records as there is place for, from number `start` on."""
+        place.copy_(_bytes_of(np.asarray(self.records(start, len(place)))))
 
     def batch(
         self, start: int, count: int, keep: Callable[[NDArray, NDArray, NDArray], NDArray] | None = None
@@ -183,6 +187,13 @@ class PicturePixels:
     prior_sigma_m: Float[np.ndarray, "h w"] | None = None
     sky: Bool[np.ndarray, "h w"] | None = None
     """Where it is known to show the sky; None: nowhere."""
+
+
+def _bytes_of(records: NDArray) -> UInt8[Tensor, "n 15"]:
+    with warnings.catch_warnings():
+        # of memory that must not be written to, which nobody does
+        warnings.simplefilter("ignore", UserWarning)
+        return torch.from_numpy(records.view(np.uint8).reshape(-1, RECORD.itemsize))
 
 
 def write_table(path: Path, most_pixels: int, pictures: Iterable[PicturePixels]) -> None:

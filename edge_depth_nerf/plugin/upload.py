@@ -52,8 +52,7 @@ class TableOnDevice:
 
     def __init__(self, table: PixelTable, device: torch.device | str) -> None:
         """Copy all of the table."""
-        # torch warns of memory that must not be written to
-        self._records = torch.from_numpy(np.array(table.packed)).to(device)
+        self._records = table.packed(0, len(table)).to(device)
         self._form: tuple[list[int], list[int]] = [], []
         self._next: list[int] = []
         self._starts = self._steps = self._of = self._places = torch.empty(0, dtype=torch.long)
@@ -125,15 +124,14 @@ class Uploads:
         """Read stretches into the first buffer, once its last content is on the device."""
         if (copied := self._copied[0]) is not None:
             copied.synchronize()
-        records = [np.asarray(self._table.records(each.start, each.count)) for each in stretches]
-        packed = [each.view(np.uint8).reshape(-1, RECORD.itemsize) for each in records]
-        np.concatenate(packed, out=self._buffers[0].numpy())
+        for place, each in zip(self._buffers[0].split([each.count for each in stretches]), stretches, strict=True):
+            self._table.read_into(place, each.start)
 
 
 def batches_on(device: torch.device | str, table: PixelTable) -> Batches:
     """Give what serves a table's batches on a device."""
     if torch.device(device).type == "cuda":
         free, _ = torch.cuda.mem_get_info(torch.device(device))
-        if table.packed.nbytes <= SHARE_OF_MEMORY * free:
+        if table.nbytes <= SHARE_OF_MEMORY * free:
             return TableOnDevice(table, device)
     return Uploads(table, device)
