@@ -222,10 +222,10 @@ class EdgeDepthNerfModel(NerfactoModel):
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
         """Nerfacto's callbacks, and one that tells the step. All schedules then end with the training."""
-        trainer = training_callback_attributes.trainer
-        if trainer is not None:
+        trainer, optimizers = training_callback_attributes.trainer, training_callback_attributes.optimizers
+        if trainer is not None and optimizers is not None:
             self._training_steps = total_steps(trainer)
-            follow_training(training_callback_attributes.optimizers, self._training_steps)
+            follow_training(optimizers, self._training_steps)
         # nerfacto reads both in steps
         for name in ("proposal_warmup", "proposal_weights_anneal_max_num_iters"):
             setattr(self.config, name, max(1, in_steps(getattr(self.config, name), self._training_steps)))
