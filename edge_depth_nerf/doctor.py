@@ -9,19 +9,23 @@ import ctypes.util
 import os
 import platform
 import shutil
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, distributions, entry_points, version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from edge_depth_nerf import __version__
+
+if TYPE_CHECKING:
+    import torch
 
 State = Literal["ok", "note", "problem"]
 MARKS: dict[State, str] = {"ok": "[green]ok[/green]", "note": "[yellow]–[/yellow]", "problem": "[bold red]✗[/bold red]"}
@@ -71,8 +75,10 @@ def check_torch() -> Iterator[Finding]:
         return
     yield Finding("PyTorch", "ok", torch.__version__)
     if torch.cuda.is_available():
-        name, total = torch.cuda.get_device_name(), torch.cuda.get_device_properties(0).total_memory / 2**30
-        yield Finding("Device", "ok", f"{name}, {total:.0f} GiB, CUDA {torch.version.cuda}")
+        free, total = (size / 2**30 for size in torch.cuda.mem_get_info())
+        versions = f"driver {_driver()}, CUDA {torch.version.cuda}, Triton {_version_of('triton')}"
+        name = torch.cuda.get_device_name()
+        yield Finding("Device", "ok", f"{name}, {total:.0f} GiB, of which {free:.0f} are free; {versions}")
         return
     built = f"for CUDA {torch.version.cuda}" if torch.version.cuda else "without CUDA"
     found = f"CPU, {os.cpu_count()} cores; torch is built {built}"
@@ -92,6 +98,64 @@ def check_kernels() -> Iterator[Finding]:
     found = " and ".join(name for name, there in (("Numba (CPU)", numba), ("Triton (CUDA)", triton)) if there)
     found = f"fused kernels: {found or 'none'}; tiny-cuda-nn is not used"
     yield _finding("Hash grids", numba, found, "Reinstall edge-depth-nerf: it brings Numba.")
+
+
+def check_gpu() -> Iterator[Finding]:
+    """What a training asks of the GPU: right kernels, and steps as CUDA graphs; nothing without a GPU."""
+    device = _gpu()
+    if device is None:
+        return
+    from edge_depth_nerf.kernels.back_ends import undisturbed
+    from edge_depth_nerf.method.losses import step_kernels
+
+    forms, failures = step_kernels(), []
+    for form in forms:
+        try:
+            with undisturbed():
+                form.try_out(device)
+        except Exception as error:  # whatever keeps it from working
+            failures.append(f"{form.name} ({_first_line(error)})")
+    right = f"{len(forms) - len(failures)} of {len(forms)} give the numbers of their formulas in torch"
+    remedy = (
+        "A training computes these in torch, with the same results but slower. Triton needs a C compiler (apt-get "
+        "install gcc), and the version that came with this torch (pip install --force-reinstall torch)."
+    )
+    yield _finding("GPU kernels", not failures, "; ".join([right, *failures]), remedy, "note")
+    try:
+        sums = replayed_sums(device)
+        found = "are recorded and replayed" if sums == [8.0, 24.0] else f"are replayed with wrong results ({sums})"
+    except Exception as error:  # whatever keeps it from working
+        found = f"cannot be recorded ({_first_line(error)})"
+    remedy = (
+        "A training launches each kernel by itself, which takes several times as long. Unset CUDA_LAUNCH_BLOCKING, end "
+        "debuggers and profilers, or update the driver."
+    )
+    yield _finding("CUDA graphs", found.endswith("replayed"), found, remedy, "note")
+
+
+def replayed_sums(device: torch.device) -> list[float]:
+    """Record the sum of twice four numbers as a CUDA graph; give that of ones, and then that of threes.
+
+    Raises:
+        RuntimeError: it cannot be recorded, or not be replayed.
+    """
+    import torch
+
+    numbers = torch.ones(4, device=device)
+    stream = torch.cuda.Stream(device)
+    stream.wait_stream(torch.cuda.current_stream(device))
+    with torch.cuda.stream(stream):
+        (2 * numbers).sum()  # kernels are loaded before the recording
+    torch.cuda.current_stream(device).wait_stream(stream)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        total = (2 * numbers).sum()
+    found = []
+    for value in (1.0, 3.0):
+        numbers.fill_(value)
+        graph.replay()
+        found.append(float(total))
+    return found
 
 
 def check_nerfstudio() -> Iterator[Finding]:
@@ -188,6 +252,7 @@ CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
     check_python,
     check_torch,
     check_kernels,
+    check_gpu,
     check_nerfstudio,
     check_opencv,
     check_lpips,
@@ -217,8 +282,31 @@ def run_doctor(console: Console | None = None) -> int:
 
 
 def _broken(what: str, package: str, error: Exception) -> Finding:
-    said = str(error).strip().split("\n")[0]
-    return Finding(what, "problem", f"cannot be imported ({said})", f"pip install --force-reinstall {package}")
+    found = f"cannot be imported ({_first_line(error)})"
+    return Finding(what, "problem", found, f"pip install --force-reinstall {package}")
+
+
+def _first_line(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}".strip().split("\n")[0]
+
+
+def _gpu() -> torch.device | None:
+    """The GPU that torch takes; None without."""
+    try:
+        import torch
+    except Exception:  # which another check reports
+        return None
+    return torch.device("cuda", torch.cuda.current_device()) if torch.cuda.is_available() else None
+
+
+def _driver() -> str:
+    """The version of NVIDIA's driver, as its own program says it."""
+    command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+    return done.stdout.strip().split("\n")[0] or "unknown"
 
 
 def _free_memory_gb() -> float | None:

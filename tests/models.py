@@ -25,13 +25,13 @@ def shrink(model: Any, num_levels: int, log2_hashmap_size: int) -> None:
 
 
 def build(**options) -> EdgeDepthNerfModel:
-    """edge-depth-nerf-lite's model with other options, on the CPU; `poses`: how cameras are refined."""
+    """edge-depth-nerf-lite's model with other options; `poses`: how cameras are refined, `device`: where it will be."""
     torch.manual_seed(0)
-    config = all_methods["edge-depth-nerf-lite"].pipeline.model
+    config, device = all_methods["edge-depth-nerf-lite"].pipeline.model, options.pop("device", "cpu")
     camera_optimizer = replace(config.camera_optimizer, mode=options.pop("poses", "off"))
     config = replace(config, camera_optimizer=camera_optimizer, **options)
     box = SceneBox(aabb=torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
-    return config.setup(scene_box=box, num_train_data=3, metadata={"metres_per_unit": 20.0}, device="cpu")
+    return config.setup(scene_box=box, num_train_data=3, metadata={"metres_per_unit": 20.0}, device=device)
 
 
 def pipeline_config(scene: Path, poses: str = "off", **model: Any) -> Any:

@@ -12,8 +12,8 @@ import torch
 from interpreted import NEEDS_A_GPU, in_interpreter
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from edge_depth_nerf.kernels import back_ends, formulas, functions, pointwise_numba, ray_numba
-from edge_depth_nerf.kernels.back_ends import Function, GpuForm, tried_out
+from edge_depth_nerf.kernels import back_ends, formulas, pointwise_numba, ray_numba
+from edge_depth_nerf.kernels.back_ends import GpuForm, tried_out
 from edge_depth_nerf.kernels.functions import (
     CONTRACT,
     DENSITY,
@@ -27,13 +27,13 @@ from edge_depth_nerf.kernels.functions import (
     SAMPLE_PDF,
     WEIGHTS,
 )
-from edge_depth_nerf.method.losses import EDGE_LOSS
+from edge_depth_nerf.method.losses import step_kernels
 from edge_depth_nerf.plugin.fused.nerfacto_losses import distortion_loss
 
 CPU = torch.device("cpu")
 FUNCTIONS = SAMPLE_PDF, INTERLEVEL_LOSS, DISTORTION_LOSS, WEIGHTS, CONTRACT, DISTANCES, HARMONICS
+EVERY: tuple[Any, ...] = tuple(step_kernels())
 ALL = (*(each for each in vars(functions).values() if isinstance(each, Function)), EDGE_LOSS)
-EVERY: tuple[Any, ...] = tuple(each.on_gpu for each in ALL if each.on_gpu is not None)
 
 
 @pytest.fixture(autouse=True)

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError
 from pathlib import Path
+from typing import Any
 
 import pytest
+from interpreted import NEEDS_A_GPU
 from rich.console import Console
 
 from edge_depth_nerf import doctor
 from edge_depth_nerf.doctor import Finding, run_doctor
-from edge_depth_nerf.method import metrics
+from edge_depth_nerf.method import losses, metrics
 
 
 def found(check) -> dict[str, Finding]:
@@ -126,3 +129,94 @@ def test_a_driver_without_a_usable_gpu(monkeypatch):
     monkeypatch.setattr(doctor.shutil, "which", lambda *_, **__: None)
     device = found(doctor.check_torch)["Device"]
     assert device.state == "note" and "edge-depth-nerf-lite" in device.remedy
+
+
+def test_a_gpu_is_named_with_its_memory_and_versions(monkeypatch):
+    import torch
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "NVIDIA H200")
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda: (100 << 30, 140 << 30))
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    monkeypatch.setattr(doctor, "_version_of", lambda package: {"triton": "3.6.0"}[package])
+    ran = subprocess.CompletedProcess([], 0, stdout="580.65.06\n580.65.06\n")
+    monkeypatch.setattr(doctor.subprocess, "run", lambda *_, **__: ran)
+    device = found(doctor.check_torch)["Device"]
+    said = "NVIDIA H200, 140 GiB, of which 100 are free; driver 580.65.06, CUDA 13.0, Triton 3.6.0"
+    assert (device.state, device.found) == ("ok", said)
+
+    def missing(*_: object, **__: object) -> None:
+        raise FileNotFoundError
+
+    monkeypatch.setattr(doctor.subprocess, "run", missing)
+    assert "driver unknown" in found(doctor.check_torch)["Device"].found
+
+
+@pytest.fixture
+def as_gpu(monkeypatch):
+    """The CPU in a GPU's place, kernels that are their formulas, and graphs that are replayed."""
+    import torch
+
+    right = [replace(form, load=lambda form=form: form.formula) for form in losses.step_kernels()]
+    monkeypatch.setattr(losses, "step_kernels", lambda: right)
+    monkeypatch.setattr(doctor, "_gpu", lambda: torch.device("cpu"))
+    monkeypatch.setattr(doctor, "replayed_sums", lambda _: [8.0, 24.0])
+    return right
+
+
+def test_a_gpu_on_which_all_works(as_gpu):
+    every = found(doctor.check_gpu)
+    assert {name: each.state for name, each in every.items()} == {"GPU kernels": "ok", "CUDA graphs": "ok"}
+    assert every["GPU kernels"].found.startswith(f"{len(as_gpu)} of {len(as_gpu)} give the numbers of their formulas")
+
+
+def test_kernels_that_are_wrong_on_a_gpu_are_named(as_gpu):
+    def broken() -> Any:
+        raise RuntimeError("no C compiler\nfound")
+
+    def doubled() -> Any:
+        return lambda **given: 2 * as_gpu[0].formula(**given)
+
+    as_gpu[0], as_gpu[1] = replace(as_gpu[0], load=doubled), replace(as_gpu[1], load=broken)
+    kernels = found(doctor.check_gpu)["GPU kernels"]
+    assert kernels.state == "note" and "gcc" in kernels.remedy
+    assert kernels.found.startswith(f"{len(as_gpu) - 2} of {len(as_gpu)} give the numbers")
+    assert f"{as_gpu[0].name} (KernelDiffersError: its result is off by 1.0e+00" in kernels.found
+    assert kernels.found.endswith(f"{as_gpu[1].name} (RuntimeError: no C compiler)")
+
+
+@pytest.mark.parametrize(
+    ("sums", "words"),
+    [
+        (RuntimeError("CUDA error: operation not permitted\nwhen stream is capturing"), "cannot be recorded"),
+        ([8.0, 8.0], "are replayed with wrong results"),
+    ],
+    ids=["not recorded", "wrong"],
+)
+def test_graphs_that_do_not_work(as_gpu, monkeypatch, sums, words):
+    def replayed(_: Any) -> Any:
+        if isinstance(sums, Exception):
+            raise sums
+        return sums
+
+    monkeypatch.setattr(doctor, "replayed_sums", replayed)
+    graphs = found(doctor.check_gpu)["CUDA graphs"]
+    assert graphs.state == "note" and words in graphs.found and "\n" not in graphs.found
+    assert "CUDA_LAUNCH_BLOCKING" in graphs.remedy
+    assert isinstance(sums, list) or "operation not permitted" in graphs.found
+
+
+def test_without_a_gpu_nothing_is_tried(monkeypatch):
+    import torch
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert found(doctor.check_gpu) == {}
+    monkeypatch.setitem(sys.modules, "torch", None)  # which is not there
+    assert found(doctor.check_gpu) == {}
+
+
+@NEEDS_A_GPU
+def test_a_graph_is_replayed_on_a_gpu():
+    import torch
+
+    assert doctor.replayed_sums(torch.device("cuda", 0)) == [8.0, 24.0]

@@ -7,6 +7,7 @@ first use of a kernel on a device compares it with its formula in torch.
 from __future__ import annotations
 
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -22,18 +23,23 @@ Example = dict[str, Any]
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Enable gradients and stop tracing, to try out kernels.
+    """Enable gradients, taken in this thread, and stop tracing, to try out kernels.
 
     The first caller may be a rendering. It has no gradients, which a trial needs. In the viewer's thread nerfstudio
     also traces each line of Python, and ends a picture by an error there. It would look like an error of the kernel.
+    Otherwise one thread of torch would compile the gradients of all kernels that are tried out side by side.
     """
     trace = sys.gettrace()
     sys.settrace(None)
     try:
-        with torch.inference_mode(False), torch.enable_grad():
+        with torch.inference_mode(False), torch.enable_grad(), torch.autograd.set_multithreading_enabled(False):
             yield
     finally:
         sys.settrace(trace)
+
+
+def _nothing() -> None:
+    """Nobody counts."""
 
 
 class KernelDiffersError(Exception):
@@ -56,19 +62,31 @@ class GpuForm:
     """Greatest difference of results and of gradients, relative to the largest value."""
     most_columns: int | None = None
     """So many columns of a matrix it serves; None: any number."""
+    in_a_step: Callable[[torch.device], Sequence[Example]] = lambda _: ()
+    """Makes arguments as a training step of the full preset has them, of few rays: Triton compiles a kernel once more
+    for other block sizes, types, and numbers that 16 divides."""
 
-    def try_out(self, device: torch.device) -> Callable[..., Any]:
+    def every_example(self, device: torch.device) -> list[Example]:
+        """Make all arguments that it is tried out on."""
+        return [*self.examples(device), *self.in_a_step(device)]
+
+    def try_out(self, device: torch.device, passed: Callable[[], None] = _nothing) -> Callable[..., Any]:
         """Give the kernel's function if its results and gradients on a device are those of the formula.
+
+        Args:
+            device: of a GPU.
+            passed: is called after each example.
 
         Raises:
             KernelDiffersError: they are not.
             Exception: whatever keeps it from working.
         """
         kernel = self.load()
-        for example in self.examples(device):
+        for example in self.every_example(device):
             expected = _outcome(self.formula, example, torch.float64)
             for (what, found), (_, exact) in zip(_outcome(kernel, example), expected, strict=True):
                 self._compare(what, found, exact)
+            passed()
         return kernel
 
     def _compare(self, what: str, found: Tensor | None, exact: Tensor | None) -> None:
@@ -117,26 +135,38 @@ def _outcome(
 
 _tried: dict[tuple[GpuForm, torch.device], Callable[..., Any] | None] = {}
 """What trials have found."""
+_locks: dict[tuple[GpuForm, torch.device], threading.Lock] = {}
+"""A thread that needs a kernel which another one is trying out waits for it."""
 
 
-def tried_out(form: GpuForm, device: torch.device) -> Callable[..., Any] | None:
+def tried_out(form: GpuForm, device: torch.device, passed: Callable[[], None] = _nothing) -> Callable[..., Any] | None:
     """Give a kernel's function if it works on a device; else None.
 
-    The first call runs the kernel, and warns where it does not work. While a CUDA graph is recorded, which a trial
-    would spoil, nothing new is tried.
+    The first call runs the kernel, and warns where it does not work.
+
+    Args:
+        form: the kernel.
+        device: of a GPU, with its number.
+        passed: is called after each example of a trial.
+
+    Raises:
+        RuntimeError: a CUDA graph is recorded, which a trial would spoil.
     """
     key = form, device
     if key not in _tried:
         if torch.cuda.is_initialized() and torch.cuda.is_current_stream_capturing():
-            return None
-        with undisturbed():
-            _tried[key] = _try_out(form, device)
+            raise RuntimeError(f"the kernel of the {form.name} was not tried out before a CUDA graph is recorded")
+        # one lock for all threads, as `setdefault` is one step
+        with _locks.setdefault(key, threading.Lock()):
+            if key not in _tried:
+                with undisturbed():
+                    _tried[key] = _try_out(form, device, passed)
     return _tried[key]
 
 
-def _try_out(form: GpuForm, device: torch.device) -> Callable[..., Any] | None:
+def _try_out(form: GpuForm, device: torch.device, passed: Callable[[], None]) -> Callable[..., Any] | None:
     try:
-        return form.try_out(device)
+        return form.try_out(device, passed)
     except KernelDiffersError as error:
         failure = str(error)
     except Exception as error:  # whatever keeps Triton from working here

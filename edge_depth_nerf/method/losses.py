@@ -18,7 +18,7 @@ from torch import Tensor
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.kernels.back_ends import Example, Function, GpuForm
-from edge_depth_nerf.kernels.functions import spread
+from edge_depth_nerf.kernels.functions import FEW_RAYS, SAMPLES, gpu_forms, spread
 
 Gaussian = Literal["point", "interval"]
 
@@ -115,8 +115,24 @@ def _examples(device: torch.device) -> Sequence[Example]:
     return [{**given, "sigma_m": sigma_m, **form, "eps": EPS, "narrow": NARROW} for form in forms]
 
 
-EDGE_LOSS = Function(_by_numba, GpuForm("edge loss", _by_triton, _by_torch, _examples, tolerance=1e-4))
+def _step_examples(device: torch.device) -> Sequence[Example]:
+    """Samples of a level of the full preset, and of the paper's."""
+    edges = 120 * spread(device, FEW_RAYS, SAMPLES + 1).sort(dim=1)[0]
+    weights = (spread(device, FEW_RAYS, SAMPLES, seed=3) ** 4).requires_grad_()
+    prior_m, sigma_m = 100 * spread(device, FEW_RAYS, seed=5) - 8, 0.2 + 8 * spread(device, FEW_RAYS, seed=7)
+    starts_m, ends_m = edges[:, :-1].contiguous(), edges[:, 1:].contiguous()
+    given = {"weights": weights, "starts_m": starts_m, "ends_m": ends_m, "prior_m": prior_m, "sigma_m": sigma_m}
+    return [{**given, "interval": full, "divide_by_norm": full, "eps": EPS, "narrow": NARROW} for full in (True, False)]
+
+
+_ON_GPU = GpuForm("edge loss", _by_triton, _by_torch, _examples, tolerance=1e-4, in_a_step=_step_examples)
+EDGE_LOSS = Function(_by_numba, _ON_GPU)
 """`edge_loss` in its compiled forms, differentiable once, by the weights alone."""
+
+
+def step_kernels() -> list[GpuForm]:
+    """List the kernels that a training step takes on a GPU; the first one is small."""
+    return [_ON_GPU, *gpu_forms()]
 
 
 def ds_nerf_loss(

@@ -6,6 +6,7 @@ nerfstudio would average depth errors over pictures.
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.plugin.compat import allow_numpy_scalars_in_checkpoints, ignore_deprecations_of_host
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManager, FisheyeDepthDataManagerConfig
 from edge_depth_nerf.plugin.detail import TrainingDetail
+from edge_depth_nerf.plugin.fused.build import kernels_prepared
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel, EdgeDepthNerfModelConfig
 from edge_depth_nerf.plugin.plain_errors import say_errors_plainly
 from edge_depth_nerf.plugin.viewer import DrivePanel
@@ -69,7 +71,10 @@ class EdgeDepthPipeline(VanillaPipeline):
             config = replace(config, datamanager=replace(data, depth_source="none"))
         elif model.surface_loss_mult == 0:
             config = replace(config, datamanager=replace(data, surface_rays_per_batch=0))
-        super().__init__(config, str(device), *args, **kwargs)
+        # kernels compile while the prior is integrated
+        trains = kwargs.get("test_mode", "val") == "val" and model.implementation == "fused"
+        with kernels_prepared(device) if trains else nullcontext():
+            super().__init__(config, str(device), *args, **kwargs)
         manager = self.datamanager
         metres_per_unit = manager.train_dataset.metadata["metres_per_unit"]
         if model.far_m / metres_per_unit > FARTHEST_UNITS:

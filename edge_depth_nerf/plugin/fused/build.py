@@ -6,10 +6,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import torch
 from nerfstudio.field_components import mlp
 from nerfstudio.fields import density_fields, nerfacto_field
 from nerfstudio.models import nerfacto
+from nerfstudio.utils.rich_utils import CONSOLE
 
+from edge_depth_nerf.base.console import progress_bars
+from edge_depth_nerf.kernels.preparation import Preparation
+from edge_depth_nerf.method.losses import step_kernels
 from edge_depth_nerf.plugin.fused.fields import FusedDensityField, FusedMLP, FusedNerfactoField
 from edge_depth_nerf.plugin.fused.hash_grid import FusedHashEncoding
 from edge_depth_nerf.plugin.fused.ray_samplers import FusedProposalSampler
@@ -28,6 +33,9 @@ FORMS: list[tuple[Any, dict[str, type]]] = [
     (mlp, {"HashEncoding": FusedHashEncoding, "MLP": FusedMLP}),
 ]
 """Names of nerfstudio's modules, and what takes their place."""
+
+LOOK_S = 0.1
+"""So often the count is read."""
 
 
 @contextmanager
@@ -64,3 +72,28 @@ def compiled_before() -> bool:
     from edge_depth_nerf.plugin import pixel_records_numba, table_rays_numba  # noqa: F401
 
     return compiled.all_on_disk()
+
+
+@contextmanager
+def kernels_prepared(device: torch.device | str) -> Iterator[None]:
+    """Compile and try out a GPU's kernels while the block runs, and then wait for them; nothing on the CPU.
+
+    Where they have to be compiled, a line counts them.
+    """
+    if torch.device(device).type != "cuda":
+        yield
+        return
+    preparation = Preparation(step_kernels(), torch.device(device))
+    try:
+        yield
+    except BaseException:
+        preparation.give_up()
+        raise
+    while not preparation.compiles:
+        if preparation.wait(LOOK_S):
+            return
+    with progress_bars(CONSOLE, counted=True) as bars:
+        task = bars.add_task("Compiling for this GPU, once:", total=preparation.total)
+        while not preparation.wait(LOOK_S):
+            bars.update(task, completed=preparation.done)
+        bars.update(task, completed=preparation.total)
