@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import subprocess
 import time
 from collections.abc import Iterator
@@ -216,3 +217,17 @@ def test_all_parts_together_fit_into_eight_minutes(gpu):
     # beside the others from the beginning
     assert limits.pop("splats") <= 480 >= sum(limits.values())
     assert limits.pop("trainings") <= 150 and max(limits.values()) <= 60
+
+
+def test_the_pages_memory_is_that_of_the_presets(load):
+    text = (ROOT / "docs" / "gpu.md").read_text(encoding="utf-8").partition("| levels, rows of a level |")[2]
+    rows = re.findall(r"^\| (\d+), 2\^(\d+)(?: \(`(.*)`\))? \| ([\d.]+) \|$", text, re.MULTILINE)
+    presets = {"edge-depth-nerf-lite": "lite", "edge-depth-nerf": "full"}
+    assert {row[2] for row in rows} == {"", *presets} and len(rows) == 5
+    for levels, log2_rows, method, gigabytes in rows:
+        sizes = load("speed.turns").sizes_of(presets.get(method, "full"))
+        grids = [(int(levels), int(log2_rows))]
+        assert not method or grids == [(sizes["num_levels"], sizes["log2_hashmap_size"])]
+        grids += [(each["num_levels"], each["log2_hashmap_size"]) for each in sizes["proposal_networks"]]
+        numbers = sum(count * 2**log2 * sizes["features_per_level"] for count, log2 in grids)
+        assert gigabytes == f"{16 * numbers / 1e9:.2f}"
