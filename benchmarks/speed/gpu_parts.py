@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import importlib.util
 import itertools
+import os
 import random
 import re
 import statistics
@@ -233,7 +234,7 @@ def splatted(settings: Settings, scene: Path, name: str) -> Found:
     with torch.no_grad():
         for camera, batch in pipeline.datamanager.fixed_indices_eval_dataloader:
             rgb = pipeline.model.get_outputs_for_camera(camera.to(pipeline.device))["rgb"]
-            mask = batch.get("mask", torch.ones(rgb.shape[:2], dtype=torch.bool)).view(rgb.shape[:2]).to(rgb.device)
+            mask = batch.get("mask", torch.ones(rgb.shape[:2], dtype=torch.bool)).reshape(rgb.shape[:2]).to(rgb.device)
             psnr.append(float(masked_psnr(rgb, pipeline.model.get_gt_img(batch["image"]), mask)))
     return {"points": name, "steps": TRAINED_STEPS, "s": taken_s, "masked PSNR, dB": statistics.fmean(psnr)}
 
@@ -243,6 +244,8 @@ def splats(settings: Settings) -> Found:
     if settings.fake or importlib.util.find_spec("gsplat") is None:
         return {"left out": "there is no GPU, or no gsplat"}
     began = time.time()
+    # most cores are left to what is timed meanwhile
+    os.environ.setdefault("MAX_JOBS", "4")
     from gsplat.cuda import _backend  # compiles
 
     if getattr(_backend, "_C", None) is None:
