@@ -9,7 +9,7 @@ BIN := $(VENV)/$(SCRIPTS)
 help:
 	@echo "make demo        synthesise a drive, train with and without the depth prior, compare (outputs/demo/)"
 	@echo "make real        all methods on a real drive, with three seeds (REAL=its folder; some hours)"
-	@echo "make gpu         what a GPU makes of it: tests, kernels, steps, a training (outputs/gpu/report.md; ten minutes)"
+	@echo "make gpu         what a GPU makes of it: start, steps, kernels, trainings, tests (outputs/gpu/report.md; eight minutes)"
 	@echo "make test-fast   tests of what needs no nerfstudio and a smoke run of the plugin, in a minute and a half"
 	@echo "make test        run all tests, in a quarter of an hour"
 	@echo "make test-pure   tests of the modules that need no nerfstudio, under NumPy 2"
@@ -44,7 +44,7 @@ real: setup
 	@test -n "$(REAL)" || { echo "Give the folder with the real drive: make real REAL=FOLDER"; exit 2; }
 	$(BIN)/python -m benchmarks.quality.real_drive --real "$(REAL)" --output outputs/real_drive
 
-# In parts of at most three minutes; called again it does what is missing. GPU=--fake goes the same way without a GPU.
+# In parts that have limits; called again it does what is missing. GPU=--fake goes the same way without a GPU.
 gpu: setup
 	$(BIN)/python -m benchmarks.speed.gpu $(GPU)
 

@@ -12,7 +12,7 @@ import torch
 from interpreted import NEEDS_A_GPU, in_interpreter
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from edge_depth_nerf.kernels import back_ends, formulas, pointwise_numba, ray_numba
+from edge_depth_nerf.kernels import back_ends, formulas, functions, pointwise_numba, ray_numba
 from edge_depth_nerf.kernels.back_ends import GpuForm, tried_out
 from edge_depth_nerf.kernels.functions import (
     CONTRACT,

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-import importlib
+import argparse
+import re
 import subprocess
-import sys
+import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from benchmark_modules import benchmark_modules
-from interpreted import in_interpreter
+from scipy.spatial import KDTree
 
 from edge_depth_nerf.base.files import read_json, write_json
 
@@ -21,72 +24,175 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 @pytest.fixture(scope="module")
-def gpu() -> Any:
+def load() -> Iterator[Any]:
     with benchmark_modules() as load:
-        yield load("speed.gpu")
+        yield load
 
 
-def test_every_part_runs_to_its_end_without_a_gpu(gpu, sample_drive, tmp_path, capsys):
+@pytest.fixture(scope="module")
+def gpu(load) -> Any:
+    return load("speed.gpu")
+
+
+@pytest.fixture(scope="module")
+def parts(gpu, load) -> Any:
+    return load("speed.gpu_parts")
+
+
+def in_this_process(turns: Any, folder: Path) -> type:
+    """A contestant of `turns.race` without a process of its own, which would import everything anew."""
+
+    class Here:
+        def __init__(self, config: Any, _: Path | None = None) -> None:
+            self.runner, self.step_s, self.render_s, self.rendered_px = turns.Runner(config, folder), [], [], (0, 0)
+
+        def ask(self, name: str, argument: Any) -> Any:
+            return getattr(self.runner, name)(argument)
+
+        def wait(self) -> None: ...
+
+        def stop(self) -> None: ...
+
+    return Here
+
+
+def test_every_part_runs_to_its_end_without_a_gpu(gpu, load, sample_drive, tmp_path, capsys, monkeypatch):
+    turns = load("speed.turns")
+    monkeypatch.setattr(turns, "Contestant", in_this_process(turns, tmp_path / "race"))
     # what is counted is a test of its own
-    parts = [name for name in gpu.PARTS if name != "counts"]
-    words = ["--fake", "--scene", str(sample_drive), "--output", str(tmp_path)]
+    names = [name for name in gpu.PARTS if name != "counts"]
     # a part that did not come to its end is done anew, one that did is not
-    write_json(tmp_path / "device.json", {"failed": "not done after 60 s"})
-    write_json(tmp_path / "beside_the_CPU.json", {"left_out": "done before"})
-    assert gpu.main([*words, "--parts", *parts]) == 0
-    assert "beside the CPU: done before" in capsys.readouterr().out
-    found = {name: read_json(gpu.file_of(tmp_path, name)) for name in parts}
+    write_json(gpu.file_of(tmp_path, "steps"), {"failed": "not done after 60 s"})
+    write_json(gpu.file_of(tmp_path, "ours again"), {"steps": 5000})
+    assert gpu.main(["--fake", "--scene", str(sample_drive), "--output", str(tmp_path), "--parts", *names]) == 0
+    assert "ours again: done before" in capsys.readouterr().out
+    found = {name: read_json(gpu.file_of(tmp_path, name)) for name in names}
     assert not [name for name, each in found.items() if "failed" in each]
-    assert found["device"]["copied_gb_s"] > 0
-    assert found["tests"]["counts"]["passed"] > 0 and not found["tests"]["said"]
-    assert {row["kernel"] for row in found["kernels"]["rows"]} == {"encode", "table_gradient", "position_gradient"}
-    beside_torch = found["samples and losses"]["rows"]
-    assert len(beside_torch) == 7 and all(row["off_torch"] == 0 and row["torch_ms"] > 0 for row in beside_torch)
-    assert set(found["our steps"]) == {"nerfacto", "ours", "left_out"} and found["our steps"]["ours"]["step_ms"][0] > 0
-    assert found["profile"]["launches"] == 0 and found["profile"]["step_ms"] > 0
-    assert "masked_psnr" in found["training"]["figures"]
+
+    first, second = found["recording"], found["start"]
+    assert (first["caches before"], second["caches before"]) == ("empty", "filled")
+    assert first["first step, s"] > 0 and first["both kinds of steps recorded"] is False
+    assert [row["trainer"] for row in found["steps"]["rows"]] == ["nerfacto", "ours"]
+    assert all(row["ms a step, early"][0] > 0 < row["ms a step, late"][0] for row in found["steps"]["rows"])
+    assert found["profile"]["launches"] == 0 and found["profile"]["ms a step"] > 0
+    for row in found["kernels"]["rows"]:
+        assert row["failed"] is None and row["off torch"] < 1e-3 and row["kernel, µs"] > 0 < row["torch, µs"], row
+        assert (row["off the CPU"] == 0) == (row["function"] == "hash grid"), row
+    for name in ("ours", "nerfacto", "DS-NeRF on LiDAR"):
+        assert found[name]["masked_psnr"] > 0 and found[name]["lidar_abs_rel"] > 0 and found[name]["steps"] == 2, name
+    assert found["tests"]["passed"] > 0 and "said" not in found["tests"]
+
     page = (tmp_path / "report.md").read_text()
-    assert "no figure here means anything" in page and "Not done yet." in page and "Failed" not in page
-    assert all(f"## {name[0].upper()}{name[1:]}" in page for name in gpu.PARTS)
+    assert "no figure here means anything" in page and page.count("Not done yet.") == 1 and "Failed" not in page
+    assert all(f"## {part.group or name}"[3:].lower() in page.lower() for name, part in gpu.PARTS.items())
+    assert "|  | ours | nerfacto | DS-NeRF on LiDAR | ours again |" in page
 
 
-def test_a_part_that_fails_or_takes_too_long_says_so_and_ends_no_other(gpu, tmp_path, monkeypatch):
+def test_each_function_of_a_gpu_is_timed(parts, tmp_path):
+    functions = set(parts.functions_of_a_gpu())
+    assert {"hash grid", "edge loss"} < functions == set(parts.arguments(parts.Settings(tmp_path, tmp_path, fake=True)))
+
+
+def test_a_function_that_fails_ends_no_other(parts, tmp_path):
+    class Broken:
+        def on(self, device: torch.device) -> Any:
+            raise RuntimeError("cannot be recorded")
+
+    row = parts.beside_torch("it", Broken(), {"x": torch.ones(2, 3)}, parts.Settings(tmp_path, tmp_path, fake=True))
+    assert (row["of"], row["failed"], row["kernel, µs"]) == ("2×3", "RuntimeError: cannot be recorded", None)
+
+
+def test_the_priors_cloud_lies_where_lidars_points_do(parts, sample_drive, tmp_path):
+    folder = parts.cloud_of_prior(parts.Settings(sample_drive, tmp_path, fake=True))
+    kinds = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    prior, lidar = (
+        np.frombuffer((scene / "points.ply").read_bytes().partition(b"end_header\n")[2], kinds)
+        for scene in (folder, sample_drive)
+    )
+    off_m, nearest = KDTree(prior["xyz"]).query(lidar["xyz"])
+    assert len(prior) > len(lidar) and np.median(off_m) < 0.3
+    assert np.corrcoef(lidar["rgb"].ravel(), prior["rgb"][nearest].ravel())[0, 1] > 0.8
+    assert read_json(folder / "transforms.json")["ply_file_path"] == "points.ply" and (folder / "images").is_dir()
+
+
+def test_a_part_that_fails_says_so_and_ends_no_other(gpu, tmp_path, monkeypatch):
     def fails(settings: Any) -> dict[str, Any]:
+        settings.keep({"rows": [{"ms": 1.5, "off": float("nan")}]})
         raise RuntimeError("out of memory")
 
-    monkeypatch.setitem(gpu.PARTS, "device", gpu.PARTS["device"].__class__(fails, 60))
-    monkeypatch.setitem(gpu.PARTS, "kernels", gpu.PARTS["kernels"].__class__(lambda settings: {"rows": []}, 60))
-    words = ["--fake", "--output", str(tmp_path), "--parts", "device", "kernels"]
-    assert gpu.main(words) == 1
-    assert read_json(tmp_path / "device.json") == {"failed": "RuntimeError: out of memory"}
-    assert "Failed: RuntimeError: out of memory" in (tmp_path / "report.md").read_text()
-    assert gpu.is_done(tmp_path / "kernels.json") and not gpu.is_done(tmp_path / "device.json")
-    # in a process of its own, as with a GPU
-    monkeypatch.setitem(gpu.PARTS, "device", gpu.PARTS["device"].__class__(fails, 0.2))
+    part = gpu.PARTS["tests"].__class__
+    monkeypatch.setitem(gpu.PARTS, "tests", part(fails, 60))
+    monkeypatch.setitem(gpu.PARTS, "counts", part(lambda settings: {"kernels": 5, "off": float("inf")}, 60))
+    assert gpu.main(["--fake", "--output", str(tmp_path), "--parts", "counts", "tests"]) == 1
+    # what it had found stays, and numbers that are none are null
+    kept = {"rows": [{"ms": 1.5, "off": None}], "failed": "RuntimeError: out of memory"}
+    assert read_json(tmp_path / "tests.json") == {**kept, "not finite": "tests / rows / 0 / off: nan"}
+    assert read_json(tmp_path / "counts.json") == {"kernels": 5, "off": None, "not finite": "counts / off: inf"}
+    assert gpu.is_done(tmp_path / "counts.json") and not gpu.is_done(tmp_path / "tests.json")
+    page = (tmp_path / "report.md").read_text()
+    assert "Failed: RuntimeError: out of memory" in page and "| 1.5 | – |" in page
+
+
+@pytest.fixture
+def options(tmp_path) -> argparse.Namespace:
+    return argparse.Namespace(output=tmp_path, scene=tmp_path, fake=True)
+
+
+def test_a_part_has_a_process_of_its_own(gpu, options):
+    found = gpu.InAProcess("splats", options).found()
+    assert found == {"left out": "there is no GPU, or no gsplat"}, (options.output / "splats.log").read_text()
+
+
+def test_a_process_that_takes_too_long_is_ended_with_all_that_it_started(gpu, options, monkeypatch):
+    kept, child = options.output / "tests.json", options.output / "child"
+    known = '{"a": 1, "failed": ""}'
+    said = f"sleep 60 & echo $! > {child}; echo '{known}' > {kept}; echo 'Step 20: without CUDA graphs'; wait"
     start = subprocess.Popen
-    monkeypatch.setattr(subprocess, "Popen", lambda command, **given: start(["sleep", "30"], **given))
-    options = gpu.argparse.Namespace(output=tmp_path, scene=tmp_path)
-    assert gpu.in_a_process("device", options) == {"failed": "not done after 0.2 s"}
+    monkeypatch.setattr(subprocess, "Popen", lambda _, **given: start(["sh", "-c", said], **given))
+    monkeypatch.setitem(gpu.PARTS, "tests", gpu.PARTS["tests"].__class__(lambda _: {}, 2))
+    found = gpu.InAProcess("tests", options).found()
+    assert found == {"a": 1, "failed": "not done after 2 s", "said of CUDA graphs": "Step 20: without CUDA graphs"}
+    for _ in range(100):
+        state = Path(f"/proc/{int(child.read_text())}/stat")
+        if not state.exists() or state.read_text().rpartition(")")[2].split()[0] == "Z":
+            return
+        time.sleep(0.05)
+    raise AssertionError("it goes on")
 
 
-def check_the_work_that_is_timed() -> None:
-    sys.path.insert(0, str(ROOT))
-    gpu_parts: Any = importlib.import_module("benchmarks.speed.gpu_parts")
-    settings = gpu_parts.Settings(Path(), Path(), fake=True)
-    assert gpu_parts.has_kernels(settings)
-    off = {row["what"]: row["off_torch"] for row in gpu_parts.samples_and_losses(settings)["rows"]}
-    assert len(off) == 7
-    for what, found in off.items():
-        assert found < 1e-5, (what, found)
+def test_a_process_ends_with_the_one_that_began_it(gpu, options):
+    process = gpu.InAProcess("profile", options)
+    process._process.stdin.close()  # as the system does it for a process that is gone
+    assert process.found() == {"failed": "status 1; profile.log says more"}
 
 
-def test_the_kernels_that_are_timed_do_the_work_of_torch():
-    pytest.importorskip("triton")
-    in_interpreter(check_the_work_that_is_timed)
+def test_trainings_run_together_and_splats_beside_everything(gpu, options, monkeypatch):
+    seen: list[str] = []
+
+    class Process:
+        def __init__(self, name: str, given: argparse.Namespace) -> None:
+            self.name, settings = name, gpu.settings_of(given)
+            caches, alone = settings.caches.is_dir(), settings.alone.exists()
+            seen.append(f"{name} begins" + " with caches" * caches + " after the timing" * alone)
+
+        def found(self) -> dict[str, Any]:
+            seen.append(f"{self.name} ends")
+            gpu.settings_of(options).caches.mkdir(parents=True, exist_ok=True)
+            return {}
+
+    monkeypatch.setattr(gpu, "InAProcess", Process)
+    options.fake = False
+    gpu.settings_of(options).caches.mkdir(parents=True)
+    assert gpu.do(["recording", "start", "ours", "nerfacto", "splats", "tests"], options) == 0
+    late = "with caches after the timing"
+    assert seen == [
+        *("splats begins with caches", "recording begins", "recording ends", "start begins with caches", "start ends"),
+        *(f"ours begins {late}", f"nerfacto begins {late}", "ours ends", "nerfacto ends"),
+        *(f"tests begins {late}", "tests ends", "splats ends"),
+    ]
 
 
-def test_the_tests_of_a_gpu_are_found(gpu):
-    parts = importlib.import_module("benchmarks.speed.gpu_parts")
+def test_the_tests_of_a_gpu_are_found(parts):
     found = {path.name for path in parts.tests_of_a_gpu()}
     needing = {
         path.name
@@ -96,22 +202,6 @@ def test_the_tests_of_a_gpu_are_found(gpu):
     assert found >= needing and len(needing) == 6
 
 
-def test_a_trainer_that_fails_ends_no_other(gpu, monkeypatch):
-    parts = importlib.import_module("benchmarks.speed.gpu_parts")
-    settings = parts.Settings(ROOT, ROOT)
-
-    def raced(_: Any, names: list[str]) -> dict[str, Any]:
-        if names == ["breaks"]:
-            raise EOFError
-        return {"nerfacto": {"graphs": None}, names[0]: {"graphs": {"waits": 0, "graphs": 2}.get(names[0])}}
-
-    monkeypatch.setattr(parts, "raced", raced)
-    assert parts.beside_others(settings, "breaks") == {"left_out": {"breaks": "EOFError: "}}
-    assert list(parts.beside_others(settings, "waits")) == ["left_out"]
-    assert parts.beside_others(settings, "graphs") == {"graphs": {"graphs": 2}}
-    assert parts.beside_others(settings, "splatfacto") == {"splatfacto": {"graphs": None}}
-
-
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_without_a_gpu_it_says_so(gpu, tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:
@@ -119,5 +209,25 @@ def test_without_a_gpu_it_says_so(gpu, tmp_path, capsys):
     assert ended.value.code == 2 and "There is no GPU here" in capsys.readouterr().err
 
 
-def test_each_part_fits_into_three_minutes(gpu):
-    assert gpu.PARTS and all(0 < part.limit_s <= 180 for part in gpu.PARTS.values())
+def test_all_parts_together_fit_into_eight_minutes(gpu):
+    limits: dict[str, int] = {}
+    for name, part in gpu.PARTS.items():
+        group = part.group or name
+        limits[group] = max(limits.get(group, 0), part.limit_s)
+    # beside the others from the beginning
+    assert limits.pop("splats") <= 480 >= sum(limits.values())
+    assert limits.pop("trainings") <= 150 and max(limits.values()) <= 60
+
+
+def test_the_pages_memory_is_that_of_the_presets(load):
+    text = (ROOT / "docs" / "gpu.md").read_text(encoding="utf-8").partition("| levels, rows of a level |")[2]
+    rows = re.findall(r"^\| (\d+), 2\^(\d+)(?: \(`(.*)`\))? \| ([\d.]+) \|$", text, re.MULTILINE)
+    presets = {"edge-depth-nerf-lite": "lite", "edge-depth-nerf": "full"}
+    assert {row[2] for row in rows} == {"", *presets} and len(rows) == 5
+    for levels, log2_rows, method, gigabytes in rows:
+        sizes = load("speed.turns").sizes_of(presets.get(method, "full"))
+        grids = [(int(levels), int(log2_rows))]
+        assert not method or grids == [(sizes["num_levels"], sizes["log2_hashmap_size"])]
+        grids += [(each["num_levels"], each["log2_hashmap_size"]) for each in sizes["proposal_networks"]]
+        numbers = sum(count * 2**log2 * sizes["features_per_level"] for count, log2 in grids)
+        assert gigabytes == f"{16 * numbers / 1e9:.2f}"

@@ -63,13 +63,13 @@ def test_a_table_on_the_device_goes_on_by_itself(table):
 
 def test_the_next_batch_is_read_before_it_is_asked_for(table, monkeypatch):
     reads: list[int] = []
-    given = PixelTable.records
+    given = table.records
 
-    def records(self: PixelTable, start: int, count: int) -> Any:
+    def records(start: int, count: int) -> Any:
         reads.append(start)
-        return given(self, start, count)
+        return given(start, count)
 
-    monkeypatch.setattr(PixelTable, "records", records)
+    monkeypatch.setattr(table, "records", records)
     uploads, sampler = Uploads(table, "cpu"), TablePixelSampler(table, 10)
     sampler._first = 0
     for step, expected in enumerate(([0, 10], [0, 10, 20])):

@@ -1,35 +1,48 @@
 """The parts of `benchmarks.speed.gpu`: what each measures on a GPU, as a dictionary for JSON.
 
 Each runs with `Settings` that say whether it is meant: without a GPU (`fake`) sizes are tiny, everything is on the CPU,
-and the figures mean nothing; what runs is the same code.
+and the figures mean nothing; what runs is the same code. In what a part gives, numbers and words stand for themselves,
+and lists of rows are tables. A part with several rows keeps them as they come, for the case that it is ended.
 """
 
 from __future__ import annotations
 
 import copy
 import importlib.util
-import math
+import itertools
 import os
+import random
 import re
+import statistics
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from torch import Tensor
 
 ROOT = Path(__file__).resolve().parents[2]
 TESTS = ROOT / "tests"
-TRAINED_STEPS = 500
-EQUAL_STEPS = 40
-"""So many steps are made on the CPU as well: each takes about a second."""
+STARTED_STEPS = 60
+"""So many are enough for both kinds of steps to be recorded."""
+TRAINED_STEPS = 5_000
 PROFILED_STEPS = 20
+LATE = 20_000
+"""A step of the schedule by which proposal networks rest in most steps."""
+RENDERED_RAYS = 1 << 20
+CALLS = 20
+"""So many calls of a function are recorded as one CUDA graph."""
 LAUNCHES = ("cudaLaunchKernel", "cudaLaunchKernelExC", "cuLaunchKernel", "cuLaunchKernelEx", "cudaGraphLaunch")
 WAITS = ("cudaStreamSynchronize", "cudaDeviceSynchronize", "cudaEventSynchronize", "cudaMemcpy")
+CACHES = {"TRITON_CACHE_DIR": "triton", "TORCHINDUCTOR_CACHE_DIR": "inductor", "NUMBA_CACHE_DIR": "numba"}
+"""The variables of the environment that say where compiled kernels are kept, and folders for them."""
+Found = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -40,15 +53,29 @@ class Settings:
     folder: Path
     """For what is written on the way."""
     fake: bool = False
+    began: float = field(default_factory=time.time)
+    """When the part's process was started, as `time.time` counts."""
+    keep: Callable[[Found], object] = lambda _: None
+    """Takes what is known so far."""
 
     @property
     def device(self) -> str:
         """Where it runs."""
         return "cpu" if self.fake else "cuda"
 
+    @property
+    def caches(self) -> Path:
+        """For compiled kernels and what is made of the scene: empty at the first start."""
+        return self.folder / "caches"
+
+    @property
+    def alone(self) -> Path:
+        """This file is there as soon as nothing is timed any more that runs alone."""
+        return self.folder / "nothing_runs_alone"
+
     def adjust(self, config: Any) -> None:
         """Keep the scene as it is; make what is trained tiny, where it is not meant."""
-        config.pipeline.datamanager.cache_dir = self.folder / "cache"
+        config.pipeline.datamanager.cache_dir = self.caches / "scene"
         if self.fake:
             shrink(config)
 
@@ -57,266 +84,21 @@ class Settings:
 class Part:
     """A measurement with a limit of its own."""
 
-    run: Callable[[Settings], dict[str, Any]]
+    run: Callable[[Settings], Found]
     limit_s: int
+    group: str = ""
+    """Parts of a group run at the same time."""
 
 
-def synchronise() -> None:
-    """Wait for a GPU, where there is one."""
-    if torch.cuda.is_available():
-        torch.cuda.synchronize()
+# ---- trainings ----------------------------------------------------------------------------------------------------
 
 
-def milliseconds(work: Callable[[], object], settings: Settings) -> float:
-    """Median of many runs on the device, whose cache is emptied in between."""
-    if settings.fake:
-        started = time.perf_counter()
-        work()
-        return 1e3 * (time.perf_counter() - started)
-    from triton.testing import do_bench
+def configuration(settings: Settings, method: str = "edge", seed: int = 0, steps: int | None = None) -> Any:
+    """The full preset on the scene, as `compare` makes it of a method; schedules are as long as the training."""
+    from edge_depth_nerf.compare.configuration import configuration as compared
+    from edge_depth_nerf.compare.specification import RunSpecification
 
-    taken: Any = do_bench(work, return_mode="median")
-    return float(taken)
-
-
-# ---- the device and its kernels -----------------------------------------------------------------------------------
-
-
-def device(settings: Settings) -> dict[str, Any]:
-    """What it is, and how many bytes a second it copies."""
-    import triton
-
-    from benchmarks.speed.turns import machine
-
-    x = torch.empty(1 << (16 if settings.fake else 28), device=settings.device)
-    taken_ms = milliseconds(lambda: x.clone(), settings)
-    about: dict[str, Any] = {**machine(), "triton": triton.__version__, "cuda": torch.version.cuda}
-    if not settings.fake:
-        properties = torch.cuda.get_device_properties(0)
-        about |= {
-            "memory_gb": properties.total_memory / 1e9,
-            "capability": f"{properties.major}.{properties.minor}",
-            "multiprocessors": properties.multi_processor_count,
-        }
-    return {**about, "copied_gb_s": 2 * x.numel() * x.element_size() / taken_ms / 1e6}
-
-
-def tests_of_a_gpu() -> list[Path]:
-    """The files that have such tests."""
-    return [path for path in sorted(TESTS.glob("test_*.py")) if "_on_a_gpu(" in path.read_text(encoding="utf-8")]
-
-
-def gpu_tests(settings: Settings) -> dict[str, Any]:
-    """The tests that a machine without a GPU skips, by number: their names end with `on_a_gpu`."""
-    files = [TESTS / "test_grad_scaler.py"] if settings.fake else tests_of_a_gpu()
-    command = [sys.executable, "-m", "pytest", *map(str, files), "-p", "no:cacheprovider"]
-    command += [f"--basetemp={settings.folder / 'tests'}", *(["-n", "0"] if settings.fake else ["-n", "4"])]
-    command += [] if settings.fake else ["-k", "on_a_gpu"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    last = done.stdout.strip().rpartition("\n")[2]
-    counts = {what: int(number) for number, what in re.findall(r"(\d+) (passed|failed|skipped|error)", last)}
-    return {"counts": counts, "said": done.stdout[-4000:] if done.returncode else ""}
-
-
-def kernels(settings: Settings) -> dict[str, Any]:
-    """The hash grid's kernels: beside the CPU's numbers, and timed at the sizes of a full step."""
-    from nerfstudio.field_components.encodings import HashEncoding
-
-    from benchmarks.speed.hash_grid import SIZES, SIZES_ON_CUDA, make_points, moved_bytes
-    from edge_depth_nerf.kernels import hash_grid_numba as on_cpu
-    from edge_depth_nerf.kernels.functions import HASH_GRID
-
-    if HASH_GRID.on(torch.device(settings.device)) is None:
-        raise RuntimeError("Triton's kernels do not work on this GPU; the warning above says why")
-    work: Any = on_cpu
-    if not settings.fake:
-        from edge_depth_nerf.kernels import hash_grid_triton as work
-    rows = []
-    for name, (levels, log2_rows, count, finest) in (SIZES if settings.fake else SIZES_ON_CUDA).items():
-        if settings.fake:
-            count, log2_rows = 320, 8
-        torch.manual_seed(0)
-        grid = HashEncoding(num_levels=levels, log2_hashmap_size=log2_rows, max_res=finest, implementation="torch")
-        table, scalings, features = grid.hash_table.detach(), grid.scalings.float(), grid.get_out_dim()
-        moved = moved_bytes(count, features)
-        for along_rays in (True, False):
-            x, gradient = make_points(count, along_rays=along_rays), torch.randn(count, features)
-            calls: dict[str, tuple[Sequence[Any], int]] = {
-                "encode": ((x, table, scalings), moved["forward"]),
-                "table_gradient": ((x, gradient, scalings, len(table)), moved["backward"]),
-                "position_gradient": ((x, table, gradient, scalings), moved["forward"]),
-            }
-            for kernel, (arguments, size) in calls.items():
-                there = [each.to(settings.device) if isinstance(each, torch.Tensor) else each for each in arguments]
-                expected, found = getattr(on_cpu, kernel)(*arguments), getattr(work, kernel)(*there).cpu()
-                off = float((found - expected).abs().max() / expected.abs().max())
-                taken_ms = milliseconds(lambda k=kernel, a=there: getattr(work, k)(*a), settings)
-                rows.append(
-                    {
-                        "size": name,
-                        "points": count,
-                        "along_rays": along_rays,
-                        "kernel": kernel,
-                        "ms": taken_ms,
-                        "gb_s": size / taken_ms / 1e6,
-                        "off_the_cpu": off,
-                    }
-                )
-    return {"rows": rows}
-
-
-Pair = tuple[Callable[[], torch.Tensor], Callable[[], torch.Tensor]]
-"""The same work by Triton's kernels and by torch."""
-
-
-def has_kernels(settings: Settings) -> bool:
-    """Whether Triton's kernels run: on a GPU, or interpreted; else torch's form stands for them."""
-    return not settings.fake or os.environ.get("TRITON_INTERPRET") == "1"
-
-
-def followed(found: torch.Tensor, *given: torch.Tensor) -> torch.Tensor:
-    """The sum and its gradients, in one row."""
-    return torch.cat(
-        [found.sum().view(1), *(each.flatten().float() for each in torch.autograd.grad(found.sum(), given))]
-    )
-
-
-def spaced(distance: torch.Tensor) -> torch.Tensor:
-    """nerfstudio's piecewise spacing."""
-    return torch.where(distance < 1, distance / 2, 1 - 1 / (2 * distance))
-
-
-def sorted_edges(rays: int, samples: int, settings: Settings) -> torch.Tensor:
-    """Edges of samples anywhere in 0..1."""
-    return torch.rand(rays, samples + 1, device=settings.device).sort(dim=1)[0]
-
-
-def work_by_number(rays: int, samples: int, settings: Settings) -> dict[str, Pair]:
-    """Distances, contraction and directions."""
-    import torch.nn.functional as F
-    from nerfstudio.utils.math import components_from_spherical_harmonics
-
-    from edge_depth_nerf.kernels import pointwise_triton
-    from edge_depth_nerf.plugin.fused.fields import CubeContraction
-
-    near, far = (torch.full((rays, 1), value, device=settings.device) for value in (0.01, 50.0))
-    edges = sorted_edges(rays, samples, settings)
-    directions = F.normalize(torch.randn(rays, 3, device=settings.device), dim=1)
-    anywhere = 3 * torch.randn(rays * samples, 3, device=settings.device)
-    contraction = CubeContraction(order=float("inf"))
-
-    def distances() -> torch.Tensor:
-        x = torch.lerp(spaced(near), spaced(far), edges)
-        return torch.where(x < 0.5, 2 * x, 1 / (2 - 2 * x))
-
-    return {
-        "contraction": (
-            lambda: pointwise_triton.contract(anywhere)[0],
-            lambda: (contraction(anywhere) + 2) / 4,
-        ),
-        "distances": (lambda: pointwise_triton.distances(edges, near, far), distances),
-        "directions": (
-            lambda: pointwise_triton.harmonics(directions, torch.float32),
-            lambda: components_from_spherical_harmonics(4, (directions + 1) / 2),
-        ),
-    }
-
-
-def work_along_rays(rays: int, samples: int, settings: Settings) -> dict[str, Pair]:
-    """Placing samples, and the losses on samples with their gradients."""
-    from nerfstudio.model_components.losses import lossfun_distortion, lossfun_outer
-
-    from edge_depth_nerf.kernels import ray_triton
-    from edge_depth_nerf.method import edge_loss_triton
-    from edge_depth_nerf.method.losses import EPS, NARROW, edge_loss
-
-    final = max(2, samples // 5)
-    outer_edges, edges = (sorted_edges(rays, each, settings) for each in (samples, final))
-    outer, weights = (
-        torch.rand(rays, each, device=settings.device).pow(4).div(each).requires_grad_() for each in (samples, final)
-    )
-    prior, sigma = 1 + 19 * torch.rand(rays, device=settings.device), torch.full((rays,), 0.2, device=settings.device)
-    wanted = torch.linspace(0.01, 0.99, final, device=settings.device).expand(rays, -1).contiguous()
-    levels = [
-        (each, 20 * of_each[:, :-1], 20 * of_each[:, 1:], prior, sigma)
-        for each, of_each in ((outer, outer_edges), (weights, edges))
-    ]
-
-    def placed() -> torch.Tensor:
-        share = outer.detach() + 0.01
-        cumulative = torch.nn.functional.pad((share / share.sum(1, keepdim=True)).cumsum(1), (1, 0))
-        above = torch.searchsorted(cumulative, wanted, side="right").clamp(1, samples)
-        low, high = (cumulative.gather(1, each) for each in (above - 1, above))
-        start, end = (outer_edges.gather(1, each) for each in (above - 1, above))
-        return start + (wanted - low) / (high - low) * (end - start)
-
-    def by_triton() -> torch.Tensor:
-        form = {"interval": True, "divide_by_norm": True, "eps": EPS, "narrow": NARROW}
-        return followed(
-            torch.stack([edge_loss_triton.edge_loss(*level, **form).sum() for level in levels]), outer, weights
-        )
-
-    def by_torch() -> torch.Tensor:
-        form: dict[str, Any] = {"gaussian": "interval", "divide_by_norm": True}
-        return followed(torch.stack([edge_loss(*level, **form).sum() for level in levels]), outer, weights)
-
-    return {
-        "placing samples": (lambda: ray_triton.sample_pdf(outer, outer_edges, wanted, 0.01, 1e-5), placed),
-        "proposal loss": (
-            lambda: followed(ray_triton.interlevel_loss(edges, weights.detach(), outer_edges, outer), outer),
-            lambda: followed(lossfun_outer(edges, weights.detach(), outer_edges, outer).mean(), outer),
-        ),
-        "distortion loss": (
-            lambda: followed(ray_triton.distortion_loss(edges, weights), weights),
-            lambda: followed(lossfun_distortion(edges, weights).mean(), weights),
-        ),
-        "edge loss": (by_triton, by_torch),
-    }
-
-
-def samples_and_losses(settings: Settings) -> dict[str, Any]:
-    """Triton's kernels for samples and losses beside torch's, at the sizes of a full step."""
-    torch.manual_seed(0)
-    rays, samples = (16, 8) if settings.fake else (4096, 256)
-    pairs = {
-        **work_by_number(rays, samples, settings),
-        **work_along_rays(rays, samples, settings),
-    }
-    rows = []
-    for name, (by_triton, by_torch) in pairs.items():
-        work = by_triton if has_kernels(settings) else by_torch
-        found, beside = work().double(), by_torch().double()
-        rows.append(
-            {
-                "what": name,
-                "triton_ms": milliseconds(work, settings),
-                "torch_ms": milliseconds(by_torch, settings),
-                "off_torch": float((found - beside).norm() / beside.norm()),
-            }
-        )
-    return {"rows": rows}
-
-
-def counts(settings: Settings) -> dict[str, Any]:
-    """What a step would ask for, counted on fake tensors, as the tests do."""
-    from benchmarks.speed import gpu_counts
-
-    if reason := gpu_counts.why_not():
-        return {"left_out": reason}
-    cases = ["lite"] if settings.fake else ["full", "full, proposals rest", "full, torch"]
-    return gpu_counts.in_a_process(cases, settings.scene, settings.folder / "counts")
-
-
-# ---- steps --------------------------------------------------------------------------------------------------------
-
-
-def configuration(settings: Settings) -> Any:
-    """The full preset on the scene."""
-    from edge_depth_nerf.plugin import config as methods
-
-    config: Any = copy.deepcopy(methods.edge_depth_nerf.config)
-    config.pipeline.datamanager.data = config.pipeline.datamanager.dataparser.data = settings.scene
-    config.machine.device_type, config.vis = settings.device, "tensorboard"
+    config, _ = compared(RunSpecification(str(settings.scene), "", "full", method, seed, steps))
     settings.adjust(config)
     return config
 
@@ -328,188 +110,452 @@ def shrink(config: Any) -> None:
     model.proposal_net_args_list = [{**each, "log2_hashmap_size": 8} for each in model.proposal_net_args_list]
     model.num_proposal_samples_per_ray, model.num_nerf_samples_per_ray = (8, 8), 8
     data.train_num_rays_per_batch, data.eval_num_rays_per_batch = 64, 64
-    if hasattr(data, "surface_rays_per_batch"):
+    if data.surface_rays_per_batch:
         data.surface_rays_per_batch = 64
 
 
-class Here:
-    """A contestant of `turns.race` in this process, which leaves its folder to tensorboard's thread."""
-
-    def __init__(self, config: Any, folder: Path) -> None:
-        from benchmarks.speed.turns import Runner
-
-        self._runner = Runner(config, folder)
-        self.step_s: list[float] = []
-        self.render_s: list[float] = []
-        self.rendered_px = (0, 0)
-
-    def wait(self) -> None:
-        """It is ready."""
-
-    def ask(self, name: str, argument: Any) -> Any:
-        """Let it do one thing."""
-        return getattr(self._runner, name)(argument)
-
-    def stop(self) -> None:
-        """Forget it."""
-        del self._runner
+def synchronise() -> None:
+    """Wait for a GPU, where there is one."""
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
 
 
-def raced(settings: Settings, names: Sequence[str]) -> dict[str, Any]:
-    """Milliseconds of a step of several trainers, in turn."""
-    from benchmarks.speed import turns
+def started(settings: Settings) -> Found:
+    """The first steps of a training in this process, which has done nothing before; whether they were recorded."""
+    import triton
+    from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 
-    rounds, steps = (1, 1) if settings.fake else (5, 100)
-    every = list(dict.fromkeys((turns.REFERENCE, *names)))
-    configs = turns.configurations("full", settings.scene, every, settings.adjust)
-    of: Any = partial(Here, folder=settings.folder / "race") if settings.fake else turns.Contestant
-    found = turns.race(configs, rounds, steps, contestant_of=of)
+    from benchmarks.speed.turns import KINDS_OF_STEPS, Runner, machine
+
+    config = configuration(settings)
+    about: Found = {**machine(), "triton": triton.__version__, "cuda": torch.version.cuda}
+    about["caches before"] = "filled" if settings.caches.exists() else "empty"
+    ready = time.time()
+    runner = Runner(config, settings.folder / "started")
+    set_up, steps_s = time.time(), []
+
+    def after_step(step: int) -> None:
+        synchronise()
+        steps_s.append(time.time())
+
+    after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
+    runner.trainer.callbacks.append(TrainingCallback(after, after_step))
+    runner.trainer.config.max_num_iterations = 2 if settings.fake else STARTED_STEPS
+    runner.trainer.train()
+    recorded = runner.graphs(None)
+    lasted_ms = [1e3 * (end - start) for start, end in itertools.pairwise(steps_s)]
     return {
-        name: {
-            "rays_per_second": None if name == turns.SPLATS else result["rays_per_second"],
-            "step_ms": [1e3 * each for each in result["step_s"]],
-            "ratio_to_nerfacto": result["step_ratio"],
-            "graphs": result["graphs"],
-        }
-        for name, result in found.items()
+        "graphs recorded": recorded,
+        "both kinds of steps recorded": recorded == KINDS_OF_STEPS,
+        "imports, s": ready - settings.began,
+        "set-up, s": set_up - ready,
+        "first step, s": steps_s[0] - set_up,
+        "until the first step is done, s": steps_s[0] - settings.began,
+        "longest step after it, ms": max(lasted_ms),
+        "last steps, each waited for, ms": lasted_ms[-20:],
+        **about,
     }
 
 
-def beside_others(settings: Settings, name: str) -> dict[str, Any]:
-    """Race a trainer that may fail on its own, so that it ends no other; `left_out` says why it has no figures."""
-    try:
-        found = raced(settings, [name])[name]
-    except Exception as error:
-        return {"left_out": {name: f"{type(error).__name__}: {error}"[:500]}}
-    if found["graphs"] == 0:
-        return {"left_out": {name: "no graph was recorded; the log says why"}}
-    return {name: found}
-
-
-def our_steps(settings: Settings) -> dict[str, Any]:
-    """Ours, fused (launched one by one, and as CUDA graphs) and in torch, beside nerfstudio's nerfacto."""
-    from benchmarks.speed import turns
-
-    found = raced(settings, ["ours"] if settings.fake else ["ours", "ours, torch"])
-    if settings.fake:
-        return {**found, "left_out": {turns.GRAPHS: "there is no GPU"}}
-    return found | beside_others(settings, turns.GRAPHS)
-
-
-def other_steps(settings: Settings) -> dict[str, Any]:
-    """depth-nerfacto; tiny-cuda-nn's nerfacto and ours where it is installed, splatfacto where gsplat works."""
-    from nerfstudio.utils.external import TCNN_EXISTS
-
-    names = ["depth-nerfacto"]
-    left_out = {}
-    if TCNN_EXISTS and not settings.fake:
-        names += ["nerfacto, tiny-cuda-nn", "ours, tiny-cuda-nn"]
-    else:
-        left_out["tiny-cuda-nn"] = "not installed"
-    found = {} if settings.fake else raced(settings, names)
-    if settings.fake or importlib.util.find_spec("gsplat") is None:
-        left_out["splatfacto"] = "gsplat is not installed, or there is no GPU"
-    else:
-        splats = beside_others(settings, "splatfacto")  # gsplat compiles at its first call
-        found, left_out = {**found, **splats}, {**left_out, **splats.get("left_out", {})}
-    return {**found, "left_out": left_out}
-
-
-def profile(settings: Settings) -> dict[str, Any]:
-    """Launches and waiting as the driver sees them, seconds of host and device, memory; of a step of ours."""
-    from torch.profiler import ProfilerActivity
-
+def trained(settings: Settings, method: str, seed: int) -> Found:
+    """A training from start to figures, as `ns-train` and `ns-eval` do it."""
     from benchmarks.speed.turns import Runner
 
-    runner = Runner(configuration(settings), settings.folder / "profile")
-    first = 20_000
-    steps = range(first, first + (1 if settings.fake else PROFILED_STEPS))
-    runner.iterate(steps)
-    started = time.perf_counter()
-    for step in steps:
-        runner._iterate(step)
-    host_s = time.perf_counter() - started
+    steps = 2 if settings.fake else TRAINED_STEPS
+    config = configuration(settings, method, seed, steps)
+    random.seed(seed)
+    np.random.seed(seed)  # noqa: NPY002 (nerfstudio draws from the global generator)
+    runner = Runner(config, settings.folder / f"{method}_{seed}", seed)
+    set_up = time.time()
+    runner.trainer.train()
     synchronise()
-    both_s = time.perf_counter() - started
+    ended = time.time()
+    with torch.no_grad():
+        figures: Any = runner.trainer.pipeline.get_average_eval_image_metrics()
+    return {
+        "steps": steps,
+        "start, s": set_up - settings.began,
+        "steps, s": ended - set_up,
+        "graphs recorded": runner.graphs(None),
+        **{name: float(value) for name, value in figures.items()},
+    }
+
+
+def cloud_of_prior(settings: Settings) -> Path:
+    """The scene with the prior's distances for its points.ply, thinned as LiDAR's are: a folder of links."""
+    from edge_depth_nerf.base.files import read_json, write_json
+    from edge_depth_nerf.scene.points import MAX_POINTS, merge_parts
+
+    manager: Any = configuration(settings).pipeline.datamanager.setup(device="cpu", test_mode="val")
+    table = manager.train_pixel_sampler.table
+    batch = table.batch(0, min(len(table), round(4 * MAX_POINTS / table.share_with_prior)))
+    known = batch.prior_distance_m[:, 0] > 0
+    outputs = manager.train_dataset._dataparser_outputs
+    with torch.no_grad():
+        rays = manager.train_ray_generator(batch.indices[known])
+    along = batch.prior_distance_m[known] / manager.train_dataset.metadata["metres_per_unit"]
+    points = (rays.origins + rays.directions * along).double() / outputs.dataparser_scale
+    transform = outputs.dataparser_transform.double()
+    in_world = (points - transform[:3, 3]) @ transform[:3, :3]
+    colours = (batch.rgb[known] * 255).round().to(torch.uint8)
+    folder = settings.folder / "with_the_priors_cloud"
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in settings.scene.resolve().iterdir():
+        if path.name not in ("points.ply", "transforms.json") and not (folder / path.name).exists():
+            (folder / path.name).symlink_to(path)
+    np.savez(folder / "points.npz", points_m=in_world.float().numpy(), colours=colours.numpy())
+    merge_parts([folder / "points.npz"], folder / "points.ply")
+    write_json(
+        folder / "transforms.json", read_json(settings.scene / "transforms.json") | {"ply_file_path": "points.ply"}
+    )
+    return folder
+
+
+def splatted(settings: Settings, scene: Path, name: str) -> Found:
+    """A training of nerfstudio's splatfacto, judged on its rectified pictures, inside their masks."""
+    from nerfstudio.configs.method_configs import method_configs
+    from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+
+    from benchmarks.speed.turns import Runner
+    from edge_depth_nerf.method.metrics import masked_psnr
+
+    config: Any = copy.deepcopy(method_configs["splatfacto"])
+    config.pipeline.datamanager.dataparser = NerfstudioDataParserConfig(data=scene, load_3D_points=True)
+    config.max_num_iterations = config.optimizers["means"]["scheduler"].max_steps = TRAINED_STEPS
+    config.pipeline.model.stop_split_at = TRAINED_STEPS // 2
+    config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = 0
+    began = time.time()
+    runner = Runner(config, settings.folder / "splats" / name)
+    runner.trainer.train()
+    synchronise()
+    taken_s = time.time() - began
+    pipeline: Any = runner.trainer.pipeline.eval()
+    psnr = []
+    with torch.no_grad():
+        for camera, batch in pipeline.datamanager.fixed_indices_eval_dataloader:
+            rgb = pipeline.model.get_outputs_for_camera(camera.to(pipeline.device))["rgb"]
+            mask = batch.get("mask", torch.ones(rgb.shape[:2], dtype=torch.bool)).reshape(rgb.shape[:2]).to(rgb.device)
+            psnr.append(float(masked_psnr(rgb, pipeline.model.get_gt_img(batch["image"]), mask)))
+    return {"points": name, "steps": TRAINED_STEPS, "s": taken_s, "masked PSNR, dB": statistics.fmean(psnr)}
+
+
+def splats(settings: Settings) -> Found:
+    """splatfacto from LiDAR's points and from the prior's cloud, where gsplat compiles; it trains beside the others."""
+    if settings.fake or importlib.util.find_spec("gsplat") is None:
+        return {"left out": "there is no GPU, or no gsplat"}
+    began = time.time()
+    # most cores are left to what is timed meanwhile
+    os.environ.setdefault("MAX_JOBS", "4")
+    from gsplat.cuda import _backend  # compiles
+
+    if getattr(_backend, "_C", None) is None:
+        return {"left out": "gsplat found no CUDA compiler; the log says more"}
+    found: Found = {"gsplat compiled, s": time.time() - began, "rows": []}
+    while not settings.alone.exists():
+        time.sleep(0.2)
+    for name, scene in (("LiDAR", lambda: settings.scene), ("prior", lambda: cloud_of_prior(settings))):
+        found["rows"].append(splatted(settings, scene(), name))
+        settings.keep(found)
+    return found
+
+
+# ---- steps --------------------------------------------------------------------------------------------------------
+
+
+def steps(settings: Settings) -> Found:
+    """Milliseconds of a step of ours, as it is and without graphs, and of nerfacto in torch, in turns."""
+    from benchmarks.speed import turns
+
+    count, rounds = (1, 1) if settings.fake else (30, 3)
+    names = [turns.REFERENCE, "ours", *([] if settings.fake else [turns.EAGER])]
+    configs = turns.configurations("full", settings.scene, names, settings.adjust)
+    firsts = [first + number * count for first in (turns.WARM_UPS, LATE) for number in range(rounds)]
+    found = turns.race(configs, len(firsts), count, firsts=firsts)
+    rays = configs["ours"].pipeline.datamanager.train_num_rays_per_batch
+    rows = []
+    for name, each in found.items():
+        early, late = ([1e3 * taken for taken in part] for part in (each["step_s"][:rounds], each["step_s"][rounds:]))
+        row = {"trainer": name, "ms a step, early": early, "ms a step, late": late}
+        row["rays/s, late"] = 1e3 * rays / statistics.median(late)
+        row |= {"× nerfacto in torch, late": each["step_ratio"][rounds:], "graphs": each["graphs"]}
+        rows.append(row)
+    return {"rays": rays, "early, from step": firsts[0], "late, from step": LATE, "rows": rows}
+
+
+def profile(settings: Settings) -> Found:
+    """A step of ours as the driver sees it: kernels, launches, copies, waits, memory; then a view."""
+    from torch.profiler import ProfilerActivity
+
+    from benchmarks.speed.turns import WARM_UPS, Runner
+
+    runner = Runner(configuration(settings), settings.folder / "profile")
+    runner.iterate(range(1 if settings.fake else WARM_UPS))
+    chosen = range(LATE, LATE + (1 if settings.fake else PROFILED_STEPS))
+    runner.iterate(chosen)
+    started_s = time.perf_counter()
+    for step in chosen:
+        runner._iterate(step)
+    host_s = time.perf_counter() - started_s
+    synchronise()
+    both_s = time.perf_counter() - started_s
+    memory = {}
+    if not settings.fake:
+        memory = {"allocated, GB": torch.cuda.max_memory_allocated() / 1e9}
+        memory["reserved, GB"] = torch.cuda.max_memory_reserved() / 1e9
     activities = [ProfilerActivity.CPU] + [ProfilerActivity.CUDA] * (not settings.fake)
     with torch.profiler.profile(activities=activities) as profiler:
-        for step in steps:
+        for step in chosen:
             runner._iterate(step)
         synchronise()
     events = profiler.key_averages()
 
     def calls(names: Sequence[str]) -> float:
-        return sum(event.count for event in events if event.key in names) / len(steps)
+        return sum(event.count for event in events if event.key in names) / len(chosen)
 
     on_device = [event for event in events if event.device_type == torch.autograd.DeviceType.CUDA]
     on_device.sort(key=lambda event: -event.self_device_time_total)
-    memory = {}
-    if not settings.fake:
-        memory = {"allocated_gb": torch.cuda.max_memory_allocated() / 1e9}
-        memory["reserved_gb"] = torch.cuda.max_memory_reserved() / 1e9
+    runner.render(RENDERED_RAYS)
+    rendered_s, (height, width) = runner.render(RENDERED_RAYS)
     return {
-        "steps": len(steps),
-        "host_ms": 1e3 * host_s / len(steps),
-        "step_ms": 1e3 * both_s / len(steps),
-        "device_ms": sum(event.self_device_time_total for event in on_device) / len(steps) / 1e3,
+        "graphs recorded": runner.graphs(None),
+        "ms a step": 1e3 * both_s / len(chosen),
+        "ms of the host": 1e3 * host_s / len(chosen),
+        "ms of the device": sum(event.self_device_time_total for event in on_device) / len(chosen) / 1e3,
+        "kernels": sum(event.count for event in on_device) / len(chosen),
         "launches": calls(LAUNCHES),
         "copies": calls(("cudaMemcpyAsync", "cudaMemcpy")),
         # the profiler waits once itself, at the end
-        "waits": max(0.0, calls(WAITS) - 1 / len(steps)),
+        "waits": max(0.0, calls(WAITS) - 1 / len(chosen)),
         **memory,
-        "slowest": [
-            {"kernel": event.key[:120], "ms": event.self_device_time_total / len(steps) / 1e3, "calls": event.count}
-            for event in on_device[:15]
+        f"a view of {width} × {height} px, s": rendered_s,
+        "rendered rays/s": width * height / rendered_s,
+        "rows": [
+            {
+                "kernel": event.key[:120],
+                "ms a step": event.self_device_time_total / len(chosen) / 1e3,
+                "calls a step": event.count / len(chosen),
+            }
+            for event in on_device[:40]
         ],
     }
 
 
-# ---- trainings ----------------------------------------------------------------------------------------------------
+# ---- kernels ------------------------------------------------------------------------------------------------------
 
 
-def trained(settings: Settings, steps: int, device_type: str) -> dict[str, Any]:
-    """Train as `ns-train` does once it has read its arguments, and judge as `ns-eval` does."""
-    from nerfstudio.scripts.train import main
-    from nerfstudio.utils.eval_utils import eval_setup
-
-    config = configuration(settings)
-    config.machine.device_type, config.max_num_iterations = device_type, steps
-    config.output_dir, config.experiment_name = settings.folder / "trained", f"{device_type}_{steps}"
-    config.timestamp = f"{time.time():.0f}"
-    config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = 0
-    started = time.perf_counter()
-    main(config)
-    synchronise()
-    taken_s = time.perf_counter() - started
-    _, pipeline, _, _ = eval_setup(config.get_base_dir() / "config.yml")
-    with torch.no_grad():
-        figures: Any = pipeline.get_average_eval_image_metrics()
-    kept = {name: float(value) for name, value in figures.items() if math.isfinite(float(value))}
-    return {"steps": steps, "seconds_with_start": taken_s, "figures": kept}
-
-
-def training(settings: Settings) -> dict[str, Any]:
-    """A training of some hundred steps, from start to figures."""
-    return trained(settings, 2 if settings.fake else TRAINED_STEPS, settings.device)
-
-
-def beside_the_cpu(settings: Settings) -> dict[str, Any]:
-    """The same steps on GPU and CPU, from the same seed: figures that should agree."""
+def device_us(work: Callable[[], object], settings: Settings) -> float:
+    """Microseconds of a call on the device: many in one replayed CUDA graph, as launches hide what is below 50."""
     if settings.fake:
-        return {"left_out": "there is no GPU"}
-    return {kind: trained(settings, EQUAL_STEPS, kind) for kind in ("cuda", "cpu")}
+        began = time.perf_counter()
+        work()
+        return 1e6 * (time.perf_counter() - began)
+    beside = torch.cuda.Stream()
+    beside.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(beside):
+        for _ in range(3):
+            work()
+    torch.cuda.current_stream().wait_stream(beside)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        for _ in range(CALLS):
+            work()
+    taken_ms = []
+    for _ in range(6):
+        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        start.record()
+        graph.replay()
+        end.record()
+        torch.cuda.synchronize()
+        taken_ms.append(start.elapsed_time(end))
+    return 1e3 * statistics.median(taken_ms[1:]) / CALLS
 
 
-PARTS = {
-    "device": Part(device, 60),
-    "counts": Part(counts, 120),
-    "tests": Part(gpu_tests, 180),
-    "kernels": Part(kernels, 120),
-    "samples and losses": Part(samples_and_losses, 120),
-    "our steps": Part(our_steps, 180),
-    "other steps": Part(other_steps, 180),
-    "profile": Part(profile, 120),
-    "training": Part(training, 180),
-    "beside the CPU": Part(beside_the_cpu, 180),
+def worked(
+    function: Callable[..., Any], given: dict[str, Any], factors: Sequence[Tensor] | None = None
+) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
+    """What a function gives, and the gradients of it, times factors, to what wants one."""
+    found = function(**given)
+    results = found if isinstance(found, tuple) else (found,)
+    wanting = [each for each in given.values() if isinstance(each, Tensor) and each.requires_grad]
+    if not wanting:
+        return results, ()
+    return results, torch.autograd.grad(results, wanting, factors or [torch.ones_like(each) for each in results])
+
+
+def outcome(function: Callable[..., Any], given: dict[str, Any]) -> Tensor:
+    """What a function and its gradients give, in one row."""
+    results, gradients = worked(function, given)
+    return torch.cat([each.detach().flatten().double() for each in (*results, *gradients)])
+
+
+def call_us(function: Callable[..., Any], given: dict[str, Any], settings: Settings) -> float:
+    """Microseconds of a call, with its gradients."""
+    factors = [torch.ones_like(each) for each in worked(function, given)[0]]
+    return device_us(partial(worked, function, given, factors), settings)
+
+
+def arguments(settings: Settings) -> dict[str, list[dict[str, Any]]]:
+    """What each function with a form for a GPU is given in a step of the full preset, by the form's name."""
+    from benchmarks.speed.hash_grid import SIZES_ON_CUDA, make_points
+    from edge_depth_nerf.method.losses import EPS, NARROW
+
+    device = settings.device
+    half = {"dtype": torch.float32 if settings.fake else torch.float16}
+    rays, outer, middle, final, surface = (16, 12, 8, 6, 32) if settings.fake else (4096, 256, 96, 48, 16384)
+
+    def edges(samples: int) -> Tensor:
+        return torch.rand(rays, samples + 1, device=device).sort(dim=1)[0]
+
+    def weights(samples: int) -> Tensor:
+        some = torch.rand(rays, samples, device=device) ** 4
+        return some / some.sum(dim=1, keepdim=True)
+
+    def grid(levels: int, log2_rows: int, count: int, finest: int, along_rays: bool) -> dict[str, Any]:
+        if settings.fake:
+            count, log2_rows = 320, 8
+        scalings = torch.floor(16 * (finest / 16) ** (torch.arange(levels, device=device) / (levels - 1)))
+        # as large as at the beginning of a training
+        table = 1e-4 * (2 * torch.rand(levels << log2_rows, 2, device=device) - 1)
+        points = make_points(count, along_rays=along_rays).to(device)
+        return {"positions": points, "table": table.requires_grad_(), "scalings": scalings, **half}
+
+    nears, fars = (torch.full((rays, 1), value, device=device) for value in (0.01, 50.0))
+    directions = torch.nn.functional.normalize(torch.randn(2 * rays + surface, 3, device=device), dim=1)
+    prior_m, sigma_m = 1 + 19 * torch.rand(rays, device=device), torch.full((rays,), 0.2, device=device)
+    in_loss = {"prior_m": prior_m, "sigma_m": sigma_m, "interval": True, "divide_by_norm": True}
+    in_loss |= {"eps": EPS, "narrow": NARROW}
+    met, inner = {"edges": edges(final), "weights": weights(final)}, (outer, middle)
+    levels = [(weights(each), 20 * edges(each)) for each in (*inner, final)]
+    return {
+        "hash grid": [grid(*size, along) for size in SIZES_ON_CUDA.values() for along in (True, False)],
+        "contraction": [{"positions": 3 * torch.randn(rays * each, 3, device=device)} for each in inner],
+        "distances": [{"places": edges(each), "nears": nears, "fars": fars} for each in inner],
+        "directions": [{"directions": directions, **half}],
+        "placing of samples": [
+            {"weights": weights(each), "edges": edges(each), "wanted": edges(next_), "padding": 0.01, "least": 1e-5}
+            for each, next_ in itertools.pairwise((*inner, final))
+        ],
+        "proposal loss": [
+            {**met, "outer_edges": edges(each), "outer_weights": weights(each).requires_grad_()} for each in inner
+        ],
+        "distortion loss": [{**met, "weights": weights(final).requires_grad_()}],
+        "edge loss": [
+            {**in_loss, "weights": each.requires_grad_(), "starts_m": ends[:, :-1], "ends_m": ends[:, 1:]}
+            for each, ends in levels
+        ],
+    }
+
+
+def functions_of_a_gpu() -> dict[str, Any]:
+    """The functions that have a form for a GPU, by the form's name."""
+    from edge_depth_nerf.kernels import functions
+    from edge_depth_nerf.kernels.back_ends import Function
+    from edge_depth_nerf.method import losses
+
+    every = [each for module in (functions, losses) for each in vars(module).values() if isinstance(each, Function)]
+    return {each.on_gpu.name: each for each in every if each.on_gpu is not None}
+
+
+def beside_torch(name: str, function: Any, given: dict[str, Any], settings: Settings) -> Found:
+    """Times of a function's form for a GPU and of its formula, and how far it is off; `failed` says why it has none."""
+    shapes = ", ".join("×".join(map(str, each.shape)) for each in given.values() if isinstance(each, Tensor))
+    kinds = ("kernel, µs", "torch, µs", "off torch", "off the CPU", "failed")
+    row: Found = {"function": name, "of": shapes, **dict.fromkeys(kinds)}
+    # the CPU has no half precision
+    whole = {key: torch.float32 if key == "dtype" else each for key, each in given.items()}
+    try:
+        kernel, formula = function.on(torch.device(settings.device)), function.on_gpu.formula
+        row["torch, µs"] = call_us(formula, given, settings)
+        row["kernel, µs"] = call_us(kernel, given, settings)
+        ours, host = outcome(kernel, whole), outcome(formula, whole)
+        row["off torch"] = float((ours - host).norm() / host.norm())
+        if name == "hash grid":
+            there = {
+                key: each.detach().cpu().requires_grad_(each.requires_grad) if isinstance(each, Tensor) else each
+                for key, each in whole.items()
+            }
+            on_cpu = outcome(function.on_cpu(), there)
+            row["off the CPU"] = float((ours.cpu() - on_cpu).norm() / on_cpu.norm())
+    except Exception as error:  # as of a function that cannot be recorded
+        row["failed"] = f"{type(error).__name__}: {error}"[:200]
+    return row
+
+
+def kernels(settings: Settings) -> Found:
+    """Each function that has a form for a GPU beside its formula in torch; hash grids beside the CPU's, too."""
+    torch.manual_seed(0)
+    given = arguments(settings)
+    copied = torch.empty(1 << (16 if settings.fake else 28), device=settings.device)
+    copied_us = device_us(copied.clone, settings)
+    found: Found = {"a copy, GB/s": 2 * copied.numel() * copied.element_size() / copied_us / 1e3, "rows": []}
+    # hash grids last, as the CPU's are slow
+    for name, function in sorted(functions_of_a_gpu().items(), key=lambda item: item[0] == "hash grid"):
+        for each in given[name]:
+            found["rows"].append(beside_torch(name, function, each, settings))
+            settings.keep(found)
+    return found
+
+
+# ---- tests --------------------------------------------------------------------------------------------------------
+
+
+def tests_of_a_gpu() -> list[Path]:
+    """The files that have such tests."""
+    return [path for path in sorted(TESTS.glob("test_*.py")) if "_on_a_gpu(" in path.read_text(encoding="utf-8")]
+
+
+def gpu_tests(settings: Settings) -> Found:
+    """The tests that a machine without a GPU skips, by number: their names end with `on_a_gpu`."""
+    files = [TESTS / "test_grad_scaler.py"] if settings.fake else tests_of_a_gpu()
+    command = [sys.executable, "-m", "pytest", *map(str, files), "-p", "no:cacheprovider"]
+    command += [f"--basetemp={settings.folder / 'tests'}", *(["-n", "0"] if settings.fake else ["-n", "8"])]
+    command += [] if settings.fake else ["-k", "on_a_gpu"]
+    done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    last = done.stdout.strip().rpartition("\n")[2]
+    counted = {what: int(number) for number, what in re.findall(r"(\d+) (passed|failed|skipped|error)", last)}
+    return {**counted, **({"said": done.stdout[-4000:]} if done.returncode else {})}
+
+
+def counts(settings: Settings) -> Found:
+    """What a step would ask for, counted on fake tensors, as the tests do."""
+    from benchmarks.speed import gpu_counts
+
+    if reason := gpu_counts.why_not():
+        return {"left out": reason}
+    cases = ["lite"] if settings.fake else ["full", "full, proposals rest"]
+    found = gpu_counts.in_a_process(cases, settings.scene, settings.folder / "counts")
+    return {
+        "rows": [
+            {
+                "step": case,
+                "kernels": each["kernels"],
+                "GB of torch's operations": each["gigabytes"],
+                "uploads": len(each["uploads"]),
+                "places that wait": len(each["synchronisations"]),
+            }
+            for case, each in found.items()
+        ]
+    }
+
+
+TRAININGS = "trainings"
+SPLATS = "splats"
+METHODS = {
+    "ours": ("edge", 0),
+    "nerfacto": ("nerfacto", 0),
+    "DS-NeRF on LiDAR": ("ds-nerf", 0),
+    "ours again": ("edge", 1),
 }
-"""In the order of what is missed most if time runs out."""
+"""Methods of `compare`, and seeds: the rivals have no extras, as they were published."""
+PARTS = {
+    "recording": Part(started, 60),
+    "steps": Part(steps, 60),
+    "profile": Part(profile, 40),
+    "start": Part(started, 40),
+    "kernels": Part(kernels, 60),
+    **{name: Part(partial(trained, method=m, seed=s), 150, TRAININGS) for name, (m, s) in METHODS.items()},
+    SPLATS: Part(splats, 470),
+    "tests": Part(gpu_tests, 60, "checks"),
+    "counts": Part(counts, 60, "checks"),
+}
+"""In the order of what is missed most if time runs out; `recording` is the first start, `start` the second."""

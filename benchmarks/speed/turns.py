@@ -5,15 +5,14 @@
 
 Four trainers with the same sizes (levels, table, samples, rays, chunk; pose refinement off) on the same scene:
 nerfstudio's nerfacto and depth-nerfacto with its own DataManager and its torch implementation, and ours with the torch
-implementation and with its fused kernels. On a GPU also, if asked for, nerfacto and ours with tiny-cuda-nn, and
-splatfacto, whose step is a picture. (nerfstudio's nerfacto would read ahead in other processes, which
-two cores do not have; VanillaDataManager, its other one, is used for both.) Each round, every trainer makes the same
-number of whole training iterations (batch, forward, losses, backward, optimisers, schedulers) in turn, at steps spread
-over the whole schedule, since proposal networks are trained less often later. A held-out view, or as many of its rows
-as `--view-rays` allows, is rendered by each in turn, too. Ratios are taken within a round: what else the machine does
-hits all of them. Median and range over the rounds. Each trainer has a process of its own, which sleeps while it is
-another's turn. With `--beside` one more is the code of another checkout (`git worktree add`), with the configuration of
-this one: whether a change made a step faster or slower is read in one run.
+implementation and with its fused kernels; if asked for, ours without CUDA graphs, too. (nerfstudio's nerfacto would
+read ahead in other processes, which two cores do not have; VanillaDataManager, its other one, is used for both.) Each
+round, every trainer makes the same number of whole training iterations (batch, forward, losses, backward, optimisers,
+schedulers) in turn, at steps spread over the whole schedule, since proposal networks are trained less often later. A
+held-out view, or as many of its rows as `--view-rays` allows, is rendered by each in turn, too. Ratios are taken within
+a round: what else the machine does hits all of them. Median and range over the rounds. Each trainer has a process of
+its own, which sleeps while it is another's turn. With `--beside` one more is the code of another checkout (`git
+worktree add`), with the configuration of this one: whether a change made a step faster or slower is read in one run.
 """
 
 from __future__ import annotations
@@ -52,30 +51,29 @@ from edge_depth_nerf.plugin import config as ours
 from edge_depth_nerf.plugin.compat import lpips_not_built
 
 PRESETS: dict[str, Any] = {"lite": ours.edge_depth_nerf_lite, "full": ours.edge_depth_nerf}
-HOST = {
-    "nerfacto": (NerfactoModelConfig, "torch"),
-    "depth-nerfacto": (DepthNerfactoModelConfig, "torch"),
-    "nerfacto, tiny-cuda-nn": (NerfactoModelConfig, "tcnn"),
-}
-GRAPHS = "ours, CUDA graphs"
+HOST = {"nerfacto": NerfactoModelConfig, "depth-nerfacto": DepthNerfactoModelConfig}
+EAGER = "ours, without CUDA graphs"
 BESIDE = "ours, other checkout"
-OURS = {"ours, torch": "torch", "ours": "fused", BESIDE: "fused", GRAPHS: "fused", "ours, tiny-cuda-nn": "tcnn"}
-SPLATS = "splatfacto"
+OURS = {"ours, torch": "torch", "ours": "fused", BESIDE: "fused", EAGER: "fused"}
 ON_EVERY_MACHINE = ("nerfacto", "depth-nerfacto", "ours, torch", "ours")
 REFERENCE = "nerfacto"
+WARM_UPS = 50
+"""So many steps are made on a GPU before any is timed."""
+KINDS_OF_STEPS = 2
+"""Those that train the proposal networks, and those that do not: a CUDA graph of each is recorded."""
 
 
 class Runner:
     """A trainer in this process."""
 
-    def __init__(self, config: TrainerConfig, folder: Path) -> None:
+    def __init__(self, config: TrainerConfig, folder: Path, seed: int = 0) -> None:
         config.machine.device_type = "cuda" if torch.cuda.is_available() else "cpu"
-        config.machine.seed = 0
+        config.machine.seed = seed
         config.vis = "tensorboard"
         config.output_dir = folder
         config.experiment_name, config.timestamp = "speed", "run"
         config.logging.local_writer.enable = False
-        torch.manual_seed(0)
+        torch.manual_seed(seed)
         with lpips_not_built():
             self.trainer = config.setup(local_rank=0, world_size=1)
             self.trainer.setup(test_mode="val")
@@ -93,10 +91,10 @@ class Runner:
             callback.run_callback_at_location(step, location=TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
 
     def graphs(self, _: None) -> int | None:
-        """How many CUDA graphs its steps are replayed from; None where none are asked for."""
-        if not getattr(self.trainer.config, "cuda_graphs", False):
+        """How many CUDA graphs its steps are replayed from; None where none are asked for, or there is no GPU."""
+        if not getattr(self.trainer.config, "cuda_graphs", False) or not torch.cuda.is_available():
             return None
-        graphs = self.trainer.pipeline.graphs
+        graphs: Any = getattr(self.trainer, "graphs", None) or getattr(self.trainer.pipeline, "graphs", None)
         return 0 if graphs is None else graphs.recorded
 
     def render(self, most_rays: int) -> tuple[float, tuple[int, int]]:
@@ -181,12 +179,8 @@ def configurations(
         if name in OURS:
             found[name] = copy.deepcopy(base)
             found[name].pipeline.model.implementation = OURS[name]
-            found[name].cuda_graphs = name == GRAPHS
-            continue
-        if name == SPLATS:
-            found[name] = config = copy.deepcopy(method_configs[SPLATS])
-            config.pipeline.datamanager.dataparser = NerfstudioDataParserConfig(data=scene, load_3D_points=True)
-            config.max_num_iterations = base.max_num_iterations
+            # without a GPU there is a line that says so
+            found[name].cuda_graphs = name != EAGER and torch.cuda.is_available()
             continue
         config: Any = copy.deepcopy(method_configs["depth-nerfacto"])
         shared = {
@@ -194,11 +188,10 @@ def configurations(
             for field in dataclasses.fields(NerfactoModelConfig)
             if field.name not in ("_target", "implementation")
         }
-        model, implementation = HOST[name]
-        config.pipeline.model = model(**shared, implementation=implementation)
+        config.pipeline.model = HOST[name](**shared, implementation="torch")
         data = config.pipeline.datamanager
         data.dataparser = NerfstudioDataParserConfig(data=scene, depth_unit_scale_factor=1 / 256)
-        if model is NerfactoModelConfig:
+        if name == "nerfacto":
             data._target = VanillaDataManager[InputDataset]
         data.train_num_rays_per_batch = base.pipeline.datamanager.train_num_rays_per_batch
         config.mixed_precision = base.mixed_precision
@@ -221,12 +214,13 @@ def race(
     rounds: int,
     steps: int,
     view_rays: int = 0,
-    contestant_of: Callable[[TrainerConfig], Contestant] = Contestant,
     beside: Path | None = None,
+    firsts: Sequence[int] | None = None,
 ) -> dict[str, Any]:
     """Let trainers of these configurations take turns.
 
-    On a GPU the allocator and what is compiled settle in tens of steps; on a CPU three are enough.
+    On a GPU the allocator and what is compiled settle in tens of steps; on a CPU three are enough. `firsts` are the
+    schedule's steps that rounds begin with; without it the steps of all rounds are spread over the schedule.
 
     Returns:
         Of each: rays_per_second (median), seconds of a step and of the rows of a view in each round, and the
@@ -235,13 +229,17 @@ def race(
     some = next(iter(configs.values()))
     rays, schedule = some.pipeline.datamanager.train_num_rays_per_batch, some.max_num_iterations
     spread = [round((number + 0.5) * schedule / (rounds * steps)) for number in range(rounds * steps)]
-    contestants = {}
-    for name, config in configs.items():  # one after the other: the first writes what all find in the cache
+    if firsts is not None:
+        spread = [first + number for first in firsts for number in range(steps)]
+    contestants = {
+        name: Contestant(config, beside.resolve() if name == BESIDE and beside else None)
+        for name, config in configs.items()
+    }
+    for name, contestant in contestants.items():  # what the first writes into the cache the others wait for
         CONSOLE.print(f"Building {name}")
-        contestants[name] = Contestant(config, beside.resolve()) if name == BESIDE and beside else contestant_of(config)
-        contestants[name].wait()
+        contestant.wait()
     for contestant in contestants.values():  # kernels are compiled, memory is there
-        contestant.ask("iterate", range(50 if torch.cuda.is_available() else 3))
+        contestant.ask("iterate", range(WARM_UPS if torch.cuda.is_available() else 3))
     for number in range(rounds):
         chosen = spread[number * steps : (number + 1) * steps]
         for contestant in contestants.values():
@@ -312,7 +310,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", type=Path, default=Path("data/sample_drive"))
     parser.add_argument("--preset", nargs="+", default=["lite"], choices=list(PRESETS))
-    choices = [*HOST, *OURS, SPLATS]
+    choices = [*HOST, *OURS]
     choices.remove(BESIDE)
     parser.add_argument("--contestants", nargs="+", default=ON_EVERY_MACHINE, choices=choices)
     parser.add_argument("--rounds", type=int, default=5)

@@ -107,7 +107,7 @@ class EdgeDepthTrainer(Trainer):
         try:
             super().setup(test_mode)
             count_steps_against_all(self)
-            if self.config.cuda_graphs and test_mode == "val" and torch.device(self.device).type == "cuda":
+            if self.config.cuda_graphs and test_mode != "inference" and torch.device(self.device).type == "cuda":
                 self._use_graphs(GpuCapture(self.device))
         except KeyboardInterrupt:
             CONSOLE.print("\nStopped before the first step.")
