@@ -82,15 +82,15 @@ def test_a_loss_is_the_mean_over_rays_with_a_prior_and_the_levels():
     final = level([3.0, 0.0, 5.0, 2.0])
     proposal = replace(level([3.0, 0.0, 5.0, 2.0], scale=2.0), final=final)
     # expected 2 m and 4 m: off by 1, -, 3, 0 and 1, -, 1, 2
-    assert float(depth_loss(OffLoss(), [final], [True]).detach()) == pytest.approx(4 / 3)
-    both = depth_loss(OffLoss(), [final, proposal], [True, True])
+    assert float(depth_loss(OffLoss(), [final]).detach()) == pytest.approx(4 / 3)
+    both = depth_loss(OffLoss(), [final, proposal])
     assert float(both.detach()) == pytest.approx((4 / 3 + 4 / 3) / 2)
     # a level that rests is left out, and the other pulls as before
-    resting = depth_loss(OffLoss(2.0), [final, proposal], [True, False])
+    resting = depth_loss(OffLoss(2.0), [final], 2)
     assert float(resting.detach()) == pytest.approx(10 / 3 / 2)
     resting.backward()
-    assert final.weights.grad is not None and proposal.weights.grad is None
-    assert float(depth_loss(OffLoss(), [level([0.0, 0.0])], [True]).detach()) == 0
+    assert final.weights.grad is not None and final.weights.grad.any()
+    assert float(depth_loss(OffLoss(), [level([0.0, 0.0])]).detach()) == 0
 
 
 @pytest.mark.parametrize("kind", [EdgeLoss, DsNerfLoss, UrbanNerfLoss, UrbanNerfSightLoss])

@@ -132,7 +132,7 @@ def test_an_operation_alone_copies_nothing_from_the_host(what, gpu_counts):
         gains, colours, picture = Gains(3), torch.rand(7, 3), torch.zeros(7).long()
         level = Level(torch.rand(7, 5), torch.rand(7, 5), torch.rand(7, 5), torch.rand(7), torch.rand(7))
         with counter:
-            found = depth_loss(LOSSES[what](), [level], [True]) if what in LOSSES else gains(colours, picture)
+            found = depth_loss(LOSSES[what](), [level]) if what in LOSSES else gains(colours, picture)
             found.sum()
     assert counter.counts.parts["other"].kernels > 0 and not counter.counts.synchronisations
 

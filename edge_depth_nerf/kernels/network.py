@@ -6,7 +6,7 @@ written to memory and read again, and its ReLU makes a second copy. `network_num
 The first bias may differ between groups of neighbouring points: what all points of a ray share in their inputs
 (direction, appearance) is multiplied once a ray and given as that.
 
-Pure: knows nothing of nerfstudio. float32.
+A GPU has torch's products (`products`). Pure: knows nothing of nerfstudio.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from edge_depth_nerf.kernels import products
+from edge_depth_nerf.kernels.back_ends import made_by_autocast
 from edge_depth_nerf.kernels.gradients import once
 
 
@@ -44,33 +45,21 @@ class _Network(torch.autograd.Function):
         return once("The network in tiles", compute, gradients[0], *ctx.saved_tensors)
 
 
-def _layer_by_layer(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tensor:
-    """Apply a network by torch's own products."""
-    shared = biases[0].view(-1, biases[0].shape[-1])
-    groups = len(shared)
-    x = F.linear(x, weights[0]).view(groups, -1, len(weights[0]))
-    x = x + shared[:, None]
-    for weight, bias in zip(weights[1:], biases[1:], strict=True):
-        # in place before it is flattened: backward would copy what is changed through another view
-        x = F.linear(x.relu_().view(-1, x.shape[-1]), weight, bias)
-    return x.view(-1, x.shape[-1])
-
-
 def network(
     x: Float[Tensor, "points in"], weights: Sequence[Tensor], biases: Sequence[Tensor]
 ) -> Float[Tensor, "points out"]:
     """Apply a network to points, differentiable once by all it is given.
 
     Args:
-        x: float32; on a GPU, where torch's products take all points at once, whatever autocast makes of it.
+        x: float32; on a GPU, where torch's products take all points at once, of any type.
         weights: of each layer, [out, in].
-        biases: of each layer, [out]; the first may be [groups, out] for equal groups of neighbouring points.
+        biases: of each layer, [out]; on the CPU the first may be [groups, out] for equal groups of neighbouring points.
 
     Returns:
         The last layer, without activation.
     """
     if x.device.type != "cpu":
-        return _layer_by_layer(x, weights, biases)
+        return products.network(x, (weights, biases), made_by_autocast(x.device))
     rows = [bias.view(-1, bias.shape[-1]) for bias in biases]
     parameters = [each for pair in zip(weights, rows, strict=True) for each in pair]
     result = _Network.apply(x, *parameters)

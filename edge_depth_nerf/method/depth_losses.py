@@ -187,17 +187,16 @@ def register(named: str) -> None:
             LOSSES[entry.name] = found
 
 
-def depth_loss(loss: DepthLoss, levels: Sequence[Level], learns: Sequence[bool]) -> Float[Tensor, ""]:
+def depth_loss(loss: DepthLoss, levels: Sequence[Level], count: int | None = None) -> Float[Tensor, ""]:
     """Compute a loss on the prior: mean over the rays, then over the levels.
 
     Args:
         loss: what to compute.
-        levels: of the same rays and prior.
-        learns: which of them have a gradient. Others would only add a number and are left out, unless the loss wants
-            them or none has one.
+        levels: of the same rays and prior. Those without a gradient would only add a number and may be left out, unless
+            the loss wants them (`of_resting_levels`).
+        count: how many levels there are; None: these.
     """
-    used = [level for level, own in zip(levels, learns, strict=True) if own or loss.of_resting_levels] or levels
     prior_m = levels[0].prior_m
-    count = len(prior_m) if loss.over_all_rays else (prior_m > 0).sum().clamp(min=1)
-    per_level = [loss(level).sum() for level in used]
-    return sum(per_level[1:], per_level[0]) / (count * len(levels))
+    rays = len(prior_m) if loss.over_all_rays else (prior_m > 0).sum().clamp(min=1)
+    per_level = [loss(level).sum() for level in levels]
+    return sum(per_level[1:], per_level[0]) / (rays * (count or len(levels)))

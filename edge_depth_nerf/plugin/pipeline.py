@@ -72,7 +72,7 @@ class EdgeDepthPipeline(VanillaPipeline):
         elif model.surface_loss_mult == 0:
             config = replace(config, datamanager=replace(data, surface_rays_per_batch=0))
         # kernels compile while the prior is integrated
-        trains = kwargs.get("test_mode") != "inference" and model.implementation == "fused"
+        trains = kwargs.get("test_mode", "val") == "val" and model.implementation == "fused"
         with kernels_prepared(device) if trains else nullcontext():
             super().__init__(config, str(device), *args, **kwargs)
         manager = self.datamanager

@@ -6,6 +6,7 @@ adds up those that its configuration asks for.
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, make_dataclass
@@ -19,7 +20,7 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.method.depth_losses import LOSSES, VARIABLE, DepthLoss, Level, depth_loss, register
 from edge_depth_nerf.method.losses import sky_loss
 from edge_depth_nerf.plugin.fused.nerfacto_losses import distortion_loss, interlevel_loss
-from edge_depth_nerf.plugin.fused.ray_samplers import edges_of
+from edge_depth_nerf.plugin.fused.ray_samplers import edges_between, edges_of
 
 register(os.environ.get(VARIABLE, ""))
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ class Planes:
 
         No sample lies elsewhere: a prior there would draw all weight to the first sample or to the last.
         """
-        return (distance_m >= max(self.near_m, LEAST_DISTANCE_M)) & (distance_m <= self.far_m)
+        return distance_m == distance_m.clamp(max(self.near_m, LEAST_DISTANCE_M), self.far_m)
 
 
 @dataclass(frozen=True)
@@ -92,21 +93,19 @@ class PriorLoss:
             step.batch[name][:, 0].to(step.outputs["rgb"].device, torch.float32)
             for name in ("prior_distance_m", "prior_sigma_m")
         )
-        met = step.planes.hold(prior_m) & (sigma_m > 0) & torch.isfinite(sigma_m)
+        met = step.planes.hold(prior_m) & (sigma_m > 0) & (sigma_m < math.inf)
         prior_m = torch.where(met, prior_m, 0)
-        levels, learns, final = [], [], None
-        for weights, samples in reversed(
-            [*zip(step.outputs["weights_list"], step.outputs["ray_samples_list"], strict=True)]
-        ):
-            starts_m, ends_m = (
-                each[..., 0] * step.planes.metres_per_unit for each in (samples.frustums.starts, samples.frustums.ends)
-            )
-            levels.append(Level(weights.squeeze(-1), starts_m, ends_m, prior_m, sigma_m, final, step.share_done))
-            learns.append(weights.requires_grad)
-            final = final or levels[0]
-            if self.final_alone:
-                break
-        return step.depth_weight * depth_loss(self.loss, levels, learns)
+        every = [*zip(step.outputs["weights_list"], step.outputs["ray_samples_list"], strict=True)][::-1]
+        every = every[:1] if self.final_alone else every
+        none_learns = not any(weights.requires_grad for weights, _ in every)
+        levels, final = [], None
+        for weights, samples in every:
+            if weights.requires_grad or self.loss.of_resting_levels or none_learns:
+                edges_m = edges_between(samples.frustums.starts, samples.frustums.ends) * step.planes.metres_per_unit
+                given = weights.squeeze(-1), edges_m[:, :-1], edges_m[:, 1:], prior_m, sigma_m, final
+                levels.append(Level(*given, step.share_done))
+                final = final or levels[0]
+        return step.depth_weight * depth_loss(self.loss, levels, len(every))
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ from edge_depth_nerf.kernels import formulas
 from edge_depth_nerf.kernels.back_ends import made_by_autocast
 from edge_depth_nerf.kernels.functions import CONTRACT, DENSITY, HARMONICS
 from edge_depth_nerf.kernels.network import network
+from edge_depth_nerf.kernels.products import field
 from edge_depth_nerf.kernels.rendering import Background, Networks, Rendered
 
 
@@ -46,11 +47,6 @@ def _in_parts(x: Tensor) -> bool:
     return x.device.type == "cpu" and x.dtype == torch.float32 and not torch.is_autocast_enabled("cpu")
 
 
-def _by_network(x: Tensor) -> bool:
-    """Say whether `network` serves these inputs; it computes once a ray what the samples of a ray share."""
-    return x.device.type == "cuda" or _in_parts(x)
-
-
 def _one_a_ray(directions: Tensor) -> bool:
     """Say whether all samples of a ray have one direction."""
     return directions.ndim == 3 and (directions.shape[1] == 1 or directions.stride(1) == 0)
@@ -62,7 +58,7 @@ def _parameters(mlp: MLP) -> tuple[list[Any], list[Any]]:
 
 
 class FusedMLP(MLP):
-    """nerfstudio's `MLP(implementation="torch")`; with ReLU, in parts that stay in the CPU's cache."""
+    """nerfstudio's `MLP(implementation="torch")`; with ReLU, in parts that stay in the CPU's cache, or few kernels."""
 
     @property
     def is_plain(self) -> bool:
@@ -71,7 +67,8 @@ class FusedMLP(MLP):
 
     def forward(self, in_tensor: Float[Tensor, "*bs in_dim"]) -> Float[Tensor, "*bs out_dim"]:
         """Apply the network."""
-        if in_tensor.numel() == 0 or not (self.is_plain and _in_parts(in_tensor)):
+        serves = in_tensor.device.type == "cuda" or _in_parts(in_tensor)
+        if in_tensor.numel() == 0 or not (self.is_plain and serves):
             return super().forward(in_tensor)
         flat = in_tensor.reshape(-1, in_tensor.shape[-1])
         result = network(flat, *_parameters(self)).view(*in_tensor.shape[:-1], -1)
@@ -145,6 +142,8 @@ class FusedNerfactoField(NerfactoField):
         positions = [samples.frustums.get_positions().reshape(-1, 3) for samples in parts]
         counts = [len(each) for each in positions]
         places, inside = _unit_cube(torch.cat(positions))
+        if places.device.type == "cuda" and self._is_plain(parts):
+            return self._by_products(parts, places, inside)
         encoded = self._encoded_directions(parts)
         of_parts = zip(parts, self.mlp_base(places).split(counts), inside.split(counts), encoded, strict=True)
         results = []
@@ -156,6 +155,24 @@ class FusedNerfactoField(NerfactoField):
             else:
                 results.append(self.get_outputs(samples, features[..., 1:], of_rays))
         return results
+
+    def _by_products(self, parts: Sequence[RaySamples], places: Tensor, inside: Tensor) -> list[dict[Any, Tensor]]:
+        """Evaluate contracted positions of several sets of samples through both networks at once."""
+        encoding, first = self.mlp_base.model
+        assert isinstance(first, FusedMLP)
+        runs = [(len(part), part.frustums.shape[1]) for part in parts]
+        width, dtype = self.direction_encoding.get_out_dim(), made_by_autocast(places.device)
+        networks = _parameters(first), _parameters(self.mlp_head)
+        before, colours = field(encoding(places), self._of_rays(parts), runs, *networks, width, dtype)
+        of_parts = colours.split([rays * number for rays, number in runs])
+        results = [
+            {FieldHeadNames.RGB: each.view(*run, 3).to(part.frustums.directions)}
+            for each, run, part in zip(of_parts, runs, parts, strict=True)
+        ]
+        densities = _densities(
+            before.view(*runs[0], 1), inside[: len(before)].view(*runs[0], 1), self.average_init_density
+        )
+        return [{FieldHeadNames.DENSITY: densities, **results[0]}, *results[1:]]
 
     def render(self, samples: RaySamples, points: RaySamples | None, background: Background) -> Rendered:
         """Render pixels on the CPU in one pass: from encoded positions through both networks, and along the rays.
@@ -178,30 +195,38 @@ class FusedNerfactoField(NerfactoField):
         weights, biases = _parameters(self.mlp_head)
         widths = [self.direction_encoding.get_out_dim(), self.geo_feat_dim, self.appearance_embedding_dim]
         of_direction, of_features, of_appearance = torch.split(weights[0], widths, dim=1)
-        of_rays, by_ray = self._encoded(torch.cat([each.frustums.directions[:, 0] for each in parts])), of_direction
+        by_ray = of_direction
         if self.embedding_appearance is not None:
-            of_rays = torch.cat([of_rays, self._appearance(parts)], dim=1)
             by_ray = torch.cat([of_direction, of_appearance], dim=1)
         networks = Networks(_parameters(first), ([of_features, *weights[1:]], biases), by_ray)
         rays, count = samples.frustums.shape
         deltas: Any = samples.deltas
         pixels = deltas.view(rays, count), self.average_init_density, background
-        return render(encoding(places), of_rays, networks, inside[:, 0], *pixels)
+        return render(encoding(places), self._of_rays(parts), networks, inside[:, 0], *pixels)
 
     def may_render(self, samples: RaySamples, points: RaySamples | None) -> bool:
         """Say whether `render` serves this field and these samples."""
         parts, deltas = [samples, *([] if points is None else [points])], samples.deltas
-        more_heads = self.use_transient_embedding or self.use_semantics or self.use_pred_normals
-        if more_heads or not isinstance(self.spatial_distortion, CubeContraction) or deltas is None:
+        if deltas is None or deltas.numel() == 0 or deltas.requires_grad or not self._is_plain(parts):
             return False
-        encoding, first = self.mlp_base.model
+        return _in_parts(samples.frustums.origins) and self.mlp_base.model[0].hash_table.dtype == torch.float32
+
+    def _is_plain(self, parts: Sequence[RaySamples]) -> bool:
+        """Say whether two plain networks behind a contraction are all of this field that these samples ask for."""
+        more_heads = self.use_transient_embedding or self.use_semantics or self.use_pred_normals
+        if more_heads or not isinstance(self.spatial_distortion, CubeContraction):
+            return False
+        _, first = self.mlp_base.model
         if not all(isinstance(each, FusedMLP) and each.is_plain for each in (first, self.mlp_head)):
             return False
         plain = first.out_activation is None and isinstance(self.mlp_head.out_activation, nn.Sigmoid)
         cameras = self.embedding_appearance is None or all(each.camera_indices is not None for each in parts)
-        one_a_ray = all(_one_a_ray(each.frustums.directions) for each in parts)
-        given = _in_parts(samples.frustums.origins) and encoding.hash_table.dtype == torch.float32
-        return plain and cameras and one_a_ray and given and deltas.numel() > 0 and not deltas.requires_grad
+        return plain and cameras and all(_one_a_ray(each.frustums.directions) for each in parts)
+
+    def _of_rays(self, parts: Sequence[RaySamples]) -> Float[Tensor, "rays shared"]:
+        """Give what the samples of a ray share: its encoded direction, and its picture's appearance if there is one."""
+        encoded = self._encoded(torch.cat([each.frustums.directions[:, 0] for each in parts]))
+        return encoded if self.embedding_appearance is None else torch.cat([encoded, self._appearance(parts)], dim=1)
 
     def _appearance(self, parts: Sequence[RaySamples]) -> Tensor:
         """Give the appearance of each ray's picture; at evaluation the mean of all, or none, as nerfstudio has it."""
@@ -239,7 +264,7 @@ class FusedNerfactoField(NerfactoField):
         directions, cameras = ray_samples.frustums.directions, ray_samples.camera_indices
         assert density_embedding is not None
         more_heads = self.use_transient_embedding or self.use_semantics or self.use_pred_normals
-        plain = isinstance(self.mlp_head, FusedMLP) and self.mlp_head.is_plain and _by_network(density_embedding)
+        plain = isinstance(self.mlp_head, FusedMLP) and self.mlp_head.is_plain and _in_parts(density_embedding)
         if more_heads or cameras is None or not _one_a_ray(directions) or not plain:
             return super().get_outputs(ray_samples, density_embedding)
         of_rays = encoded
@@ -247,7 +272,7 @@ class FusedNerfactoField(NerfactoField):
             of_rays = self._encoded(directions[:, 0])
         weights, biases = _parameters(self.mlp_head)
         features, widths = density_embedding.reshape(-1, self.geo_feat_dim), (of_rays.shape[1], self.geo_feat_dim)
-        if _in_parts(features) and len(features) == len(of_rays) and self.embedding_appearance is None:
+        if len(features) == len(of_rays) and self.embedding_appearance is None:
             # a ray of one sample has nothing that samples share
             colours = network(torch.cat([of_rays, features], dim=1), weights, biases)
         else:
@@ -261,5 +286,4 @@ class FusedNerfactoField(NerfactoField):
                 elif self.use_average_appearance_embedding:
                     shared = shared + of_appearance @ self.embedding_appearance.mean(dim=0)
             colours = network(features, [of_features, *weights[1:]], [shared, *biases[1:]])
-        # float32 also where autocast had it otherwise, as nerfstudio's
         return {FieldHeadNames.RGB: torch.sigmoid(colours).view(directions.shape).to(directions)}

@@ -5,7 +5,7 @@ Host-facing; the numbers are nerfstudio's to float32's noise, from the same rand
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -123,8 +123,11 @@ class FusedProposalSampler(ProposalNetworkSampler):
 
 def edges_of(samples: RaySamples) -> Tensor:
     """Give where a ray's samples begin and the last one ends, in the spacing of 0..1, [rays, samples + 1]."""
-    starts: Any = samples.spacing_starts
-    ends: Any = samples.spacing_ends
+    return edges_between(samples.spacing_starts, samples.spacing_ends)
+
+
+def edges_between(starts: Any, ends: Any) -> Tensor:
+    """Give where samples begin and the last one ends, [rays, samples + 1]; of [rays, samples, 1] each."""
     rays, count = starts.shape[:2]
     step = starts.stride(1)
     if (
@@ -154,16 +157,29 @@ class FusedRaySamples(RaySamples):
 
 
 class FusedFrustums(Frustums):
-    """nerfstudio's `Frustums`; positions without a gradient come from one kernel."""
+    """nerfstudio's `Frustums`; positions come from one kernel where they have no gradient, on a GPU from two."""
 
     def get_positions(self) -> Float[Tensor, "*batch 3"]:
         """Give the positions in the middle of the samples."""
         given = self.origins, self.directions, self.starts, self.ends
         of_rays = self.origins.ndim == 3 and all(each.shape[1] == 1 or each.stride(1) == 0 for each in given[:2])
+        if self.origins.device.type == "cuda" and self.offsets is None:
+            return torch.addcmul(self.origins, self.directions, torch.lerp(self.starts, self.ends, 0.5))
         compute = POSITIONS.compiled_for(*given) if of_rays and self.offsets is None else None
         if compute is None:
             return super().get_positions()
         return compute(self.origins[:, 0], self.directions[:, 0], self.starts[..., 0], self.ends[..., 0])
+
+
+def in_a_row(parts: Sequence[Tensor]) -> Tensor:
+    """Join tensors of one form along their first axis; without a copy where they lie so, as parts of a batch do."""
+    first, at, rows = parts[0], parts[0].storage_offset(), 0
+    for part in parts:
+        follows = part.untyped_storage()._cdata == first.untyped_storage()._cdata and part.storage_offset() == at
+        if not follows or part.stride() != first.stride() or part.requires_grad:
+            return torch.cat([*parts])
+        at, rows = at + len(part) * part.stride(0), rows + len(part)
+    return first.as_strided((rows, *first.shape[1:]), first.stride())
 
 
 def _whole(kind: type[Any], shape: tuple[int, ...], **values: Any) -> Any:

@@ -1,0 +1,227 @@
+"""Networks by torch's products, as they serve a GPU: few kernels beside the products themselves.
+
+Parameters come into the type of the products by one kernel, and their gradients back by one. Bias and ReLU belong to a
+product where torch can have it so. The gradient to a bias is a product with a row of ones, as torch's sums along
+columns of half precision take several times as long.
+
+Pure torch, for any device; products in half precision are those that autocast would make.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from edge_depth_nerf.kernels.gradients import once
+
+Layers = tuple[Sequence[Tensor], Sequence[Tensor]]
+"""Weights, [out, in], and biases, [out], of a network."""
+
+
+def _relu_of_product(bias: Tensor, x: Tensor, weight: Tensor) -> Tensor:
+    """What `torch._addmm_activation` gives, which is private."""
+    return torch.addmm(bias, x, weight).relu_()
+
+
+_with_relu: Callable[..., Tensor] = getattr(torch, "_addmm_activation", _relu_of_product)
+
+
+def _parts_of(flat: Tensor, like: Sequence[Tensor]) -> list[Tensor]:
+    parts = flat.split([each.numel() for each in like])
+    return [part.view(each.shape) for part, each in zip(parts, like, strict=True)]
+
+
+def _in_type(parameters: Sequence[Tensor], dtype: torch.dtype) -> list[Tensor]:
+    """Give parameters in the type of the products."""
+    parameters = [each.detach() for each in parameters]
+    if all(each.dtype == dtype for each in parameters):
+        return parameters
+    found = _parts_of(parameters[0].new_empty(sum(each.numel() for each in parameters), dtype=dtype), parameters)
+    torch._foreach_copy_(found, parameters)
+    return found
+
+
+def _forward(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], follow: bool) -> list[Tensor]:
+    """Give what enters each layer, if it is to be kept for backward, and what the last one gives."""
+    entering = [x]
+    for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
+        entering.append(_with_relu(bias, entering[-1], weight.t()))
+        entering = entering if follow else entering[-1:]
+    return [*entering, torch.addmm(biases[-1], entering[-1], weights[-1].t())]
+
+
+def _backward(
+    gradient: Tensor, weights: Sequence[Tensor], entering: Sequence[Tensor], ones: Tensor, into: Layers, on: bool = True
+) -> Tensor | None:
+    """Write the gradients to a network's parameters; if asked for, give that to what enters it."""
+    to_weights, to_biases = into
+    for layer in reversed(range(len(weights))):
+        torch.mm(gradient.t(), entering[layer], out=to_weights[layer])
+        torch.mm(ones, gradient, out=to_biases[layer][None])
+        if layer == 0 and not on:
+            return None
+        gradient = gradient @ weights[layer]
+        if layer > 0:
+            gradient = torch.ops.aten.threshold_backward(gradient, entering[layer], 0)
+    return gradient
+
+
+class _Network(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, dtype: torch.dtype, follow: bool, *parameters: Tensor) -> Tensor:
+        count = len(parameters) // 2
+        made = _in_type(parameters, dtype)
+        *entering, found = _forward(x.detach().to(dtype), made[:count], made[count:], follow)
+        if follow:
+            ctx.count, ctx.made = count, made
+            ctx.save_for_backward(x, *parameters, *entering)
+        return found
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        x, *saved = ctx.saved_tensors
+        parameters, entering, count = saved[: 2 * ctx.count], saved[2 * ctx.count :], ctx.count
+
+        def compute() -> tuple[Tensor | None, ...]:
+            gradient = gradients[0]
+            flat = gradient.new_empty(sum(each.numel() for each in parameters))
+            into = _parts_of(flat, parameters)
+            ones = gradient.new_ones(1, len(gradient))
+            weights, layers = ctx.made[:count], (into[:count], into[count:])
+            to_x = _backward(gradient, weights, entering, ones, layers, ctx.needs_input_grad[0])
+            return None if to_x is None else to_x.to(x.dtype), *_parts_of(flat.to(parameters[0].dtype), parameters)
+
+        to_x, *to_parameters = once("The network by products", compute, gradients[0], x, *parameters)
+        return to_x, None, None, *to_parameters
+
+
+def network(
+    x: Float[Tensor, "points in"], layers: Layers, dtype: torch.dtype = torch.float32
+) -> Float[Tensor, "points out"]:
+    """Apply a network with ReLU between its layers to points, differentiable once by all it is given.
+
+    Args:
+        x: of any type.
+        layers: float32.
+        dtype: of the products, and of what is given.
+    """
+    found = _Network.apply(x, dtype, torch.is_grad_enabled(), *layers[0], *layers[1])
+    assert isinstance(found, Tensor)
+    return found
+
+
+class _Field(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, encoded: Tensor, of_rays: Tensor, form: tuple[Sequence[tuple[int, int]], int, int, torch.dtype, bool],
+        *parameters: Tensor,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        runs, directions, count, dtype, follow = form
+        made = _in_type(parameters, dtype)
+        weights, biases = made[: len(made) // 2], made[len(made) // 2 :]
+        *entering, features = _forward(encoded.detach().to(dtype), weights[:count], biases[:count], follow)
+        # the density is no input of the second network: it has the weight 0
+        rows, width = weights[count], features.shape[1]
+        own = rows[:, directions - 1 : directions - 1 + width].clone()
+        own[:, 0].zero_()
+        by_ray = _without(rows, directions, width - 1)
+        rays = of_rays.detach().to(dtype)
+        shared, hidden = torch.addmm(biases[count], rays, by_ray.t()), features @ own.t()
+        for number, of_run, of_points in _by_run(runs, shared, hidden):
+            of_points.view(len(of_run), number, -1).add_(of_run[:, None])
+        *behind, before_sigmoid = _forward(hidden.relu_(), weights[count + 1 :], biases[count + 1 :], follow)
+        colours = torch.sigmoid(before_sigmoid, out=torch.empty_like(before_sigmoid, dtype=torch.float32))
+        if follow:
+            ctx.form, ctx.made, ctx.multiplied = form, made, (own, by_ray)
+            ctx.counts = len(parameters), len(entering)
+            ctx.save_for_backward(encoded, of_rays, colours, features, rays, *parameters, *entering, *behind)
+        rays_first, each = runs[0]
+        return features[: rays_first * each, 0].clone(), colours
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        encoded, of_rays, colours, features, rays, *saved = ctx.saved_tensors
+        (runs, directions, count, _, _), made, (own, by_ray) = ctx.form, ctx.made, ctx.multiplied
+        parameters, entering = saved[: ctx.counts[0]], saved[ctx.counts[0] : sum(ctx.counts)]
+        behind = saved[sum(ctx.counts) :]
+
+        def compute() -> tuple[Tensor | None, ...]:
+            to_before, to_colours = gradients
+            flat = features.new_empty(sum(each.numel() for each in parameters))
+            into = _parts_of(flat, parameters)
+            half = len(parameters) // 2
+            weights, to_weights, to_biases = made[:half], into[:half], into[half:]
+            ones = features.new_ones(1, len(features))
+            gradient = torch.empty_like(colours, dtype=features.dtype)
+            torch.ops.aten.sigmoid_backward.grad_input(to_colours, colours, grad_input=gradient)
+            rest = to_weights[count + 1 :], to_biases[count + 1 :]
+            to_hidden = _backward(gradient, weights[count + 1 :], behind, ones, rest)
+            assert to_hidden is not None
+            to_hidden = torch.ops.aten.threshold_backward(to_hidden, behind[0], 0)
+            to_shared = to_hidden.new_empty(len(rays), to_hidden.shape[1])
+            for number, of_run, of_points in _by_run(runs, to_shared, to_hidden):
+                torch.sum(of_points.view(len(of_run), number, -1), 1, out=of_run)
+            to_own, to_by_ray = to_hidden.t() @ features, to_shared.t() @ rays
+            torch.cat([to_by_ray[:, :directions], to_own[:, 1:], to_by_ray[:, directions:]], 1, out=to_weights[count])
+            torch.mm(ones[:, : len(to_shared)], to_shared, out=to_biases[count][None])
+            to_features = to_hidden @ own
+            to_features[: len(to_before), 0].copy_(to_before)
+            first = to_weights[:count], to_biases[:count]
+            to_encoded = _backward(to_features, weights[:count], entering, ones, first, ctx.needs_input_grad[0])
+            to_rays = (to_shared @ by_ray).to(of_rays.dtype) if ctx.needs_input_grad[1] else None
+            to_encoded = None if to_encoded is None else to_encoded.to(encoded.dtype)
+            return to_encoded, to_rays, *_parts_of(flat.to(parameters[0].dtype), parameters)
+
+        made_of = *gradients, encoded, of_rays, *parameters
+        to_encoded, to_rays, *to_parameters = once("The field by products", compute, *made_of)
+        return to_encoded, to_rays, None, *to_parameters
+
+
+def _without(rows: Tensor, first: int, count: int) -> Tensor:
+    """Give a matrix without some of its columns."""
+    if first + count == rows.shape[1]:
+        return rows[:, :first]
+    return torch.cat([rows[:, :first], rows[:, first + count :]], 1)
+
+
+def _by_run(runs: Sequence[tuple[int, int]], of_rays: Tensor, of_points: Tensor) -> list[tuple[int, Tensor, Tensor]]:
+    """Give, of each run, the number of points of a ray, its rays and its points."""
+    rays, numbers = zip(*runs, strict=True)
+    of_runs = of_points.split([count * number for count, number in runs])
+    return list(zip(numbers, of_rays.split(list(rays)), of_runs, strict=True))
+
+
+def field(
+    encoded: Float[Tensor, "points encoded"],
+    of_rays: Float[Tensor, "rays shared"],
+    runs: Sequence[tuple[int, int]],
+    first: Layers,
+    second: Layers,
+    directions: int,
+    dtype: torch.dtype = torch.float32,
+) -> tuple[Float[Tensor, "samples"], Float[Tensor, "points 3"]]:
+    """Apply a field's two networks to points on rays, differentiable once by all it is given.
+
+    The first network's first output becomes the density, its others enter the second one behind a ray's direction and
+    in front of what else a ray has. What a ray has is multiplied once a ray.
+
+    Args:
+        encoded: what enters the first network, of any type.
+        of_rays: what a ray has, of any type: its encoded direction, then the rest.
+        runs: numbers of rays, and of points on each of them, one run behind the other.
+        first: of the first network, float32.
+        second: likewise.
+        directions: the width of an encoded direction.
+        dtype: of the products.
+
+    Returns:
+        The first outputs of the first run's points, in the type of the products; the colours of all points, float32.
+    """
+    form = runs, directions, len(first[0]), dtype, torch.is_grad_enabled()
+    parameters = *first[0], *second[0], *first[1], *second[1]
+    before, colours = _Field.apply(encoded, of_rays, form, *parameters)  # pyright: ignore[reportGeneralTypeIssues]
+    return before, colours
