@@ -7,6 +7,8 @@ cameras, projection or conventions is used, so that a mistake there cannot cance
 
 from __future__ import annotations
 
+import re
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -303,6 +305,24 @@ def _write_shifted(drive: RoomDrive, cameras: tuple[str, ...]) -> None:
 
 def halve(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+Change = bytes | tuple[str, str] | Callable[[Path], object] | None
+
+
+def spoil(root: Path, pattern: str, change: Change) -> None:
+    """Remove what a pattern names (None), write bytes to it, replace a regex in it once, or call a function with it."""
+    for path in sorted(root.glob(pattern)) or [root / pattern]:
+        if change is None:
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        elif isinstance(change, bytes):
+            path.write_bytes(change)
+        elif isinstance(change, tuple):
+            text, count = re.subn(*change, path.read_text(), count=1)
+            assert count, change
+            path.write_text(text)
+        else:
+            change(path)
 
 
 def write_mono(folder: Path, drive: RoomDrive, distance_m: Callable[[str, int], float] | float) -> Path:

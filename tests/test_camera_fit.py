@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
-import cv2
 import pytest
 import torch
 from lenses import FISHEYE, IMAGE_02, IMAGE_03, KITTI, nerfstudio_directions, rays
@@ -188,20 +186,3 @@ def test_where_nerfstudio_goes_astray_is_told() -> None:
     # up to there all is well, for us and for nerfstudio
     assert host_residual(camera, camera, wrong - 0.01)[0].max_px < 1e-6
     assert host_error_px(camera, camera, wrong - 0.01).max() < 2e-3
-
-
-def test_the_constants_are_kitti_360s_own(real_data: Path) -> None:
-    for name, camera in (("image_02", IMAGE_02), ("image_03", IMAGE_03)):
-        storage = cv2.FileStorage(str(real_data / "kitti360_calibration" / f"{name}.yaml"), cv2.FILE_STORAGE_READ)
-        mirror, distortion = storage.getNode("mirror_parameters"), storage.getNode("distortion_parameters")
-        projection = storage.getNode("projection_parameters")
-        assert camera == MEI(
-            int(storage.getNode("image_width").real()),
-            int(storage.getNode("image_height").real()),
-            projection.getNode("gamma1").real(),
-            projection.getNode("gamma2").real(),
-            projection.getNode("u0").real() + 0.5,
-            projection.getNode("v0").real() + 0.5,
-            mirror.getNode("xi").real(),
-            *(distortion.getNode(key).real() for key in ("k1", "k2", "p1", "p2")),
-        )
