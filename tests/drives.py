@@ -5,8 +5,6 @@ the MEI model written out here in NumPy with KITTI-360's integer pixel centres (
 cameras, projection or conventions is used, so that a mistake there cannot cancel out.
 """
 
-from __future__ import annotations
-
 import re
 import shutil
 from collections.abc import Callable
@@ -75,7 +73,7 @@ class MeiTwin:
     v0: float
 
     @classmethod
-    def kitti360(cls, name: str, size: int) -> MeiTwin:
+    def kitti360(cls, name: str, size: int) -> "MeiTwin":
         xi, k1, k2, p1, p2, gamma1, gamma2, u0, v0 = MEI_NUMBERS[name]
         s = size / FULL_SIZE
         # of pixels counted from their centres: the picture's border is at -0.5
@@ -305,6 +303,10 @@ def _write_shifted(drive: RoomDrive, cameras: tuple[str, ...]) -> None:
 
 def halve(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-3])
 
 
 Change = bytes | tuple[str, str] | Callable[[Path], object] | None

@@ -1,7 +1,5 @@
 """Cameras and rays that several test modules use, and nerfstudio's own rays to compare with."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Scene folders made of the real KITTI-360 excerpts (not part of the project; see the fixture `real_data`)."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

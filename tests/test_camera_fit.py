@@ -1,7 +1,5 @@
 """The Kannala-Brandt camera fitted to KITTI-360's, alone and as nerfstudio takes it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -108,8 +106,6 @@ def test_what_cannot_be_fitted_is_said(camera: Camera, degrees: float, message: 
 
 
 # ---- nerfstudio's rays up to 110° ------------------------------------------------------------------------------
-
-
 def filling(camera: Camera, degrees: float) -> Camera:
     """The camera with focal lengths that put this angle at 0.48 of the picture's width from its middle."""
     theta = min(math.radians(degrees), 0.999 * camera.theta_max_rad)

@@ -1,7 +1,5 @@
 """The grid of losses, priors and extras: its cells, its searches and its tables; nothing is trained."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import combinations
@@ -189,15 +187,9 @@ def asked(folder: Path, **changes):
     for scene in scenes.values():
         if not scene.is_dir():
             write_scene(scene)
-    asked = GridOptions(
-        scenes=(scenes["street"], scenes["turn"]),
-        tuning=(scenes["tune_a"], scenes["tune_b"]),
-        lambdas=LAMBDAS,
-        sigmas_m=SIGMAS_M,
-        output=folder / "out",
-        steps=5,
-    )
-    return replace(asked, **changes)
+    drives = {"scenes": (scenes["street"], scenes["turn"]), "tuning": (scenes["tune_a"], scenes["tune_b"])}
+    search = {"lambdas": LAMBDAS, "sigmas_m": SIGMAS_M, "output": folder / "out", "steps": 5}
+    return GridOptions(**drives | search | changes)
 
 
 @pytest.mark.slow

@@ -1,7 +1,5 @@
 """Looking at a scene: its figures against independent numbers, its warnings, its pictures pixel by pixel."""
 
-from __future__ import annotations
-
 import io
 import json
 import math
@@ -68,11 +66,8 @@ def look(scene: Path, output: Path, **options: Any) -> dict[str, Any]:
 
 
 # ---- the sample drive ------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def sample(sample_drive, tmp_path_factory):
-    """The summary of the sample drive, where it was written, and the scene's files before and after."""
     output = tmp_path_factory.mktemp("inspection") / "out"
 
     def files() -> list[Path]:
@@ -262,7 +257,6 @@ def test_the_figures_in_the_terminal(sample_drive, tmp_path):
 
 
 # ---- small drives with one fault each --------------------------------------------------------------------------
-
 SIZE = (16, 12)
 
 
@@ -510,8 +504,6 @@ def test_of_many_warnings_of_a_kind_some_are_printed():
 
 
 # ---- what is measured and shown --------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("numbers", "cameras", "measured"), [(200, 1, 64), (100, 2, 32), (12, 2, 12)])
 def test_long_drives_are_sampled_evenly(tmp_path, numbers, cameras, measured):
     scene = read_scene(write_drive(tmp_path / "drive", numbers, ("left", "right")[:cameras]))
@@ -603,8 +595,6 @@ def test_the_sheet_says_what_a_prior_comes_from(drive):
 
 
 # ---- other people's scenes -------------------------------------------------------------------------------------
-
-
 def test_z_depth_of_a_pinhole_scene_becomes_distance(tmp_path):
     scene = write_scene(tmp_path / "scene", [pinhole()], lidar=False, mono=False, mask=False, truth=False, split=False)
     meta = read_json(scene / "transforms.json")
@@ -645,8 +635,6 @@ def test_cameras_and_frames_without_names(drive):
 
 
 # ---- bad input -------------------------------------------------------------------------------------------------
-
-
 SPOILT: dict[str, Callable[[Path], Any]] = {
     "process": shutil.rmtree,
     "not valid JSON": lambda drive: cut(drive / "transforms.json"),
@@ -707,8 +695,6 @@ def test_the_command_runs_without_nerfstudio(drive, tmp_path):
 
 
 # ---- drawing ---------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("map_size", "size"), [(128, 640), (128, 128), (1400, 700), (350, 640)])
 def test_points_are_drawn_where_they_are(map_size, size):
     """Lone returns become discs around their own pixel's centre, in their own colour."""

@@ -1,7 +1,5 @@
 """From a raw drive to a scene: geometry against closed forms, KITTI-360's files, and everything that can be wrong."""
 
-from __future__ import annotations
-
 import json
 import math
 import os
@@ -21,6 +19,7 @@ from drives import (
     Change,
     RoomDrive,
     aimed_points,
+    cut,
     halve,
     matrix,
     pose,
@@ -33,7 +32,8 @@ from drives import (
 )
 from lenses import IMAGE_02, IMAGE_03, nerfstudio_directions
 from rich.console import Console
-from test_scene import read_ply, tree
+from scenes import tree
+from test_scene import read_ply
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import (
@@ -91,13 +91,11 @@ def refused(drive: RoomDrive, output: Path, message: str, **options: Any) -> Non
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> RoomDrive:
-    """A drive with all there is; not to be changed."""
     return write_room_drive(tmp_path_factory.mktemp("room") / "drive", truth=True)
 
 
 @pytest.fixture(scope="module")
 def scene(room: RoomDrive) -> Path:
-    """The scene of it; not to be changed."""
     output = room.root.parent / "scene"
     process(room, output, ego_mask=write_masks(room.root.parent / "masks", room))
     return output
@@ -105,7 +103,6 @@ def scene(room: RoomDrive) -> Path:
 
 @pytest.fixture
 def drive(tmp_path: Path) -> RoomDrive:
-    """A small drive that a test may break."""
     return write_room_drive(tmp_path / "drive", frames=3, beams=300, size=32)
 
 
@@ -120,8 +117,6 @@ def scene_camera(frame: dict[str, Any]) -> KannalaBrandt:
 
 
 # ---- geometry --------------------------------------------------------------------------------------------------
-
-
 def test_lidar_is_at_the_walls_of_the_room(room: RoomDrive, scene: Path) -> None:
     found = maps(scene, "lidar_file_path")
     assert set(found) == {(name, frame) for name in CAMERAS for frame in room.frames}
@@ -220,8 +215,6 @@ def test_cloud_has_nothing_of_held_out_frames(tmp_path: Path, drive: RoomDrive) 
 
 
 # ---- sweeps ----------------------------------------------------------------------------------------------------
-
-
 def off_the_walls(drive: RoomDrive, scene: Path, slack: float = 0.0) -> np.ndarray:
     """How far each pixel's LiDAR distance is outside what the room's walls allow there, metres; all training maps."""
     # integer pixel centres: the pixel in column c covers u from c - 0.5 to c + 0.5
@@ -399,8 +392,7 @@ def test_other_poses_found_make_other_maps(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_the_only_frame_is_without_a_sweep(drive: RoomDrive, tmp_path: Path) -> None:
-    path = drive.sweep(drive.frames[0])
-    path.write_bytes(path.read_bytes()[:-3])
+    cut(drive.sweep(drive.frames[0]))
     message = r"\.bin: .*expected a multiple of 16.*choose more by --frames"
     refused(drive, tmp_path / "scene", message, frames=1, strict=False)
 
@@ -410,8 +402,6 @@ def test_a_search_that_cannot_begin_leaves_nothing_behind(drive: RoomDrive, tmp_
 
 
 # ---- what the scene holds --------------------------------------------------------------------------------------
-
-
 def test_frames_split_masks_and_truth(room: RoomDrive, scene: Path) -> None:
     meta = read_json(scene / "transforms.json")
     assert meta["camera_model"] == "OPENCV_FISHEYE"
@@ -550,8 +540,6 @@ def test_points_that_are_none_are_counted(drive: RoomDrive, tmp_path: Path) -> N
 
 
 # ---- choosing frames -------------------------------------------------------------------------------------------
-
-
 def test_frames_without_pose_sweep_or_picture_are_listed_and_skipped(tmp_path: Path) -> None:
     drive = write_room_drive(tmp_path / "drive", frames=12, beams=300, size=32)
     lines = drive.poses_file().read_text().splitlines(keepends=True)
@@ -612,8 +600,6 @@ def test_options_out_of_range(drive: RoomDrive, tmp_path: Path, options: dict[st
 
 
 # ---- bad drives ------------------------------------------------------------------------------------------------
-
-
 YAML = "calibration/image_03.yaml"
 TO_POSE, TO_VELO = "calibration/calib_cam_to_pose.txt", "calibration/calib_cam_to_velo.txt"
 POSES = f"data_poses/{SEQUENCE}/poses.txt"
@@ -672,11 +658,7 @@ BROKEN: list[tuple[str, Change, str]] = [
     (POSES, ("^0 ", "1.5 "), r"poses\.txt, line 1: '1\.5' is not a frame number"),
     (TIMES, (r".*\n\Z", ""), r"image_03/timestamps\.txt: ends after line 2, but frame 2"),
     (TIMES, (r"2013-05-28 08:46:00\.1", "yesterday "), r"image_03/timestamps\.txt, line 2: 'yesterday .*is not a time"),
-    (
-        f"{SWEEPS}/0000000001.bin",
-        lambda path: path.write_bytes(path.read_bytes()[:-3]),
-        r"0000000001\.bin: 4797 bytes, expected a multiple of 16",
-    ),
+    (f"{SWEEPS}/0000000001.bin", cut, r"0000000001\.bin: 4797 bytes, expected a multiple of 16"),
     (f"{SWEEPS}/0000000002.bin", b"", r"0000000002\.bin: 0 bytes"),
     (PICTURE, halve, r"image_03/data_rgb/0000000001\.png: truncated"),
     (PICTURE, b"", r"0000000001\.png: not a PNG \(0 bytes\)"),
@@ -784,8 +766,6 @@ def test_missing_timestamps_are_no_obstacle(drive: RoomDrive, tmp_path: Path) ->
 
 
 # ---- run again -------------------------------------------------------------------------------------------------
-
-
 def test_same_input_same_bytes_and_nothing_done_twice(drive: RoomDrive, tmp_path: Path) -> None:
     assert process(drive, tmp_path / "one").written == 6
     assert process(drive, tmp_path / "two").written == 6
@@ -809,8 +789,6 @@ def test_other_options_or_other_input_are_another_scene(drive: RoomDrive, tmp_pa
 
 
 # ---- KITTI-360's files -----------------------------------------------------------------------------------------
-
-
 def test_yaml_without_spaces_after_the_colon(tmp_path: Path) -> None:
     drive = write_room_drive(tmp_path / "drive", frames=1, beams=300, size=32, space="")
     twin = drive.camera("image_02")

@@ -77,7 +77,6 @@ def trained_step(model, further=None):
 
 
 def are_taught(parameters) -> bool:
-    """Whether any of them has a gradient."""
     return any(each.grad is not None and bool(each.grad.any()) for each in parameters)
 
 
@@ -220,7 +219,6 @@ def test_without_weight_the_prior_serves_surface_and_sky_alone():
 
 
 def colours_at(model, bundle: RayBundle, distance_units) -> torch.Tensor:
-    """What the field says of places along rays."""
     places = bundle.get_ray_samples(bin_starts=distance_units[:, None, None], bin_ends=distance_units[:, None, None])
     return model.field(places)[FieldHeadNames.RGB][:, 0]
 

@@ -1,7 +1,5 @@
 """What motion teaches the depth network, what is left out of it, and the calibration beyond its field that follows."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 
@@ -129,7 +127,6 @@ def test_sigma_falls_with_parallax_and_confidence():
 
 
 # ---- beyond LiDAR's field ----------------------------------------------------------------------------------------
-
 SIZE = (80, 120)
 FIELD_TOP_DEG = 2.0
 
@@ -312,8 +309,6 @@ def test_a_scene_keeps_what_was_measured_beyond(tmp_path: Path):
 
 
 # ---- sky ---------------------------------------------------------------------------------------------------------
-
-
 def test_what_is_matched_is_no_sky(tmp_path: Path):
     scene = read_scene(write_scene(tmp_path, [fisheye(96, 84)], frames=3))
     picture = scene.pictures[0]

@@ -1,7 +1,5 @@
 """Moving things: found in sweeps of small analytic worlds, grown in pictures, and on a synthetic drive."""
 
-from __future__ import annotations
-
 import dataclasses
 import shutil
 from collections.abc import Callable
@@ -100,8 +98,6 @@ def share_found(sweep: WorldSweep, things: list[Thing], box: Box) -> float:
 
 
 # ---- in sweeps -------------------------------------------------------------------------------------------------
-
-
 def test_one_stretch_of_presence_counts_and_a_mixture_does_not() -> None:
     columns = {
         "gone, there, gone": ("through through met met through through", 4),
@@ -171,8 +167,6 @@ def test_a_sweep_is_evaluated_by_those_near_by_and_by_the_whole_drive() -> None:
 
 
 # ---- in a picture ----------------------------------------------------------------------------------------------
-
-
 def test_points_grow_to_the_outline_that_the_picture_shows() -> None:
     rng = np.random.default_rng(0)
     true = np.zeros((120, 160), bool)
@@ -206,8 +200,6 @@ def test_a_roof_above_the_field_is_where_the_picture_has_an_edge() -> None:
 
 
 # ---- on a drive ------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("traffic") / "drive"
