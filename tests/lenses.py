@@ -7,7 +7,7 @@ import torch
 from drives import FULL_SIZE, MEI_NUMBERS
 from torch import Tensor
 
-from edge_depth_nerf.cameras import MEI, Camera, KannalaBrandt
+from edge_depth_nerf.cameras import MEI, KannalaBrandt, Pinhole
 
 
 def kitti_360(name: str) -> MEI:
@@ -38,21 +38,18 @@ def angle(a: Tensor, b: Tensor) -> Tensor:
     return 2 * torch.atan2((a - b).norm(dim=-1), (a + b).norm(dim=-1))
 
 
-def nerfstudio_directions(camera: Camera, camera_type: str, parameters: dict[str, float], pixels: Tensor) -> Tensor:
-    """What nerfstudio makes of the same parameters, turned to OpenCV's axes."""
+def nerfstudio_directions(camera: KannalaBrandt | Pinhole, pixels: Tensor) -> Tensor:
+    """What nerfstudio makes of the camera's parameters, turned to OpenCV's axes."""
     from nerfstudio.cameras.camera_utils import get_distortion_params
     from nerfstudio.cameras.cameras import Cameras, CameraType
 
+    kind = CameraType.FISHEYE if isinstance(camera, KannalaBrandt) else CameraType.PERSPECTIVE
+    numbers = [getattr(camera, key) for key in ("k1", "k2", "k3", "k4", "p1", "p2")]
     host = Cameras(
         camera_to_worlds=torch.eye(4)[:3],
-        fx=camera.fx,
-        fy=camera.fy,
-        cx=camera.cx,
-        cy=camera.cy,
-        width=camera.width,
-        height=camera.height,
-        distortion_params=get_distortion_params(**parameters),
-        camera_type=CameraType[camera_type],
+        **{key: getattr(camera, key) for key in ("fx", "fy", "cx", "cy", "width", "height")},
+        distortion_params=get_distortion_params(*numbers),
+        camera_type=kind,
     )
     bundle = host.generate_rays(camera_indices=0, coords=pixels.flip(-1).float())
     # OpenGL: y up, z backwards

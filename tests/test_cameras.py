@@ -536,8 +536,7 @@ def test_kannala_brandt_is_nerfstudios_fisheye_camera() -> None:
     ours, valid = FISHEYE.unproject(pixels)
     kept = valid & (torch.atan2(ours[:, :2].norm(dim=-1), ours[:, 2]) <= math.radians(95))
     assert kept.float().mean() > 0.7
-    parameters = {name: getattr(FISHEYE, name) for name in ("k1", "k2", "k3", "k4", "p1", "p2")}
-    theirs = nerfstudio_directions(FISHEYE, "FISHEYE", parameters, pixels[kept])
+    theirs = nerfstudio_directions(FISHEYE, pixels[kept])
     # their rays are float32: 1e-6 rad is 4e-4 px here
     assert angle(ours[kept], theirs).max() < 2e-6
 
@@ -547,6 +546,5 @@ def test_pinhole_is_nerfstudios_perspective_camera() -> None:
     pixels = camera.pixel_centres()[::5, ::5].reshape(-1, 2)
     ours, valid = camera.unproject(pixels)
     assert valid.all()
-    parameters = {name: getattr(camera, name) for name in ("k1", "k2", "p1", "p2")}
-    theirs = nerfstudio_directions(camera, "PERSPECTIVE", parameters, pixels)
+    theirs = nerfstudio_directions(camera, pixels)
     assert angle(ours, theirs).max() < 2e-6

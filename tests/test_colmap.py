@@ -53,20 +53,13 @@ def rays_within(degrees: float, seed: int = 0) -> np.ndarray:
     return np.stack((np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)), -1)
 
 
-def kannala_brandt_twin(c: KannalaBrandt, rays: np.ndarray) -> np.ndarray:
-    theta = np.arccos(rays[:, 2])
-    x, y = rays[:, :2].T / np.hypot(*rays[:, :2].T) * theta
+def twin_of(c: KannalaBrandt | Pinhole, rays: np.ndarray) -> np.ndarray:
+    """Pixels of rays, written out."""
+    is_fisheye = isinstance(c, KannalaBrandt)
+    along = np.arccos(rays[:, 2]) / np.hypot(*rays[:, :2].T) if is_fisheye else 1 / rays[:, 2]
+    x, y = rays[:, :2].T * along
     r2 = x * x + y * y
-    radial = 1 + c.k1 * r2 + c.k2 * r2**2 + c.k3 * r2**3 + c.k4 * r2**4
-    u = x * radial + 2 * c.p1 * x * y + c.p2 * (r2 + 2 * x * x)
-    v = y * radial + c.p1 * (r2 + 2 * y * y) + 2 * c.p2 * x * y
-    return np.stack((c.fx * u + c.cx, c.fy * v + c.cy), -1)
-
-
-def pinhole_twin(c: Pinhole, rays: np.ndarray) -> np.ndarray:
-    x, y = rays[:, :2].T / rays[:, 2]
-    r2 = x * x + y * y
-    radial = 1 + c.k1 * r2 + c.k2 * r2**2 + c.k3 * r2**3
+    radial = 1 + c.k1 * r2 + c.k2 * r2**2 + c.k3 * r2**3 + (c.k4 * r2**4 if is_fisheye else 0)
     u = x * radial + 2 * c.p1 * x * y + c.p2 * (r2 + 2 * x * x)
     v = y * radial + c.p1 * (r2 + 2 * y * y) + 2 * c.p2 * x * y
     return np.stack((c.fx * u + c.cx, c.fy * v + c.cy), -1)
@@ -78,11 +71,11 @@ def test_colmap_projects_as_the_camera_does(name):
     if name == "kannala_brandt":
         camera = KannalaBrandt(640, 480, 200.0, 201.0, 322.5, 238.0, -0.01, 0.008, -0.002, 1e-4, 3e-3, -2e-3)
         rays, tolerance_px = rays_within(84), 1e-9
-        expected = kannala_brandt_twin(camera, rays)
+        expected = twin_of(camera, rays)
     elif name == "pinhole":
         camera = Pinhole(640, 480, 500.0, 510.0, 322.5, 238.0, -0.2, 0.05, 1e-3, -2e-3, 0.01)
         rays, tolerance_px = rays_within(35), 1e-9
-        expected = pinhole_twin(camera, rays)
+        expected = twin_of(camera, rays)
     else:
         twin = MeiTwin.kitti360(name, 350)
         numbers = (twin.gamma1, twin.gamma2, twin.u0 + 0.5, twin.v0 + 0.5, twin.xi, twin.k1, twin.k2, twin.p1, twin.p2)
@@ -270,10 +263,7 @@ def test_the_scale_is_that_of_lidar_moved_by_the_path():
     assert worst_deviation_m(path, drive) < 0.005 * SPEED_M_S * 1.1
 
     # the sweeps' timing is what makes it so: what lies ahead seems too far, what lies behind too near
-    exact = [
-        model_of(drive, left, 2.5, seed=1, points=features),
-        model_of(drive, right, 0.4, seed=2, points=features),
-    ]
+    exact = [model_of(drive, left, 2.5, seed=1, points=features), model_of(drive, right, 0.4, seed=2, points=features)]
     still = dataclasses.replace(drive, sweeps=tuple(dataclasses.replace(s, timing=None) for s in drive.sweeps))
     assert metric_path(still, exact)[1].spread > 5 * metric_path(drive, exact)[1].spread
 

@@ -168,8 +168,7 @@ def test_nerfstudio_sees_the_walls_too(room: RoomDrive, scene: Path) -> None:
     meta = read_json(scene / "transforms.json")
     for frame in (meta["frames"][2], meta["frames"][-1]):
         camera, pose = scene_camera(frame), np.array(frame["transform_matrix"])
-        parameters = {key: frame[key] for key in ("k1", "k2", "k3", "k4", "p1", "p2")}
-        rays = nerfstudio_directions(camera, "FISHEYE", parameters, camera.pixel_centres()).numpy() * (1, -1, -1)
+        rays = nerfstudio_directions(camera, camera.pixel_centres()).numpy() * (1, -1, -1)
         distance = read_distance_png(scene / frame["truth_distance_file_path"])
         used = (distance > 0) & read_mask(scene / frame["mask_path"])
         assert used.sum() > 2000

@@ -117,9 +117,7 @@ def test_the_loss_counts_by_weight():
 def test_sigma_falls_with_parallax_and_confidence():
     shape = (1, 3)
     found = MotionDistance(
-        np.full(shape, 10, np.float32),
-        np.array([[0.99, 0.99, 0.75]], np.float32),
-        np.array([[3, 30, 30]], np.float32),
+        np.full(shape, 10, np.float32), np.array([[0.99, 0.99, 0.75]], np.float32), np.array([[3, 30, 30]], np.float32)
     )
     near_none, exact, doubtful = found.sigma_m[0]
     assert exact < near_none and exact < doubtful

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from data_sets import beams
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
@@ -35,9 +36,7 @@ PARKED: Box = ((6.0, -6.0, GROUND_M), (10.0, -4.2, -0.3))
 def scanned(boxes: list[Box], origin: np.ndarray) -> np.ndarray:
     """Returns of a scanner over a level ground inside a round wall, with boxes in it; in the world."""
     azimuth, elevation = np.meshgrid(np.radians(np.arange(0, 360, 0.6)), np.radians(np.linspace(-24, 3, 40)))
-    rays = np.stack(
-        (np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)), -1
-    ).reshape(-1, 3)
+    rays = beams(azimuth, elevation)
     flat = np.linalg.norm(rays[:, :2], axis=1)
     along = (rays[:, :2] @ origin[:2]) / flat
     wall = (-along + np.sqrt(along**2 + WALL_M**2 - origin[:2] @ origin[:2])) / flat

@@ -80,17 +80,8 @@ def scanned(scene: str, frames: int, rings: int = 32, motion: str = "drive") -> 
         taken = sweep(world, Motion(poses), time_s, np.random.default_rng(frame), SCANNERS[rings])
         points = torch.from_numpy(taken.raw.astype(np.float64))
         read = Sweep(points[:, :3], points[:, 3], 0, 0)
-        sweeps.append(
-            RecordedSweep(
-                Path(f"lidar/{frame}.bin"),
-                time_s,
-                frame,
-                "roof",
-                VELO_TO_POSE,
-                lambda read=read: read,
-                SweepTiming(TURN_S),
-            )
-        )
+        where = (Path(f"lidar/{frame}.bin"), time_s, frame, "roof", VELO_TO_POSE)
+        sweeps.append(RecordedSweep(*where, lambda read=read: read, SweepTiming(TURN_S)))
     lens = Pinhole(64, 48, 40.0, 40.0, 32.0, 24.0)
     to_vehicle = np.eye(4)
     to_vehicle[:3, :3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]

@@ -196,8 +196,7 @@ def test_sweeps_of_other_pictures_are_not_taken(ball: Path, tmp_path: Path, monk
 
 
 @pytest.mark.parametrize(
-    ("steps_m", "reason"),
-    [((0.5,) * 6, "the vehicle stands"), ((0.0, 0.3, 0.6), "2 training pictures are too few")],
+    ("steps_m", "reason"), [((0.5,) * 6, "the vehicle stands"), ((0.0, 0.3, 0.6), "2 training pictures are too few")]
 )
 def test_without_motion_it_says_why(steps_m: tuple[float, ...], reason: str, tmp_path: Path) -> None:
     scene = write_ball_scene(tmp_path, steps_m)

@@ -17,13 +17,7 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras import Camera, KannalaBrandt, Pinhole
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.poses.matches import Matches, sights_of
-from edge_depth_nerf.poses.tracks import (
-    features_joined,
-    join_matches,
-    reprojection_px,
-    spread,
-    triangulate,
-)
+from edge_depth_nerf.poses.tracks import features_joined, join_matches, reprojection_px, spread, triangulate
 from edge_depth_nerf.process.colmap import refine as refining
 from edge_depth_nerf.process.colmap.bundle import Shot, Softness, _Bundle, adjust_bundle
 from edge_depth_nerf.process.colmap.refine import Refinement, _is_check, refine

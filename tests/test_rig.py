@@ -628,11 +628,7 @@ def test_a_wrong_rig_file_is_named(mine: Path, old: str, new: str, message: str)
             r"\.pcd: a scan without points",
         ),
         ("masks/left.png", None, r"masks/left\.png: no such file"),
-        (
-            "masks/front.png",
-            lambda path: shutil.copy(path.with_name("left.png"), path),
-            r"front\.png: 128×128 pixels",
-        ),
+        ("masks/front.png", lambda path: shutil.copy(path.with_name("left.png"), path), r"front\.png: 128×128 pixels"),
         ("rig.json", b"{}", "found rig.toml and rig.json"),
         ("rig.toml", None, "expected rig.toml or rig.json in it, found neither"),
     ],

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from data_sets import beams
 from torch import Tensor
 
 from edge_depth_nerf.cameras import MEI, Camera, KannalaBrandt, Pinhole
@@ -148,14 +149,7 @@ def test_of_one_surface_the_newest_point_wins() -> None:
 def test_what_reaches_the_edge_of_the_field_goes_on_above_it() -> None:
     azimuth = np.radians(np.arange(-20, 20, 0.2))
     elevation = np.radians(np.linspace(-20, 2, 50))
-    rays = np.stack(
-        (
-            np.cos(elevation)[:, None] * np.cos(azimuth),
-            np.cos(elevation)[:, None] * np.sin(azimuth),
-            np.repeat(np.sin(elevation)[:, None], len(azimuth), 1),
-        ),
-        -1,
-    ).reshape(-1, 3)
+    rays = beams(*np.meshgrid(azimuth, elevation))
     tree = rays * (3 / rays[:, :1])
     sweep = sweep_in_world(as_sweep(tree), 0.0, np.eye(4), straight(0.0), None)
     points, spacing = above_field(sweep, np.array([0.0, 0.5, 0.4]))
@@ -167,11 +161,8 @@ def test_what_reaches_the_edge_of_the_field_goes_on_above_it() -> None:
 
 
 # ---- free space ------------------------------------------------------------------------------------------------
-def circle(range_m: float, beams: int = 40) -> np.ndarray:
-    azimuth, elevation = np.meshgrid(np.radians(np.arange(0, 360, 0.2)), np.radians(np.linspace(-20, 2, beams)))
-    return range_m * np.stack(
-        (np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)), -1
-    ).reshape(-1, 3)
+def circle(range_m: float, rings: int = 40) -> np.ndarray:
+    return range_m * beams(*np.meshgrid(np.radians(np.arange(0, 360, 0.2)), np.radians(np.linspace(-20, 2, rings))))
 
 
 def test_sees_through_what_is_gone_and_not_through_what_is_there() -> None:
@@ -201,17 +192,8 @@ def stored(worlds: dict[int, np.ndarray], speed_m_s: float = 0.0, interval_s: fl
     sweeps = []
     for frame, world in worlds.items():
         raw = world - [speed_m_s * frame * interval_s, 0, 0]
-        sweeps.append(
-            RecordedSweep(
-                path=Path(f"{frame}.bin"),
-                time_s=frame * interval_s,
-                frame=frame,
-                scanner="top",
-                to_vehicle=np.eye(4),
-                read=lambda raw=raw: as_sweep(raw),
-                timing=None,
-            )
-        )
+        where = (Path(f"{frame}.bin"), frame * interval_s, frame, "top", np.eye(4))
+        sweeps.append(RecordedSweep(*where, read=lambda raw=raw: as_sweep(raw), timing=None))
     return sweeps
 
 
