@@ -320,7 +320,7 @@ def spoil(root: Path, pattern: str, change: Change) -> None:
         elif isinstance(change, bytes):
             path.write_bytes(change)
         elif isinstance(change, tuple):
-            text, count = re.subn(*change, path.read_text(), count=1)
+            text, count = re.subn(change[0], change[1], path.read_text(), count=1)
             assert count, change
             path.write_text(text)
         else:

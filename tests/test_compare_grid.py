@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import pytest
 from comparisons import QUIET, differing, fake, resolved
@@ -188,8 +189,8 @@ def asked(folder: Path, **changes):
         if not scene.is_dir():
             write_scene(scene)
     drives = {"scenes": (scenes["street"], scenes["turn"]), "tuning": (scenes["tune_a"], scenes["tune_b"])}
-    search = {"lambdas": LAMBDAS, "sigmas_m": SIGMAS_M, "output": folder / "out", "steps": 5}
-    return GridOptions(**drives | search | changes)
+    given: dict[str, Any] = {"lambdas": LAMBDAS, "sigmas_m": SIGMAS_M, "output": folder / "out", "steps": 5, **drives}
+    return GridOptions(**given | changes)
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from comparisons import QUIET, fake
 from scenes import write_scene
@@ -39,7 +40,7 @@ def test_a_search_writes_what_compare_takes(tmp_path, monkeypatch):
 
     monkeypatch.setattr(command, "do_runs", train)
     scene, output = write_scene(tmp_path / "x"), tmp_path / "out"
-    tried = {"lambdas": (0.01, 0.1, 0.3, 1.0), "sigmas_m": ("own", 0.1, 0.5, 2.0)}
+    tried: dict[str, Any] = {"lambdas": (0.01, 0.1, 0.3, 1.0), "sigmas_m": ("own", 0.1, 0.5, 2.0)}
     asked = SearchOptions(scenes=(scene,), output=output, seeds=(7,), methods=("ds-nerf", "edge"), **tried)
     found = search.search(asked, QUIET)
     assert len(found.runs) == 2 * 4 * 4

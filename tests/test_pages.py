@@ -523,7 +523,7 @@ def run_blocks(page: str, folder: Path) -> str:
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     environment["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     call = ["bash", "-c", script.replace("/DATE/", "/*/")]
-    output = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    output: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
     done = subprocess.run(call, cwd=folder, env=environment, timeout=TIMEOUT_S, check=False, **output)
     assert done.returncode == 0, done.stdout[-4000:]
     return done.stdout

@@ -240,8 +240,11 @@ def test_a_broken_cloud_costs_the_view_in_3d_alone(tmp_path, capsys):
         (
             ("compare",),
             CompareOptions(
-                **{"scenes": (Path("a b"), Path("c")), "output": Path("out"), "methods": ("nerfacto", "edge")},
-                **{"seeds": (0, 1), "detail": True},
+                scenes=(Path("a b"), Path("c")),
+                output=Path("out"),
+                methods=("nerfacto", "edge"),
+                seeds=(0, 1),
+                detail=True,
             ),
         ),
         (
