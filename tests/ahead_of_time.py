@@ -3,8 +3,6 @@
 The functions are called on CPU tensors; each launch compiles its kernel for the GPU and is left out.
 """
 
-from __future__ import annotations
-
 import re
 import subprocess
 from collections.abc import Callable, Iterator

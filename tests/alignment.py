@@ -1,9 +1,17 @@
-"""The similarity between two sets of points, for evaluating poses that have a world of their own."""
+"""Poses by angles, and the similarity between two sets of points, for poses that have a world of their own."""
 
-from __future__ import annotations
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+
+def pose(turn_deg: Sequence[float], position_m: Sequence[float]) -> NDArray:
+    found = np.eye(4)
+    found[:3, :3] = Rotation.from_euler("xyz", turn_deg, degrees=True).as_matrix()
+    found[:3, 3] = position_m
+    return found
 
 
 def umeyama(points: NDArray, truth: NDArray) -> tuple[float, NDArray]:

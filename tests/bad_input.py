@@ -1,7 +1,5 @@
 """Valid files of every kind that is read, how each is read, and how they are spoilt. For tests and fuzzers."""
 
-from __future__ import annotations
-
 import io
 import json
 import re
@@ -277,7 +275,6 @@ def scan(path: Path) -> None:
 
 
 # ---- faults ----------------------------------------------------------------------------------------------------
-
 WORDS = (
     *("nan", "inf", "-inf", "-1", "0", "1e308", "-1e308", "1e-320", "9" * 400, "9" * 5000, "0x10", "1_0", "true"),
     *(

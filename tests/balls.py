@@ -1,7 +1,5 @@
 """Views inside a textured ball, whose distances follow from a formula."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

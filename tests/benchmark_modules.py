@@ -1,7 +1,5 @@
 """Importing the programs of benchmarks/, which are not installed."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from collections.abc import Callable, Iterator

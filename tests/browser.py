@@ -1,7 +1,5 @@
 """A browser for tests of pages: Debian's Chromium or Google's Chrome, driven by Playwright; never downloaded."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Made-up runs and options for tests of comparisons."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from dataclasses import replace

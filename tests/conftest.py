@@ -1,7 +1,5 @@
 """Shared fixtures and options: which tests are fast, where real data may lie, no surprises from the machine."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -4,8 +4,6 @@ The vehicle (x forward, y left, z up) drives at 10 m/s and turns, so that a wron
 are pinholes without distortion; sweeps are corrected to the frame that their data set says.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from datetime import datetime, timezone

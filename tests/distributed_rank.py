@@ -3,8 +3,6 @@
 nerfstudio's own worker asserts CUDA; this does what it does, over gloo, and writes down what the test looks at.
 """
 
-from __future__ import annotations
-
 import sys
 from datetime import timedelta
 from pathlib import Path

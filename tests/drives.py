@@ -5,8 +5,8 @@ the MEI model written out here in NumPy with KITTI-360's integer pixel centres (
 cameras, projection or conventions is used, so that a mistake there cannot cancel out.
 """
 
-from __future__ import annotations
-
+import re
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -73,7 +73,7 @@ class MeiTwin:
     v0: float
 
     @classmethod
-    def kitti360(cls, name: str, size: int) -> MeiTwin:
+    def kitti360(cls, name: str, size: int) -> "MeiTwin":
         xi, k1, k2, p1, p2, gamma1, gamma2, u0, v0 = MEI_NUMBERS[name]
         s = size / FULL_SIZE
         # of pixels counted from their centres: the picture's border is at -0.5
@@ -303,6 +303,28 @@ def _write_shifted(drive: RoomDrive, cameras: tuple[str, ...]) -> None:
 
 def halve(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-3])
+
+
+Change = bytes | tuple[str, str] | Callable[[Path], object] | None
+
+
+def spoil(root: Path, pattern: str, change: Change) -> None:
+    """Remove what a pattern names (None), write bytes to it, replace a regex in it once, or call a function with it."""
+    for path in sorted(root.glob(pattern)) or [root / pattern]:
+        if change is None:
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        elif isinstance(change, bytes):
+            path.write_bytes(change)
+        elif isinstance(change, tuple):
+            text, count = re.subn(change[0], change[1], path.read_text(), count=1)
+            assert count, change
+            path.write_text(text)
+        else:
+            change(path)
 
 
 def write_mono(folder: Path, drive: RoomDrive, distance_m: Callable[[str, int], float] | float) -> Path:

@@ -5,8 +5,6 @@ error that is not ours, a second without an answer, or more than a gigabyte besi
 status 1 and the input in a file. Without a name it runs all of them, each in a process of its own.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tempfile

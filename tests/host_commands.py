@@ -4,8 +4,6 @@ Each job has the `words` of a command, an `environment` of its own and a `log` f
 LOG.status gets its exit status; a job without one was not begun.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import runpy

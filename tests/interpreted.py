@@ -3,8 +3,6 @@
 The variable TRITON_INTERPRET has to be set before Triton is imported.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

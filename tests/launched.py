@@ -1,7 +1,5 @@
 """Launches of Triton kernels on another device than that of their tensors."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import interpreted

@@ -1,42 +1,22 @@
 """Cameras and rays that several test modules use, and nerfstudio's own rays to compare with."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
 import torch
+from drives import FULL_SIZE, MEI_NUMBERS
 from torch import Tensor
 
-from edge_depth_nerf.cameras import MEI, Camera, KannalaBrandt
+from edge_depth_nerf.cameras import MEI, KannalaBrandt, Pinhole
 
-# KITTI-360's published calibration; its u0, v0 count integer pixel centres
-IMAGE_02 = MEI(
-    width=1400,
-    height=1400,
-    fx=1.3363220825849971e03,
-    fy=1.3357883350012958e03,
-    cx=7.1694323510126321e02 + 0.5,
-    cy=7.0576498308221585e02 + 0.5,
-    xi=2.2134047507854890e00,
-    k1=1.6798235660113681e-02,
-    k2=1.6548773243373522e00,
-    p1=4.2223943394772046e-04,
-    p2=4.2462134260997584e-04,
-)
-IMAGE_03 = MEI(
-    width=1400,
-    height=1400,
-    fx=1.4854388981875156e03,
-    fy=1.4849477411748708e03,
-    cx=6.9888316784030962e02 + 0.5,
-    cy=6.9814541887723055e02 + 0.5,
-    xi=2.5535139132482758e00,
-    k1=4.9370396274089505e-02,
-    k2=4.5068455478645308e00,
-    p1=1.3477698472982495e-03,
-    p2=-7.0340482615055284e-04,
-)
+
+def kitti_360(name: str) -> MEI:
+    """KITTI-360's published calibration; its u0, v0 count integer pixel centres."""
+    xi, k1, k2, p1, p2, gamma1, gamma2, u0, v0 = MEI_NUMBERS[name]
+    return MEI(FULL_SIZE, FULL_SIZE, gamma1, gamma2, u0 + 0.5, v0 + 0.5, xi, k1, k2, p1, p2)
+
+
+IMAGE_02, IMAGE_03 = kitti_360("image_02"), kitti_360("image_03")
 KITTI = [pytest.param(IMAGE_02, id="image_02"), pytest.param(IMAGE_03, id="image_03")]
 
 # near to what image_02 is fitted by: rises to 114°
@@ -58,21 +38,18 @@ def angle(a: Tensor, b: Tensor) -> Tensor:
     return 2 * torch.atan2((a - b).norm(dim=-1), (a + b).norm(dim=-1))
 
 
-def nerfstudio_directions(camera: Camera, camera_type: str, parameters: dict[str, float], pixels: Tensor) -> Tensor:
-    """What nerfstudio makes of the same parameters, turned to OpenCV's axes."""
+def nerfstudio_directions(camera: KannalaBrandt | Pinhole, pixels: Tensor) -> Tensor:
+    """What nerfstudio makes of the camera's parameters, turned to OpenCV's axes."""
     from nerfstudio.cameras.camera_utils import get_distortion_params
     from nerfstudio.cameras.cameras import Cameras, CameraType
 
+    kind = CameraType.FISHEYE if isinstance(camera, KannalaBrandt) else CameraType.PERSPECTIVE
+    numbers = [getattr(camera, key) for key in ("k1", "k2", "k3", "k4", "p1", "p2")]
     host = Cameras(
         camera_to_worlds=torch.eye(4)[:3],
-        fx=camera.fx,
-        fy=camera.fy,
-        cx=camera.cx,
-        cy=camera.cy,
-        width=camera.width,
-        height=camera.height,
-        distortion_params=get_distortion_params(**parameters),
-        camera_type=CameraType[camera_type],
+        **{key: getattr(camera, key) for key in ("fx", "fy", "cx", "cy", "width", "height")},
+        distortion_params=get_distortion_params(*numbers),
+        camera_type=kind,
     )
     bundle = host.generate_rays(camera_indices=0, coords=pixels.flip(-1).float())
     # OpenGL: y up, z backwards

@@ -1,7 +1,5 @@
 """Small models for tests, and what they are trained with."""
 
-from __future__ import annotations
-
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Scene folders made of the real KITTI-360 excerpts (not part of the project; see the fixture `real_data`)."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -44,15 +42,8 @@ def fisheye_frame_scene(real_data: Path, output: Path, downscale: int) -> Path:
     folder = real_data / "kitti360_fisheye_frame"
     sample = read_json(folder / "kitti360_sample.json")["cam_params"]
     # KITTI-360 counts integer pixel centres
-    camera = MEI(
-        width=1400,
-        height=1400,
-        fx=sample["fx"],
-        fy=sample["fy"],
-        cx=sample["cx"] + 0.5,
-        cy=sample["cy"] + 0.5,
-        **{name: sample[name] for name in ("xi", "k1", "k2", "p1", "p2")},
-    )
+    size = (1400, 1400, sample["fx"], sample["fy"], sample["cx"] + 0.5, sample["cy"] + 0.5)
+    camera = MEI(*size, *(sample[name] for name in ("xi", "k1", "k2", "p1", "p2")))
     hidden = np.load(folder / "mask_left_fisheye.npy")
     lidar = read_distance_png(folder / "kitti360_depth.png")
     evaluated = held_out_blocks(1400)

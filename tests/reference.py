@@ -3,8 +3,6 @@
 They share no code with the package. NumPy arrays in, NumPy arrays or floats out; units as there.
 """
 
-from __future__ import annotations
-
 import math
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Small scene folders with a known truth: cameras inside a ball of 6 m with a coloured wall; the sample drive."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from typing import Any
@@ -20,6 +18,11 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV camera axes to OpenGL's
 def copy_sample_drive(folder: Path) -> Path:
     """Copy data/sample_drive as the repository has it: without the `.cache` of those who trained on it."""
     return Path(shutil.copytree(SAMPLE_DRIVE, folder, ignore=shutil.ignore_patterns(".cache")))
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    """Contents of a folder's files by their names."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
 def fisheye(width: int = 32, height: int = 28) -> KannalaBrandt:

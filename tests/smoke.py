@@ -1,7 +1,5 @@
 """A handful of steps with nerfstudio's trainer: `python smoke.py SCENE FOLDER STEPS` writes FOLDER/losses.json."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

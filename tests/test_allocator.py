@@ -1,7 +1,5 @@
 """What keeping freed memory does: a large tensor's pages are not taken from the system again."""
 
-from __future__ import annotations
-
 import platform
 import subprocess
 import sys

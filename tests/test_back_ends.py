@@ -27,7 +27,7 @@ from edge_depth_nerf.kernels.functions import (
     SAMPLE_PDF,
     WEIGHTS,
 )
-from edge_depth_nerf.method.losses import step_kernels
+from edge_depth_nerf.method.losses import EDGE_LOSS, step_kernels
 from edge_depth_nerf.plugin.fused.nerfacto_losses import distortion_loss
 
 CPU = torch.device("cpu")

@@ -4,8 +4,6 @@ The suite throws `BAD_INPUTS` at each reader, 40 by default; `make fuzz` throws 
 each of our own parsers through a coverage-guided fuzzer (tests/fuzz_parsers.py).
 """
 
-from __future__ import annotations
-
 import json
 import os
 import struct
@@ -84,7 +82,6 @@ def seconds_of(read, path: Path) -> float:
 
 @pytest.fixture(scope="module", params=READERS)
 def valid(request, tmp_path_factory):
-    """A reader and its valid file."""
     reader = READERS[request.param]
     path = reader.make(tmp_path_factory.mktemp(request.param.replace(" ", "_")))
     reader.read(path)
@@ -136,18 +133,8 @@ FOUND: dict[str, tuple[str, str, str | bytes, str]] = {
     "a huge label map": ("labels", "a.png", png_of(60_000, 60_000), "60000×60000 pixels"),
     "a bomb": ("arrays npz", "a.npz", npz(distance_m=np.zeros(10**7, np.float32)), "more than 768 bytes"),
     "objects in an archive": ("arrays npz", "a.npz", npz(distance_m=np.array([{}], object)), "holds object"),
-    "a header of depth": (
-        "array npy",
-        "a.npy",
-        npy(np.ones(3)).replace(b"False", b"-" * 40 + b"1"),
-        "cannot be read as an array",
-    ),
-    "an array of more than the file": (
-        "array npy",
-        "a.npy",
-        npy(np.ones(3)).replace(b"(3,)", b"(9**9,)"),
-        "cannot be read as an array",
-    ),
+    "a header of depth": ("array npy", "a.npy", npy(np.ones(3)).replace(b"False", b"-" * 40 + b"1"), "as an array"),
+    "an array beyond the file": ("array npy", "a.npy", npy(np.ones(3)).replace(b"(3,)", b"(9**9,)"), "as an array"),
     "a count that cannot be printed": (
         "scan pcd binary",
         "a.pcd",
@@ -168,12 +155,7 @@ FOUND: dict[str, tuple[str, str, str | bytes, str]] = {
     "a line without end": ("tum", "a.txt", "1 " * 100_000, "line 1: longer than"),
     "another encoding": ("kitti poses", "a.txt", "0 1 0 0".encode("utf-16"), "not a text file"),
     "orders to a terminal": ("kitti cam to velo", "a.txt", "\x1b[2J 1 2", "x1b"),
-    "an error of a megabyte": (
-        "poses of nerfstudio",
-        "a.json",
-        frame(transform_matrix=[1] * 10**5),
-        "a list of 100000",
-    ),
+    "an error of a megabyte": ("poses of nerfstudio", "a.json", frame(transform_matrix=[1] * 10**5), "list of 100000"),
     "a tuned weight beyond float": (
         "tuned",
         "a.json",

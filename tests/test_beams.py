@@ -1,7 +1,5 @@
 """LiDAR beams that are held out of everything: which, from what, and that training views are evaluated by them."""
 
-from __future__ import annotations
-
 import io
 import math
 from pathlib import Path

@@ -27,7 +27,6 @@ from edge_depth_nerf.scene.reader import read_scene
 
 
 def both(lidar: np.ndarray, mono: np.ndarray) -> dict[str, np.ndarray]:
-    """The maps of a picture by source."""
     return {"lidar": lidar, "mono": mono}
 
 
@@ -159,8 +158,6 @@ def test_blocks_rows_and_single_points_are_left_out():
 
 
 # ---- scenes ----------------------------------------------------------------------------------------------------------
-
-
 def change_map(scene, key, frame, change):
     meta = read_json(scene / "transforms.json")
     path = scene / meta["frames"][frame][key]

@@ -1,7 +1,5 @@
 """Paths of films: their geometry, and what nerfstudio makes of the files."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -173,8 +171,6 @@ def test_a_drive_needs_two_pictures_at_increasing_times():
 
 
 # -- the files
-
-
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory) -> Path:
     """Two cameras that drive 8 m along x and look to its sides, with times 0.25 s apart.
@@ -218,7 +214,6 @@ def trained(scene, tmp_path_factory):
 
 
 def poses_of_training(parser, scene: Path) -> dict[str, np.ndarray]:
-    """By name of the picture: where nerfstudio's own cameras stand, of all splits."""
     found = {}
     for split in ("train", "test"):
         outputs = parser.setup().get_dataparser_outputs(split=split)

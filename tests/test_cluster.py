@@ -1,7 +1,5 @@
 """Tasks on real clusters of separate processes: killed workers, failing tasks, GPUs, what a worker must have."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
@@ -73,7 +71,6 @@ def wait_until(happened: Callable[[], Any], seconds: float = 300.0) -> Any:
 
 
 def child_of_worker(word: str) -> psutil.Process | None:
-    """The process of a task, whose parent is the worker."""
     for child in psutil.Process().children(recursive=True):
         try:
             if any(word in part for part in child.cmdline()) and child.status() != psutil.STATUS_ZOMBIE:
@@ -95,8 +92,6 @@ def kill_worker_of(word: str, happened: Callable[[], Any]) -> threading.Thread:
 
 
 # ---- what is given -----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("given", ["", "10.0.0.1:8786", "http://10.0.0.1:8786", "here"])
 def test_an_address_is_local_or_a_schedulers(given: str) -> None:
     with pytest.raises(InputError, match=r"--cluster .*expected local, or the address"):
@@ -121,8 +116,6 @@ def test_nobody_at_an_address_is_told(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 # ---- processes on this machine -------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_a_killed_workers_task_goes_on_where_it_was(tmp_path: Path) -> None:
     console = Console(file=io.StringIO(), width=200)
@@ -205,24 +198,16 @@ def test_the_local_cluster_is_closed_to_others(tmp_path: Path) -> None:
 
 
 # ---- a scheduler by hand -----------------------------------------------------------------------------------------
-
-
 @contextmanager
 def scheduler(tmp_path: Path) -> Iterator[tuple[str, Callable[..., None]]]:
     """A scheduler as docs/cluster.md starts one; its address, and what starts a worker."""
     started: list[subprocess.Popen] = []
 
     def start(*words: str, **environment: str) -> None:
+        call = [sys.executable, "-m", "dask", *words]
         with (tmp_path / "dask.log").open("a") as log:
-            started.append(
-                subprocess.Popen(
-                    [sys.executable, "-m", "dask", *words],
-                    env={**os.environ, **environment},
-                    cwd=tmp_path,
-                    stdout=log,
-                    stderr=subprocess.STDOUT,
-                )
-            )
+            output = {"stdout": log, "stderr": subprocess.STDOUT}
+            started.append(subprocess.Popen(call, env={**os.environ, **environment}, cwd=tmp_path, **output))
 
     file = tmp_path / "scheduler.json"
     where = ("--host", "127.0.0.1", "--no-dashboard", "--dashboard-address", "127.0.0.1:0")
@@ -286,8 +271,6 @@ def test_a_training_has_a_gpu_for_itself(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 # ---- the commands ------------------------------------------------------------------------------------------------
-
-
 def files_of(folder: Path) -> dict[str, bytes]:
     """All files but those that tell of the folder's own name or time."""
     return {
@@ -298,18 +281,9 @@ def files_of(folder: Path) -> dict[str, bytes]:
 
 
 def test_a_command_line_gives_the_options_back(tmp_path: Path) -> None:
-    options = Kitti360Options(
-        output=Path("scenes/000"),
-        root=tmp_path,
-        sequence=SEQUENCE,
-        first=7,
-        frames=3,
-        cameras=("image_03",),
-        moving_classes=(),
-        raw_lidar=True,
-        ego_mask=Path("masks"),
-        theta_max_deg=92.5,
-    )
+    chosen: dict[str, Any] = {"first": 7, "frames": 3, "cameras": ("image_03",), "moving_classes": ()}
+    chosen |= {"raw_lidar": True, "ego_mask": Path("masks"), "theta_max_deg": 92.5}
+    options = Kitti360Options(output=Path("scenes/000"), root=tmp_path, sequence=SEQUENCE, **chosen)
     _, module, ends_with_parent, *words = own_command(("process", "kitti360"), options)
     assert (module, ends_with_parent) == ("edge_depth_nerf", "--end-with-parent")
     command = cli.parse(words)

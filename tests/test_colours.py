@@ -1,7 +1,5 @@
 """Views in colours: as the NumPy form of the same scale, to one of its 256 steps."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """nerfstudio's own commands on our method and our scene, as a user gives them: offline, on the CPU."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import os

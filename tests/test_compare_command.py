@@ -1,7 +1,5 @@
 """What a comparison refuses, and what its folder keeps; nothing is trained."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys
@@ -159,7 +157,6 @@ def test_a_folder_keeps_what_its_runs_share(tmp_path, monkeypatch, begin):
 
 
 def tuned_values(path: Path, scene: object = "tuning", **tuned: float | str) -> Path:
-    """A file of λ = 0.1 and these σ."""
     methods = {name.replace("_", "-"): {"lambda": 0.1, "sigma_m": sigma_m} for name, sigma_m in tuned.items()}
     write_json(path, {"scene": scene, "methods": methods})
     return path

@@ -1,7 +1,5 @@
 """Evaluation: on which pixels and views, and without a trace in the training."""
 
-from __future__ import annotations
-
 import math
 from copy import deepcopy
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Figures of comparisons by hand."""
 
-from __future__ import annotations
-
 import math
 from itertools import pairwise
 

@@ -1,11 +1,10 @@
 """The grid of losses, priors and extras: its cells, its searches and its tables; nothing is trained."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import pytest
 from comparisons import QUIET, differing, fake, resolved
@@ -189,15 +188,9 @@ def asked(folder: Path, **changes):
     for scene in scenes.values():
         if not scene.is_dir():
             write_scene(scene)
-    asked = GridOptions(
-        scenes=(scenes["street"], scenes["turn"]),
-        tuning=(scenes["tune_a"], scenes["tune_b"]),
-        lambdas=LAMBDAS,
-        sigmas_m=SIGMAS_M,
-        output=folder / "out",
-        steps=5,
-    )
-    return replace(asked, **changes)
+    drives = {"scenes": (scenes["street"], scenes["turn"]), "tuning": (scenes["tune_a"], scenes["tune_b"])}
+    given: dict[str, Any] = {"lambdas": LAMBDAS, "sigmas_m": SIGMAS_M, "output": folder / "out", "steps": 5, **drives}
+    return GridOptions(**given | changes)
 
 
 @pytest.mark.slow

@@ -1,10 +1,9 @@
 """The search for weights: its folders and what it writes."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from comparisons import QUIET, fake
 from scenes import write_scene
@@ -41,14 +40,8 @@ def test_a_search_writes_what_compare_takes(tmp_path, monkeypatch):
 
     monkeypatch.setattr(command, "do_runs", train)
     scene, output = write_scene(tmp_path / "x"), tmp_path / "out"
-    asked = SearchOptions(
-        scenes=(scene,),
-        output=output,
-        seeds=(7,),
-        methods=("ds-nerf", "edge"),
-        lambdas=(0.01, 0.1, 0.3, 1.0),
-        sigmas_m=("own", 0.1, 0.5, 2.0),
-    )
+    tried: dict[str, Any] = {"lambdas": (0.01, 0.1, 0.3, 1.0), "sigmas_m": ("own", 0.1, 0.5, 2.0)}
+    asked = SearchOptions(scenes=(scene,), output=output, seeds=(7,), methods=("ds-nerf", "edge"), **tried)
     found = search.search(asked, QUIET)
     assert len(found.runs) == 2 * 4 * 4
     tuned = read_json(output / "tuned.json")

@@ -1,7 +1,5 @@
 """Tables by hand, of made-up runs."""
 
-from __future__ import annotations
-
 import statistics
 
 import numpy as np

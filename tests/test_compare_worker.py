@@ -1,7 +1,5 @@
 """The command once for real: worker, report, plots, and going on where it was."""
 
-from __future__ import annotations
-
 import csv
 import html
 import json

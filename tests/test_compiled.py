@@ -1,7 +1,5 @@
 """Whether what Numba compiles lies on disk already."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -147,12 +147,6 @@ def test_no_scene(tmp_path):
     ("change", "message"),
     [
         (lambda meta: meta.update(camera_model="MEI"), "camera_model is 'MEI'.*OPENCV_FISHEYE"),
-        (lambda meta: meta.update(frames=[]), "no list of frames"),
-        (lambda meta: meta["frames"][2].pop("transform_matrix"), "frame 2 has no transform_matrix"),
-        (
-            lambda meta: meta["frames"][3].update(transform_matrix=[[1, 2], [3, 4]]),
-            r"frame 3: transform_.*4×4.*\[\[1, 2\], \[3, 4\]\]",
-        ),
         (lambda meta: meta["frames"][5].pop("fl_x"), "frame 5 .*0005.png.* has no fl_x"),
         (lambda meta: meta["test_filenames"].append("images/x.png"), "test_filenames names images/x.png"),
         (lambda meta: [frame.update(frame=3) for frame in meta["frames"]], "frame 3 is in train_.* and in val_"),

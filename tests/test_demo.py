@@ -1,7 +1,5 @@
 """The demo, small: every stage for real."""
 
-from __future__ import annotations
-
 import html
 import shlex
 import shutil

@@ -1,7 +1,5 @@
 """Losses on the prior by name: how one is registered, found, and averaged over rays and levels."""
 
-from __future__ import annotations
-
 from copy import copy
 from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint
@@ -46,7 +44,6 @@ def level(prior: list[float], scale: float = 1.0, **more) -> Level:
 
 @pytest.fixture
 def table(monkeypatch):
-    """The table of losses, as it was afterwards."""
     monkeypatch.setattr(depth_losses, "LOSSES", dict(LOSSES))
     return depth_losses.LOSSES
 

@@ -1,7 +1,5 @@
 """Detail of training pictures: what it adds to views, from where, and when it is rendered again."""
 
-from __future__ import annotations
-
 from copy import deepcopy
 
 import numpy as np
@@ -24,8 +22,6 @@ LENSES = {"fisheye": [fisheye(64, 56)], "pinhole": [pinhole(64, 56)], "both": [f
 
 
 # ---- the formulas ---------------------------------------------------------------------------------------------------
-
-
 def at(x: float, angle: float = 0.0) -> np.ndarray:
     """A camera-to-world matrix, OpenCV axes: beside the ball's middle, turned about y."""
     pose = np.eye(4)
@@ -142,8 +138,6 @@ def test_undefined_rays_get_nothing_and_take_nothing_from_others():
 
 
 # ---- exposures ------------------------------------------------------------------------------------------------------
-
-
 def test_a_picture_that_is_its_rendering_exposed_shows_nothing_beyond():
     generator = torch.Generator().manual_seed(0)
     exposure = Gains(4)
@@ -162,8 +156,6 @@ def test_a_picture_that_is_its_rendering_exposed_shows_nothing_beyond():
 
 
 # ---- in the model ---------------------------------------------------------------------------------------------------
-
-
 def grey_ball(pipeline, monkeypatch):
     """Let a model render the scene's ball in grey, at its true distance; give the numbers of rays that it rendered."""
     model, dataset, rendered = pipeline.model, pipeline.datamanager.train_dataset, []
@@ -361,8 +353,6 @@ def test_with_an_embedding_a_picture_is_rendered_as_it_looks(tmp_path, implement
 
 
 # ---- evaluated ------------------------------------------------------------------------------------------------------
-
-
 def test_views_are_evaluated_with_detail_beside_those_without(tmp_path, monkeypatch):
     scene = write_scene(tmp_path / "scene", frames=17)
     meta = read_json(scene / "transforms.json")

@@ -1,7 +1,5 @@
 """One training over several processes: nerfstudio's DDP around our DataManager and model."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from itertools import chain

@@ -1,7 +1,5 @@
 """Eq. 4's kernels against the slow twin and torch in float64: Numba's, and Triton's interpreted and compiled."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The fused hash grid against nerfstudio's class and against a NumPy form of its own."""
 
-from __future__ import annotations
-
 import multiprocessing
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -37,7 +35,6 @@ SIZES = {
 
 @pytest.fixture(autouse=True)
 def threads():
-    """Leave torch's number of threads as it was."""
     before = torch.get_num_threads()
     yield
     torch.set_num_threads(before)
@@ -45,7 +42,6 @@ def threads():
 
 @pytest.fixture
 def small_shares(monkeypatch):
-    """Let even a few points be shared out to all threads."""
     monkeypatch.setattr(cpu, "LEAST_SHARE", 1)
 
 

@@ -1,7 +1,5 @@
 """How commands end early, as the terminal sees it."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -122,7 +120,6 @@ def test_debug_is_told_of(monkeypatch, capsys):
 
 
 def command(run: str, before: str = "") -> str:
-    """Code that begins a command whose work is the function `run`."""
     call = 'cli.run = run\nsys.argv = ["edge-depth-nerf", "doctor"]\nentry.main()\n'
     return f"import sys, time\n{before}\nfrom edge_depth_nerf import cli, entry\n{run}\n{call}"
 

@@ -2,7 +2,10 @@
 
 import pytest
 import torch
+import yaml
+from scenes import write_scene
 
+from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.plugin.exposure import Gains
 
 
@@ -45,3 +48,14 @@ def test_gains_learn_a_cameras_gain(colours):
         loss.backward()
         optimizer.step()
     assert float(loss.detach()) < 3e-4 < float((colours - target).square().mean())
+
+
+@pytest.mark.parametrize("exposure", ["affine", "grid"])
+def test_a_training_with_an_exposure_of_an_earlier_version_is_refused(tmp_path, exposure):
+    from models import pipeline_config  # imports nerfstudio
+
+    text = yaml.dump(pipeline_config(write_scene(tmp_path, frames=2)))
+    assert "exposure: gain" in text
+    config = yaml.load(text.replace("exposure: gain", f"exposure: {exposure}"), yaml.Loader)  # as ns-eval does
+    with pytest.raises(InputError, match=rf"exposure {exposure}: .*one of gain, embedding, none\. Train again"):
+        config.setup(device="cpu", test_mode="test")

@@ -4,8 +4,6 @@ The figures of all runs are in the repository, each with its whole configuration
 wrong; its test holds that to be nothing, and then puts the former fault back.
 """
 
-from __future__ import annotations
-
 import copy
 import re
 from collections.abc import Iterator, Mapping
@@ -58,7 +56,6 @@ RUNS_OF = {
 
 @pytest.fixture(scope="module")
 def unseen() -> Iterator[ModuleType]:
-    """benchmarks/quality/unseen.py."""
     with benchmark_modules() as load:
         yield load("quality.unseen")
 
@@ -86,10 +83,7 @@ def with_fields(runs: list[RunResult], method: MethodName, fields: Mapping[str, 
 
 
 # --- the drives of the tables -----------------------------------------------------------------------------------------
-
-
 def drives_of_choices(page: str, runs: dict[str, list[RunResult]]) -> set[str]:
-    """Drives that took part in a choice and that a page's tables are of."""
     parts = re.findall(r"<!-- (.+?) -->", page)
     names = [name for name in parts if name not in ("end", "run") and not name.startswith("--8<--")]
     assert names
@@ -144,8 +138,6 @@ def test_the_default_pipeline_and_simulated_maps_are_told_apart(unseen, kept):
 
 
 # --- one difference at a time -----------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Pair:
     """Two rows of a table, and the fields that they may differ in."""
@@ -263,8 +255,6 @@ def test_all_rows_have_one_exposure_model(kept):
 
 
 # --- the searches -----------------------------------------------------------------------------------------------------
-
-
 def of_another_length(runs: list[RunResult]) -> set[MethodName]:
     """Methods whose search is not that of ours: the same drives, seeds, steps, λ and σ."""
     shapes: dict[MethodName, set[tuple[object, ...]]] = {}
@@ -306,8 +296,6 @@ def test_all_methods_have_equal_searches_that_are_kept(unseen, kept):
 
 
 # --- what is shipped is what is compared ------------------------------------------------------------------------------
-
-
 CALLED_BEFORE = {
     "pipeline.model.losses.edge.gaussian": "pipeline.model.edge_gaussian",
     "pipeline.model.losses.edge.divide_by_norm": "pipeline.model.edge_divide_by_norm",
@@ -337,8 +325,6 @@ def test_the_preset_paper_is_the_method_of_the_tables(kept):
 
 
 # --- what the pages say in words --------------------------------------------------------------------------------------
-
-
 def gain_db(runs: list[RunResult], one: MethodName, other: MethodName, others: list[RunResult] | None = None) -> float:
     """Mean of the differences in PSNR over the drives and seeds that both have."""
     psnr, theirs = (

@@ -1,7 +1,5 @@
 """What the LiDAR of other frames shows of a picture, above its own returns."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 
@@ -73,7 +71,6 @@ def write_drive(folder: Path, extra_m: dict[int, np.ndarray] | None = None, top_
 
 
 def shown(scene: SceneFolder, index: int) -> np.ndarray:
-    """What the whole drive's LiDAR shows of one picture."""
     cloud = static_cloud(scene, scene.pictures)
     return seen_above(cloud, scene, scene.pictures[index], (LENS.width, LENS.height))
 
@@ -138,8 +135,6 @@ def test_one_picture_or_none_knows_nothing_more(tmp_path, pictures):
 
 
 # ---- long drives -----------------------------------------------------------------------------------------------
-
-
 def copies(scene: SceneFolder, count: int, apart_m: float = 300.0) -> list[ScenePicture]:
     """The drive again and again, one behind the other along x, diagonally into negative coordinates."""
     return [

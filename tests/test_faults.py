@@ -1,7 +1,5 @@
 """Each fault of a value or a file, one by one, with what is said of it; test_bad_input.py spoils files at random."""
 
-from __future__ import annotations
-
 import errno
 import os
 import threading
@@ -24,9 +22,8 @@ from edge_depth_nerf.scene.format import read_transforms
 
 POSE = np.eye(4).tolist()
 
+
 # ---- values ----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("value", "number"),
     [(1, 1.0), (-2.5, -2.5), (10**400, None), (True, None), ("1", None), (None, None), (float("nan"), None)],
@@ -84,8 +81,6 @@ def test_text_has_not_too_many_lines(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 # ---- files -----------------------------------------------------------------------------------------------------
-
-
 def test_json_has_not_too_many_values(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.json"
     path.write_text("[1, 2, [3]]")
@@ -190,8 +185,6 @@ def test_windows_is_not_asked_whether_a_process_runs(tmp_path: Path, monkeypatch
 
 
 # ---- transforms.json -------------------------------------------------------------------------------------------
-
-
 def transforms(frame: dict[str, Any] | None = None, **more: Any) -> dict[str, Any]:
     return {"frames": [{"file_path": "a.png", "transform_matrix": POSE, **(frame or {})}], **more}
 

@@ -1,7 +1,5 @@
 """Numbers stay finite: losses and integration in half precision and at their limits, trainings on hostile scenes."""
 
-from __future__ import annotations
-
 import math
 import re
 import shutil
@@ -29,9 +27,8 @@ from edge_depth_nerf.plugin.fused.nerfacto_losses import distortion_loss, interl
 HALVES = [torch.float16, torch.bfloat16]
 GAUSSIANS: tuple[Gaussian, ...] = ("point", "interval")
 
+
 # ---- losses ----------------------------------------------------------------------------------------------------
-
-
 def samples(dtype: torch.dtype, rays: int = 7, count: int = 12) -> tuple[torch.Tensor, ...]:
     """Edges and weights along rays: some of no length, some far, one backwards, some weights 0."""
     torch.manual_seed(1)
@@ -90,8 +87,6 @@ def test_the_losses_of_samples_are_finite(dtype: torch.dtype) -> None:
 
 
 # ---- integration -----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("dtype", [*HALVES, torch.float32])
 @pytest.mark.parametrize("autocast", [None, *HALVES])
 @pytest.mark.parametrize("normalise", ["pooled", "per-source"])
@@ -124,8 +119,6 @@ def test_maps_of_next_to_nothing(shape: tuple[int, ...]) -> None:
 
 
 # ---- hostile scenes --------------------------------------------------------------------------------------------
-
-
 def copied(folder: Path, frames: int = 6) -> Path:
     """A camera's first frames of the sample drive."""
     copy_sample_drive(folder)
@@ -298,8 +291,6 @@ def test_a_step_under_autocast_is_finite(tmp_path: Path, implementation: str) ->
 
 
 # ---- where it is not finite ------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def short(tmp_path_factory: pytest.TempPathFactory) -> Any:
     folder = tmp_path_factory.mktemp("short")
@@ -359,8 +350,6 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(short: Any, m
 
 
 # ---- taken up again --------------------------------------------------------------------------------------------
-
-
 def test_the_last_whole_checkpoint_is_taken_up(short: Any, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(short.checkpoint_dir, tmp_path / "checkpoints"))
     newest = folder / "step-000000003.ckpt"

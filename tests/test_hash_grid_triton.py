@@ -1,7 +1,5 @@
 """The hash grid's Triton kernels against the CPU's kernels, in Triton's interpreter; and compiled."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from ahead_of_time import ARCHITECTURES, check_registers

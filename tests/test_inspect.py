@@ -1,7 +1,5 @@
 """Looking at a scene: its figures against independent numbers, its warnings, its pictures pixel by pixel."""
 
-from __future__ import annotations
-
 import io
 import json
 import math
@@ -68,11 +66,8 @@ def look(scene: Path, output: Path, **options: Any) -> dict[str, Any]:
 
 
 # ---- the sample drive ------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def sample(sample_drive, tmp_path_factory):
-    """The summary of the sample drive, where it was written, and the scene's files before and after."""
     output = tmp_path_factory.mktemp("inspection") / "out"
 
     def files() -> list[Path]:
@@ -262,7 +257,6 @@ def test_the_figures_in_the_terminal(sample_drive, tmp_path):
 
 
 # ---- small drives with one fault each --------------------------------------------------------------------------
-
 SIZE = (16, 12)
 
 
@@ -296,19 +290,10 @@ def write_drive(folder: Path, numbers: int = 12, cameras: tuple[str, ...] = ("le
         "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
         "1.0 3.0 0.0\n4.0 -2.0 1.0\n"
     )
-    write_json(
-        folder / "transforms.json",
-        {
-            "camera_model": "PINHOLE",
-            **{"w": SIZE[0], "h": SIZE[1], "fl_x": 8.0, "fl_y": 8.0, "cx": 8.0, "cy": 6.0},
-            "camera_fits": {camera: {"rms_px": 0.01, "max_px": 0.03, "theta_max_deg": 90.0} for camera in cameras},
-            "frames": frames,
-            "train_filenames": names[False],
-            "val_filenames": names[True],
-            "test_filenames": names[True],
-            "ply_file_path": "points.ply",
-        },
-    )
+    meta = {"camera_model": "PINHOLE", "w": SIZE[0], "h": SIZE[1], "fl_x": 8.0, "fl_y": 8.0, "cx": 8.0, "cy": 6.0}
+    meta["camera_fits"] = {camera: {"rms_px": 0.01, "max_px": 0.03, "theta_max_deg": 90.0} for camera in cameras}
+    meta |= {"train_filenames": names[False], "val_filenames": names[True], "test_filenames": names[True]}
+    write_json(folder / "transforms.json", {**meta, "frames": frames, "ply_file_path": "points.ply"})
     return folder
 
 
@@ -377,13 +362,7 @@ def without(*keys: str):
 POSES_AND_LISTS = [
     (shift_from(5, 4.8), "gap", ("left",), (4, 5), "Frames 4 and 5 are 5.3 m apart, 11 times the usual 0.5 m"),
     (turn_from(9, 30), "turn", ("left",), (8, 9), "From frame 8 to 9 the camera turns by 30 degrees"),
-    (
-        lambda meta: meta["frames"][7].update(timestamp_s=50.6),
-        "timestamps",
-        ("left",),
-        (7,),
-        "do not increase at frame 7",
-    ),
+    (lambda meta: meta["frames"][7].update(timestamp_s=50.6), "timestamps", ("left",), (7,), "not increase at frame 7"),
     (lambda meta: meta["camera_fits"]["left"].update(rms_px=0.2), "fit", ("left",), (), "0.20 px rms"),
     (all_in, "no_held_out", (), (), "--holdout-every"),
     (without("train_filenames", "val_filenames", "test_filenames"), "no_split", (), (), "every eighth"),
@@ -392,13 +371,7 @@ POSES_AND_LISTS = [
     (without("mono_file_path", "lidar_file_path", "frame"), "no_prior", (), (), "plain nerfacto"),
     (without("mask_path"), "no_mask", (), (), "--ego-mask"),
     (without("ply_file_path"), "no_points", (), (), "ply_file_path"),
-    (
-        lambda meta: meta["frames"][3].pop("mono_file_path"),
-        "incomplete",
-        (),
-        (),
-        "mono_file_path is given for 11 of 12 pictures",
-    ),
+    (lambda meta: meta["frames"][3].pop("mono_file_path"), "incomplete", (), (), "mono_file_path is given for 11 of"),
 ]
 
 
@@ -450,21 +423,15 @@ def sparse(lidar):
     return lidar
 
 
+EVERY = tuple(range(12))
 CONTENTS = [
     ("lidar", (6,), sparse, "lidar", (6,), "frame 6 of left; 50.00% is usual for training"),
     ("images", (2, 3), lambda picture: picture // 3, "dark", (2, 3), "frames 2, 3 of left is dark: mean grey 33"),
     ("images", (8,), lambda picture: picture * 2 + 30, "bright", (8,), "frame 8 of left is bright"),
-    ("mono", tuple(range(12)), lambda mono: mono * 1.5, "mono_scale", (), "1.57 times LiDAR's in left"),
-    (
-        "mono",
-        tuple(range(12)),
-        lambda mono: mono * np.resize([0.6, 1, 1.6], mono.shape),
-        "mono_shape",
-        (),
-        "by 40% in left",
-    ),
+    ("mono", EVERY, lambda mono: mono * 1.5, "mono_scale", (), "1.57 times LiDAR's in left"),
+    ("mono", EVERY, lambda mono: mono * np.resize([0.6, 1, 1.6], mono.shape), "mono_shape", (), "by 40% in left"),
     ("mono", (1,), lambda mono: mono / 2, "mono_scale", (1,), "0.52 times LiDAR's in frame 1 of left"),
-    ("lidar", tuple(range(12)), np.zeros_like, "lidar", (), "maps of left are empty"),
+    ("lidar", EVERY, np.zeros_like, "lidar", (), "maps of left are empty"),
 ]
 
 
@@ -510,8 +477,6 @@ def test_of_many_warnings_of_a_kind_some_are_printed():
 
 
 # ---- what is measured and shown --------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("numbers", "cameras", "measured"), [(200, 1, 64), (100, 2, 32), (12, 2, 12)])
 def test_long_drives_are_sampled_evenly(tmp_path, numbers, cameras, measured):
     scene = read_scene(write_drive(tmp_path / "drive", numbers, ("left", "right")[:cameras]))
@@ -603,8 +568,6 @@ def test_the_sheet_says_what_a_prior_comes_from(drive):
 
 
 # ---- other people's scenes -------------------------------------------------------------------------------------
-
-
 def test_z_depth_of_a_pinhole_scene_becomes_distance(tmp_path):
     scene = write_scene(tmp_path / "scene", [pinhole()], lidar=False, mono=False, mask=False, truth=False, split=False)
     meta = read_json(scene / "transforms.json")
@@ -645,8 +608,6 @@ def test_cameras_and_frames_without_names(drive):
 
 
 # ---- bad input -------------------------------------------------------------------------------------------------
-
-
 SPOILT: dict[str, Callable[[Path], Any]] = {
     "process": shutil.rmtree,
     "not valid JSON": lambda drive: cut(drive / "transforms.json"),
@@ -656,9 +617,7 @@ SPOILT: dict[str, Callable[[Path], Any]] = {
     "cannot be read as a PLY": lambda drive: cut(drive / "points.ply"),
     "EQUIRECTANGULAR": lambda drive: change(drive, lambda meta: meta.update(camera_model="EQUIRECTANGULAR")),
     "fl_x is None": lambda drive: change(drive, without("fl_x")),
-    "transform_matrix": lambda drive: change(
-        drive, lambda meta: meta["frames"][2].update(transform_matrix=[[1, 2, 3]])
-    ),
+    "transform_matrix": lambda drive: change(drive, lambda meta: meta["frames"][2].update(transform_matrix=[[1, 2]])),
     "9×9": lambda drive: write_png(drive / "images/left/0000000000.png", np.zeros((9, 9, 3), np.uint8)),
     "1000000000×1000000000": lambda drive: change(drive, lambda meta: meta.update(w=10**9, h=10**9)),
     "cannot be decoded": lambda drive: (drive / "mono/left/0000000000.png").write_bytes(b"no picture"),
@@ -700,15 +659,12 @@ def test_the_command_runs_without_nerfstudio(drive, tmp_path):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "out" / "top_view.png").is_file()
-    spoiled = subprocess.run(
-        [sys.executable, "-c", code.replace("'1'", "'0'")], capture_output=True, text=True, check=False
-    )
+    wrong = [sys.executable, "-c", code.replace("'1'", "'0'")]
+    spoiled = subprocess.run(wrong, capture_output=True, text=True, check=False)
     assert spoiled.returncode == 2 and spoiled.stderr.startswith("edge-depth-nerf: --frames 0")
 
 
 # ---- drawing ---------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("map_size", "size"), [(128, 640), (128, 128), (1400, 700), (350, 640)])
 def test_points_are_drawn_where_they_are(map_size, size):
     """Lone returns become discs around their own pixel's centre, in their own colour."""

@@ -1,15 +1,13 @@
 """JBNU-Depth360: its folders with a calibration and poses handed in go the whole way; the page's example is read."""
 
-from __future__ import annotations
-
 import re
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from drives import Change, spoil
 from rich.console import Console
-from test_real import train
+from trainings import train
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_json, write_png
@@ -35,14 +33,8 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def options(root: Path, **changes) -> JbnuDepth360Options:
-    given = {
-        "root": root,
-        "calibration": root / "calibration.toml",
-        "output": root.parent / "scene",
-        "strict": True,
-        **changes,
-    }
-    return JbnuDepth360Options(**given)
+    given = {"root": root, "calibration": root / "calibration.toml", "output": root.parent / "scene", "strict": True}
+    return JbnuDepth360Options(**given | changes)
 
 
 @pytest.fixture(scope="module")
@@ -74,14 +66,12 @@ def test_four_fisheyes_make_a_scene(scene: Path, drive: Path) -> None:
         assert np.mean(np.concatenate(errors) < 0.05) > 0.8
 
 
-def test_it_trains(scene: Path) -> None:
-    _, losses = train(scene, 25)
+def test_it_trains(scene: Path, tmp_path: Path) -> None:
+    _, losses = train(scene, tmp_path, 25)
     assert np.mean(losses[-5:]) < 0.6 * np.mean(losses[:3])
 
 
 # ---- as published: the front camera alone, without calibration ---------------------------------------------------
-
-
 @pytest.fixture
 def published(tmp_path: Path) -> Path:
     """A sequence of six frames, of which one has no picture, and the page's calibration."""
@@ -166,25 +156,16 @@ def test_a_key_in_the_file_replaces_its_assumption_alone(published: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("spoil", "message"),
+    ("file", "change", "message"),
     [
-        (lambda root: shutil.rmtree(root / "bin"), r"test_1/bin: no such folder; .* holds image.*sequence's folder"),
-        (
-            lambda root: (root / "bin/000021.bin").write_bytes(bytes(30)),
-            r"000021\.bin: 30 bytes, expected a multiple of 16",
-        ),
-        (lambda root: (root.parents[1] / "calibration.toml").unlink(), r"calibration\.toml: no such file"),
-        (
-            lambda root: (root.parents[1] / "calibration.toml").write_text("cameras = 3"),
-            r"calibration\.toml: cameras is 3, expected tables",
-        ),
-        (
-            lambda root: (root.parents[1] / "calibration.toml").write_text("[cameras.front]"),
-            r"cameras\.front\.fx is missing",
-        ),
+        ("230329/test_1/bin", None, r"test_1/bin: no such folder; .* holds image.*sequence's folder"),
+        ("230329/test_1/bin/000021.bin", bytes(30), r"000021\.bin: 30 bytes, expected a multiple of 16"),
+        ("calibration.toml", None, r"calibration\.toml: no such file"),
+        ("calibration.toml", b"cameras = 3", r"calibration\.toml: cameras is 3, expected tables"),
+        ("calibration.toml", b"[cameras.front]", r"cameras\.front\.fx is missing"),
     ],
 )
-def test_what_is_wrong_is_said(published: Path, spoil, message: str) -> None:
-    spoil(published)
+def test_what_is_wrong_is_said(published: Path, file: str, change: Change, message: str) -> None:
+    spoil(published.parents[1], file, change)
     with pytest.raises((InputError, FileNotFoundError), match=message):
         read_jbnu_depth360(given(published))

@@ -1,7 +1,5 @@
 """JPEGs of which a part is missing are told from whole ones, of whatever kind these are."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 

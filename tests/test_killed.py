@@ -1,7 +1,5 @@
 """Killed at any moment, broken caches, two at once, full disks: what is there afterwards is right, or made again."""
 
-from __future__ import annotations
-
 import copy
 import errno
 import io
@@ -21,6 +19,7 @@ import pytest
 import torch
 from drives import SEQUENCE, RoomDrive, write_room_drive
 from rich.console import Console
+from scenes import tree as contents
 from scenes import write_scene
 
 from edge_depth_nerf import entry
@@ -52,10 +51,6 @@ DEAD = 2**22 + 1
 """No process has such a number."""
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
-
-
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> RoomDrive:
     return write_room_drive(tmp_path_factory.mktemp("room") / "drive", frames=5, beams=800, size=32)
@@ -67,8 +62,6 @@ def options_of(room: RoomDrive, output: Path, **changes) -> Kitti360Options:
 
 
 # ---- files and caches ------------------------------------------------------------------------------------------
-
-
 def test_a_sealed_file_is_whole_or_not_there(tmp_path: Path) -> None:
     path = tmp_path / "a.bin"
     write_checked(path, 3, lambda file: [file.write(b"one"), file.write(b" two")])
@@ -198,7 +191,6 @@ def test_the_same_weights_are_the_same_bytes(tmp_path: Path) -> None:
 
 
 # ---- two at once -----------------------------------------------------------------------------------------------
-
 HOLD = """
 import sys, time
 from pathlib import Path
@@ -248,7 +240,6 @@ def test_two_processes_on_one_scene(room: RoomDrive, tmp_path: Path) -> None:
 
 
 # ---- killed ----------------------------------------------------------------------------------------------------
-
 DIE_AT_REPLACE = """
 import os, sys
 replace, last = os.replace, sys.argv.pop(1)
@@ -339,8 +330,6 @@ def test_the_newest_whole_checkpoint_is_taken(tmp_path: Path) -> None:
 
 
 # ---- disks -----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EACCES])
 def test_a_file_that_cannot_be_written_is_named(tmp_path: Path, number: int, monkeypatch: pytest.MonkeyPatch) -> None:
     write_bytes(tmp_path / "a.bin", b"before")

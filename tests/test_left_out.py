@@ -1,17 +1,14 @@
 """Broken and missing files in the middle of a drive: left out and named, not fatal; fatal under --strict."""
 
-from __future__ import annotations
-
 import os
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from drives import SEQUENCE, RoomDrive, halve, write_mono, write_points, write_room_drive
+from drives import SEQUENCE, Change, RoomDrive, cut, halve, spoil, write_mono, write_points, write_room_drive
 from rich.console import Console
-from test_scene import tree as contents
+from scenes import tree as contents
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json, write_distance_png
@@ -47,47 +44,30 @@ def damage(path: Path) -> None:
     path.write_bytes(content)
 
 
-def mono(drive: RoomDrive, frame: int) -> Path:
-    return drive.root.parent / f"mono/image_02/{frame:010d}.png"
+PICTURE = f"drive/data_2d_raw/{SEQUENCE}/image_03/data_rgb/0000000005.png"
+SWEEP = f"drive/data_3d_raw/{SEQUENCE}/velodyne_points/data/0000000007.bin"
+MONO = "mono/image_02/0000000006.png"
+MISSING = {PICTURE: {("image_03", 5)}, SWEEP: {("image_02", 7), ("image_03", 7)}, MONO: {("image_02", 6)}}
+"""Pictures that are left out with these files."""
 
 
-FAULTS: dict[str, tuple[Callable[[RoomDrive], object], set[tuple[str, int]], str]] = {
-    "truncated picture": (lambda d: halve(d.image("image_03", 5)), {("image_03", 5)}, r"0000000005\.png: truncated"),
-    "damaged picture": (
-        lambda d: damage(d.image("image_03", 5)),
-        {("image_03", 5)},
-        r"0000000005\.png: (damaged|cannot be decoded)",
-    ),
-    "empty picture": (lambda d: d.image("image_03", 5).write_bytes(b""), {("image_03", 5)}, "not a PNG"),
-    "truncated sweep": (
-        lambda d: d.sweep(7).write_bytes(d.sweep(7).read_bytes()[:-3]),
-        {("image_02", 7), ("image_03", 7)},
-        r"0000000007\.bin: .* bytes, expected a multiple of 16",
-    ),
-    "sweep of NaN": (
-        lambda d: write_points(d.sweep(7), np.full((50, 3), np.nan)),
-        {("image_02", 7), ("image_03", 7)},
-        r"0000000007\.bin: none of its 50 points can be used",
-    ),
-    "missing monocular map": (lambda d: mono(d, 6).unlink(), {("image_02", 6)}, r"0000000006\.png: no such file"),
-    "damaged monocular map": (
-        lambda d: damage(mono(d, 6)),
-        {("image_02", 6)},
-        r"0000000006\.png: (damaged|cannot be decoded)",
-    ),
-    "empty monocular map": (
-        lambda d: write_distance_png(mono(d, 6), np.zeros((32, 32))),
-        {("image_02", 6)},
-        "contains no distance",
-    ),
-}
+@pytest.mark.parametrize(
+    ("file", "change", "message"),
+    [
+        (PICTURE, halve, r"0000000005\.png: truncated"),
+        (PICTURE, damage, r"0000000005\.png: (damaged|cannot be decoded)"),
+        (PICTURE, b"", "not a PNG"),
+        (SWEEP, cut, r"0000000007\.bin: .* bytes, expected a multiple of 16"),
+        (SWEEP, lambda path: write_points(path, np.full((50, 3), np.nan)), "7.bin: none of its 50 points can be used"),
+        (MONO, None, r"0000000006\.png: no such file"),
+        (MONO, damage, r"0000000006\.png: (damaged|cannot be decoded)"),
+        (MONO, lambda path: write_distance_png(path, np.zeros((32, 32))), "contains no distance"),
+    ],
+)
+def test_a_broken_file_is_left_out_and_named(drive: RoomDrive, file: str, change: Change, message: str) -> None:
+    spoil(drive.root.parent, file, change)
+    missing, sky = MISSING[file], message == "contains no distance"
 
-
-@pytest.mark.parametrize("fault", FAULTS)
-def test_a_broken_file_is_left_out_and_named(drive: RoomDrive, fault: str) -> None:
-    spoil, missing, message = FAULTS[fault]
-    spoil(drive)
-    sky = fault == "empty monocular map"
     report, said = run(drive, sky=sky)
     scene = report.scene
     meta = read_json(scene / "transforms.json")
@@ -111,18 +91,6 @@ def test_a_broken_file_is_left_out_and_named(drive: RoomDrive, fault: str) -> No
     assert not (drive.root.parent / "strict/transforms.json").exists()
 
 
-def test_a_picture_that_is_mended_comes_into_the_scene(drive: RoomDrive) -> None:
-    path = drive.image("image_03", 5)
-    whole = path.read_bytes()
-    damage(path)
-    run(drive)
-    path.write_bytes(whole)
-    report, said = run(drive)
-    assert report.written and not report.left_out and "Left out" not in said
-    run(drive, "other")
-    assert contents(report.scene) == contents(drive.root.parent / "other")
-
-
 def test_a_mended_file_may_have_an_older_date(drive: RoomDrive) -> None:
     """As `cp -p`, tar and wget leave it."""
     path = drive.image("image_03", 5)
@@ -134,19 +102,20 @@ def test_a_mended_file_may_have_an_older_date(drive: RoomDrive) -> None:
     assert not run(drive)[0].left_out
 
 
-@pytest.mark.parametrize("kind", ["picture", "sweep"])
-def test_a_file_that_is_copied_again_may_have_another_size(drive: RoomDrive, kind: str) -> None:
-    path = drive.image("image_03", 5) if kind == "picture" else drive.sweep(7)
+@pytest.mark.parametrize(("file", "change"), [(PICTURE, damage), (PICTURE, cut), (SWEEP, cut)])
+def test_a_file_that_is_mended_comes_into_the_scene(drive: RoomDrive, file: str, change: Change) -> None:
+    path = drive.root.parent / file
     whole = path.read_bytes()
-    path.write_bytes(whole[:-3])
+    spoil(drive.root.parent, file, change)
     assert run(drive)[0].left_out
     path.write_bytes(whole)
-    report, _ = run(drive)
-    assert not report.left_out and report.training + report.held_out == 24
+    report, said = run(drive)
+    assert report.written and not report.left_out and "Left out" not in said
+    assert report.training + report.held_out == 24
     run(drive, "other")
     assert contents(report.scene) == contents(drive.root.parent / "other")
     # from here on it is whole, and another drive is another drive
-    path.write_bytes(whole[:-3])
+    cut(path)
     with pytest.raises(InputError, match="contains another scene: inputs_sha256"):
         run(drive)
 

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -244,7 +242,6 @@ def test_the_sky_loss_is_the_mean_share_that_is_stopped():
 
 
 def urban_rays(seed: int, dtype: torch.dtype = torch.float64) -> dict:
-    """Random rays, without a σ of each."""
     rays = random_rays(seed, dtype=dtype)
     del rays["sigma_m"]
     return rays

@@ -1,15 +1,13 @@
 """Features matched between pictures, and their distances to epipolar curves: against curves drawn point by point."""
 
-from __future__ import annotations
-
 import math
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from alignment import pose
 from lenses import FISHEYE
-from scipy.spatial.transform import Rotation
 
 from edge_depth_nerf.cameras import Camera, Pinhole
 from edge_depth_nerf.cameras.rays import rays
@@ -32,13 +30,6 @@ PINHOLE = Pinhole(640, 480, 400.0, 405.0, 318.0, 243.0, -0.05, 0.01, 1e-3, -5e-4
 LENSES = [pytest.param(FISHEYE, id="fisheye"), pytest.param(PINHOLE, id="pinhole")]
 
 
-def pose(turn_deg: tuple[float, float, float], position_m: tuple[float, float, float]) -> np.ndarray:
-    found = np.eye(4)
-    found[:3, :3] = Rotation.from_euler("xyz", turn_deg, degrees=True).as_matrix()
-    found[:3, 3] = position_m
-    return found
-
-
 def seen(lens: Camera, points_m: np.ndarray, camera_to_world: np.ndarray) -> np.ndarray:
     """Pixels of points in the world, NaN where the lens has none."""
     in_camera = (points_m - camera_to_world[:3, 3]) @ camera_to_world[:3, :3]
@@ -48,7 +39,6 @@ def seen(lens: Camera, points_m: np.ndarray, camera_to_world: np.ndarray) -> np.
 def matches_of(
     lens: Camera, first: np.ndarray, second: np.ndarray, rng: np.random.Generator, sideways: float = 1.0
 ) -> Matches:
-    """Exact matches of points ahead of the two cameras."""
     away = rng.normal(size=(400, 3))
     away[:, :2] *= sideways
     away[:, 2] = np.abs(away[:, 2]) + 0.5

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import logging
 import math
 
@@ -14,7 +12,6 @@ from edge_depth_nerf.method.metrics import DepthErrors, load_lpips, masked_lpips
 
 
 def pictures(seed: int = 0, height: int = 40, width: int = 50) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """A picture, a noisier one, and a mask that is a disc."""
     generator = torch.Generator().manual_seed(seed)
     target = torch.rand(height // 5, width // 5, 3, generator=generator)
     target = target.repeat_interleave(5, 0).repeat_interleave(5, 1)

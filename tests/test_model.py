@@ -12,13 +12,7 @@ from nerfstudio.model_components.losses import ds_nerf_depth_loss, urban_radianc
 from nerfstudio.model_components.renderers import DepthRenderer
 from nerfstudio.models.nerfacto import NerfactoModel
 
-from edge_depth_nerf.method.depth_losses import (
-    DsNerfLoss,
-    EdgeLoss,
-    Level,
-    UrbanNerfLoss,
-    UrbanNerfSightLoss,
-)
+from edge_depth_nerf.method.depth_losses import DsNerfLoss, EdgeLoss, Level, UrbanNerfLoss, UrbanNerfSightLoss
 from edge_depth_nerf.method.losses import edge_loss, urban_nerf_loss
 from edge_depth_nerf.plugin.compat import lpips_not_built
 from edge_depth_nerf.plugin.model import LossOptions
@@ -77,7 +71,6 @@ def trained_step(model, further=None):
 
 
 def are_taught(parameters) -> bool:
-    """Whether any of them has a gradient."""
     return any(each.grad is not None and bool(each.grad.any()) for each in parameters)
 
 
@@ -220,7 +213,6 @@ def test_without_weight_the_prior_serves_surface_and_sky_alone():
 
 
 def colours_at(model, bundle: RayBundle, distance_units) -> torch.Tensor:
-    """What the field says of places along rays."""
     places = bundle.get_ray_samples(bin_starts=distance_units[:, None, None], bin_ends=distance_units[:, None, None])
     return model.field(places)[FieldHeadNames.RGB][:, 0]
 
@@ -434,9 +426,7 @@ def test_views_are_evaluated_inside_the_mask(monkeypatch, tmp_path):
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     model, outputs, truth = evaluated_view()
     metrics, images = model.get_image_metrics_and_images(outputs, truth)
-    assert set(metrics) == {
-        *("psnr", "ssim", "masked_psnr", "masked_ssim", "truth_masked_psnr", "truth_masked_ssim"),
-    }
+    assert set(metrics) == {*("psnr", "ssim", "masked_psnr", "masked_ssim", "truth_masked_psnr", "truth_masked_ssim")}
     inside = ((outputs["rgb"] - truth["image"])[:, 4:] ** 2).mean()
     assert metrics["masked_psnr"] == pytest.approx(-10 * math.log10(inside), abs=1e-4)
     assert metrics["truth_masked_ssim"] == pytest.approx(1)

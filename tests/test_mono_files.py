@@ -1,7 +1,5 @@
 """Monocular maps by file: formats, units, z and distance, unknown scale, and everything that can be wrong with them."""
 
-from __future__ import annotations
-
 import dataclasses
 import struct
 import sys
@@ -16,7 +14,6 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_json, write_distance_png, write_json, write_png
 from edge_depth_nerf.entry import main
 from edge_depth_nerf.mono.estimate import estimate_depth
-from edge_depth_nerf.mono.files import npy_shape, read_npy
 from edge_depth_nerf.mono.options import EstimateDepthOptions
 from edge_depth_nerf.scene.reader import ScenePicture, read_scene
 
@@ -253,18 +250,6 @@ def test_broken_arrays_are_named_before_any_work(scene, tmp_path, content, expec
     np.save(maps / "images/0000.npy", np.zeros((44, 48)))
     with pytest.raises(InputError, match=rf"0003.npy: .*{expected}"):
         take(scene, maps)
-
-
-def test_a_pickle_is_never_loaded(tmp_path):
-    class Trap:
-        def __reduce__(self):
-            return (Path.touch, (tmp_path / "sprung",))
-
-    np.save(tmp_path / "trap.npy", np.array([[Trap()]], dtype=object), allow_pickle=True)
-    for read in (npy_shape, read_npy):
-        with pytest.raises(InputError, match="holds object"):
-            read(tmp_path / "trap.npy")
-    assert not (tmp_path / "sprung").exists()
 
 
 def test_broken_pngs_are_named_before_any_work(scene, tmp_path):

@@ -1,7 +1,5 @@
 """Ready-made networks: pinhole views of a fisheye picture, views brought to agree and blended, networks from disk."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 from pathlib import Path
@@ -50,7 +48,6 @@ def in_a_room(along: np.ndarray) -> np.ndarray:
 
 
 def layer_of(view: PinholeView, said: np.ndarray) -> Layer:
-    """What a view says."""
     return Layer(view.box, view.back(said.astype(np.float32)), view.cosine, view.weight)
 
 
@@ -185,8 +182,6 @@ def test_layers_are_blended_by_weight_in_log_distance():
 
 
 # ---- scenes -------------------------------------------------------------------------------------------------------
-
-
 def seen_in_the_ball(picture: ScenePicture, in_camera: np.ndarray) -> np.ndarray:
     """Distance from a picture of `write_scene` to the wall, along rays of the camera."""
     world = in_camera @ (picture.rotation @ FLIP[:3, :3]).T
@@ -254,88 +249,43 @@ def test_a_map_that_runs_the_wrong_way_is_told(tmp_path, is_said, kind):
 
 
 # ---- networks from disk -------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def networks(tmp_path_factory) -> Path:
-    """A folder with tiny networks of several architectures, with random weights."""
     transformers = pytest.importorskip("transformers")
     folder = tmp_path_factory.mktemp("networks")
     transformers.utils.logging.disable_progress_bar()
     torch.manual_seed(0)
-    dino = transformers.Dinov2Config(
-        hidden_size=16,
-        num_hidden_layers=2,
-        num_attention_heads=2,
-        mlp_ratio=1,
-        image_size=28,
-        patch_size=14,
-        out_features=["stage1", "stage2"],
-        reshape_hidden_states=False,
+    sizes, square = {"hidden_size": 16, "num_attention_heads": 2}, {"image_size": 32, "patch_size": 16}
+    stages = {"out_features": ["stage1", "stage2"], "reshape_hidden_states": False}
+    dino = transformers.Dinov2Config(**sizes, **stages, num_hidden_layers=2, mlp_ratio=1, image_size=28, patch_size=14)
+    head = {"neck_hidden_sizes": [8, 8], "fusion_hidden_size": 8, "head_hidden_size": 4}
+    parts = {"patch_size": 14, "reassemble_hidden_size": 16, "reassemble_factors": [2, 1]}
+    relative, metric = (
+        transformers.DepthAnythingConfig(backbone_config=dino, **parts, **head, **more)
+        for more in ({}, {"depth_estimation_type": "metric", "max_depth": 80})
     )
-    anything = {
-        "backbone_config": dino,
-        "patch_size": 14,
-        "reassemble_hidden_size": 16,
-        "reassemble_factors": [2, 1],
-        "neck_hidden_sizes": [8, 8],
-        "fusion_hidden_size": 8,
-        "head_hidden_size": 4,
-    }
-    relative = transformers.DepthAnythingConfig(**anything)
-    metric = transformers.DepthAnythingConfig(**anything, depth_estimation_type="metric", max_depth=80)
-    dpt = transformers.DPTConfig(
-        hidden_size=16,
-        num_hidden_layers=4,
-        num_attention_heads=2,
-        intermediate_size=16,
-        image_size=32,
-        patch_size=16,
-        backbone_out_indices=[0, 1, 2, 3],
-        neck_hidden_sizes=[8, 8, 8, 8],
-        fusion_hidden_size=8,
-    )
+    deep, neck = {**sizes, **square, "num_hidden_layers": 4, "intermediate_size": 16}, {"neck_hidden_sizes": [8] * 4}
+    dpt = transformers.DPTConfig(**deep, **neck, backbone_out_indices=[0, 1, 2, 3], fusion_hidden_size=8)
+    ones, eights = [1, 1, 1, 1], [8, 8, 8, 8]
     glpn = transformers.GLPNConfig(
-        depths=[1, 1, 1, 1],
-        hidden_sizes=[8, 8, 8, 8],
-        decoder_hidden_size=8,
-        num_attention_heads=[1, 1, 1, 1],
-        sr_ratios=[1, 1, 1, 1],
-        max_depth=40,
+        depths=ones, hidden_sizes=eights, decoder_hidden_size=8, num_attention_heads=ones, sr_ratios=ones, max_depth=40
     )
+    stages["out_features"] = ["stage1", "stage2", "stage3", "stage4"]
+    beit = transformers.BeitConfig(**deep, **stages, use_relative_position_bias=True)
+    bins = {"bin_configurations": [{"n_bins": 8, "min_depth": 0.1, "max_depth": 80.0, "name": "kitti"}]}
+    few = {"bottleneck_features": 8, "num_relative_features": 4, "bin_embedding_dim": 8, "num_attractors": [2] * 4}
     zoe = transformers.ZoeDepthConfig(
-        backbone_config=transformers.BeitConfig(
-            hidden_size=16,
-            num_hidden_layers=4,
-            num_attention_heads=2,
-            intermediate_size=16,
-            image_size=32,
-            patch_size=16,
-            out_features=["stage1", "stage2", "stage3", "stage4"],
-            reshape_hidden_states=False,
-            use_relative_position_bias=True,
-        ),
-        backbone_hidden_size=16,
-        neck_hidden_sizes=[8, 8, 8, 8],
-        fusion_hidden_size=8,
-        bottleneck_features=8,
-        num_relative_features=4,
-        bin_embedding_dim=8,
-        num_attractors=[2, 2, 2, 2],
-        bin_configurations=[{"n_bins": 8, "min_depth": 0.1, "max_depth": 80.0, "name": "kitti"}],
+        backbone_config=beit, backbone_hidden_size=16, fusion_hidden_size=8, **neck, **few, **bins
     )
+    square_px = {"height": 32, "width": 32}
     fourteen = transformers.DPTImageProcessor(size={"height": 28, "width": 28}, ensure_multiple_of=14)
-    sixteen = transformers.DPTImageProcessor(size={"height": 32, "width": 32})
+    sixteen = transformers.DPTImageProcessor(size=square_px)
     for name, model, processor in (
         ("anything", transformers.DepthAnythingForDepthEstimation(relative), fourteen),
         ("anything-metric", transformers.DepthAnythingForDepthEstimation(metric), fourteen),
         ("dpt", transformers.DPTForDepthEstimation(dpt), sixteen),
         ("glpn", transformers.GLPNForDepthEstimation(glpn), transformers.GLPNImageProcessor()),
-        (
-            "zoe",
-            transformers.ZoeDepthForDepthEstimation(zoe),
-            transformers.ZoeDepthImageProcessor(size={"height": 32, "width": 32}),
-        ),
+        ("zoe", transformers.ZoeDepthForDepthEstimation(zoe), transformers.ZoeDepthImageProcessor(size=square_px)),
         # the trunk of a depth network, and one that knows no depth
         ("trunk", transformers.DPTModel(dpt), sixteen),
         ("dino", transformers.Dinov2Model(dino), sixteen),
@@ -347,13 +297,7 @@ def networks(tmp_path_factory) -> Path:
 
 @pytest.mark.parametrize(
     ("name", "kind"),
-    [
-        ("anything", "inverse"),
-        ("anything-metric", "metric"),
-        ("dpt", "inverse"),
-        ("glpn", "metric"),
-        ("zoe", "metric"),
-    ],
+    [("anything", "inverse"), ("anything-metric", "metric"), ("dpt", "inverse"), ("glpn", "metric"), ("zoe", "metric")],
 )
 def test_networks_say_what_their_maps_are(networks, name, kind):
     network = load_ready_network(str(networks / name))

@@ -1,7 +1,5 @@
 """The monocular network: losses, lens-true augmentation, training, weights on disk, maps in scenes."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import json
@@ -17,7 +15,7 @@ import torch
 from rich.console import Console
 from safetensors import safe_open
 from safetensors.torch import load_file, save, save_file
-from scenes import fisheye, frame_entry, write_scene
+from scenes import fisheye, frame_entry, tree, write_scene
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import (
@@ -67,7 +65,7 @@ from edge_depth_nerf.scene.reader import read_scene
 
 pytestmark = pytest.mark.slow
 
-CPU = torch.device("cpu")
+CPU, QUIET = torch.device("cpu"), Console(quiet=True)
 HEIGHT_M = 1.5
 TINY = NetworkSettings((8, 16), 32, HEIGHT_M, 5.0)
 LENS = KannalaBrandt(40, 36, 11.0, 11.2, 20.7, 17.1, 0.01, -0.003, 0.0, 0.0, 1e-3, -2e-3)
@@ -79,11 +77,6 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
-
-
-@pytest.fixture
-def quiet() -> Console:
-    return Console(quiet=True, file=io.StringIO())
 
 
 def write_street(folder: Path, frames: int = 10, seed: int = 0, lidar: bool = True) -> Path:
@@ -150,14 +143,11 @@ def examples_of(scene: Path, held_out: bool = False) -> Examples:
 
 
 def same(one: DepthNetwork, other: DepthNetwork) -> bool:
-    """Whether two networks have the same weights."""
     weights, others = one.state_dict(), other.state_dict()
     return weights.keys() == others.keys() and all(torch.equal(weights[name], others[name]) for name in weights)
 
 
 # ---- losses ----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("balance", [0.0, 0.5, 1.0])
 def test_scale_invariant_loss_is_its_formula_averaged_over_pictures(balance):
     rng = np.random.default_rng(0)
@@ -204,8 +194,6 @@ def test_the_room_is_its_floor_and_its_wall():
 
 
 # ---- augmentation ----------------------------------------------------------------------------------------------
-
-
 def test_mirrored_and_cut_pictures_still_show_the_plane_they_showed(small_street):
     """A rendered floor: after any augmentation the ray of each pixel still meets it at the pixel's distance."""
     height_m, examples = 1.3, examples_of(small_street)
@@ -281,8 +269,6 @@ def test_the_camera_height_is_that_above_the_floor(small_street):
 
 
 # ---- training --------------------------------------------------------------------------------------------------
-
-
 def test_it_learns_what_colours_mean(street):
     """Held-out pictures of a toy street, against truth, beside the best constant and the plain room."""
     scene = read_scene(street)
@@ -417,15 +403,13 @@ def test_what_is_kept_for_stopping_are_whole_training_frames(tmp_path):
 
 
 # ---- the command -----------------------------------------------------------------------------------------------
-
-
-def test_held_out_pictures_have_no_say_and_the_command_continues(small_street, tmp_path, quiet):
+def test_held_out_pictures_have_no_say_and_the_command_continues(small_street, tmp_path):
     other = tmp_path / "other"
     shutil.copytree(small_street, other)
     held_out = "0004.png"
     write_png(other / "images" / held_out, np.full((LENS.height, LENS.width, 3), 200, np.uint8))
     write_distance_png(other / "lidar" / held_out, np.full((LENS.height, LENS.width), 33.0))
-    reports = [estimate_depth(EstimateDepthOptions((scene,), train_steps=6), quiet) for scene in (small_street, other)]
+    reports = [estimate_depth(EstimateDepthOptions((scene,), train_steps=6), QUIET) for scene in (small_street, other)]
     weights = [load_file(report.weights) for report in reports]
     assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
     assert reports[0].trained is not None and reports[0].trained.steps == 6 and reports[0].predicted == 10
@@ -435,16 +419,14 @@ def test_held_out_pictures_have_no_say_and_the_command_continues(small_street, t
     assert entry["trained_frames"] == [f"images/{number:04d}.png" for number in (0, 1, 2, 3, 6, 7, 8, 9)]
 
     # what is trained is not trained again, until something is asked for differently
-    assert estimate_depth(EstimateDepthOptions((small_street,), train_steps=6), quiet).trained is None
-    assert estimate_depth(EstimateDepthOptions((small_street,), train_steps=7), quiet).trained is not None
+    assert estimate_depth(EstimateDepthOptions((small_street,), train_steps=6), QUIET).trained is None
+    assert estimate_depth(EstimateDepthOptions((small_street,), train_steps=7), QUIET).trained is not None
 
 
-def test_a_network_whose_time_was_up_early_is_told_of(small_street):
-    said_to = io.StringIO()
-    console = Console(file=said_to, width=200)
-    report = estimate_depth(EstimateDepthOptions((small_street,), train_steps=100_000, seconds=0.3), console)
+def test_a_network_whose_time_was_up_early_is_told_of(small_street, capsys):
+    report = estimate_depth(EstimateDepthOptions((small_street,), train_steps=100_000, seconds=0.3), Console(width=200))
     assert report.trained is not None and report.trained.steps < 200
-    said = said_to.getvalue()
+    said = capsys.readouterr().out
     assert f"Trained {report.trained.steps} steps of 100,000, where the time limit was reached, in " in said
     assert "make poor maps: increase --seconds" in said
 
@@ -495,10 +477,10 @@ def test_a_map_has_the_size_of_its_picture_and_begins_as_the_room(small_street):
     np.testing.assert_allclose(found[inside], np.minimum(wall_m, floor_m)[inside], rtol=1e-4)
 
 
-def test_training_goes_on_from_given_weights(small_street, tmp_path, quiet):
+def test_training_goes_on_from_given_weights(small_street, tmp_path):
     settings, start = dataclasses.replace(TINY, camera_height_m=1.0), tmp_path / "start.safetensors"
     save_network(start, DepthNetwork(settings), {})
-    report = estimate_depth(EstimateDepthOptions((small_street,), model=start, train_steps=2), quiet)
+    report = estimate_depth(EstimateDepthOptions((small_street,), model=start, train_steps=2), QUIET)
     network, _ = load_network(report.weights)
     assert report.weights == small_street / WEIGHTS and network.settings == settings
     assert float(network.head.weight.detach().abs().max()) > 0
@@ -524,32 +506,32 @@ def test_weights_in_the_scene_that_are_of_no_use_are_made_anew(small_street, con
     assert load_network(path)[1]["steps"] == 1
 
 
-def test_no_file_of_others_is_overwritten(small_street, tmp_path, quiet):
+def test_no_file_of_others_is_overwritten(small_street, tmp_path):
     path = tmp_path / "theirs.safetensors"
     options = EstimateDepthOptions((small_street,), train_steps=1, output=path)
     for content in (save({"a": torch.zeros(2)}, {"format": "pt"}), b"no safetensors"):
         path.write_bytes(content)
         with pytest.raises(InputError, match="was not written by `estimate-depth`"):
-            estimate_depth(options, quiet)
+            estimate_depth(options, QUIET)
         assert path.read_bytes() == content
     # what was written by another version of this project may go
     save_file({"a": torch.zeros(2)}, path, {"architecture": "edge-depth-nerf/u-net-0", "header": "{}"})
-    estimate_depth(options, quiet)
+    estimate_depth(options, QUIET)
     assert load_network(path)[1]["steps"] == 1
 
 
-def test_training_never_writes_over_the_weights_it_starts_from(small_street, tmp_path, monkeypatch, quiet):
+def test_training_never_writes_over_the_weights_it_starts_from(small_street, tmp_path, monkeypatch):
     path = small_street / WEIGHTS
     save_network(path, DepthNetwork(TINY), {})
     before = path.read_bytes()
     monkeypatch.chdir(small_street)
     for model in (path, Path(WEIGHTS), tmp_path / "street" / ".." / "street" / WEIGHTS):
         with pytest.raises(InputError, match="Name another file with --output"):
-            estimate_depth(EstimateDepthOptions((small_street,), model=model, train_steps=1), quiet)
+            estimate_depth(EstimateDepthOptions((small_street,), model=model, train_steps=1), QUIET)
     assert path.read_bytes() == before
     other = EstimateDepthOptions((small_street,), model=path, train_steps=1, output=tmp_path / "on.safetensors")
-    assert estimate_depth(other, quiet).trained is not None
-    assert estimate_depth(other, quiet).trained is None
+    assert estimate_depth(other, QUIET).trained is not None
+    assert estimate_depth(other, QUIET).trained is None
     assert path.read_bytes() == before
 
 
@@ -562,13 +544,13 @@ def test_pictures_kept_for_stopping_without_points(small_street):
     assert about["steps"] == 2 and about["abs_rel"] is None
 
 
-def test_scenes_of_one_name_keep_their_own_trained_frames(tmp_path, quiet):
+def test_scenes_of_one_name_keep_their_own_trained_frames(tmp_path):
     one = write_street(tmp_path / "a" / "scene", frames=10, seed=1)
     other = write_street(tmp_path / "b" / "scene", frames=4, seed=2)
     unseen = write_street(tmp_path / "c" / "scene", frames=10, seed=3)
-    report = estimate_depth(EstimateDepthOptions((one, other), train_steps=1), quiet)
+    report = estimate_depth(EstimateDepthOptions((one, other), train_steps=1), QUIET)
     moved = other.rename(tmp_path / "elsewhere")
-    estimate_depth(EstimateDepthOptions((unseen, moved), model=report.weights), quiet)
+    estimate_depth(EstimateDepthOptions((unseen, moved), model=report.weights), QUIET)
 
     def frames(scene: Path) -> list[str]:
         return [str(Path(name).stem) for name in read_json(scene / "transforms.json")["mono"]["trained_frames"]]
@@ -578,7 +560,7 @@ def test_scenes_of_one_name_keep_their_own_trained_frames(tmp_path, quiet):
     assert frames(unseen) == []
 
 
-def test_the_field_of_the_training_points_goes_with_weights_and_maps(tmp_path, quiet):
+def test_the_field_of_the_training_points_goes_with_weights_and_maps(tmp_path):
     low, high = (write_street(tmp_path / name, seed=seed) for seed, name in enumerate(("low", "high")))
     expected = []
     for folder, sign in ((low, 1), (high, -1)):
@@ -600,17 +582,17 @@ def test_the_field_of_the_training_points_goes_with_weights_and_maps(tmp_path, q
         expected.append(np.quantile(np.concatenate(up), [0.001, 0.999]))
     expected = [min(e[0] for e in expected), max(e[1] for e in expected)]
     assert expected[0] < -30 and expected[1] > 30
-    report = estimate_depth(EstimateDepthOptions((low, high), train_steps=1), quiet)
+    report = estimate_depth(EstimateDepthOptions((low, high), train_steps=1), QUIET)
     # pixels are degrees apart
     found = load_network(report.weights)[1]["field_deg"]
     assert found == pytest.approx(expected, abs=0.5)
     target = write_street(tmp_path / "target", frames=2, seed=5, lidar=False)
-    estimate_depth(EstimateDepthOptions((target,), model=report.weights), quiet)
+    estimate_depth(EstimateDepthOptions((target,), model=report.weights), QUIET)
     assert read_json(target / "transforms.json")["mono"]["field_deg"] == found
 
     # weights of before have none
     save_network(tmp_path / "old.safetensors", DepthNetwork(TINY), {"trained_frames": {"target": ["x"]}})
-    estimate_depth(EstimateDepthOptions((target,), model=tmp_path / "old.safetensors"), quiet)
+    estimate_depth(EstimateDepthOptions((target,), model=tmp_path / "old.safetensors"), QUIET)
     entry = read_json(target / "transforms.json")["mono"]
     assert "field_deg" not in entry and entry["trained_frames"] == ["x"]
 
@@ -650,14 +632,14 @@ def test_bad_weights_are_named(tmp_path, small_street, monkeypatch, capsys):
         load_network(path)
 
 
-def test_bad_scenes_and_options_are_named(tmp_path, small_street, quiet):
+def test_bad_scenes_and_options_are_named(tmp_path, small_street):
     no_lidar = write_street(tmp_path / "no_lidar", frames=3, lidar=False)
     with pytest.raises(InputError, match="has no LiDAR maps"):
-        estimate_depth(EstimateDepthOptions((no_lidar,)), quiet)
+        estimate_depth(EstimateDepthOptions((no_lidar,)), QUIET)
     with pytest.raises(InputError, match="given twice"):
-        estimate_depth(EstimateDepthOptions((small_street, small_street)), quiet)
+        estimate_depth(EstimateDepthOptions((small_street, small_street)), QUIET)
     with pytest.raises(FileNotFoundError):
-        estimate_depth(EstimateDepthOptions((tmp_path / "none",)), quiet)
+        estimate_depth(EstimateDepthOptions((tmp_path / "none",)), QUIET)
     wrong: list[dict[str, Any]] = [{"train_steps": 0}, {"seconds": 0.0}, {"seconds": float("nan")}]
     for bad in [*wrong, {"output": Path("x.pt")}]:
         with pytest.raises(InputError, match="expected"):
@@ -665,12 +647,10 @@ def test_bad_scenes_and_options_are_named(tmp_path, small_street, quiet):
     for lidar in (small_street / "lidar").iterdir():
         write_distance_png(lidar, np.zeros((LENS.height, LENS.width)))
     with pytest.raises(InputError, match="nothing to train on"):
-        estimate_depth(EstimateDepthOptions((small_street,), train_steps=1), quiet)
+        estimate_depth(EstimateDepthOptions((small_street,), train_steps=1), QUIET)
 
 
 # ---- maps in scenes --------------------------------------------------------------------------------------------
-
-
 def test_maps_are_put_into_a_scene_and_nothing_else_changes(tmp_path):
     folder = write_scene(tmp_path / "scene", [fisheye()], frames=4, mono=False, theta_max_deg=60.0)
     (folder / CALIBRATION_FILE).write_text("{}")
@@ -699,11 +679,7 @@ def test_a_run_that_fails_leaves_the_scene_as_it_was(tmp_path):
     folder = write_scene(tmp_path / "scene", [fisheye()], frames=4)
     good = np.full((28, 32), 5.0, np.float32)
     names = [picture.name for picture in read_scene(folder).pictures]
-
-    def state() -> dict[str, bytes]:
-        return {str(path): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
-
-    before = state()
+    before = tree(folder)
 
     def killed():
         yield names[0], good
@@ -711,7 +687,7 @@ def test_a_run_that_fails_leaves_the_scene_as_it_was(tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         write_maps(folder, "mono", killed(), {"trained_on": "scene"})
-    assert state() == before
+    assert tree(folder) == before
     whole = [(name, good) for name in names]
     for maps, match in (
         (whole[:-1], "1 of 4 frames have no monocular map"),
@@ -723,6 +699,6 @@ def test_a_run_that_fails_leaves_the_scene_as_it_was(tmp_path):
     ):
         with pytest.raises(InputError, match=match):
             write_maps(folder, "mono", maps, {"trained_on": "scene"})
-        assert state() == before
+        assert tree(folder) == before
     with pytest.raises(InputError, match="trained_on"):
         write_maps(folder, "mono", whole, {})

@@ -1,7 +1,5 @@
 """Muon: against its formula by singular values, and AdamW beside it against torch's."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -35,7 +33,6 @@ def test_no_gradient_changes_nothing_but_the_decay():
 
 
 def small() -> tuple[nn.Conv2d, nn.Conv2d, nn.Sequential]:
-    """A network's first and last convolution, and the network."""
     torch.manual_seed(0)
     first, last = nn.Conv2d(3, 8, 3), nn.Conv2d(8, 4, 3)
     network = nn.Sequential(first, nn.GroupNorm(2, 8), last).double()

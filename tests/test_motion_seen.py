@@ -1,7 +1,5 @@
 """What motion teaches the depth network, what is left out of it, and the calibration beyond its field that follows."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 
@@ -119,9 +117,7 @@ def test_the_loss_counts_by_weight():
 def test_sigma_falls_with_parallax_and_confidence():
     shape = (1, 3)
     found = MotionDistance(
-        np.full(shape, 10, np.float32),
-        np.array([[0.99, 0.99, 0.75]], np.float32),
-        np.array([[3, 30, 30]], np.float32),
+        np.full(shape, 10, np.float32), np.array([[0.99, 0.99, 0.75]], np.float32), np.array([[3, 30, 30]], np.float32)
     )
     near_none, exact, doubtful = found.sigma_m[0]
     assert exact < near_none and exact < doubtful
@@ -129,7 +125,6 @@ def test_sigma_falls_with_parallax_and_confidence():
 
 
 # ---- beyond LiDAR's field ----------------------------------------------------------------------------------------
-
 SIZE = (80, 120)
 FIELD_TOP_DEG = 2.0
 
@@ -312,8 +307,6 @@ def test_a_scene_keeps_what_was_measured_beyond(tmp_path: Path):
 
 
 # ---- sky ---------------------------------------------------------------------------------------------------------
-
-
 def test_what_is_matched_is_no_sky(tmp_path: Path):
     scene = read_scene(write_scene(tmp_path, [fisheye(96, 84)], frames=3))
     picture = scene.pictures[0]

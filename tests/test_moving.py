@@ -1,7 +1,5 @@
 """Moving things: found in sweeps of small analytic worlds, grown in pictures, and on a synthetic drive."""
 
-from __future__ import annotations
-
 import dataclasses
 import shutil
 from collections.abc import Callable
@@ -10,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from data_sets import beams
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
@@ -37,9 +36,7 @@ PARKED: Box = ((6.0, -6.0, GROUND_M), (10.0, -4.2, -0.3))
 def scanned(boxes: list[Box], origin: np.ndarray) -> np.ndarray:
     """Returns of a scanner over a level ground inside a round wall, with boxes in it; in the world."""
     azimuth, elevation = np.meshgrid(np.radians(np.arange(0, 360, 0.6)), np.radians(np.linspace(-24, 3, 40)))
-    rays = np.stack(
-        (np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)), -1
-    ).reshape(-1, 3)
+    rays = beams(azimuth, elevation)
     flat = np.linalg.norm(rays[:, :2], axis=1)
     along = (rays[:, :2] @ origin[:2]) / flat
     wall = (-along + np.sqrt(along**2 + WALL_M**2 - origin[:2] @ origin[:2])) / flat
@@ -100,8 +97,6 @@ def share_found(sweep: WorldSweep, things: list[Thing], box: Box) -> float:
 
 
 # ---- in sweeps -------------------------------------------------------------------------------------------------
-
-
 def test_one_stretch_of_presence_counts_and_a_mixture_does_not() -> None:
     columns = {
         "gone, there, gone": ("through through met met through through", 4),
@@ -171,8 +166,6 @@ def test_a_sweep_is_evaluated_by_those_near_by_and_by_the_whole_drive() -> None:
 
 
 # ---- in a picture ----------------------------------------------------------------------------------------------
-
-
 def test_points_grow_to_the_outline_that_the_picture_shows() -> None:
     rng = np.random.default_rng(0)
     true = np.zeros((120, 160), bool)
@@ -206,8 +199,6 @@ def test_a_roof_above_the_field_is_where_the_picture_has_an_edge() -> None:
 
 
 # ---- on a drive ------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("traffic") / "drive"

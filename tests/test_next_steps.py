@@ -1,7 +1,5 @@
 """What a command names as the next one: it exists, with these options."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from pathlib import Path

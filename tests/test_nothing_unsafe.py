@@ -1,7 +1,5 @@
 """No data makes this program run code, leave its folder, or load more than weights; see test_unsafe_calls.py, too."""
 
-from __future__ import annotations
-
 import ast
 import pickle
 import re
@@ -45,8 +43,6 @@ class Trap:
 
 
 # ---- checkpoints -----------------------------------------------------------------------------------------------
-
-
 class Pipeline:
     def load_pipeline(self, *_) -> None:
         raise AssertionError("a checkpoint was loaded")
@@ -99,8 +95,6 @@ def test_weights_are_no_pickle(tmp_path):
 
 
 # ---- config.yml ------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def config(tmp_path_factory) -> Path:
     settings = edge_depth_nerf_lite.config
@@ -212,8 +206,6 @@ def test_a_split_that_is_not_listed(tmp_path):
 
 
 # ---- paths -----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", OUTSIDE)
 @pytest.mark.parametrize(
     "key", ["file_path", "mask_path", "depth_file_path", "lidar_file_path", "mono_file_path", "truth_rgb_file_path"]
@@ -248,8 +240,6 @@ def test_a_rig_names_files_of_the_recording(tmp_path, key, name):
 
 
 # ---- the host ----------------------------------------------------------------------------------------------------
-
-
 def test_each_workaround_names_its_issue_and_its_end():
     found = [value for name, value in vars(compat).items() if getattr(value, "__module__", "") == compat.__name__]
     assert len(found) >= 3

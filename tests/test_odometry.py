@@ -1,7 +1,5 @@
 """The path from LiDAR alone, against the true one of rendered sweeps; no pictures are rendered."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math
@@ -82,17 +80,8 @@ def scanned(scene: str, frames: int, rings: int = 32, motion: str = "drive") -> 
         taken = sweep(world, Motion(poses), time_s, np.random.default_rng(frame), SCANNERS[rings])
         points = torch.from_numpy(taken.raw.astype(np.float64))
         read = Sweep(points[:, :3], points[:, 3], 0, 0)
-        sweeps.append(
-            RecordedSweep(
-                Path(f"lidar/{frame}.bin"),
-                time_s,
-                frame,
-                "roof",
-                VELO_TO_POSE,
-                lambda read=read: read,
-                SweepTiming(TURN_S),
-            )
-        )
+        where = (Path(f"lidar/{frame}.bin"), time_s, frame, "roof", VELO_TO_POSE)
+        sweeps.append(RecordedSweep(*where, lambda read=read: read, SweepTiming(TURN_S)))
     lens = Pinhole(64, 48, 40.0, 40.0, 32.0, 24.0)
     to_vehicle = np.eye(4)
     to_vehicle[:3, :3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
@@ -112,8 +101,6 @@ def errors(path: Trajectory, poses: Poses) -> tuple[np.ndarray, np.ndarray, floa
 
 
 # ---- the path --------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", ["street", "turn"])
 def test_the_path_is_right_from_the_first_step(scene):
@@ -192,8 +179,6 @@ def test_pictures_away_from_the_sweeps_are_listed():
 
 
 # ---- the whole way ---------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module", params=["kitti-360", "rig", "jbnu-depth360"])
 def blind(request, tmp_path_factory) -> ProcessOptions:
     """Options for a rendered drive whose poses are taken away; every second frame is asked for."""
@@ -229,8 +214,6 @@ def test_a_drive_without_poses_becomes_a_scene(blind):
 
 
 # ---- how far two paths agree -----------------------------------------------------------------------------------
-
-
 def test_paths_are_compared_in_any_world(tmp_path):
     first = driven(np.full(30, 8.0), np.linspace(0, 0.5, 30), 0.1)
     world = np.eye(4)
@@ -282,8 +265,6 @@ def test_a_path_from_pictures_is_held_against_lidar(tmp_path, monkeypatch):
 
 
 # ---- what it cannot do -----------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("motion", "message"), [("stands", "stands still"), ("turns", r"turns on the spot, by \d+°")])
 def test_a_vehicle_that_goes_nowhere_has_no_path(motion, message):
@@ -336,10 +317,7 @@ def test_the_scanner_with_most_points_is_followed():
 
 
 # ---- paths that no vehicle drives ------------------------------------------------------------------------------
-
-
 def driven(speed_m_s: np.ndarray, course_rad: np.ndarray, interval_s: float) -> Trajectory:
-    """A path of steps, the vehicle looking ahead."""
     ahead = np.stack((np.cos(course_rad), np.sin(course_rad), 0 * course_rad), -1)
     poses = np.tile(np.eye(4), (len(speed_m_s), 1, 1))
     poses[1:, :3, 3] = np.cumsum((ahead * speed_m_s[:, None] * interval_s)[:-1], axis=0)

@@ -1,7 +1,5 @@
 """torch's threads sleep when they have nothing to do."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -114,13 +114,9 @@ def test_the_wheel_works_without_the_sources(wheel, tmp_path):
     assert done.returncode == 0, done.stderr
 
 
-PAGES = [
-    "README.md",
-    "CONTRIBUTING.md",
-    "CHANGELOG.md",
-    "data/README.md",
-    *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md"))),
-]
+PAGES = sorted(
+    str(page.relative_to(ROOT)) for pattern in ("*.md", "data/*.md", "docs/*.md") for page in ROOT.glob(pattern)
+)
 
 
 @pytest.mark.parametrize("page", PAGES)

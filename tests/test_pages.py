@@ -1,7 +1,5 @@
 """The pages: what they tell users to type exists and runs, what is generated is current, the site needs no network."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib.metadata
 import importlib.util
@@ -45,7 +43,6 @@ TIMEOUT_S = 400
 
 
 def load(name: str) -> Any:
-    """A program of docs/ or docs/examples/ as a module."""
     path = DOCS / f"{name}.py"
     specification = importlib.util.spec_from_file_location(path.stem, path)
     assert specification and specification.loader
@@ -56,8 +53,6 @@ def load(name: str) -> Any:
 
 
 # ---- what the pages say ----------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Block:
     """Code of a page that is not of another language."""
@@ -68,7 +63,6 @@ class Block:
 
 
 def blocks(page: str, text: str) -> Iterator[Block]:
-    """Fenced and indented blocks."""
     fenced: list[str] | None = None
     language, indented, is_run = "", [], False
     for line in [*text.splitlines(), "end"]:
@@ -130,7 +124,6 @@ class NotAccepted(AssertionError):
 
 
 def parse(words: list[str]) -> None:
-    """Let the program's own parser read its options, without running it."""
     program, *arguments = words
     try:
         if program == "edge-depth-nerf":
@@ -266,8 +259,6 @@ def test_options_named_in_the_text_exist(page, known_options):
 
 
 # ---- what is generated -----------------------------------------------------------------------------------------
-
-
 def test_the_page_of_options_is_current():
     assert (DOCS / "options.md").read_text(encoding="utf-8") == load("make_options").page(), (
         "run python docs/make_options.py"
@@ -371,20 +362,13 @@ def test_the_kernel_picture_is_of_eq_7(sample_drive):
 
 
 # ---- the site --------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def site(tmp_path_factory) -> Path:
     pytest.importorskip("material", reason="pip install '.[docs]'")
     folder = tmp_path_factory.mktemp("site")
-    done = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)],
-        cwd=ROOT,
-        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    build = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)]
+    environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(build, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return folder
 
@@ -519,8 +503,6 @@ def test_included_code_is_shown(site):
 
 
 # ---- the examples ----------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def clone(tmp_path) -> Path:
     """A folder with what commands of the pages use of the repository; the scene is written into."""
@@ -538,20 +520,11 @@ def run_blocks(page: str, folder: Path) -> str:
         "\n".join(("set -euo pipefail", *marked)),
         flags=re.MULTILINE,
     )
-    done = subprocess.run(
-        ["bash", "-c", script.replace("/DATE/", "/*/")],
-        cwd=folder,
-        env={
-            **os.environ,
-            "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
-            "OMP_NUM_THREADS": "1",
-        },
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        timeout=TIMEOUT_S,
-        check=False,
-    )
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    environment["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    call = ["bash", "-c", script.replace("/DATE/", "/*/")]
+    output: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    done = subprocess.run(call, cwd=folder, env=environment, timeout=TIMEOUT_S, check=False, **output)
     assert done.returncode == 0, done.stdout[-4000:]
     return done.stdout
 

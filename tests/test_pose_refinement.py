@@ -1,7 +1,5 @@
 """Poses that training mends: shared by a frame, in metres, without drift."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from nerfstudio.cameras.rays import RayBundle

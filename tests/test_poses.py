@@ -1,7 +1,5 @@
 """Poses in the formats that people have, against numbers written out by hand."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

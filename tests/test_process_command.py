@@ -1,7 +1,5 @@
 """`process` as a whole: scene, monocular maps and their calibration by one command, each done once."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +24,6 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(autouse=True)
 def small_network(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A network of seconds."""
     small = PresetValues((8, 16, 24), 64, TrainingOptions(steps=12, batch=2, evaluate_every=6))
     monkeypatch.setitem(estimate.PRESETS, "lite", small)
 
@@ -99,10 +96,7 @@ def test_maps_that_came_later_stay(room: RoomDrive, tmp_path: Path) -> None:
     scene = tmp_path / "scene"
     run(options_of(room, scene, estimate_depth=False))
     assert not read_scene(scene).has("mono")
-    names = [picture.name for picture in read_scene(scene).pictures]
-    write_maps(
-        scene, "mono", ((name, np.full((64, 64), 3.0, np.float32)) for name in names), {"trained_on": "elsewhere"}
-    )
+    put_in(scene, 3.0)
     said = run(options_of(room, scene))
     assert "Train" not in said
     meta = read_json(scene / "transforms.json")

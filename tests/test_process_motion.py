@@ -1,7 +1,5 @@
 """Distances from motion for scenes: written whole, continued, made of training pictures alone."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any
@@ -11,6 +9,7 @@ import pytest
 from balls import FISHEYE, THETA_MAX_RAD, in_ball, pose
 from drives import SEQUENCE, write_room_drive
 from rich.console import Console
+from scenes import frame_entry
 
 from edge_depth_nerf.base.files import (
     read_distance_png,
@@ -47,27 +46,14 @@ def write_ball_scene(folder: Path, steps_m: tuple[float, ...] = STEPS_M) -> Path
         grey = np.clip(np.nan_to_num(view.grey), 0, 255).astype(np.uint8)
         write_png(folder / "images" / name, np.repeat(grey[..., None], 3, -1))
         write_distance_png(folder / "truth" / name, np.where(view.used, truth, 0))
-        frames.append(
-            {
-                "file_path": f"images/{name}",
-                "truth_distance_file_path": f"truth/{name}",
-                "mask_path": MASK,
-                "transform_matrix": (place @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist(),
-                **{"w": FISHEYE.width, "h": FISHEYE.height, "fl_x": FISHEYE.fx, "fl_y": FISHEYE.fy},
-                **{key: getattr(FISHEYE, key) for key in ("cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")},
-            }
-        )
+        files = {"truth_distance_file_path": f"truth/{name}", "mask_path": MASK}
+        frames.append(frame_entry(FISHEYE, place, name) | files)
     write_whole_mask(folder)
     names = [frame["file_path"] for frame in frames]
     held_out = names[HELD_OUT : HELD_OUT + 1]
-    meta = {
-        "camera_model": "OPENCV_FISHEYE",
-        "world_offset_m": [0, 0, 0],
-        "theta_max_deg": math.degrees(THETA_MAX_RAD),
-        "frames": frames,
-        "train_filenames": [name for name in names if name not in held_out],
-        **{"val_filenames": held_out, "test_filenames": held_out},
-    }
+    meta = {"camera_model": "OPENCV_FISHEYE", "world_offset_m": [0, 0, 0], "frames": frames}
+    meta |= {"train_filenames": [name for name in names if name not in held_out]}
+    meta |= {"theta_max_deg": math.degrees(THETA_MAX_RAD), "val_filenames": held_out, "test_filenames": held_out}
     write_json(folder / "transforms.json", meta)
     return folder
 
@@ -210,8 +196,7 @@ def test_sweeps_of_other_pictures_are_not_taken(ball: Path, tmp_path: Path, monk
 
 
 @pytest.mark.parametrize(
-    ("steps_m", "reason"),
-    [((0.5,) * 6, "the vehicle stands"), ((0.0, 0.3, 0.6), "2 training pictures are too few")],
+    ("steps_m", "reason"), [((0.5,) * 6, "the vehicle stands"), ((0.0, 0.3, 0.6), "2 training pictures are too few")]
 )
 def test_without_motion_it_says_why(steps_m: tuple[float, ...], reason: str, tmp_path: Path) -> None:
     scene = write_ball_scene(tmp_path, steps_m)

@@ -1,7 +1,5 @@
 """The prose rules: pages, messages and docstrings pass, and riddles of former pages do not."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 import sys

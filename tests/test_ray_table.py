@@ -1,7 +1,5 @@
 """Rays read from the table of a lens against nerfstudio's own."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

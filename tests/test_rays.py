@@ -1,7 +1,5 @@
 """The rays of a lens's pixels, against formulas written out again."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -18,7 +16,6 @@ FOLDS_BACK = MEI(60, 60, 20.0, 20.0, 30.0, 30.0, 1.5, 0.0, 0.0, 0.0, 0.0)
 
 
 def off_axis(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """x and y of each pixel's centre from the principal point, float64."""
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
     return x - camera.cx, y - camera.cy
 

@@ -1,44 +1,18 @@
 """Real KITTI-360 excerpts go the whole way: scene, prior, training, evaluation. Here the geometry must hold and the
 training must learn; how good it gets is a matter of benchmarks/quality/real_drive.py."""
 
-from __future__ import annotations
-
-from copy import deepcopy
-
 import numpy as np
 import pytest
-import torch
-from nerfstudio.configs.method_configs import all_methods
-from nerfstudio.engine.optimizers import Optimizers
 from real_scenes import fisheye_frame_scene, stereo_scene
+from trainings import train
 
 from edge_depth_nerf.base.files import read_distance_png, read_json, read_mask
 
 pytestmark = pytest.mark.slow
 
 
-def train(scene, steps, **model):
-    torch.manual_seed(0)
-    config = deepcopy(all_methods["edge-depth-nerf-lite"])
-    config.pipeline.datamanager.data = scene
-    config.pipeline.datamanager.train_num_rays_per_batch = 256
-    for name, value in {"num_levels": 4, "log2_hashmap_size": 14, **model}.items():
-        setattr(config.pipeline.model, name, value)
-    pipeline = config.pipeline.setup(device="cpu", test_mode="test")
-    optimisers = Optimizers(deepcopy(config.optimizers), pipeline.get_param_groups())
-    colour_losses = []
-    for step in range(steps):
-        optimisers.zero_grad_all()
-        _, losses, _ = pipeline.get_train_loss_dict(step)
-        torch.stack(list(losses.values())).sum().backward()
-        optimisers.optimizer_step_all()
-        colour_losses.append(float(losses["rgb_loss"]))
-        assert np.isfinite(colour_losses[-1])
-    return pipeline, colour_losses
-
-
 def test_the_real_fisheye_frame(real_data, tmp_path):
-    scene = fisheye_frame_scene(real_data, tmp_path, downscale=10)
+    scene = fisheye_frame_scene(real_data, tmp_path / "scene", downscale=10)
     frames = read_json(scene / "transforms.json")["frames"]
     mask = read_mask(scene / frames[0]["mask_path"])
     trained, evaluated = (read_distance_png(scene / frame["lidar_file_path"]) for frame in frames)
@@ -48,14 +22,14 @@ def test_the_real_fisheye_frame(real_data, tmp_path):
     hidden = np.load(real_data / "kitti360_fisheye_frame" / "mask_left_fisheye.npy")
     assert mask.mean() < 1 - hidden.mean()  # the real mask keeps more than the lens circle
 
-    pipeline, losses = train(scene, 200)
+    pipeline, losses = train(scene, tmp_path, 200)
     assert np.mean(losses[-10:]) < 0.3 * np.mean(losses[:5])
     metrics = pipeline.get_average_eval_image_metrics()
     assert np.isfinite(metrics["masked_psnr"]) and metrics["lidar_pixels"] > 20
 
 
 def test_the_real_stereo_drive(real_data, tmp_path):
-    scene = stereo_scene(real_data, tmp_path, downscale=16)
+    scene = stereo_scene(real_data, tmp_path / "scene", downscale=16)
     transforms = read_json(scene / "transforms.json")
     assert len(transforms["frames"]) == 10 and len(transforms["test_filenames"]) == 2
     distance = read_distance_png(scene / transforms["frames"][0]["mono_file_path"])
@@ -63,7 +37,7 @@ def test_the_real_stereo_drive(real_data, tmp_path):
     assert known.mean() > 0.4
     # a street seen from a car: the road some metres ahead, nothing nearer than its bonnet
     assert 2 < np.percentile(distance[known], 5) < np.percentile(distance[known], 95) < 120
-    pipeline, losses = train(scene, 200)
+    pipeline, losses = train(scene, tmp_path, 200)
     assert np.mean(losses[-10:]) < 0.3 * np.mean(losses[:5])
     metrics = pipeline.get_average_eval_image_metrics()
     assert np.isfinite(metrics["masked_psnr"])

@@ -1,8 +1,6 @@
 """The recipes for data sets (docs/examples/*_to_rig.py): small drives in the layouts that are published become scenes
 whose LiDAR lies where it is."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 import subprocess

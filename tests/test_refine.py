@@ -1,17 +1,15 @@
 """Poses refined by features: points seen exactly, from disturbed poses, must bring the true ones back."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from alignment import pose
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
@@ -19,13 +17,7 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras import Camera, KannalaBrandt, Pinhole
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.poses.matches import Matches, sights_of
-from edge_depth_nerf.poses.tracks import (
-    features_joined,
-    join_matches,
-    reprojection_px,
-    spread,
-    triangulate,
-)
+from edge_depth_nerf.poses.tracks import features_joined, join_matches, reprojection_px, spread, triangulate
 from edge_depth_nerf.process.colmap import refine as refining
 from edge_depth_nerf.process.colmap.bundle import Shot, Softness, _Bundle, adjust_bundle
 from edge_depth_nerf.process.colmap.refine import Refinement, _is_check, refine
@@ -35,13 +27,6 @@ from edge_depth_nerf.process.recording import RecordedCamera, RecordedPicture, R
 PINHOLE = Pinhole(640, 480, 400.0, 405.0, 318.0, 243.0, -0.05, 0.01, 1e-3, -5e-4)
 FISHEYE = KannalaBrandt(700, 700, 210.0, 210.0, 350.0, 350.0, -0.01, 0.01, -0.002, -0.0002)
 FRAMES = 12
-
-
-def pose(turn_deg: Sequence[float], position_m: Sequence[float]) -> np.ndarray:
-    found = np.eye(4)
-    found[:3, :3] = Rotation.from_euler("xyz", turn_deg, degrees=True).as_matrix()
-    found[:3, 3] = position_m
-    return found
 
 
 @dataclasses.dataclass
@@ -107,7 +92,6 @@ def disturbed(path: np.ndarray, rng: np.random.Generator, metres: float = 0.03, 
 
 
 def step_errors(path: np.ndarray, true: np.ndarray) -> tuple[float, float]:
-    """Mean error of the steps, metres and degrees."""
     off = [
         np.linalg.inv(np.linalg.inv(a) @ b) @ np.linalg.inv(c) @ d
         for a, b, c, d in zip(true, true[1:], path, path[1:], strict=False)
@@ -117,8 +101,6 @@ def step_errors(path: np.ndarray, true: np.ndarray) -> tuple[float, float]:
 
 
 # ---- tracks ----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_matches_join_into_one_track_for_each_point() -> None:
     rng = np.random.default_rng(1)
@@ -196,8 +178,6 @@ def test_few_tracks_are_kept_evenly_and_the_longest_first() -> None:
 
 
 # ---- the bundle ------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def colmap() -> Any:
     return pytest.importorskip("pycolmap")
@@ -228,7 +208,6 @@ def test_disturbed_poses_come_back(colmap: Any) -> None:
 
 @pytest.mark.slow
 def test_what_evaluates_takes_no_part(colmap: Any) -> None:
-    """Features that check are not moved by: with them far off, the refined path is the same."""
     rng = np.random.default_rng(5)
     given = world(rng, points=250)
     matches = given.matches(0.2, rng)
@@ -298,8 +277,6 @@ def test_softness_is_in_metres_and_radians(colmap: Any) -> None:
 
 
 # ---- a recording -----------------------------------------------------------------------------------------------
-
-
 def recorded(given: World, path: np.ndarray, poses_s: float = 0.1, shutter_s: float = 0.004) -> Recording:
     """A recording of a path; the second camera fires a little later."""
     times_s = poses_s * np.arange(len(path))

@@ -1,7 +1,5 @@
 """Networks and rendering in one pass, against the same arithmetic in float64 and against nerfstudio's."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -31,7 +29,6 @@ def threads(request, monkeypatch):
 
 
 def straight_networks(x: Tensor, of_points: Tensor, first: Any, second: Any, by_ray: Tensor) -> Tensor:
-    """Both networks one layer after the other."""
     (weights, biases), (more_weights, more_biases) = first, second
     for number, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
         x = (x.relu() if number else x) @ weight.T + bias

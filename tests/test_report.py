@@ -1,7 +1,5 @@
 """report.html: its pictures by formula, its text escaped, nothing loaded, and the page in a real browser."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json
@@ -43,8 +41,6 @@ NASTY = "</script><script>window.hacked = 1</script><img src=x onerror='window.h
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------
-
-
 def decoded(content: bytes) -> np.ndarray:
     return cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)
 
@@ -76,16 +72,8 @@ def test_errors_by_formula():
     rendered_m[:, 48:] = 5
     mask = np.ones((size, size), bool)
     mask[:16] = False
-    view = ComparedView(
-        "a.png",
-        target,
-        None,
-        mask,
-        true_m,
-        "truth_distance_file_path",
-        {"m": colours},
-        {"m": colour_distance(rendered_m, mask)},
-    )
+    distances = {"m": colour_distance(rendered_m, mask)}
+    view = ComparedView("a.png", target, None, mask, true_m, "truth_distance_file_path", {"m": colours}, distances)
     shown = show_view(view, 10**6)
     assert set(shown.truth) == {"colour", "distance"} and set(shown.rendered["m"]) == {kind.key for kind in KINDS}
     truth = decoded(shown.truth["colour"])
@@ -156,6 +144,7 @@ def test_pictures_are_small():
 
 def test_some_views_spread_over_the_drive():
     assert spread_over(10, 3) == [0, 4, 9] and spread_over(2, 6) == [0, 1] and spread_over(5, 1) == [0]
+    assert spread_over(5, 256) == [0, 1, 2, 3, 4] and spread_over(1000, 4) == [0, 333, 666, 999]
 
 
 def write_rendered(scene: Path, folder: Path, gain: float) -> None:
@@ -202,8 +191,6 @@ def test_views_come_in_the_order_of_the_evaluation(tmp_path):
 
 
 # --- points -----------------------------------------------------------------------------------------------------------
-
-
 def test_points_come_back_from_their_steps(tmp_path):
     scene = write_scene(tmp_path, ply_file_path="points.ply")
     generator = np.random.default_rng(0)
@@ -245,8 +232,6 @@ def test_a_broken_cloud_costs_the_view_in_3d_alone(tmp_path, capsys):
 
 
 # --- commands ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("words", "options"),
     [
@@ -282,8 +267,6 @@ def test_a_command_gives_its_options_again(words, options):
 
 
 # --- the page as text -------------------------------------------------------------------------------------------------
-
-
 def flat(red: int, green: int, blue: int) -> bytes:
     return encode(np.full((64, 64, 3), (red, green, blue), np.uint8), 10**6)
 
@@ -314,7 +297,6 @@ def small_plot() -> Plot:
 
 
 def write_cloud(folder: Path, points_m: np.ndarray, rgb: np.ndarray | None = None) -> None:
-    """A point cloud of a scene, as text."""
     names = ["float x", "float y", "float z", *([] if rgb is None else ["uchar red", "uchar green", "uchar blue"])]
     header = ["ply", "format ascii 1.0", f"element vertex {len(points_m)}", *(f"property {name}" for name in names)]
     rows = points_m if rgb is None else np.hstack([points_m, rgb])
@@ -467,8 +449,6 @@ def test_the_page_is_written_whole_or_not_at_all(report, tmp_path, monkeypatch):
 
 
 # --- the page in a browser --------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def browser():
     with open_browser() as found:

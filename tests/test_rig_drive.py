@@ -1,12 +1,11 @@
 """Drives synthesised in other layouts than KITTI-360's."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from scenes import tree as contents
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, read_mask
@@ -15,10 +14,6 @@ from edge_depth_nerf.synthetic.options import LayoutName, SynthesizeOptions
 from edge_depth_nerf.synthetic.rig_drive import jbnu_cameras, looking, rig_cameras
 
 pytestmark = pytest.mark.slow
-
-
-def contents(root: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
 
 
 @pytest.mark.parametrize("layout", ["rig", "jbnu-depth360"])

@@ -1,7 +1,5 @@
 """The scene in the repository is what its README says, and trains as it is."""
 
-from __future__ import annotations
-
 import dataclasses
 import subprocess
 import sys

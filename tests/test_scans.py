@@ -1,7 +1,5 @@
 """Scans of any recorder: every format gives the same points, and broken files are named."""
 
-from __future__ import annotations
-
 import math
 import struct
 import sys
@@ -56,7 +54,6 @@ def lines() -> bytes:
 
 
 def lzf_literals(content: bytes) -> bytes:
-    """LZF that only says what follows, 32 bytes at most at a time."""
     parts = [content[start : start + 32] for start in range(0, len(content), 32)]
     return b"".join(bytes([len(part) - 1]) + part for part in parts)
 
@@ -224,8 +221,6 @@ def test_what_is_no_point_is_left_out_and_counted(tmp_path: Path) -> None:
 
 
 # ---- broken files ----------------------------------------------------------------------------------------------
-
-
 def named(folder: Path, name: str, content: bytes) -> Path:
     (folder / name).write_bytes(content)
     return folder / name
@@ -269,10 +264,7 @@ BROKEN = {
     "big promise": (lambda f: ply(f / "a.ply", "ascii", lines(), MAX_POINTS), "cannot hold the declared 5000000 lines"),
     "negative": (lambda f: pcd(f / "a.pcd", "binary", b"", points=-3), "negative count"),
     "pcd without z": (lambda f: pcd(f / "a.pcd", "ascii", lines(), "x y h intensity t"), "has no column z"),
-    "pcd of another kind": (
-        lambda f: pcd(f / "a.pcd", "binary_zstd", lines()),
-        "the header cannot be read.*binary_zstd",
-    ),
+    "pcd of another kind": (lambda f: pcd(f / "a.pcd", "binary_zstd", lines()), "header cannot be read.*binary_zstd"),
     "cut pcd": (lambda f: pcd(f / "a.pcd", "binary", records().tobytes()[:-20]), "the file is truncated"),
     "compressed to another size": (
         lambda f: pcd(f / "a.pcd", "binary_compressed", struct.pack("<II", 3, 99) + b"\0a"),

@@ -1,7 +1,5 @@
 """The scene folder's writer, and what it uses: PNG headers, smaller maps, the point cloud."""
 
-from __future__ import annotations
-
 import functools
 import json
 import math
@@ -22,6 +20,7 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
+from scenes import tree
 from scipy.spatial.transform import Rotation
 
 from edge_depth_nerf.base.errors import InputError
@@ -103,17 +102,10 @@ def test_a_short_drive_is_told_how_to_hold_one_out(count: int) -> None:
 
 
 def frames(count: int = 6, load: Callable[[int], FrameContent] | None = None) -> list[SceneFrame]:
-    held_out = held_out_frames(count, 8)
+    made = [content(index) if load is None else functools.partial(load, index) for index in range(count)]
     return [
-        SceneFrame(
-            "image_02",
-            index,
-            pose(index),
-            content(index) if load is None else functools.partial(load, index),
-            timestamp_s=1369730000.5 + index,
-            held_out=held_out[index],
-        )
-        for index in range(count)
+        SceneFrame("image_02", index, pose(index), made[index], timestamp_s=1369730000.5 + index, held_out=held_out)
+        for index, held_out in enumerate(held_out_frames(count, 8))
     ]
 
 
@@ -129,13 +121,7 @@ def write(
     return write_scene(output, cameras, frames() if given is None else given, **options)
 
 
-def tree(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
 # ---- the format ------------------------------------------------------------------------------------------------
-
-
 def test_writes_what_nerfstudio_and_this_project_read(tmp_path: Path) -> None:
     report = write(tmp_path / "scene")
     meta = read_json(tmp_path / "scene/transforms.json")
@@ -278,8 +264,9 @@ def test_cameras_that_nerfstudio_knows_are_not_fitted(tmp_path: Path, camera: Ka
     assert report.fits["image_02"].max_px < 1e-6
     assert meta["camera_fits"]["image_02"]["rms_px"] == 0.0
     assert meta["camera_model"] == ("OPENCV" if camera is PINHOLE else "OPENCV_FISHEYE")
-    names = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "k1": "k1", "k2": "k2", "p1": "p1", "p2": "p2"}
-    for key, name in names.items():
+    for key, name in {"fl_x": "fx", "fl_y": "fy"}.items() | {
+        key: key for key in ("cx", "cy", "k1", "k2", "p1", "p2")
+    }.items():
         assert meta["frames"][0][key] == getattr(camera, name)
 
 
@@ -299,13 +286,10 @@ def test_without_held_out_frames_it_evaluates_on_the_training_frames(tmp_path: P
 
 
 def test_shifted_views_and_truth(tmp_path: Path) -> None:
-    given = [
-        replace(
-            frame, content=replace(content(frame.frame), truth_distance=np.full((SIZE, SIZE), 7.0), truth_rgb=image)
-        )
-        for frame in frames()
-        for image in [content(frame.frame, 9).image]
-    ]
+    given = []
+    for frame in frames():
+        truth = {"truth_distance": np.full((SIZE, SIZE), 7.0), "truth_rgb": content(frame.frame, 9).image}
+        given.append(replace(frame, content=replace(content(frame.frame), **truth)))
     view = ShiftedView(
         2, "image_02", 4, pose(4) @ pose(1), lambda: (np.full((SIZE, SIZE, 3), 9, np.uint8), np.full((SIZE, SIZE), 3.0))
     )
@@ -341,8 +325,6 @@ def test_files_are_copied_byte_by_byte_where_they_can_be(tmp_path: Path) -> None
 
 
 # ---- points.ply ------------------------------------------------------------------------------------------------
-
-
 def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     cloud = trimesh.load(path)
     assert isinstance(cloud, trimesh.PointCloud)
@@ -397,8 +379,6 @@ def test_cloud_without_points_is_an_error(tmp_path: Path) -> None:
 
 
 # ---- interrupted, and run again --------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_interrupted_run_is_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "cpu_count", lambda: 1)
@@ -502,8 +482,6 @@ def test_broken_record_is_named(tmp_path: Path) -> None:
 
 
 # ---- what cannot be a scene ------------------------------------------------------------------------------------
-
-
 def bad(change: dict[str, Any]) -> list[SceneFrame]:
     return [replace(frame, content=replace(content(frame.frame), **change)) for frame in frames()]
 
@@ -571,7 +549,6 @@ def test_camera_that_nerfstudio_cannot_match_is_an_error(
 
 
 def test_cameras_of_all_models_make_one_scene(tmp_path: Path) -> None:
-    """Each frame with its own camera; nerfstudio's rays of all of them are those of the originals."""
     originals: dict[str, Camera] = {"mei": FISHEYE, "polynomial": POLYNOMIAL, "pinhole": PINHOLE}
     given = [replace(frame, camera=name) for name in originals for frame in frames(3)]
     cameras = [SceneCamera(name, camera) for name, camera in originals.items()]
@@ -613,8 +590,6 @@ def test_check_rigid() -> None:
 
 
 # ---- splitting, smaller maps, PNG headers ----------------------------------------------------------------------
-
-
 def test_held_out_frames() -> None:
     assert [i for i, held in enumerate(held_out_frames(30, 8)) if held] == [4, 12, 20, 28]
     assert [i for i, held in enumerate(held_out_frames(6, 2)) if held] == [1, 3, 5]
@@ -709,8 +684,6 @@ def test_damaged_png_is_an_error(tmp_path: Path) -> None:
 
 
 # ---- real data -------------------------------------------------------------------------------------------------
-
-
 def test_real_fisheye_frame(tmp_path: Path, real_data: Path) -> None:
     folder = real_data / "kitti360_fisheye_frame"
     numbers = json.loads((folder / "kitti360_sample.json").read_text())["cam_params"]
@@ -730,32 +703,3 @@ def test_real_fisheye_frame(tmp_path: Path, real_data: Path) -> None:
     assert np.array_equal(written, np.where(kept, lidar, 0))
     assert 25_000 < np.count_nonzero(written) < 50_789
     assert (tmp_path / "scene/images/image_02/0000000000.png").read_bytes() == frame.content.image.read_bytes()  # type: ignore[union-attr]
-
-
-def test_real_stereo_frames(tmp_path: Path, real_data: Path) -> None:
-    folder = real_data / "kitti360_stereo"
-    meta = json.loads((folder / "transforms.json").read_text())
-    camera = Pinhole(meta["w"], meta["h"], meta["fl_x"], meta["fl_y"], meta["cx"], meta["cy"])
-    mono = np.full((camera.height, camera.width), 12.5)
-    flip = np.diag([1.0, -1.0, -1.0, 1.0])
-    given = [
-        SceneFrame(
-            f"image_{entry['file_path'][4:6]}",
-            int(entry["file_path"][:3]),
-            np.array(entry["transform_matrix"]) @ flip,
-            FrameContent(folder / entry["file_path"], mono=mono),
-            held_out=entry["file_path"].startswith("702"),
-        )
-        for entry in meta["frames"]
-    ]
-    cameras = [SceneCamera("image_00", camera), SceneCamera("image_01", camera)]
-    report = write(tmp_path / "scene", given=given, cameras=cameras, layers=("mono",))
-    assert (report.training, report.held_out) == (8, 2)
-    written = read_json(tmp_path / "scene/transforms.json")
-    assert written["camera_model"] == "OPENCV"
-    assert report.mask_share == {"image_00": 1.0, "image_01": 1.0}
-    by_name = {f"{f['frame']}_{f['camera'][-2:]}.png": f["transform_matrix"] for f in written["frames"]}
-    for entry in meta["frames"]:
-        moved = np.array(entry["transform_matrix"])
-        moved[:3, 3] -= written["world_offset_m"]
-        np.testing.assert_allclose(by_name[entry["file_path"]], moved, atol=1e-12)

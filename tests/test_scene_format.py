@@ -1,7 +1,5 @@
 """Scenes of other people, and what changes in a scene after its prior was calibrated."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The sky in pictures that see little of it: a front camera's, in any light, with what looks like sky but is none."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +25,6 @@ WHITE = (252, 251, 252)
 
 
 def sky_of_kind(kind: str) -> NDArray[np.float64]:
-    """A sky's colours, H×W×3."""
     share = np.clip(ROWS / HORIZON, 0, 1)[..., None]
     if kind == "blown out":
         return np.full((HEIGHT, WIDTH, 3), 270.0)
@@ -61,7 +58,6 @@ def taken(colours: NDArray[np.float64]) -> NDArray[np.uint8]:
 
 
 def box(left: int, right: int, top: int, bottom: int) -> Mask:
-    """Pixels of a rectangle."""
     return (COLUMNS >= left) & (COLUMNS < right) & (ROWS >= top) & (ROWS < bottom)
 
 
@@ -72,7 +68,6 @@ def points_of(where: Mask, top: int) -> NDArray[np.float32]:
 
 
 def found_in(colours: NDArray[np.float64], lidar_points: NDArray[np.float32] = NO_LIDAR) -> Mask:
-    """The sky in a picture of the level camera."""
     return find_sky(taken(colours), USE, UP, CAMERA, lidar_points)
 
 

@@ -1,7 +1,5 @@
 """The plugin runs: a tiny scene, some steps of nerfstudio's trainer, finite losses. `make test-fast` has this of it."""
 
-from __future__ import annotations
-
 import json
 import math
 import subprocess

@@ -1,7 +1,5 @@
 """Distance from motion on scenes whose distances follow from a formula."""
 
-from __future__ import annotations
-
 import math
 
 import cv2
@@ -52,13 +50,6 @@ def of_wall(camera: Camera, to_world: np.ndarray, contrast: float = 1.0) -> tupl
     return View(np.rint(grey).astype(np.float32), camera, to_world), distance
 
 
-def shifted_by(x_m: float) -> np.ndarray:
-    """Pose of a camera beside the world's origin."""
-    to_world = np.eye(4)
-    to_world[0, 3] = x_m
-    return to_world
-
-
 def found(views: list[View], index: int = MIDDLE) -> MotionDistance:
     motion = Motion(
         np.stack([view.camera_to_world[:3, 3] for view in views]), ["only"] * len(views), lambda number: views[number]
@@ -74,7 +65,6 @@ def errors(distance: MotionDistance, truth_m: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def ball() -> tuple[list[View], np.ndarray]:
-    """Sideways through the ball, looking along y's normal plane's z; the truth of the middle one."""
     views = [in_ball(FISHEYE, pose(x, 0.1 * x, 0.05, 0.1 * x)) for x in STEPS]
     return [view for view, _ in views], views[MIDDLE][1]
 
@@ -102,7 +92,7 @@ def test_neighbours_distances_are_seen_where_they_lie(ball):
 
 def test_what_a_near_thing_hides_is_not_seen():
     # a wall at 5 m and a board at 2 m before its middle, both known from beside
-    view, beside = (View(np.full((80, 110), 100, np.float32), WALL, pose) for pose in (np.eye(4), shifted_by(0.3)))
+    view, beside = (View(np.full((80, 110), 100, np.float32), WALL, place) for place in (pose(0.0), pose(0.3)))
 
     def scene_m(position_x: float) -> np.ndarray:
         x, y, z = np.moveaxis(rays(WALL).directions, -1, 0)
@@ -116,8 +106,6 @@ def test_what_a_near_thing_hides_is_not_seen():
 
 
 # ---- lenses ----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("camera", "theta_max_deg"),
     [
@@ -162,8 +150,6 @@ def test_beyond_the_lens_nothing_is_projected():
 
 
 # ---- the loops against slow twins ------------------------------------------------------------------------------
-
-
 def slow_cost(view: View, neighbours: list[View], inverse_per_m: float, noise: float) -> np.ndarray:
     """1 - the mean correlation of the best half, in float64, window by window."""
     height, width = view.grey.shape
@@ -217,7 +203,6 @@ def test_sweep_is_its_slow_twin():
 
 
 def slow_paths(cost: np.ndarray, picture: np.ndarray, small: float, large: float, edge: float) -> np.ndarray:
-    """Semi-global aggregation, path by path, hypothesis by hypothesis."""
     height, width, count = cost.shape
     total = np.zeros(cost.shape)
     for di, dj in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1)):
@@ -249,8 +234,6 @@ def test_aggregation_is_its_slow_twin():
 
 
 # ---- right distances -------------------------------------------------------------------------------------------
-
-
 def test_distances_in_a_ball_are_right_also_beyond_90_deg(ball, of_ball):
     views, truth = ball
     error = errors(of_ball, truth)
@@ -303,8 +286,6 @@ def test_the_doubtful_are_wrong_more_often():
 
 
 # ---- no distance is better than a wrong one --------------------------------------------------------------------
-
-
 def test_along_the_direction_of_travel_there_is_none():
     views = [in_ball(FISHEYE, pose(0.0, 0.0, z)) for z in (-0.5, -0.25, 0.0, 0.25, 0.5)]
     ahead = found([view for view, _ in views])
@@ -383,8 +364,6 @@ def test_what_is_masked_takes_no_part(ball):
 
 
 # ---- what confirms a distance ----------------------------------------------------------------------------------
-
-
 def swept_at(distance_m: np.ndarray) -> Swept:
     shape = distance_m.shape
     good = np.full(shape, 0.9, np.float32)
@@ -429,8 +408,6 @@ def test_too_few_neighbours_confirm_nothing():
 
 
 # ---- neighbours and hypotheses ---------------------------------------------------------------------------------
-
-
 def test_a_stop_leaves_place_for_views_from_elsewhere():
     """Two cameras, side by side, that stand for 40 frames and then drive."""
     along_m = [*np.zeros(40), *np.arange(1, 21) * 0.5]

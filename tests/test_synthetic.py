@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from scenes import tree as files_of
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, read_mask
@@ -37,7 +38,6 @@ def street_model():
 
 @pytest.fixture(scope="module")
 def street(tmp_path_factory, street_model):
-    """A street drive whose last frame is held out."""
     options = SynthesizeOptions(tmp_path_factory.mktemp("street") / "drive", "street", frames=FRAMES, size=SIZE)
     with pytest.MonkeyPatch.context() as patch:
         # the same scene, not built twice
@@ -47,7 +47,6 @@ def street(tmp_path_factory, street_model):
 
 @pytest.fixture(scope="module")
 def parking(tmp_path_factory):
-    """A small car park drive with cars that drive."""
     output = tmp_path_factory.mktemp("parking") / "drive"
     options = SynthesizeOptions(output, "parking", frames=2, size=64, moving=2, seed=3)
     return options, synthesize_drive(options)
@@ -55,7 +54,6 @@ def parking(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def roundabout(tmp_path_factory):
-    """The scene of a short drive around a roundabout, rays in it, and the drive."""
     options = SynthesizeOptions(tmp_path_factory.mktemp("roundabout") / "drive", "roundabout", frames=2, size=SIZE)
     model = build_scene(options)
     with pytest.MonkeyPatch.context() as patch:
@@ -66,10 +64,6 @@ def roundabout(tmp_path_factory):
 @pytest.fixture(scope="module")
 def street_world(street_model):
     return street_model, World(street_model, 0)
-
-
-def files_of(root: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(root)): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
 
 
 def poses_of(root: Path) -> np.ndarray:
@@ -94,13 +88,10 @@ def points_of(root: Path, frame: int, folder: str = "truth") -> np.ndarray:
 
 
 # ------------------------------------------------------------------------------------------------- layout
-
-
 def test_layout_is_complete(street):
     _, root = street
     expected = {
-        "drive.json",
-        f"truth/{SEQUENCE}/shifted.json",
+        *("drive.json", f"truth/{SEQUENCE}/shifted.json"),
         f"data_3d_raw/{SEQUENCE}/velodyne_points/timestamps.txt",
     }
     calibration = ("image_02.yaml", "image_03.yaml", "calib_cam_to_pose.txt", "calib_cam_to_velo.txt")
@@ -182,8 +173,6 @@ def test_sensors_stand_as_high_as_kitti360s():
 
 
 # ------------------------------------------------------------------------------------------------- determinism
-
-
 def test_same_options_same_bytes_and_interrupted_runs_are_continued(parking, tmp_path, monkeypatch):
     options, root = parking
     other = dataclasses.replace(options, output=tmp_path / "again")
@@ -218,12 +207,11 @@ def test_another_seed_is_another_drive(parking, tmp_path):
     options, root = parking
     other = files_of(synthesize_drive(dataclasses.replace(options, output=tmp_path / "other", seed=4, frames=1)))
     first = files_of(root)
+    camera = "image_03/distance/0000000000.png"
     for name in (
-        f"data_2d_raw/{SEQUENCE}/image_02/data_rgb/0000000000.png",
+        *(f"data_2d_raw/{SEQUENCE}/image_02/data_rgb/0000000000.png", f"truth/{SEQUENCE}/{camera}"),
         f"data_3d_raw/{SEQUENCE}/velodyne_points/data/0000000000.bin",
-        f"truth/{SEQUENCE}/image_03/distance/0000000000.png",
-        f"simulated_mono/{SEQUENCE}/image_03/0000000000.png",
-        f"data_poses/{SEQUENCE}/poses.txt",
+        *(f"simulated_mono/{SEQUENCE}/image_03/0000000000.png", f"data_poses/{SEQUENCE}/poses.txt"),
     ):
         assert other[name] != first[name]
     assert other["calibration/image_02.yaml"] == first["calibration/image_02.yaml"]
@@ -269,21 +257,15 @@ def test_bad_options_are_refused_before_anything_is_written(change, message, tmp
     assert not (tmp_path / "drive").exists()
 
 
-def test_options_are_light_to_import():
-    code = (
-        "import sys, edge_depth_nerf.synthetic.options\n"
-        "heavy = {'numpy', 'cv2', 'torch', 'trimesh', 'embreex', 'nerfstudio'} & set(sys.modules)\n"
-        "sys.exit(', '.join(heavy) or 0)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+@pytest.mark.parametrize("room", ["synthetic", "process"])
+def test_options_are_light_to_import(room):
+    heavy = "{'numpy', 'cv2', 'torch', 'trimesh', 'embreex', 'nerfstudio'}"
+    code = f"import sys, edge_depth_nerf.{room}.options\nsys.exit(', '.join({heavy} & set(sys.modules)) or 0)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 # ------------------------------------------------------------------------------------------------- LiDAR
-
-
 def in_camera(root: Path, camera: str, folder: str = "truth") -> np.ndarray:
-    """The points of frame 1 in a camera."""
     to_camera = np.linalg.inv(rig.CAMERA_TO_POSE[camera]) @ rig.VELO_TO_POSE
     return points_of(root, 1, folder)[:, :3] @ to_camera[:3, :3].T + to_camera[:3, 3]
 
@@ -396,8 +378,6 @@ def test_five_percent_of_points_are_lost(street, street_world, monkeypatch):
 
 
 # ------------------------------------------------------------------------------------------------- pictures
-
-
 def test_masks_lens_and_own_car(street):
     _, root = street
     assert len(rig.CAMERAS) == 2
@@ -423,23 +403,20 @@ def test_masks_lens_and_own_car(street):
 
 
 def test_distances_are_zero_exactly_where_nothing_is_known(street, parking):
-    _, root = street
     assert len(rig.CAMERAS) == 2
     for camera in rig.CAMERAS:
-        keep = read_mask(root / "truth" / "masks" / f"{camera}.png")
-        distance = read_distance_png(truth(root, camera, "distance", 0))
+        (keep, distance), (inside, hall) = (
+            (read_mask(root / f"truth/masks/{camera}.png"), read_distance_png(truth(root, camera, "distance", 0)))
+            for _, root in (street, parking)
+        )
         assert np.all(distance[~keep] == 0)
         sky = keep & (distance == 0)
         assert 0.2 < sky.sum() / keep.sum() < 0.6
         assert np.nonzero(sky)[0].mean() < 0.4 * SIZE
-    _, root = parking
-    for camera in rig.CAMERAS:
-        keep = read_mask(root / "truth" / "masks" / f"{camera}.png")
-        distance = read_distance_png(truth(root, camera, "distance", 0))
-        assert np.all(distance[keep] > 0), "no sky in a car park"
+        assert np.all(hall[inside] > 0), "no sky in a car park"
         # the ceiling is 2.6 m, the camera 2.0 m above the floor: straight up it is some 0.6 m away
-        top = np.nonzero(keep[:, 32])[0][0]
-        assert 0.2 < distance[top + 1, 32] < 0.75
+        top = np.nonzero(inside[:, 32])[0][0]
+        assert 0.2 < hall[top + 1, 32] < 0.75
 
 
 def test_sky_is_blown_out_towards_the_sun(street, parking):
@@ -616,8 +593,6 @@ def test_traffic_passes_stops_and_starts_and_nobody_is_run_over(frames):
 
 
 # ------------------------------------------------------------------------------------------------- simulated mono
-
-
 def test_simulated_estimate_has_a_networks_faults(street):
     _, root = street
     camera = "image_02"
@@ -663,8 +638,6 @@ def test_simulated_edges_are_blurred():
 
 
 # ------------------------------------------------------------------------------------------------- parts
-
-
 def test_route_has_unit_speed_and_turns_by_its_angle():
     route = Route((1.0, -2.0), 0.3, turn_rad=-np.pi / 2, turn_at_m=15.0, radius_m=8.0)
     s, step = np.linspace(-5, 50, 2201, retstep=True)
@@ -763,18 +736,6 @@ def test_roundabout_pictures_sweeps_and_distances_agree(roundabout):
         upper, lower = sky[: SIZE // 2], sky[int(0.6 * SIZE) :]
         assert 0.2 < upper[keep[: SIZE // 2]].mean() < 0.9
         assert not lower.any(), "the road's end is not the sky"
-
-
-def test_turn_drives_straight_turns_and_drives_on():
-    options = SynthesizeOptions(Path(), "turn", frames=70)
-    route = Route((0.0, -1.75), turn_rad=-np.pi / 2, turn_at_m=15.0)
-    drive = Drive.random(route, 0.0, options.mean_speed_m_s, np.random.default_rng(0))
-    poses = drive.pose_to_world(np.arange(options.frames) * 0.1)
-    heading = np.degrees(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
-    assert abs(heading[0]) < 2.5
-    assert abs(heading[-1] + 90) < 2.5
-    # a right-hand turn
-    assert poses[-1, 1, 3] < -15
 
 
 def test_pose_is_a_rotation_at_every_time():

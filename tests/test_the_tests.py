@@ -1,7 +1,5 @@
 """Tests can fail: none has all of its assertions in loops over data that may not be there."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Torch on one thread, kernels on all: the numbers, and that a training step asks for it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from threading import Event, Thread
 

@@ -1,7 +1,5 @@
 """The vehicle's path between its poses, against matrix exponentials."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """No module of the package calls what could run the data that it reads."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

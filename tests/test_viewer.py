@@ -1,7 +1,5 @@
 """What the viewer shows: in numbers, on the server's side, and in a browser."""
 
-from __future__ import annotations
-
 import math
 import shutil
 import socket
@@ -30,7 +28,6 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import as_people_count
-from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.base.pictures import SIGMA, colour_distance
 from edge_depth_nerf.cameras import KannalaBrandt
 from edge_depth_nerf.plugin.coarse_to_fine import LONGEST_START_S, CoarseToFine
@@ -51,8 +48,6 @@ def until(condition: Callable[[], bool], wait: Callable[[float], None] = time.sl
 
 
 # ---- lenses ----------------------------------------------------------------------------------------------------------
-
-
 def test_the_rim_of_an_equidistant_lens():
     """r = f·θ; wider than tall, so that the picture's edge, its corners and theta_max each are the rim somewhere."""
     camera = KannalaBrandt(100, 60, 25.0, 25.0, 48.0, 31.0, 0.0, 0.0, 0.0, 0.0)
@@ -94,14 +89,7 @@ def test_names_with_numbers_are_in_order():
     assert sorted(names, key=lambda name: as_people_count(Path(name))) == [names[3], names[2], names[1], names[0]]
 
 
-def test_some_of_many_are_spread():
-    assert spread_over(5, 256) == [0, 1, 2, 3, 4]
-    assert spread_over(1000, 4) == [0, 333, 666, 999]
-
-
 # ---- outputs ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory) -> Path:
     return write_scene(tmp_path_factory.mktemp("scene"), [fisheye(24, 20)])
@@ -191,10 +179,7 @@ def test_previews_of_any_size_are_whole(scene, kind, implementation):
 
 
 # ---- layers ----------------------------------------------------------------------------------------------------------
-
-
 def in_scene_m(pipeline, points: np.ndarray) -> np.ndarray:
-    """Points of the model's coordinates, back in the scene's metres."""
     outputs = pipeline.datamanager.train_dataset._dataparser_outputs
     transform = outputs.dataparser_transform.numpy().astype(float)
     return (points / outputs.dataparser_scale - transform[:, 3]) @ transform[:, :3]
@@ -256,8 +241,6 @@ def test_nothing_is_made_without_a_viewer(scene, monkeypatch):
 
 
 # ---- from coarse to fine ---------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def machine() -> CoarseToFine:
     """Of a browser that is 1.5 times as wide as high; nothing is rendered."""
@@ -370,7 +353,6 @@ def test_a_movement_ends_a_fine_picture_and_no_other(machine):
 
 
 def reported(x: float, aspect: float = 1.5) -> CameraState:
-    """What a browser reports from a place."""
     c2w = torch.eye(4, dtype=torch.float64)[:3]
     c2w[0, 3] = x
     return CameraState(1.3, aspect, c2w, CameraType.PERSPECTIVE)
@@ -456,8 +438,6 @@ def test_where_a_browser_opened_is_not_rendered(machine, monkeypatch):
 
 
 # ---- the viewer itself, during a training ---------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def training(tmp_path_factory) -> Iterator[SimpleNamespace]:
     """A training of the sample drive that goes on while it is looked at; `trainer`, `viewer`, `layers`."""
@@ -582,8 +562,6 @@ def test_a_file_that_went_away_is_said_and_the_switch_goes_back(training, capsys
 
 
 # ---- in a browser ----------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def browser():
     if CHROMIUM is None:
@@ -633,7 +611,6 @@ def look_from_above(training) -> None:
 
 
 def canvas(page) -> np.ndarray:
-    """The viewport without title bar and panel."""
     import cv2
 
     png = page.screenshot(clip={"x": 0, "y": 60, "width": 570, "height": 550})

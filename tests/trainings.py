@@ -1,7 +1,5 @@
 """Short trainings in this process, on the CPU."""
 
-from __future__ import annotations
-
 import copy
 from pathlib import Path
 from typing import Any
@@ -35,3 +33,10 @@ def trainer_of(scene: Path, output: Path, rank: int = 0, world_size: int = 1, **
     assert isinstance(trainer, EdgeDepthTrainer)
     trainer.setup()
     return trainer
+
+
+def train(scene: Path, output: Path, steps: int) -> tuple[Any, list[float]]:
+    """Train on 256 rays a step: the pipeline, and the loss of the colours in each step."""
+    options = {"data__train_num_rays_per_batch": 256, "model__log2_hashmap_size": 14}
+    trainer = trainer_of(scene, output, **options)
+    return trainer.pipeline, [float(trainer.train_iteration(step)[1]["rgb_loss"].detach()) for step in range(steps)]

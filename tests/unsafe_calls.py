@@ -1,7 +1,5 @@
 """What in a module's text could run what it reads: found in its syntax tree, whatever names it imports things under."""
 
-from __future__ import annotations
-
 import ast
 import builtins
 from collections.abc import Iterator

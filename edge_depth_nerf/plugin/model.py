@@ -11,7 +11,7 @@ from contextlib import nullcontext
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Literal, TypeGuard
+from typing import Any, Literal, TypeGuard, get_args
 
 import torch
 import tyro
@@ -27,6 +27,7 @@ from nerfstudio.models.nerfacto import NerfactoModel, NerfactoModelConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.pictures import DISTANCE, SIGMA, colour_distance
 from edge_depth_nerf.kernels.allocator import keep_freed_memory
 from edge_depth_nerf.kernels.openmp import let_idle_threads_sleep
@@ -71,6 +72,9 @@ LARGEST_NEAR_PLANE_M = 0.5
 """A near plane beyond this cuts off road and car beside the camera."""
 
 
+Exposure = Literal["gain", "embedding", "none"]
+
+
 @dataclass
 class EdgeDepthNerfModelConfig(NerfactoModelConfig):
     """nerfacto supervised by a distance prior."""
@@ -103,7 +107,7 @@ class EdgeDepthNerfModelConfig(NerfactoModelConfig):
     surface_loss_mult: tyro.conf.Suppress[float] = 1.0
     """With a depth loss: weight of the colour error of the field at the prior's distance, for the datamanager's
     `surface_rays_per_batch` additional pixels, with one sample each."""
-    exposure: Literal["gain", "embedding", "none"] = "gain"
+    exposure: Exposure = "gain"
     """How a camera's drifting exposure and white balance are modelled. gain: a factor per colour and training picture;
     their geometric mean is 1, and views are rendered with it. embedding: nerfacto's appearance embedding; views use the
     mean of all pictures, which does not give their mean colour. none: not modelled."""
@@ -136,8 +140,13 @@ class EdgeDepthNerfModel(NerfactoModel):
         """Build nerfacto with near and far planes in metres, and what it lacks.
 
         Raises:
-            InputError: the loss on the prior is not registered.
+            InputError: the loss on the prior is not registered, or the exposure is one of an earlier version.
         """
+        if self.config.exposure not in (known := get_args(Exposure)):
+            raise InputError(
+                f"--pipeline.model.exposure {self.config.exposure}: there is no such model; expected one of "
+                f"{', '.join(known)}. Train again, or load this training with the version that made it."
+            )
         metadata = self.kwargs.get("metadata") or {}
         self.metres_per_unit: float = metadata.get("metres_per_unit", 1.0)
         self.planes = Planes(self.config.near_m, self.config.far_m, self.metres_per_unit)
