@@ -220,7 +220,7 @@ class StepGraphs:
         return [float(model.depth_weight()), float(model.proposal_sampler._anneal), *rates]
 
     def _step_schedulers(self, step: int) -> None:
-        """Go on with the learning rates, as nerfstudio's trainer does where the scale has not fallen."""
+        """Continue the learning rates, as nerfstudio's trainer does where the scale has not fallen."""
         scaler: Any = self._trainer.grad_scaler
         before = scaler.get_scale()
         scaler.look()

@@ -38,7 +38,7 @@ from edge_depth_nerf.plugin.settings import changed_settings
 from edge_depth_nerf.plugin.step_graphs import Capture, GpuCapture, StepGraphs, why_not
 
 COST_BETWEEN = (50, 100)
-"""After so many steps of a training it is said what one costs: those between the two are measured."""
+"""After so many steps of a training a message reports what one costs: those between the two are measured."""
 FOR_A_GPU = ("edge-depth-nerf", "edge-depth-nerf-paper")
 """Methods with full-size models."""
 
