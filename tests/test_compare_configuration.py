@@ -154,6 +154,7 @@ def test_each_method_is_what_its_name_says():
 @pytest.mark.parametrize("preset", ["lite", "full"])
 def test_schedules_of_every_method_follow_the_steps_asked_for(preset):
     """By one rule: nothing but the number of steps is set, and lengths are shares of it."""
+    assert len(METHODS) > 5
     shares = {f"pipeline.model.proposal_{name}" for name in ("warmup", "weights_anneal_max_num_iters")}
     for name in METHODS:
         whole, other = (resolved(name, preset, steps=steps) for steps in (None, 700))

@@ -199,7 +199,7 @@ def test_the_tests_of_a_gpu_are_found(parts):
         for path in (ROOT / "tests").glob("test_*.py")
         if "@NEEDS_A_GPU" in (text := path.read_text(encoding="utf-8")) or "skipif(not torch.cuda" in text
     } - {Path(__file__).name}
-    assert found >= needing and len(needing) == 6
+    assert found >= needing and len(needing) == 7
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")

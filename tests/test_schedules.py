@@ -60,7 +60,9 @@ def test_lite_has_at_its_own_length_the_rates_that_its_figures_were_made_with():
 @pytest.mark.parametrize("steps", [1, 7, 5000])
 def test_the_last_rate_is_lr_final_after_any_number_of_steps(method, steps):
     config = all_methods[method]
-    for name, (first, *between, last) in rates_of_training(config, steps).items():
+    rates = rates_of_training(config, steps)
+    assert {"fields", "proposal_networks"} <= {*rates}
+    for name, (first, *between, last) in rates.items():
         each = config.optimizers[name]
         assert last == pytest.approx(each["scheduler"].lr_final)
         after_warmup = between[in_steps(each["scheduler"].warmup_steps, steps) :]

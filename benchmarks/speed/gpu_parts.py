@@ -439,6 +439,21 @@ def arguments(settings: Settings) -> dict[str, list[dict[str, Any]]]:
             {**met, "outer_edges": edges(each), "outer_weights": weights(each).requires_grad_()} for each in inner
         ],
         "distortion loss": [{**met, "weights": weights(final).requires_grad_()}],
+        "density": [
+            {
+                "before": torch.randn(rays * each, device=device, dtype=half["dtype"]).requires_grad_(),
+                "inside": torch.ones(rays * each, device=device),
+                "scale": 0.01,
+            }
+            for each in (*inner, final)
+        ],
+        "weights": [
+            {
+                "densities": (20 * torch.rand(rays, each, device=device) ** 4).requires_grad_(),
+                "deltas": torch.rand(rays, each, device=device),
+            }
+            for each in (*inner, final)
+        ],
         "edge loss": [
             {**in_loss, "weights": each.requires_grad_(), "starts_m": ends[:, :-1], "ends_m": ends[:, 1:]}
             for each, ends in levels
