@@ -132,7 +132,7 @@ def with_graphs(trainer: EdgeDepthTrainer, monkeypatch: pytest.MonkeyPatch, **fa
 def never_recorded(trainer: EdgeDepthTrainer) -> EdgeDepthTrainer:
     """The same steps, one after the other."""
     trainer.graphs = StepGraphs(trainer, RunAgain(trainer))
-    trainer.graphs._try_to_record = lambda *_: None
+    trainer.graphs._try_to_record = lambda *_: None  # pyright: ignore[reportAttributeAccessIssue]
     return trainer
 
 
@@ -218,7 +218,7 @@ def test_training_goes_on_after_a_failed_recording(folder, fails, monkeypatch, c
     assert capture.recovered == 3 and (capture.replays > 0) == (fails == "second")
     # the last steps are those of nerfstudio's trainer
     assert_same(computed, trainer, expected, found, tolerance=1e-3)
-    seen = [each.pipeline.datamanager.trained_on for each in (computed, trainer)]
+    seen: list[Any] = [each.pipeline.datamanager.trained_on for each in (computed, trainer)]
     assert torch.equal(*seen)
     said = " ".join(capsys.readouterr().out.split())
     assert said.count("continues without CUDA graphs") == 1 and "RuntimeError: operation" in said

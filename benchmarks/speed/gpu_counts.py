@@ -311,8 +311,9 @@ def fake_trainer(gpu: FakeGpu, method: str, scene: Path, folder: Path, **changes
     manager._batches._records = gpu.tensor(manager._batches._records)
     trainer.optimizers = trainer.setup_optimizers()
     if why_not(trainer) is None:
+        capture: Any = NoCapture()
         with gpu.mode:
-            trainer.graphs = StepGraphs(trainer, NoCapture())
+            trainer.graphs = StepGraphs(trainer, capture)
     sampler = model.proposal_sampler
     sampler._step, sampler._steps_since_update = STEP, 100 if changes.get("updated", True) else 0
     return trainer
