@@ -146,13 +146,13 @@ def test_shifted_views_have_the_figures_of_the_whole_picture(tmp_path):
     with evaluated(model):
         for metres in views:
             view = views[metres][0]()
-            model.reset_depth_errors()
+            model.evaluation.reset()
             outputs = model.get_outputs_for_camera(view.camera)
             figures, _ = model.get_image_metrics_and_images(outputs, view.batch)
             mask, target = view.batch["mask"][..., 0], view.batch["image"]
             fitted = affine_fitted(outputs["rgb"].clamp(0, 1), target, mask)
             figures["affine_masked_psnr"] = float(masked_psnr(fitted, target, mask))
-            figures |= model.pooled_depth_errors()
+            figures |= model.evaluation.pooled()
             kept = ("masked_", "affine_", "truth_")
             expected |= {f"shifted_{metres}m_{name}": value for name, value in figures.items() if name.startswith(kept)}
     assert {"shifted_1m_masked_psnr", "shifted_1m_masked_ssim", "shifted_0m_truth_abs_rel"} <= set(found)

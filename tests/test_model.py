@@ -432,7 +432,7 @@ def test_views_are_evaluated_inside_the_mask(monkeypatch, tmp_path):
     assert metrics["truth_masked_ssim"] == pytest.approx(1)
     assert images["distance"].shape == (24, 20, 3)
     # |d - 1.25 d| / 1.25 d = 0.2, and |d - 2 d| / 2 d = 0.5 at every pixel
-    pooled = model.pooled_depth_errors()
+    pooled = model.evaluation.pooled()
     assert pooled["lidar_abs_rel"] == pytest.approx(0.2, abs=1e-5)
     assert pooled["truth_abs_rel"] == pytest.approx(0.5, abs=1e-5)
     assert pooled["truth_pixels"] == 24 * 16
@@ -441,9 +441,9 @@ def test_views_are_evaluated_inside_the_mask(monkeypatch, tmp_path):
     truth["lidar_distance_m"] = outputs["depth"] * METRES_PER_UNIT
     model.get_image_metrics_and_images({**outputs}, {**truth, "mask": torch.ones_like(truth["mask"])})
     # 384 pixels of 0.2 and 480 of 0: pooled over pixels 384 · 0.2 / 864, not (0.2 + 0) / 2
-    assert model.pooled_depth_errors()["lidar_abs_rel"] == pytest.approx(384 * 0.2 / 864, abs=1e-5)
-    model.reset_depth_errors()
-    assert model.pooled_depth_errors() == {}
+    assert model.evaluation.pooled()["lidar_abs_rel"] == pytest.approx(384 * 0.2 / 864, abs=1e-5)
+    model.evaluation.reset()
+    assert model.evaluation.pooled() == {}
 
 
 def test_lpips_is_used_where_its_weights_are(monkeypatch):

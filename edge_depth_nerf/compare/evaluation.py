@@ -299,7 +299,7 @@ class ViewEvaluator:
     def _mean(self, views: Iterator[EvaluatedView], look: Callable[..., None]) -> dict[str, float]:
         """Means over views of the model's own figures and of those after a colour fit; depth errors are pooled."""
         model, found = self.model, []
-        model.reset_depth_errors()
+        model.evaluation.reset()
         with evaluated(model):
             for view in views:
                 outputs = model.get_outputs_for_camera(view.camera.to(model.device))
@@ -314,7 +314,7 @@ class ViewEvaluator:
                 look(view, outputs, images)
                 found.append(figures)
                 self.on_view()
-        return _means(found) | model.pooled_depth_errors()
+        return _means(found) | model.evaluation.pooled()
 
 
 def _save(colours: Tensor, path: Path) -> None:

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Literal, get_args
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
+
+from edge_depth_nerf.base.errors import InputError
+
+Exposure = Literal["gain", "embedding", "none"]
 
 
 class Gains(nn.Module):
@@ -32,3 +38,17 @@ class Gains(nn.Module):
     ) -> Float[Tensor, "h w 3"]:
         """Subtract a neutral rendering from a picture, in neutral colours."""
         return image / self.gains[picture] - rendered
+
+
+def exposure_model(exposure: str, pictures: int) -> Gains | None:
+    """Give what models the exposure of pictures; None where nerfacto's embedding does, or nothing.
+
+    Raises:
+        InputError: config.yml of an earlier version has a model that there is no more.
+    """
+    if exposure not in (known := get_args(Exposure)):
+        raise InputError(
+            f"--pipeline.model.exposure {exposure}: there is no such model; expected one of {', '.join(known)}. Train "
+            "again, or load this training with the version that made it."
+        )
+    return Gains(pictures) if exposure == "gain" else None

@@ -6,12 +6,11 @@ the dataset's metadata, so that near, far, sigma and the loss weight mean the sa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
 from copy import copy
 from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import Any, Literal, TypeGuard, get_args
+from typing import Any, Literal, TypeGuard
 
 import torch
 import tyro
@@ -27,7 +26,6 @@ from nerfstudio.models.nerfacto import NerfactoModel, NerfactoModelConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.pictures import DISTANCE, SIGMA, colour_distance
 from edge_depth_nerf.kernels.allocator import keep_freed_memory
 from edge_depth_nerf.kernels.openmp import let_idle_threads_sleep
@@ -37,12 +35,17 @@ from edge_depth_nerf.plugin.colours import coloured
 from edge_depth_nerf.plugin.compat import lpips_not_built, total_steps, without_undefined_ray
 from edge_depth_nerf.plugin.detail import TrainingDetail
 from edge_depth_nerf.plugin.evaluation import LpipsAtFirstUse, Psnr, ViewEvaluation
-from edge_depth_nerf.plugin.exposure import Gains
+from edge_depth_nerf.plugin.exposure import Exposure, exposure_model
 from edge_depth_nerf.plugin.fused.build import compiled_before, fused_forms
 from edge_depth_nerf.plugin.fused.fields import CubeContraction, FusedNerfactoField
 from edge_depth_nerf.plugin.fused.hash_grid import sum_tables_later
 from edge_depth_nerf.plugin.fused.ray_samplers import in_a_row
-from edge_depth_nerf.plugin.pose_refinement import FRAMES, PoseRefiner, PoseRefinerConfig
+from edge_depth_nerf.plugin.pose_refinement import (
+    FRAMES,
+    PoseRefiner,
+    PoseRefinerConfig,
+    without_gradient_to_positions,
+)
 from edge_depth_nerf.plugin.ray_table import ViewRays
 from edge_depth_nerf.plugin.renderers import (
     INFINITELY_FAR,
@@ -55,7 +58,7 @@ from edge_depth_nerf.plugin.renderers import (
     render,
     with_sky,
 )
-from edge_depth_nerf.plugin.schedules import USUAL_STEPS, follow_training, in_steps
+from edge_depth_nerf.plugin.schedules import USUAL_STEPS, follow_training, proposals_in_steps
 from edge_depth_nerf.plugin.step_losses import (
     DepthLossName,
     LossOptions,
@@ -70,9 +73,6 @@ from edge_depth_nerf.plugin.step_losses import (
 
 LARGEST_NEAR_PLANE_M = 0.5
 """A near plane beyond this cuts off road and car beside the camera."""
-
-
-Exposure = Literal["gain", "embedding", "none"]
 
 
 @dataclass
@@ -125,11 +125,6 @@ class EdgeDepthNerfModelConfig(NerfactoModelConfig):
     nerfstudio's code, with the same results and checkpoints, but many times slower on a CPU."""
 
 
-def _density_at(density_fn: Callable[..., Tensor], positions: Tensor, *args: Any, **kwargs: Any) -> Tensor:
-    """A proposal network's density, without a gradient to the positions."""
-    return density_fn(positions.detach(), *args, **kwargs)
-
-
 class EdgeDepthNerfModel(NerfactoModel):
     """nerfacto supervised by a distance prior."""
 
@@ -142,15 +137,11 @@ class EdgeDepthNerfModel(NerfactoModel):
         Raises:
             InputError: the loss on the prior is not registered, or the exposure is one of an earlier version.
         """
-        if self.config.exposure not in (known := get_args(Exposure)):
-            raise InputError(
-                f"--pipeline.model.exposure {self.config.exposure}: there is no such model; expected one of "
-                f"{', '.join(known)}. Train again, or load this training with the version that made it."
-            )
         metadata = self.kwargs.get("metadata") or {}
         self.metres_per_unit: float = metadata.get("metres_per_unit", 1.0)
         self.planes = Planes(self.config.near_m, self.config.far_m, self.metres_per_unit)
         step_losses_of(self.config)  # refuses a loss that there is not
+        exposure = exposure_model(self.config.exposure, self.num_train_data)
         self._settle()
         with lpips_not_built(), fused_forms() if self.fused else nullcontext():
             super().populate_modules()
@@ -162,9 +153,8 @@ class EdgeDepthNerfModel(NerfactoModel):
             for network in (self.field, *self.proposal_networks):
                 network.spatial_distortion = CubeContraction(order=float("inf"))
         self._set_renderers()
-        self.lpips = LpipsAtFirstUse()
+        self.exposure, self.lpips = exposure, LpipsAtFirstUse()
         self.psnr = Psnr()
-        self.exposure = Gains(self.num_train_data) if self.config.exposure == "gain" else None
         self._step = 0
         self._training_steps = USUAL_STEPS
         self.scheduled_weight: Tensor | None = None
@@ -172,7 +162,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         self.detail: TrainingDetail | None = None
         """Of the training pictures; the pipeline sets it."""
         self._view_rays = ViewRays()
-        self._evaluation = ViewEvaluation()
+        self.evaluation = ViewEvaluation()
 
     def _settle(self) -> None:
         """Decide what computes, and turn our options into nerfacto's."""
@@ -211,7 +201,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         if isinstance(self.camera_optimizer, PoseRefiner):
             frames = metadata.get(FRAMES, list(range(self.num_train_data)))
             self.camera_optimizer.settle(frames, self.metres_per_unit)
-        self.density_fns = [partial(_density_at, density_fn) for density_fn in self.density_fns]
+        self.density_fns = [without_gradient_to_positions(density_fn) for density_fn in self.density_fns]
 
     def _set_renderers(self) -> None:
         """Set nerfacto's renderers and planes to ours."""
@@ -236,9 +226,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         if trainer is not None and optimizers is not None:
             self._training_steps = total_steps(trainer)
             follow_training(optimizers, self._training_steps)
-        # nerfacto reads both in steps
-        for name in ("proposal_warmup", "proposal_weights_anneal_max_num_iters"):
-            setattr(self.config, name, max(1, in_steps(getattr(self.config, name), self._training_steps)))
+        proposals_in_steps(self.config, self._training_steps)
 
         def remember(step: int) -> None:
             self._step = step
@@ -438,14 +426,6 @@ class EdgeDepthNerfModel(NerfactoModel):
         """The share of the training that is behind; of `USUAL_STEPS` if no trainer states them."""
         return min(1.0, self._step / max(1, self._training_steps))
 
-    def reset_depth_errors(self) -> None:
-        """Start pooling depth errors again."""
-        self._evaluation.reset()
-
-    def pooled_depth_errors(self) -> dict[str, float]:
-        """Depth errors over all pixels evaluated since the last reset."""
-        return self._evaluation.pooled()
-
     @torch.no_grad()
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Any]
@@ -456,14 +436,14 @@ class EdgeDepthNerfModel(NerfactoModel):
             psnr, ssim and, given weights, lpips over the full frame; masked_* inside the mask; truth_masked_*
             against the picture without noise where it is known. The pictures hold `distance`, the median distance
             in metric colours, besides nerfacto's. The errors of the median distance (1-60 m) against LiDAR and
-            truth, where there are any, are in `pooled_depth_errors`: a view without them has no figure of its own.
+            truth, where there are any, are in `evaluation.pooled`: a view without them has no figure of its own.
         """
         metrics, images = super().get_image_metrics_and_images(outputs, batch)
         lpips = self.lpips.load(self.device)
         if lpips is None:
             del metrics["lpips"]
         distance_m = outputs["depth"][..., 0] * self.metres_per_unit
-        metrics |= self._evaluation.of_view(outputs["rgb"].clamp(0, 1), distance_m, batch, lpips)
+        metrics |= self.evaluation.of_view(outputs["rgb"].clamp(0, 1), distance_m, batch, lpips)
         coloured_distance = colour_distance(distance_m.cpu().numpy(), batch["mask"][..., 0].cpu().numpy())
         images["distance"] = torch.from_numpy(coloured_distance).float() / 255
         return metrics, images

@@ -185,9 +185,9 @@ class EdgeDepthPipeline(VanillaPipeline):
         """Figures and pictures of one held-out view."""
         model = self.model
         assert isinstance(model, EdgeDepthNerfModel)
-        model.reset_depth_errors()
+        model.evaluation.reset()
         metrics, images = super().get_eval_image_metrics_and_images(step)
-        return {**metrics, **model.pooled_depth_errors()}, images
+        return {**metrics, **model.evaluation.pooled()}, images
 
     def get_average_image_metrics(
         self,
@@ -200,9 +200,9 @@ class EdgeDepthPipeline(VanillaPipeline):
         """Average figures over pictures as nerfstudio does, but AbsRel, RMSE and δ over all their pixels together."""
         model = self.model
         assert isinstance(model, EdgeDepthNerfModel)
-        model.reset_depth_errors()
+        model.evaluation.reset()
         metrics = super().get_average_image_metrics(data_loader, image_prefix, step, output_path, get_std)
-        pooled = model.pooled_depth_errors()
+        pooled = model.evaluation.pooled()
         # a spread over pictures says nothing of a pooled figure, and of a single picture it is NaN
         spreads = {f"{name}_std" for name in pooled}
         kept = {name: value for name, value in metrics.items() if name not in spreads and math.isfinite(value)}

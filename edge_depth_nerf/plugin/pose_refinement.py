@@ -9,6 +9,7 @@ not correct it.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -93,6 +94,11 @@ class PoseRefiner(CameraOptimizer):
                 lengths = values.norm(dim=-1) * unit
                 metrics_dict[f"camera_opt_{name}_max"] = lengths.max()
                 metrics_dict[f"camera_opt_{name}_mean"] = lengths.mean()
+
+
+def without_gradient_to_positions(density_fn: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """Give a proposal network's density with no gradient to where it is asked for."""
+    return lambda positions, *args, **kwargs: density_fn(positions.detach(), *args, **kwargs)
 
 
 def _sigmas(config: PoseRefinerConfig, metres_per_unit: float, like: Tensor) -> Float[Tensor, "6"]:

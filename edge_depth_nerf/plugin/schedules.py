@@ -20,6 +20,12 @@ def in_steps(length: float, steps: int) -> int:
     return round(length * steps if length < 1 else length)
 
 
+def proposals_in_steps(config: Any, steps: int) -> None:
+    """Turn the proposal networks' warm-up and annealing into steps of a training, as nerfacto reads them; in place."""
+    for name in ("proposal_warmup", "proposal_weights_anneal_max_num_iters"):
+        setattr(config, name, max(1, in_steps(getattr(config, name), steps)))
+
+
 @dataclass
 class TrainingScheduleConfig(ExponentialDecaySchedulerConfig):
     """nerfstudio's exponential decay, over the steps of the training unless a number of steps is given."""
