@@ -94,7 +94,7 @@ class Runner:
         """How many CUDA graphs its steps are replayed from; None where none are asked for, or there is no GPU."""
         if not getattr(self.trainer.config, "cuda_graphs", False) or not torch.cuda.is_available():
             return None
-        graphs: Any = getattr(self.trainer, "graphs", None) or getattr(self.trainer.pipeline, "graphs", None)
+        graphs: Any = self.trainer.graphs
         return 0 if graphs is None else graphs.recorded
 
     def render(self, most_rays: int) -> tuple[float, tuple[int, int]]:
@@ -179,8 +179,7 @@ def configurations(
         if name in OURS:
             found[name] = copy.deepcopy(base)
             found[name].pipeline.model.implementation = OURS[name]
-            # without a GPU there is a line that says so
-            found[name].cuda_graphs = name != EAGER and torch.cuda.is_available()
+            found[name].cuda_graphs = name != EAGER
             continue
         config: Any = copy.deepcopy(method_configs["depth-nerfacto"])
         shared = {
