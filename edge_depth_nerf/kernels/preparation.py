@@ -6,6 +6,7 @@ that second is spent without Python's lock or in a program of its own.
 
 from __future__ import annotations
 
+import gc
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -51,6 +52,7 @@ class Preparation:
 
     def _try_all(self) -> None:
         with (
+            without_garbage_collection(),
             told_of_compilation(self._compiling),
             ThreadPoolExecutor(min(_MOST_THREADS, os.cpu_count() or 1), thread_name_prefix="compiles") as pool,
         ):
@@ -69,6 +71,22 @@ class Preparation:
 
     def _compiling(self) -> None:
         self.compiles = True
+
+
+@contextmanager
+def without_garbage_collection() -> Iterator[None]:
+    """Collect no garbage meanwhile, so that threads may parse source side by side.
+
+    Python 3.11 before 3.11.8 parses for one thread at a time (its issue 106905). A collection in the midst of it lets
+    another thread parse, and `ast.parse` then raises SystemError.
+    """
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
 
 
 @contextmanager
