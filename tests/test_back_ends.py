@@ -12,7 +12,7 @@ import torch
 from interpreted import NEEDS_A_GPU, in_interpreter
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from edge_depth_nerf.kernels import back_ends, formulas, functions, pointwise_numba, ray_numba
+from edge_depth_nerf.kernels import back_ends, formulas, functions, pointwise_numba
 from edge_depth_nerf.kernels.back_ends import GpuForm, tried_out
 from edge_depth_nerf.kernels.functions import (
     CONTRACT,
@@ -28,7 +28,7 @@ from edge_depth_nerf.kernels.functions import (
     WEIGHTS,
 )
 from edge_depth_nerf.method.losses import EDGE_LOSS, step_kernels
-from edge_depth_nerf.plugin.fused.nerfacto_losses import distortion_loss
+from edge_depth_nerf.plugin.step_losses import distortion_loss
 
 CPU = torch.device("cpu")
 FUNCTIONS = SAMPLE_PDF, INTERLEVEL_LOSS, DISTORTION_LOSS, WEIGHTS, CONTRACT, DISTANCES, HARMONICS
@@ -237,9 +237,9 @@ def test_what_kernels_serve(monkeypatch):
         assert not any(map(function.compiled_for, (half, followed)))
         with torch.no_grad():
             assert function.compiled_for(followed) is loads[function]
-    # torch serves a GPU as fast
+    # torch serves a GPU as fast, or the CPU
     assert POSITIONS.compiled_for(x) is None
-    assert WEIGHTS.compiled_for(torch.empty(4, 4096)) is ray_numba.weights_from_densities
+    assert WEIGHTS.compiled_for(torch.empty(4, 48)) is None
     assert DISTANCES.compiled_for(torch.empty(4, 3)) is pointwise_numba.distances
     assert HASH_GRID.on(torch.device("mps")) is None
     assert DENSITY.compiled_for(on_cpu, of_size(4, 48, device="cpu", dtype=torch.float16)) is None

@@ -22,7 +22,7 @@ from edge_depth_nerf.method.depth_losses import EdgeLoss
 from edge_depth_nerf.method.integration import IntegrationOptions, integrate_depth, select_prior, sigma_m
 from edge_depth_nerf.method.losses import Gaussian, edge_loss, urban_nerf_loss
 from edge_depth_nerf.method.prior import PriorOptions
-from edge_depth_nerf.plugin.fused.nerfacto_losses import distortion_loss, interlevel_loss
+from edge_depth_nerf.plugin.step_losses import distortion_loss, interlevel_loss
 
 HALVES = [torch.float16, torch.bfloat16]
 GAUSSIANS: tuple[Gaussian, ...] = ("point", "interval")

@@ -29,7 +29,6 @@ from edge_depth_nerf.plugin.config import FusedAdamConfig
 from edge_depth_nerf.plugin.fused.build import FORMS, fused_forms
 from edge_depth_nerf.plugin.fused.fields import FusedDensityField, FusedMLP, FusedNerfactoField
 from edge_depth_nerf.plugin.fused.hash_grid import FusedHashEncoding
-from edge_depth_nerf.plugin.fused.nerfacto_losses import distortion_loss, interlevel_loss
 from edge_depth_nerf.plugin.fused.ray_samplers import (
     FirstSampler,
     FusedFrustums,
@@ -37,10 +36,10 @@ from edge_depth_nerf.plugin.fused.ray_samplers import (
     FusedProposalSampler,
     FusedRaySamples,
     edges_of,
-    in_a_row,
     samples_along,
 )
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
+from edge_depth_nerf.plugin.step_losses import distortion_loss, interlevel_loss
 
 
 @pytest.fixture(autouse=True)
@@ -409,18 +408,3 @@ def test_a_fields_normals_can_be_had_at_evaluation():
     normals = next(value for key, value in outputs.items() if key.name == "NORMALS")
     assert normals.shape == (40, 24, 3)
     assert bool((normals.norm(dim=-1) > 0.5).any())
-
-
-def test_parts_of_a_batch_are_joined_without_a_copy():
-    whole = torch.randn(7, 4)[:, 1:3]
-    joined = in_a_row([whole[:2], whole[2:6], whole[6:]])
-    assert torch.equal(joined, whole) and joined.data_ptr() == whole.data_ptr()
-    for parts in (
-        [whole[2:], whole[:2]],
-        [whole[:2], whole[3:]],
-        [whole[:2], whole[2:].clone()],
-        [whole[:2], whole[2:].contiguous()],
-        [whole[:2].requires_grad_(), whole[2:]],
-    ):
-        found = in_a_row(parts)
-        assert torch.equal(found, torch.cat(parts)) and found.data_ptr() != parts[0].data_ptr()

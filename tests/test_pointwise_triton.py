@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, no_type_check
+from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from ahead_of_time import ARCHITECTURES, check_registers
 from interpreted import NEEDS_A_GPU, assert_near, in_interpreter, moved_in_interpreter, on_a_gpu
-from numba import njit
 
 from edge_depth_nerf.kernels import pointwise_numba, threads
-from edge_depth_nerf.kernels.exponential_numba import exp
 
 SIZES = ((1, 1), (5, 17), (33, 49), (3, 256), (7, 300))
 """Rays and samples, of which few are multiples of what a program works on."""
@@ -124,32 +121,12 @@ def test_in_the_interpreter():
     in_interpreter(check_distances, check_contraction, check_densities, check_harmonics)
 
 
-@njit
-@no_type_check
-def exponentials(x, into):
-    for k in range(len(x)):
-        into[k] = exp(x[k])
-
-
-def test_the_exponential_function():
-    x = np.linspace(-87.3, 88.3, 1_000_003, dtype=np.float32)
-    found = np.empty_like(x)
-    exponentials(x, found)
-    exact = np.exp(x.astype(np.float64))
-    assert np.abs(found / exact - 1).max() < 1.5 * 2**-23
-    assert (np.diff(found) >= 0).mean() > 0.999
-    x = np.array([0, -0.0, -88, -np.inf, 89, np.inf, np.nan, 1], np.float32)
-    exponentials(x, found[:8])
-    np.testing.assert_array_equal(found[:7], np.array([1, 1, 0, 0, np.inf, np.inf, np.nan], np.float32))
-    assert found[7] == np.float32(np.e)
-
-
-@pytest.mark.parametrize("check", [check_distances, check_positions, check_densities, check_harmonics])
+@pytest.mark.parametrize("check", [check_distances, check_positions, check_harmonics])
 def test_the_same_on_the_cpu(check):
     check(pointwise_numba)
 
 
-@pytest.mark.parametrize("check", [check_distances, check_positions, check_densities])
+@pytest.mark.parametrize("check", [check_distances, check_positions])
 def test_the_same_on_three_threads(check, monkeypatch):
     monkeypatch.setattr(threads, "kernel_threads", lambda: 3)
     monkeypatch.setattr(pointwise_numba, "LEAST_SHARE", 2)

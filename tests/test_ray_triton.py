@@ -10,7 +10,7 @@ import torch
 from ahead_of_time import ARCHITECTURES, check_registers, compiled
 from interpreted import NEEDS_A_GPU, assert_near, in_interpreter, on_a_gpu
 
-from edge_depth_nerf.kernels import formulas, ray_numba, threads
+from edge_depth_nerf.kernels import formulas, ray_numba
 
 SIZES = ((2, 1), (5, 16), (33, 17), (9, 48), (3, 256), (2, 300))
 """Rays and samples, of which few are multiples of what a program works on."""
@@ -189,17 +189,6 @@ OF_WEIGHTS = (check_weights, check_weights_of_what_is_not_finite)
 def test_in_the_interpreter(checks):
     pytest.importorskip("triton")
     in_interpreter(*checks)
-
-
-@pytest.mark.parametrize("check", [*OF_WEIGHTS, check_the_distortion_loss])
-def test_the_same_on_the_cpu(check):
-    check(ray_numba)
-
-
-def test_weights_are_the_same_on_three_threads(monkeypatch):
-    monkeypatch.setattr(threads, "kernel_threads", lambda: 3)
-    monkeypatch.setattr(ray_numba, "LEAST_SHARE", 2)
-    check_weights(ray_numba)
 
 
 def step(samples: int = 48, intervals: int = 256) -> None:

@@ -12,9 +12,8 @@ from nerfstudio.model_components import renderers
 from torch import Tensor
 
 from edge_depth_nerf.kernels import rendering_numba
-from edge_depth_nerf.kernels.pointwise_numba import STEEPEST
 from edge_depth_nerf.kernels.rendering import Background, Networks, Rendered
-from edge_depth_nerf.kernels.rendering_numba import render
+from edge_depth_nerf.kernels.rendering_numba import STEEPEST, render
 from edge_depth_nerf.plugin.fused.fields import FusedNerfactoField
 
 

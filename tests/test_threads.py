@@ -10,7 +10,6 @@ import torch
 from edge_depth_nerf.kernels import contraction_numba, ray_numba, threads
 from edge_depth_nerf.kernels.hash_grid_numba import _threads
 from edge_depth_nerf.kernels.threads import kernel_threads, take_all_threads, torch_on_one_thread
-from edge_depth_nerf.plugin import pixel_records_numba, table_rays_numba
 
 
 @pytest.fixture
@@ -85,17 +84,7 @@ def contracted() -> tuple[torch.Tensor, ...]:
     return contraction_numba.contract(4 * torch.randn(11, 3))
 
 
-def unpacked() -> tuple[torch.Tensor, ...]:
-    return pixel_records_numba.unpacked(torch.randint(256, (11 * 15,), dtype=torch.uint8).numpy(), 256, 65535)
-
-
-def turned() -> tuple[torch.Tensor, ...]:
-    indices = torch.stack([torch.randint(2, (11,)), torch.randint(4, (11,)), torch.randint(3, (11,))], dim=1)
-    begins, widths = torch.tensor([0, 12]), torch.tensor([3, 3])
-    return table_rays_numba.turned(torch.rand(24, 5), begins, widths, indices, torch.rand(2, 3, 4))
-
-
-@pytest.mark.parametrize("work", [places, interlevel_loss, contracted, unpacked, turned])
+@pytest.mark.parametrize("work", [places, interlevel_loss, contracted])
 def test_the_same_on_three_threads(work: Callable[[], torch.Tensor | tuple[torch.Tensor, ...]], monkeypatch):
     def once() -> list[np.ndarray]:
         torch.manual_seed(3)
@@ -112,21 +101,9 @@ def test_the_same_on_three_threads(work: Callable[[], torch.Tensor | tuple[torch
 
     monkeypatch.setattr(threads, "share_out", counted)
     monkeypatch.setattr(threads, "kernel_threads", lambda: 3)
-    for module in (ray_numba, contraction_numba, pixel_records_numba, table_rays_numba):
+    for module in (ray_numba, contraction_numba):
         for name in ("LEAST_SHARE", "LEAST_WALKED"):
             monkeypatch.setattr(module, name, 2, raising=False)
     for together, one in zip(once(), alone, strict=True):
         np.testing.assert_allclose(together, one, rtol=1e-6)
     assert 3 in shares
-
-
-def test_a_pixel_that_is_not_there_is_found_by_every_thread(monkeypatch):
-    monkeypatch.setattr(threads, "kernel_threads", lambda: 3)
-    monkeypatch.setattr(table_rays_numba, "LEAST_SHARE", 2)
-    begins, widths, poses = torch.tensor([0, 12]), torch.tensor([3, 3]), torch.rand(2, 3, 4)
-    for place in range(9):
-        for wrong in ([2, 0, 0], [-1, 0, 0], [1, 4, 0], [0, -1, 0]):
-            indices = torch.zeros(9, 3, dtype=torch.int64)
-            indices[place] = torch.tensor(wrong)
-            with pytest.raises(IndexError, match="2 cameras, and 24 pixels"):
-                table_rays_numba.turned(torch.rand(24, 5), begins, widths, indices, poses)

@@ -183,8 +183,8 @@ def _try_out(form: GpuForm, device: torch.device, passed: Callable[[], None]) ->
 class Function:
     """A function that has compiled forms, which give what torch gives in fewer passes."""
 
-    on_cpu: Callable[[], Callable[..., Any]]
-    """Gives the form of the CPU. It imports Numba, which takes half a second."""
+    on_cpu: Callable[[], Callable[..., Any]] | None = None
+    """Gives the form of the CPU. It imports Numba, which takes half a second. None: torch serves the CPU as fast."""
     on_gpu: GpuForm | None = None
     """None: torch serves a GPU as fast."""
     follows: bool = True
@@ -193,7 +193,7 @@ class Function:
     def on(self, device: torch.device) -> Callable[..., Any] | None:
         """Give the form for a device; None where torch's has to serve."""
         if device.type == "cpu":
-            return self.on_cpu()
+            return None if self.on_cpu is None else self.on_cpu()
         if device.type != "cuda" or self.on_gpu is None:
             return None
         return tried_out(self.on_gpu, device)

@@ -6,10 +6,11 @@ Modules of Numba and of Triton are imported when one of their functions is asked
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
 from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -35,6 +36,34 @@ def _triton() -> SimpleNamespace:
     return SimpleNamespace(hash_grid=hash_grid_triton, pointwise=pointwise_triton, ray=ray_triton)
 
 
+PROPOSALS, SAMPLES = (256, 96), 48
+"""Samples of a ray on each level of the full preset."""
+LEVELS = (16, 5)
+"""Levels of the hash grids of its field and its proposal networks, of two features each."""
+
+
+class Sizes(NamedTuple):
+    """Of a set of examples."""
+
+    rays: int
+    points: int
+    samples: Sequence[int]
+    """Of a ray, level after level; the last ones are the field's."""
+    weighted: Sequence[int]
+    """Of a ray whose densities become weights."""
+    levels: Sequence[int]
+    """Of hash grids."""
+    dtypes: Sequence[torch.dtype]
+    """Under autocast networks give half precision, and get it."""
+    in_a_step: bool
+
+
+ODD = Sizes(7, 151, (43, 28), (43,), (3,), (torch.float32, torch.float16), in_a_step=False)
+"""A few hundred numbers, of no round sizes."""
+STEP = Sizes(16, 128, (*PROPOSALS, SAMPLES), (*PROPOSALS, SAMPLES), LEVELS, (torch.float16,), in_a_step=True)
+"""As a step has them, of few rays: 16 divides them, as it divides a step's numbers of rays and of points."""
+
+
 def spread(device: torch.device, *shape: int, seed: int = 2) -> Tensor:
     """Give float32 numbers that are spread over 0..1, everywhere the same ones: multiples of a root, modulo 1."""
     numbers = torch.arange(1, math.prod(shape) + 1, device=device, dtype=torch.float64)
@@ -48,225 +77,134 @@ def _histogram(device: torch.device, rays: int, samples: int, seed: int) -> tupl
     return edges, weights / weights.sum(1, keepdim=True)
 
 
-def _positions(device: torch.device) -> Sequence[Example]:
-    return [{"positions": 8 * spread(device, 151, 3) - 4}]
+def _positions(device: torch.device, sizes: Sizes) -> Sequence[Example]:
+    return [{"positions": 8 * spread(device, sizes.points, 3) - 4}]
 
 
-def _places(device: torch.device) -> Sequence[Example]:
-    nears, fars = (low + length * spread(device, 7, 1) for low, length in ((0.01, 0.3), (2, 30)))
+def _places(device: torch.device, sizes: Sizes) -> Sequence[Example]:
+    nears, fars = (low + length * spread(device, sizes.rays, 1) for low, length in ((0.01, 0.3), (2, 30)))
     # where samples begin is a view of all edges
-    return [{"places": spread(device, 7, 38).sort(dim=1)[0][:, :-1], "nears": nears, "fars": fars}]
+    edges = spread(device, sizes.rays, sizes.samples[-1] + 2).sort(dim=1)[0]
+    return [{"places": edges[:, :-1], "nears": nears, "fars": fars}]
 
 
-def _directions(device: torch.device) -> Sequence[Example]:
-    directions = torch.nn.functional.normalize(2 * spread(device, 67, 3) - 1, dim=1)
-    return [{"directions": directions, "dtype": dtype} for dtype in (torch.float32, torch.float16)]
+def _directions(device: torch.device, sizes: Sizes) -> Sequence[Example]:
+    directions = torch.nn.functional.normalize(2 * spread(device, 10 * sizes.rays, 3) - 1, dim=1)
+    return [{"directions": directions, "dtype": dtype} for dtype in sizes.dtypes]
 
 
-def _wanted(device: torch.device) -> Sequence[Example]:
-    edges, weights = _histogram(device, 7, 43, 2)
-    wanted = spread(device, 7, 29, seed=5).sort(dim=1)[0]
-    return [{"weights": weights, "edges": edges, "wanted": wanted, "padding": 0.01, "least": 1e-5}]
-
-
-def _proposals(device: torch.device) -> Sequence[Example]:
-    (edges, weights), (outer_edges, outer) = _histogram(device, 7, 29, 2), _histogram(device, 7, 43, 6)
-    given = {"edges": edges, "weights": weights, "outer_edges": outer_edges}
-    return [{**given, "outer_weights": outer.requires_grad_()}]
-
-
-def _samples(device: torch.device) -> Sequence[Example]:
-    edges, weights = _histogram(device, 7, 43, 2)
-    return [{"edges": edges, "weights": weights.requires_grad_()}]
-
-
-def _outputs(device: torch.device) -> Sequence[Example]:
-    # a network's, under autocast in half precision
-    outputs = ((8 * spread(device, 151) - 4).to(dtype) for dtype in (torch.float32, torch.float16))
-    inside = (spread(device, 151, seed=3) < 0.7).float()
-    return [{"before": each.requires_grad_(), "inside": inside, "scale": 0.01} for each in outputs]
-
-
-def _optical(device: torch.device) -> Sequence[Example]:
-    densities = 20 * spread(device, 7, 43) ** 4
-    return [{"densities": densities.requires_grad_(), "deltas": spread(device, 7, 43, seed=3)}]
-
-
-def _points(device: torch.device) -> Sequence[Example]:
-    scalings = torch.tensor([4.0, 23.0, 64.0], device=device)
-    points = {"positions": spread(device, 151, 3).requires_grad_(), "scalings": scalings}
-    table = (2 * spread(device, 3 << 8, 2) - 1).requires_grad_()
-    # under autocast it is given in half precision
-    return [{**points, "table": table, "dtype": dtype} for dtype in (torch.float32, torch.float16)]
-
-
-FEW_RAYS, FEW_POINTS = 16, 128
-"""Of examples as a step has them: 16 divides them, as it divides a step's numbers of rays and of points."""
-PROPOSALS, SAMPLES = (256, 96), 48
-"""Samples of a ray on each level of the full preset."""
-LEVELS = (16, 5)
-"""Levels of the hash grids of its field and its proposal networks, of two features each."""
-
-
-def _step_positions(device: torch.device) -> Sequence[Example]:
-    return [{"positions": 8 * spread(device, FEW_POINTS, 3) - 4}]
-
-
-def _step_places(device: torch.device) -> Sequence[Example]:
-    nears, fars = (low + length * spread(device, FEW_RAYS, 1) for low, length in ((0.01, 0.3), (2, 30)))
-    return [{"places": spread(device, FEW_RAYS, SAMPLES + 1).sort(dim=1)[0], "nears": nears, "fars": fars}]
-
-
-def _step_directions(device: torch.device) -> Sequence[Example]:
-    directions = torch.nn.functional.normalize(2 * spread(device, FEW_RAYS, 3) - 1, dim=1)
-    return [{"directions": directions, "dtype": torch.float16}]
-
-
-def _step_wanted(device: torch.device) -> Sequence[Example]:
+def _wanted(device: torch.device, sizes: Sizes) -> Sequence[Example]:
     made = []
-    for samples, following in pairwise((*PROPOSALS, SAMPLES)):
-        edges, weights = _histogram(device, FEW_RAYS, samples, 2)
-        wanted = spread(device, FEW_RAYS, following + 1, seed=5).sort(dim=1)[0]
+    for samples, following in pairwise(sizes.samples):
+        edges, weights = _histogram(device, sizes.rays, samples, 2)
+        wanted = spread(device, sizes.rays, following + 1, seed=5).sort(dim=1)[0]
         made.append({"weights": weights, "edges": edges, "wanted": wanted, "padding": 0.01, "least": 1e-5})
     return made
 
 
-def _step_proposals(device: torch.device) -> Sequence[Example]:
-    edges, weights = _histogram(device, FEW_RAYS, SAMPLES, 2)
+def _proposals(device: torch.device, sizes: Sizes) -> Sequence[Example]:
+    edges, weights = _histogram(device, sizes.rays, sizes.samples[-1], 2)
     made = []
-    for samples in PROPOSALS:
-        outer_edges, outer = _histogram(device, FEW_RAYS, samples, 6)
+    for samples in sizes.samples[:-1]:
+        outer_edges, outer = _histogram(device, sizes.rays, samples, 6)
         given = {"edges": edges, "weights": weights, "outer_edges": outer_edges}
         # proposal networks rest in most steps
-        made += [{**given, "outer_weights": outer}, {**given, "outer_weights": outer.clone().requires_grad_()}]
+        made += [{**given, "outer_weights": outer}] if sizes.in_a_step else []
+        made.append({**given, "outer_weights": outer.clone().requires_grad_()})
     return made
 
 
-def _step_samples(device: torch.device) -> Sequence[Example]:
-    edges, weights = _histogram(device, FEW_RAYS, SAMPLES, 2)
+def _samples(device: torch.device, sizes: Sizes) -> Sequence[Example]:
+    edges, weights = _histogram(device, sizes.rays, sizes.samples[-1], 2)
     return [{"edges": edges, "weights": weights.requires_grad_()}]
 
 
-def _step_outputs(device: torch.device) -> Sequence[Example]:
-    before = spread(device, FEW_POINTS).half().requires_grad_()
-    return [{"before": before, "inside": torch.ones(FEW_POINTS, device=device), "scale": 0.01}]
+def _outputs(device: torch.device, sizes: Sizes) -> Sequence[Example]:
+    outputs = ((8 * spread(device, sizes.points) - 4).to(dtype) for dtype in sizes.dtypes)
+    inside = (spread(device, sizes.points, seed=3) < 0.7).float()
+    return [{"before": each.requires_grad_(), "inside": inside, "scale": 0.01} for each in outputs]
 
 
-def _step_optical(device: torch.device) -> Sequence[Example]:
+def _optical(device: torch.device, sizes: Sizes) -> Sequence[Example]:
     return [
         {
-            "densities": (20 * spread(device, FEW_RAYS, samples) ** 4).requires_grad_(),
-            "deltas": spread(device, FEW_RAYS, samples, seed=3),
+            "densities": (20 * spread(device, sizes.rays, samples) ** 4).requires_grad_(),
+            "deltas": spread(device, sizes.rays, samples, seed=3),
         }
-        for samples in (*PROPOSALS, SAMPLES)
+        for samples in sizes.weighted
     ]
 
 
-def _step_points(device: torch.device) -> Sequence[Example]:
+def _points(device: torch.device, sizes: Sizes) -> Sequence[Example]:
     made = []
-    for levels in LEVELS:
+    for levels in sizes.levels:
         scalings = 4 * 1.4 ** torch.arange(levels, device=device)
         table = (2 * spread(device, levels << 8, 2) - 1).requires_grad_()
-        points = {"positions": spread(device, FEW_POINTS, 3), "scalings": scalings}
-        made.append({**points, "table": table, "dtype": torch.float16})
+        # in a step nobody asks for the gradient to positions
+        positions = spread(device, sizes.points, 3).requires_grad_(not sizes.in_a_step)
+        given = {"positions": positions, "scalings": scalings, "table": table}
+        made += [{**given, "dtype": dtype} for dtype in sizes.dtypes]
     return made
 
 
 MOST = 2048
 """So many samples of a ray stay on a GPU's chip."""
 
+
+def on_gpu(
+    title: str,
+    load: Callable[[], Callable[..., Any]],
+    formula: Callable[..., Any],
+    examples: Callable[[torch.device, Sizes], Sequence[Example]],
+    tolerance: float,
+    most_columns: int | None = None,
+) -> GpuForm:
+    """Make a kernel of Triton that is tried out on a function's examples of both sizes."""
+    odd, in_a_step = (partial(examples, sizes=sizes) for sizes in (ODD, STEP))
+    return GpuForm(title, load, formula, odd, tolerance, most_columns, in_a_step)
+
+
 HASH_GRID = Function(
     lambda: partial(hash_grid, work=_numba().hash_grid),
-    GpuForm(
-        "hash grid",
-        lambda: partial(hash_grid, work=_triton().hash_grid),
-        formulas.hash_grid,
-        _points,
-        tolerance=2e-5,
-        in_a_step=_step_points,
+    on_gpu(
+        "hash grid", lambda: partial(hash_grid, work=_triton().hash_grid), formulas.hash_grid, _points, tolerance=2e-5
     ),
 )
 CONTRACT = Function(
     lambda: _numba().contraction.contract,
-    GpuForm(
-        "contraction",
-        lambda: _triton().pointwise.contract,
-        formulas.contract,
-        _positions,
-        tolerance=1e-5,
-        in_a_step=_step_positions,
-    ),
+    on_gpu("contraction", lambda: _triton().pointwise.contract, formulas.contract, _positions, 1e-5),
     follows=False,
 )
 DISTANCES = Function(
     lambda: _numba().pointwise.distances,
-    GpuForm(
-        "distances",
-        lambda: _triton().pointwise.distances,
-        formulas.distances,
-        _places,
-        tolerance=1e-4,
-        in_a_step=_step_places,
-    ),
+    on_gpu("distances", lambda: _triton().pointwise.distances, formulas.distances, _places, 1e-4),
     follows=False,
 )
 HARMONICS = Function(
     lambda: _numba().pointwise.harmonics,
-    GpuForm(
-        "directions",
-        lambda: _triton().pointwise.harmonics,
-        formulas.harmonics,
-        _directions,
-        tolerance=1e-5,
-        in_a_step=_step_directions,
-    ),
+    on_gpu("directions", lambda: _triton().pointwise.harmonics, formulas.harmonics, _directions, 1e-5),
     follows=False,
 )
 SAMPLE_PDF = Function(
     lambda: _numba().ray.sample_pdf,
-    GpuForm(
-        "placing of samples", lambda: _triton().ray.sample_pdf, formulas.sample_pdf, _wanted, 1e-4, MOST, _step_wanted
-    ),
+    on_gpu("placing of samples", lambda: _triton().ray.sample_pdf, formulas.sample_pdf, _wanted, 1e-4, MOST),
 )
 INTERLEVEL_LOSS = Function(
     lambda: _numba().ray.interlevel_loss,
-    GpuForm(
-        "proposal loss",
-        lambda: _triton().ray.interlevel_loss,
-        formulas.interlevel_loss,
-        _proposals,
-        1e-4,
-        MOST,
-        _step_proposals,
-    ),
+    on_gpu("proposal loss", lambda: _triton().ray.interlevel_loss, formulas.interlevel_loss, _proposals, 1e-4, MOST),
 )
 DISTORTION_LOSS = Function(
-    lambda: _numba().ray.distortion_loss,
-    GpuForm(
-        "distortion loss",
-        lambda: _triton().ray.distortion_loss,
-        formulas.distortion_loss,
-        _samples,
-        1e-4,
-        MOST,
-        _step_samples,
+    on_gpu=on_gpu(
+        "distortion loss", lambda: _triton().ray.distortion_loss, formulas.distortion_loss, _samples, 1e-4, MOST
     ),
 )
 POSITIONS = Function(lambda: _numba().pointwise.midpoints, follows=False)
 DENSITY = Function(
-    lambda: _numba().pointwise.density,
-    GpuForm("density", lambda: _triton().pointwise.density, formulas.density, _outputs, 1e-5, None, _step_outputs),
+    on_gpu=on_gpu("density", lambda: _triton().pointwise.density, formulas.density, _outputs, 1e-5),
 )
 WEIGHTS = Function(
-    lambda: _numba().ray.weights_from_densities,
-    GpuForm(
-        "weights",
-        lambda: _triton().ray.weights_from_densities,
-        formulas.weights_from_densities,
-        _optical,
-        1e-5,
-        MOST,
-        _step_optical,
+    on_gpu=on_gpu(
+        "weights", lambda: _triton().ray.weights_from_densities, formulas.weights_from_densities, _optical, 1e-5, MOST
     ),
 )
 

@@ -11,30 +11,27 @@ from torch import Tensor
 
 class _Sloped(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, followed: Tensor, compute: Callable[[bool], tuple[Tensor, Tensor]], divisor: int) -> Tensor:
+    def forward(ctx: Any, followed: Tensor, compute: Callable[[bool], tuple[Tensor, Tensor]]) -> Tensor:
         loss, slopes = compute(ctx.needs_input_grad[0])
         if ctx.needs_input_grad[0]:
             ctx.save_for_backward(slopes)
-            ctx.divisor = divisor
         return loss
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
-        gradient = gradients[0] if ctx.divisor == 1 else gradients[0] / ctx.divisor
-        return ctx.saved_tensors[0] * gradient.reshape(-1, 1), None, None
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        return ctx.saved_tensors[0] * gradients[0].reshape(-1, 1), None
 
 
-def sloped(followed: Tensor, compute: Callable[[bool], tuple[Tensor, Tensor]], divisor: int = 1) -> Tensor:
+def sloped(followed: Tensor, compute: Callable[[bool], tuple[Tensor, Tensor]]) -> Tensor:
     """Make a loss differentiable once by one matrix, with the gradient that its kernel gives beside it.
 
     Args:
         followed: the matrix, [rays, n].
-        compute: gives the loss, a number or one for each ray, and its slope at each number of the matrix times
-            `divisor`. Its argument says whether slopes are asked for.
-        divisor: of the slopes.
+        compute: gives the loss, a number or one for each ray, and its slope at each number of the matrix. Its argument
+            says whether slopes are asked for.
     """
-    loss = _Sloped.apply(followed, compute, divisor)
+    loss = _Sloped.apply(followed, compute)
     assert isinstance(loss, Tensor)
     return loss
 

@@ -1,12 +1,12 @@
 """What nerfacto computes number by number on the CPU, each in one pass: torch needs four to seventy.
 
-Where samples lie, their distances from places in 0..1, densities, and directions in spherical harmonics. The same
-functions as in `pointwise_triton`, float32. Importing this module imports Numba.
+Where samples lie, their distances from places in 0..1, and directions in spherical harmonics; float32. Importing this
+module imports Numba.
 """
 
 from __future__ import annotations
 
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import numpy as np
 import torch
@@ -14,13 +14,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from edge_depth_nerf.kernels.compiled import compiled
-from edge_depth_nerf.kernels.exponential_numba import exp
 from edge_depth_nerf.kernels.threads import in_parts
 
 HARMONICS = 16
 """Spherical harmonics of four degrees."""
-STEEPEST = 15.0
-"""nerfstudio's: the gradient of exp(x) is taken at an x of this at most."""
 LEAST_SHARE = 1 << 16
 """A thread gets at least so many numbers."""
 HALF, ONE, TWO = np.float32(0.5), np.float32(1), np.float32(2)
@@ -109,66 +106,6 @@ def midpoints(
     arrays = *matrices, positions.view(-1).numpy(), columns
     in_parts(lambda first, last: find_midpoints(*arrays, first, last), rays, LEAST_SHARE // max(1, columns))
     return positions
-
-
-@compiled()
-@no_type_check
-def find_densities(before, stride, inside, densities, scale, first, last):
-    """Write the densities of some points; calls for different ones may run at once."""
-    given, within, found = before[first * stride :], inside[first:], densities[first:]
-    for k in range(last - first):
-        found[k] = scale * exp(given[np.uint64(k * stride)]) * within[k]
-
-
-@compiled()
-@no_type_check
-def _density_gradients(before, stride, densities, inside, gradient, to_before, scale, steepest, first, last):
-    given, within, found = before[first * stride :], inside[first:], densities[first:]
-    of_density, into = gradient[first:], to_before[first:]
-    most, least = scale * exp(steepest), scale * exp(-steepest)
-    for k in range(last - first):
-        x = given[np.uint64(k * stride)]
-        # the densities themselves, but for those whose slope is limited
-        slope = most * within[k] if x > steepest else found[k]
-        slope = least * within[k] if x < -steepest else slope
-        into[k] = of_density[k] * slope
-
-
-class _Density(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, before: Tensor, inside: Tensor, scale: float) -> Tensor:
-        inside, densities = inside.detach().contiguous(), torch.empty(len(before))
-        given, stride = flat_rows(before[:, None])
-        arrays = given, stride, inside.numpy(), densities.numpy(), np.float32(scale)
-        in_parts(lambda first, last: find_densities(*arrays, first, last), len(before), LEAST_SHARE)
-        if ctx.needs_input_grad[0]:
-            ctx.save_for_backward(before, inside, densities)
-            ctx.scale = scale
-        return densities
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
-        before, inside, densities = ctx.saved_tensors
-        to_before = torch.empty(len(before))
-        given, stride = flat_rows(before[:, None])
-        arrays = given, stride, densities.numpy(), inside.numpy(), gradients[0].contiguous().numpy(), to_before.numpy()
-        numbers = np.float32(ctx.scale), np.float32(STEEPEST)
-        in_parts(lambda first, last: _density_gradients(*arrays, *numbers, first, last), len(before), LEAST_SHARE)
-        return to_before, None, None
-
-
-def density(before: Float[Tensor, "points"], inside: Float[Tensor, "points"], scale: float) -> Float[Tensor, "points"]:
-    """Compute densities, scale · exp(before) inside the scene and 0 outside; the gradient as nerfstudio's `trunc_exp`.
-
-    Args:
-        before: a network's outputs, any stride. Differentiable once, by them alone.
-        inside: 1 where a point is inside, else 0.
-        scale: the density of what a new network gives.
-    """
-    found = _Density.apply(before, inside, scale)
-    assert isinstance(found, Tensor)
-    return found
 
 
 @compiled()

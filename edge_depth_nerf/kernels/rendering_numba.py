@@ -20,13 +20,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from edge_depth_nerf.kernels.compiled import compiled, flat
-from edge_depth_nerf.kernels.exponential_numba import exp
 from edge_depth_nerf.kernels.network_numba import Arrays, Slopes, writes_forward
-from edge_depth_nerf.kernels.pointwise_numba import STEEPEST
 from edge_depth_nerf.kernels.rendering import Background, Networks, Rendered
 from edge_depth_nerf.kernels.threads import in_parts
 
 ZERO, ONE = np.float32(0), np.float32(1)
+STEEPEST = 15.0
+"""nerfstudio's: the gradient of exp(x) is taken at an x of this at most."""
 LAST_SAMPLE, POINT = int(Background.LAST_SAMPLE), int(Background.POINT)
 LEAST_SHARE = 1 << 11
 """A thread gets at least so many points."""
@@ -58,7 +58,7 @@ class _Gradients(NamedTuple):
 @compiled(error_model="numpy")
 @no_type_check
 def _sigmoid(x):
-    return ONE / (ONE + exp(-x))
+    return ONE / (ONE + np.exp(-x))
 
 
 @compiled()
@@ -66,7 +66,7 @@ def _sigmoid(x):
 def _sum_depths(before, inside, delta, scale, densities, depths, reached):
     """Write densities and optical depths of a ray's samples, and the sums of the depths in front of each."""
     for k in range(len(depths)):
-        densities[k] = scale * exp(before[k]) * inside[k]
+        densities[k] = scale * np.exp(before[k]) * inside[k]
         depths[k] = delta[k] * densities[k]
     running = 0.0
     for k in range(len(depths)):
@@ -95,7 +95,7 @@ def _render(given, rgb, accumulation, weights, point_rgb, first, last):
         weight = weights[begin:]
         _sum_depths(values[begin:], given.inside[begin:], given.deltas[begin:], given.scale, densities, depths, reached)
         for k in range(samples):
-            found = (ONE - exp(-depths[k])) * exp(-reached[k])
+            found = (ONE - np.exp(-depths[k])) * np.exp(-reached[k])
             # as nerfstudio: what is not a number weighs nothing
             weight[k] = found if found == found else ZERO
         hit = 0.0
@@ -130,7 +130,7 @@ def _all_gradients(given, point_rgb, gradients, to_values, steepest, first, last
     densities, depths, reached = (np.empty(samples, np.float32), np.empty(samples, np.float32),
                                   np.empty(samples, np.float32))  # fmt: skip
     weight, of_weight = np.empty(samples, np.float32), np.empty(samples, np.float32)
-    most, least = given.scale * exp(steepest), given.scale * exp(-steepest)
+    most, least = given.scale * np.exp(steepest), given.scale * np.exp(-steepest)
     for ray in range(first, last):
         begin = ray * samples
         before, within, delta = values[begin:], given.inside[begin:], given.deltas[begin:]
@@ -138,7 +138,7 @@ def _all_gradients(given, point_rgb, gradients, to_values, steepest, first, last
         _sum_depths(before, within, delta, given.scale, densities, depths, reached)
         hit = 0.0
         for k in range(samples):
-            depths[k], reached[k] = exp(-depths[k]), exp(-reached[k])
+            depths[k], reached[k] = np.exp(-depths[k]), np.exp(-reached[k])
             weight[k] = (ONE - depths[k]) * reached[k]
             hit += weight[k] if weight[k] == weight[k] else ZERO
         left = np.float32(1 - hit)

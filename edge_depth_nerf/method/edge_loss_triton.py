@@ -79,18 +79,10 @@ def edge_loss(
     eps: float,
     narrow: float,
 ) -> Float[Tensor, "rays"]:
-    """Compute Eq. 4 of each ray; float32.
+    """Compute Eq. 4 of each ray, as `losses.edge_loss` does with these arguments; float32.
 
-    Args:
-        weights: rendering weights. Differentiable once, by them alone.
-        starts_m: where each sample begins along its ray.
-        ends_m: where it ends.
-        prior_m: d̃; a ray where it is not positive and finite gives 0.
-        sigma_m: σ̂; likewise.
-        interval: take the Gaussian's mass over a sample, not its value at the midpoint.
-        divide_by_norm: divide by σ̂ √(2π).
-        eps: added to the weights inside the logarithm.
-        narrow: below this length, in units of σ̂, an interval's mass comes from its midpoint.
+    Differentiable once, by the weights alone. `eps` is added to the weights inside the logarithm; below a length of
+    `narrow`, in units of σ̂, an interval's mass comes from its midpoint.
     """
     options = {"eps": eps, "narrow": narrow, "INTERVAL": interval, "NORM": divide_by_norm, "RAYS": RAYS}
     (rays, samples), weights = weights.shape, weights.float()

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.kernels.back_ends import Example, Function, GpuForm
-from edge_depth_nerf.kernels.functions import FEW_RAYS, SAMPLES, gpu_forms, spread
+from edge_depth_nerf.kernels.functions import Sizes, gpu_forms, on_gpu, spread
 
 Gaussian = Literal["point", "interval"]
 
@@ -105,27 +105,18 @@ def _by_torch(*, interval: bool, divide_by_norm: bool, eps: float, narrow: float
     return edge_loss(**rays, gaussian="interval" if interval else "point", divide_by_norm=divide_by_norm)
 
 
-def _examples(device: torch.device) -> Sequence[Example]:
+def _examples(device: torch.device, sizes: Sizes) -> Sequence[Example]:
     """Samples of rays, of which some have no prior; both forms of the Gaussian."""
-    edges = 120 * spread(device, 13, 38).sort(dim=1)[0]
-    weights = (spread(device, 13, 37, seed=3) ** 4).requires_grad_()
-    prior_m, sigma_m = 100 * spread(device, 13, seed=5) - 8, 0.2 + 8 * spread(device, 13, seed=7)
+    rays, samples = sizes.rays, sizes.samples[-1]
+    edges = 120 * spread(device, rays, samples + 1).sort(dim=1)[0]
+    weights = (spread(device, rays, samples, seed=3) ** 4).requires_grad_()
+    prior_m, sigma_m = 100 * spread(device, rays, seed=5) - 8, 0.2 + 8 * spread(device, rays, seed=7)
     given = {"weights": weights, "starts_m": edges[:, :-1], "ends_m": edges[:, 1:], "prior_m": prior_m}
     forms = ({"interval": True, "divide_by_norm": True}, {"interval": False, "divide_by_norm": False})
     return [{**given, "sigma_m": sigma_m, **form, "eps": EPS, "narrow": NARROW} for form in forms]
 
 
-def _step_examples(device: torch.device) -> Sequence[Example]:
-    """Samples of a level of the full preset, and of the paper's."""
-    edges = 120 * spread(device, FEW_RAYS, SAMPLES + 1).sort(dim=1)[0]
-    weights = (spread(device, FEW_RAYS, SAMPLES, seed=3) ** 4).requires_grad_()
-    prior_m, sigma_m = 100 * spread(device, FEW_RAYS, seed=5) - 8, 0.2 + 8 * spread(device, FEW_RAYS, seed=7)
-    starts_m, ends_m = edges[:, :-1].contiguous(), edges[:, 1:].contiguous()
-    given = {"weights": weights, "starts_m": starts_m, "ends_m": ends_m, "prior_m": prior_m, "sigma_m": sigma_m}
-    return [{**given, "interval": full, "divide_by_norm": full, "eps": EPS, "narrow": NARROW} for full in (True, False)]
-
-
-_ON_GPU = GpuForm("edge loss", _by_triton, _by_torch, _examples, tolerance=1e-4, in_a_step=_step_examples)
+_ON_GPU = on_gpu("edge loss", _by_triton, _by_torch, _examples, tolerance=1e-4)
 EDGE_LOSS = Function(_by_numba, _ON_GPU)
 """`edge_loss` in its compiled forms, differentiable once, by the weights alone."""
 
@@ -145,14 +136,7 @@ def ds_nerf_loss(
     """Compute the DS-NeRF loss of each ray, -Σ_k log(w_k) · exp(-(t_k - z)² / 2σ²) · Δt_k.
 
     Deng et al., Depth-supervised NeRF, CVPR 2022, Eq. 6: Eq. 4's literal form with one σ for all rays. nerfstudio's
-    divides by 2σ instead, so what it calls sigma is a variance.
-
-    Args:
-        weights: rendering weights, 0 or more.
-        starts_m: where each sample begins along its ray.
-        ends_m: where it ends.
-        prior_m: z.
-        sigma_m: σ.
+    divides by 2σ instead, so what it calls sigma is a variance. Arguments are those of `edge_loss`, with one σ.
     """
     return edge_loss(weights, starts_m, ends_m, prior_m, torch.full_like(prior_m, _positive("ds_nerf_loss", sigma_m)))
 
@@ -172,15 +156,8 @@ def urban_nerf_loss_of_nerfstudio(
     """Compute UrbanNeRF's loss of each ray as nerfstudio has it: (E - z)² + Σ near (w_k - K(t_k - z))² + Σ empty w_k².
 
     A midpoint t_k is near within σ of z, and empty before that; K is a Gaussian of standard deviation σ/3. Weights,
-    which have no unit, are held against K, which is a density (nerfstudio issues 1793 and 1871).
-
-    Args:
-        weights: rendering weights, 0 or more.
-        starts_m: where each sample begins along its ray.
-        ends_m: where it ends.
-        prior_m: z.
-        expected_m: E, the expected distance of the ray's final samples.
-        sigma_m: σ.
+    which have no unit, are held against K, which is a density (nerfstudio issues 1793 and 1871). Arguments are those of
+    `edge_loss`, with one σ, and E, the expected distance of the ray's final samples.
     """
     _check_shapes(
         "urban_nerf_loss_of_nerfstudio",
@@ -223,18 +200,8 @@ def urban_nerf_loss(
         near      ∫ (h(t) - K(t - z))² dt   from z - ε to z + ε
 
     Their third term of the line of sight, behind z + ε, is left out: weight behind is weight that near lacks.
-    h(t) = w_k / Δt_k within a sample, and the integrals are exact for that, however short ε is.
-
-    Args:
-        weights: rendering weights, 0 or more.
-        starts_m: where each sample begins along its ray. A sample of no length, of negative length or with an end
-            that is not finite gives nothing.
-        ends_m: where it ends.
-        prior_m: z.
-        sigma_m: σ; ε is three times that.
-        expected: weight of the squared error of the expected distance, per m².
-        empty: weight of the light that ends before the surface, metres.
-        near: weight of how light ends at the surface, metres.
+    h(t) = w_k / Δt_k within a sample, and the integrals are exact for that, however short ε is. Arguments are those of
+    `edge_loss`, with one σ, and the weights of the three terms: `expected` per m², `empty` and `near` in metres.
 
     Raises:
         InputError: shapes that do not fit, or a σ that is not positive.

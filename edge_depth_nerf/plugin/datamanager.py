@@ -353,8 +353,8 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         return PixelTable(path)
 
 
-def _of_use(distance_m: Any, sigma_m: Any, sky: Any) -> Any:
-    """Say whether a pixel shows the sky, or a surface whose prior is not too vague. Arrays or tensors."""
+def _of_use(distance_m: Tensor, sigma_m: Tensor, sky: Tensor) -> Tensor:
+    """Say whether a pixel shows the sky, or a surface whose prior is not too vague."""
     vague = sigma_m > SURFACE_SIGMA_M + SURFACE_SIGMA_SHARE * distance_m
     return sky | (distance_m > 0) & ~vague
 

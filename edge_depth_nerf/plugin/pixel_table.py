@@ -80,7 +80,7 @@ class PixelBatch:
 
 
 def decode(packed: UInt8[Tensor, "n 15"]) -> PixelBatch:
-    """Unpack records where they are; on a GPU, which then gets 15 bytes a pixel and not 53. The numbers of `batch`.
+    """Unpack records where they are; on a GPU, which then gets 15 bytes a pixel and not 53.
 
     Args:
         packed: the bytes of `PixelTable.records`.
@@ -151,28 +151,20 @@ class PixelTable:
         place.copy_(_bytes_of(np.asarray(self.records(start, len(place)))))
 
     def batch(
-        self, start: int, count: int, keep: Callable[[NDArray, NDArray, NDArray], NDArray] | None = None
+        self, start: int, count: int, keep: Callable[[Tensor, Tensor, Tensor], Tensor] | None = None
     ) -> PixelBatch:
         """Read `count` pixels from number `start` on; after the last one comes the first again.
 
         Args:
             start: number of the first one.
             count: of pixels.
-            keep: whether a pixel is in the batch, by its distance and sigma in metres and whether it shows the sky, [n]
-                each. None: all are.
+            keep: whether a pixel is in the batch, by its distance and sigma in metres and whether it shows the sky, [n,
+                1] each. None: all are.
         """
-        # imported here, because Numba takes half a second to load
-        from edge_depth_nerf.plugin.pixel_records_numba import unpacked
-
-        records = self.records(start, count)
-        if keep is not None:
-            distance, sigma = records["distance"], records["sigma"]
-            sky = (distance == 0) & (sigma == SKY)
-            steps_per_metre = np.float32(DISTANCE_STEPS_PER_METRE)
-            sigma = np.where(sky, 0, sigma).astype(np.float32)
-            records = records[keep(distance.astype(np.float32) / steps_per_metre, sigma / steps_per_metre, sky)]
-        packed = np.ascontiguousarray(records).view(np.uint8)
-        return PixelBatch(*unpacked(packed, DISTANCE_STEPS_PER_METRE, SKY))
+        pixels = decode(self.packed(start, count))
+        if keep is None:
+            return pixels
+        return pixels[keep(pixels.prior_distance_m, pixels.prior_sigma_m, pixels.sky)[:, 0]]
 
 
 @dataclass(frozen=True, eq=False)

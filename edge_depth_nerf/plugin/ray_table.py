@@ -36,9 +36,6 @@ MOST_PIXELS = 1 << 24
 """Lenses with more pixels than this in all (a table of 335 MB) get no table."""
 STRIP = 1 << 16
 """So many rays are made at once."""
-DIRECTION, REST = slice(0, 3), slice(3, 5)
-"""Columns: direction in the camera's frame (OpenGL, unit length), the area of the pixel at distance 1, and the length
-of the direction before it was normalised."""
 
 
 def _lenses(cameras: Cameras) -> tuple[Float[Tensor, "lenses 13"], Int[Tensor, "cameras"]]:
@@ -52,7 +49,11 @@ def _lenses(cameras: Cameras) -> tuple[Float[Tensor, "lenses 13"], Int[Tensor, "
 
 
 def _make(lenses: Tensor, advance: Callable[[int], object]) -> np.ndarray:
-    """Make the table of some lenses, each row by row; `advance` gets the number of finished pixels."""
+    """Make the table of some lenses, each row by row; `advance` gets the number of finished pixels.
+
+    Its columns are the direction in the camera's frame (OpenGL, unit length), the area of the pixel at distance 1, and
+    the length of the direction before it was normalised.
+    """
     parts = []
     for lens in lenses.float():
         width, height = int(lens[0]), int(lens[1])
@@ -144,22 +145,19 @@ class TableRayGenerator(RayGenerator):
     def forward(self, ray_indices: Int[Tensor, "num_rays 3"]) -> RayBundle:
         """Give the rays of pixels: picture, row and column."""
         picture, row, column = ray_indices.unbind(-1)
-        if ray_indices.device.type == "cpu":
-            # imported here, because Numba takes half a second to load
-            from edge_depth_nerf.plugin.table_rays_numba import turned
-
-            origins, directions, rest = turned(self.table, self.first, self.widths, ray_indices, self.poses)
-        else:
-            place = self.first[picture] + row * self.widths[picture] + column
-            ray, pose = self.table[place], self.poses[picture]
-            origins, rest = pose[:, :3, 3], ray[:, REST]
-            directions = torch.sum(ray[:, None, DIRECTION] * pose[:, :3, :3], dim=-1)
+        place = self.first[picture] + row * self.widths[picture] + column
+        # torch would count these from the end
+        if place.device.type == "cpu" and bool(((picture | place) < 0).any()):
+            raise IndexError(f"Pixels from {ray_indices.amin(0).tolist()} (picture, row, column) on were asked for.")
+        ray, pose = self.table[place], self.poses[picture]
+        # column by column: on the CPU a sum over three numbers takes several times as long
+        x, y, z, area, length = ray.split(1, dim=1)
         return rays_of(
-            origins=origins,
-            directions=directions,
-            pixel_area=rest[:, :1],
+            origins=pose[:, :3, 3],
+            directions=x * pose[:, :3, 0] + y * pose[:, :3, 1] + z * pose[:, :3, 2],
+            pixel_area=area,
             camera_indices=picture[:, None],
-            metadata={"directions_norm": rest[:, 1:]},
+            metadata={"directions_norm": length},
         )
 
 

@@ -14,12 +14,14 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from jaxtyping import Bool, Float
+from nerfstudio.model_components.losses import lossfun_outer
 from torch import Tensor
 
 from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.kernels import formulas
+from edge_depth_nerf.kernels.functions import DISTORTION_LOSS, INTERLEVEL_LOSS
 from edge_depth_nerf.method.depth_losses import LOSSES, VARIABLE, DepthLoss, Level, depth_loss, register
 from edge_depth_nerf.method.losses import sky_loss
-from edge_depth_nerf.plugin.fused.nerfacto_losses import distortion_loss, interlevel_loss
 from edge_depth_nerf.plugin.fused.ray_samplers import edges_between, edges_of
 
 register(os.environ.get(VARIABLE, ""))
@@ -185,6 +187,30 @@ def draw_surface_m(batch: Mapping[str, Any], planes: Planes) -> Float[Tensor, "p
     return torch.where(beyond, distance_m - off_m, drawn_m).clamp(planes.near_m, planes.far_m)
 
 
+def distortion_loss(edges: Float[Tensor, "rays edges"], weights: Float[Tensor, "rays samples"]) -> Float[Tensor, ""]:
+    """Compute mip-NeRF 360's distortion loss (its Eq. 15), mean over the rays.
+
+    Edges of samples ascend, in the spacing of 0..1.
+    """
+    compute = None if edges.requires_grad else DISTORTION_LOSS.compiled_for(edges, weights)
+    return (compute or formulas.distortion_loss)(edges, weights)
+
+
+def interlevel_loss(
+    edges: Float[Tensor, "rays edges"],
+    weights: Float[Tensor, "rays samples"],
+    proposal_edges: Float[Tensor, "rays proposal_edges"],
+    proposal_weights: Float[Tensor, "rays proposal_samples"],
+) -> Float[Tensor, ""]:
+    """Compute mip-NeRF 360's interlevel loss (its Eq. 13) of one proposal network, mean over the samples.
+
+    `weights` are taken as given: the gradient goes to `proposal_weights` alone.
+    """
+    given = edges, weights.detach(), proposal_edges, proposal_weights
+    compute = INTERLEVEL_LOSS.compiled_for(*given)
+    return lossfun_outer(*given).mean() if compute is None else compute(*given)
+
+
 def distortion_of(outputs: Mapping[str, Any]) -> Float[Tensor, ""]:
     """Compute nerfacto's distortion loss, without its weight."""
     return distortion_loss(edges_of(outputs["ray_samples_list"][-1]), outputs["weights_list"][-1].squeeze(-1))
@@ -196,5 +222,5 @@ def interlevel_of(outputs: Mapping[str, Any]) -> Float[Tensor, ""]:
         (edges_of(samples), weights.squeeze(-1))
         for samples, weights in zip(outputs["ray_samples_list"], outputs["weights_list"], strict=True)
     )
-    losses = [interlevel_loss(final[0], final[1].detach(), *proposal) for proposal in proposals]
+    losses = [interlevel_loss(*final, *proposal) for proposal in proposals]
     return sum(losses[1:], losses[0])

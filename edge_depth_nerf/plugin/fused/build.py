@@ -69,7 +69,6 @@ def compiled_before() -> bool:
         table_adam_numba,
     )
     from edge_depth_nerf.method import edge_loss_numba, integration_numba  # noqa: F401
-    from edge_depth_nerf.plugin import pixel_records_numba, table_rays_numba  # noqa: F401
 
     return compiled.all_on_disk()
 

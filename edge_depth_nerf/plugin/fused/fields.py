@@ -118,16 +118,11 @@ class FusedNerfactoField(NerfactoField):
             return super().get_density(ray_samples)
         positions = ray_samples.frustums.get_positions()
         places, inside = _unit_cube(positions)
-        features = self.mlp_base(places).view(*positions.shape[:-1], -1)
-        return self._density(features, inside)
-
-    def _density(self, features: Tensor, inside: Tensor) -> tuple[Tensor, Tensor]:
-        """Split the first network's outputs into density and what colours are made of."""
-        before, embedding = torch.split(features, [1, self.geo_feat_dim], dim=-1)
+        before, embedding = self.mlp_base(places).view(*positions.shape[:-1], -1).split([1, self.geo_feat_dim], dim=-1)
         return _densities(before, inside, self.average_init_density), embedding
 
     def forward_together(self, parts: Sequence[RaySamples]) -> list[dict[FieldHeadNames, Tensor]]:
-        """Evaluate several sets of samples in one pass through the hash grid.
+        """Evaluate several sets of samples; on a GPU in one pass through the hash grid and both networks.
 
         Passes of their own would each fill a gradient of the size of the table, and these would be added.
 
@@ -137,27 +132,9 @@ class FusedNerfactoField(NerfactoField):
         Returns:
             What `forward` gives for each, without normals; densities of the first alone.
         """
-        if not isinstance(self.spatial_distortion, CubeContraction) or self.use_pred_normals:
+        if parts[0].frustums.origins.device.type != "cuda" or not self._is_plain(parts):
             return [self.forward(samples) for samples in parts]
-        positions = [samples.frustums.get_positions().reshape(-1, 3) for samples in parts]
-        counts = [len(each) for each in positions]
-        places, inside = _unit_cube(torch.cat(positions))
-        if places.device.type == "cuda" and self._is_plain(parts):
-            return self._by_products(parts, places, inside)
-        encoded = self._encoded_directions(parts)
-        of_parts = zip(parts, self.mlp_base(places).split(counts), inside.split(counts), encoded, strict=True)
-        results = []
-        for samples, features, valid, of_rays in of_parts:
-            features, valid = (value.view(*samples.frustums.shape, -1) for value in (features, valid))
-            if not results:
-                density, embedding = self._density(features, valid)
-                results.append({FieldHeadNames.DENSITY: density, **self.get_outputs(samples, embedding, of_rays)})
-            else:
-                results.append(self.get_outputs(samples, features[..., 1:], of_rays))
-        return results
-
-    def _by_products(self, parts: Sequence[RaySamples], places: Tensor, inside: Tensor) -> list[dict[Any, Tensor]]:
-        """Evaluate contracted positions of several sets of samples through both networks at once."""
+        places, inside = _unit_cube(torch.cat([samples.frustums.get_positions().reshape(-1, 3) for samples in parts]))
         encoding, first = self.mlp_base.model
         assert isinstance(first, FusedMLP)
         runs = [(len(part), part.frustums.shape[1]) for part in parts]
@@ -237,14 +214,6 @@ class FusedNerfactoField(NerfactoField):
         shown = mean if self.use_average_appearance_embedding else torch.zeros_like(mean)
         return shown.expand(sum(len(each) for each in parts), -1)
 
-    def _encoded_directions(self, parts: Sequence[RaySamples]) -> Sequence[Tensor | None]:
-        """Encode the directions of the rays of all parts together; None where samples have their own."""
-        directions = [samples.frustums.directions for samples in parts]
-        if not all(map(_one_a_ray, directions)):
-            return [None] * len(parts)
-        every = torch.cat([each[:, 0] for each in directions])
-        return self._encoded(every).split([len(each) for each in directions])
-
     def _encoded(self, directions: Float[Tensor, "rays 3"]) -> Float[Tensor, "rays encoded"]:
         """Encode directions in nerfstudio's spherical harmonics, without a gradient."""
         encoding = self.direction_encoding
@@ -253,37 +222,3 @@ class FusedNerfactoField(NerfactoField):
         if compute is None:
             return encoding(get_normalized_directions(directions))
         return compute(directions, made_by_autocast(directions.device))
-
-    def get_outputs(
-        self,
-        ray_samples: RaySamples,
-        density_embedding: Tensor | None = None,
-        encoded: Float[Tensor, "rays encoded"] | None = None,
-    ) -> dict[FieldHeadNames, Tensor]:
-        """Compute colours of samples; `encoded` are their rays' directions if these are encoded already."""
-        directions, cameras = ray_samples.frustums.directions, ray_samples.camera_indices
-        assert density_embedding is not None
-        more_heads = self.use_transient_embedding or self.use_semantics or self.use_pred_normals
-        plain = isinstance(self.mlp_head, FusedMLP) and self.mlp_head.is_plain and _in_parts(density_embedding)
-        if more_heads or cameras is None or not _one_a_ray(directions) or not plain:
-            return super().get_outputs(ray_samples, density_embedding)
-        of_rays = encoded
-        if of_rays is None:
-            of_rays = self._encoded(directions[:, 0])
-        weights, biases = _parameters(self.mlp_head)
-        features, widths = density_embedding.reshape(-1, self.geo_feat_dim), (of_rays.shape[1], self.geo_feat_dim)
-        if len(features) == len(of_rays) and self.embedding_appearance is None:
-            # a ray of one sample has nothing that samples share
-            colours = network(torch.cat([of_rays, features], dim=1), weights, biases)
-        else:
-            of_direction, of_features, of_appearance = torch.split(
-                weights[0], [*widths, self.appearance_embedding_dim], dim=1
-            )
-            shared = torch.addmm(biases[0], of_rays, of_direction.t())
-            if self.embedding_appearance is not None:
-                if self.training:
-                    shared = torch.addmm(shared, self.embedding_appearance(cameras[:, 0, 0]), of_appearance.t())
-                elif self.use_average_appearance_embedding:
-                    shared = shared + of_appearance @ self.embedding_appearance.mean(dim=0)
-            colours = network(features, [of_features, *weights[1:]], [shared, *biases[1:]])
-        return {FieldHeadNames.RGB: torch.sigmoid(colours).view(directions.shape).to(directions)}

@@ -5,7 +5,7 @@ Host-facing; the numbers are nerfstudio's to float32's noise, from the same rand
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import fields
 from typing import Any
 
@@ -169,17 +169,6 @@ class FusedFrustums(Frustums):
         if compute is None:
             return super().get_positions()
         return compute(self.origins[:, 0], self.directions[:, 0], self.starts[..., 0], self.ends[..., 0])
-
-
-def in_a_row(parts: Sequence[Tensor]) -> Tensor:
-    """Join tensors of one form along their first axis; without a copy where they lie so, as parts of a batch do."""
-    first, at, rows = parts[0], parts[0].storage_offset(), 0
-    for part in parts:
-        follows = part.untyped_storage()._cdata == first.untyped_storage()._cdata and part.storage_offset() == at
-        if not follows or part.stride() != first.stride() or part.requires_grad:
-            return torch.cat([*parts])
-        at, rows = at + len(part) * part.stride(0), rows + len(part)
-    return first.as_strided((rows, *first.shape[1:]), first.stride())
 
 
 def _whole(kind: type[Any], shape: tuple[int, ...], **values: Any) -> Any:
