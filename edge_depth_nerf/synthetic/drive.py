@@ -62,7 +62,7 @@ def held_out(frame: int) -> bool:
     return frame % 8 == 4
 
 
-_ONCE_ONLY = {"layout": "kitti-360", "body": "grey"}
+_ONCE_ONLY = {"layout": "kitti-360"}
 """What is not written into a drive's options: there was no other choice once."""
 
 

@@ -75,7 +75,7 @@ class DriveLayout(ABC):
         """Build the scene, and what each camera sees of the own car."""
         model, seed = build_scene(self.options), self.options.seed
         self.drive, self._world = model.drive, World(model, seed)
-        own_car = own_car_world(model, seed, self.options.body)
+        own_car = own_car_world(model, seed)
         # that world has z up, its origin on the road below the pose's
         pose_to_ground = VEHICLE_TO_POSE.copy()
         pose_to_ground[2, 3] = POSE_HEIGHT_M

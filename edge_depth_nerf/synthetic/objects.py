@@ -6,7 +6,7 @@ house), y left or away from the street, z up from the ground, metres. Random cho
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 
@@ -16,7 +16,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
-from edge_depth_nerf.synthetic.geometry import Colour, Geometry, MeshBuilder, Pair, Real, Triple
+from edge_depth_nerf.synthetic.geometry import Colour, Geometry, MeshBuilder, Pair, Real, Triple, placement
 from edge_depth_nerf.synthetic.materials import Material
 
 _DARK: Colour = (0.02, 0.02, 0.022)
@@ -240,29 +240,8 @@ def recording_car() -> Geometry:
     mesh.add_box((-0.98, 0.64, 1.60), (0.14, 0.10, 0.10), Material.PAINTED, (0.75, 0.42, 0.03))
     beacon = dome.copy().apply_scale(0.7).apply_translation((-0.98, 0.64, 1.67))
     mesh.add_mesh(beacon, Material.PAINTED, (0.55, 0.03, 0.015))
-    return mesh.build().transformed(_middle_to_pose(shape))
-
-
-def plain_recording_car(paint: Colour) -> Geometry:
-    """The same car in matt paint, without what is fitted to it, and lit all over as the level ground is."""
-    shape, mesh = CAR_SHAPES["estate"], MeshBuilder()
-    _body(mesh, shape, paint)
-    _cabin(mesh, shape, paint)
-    _wheels(mesh, shape)
-    built = mesh.build().transformed(_middle_to_pose(shape))
-    painted = built.material == Material.CAR_PAINT
-    return replace(
-        built,
-        material=np.where(painted, Material.PAINTED, built.material).astype(np.uint8),
-        normals=np.where(painted[:, None, None], np.array((0, 0, 1), np.float32), built.normals),
-    )
-
-
-def _middle_to_pose(shape: CarShape) -> NDArray[np.float64]:
-    """From a car's middle to the rear axle, near which the pose's origin lies, 4×4."""
-    shift = np.eye(4)
-    shift[:3, 3] = (shape.wheelbase / 2, -0.2985, 0)
-    return shift
+    # the pose's origin lies near the rear axle
+    return mesh.build().transformed(placement(shape.wheelbase / 2, -0.2985))
 
 
 # ------------------------------------------------------------------------------------------------- houses

@@ -12,7 +12,6 @@ from edge_depth_nerf.base.errors import InputError
 
 SceneName = Literal["street", "parking", "turn", "traffic", "roundabout"]
 LayoutName = Literal["kitti-360", "jbnu-depth360", "rig"]
-BodyName = Literal["grey", "ground"]
 
 MEAN_SPEED_M_S: dict[SceneName, float] = {
     "street": 8.0,
@@ -54,10 +53,6 @@ class SynthesizeOptions:
     """kitti-360: two fisheyes, Velodyne; jbnu-depth360: four 183 degree fisheyes, Ouster; rig: two fisheyes to 110
     degrees, a pinhole and a scanner, described by a rig.toml. --size is the width; not all pictures are square."""
 
-    body: tyro.conf.Suppress[BodyName] = "grey"
-    """Of the recording car. grey: grey paint, with bars, a box and cables on the roof. ground: without these, in matt
-    paint of the ground's colour, so that there is no clear outline in the pictures."""
-
     @property
     def has_movers(self) -> bool:
         """Whether anything but the recording car moves."""
@@ -74,7 +69,7 @@ class SynthesizeOptions:
         Raises:
             InputError: a value cannot be used; names the option, the value and the range.
         """
-        for name, choices in (("scene", SceneName), ("layout", LayoutName), ("body", BodyName)):
+        for name, choices in (("scene", SceneName), ("layout", LayoutName)):
             if (given := getattr(self, name)) not in get_args(choices):
                 expected = ", ".join(get_args(choices))
                 raise InputError(f"--{name} {given}: no such {name}, expected one of {expected}.")

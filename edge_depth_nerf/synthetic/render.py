@@ -31,8 +31,7 @@ from edge_depth_nerf.synthetic.materials import (
     reflectance,
 )
 from edge_depth_nerf.synthetic.motion import Mover
-from edge_depth_nerf.synthetic.objects import plain_recording_car, recording_car
-from edge_depth_nerf.synthetic.options import BodyName
+from edge_depth_nerf.synthetic.objects import recording_car
 from edge_depth_nerf.synthetic.scenes import SceneModel
 
 Array = NDArray[np.float32]
@@ -440,12 +439,8 @@ def _rays_from(camera_to_world: NDArray[np.float64], rays: Array) -> tuple[Array
     return np.tile(_f32(camera_to_world[:3, 3]), (len(directions), 1)), directions
 
 
-def own_car_world(model: SceneModel, seed: int, body: BodyName = "grey") -> World:
-    """The recording car alone, under the scene's light; indoors, a grey one has two lamps above it."""
+def own_car_world(model: SceneModel, seed: int) -> World:
+    """The recording car alone, under the scene's light; indoors it has two lamps above it."""
     lamps = np.array([(x + 1.4, -0.3, 2.4) for x in (-1.9, 1.9)])
-    if body == "ground":
-        car, lamps = plain_recording_car(model.ground), lamps[:0]
-    else:
-        car = recording_car()
     lighting = replace(model.lighting, lamps=lamps if len(model.lighting.lamps) else model.lighting.lamps)
-    return World(SceneModel(car, [], lighting, [], model.drive, model.ground), seed)
+    return World(SceneModel(recording_car(), [], lighting, [], model.drive), seed)

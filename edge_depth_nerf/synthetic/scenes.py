@@ -29,8 +29,6 @@ KERB_HEIGHT_M = 0.12
 
 _ASPHALT: Colour = (0.115, 0.113, 0.11)
 _CONCRETE: Colour = (0.23, 0.23, 0.225)
-_CONCRETE_UNDER_LAMPS: Colour = (0.31, 0.31, 0.303)
-"""Paint that is as bright in a car park's ambient light as its ground under the lamps."""
 _PAVING: Colour = (0.27, 0.255, 0.235)
 _KERB: Colour = (0.36, 0.35, 0.33)
 _GRASS: Colour = (0.085, 0.125, 0.04)
@@ -69,8 +67,6 @@ class SceneModel:
     contacts: list[NDArray[np.float64]]
     """Convex outlines (N×2) of what stands on the ground and keeps light from it."""
     drive: Drive
-    ground: Colour
-    """Paint that is as bright as what is driven on, in the sun or, indoors, without the lamps' light."""
 
 
 class _Site:
@@ -291,8 +287,7 @@ def _driven_through(
     movers = _movers(options, drive, oncoming, -start_m, np.random.default_rng([options.seed, 3]))
     if options.scene == "traffic":
         movers += traffic(drive, options.frames * FRAME_INTERVAL_S, np.random.default_rng([options.seed, 4]))
-    ground = _CONCRETE_UNDER_LAMPS if options.scene == "parking" else _ASPHALT
-    return SceneModel(site.mesh.build(), movers, lighting, site.contacts, drive, ground)
+    return SceneModel(site.mesh.build(), movers, lighting, site.contacts, drive)
 
 
 def _end(site: _Site, reach: Real, rng: Generator) -> None:
