@@ -20,17 +20,17 @@ from __future__ import annotations
 
 import argparse
 import statistics
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 
 from benchmarks.commands import TUNED, ours
 from benchmarks.kept_runs import keep, results_of
 from benchmarks.pages import with_part
-from benchmarks.quality.unseen import DRIVES, GRIDS_STEPS, STEPS, steps_of, write_kept
+from benchmarks.quality.unseen import DRIVES, GRIDS_STEPS, STEPS, figures_of, steps_of, write_kept
 from edge_depth_nerf.base.files import write_text
 from edge_depth_nerf.compare.methods import METHODS
 from edge_depth_nerf.compare.options import MethodName
-from edge_depth_nerf.compare.results import Results, RunResult
+from edge_depth_nerf.compare.results import Results
 
 HERE = Path(__file__).parent
 KEPT = {HERE / "detail.json.xz": ("claims", "seconds"), HERE / "detail_real.json.xz": ("real", "real_seconds")}
@@ -49,26 +49,10 @@ def longer(kept: str, but: Iterable[int]) -> tuple[MethodName, int]:
     return runs[0].method, runs[0].content["steps"]
 
 
-def figures_of(runs: Iterable[RunResult], name: str) -> str:
-    """Mean over drives, with its standard deviation over seeds where there are several."""
-    runs = list(runs)
-    seeds = sorted({run.seed for run in runs})
-    means = [statistics.fmean(run.figures[name] for run in runs if run.seed == seed) for seed in seeds]
-    spread = f" ± {statistics.stdev(means):.2f}" if len(means) > 1 else ""
-    return f"{statistics.fmean(means):.2f}{spread}"
-
-
-def rows_of(results: Results, methods: Iterable[tuple[MethodName, int]]) -> Iterator[tuple[str, list[RunResult]]]:
-    """Methods with their steps, as tables call them, and their runs."""
-    for method, steps in methods:
-        runs = [run for run in results.runs if (run.method, run.content["steps"]) == (method, steps)]
-        if runs:
-            yield METHODS[method].title, runs
-
-
 def table(results: Results, name: str, methods: Iterable[tuple[MethodName, int]]) -> str:
     """PSNR without and with detail, drive by drive, as Markdown."""
-    rows = list(rows_of(results, methods))
+    of_each = ([run for run in results.runs if (run.method, run.content["steps"]) == each] for each in methods)
+    rows = [(METHODS[runs[0].method].title, runs) for runs in of_each if runs]
     scenes = sorted({run.scene for _, runs in rows for run in runs})
     shown = [*scenes, "average"] if len(scenes) > 1 else scenes
     lines = ["| method | " + " | ".join([*shown, "steps", "processor seconds"]) + " |", "|---" * (len(shown) + 3) + "|"]

@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.commands import TUNED, ours
+from benchmarks.quality.unseen import IN_SECONDS
 from edge_depth_nerf.base.files import read_json, write_json, write_text
 from edge_depth_nerf.compare.command import RUNS
 from edge_depth_nerf.compare.options import MethodName
@@ -45,13 +46,7 @@ PRIORS = {"without": "without motion", "motion": "with motion", "everywhere": "a
 RIVALS: dict[MethodName, str] = {"nerfacto": "nerfacto", "ds-nerf": "DS-NeRF on LiDAR"}
 """They use no monocular maps: trained on one of the scenes."""
 PLACES = {"everywhere": "all", "in_field": "in the field", "outside": "outside it"}
-COLUMNS = {
-    "PSNR": ("truth_masked_psnr", ".2f"),
-    "SSIM": ("truth_masked_ssim", ".3f"),
-    "AbsRel": ("truth_abs_rel", ".4f"),
-    "δ": ("truth_delta_1_25", ".3f"),
-    "PSNR 1 m beside": ("shifted_1m_masked_psnr", ".2f"),
-}
+COLUMNS = {**IN_SECONDS, "PSNR 1 m beside": ("shifted_1m_masked_psnr", ".2f")}
 """Figures of a trained model, and how they are written."""
 
 
@@ -117,11 +112,6 @@ def make_scenes(kind: str, seed: int, options: argparse.Namespace) -> dict[str, 
     return scenes
 
 
-def read_evaluated(kept: Path) -> Evaluated:
-    """Read what `evaluated` wrote."""
-    return {name: figures and PriorFigures(**figures) for name, figures in read_json(kept).items()}
-
-
 def evaluated(scene: Path, kept: Path) -> Evaluated:
     """How good a scene's default prior is; read from `kept` if it is there."""
     if not kept.is_file():
@@ -129,7 +119,7 @@ def evaluated(scene: Path, kept: Path) -> Evaluated:
         parts = {"everywhere": pixels, **{name: pixels[:, pixels[3] == i] for i, name in enumerate(list(PLACES)[1:])}}
         found = {name: prior_figures(part) for name, part in parts.items()}
         write_json(kept, {name: figures and dataclasses.asdict(figures) for name, figures in found.items()})
-    return read_evaluated(kept)
+    return {name: figures and PriorFigures(**figures) for name, figures in read_json(kept).items()}
 
 
 def prior_table(priors: Mapping[str, Mapping[str, Evaluated]]) -> Iterator[str]:

@@ -78,17 +78,10 @@ OVER_LAMBDA = (COLUMNS[0], COLUMNS[3])
 """Picture and depth."""
 
 
-def write_tuned(path: Path, weight: float) -> Path:
-    """Write the tuned values with another λ for every method that has one."""
+def write_tuned(path: Path, others: Mapping[MethodName, MethodName | None], **changes: float) -> Path:
+    """Write λ and σ of methods: those that others were tuned to, but for the changes."""
     methods = read_json(TUNED)["methods"]
-    write_json(path, {"methods": {name: {**methods[name], "lambda": weight} for name in WITH_LAMBDA}})
-    return path
-
-
-def write_cells_tuned(path: Path) -> Path:
-    """Write the tuned values for the cells of the grid."""
-    methods = read_json(TUNED)["methods"]
-    write_json(path, {"methods": {name: methods[of_loss] for name, of_loss in CELLS.items() if of_loss}})
+    write_json(path, {"methods": {name: methods[other] | changes for name, other in others.items() if other}})
     return path
 
 
@@ -299,7 +292,7 @@ def main() -> None:
     cells = options.output / "cells"
     if options.cells:
         scene = scenes.get("half", next(iter(scenes.values())))
-        given = write_cells_tuned(options.output / "cells.json")
+        given = write_tuned(options.output / "cells.json", CELLS)
         common = ("--tuned", given, "--output", cells, *jobs, *steps)
         ours("compare", scene, "--methods", *CELLS, "--seeds", options.seeds[0], *common)
     of_cells = read_results(cells / RUNS)
@@ -311,7 +304,9 @@ def main() -> None:
     curves: list[RunResult] = []
     for weight in options.lambdas:
         folder = options.output / f"lambda_{weight:g}"
-        given = write_tuned(options.output / f"lambda_{weight:g}.json", weight)
+        given = write_tuned(
+            options.output / f"lambda_{weight:g}.json", {name: name for name in WITH_LAMBDA}, **{"lambda": weight}
+        )
         scene = scenes.get("half", next(iter(scenes.values())))
         common = ("--tuned", given, "--output", folder, *jobs, *curve_steps)
         ours("compare", scene, "--methods", *WITH_LAMBDA, *common)

@@ -116,19 +116,24 @@ def steps_of(runs: Iterable[RunResult]) -> str:
     return " to ".join(f"{each:,}" for each in sorted({run.content["steps"] for run in runs}))
 
 
+def figures_of(runs: Iterable[RunResult], name: str, form: str = ".2f") -> str:
+    """Mean over drives, with its standard deviation over seeds where there are several."""
+    runs = list(runs)
+    seeds = sorted({run.seed for run in runs})
+    means = [statistics.fmean(run.figures[name] for run in runs if run.seed == seed) for seed in seeds]
+    spread = f" ± {statistics.stdev(means):{form}}" if len(means) > 1 else ""
+    return f"{statistics.fmean(means):{form}}{spread}"
+
+
 def short_table(claims: Results) -> Iterator[str]:
     """Means over the drives, with their standard deviation over seeds, as Markdown: the README's table."""
     yield "| " + " | ".join(["method", *IN_SECONDS, "steps", "processor seconds"]) + " |"
     yield "|---" * (len(IN_SECONDS) + 3) + "|"
     for method in claims.methods():
-        of_seeds = [of(claims, [method], [seed]).runs for seed in claims.seeds()]
-        cells = []
-        for name, form in IN_SECONDS.values():
-            means = [statistics.fmean(run.figures[name] for run in runs) for runs in of_seeds if runs]
-            spread = f" ± {statistics.stdev(means):{form}}" if len(means) > 1 else ""
-            cells.append(f"{statistics.fmean(means):{form}}{spread}")
+        runs = of(claims, [method]).runs
+        cells = [figures_of(runs, name, form) for name, form in IN_SECONDS.values()]
         seconds = f"{processor_seconds(claims, method):.0f}"
-        yield "| " + " | ".join([METHODS[method].title, *cells, steps_of(of_seeds[0]), seconds]) + " |"
+        yield "| " + " | ".join([METHODS[method].title, *cells, steps_of(runs), seconds]) + " |"
 
 
 def seconds_table(claims: Results, longer: Results) -> Iterator[str]:

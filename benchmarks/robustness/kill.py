@@ -32,7 +32,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import torch
 
@@ -197,6 +197,11 @@ def children(process: int) -> list[int]:
         return []
 
 
+def begun(command: list[str], sink: IO[str]) -> subprocess.Popen[bytes]:
+    """Start a command on one thread."""
+    return subprocess.Popen(command, stdout=sink, stderr=subprocess.STDOUT, env={**os.environ, "OMP_NUM_THREADS": "1"})
+
+
 def run_for(command: list[str], log: Path, seconds: float | None, worker: bool) -> bool:
     """Run a command, to its end or for so many seconds; whether it was killed.
 
@@ -206,9 +211,7 @@ def run_for(command: list[str], log: Path, seconds: float | None, worker: bool) 
     with log.open("a", encoding="utf-8") as sink:
         sink.write(f"$ {' '.join(command)}\n")
         sink.flush()
-        process = subprocess.Popen(
-            command, stdout=sink, stderr=subprocess.STDOUT, env={**os.environ, "OMP_NUM_THREADS": "1"}
-        )
+        process = begun(command, sink)
         try:
             status = process.wait(seconds)
         except subprocess.TimeoutExpired:
@@ -229,8 +232,7 @@ def timed_run(part: Part, folder: Path) -> tuple[float, float]:
     command = part.command(folder)
     assert command is not None
     with (folder / "log.txt").open("w") as sink:
-        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-        process = subprocess.Popen(command, stdout=sink, stderr=subprocess.STDOUT, env=environment)
+        process = begun(command, sink)
         while process.poll() is None:
             if not first and len(list(folder.rglob("*"))) > before + 1:
                 first = time.monotonic() - started

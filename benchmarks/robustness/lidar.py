@@ -47,15 +47,11 @@ def drive(output: Path, **options: object) -> SynthesizeOptions:
     return made
 
 
-def recording(made: SynthesizeOptions, sweeps: int) -> Recording:
-    return read_kitti360(options(made, Path("unused"), sweeps))
-
-
-def options(made: SynthesizeOptions, output: Path, sweeps: int, *, raw_lidar: bool = False) -> Kitti360Options:
+def options(made: SynthesizeOptions, sweeps: int, *, raw_lidar: bool = False) -> Kitti360Options:
     return Kitti360Options(
         root=made.output,
         sequence=made.sequence,
-        output=output,
+        output=Path("unused"),
         sweeps=sweeps,
         raw_lidar=raw_lidar,
         ego_mask=made.output / "truth" / "masks",
@@ -65,7 +61,7 @@ def options(made: SynthesizeOptions, output: Path, sweeps: int, *, raw_lidar: bo
 
 def deskewing(made: SynthesizeOptions) -> Table:
     """Distances from the truth in the scanner's frame of the sweep's moment."""
-    found = recording(made, 0)
+    found = read_kitti360(options(made, 0))
     assert found.trajectory is not None
     errors: dict[str, list[NDArray]] = {"raw": [], "de-skewed": []}
     for recorded in found.sweeps:
@@ -127,12 +123,9 @@ COLUMNS = (*(f"wrong: {kind}" for kind in KINDS), "right ones kept", "cover: all
 
 def evaluate(made: SynthesizeOptions, reach: int, every: int, *, free_space: bool = True) -> dict[str, Counts]:
     """Project the sweeps that training pictures get, and compare the maps with the truth."""
-    found = recording(made, reach)
+    found = read_kitti360(options(made, reach))
     held_out = {frame for frame in range(made.frames) if frame % HOLDOUT_EVERY == HOLDOUT_EVERY // 2}
-    stores = {
-        kind: SweepStore(found, options(made, Path("unused"), reach, raw_lidar=kind == "recorded"), held_out)
-        for kind in KINDS
-    }
+    stores = {kind: SweepStore(found, options(made, reach, raw_lidar=kind == "recorded"), held_out) for kind in KINDS}
     for kind, store in stores.items():
         for scanner in store.scanners if kind != "kept" or not free_space else ():
             scanner.moved = partial(nothing_moved, scanner)

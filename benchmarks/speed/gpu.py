@@ -33,6 +33,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.speed.gpu_parts import CACHES, PARTS, ROOT, SPLATS, TRAININGS, Found, Settings
+from benchmarks.speed.report import rows_of
 from edge_depth_nerf.base.files import read_json, write_json, write_text
 from edge_depth_nerf.jobs.runs import end_with_parent
 
@@ -145,8 +146,7 @@ def cell(value: Any) -> str:
 
 def table(heads: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     """A table in Markdown; all columns but the first are numbers."""
-    lines = [heads, ["---", *["---:"] * (len(heads) - 1)], *[[cell(each) for each in row] for row in rows]]
-    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
+    return rows_of(heads, [[cell(each) for each in row] for row in rows])
 
 
 def section(name: str, parts: dict[str, Found | None]) -> str:

@@ -35,6 +35,7 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import torch
 from torch._subclasses.fake_tensor import FakeTensorMode
@@ -184,34 +185,21 @@ class Counter(TorchDispatchMode):
 
     @contextlib.contextmanager
     def during(self, part: str) -> Iterator[None]:
-        """Count what comes as of a part."""
+        """Count what comes, or what the decorated function does, as of a part."""
         before, self.part = self.part, part
         try:
             yield
         finally:
             self.part = before
 
-    def named(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """A function whose operations are of a part."""
-
-        def called(*args: Any, **kwargs: Any) -> Any:
-            with self.during(part):
-                return function(*args, **kwargs)
-
-        return called
-
 
 @contextlib.contextmanager
 def replaced(*changes: tuple[Any, str, Any]) -> Iterator[None]:
     """Other attributes of objects, for a while."""
-    before = [(holder, name, getattr(holder, name)) for holder, name, _ in changes]
-    for holder, name, value in changes:
-        setattr(holder, name, value)
-    try:
+    with contextlib.ExitStack() as stack:
+        for change in changes:
+            stack.enter_context(mock.patch.object(*change))
         yield
-    finally:
-        for holder, name, value in reversed(before):
-            setattr(holder, name, value)
 
 
 class NoCapture:
@@ -325,12 +313,12 @@ def counted_step(gpu: FakeGpu, trainer: Any) -> Counts:
 
     model, manager, counter = trainer.pipeline.model, trainer.pipeline.datamanager, gpu.counter
     for name in ("next_train", "batch_of", "packed"):
-        setattr(manager, name, counter.named("data", getattr(manager, name)))
+        setattr(manager, name, counter.during("data")(getattr(manager, name)))
     if trainer.graphs is not None:
-        trainer.graphs._work = counter.named("scaler and optimisers", trainer.graphs._work)
-    model.forward = counter.named("forward", model.forward)
+        trainer.graphs._work = counter.during("scaler and optimisers")(trainer.graphs._work)
+    model.forward = counter.during("forward")(model.forward)
     for name in ("get_metrics_dict", "get_loss_dict"):
-        setattr(model, name, counter.named("metrics and losses", getattr(model, name)))
+        setattr(model, name, counter.during("metrics and losses")(getattr(model, name)))
     sampler = model.proposal_sampler
     rest = sampler._steps_since_update
     for step in (STEP, STEP + 1):

@@ -397,18 +397,12 @@ def call_us(function: Callable[..., Any], given: dict[str, Any], settings: Setti
 def arguments(settings: Settings) -> dict[str, list[dict[str, Any]]]:
     """What each function with a form for a GPU is given in a step of the full preset, by the form's name."""
     from benchmarks.speed.hash_grid import SIZES_ON_CUDA, make_points
-    from edge_depth_nerf.method.losses import EPS, NARROW
+    from edge_depth_nerf.kernels.functions import PROPOSALS, STEP
 
-    device = settings.device
-    half = {"dtype": torch.float32 if settings.fake else torch.float16}
-    rays, outer, middle, final, surface = (16, 12, 8, 6, 32) if settings.fake else (4096, 256, 96, 48, 16384)
-
-    def edges(samples: int) -> Tensor:
-        return torch.rand(rays, samples + 1, device=device).sort(dim=1)[0]
-
-    def weights(samples: int) -> Tensor:
-        some = torch.rand(rays, samples, device=device) ** 4
-        return some / some.sum(dim=1, keepdim=True)
+    device, dtype = settings.device, torch.float32 if settings.fake else torch.float16
+    sizes = STEP._replace(dtypes=(dtype,))
+    if not settings.fake:
+        sizes = sizes._replace(rays=4096, points=4096 * PROPOSALS[0])
 
     def grid(levels: int, log2_rows: int, count: int, finest: int, along_rays: bool) -> dict[str, Any]:
         if settings.fake:
@@ -417,48 +411,11 @@ def arguments(settings: Settings) -> dict[str, list[dict[str, Any]]]:
         # as large as at the beginning of a training
         table = 1e-4 * (2 * torch.rand(levels << log2_rows, 2, device=device) - 1)
         points = make_points(count, along_rays=along_rays).to(device)
-        return {"positions": points, "table": table.requires_grad_(), "scalings": scalings, **half}
+        return {"positions": points, "table": table.requires_grad_(), "scalings": scalings, "dtype": dtype}
 
-    nears, fars = (torch.full((rays, 1), value, device=device) for value in (0.01, 50.0))
-    directions = torch.nn.functional.normalize(torch.randn(2 * rays + surface, 3, device=device), dim=1)
-    prior_m, sigma_m = 1 + 19 * torch.rand(rays, device=device), torch.full((rays,), 0.2, device=device)
-    in_loss = {"prior_m": prior_m, "sigma_m": sigma_m, "interval": True, "divide_by_norm": True}
-    in_loss |= {"eps": EPS, "narrow": NARROW}
-    met, inner = {"edges": edges(final), "weights": weights(final)}, (outer, middle)
-    levels = [(weights(each), 20 * edges(each)) for each in (*inner, final)]
-    return {
-        "hash grid": [grid(*size, along) for size in SIZES_ON_CUDA.values() for along in (True, False)],
-        "contraction": [{"positions": 3 * torch.randn(rays * each, 3, device=device)} for each in inner],
-        "distances": [{"places": edges(each), "nears": nears, "fars": fars} for each in inner],
-        "directions": [{"directions": directions, **half}],
-        "placing of samples": [
-            {"weights": weights(each), "edges": edges(each), "wanted": edges(next_), "padding": 0.01, "least": 1e-5}
-            for each, next_ in itertools.pairwise((*inner, final))
-        ],
-        "proposal loss": [
-            {**met, "outer_edges": edges(each), "outer_weights": weights(each).requires_grad_()} for each in inner
-        ],
-        "distortion loss": [{**met, "weights": weights(final).requires_grad_()}],
-        "density": [
-            {
-                "before": torch.randn(rays * each, device=device, dtype=half["dtype"]).requires_grad_(),
-                "inside": torch.ones(rays * each, device=device),
-                "scale": 0.01,
-            }
-            for each in (*inner, final)
-        ],
-        "weights": [
-            {
-                "densities": (20 * torch.rand(rays, each, device=device) ** 4).requires_grad_(),
-                "deltas": torch.rand(rays, each, device=device),
-            }
-            for each in (*inner, final)
-        ],
-        "edge loss": [
-            {**in_loss, "weights": each.requires_grad_(), "starts_m": ends[:, :-1], "ends_m": ends[:, 1:]}
-            for each, ends in levels
-        ],
-    }
+    grids = [grid(*size, along) for size in SIZES_ON_CUDA.values() for along in (True, False)]
+    given = {name: each.on_gpu.in_a_step(device, sizes=sizes) for name, each in functions_of_a_gpu().items()}
+    return given | {"hash grid": grids}
 
 
 def functions_of_a_gpu() -> dict[str, Any]:

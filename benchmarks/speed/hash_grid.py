@@ -43,12 +43,6 @@ def make_points(count: int, *, along_rays: bool) -> Tensor:
     return (starts + places * (ends - starts)).view(-1, 3)
 
 
-def moved_bytes(points: int, features: int) -> dict[str, int]:
-    """What the parts of a step cannot but read and write; `features` of all levels together, float32."""
-    corners, once = 8 * points * features * 4, 4 * points * (3 + features)
-    return {"forward": once + corners, "backward": once + 2 * corners, "both": 2 * once + 3 * corners}
-
-
 def differences(host: HashEncoding, fused: HashEncoding, x: Tensor, gradient: Tensor) -> dict[str, float]:
     """Largest differences, relative to the largest value."""
     results = []

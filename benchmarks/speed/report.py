@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from benchmarks.pages import with_part
 from edge_depth_nerf.base.files import write_atomically
 
 
-def middle(values: Sequence[float]) -> float:
-    return statistics.median(values)
-
-
 def times(values: Sequence[float]) -> str:
     """A ratio: median and range."""
-    return f"{middle(values):.1f} ({min(values):.1f}-{max(values):.1f})"
+    return f"{median(values):.1f} ({min(values):.1f}-{max(values):.1f})"
 
 
 def rows_of(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -38,9 +34,9 @@ def summary(results: dict[str, Any]) -> str:
         if preset not in results:
             continue
         host, ours = results[preset]["nerfacto"], results[preset]["ours"]
-        steps = [f"{middle(each['step_s']) * 1e3:,.0f} ms" for each in (host, ours)]
+        steps = [f"{median(each['step_s']) * 1e3:,.0f} ms" for each in (host, ours)]
         rows.append([f"training step, {preset}", *steps, times(ours["step_ratio"])])
-        views = [f"{middle(each['render_s']):.2f} s" for each in (host, ours)]
+        views = [f"{median(each['render_s']):.2f} s" for each in (host, ours)]
         height, width = ours["rendered_px"]
         rows.append([f"rendering {width} × {height} px, {preset}", *views, times(ours["render_ratio"])])
     if "memory" in results:
@@ -57,7 +53,7 @@ def trainers(results: dict[str, Any]) -> str:
     for preset in ("lite", "full"):
         for name, found in results.get(preset, {}).items():
             steps = times([1e3 * each for each in found["step_s"]]), times(found["step_ratio"])
-            views = f"{middle(found['render_s']):.2f}", times(found["render_ratio"])
+            views = f"{median(found['render_s']):.2f}", times(found["render_ratio"])
             rows.append([f"{preset}: {name}", f"{found['rays_per_second']:,.0f}", *steps, *views])
     return rows_of(["", "rays/s", "ms a step", "× nerfacto", "s a view", "× nerfacto"], rows)
 
@@ -71,7 +67,7 @@ def growth(results: dict[str, Any]) -> str:
     for part, label in GROWTH.items():
         for found in results.get(part, []):
             host, ours = found["nerfacto"], found["ours"]
-            steps = [f"{middle(each['step_s']) * 1e3:,.0f}" for each in (host, ours)]
+            steps = [f"{median(each['step_s']) * 1e3:,.0f}" for each in (host, ours)]
             rows.append([f"{label}: {found['value']:g}", *steps, times(ours["step_ratio"])])
     return rows_of(["", "nerfacto, ms a step", "ours, ms a step", "ratio"], rows)
 
@@ -115,8 +111,8 @@ def rest(results: dict[str, Any]) -> str:
     rows = []
     if "start_up" in results:
         found = results["start_up"]
-        rows.append(["`edge-depth-nerf --help`", f"{middle(found['help_s']):.2f} s"])
-        rows.append(["what the plugin adds to any `ns-*` command", f"{middle(found['plugin_adds_s']):.2f} s"])
+        rows.append(["`edge-depth-nerf --help`", f"{median(found['help_s']):.2f} s"])
+        rows.append(["what the plugin adds to any `ns-*` command", f"{median(found['plugin_adds_s']):.2f} s"])
     for row in results.get("preparation", []):
         cores = "1 core" if row["cores"] == 1 else f"{row['cores']} cores"
         what = f"`process`, {row['pictures']} pictures of 1400 px, {cores}"
@@ -140,8 +136,7 @@ TABLES = {"commits": commits, "summary": summary, "trainers": trainers, "growth"
 def with_tables(page: str, results: dict[str, Any]) -> str:
     """A page with its tables made anew."""
     for name, make in TABLES.items():
-        if f"<!-- speed: {name} -->" in page:
-            page = with_part(page, f"speed: {name}", make(results))
+        page = with_part(page, f"speed: {name}", make(results))
     return page
 
 
@@ -183,7 +178,7 @@ def draw(results: dict[str, Any], path: Path) -> None:
 
 
 def step_ms(row: dict[str, Any], name: str) -> float:
-    return 1e3 * middle(row[name]["step_s"])
+    return 1e3 * median(row[name]["step_s"])
 
 
 def data_mb(row: dict[str, Any], name: str) -> float:

@@ -23,13 +23,14 @@ docs/speed.md and the curves (docs/speed.svg) are written from the results; `--p
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
-import shutil
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -247,18 +248,11 @@ def commit() -> str:
     return shown.stdout.strip() + ("+" if changed else "")
 
 
-class temporary:
+@contextlib.contextmanager
+def temporary(work: Path) -> Iterator[Path]:
     """A folder beside the scenes (pictures are linked into it), removed in the end."""
-
-    def __init__(self, work: Path) -> None:
-        self.folder = work / f"temporary{os.getpid()}"
-
-    def __enter__(self) -> Path:
-        self.folder.mkdir(parents=True)
-        return self.folder
-
-    def __exit__(self, *_: object) -> None:
-        shutil.rmtree(self.folder)
+    with tempfile.TemporaryDirectory(dir=work) as folder:
+        yield Path(folder)
 
 
 def parts(work: Path) -> dict[str, Callable[[], Any]]:
