@@ -12,7 +12,7 @@ import torch
 from interpreted import NEEDS_A_GPU, in_interpreter
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from edge_depth_nerf.kernels import back_ends, formulas, functions, pointwise_numba
+from edge_depth_nerf.kernels import back_ends, contraction_numba, formulas, functions
 from edge_depth_nerf.kernels.back_ends import GpuForm, tried_out
 from edge_depth_nerf.kernels.functions import (
     CONTRACT,
@@ -23,7 +23,6 @@ from edge_depth_nerf.kernels.functions import (
     HASH_GRID,
     INTERLEVEL_LOSS,
     MOST,
-    POSITIONS,
     SAMPLE_PDF,
     WEIGHTS,
 )
@@ -237,10 +236,9 @@ def test_what_kernels_serve(monkeypatch):
         assert not any(map(function.compiled_for, (half, followed)))
         with torch.no_grad():
             assert function.compiled_for(followed) is loads[function]
-    # torch serves a GPU as fast, or the CPU
-    assert POSITIONS.compiled_for(x) is None
+    # torch serves the CPU as fast
     assert WEIGHTS.compiled_for(torch.empty(4, 48)) is None
-    assert DISTANCES.compiled_for(torch.empty(4, 3)) is pointwise_numba.distances
+    assert CONTRACT.compiled_for(torch.empty(4, 3)) is contraction_numba.contract
     assert HASH_GRID.on(torch.device("mps")) is None
     assert DENSITY.compiled_for(on_cpu, of_size(4, 48, device="cpu", dtype=torch.float16)) is None
 

@@ -1,4 +1,4 @@
-"""The kernels that work number by number against float64 twins: Numba's, and Triton's interpreted and compiled."""
+"""The kernels that work number by number against float64 twins: Triton's, interpreted and compiled."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ import pytest
 import torch
 from ahead_of_time import ARCHITECTURES, check_registers
 from interpreted import NEEDS_A_GPU, assert_near, in_interpreter, moved_in_interpreter, on_a_gpu
-
-from edge_depth_nerf.kernels import pointwise_numba, threads
 
 SIZES = ((1, 1), (5, 17), (33, 49), (3, 256), (7, 300))
 """Rays and samples, of which few are multiples of what a program works on."""
@@ -26,8 +24,8 @@ def by_triton() -> Any:
     return pointwise_triton
 
 
-def check_distances(kernels: Any = None) -> None:
-    kernels = kernels or by_triton()
+def check_distances() -> None:
+    kernels = by_triton()
     for rays, count in SIZES:
         torch.manual_seed(rays)
         places = torch.rand(rays, count + 1).sort(dim=1)[0][:, :-1]
@@ -46,22 +44,9 @@ def check_distances(kernels: Any = None) -> None:
     assert kernels.distances(places[:0], nears[:0], fars[:0]).shape == (0, count)
 
 
-def check_positions(kernels: Any) -> None:
-    for rays, count in SIZES:
-        torch.manual_seed(rays)
-        origins, directions = torch.randn(rays, 3, 4)[..., 0], torch.randn(2 * rays, 3)[::2]
-        edges = torch.rand(rays, count + 1).cumsum(1)
-        found = kernels.midpoints(origins.contiguous(), directions, edges[:, :-1], edges[:, 1:])
-        midpoints = (edges[:, :-1].double() + edges[:, 1:]) / 2
-        assert_near(found, origins[:, None].double() + directions[:, None] * midpoints[..., None], 3e-7)
-        assert torch.equal(found, kernels.midpoints(origins, directions, edges[:, :-1], edges[:, 1:]))
-    assert kernels.midpoints(origins[:0], directions[:0], edges[:0], edges[:0]).shape == (0, count + 1, 3)
-
-
-def check_densities(kernels: Any = None) -> None:
-    kernels = kernels or by_triton()
-    # what autocast makes of a network's outputs is read by Triton's alone
-    dtypes = ((torch.float32, 1e-6), (torch.float16, 1e-3))[: 1 if kernels is pointwise_numba else 2]
+def check_densities() -> None:
+    kernels = by_triton()
+    dtypes = ((torch.float32, 1e-6), (torch.float16, 1e-3))
     for count in (1, 255, 700):
         torch.manual_seed(count)
         for dtype, tolerance in dtypes:
@@ -84,10 +69,10 @@ def check_densities(kernels: Any = None) -> None:
     assert kernels.density(before[:0], inside[:0], 1.0).shape == (0,)
 
 
-def check_harmonics(kernels: Any = None) -> None:
+def check_harmonics() -> None:
     from nerfstudio.utils.math import components_from_spherical_harmonics
 
-    kernels = kernels or by_triton()
+    kernels = by_triton()
     for count in (1, 255, 700):
         directions = torch.nn.functional.normalize(torch.randn(count, 4)[:, :3], dim=1)
         exact = (directions.double() + 1) / 2
@@ -119,18 +104,6 @@ def check_contraction() -> None:
 def test_in_the_interpreter():
     pytest.importorskip("triton")
     in_interpreter(check_distances, check_contraction, check_densities, check_harmonics)
-
-
-@pytest.mark.parametrize("check", [check_distances, check_positions, check_harmonics])
-def test_the_same_on_the_cpu(check):
-    check(pointwise_numba)
-
-
-@pytest.mark.parametrize("check", [check_distances, check_positions])
-def test_the_same_on_three_threads(check, monkeypatch):
-    monkeypatch.setattr(threads, "kernel_threads", lambda: 3)
-    monkeypatch.setattr(pointwise_numba, "LEAST_SHARE", 2)
-    check(pointwise_numba)
 
 
 @NEEDS_A_GPU

@@ -22,11 +22,9 @@ from edge_depth_nerf.kernels.hash_grid import hash_grid
 
 def _numba() -> SimpleNamespace:
     """Import the modules of the CPU."""
-    from edge_depth_nerf.kernels import contraction_numba, hash_grid_numba, pointwise_numba, ray_numba
+    from edge_depth_nerf.kernels import contraction_numba, hash_grid_numba, ray_numba
 
-    return SimpleNamespace(
-        contraction=contraction_numba, hash_grid=hash_grid_numba, pointwise=pointwise_numba, ray=ray_numba
-    )
+    return SimpleNamespace(contraction=contraction_numba, hash_grid=hash_grid_numba, ray=ray_numba)
 
 
 def _triton() -> SimpleNamespace:
@@ -176,13 +174,11 @@ CONTRACT = Function(
     follows=False,
 )
 DISTANCES = Function(
-    lambda: _numba().pointwise.distances,
-    on_gpu("distances", lambda: _triton().pointwise.distances, formulas.distances, _places, 1e-4),
+    on_gpu=on_gpu("distances", lambda: _triton().pointwise.distances, formulas.distances, _places, 1e-4),
     follows=False,
 )
 HARMONICS = Function(
-    lambda: _numba().pointwise.harmonics,
-    on_gpu("directions", lambda: _triton().pointwise.harmonics, formulas.harmonics, _directions, 1e-5),
+    on_gpu=on_gpu("directions", lambda: _triton().pointwise.harmonics, formulas.harmonics, _directions, 1e-5),
     follows=False,
 )
 SAMPLE_PDF = Function(
@@ -198,7 +194,6 @@ DISTORTION_LOSS = Function(
         "distortion loss", lambda: _triton().ray.distortion_loss, formulas.distortion_loss, _samples, 1e-4, MOST
     ),
 )
-POSITIONS = Function(lambda: _numba().pointwise.midpoints, follows=False)
 DENSITY = Function(
     on_gpu=on_gpu("density", lambda: _triton().pointwise.density, formulas.density, _outputs, 1e-5),
 )

@@ -14,9 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from edge_depth_nerf.kernels.compiled import compiled, flat
+from edge_depth_nerf.kernels.compiled import compiled, flat, flat_rows
 from edge_depth_nerf.kernels.gradients import sloped
-from edge_depth_nerf.kernels.pointwise_numba import flat_rows
 from edge_depth_nerf.kernels.threads import in_parts
 
 LEAST_SHARE = 1 << 13

@@ -63,7 +63,6 @@ def compiled_before() -> bool:
         contraction_numba,
         hash_grid_numba,
         network_numba,
-        pointwise_numba,
         ray_numba,
         rendering_numba,
         table_adam_numba,

@@ -15,7 +15,7 @@ from nerfstudio.cameras.rays import Frustums, RayBundle, RaySamples
 from nerfstudio.model_components.ray_samplers import PDFSampler, ProposalNetworkSampler, UniformLinDispPiecewiseSampler
 from torch import Tensor
 
-from edge_depth_nerf.kernels.functions import DISTANCES, POSITIONS, SAMPLE_PDF, WEIGHTS
+from edge_depth_nerf.kernels.functions import DISTANCES, SAMPLE_PDF, WEIGHTS
 
 
 class FirstSampler(UniformLinDispPiecewiseSampler):
@@ -157,18 +157,13 @@ class FusedRaySamples(RaySamples):
 
 
 class FusedFrustums(Frustums):
-    """nerfstudio's `Frustums`; positions come from one kernel where they have no gradient, on a GPU from two."""
+    """nerfstudio's `Frustums`; positions take two passes."""
 
     def get_positions(self) -> Float[Tensor, "*batch 3"]:
         """Give the positions in the middle of the samples."""
-        given = self.origins, self.directions, self.starts, self.ends
-        of_rays = self.origins.ndim == 3 and all(each.shape[1] == 1 or each.stride(1) == 0 for each in given[:2])
-        if self.origins.device.type == "cuda" and self.offsets is None:
-            return torch.addcmul(self.origins, self.directions, torch.lerp(self.starts, self.ends, 0.5))
-        compute = POSITIONS.compiled_for(*given) if of_rays and self.offsets is None else None
-        if compute is None:
+        if self.offsets is not None:
             return super().get_positions()
-        return compute(self.origins[:, 0], self.directions[:, 0], self.starts[..., 0], self.ends[..., 0])
+        return torch.addcmul(self.origins, self.directions, torch.lerp(self.starts, self.ends, 0.5))
 
 
 def _whole(kind: type[Any], shape: tuple[int, ...], **values: Any) -> Any:
