@@ -37,11 +37,7 @@ def literal_form() -> dict[str, Any]:
 
 
 def configuration(run: RunSpecification, folder: Path | None = None) -> tuple[TrainerConfig, set[str]]:
-    """Resolve the configuration of a run.
-
-    Args:
-        run: what is trained.
-        folder: the run's folder; nerfstudio's files go to a folder in it.
+    """Resolve the configuration of a run; nerfstudio's files go to a folder in the run's.
 
     Returns:
         The configuration, and the dotted names in which its method may differ from others.

@@ -9,11 +9,7 @@ HELD_OUT_SHARE = 0.2
 
 
 def departures(meta: dict[str, Any]) -> list[str]:
-    """Say what of a scene is other than the paper has it: frames, split, sweeps, masks.
-
-    Args:
-        meta: its transforms.json.
-    """
+    """Say by a scene's transforms.json what of it is other than the paper has it: frames, split, sweeps, masks."""
     source = meta.get("source", {})
     frames = {split: _frames(meta, split) for split in ("train", "test")}
     found = []

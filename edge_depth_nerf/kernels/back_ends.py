@@ -71,11 +71,9 @@ class GpuForm:
         return [*self.examples(device), *self.in_a_step(device)]
 
     def try_out(self, device: torch.device, passed: Callable[[], None] = _nothing) -> Callable[..., Any]:
-        """Give the kernel's function if its results and gradients on a device are those of the formula.
+        """Give the kernel's function if its results and gradients on a GPU are those of the formula.
 
-        Args:
-            device: of a GPU.
-            passed: is called after each example.
+        `passed` is called after each example.
 
         Raises:
             KernelDiffersError: they are not.

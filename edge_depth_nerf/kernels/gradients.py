@@ -24,12 +24,10 @@ class _Sloped(torch.autograd.Function):
 
 
 def sloped(followed: Tensor, compute: Callable[[bool], tuple[Tensor, Tensor]]) -> Tensor:
-    """Make a loss differentiable once by one matrix, with the gradient that its kernel gives beside it.
+    """Make a loss differentiable once by one matrix, [rays, n], with the gradient that its kernel gives beside it.
 
-    Args:
-        followed: the matrix, [rays, n].
-        compute: gives the loss, a number or one for each ray, and its slope at each number of the matrix. Its argument
-            says whether slopes are asked for.
+    `compute` gives the loss, a number or one for each ray, and its slope at each number of the matrix; its argument
+    says whether slopes are asked for.
     """
     loss = _Sloped.apply(followed, compute)
     assert isinstance(loss, Tensor)
@@ -53,11 +51,5 @@ class _Once(torch.autograd.Function):
 
 
 def once(kernel: str, compute: Callable[[], tuple[Tensor | None, ...]], *made_of: Tensor | None) -> Any:
-    """Give gradients that refuse to be differentiated once more.
-
-    Args:
-        kernel: as an error names it.
-        compute: gives the gradients.
-        made_of: tensors that they are computed from.
-    """
+    """Give gradients computed from `made_of` that refuse to be differentiated again; an error names the kernel."""
     return _Once.apply(kernel, compute, *made_of)

@@ -65,17 +65,14 @@ def hash_grid(
     work: ModuleType,
     dtype: torch.dtype = torch.float32,
 ) -> Float[Tensor, "points encoded"]:
-    """Encode points, differentiable once by positions and table.
+    """Encode points, differentiable once by positions and table, float32 each.
 
     Args:
-        positions: float32.
-        table: float32, all levels one after the other, each with the same power of two of rows.
+        positions: in the unit cube.
+        table: all levels one after the other, each with the same power of two of rows.
         scalings: float32, cells along an axis of the unit cube, for each level.
         work: the module of kernels, for the device of these tensors.
-        dtype: of what is given; the CPU has float32 alone.
-
-    Returns:
-        The features of each point, level after level.
+        dtype: of what is given, level after level; the CPU has float32 alone.
     """
     encoded = _HashGrid.apply(positions, table, scalings, work, dtype)
     assert isinstance(encoded, Tensor)

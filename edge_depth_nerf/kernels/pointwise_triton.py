@@ -143,13 +143,8 @@ class _Density(torch.autograd.Function):
 def density(before: Float[Tensor, "points"], inside: Float[Tensor, "points"], scale: float) -> Float[Tensor, "points"]:
     """Compute densities, scale · exp(before) inside the scene and 0 outside; the gradient as nerfstudio's `trunc_exp`.
 
-    Args:
-        before: a network's outputs, half precision or float32, any stride. Differentiable once, by them alone.
-        inside: 1 where a point is inside, else 0; float32.
-        scale: the density of what a new network gives.
-
-    Returns:
-        float32.
+    A network's outputs, `before`, are half precision or float32, of any stride; differentiable once, by them alone.
+    `inside` is 1 or 0, and float32 as the result.
     """
     found = _Density.apply(before, inside, scale)
     assert isinstance(found, Tensor)
@@ -188,12 +183,7 @@ def _harmonics_kernel(directions, encoded, rays, stride, NUMBERS: tl.constexpr):
 
 
 def harmonics(directions: Float[Tensor, "rays 3"], dtype: torch.dtype) -> Float[Tensor, "rays 16"]:
-    """Encode directions as nerfacto does, by the spherical harmonics of four degrees of (d + 1) / 2; no gradient.
-
-    Args:
-        directions: of length 1, float32.
-        dtype: of what is given.
-    """
+    """Encode unit vectors as nerfacto does, by the spherical harmonics of four degrees of (d + 1) / 2; no gradient."""
     directions, stride = rows_of(directions)
     encoded = torch.empty(len(directions), HARMONICS, dtype=dtype, device=directions.device)
     programs = triton.cdiv(len(directions), NUMBERS)

@@ -25,12 +25,7 @@ class Preparation:
     """Trials of kernels in threads, from the construction on."""
 
     def __init__(self, forms: Sequence[GpuForm], device: torch.device) -> None:
-        """Begin.
-
-        Args:
-            forms: the kernels; the first one is tried out alone, as it also loads the driver.
-            device: of a GPU, with its number.
-        """
+        """Begin; the first kernel is tried out alone, as it also loads the driver."""
         self.total = sum(len(form.every_example(torch.device("cpu"))) for form in forms)
         """Trials: more than kernels, each of which is compiled for several types and sizes."""
         self.done = 0

@@ -102,12 +102,9 @@ class _Network(torch.autograd.Function):
 def network(
     x: Float[Tensor, "points in"], layers: Layers, dtype: torch.dtype = torch.float32
 ) -> Float[Tensor, "points out"]:
-    """Apply a network with ReLU between its layers to points, differentiable once by all it is given.
+    """Apply a network of float32 with ReLU between its layers to points, differentiable once by all it is given.
 
-    Args:
-        x: of any type.
-        layers: float32.
-        dtype: of the products, and of what is given.
+    Products and results are of `dtype`, whatever `x` is of.
     """
     found = _Network.apply(x, dtype, torch.is_grad_enabled(), *layers[0], *layers[1])
     assert isinstance(found, Tensor)

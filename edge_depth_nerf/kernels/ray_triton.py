@@ -114,11 +114,9 @@ def _along_rays(kernel: Any, *tensors: Tensor) -> None:
 def weights_from_densities(
     densities: Float[Tensor, "rays samples"], deltas: Float[Tensor, "rays samples"]
 ) -> Float[Tensor, "rays samples"]:
-    """Compute rendering weights, w_k = (1 - exp(-σ_k δ_k)) exp(-Σ_j<k σ_j δ_j); NaN becomes 0.
+    """Compute rendering weights, w_k = (1 - exp(-σ_k δ_k)) exp(-Σ_j<k σ_j δ_j), of float32; NaN becomes 0.
 
-    Args:
-        densities: σ, 0 or more, float32. Differentiable once, by them alone.
-        deltas: δ, the samples' lengths, float32.
+    Differentiable once, by the densities σ alone, which are 0 or more.
     """
     weights = _Weights.apply(densities, deltas)
     assert isinstance(weights, Tensor)
@@ -269,11 +267,7 @@ def _distortion_kernel(
 def distortion_loss(edges: Float[Tensor, "rays edges"], weights: Float[Tensor, "rays samples"]) -> Float[Tensor, ""]:
     """Compute mip-NeRF 360's distortion loss (Eq. 15), mean over the rays; differentiable once, by the weights alone.
 
-    Σ_ij w_i w_j |m_i - m_j| + 1/3 Σ_i w_i² Δ_i, with midpoints m and lengths Δ of the samples.
-
-    Args:
-        edges: of the samples, in the spacing of 0..1, float32.
-        weights: rendering weights, float32.
+    Σ_ij w_i w_j |m_i - m_j| + 1/3 Σ_i w_i² Δ_i, with midpoints m and lengths Δ of the samples, in the spacing of 0..1.
     """
     (rays, samples), (of_edges, stride) = weights.shape, rows_of(edges)
 

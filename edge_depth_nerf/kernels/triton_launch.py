@@ -10,15 +10,10 @@ from torch import Tensor
 
 
 def launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, **constants: Any) -> None:
-    """Launch a kernel where its first argument lies; nothing if there is no program to run.
+    """Launch a kernel where its first argument, a tensor, lies; nothing if there is no program to run.
 
     A product and a sum stay two roundings, as in torch: where a point lies in its cell must not depend on the compiler.
-
-    Args:
-        kernel: of Triton.
-        grid: programs along each axis.
-        arguments: the kernel's, a tensor first.
-        constants: what it is compiled for, and options of the compiler.
+    `constants` are what the kernel is compiled for, and options of the compiler.
     """
     if 0 not in grid:
         with torch.cuda.device_of(arguments[0]):

@@ -105,9 +105,7 @@ def both(
 def fit_logs(lidar_m: Float[np.ndarray, "n"], mono_m: Float[np.ndarray, "n"]) -> Fit:
     """Fit scale and exponent, robust against outliers (iteratively reweighted least squares, Geman-McClure weights).
 
-    Args:
-        lidar_m: distances of LiDAR points, all positive, at least one.
-        mono_m: the map at the same pixels, all positive.
+    Distances of LiDAR points, at least one, and the map at the same pixels are positive.
     """
     x, y = np.log(mono_m.astype(np.float64)), np.log(lidar_m.astype(np.float64))
     middle = float(np.median(x))

@@ -165,11 +165,7 @@ VARIABLE = "EDGE_DEPTH_NERF_LOSSES"
 
 
 def register(named: str) -> None:
-    """Add to `LOSSES` those of installed packages, and those that `VARIABLE` names; warn of what is none.
-
-    Args:
-        named: the variable's value.
-    """
+    """Add to `LOSSES` those of installed packages, and those that `VARIABLE`'s value names; warn of what is none."""
     words = [word.partition("=") for word in named.split(",") if word.strip()]
     further = [EntryPoint(name.strip(), value.strip(), VARIABLE) for name, _, value in words]
     for entry in [*entry_points(group=GROUP), *further]:

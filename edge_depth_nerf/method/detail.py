@@ -51,16 +51,10 @@ def detail_of(
     distance: Float[Tensor, "h w"],
     usable: Bool[Tensor, "h w"],
 ) -> Detail:
-    """Keep a picture's detail.
+    """Keep a picture's detail: `beyond` are its colours less its rendering's; more than 1 counts as 1.
 
-    Args:
-        lens: the picture's.
-        pose: camera to scene, as in `Detail`.
-        image: its colours, 0 to 1. An overexposed one may be any brighter: it does not say that a bright rendering is
-            too bright.
-        beyond: its colours less its rendering's; more than 1 counts as 1.
-        distance: rendered, in the scene's unit.
-        usable: which pixels count.
+    `distance` is rendered, in the scene's unit. Colours are 0 to 1, but an overexposed one may be any brighter: it does
+    not say that a bright rendering is too bright.
     """
     beyond = torch.where(image >= OVEREXPOSED, beyond.clamp(min=0), beyond)
     # half the memory; rounding is 0.05 %, much less than AGREEMENT
@@ -71,12 +65,7 @@ def detail_of(
 def seen_from(
     lens: Camera, pose: Float[Tensor, "3 4"], points: Float[Tensor, "points 3"]
 ) -> tuple[Float[Tensor, "points 2"], Float[Tensor, "points 3"], Float[Tensor, "points"]]:
-    """Look at points from a picture.
-
-    Args:
-        lens: the picture's.
-        pose: camera to scene, as in `Detail`.
-        points: in the scene.
+    """Look at points in the scene from a picture.
 
     Returns:
         Where they are in the picture, -1 to 1 over its width and height, and beyond where it does not see them; the
@@ -155,16 +144,10 @@ def carried(
     distance: Float[Tensor, "rays"],
     details: Iterable[Detail],
 ) -> Float[Tensor, "rays 3"]:
-    """Look up the detail of a view in pictures.
+    """Look up the detail of a view in pictures around it; the view's rays are those of `pictures_that_see`.
 
     A picture counts where its own rendered distance agrees with the place that a ray ends at: it sees this place, and
     nothing in front of it.
-
-    Args:
-        origins: of the view's rays.
-        directions: of the view's rays, unit vectors.
-        distance: at which the rays end, in the scene's unit.
-        details: of pictures around the view.
 
     Returns:
         What is to be added to the colours of the rays: the weighted mean of the pictures' detail, less where few count.

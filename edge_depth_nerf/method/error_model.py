@@ -279,9 +279,7 @@ class BeyondField:
     ) -> Bool[np.ndarray, "h w"]:
         """Find where the monocular map's error is known.
 
-        Args:
-            elevation_rad: of each ray.
-            known: pixels with a LiDAR point or a distance from motion.
+        `known` are pixels with a LiDAR point or a distance from motion.
         """
         if self.network_model is None:
             return np.zeros(elevation_rad.shape, bool)

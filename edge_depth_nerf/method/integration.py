@@ -164,9 +164,7 @@ def join_estimates(
 def weight_of_errors(motion_error: float, mono_error: float) -> float:
     """Give the ρ of `join_estimates` that makes the mean's error least, if the errors of both are independent.
 
-    Args:
-        motion_error: relative standard deviation of distances from motion.
-        mono_error: of monocular ones.
+    Both are relative standard deviations.
     """
     return mono_error**2 / max(motion_error**2 + mono_error**2, 1e-12)
 
@@ -269,14 +267,9 @@ def integrate_by_torch(
     options: IntegrationOptions,
     out: Float[Tensor, "3 h w"],
 ) -> None:
-    """Integrate one map on any device, some rows at a time.
+    """Integrate one map on any device, some rows at a time; distances are metres along the ray.
 
-    Args:
-        lidar: D, metres along the ray.
-        mono: D̂, likewise.
-        valid: True where the pixel may be used.
-        options: of the integration.
-        out: gets the fields of IntegratedDepth, one after the other.
+    `out` gets the fields of IntegratedDepth, one after the other.
     """
     if not out.numel():
         return

@@ -231,12 +231,7 @@ def urban_nerf_loss(
 def sky_loss(weights: Float[Tensor, "rays samples"], sky: Bool[Tensor, "rays"]) -> Float[Tensor, ""]:
     """Compute what rays into the sky hit: the sum of their weights, mean over them.
 
-    Args:
-        weights: rendering weights, 0 or more.
-        sky: which rays are known to reach the sky.
-
-    Returns:
-        0 where all of them reach the background, 1 where none does; 0, still connected to `weights`, without such rays.
+    0 where all of them reach the background, 1 where none does; 0, still connected to `weights`, without such rays.
     """
     hit = weights.sum(dim=1, dtype=torch.promote_types(weights.dtype, torch.float32))
     return (hit * (sky / sky.sum().clamp(min=1))).sum()

@@ -110,13 +110,7 @@ def masked_lpips(
     mask: Bool[Tensor, "h w"],
     network: Callable[[Tensor, Tensor], Tensor],
 ) -> Float[Tensor, ""]:
-    """Compute LPIPS of the two pictures, both blacked out outside the mask.
-
-    Args:
-        pred: rendered picture; clipped to 0 to 1, as the network refuses anything else.
-        target: true picture; likewise.
-        mask: True = evaluate.
-        network: what `load_lpips` gave.
+    """Compute LPIPS of the two pictures, both blacked out outside the mask, and clipped to 0 to 1 for the network.
 
     Raises:
         InputError: shapes that do not fit, or an empty mask.

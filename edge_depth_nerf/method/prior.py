@@ -133,12 +133,7 @@ class RayAngles:
 
 
 def ray_angles(camera: Camera, up_in_camera: Float[np.ndarray, "3"]) -> RayAngles:
-    """Compute the angles of a picture's rays.
-
-    Args:
-        camera: its lens.
-        up_in_camera: the world's upward unit vector in the camera's axes (OpenCV).
-    """
+    """Compute the angles of a picture's rays; `up_in_camera` is the world's upward unit vector in its OpenCV axes."""
     found = rays(camera)
     elevation = np.arcsin(np.clip(found.directions @ up_in_camera.astype(np.float32), -1, 1))
     theta = np.arccos(np.clip(found.cos_theta, -1, 1))
@@ -263,9 +258,7 @@ def integrate_frame(
 def confirmed(mono_m: NDArray[np.float32], around_m: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Find where neighbouring pictures show the same distance, at a pixel or at one of the eight beside it.
 
-    Args:
-        mono_m: H×W, the aligned monocular map, 0 = none.
-        around_m: H×W, what the neighbours' distances from motion show, 0 = nothing.
+    H×W each, 0 = none: the aligned monocular map, and what the neighbours' distances from motion show.
     """
     height, width = mono_m.shape
     padded = np.pad(around_m, 1)

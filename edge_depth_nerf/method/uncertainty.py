@@ -19,12 +19,8 @@ def termination_std(
     """Compute the standard deviation of a ray's termination distribution.
 
     The distribution is even within each sample's interval (h_k = w_k / Δt_k of Eq. 4), and normalised: what passes all
-    samples does not count. Where nothing stops the ray, every place on it is as likely as any other.
-
-    Args:
-        weights: rendering weights w_k, not negative.
-        starts: distance at which each sample's interval begins.
-        ends: distance at which it ends.
+    samples does not count. Where nothing stops the ray, every place on it is as likely as any other. No weight is
+    negative.
     """
     lengths = ends - starts
     stopped = weights.sum(-1, keepdim=True)

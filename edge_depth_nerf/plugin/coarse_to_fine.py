@@ -48,10 +48,7 @@ class CoarseToFine(RenderStateMachine):
     ) -> None:
         """Render for one browser; nothing is rendered before `begin`.
 
-        Args:
-            viewer: nerfstudio's.
-            client: the browser.
-            shows_detail: whether complete pictures are to have the detail of training pictures.
+        `shows_detail` says whether complete pictures are to have the detail of training pictures.
         """
         super().__init__(viewer, VISER_NERFSTUDIO_SCALE_RATIO, client)
         self._moves: dict[str, dict[str, str]] = self.transitions  # pyright: ignore[reportAttributeAccessIssue]
@@ -68,8 +65,7 @@ class CoarseToFine(RenderStateMachine):
     def begin(self, first: CameraState) -> None:
         """Start with the view that the browser was just sent to.
 
-        Args:
-            first: The browser's own view, which it reports some more times before it goes where it was sent.
+        `first` is the browser's own view, which it reports some more times before it goes where it was sent.
         """
         self._first, self._first_until_s = first, time.monotonic() + LONGEST_START_S
         self._requested = self.viewer.get_camera_state(self.client)

@@ -99,10 +99,7 @@ class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig):
     """Folder for integrated priors and tables of training pixels. Not set: .cache/ in the scene folder."""
 
     def source_of_prior(self, sources: Collection[str]) -> str | None:
-        """Return the depth source; `auto` becomes what the scene has. None: no prior.
-
-        Args:
-            sources: the layers that all pictures have.
+        """Return the depth source, of layers that all pictures have; `auto` becomes what the scene has. None: no prior.
 
         Raises:
             InputError: the depth source is unknown, or is not in the scene.

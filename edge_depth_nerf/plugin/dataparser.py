@@ -36,9 +36,6 @@ def default_metres_per_unit(camera_positions_m: NDArray) -> float:
     nerfacto's scene contraction keeps the cube |x|_inf <= 1 unit and squeezes the rest into 1..2, its hash grid spans
     the contracted -2..2, and its sampler spends half of its samples below 1 unit. The drive should lie inside the
     cube: beyond r units, cells grow with r². The finest cell, 4 · metres_per_unit / resolution, should stay small.
-
-    Args:
-        camera_positions_m: N×3 camera centres, metres.
     """
     half_extent_m = float(np.ptp(camera_positions_m, axis=0).max()) / 2
     return float(np.clip(half_extent_m, SMALLEST_METRES_PER_UNIT, LARGEST_METRES_PER_UNIT))

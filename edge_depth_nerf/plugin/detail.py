@@ -83,14 +83,9 @@ class TrainingDetail:
             self.of_picture.cache_clear()
 
     def of_view(self, rays: RayBundle, distance: Float[Tensor, "*rays 1"]) -> Float[Tensor, "*rays 3"]:
-        """Look up the detail of a view.
+        """Look up what is to be added to the colours of a view's rays, which end at `distance`, scene units.
 
-        Args:
-            rays: the view's, from one place or nearly so.
-            distance: at which they end, scene units.
-
-        Returns:
-            What is to be added to its colours, on the distance's device.
+        The rays are from one place or nearly so. What is given lies on the distance's device.
         """
         device = self.model.device
         origins, directions = (each.reshape(-1, 3).to(device) for each in (rays.origins, rays.directions))

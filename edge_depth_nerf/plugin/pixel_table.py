@@ -80,11 +80,7 @@ class PixelBatch:
 
 
 def decode(packed: UInt8[Tensor, "n 15"]) -> PixelBatch:
-    """Unpack records where they are; on a GPU, which then gets 15 bytes a pixel and not 53.
-
-    Args:
-        packed: the bytes of `PixelTable.records`.
-    """
+    """Unpack the bytes of `PixelTable.records` where they are; a GPU then gets 15 bytes a pixel and not 53."""
     # distance, sigma, low and high half of the picture's number, row, column
     words = packed[:, 3:].contiguous().view(torch.int16).int() & 0xFFFF
     distance, sigma = words[:, :1], words[:, 1:2]
@@ -155,11 +151,8 @@ class PixelTable:
     ) -> PixelBatch:
         """Read `count` pixels from number `start` on; after the last one comes the first again.
 
-        Args:
-            start: number of the first one.
-            count: of pixels.
-            keep: whether a pixel is in the batch, by its distance and sigma in metres and whether it shows the sky, [n,
-                1] each. None: all are.
+        `keep` says whether a pixel is in the batch, by its distance and sigma in metres and whether it shows the sky,
+        [n, 1] each. None: all are.
         """
         pixels = decode(self.packed(start, count))
         if keep is None:

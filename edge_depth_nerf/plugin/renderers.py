@@ -78,12 +78,9 @@ class DepthMoments(DepthRenderer):
 
 
 def points_on(bundles: Sequence[RayBundle], distances: Sequence[Tensor], fused: bool) -> RaySamples:
-    """Make a sample without length on each ray.
+    """Make a sample without length on each ray, one set of rays after the other, at distances in scene units.
 
-    Args:
-        bundles: the rays, one set after the other.
-        distances: of each set, [rays], scene units.
-        fused: whether the samples are of our form.
+    `fused` says whether the samples are of our form.
     """
     origins, directions, areas, pictures = (
         torch.cat([getattr(bundle, name) for bundle in bundles])

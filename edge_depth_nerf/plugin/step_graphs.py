@@ -177,10 +177,7 @@ class StepGraphs:
         return self._failures >= len(RECORD_AT)
 
     def step(self, step: int) -> Step | None:
-        """Take a training step.
-
-        Args:
-            step: its number.
+        """Take the training step of this number.
 
         Returns:
             Sum of the losses, losses and metrics, until the next replay; None where this has ended: the caller has to

@@ -79,13 +79,9 @@ def worth_asking(swept: Swept) -> Bool[np.ndarray, "h w"]:
 def confirm(
     view: View, swept: Swept, neighbours: Sequence[View], theirs: Sequence[Float32[np.ndarray, "_ _"]]
 ) -> MotionDistance:
-    """Keep of a sweep what the neighbours' own sweeps confirm.
+    """Keep of a view's sweep what the neighbours' own sweeps confirm.
 
-    Args:
-        view: the picture.
-        swept: its sweep.
-        neighbours: pictures with sweeps of their own.
-        theirs: the inverse distances of these, 0 where they are not `worth_asking`.
+    `theirs` are the inverse distances of the neighbours, 0 where they are not `worth_asking`.
     """
     # imported here, because Numba takes half a second to load
     from edge_depth_nerf.stereo import sphere_sweep
