@@ -39,6 +39,7 @@ from edge_depth_nerf.plugin.exposure import Exposure, exposure_model
 from edge_depth_nerf.plugin.fused.build import compiled_before, fused_forms
 from edge_depth_nerf.plugin.fused.fields import CubeContraction, FusedNerfactoField
 from edge_depth_nerf.plugin.fused.hash_grid import sum_tables_later
+from edge_depth_nerf.plugin.fused.ray_samplers import in_a_row
 from edge_depth_nerf.plugin.pose_refinement import (
     FRAMES,
     PoseRefiner,
@@ -336,7 +337,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         """
         if not self.training or self.exposure is None:
             return colours
-        pictures = torch.cat([rays.camera_indices[:, 0] for rays in bundles if rays.camera_indices is not None])
+        pictures = in_a_row([rays.camera_indices[:, 0] for rays in bundles if rays.camera_indices is not None])
         return self.exposure(torch.cat(colours), pictures).split([len(each) for each in colours])
 
     def rays_of_view(self, camera: Cameras, obb_box: OrientedBox | None = None) -> RayBundle:

@@ -19,7 +19,7 @@ from torch import Tensor
 from edge_depth_nerf.kernels.rendering import Background, Rendered
 from edge_depth_nerf.method.uncertainty import termination_std
 from edge_depth_nerf.plugin.fused.fields import FusedNerfactoField
-from edge_depth_nerf.plugin.fused.ray_samplers import rays_of, samples_along
+from edge_depth_nerf.plugin.fused.ray_samplers import in_a_row, rays_of, samples_along
 
 INFINITELY_FAR = 1e4
 """Scene units: so far that the place in the contracted scene is the direction alone."""
@@ -83,7 +83,7 @@ def points_on(bundles: Sequence[RayBundle], distances: Sequence[Tensor], fused: 
     `fused` says whether the samples are of our form.
     """
     origins, directions, areas, pictures = (
-        torch.cat([getattr(bundle, name) for bundle in bundles])
+        in_a_row([getattr(bundle, name) for bundle in bundles])
         for name in ("origins", "directions", "pixel_area", "camera_indices")
     )
     at = torch.cat([*distances])[:, None, None]

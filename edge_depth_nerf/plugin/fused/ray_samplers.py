@@ -5,7 +5,7 @@ Host-facing; the numbers are nerfstudio's to float32's noise, from the same rand
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -164,6 +164,17 @@ class FusedFrustums(Frustums):
         if self.offsets is not None:
             return super().get_positions()
         return torch.addcmul(self.origins, self.directions, torch.lerp(self.starts, self.ends, 0.5))
+
+
+def in_a_row(parts: Sequence[Tensor]) -> Tensor:
+    """Join tensors of one form along their first axis; without a copy where they lie so, as parts of a batch do."""
+    first, at, rows = parts[0], parts[0].storage_offset(), 0
+    for part in parts:
+        follows = part.untyped_storage()._cdata == first.untyped_storage()._cdata and part.storage_offset() == at
+        if not follows or part.stride() != first.stride() or part.requires_grad:
+            return torch.cat([*parts])
+        at, rows = at + len(part) * part.stride(0), rows + len(part)
+    return first.as_strided((rows, *first.shape[1:]), first.stride())
 
 
 def _whole(kind: type[Any], shape: tuple[int, ...], **values: Any) -> Any:
