@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 from numba import njit
 from torch import Tensor
 
@@ -58,6 +59,21 @@ def _forget_older(compiled_in: Path, sources: Path) -> None:
 def flat(values: Tensor) -> np.ndarray:
     """Give a tensor's numbers in a row, for a kernel; a contiguous tensor is not copied."""
     return values.detach().contiguous().view(-1).numpy()
+
+
+def flat_rows(matrix: Float[Tensor, "rows columns"]) -> tuple[np.ndarray, int]:
+    """Give a matrix as a flat array, and how many numbers lie from one row's begin to the next one's.
+
+    Where samples begin is a view of all edges, which need not be copied.
+    """
+    matrix = matrix.detach()
+    rows, columns = matrix.shape
+    if matrix.numel() == 0:
+        return np.empty(0, np.float32), columns
+    if columns > 1 and matrix.stride(1) != 1:
+        matrix = matrix.contiguous()
+    stride = matrix.stride(0)
+    return matrix.as_strided(((rows - 1) * stride + columns,), (1,)).numpy(), stride
 
 
 def all_on_disk() -> bool:

@@ -87,6 +87,12 @@ def edge_loss(
     return -(target * torch.log(weights + EPS)).sum(-1)
 
 
+def _by_numba() -> Callable[..., Tensor]:
+    from edge_depth_nerf.method import edge_loss_numba
+
+    return edge_loss_numba.edge_loss
+
+
 def _by_triton() -> Callable[..., Tensor]:
     from edge_depth_nerf.method import edge_loss_triton
 
@@ -111,8 +117,8 @@ def _examples(device: torch.device, sizes: Sizes) -> Sequence[Example]:
 
 
 _ON_GPU = on_gpu("edge loss", _by_triton, _by_torch, _examples, tolerance=1e-4)
-EDGE_LOSS = Function(on_gpu=_ON_GPU)
-"""`edge_loss` in its compiled form, differentiable once, by the weights alone."""
+EDGE_LOSS = Function(_by_numba, _ON_GPU)
+"""`edge_loss` in its compiled forms, differentiable once, by the weights alone."""
 
 
 def step_kernels() -> list[GpuForm]:

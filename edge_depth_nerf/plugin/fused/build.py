@@ -67,7 +67,7 @@ def compiled_before() -> bool:
         rendering_numba,
         table_adam_numba,
     )
-    from edge_depth_nerf.method import integration_numba  # noqa: F401
+    from edge_depth_nerf.method import edge_loss_numba, integration_numba  # noqa: F401
 
     return compiled.all_on_disk()
 
