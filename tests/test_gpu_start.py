@@ -122,6 +122,23 @@ def test_kernels_are_tried_out_side_by_side_after_the_first(nothing_tried):
     assert len(begun) == 2
 
 
+def test_what_fails_once_beside_others_is_tried_again(nothing_tried):
+    calls = []
+
+    def kernel(x: torch.Tensor) -> torch.Tensor:
+        calls.append(x)
+        if len(calls) == 1:
+            raise RuntimeError("dictionary changed size during iteration")
+        return 2 * x
+
+    prepared = Preparation([doubling("first"), doubling("stumbles", lambda: kernel, tries=2)], CPU)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert prepared.wait(SOON_S)
+    assert back_ends._tried[next(form for form, _ in back_ends._tried if form.name == "stumbles"), CPU] is kernel
+    assert len(calls) == 5 and prepared.done == prepared.total
+
+
 def test_who_needs_a_kernel_meanwhile_waits_for_its_trial(nothing_tried):
     loads, begun, may_end = [], threading.Event(), threading.Event()
 
