@@ -1,7 +1,6 @@
 """What the viewer shows: in numbers, on the server's side, and in a browser."""
 
 import math
-import shutil
 import socket
 import threading
 import time
@@ -15,7 +14,7 @@ import jaxtyping
 import numpy as np
 import pytest
 import torch
-from browser import SOFTWARE_WEBGL
+from browser import open_browser
 from models import pipeline_of, shrink
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.configs.method_configs import all_methods
@@ -36,7 +35,6 @@ from edge_depth_nerf.plugin.viewer import AZIMUTHS, RINGS, DriveLayers, lens_cap
 pytestmark = pytest.mark.slow
 
 METHOD = "edge-depth-nerf-lite"
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 TIMEOUT_S = 120
 
 
@@ -564,13 +562,8 @@ def test_a_file_that_went_away_is_said_and_the_switch_goes_back(training, capsys
 # ---- in a browser ----------------------------------------------------------------------------------------------------
 @pytest.fixture(scope="module")
 def browser():
-    if CHROMIUM is None:
-        pytest.skip("no Chromium on this machine (Debian: apt-get install chromium)")
-    sync_api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed (pip install playwright)")
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *SOFTWARE_WEBGL])
-        yield browser
-        browser.close()
+    with open_browser() as found:
+        yield found
 
 
 @pytest.fixture(scope="module")
