@@ -353,21 +353,18 @@ def test_a_drive_is_cut_as_by_hand(room: RoomDrive, tmp_path: Path) -> None:
 def test_a_comparison_goes_on_when_a_worker_is_killed(tmp_path: Path) -> None:
     write_compared_scene(tmp_path / "sample")
     output = tmp_path / "out"
-    asked = CompareOptions(
-        scenes=(tmp_path / "sample",), output=output, methods=("nerfacto", "edge"), steps=8, cluster="local"
-    )
+    asked = CompareOptions((tmp_path / "sample",), output=output, methods=("edge",), steps=8, cluster="local")
     folder = output / "runs" / "sample" / "edge_seed-0"
     killer = kill_worker_of(str(folder), lambda: list(folder.rglob("nerfstudio_models/step-000000007.ckpt")))
     console = Console(file=io.StringIO(), width=200)
     results = compare(asked, console)
     killer.join()
     assert "sample edge seed 0: worker lost" in console.file.getvalue()  # pyright: ignore
-    assert {run.method for run in results.runs} == {"nerfacto", "edge"}
+    assert [run.method for run in results.runs] == ["edge"]
     said = (folder / "run.log").read_text()
     first, second = said.split("$ ")[1:]
     assert "No Nerfstudio checkpoint to load" in first and "Done loading Nerfstudio checkpoint" in second
     assert list(read_json(folder / "progress.json")["times"]) == ["8"]
-    assert (output / "runs/sample/nerfacto_seed-0/run.log").read_text().count("$ ") == 1
     # what is done is done: the same tables come from the same command without a cluster
     tables = (output / "tables.md").read_text()
     compare(replace(asked, cluster=None), QUIET)

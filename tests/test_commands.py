@@ -1,8 +1,6 @@
 """nerfstudio's own commands on our method and our scene, as a user gives them: offline, on the CPU."""
 
 import gzip
-import json
-import os
 import shutil
 import signal
 import socket
@@ -17,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from host_commands import in_one_process
 from nerfstudio.utils.eval_utils import eval_setup
 from scenes import fisheye, write_scene
 
@@ -122,30 +121,12 @@ def commands_of(killed_run: Path, scene: Path, outputs: Path) -> dict[str, list[
 def done(killed_run, scene, torch_home, tmp_path_factory) -> Callable[[str], tuple[str, Path]]:
     """Asserts that a command ended well; returns what it said and where it wrote."""
     outputs = tmp_path_factory.mktemp("outputs")
-    jobs = []
-    for name, words in commands_of(killed_run, scene, outputs).items():
+    commands = commands_of(killed_run, scene, outputs)
+    for name in commands:
         (outputs / name).mkdir()
-        jobs.append(
-            {
-                "words": [str(word) for word in words],
-                "environment": {"TORCH_HOME": str(torch_home)} if "nerfacto" in name else {},
-                "log": str(outputs / f"{name}.log"),
-            }
-        )
-    (outputs / "jobs.json").write_text(json.dumps(jobs))
-    subprocess.run(
-        [sys.executable, Path(__file__).with_name("host_commands.py"), outputs / "jobs.json"],
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-        timeout=2 * TIMEOUT_S,
-        check=False,
-    )
-
-    def ended_well(name: str) -> tuple[str, Path]:
-        status, said = outputs / f"{name}.log.status", (outputs / f"{name}.log").read_text()
-        assert status.is_file() and status.read_text() == "0", said[-4000:]
-        return said, outputs / name
-
-    return ended_well
+    weights = {name: {"TORCH_HOME": str(torch_home)} for name in ("nerfacto", "depth-nerfacto")}
+    ended_well = in_one_process(commands, outputs, weights)
+    return lambda name: (ended_well(name), outputs / name)
 
 
 def last_step(run: Path) -> int:

@@ -169,16 +169,6 @@ def test_the_host_sets_the_size_of_batches(tmp_path):
     assert data.get_train_rays_per_batch() == 33
 
 
-def test_integration_happens_once(tmp_path, monkeypatch):
-    scene = write_scene(tmp_path)
-    manager(scene)
-    assert len(list((scene / ".cache" / "prior").glob("*.npz"))) == 8
-    monkeypatch.setattr("edge_depth_nerf.method.prior.make_prior", lambda *_: pytest.fail("integrated again"))
-    manager(scene)
-    with pytest.raises(pytest.fail.Exception):
-        manager(scene, prior=weighted(0.5))
-
-
 def test_nothing_is_integrated_for_rendering(tmp_path, monkeypatch):
     monkeypatch.setattr(datamanager_module, "PriorCache", lambda *_: pytest.fail("integrated"))
     scene = write_scene(tmp_path)
@@ -296,14 +286,6 @@ def test_the_second_training_reads_no_picture(tmp_path, monkeypatch):
         (scene / "images" / "0002.png").touch()
         with pytest.raises(pytest.fail.Exception):
             manager(scene)
-
-
-def test_a_broken_table_is_made_anew(tmp_path):
-    scene = write_scene(tmp_path)
-    whole = manager(scene).train_pixel_sampler.table.batch(0, 500).indices
-    for path in (scene / ".cache" / "pixels").glob("*.npy"):
-        path.write_bytes(path.read_bytes()[:-40])
-    assert torch.equal(manager(scene).train_pixel_sampler.table.batch(0, 500).indices, whole)
 
 
 def test_a_scene_that_cannot_be_written_trains(tmp_path):

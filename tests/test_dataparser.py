@@ -1,5 +1,3 @@
-import json
-
 import numpy as np
 import pytest
 import torch
@@ -168,13 +166,6 @@ def test_a_missing_map_is_named_before_training(tmp_path):
         parse(scene)
 
 
-def test_broken_json_is_named(tmp_path):
-    scene = write_scene(tmp_path)
-    (scene / "transforms.json").write_text(json.dumps(read_json(scene / "transforms.json"))[:-40])
-    with pytest.raises(InputError, match=r"transforms\.json"):
-        parse(scene)
-
-
 @pytest.mark.parametrize("value", [0.0, -3.0, float("nan")])
 def test_the_scale_must_be_positive(tmp_path, value):
     with pytest.raises(InputError, match="metres_per_unit"):
@@ -257,17 +248,6 @@ def test_a_frame_is_trained_on_or_held_out_with_all_its_cameras(tmp_path):
         parse(scene)
     edit(scene, lambda meta: meta.update({f"{split}_filenames": meta["train_filenames"] for split in ("val", "test")}))
     assert len(parse(scene, "test").image_filenames) == 9  # nothing held out
-
-
-def test_a_truncated_picture_is_named(tmp_path):
-    scene = write_scene(tmp_path)
-    picture = scene / "images" / "0000.png"
-    picture.write_bytes(picture.read_bytes()[:300])
-    dataset = FisheyeDepthDataset(parse(scene))
-    with pytest.raises(InputError, match=r"0000\.png.*decoded"):
-        dataset[0]
-    with pytest.raises(InputError, match=r"0000\.png.*decoded"):
-        dataset.rgb(0)
 
 
 def test_a_truncated_array_is_named(tmp_path):

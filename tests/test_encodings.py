@@ -428,5 +428,3 @@ def test_the_contraction_is_nerfactos():
     assert torch.equal(found[0][0], found[1][0])
     # at the very centre both give NaN, from 0 / 0 in the branch that is not selected
     torch.testing.assert_close(found[1][1], found[0][1], equal_nan=True)
-
-

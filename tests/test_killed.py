@@ -242,14 +242,23 @@ def test_two_processes_on_one_scene(room: RoomDrive, tmp_path: Path) -> None:
 # ---- killed ----------------------------------------------------------------------------------------------------
 DIE_AT_REPLACE = """
 import os, sys
-replace, last = os.replace, sys.argv.pop(1)
-def dying(temporary, path):
-    if str(path).endswith(last):
-        os.kill(os.getpid(), 9)
-    return replace(temporary, path)
-os.replace = dying
+from pathlib import Path
+import edge_depth_nerf.process.command, edge_depth_nerf.process.kitti360.converter  # once for all
 from edge_depth_nerf.entry import main
-main()
+replace, lasts, scene = os.replace, sys.argv.pop(1).split(), Path(sys.argv.pop(1))
+sys.argv += ["--output", str(scene)]
+for last in lasts:
+    def dying(temporary, path):
+        if str(path).endswith(last):
+            os.kill(os.getpid(), 9)
+        return replace(temporary, path)
+    child = os.fork()
+    if not child:
+        os.replace = dying
+        main()
+        os._exit(0)
+    assert os.waitpid(child, 0)[1] == 9, last
+    assert not (scene / "transforms.json").exists(), last
 """
 
 
@@ -257,12 +266,11 @@ def test_process_killed_before_a_file_appears(room: RoomDrive, tmp_path: Path) -
     """One run, killed again and again, each time further on."""
     process(options_of(room, tmp_path / "whole"), Console(quiet=True))
     expected = contents(tmp_path / "whole")
-    for last in ("process.json", "image_03/0000000003.npz", "points.ply", "transforms.json"):
-        command = [sys.executable, "-c", DIE_AT_REPLACE, last, "process", "kitti360", "--root", str(room.root)]
-        command += ["--sequence", SEQUENCE, "--output", str(tmp_path / "scene"), "--sweeps", "1", "--no-find-ego"]
-        done = subprocess.run([*command, "--no-estimate-depth"], capture_output=True, text=True, check=False)
-        assert done.returncode == -9, done.stderr
-        assert not (tmp_path / "scene/transforms.json").exists()
+    lasts = "process.json image_03/0000000003.npz points.ply transforms.json"
+    command = [sys.executable, "-c", DIE_AT_REPLACE, lasts, tmp_path / "scene", "process", "kitti360"]
+    command += ["--root", room.root, "--sequence", SEQUENCE, "--sweeps", "1", "--no-find-ego", "--no-estimate-depth"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
     process(options_of(room, tmp_path / "scene"), Console(quiet=True))
     assert contents(tmp_path / "scene") == expected
 
