@@ -3,7 +3,6 @@
 import html
 import shlex
 import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -127,17 +126,6 @@ def test_options_are_checked_before_anything_starts(tmp_path):
         with pytest.raises(InputError, match=message):
             demo.run_demo(replace(DemoOptions(output=output), **changes), QUIET)
     assert not output.exists()
-
-
-def test_the_command_says_what_is_wrong_without_a_traceback(tmp_path):
-    call = [sys.executable, "-m", "edge_depth_nerf", "process", "kitti360", "--root", str(tmp_path)]
-    call += ["--sequence", "drive", "--output", str(tmp_path / "scene")]
-    done = subprocess.run(call, capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert done.stderr.startswith("edge-depth-nerf: ")
-    assert str(tmp_path) in done.stderr
-    assert "Traceback" not in done.stderr
-    assert not (tmp_path / "scene").exists()
 
 
 def test_colours_of_distance():

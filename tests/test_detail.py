@@ -5,9 +5,10 @@ from copy import deepcopy
 import numpy as np
 import pytest
 import torch
+from balls import pose
 from models import pipeline_of
 from nerfstudio.model_components.renderers import background_color_override_context
-from scenes import RADIUS_M, fisheye, pinhole, view, write_scene
+from scenes import FLIP, RADIUS_M, fisheye, pinhole, view, write_scene
 
 from edge_depth_nerf.base.files import read_json, write_json
 from edge_depth_nerf.compare.evaluation import ViewEvaluator, evaluated, shifted_views
@@ -17,17 +18,13 @@ from edge_depth_nerf.plugin.detail import TrainingDetail, detail_shown, with_app
 from edge_depth_nerf.plugin.exposure import Gains
 
 GREY = 0.5
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 LENSES = {"fisheye": [fisheye(64, 56)], "pinhole": [pinhole(64, 56)], "both": [fisheye(64, 56), pinhole(64, 56)]}
 
 
 # ---- the formulas ---------------------------------------------------------------------------------------------------
 def at(x: float, angle: float = 0.0) -> np.ndarray:
     """A camera-to-world matrix, OpenCV axes: beside the ball's middle, turned about y."""
-    pose = np.eye(4)
-    pose[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
-    pose[0, 3] = x
-    return pose
+    return pose(x, turn_rad=angle)
 
 
 def opengl(pose: np.ndarray) -> torch.Tensor:

@@ -34,8 +34,6 @@ from edge_depth_nerf.method.prior import PriorOptions
 from edge_depth_nerf.mono import estimate
 from edge_depth_nerf.mono.calibration import calibrate_scene
 from edge_depth_nerf.mono.network import DepthNetwork, NetworkSettings, read_tensors, write_tensors
-from edge_depth_nerf.mono.options import EstimateDepthOptions
-from edge_depth_nerf.mono.training import TrainingOptions
 from edge_depth_nerf.plugin import datamanager
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
@@ -273,37 +271,6 @@ def test_process_killed_before_a_file_appears(room: RoomDrive, tmp_path: Path) -
     assert done.returncode == 0, done.stderr
     process(options_of(room, tmp_path / "scene"), Console(quiet=True))
     assert contents(tmp_path / "scene") == expected
-
-
-def test_estimate_depth_killed_after_its_weights_were_saved(
-    room: RoomDrive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The weights that are read give the maps of those that were trained, to the last bit."""
-    small = estimate.PresetValues((16, 32, 64), 128, TrainingOptions(steps=4, batch=2, evaluate_every=2))
-    monkeypatch.setitem(estimate.PRESETS, "lite", small)
-    quiet, scene = Console(quiet=True), tmp_path / "scene"
-    options = EstimateDepthOptions((scene,))
-    process(options_of(room, scene), quiet)
-    shutil.copytree(scene, tmp_path / "before")
-    estimate.estimate_depth(options, quiet)
-    expected = contents(scene)
-    # the maps tell the scene's folder: once more in the same one
-    shutil.rmtree(scene)
-    shutil.move(tmp_path / "before", scene)
-
-    def dying(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(estimate, "write_maps", dying)
-        with pytest.raises(KeyboardInterrupt):
-            estimate.estimate_depth(options, quiet)
-    # killed a moment earlier, with the training's own checkpoint still there
-    (scene / "mono_network.checkpoint").write_bytes(b"of no use")
-    estimate.estimate_depth(options, quiet)
-    found = contents(scene)
-    assert sorted(found) == sorted(expected)
-    assert [name for name in expected if found[name] != expected[name]] == []
 
 
 def test_weights_that_were_read_predict_what_trained_ones_did(sample_drive: Path) -> None:

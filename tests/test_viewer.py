@@ -24,6 +24,7 @@ from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
 from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerElement
 from scenes import RADIUS_M, copy_sample_drive, fisheye, pinhole, write_scene
 from torch._subclasses.fake_tensor import FakeTensorMode
+from waiting import until
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import as_people_count
@@ -36,13 +37,6 @@ pytestmark = pytest.mark.slow
 
 METHOD = "edge-depth-nerf-lite"
 TIMEOUT_S = 120
-
-
-def until(condition: Callable[[], bool], wait: Callable[[float], None] = time.sleep) -> None:
-    deadline = time.monotonic() + TIMEOUT_S
-    while not condition():
-        assert time.monotonic() < deadline
-        wait(0.1)
 
 
 # ---- lenses ----------------------------------------------------------------------------------------------------------
@@ -589,7 +583,7 @@ def page(browser, training, interruptible):
     page.wait_for_selector("text=Output type", timeout=TIMEOUT_S * 1000)
     training.viewer.control_panel._max_res.value = 128
     training.trainer.training_state = "paused"
-    until(lambda: bool(server.get_clients()), lambda seconds: page.wait_for_timeout(1000 * seconds))
+    until(lambda: bool(server.get_clients()), wait=lambda seconds: page.wait_for_timeout(1000 * seconds))
     look_from_above(training)
     yield page
     training.trainer.training_state = "training"
@@ -618,7 +612,7 @@ def settled(page, shows: Callable[[np.ndarray], bool] = lambda _: True) -> np.nd
         pictures.append(canvas(page))
         return bool((np.abs(pictures[-1] - pictures[-2]).max(-1) > 30).mean() < 1e-3) and shows(pictures[-1])
 
-    until(still, lambda seconds: page.wait_for_timeout(10_000 * seconds))
+    until(still, wait=lambda seconds: page.wait_for_timeout(10_000 * seconds))
     return pictures[-1]
 
 
@@ -641,7 +635,7 @@ def test_a_browser_begins_at_a_training_camera(browser, page, training):
     known = set(server.get_clients())
     other = browser.new_page(viewport={"width": 500, "height": 400})
     other.goto(f"http://127.0.0.1:{server.get_port()}")
-    until(lambda: bool(set(server.get_clients()) - known), lambda seconds: other.wait_for_timeout(1000 * seconds))
+    until(lambda: bool(set(server.get_clients()) - known), wait=lambda seconds: other.wait_for_timeout(1000 * seconds))
     (number,) = set(server.get_clients()) - known
     dataset = training.trainer.pipeline.datamanager.train_dataset
     pose = dataset.cameras.camera_to_worlds[5].double().numpy()  # of eleven of the first camera
@@ -670,7 +664,7 @@ def test_switches_work(page, training, label, layer):
         box.click()
         until(
             lambda: training.layers.switches[layer].value is shown and seen(training, layer) is shown,
-            lambda seconds: page.wait_for_timeout(1000 * seconds),
+            wait=lambda seconds: page.wait_for_timeout(1000 * seconds),
         )
         page.mouse.move(300, 300)
         return settled(page, shows)
@@ -702,6 +696,6 @@ def test_outputs_and_the_fisheye_preview(page, training):
             training.viewer.render_tab_state.preview_render
             and training.viewer.render_tab_state.preview_camera_type == "Fisheye"
         ),
-        lambda seconds: page.wait_for_timeout(1000 * seconds),
+        wait=lambda seconds: page.wait_for_timeout(1000 * seconds),
     )
     settled(page, lambda picture: picture[150:400].std() > 5 and changed(plain, picture) > 5000)
