@@ -204,20 +204,6 @@ def test_a_scene_without_depth_has_no_prior(tmp_path):
     assert (batch["prior_distance_m"] == 0).all()
 
 
-def test_options_out_of_range(tmp_path):
-    with pytest.raises(InputError, match="alpha"):
-        manager(write_scene(tmp_path), prior=PriorOptions(integration=IntegrationOptions(alpha=1.4)))
-
-
-def test_the_same_seed_gives_the_same_rays(tmp_path):
-    scene = write_scene(tmp_path)
-    drawn = []
-    for _ in range(2):
-        torch.manual_seed(7)
-        drawn.append(manager(scene).next_train(0)[1]["indices"])
-    assert np.array_equal(drawn[0], drawn[1])
-
-
 def test_a_held_out_mask_that_leaves_nothing_is_found_before_training(tmp_path):
     scene = write_scene(tmp_path)
     meta = read_json(scene / "transforms.json")

@@ -218,12 +218,6 @@ def test_arrays_of_other_tools_say_none_in_many_ways(tmp_path):
     assert found is not None and found[0, :5].tolist() == pytest.approx([0, 0, 0, 0, 4])
 
 
-def test_k4_is_read(tmp_path):
-    scene = write_scene(tmp_path)
-    edit(scene, lambda meta: [frame.update(k4=0.0123) for frame in meta["frames"]])
-    assert FisheyeDepthDataset(parse(scene)).camera(0).to_dict()["k4"] == pytest.approx(0.0123)
-
-
 def test_a_plain_scene_of_one_picture(tmp_path):
     scene = write_scene(tmp_path, frames=1, split=False)
     for split in ("train", "test"):

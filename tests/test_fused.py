@@ -386,7 +386,7 @@ def test_a_rendered_view_is_the_torch_view(average):
 
 def test_training_renders_no_depth_that_nobody_reads():
     outputs = build().train()(bundle())
-    assert not [name for name in outputs if "depth" in name]
+    assert not [name for name in outputs if "depth" in name or "distance" in name]
 
 
 def test_a_fields_normals_can_be_had_at_evaluation():

@@ -149,13 +149,6 @@ def test_uncertainty_is_of_the_weights_that_colour_the_ray(pipeline):
         assert float(outputs["distance_uncertainty"][ray]) == pytest.approx(expected_m, rel=0.02)
 
 
-def test_training_has_neither(pipeline):
-    pipeline.train()
-    rays, _ = pipeline.datamanager.next_train(0)
-    outputs = pipeline.model(rays)
-    assert not {"distance", "distance_uncertainty", "expected_depth"} & set(outputs)
-
-
 @pytest.mark.parametrize("kind", [CameraType.FISHEYE, CameraType.EQUIRECTANGULAR, CameraType.PERSPECTIVE])
 @pytest.mark.parametrize("implementation", ["fused", "torch"])
 def test_previews_of_any_size_are_whole(scene, kind, implementation):
