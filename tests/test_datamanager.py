@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 import torch
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager
-from scenes import fisheye, pinhole, write_scene
+from scenes import fisheye, pinhole, transforms, write_scene
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import read_distance_png, read_json, write_distance_png, write_json, write_mask
+from edge_depth_nerf.base.files import read_distance_png, write_distance_png, write_mask
 from edge_depth_nerf.method.error_model import read_calibration
 from edge_depth_nerf.method.integration import IntegrationOptions
 from edge_depth_nerf.method.prior import PriorOptions, make_prior, ray_angles
@@ -206,10 +206,9 @@ def test_a_scene_without_depth_has_no_prior(tmp_path):
 
 def test_a_held_out_mask_that_leaves_nothing_is_found_before_training(tmp_path):
     scene = write_scene(tmp_path)
-    meta = read_json(scene / "transforms.json")
-    write_mask(scene / "masks" / "thin.png", np.arange(28)[:, None] * np.ones((1, 32)) == 3)
-    meta["frames"][4]["mask_path"] = "masks/thin.png"
-    write_json(scene / "transforms.json", meta)
+    with transforms(scene) as meta:
+        write_mask(scene / "masks" / "thin.png", np.arange(28)[:, None] * np.ones((1, 32)) == 3)
+        meta["frames"][4]["mask_path"] = "masks/thin.png"
     with pytest.raises(InputError, match=r"thin\.png.*held-out picture 0004\.png"):
         manager(scene)
 

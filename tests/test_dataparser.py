@@ -3,10 +3,10 @@ import pytest
 import torch
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-from scenes import fisheye, pinhole, write_scene
+from scenes import fisheye, pinhole, transforms, write_scene
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import read_json, write_distance_png, write_json, write_mask, write_png
+from edge_depth_nerf.base.files import read_json, write_distance_png, write_mask, write_png
 from edge_depth_nerf.cameras import Pinhole
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig, default_metres_per_unit
 from edge_depth_nerf.plugin.dataset import FisheyeDepthDataset
@@ -17,9 +17,8 @@ def parse(folder, split="train", **options):
 
 
 def edit(folder, change):
-    meta = read_json(folder / "transforms.json")
-    change(meta)
-    write_json(folder / "transforms.json", meta)
+    with transforms(folder) as meta:
+        change(meta)
 
 
 def test_positions_are_metres_over_metres_per_unit(tmp_path):

@@ -16,10 +16,10 @@ import pytest
 import tyro
 from browser import open_browser
 from rich.console import Console
-from scenes import write_scene
+from scenes import transforms, write_scene
 
 from edge_depth_nerf import cli
-from edge_depth_nerf.base.files import read_json, write_json, write_png
+from edge_depth_nerf.base.files import write_png
 from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.base.pictures import NO_VALUE_RGB, colour_distance, distance_of_colours
 from edge_depth_nerf.compare.methods import METHODS
@@ -174,16 +174,15 @@ def test_drives_are_read_from_what_runs_left(tmp_path):
 def test_views_come_in_the_order_of_the_evaluation(tmp_path):
     """nerfstudio sorts folder by folder; letter by letter, "front-left/" comes before "front/"."""
     scene = write_scene(tmp_path / "x", frames=4, split=False)
-    meta = read_json(scene / "transforms.json")
-    wanted = ("front/0000", "front/0001", "front-left/0000", "front-left/0001")
-    for frame, name in zip(meta["frames"], wanted, strict=True):
-        path = scene / f"images/{name}.png"
-        path.parent.mkdir(exist_ok=True)
-        (scene / frame["file_path"]).rename(path)
-        frame["file_path"] = f"images/{name}.png"
-    names = [frame["file_path"] for frame in meta["frames"]]
-    meta |= {f"{split}_filenames": names for split in ("train", "val", "test")}
-    write_json(scene / "transforms.json", meta)
+    with transforms(scene) as meta:
+        wanted = ("front/0000", "front/0001", "front-left/0000", "front-left/0001")
+        for frame, name in zip(meta["frames"], wanted, strict=True):
+            path = scene / f"images/{name}.png"
+            path.parent.mkdir(exist_ok=True)
+            (scene / frame["file_path"]).rename(path)
+            frame["file_path"] = f"images/{name}.png"
+        names = [frame["file_path"] for frame in meta["frames"]]
+        meta |= {f"{split}_filenames": names for split in ("train", "val", "test")}
     parser = FisheyeDepthDataParserConfig(data=scene).setup()
     evaluated = [str(path.relative_to(scene)) for path in parser.get_dataparser_outputs("test").image_filenames]
     assert evaluated == names != sorted(names)
