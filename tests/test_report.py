@@ -5,7 +5,6 @@ import hashlib
 import json
 import re
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -14,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import tyro
-from browser import open_browser
+from html_page import Page
 from rich.console import Console
 from scenes import transforms, write_scene
 
@@ -345,30 +344,6 @@ def report(cloud) -> Report:
     )
 
 
-class Page(HTMLParser):
-    """Tags with attributes, and the text of each kind of element."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.tags: list[tuple[str, dict[str, str]]] = []
-        self.texts: dict[str, list[str]] = {}
-        self._open: list[str] = []
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, {name: value or "" for name, value in attrs}))
-        self._open.append(tag)
-        self.texts.setdefault(tag, []).append("")
-
-    def handle_endtag(self, tag: str) -> None:
-        while self._open and self._open.pop() != tag:
-            pass
-
-    def handle_data(self, data: str) -> None:
-        if self._open:
-            self.texts[self._open[-1]][-1] += data
-
-
 def test_text_is_escaped(report):
     text = build_report(report)
     page = Page(text)
@@ -448,12 +423,6 @@ def test_the_page_is_written_whole_or_not_at_all(report, tmp_path, monkeypatch):
 
 
 # --- the page in a browser --------------------------------------------------------------------------------------------
-@pytest.fixture(scope="module")
-def browser():
-    with open_browser() as found:
-        yield found
-
-
 @pytest.fixture(scope="module")
 def address(report, tmp_path_factory) -> str:
     path = tmp_path_factory.mktemp("report") / "report.html"

@@ -14,7 +14,6 @@ import jaxtyping
 import numpy as np
 import pytest
 import torch
-from browser import open_browser
 from models import pipeline_of, shrink
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.configs.method_configs import all_methods
@@ -547,12 +546,6 @@ def test_a_file_that_went_away_is_said_and_the_switch_goes_back(training, capsys
 
 
 # ---- in a browser ----------------------------------------------------------------------------------------------------
-@pytest.fixture(scope="module")
-def browser():
-    with open_browser() as found:
-        yield found
-
-
 @pytest.fixture(scope="module")
 def interruptible() -> Iterator[None]:
     """Renderings that may be interrupted: types are not checked.
