@@ -1,3 +1,4 @@
+import inspect
 import subprocess
 import sys
 from copy import deepcopy
@@ -15,7 +16,7 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.method.depth_losses import EdgeLoss
 from edge_depth_nerf.method.integration import IntegrationOptions
 from edge_depth_nerf.method.prior import PriorOptions
-from edge_depth_nerf.plugin import config
+from edge_depth_nerf.plugin import compat, config
 from edge_depth_nerf.plugin.dataparser import LARGEST_METRES_PER_UNIT, FisheyeDepthDataParserConfig
 
 ROOT = Path(__file__).parents[1]
@@ -142,6 +143,13 @@ def test_the_command_line_imports_nothing_heavy():
     code = f"import sys, edge_depth_nerf.cli; sys.exit(', '.join({heavy} & set(sys.modules)) or 0)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_a_frame_of_the_importer_has_its_module():
+    """Which Python would search for in all modules, again and again while nerfstudio is imported."""
+    compat.know_modules_of_importer()
+    found = inspect.getmodule(compile("0", "<frozen importlib._bootstrap>", "exec"))
+    assert found is not None and found.__name__ == "importlib._bootstrap"
 
 
 UNCHANGED = """
