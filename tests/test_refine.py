@@ -227,7 +227,7 @@ def test_what_evaluates_takes_no_part(colmap: Any) -> None:
 
 @pytest.mark.slow
 def test_cameras_that_fire_at_other_times_stand_on_the_refined_path(colmap: Any) -> None:
-    given = world(14)
+    given = world(14, points=250)
     matches = given.matches(0.2)
     path = given.disturbed()
     true = shots_of(given)
@@ -339,7 +339,7 @@ def test_what_was_found_is_kept_for_the_same_inputs(colmap: Any, refined: Refine
 
 @pytest.mark.slow
 def test_true_poses_stay(colmap: Any, refined: Refined) -> None:
-    given = world(8)
+    given = world(8, points=250)
     drive = recorded(given, given.path, shutter_s=0.0)
     kept = refined(drive, given.matches(0.3))
     assert "given poses are used unchanged: features agree with them as well" in kept.notices[-1]
@@ -349,7 +349,7 @@ def test_true_poses_stay(colmap: Any, refined: Refined) -> None:
 
 @pytest.mark.slow
 def test_poses_that_are_far_off_are_not_trusted_to_features(colmap: Any, refined: Refined) -> None:
-    given = world(9)
+    given = world(9, points=250)
     refined.monkeypatch.setattr(refining, "FURTHEST_M", 0.02)
     kept = refined(recorded(given, given.disturbed()), given.matches(0.3))
     assert "too far to be trusted" in kept.notices[-1]
@@ -366,7 +366,7 @@ def test_few_features_change_nothing(colmap: Any, refined: Refined) -> None:
 
 @pytest.mark.slow
 def test_a_frame_without_features_moves_with_its_neighbours(colmap: Any, refined: Refined) -> None:
-    given = world(11)
+    given = world(11, points=250)
     wanted = pose((0, 0.1, 0), (0.05, 0, 0.02))
     path = given.path @ np.linalg.inv(wanted)
     matches = given.matches(0.2)
