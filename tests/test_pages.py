@@ -506,13 +506,15 @@ def run_typed(page: str, folder: Path) -> str:
     lines = [line for block in marked for line in block.text.splitlines()]
     copies = [line for line in lines if line.startswith(("cp ", "mkdir "))]
     subprocess.run(["bash", "-ec", "\n".join(copies)], cwd=folder, check=True)
-    exported = [word.partition("=")[::2] for line in lines if line.startswith("export ") for word in line.split()[1:]]
+    exported = [word.partition("=") for line in lines if line.startswith("export ") for word in line.split()[1:]]
     commands = {f"{number} {words[0]}": words for number, words in enumerate(itertools.chain(*map(calls, marked)))}
     short = ["--timestamp", "DATE", "--max-num-iterations", "3", "--viewer.quit-on-train-completion", "True"]
     for words in commands.values():
         words[2:2] = short if words[0] == "ns-train" else []
     (folder / "logs").mkdir()
-    ended_well = in_one_process(commands, folder / "logs", cwd=folder, variables=dict(exported))
+    ended_well = in_one_process(
+        commands, folder / "logs", cwd=folder, variables={name: value for name, _, value in exported}
+    )
     assert len(commands) == 5
     return "\n".join(map(ended_well, commands))
 
