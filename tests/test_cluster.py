@@ -345,7 +345,7 @@ def test_a_drive_is_cut_as_by_hand(room: RoomDrive, tmp_path: Path) -> None:
 def test_a_comparison_goes_on_when_a_worker_is_killed(tmp_path: Path) -> None:
     write_compared_scene(tmp_path / "sample")
     output = tmp_path / "out"
-    asked = CompareOptions((tmp_path / "sample",), output=output, methods=("edge",), steps=8, cluster="local")
+    asked = CompareOptions(scenes=(tmp_path / "sample",), output=output, methods=("edge",), steps=8, cluster="local")
     folder = output / "runs" / "sample" / "edge_seed-0"
     killer = kill_worker_of(str(folder), lambda: list(folder.rglob("nerfstudio_models/step-000000007.ckpt")))
     console = Console(file=io.StringIO(), width=200)
