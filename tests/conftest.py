@@ -116,6 +116,15 @@ def sample_drive(tmp_path_factory) -> Iterator[Path]:
     assert {path: path.stat().st_mtime_ns for path in scene.rglob("*")} == before, "a test wrote into the shared copy"
 
 
+@pytest.fixture(scope="module")
+def browser():
+    """For pages that tests open; see browser.py."""
+    from browser import open_browser
+
+    with open_browser() as found:
+        yield found
+
+
 @pytest.fixture
 def unchecked_types():
     """Switch the tests' type checker off, to reach the package's own errors."""

@@ -41,7 +41,7 @@ def _in_a_process(checks: Sequence[Callable[[], None]], before: Sequence[str], v
         env={**os.environ, "PYTHONPATH": path, **variables},
         capture_output=True,
         text=True,
-        timeout=240,
+        timeout=480,
     )
     assert done.stdout.endswith(f"{DONE}\n"), done.stdout + done.stderr
 

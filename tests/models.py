@@ -74,6 +74,20 @@ def supervision(count: int, seed: int) -> dict[str, torch.Tensor]:
     }
 
 
+def surface(count: int = 6) -> dict[str, Any]:
+    """What a batch holds of further pixels, the last two of them sky."""
+    generator = torch.Generator().manual_seed(4)
+    sky = (torch.arange(count) >= count - 2)[:, None]
+    distance = torch.where(sky, 0.0, 4 + torch.rand(count, 1, generator=generator))
+    return {
+        "surface_rays": bundle(count),
+        "surface_image": torch.rand(count, 3, generator=generator),
+        "surface_distance_m": distance,
+        "surface_sigma_m": torch.where(sky, 0.0, 1e-6),
+        "surface_sky": sky,
+    }
+
+
 def layers(*widths: int) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
     """Weights and biases of a network that follows gradients."""
     shapes = list(zip(widths[1:], widths, strict=False))

@@ -1,17 +1,20 @@
 """Small scene folders with a known truth: cameras inside a ball of 6 m with a coloured wall; the sample drive."""
 
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from balls import RADIUS_M
+from balls import pose as turned
 
-from edge_depth_nerf.base.files import write_distance_png, write_json, write_mask, write_png
+from edge_depth_nerf.base.files import read_json, write_distance_png, write_json, write_mask, write_png
 from edge_depth_nerf.cameras import Camera, KannalaBrandt, Pinhole
 
 SAMPLE_DRIVE = Path(__file__).resolve().parents[1] / "data" / "sample_drive"
-RADIUS_M = 6.0
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV camera axes to OpenGL's
 
 
@@ -23,6 +26,14 @@ def copy_sample_drive(folder: Path) -> Path:
 def tree(folder: Path) -> dict[str, bytes]:
     """Contents of a folder's files by their names."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+@contextmanager
+def transforms(scene: Path) -> Iterator[dict[str, Any]]:
+    """What transforms.json says, to be changed."""
+    meta = read_json(scene / "transforms.json")
+    yield meta
+    write_json(scene / "transforms.json", meta)
 
 
 def fisheye(width: int = 32, height: int = 28) -> KannalaBrandt:
@@ -75,10 +86,7 @@ def write_scene(
     entries = []
     for index in range(frames):
         camera = cameras[index % len(cameras)]
-        angle = 0.7 * index
-        pose = np.eye(4)
-        pose[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
-        pose[:3, 3] = [0.2 * index, 0.1 * np.sin(index), 0.05 * index]
+        pose = turned(0.2 * index, 0.1 * np.sin(index), 0.05 * index, 0.7 * index)
         colours, distance, _ = view(camera, pose)
         name = f"{index:04d}.png"
         write_png(folder / "images" / name, colours)

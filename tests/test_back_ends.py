@@ -144,8 +144,8 @@ def check_that_trials_run_each_kernel() -> None:
         assert all(callable(tried_out(form, CPU)) for form in EVERY)
     assert launched == {name for module in modules for name in vars(module) if name.endswith("_kernel")}
 
-    back_ends._tried.clear()
-
+    # the others are known to be right
+    del back_ends._tried[DISTORTION_LOSS.on_gpu, CPU]
     right = modules[2].distortion_loss
 
     def off(edges: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:

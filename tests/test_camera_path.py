@@ -13,10 +13,10 @@ from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.configs.method_configs import method_configs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from rich.console import Console
-from scenes import fisheye, pinhole, write_scene
+from scenes import fisheye, pinhole, transforms, write_scene
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import read_json, write_json
+from edge_depth_nerf.base.files import read_json
 from edge_depth_nerf.films.command import write_camera_path
 from edge_depth_nerf.films.options import CameraPathOptions
 from edge_depth_nerf.films.paths import CameraPath, lane_shift, orbit, replay, up_of
@@ -178,20 +178,19 @@ def scene(tmp_path_factory) -> Path:
     It was turned and scaled before it was written: nerfstudio's transform begins there, its poses do not.
     """
     folder = write_scene(tmp_path_factory.mktemp("scene"), [fisheye(32, 28)], frames=18)
-    meta = read_json(folder / "transforms.json")
-    for index, frame in enumerate(meta["frames"]):
-        number, side = divmod(index, 2)
-        pose = np.eye(4)
-        pose[:3, :3] = looking(np.array([0.0, -1.0 if side else 1.0, 0.0]))
-        pose[:3, 3] = 100 + number, 0.3 - 0.6 * side, 0.1 * np.sin(number)
-        frame["transform_matrix"] = pose.tolist()
-        frame |= {"camera": ("left", "right")[side], "frame": number, "timestamp_s": 1.3e9 + 0.25 * number}
-    names = [frame["file_path"] for frame in meta["frames"]]
-    meta["val_filenames"] = meta["test_filenames"] = names[8:10]
-    meta["train_filenames"] = names[:8] + names[10:]
-    meta["applied_transform"] = [[0.0, 1.0, 0.0, 3.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
-    meta["applied_scale"] = 2.5
-    write_json(folder / "transforms.json", meta)
+    with transforms(folder) as meta:
+        for index, frame in enumerate(meta["frames"]):
+            number, side = divmod(index, 2)
+            pose = np.eye(4)
+            pose[:3, :3] = looking(np.array([0.0, -1.0 if side else 1.0, 0.0]))
+            pose[:3, 3] = 100 + number, 0.3 - 0.6 * side, 0.1 * np.sin(number)
+            frame["transform_matrix"] = pose.tolist()
+            frame |= {"camera": ("left", "right")[side], "frame": number, "timestamp_s": 1.3e9 + 0.25 * number}
+        names = [frame["file_path"] for frame in meta["frames"]]
+        meta["val_filenames"] = meta["test_filenames"] = names[8:10]
+        meta["train_filenames"] = names[:8] + names[10:]
+        meta["applied_transform"] = [[0.0, 1.0, 0.0, 3.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
+        meta["applied_scale"] = 2.5
     return folder
 
 

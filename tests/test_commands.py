@@ -1,14 +1,11 @@
 """nerfstudio's own commands on our method and our scene, as a user gives them: offline, on the CPU."""
 
 import gzip
-import json
-import os
 import shutil
 import signal
 import socket
 import subprocess
 import sys
-import time
 import urllib.request
 from collections.abc import Callable
 from pathlib import Path
@@ -17,15 +14,16 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from host_commands import in_one_process
 from nerfstudio.utils.eval_utils import eval_setup
 from scenes import fisheye, write_scene
+from waiting import until
 
 from edge_depth_nerf.base.files import read_json
 
 pytestmark = pytest.mark.slow
 
 METHOD = "edge-depth-nerf-lite"
-TIMEOUT_S = 240
 SMALL = (
     *("--pipeline.datamanager.train-num-rays-per-batch", "128", "--pipeline.model.num-levels", "4"),
     *("--pipeline.model.log2-hashmap-size", "12", "--logging.local-writer.max-log-size", "0", "--vis", "tensorboard"),
@@ -53,12 +51,11 @@ def killed_run(scene, tmp_path_factory) -> Path:
         *("--timestamp", "run", "--max-num-iterations", 100000, "--steps-per-save", 5, *SMALL),
     )
     run = output / "killed" / METHOD / "run"
+    newest = run / "nerfstudio_models" / "step-000000020.ckpt"
     with subprocess.Popen(train, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         try:
-            deadline = time.monotonic() + TIMEOUT_S
-            while not (run / "nerfstudio_models" / "step-000000020.ckpt").exists():
-                assert process.poll() is None and time.monotonic() < deadline
-                time.sleep(0.01)
+            until(lambda: newest.exists() or process.poll() is not None)
+            assert newest.exists()
         finally:
             process.send_signal(signal.SIGKILL)
     return run
@@ -92,14 +89,6 @@ def commands_of(killed_run: Path, scene: Path, outputs: Path) -> dict[str, list[
             *("ns-render", "interpolate", *load, "--interpolation-steps", 2, "--pose-source", "train"),
             *("--output-path", outputs / "interpolate" / "film.mp4"),
         ],
-        "path": [
-            *("edge-depth-nerf", "camera-path", *load, "--camera", "fisheye", "--width", 36, "--fps", 5),
-            *("--seconds", 0.4, "--output", outputs / "path" / "path.json"),
-        ],
-        "film": [
-            *("ns-render", "camera-path", *load, "--camera-path-filename", outputs / "path" / "path.json"),
-            *("--output-path", outputs / "film" / "film.mp4"),
-        ],
         "pointcloud": [
             *("ns-export", "pointcloud", *load, "--output-dir", outputs / "pointcloud", "--num-points", 500),
             *("--num-rays-per-batch", 256, "--normal-method", "open3d", "--save-world-frame", "True"),
@@ -110,7 +99,6 @@ def commands_of(killed_run: Path, scene: Path, outputs: Path) -> dict[str, list[
             *("--experiment-name", "resumed", "--timestamp", "run", "--max-num-iterations", 7),
             *("--load-dir", killed_run / "nerfstudio_models", *SMALL),
         ],
-        "nerfacto": ["ns-train", "nerfacto", *train, *own, *SMALL, *data],
         "depth-nerfacto": [
             *("ns-train", "depth-nerfacto", *train, *own, *SMALL, "--pipeline.model.is-euclidean-depth", "True"),
             *data,
@@ -122,30 +110,11 @@ def commands_of(killed_run: Path, scene: Path, outputs: Path) -> dict[str, list[
 def done(killed_run, scene, torch_home, tmp_path_factory) -> Callable[[str], tuple[str, Path]]:
     """Asserts that a command ended well; returns what it said and where it wrote."""
     outputs = tmp_path_factory.mktemp("outputs")
-    jobs = []
-    for name, words in commands_of(killed_run, scene, outputs).items():
+    commands = commands_of(killed_run, scene, outputs)
+    for name in commands:
         (outputs / name).mkdir()
-        jobs.append(
-            {
-                "words": [str(word) for word in words],
-                "environment": {"TORCH_HOME": str(torch_home)} if "nerfacto" in name else {},
-                "log": str(outputs / f"{name}.log"),
-            }
-        )
-    (outputs / "jobs.json").write_text(json.dumps(jobs))
-    subprocess.run(
-        [sys.executable, Path(__file__).with_name("host_commands.py"), outputs / "jobs.json"],
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-        timeout=2 * TIMEOUT_S,
-        check=False,
-    )
-
-    def ended_well(name: str) -> tuple[str, Path]:
-        status, said = outputs / f"{name}.log.status", (outputs / f"{name}.log").read_text()
-        assert status.is_file() and status.read_text() == "0", said[-4000:]
-        return said, outputs / name
-
-    return ended_well
+    ended_well = in_one_process(commands, outputs, {"depth-nerfacto": {"TORCH_HOME": str(torch_home)}})
+    return lambda name: (ended_well(name), outputs / name)
 
 
 def last_step(run: Path) -> int:
@@ -208,18 +177,6 @@ def test_render_interpolate(done):
     assert film.get(cv2.CAP_PROP_FRAME_COUNT) > 2
 
 
-@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ns-render camera-path writes films with ffmpeg")
-def test_a_film_of_a_camera_path(done):
-    done("path")
-    _, output = done("film")
-    film = cv2.VideoCapture(str(output / "film.mp4"))
-    assert film.get(cv2.CAP_PROP_FRAME_COUNT) == 2 and film.get(cv2.CAP_PROP_FPS) == 5
-    pictures = [film.read()[1] for _ in range(2)]
-    assert all(picture.shape == (30, 36, 3) for picture in pictures)
-    # it looks elsewhere at the drive's end than at its beginning
-    assert np.abs(pictures[0].astype(int) - pictures[1]).mean() > 2
-
-
 def test_export_pointcloud(done):
     try:
         import open3d  # noqa: F401
@@ -238,24 +195,21 @@ def test_viewer(killed_run):
         *("ns-viewer", "--load-config", killed_run / "config.yml", "--viewer.websocket-host", "127.0.0.1"),
         *("--viewer.websocket-port", port),
     )
+
+    def page() -> bytes:
+        try:
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=5) as answer:
+                return answer.read()
+        except OSError:
+            return b"" if process.poll() is None else b"it ended"
+
     with subprocess.Popen(viewer, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         try:
-            deadline = time.monotonic() + TIMEOUT_S
-            page = b""
-            while not page:
-                assert process.poll() is None, process.stdout and process.stdout.read()[-3000:]
-                assert time.monotonic() < deadline
-                try:
-                    with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=5) as answer:
-                        page = answer.read()
-                except OSError:
-                    time.sleep(0.5)
-            assert b"<html" in page.lower()
+            assert b"<html" in until(page).lower(), process.stdout and process.stdout.read()[-3000:]
         finally:
             process.kill()
 
 
-@pytest.mark.parametrize("method", ["nerfacto", "depth-nerfacto"])
-def test_the_host_methods_read_our_scene(done, method):
-    run = done(method)[1].parent / "host" / "host" / method / "run"
+def test_the_hosts_method_with_depth_reads_our_scene(done):
+    run = done("depth-nerfacto")[1].parent / "host" / "host" / "depth-nerfacto" / "run"
     assert last_step(run) == 2

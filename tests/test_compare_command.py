@@ -3,13 +3,13 @@
 import shutil
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from comparisons import QUIET, options
 from scenes import write_scene
+from waiting import until
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_json, write_distance_png, write_json
@@ -219,19 +219,13 @@ LoggedCommands().call([sys.executable, "-c", sys.argv[1], sys.argv[2]], Path(sys
 
 def test_a_program_ends_with_the_one_that_started_it(tmp_path):
     pid = tmp_path / "pid"
-    deadline = time.monotonic() + 300
-
-    def wait_for(happened):
-        while not happened():
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
 
     def is_gone():
         done = subprocess.run(["ps", "-o", "stat=", "-p", pid.read_text()], capture_output=True, text=True, check=False)
         return done.stdout.strip() in ("", "Z")
 
     with subprocess.Popen([sys.executable, "-c", PARENT, CHILD, str(pid)]) as parent:
-        wait_for(lambda: pid.is_file() and pid.read_text())
+        until(lambda: pid.is_file() and pid.read_text())
         assert not is_gone()
         parent.kill()
-    wait_for(is_gone)
+    until(is_gone)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from models import pipeline_of
 from nerfstudio.engine.optimizers import Optimizers
-from scenes import write_scene
+from scenes import transforms, write_scene
 
 from edge_depth_nerf.base.files import read_json, write_json, write_mask
 from edge_depth_nerf.compare.evaluation import (
@@ -71,12 +71,11 @@ def test_pixels_of_a_few_views_are_spread_evenly(tmp_path):
 
 def test_a_view_without_a_usable_pixel_is_passed_over(tmp_path):
     scene = write_scene(tmp_path)
-    meta = read_json(scene / "transforms.json")
-    write_mask(scene / "masks/none.png", np.zeros((28, 32), bool))
-    for frame in meta["frames"]:
-        if frame["file_path"] == meta["train_filenames"][2]:
-            frame["mask_path"] = "masks/none.png"
-    write_json(scene / "transforms.json", meta)
+    with transforms(scene) as meta:
+        write_mask(scene / "masks/none.png", np.zeros((28, 32), bool))
+        for frame in meta["frames"]:
+            if frame["file_path"] == meta["train_filenames"][2]:
+                frame["mask_path"] = "masks/none.png"
     pipeline = pipeline_of(scene)
     chosen = choose_pixels(pipeline.datamanager.train_dataset)
     assert [int(view.indices[0, 0]) for view in chosen] == [0, 1, 3, 4, 5, 6, 7]
@@ -97,21 +96,20 @@ def test_the_pixels_are_always_the_same_and_inside_the_mask(tmp_path):
 
 def with_shifted_views(scene):
     """Views where a held-out picture stands and beside it, with that picture's files as their truth."""
-    meta = read_json(scene / "transforms.json")
-    for frame in meta["frames"]:
-        frame["camera"] = "only"
-    held_out = next(frame for frame in meta["frames"] if frame["file_path"] == meta["test_filenames"][0])
-    moved = np.array(held_out["transform_matrix"])
-    moved[:3, 3] += [0.3, -0.2, 0.1]
-    files = {key: held_out[key] for key in ("truth_rgb_file_path", "truth_distance_file_path")}
-    meta["shifted_views"] = {
-        "0": [{"camera": "only", "transform_matrix": held_out["transform_matrix"], **files}],
-        "1": [
-            {"camera": "only", "transform_matrix": moved.tolist(), **files},
-            {"camera": "none there", "transform_matrix": moved.tolist(), **files},
-        ],
-    }
-    write_json(scene / "transforms.json", meta)
+    with transforms(scene) as meta:
+        for frame in meta["frames"]:
+            frame["camera"] = "only"
+        held_out = next(frame for frame in meta["frames"] if frame["file_path"] == meta["test_filenames"][0])
+        moved = np.array(held_out["transform_matrix"])
+        moved[:3, 3] += [0.3, -0.2, 0.1]
+        files = {key: held_out[key] for key in ("truth_rgb_file_path", "truth_distance_file_path")}
+        meta["shifted_views"] = {
+            "0": [{"camera": "only", "transform_matrix": held_out["transform_matrix"], **files}],
+            "1": [
+                {"camera": "only", "transform_matrix": moved.tolist(), **files},
+                {"camera": "none there", "transform_matrix": moved.tolist(), **files},
+            ],
+        }
     return scene
 
 

@@ -69,13 +69,6 @@ def test_cells_that_differ_in_one_thing_differ_in_its_fields_alone():
     assert seen == {"prior": 2 * losses - 1, "extras": 2 * (losses - 1), "loss": pairs_of_losses}
 
 
-def test_nerfacto_stands_for_the_grid_without_loss_and_extras():
-    found = differing(resolved("nerfacto"), resolved("ds-nerf"))
-    assert {*found} <= {LOSS, SOURCE, "pipeline.model.depth_loss_mult"}
-    values = resolved("nerfacto-lidar-extras")
-    assert values["pipeline.model.depth_loss_mult"] == 0.0 and values[SOURCE] == "lidar"
-
-
 def psnr_of(name: MethodName, scene: str) -> float:
     """A made-up figure: 20 dB, 0.5 for the integrated prior, the loss's, 2 for extras, and 1 on the turn."""
     cell = METHODS[name]

@@ -121,12 +121,6 @@ def test_a_finished_training_gets_detail_by_a_line_of_its_configuration(finished
     assert found["truth_masked_psnr"] == pytest.approx(run.figures["detail_truth_masked_psnr"], abs=1e-3)
 
 
-def test_what_is_there_is_not_done_again(finished, monkeypatch):
-    asked, results = finished
-    monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: pytest.fail("started a command"))
-    assert command.compare(asked, QUIET).rows() == results.rows()
-
-
 @pytest.mark.parametrize("kept", [(), ("edge",)])
 def test_runs_of_which_only_the_figures_are_left_count_in_the_tables(finished, tmp_path, monkeypatch, kept):
     asked, results = finished

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 import torch
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager
-from scenes import fisheye, pinhole, write_scene
+from scenes import fisheye, pinhole, transforms, write_scene
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import read_distance_png, read_json, write_distance_png, write_json, write_mask
+from edge_depth_nerf.base.files import read_distance_png, write_distance_png, write_mask
 from edge_depth_nerf.method.error_model import read_calibration
 from edge_depth_nerf.method.integration import IntegrationOptions
 from edge_depth_nerf.method.prior import PriorOptions, make_prior, ray_angles
@@ -169,16 +169,6 @@ def test_the_host_sets_the_size_of_batches(tmp_path):
     assert data.get_train_rays_per_batch() == 33
 
 
-def test_integration_happens_once(tmp_path, monkeypatch):
-    scene = write_scene(tmp_path)
-    manager(scene)
-    assert len(list((scene / ".cache" / "prior").glob("*.npz"))) == 8
-    monkeypatch.setattr("edge_depth_nerf.method.prior.make_prior", lambda *_: pytest.fail("integrated again"))
-    manager(scene)
-    with pytest.raises(pytest.fail.Exception):
-        manager(scene, prior=weighted(0.5))
-
-
 def test_nothing_is_integrated_for_rendering(tmp_path, monkeypatch):
     monkeypatch.setattr(datamanager_module, "PriorCache", lambda *_: pytest.fail("integrated"))
     scene = write_scene(tmp_path)
@@ -214,26 +204,11 @@ def test_a_scene_without_depth_has_no_prior(tmp_path):
     assert (batch["prior_distance_m"] == 0).all()
 
 
-def test_options_out_of_range(tmp_path):
-    with pytest.raises(InputError, match="alpha"):
-        manager(write_scene(tmp_path), prior=PriorOptions(integration=IntegrationOptions(alpha=1.4)))
-
-
-def test_the_same_seed_gives_the_same_rays(tmp_path):
-    scene = write_scene(tmp_path)
-    drawn = []
-    for _ in range(2):
-        torch.manual_seed(7)
-        drawn.append(manager(scene).next_train(0)[1]["indices"])
-    assert np.array_equal(drawn[0], drawn[1])
-
-
 def test_a_held_out_mask_that_leaves_nothing_is_found_before_training(tmp_path):
     scene = write_scene(tmp_path)
-    meta = read_json(scene / "transforms.json")
-    write_mask(scene / "masks" / "thin.png", np.arange(28)[:, None] * np.ones((1, 32)) == 3)
-    meta["frames"][4]["mask_path"] = "masks/thin.png"
-    write_json(scene / "transforms.json", meta)
+    with transforms(scene) as meta:
+        write_mask(scene / "masks" / "thin.png", np.arange(28)[:, None] * np.ones((1, 32)) == 3)
+        meta["frames"][4]["mask_path"] = "masks/thin.png"
     with pytest.raises(InputError, match=r"thin\.png.*held-out picture 0004\.png"):
         manager(scene)
 
@@ -296,14 +271,6 @@ def test_the_second_training_reads_no_picture(tmp_path, monkeypatch):
         (scene / "images" / "0002.png").touch()
         with pytest.raises(pytest.fail.Exception):
             manager(scene)
-
-
-def test_a_broken_table_is_made_anew(tmp_path):
-    scene = write_scene(tmp_path)
-    whole = manager(scene).train_pixel_sampler.table.batch(0, 500).indices
-    for path in (scene / ".cache" / "pixels").glob("*.npy"):
-        path.write_bytes(path.read_bytes()[:-40])
-    assert torch.equal(manager(scene).train_pixel_sampler.table.batch(0, 500).indices, whole)
 
 
 def test_a_scene_that_cannot_be_written_trains(tmp_path):

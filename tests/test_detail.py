@@ -5,11 +5,11 @@ from copy import deepcopy
 import numpy as np
 import pytest
 import torch
+from balls import pose
 from models import pipeline_of
 from nerfstudio.model_components.renderers import background_color_override_context
-from scenes import RADIUS_M, fisheye, pinhole, view, write_scene
+from scenes import FLIP, RADIUS_M, fisheye, pinhole, transforms, view, write_scene
 
-from edge_depth_nerf.base.files import read_json, write_json
 from edge_depth_nerf.compare.evaluation import ViewEvaluator, evaluated, shifted_views
 from edge_depth_nerf.method.detail import carried, detail_of, pictures_that_see, seen_from
 from edge_depth_nerf.plugin import detail as plugin_detail
@@ -17,17 +17,13 @@ from edge_depth_nerf.plugin.detail import TrainingDetail, detail_shown, with_app
 from edge_depth_nerf.plugin.exposure import Gains
 
 GREY = 0.5
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 LENSES = {"fisheye": [fisheye(64, 56)], "pinhole": [pinhole(64, 56)], "both": [fisheye(64, 56), pinhole(64, 56)]}
 
 
 # ---- the formulas ---------------------------------------------------------------------------------------------------
 def at(x: float, angle: float = 0.0) -> np.ndarray:
     """A camera-to-world matrix, OpenCV axes: beside the ball's middle, turned about y."""
-    pose = np.eye(4)
-    pose[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
-    pose[0, 3] = x
-    return pose
+    return pose(x, turn_rad=angle)
 
 
 def opengl(pose: np.ndarray) -> torch.Tensor:
@@ -308,14 +304,13 @@ def test_detail_is_seen_from_where_training_has_moved_the_cameras(tmp_path, monk
     right = pipeline_of(scene)
     grey_ball(right, monkeypatch)
     straight = errors(right)[1]
-    meta = read_json(scene / "transforms.json")
-    # training pictures are said to be 0.8 m beside where they were taken, every other one to the other side
-    train = set(meta["train_filenames"])
-    signs = iter([1.0, -1.0] * len(train))
-    moved = {name: next(signs) for name in sorted(train)}
-    for frame in meta["frames"]:
-        frame["transform_matrix"][1][3] += 0.8 * moved.get(frame["file_path"], 0.0)
-    write_json(scene / "transforms.json", meta)
+    with transforms(scene) as meta:
+        # training pictures are said to be 0.8 m beside where they were taken, every other one to the other side
+        train = set(meta["train_filenames"])
+        signs = iter([1.0, -1.0] * len(train))
+        moved = {name: next(signs) for name in sorted(train)}
+        for frame in meta["frames"]:
+            frame["transform_matrix"][1][3] += 0.8 * moved.get(frame["file_path"], 0.0)
     wrong = pipeline_of(scene, poses="SO3xR3")
     grey_ball(wrong, monkeypatch)
     assert errors(wrong)[1] > 1.3 * straight
@@ -355,13 +350,12 @@ def test_with_an_embedding_a_picture_is_rendered_as_it_looks(tmp_path, implement
 # ---- evaluated ------------------------------------------------------------------------------------------------------
 def test_views_are_evaluated_with_detail_beside_those_without(tmp_path, monkeypatch):
     scene = write_scene(tmp_path / "scene", frames=17)
-    meta = read_json(scene / "transforms.json")
-    for frame in meta["frames"]:
-        frame["camera"] = "only"
-    held_out = next(frame for frame in meta["frames"] if frame["file_path"] == meta["test_filenames"][0])
-    files = {key: held_out[key] for key in ("truth_rgb_file_path", "truth_distance_file_path")}
-    meta["shifted_views"] = {"1": [{"camera": "only", "transform_matrix": held_out["transform_matrix"], **files}]}
-    write_json(scene / "transforms.json", meta)
+    with transforms(scene) as meta:
+        for frame in meta["frames"]:
+            frame["camera"] = "only"
+        held_out = next(frame for frame in meta["frames"] if frame["file_path"] == meta["test_filenames"][0])
+        files = {key: held_out[key] for key in ("truth_rgb_file_path", "truth_distance_file_path")}
+        meta["shifted_views"] = {"1": [{"camera": "only", "transform_matrix": held_out["transform_matrix"], **files}]}
     pipeline = pipeline_of(scene)
     grey_ball(pipeline, monkeypatch)
     told: list[int] = []

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from scenes import copy_sample_drive
+from scenes import copy_sample_drive, transforms
 from trainings import trainer_of
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import read_json, write_distance_png, write_json, write_mask, write_png
+from edge_depth_nerf.base.files import write_distance_png, write_mask, write_png
 from edge_depth_nerf.method import depth_losses
 from edge_depth_nerf.method.depth_losses import EdgeLoss
 from edge_depth_nerf.method.integration import IntegrationOptions, integrate_depth, select_prior, sigma_m
@@ -122,17 +122,16 @@ def test_maps_of_next_to_nothing(shape: tuple[int, ...]) -> None:
 def copied(folder: Path, frames: int = 6) -> Path:
     """A camera's first frames of the sample drive."""
     copy_sample_drive(folder)
-    meta = read_json(folder / "transforms.json")
-    kept = [f for f in meta["frames"] if f["camera"] == "image_02" and f["frame"] < frames]
-    for frame in kept:
-        for key in [key for key in frame if key.startswith("truth")]:
-            del frame[key]
-    names = {frame["file_path"] for frame in kept}
-    meta["frames"] = kept
-    for key in ("train_filenames", "val_filenames", "test_filenames"):
-        meta[key] = [name for name in meta[key] if name in names]
-    meta.pop("shifted_views")
-    write_json(folder / "transforms.json", meta)
+    with transforms(folder) as meta:
+        kept = [f for f in meta["frames"] if f["camera"] == "image_02" and f["frame"] < frames]
+        for frame in kept:
+            for key in [key for key in frame if key.startswith("truth")]:
+                del frame[key]
+        names = {frame["file_path"] for frame in kept}
+        meta["frames"] = kept
+        for key in ("train_filenames", "val_filenames", "test_filenames"):
+            meta[key] = [name for name in meta[key] if name in names]
+        meta.pop("shifted_views")
     return folder
 
 
@@ -166,40 +165,36 @@ def one_lidar_point(scene: Path) -> None:
 
 def one_pixel(scene: Path) -> None:
     """Masks of training pictures; a held-out one may not be so small."""
-    meta = read_json(scene / "transforms.json")
-    keep = np.zeros((128, 128), bool)
-    keep[70, 64] = True
-    write_mask(scene / "masks/one.png", keep)
-    for frame in meta["frames"]:
-        if frame["file_path"] in meta["train_filenames"]:
-            frame["mask_path"] = "masks/one.png"
-    write_json(scene / "transforms.json", meta)
+    with transforms(scene) as meta:
+        keep = np.zeros((128, 128), bool)
+        keep[70, 64] = True
+        write_mask(scene / "masks/one.png", keep)
+        for frame in meta["frames"]:
+            if frame["file_path"] in meta["train_filenames"]:
+                frame["mask_path"] = "masks/one.png"
 
 
 def moved(first_m: float, next_m: float) -> Callable[[Path], None]:
     """All three coordinates of each pose get more."""
 
     def apply(scene: Path) -> None:
-        meta = read_json(scene / "transforms.json")
-        for number, frame in enumerate(meta["frames"]):
-            for row in frame["transform_matrix"][:3]:
-                row[3] += first_m + number * next_m
-        write_json(scene / "transforms.json", meta)
+        with transforms(scene) as meta:
+            for number, frame in enumerate(meta["frames"]):
+                for row in frame["transform_matrix"][:3]:
+                    row[3] += first_m + number * next_m
 
     return apply
 
 
 def in_one_place(scene: Path) -> None:
-    meta = read_json(scene / "transforms.json")
-    for frame in meta["frames"]:
-        frame["transform_matrix"] = np.eye(4).tolist()
-    write_json(scene / "transforms.json", meta)
+    with transforms(scene) as meta:
+        for frame in meta["frames"]:
+            frame["transform_matrix"] = np.eye(4).tolist()
 
 
 def one_training_picture(scene: Path) -> None:
-    meta = read_json(scene / "transforms.json")
-    meta["train_filenames"] = meta["train_filenames"][:1]
-    write_json(scene / "transforms.json", meta)
+    with transforms(scene) as meta:
+        meta["train_filenames"] = meta["train_filenames"][:1]
 
 
 def both(*changes: Callable[[Path], None]) -> Callable[[Path], None]:

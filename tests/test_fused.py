@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 import torch
-from models import build, bundle, layers, supervision
-from nerfstudio.cameras.rays import Frustums, RayBundle, RaySamples
+from models import build, bundle, layers, supervision, surface
+from nerfstudio.cameras.rays import Frustums, RaySamples
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.field_components.encodings import HashEncoding
 from nerfstudio.field_components.mlp import MLP
@@ -342,16 +342,6 @@ def test_training_goes_as_with_torch(options):
 TABLE = "field.mlp_base.model.0.hash_table"
 
 
-def surface(count: int = 30) -> dict[str, RayBundle | torch.Tensor]:
-    torch.manual_seed(0)
-    return {
-        "surface_rays": bundle(count),
-        "surface_distance_m": torch.rand(count, 1) * 20 + 1,
-        "surface_sigma_m": torch.full((count, 1), 0.01),
-        "surface_sky": (torch.arange(count) % 5 == 0)[:, None],
-    }
-
-
 @pytest.mark.parametrize("planes", [False, True])
 def test_samples_sky_and_surfaces_are_looked_up_together(monkeypatch, planes):
     """One gradient of the field's table a step, not three that are added; the numbers are those of torch's calls.
@@ -367,7 +357,7 @@ def test_samples_sky_and_surfaces_are_looked_up_together(monkeypatch, planes):
     found = []
     for model in models:
         torch.manual_seed(1)
-        outputs = model(bundle(planes=planes), surface())
+        outputs = model(bundle(planes=planes), surface(30))
         (outputs["rgb"].sum() + outputs["surface_rgb"].square().sum()).backward()
         found.append((outputs["rgb"], outputs["surface_rgb"], model.get_parameter(TABLE).grad))
     assert made.count(len(table)) == 1
@@ -395,7 +385,7 @@ def test_a_rendered_view_is_the_torch_view(average):
 
 def test_training_renders_no_depth_that_nobody_reads():
     outputs = build().train()(bundle())
-    assert not [name for name in outputs if "depth" in name]
+    assert not [name for name in outputs if "depth" in name or "distance" in name]
 
 
 def test_a_fields_normals_can_be_had_at_evaluation():

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import re
 import subprocess
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ import pytest
 import torch
 from benchmark_modules import benchmark_modules
 from scipy.spatial import KDTree
+from waiting import until
 
 from edge_depth_nerf.base.files import read_json, write_json
 
@@ -152,12 +152,8 @@ def test_a_process_that_takes_too_long_is_ended_with_all_that_it_started(gpu, op
     monkeypatch.setitem(gpu.PARTS, "tests", gpu.PARTS["tests"].__class__(lambda _: {}, 2))
     found = gpu.InAProcess("tests", options).found()
     assert found == {"a": 1, "failed": "not done after 2 s", "said of CUDA graphs": "Step 20: without CUDA graphs"}
-    for _ in range(100):
-        state = Path(f"/proc/{int(child.read_text())}/stat")
-        if not state.exists() or state.read_text().rpartition(")")[2].split()[0] == "Z":
-            return
-        time.sleep(0.05)
-    raise AssertionError("it goes on")
+    state = Path(f"/proc/{int(child.read_text())}/stat")
+    until(lambda: not state.exists() or state.read_text().rpartition(")")[2].split()[0] == "Z", 5.0)
 
 
 def test_a_process_ends_with_the_one_that_began_it(gpu, options):

@@ -57,13 +57,3 @@ def test_a_checkpoint_keeps_the_scale_of_its_moment(scaler, monkeypatch):
     assert other.get_scale() == 2.0**15
     step(other, weight, 1.0)
     assert other.state_dict()["scale"] == 2.0**15 and other.state_dict()["_growth_tracker"] == 1
-
-
-def test_checkpoints_go_from_a_cpu_to_a_gpu_and_back(scaler):
-    on_cpu = PatientGradScaler(enabled=False)
-    assert on_cpu.state_dict() == {} and on_cpu.get_scale() == 1.0
-    scaler.load_state_dict(on_cpu.state_dict())
-    assert scaler.get_scale() == 2.0**16
-    step(scaler, torch.nn.Parameter(torch.zeros(1)), 1.0)
-    on_cpu.load_state_dict(scaler.state_dict())
-    assert on_cpu.state_dict() == {} and on_cpu.get_scale() == 1.0

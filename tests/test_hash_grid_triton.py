@@ -75,10 +75,9 @@ def check_what_is_not_finite() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("check", [check_encoding, check_the_tables_gradient, check_what_is_not_finite])
-def test_in_the_interpreter(check):
+def test_in_the_interpreter():
     pytest.importorskip("triton")
-    in_interpreter(check)
+    in_interpreter(check_encoding, check_the_tables_gradient, check_what_is_not_finite)
 
 
 @NEEDS_A_GPU

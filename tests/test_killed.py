@@ -34,8 +34,6 @@ from edge_depth_nerf.method.prior import PriorOptions
 from edge_depth_nerf.mono import estimate
 from edge_depth_nerf.mono.calibration import calibrate_scene
 from edge_depth_nerf.mono.network import DepthNetwork, NetworkSettings, read_tensors, write_tensors
-from edge_depth_nerf.mono.options import EstimateDepthOptions
-from edge_depth_nerf.mono.training import TrainingOptions
 from edge_depth_nerf.plugin import datamanager
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
@@ -242,14 +240,23 @@ def test_two_processes_on_one_scene(room: RoomDrive, tmp_path: Path) -> None:
 # ---- killed ----------------------------------------------------------------------------------------------------
 DIE_AT_REPLACE = """
 import os, sys
-replace, last = os.replace, sys.argv.pop(1)
-def dying(temporary, path):
-    if str(path).endswith(last):
-        os.kill(os.getpid(), 9)
-    return replace(temporary, path)
-os.replace = dying
+from pathlib import Path
+import edge_depth_nerf.process.command, edge_depth_nerf.process.kitti360.converter  # once for all
 from edge_depth_nerf.entry import main
-main()
+replace, lasts, scene = os.replace, sys.argv.pop(1).split(), Path(sys.argv.pop(1))
+sys.argv += ["--output", str(scene)]
+for last in lasts:
+    def dying(temporary, path):
+        if str(path).endswith(last):
+            os.kill(os.getpid(), 9)
+        return replace(temporary, path)
+    child = os.fork()
+    if not child:
+        os.replace = dying
+        main()
+        os._exit(0)
+    assert os.waitpid(child, 0)[1] == 9, last
+    assert not (scene / "transforms.json").exists(), last
 """
 
 
@@ -257,45 +264,13 @@ def test_process_killed_before_a_file_appears(room: RoomDrive, tmp_path: Path) -
     """One run, killed again and again, each time further on."""
     process(options_of(room, tmp_path / "whole"), Console(quiet=True))
     expected = contents(tmp_path / "whole")
-    for last in ("process.json", "image_03/0000000003.npz", "points.ply", "transforms.json"):
-        command = [sys.executable, "-c", DIE_AT_REPLACE, last, "process", "kitti360", "--root", str(room.root)]
-        command += ["--sequence", SEQUENCE, "--output", str(tmp_path / "scene"), "--sweeps", "1", "--no-find-ego"]
-        done = subprocess.run([*command, "--no-estimate-depth"], capture_output=True, text=True, check=False)
-        assert done.returncode == -9, done.stderr
-        assert not (tmp_path / "scene/transforms.json").exists()
+    lasts = "process.json image_03/0000000003.npz points.ply transforms.json"
+    command = [sys.executable, "-c", DIE_AT_REPLACE, lasts, tmp_path / "scene", "process", "kitti360"]
+    command += ["--root", room.root, "--sequence", SEQUENCE, "--sweeps", "1", "--no-find-ego", "--no-estimate-depth"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
     process(options_of(room, tmp_path / "scene"), Console(quiet=True))
     assert contents(tmp_path / "scene") == expected
-
-
-def test_estimate_depth_killed_after_its_weights_were_saved(
-    room: RoomDrive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The weights that are read give the maps of those that were trained, to the last bit."""
-    small = estimate.PresetValues((16, 32, 64), 128, TrainingOptions(steps=4, batch=2, evaluate_every=2))
-    monkeypatch.setitem(estimate.PRESETS, "lite", small)
-    quiet, scene = Console(quiet=True), tmp_path / "scene"
-    options = EstimateDepthOptions((scene,))
-    process(options_of(room, scene), quiet)
-    shutil.copytree(scene, tmp_path / "before")
-    estimate.estimate_depth(options, quiet)
-    expected = contents(scene)
-    # the maps tell the scene's folder: once more in the same one
-    shutil.rmtree(scene)
-    shutil.move(tmp_path / "before", scene)
-
-    def dying(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(estimate, "write_maps", dying)
-        with pytest.raises(KeyboardInterrupt):
-            estimate.estimate_depth(options, quiet)
-    # killed a moment earlier, with the training's own checkpoint still there
-    (scene / "mono_network.checkpoint").write_bytes(b"of no use")
-    estimate.estimate_depth(options, quiet)
-    found = contents(scene)
-    assert sorted(found) == sorted(expected)
-    assert [name for name in expected if found[name] != expected[name]] == []
 
 
 def test_weights_that_were_read_predict_what_trained_ones_did(sample_drive: Path) -> None:

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 import torch
-from models import build
+from models import build, bundle, supervision, surface
 from nerfstudio.cameras.rays import Frustums, RayBundle, RaySamples
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.field_components.field_heads import FieldHeadNames
@@ -24,41 +24,12 @@ LOSSES = {name: f"{name.replace('-', '_')}_loss" for name in ("edge", "ds-nerf",
 NO_EXTRAS = {"sky_loss_mult": 0.0, "sky_background": False, "surface_loss_mult": 0.0, "depth_loss_final": 1.0}
 
 
-def rays(count=16) -> RayBundle:
-    generator = torch.Generator().manual_seed(1)
-    directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
-    return RayBundle(
-        origins=torch.zeros(count, 3),
-        directions=directions,
-        pixel_area=torch.full((count, 1), 1e-4),
-        camera_indices=torch.zeros(count, 1, dtype=torch.long),
-    )
+def rays() -> RayBundle:
+    return bundle(16)
 
 
-def batch(count=16) -> dict:
-    generator = torch.Generator().manual_seed(2)
-    prior = 3 + 10 * torch.rand(count, 1, generator=generator)
-    prior[::4] = 0
-    return {
-        "image": torch.rand(count, 3, generator=generator),
-        "prior_distance_m": prior,
-        "prior_sigma_m": 0.1 * prior,
-        "sky": (torch.arange(count) % 8 == 0)[:, None],
-    }
-
-
-def surface(count=6) -> dict:
-    """Further pixels, the last two of them sky."""
-    generator = torch.Generator().manual_seed(4)
-    sky = (torch.arange(count) >= count - 2)[:, None]
-    distance = torch.where(sky, 0.0, 4 + torch.rand(count, 1, generator=generator))
-    return {
-        "surface_rays": rays(count),
-        "surface_image": torch.rand(count, 3, generator=generator),
-        "surface_distance_m": distance,
-        "surface_sigma_m": torch.where(sky, 0.0, 1e-6),
-        "surface_sky": sky,
-    }
+def batch() -> dict:
+    return supervision(16, 2)
 
 
 def trained_step(model, further=None):

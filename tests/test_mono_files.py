@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scenes import FLIP, fisheye, pinhole, view, write_scene
+from scenes import FLIP, fisheye, pinhole, transforms, view, write_scene
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import read_distance_png, read_json, write_distance_png, write_json, write_png
+from edge_depth_nerf.base.files import read_distance_png, read_json, write_distance_png, write_png
 from edge_depth_nerf.entry import main
 from edge_depth_nerf.mono.estimate import estimate_depth
 from edge_depth_nerf.mono.options import EstimateDepthOptions
@@ -119,10 +119,9 @@ def test_a_z_map_of_a_pinhole(tmp_path):
 
 def test_z_needs_the_cameras_intrinsics(scene, tmp_path):
     maps = write_maps(scene, tmp_path / "maps", lambda p, distance, c: distance * c)
-    meta = read_json(scene / "transforms.json")
-    for entry in meta["frames"]:
-        del entry["fl_x"]
-    write_json(scene / "transforms.json", meta)
+    with transforms(scene) as meta:
+        for entry in meta["frames"]:
+            del entry["fl_x"]
     with pytest.raises(InputError, match=r"transforms.json: images/0000.png: fl_x is None, expected a number"):
         take(scene, maps, along="z")
 

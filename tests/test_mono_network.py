@@ -15,7 +15,7 @@ import torch
 from rich.console import Console
 from safetensors import safe_open
 from safetensors.torch import load_file, save, save_file
-from scenes import fisheye, frame_entry, tree, write_scene
+from scenes import fisheye, frame_entry, transforms, tree, write_scene
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import (
@@ -383,13 +383,12 @@ def test_training_ends_in_time_and_where_nothing_improves(small_street):
 
 def test_what_is_kept_for_stopping_are_whole_training_frames(tmp_path):
     folder = write_street(tmp_path / "two", frames=20)
-    meta = read_json(folder / "transforms.json")
-    for frame in meta["frames"]:
-        frame["camera"], frame["frame"] = ("left", "right")[frame["frame"] % 2], frame["frame"] // 2
-    held_out = [frame["file_path"] for frame in meta["frames"] if frame["frame"] == 4]
-    meta["val_filenames"] = meta["test_filenames"] = held_out
-    meta["train_filenames"] = [f["file_path"] for f in meta["frames"] if f["file_path"] not in held_out]
-    write_json(folder / "transforms.json", meta)
+    with transforms(folder) as meta:
+        for frame in meta["frames"]:
+            frame["camera"], frame["frame"] = ("left", "right")[frame["frame"] % 2], frame["frame"] // 2
+        held_out = [frame["file_path"] for frame in meta["frames"] if frame["frame"] == 4]
+        meta["val_filenames"] = meta["test_filenames"] = held_out
+        meta["train_filenames"] = [f["file_path"] for f in meta["frames"] if f["file_path"] not in held_out]
     used, kept = training_split(read_scene(folder))
     assert {picture.frame for picture in kept} == {5}
     assert {picture.frame for picture in used} == set(range(10)) - {4, 5}

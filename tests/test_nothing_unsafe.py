@@ -14,7 +14,7 @@ import yaml
 from bad_input import RIG, spoilt
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.utils import eval_utils
-from scenes import write_scene
+from scenes import transforms, write_scene
 from test_bad_input import INPUTS, throw
 
 from edge_depth_nerf.base.errors import InputError
@@ -198,9 +198,8 @@ def test_a_null_is_no_number(tmp_path, change, message):
 
 def test_a_split_that_is_not_listed(tmp_path):
     scene = write_scene(tmp_path, frames=2)
-    meta = read_json(scene / "transforms.json")
-    del meta["val_filenames"]
-    write_json(scene / "transforms.json", meta)
+    with transforms(scene) as meta:
+        del meta["val_filenames"]
     with pytest.raises(InputError, match="but no val_filenames"):
         FisheyeDepthDataParserConfig(data=scene).setup().get_dataparser_outputs("val")
 
@@ -212,9 +211,8 @@ def test_a_split_that_is_not_listed(tmp_path):
 )
 def test_a_scene_names_its_own_files(tmp_path, key, name):
     scene = write_scene(tmp_path / "scene", frames=2)
-    meta = read_json(scene / "transforms.json")
-    meta["frames"][1][key] = name
-    write_json(scene / "transforms.json", meta)
+    with transforms(scene) as meta:
+        meta["frames"][1][key] = name
     for read in (read_scene, lambda path: FisheyeDepthDataParserConfig(data=path).setup().get_dataparser_outputs()):
         with pytest.raises(InputError, match=rf"frame 1(: {key} is .*not leading out of it| has no file_path)"):
             read(scene)

@@ -3,6 +3,7 @@
 import dataclasses
 import importlib.metadata
 import importlib.util
+import itertools
 import os
 import re
 import shlex
@@ -11,7 +12,6 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -23,7 +23,8 @@ import pytest
 import torch
 import tyro
 import yaml
-from browser import open_browser
+from host_commands import in_one_process
+from html_page import Page
 from scenes import copy_sample_drive
 
 from edge_depth_nerf import cli
@@ -373,31 +374,19 @@ def site(tmp_path_factory) -> Path:
     return folder
 
 
-class References(HTMLParser):
-    """What a page of HTML loads, and what it links to."""
+def loads_of(page: Page) -> list[str]:
+    """What a page loads."""
+    found = []
+    for tag, values in page.tags:
+        if tag == "link":
+            found += [values["href"]] if values.get("rel") not in ("canonical", "prev", "next") else []
+        elif tag != "a":
+            found += [values[name] for name in ("src", "srcset", "data", "poster") if values.get(name)]
+    return found
 
-    def __init__(self, path: Path) -> None:
-        super().__init__()
-        self.loads: list[str] = []
-        self.links: list[str] = []
-        self.styles = ""
-        self._in_style = False
-        self.feed(path.read_text(encoding="utf-8"))
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        values = {name: value or "" for name, value in attrs}
-        self._in_style = tag == "style"
-        if tag == "a":
-            self.links.append(values.get("href", ""))
-        elif tag == "link":
-            self.loads += [values["href"]] if values.get("rel") not in ("canonical", "prev", "next") else []
-        else:
-            self.loads += [values[name] for name in ("src", "srcset", "data", "poster") if values.get(name)]
-        self.styles += values.get("style", "")
-
-    def handle_data(self, data: str) -> None:
-        if self._in_style:
-            self.styles += data
+def page_of(path: Path) -> Page:
+    return Page(path.read_text(encoding="utf-8"))
 
 
 def is_elsewhere(reference: str) -> bool:
@@ -412,11 +401,12 @@ def test_the_site_needs_no_network(site):
     pages = sorted(site.rglob("*.html"))
     assert len(pages) > 15
     for page in pages:
-        found = References(page)
+        found = page_of(page)
         # the slider page contains all that it shows
-        assert len(found.loads) > 3 or page.name == "slider.html", page
-        assert not [each for each in found.loads if is_elsewhere(each)], page
-        assert not re.search(LOADED_ELSEWHERE, found.styles), page
+        assert len(loads_of(found)) > 3 or page.name == "slider.html", page
+        assert not [each for each in loads_of(found) if is_elsewhere(each)], page
+        styles = [*found.texts.get("style", []), *(values.get("style", "") for _, values in found.tags)]
+        assert not re.search(LOADED_ELSEWHERE, " ".join(styles)), page
         # Material fetches its program for diagrams where there are any
         assert "mermaid" not in page.read_text(encoding="utf-8"), page
     for style in site.rglob("*.css"):
@@ -428,7 +418,7 @@ def test_what_loads_elsewhere_is_noticed(tmp_path):
     page.write_text(
         '<script src="//x.org/a.js"></script><link rel=stylesheet href="https://x.org/a.css"><img src="a.png">'
     )
-    assert [is_elsewhere(each) for each in References(page).loads] == [True, True, False]
+    assert [is_elsewhere(each) for each in loads_of(page_of(page))] == [True, True, False]
 
 
 def test_links_and_pictures_of_the_site_are_there(site):
@@ -436,47 +426,46 @@ def test_links_and_pictures_of_the_site_are_there(site):
     pages = [page for page in site.rglob("*.html") if page.name != "404.html"]
     assert len(pages) > 10
     for page in pages:
-        found = References(page)
-        local = [each for each in (*found.loads, *found.links) if not re.match(r"([a-z]+:|//|#|$)", each)]
+        found = page_of(page)
+        links = [values.get("href", "") for tag, values in found.tags if tag == "a"]
+        local = [each for each in (*loads_of(found), *links) if not re.match(r"([a-z]+:|//|#|$)", each)]
         assert local, page
         for reference in local:
             target = page.parent / reference.partition("#")[0].partition("?")[0]
             assert target.exists(), f"{page.name}: {reference}"
 
 
-def test_pages_opened_as_files_are_searched(site):
-    with open_browser() as browser:
-        for name in ("index.html", "data/index.html"):
-            page = browser.new_context(offline=True).new_page()
-            failed: list[str] = []
-            page.on("requestfailed", lambda request, failed=failed: failed.append(request.url))
-            page.goto((site / name).as_uri())
-            page.get_by_placeholder("Search").first.click()
-            page.keyboard.type("epipolar")
-            found = page.locator(".md-search-result__item a").first
-            found.click()
-            page.wait_for_url(re.compile(r"\.html\?h="))
-            assert "epipolar" in page.locator("article").inner_text(), name
-            assert failed == [], name
+def test_pages_opened_as_files_are_searched(site, browser):
+    for name in ("index.html", "data/index.html"):
+        page = browser.new_context(offline=True).new_page()
+        failed: list[str] = []
+        page.on("requestfailed", lambda request, failed=failed: failed.append(request.url))
+        page.goto((site / name).as_uri())
+        page.get_by_placeholder("Search").first.click()
+        page.keyboard.type("epipolar")
+        found = page.locator(".md-search-result__item a").first
+        found.click()
+        page.wait_for_url(re.compile(r"\.html\?h="))
+        assert "epipolar" in page.locator("article").inner_text(), name
+        assert failed == [], name
 
 
-def test_the_slider_page_shows_both_methods_without_a_network(site):
+def test_the_slider_page_shows_both_methods_without_a_network(site, browser):
     text = (site / "slider.html").read_text(encoding="utf-8")
     assert len(text) < 3_000_000 and not (site / "slider").exists()
     assert 'href="slider.html"' in (site / "results.html").read_text(encoding="utf-8")
-    with open_browser() as browser:
-        page = browser.new_context(offline=True).new_page()
-        page.goto((site / "slider.html").as_uri())
-        page.get_by_text("Distance", exact=True).click()
-        assert page.locator(".stage .tag").all_inner_texts() == ["ground truth", "ours"]
-        page.get_by_label("Left", exact=True).select_option(label="nerfacto")
-        assert page.locator(".stage .tag").all_inner_texts() == ["nerfacto", "ours"]
-        assert page.locator(".stage img.over").evaluate("image => image.naturalWidth") > 100
-        page.get_by_role("link", name="Results").click()
-        page.wait_for_url(re.compile(r"/results\.html$"))
-        page.go_back()
-        page.get_by_role("link", name="Home").click()
-        page.wait_for_url(re.compile(r"/index\.html$"))
+    page = browser.new_context(offline=True).new_page()
+    page.goto((site / "slider.html").as_uri())
+    page.get_by_text("Distance", exact=True).click()
+    assert page.locator(".stage .tag").all_inner_texts() == ["ground truth", "ours"]
+    page.get_by_label("Left", exact=True).select_option(label="nerfacto")
+    assert page.locator(".stage .tag").all_inner_texts() == ["nerfacto", "ours"]
+    assert page.locator(".stage img.over").evaluate("image => image.naturalWidth") > 100
+    page.get_by_role("link", name="Results").click()
+    page.wait_for_url(re.compile(r"/results\.html$"))
+    page.go_back()
+    page.get_by_role("link", name="Home").click()
+    page.wait_for_url(re.compile(r"/index\.html$"))
 
 
 def test_every_page_is_in_the_navigation():
@@ -511,28 +500,32 @@ def clone(tmp_path) -> Path:
     return tmp_path
 
 
-def run_blocks(page: str, folder: Path) -> str:
-    """Run the blocks of a page that are marked, in order, as typed; trainings end after three steps."""
-    marked = [block.text for block in ALL_BLOCKS if block.page == page and block.is_run]
-    script = re.sub(
-        r"^(ns-train \S+)",
-        r"\1 --max-num-iterations 3 --viewer.quit-on-train-completion True",
-        "\n".join(("set -euo pipefail", *marked)),
-        flags=re.MULTILINE,
+def run_typed(page: str, folder: Path) -> str:
+    """Run the marked blocks of a page in order, all programs in one process; trainings end after three steps."""
+    marked = [block for block in ALL_BLOCKS if block.page == page and block.is_run]
+    lines = [line for block in marked for line in block.text.splitlines()]
+    copies = [line for line in lines if line.startswith(("cp ", "mkdir "))]
+    subprocess.run(["bash", "-ec", "\n".join(copies)], cwd=folder, check=True)
+    exported = [word.partition("=") for line in lines if line.startswith("export ") for word in line.split()[1:]]
+    commands = {f"{number} {words[0]}": words for number, words in enumerate(itertools.chain(*map(calls, marked)))}
+    short = ["--timestamp", "DATE", "--max-num-iterations", "3", "--viewer.quit-on-train-completion", "True"]
+    for words in commands.values():
+        words[2:2] = short if words[0] == "ns-train" else []
+    (folder / "logs").mkdir()
+    ended_well = in_one_process(
+        commands, folder / "logs", cwd=folder, variables={name: value for name, _, value in exported}
     )
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    environment["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    call = ["bash", "-c", script.replace("/DATE/", "/*/")]
-    output: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    done = subprocess.run(call, cwd=folder, env=environment, timeout=TIMEOUT_S, check=False, **output)
-    assert done.returncode == 0, done.stdout[-4000:]
-    return done.stdout
+    assert len(commands) == 5
+    return "\n".join(map(ended_well, commands))
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is missing (Debian: apt-get install ffmpeg)")
 def test_the_quick_start_as_it_is_typed(clone):
-    run_blocks("docs/quick_start.md", clone)
+    run_typed("docs/quick_start.md", clone)
+    # by the calibration that the drive brings, which was not made again
+    cache = clone / "data/sample_drive/.cache"
+    assert list(cache.iterdir()) and not list(cache.glob("mono_trust_*"))
     assert list((clone / "data/sample_drive_inspection").glob("image_0*.png"))
     assert np.isfinite(read_json(clone / "figures.json")["results"]["masked_psnr"])
     film = cv2.VideoCapture(str(clone / "film.mp4"))
@@ -542,7 +535,7 @@ def test_the_quick_start_as_it_is_typed(clone):
 
 @pytest.mark.slow
 def test_the_examples_as_they_are_typed(clone):
-    said = run_blocks("docs/extending.md", clone)
+    said = run_typed("docs/extending.md", clone)
     (config,) = (clone / "outputs/ratio/edge-depth-nerf-lite").glob("*/config.yml")
     assert "depth_loss: ratio" in config.read_text() and "delta: 0.2" in config.read_text()
     # the flat road: every map is there, and of the road it is right

@@ -150,10 +150,6 @@ def test_what_16_bits_cannot_hold_is_no_prior_and_no_sky(tmp_path):
     assert torch.equal(batch.sky[:, 0], batch.indices[:, 2] == 2)
 
 
-def test_a_record_has_no_gaps():
-    assert RECORD.itemsize == 15
-
-
 def test_what_is_not_whole_does_not_open(tmp_path):
     path = tmp_path / "t.npy"
     table_of(path, [np.ones((8, 8), bool)])

@@ -72,21 +72,6 @@ def test_whatever_changes_makes_another_file(tmp_path, change):
     assert np.array_equal(again.distance_m, make_prior(both(lidar, mono), mask, "integrated", options).distance_m)
 
 
-@pytest.mark.parametrize("damage", ["truncated", "empty", "another shape", "garbage"])
-def test_a_damaged_file_is_made_anew(tmp_path, damage):
-    lidar, mono, mask = maps()
-    cache = PriorCache(tmp_path, "integrated", PriorOptions())
-    good = cache.prior(both(lidar, mono), mask)
-    (file,) = tmp_path.iterdir()
-    if damage == "another shape":
-        np.savez(file, distance_m=np.zeros((2, 2), np.float32), sigma_m=np.zeros((2, 2), np.float32))
-    else:
-        content = file.read_bytes()
-        file.write_bytes({"truncated": content[:200], "empty": b"", "garbage": b"x" * 500}[damage])
-    assert np.array_equal(cache.prior(both(lidar, mono), mask).distance_m, good.distance_m)
-    assert np.array_equal(cache.prior(both(lidar, mono), mask).sigma_m, good.sigma_m)
-
-
 def test_a_folder_that_cannot_be_made_is_no_error(tmp_path):
     (tmp_path / "file").write_text("in the way")
     lidar, mono, mask = maps()

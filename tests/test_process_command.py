@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from drives import SEQUENCE, RoomDrive, write_mono, write_room_drive
 from rich.console import Console
+from scenes import transforms
 
 from edge_depth_nerf.base.files import read_distance_png, read_json, write_distance_png, write_json
 from edge_depth_nerf.method.error_model import read_calibration
@@ -124,10 +125,9 @@ def test_maps_that_are_given_are_calibrated(room: RoomDrive, tmp_path: Path) -> 
 def test_without_lidar_it_says_what_to_do(room: RoomDrive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = tmp_path / "scene"
     report = process(options_of(room, scene, estimate_depth=False), Console(quiet=True))
-    meta = read_json(scene / "transforms.json")
-    for frame in meta["frames"]:
-        del frame["lidar_file_path"], frame["depth_file_path"]
-    write_json(scene / "transforms.json", meta)
+    with transforms(scene) as meta:
+        for frame in meta["frames"]:
+            del frame["lidar_file_path"], frame["depth_file_path"]
     monkeypatch.setattr("edge_depth_nerf.process.command.convert", lambda *_: report)
     assert "estimate-depth SCENE --model" in run(options_of(room, scene))
     assert not read_scene(scene).has("mono")

@@ -185,10 +185,9 @@ OF_WEIGHTS = (check_weights, check_weights_of_what_is_not_finite)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("checks", [OF_WEIGHTS, *((each,) for each in BY_TRITON)])
-def test_in_the_interpreter(checks):
+def test_in_the_interpreter():
     pytest.importorskip("triton")
-    in_interpreter(*checks)
+    in_interpreter(*OF_WEIGHTS, *BY_TRITON)
 
 
 def step(samples: int = 48, intervals: int = 256) -> None:

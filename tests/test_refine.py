@@ -37,6 +37,7 @@ class World:
     to_vehicle: list[np.ndarray]
     path: np.ndarray
     points_m: np.ndarray
+    rng: np.random.Generator
 
     @property
     def shots(self) -> list[tuple[int, int]]:
@@ -56,8 +57,13 @@ class World:
         fine = camera.inside(pixels).numpy() & (theta < math.radians(80))
         return np.where(fine[:, None], pixels.numpy(), np.nan)
 
-    def matches(self, noise_px: float, rng: np.random.Generator, wrong: float = 0.0) -> list[Matches]:
+    def disturbed(self, metres: float = 0.03, degrees: float = 0.1) -> np.ndarray:
+        normal = self.rng.normal
+        return np.stack([at @ pose([*normal(0, degrees, 3)], [*normal(0, metres, 3)]) for at in self.path])
+
+    def matches(self, noise_px: float, wrong: float = 0.0) -> list[Matches]:
         """Of each picture with the next ones of its camera; some of the features are of other points."""
+        rng = self.rng
         seen = [self.pixels(shot) for shot in range(len(self.shots))]
         seen = [pixels + rng.normal(0, noise_px, pixels.shape) for pixels in seen]
         found = []
@@ -78,17 +84,14 @@ class World:
         return found
 
 
-def world(rng: np.random.Generator, points: int = 500) -> World:
+def world(seed: int, points: int = 500) -> World:
+    rng = np.random.default_rng(seed)
     path = np.stack([pose((0, 2.0 * n, 0), (0.03 * n**2 + 4000, 20, 0.9 * n - 7000)) for n in range(FRAMES)])
     left = np.eye(4)
     left[:3, :3] = Rotation.from_euler("y", -80, degrees=True).as_matrix()
     left[:3, 3] = (-0.6, -0.2, 0.4)
     points_m = rng.uniform((3986, 15, -7004), (4016, 21.5, -6972), (points, 3))
-    return World([PINHOLE, FISHEYE], [pose((5, 0, 0), (0.1, -0.3, 1.0)), left], path, points_m)
-
-
-def disturbed(path: np.ndarray, rng: np.random.Generator, metres: float = 0.03, degrees: float = 0.1) -> np.ndarray:
-    return np.stack([at @ pose([*rng.normal(0, degrees, 3)], [*rng.normal(0, metres, 3)]) for at in path])
+    return World([PINHOLE, FISHEYE], [pose((5, 0, 0), (0.1, -0.3, 1.0)), left], path, points_m, rng)
 
 
 def step_errors(path: np.ndarray, true: np.ndarray) -> tuple[float, float]:
@@ -103,9 +106,8 @@ def step_errors(path: np.ndarray, true: np.ndarray) -> tuple[float, float]:
 # ---- tracks ----------------------------------------------------------------------------------------------------
 @pytest.mark.slow
 def test_matches_join_into_one_track_for_each_point() -> None:
-    rng = np.random.default_rng(1)
-    given = world(rng)
-    matches = given.matches(0.0, rng)
+    given = world(1)
+    matches = given.matches(0.0)
     tracks = join_matches(matches)
     points = triangulate(tracks, given.poses())
     known = np.isfinite(points).all(-1)
@@ -121,14 +123,13 @@ def test_matches_join_into_one_track_for_each_point() -> None:
 
 @pytest.mark.slow
 def test_reprojection_is_in_pixels() -> None:
-    rng = np.random.default_rng(2)
-    given = world(rng)
-    tracks = join_matches(given.matches(0.0, rng))
+    given = world(2)
+    tracks = join_matches(given.matches(0.0))
     points = triangulate(tracks, given.poses())
     moved = given.poses().copy()
     moved[:, :3, 3] += (0.01, -0.01, 0.005)
     off_px = reprojection_px(tracks, points, moved)
-    rows = rng.choice(np.flatnonzero(np.isfinite(off_px)), 100)
+    rows = given.rng.choice(np.flatnonzero(np.isfinite(off_px)), 100)
     expected = []
     for row in rows:
         picture = tracks.picture[row]
@@ -166,8 +167,7 @@ def test_rays_that_hardly_differ_give_no_point() -> None:
 
 @pytest.mark.slow
 def test_few_tracks_are_kept_evenly_and_the_longest_first() -> None:
-    rng = np.random.default_rng(3)
-    tracks = join_matches(world(rng).matches(0.0, rng))
+    tracks = join_matches(world(3).matches(0.0))
     lengths = np.bincount(tracks.track)
     kept = spread(tracks, 20)
     assert np.bincount(kept.picture).min() >= min(20, np.bincount(tracks.picture).min())
@@ -189,10 +189,9 @@ def shots_of(given: World) -> list[Shot]:
 
 @pytest.mark.slow
 def test_disturbed_poses_come_back(colmap: Any) -> None:
-    rng = np.random.default_rng(4)
-    given = world(rng)
-    matches = given.matches(0.3, rng, wrong=0.1)
-    path = disturbed(given.path, rng)
+    given = world(4)
+    matches = given.matches(0.3, wrong=0.1)
+    path = given.disturbed()
     found = refine(colmap, shots_of(given), matches, path)
     before_m, before_deg = step_errors(path, given.path)
     after_m, after_deg = step_errors(found.vehicle_to_world, given.path)
@@ -208,10 +207,9 @@ def test_disturbed_poses_come_back(colmap: Any) -> None:
 
 @pytest.mark.slow
 def test_what_evaluates_takes_no_part(colmap: Any) -> None:
-    rng = np.random.default_rng(5)
-    given = world(rng, points=250)
-    matches = given.matches(0.2, rng)
-    path = disturbed(given.path, rng)
+    given = world(5, points=250)
+    matches = given.matches(0.2)
+    path = given.disturbed()
     is_check = [_is_check(groups) for groups in features_joined(matches)]
     assert 0.1 < np.concatenate(is_check).mean() < 0.3
 
@@ -229,12 +227,11 @@ def test_what_evaluates_takes_no_part(colmap: Any) -> None:
 
 @pytest.mark.slow
 def test_cameras_that_fire_at_other_times_stand_on_the_refined_path(colmap: Any) -> None:
-    rng = np.random.default_rng(14)
-    given = world(rng)
-    matches = given.matches(0.2, rng)
-    path = disturbed(given.path, rng)
+    given = world(14, points=250)
+    matches = given.matches(0.2)
+    path = given.disturbed()
     true = shots_of(given)
-    turns = [pose([*rng.normal(0, 0.1, 3)], (0, 0, 0)) for _ in true]
+    turns = [pose([*given.rng.normal(0, 0.1, 3)], (0, 0, 0)) for _ in true]
     off = [dataclasses.replace(shot, to_vehicle=turn @ shot.to_vehicle) for turn, shot in zip(turns, true, strict=True)]
     frozen = refine(colmap, off, matches, path)
     found = refine(colmap, off, matches, path, reshoot=lambda *_: true)
@@ -245,10 +242,9 @@ def test_cameras_that_fire_at_other_times_stand_on_the_refined_path(colmap: Any)
 
 
 def test_without_features_poses_are_the_given_ones(colmap: Any) -> None:
-    rng = np.random.default_rng(6)
-    given = world(rng)
+    given = world(6)
     nothing = join_matches([])
-    start = disturbed(given.path, rng, metres=0.1, degrees=0.5)
+    start = given.disturbed(metres=0.1, degrees=0.5)
     softness = Softness(0.1, math.radians(0.3))
     points = np.zeros((0, 3))
     found = adjust_bundle(colmap, shots_of(given), nothing, points, start, given.path, softness)
@@ -313,11 +309,10 @@ def refined(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Refined:
 
 @pytest.mark.slow
 def test_a_recording_moves_as_a_whole(colmap: Any, refined: Refined) -> None:
-    rng = np.random.default_rng(7)
-    given = world(rng)
-    path = disturbed(given.path, rng)
+    given = world(7)
+    path = given.disturbed()
     drive = recorded(given, path, shutter_s=0.0)
-    moved = refined(drive, given.matches(0.2, rng))
+    moved = refined(drive, given.matches(0.2))
     assert "Poses refined by" in moved.notices[-1]
     assert moved.trajectory is not None
     poses = np.stack([moved.pose(picture) for picture in moved.pictures])
@@ -331,10 +326,9 @@ def test_a_recording_moves_as_a_whole(colmap: Any, refined: Refined) -> None:
 
 @pytest.mark.slow
 def test_what_was_found_is_kept_for_the_same_inputs(colmap: Any, refined: Refined) -> None:
-    rng = np.random.default_rng(13)
-    given = world(rng, points=250)
-    drive = recorded(given, disturbed(given.path, rng))
-    first = refined(drive, given.matches(0.2, rng))
+    given = world(13, points=250)
+    drive = recorded(given, given.disturbed())
+    first = refined(drive, given.matches(0.2))
     again = refined(drive, [])
     assert first.trajectory is not None and again.trajectory is not None
     np.testing.assert_array_equal(first.trajectory.vehicle_to_world, again.trajectory.vehicle_to_world)
@@ -345,10 +339,9 @@ def test_what_was_found_is_kept_for_the_same_inputs(colmap: Any, refined: Refine
 
 @pytest.mark.slow
 def test_true_poses_stay(colmap: Any, refined: Refined) -> None:
-    rng = np.random.default_rng(8)
-    given = world(rng)
+    given = world(8, points=250)
     drive = recorded(given, given.path, shutter_s=0.0)
-    kept = refined(drive, given.matches(0.3, rng))
+    kept = refined(drive, given.matches(0.3))
     assert "given poses are used unchanged: features agree with them as well" in kept.notices[-1]
     assert kept.trajectory is drive.trajectory
     assert kept.pictures == drive.pictures
@@ -356,18 +349,16 @@ def test_true_poses_stay(colmap: Any, refined: Refined) -> None:
 
 @pytest.mark.slow
 def test_poses_that_are_far_off_are_not_trusted_to_features(colmap: Any, refined: Refined) -> None:
-    rng = np.random.default_rng(9)
-    given = world(rng)
+    given = world(9, points=250)
     refined.monkeypatch.setattr(refining, "FURTHEST_M", 0.02)
-    kept = refined(recorded(given, disturbed(given.path, rng)), given.matches(0.3, rng))
+    kept = refined(recorded(given, given.disturbed()), given.matches(0.3))
     assert "too far to be trusted" in kept.notices[-1]
     assert "--poses colmap" in kept.notices[-1]
 
 
 def test_few_features_change_nothing(colmap: Any, refined: Refined) -> None:
-    rng = np.random.default_rng(10)
-    given = world(rng, points=6)
-    kept = refined(recorded(given, disturbed(given.path, rng)), given.matches(0.3, rng))
+    given = world(10, points=6)
+    kept = refined(recorded(given, given.disturbed()), given.matches(0.3))
     assert "could be matched for the check" in kept.notices[-1]
     none = refined(recorded(given, given.path), [])
     assert "only 0 features" in none.notices[-1]
@@ -375,11 +366,10 @@ def test_few_features_change_nothing(colmap: Any, refined: Refined) -> None:
 
 @pytest.mark.slow
 def test_a_frame_without_features_moves_with_its_neighbours(colmap: Any, refined: Refined) -> None:
-    rng = np.random.default_rng(11)
-    given = world(rng)
+    given = world(11, points=250)
     wanted = pose((0, 0.1, 0), (0.05, 0, 0.02))
     path = given.path @ np.linalg.inv(wanted)
-    matches = given.matches(0.2, rng)
+    matches = given.matches(0.2)
     dark = 5
     found = Refinement(given.path.copy(), np.arange(FRAMES) != dark, 100, 1.0, 0.1, 1000)
     found.vehicle_to_world[dark] = path[dark]
@@ -396,7 +386,6 @@ def test_a_frame_without_features_moves_with_its_neighbours(colmap: Any, refined
 
 def test_pycolmap_missing_is_said_before_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    rng = np.random.default_rng(12)
-    given = world(rng)
+    given = world(12)
     with pytest.raises(InputError, match=r"--refine-poses: needs COLMAP's Python package.*--no-refine-poses"):
         refining.check_refining(recorded(given, given.path), ProcessOptions(output=Path("none")))

@@ -5,7 +5,6 @@ import hashlib
 import json
 import re
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -14,12 +13,12 @@ import cv2
 import numpy as np
 import pytest
 import tyro
-from browser import open_browser
+from html_page import Page
 from rich.console import Console
-from scenes import write_scene
+from scenes import transforms, write_scene
 
 from edge_depth_nerf import cli
-from edge_depth_nerf.base.files import read_json, write_json, write_png
+from edge_depth_nerf.base.files import write_png
 from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.base.pictures import NO_VALUE_RGB, colour_distance, distance_of_colours
 from edge_depth_nerf.compare.methods import METHODS
@@ -174,16 +173,15 @@ def test_drives_are_read_from_what_runs_left(tmp_path):
 def test_views_come_in_the_order_of_the_evaluation(tmp_path):
     """nerfstudio sorts folder by folder; letter by letter, "front-left/" comes before "front/"."""
     scene = write_scene(tmp_path / "x", frames=4, split=False)
-    meta = read_json(scene / "transforms.json")
-    wanted = ("front/0000", "front/0001", "front-left/0000", "front-left/0001")
-    for frame, name in zip(meta["frames"], wanted, strict=True):
-        path = scene / f"images/{name}.png"
-        path.parent.mkdir(exist_ok=True)
-        (scene / frame["file_path"]).rename(path)
-        frame["file_path"] = f"images/{name}.png"
-    names = [frame["file_path"] for frame in meta["frames"]]
-    meta |= {f"{split}_filenames": names for split in ("train", "val", "test")}
-    write_json(scene / "transforms.json", meta)
+    with transforms(scene) as meta:
+        wanted = ("front/0000", "front/0001", "front-left/0000", "front-left/0001")
+        for frame, name in zip(meta["frames"], wanted, strict=True):
+            path = scene / f"images/{name}.png"
+            path.parent.mkdir(exist_ok=True)
+            (scene / frame["file_path"]).rename(path)
+            frame["file_path"] = f"images/{name}.png"
+        names = [frame["file_path"] for frame in meta["frames"]]
+        meta |= {f"{split}_filenames": names for split in ("train", "val", "test")}
     parser = FisheyeDepthDataParserConfig(data=scene).setup()
     evaluated = [str(path.relative_to(scene)) for path in parser.get_dataparser_outputs("test").image_filenames]
     assert evaluated == names != sorted(names)
@@ -346,30 +344,6 @@ def report(cloud) -> Report:
     )
 
 
-class Page(HTMLParser):
-    """Tags with attributes, and the text of each kind of element."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.tags: list[tuple[str, dict[str, str]]] = []
-        self.texts: dict[str, list[str]] = {}
-        self._open: list[str] = []
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, {name: value or "" for name, value in attrs}))
-        self._open.append(tag)
-        self.texts.setdefault(tag, []).append("")
-
-    def handle_endtag(self, tag: str) -> None:
-        while self._open and self._open.pop() != tag:
-            pass
-
-    def handle_data(self, data: str) -> None:
-        if self._open:
-            self.texts[self._open[-1]][-1] += data
-
-
 def test_text_is_escaped(report):
     text = build_report(report)
     page = Page(text)
@@ -449,12 +423,6 @@ def test_the_page_is_written_whole_or_not_at_all(report, tmp_path, monkeypatch):
 
 
 # --- the page in a browser --------------------------------------------------------------------------------------------
-@pytest.fixture(scope="module")
-def browser():
-    with open_browser() as found:
-        yield found
-
-
 @pytest.fixture(scope="module")
 def address(report, tmp_path_factory) -> str:
     path = tmp_path_factory.mktemp("report") / "report.html"

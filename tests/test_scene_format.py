@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from rich.console import Console
-from scenes import pinhole, write_scene
+from scenes import pinhole, transforms, write_scene
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import (
@@ -117,9 +117,8 @@ def test_another_geometry_makes_a_calibration_stale(tmp_path: Path, change) -> N
     scene = write_scene(tmp_path)
     calibrate_scene(scene)
     assert saved_calibration(read_scene(scene), PriorOptions()) is not None
-    meta = read_json(scene / "transforms.json")
-    change(meta)
-    write_json(scene / "transforms.json", meta)
+    with transforms(scene) as meta:
+        change(meta)
     assert saved_calibration(read_scene(scene), PriorOptions()) is None
     # what inspect draws is never made by a stale one
     assert ShownScene(read_scene(scene)).calibration is None
@@ -137,20 +136,18 @@ def test_another_map_of_the_same_size_makes_a_calibration_stale(tmp_path: Path) 
 
 def test_pictures_that_no_list_names_are_not_trained_on(tmp_path: Path) -> None:
     scene = write_scene(tmp_path, frames=12)
-    meta = read_json(scene / "transforms.json")
-    names = [frame["file_path"] for frame in meta["frames"]]
-    meta |= {"train_filenames": names[:4], "val_filenames": names[5:6], "test_filenames": names[5:6]}
-    write_json(scene / "transforms.json", meta)
+    with transforms(scene) as meta:
+        names = [frame["file_path"] for frame in meta["frames"]]
+        meta |= {"train_filenames": names[:4], "val_filenames": names[5:6], "test_filenames": names[5:6]}
     assert [picture.name for picture in read_scene(scene).pictures if not picture.held_out] == names[:4]
     assert len(calibrate_scene(scene).frames) == 4
 
 
 def test_a_picture_that_is_masked_whole_gets_an_empty_map(tmp_path: Path) -> None:
     scene = write_scene(tmp_path)
-    meta = read_json(scene / "transforms.json")
-    write_mask(scene / "masks/none.png", np.zeros((28, 32), bool))
-    meta["frames"][2]["mask_path"] = "masks/none.png"
-    write_json(scene / "transforms.json", meta)
+    with transforms(scene) as meta:
+        write_mask(scene / "masks/none.png", np.zeros((28, 32), bool))
+        meta["frames"][2]["mask_path"] = "masks/none.png"
     put_in(scene)
     empty = [
         not read_distance_png(scene / f["mono_file_path"]).any() for f in read_json(scene / "transforms.json")["frames"]

@@ -177,25 +177,33 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.fixture(scope="module")
+def computed(tmp_path_factory: pytest.TempPathFactory) -> tuple[EdgeDepthTrainer, list[dict[str, float]]]:
+    """A training step by step, and its losses."""
+    folder = tmp_path_factory.mktemp("computed")
+    write_scene(folder / "scene")
+    trainer = never_recorded(trainer_in(folder, "run"))
+    return trainer, losses_of(trainer, range(STEPS))
+
+
 def test_the_first_steps_are_those_of_nerfstudios_trainer(folder):
     """But for learning rates and λ, which are of float32 on a GPU."""
-    computed, other = (trainer_in(folder, name) for name in ("computed", "other"))
-    losses = [losses_of(each, range(5)) for each in (computed, never_recorded(other))]
-    assert_same(computed, other, *losses, tolerance=1e-4)
+    of_host, other = (trainer_in(folder, name) for name in ("host", "other"))
+    losses = [losses_of(each, range(5)) for each in (of_host, never_recorded(other))]
+    assert_same(of_host, other, *losses, tolerance=1e-4)
 
 
-def test_replayed_steps_are_those_that_are_computed(folder, monkeypatch):
+def test_replayed_steps_are_those_that_are_computed(folder, computed, monkeypatch):
     """Both kinds of steps, with λ, annealing and learning rates on their way; a checkpoint between loads."""
-    computed, replayed = (trainer_in(folder, name) for name in ("computed", "replayed"))
-    never_recorded(computed)
+    replayed = trainer_in(folder, "replayed")
     capture = with_graphs(replayed, monkeypatch)
-    expected, found = (losses_of(trainer, range(STEPS)) for trainer in (computed, replayed))
+    found = losses_of(replayed, range(STEPS))
     assert replayed.graphs is not None
     assert (capture.recorded, replayed.graphs.recorded, capture.recovered) == (2, 2, 0)
     # all but those that were taken before a recording of their kind; proposal networks rest from the tenth step on
     assert STEPS - 10 - 4 <= capture.replays < STEPS - RECORD_AT[0]
     assert len({each["edge_loss"] for each in found}) == STEPS
-    assert_same(computed, replayed, expected, found, tolerance=1e-6)
+    assert_same(computed[0], replayed, computed[1], found, tolerance=1e-6)
     replayed.save_checkpoint(STEPS - 1)
     again = trainer_in(folder, "again", load_dir=replayed.checkpoint_dir)
     assert again._start_step == STEPS
@@ -208,30 +216,28 @@ def test_replayed_steps_are_those_that_are_computed(folder, monkeypatch):
 
 
 @pytest.mark.parametrize("fails", ["middle", "end", "second"])
-def test_training_goes_on_after_a_failed_recording(folder, fails, monkeypatch, capsys):
+def test_training_goes_on_after_a_failed_recording(folder, computed, fails, monkeypatch, capsys):
     """It is tried again later, then given up; steps, learning rates and batches are those of a training without."""
-    computed, trainer = (trainer_in(folder, name) for name in ("computed", "fails"))
-    never_recorded(computed)
+    trainer = trainer_in(folder, "fails")
     capture = with_graphs(trainer, monkeypatch, fails=fails)
-    expected, found = (losses_of(each, range(STEPS)) for each in (computed, trainer))
+    found = losses_of(trainer, range(STEPS))
     assert trainer.graphs is not None and trainer.graphs.has_ended and trainer.graphs.recorded == 0
     assert capture.recovered == 3 and (capture.replays > 0) == (fails == "second")
     # the last steps are those of nerfstudio's trainer
-    assert_same(computed, trainer, expected, found, tolerance=1e-3)
-    seen: list[Any] = [each.pipeline.datamanager.trained_on for each in (computed, trainer)]
+    assert_same(computed[0], trainer, computed[1], found, tolerance=1e-3)
+    seen: list[Any] = [each.pipeline.datamanager.trained_on for each in (computed[0], trainer)]
     assert torch.equal(*seen)
     said = " ".join(capsys.readouterr().out.split())
     assert said.count("continues without CUDA graphs") == 1 and "RuntimeError: operation" in said
 
 
-def test_a_recording_that_works_later_is_used(folder, monkeypatch):
-    computed, trainer = (trainer_in(folder, name) for name in ("computed", "later"))
-    never_recorded(computed)
+def test_a_recording_that_works_later_is_used(folder, computed, monkeypatch):
+    trainer = trainer_in(folder, "later")
     capture = with_graphs(trainer, monkeypatch, fails="middle", failures=1)
-    expected, found = (losses_of(each, range(STEPS)) for each in (computed, trainer))
+    found = losses_of(trainer, range(STEPS))
     assert trainer.graphs is not None and trainer.graphs.recorded == 2
     assert capture.recovered == 1 and STEPS - 14 - 4 <= capture.replays < STEPS - 14
-    assert_same(computed, trainer, expected, found, tolerance=1e-6)
+    assert_same(computed[0], trainer, computed[1], found, tolerance=1e-6)
 
 
 @pytest.mark.parametrize("change", ["rays", "options", "trained"])

@@ -13,10 +13,9 @@ from nerfstudio.engine.trainer import Trainer
 from nerfstudio.pipelines.base_pipeline import Pipeline
 from nerfstudio.utils import writer
 from nerfstudio.viewer.viewer import Viewer
-from scenes import write_scene
+from scenes import transforms, write_scene
 from trainings import trainer_of
 
-from edge_depth_nerf.base.files import read_json, write_json
 from edge_depth_nerf.jobs.runs import newest_checkpoint
 from edge_depth_nerf.kernels.threads import kernel_threads
 from edge_depth_nerf.plugin.grad_scaler import PatientGradScaler
@@ -189,10 +188,9 @@ def test_a_drive_without_lidar_has_no_prior_of_it(tmp_path, monkeypatch, capsys)
     """With distances from motion alone, these are the prior."""
     monkeypatch.setenv("COLUMNS", "300")
     scene = write_scene(tmp_path / "scene", lidar=False)
-    meta = read_json(scene / "transforms.json")
-    for frame in meta["frames"]:
-        frame["motion_file_path"] = frame.pop("mono_file_path")
-    write_json(scene / "transforms.json", meta)
+    with transforms(scene) as meta:
+        for frame in meta["frames"]:
+            frame["motion_file_path"] = frame.pop("mono_file_path")
     trainer_of(scene, tmp_path / "runs", max_num_iterations=STEPS)
     said = capsys.readouterr().out
     assert "with a depth prior" in said and "LiDAR alone" not in said

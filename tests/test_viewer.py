@@ -1,7 +1,6 @@
 """What the viewer shows: in numbers, on the server's side, and in a browser."""
 
 import math
-import shutil
 import socket
 import threading
 import time
@@ -15,7 +14,6 @@ import jaxtyping
 import numpy as np
 import pytest
 import torch
-from browser import SOFTWARE_WEBGL
 from models import pipeline_of, shrink
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.configs.method_configs import all_methods
@@ -25,6 +23,7 @@ from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
 from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerElement
 from scenes import RADIUS_M, copy_sample_drive, fisheye, pinhole, write_scene
 from torch._subclasses.fake_tensor import FakeTensorMode
+from waiting import until
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import as_people_count
@@ -36,15 +35,7 @@ from edge_depth_nerf.plugin.viewer import AZIMUTHS, RINGS, DriveLayers, lens_cap
 pytestmark = pytest.mark.slow
 
 METHOD = "edge-depth-nerf-lite"
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 TIMEOUT_S = 120
-
-
-def until(condition: Callable[[], bool], wait: Callable[[float], None] = time.sleep) -> None:
-    deadline = time.monotonic() + TIMEOUT_S
-    while not condition():
-        assert time.monotonic() < deadline
-        wait(0.1)
 
 
 # ---- lenses ----------------------------------------------------------------------------------------------------------
@@ -155,13 +146,6 @@ def test_uncertainty_is_of_the_weights_that_colour_the_ray(pipeline):
         drawn = starts[chosen] + (ends - starts)[chosen] * rng.random(200_000)
         expected_m = drawn.std() * model.metres_per_unit
         assert float(outputs["distance_uncertainty"][ray]) == pytest.approx(expected_m, rel=0.02)
-
-
-def test_training_has_neither(pipeline):
-    pipeline.train()
-    rays, _ = pipeline.datamanager.next_train(0)
-    outputs = pipeline.model(rays)
-    assert not {"distance", "distance_uncertainty", "expected_depth"} & set(outputs)
 
 
 @pytest.mark.parametrize("kind", [CameraType.FISHEYE, CameraType.EQUIRECTANGULAR, CameraType.PERSPECTIVE])
@@ -563,17 +547,6 @@ def test_a_file_that_went_away_is_said_and_the_switch_goes_back(training, capsys
 
 # ---- in a browser ----------------------------------------------------------------------------------------------------
 @pytest.fixture(scope="module")
-def browser():
-    if CHROMIUM is None:
-        pytest.skip("no Chromium on this machine (Debian: apt-get install chromium)")
-    sync_api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed (pip install playwright)")
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *SOFTWARE_WEBGL])
-        yield browser
-        browser.close()
-
-
-@pytest.fixture(scope="module")
 def interruptible() -> Iterator[None]:
     """Renderings that may be interrupted: types are not checked.
 
@@ -596,7 +569,7 @@ def page(browser, training, interruptible):
     page.wait_for_selector("text=Output type", timeout=TIMEOUT_S * 1000)
     training.viewer.control_panel._max_res.value = 128
     training.trainer.training_state = "paused"
-    until(lambda: bool(server.get_clients()), lambda seconds: page.wait_for_timeout(1000 * seconds))
+    until(lambda: bool(server.get_clients()), wait=lambda seconds: page.wait_for_timeout(1000 * seconds))
     look_from_above(training)
     yield page
     training.trainer.training_state = "training"
@@ -625,7 +598,7 @@ def settled(page, shows: Callable[[np.ndarray], bool] = lambda _: True) -> np.nd
         pictures.append(canvas(page))
         return bool((np.abs(pictures[-1] - pictures[-2]).max(-1) > 30).mean() < 1e-3) and shows(pictures[-1])
 
-    until(still, lambda seconds: page.wait_for_timeout(10_000 * seconds))
+    until(still, wait=lambda seconds: page.wait_for_timeout(10_000 * seconds))
     return pictures[-1]
 
 
@@ -648,7 +621,7 @@ def test_a_browser_begins_at_a_training_camera(browser, page, training):
     known = set(server.get_clients())
     other = browser.new_page(viewport={"width": 500, "height": 400})
     other.goto(f"http://127.0.0.1:{server.get_port()}")
-    until(lambda: bool(set(server.get_clients()) - known), lambda seconds: other.wait_for_timeout(1000 * seconds))
+    until(lambda: bool(set(server.get_clients()) - known), wait=lambda seconds: other.wait_for_timeout(1000 * seconds))
     (number,) = set(server.get_clients()) - known
     dataset = training.trainer.pipeline.datamanager.train_dataset
     pose = dataset.cameras.camera_to_worlds[5].double().numpy()  # of eleven of the first camera
@@ -677,7 +650,7 @@ def test_switches_work(page, training, label, layer):
         box.click()
         until(
             lambda: training.layers.switches[layer].value is shown and seen(training, layer) is shown,
-            lambda seconds: page.wait_for_timeout(1000 * seconds),
+            wait=lambda seconds: page.wait_for_timeout(1000 * seconds),
         )
         page.mouse.move(300, 300)
         return settled(page, shows)
@@ -709,6 +682,6 @@ def test_outputs_and_the_fisheye_preview(page, training):
             training.viewer.render_tab_state.preview_render
             and training.viewer.render_tab_state.preview_camera_type == "Fisheye"
         ),
-        lambda seconds: page.wait_for_timeout(1000 * seconds),
+        wait=lambda seconds: page.wait_for_timeout(1000 * seconds),
     )
     settled(page, lambda picture: picture[150:400].std() > 5 and changed(plain, picture) > 5000)

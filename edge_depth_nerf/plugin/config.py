@@ -1,7 +1,7 @@
 """The methods that nerfstudio registers, made from nerfstudio_method.toml.
 
-Every ns-* command imports this module. Nothing is changed by that: what a command needs for our methods is set up when
-one of them is (`EdgeDepthPipelineConfig.setup`, `EdgeDepthTrainerConfig.save_config`).
+Every ns-* command imports this module. Nothing of the host is changed by that: what a command needs for our methods is
+set up when one of them is (`EdgeDepthPipelineConfig.setup`, `EdgeDepthTrainerConfig.save_config`).
 
 An override is a dotted name in the configuration and a value. Names and types are checked against the configuration
 itself; one error reports all that is wrong.
@@ -23,6 +23,7 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.kernels.table_adam import TableAdam
+from edge_depth_nerf.plugin.compat import know_modules_of_importer
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModelConfig
 from edge_depth_nerf.plugin.pipeline import EdgeDepthPipelineConfig
@@ -154,6 +155,7 @@ def make_specifications(declared: dict[str, Any]) -> dict[str, MethodSpecificati
     return specifications
 
 
+know_modules_of_importer()
 _specifications = make_specifications(read_method_file())
 
 edge_depth_nerf = _specifications["edge-depth-nerf"]
