@@ -451,6 +451,7 @@ def _sweeps(
                     to_vehicle=lidar.to_vehicle,
                     read=partial(_read, item.path, lidar, counted_from_s),
                     timing=lidar.timing,
+                    columns=len(lidar.columns) if lidar.dtype == "float32" and item.path.suffix == ".bin" else None,
                 )
             )
     return found
