@@ -34,8 +34,10 @@ from edge_depth_nerf.masks.semantics import check_classes, keep_static, read_lab
 from edge_depth_nerf.masks.semantics import sky as sky_of_labels
 from edge_depth_nerf.masks.sky import find_sky
 from edge_depth_nerf.process.lidar_checks import LidarCheck, check_lidar
+from edge_depth_nerf.process.mask_checks import mask_warnings
 from edge_depth_nerf.process.moving import find_moving
 from edge_depth_nerf.process.options import ProcessOptions
+from edge_depth_nerf.process.path_checks import path_warnings
 from edge_depth_nerf.process.pose_checks import features_say, lidar_says
 from edge_depth_nerf.process.reading import (
     downscale_distance,
@@ -190,12 +192,15 @@ def _checked(recording: Recording, options: ProcessOptions, console: Console) ->
         return LidarCheck((), tuple(kept["warnings"]))
     if recording.trajectory is None:
         raise InputError("the recording has no poses. Give them, or compute them: --poses lidar, --poses colmap.")
-    masks, usable = vehicle_masks(recording), {}
-    for recorded in recording.cameras:
-        lens = lens_circle(recorded.camera, options.theta_max_deg)
-        usable[recorded.name] = lens & masks[recorded.name] if recorded.name in masks else lens
+    masks = vehicle_masks(recording)
+    usable = {one.name: lens_circle(one.camera, options.theta_max_deg) for one in recording.cameras}
     with console.status("Comparing LiDAR with the pictures"):
-        found = check_lidar(recording, usable)
+        # where the path or a mask is wrong, LiDAR seems to be, too
+        warnings = path_warnings(recording) if options.poses == "recorded" else []
+        warnings += mask_warnings(recording, usable)
+        for name, mask in masks.items():
+            usable[name] = usable[name] & mask
+        found = LidarCheck((), tuple(warnings)) if warnings else check_lidar(recording, usable)
     if options.strict and found.warnings:
         raise InputError(" ".join(found.warnings) + " Without --strict this is a warning.")
     return found
@@ -446,7 +451,8 @@ class _Builder:
         if self._without:
             found.append(
                 f"No LiDAR point in {len(self._without)} pictures: frames {', '.join(sorted(self._without)[:10])}"
-                f"{' …' if len(self._without) > 10 else ''}."
+                f"{' …' if len(self._without) > 10 else ''}. If LiDAR's field meets that camera's, check to_vehicle "
+                "of both (in metres?) and the clocks."
             )
         return found
 
