@@ -196,11 +196,13 @@ def _checked(recording: Recording, options: ProcessOptions, console: Console) ->
     usable = {one.name: lens_circle(one.camera, options.theta_max_deg) for one in recording.cameras}
     with console.status("Comparing LiDAR with the pictures"):
         # where the path or a mask is wrong, LiDAR seems to be, too
-        warnings = path_warnings(recording) if options.poses == "recorded" else []
-        warnings += mask_warnings(recording, usable)
+        of_masks = mask_warnings(recording, usable)
         for name, mask in masks.items():
             usable[name] = usable[name] & mask
-        found = LidarCheck((), tuple(warnings)) if warnings else check_lidar(recording, usable)
+        of_path, lost = path_warnings(recording, usable) if options.poses == "recorded" else ([], False)
+        # where lengths or masks are wrong, LiDAR seems to be, too
+        found = LidarCheck((), ()) if lost or of_masks else check_lidar(recording, usable)
+        found = dataclasses.replace(found, warnings=(*of_path, *of_masks, *found.warnings))
     if options.strict and found.warnings:
         raise InputError(" ".join(found.warnings) + " Without --strict this is a warning.")
     return found

@@ -71,15 +71,19 @@ _FAINTEST = 0.02
 """Pictures with less contrast at the LiDAR points (root mean square) say nothing."""
 _FITTING = 0.3
 """And only if the lack that it leaves is less."""
-_LOG_RATIOS = np.linspace(-1.6, 1.6, 81)
-"""Distances are searched from a fifth of LiDAR's to five times them."""
+_LOG_RATIOS = np.linspace(-1.8, 1.8, 91)
+"""Distances are searched from a sixth of LiDAR's to six times them."""
+_LEAST_LACK = 0.03
+"""Less is noise."""
+_MOVES = 0.6
+"""A reading fits only if its lack is less than this part of what it were if the camera had not moved."""
 _DOUBT = 0.3
 """Large faults are looked for only above this lack, or where the ratio is off."""
 _TRIED_WHOLE = 8
 """So many readings, the best on some of the pairs, are tried on all of them."""
 _FEWEST_RATIOS = 30
 """The median of fewer ratios says nothing."""
-_SEARCHED = 400
+_SEARCHED = 800
 """So many points of a pair are searched for."""
 _FAR_SHARE = 0.2
 """A scanner has so large a share of its points beyond reach only in another unit; in metres it is 0."""
@@ -157,6 +161,8 @@ class _Fit:
     """How well a reading fits a camera: sums over its pairs."""
 
     lack: float
+    still: float
+    """The lack if the points were at the same pixels in both: as if the camera had not moved."""
     edge: float
     """0 without edges."""
     tells: bool
@@ -299,12 +305,17 @@ def _in_front(pixels: Float[np.ndarray, "n 2"], distance_m: Float[np.ndarray, "n
 
 
 def _fit(values: Sequence[np.ndarray], edges: Sequence[tuple[float, int]]) -> _Fit:
-    first, second = np.concatenate(values, 1).astype(np.float64) if values else np.zeros((2, 0))
-    squares = float(first @ first), float(second @ second)
-    tells = len(first) >= _FEWEST and min(squares) > len(first) * _FAINTEST**2
+    """Of contrasts in the first picture, in the second, and in the second at the first's pixels."""
+    first, second, still = np.concatenate(values, 1).astype(np.float64) if values else np.zeros((3, 0))
+    power = float(first @ first)
+    tells = len(first) >= _FEWEST and min(power, float(second @ second)) > len(first) * _FAINTEST**2
     strength, count = np.sum(edges, 0) if edges else (0.0, 0)
-    lack = 1 - float(first @ second) / max(math.sqrt(squares[0] * squares[1]), 1e-9) if tells else 1.0
-    return _Fit(max(lack, 1e-3), float(strength) / count if count >= _FEWEST / 4 else 0.0, tells)
+
+    def lack(other: np.ndarray) -> float:
+        return max(1 - float(first @ other) / max(math.sqrt(power * float(other @ other)), 1e-9), _LEAST_LACK)
+
+    edge = float(strength) / count if count >= _FEWEST / 4 else 0.0
+    return _Fit(lack(second) if tells else 1.0, lack(still) if tells else 1.0, edge, tells)
 
 
 class _Source:
@@ -336,7 +347,8 @@ class _Source:
                     continue
                 world = scan.seen.world(reading, self._path)
             _, pixels = view.seen(pair, world, reading)
-            values.append(np.stack([_sampled(c, p) for c, p in zip(pair.contrasts, pixels, strict=True)]))
+            of_pictures = [_sampled(c, p) for c, p in zip(pair.contrasts, pixels, strict=True)]
+            values.append(np.stack([*of_pictures, _sampled(pair.contrasts[1], pixels[0])]))
             if scan is not None:
                 edges.append(view.edge(pair, scan.edges.world(reading, self._path), reading))
         return _fit(values, edges)
@@ -598,6 +610,8 @@ def _tried(
     if not told:
         return candidate
     lacks = sum(b.lack for b, _ in told), sum(a.lack for _, a in told)
+    if lacks[1] > _MOVES * sum(a.still for _, a in told):
+        return candidate
     gain = math.log(lacks[0] / lacks[1])
     steps = [math.log(a.edge / b.edge) for b, a in told if a.edge > 0 and b.edge > 0]
     gain += 3 * float(np.clip(np.mean(steps), -0.15, 0.15)) if steps else 0.0
@@ -673,7 +687,7 @@ def _ratios(source: _Source, view: _View) -> tuple[np.ndarray, np.ndarray]:
         second = np.where(far, alike, -1.0).max(-1)
         middle = len(_LOG_RATIOS) // 2
         moves = np.linalg.norm(pixels[:, middle + 10] - pixels[:, middle - 10], axis=-1)
-        sure = (alike.max(-1) > 0.85) & (alike.max(-1) - second > 0.15) & (moves > 3)
+        sure = (alike.max(-1) > 0.8) & (alike.max(-1) - second > 0.15) & (moves > 3)
         found.append(_LOG_RATIOS[best[sure]])
         sides.append((first[sure, 0] / view.small.width * 3).astype(int))
     return np.concatenate(found), np.concatenate(sides)

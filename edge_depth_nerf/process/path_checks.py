@@ -9,22 +9,23 @@ in a bend. Straight on it says nothing, but the cameras' upward axes do: upright
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import cv2
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from edge_depth_nerf.base.files import read_image
 from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.poses.breaks import find_break
-from edge_depth_nerf.process.readings import UNITS, Reading, of_path
+from edge_depth_nerf.process.readings import of_path
 from edge_depth_nerf.process.recording import RecordedPicture, Recording
 
 _FARTHEST_M = 50.0
 """No sensor sits so far from its vehicle's frame."""
-_FASTEST_M_S = 100.0
-"""No road vehicle is faster."""
+_SLOWEST_M_S, _FASTEST_M_S = 0.3, 100.0
+"""No road vehicle is faster; slower than the first, and faster than half of the second, no reading is likely."""
 _STANDS_M = 0.5
 """A vehicle that stays within so much of where it begins does not drive."""
 _ALIKE = 0.6
@@ -39,8 +40,16 @@ _LOOKED_AT = 2000
 """Of longer paths, so many poses."""
 
 
-def path_warnings(recording: Recording) -> list[str]:
-    """Say what of the given poses and mountings no vehicle has, with the likely cause."""
+def path_warnings(recording: Recording, usable: Mapping[str, Bool[np.ndarray, "h w"]]) -> tuple[list[str], bool]:
+    """Say what of the given poses and mountings no vehicle has, with the likely cause.
+
+    Args:
+        recording: with the vehicle's path.
+        usable: of each camera at its pictures' size, True within the lens.
+
+    Returns:
+        Sentences, and whether lengths are so wrong that nothing else can be told.
+    """
     assert recording.trajectory is not None
     mountings = [(camera.name, camera.to_vehicle) for camera in recording.cameras]
     mountings += {sweep.scanner: sweep.to_vehicle for sweep in recording.sweeps}.items()
@@ -49,18 +58,20 @@ def path_warnings(recording: Recording) -> list[str]:
         far_m = float(np.linalg.norm(to_vehicle[:3, 3]))
         if far_m > _FARTHEST_M:
             likely = f" Are they millimetres? {far_m / 1000:.2f} m would fit." if far_m / 1000 < _FARTHEST_M else ""
-            found.append(
-                f"{name} is {far_m:.0f} m from the vehicle's frame by its to_vehicle; expected metres.{likely}"
-            )
+            found.append(f"to_vehicle of {name} puts it {far_m:.0f} m from the vehicle; expected metres.{likely}")
     path = _looked_at(recording)
     places = path.vehicle_to_world[:, :3, 3]
-    speed = np.linalg.norm(np.diff(places, axis=0), axis=-1) / np.diff(path.times_s)
     reach_m = float(np.linalg.norm(places - places[0], axis=-1).max())
-    if np.median(speed) > _FASTEST_M_S:
-        return [*found, _too_fast(float(np.median(speed)))]
     if reach_m < _STANDS_M:
-        return [*found, _stands(recording, path, reach_m)]
-    return found + (_misread(recording, path) or _broken(path))
+        return [*found, _stands(recording, path, reach_m, usable)], True
+    misread = _misread(recording, path)
+    return [*found, *(misread or _broken(path))], bool(found) or _speed(path) > _FASTEST_M_S
+
+
+def _speed(path: Trajectory) -> float:
+    """The median."""
+    shifts = np.linalg.norm(np.diff(path.vehicle_to_world[:, :3, 3], axis=0), axis=-1)
+    return float(np.median(shifts / np.diff(path.times_s)))
 
 
 def _looked_at(recording: Recording) -> Trajectory:
@@ -75,19 +86,13 @@ def _looked_at(recording: Recording) -> Trajectory:
     return Trajectory(path.times_s[index], path.vehicle_to_world[index])
 
 
-def _too_fast(speed: float) -> str:
-    fit = [unit for unit, metres in UNITS.items() if 1 <= speed * metres <= _FASTEST_M_S / 2]
-    likely = "check metres_per_unit and the times"
-    if fit:
-        likely = f"are they in {fit[0]}? metres_per_unit = {UNITS[fit[0]]:g}"
-    return f"By the poses the vehicle drives at {speed:.0f} m/s (median), faster than any: {likely}."
-
-
-def _stands(recording: Recording, path: Trajectory, reach_m: float) -> str:
+def _stands(
+    recording: Recording, path: Trajectory, reach_m: float, usable: Mapping[str, Bool[np.ndarray, "h w"]]
+) -> str:
     said = f"By the poses the vehicle never moves: it stays within {reach_m:.3f} m of its start"
     camera = recording.cameras[0].name
     pictures = [picture for picture in recording.pictures if picture.camera == camera]
-    if _alike(pictures[0], pictures[len(pictures) // 2]):
+    if _alike(pictures[0], pictures[len(pictures) // 2], usable[camera]):
         return f"{said}. Pictures from one place give no distances; use frames of a stretch where it drives."
     x, y = np.abs(path.vehicle_to_world[0, :2, 3])
     degrees = reach_m > 0 and max(x, y) > 0.01 and x <= 180 and y <= 180
@@ -95,36 +100,37 @@ def _stands(recording: Recording, path: Trajectory, reach_m: float) -> str:
     return f"{said}, but the pictures change. {likely}, or compute the poses: --poses lidar, --poses colmap."
 
 
-def _alike(first: RecordedPicture, second: RecordedPicture) -> bool:
+def _alike(first: RecordedPicture, second: RecordedPicture, usable: Bool[np.ndarray, "h w"]) -> bool:
     """Whether two pictures show the same at the same place."""
     grey = [cv2.cvtColor(read_image(one.path), cv2.COLOR_RGB2GRAY).astype(np.float32) for one in (first, second)]
-    small = [cv2.resize(one, (64, 64), interpolation=cv2.INTER_AREA) for one in grey]
-    fine = [one - cv2.GaussianBlur(one, (0, 0), 4.0) for one in small]
-    return bool(np.corrcoef(fine[0].ravel(), fine[1].ravel())[0, 1] > _ALIKE)
+    small = [cv2.resize(one, (96, 96), interpolation=cv2.INTER_AREA) for one in grey]
+    inner = cv2.resize(usable.astype(np.uint8), (96, 96), interpolation=cv2.INTER_NEAREST)
+    inner = cv2.erode(inner, np.ones((9, 9))) > 0
+    fine = [(one - cv2.GaussianBlur(one, (0, 0), 3.0))[inner] for one in small]
+    return bool(np.corrcoef(fine[0], fine[1])[0, 1] > _ALIKE)
 
 
 def _misread(recording: Recording, path: Trajectory) -> list[str]:
-    """Whether the vehicle is upright and goes where it points; which reading of the poses makes it so."""
-    course, upright = _course(path), _upright(recording, path)
-    if course >= _LEAST_COURSE and upright >= _LEAST_UPRIGHT:
+    """Whether the vehicle is upright, and drives where it points, not too fast; else which reading makes it so."""
+    course, upright, speed = _course(path), _upright(recording, path), _speed(path)
+    faults = [f"drives at {speed:.0f} m/s (median)"] if speed > _FASTEST_M_S else []
+    faults += [f"moves along one axis of its own frame for {course:.0%} only"] if course < _LEAST_COURSE else []
+    if upright < _LEAST_UPRIGHT:
+        degrees = math.degrees(math.acos(np.clip(upright, -1, 1)))
+        faults.append(f"lies on its side or its roof: its sensors' upward axes are {degrees:.0f}° from z")
+    if not faults:
         return []
-    fits: list[tuple[float, Reading]] = []
+    fits = []
     for reading in of_path():
         assert reading.path is not None
         other = reading.path(path)
-        measured = _course(other), _upright(recording, other)
-        if measured[0] >= max(_GOOD_COURSE, course - 0.01) and measured[1] >= _GOOD_UPRIGHT:
-            fits.append((sum(measured), reading))
-    best = max(fits, key=lambda one: round(one[0], 2), default=None)
-    faults = [f"only {course:.0%} of its motion is along one axis of its own frame"] if course < _LEAST_COURSE else []
-    if upright < _LEAST_UPRIGHT:
-        faults.append(f"its sensors' upward axes are {math.degrees(math.acos(np.clip(upright, -1, 1))):.0f}° from z")
-    remedy = (
-        f"That is right if {best[1].said}."
-        if best
-        else "Check the order of the quaternions (x y z w), poses.up, poses.of and the axes."
-    )
-    return [f"By the poses the vehicle does not move like one: {' and '.join(faults)}. {remedy}"]
+        plausible = _SLOWEST_M_S <= _speed(other) <= _FASTEST_M_S / 2 and _course(other) >= max(course, _GOOD_COURSE)
+        if plausible and _upright(recording, other) >= _GOOD_UPRIGHT:
+            fits.append(reading.said)
+    remedy = "Check the order of the quaternions (x y z w), poses.up, poses.of, and the units."
+    if fits:
+        remedy = f"It does not if {', or if '.join(fits[:3])}."
+    return [f"By the poses the vehicle {' and '.join(faults)}. {remedy}"]
 
 
 def _course(path: Trajectory) -> float:
