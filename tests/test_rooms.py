@@ -28,7 +28,7 @@ MOST_LINES = {
     "edge_depth_nerf/plugin": 4_780,
     "edge_depth_nerf/plugin/fused": 740,
     "edge_depth_nerf/poses": 830,
-    "edge_depth_nerf/process": 4_400,
+    "edge_depth_nerf/process": 5_200,
     "edge_depth_nerf/process/colmap": 1_750,
     "edge_depth_nerf/process/kitti360": 660,
     "edge_depth_nerf/report": 790,

@@ -230,8 +230,6 @@ def _posed(recording: Recording, options: ProcessOptions, console: Console) -> t
         notices = lidar_says(recording, options.output, console)
     elif options.poses == "lidar":
         notices = features_say(recording, options, console)
-    if recording.trajectory is None:
-        raise InputError("the recording has no poses. Give them, or compute them: --poses lidar, --poses colmap.")
     if options.refine_poses:
         from edge_depth_nerf.process.colmap.refine import check_refining, refine_poses
 

@@ -1,6 +1,6 @@
 """Whether LiDAR fits the pictures, the path and itself, and which other reading of the recording fits better.
 
-Three things are measured on a few frames, each as it depends on how the recording is read:
+Three things are measured on a few frames, for each way to read the recording:
 
 - A LiDAR point is seen by two pictures of a camera between which the vehicle has moved. If its distance and place are
   right, both have the same contrast there: brightness against its surroundings, in which exposure cancels. What the
@@ -78,7 +78,7 @@ _LEAST_LACK = 0.03
 _MOVES = 0.6
 """A reading fits only if its lack is less than this part of what it were if the camera had not moved."""
 _DOUBT = 0.3
-"""Large faults are looked for only above this lack, or where the ratio is off."""
+"""`_best` searches for large faults only above this lack, or where the ratio is off."""
 _TRIED_WHOLE = 8
 """So many readings, the best on some of the pairs, are tried on all of them."""
 _FEWEST_RATIOS = 30
@@ -137,7 +137,7 @@ class _Points:
 
 @dataclass(frozen=True)
 class _Scan:
-    """A sweep, as it is looked at."""
+    """Points of a sweep for each of the comparisons."""
 
     seen: _Points
     edges: _Points
@@ -217,7 +217,7 @@ def _steps(points: Float64[np.ndarray, "n 3"]) -> np.ndarray:
 
 
 class _View:
-    """A camera of the recording, and what of it is looked at."""
+    """A camera of the recording, with the pictures that are compared."""
 
     def __init__(self, recording: Recording, camera: RecordedCamera, usable: Bool[np.ndarray, "h w"]) -> None:
         self.camera, self._path = camera, recording.trajectory
@@ -497,12 +497,12 @@ def check_lidar(recording: Recording, usable: Mapping[str, Bool[np.ndarray, "h w
     warnings: list[str] = []
     for name in dict.fromkeys(sweep.scanner for sweep in recording.sweeps):
         source = _Source(recording, name)
-        found, said = _judged(source, views)
+        found, said = _evaluated(source, views)
         figures += found
         warnings += said
     for view in views:
         if view.pairs and view.pairs[0].pictures[0].depth is not None:
-            found, said = _judged(_Source(recording, view.camera.name), [view])
+            found, said = _evaluated(_Source(recording, view.camera.name), [view])
             figures += found
             warnings += said
     return LidarCheck(tuple(figures), tuple(dict.fromkeys(warnings)))
@@ -539,7 +539,7 @@ def _file_warnings(source: _Source, views: Sequence[_View]) -> list[str]:
     return found
 
 
-def _judged(source: _Source, views: Sequence[_View]) -> tuple[list[LidarFigures], list[str]]:
+def _evaluated(source: _Source, views: Sequence[_View]) -> tuple[list[LidarFigures], list[str]]:
     if of_files := _file_warnings(source, views):
         return [], of_files
     given = {view: source.fit(view, view.pairs, Reading()) for view in views if view.pairs}

@@ -31,7 +31,7 @@ def mask_warnings(recording: Recording, lenses: Mapping[str, Bool[np.ndarray, "h
     """Say which cameras' masks are inverted, or hide most of the lens.
 
     Args:
-        recording: with the masks that are given. Those of single pictures are looked at in some.
+        recording: with the masks that are given. Of those of single pictures, some are read.
         lenses: of each camera, True within its lens.
     """
     found = []

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 
 import cv2
 import numpy as np
@@ -19,6 +20,7 @@ from edge_depth_nerf.base.files import read_image
 from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.poses.breaks import find_break
+from edge_depth_nerf.process.reading import read_if_whole
 from edge_depth_nerf.process.readings import of_path
 from edge_depth_nerf.process.recording import RecordedPicture, Recording
 
@@ -102,7 +104,10 @@ def _stands(
 
 def _alike(first: RecordedPicture, second: RecordedPicture, usable: Bool[np.ndarray, "h w"]) -> bool:
     """Whether two pictures show the same at the same place."""
-    grey = [cv2.cvtColor(read_image(one.path), cv2.COLOR_RGB2GRAY).astype(np.float32) for one in (first, second)]
+    read = [read_if_whole(partial(read_image, one.path)) for one in (first, second)]
+    if read[0] is None or read[1] is None:
+        return False
+    grey = [cv2.cvtColor(one, cv2.COLOR_RGB2GRAY).astype(np.float32) for one in (read[0], read[1])]
     small = [cv2.resize(one, (96, 96), interpolation=cv2.INTER_AREA) for one in grey]
     inner = cv2.resize(usable.astype(np.uint8), (96, 96), interpolation=cv2.INTER_NEAREST)
     inner = cv2.erode(inner, np.ones((9, 9))) > 0
