@@ -40,7 +40,17 @@ from edge_depth_nerf.lidar import Sweep
 from edge_depth_nerf.lidar.scans import columns_told
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.process.reading import downscale_image, downscale_mask, read_depth, read_if_whole
-from edge_depth_nerf.process.readings import OFF, Reading, mountings, of_maps, of_path, of_scans, small, turn
+from edge_depth_nerf.process.readings import (
+    CLEAR_SMALL,
+    OFF,
+    Reading,
+    mountings,
+    of_maps,
+    of_path,
+    of_scans,
+    small,
+    turn,
+)
 from edge_depth_nerf.process.recording import RecordedCamera, RecordedPicture, RecordedSweep, Recording
 
 _CONTRAST_PX, _EDGES_PX = 320, 704
@@ -468,16 +478,19 @@ def _of_point_times(source: _Source) -> list[Reading]:
             if by_azimuth
             else "the point times of {name} count backwards: change their sign, or timestamp",
             point_times=lambda given: 2 * middle_s - given,
+            clear=CLEAR_SMALL,
         ),
         Reading(
             "the scans of {name} begin on the other side: add 180 to start_azimuth_deg"
             if by_azimuth
             else "the point times of {name} are off by half a turn",
             point_times=other_half,
+            clear=CLEAR_SMALL,
         ),
         Reading(
             "the points of {name} are corrected for the vehicle's motion already: set corrected_to",
             point_times=lambda given: np.full_like(given, middle_s),
+            clear=CLEAR_SMALL,
         ),
     ]
 

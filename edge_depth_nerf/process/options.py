@@ -85,7 +85,7 @@ class ProcessOptions:
     Off: the scene gets no maps. With that command you can add those of other networks, or of a larger one."""
     strict: bool = False
     """Stop at the first broken or missing picture, sweep or map, and if something seems to be wrong with the recording,
-    such as a unit or a clock. Otherwise up to a tenth of them are left out of the scene, and all is named at the end."""
+    such as a unit or a clock. Otherwise up to a tenth of them are left out of the scene and named at the end."""
     sky: tyro.conf.Suppress[bool] = True
     """Give the sky no monocular distance, instead of a wrong one."""
     cluster: str | None = None

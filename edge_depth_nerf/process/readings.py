@@ -16,7 +16,7 @@ from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar.trajectory import Trajectory
 
 CLEAR, CLEAR_SMALL = 0.35, 0.18
-"""A reading is named from this gain on; an angle or a shift of a clock, whose right amount is searched, from less."""
+"""A reading is named from this gain on; angles and times, which change the figures less, from the second on."""
 OFF = 1.15
 """A ratio further from 1 than this is reported."""
 
