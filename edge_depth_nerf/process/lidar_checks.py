@@ -558,16 +558,11 @@ def _evaluated(source: _Source, views: Sequence[_View]) -> tuple[list[LidarFigur
     given = {view: source.fit(view, view.pairs, Reading()) for view in views if view.pairs}
     apart_m = source.apart_m(Reading())
     figures = [_figures(source, view, fit, apart_m) for view, fit in given.items()]
-    ratios = [one.ratio for one in figures if one.ratio is not None]
-    ratio = float(np.exp(np.median(np.log(ratios)))) if ratios else None
-    best = _best(source, given, apart_m, ratio)
+    off = [one for one in figures if one.ratio is not None and abs(math.log(one.ratio)) > math.log(OFF)]
+    best = _best(source, given, apart_m, bool(off) or any(fit.lack > _DOUBT for fit in given.values()))
     if best:
         return figures, [_said(one) for one in best]
-    unfit = [
-        one
-        for one in figures
-        if one.ratio is not None and (one.correlation < _FITTING or abs(math.log(one.ratio)) > math.log(OFF))
-    ]
+    unfit = [one for one in figures if one in off or (one.ratio is not None and one.correlation < _FITTING)]
     return figures, [
         f"{one.scanner} does not lie on what {one.camera} shows: its distances are {one.ratio:.2f} times those of the "
         f"pictures (median), and contrast agrees by {one.correlation:.2f} only (1 is best). No other reading that was "
@@ -576,16 +571,14 @@ def _evaluated(source: _Source, views: Sequence[_View]) -> tuple[list[LidarFigur
     ]
 
 
-def _best(source: _Source, given: dict[_View, _Fit], apart_m: float | None, ratio: float | None) -> list[_Candidate]:
+def _best(source: _Source, given: dict[_View, _Fit], apart_m: float | None, doubt: bool) -> list[_Candidate]:
     """The readings that fit clearly better: one of the scanner or the path, or one for each camera."""
     views = tuple(given)
-    doubt = any(fit.lack > _DOUBT for fit in given.values())
-    doubt = doubt or (ratio is not None and abs(math.log(ratio)) > math.log(OFF))
     if not source.sweeps:
-        of_all = of_maps(ratio)
+        of_all = of_maps()
     else:
         of_all = [*small("scanner"), *_of_point_times(source)]
-        of_all += [*mountings("scanner"), *of_scans(ratio)] if doubt else []
+        of_all += [*mountings("scanner"), *of_scans()] if doubt else []
     of_all += of_path() if doubt else []
     tried = [_Candidate(reading, source.name, views) for reading in of_all]
     for view in views:

@@ -102,6 +102,11 @@ def _named(change: Float64[np.ndarray, "3 3"]) -> str:
 
 UNITS = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254, "feet": 0.3048, "yards": 0.9144}
 """Metres per unit."""
+_FACTORS = [0.15 * step for step in range(-20, 21) if step]
+"""Logarithms of factors on lengths, a twentieth to twenty."""
+_FINER = 0.075
+_SAME_UNIT = 0.05
+"""A unit is the one that is known if their logarithms differ by less."""
 _CLOCKS_S = (0.05, 0.1, 0.2, 0.5, 1.0)
 _ANGLES_DEG = (2.0, 5.0)
 
@@ -150,42 +155,47 @@ def mountings(sensor: str) -> list[Reading]:
     return found
 
 
-def _unit_said(metres: float) -> str:
-    near = [unit for unit, size in UNITS.items() if abs(math.log(metres / size)) < 0.05]
-    return f"{near[0]}? metres_per_unit = {UNITS[near[0]]:g}" if near else f"metres? metres_per_unit = {metres:.3g}"
+def _in_unit(logarithm: float) -> Reading:
+    """The points' coordinates in a unit of so many metres."""
+    metres = math.exp(logarithm)
+    near = min(UNITS.items(), key=lambda item: abs(math.log(metres / item[1])))
+    known = abs(math.log(metres / near[1])) < _SAME_UNIT
+    asked = f"are the points of {{name}} in {near[0]}? " if known else "is their unit not the metre? "
+    metres = near[1] if known else metres
+    said = f"LiDAR's distances are {1 / metres:.3g} times what the pictures show: {asked}metres_per_unit = {metres:.4g}"
+    scaled = np.diag([metres, metres, metres, 1.0])
+    return Reading(said, scanner=_after(scaled), scales=True, finer=_in_unit, amount=logarithm, step=_FINER)
 
 
-def of_scans(ratio: float | None) -> list[Reading]:
+def _longer(logarithm: float) -> Reading:
+    """Depth maps whose distances are to be longer by a factor."""
+    factor = math.exp(logarithm)
+    said = (
+        f"the depth maps of {{name}} show {1 / factor:.3g} times what the pictures show: multiply metres_per_count by "
+        f"{factor:.3g}"
+    )
+    return Reading(said, to_distance=lambda far, _: far * factor, finer=_longer, amount=logarithm, step=_FINER)
+
+
+def of_scans() -> list[Reading]:
     """Other units of the points."""
-    sizes = [*UNITS.values(), *([1 / ratio] if ratio and abs(math.log(ratio)) > math.log(OFF) else [])]
-    return [
-        Reading(
-            f"LiDAR's distances are {1 / size:.3g} times what the pictures show: are the points of {{name}} in "
-            + _unit_said(size),
-            scanner=_after(np.diag([size, size, size, 1.0])),
-            scales=True,
-        )
-        for size in sizes
-    ]
+    return [_in_unit(logarithm) for logarithm in _FACTORS]
 
 
-def of_maps(ratio: float | None) -> list[Reading]:
+def of_maps() -> list[Reading]:
     """Other kinds and units of depth maps."""
-    found = [
-        Reading(
-            "the depth maps of {name} hold z_depth: set kind", to_distance=lambda far, cosine: far / cosine.clip(0.05)
-        ),
-        Reading(
-            "the depth maps of {name} hold distance: set kind", to_distance=lambda far, cosine: far * cosine.clip(0.05)
-        ),
+
+    def as_z(far: np.ndarray, cosine: np.ndarray) -> np.ndarray:
+        return far / cosine.clip(0.05)
+
+    def as_distance(far: np.ndarray, cosine: np.ndarray) -> np.ndarray:
+        return far * cosine.clip(0.05)
+
+    return [
+        Reading("the depth maps of {name} hold z_depth: set kind", to_distance=as_z),
+        Reading("the depth maps of {name} hold distance: set kind", to_distance=as_distance),
+        *(_longer(logarithm) for logarithm in _FACTORS),
     ]
-    if ratio and abs(math.log(ratio)) > math.log(OFF):
-        said = (
-            f"the depth maps of {{name}} are {ratio:.3g} times what the pictures show: multiply metres_per_count by "
-            f"{1 / ratio:.3g}"
-        )
-        found.append(Reading(said, to_distance=lambda far, _: far / ratio))
-    return found
 
 
 def of_path() -> list[Reading]:
