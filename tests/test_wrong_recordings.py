@@ -152,6 +152,19 @@ def test_columns_of_a_file_are_told(tmp_path: Path, recording: Recording, count:
     assert columns_told(path) == count
 
 
+def test_the_real_drive(real_data: Path) -> None:
+    recording = read_rig_recording(RigOptions(root=real_data / "kitti360_drive", output=Path("unused")))
+    found = checked(recording)
+    assert found.warnings == () and found.figures[0].correlation > 0.9
+    assert found.figures[0].ratio == pytest.approx(1, abs=0.05)
+    sweeps = []
+    for one in recording.sweeps:
+        assert one.timing is not None
+        sweeps.append(replace(one, timing=replace(one.timing, clockwise=False)))
+    (warning,) = checked(replace(recording, sweeps=tuple(sweeps))).warnings
+    assert "roof turns the other way: change its direction" in warning
+
+
 # ---- depth maps --------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     ("factor", "kind", "said"),
