@@ -504,6 +504,9 @@ def check_lidar(recording: Recording, usable: Mapping[str, Bool[np.ndarray, "h w
     Args:
         recording: with the vehicle's path. Files that cannot be read are passed over.
         usable: of each camera at its pictures' size, True where they may be used.
+
+    Raises:
+        InputError: no scan of a scanner can be read.
     """
     views = [_View(recording, camera, usable[camera.name]) for camera in recording.cameras]
     figures: list[LidarFigures] = []
@@ -532,6 +535,9 @@ def _file_warnings(source: _Source, views: Sequence[_View]) -> list[str]:
                 f"Name all {told} in columns of lidars.{source.name}."
             )
     read = [sweep for one in looked_at if (sweep := read_if_whole(one.read)) is not None]
+    if looked_at and not read:
+        # none can be read: say why before anything long
+        looked_at[0].read()
     far = [sweep.too_far / (sweep.too_far + len(sweep.points_m)) for sweep in read]
     if far and np.median(far) > _FAR_SHARE:
         found.append(
