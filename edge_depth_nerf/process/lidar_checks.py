@@ -567,7 +567,7 @@ def _evaluated(source: _Source, views: Sequence[_View]) -> tuple[list[LidarFigur
     off = [one for one in figures if one.ratio is not None and abs(math.log(one.ratio)) > math.log(OFF)]
     best = _best(source, given, apart_m, bool(off) or any(fit.lack > _DOUBT for fit in given.values()))
     if best:
-        return figures, [_said(one) for one in best]
+        return figures, [_said(best)]
     unfit = [one for one in figures if one in off or (one.ratio is not None and one.correlation < _FITTING)]
     return figures, [
         f"{one.scanner} does not lie on what {one.camera} shows: its distances are {one.ratio:.2f} times those of the "
@@ -647,11 +647,15 @@ def _refined(source: _Source, best: _Candidate, given: dict[_View, _Fit], apart_
     return best
 
 
-def _said(best: _Candidate) -> str:
+def _said(best: Sequence[_Candidate]) -> str:
+    fits = ", and ".join(one.reading.said.replace("{name}", one.sensor) for one in best)
+    then, given = (
+        ", ".join(f"{1 - lack:.2f}" for lack in lacks)
+        for lacks in zip(*((b.lack, b.before) for b in best), strict=True)
+    )
     return (
-        "LiDAR does not lie on what the pictures show. It does if "
-        f"{best.reading.said.replace('{name}', best.sensor)} (contrast at its points agrees by {1 - best.lack:.2f} "
-        f"then, by {1 - best.before:.2f} as given)."
+        f"LiDAR does not lie on what the pictures show. It does if {fits} (contrast at its points agrees by {then} "
+        f"then, by {given} as given)."
     )
 
 

@@ -24,8 +24,8 @@ QUATERNION_TOLERANCE = 1e-3
 SAME_POSE_M, SAME_POSE_DEG = 0.02, 0.2
 """Poses of one time that differ by no more are one; the first counts."""
 
-DOUBLED_SHARE = 0.01
-"""Of so many lines the time may be that of the line before."""
+DOUBLED_SHARE, FEW_POSES = 0.01, 10
+"""Of so many lines the time may be that of the line before; of one in any case, if there are not fewer poses."""
 
 
 def read_tum(path: Path) -> tuple[Float64[np.ndarray, "poses"], Float64[np.ndarray, "poses 4 4"], list[int]]:
@@ -65,7 +65,7 @@ def read_tum(path: Path) -> tuple[Float64[np.ndarray, "poses"], Float64[np.ndarr
             continue
         times.append(values[0])
         poses.append(pose)
-    if len(doubled) > DOUBLED_SHARE * len(times):
+    if len(doubled) > max(DOUBLED_SHARE * len(times), len(times) >= FEW_POSES):
         raise InputError(doubled[0][1])
     return np.array(times, np.float64), np.array(poses, np.float64).reshape(-1, 4, 4), [line for line, _ in doubled]
 
