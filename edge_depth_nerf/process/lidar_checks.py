@@ -91,6 +91,8 @@ _DOUBT = 0.3
 """`_best` searches for large faults only above this lack, or where the ratio is off."""
 _TRIED_WHOLE = 8
 """So many readings, the best on some of the pairs, are tried on all of them."""
+_UNSEEN = 5
+"""A scanner of which a pair of pictures sees fewer of `_POINTS` points does not see what the camera sees."""
 _FEWEST_RATIOS = 30
 """The median of fewer ratios says nothing."""
 _SEARCHED = 800
@@ -175,6 +177,8 @@ class _Fit:
     """The lack if the points were at the same pixels in both: as if the camera had not moved."""
     edge: float
     """0 without edges."""
+    points: int
+    """How many points both pictures of a pair see."""
     tells: bool
     """Whether enough points lie on things with contrast."""
 
@@ -325,7 +329,7 @@ def _fit(values: Sequence[np.ndarray], edges: Sequence[tuple[float, int]]) -> _F
         return max(1 - float(first @ other) / max(math.sqrt(power * float(other @ other)), 1e-9), _LEAST_LACK)
 
     edge = float(strength) / count if count >= _FEWEST / 4 else 0.0
-    return _Fit(lack(second) if tells else 1.0, lack(still) if tells else 1.0, edge, tells)
+    return _Fit(lack(second) if tells else 1.0, lack(still) if tells else 1.0, edge, len(first), tells)
 
 
 class _Source:
@@ -569,7 +573,12 @@ def _evaluated(source: _Source, views: Sequence[_View]) -> tuple[list[LidarFigur
     if best:
         return figures, [_said(best)]
     unfit = [one for one in figures if one in off or (one.ratio is not None and one.correlation < _FITTING)]
-    return figures, [
+    unseen = [view.camera.name for view, fit in given.items() if fit.points < _UNSEEN * len(view.pairs)]
+    said = [
+        f"No point of {source.name} lies in the pictures of {', '.join(unseen)}. If its field meets theirs, check "
+        "to_vehicle of both (in metres?), the clocks, and the times of its points."
+    ]
+    return figures, (said if unseen else []) + [
         f"{one.scanner} does not lie on what {one.camera} shows: its distances are {one.ratio:.2f} times those of the "
         f"pictures (median), and contrast agrees by {one.correlation:.2f} only (1 is best). No other reading that was "
         "tried fits. Check to_vehicle, the clocks, the units and the poses."

@@ -129,7 +129,7 @@ def _misread(recording: Recording, path: Trajectory) -> list[str]:
     for reading in of_path():
         assert reading.path is not None
         other = reading.path(path)
-        plausible = _SLOWEST_M_S <= _speed(other) <= _FASTEST_M_S / 2 and _course(other) >= max(course, _GOOD_COURSE)
+        plausible = _SLOWEST_M_S <= _speed(other) <= _FASTEST_M_S / 2 and _course(other) >= _GOOD_COURSE
         if plausible and _upright(recording, other) >= _GOOD_UPRIGHT:
             fits.append(reading.said)
     remedy = "Check the order of the quaternions (x y z w), poses.up, poses.of, and the units."
