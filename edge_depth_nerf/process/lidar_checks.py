@@ -91,6 +91,8 @@ _DOUBT = 0.3
 """`_best` searches for large faults only above this lack, or where the ratio is off."""
 _TRIED_WHOLE = 8
 """So many readings, the best on some of the pairs, are tried on all of them."""
+_LEAST_GAINS = (-0.05, 0.01)
+"""Of a small angle or shift, contrast may lose so much at most, and edges must gain so much."""
 _UNSEEN = 5
 """A scanner of which a pair of pictures sees fewer of `_POINTS` points does not see what the camera sees."""
 _FEWEST_RATIOS = 30
@@ -635,7 +637,10 @@ def _tried(
         return candidate
     gain = math.log(lacks[0] / lacks[1])
     steps = [math.log(a.edge / b.edge) for b, a in told if a.edge > 0 and b.edge > 0]
-    gain += 3 * float(np.clip(np.mean(steps), -0.15, 0.15)) if steps else 0.0
+    step = float(np.clip(np.mean(steps), -0.15, 0.15)) if steps else 0.0
+    if some is None and reading.both and (gain < _LEAST_GAINS[0] or step < _LEAST_GAINS[1]):
+        return candidate
+    gain += 3 * step
     of_sweeps = candidate.sensor == source.name and not reading.scales
     if apart_m is not None and of_sweeps and gain > -0.2:
         other_m = source.apart_m(reading)

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar.trajectory import Trajectory
 
-CLEAR, CLEAR_SMALL = 0.35, 0.18
+CLEAR, CLEAR_SMALL = 0.35, 0.2
 """A reading is named from this gain on; angles and times, which change the figures less, from the second on."""
 OFF = 1.15
 """A ratio further from 1 than this is reported."""
@@ -49,6 +49,9 @@ class Reading:
     """Whether it changes lengths: sweeps that are smaller are less apart, which says nothing."""
     clear: float = CLEAR
     """The gain that it needs."""
+    both: bool = False
+    """Whether it must fit the edges and the contrasts, each for itself: small turns of a camera may fit contrasts alone,
+    in a good recording of a car park by 0.6."""
     finer: Callable[[float], Reading] | None = None
     """The same by another amount, where it has one."""
     amount: float = 0.0
@@ -138,7 +141,7 @@ def small(sensor: str) -> list[Reading]:
     found = []
     for by, sizes in amounts:
         for size in sizes:
-            found += [replace(by(amount), step=size / 2, clear=CLEAR_SMALL) for amount in (size, -size)]
+            found += [replace(by(amount), step=size / 2, clear=CLEAR_SMALL, both=True) for amount in (size, -size)]
     return found
 
 
