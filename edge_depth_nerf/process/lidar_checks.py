@@ -29,7 +29,7 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Float64, UInt8
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from edge_depth_nerf.base.files import read_distance_png, read_image
 from edge_depth_nerf.base.numbers import spread_over
@@ -258,7 +258,7 @@ class _View:
             read = [read_if_whole(partial(read_image, picture.path)) for picture in pairs[index]]
             if read[0] is None or read[1] is None:
                 continue
-            contrasts = [_contrast(downscale_image(picture, self._factors[0])) for picture in read]
+            contrasts = [_contrast(downscale_image(picture, self._factors[0])) for picture in (read[0], read[1])]
             edges = _edges(downscale_image(read[0], self._factors[1]))
             inner = self._finer_usable > 0
             edges /= max(float(edges[inner].mean()) if inner.any() else 1.0, 1e-6)
@@ -421,7 +421,7 @@ class _Source:
         found = []
         for few, many in self._two_sweeps:
             points, others = few.world(reading, self._path), many.world(reading, self._path)
-            distance_m, nearest = cKDTree(others).query(points, 10, distance_upper_bound=1.0)
+            distance_m, nearest = KDTree(others).query(points, 10, distance_upper_bound=1.0)
             met = np.isfinite(distance_m).all(-1)
             around = others[nearest[met]]
             middle = around.mean(1)
@@ -574,7 +574,8 @@ def _evaluated(source: _Source, views: Sequence[_View]) -> tuple[list[LidarFigur
     best = _best(source, given, apart_m, bool(off) or any(fit.lack > _DOUBT for fit in given.values()))
     if best:
         return figures, [_said(best)]
-    unfit = [one for one in figures if one in off or (one.ratio is not None and one.correlation < _FITTING)]
+    poor = [one for one in figures if one.ratio is not None and one.correlation < 1 - _DOUBT]
+    unfit = [one for one in poor if one in off or one.correlation < _FITTING]
     unseen = [view.camera.name for view, fit in given.items() if fit.points < _UNSEEN * len(view.pairs)]
     said = [
         f"No point of {source.name} lies in the pictures of {', '.join(unseen)}. If its field meets theirs, check "

@@ -50,8 +50,8 @@ class Reading:
     clear: float = CLEAR
     """The gain that it needs."""
     both: bool = False
-    """Whether it must fit the edges and the contrasts, each for itself: small turns of a camera may fit contrasts alone,
-    in a good recording of a car park by 0.6."""
+    """Whether it must fit edges and contrasts, each for itself: a small turn of a camera may fit contrasts alone, in a
+    good recording of a car park by 0.6."""
     finer: Callable[[float], Reading] | None = None
     """The same by another amount, where it has one."""
     amount: float = 0.0
@@ -68,6 +68,10 @@ def _turned(axis: str, degrees: float) -> Transform:
 
 def _after(change: Transform) -> Change:
     return lambda given: given @ change
+
+
+def _inverse(given: Transform) -> Transform:
+    return np.linalg.inv(given)
 
 
 def _rescaled(given: Transform, metres: float) -> Transform:
@@ -114,14 +118,17 @@ _CLOCKS_S = (0.05, 0.1, 0.2, 0.5, 1.0)
 _ANGLES_DEG = (2.0, 5.0)
 
 
+def _mounting(sensor: str, said: str, change: Change) -> Reading:
+    """Another transform from a "scanner" or a "camera" to the vehicle."""
+    return Reading(said, scanner=change) if sensor == "scanner" else Reading(said, camera=change)
+
+
 def turn(sensor: str, axis: str) -> Callable[[float], Reading]:
     """Make readings that turn a "scanner" or a "camera" about an axis of its own, by degrees."""
 
     def by(degrees: float) -> Reading:
         said = f"{{name}} is turned by {degrees:.1f}° about its {axis} axis: multiply to_vehicle by this from the right"
-        change = _after(_turned(axis, degrees))
-        of = {"scanner": change} if sensor == "scanner" else {"camera": change}
-        return Reading(said, **of, finer=by, amount=degrees)  # pyright: ignore[reportArgumentType]
+        return replace(_mounting(sensor, said, _after(_turned(axis, degrees))), finer=by, amount=degrees)
 
     return by
 
@@ -129,8 +136,9 @@ def turn(sensor: str, axis: str) -> Callable[[float], Reading]:
 def _later(sensor: str) -> Callable[[float], Reading]:
     def by(seconds: float) -> Reading:
         said = f"the clock of {{name}} is apart from the others: add {seconds:.2f} to its time_offset_s"
-        of = {"scans_later_s": seconds} if sensor == "scanner" else {"pictures_later_s": seconds}
-        return Reading(said, **of, finer=by, amount=seconds)
+        if sensor == "scanner":
+            return Reading(said, scans_later_s=seconds, finer=by, amount=seconds)
+        return Reading(said, pictures_later_s=seconds, finer=by, amount=seconds)
 
     return by
 
@@ -147,14 +155,16 @@ def small(sensor: str) -> list[Reading]:
 
 def mountings(sensor: str) -> list[Reading]:
     """Large faults of a transform to the vehicle."""
-    found = [Reading("to_vehicle of {name} is inverted: give its inverse", **{sensor: np.linalg.inv})]
+    found = [
+        _mounting(sensor, "to_vehicle of {name} is inverted: give its inverse", lambda given: np.linalg.inv(given))
+    ]
     for change, said in _axes():
         if sensor == "scanner" or np.linalg.det(change[:3, :3]) > 0:
             remedy = "change its to_vehicle, or its points" if sensor == "scanner" else "change its to_vehicle"
-            found.append(Reading(f"{{name}} is {said}: {remedy}", **{sensor: _after(change)}))
+            found.append(_mounting(sensor, f"{{name}} is {said}: {remedy}", _after(change)))
     for unit, metres in UNITS.items():
         said = f"the translation in to_vehicle of {{name}} is in {unit}: give metres"
-        found.append(Reading(said, **{sensor: partial(_rescaled, metres=metres)}))
+        found.append(_mounting(sensor, said, partial(_rescaled, metres=metres)))
     return found
 
 
