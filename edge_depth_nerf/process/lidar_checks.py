@@ -423,7 +423,7 @@ class _Source:
             points, others = few.world(reading, self._path), many.world(reading, self._path)
             distance_m, nearest = KDTree(others).query(points, 10, distance_upper_bound=1.0)
             met = np.isfinite(distance_m).all(-1)
-            around = others[nearest[met]]
+            around = others[np.asarray(nearest)[met]]
             middle = around.mean(1)
             off = around - middle[:, None]
             sizes, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", off, off))
@@ -627,20 +627,20 @@ def _tried(
     some: Mapping[_View, Sequence[_Pair]] | None = None,
 ) -> _Candidate:
     """Try a reading, on some or all pairs of pictures, and with `apart_m` on sweeps."""
-    reading = candidate.reading
+    reading, unfit = candidate.reading, replace(candidate, gain=-math.inf)
     before = [given[view] for view in candidate.views]
     after = [source.fit(view, some[view] if some else view.pairs, reading) for view in candidate.views]
     told = [(b, a) for b, a in zip(before, after, strict=True) if b.tells or a.tells]
     if not told:
-        return candidate
+        return unfit
     lacks = sum(b.lack for b, _ in told), sum(a.lack for _, a in told)
     if lacks[1] > _MOVES * sum(a.still for _, a in told):
-        return candidate
+        return unfit
     gain = math.log(lacks[0] / lacks[1])
     steps = [math.log(a.edge / b.edge) for b, a in told if a.edge > 0 and b.edge > 0]
     step = float(np.clip(np.mean(steps), -0.15, 0.15)) if steps else 0.0
     if some is None and reading.both and (gain < _LEAST_GAINS[0] or step < _LEAST_GAINS[1]):
-        return candidate
+        return unfit
     gain += 3 * step
     of_sweeps = candidate.sensor == source.name and not reading.scales
     if apart_m is not None and of_sweeps and gain > -0.2:

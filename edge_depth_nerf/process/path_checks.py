@@ -64,7 +64,8 @@ def path_warnings(recording: Recording, usable: Mapping[str, Bool[np.ndarray, "h
     path = _looked_at(recording)
     places = path.vehicle_to_world[:, :3, 3]
     reach_m = float(np.linalg.norm(places - places[0], axis=-1).max())
-    if reach_m < _STANDS_M:
+    # a drive of a few frames may be short, and yet moves
+    if reach_m < min(_STANDS_M, _SLOWEST_M_S * float(path.times_s[-1] - path.times_s[0])):
         return [*found, _stands(recording, path, reach_m, usable)], True
     misread = _misread(recording, path)
     return [*found, *(misread or _broken(path))], bool(found) or _speed(path) > _FASTEST_M_S
