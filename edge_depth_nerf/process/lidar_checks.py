@@ -79,8 +79,9 @@ _FEWEST = 400
 """Fewer LiDAR points seen in both pictures say nothing."""
 _FAINTEST = 0.02
 """Pictures with less contrast at the LiDAR points (root mean square) say nothing."""
-_FITTING = 0.3
-"""And only if the lack that it leaves is less."""
+_FITTING, _FITTING_SMALL = 0.3, 0.1
+"""And only if the lack that it leaves is less; small angles and shifts must leave less, lest one pillar of a car park is
+taken for the next."""
 _LOG_RATIOS = np.linspace(-1.8, 1.8, 91)
 """Distances are searched from a sixth of LiDAR's to six times them."""
 _LEAST_LACK = 0.03
@@ -608,7 +609,11 @@ def _best(source: _Source, given: dict[_View, _Fit], apart_m: float | None, doub
     chosen = sorted(first, key=lambda one: -one.gain)[:_TRIED_WHOLE]
     chosen += [one for one in first if one.reading.point_times is not None and one not in chosen]
     whole = [_tried(source, one, given, apart_m) for one in chosen]
-    whole = [one for one in whole if one.gain >= one.reading.clear and one.lack < _FITTING]
+    whole = [
+        one
+        for one in whole
+        if one.gain >= one.reading.clear and one.lack < (_FITTING_SMALL if one.reading.both else _FITTING)
+    ]
     if not whole:
         return []
     best = max(whole, key=lambda one: one.gain)
