@@ -67,7 +67,7 @@ _POINTS = 3000
 """So many points of a scan are seen."""
 _SWEEPS_MOVED_M = 6.0
 """So far the vehicle has moved between two sweeps: what was measured ahead is then measured beside it."""
-_SWEEP_POINTS = (1000, 30_000)
+_SWEEP_POINTS = (2500, 60_000)
 """So many points of a sweep are held against so many of the other."""
 _SURROUNDINGS_PX = 4.0
 """Scale of what contrast is measured against."""
@@ -80,8 +80,8 @@ _FEWEST = 400
 _FAINTEST = 0.02
 """Pictures with less contrast at the LiDAR points (root mean square) say nothing."""
 _FITTING, _FITTING_SMALL = 0.3, 0.1
-"""And only if the lack that it leaves is less; small angles and shifts must leave less, lest one pillar of a car park is
-taken for the next."""
+"""And only if the lack that it leaves is less; of small angles and shifts, lest a pillar is taken for the next, the
+second."""
 _LOG_RATIOS = np.linspace(-1.8, 1.8, 91)
 """Distances are searched from a sixth of LiDAR's to six times them."""
 _LEAST_LACK = 0.03
