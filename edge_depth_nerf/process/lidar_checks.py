@@ -572,7 +572,9 @@ def _evaluated(source: _Source, views: Sequence[_View]) -> tuple[list[LidarFigur
     apart_m = source.apart_m(Reading())
     figures = [_figures(source, view, fit, apart_m) for view, fit in given.items()]
     off = [one for one in figures if one.ratio is not None and abs(math.log(one.ratio)) > math.log(OFF)]
-    best = _best(source, given, apart_m, bool(off) or any(fit.lack > _DOUBT for fit in given.values()))
+    known = sum(one.ratio is not None for one in figures)
+    doubt = len(off) * 2 > known or any(fit.lack > _DOUBT for fit in given.values())
+    best = _best(source, given, apart_m, doubt)
     if best:
         return figures, [_said(best)]
     poor = [one for one in figures if one.ratio is not None and one.correlation < 1 - _DOUBT]
