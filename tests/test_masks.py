@@ -472,3 +472,13 @@ def test_the_real_frame(real_data: Path) -> None:
     assert not found[lidar_points > 0].any()
     for path in (real_data / "kitti360_stereo").glob("*.png"):
         assert lens.dark_rim([read_image(path)]) is None
+
+
+@pytest.mark.parametrize(
+    ("columns", "kept"), [((10, 90), True), ((0, 20), True), ((80, 100), True), ((40, 60), False), ((15, 40), False)]
+)
+def test_a_vehicle_touches_the_lower_rim_broadly_or_a_corner(columns: tuple[int, int], kept: bool) -> None:
+    """Strips of lane that stay alike in a few pictures end in the middle of the lower edge."""
+    lens, vehicle = np.ones((60, 100), bool), np.zeros((60, 100), bool)
+    vehicle[40:, slice(*columns)] = True
+    assert ego._at_vehicles_place(vehicle, lens).any() == kept

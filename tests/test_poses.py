@@ -20,7 +20,7 @@ def text(folder: Path, content: str) -> Path:
 
 def test_tum(tmp_path: Path) -> None:
     # a quarter turn about z: x goes to y
-    times, poses = read_tum(
+    times, poses, _ = read_tum(
         text(tmp_path, f"# time x y z qx qy qz qw\n\n1.5 1 2 3 0 0 {HALF} {HALF}\n2.5 0 0 0 0 0 0 1\n")
     )
     assert times.tolist() == [1.5, 2.5]
@@ -30,11 +30,11 @@ def test_tum(tmp_path: Path) -> None:
 
 def test_poses_of_one_time_are_one(tmp_path: Path) -> None:
     """Sensors that were read at once bring the vehicle's pose each, with the digits that they have."""
-    times, poses = read_tum(text(tmp_path, "1 1 2 3 0 0 0 1\n1 1.01 2 3 0 0 0.001 1\n2 5 2 3 0 0 0 1\n"))
+    times, poses, _ = read_tum(text(tmp_path, "1 1 2 3 0 0 0 1\n1 1.01 2 3 0 0 0.001 1\n2 5 2 3 0 0 0 1\n"))
     assert times.tolist() == [1, 2]
     assert poses[0, :3, 3].tolist() == [1, 2, 3]
     # nanoseconds that float64 cannot tell apart
-    times, _ = read_tum(text(tmp_path, "315968112.449927216 1 2 3 0 0 0 1\n315968112.449927217 1 2 3 0 0 0 1\n"))
+    times, _, _ = read_tum(text(tmp_path, "315968112.449927216 1 2 3 0 0 0 1\n315968112.449927217 1 2 3 0 0 0 1\n"))
     assert len(times) == 1
 
 
@@ -105,3 +105,11 @@ def test_a_broken_transforms_json_is_named(tmp_path: Path, content: dict, messag
 def test_what_is_no_matrix_is_said(rows: object) -> None:
     with pytest.raises(InputError, match="here: expected 4 rows of 4 numbers"):
         transform_of_rows(rows, "here")
+
+
+def test_a_doubled_time_in_many_lines_is_left_out(tmp_path: Path) -> None:
+    lines = [f"{number} {number} 0 0 0 0 0 1" for number in range(200)]
+    lines.insert(31, "30 30.5 0 0 0 0 0 1")
+    times, poses, doubled = read_tum(text(tmp_path, "\n".join(lines)))
+    assert times.tolist() == list(range(200)) and doubled == [32]
+    assert poses[30, 0, 3] == 30

@@ -15,6 +15,7 @@ from rich.console import Console
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, read_mask, write_png
+from edge_depth_nerf.inspecting.findings import find
 from edge_depth_nerf.lidar import Sweep
 from edge_depth_nerf.masks.lens import lens_circle
 from edge_depth_nerf.process.build import _never_held_out
@@ -25,7 +26,7 @@ from edge_depth_nerf.process.found_path import upright
 from edge_depth_nerf.process.options import RigOptions
 from edge_depth_nerf.process.recording import Recording
 from edge_depth_nerf.process.rig import read_rig_recording
-from edge_depth_nerf.process.transform_checks import ContrastAgreement, agreement_notices, agreements
+from edge_depth_nerf.scene.reader import read_scene
 from edge_depth_nerf.scene.writer import ProcessReport
 from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
@@ -83,93 +84,10 @@ def test_a_cut_jpeg_is_left_out_and_named(mine: Path, downscale: int) -> None:
         run(mine, output=mine.parent / "strict", strict=True, **changes)
 
 
-# ---- inverted transforms -----------------------------------------------------------------------------------------
+# ---- what is wrong with a recording --------------------------------------------------------------------------------
 @pytest.fixture(scope="module")
 def recording(drive: Path) -> Recording:
     return read_rig_recording(RigOptions(root=drive, output=drive.parent / "unused"))
-
-
-def found(recording: Recording) -> list[ContrastAgreement]:
-    usable = {}
-    for camera in recording.cameras:
-        assert camera.ego_mask is not None
-        usable[camera.name] = lens_circle(camera.camera, 95.0) & read_mask(camera.ego_mask)
-    return agreements(recording, usable)
-
-
-def inverted(recording: Recording, cameras: tuple[str, ...] = (), scanner: bool = False) -> Recording:
-    turned = [
-        replace(camera, to_vehicle=np.linalg.inv(camera.to_vehicle)) if camera.name in cameras else camera
-        for camera in recording.cameras
-    ]
-    sweeps = [replace(one, to_vehicle=np.linalg.inv(one.to_vehicle)) if scanner else one for one in recording.sweeps]
-    return replace(recording, cameras=tuple(turned), sweeps=tuple(sweeps))
-
-
-def test_right_transforms_are_not_warned_of(recording: Recording) -> None:
-    measured = found(recording)
-    assert [one.camera for one in measured] == list(CAMERAS)
-    for one in measured:
-        assert one.given > 0.8 and one.better is None and one.fits
-    assert agreement_notices(measured) == []
-
-
-@pytest.mark.parametrize("which", [*CAMERAS, "all cameras", "scanner", "everything"])
-def test_an_inverse_is_noticed_and_said(recording: Recording, which: str) -> None:
-    wrong = CAMERAS if which in ("all cameras", "everything") else (which,) if which in CAMERAS else ()
-    measured = found(inverted(recording, wrong, scanner=which in ("scanner", "everything")))
-    expected = {"scanner": "scanner", "everything": "both"}.get(which, "camera")
-    concerned = CAMERAS if which in ("scanner", "everything") else wrong
-    assert {one.camera: one.better for one in measured} == {
-        name: expected if name in concerned else None for name in CAMERAS
-    }
-    (said,) = agreement_notices(measured)
-    named = re.search(r"With the inverse of .*? \((.*?)\) the pictures agree better", said)
-    assert named is not None and "to_vehicle inverted" in said
-    names = {"camera": ", ".join(wrong), "scanner": "roof", "both": "left, right, front and roof"}[expected]
-    assert named[1] == names
-
-
-def test_poses_of_the_pictures_own_tell_as_well(recording: Recording) -> None:
-    """With --poses colmap the cameras' poses are right whatever the transforms say, and the vehicle's follow them."""
-    assert recording.trajectory is not None
-    front = next(camera for camera in recording.cameras if camera.name == "front")
-    pictures = [
-        replace(picture, camera_to_world=recording.trajectory.at(np.array([picture.time_s]))[0] @ front.to_vehicle)
-        for picture in recording.pictures
-        if picture.camera == "front"
-    ]
-    own = replace(recording, cameras=(front,), pictures=tuple(pictures))
-    assert [one.better for one in found(own)] == [None]
-    assert [one.better for one in found(inverted(own, ("front",)))] == ["camera"]
-
-
-def test_what_tells_nothing_is_not_judged(recording: Recording) -> None:
-    assert recording.trajectory is not None
-    first = [picture for picture in recording.pictures if picture.frame == 0]
-    assert found(replace(recording, pictures=tuple(first))) == [], "a single moment"
-    assert found(replace(recording, sweeps=())) == [], "no LiDAR"
-    still = np.repeat(recording.trajectory.vehicle_to_world[:1], len(recording.trajectory.times_s), 0)
-    stands = replace(recording, trajectory=replace(recording.trajectory, vehicle_to_world=still))
-    assert found(stands) == [], "a vehicle that stands"
-
-
-def test_a_transform_of_other_axes_does_not_fit(recording: Recording) -> None:
-    upright = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-    cameras = [
-        replace(camera, to_vehicle=camera.to_vehicle @ upright) if camera.name == "front" else camera
-        for camera in recording.cameras
-    ]
-    (front,) = [one for one in found(replace(recording, cameras=tuple(cameras))) if one.camera == "front"]
-    assert front.given < 0.3
-
-
-def test_no_fit_is_said_where_the_pictures_could_tell() -> None:
-    unfit = ContrastAgreement("front", "roof", 0.1, {"camera": 0.2, "scanner": 0.1, "both": 0.15}, 0.7)
-    (said,) = agreement_notices([unfit])
-    assert "no inverse of a transform fits, either: front with roof (0.10)" in said
-    # noise has no agreement either way
-    assert agreement_notices([replace(unfit, still=0.3)]) == []
 
 
 def test_a_camera_that_is_never_held_out_is_named(recording: Recording) -> None:
@@ -227,22 +145,17 @@ def test_process_says_it_before_the_work(mine: Path) -> None:
     assert given is not None
     matrix = np.array(ast.literal_eval(f"[{given[2]}]"))
     edit(mine, lambda text: rows.sub(lambda match: match[1] + str(np.linalg.inv(matrix).tolist()), text))
+    with pytest.raises(InputError, match=r"to_vehicle of left is inverted.*Without --strict"):
+        run(mine, strict=True)
+    assert not (mine.parent / "scene/transforms.json").exists()
     report, said = run(mine)
-    (notice,) = [one for one in report.notices if "to_vehicle inverted" in one]
-    assert "(left)" in notice and notice in said
-    # a scene that is done is not looked at again
-    again, _ = run(mine)
-    assert again.written == 0 and not any("to_vehicle inverted" in one for one in again.notices)
-
-
-def test_the_real_drive(real_data: Path) -> None:
-    options = RigOptions(root=real_data / "kitti360_drive", output=Path("unused"))
-    recording = read_rig_recording(options)
-    usable = {"front": np.ones((376, 1408), bool)}
-    (one,) = agreements(recording, usable)
-    assert one.given > 0.9 and one.better is None
-    (one,) = agreements(inverted(recording, ("front",)), usable)
-    assert one.better == "camera" and one.given < 0.2
+    (warning,) = report.warnings
+    assert "to_vehicle of left is inverted" in warning and warning in said
+    # a scene that is done is not looked at again, and what was found is said again
+    again, said = run(mine)
+    assert again.written == 0 and again.warnings == report.warnings and warning in said
+    found = [one for one in find(read_scene(report.scene), []) if one.kind == "recording"]
+    assert [one.text.startswith(warning) for one in found] == [True]
 
 
 # ---- the vehicle -------------------------------------------------------------------------------------------------

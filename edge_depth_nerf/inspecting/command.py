@@ -25,7 +25,7 @@ from edge_depth_nerf.inspecting.figures import (
     measured_frames,
     path_figures,
 )
-from edge_depth_nerf.inspecting.findings import find, limited
+from edge_depth_nerf.inspecting.findings import checks_of, find, limited
 from edge_depth_nerf.inspecting.options import InspectOptions
 from edge_depth_nerf.inspecting.pose_check import check_poses, known_steps, pose_figures
 from edge_depth_nerf.inspecting.sheets import draw_sheet
@@ -90,7 +90,11 @@ def inspect_scene(options: InspectOptions, console: Console | None = None) -> di
         "measured": _sample(len(figures), len(scene.pictures)),
         "maps": map_figures(figures),
         "cameras": {
-            name: {**camera_figures(scene, name, figures), "epipolar": pose_figures(agreements, name)}
+            name: {
+                **camera_figures(scene, name, figures),
+                "epipolar": pose_figures(agreements, name),
+                "lidar_fit": [one for one in checks_of(scene).get("figures", ()) if one["camera"] == name],
+            }
             for name in scene.cameras()
         },
         "warnings": [asdict(finding) for finding in findings],
@@ -206,6 +210,10 @@ def _rows(cameras: Sequence[dict[str, Any]]) -> list[tuple[str, list[str]]]:
             return "–"
         return f"{camera['mono_over_lidar_median']:.2f}, {camera['mono_against_lidar_abs_rel']:.2f}"
 
+    def fitted(camera: dict[str, Any], form: str) -> str:
+        found = [one for one in camera["lidar_fit"] if all(one[key] is not None for key in re.findall(r"{(\w+)", form))]
+        return ", ".join(form.format(**one) for one in found) or "–"
+
     quantiles = "{median:.1f} m ({p5:.1f} to {p95:.1f})"
     rows = {
         "pictures (held out)": lambda c: f"{c['pictures']} ({c['held_out']})",
@@ -219,6 +227,13 @@ def _rows(cameras: Sequence[dict[str, Any]]) -> list[tuple[str, list[str]]]:
         "mono coverage": lambda c: _spread(c["mono_coverage"], ".0%"),
         "pixels with a prior": lambda c: _spread(c["prior_share"], ".0%"),
         "without a prior (sky, …)": lambda c: _number(c["no_prior_share"], ".0%"),
+        "LiDAR / motion's distance": lambda c: fitted(c, "{ratio:.2f} (±{ratio_spread:.2f})"),
+        "the same left, ahead, right": lambda c: " ".join(
+            _number(part, ".2f") for one in c["lidar_fit"] for part in one["ratio_by_side"]
+        ),
+        "contrast agrees at LiDAR": lambda c: fitted(c, "{correlation:.2f}"),
+        "edges at LiDAR's / beside": lambda c: fitted(c, "{edge:.2f}"),
+        "sweeps apart": lambda c: fitted(c, "{apart_m:.3f} m"),
         "LiDAR distance": lambda c: _filled(quantiles, c["lidar_distance_m"]),
         "prior distance": lambda c: _filled(quantiles, c["prior_distance_m"]),
         "sigma, median": lambda c: _number(c["sigma_median_m"], ".2f", " m"),

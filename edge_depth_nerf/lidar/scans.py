@@ -50,6 +50,8 @@ _MAX_TEXT_BYTES = 1 << 27
 _MAX_LZF_RATIO = 100
 """LZF makes at most 264 bytes of three."""
 _MAX_HEADER_BYTES = 1 << 16
+_LOOKED_AT = 200_000
+"""So many values of a file tell its columns."""
 _AGAIN = "Copy or export the file again, or delete it so that its frame is skipped."
 
 _PLY_TYPES = {
@@ -93,6 +95,8 @@ class ScanFormat:
     """What x, y, z, intensity are called in the files, where they are called something else."""
     times: PointTimes | None = None
     """Where each point's time is, if anywhere."""
+    metres_per_unit: float = 1.0
+    """Of the coordinates."""
 
     def name(self, quantity: str) -> str:
         """What x, y, z or intensity is called in the files."""
@@ -139,12 +143,21 @@ def read_scan(path: Path, scan: ScanFormat, time_s: float = 0.0) -> Sweep:
     """
     header = _read_header(path, scan)
     columns = _read_columns(path, header, [*scan.needed, scan.name("intensity")], scan)
-    points_m = np.stack([columns[scan.name(axis)] for axis in "xyz"], -1)
+    points_m = np.stack([columns[scan.name(axis)] for axis in "xyz"], -1) * scan.metres_per_unit
     intensity = columns.get(scan.name("intensity"), np.zeros(len(points_m)))
     offset_s = None
     if scan.times is not None:
         offset_s = torch.from_numpy(columns[scan.times.column] * scan.times.seconds_per_count - time_s)
     return usable_points(path, torch.from_numpy(points_m), torch.from_numpy(intensity), offset_s)
+
+
+def columns_told(path: Path) -> int:
+    """How many float32 columns a .bin file seems to have, 3 to 8: values of one column are alike in size."""
+    values = np.nan_to_num(np.fromfile(path, "<f4", _LOOKED_AT))
+    size = np.log(np.abs(np.clip(values, -1e6, 1e6)) + 0.01)
+    size -= size.mean()
+    alike = {count: float((size[count:] * size[:-count]).mean()) for count in range(3, 9)}
+    return min(count for count in alike if alike[count] >= 0.9 * max(alike.values()))
 
 
 def read_cloud(path: Path) -> tuple[Float64[np.ndarray, "points 3"], UInt8[np.ndarray, "points 3"] | None]:

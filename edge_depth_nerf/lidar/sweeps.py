@@ -60,6 +60,8 @@ class Sweep:
     """How many points were left out because they lie nearer than 0.5 m (zeros among them) or beyond 255 m."""
     offset_s: Float[Tensor, "points"] | None = None
     """When each point was measured, counted from the sweep's own time, if the file gives it; float64."""
+    too_far: int = 0
+    """How many of the points out of range lie beyond 255 m."""
 
 
 BEAM_RAD = math.radians(0.4)
@@ -128,8 +130,8 @@ def usable_points(
     if not usable.any():
         raise InputError(
             f"{path}: none of its {len(points_m)} points can be used ({int((~finite).sum())} are NaN or infinite, the "
-            f"others are nearer than {MIN_RANGE_M} m or beyond {MAX_RANGE_M:.0f} m). Copy the file again, or delete it "
-            "so that its frame is skipped."
+            f"others are nearer than {MIN_RANGE_M} m or beyond {MAX_RANGE_M:.0f} m). Set metres_per_unit if they are "
+            "in another unit; else copy the file again, or delete it so that its frame is skipped."
         )
     return Sweep(
         points_m=points_m[usable],
@@ -137,6 +139,7 @@ def usable_points(
         not_finite=int((~finite).sum()),
         out_of_range=int((finite & ~usable).sum()),
         offset_s=None if offset_s is None else offset_s[usable],
+        too_far=int((finite & (range_m > MAX_RANGE_M)).sum()),
     )
 
 

@@ -96,6 +96,11 @@ _SMALLEST_SHARE = 0.003
 """A smaller patch, as a share of the lens, is no part of a vehicle."""
 _LOWER_RIM = 0.3
 """The lower rim begins so far below the lens's middle, as a share of the way to its lowest point."""
+_BROAD = 0.4
+"""What is no lower corner of the picture must touch so much of the lower rim. On rendered drives vehicles touch 0.7
+or more, or a corner; lane markings and verges of a real road that stayed alike touched 0.25 in the middle."""
+_CORNER = 0.02
+"""Side of a corner."""
 _TOLERANCES = (1.0, 1.5, 2.25)
 """Factors on the noise, tried until the outline is clear: strong compression adds noise along edges alone."""
 _CLEAR = 0.9
@@ -173,6 +178,7 @@ def find_ego(
             vehicle, certainty = found
         if certainty >= _CLEAR:
             break
+    vehicle = _at_vehicles_place(vehicle, small_lens)
     if not vehicle.any():
         return NoEgo("No region at the lower border of the pictures stays the same while the vehicle moves.")
     if certainty < _MIN_CERTAINTY:
@@ -366,12 +372,28 @@ def _middle_row(lens: Bool[np.ndarray, "h w"]) -> int:
     return int((rows[0] + rows[-1]) / 2)
 
 
+def _lower_rim(lens: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    middle, lowest = _middle_row(lens), int(np.flatnonzero(lens.any(1))[-1])
+    rim = lens & ~eroded(lens, _LINK * max(lens.shape))
+    rim[: round(middle + _LOWER_RIM * (lowest - middle))] = False
+    return rim
+
+
+def _at_vehicles_place(vehicle: Bool[np.ndarray, "h w"], lens: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Keep the pieces that touch the lower rim broadly, or a lower corner of the picture."""
+    labels, sizes = components(vehicle)
+    rim, corner = _lower_rim(lens), max(2, round(_CORNER * max(lens.shape)))
+    broad = np.bincount(labels[rim], minlength=len(sizes)) >= _BROAD * rim.sum()
+    kept = broad & (sizes > 0)
+    for columns in (slice(None, corner), slice(-corner, None)):
+        kept[np.unique(labels[-corner:, columns])] = True
+    return kept[labels] & vehicle
+
+
 def _clean(still: Bool[np.ndarray, "h w"], lens: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Keep what reaches the lower rim, fill its holes, drop islands, smooth the outline."""
-    side = max(lens.shape)
-    middle, lowest = _middle_row(lens), int(np.flatnonzero(lens.any(1))[-1])
-    rim = lens & ~eroded(lens, _LINK * side)
-    rim[: round(middle + _LOWER_RIM * (lowest - middle))] = False
+    side, middle = max(lens.shape), _middle_row(lens)
+    rim = _lower_rim(lens)
     # outside the lens all is still, lest the patches are rounded off at the rim
     labels, sizes = components(opened(still | ~lens, _LINK * side / 2) & lens)
     at_rim = np.unique(labels[rim])

@@ -117,7 +117,8 @@ def reprojection_px(
     """How far each sighting lies from its point's image, to first order, in pixels; NaN without a point or behind."""
     poses = camera_to_world[tracks.picture]
     towards = np.einsum("nji,nj->ni", poses[:, :3, :3], points[tracks.track] - poses[:, :3, 3])
-    towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
+    # a point at the camera's own place has no direction
+    towards /= np.maximum(np.linalg.norm(towards, axis=-1, keepdims=True), 1e-12)
     ahead = (towards * tracks.sights.rays).sum(-1) > 0
     per_pixel = tracks.sights.ray_per_pixel
     square = np.einsum("nij,nik->njk", per_pixel, per_pixel)

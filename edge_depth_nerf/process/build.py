@@ -33,8 +33,11 @@ from edge_depth_nerf.masks.lens import lens_circle
 from edge_depth_nerf.masks.semantics import check_classes, keep_static, read_labels
 from edge_depth_nerf.masks.semantics import sky as sky_of_labels
 from edge_depth_nerf.masks.sky import find_sky
+from edge_depth_nerf.process.lidar_checks import LidarCheck, check_lidar
+from edge_depth_nerf.process.mask_checks import mask_warnings
 from edge_depth_nerf.process.moving import find_moving
 from edge_depth_nerf.process.options import ProcessOptions
+from edge_depth_nerf.process.path_checks import path_warnings
 from edge_depth_nerf.process.pose_checks import features_say, lidar_says
 from edge_depth_nerf.process.reading import (
     downscale_distance,
@@ -46,10 +49,9 @@ from edge_depth_nerf.process.reading import (
 )
 from edge_depth_nerf.process.recording import RecordedPicture, Recording
 from edge_depth_nerf.process.sweep_store import SweepStore
-from edge_depth_nerf.process.transform_checks import agreement_notices, agreements
 from edge_depth_nerf.process.vehicle import find_vehicle, vehicle_masks, with_given_masks
 from edge_depth_nerf.scene.checks import read_camera_mask
-from edge_depth_nerf.scene.format import TRANSFORMS
+from edge_depth_nerf.scene.format import CHECKS, TRANSFORMS
 from edge_depth_nerf.scene.points import PointCloud
 from edge_depth_nerf.scene.writer import (
     CLOUD,
@@ -90,6 +92,8 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
     with console.status("Checking cameras and files …"):
         source = _source(recording, options)
         check_cameras(_scene_cameras(recording, vehicle_masks(recording), options), options.theta_max_deg)
+    # poses that come with the drive are checked before anything long
+    checked = _checked(recording, options, console) if options.poses == "recorded" else None
     open_scene(options.output, source)
     if options.poses == "lidar":
         from edge_depth_nerf.process.lidar_poses import lidar_poses
@@ -102,6 +106,9 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
         recording, notices = find_vehicle(recording, training, options, console)
     recording, said = _posed(recording, options, console)
     notices += said
+    checked = checked or _checked(recording, options, console)
+    if checked.figures or not (options.output / CHECKS).is_file():
+        write_json(options.output / CHECKS, dataclasses.asdict(checked))
     if recording.skipped:
         say(console, f"Skipped {summarise(recording.skipped)}", "yellow")
     held_out, masks = _held_out(recording, options), vehicle_masks(recording)
@@ -122,7 +129,6 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
         )
         for picture in recording.pictures
     ]
-    notices += _disagreements(recording, masks, options, console)
     report = write_scene(
         options.output,
         cameras,
@@ -142,6 +148,7 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
         skipped=recording.skipped,
         left_out=(*recording.left_out, *report.left_out),
         notices=(*recording.notices, *notices, *builder.notices(), *report.notices),
+        warnings=checked.warnings,
     )
     _show(report, console)
     return report
@@ -174,18 +181,31 @@ def _never_held_out(recording: Recording, held_out: Collection[int], holdout_eve
     ]
 
 
-def _disagreements(
-    recording: Recording, masks: dict[str, NDArray[np.bool_]], options: ProcessOptions, console: Console
-) -> list[str]:
-    """Warn where LiDAR and the pictures contradict the given transforms. A complete scene was checked before."""
-    if (options.output / TRANSFORMS).is_file():
-        return []
-    usable = {}
-    for recorded in recording.cameras:
-        lens = lens_circle(recorded.camera, options.theta_max_deg)
-        usable[recorded.name] = lens & masks[recorded.name] if recorded.name in masks else lens
+def _checked(recording: Recording, options: ProcessOptions, console: Console) -> LidarCheck:
+    """Hold LiDAR, the pictures, the path and the masks against each other. A complete scene was checked before.
+
+    Raises:
+        InputError: under `strict`, something seems to be wrong.
+    """
+    if (options.output / TRANSFORMS).is_file() and (options.output / CHECKS).is_file():
+        kept = read_json(options.output / CHECKS)
+        return LidarCheck((), tuple(kept["warnings"]))
+    if recording.trajectory is None:
+        raise InputError("the recording has no poses. Give them, or compute them: --poses lidar, --poses colmap.")
+    masks = vehicle_masks(recording)
+    usable = {one.name: lens_circle(one.camera, options.theta_max_deg) for one in recording.cameras}
     with console.status("Comparing LiDAR with the pictures"):
-        return agreement_notices(agreements(recording, usable))
+        # where the path or a mask is wrong, LiDAR seems to be, too
+        of_masks = mask_warnings(recording, usable)
+        for name, mask in masks.items():
+            usable[name] = usable[name] & mask
+        of_path, lost = path_warnings(recording, usable) if options.poses == "recorded" else ([], False)
+        # where lengths or masks are wrong, LiDAR seems to be, too
+        found = LidarCheck((), ()) if lost or of_masks else check_lidar(recording, usable)
+        found = dataclasses.replace(found, warnings=(*of_path, *of_masks, *found.warnings))
+    if options.strict and found.warnings:
+        raise InputError(" ".join(found.warnings) + " Without --strict this is a warning.")
+    return found
 
 
 def _check_poses(recording: Recording, options: ProcessOptions) -> None:
@@ -210,8 +230,6 @@ def _posed(recording: Recording, options: ProcessOptions, console: Console) -> t
         notices = lidar_says(recording, options.output, console)
     elif options.poses == "lidar":
         notices = features_say(recording, options, console)
-    if recording.trajectory is None:
-        raise InputError("the recording has no poses. Give them, or compute them: --poses lidar, --poses colmap.")
     if options.refine_poses:
         from edge_depth_nerf.process.colmap.refine import check_refining, refine_poses
 
@@ -433,7 +451,8 @@ class _Builder:
         if self._without:
             found.append(
                 f"No LiDAR point in {len(self._without)} pictures: frames {', '.join(sorted(self._without)[:10])}"
-                f"{' …' if len(self._without) > 10 else ''}."
+                f"{' …' if len(self._without) > 10 else ''}. If LiDAR's field meets that camera's, check to_vehicle "
+                "of both (in metres?) and the clocks."
             )
         return found
 
@@ -502,7 +521,7 @@ def _show(report: ProcessReport, console: Console) -> None:
         fit = report.fits[name]
         fits = f"fits within {fit.rms_px:.4f} px rms, {fit.max_px:.3f} px at most" if fit.max_px >= 5e-4 else "is exact"
         say(console, f"{name}: the camera model for nerfstudio {fits}; the mask keeps {share:.0%} of the picture")
-    for notice in report.notices:
+    for notice in (*report.notices, *report.warnings):
         say(console, notice, "yellow")
     for item in report.left_out[:MOST_LISTED]:
         say(console, f"Left out: {item.key}. {item.fault}", "yellow")

@@ -111,6 +111,8 @@ def process(options: ProcessOptions, console: Console | None = None) -> ProcessR
         report = convert(options, console)
         _add_motion(read_scene(report.scene), options, console)
         _add_mono(read_scene(report.scene), options, console)
+        for warning in report.warnings:
+            say(console, f"Warning: {warning}", "bold red")
         return report
 
 

@@ -84,8 +84,8 @@ class ProcessOptions:
     """If no monocular maps are given, train a network on the drive's LiDAR, as `edge-depth-nerf estimate-depth` does.
     Off: the scene gets no maps. With that command you can add those of other networks, or of a larger one."""
     strict: bool = False
-    """Stop at the first broken or missing picture, sweep or map. Otherwise up to a tenth of them are left out of the
-    scene and named at the end."""
+    """Stop at the first broken or missing picture, sweep or map, and if something seems to be wrong with the recording,
+    such as a unit or a clock. Otherwise up to a tenth of them are left out of the scene and named at the end."""
     sky: tyro.conf.Suppress[bool] = True
     """Give the sky no monocular distance, instead of a wrong one."""
     cluster: str | None = None

@@ -24,20 +24,24 @@ QUATERNION_TOLERANCE = 1e-3
 SAME_POSE_M, SAME_POSE_DEG = 0.02, 0.2
 """Poses of one time that differ by no more are one; the first counts."""
 
+DOUBLED_SHARE, FEW_POSES = 0.01, 10
+"""Of so many lines the time may be that of the line before; of one in any case, if there are not fewer poses."""
 
-def read_tum(path: Path) -> tuple[Float64[np.ndarray, "poses"], Float64[np.ndarray, "poses 4 4"]]:
+
+def read_tum(path: Path) -> tuple[Float64[np.ndarray, "poses"], Float64[np.ndarray, "poses 4 4"], list[int]]:
     """Read TUM's format: lines "time x y z qx qy qz qw"; seconds, metres, a unit quaternion.
 
-    A pose of the same time as the one before is left out if it agrees with it.
+    A pose of the same time as the one before is left out; of those that differ from it, a few are, as the rounding of
+    times makes them.
 
     Returns:
-        Times, increasing, and poses.
+        Times, increasing, poses, and the numbers of the lines that were left out and differ.
 
     Raises:
         FileNotFoundError: there is no such file.
         InputError: a line is not such a pose, or the times do not increase.
     """
-    times, poses = [], []
+    times, poses, doubled = [], [], []
     for line, values in _number_lines(path):
         if len(values) != 8:
             raise InputError(
@@ -51,13 +55,19 @@ def read_tum(path: Path) -> tuple[Float64[np.ndarray, "poses"], Float64[np.ndarr
             # sensors that were read at once bring the vehicle's pose each
             continue
         if times and not values[0] > times[-1]:
-            raise InputError(
+            said = (
                 f"{path}, line {line}: its time {values[0]:.6f} is not after {times[-1]:.6f} of the line before. Sort "
                 f"them by time; poses of one time must agree within {100 * SAME_POSE_M:g} cm and {SAME_POSE_DEG:g}°."
             )
+            if values[0] < times[-1]:
+                raise InputError(said)
+            doubled.append((line, said))
+            continue
         times.append(values[0])
         poses.append(pose)
-    return np.array(times, np.float64), np.array(poses, np.float64).reshape(-1, 4, 4)
+    if len(doubled) > max(DOUBLED_SHARE * len(times), len(times) >= FEW_POSES):
+        raise InputError(doubled[0][1])
+    return np.array(times, np.float64), np.array(poses, np.float64).reshape(-1, 4, 4), [line for line, _ in doubled]
 
 
 def _same(pose: Transform, other: Transform) -> bool:

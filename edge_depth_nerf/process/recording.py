@@ -106,6 +106,8 @@ class RecordedSweep:
     """Reads it; called from several threads at once."""
     timing: SweepTiming | None = None
     """When each azimuth was measured; not used where the file says each point's time; None = all at once."""
+    columns: int | None = None
+    """How many float32 columns its .bin file is read with; None = its file says it."""
 
 
 @dataclass(frozen=True)

@@ -144,12 +144,25 @@ def recording_of_rig(rig: Rig, options: RigOptions | JbnuDepth360Options, kind: 
         whole_inputs=_whole_inputs(rig, cameras, with_poses=path is not None),
         skipped=tuple(skipped),
         left_out=tolerance.left_out,
-        notices=tuple(
-            f"{lidar.name}: neither turn_s with direction nor point_times is given; all points of a scan get one time."
-            for lidar in rig.lidars
-            if lidar.timing is None and lidar.format.times is None and lidar.corrected_to is None
+        notices=(
+            *_doubled(rig.poses if path is not None else None),
+            *(
+                f"{lidar.name}: neither turn_s with direction nor point_times is given; all its points get one time."
+                for lidar in rig.lidars
+                if lidar.timing is None and lidar.format.times is None and lidar.corrected_to is None
+            ),
         ),
     )
+
+
+def _doubled(poses: RigPoses | None) -> list[str]:
+    """Say which lines of a file of poses are left out."""
+    if poses is None or poses.format != "tum":
+        return []
+    _, _, lines = read_tum(poses.file)
+    some = ", ".join(map(str, lines[:5])) + (" …" if len(lines) > 5 else "")
+    said = f"{poses.file}: {len(lines)} poses are left out, each of the time of the line before (line {some})."
+    return [said] if lines else []
 
 
 def _whole_inputs(rig: Rig, cameras: Sequence[RigCamera], *, with_poses: bool) -> tuple[Path, ...]:
@@ -342,7 +355,8 @@ def _path(
 
 def _pose_list(poses: RigPoses) -> tuple[np.ndarray, np.ndarray]:
     if poses.format == "tum":
-        return read_tum(poses.file)
+        times, matrices, _ = read_tum(poses.file)
+        return times, matrices
     matrices, times_file = read_kitti(poses.file), poses.times_file
     if poses.times_from_names:
         raise InputError(f"{poses.file}: KITTI's poses have no names; give poses.times_file or poses.rate_hz.")
@@ -451,6 +465,7 @@ def _sweeps(
                     to_vehicle=lidar.to_vehicle,
                     read=partial(_read, item.path, lidar, counted_from_s),
                     timing=lidar.timing,
+                    columns=len(lidar.columns) if lidar.dtype == "float32" and item.path.suffix == ".bin" else None,
                 )
             )
     return found

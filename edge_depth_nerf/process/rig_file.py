@@ -288,6 +288,8 @@ class RigLidar(_Sensor):
     array: Text | None = None
     """Name of the points' array in .npz files."""
     names: _Names = _Names()
+    metres_per_unit: Scale = 1.0
+    """Of its points' coordinates."""
     points_in: Literal["scanner", "vehicle"] = "scanner"
     """The frame of its points."""
     corrected_to: Literal["timestamp", "start", "middle", "end"] | None = None
@@ -308,6 +310,7 @@ class RigLidar(_Sensor):
             dtype=self.dtype,
             array=self.array,
             names=self.names.model_dump(),
+            metres_per_unit=self.metres_per_unit,
             times=times and PointTimes(times.column, _SECONDS[times.unit], absolute=times.counted_from == "clock"),
         )
 

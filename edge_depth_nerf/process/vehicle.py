@@ -48,7 +48,7 @@ _INNER = 0.01
 """So far inside the outline, as a share of the picture's longer side: scanner and camera do not see quite the same."""
 
 _NOT_FOUND = "nothing is masked as the vehicle."
-_LOOK = "Check {}; if you correct it there, process the drive again."
+_LOOK = "Check {}; if you correct it there, process the drive again. --no-find-ego hides nothing as the vehicle."
 _UNSEEN = (
     "That is right if the camera does not see the vehicle. Otherwise paint the vehicle black in {} and process again."
 )

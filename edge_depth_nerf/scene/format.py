@@ -27,6 +27,9 @@ CALIBRATION_FILE = "mono_trust.json"
 REFINED_POSES = "refined_poses.json"
 """What refining the poses by the pictures found; the next `process` reads it."""
 
+CHECKS = "checks.json"
+"""What `process` measured of LiDAR against the pictures, and what it warns of."""
+
 OWN_MOTION = "sphere sweep"
 """Kind of distances from motion that `process` finds itself, in transforms.json."""
 

@@ -185,6 +185,8 @@ class ProcessReport:
     left_out: tuple[LeftOut, ...] = ()
     """What is broken or missing, and so not in the scene."""
     notices: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    """What seems to be wrong with the recording."""
 
 
 def summarise(skipped: Iterable[Skipped]) -> str:
