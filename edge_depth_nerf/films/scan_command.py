@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 from rich.console import Console
-from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from edge_depth_nerf import __version__
@@ -20,7 +19,7 @@ from edge_depth_nerf.films.paths import CameraPath, lane_shift
 from edge_depth_nerf.films.placed import placed
 from edge_depth_nerf.films.scan_files import Scan, write_scan
 from edge_depth_nerf.films.scan_options import RenderLidarOptions
-from edge_depth_nerf.films.scanning import Caster, Returns, evaluate, learn_returns, recorded_pattern
+from edge_depth_nerf.films.scanning import Caster, RayDrop, evaluate, learn_ray_drop, recorded_pattern
 from edge_depth_nerf.lidar.patterns import SENSORS, TEN_TURNS, ScanPattern, pattern_of_scan, rings_of
 from edge_depth_nerf.lidar.scans import ScanFormat, read_scan
 from edge_depth_nerf.lidar.trajectory import Trajectory
@@ -31,7 +30,7 @@ from edge_depth_nerf.scene.sweeps import SceneScanner, scanners_of
 
 RECORD, POSES, FIGURES = "scans.json", "poses.txt", "figures.json"
 OUTSIDE_M = 10.0
-"""A path further from the drive than this is said to lead out of it."""
+"""Of a path further from the drive than this a message warns."""
 UP = np.array([0.0, 0.0, 1.0])
 _WORDS = {"sweeps": "Held-out sweeps", "beams": "Held-out beams"}
 
@@ -69,17 +68,17 @@ def render_lidar(options: RenderLidarOptions, console: Console | None = None) ->
     _open(output, record)
     with console.status("Loading the model …"), quiet_host():
         caster = Caster(_model(options.load_config, scene.path), to_model)
-    returns = Returns()
+    ray_drop = RayDrop()
     if scanner is not None and recorded is not None:
         with console.status("Learning which rays come back"):
-            returns = learn_returns(caster, scanner, recorded)
-    _render(output, options, caster, pattern, returns, times_s, poses, console)
+            ray_drop = learn_ray_drop(caster, scanner, recorded)
+    _render(output, options, caster, pattern, ray_drop, times_s, poses, console)
     _write_poses(output / POSES, scene, times_s[:: options.every], poses[:: options.every])
     say(console, f"{len(times_s[:: options.every])} scans of {len(pattern.elevation_rad)} × {pattern.firings} rays:")
     say(console, f"  {output}")
     if scanner is not None:
         with console.status("Comparing with what no training saw"):
-            figures = evaluate(caster, scanner, recorded, returns)
+            figures = evaluate(caster, scanner, recorded, ray_drop)
         write_json(output / FIGURES, figures)
         _show(figures, console)
     return output
@@ -194,7 +193,7 @@ def _render(
     options: RenderLidarOptions,
     caster: Caster,
     pattern: ScanPattern,
-    returns: Returns,
+    ray_drop: RayDrop,
     times_s: Float64[np.ndarray, "scans"],
     poses: Float64[np.ndarray, "scans 4 4"],
     console: Console,
@@ -207,7 +206,7 @@ def _render(
         task = progress.add_task("Rendering scans", total=len(numbers), completed=len(numbers) - len(missing))
         for number in missing:
             cast, _, _ = caster.scan(pattern, float(times_s[number]), path)
-            kept = returns.of(cast, pattern.reach_m)
+            kept = ray_drop.kept(cast, pattern.reach_m)
             # in the order of time: firing by firing
             firing, ring = np.nonzero(kept.T)
             points_m = pattern.directions[ring, firing] * cast.distance_m[ring, firing][:, None]
@@ -234,18 +233,14 @@ def _show(figures: dict[str, dict[str, float]], console: Console) -> None:
     if not figures:
         say(console, "No sweep and no beam is held out, so nothing says how true the scans are.", "yellow")
         return
-    table = Table(
-        "Rendered distance", "rays", "median", "95 %", "within 10 cm", "within 30 cm", "lost rays, F1", "chamfer"
-    )
     for name, found in figures.items():
-        table.add_row(
-            _WORDS[name],
-            f"{found['rays']:,.0f}",
-            f"{100 * found['median_m']:.1f} cm",
-            f"{found['p95_m']:.2f} m",
-            f"{found['within_10_cm']:.1%}",
-            f"{found['within_30_cm']:.1%}",
-            f"{found['drop_f1']:.2f}" if "drop_f1" in found else "",
-            f"{100 * found['chamfer_m']:.1f} cm" if "chamfer_m" in found else "",
+        text = (
+            f"{_WORDS[name]}, {found['rays']:,.0f} rays: the rendered distance is off by "
+            f"{100 * found['median_m']:.1f} cm (median) and {found['p95_m']:.2f} m (95 %); {found['within_10_cm']:.1%} "
+            f"are within 10 cm, {found['within_30_cm']:.1%} within 30 cm."
         )
-    console.print(table)
+        if "drop_f1" in found:
+            text += (
+                f" Rays that are lost: F1 {found['drop_f1']:.2f}. Chamfer distance: {100 * found['chamfer_m']:.1f} cm."
+            )
+        say(console, text)

@@ -50,7 +50,7 @@ class Caster:
     def cast(self, origin_m: Float[np.ndarray, "*rays 3"], direction: Float[np.ndarray, "*rays 3"]) -> Cast:
         """Cast rays from places in the scene (metres) along unit vectors in the scene."""
         shape = direction.shape[:-1]
-        flat = [np.broadcast_to(each, direction.shape).reshape(1, -1, 3) for each in (origin_m, direction)]
+        flat = [each.reshape(1, -1, 3) for each in (origin_m, direction)]
         place = self._to_model
         origins = place.units_per_metre * (flat[0] @ place.rotation.T + place.shift_m)
         given = (torch.from_numpy(each.astype(np.float32)) for each in (origins, flat[1] @ place.rotation.T))
@@ -73,11 +73,11 @@ class Caster:
         poses = scanner.at(time_s + pattern.offset_s)
         directions = np.einsum("fij,rfj->rfi", poses[:, :3, :3], pattern.directions)
         origins = poses[:, :3, 3]
-        return self.cast(origins[None], directions), origins, directions
+        return self.cast(np.broadcast_to(origins, directions.shape), directions), origins, directions
 
 
 def in_scanner(sweep: SceneSweep, rays: SweepRays, scanner: Trajectory) -> Float[np.ndarray, "rays 3"]:
-    """Give a sweep's points in the scanner's frame at each point's own time, as they were recorded."""
+    """Give a sweep's points in the scanner's frame at each point's own time."""
     poses = scanner.at(sweep.time_s + rays.offset_s.astype(np.float64))
     along = np.einsum("nji,nj->ni", poses[:, :3, :3], rays.direction.astype(np.float64))
     return along * rays.distance_m[:, None].astype(np.float64)
@@ -109,7 +109,7 @@ def came_back(
     return found | (np.roll(found, 1, axis=1) & np.roll(found, -1, axis=1))
 
 
-class Returns:
+class RayDrop:
     """Which rays a scanner gets back, learned from a drive's own: a logistic regression on what they meet."""
 
     def __init__(self, weights: NDArray[np.float64] | None = None) -> None:
@@ -122,7 +122,7 @@ class Returns:
         return np.stack([np.ones_like(hit), hit, far, far**2, hit * far], axis=-1)
 
     @classmethod
-    def learned(cls, cast: Cast, back: Bool[np.ndarray, "*rays"]) -> Returns:
+    def learned(cls, cast: Cast, back: Bool[np.ndarray, "*rays"]) -> RayDrop:
         """Learn from rays, and which of them came back."""
         features, wanted = cls._features(cast).reshape(-1, 5), np.where(back.reshape(-1), 1.0, -1.0)
         if len(np.unique(wanted)) < 2:
@@ -137,7 +137,7 @@ class Returns:
 
         return cls(minimize(loss, np.zeros(5), jac=True, method="L-BFGS-B").x)
 
-    def of(self, cast: Cast, reach_m: float) -> Bool[np.ndarray, "*rays"]:
+    def kept(self, cast: Cast, reach_m: float) -> Bool[np.ndarray, "*rays"]:
         """Say which rays come back from within the scanner's reach."""
         within = (cast.distance_m >= MIN_RANGE_M) & (cast.distance_m <= reach_m)
         if self._weights is None:
@@ -145,7 +145,7 @@ class Returns:
         return within & (self._features(cast) @ self._weights > 0)
 
 
-def learn_returns(caster: Caster, scanner: SceneScanner, pattern: ScanPattern) -> Returns:
+def learn_ray_drop(caster: Caster, scanner: SceneScanner, pattern: ScanPattern) -> RayDrop:
     """Learn from a drive's own sweeps which rays come back; only from those that the training saw."""
     training = [sweep for sweep in scanner.sweeps if not sweep.held_out]
     rng, casts, back = np.random.default_rng(0), [], []
@@ -157,9 +157,9 @@ def learn_returns(caster: Caster, scanner: SceneScanner, pattern: ScanPattern) -
         casts.append(caster.cast(poses[:, :3, 3], along))
         back.append(whole[rows, columns])
     if not casts:
-        return Returns()
+        return RayDrop()
     together = Cast(*(np.concatenate([getattr(each, name) for each in casts]) for name in ("distance_m", "hit")))
-    return Returns.learned(together, np.concatenate(back))
+    return RayDrop.learned(together, np.concatenate(back))
 
 
 def _spread(sweeps: Sequence[SceneSweep], most: int) -> list[SceneSweep]:
@@ -187,7 +187,7 @@ def chamfer_m(points_m: Float[np.ndarray, "points 3"], others_m: Float[np.ndarra
 
 
 def evaluate(
-    caster: Caster, scanner: SceneScanner, pattern: ScanPattern | None, returns: Returns
+    caster: Caster, scanner: SceneScanner, pattern: ScanPattern | None, ray_drop: RayDrop
 ) -> dict[str, dict[str, float]]:
     """Hold the model against what no training saw: held-out sweeps, and held-out beams of the others.
 
@@ -215,7 +215,7 @@ def evaluate(
             measured.append(rays.distance_m[of_use])
             rendered.append(cast.distance_m)
             if pattern is not None and name == "sweeps":
-                more.append(_of_whole(caster, scanner.trajectory, sweep, rays, pattern, returns))
+                more.append(_of_whole(caster, scanner.trajectory, sweep, rays, pattern, ray_drop))
         if measured:
             found[name] = errors(np.concatenate(measured), np.concatenate(rendered))
             found[name] |= {key: float(np.mean([each[key] for each in more])) for key in (more[0] if more else ())}
@@ -228,10 +228,10 @@ def _of_whole(
     sweep: SceneSweep,
     rays: SweepRays,
     pattern: ScanPattern,
-    returns: Returns,
+    ray_drop: RayDrop,
 ) -> dict[str, float]:
     cast, origins, directions = caster.scan(pattern, sweep.time_s, scanner)
-    kept = returns.of(cast, pattern.reach_m)
+    kept = ray_drop.kept(cast, pattern.reach_m)
     lost, truly = ~kept, ~came_back(sweep, rays, pattern, scanner)
     both = (lost & truly).sum()
     points_m = (origins[None] + directions * cast.distance_m[..., None])[kept]

@@ -71,8 +71,8 @@ def _even(highest_deg: float, lowest_deg: float, rings: int) -> NDArray[np.float
 
 
 SENSORS: dict[str, ScanPattern] = {
-    "hdl-64": ScanPattern("hdl-64", np.concatenate([_even(2, -8.33, 32), _even(-8.83, -24.33, 32)]), 2083, 120.0),
-    "vlp-16": ScanPattern("vlp-16", _even(15, -15, 16), 1800, 100.0),
+    "hdl-64": ScanPattern("hdl-64", np.concatenate([_even(2.0, -8.33, 32), _even(-8.83, -24.33, 32)]), 2083, 120.0),
+    "vlp-16": ScanPattern("vlp-16", _even(15.0, -15.0, 16), 1800, 100.0),
     "os1-128": ScanPattern("os1-128", _even(22.5, -22.5, 128), 2048, 120.0),
 }
 """Scanners by their makers' data sheets, at ten turns a second: Velodyne's HDL-64E S2 (two blocks of beams) and VLP-16,
