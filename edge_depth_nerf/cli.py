@@ -16,6 +16,7 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.compare.options import CompareOptions, GridOptions, SearchOptions
 from edge_depth_nerf.demo.options import DemoOptions
 from edge_depth_nerf.films.options import CameraPathOptions
+from edge_depth_nerf.films.scan_options import RenderLidarOptions
 from edge_depth_nerf.inspecting.options import InspectOptions
 from edge_depth_nerf.mono.options import EstimateDepthOptions
 from edge_depth_nerf.plugin.compat import join_lines_of_option_help
@@ -48,6 +49,7 @@ Command = (
     | Annotated[EstimateDepthOptions, tyro.conf.subcommand("estimate-depth")]
     | Annotated[InspectOptions, tyro.conf.subcommand("inspect")]
     | Annotated[CameraPathOptions, tyro.conf.subcommand("camera-path")]
+    | Annotated[RenderLidarOptions, tyro.conf.subcommand("render-lidar")]
     | Annotated[CompareOptions, tyro.conf.subcommand("compare")]
     | Annotated[SearchOptions, tyro.conf.subcommand("search")]
     | Annotated[GridOptions, tyro.conf.subcommand("grid")]
@@ -144,6 +146,8 @@ def _work_of(command: Command) -> Callable[..., Any]:
         from edge_depth_nerf.inspecting.command import inspect_scene as work
     elif isinstance(command, CameraPathOptions):
         from edge_depth_nerf.films.command import write_camera_path as work
+    elif isinstance(command, RenderLidarOptions):
+        from edge_depth_nerf.films.scan_command import render_lidar as work
     elif isinstance(command, CompareOptions):
         from edge_depth_nerf.compare.command import compare as work
     elif isinstance(command, GridOptions):

@@ -1,7 +1,4 @@
-"""`edge-depth-nerf camera-path`: a path file for `ns-render camera-path`, in the trained model's coordinates.
-
-The scene's place in the model's coordinates comes from nerfstudio's own dataparser, with the training's settings.
-"""
+"""`edge-depth-nerf camera-path`: a path file for `ns-render camera-path`, in the trained model's coordinates."""
 
 from __future__ import annotations
 
@@ -19,23 +16,19 @@ from rich.console import Console
 from edge_depth_nerf import __version__
 from edge_depth_nerf.base.console import say
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import read_json_object, write_json
+from edge_depth_nerf.base.files import write_json
 from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.cameras import KannalaBrandt, Pinhole
 from edge_depth_nerf.films.options import LARGEST_PX, CameraPathOptions
 from edge_depth_nerf.films.paths import CameraPath, lane_shift, orbit, replay, up_of
-from edge_depth_nerf.films.training import read_dataparser
+from edge_depth_nerf.films.placed import placed, poses_of
 from edge_depth_nerf.plugin.compat import quiet_host
-from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
+from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
 
 DEFAULT_RATE_HZ = 10.0
 """Used for scenes without times."""
 ORBIT_SECONDS = 6.0
 LARGEST_FILM_FRAMES = 100_000
-SAVED_TRANSFORM = "dataparser_transforms.json"
-"""A file beside config.yml. It contains the scene's transform at the time of the training."""
-SAME_PLACE = 1e-3
-"""Largest difference of a camera's position between the path and the training, in scene units."""
 KEYFRAMES = 12
 """Number of keyframes. nerfstudio's viewer draws the path through them when it loads the file."""
 
@@ -53,23 +46,6 @@ class FilmLens:
     def fov_deg(self) -> float:
         """What path files call fov: nerfstudio computes every focal length as height / 2 / tan(fov / 2)."""
         return math.degrees(2 * math.atan(self.height / 2 / self.focal_px))
-
-
-@dataclass(frozen=True)
-class SceneToModel:
-    """Transform from a scene to the coordinates that its model was trained in."""
-
-    rotation: Float64[np.ndarray, "3 3"]
-    shift_m: Float64[np.ndarray, "3"]
-    """Added after the rotation and before the scaling."""
-    units_per_metre: float
-
-    def poses(self, camera_to_scene: Float64[np.ndarray, "n 4 4"]) -> Float64[np.ndarray, "n 4 4"]:
-        """Turn poses in the scene (metres) into poses in the model's coordinates."""
-        moved = camera_to_scene.copy()
-        moved[:, :3, :3] = self.rotation @ camera_to_scene[:, :3, :3]
-        moved[:, :3, 3] = self.units_per_metre * (camera_to_scene[:, :3, 3] @ self.rotation.T + self.shift_m)
-        return moved
 
 
 def write_camera_path(options: CameraPathOptions, console: Console | None = None) -> Path:
@@ -92,10 +68,10 @@ def write_camera_path(options: CameraPathOptions, console: Console | None = None
             style="yellow",
         )
     with console.status("Reading the scene's place in the model's coordinates from nerfstudio …"), quiet_host():
-        scene, to_model = _placed(options)
+        scene, to_model = placed(options.load_config, options.scene)
 
     pictures = _followed(scene, options.follow)
-    drive = CameraPath(_times_s(pictures), _poses(pictures), up_of(np.stack([p.rotation for p in scene.pictures])))
+    drive = CameraPath(_times_s(pictures), poses_of(pictures), up_of(np.stack([p.rotation for p in scene.pictures])))
     lens = film_lens(pictures[0].lens, options)
     fps = options.fps or round(drive.frame_rate_hz, 3)
     frames = _frames(drive, options, fps)
@@ -205,52 +181,3 @@ def _times_s(pictures: tuple[ScenePicture, ...]) -> Float64[np.ndarray, "n"]:
         return np.array([picture.frame / DEFAULT_RATE_HZ for picture in pictures])
     times_s = np.array(known, dtype=np.float64)
     return times_s - times_s[0]
-
-
-def _poses(pictures: tuple[ScenePicture, ...]) -> Float64[np.ndarray, "n 4 4"]:
-    poses = np.tile(np.eye(4), (len(pictures), 1, 1))
-    poses[:, :3, :3] = [picture.rotation for picture in pictures]
-    poses[:, :3, 3] = [picture.position_m for picture in pictures]
-    return poses
-
-
-def _placed(options: CameraPathOptions) -> tuple[SceneFolder, SceneToModel]:
-    """Return the scene, and its place in the model's coordinates by the training's own dataparser."""
-    dataparser = read_dataparser(options.load_config)
-    scene = read_scene(options.scene or Path(dataparser.data))
-    dataparser.data = scene.path
-    outputs = dataparser.setup().get_dataparser_outputs(split="train")
-    _check_unchanged(outputs, options.load_config.parent / SAVED_TRANSFORM, scene)
-    # both start from the coordinates before transforms.json, which nerfstudio may have changed
-    applied = np.vstack((scene.meta.get("applied_transform", np.eye(4)[:3]), [0, 0, 0, 1])).astype(np.float64)
-    transform = outputs.dataparser_transform.numpy().astype(np.float64) @ np.linalg.inv(applied)
-    scale = float(outputs.dataparser_scale) / float(scene.meta.get("applied_scale", 1.0))
-    to_model = SceneToModel(transform[:, :3], transform[:, 3], scale)
-
-    trained = outputs.cameras.camera_to_worlds.numpy()[:, :3, 3].astype(np.float64)
-    ours = to_model.poses(_poses(scene.pictures))[:, :3, 3]
-    furthest = max(float(np.linalg.norm(ours - place, axis=1).min()) for place in trained)
-    if furthest > SAME_PLACE * max(1.0, float(np.abs(trained).max())):
-        raise InputError(
-            f"{scene.path}: the training's dataparser places the cameras {furthest:.3g} scene units away from where "
-            "its own transform places them, so no path can be computed. Train with fisheye-depth-data or "
-            "nerfstudio-data."
-        )
-    return scene, to_model
-
-
-def _check_unchanged(outputs: Any, saved: Path, scene: SceneFolder) -> None:
-    """Compare the scene's place with the one that the training saved; raise an InputError if they differ."""
-    if not saved.is_file():
-        return
-    record = read_json_object(saved, "transform", "scale")
-    now = np.append(outputs.dataparser_transform.numpy(), outputs.dataparser_scale)
-    try:
-        then = np.append(np.asarray(record["transform"], dtype=np.float64), float(record["scale"]))
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{saved}: expected a matrix under transform and a number under scale. Train again.") from None
-    if now.shape != then.shape or not np.allclose(now, then, rtol=1e-4, atol=1e-4):
-        raise InputError(
-            f"{scene.path}: its place in the model's coordinates differs from {saved}. It is another scene, or it was "
-            "changed after the training. Give the scene that the model was trained on, or train again."
-        )

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from edge_depth_nerf.base.bounds import check_bytes
@@ -68,13 +68,18 @@ BEAM_RAD = math.radians(0.4)
 """Height of the bands of elevation in which beams are held out."""
 
 
-def without_beams(sweep: Sweep, one_of: int) -> tuple[Sweep, Sweep]:
-    """Split a sweep into what is kept and every `one_of`-th band of elevation, `BEAM_RAD` high.
+def held_out_beams(sweep: Sweep, one_of: int) -> Bool[Tensor, "points"]:
+    """Say which points lie in every `one_of`-th band of elevation, `BEAM_RAD` high.
 
     The same bands of every sweep, whatever the scanner: what lies between its rings is what is asked for.
     """
     elevation = torch.atan2(sweep.points_m[:, 2], sweep.points_m[:, :2].norm(dim=-1))
-    held_out = torch.remainder(torch.floor(elevation / BEAM_RAD), one_of) == one_of // 2
+    return torch.remainder(torch.floor(elevation / BEAM_RAD), one_of) == one_of // 2
+
+
+def without_beams(sweep: Sweep, one_of: int) -> tuple[Sweep, Sweep]:
+    """Split a sweep into what is kept and `held_out_beams`."""
+    held_out = held_out_beams(sweep, one_of)
 
     def part(chosen: Tensor) -> Sweep:
         offset_s = None if sweep.offset_s is None else sweep.offset_s[chosen]

@@ -72,11 +72,7 @@ def sweep_in_world(
         timing: when which azimuth is measured; times from the file come first. None and no times = all at once.
         deskew: False takes all points as measured at the sweep's own time.
     """
-    offset_s = torch.zeros(len(sweep.points_m), dtype=torch.float64)
-    if deskew and sweep.offset_s is not None:
-        offset_s = sweep.offset_s
-    elif deskew and timing is not None:
-        offset_s = timing.offsets_s(sweep.points_m)
+    offset_s = offsets_s(sweep, timing, deskew)
     in_vehicle = transform_points(torch.from_numpy(scanner_to_vehicle), sweep.points_m)
     vehicle_to_world = trajectory.at(np.array([time_s], np.float64))[0]
 
@@ -94,6 +90,15 @@ def sweep_in_world(
         elevation_rad=(float(np.arcsin(low)), float(np.arcsin(high))),
         offset_s=offset_s,
     )
+
+
+def offsets_s(sweep: Sweep, timing: SweepTiming | None, deskew: bool) -> Float[Tensor, "points"]:
+    """When each point was measured, counted from the sweep's own time, float64; arguments as of `sweep_in_world`."""
+    if deskew and sweep.offset_s is not None:
+        return sweep.offset_s
+    if deskew and timing is not None:
+        return timing.offsets_s(sweep.points_m)
+    return torch.zeros(len(sweep.points_m), dtype=torch.float64)
 
 
 def above_field(

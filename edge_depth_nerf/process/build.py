@@ -33,6 +33,7 @@ from edge_depth_nerf.masks.lens import lens_circle
 from edge_depth_nerf.masks.semantics import check_classes, keep_static, read_labels
 from edge_depth_nerf.masks.semantics import sky as sky_of_labels
 from edge_depth_nerf.masks.sky import find_sky
+from edge_depth_nerf.process.kept_sweeps import keep_sweeps
 from edge_depth_nerf.process.lidar_checks import LidarCheck, check_lidar
 from edge_depth_nerf.process.mask_checks import mask_warnings
 from edge_depth_nerf.process.moving import find_moving
@@ -68,6 +69,7 @@ from edge_depth_nerf.scene.writer import (
     held_out_frames,
     open_scene,
     summarise,
+    world_offset_m,
     write_scene,
 )
 
@@ -129,6 +131,7 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
         )
         for picture in recording.pictures
     ]
+    scanners = keep_sweeps(recording, options, held_out, world_offset_m(frames), builder.found, console)
     report = write_scene(
         options.output,
         cameras,
@@ -137,6 +140,7 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
         source=source,
         theta_max_deg=options.theta_max_deg,
         shifted=[view for view in recording.shifted if view.frame in held_out],
+        scanners=scanners,
         strict=options.strict,
         console=console,
     )
@@ -282,7 +286,7 @@ class _Builder:
             usable = lens_circle(scene_camera.original, options.theta_max_deg)
             self._usable[scene_camera.name] = usable if scene_camera.mask is None else usable & scene_camera.mask
         as_recorded = options.poses == "recorded" and not options.refine_poses
-        self._found = [] if as_recorded else [self._keep_poses()]
+        self.found = [] if as_recorded else [self._keep_poses()]
         self._lock = threading.Lock()
         self._coverage: dict[str, list[float]] = defaultdict(list)
         self._without: list[str] = []
@@ -311,7 +315,7 @@ class _Builder:
         """Files that a picture's maps are made from."""
         sweeps = [sweep.path for sweep in self._store.used(picture.frame, picture.time_s)]
         ego = self._cameras[picture.camera].ego_mask
-        return (*picture.inputs, *sweeps, *self._found, *([] if ego is None else [ego]))
+        return (*picture.inputs, *sweeps, *self.found, *([] if ego is None else [ego]))
 
     def content(self, picture: RecordedPicture) -> FrameContent:
         """Make the maps of one picture, at the scene's size."""

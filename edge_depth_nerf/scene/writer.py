@@ -9,6 +9,7 @@
     lidar/image_02/0000000123.png         LiDAR distance map
     mono/image_02/0000000123.png          monocular distance map
     truth/image_02/{distance,rgb}/…       what is really there, in synthetic drives, for evaluation alone
+    sweeps/roof/0000000123.npz            a scanner's own rays, see `scene.sweeps`
     truth/image_02/shifted_1m/{distance,rgb}/…   the same from beside the path
 
 Distances are metres along the ray, in 16-bit PNGs of 1/256 m, 0 = none. In memory, poses are camera-to-world with
@@ -67,6 +68,7 @@ from edge_depth_nerf.scene.format import (
     read_transforms,
 )
 from edge_depth_nerf.scene.points import PointCloud, merge_parts, write_part
+from edge_depth_nerf.scene.sweeps import SCANNERS, SceneScanner, entries
 
 RECORD = "process.json"
 LEFT_OUT = "left_out.json"
@@ -231,6 +233,7 @@ def write_scene(
     source: Mapping[str, Any],
     theta_max_deg: float = 95.0,
     shifted: Sequence[ShiftedView] = (),
+    scanners: Sequence[SceneScanner] = (),
     strict: bool = True,
     console: Console | None = None,
 ) -> ProcessReport:
@@ -245,6 +248,7 @@ def write_scene(
         source: what the scene is made of, as JSON; decides whether a folder that exists is the same scene.
         theta_max_deg: rays further from the axis are masked out; less, where a camera's own range ends before.
         shifted: true views from beside the path.
+        scanners: whose rays are in the folder already.
         strict: a frame whose content cannot be read is an error; otherwise it is left out, up to a tenth of them.
         console: where progress is shown.
 
@@ -257,8 +261,7 @@ def write_scene(
     _check(by_name, cameras, frames, shifted, layers, theta_max_deg)
     fits = _fits(cameras, theta_max_deg)
     masks = {camera.name: _camera_mask(camera, theta_max_deg) for camera in cameras}
-    # adding zero turns -0.0 into 0.0
-    offset = np.round(np.mean([frame.camera_to_world[:3, 3] for frame in frames], axis=0)) + 0.0
+    offset = world_offset_m(frames)
 
     open_scene(output, source)
     for name, mask in masks.items():
@@ -289,6 +292,8 @@ def write_scene(
     if work.cloud:
         _write_cloud(output, frames)
     content = _transforms(cameras, fits, frames, shifted, layers, offset, theta_max_deg, source)
+    if scanners:
+        content[SCANNERS] = entries(scanners, output)
     for name, maps in later.items():
         content[name] = maps.entry
         for frame in content["frames"]:
@@ -308,6 +313,12 @@ def write_scene(
         left_out=tolerance.left_out,
         notices=tuple(notices),
     )
+
+
+def world_offset_m(frames: Sequence[SceneFrame]) -> Float64[np.ndarray, "3"]:
+    """Give the scene's origin in the recording's world: whole metres near the mean camera."""
+    # adding zero turns -0.0 into 0.0
+    return np.round(np.mean([frame.camera_to_world[:3, 3] for frame in frames], axis=0)) + 0.0
 
 
 def _write_cloud(output: Path, frames: Sequence[SceneFrame]) -> None:

@@ -1,0 +1,97 @@
+"""A scene's place in the coordinates of a model: from nerfstudio's own dataparser, with the training's settings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_json_object
+from edge_depth_nerf.films.training import read_dataparser
+from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
+
+SAVED_TRANSFORM = "dataparser_transforms.json"
+"""A file beside config.yml. It contains the scene's transform at the time of the training."""
+SAME_PLACE = 1e-3
+"""Largest difference of a camera's position between the path and the training, in scene units."""
+
+
+@dataclass(frozen=True)
+class SceneToModel:
+    """Transform from a scene to the coordinates that its model was trained in."""
+
+    rotation: Float64[np.ndarray, "3 3"]
+    shift_m: Float64[np.ndarray, "3"]
+    """Added after the rotation and before the scaling."""
+    units_per_metre: float
+
+    def poses(self, camera_to_scene: Float64[np.ndarray, "n 4 4"]) -> Float64[np.ndarray, "n 4 4"]:
+        """Turn poses in the scene (metres) into poses in the model's coordinates."""
+        moved = camera_to_scene.copy()
+        moved[:, :3, :3] = self.rotation @ camera_to_scene[:, :3, :3]
+        moved[:, :3, 3] = self.units_per_metre * (camera_to_scene[:, :3, 3] @ self.rotation.T + self.shift_m)
+        return moved
+
+
+def poses_of(pictures: Sequence[ScenePicture]) -> Float64[np.ndarray, "n 4 4"]:
+    """Give the pictures' poses, camera (OpenGL) to scene."""
+    poses = np.tile(np.eye(4), (len(pictures), 1, 1))
+    poses[:, :3, :3] = [picture.rotation for picture in pictures]
+    poses[:, :3, 3] = [picture.position_m for picture in pictures]
+    return poses
+
+
+def placed(load_config: Path, moved_to: Path | None) -> tuple[SceneFolder, SceneToModel]:
+    """Return the scene, and its place in the model's coordinates by the training's own dataparser.
+
+    Args:
+        load_config: the training's config.yml.
+        moved_to: the scene folder, if it was moved after the training.
+
+    Raises:
+        FileNotFoundError: there is no scene, or no config.yml, at the given path.
+        InputError: the scene or the training cannot be used.
+    """
+    dataparser = read_dataparser(load_config)
+    scene = read_scene(moved_to or Path(dataparser.data))
+    dataparser.data = scene.path
+    outputs = dataparser.setup().get_dataparser_outputs(split="train")
+    _check_unchanged(outputs, load_config.parent / SAVED_TRANSFORM, scene)
+    # both start from the coordinates before transforms.json, which nerfstudio may have changed
+    applied = np.vstack((scene.meta.get("applied_transform", np.eye(4)[:3]), [0, 0, 0, 1])).astype(np.float64)
+    transform = outputs.dataparser_transform.numpy().astype(np.float64) @ np.linalg.inv(applied)
+    scale = float(outputs.dataparser_scale) / float(scene.meta.get("applied_scale", 1.0))
+    to_model = SceneToModel(transform[:, :3], transform[:, 3], scale)
+
+    trained = outputs.cameras.camera_to_worlds.numpy()[:, :3, 3].astype(np.float64)
+    ours = to_model.poses(poses_of(scene.pictures))[:, :3, 3]
+    furthest = max(float(np.linalg.norm(ours - place, axis=1).min()) for place in trained)
+    if furthest > SAME_PLACE * max(1.0, float(np.abs(trained).max())):
+        raise InputError(
+            f"{scene.path}: the training's dataparser places the cameras {furthest:.3g} scene units away from where "
+            "its own transform places them, so no path can be computed. Train with fisheye-depth-data or "
+            "nerfstudio-data."
+        )
+    return scene, to_model
+
+
+def _check_unchanged(outputs: Any, saved: Path, scene: SceneFolder) -> None:
+    """Compare the scene's place with the one that the training saved; raise an InputError if they differ."""
+    if not saved.is_file():
+        return
+    record = read_json_object(saved, "transform", "scale")
+    now = np.append(outputs.dataparser_transform.numpy(), outputs.dataparser_scale)
+    try:
+        then = np.append(np.asarray(record["transform"], dtype=np.float64), float(record["scale"]))
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f"{saved}: expected a matrix under transform and a number under scale. Train again.") from None
+    if now.shape != then.shape or not np.allclose(now, then, rtol=1e-4, atol=1e-4):
+        raise InputError(
+            f"{scene.path}: its place in the model's coordinates differs from {saved}. It is another scene, or it was "
+            "changed after the training. Give the scene that the model was trained on, or train again."
+        )

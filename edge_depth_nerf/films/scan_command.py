@@ -1,0 +1,246 @@
+"""`edge-depth-nerf render-lidar`: the scans that a LiDAR would record in a trained scene, and how true they are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+from rich.console import Console
+from scipy.spatial.transform import Rotation
+
+from edge_depth_nerf import __version__
+from edge_depth_nerf.base.console import progress_bars, say
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import check_is_folder, read_json, write_json, write_text
+from edge_depth_nerf.films.paths import CameraPath, lane_shift
+from edge_depth_nerf.films.placed import placed
+from edge_depth_nerf.films.scan_files import Scan, write_scan
+from edge_depth_nerf.films.scan_options import RenderLidarOptions
+from edge_depth_nerf.films.scanning import Caster, RayDrop, evaluate, learn_ray_drop, recorded_pattern
+from edge_depth_nerf.lidar.patterns import SENSORS, TEN_TURNS, ScanPattern, pattern_of_scan, rings_of
+from edge_depth_nerf.lidar.scans import ScanFormat, read_scan
+from edge_depth_nerf.lidar.trajectory import Trajectory
+from edge_depth_nerf.plugin.compat import quiet_host
+from edge_depth_nerf.process.poses import read_tum
+from edge_depth_nerf.scene.reader import SceneFolder
+from edge_depth_nerf.scene.sweeps import SceneScanner, scanners_of
+
+RECORD, POSES, FIGURES = "scans.json", "poses.txt", "figures.json"
+OUTSIDE_M = 10.0
+"""Of a path further from the drive than this a message warns."""
+UP = np.array([0.0, 0.0, 1.0])
+_WORDS = {"sweeps": "Held-out sweeps", "beams": "Held-out beams"}
+
+
+def render_lidar(options: RenderLidarOptions, console: Console | None = None) -> Path:
+    """Render scans, and hold the model against those of the drive that no training saw.
+
+    Scans are in the scanner's frame, point by point at its own time, as a moving scanner records them. `poses.txt` has
+    the scanner's pose in the recording's world at each scan's own time, in TUM's format. A run that was interrupted
+    continues.
+
+    Returns:
+        The folder with the scans.
+
+    Raises:
+        FileNotFoundError: there is no scene, training or file at a given path.
+        InputError: an option, the scene, the training or a file cannot be used, or the folder holds something else.
+    """
+    options.check()
+    console = console or Console()
+    output = options.output or options.load_config.parent / "scans"
+    with console.status("Reading the scene's place in the model's coordinates from nerfstudio …"), quiet_host():
+        scene, to_model = placed(options.load_config, options.scene)
+    scanner = _scanner(scene, options)
+    recorded = None if scanner is None else recorded_pattern(scanner)
+    pattern = _pattern(options, scanner, recorded)
+    times_s, poses = _path(options, scene, scanner, console)
+    record = {
+        "made_by": f"edge-depth-nerf {__version__}",
+        "scene": str(scene.path),
+        "load_config": str(options.load_config),
+        **{name: getattr(options, name) for name in ("sensor", "path", "shift_m", "every", "form")},
+        "scanner": None if scanner is None else scanner.name,
+    }
+    _open(output, record)
+    with console.status("Loading the model …"), quiet_host():
+        caster = Caster(_model(options.load_config, scene.path), to_model)
+    ray_drop = RayDrop()
+    if scanner is not None and recorded is not None:
+        with console.status("Learning which rays come back"):
+            ray_drop = learn_ray_drop(caster, scanner, recorded)
+    _render(output, options, caster, pattern, ray_drop, times_s, poses, console)
+    _write_poses(output / POSES, scene, times_s[:: options.every], poses[:: options.every])
+    say(console, f"{len(times_s[:: options.every])} scans of {len(pattern.elevation_rad)} × {pattern.firings} rays:")
+    say(console, f"  {output}")
+    if scanner is not None:
+        with console.status("Comparing with what no training saw"):
+            figures = evaluate(caster, scanner, recorded, ray_drop)
+        write_json(output / FIGURES, figures)
+        _show(figures, console)
+    return output
+
+
+def _scanner(scene: SceneFolder, options: RenderLidarOptions) -> SceneScanner | None:
+    """Give the scanner of the drive that was asked for; None if the scene has none and none is needed."""
+    scanners = scanners_of(scene.meta, scene.path)
+    if options.scanner is not None and options.scanner not in scanners:
+        there = f"it has {', '.join(scanners)}" if scanners else "it has none"
+        raise InputError(f"--scanner {options.scanner}: {scene.path} has no such scanner; {there}.")
+    found = scanners.get(options.scanner) if options.scanner else next(iter(scanners.values()), None)
+    needed = [name for name in ("sensor", "path") if getattr(options, name) in ("recorded", "lane-shift")]
+    if (found is None or len(found.sweeps) < 2) and needed:
+        raise InputError(
+            f"{scene.path}: keeps no sweeps of a scanner, so --{needed[0]} {getattr(options, needed[0])} is unknown. "
+            "Process the drive again with this version; a drive of depth maps has none. Or name a scanner (--sensor "
+            f"{', '.join(SENSORS)}) and a file of its poses (--path FILE)."
+        )
+    return found
+
+
+def _pattern(options: RenderLidarOptions, scanner: SceneScanner | None, recorded: ScanPattern | None) -> ScanPattern:
+    """Give the pattern of the sensor that was asked for; it turns as the drive's own scanner does, where that is known.
+
+    Raises:
+        FileNotFoundError, InputError: there is no such sensor or file, or the file has no rings.
+    """
+    timing = (scanner.timing if scanner is not None else None) or TEN_TURNS
+    if options.sensor == "recorded":
+        if recorded is None:
+            assert scanner is not None
+            raise InputError(
+                f"the rings of {scanner.sweeps[0].path.parent} cannot be told apart, so --sensor recorded is unknown. "
+                f"Name a scanner: {', '.join(SENSORS)}."
+            )
+        return recorded
+    if options.sensor in SENSORS:
+        return replace(SENSORS[options.sensor], timing=timing)
+    path = Path(options.sensor)
+    if not path.is_file():
+        raise InputError(
+            f"--sensor {options.sensor}: neither a scanner ({', '.join(('recorded', *SENSORS))}) nor a file of a scan."
+        )
+    points_m = read_scan(path, ScanFormat()).points_m.numpy()
+    return pattern_of_scan(points_m, rings_of(points_m, str(path)), timing, str(path))
+
+
+def _path(
+    options: RenderLidarOptions, scene: SceneFolder, scanner: SceneScanner | None, console: Console
+) -> tuple[Float64[np.ndarray, "scans"], Float64[np.ndarray, "scans 4 4"]]:
+    """Give times of scans, and poses, scanner to scene."""
+    if options.path in ("recorded", "lane-shift"):
+        assert scanner is not None
+        path = scanner.trajectory
+        times_s, poses = path.times_s, path.vehicle_to_world
+        if options.path == "lane-shift":
+            poses = lane_shift(CameraPath(times_s, poses, UP), times_s, False, options.shift_m)
+        return times_s, poses
+    if not Path(options.path).is_file():
+        raise InputError(f"--path {options.path}: neither recorded nor lane-shift, nor a file of poses.")
+    times_s, poses, _ = read_tum(Path(options.path))
+    if len(times_s) < 2:
+        raise InputError(f"{options.path}: {len(times_s)} poses, expected at least two: scans need the motion.")
+    poses = poses.copy()
+    poses[:, :3, 3] -= np.array(scene.meta.get("world_offset_m", [0.0, 0.0, 0.0]), np.float64)
+    driven = np.stack([picture.position_m for picture in scene.pictures])
+    away_m = np.array([np.linalg.norm(driven - pose[:3, 3], axis=1).min() for pose in poses])
+    if (away_m > OUTSIDE_M).any():
+        say(
+            console,
+            f"{options.path}: {int((away_m > OUTSIDE_M).sum())} of {len(poses)} poses lie more than {OUTSIDE_M:g} m "
+            f"from the drive, the furthest {away_m.max():.0f} m: nothing was recorded there, and what is rendered may "
+            "be anything.",
+            "yellow",
+        )
+    return times_s, poses
+
+
+def _open(output: Path, record: dict[str, Any]) -> None:
+    """Begin the folder, or continue one that has the same scans."""
+    check_is_folder(output)
+    path = output / RECORD
+    if path.is_file():
+        there = read_json(path)
+        differing = [key for key in record if not isinstance(there, dict) or there.get(key) != record[key]]
+        if differing:
+            raise InputError(
+                f"{output}: holds other scans ({differing[0]} differs). Give another --output, or delete that folder."
+            )
+    elif output.is_dir() and any(output.iterdir()):
+        raise InputError(f"{output}: holds something else. Give another --output, or empty that folder.")
+    else:
+        write_json(path, record)
+
+
+def _model(load_config: Path, scene: Path) -> Any:
+    """Load a training's model, as nerfstudio does."""
+    from nerfstudio.utils.eval_utils import eval_setup
+
+    def of_scene(config: Any) -> Any:
+        config.pipeline.datamanager.data = scene
+        config.pipeline.datamanager.dataparser.data = scene
+        return config
+
+    _, pipeline, _, _ = eval_setup(load_config, test_mode="inference", update_config_callback=of_scene)
+    return pipeline.model
+
+
+def _render(
+    output: Path,
+    options: RenderLidarOptions,
+    caster: Caster,
+    pattern: ScanPattern,
+    ray_drop: RayDrop,
+    times_s: Float64[np.ndarray, "scans"],
+    poses: Float64[np.ndarray, "scans 4 4"],
+    console: Console,
+) -> None:
+    """Write the scans that are missing."""
+    path = Trajectory(times_s, poses)
+    numbers = range(0, len(times_s), options.every)
+    missing = [each for each in numbers if not (output / f"{each:010d}.{options.form}").is_file()]
+    with progress_bars(console, counted=True) as progress:
+        task = progress.add_task("Rendering scans", total=len(numbers), completed=len(numbers) - len(missing))
+        for number in missing:
+            cast, _, _ = caster.scan(pattern, float(times_s[number]), path)
+            kept = ray_drop.kept(cast, pattern.reach_m)
+            # in the order of time: firing by firing
+            firing, ring = np.nonzero(kept.T)
+            points_m = pattern.directions[ring, firing] * cast.distance_m[ring, firing][:, None]
+            offset_s = pattern.offset_s[firing].astype(np.float32)
+            scan = Scan(points_m.astype(np.float32), offset_s, ring.astype(np.int16))
+            write_scan(output / f"{number:010d}.{options.form}", scan)
+            progress.advance(task)
+
+
+def _write_poses(
+    path: Path, scene: SceneFolder, times_s: Float64[np.ndarray, "scans"], poses: Float64[np.ndarray, "scans 4 4"]
+) -> None:
+    places = poses[:, :3, 3] + np.array(scene.meta.get("world_offset_m", [0.0, 0.0, 0.0]), np.float64)
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    lines = [
+        " ".join(f"{value:.9f}" for value in (time_s, *place, *turn))
+        for time_s, place, turn in zip(times_s, places, turns, strict=True)
+    ]
+    write_text(path, "\n".join(["# time x y z qx qy qz qw: scanner to world", *lines]) + "\n")
+
+
+def _show(figures: dict[str, dict[str, float]], console: Console) -> None:
+    """Print how true scans are."""
+    if not figures:
+        say(console, "No sweep and no beam is held out, so nothing says how true the scans are.", "yellow")
+        return
+    for name, found in figures.items():
+        text = (
+            f"{_WORDS[name]}, {found['rays']:,.0f} rays: the rendered distance is off by "
+            f"{100 * found['median_m']:.1f} cm (median) and {found['p95_m']:.2f} m (95 %); {found['within_10_cm']:.1%} "
+            f"are within 10 cm, {found['within_30_cm']:.1%} within 30 cm."
+        )
+        if "drop_f1" in found:
+            text += (
+                f" Rays that are lost: F1 {found['drop_f1']:.2f}. Chamfer distance: {100 * found['chamfer_m']:.1f} cm."
+            )
+        say(console, text)

@@ -1,0 +1,71 @@
+"""Files of scans: .ply, .pcd and .bin, in binary form, little-endian."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Int16
+from numpy.typing import NDArray
+
+from edge_depth_nerf.base.files import write_bytes
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """A scan, point by point, in the order of time."""
+
+    points_m: Float32[np.ndarray, "points 3"]
+    """In the scanner's frame at each point's own time, as a scanner records them."""
+    offset_s: Float32[np.ndarray, "points"]
+    """When, counted from the scan's own time."""
+    ring: Int16[np.ndarray, "points"]
+    """From the highest, 0, to the lowest."""
+
+
+def _records(scan: Scan) -> NDArray:
+    kinds = [*((axis, "<f4") for axis in "xyz"), ("time", "<f4"), ("ring", "<u2")]
+    rows = np.empty(len(scan.points_m), kinds)
+    for column, axis in enumerate("xyz"):
+        rows[axis] = scan.points_m[:, column]
+    rows["time"], rows["ring"] = scan.offset_s, scan.ring
+    return rows
+
+
+def _ply(scan: Scan) -> bytes:
+    rows = _records(scan)
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    header += [f"property {'ushort' if name == 'ring' else 'float'} {name}" for name in rows.dtype.names or ()]
+    return "\n".join([*header, "end_header\n"]).encode() + rows.tobytes()
+
+
+def _pcd(scan: Scan) -> bytes:
+    rows = _records(scan)
+    header = [
+        "# .PCD v0.7",
+        "VERSION 0.7",
+        "FIELDS x y z time ring",
+        "SIZE 4 4 4 4 2",
+        "TYPE F F F F U",
+        "COUNT 1 1 1 1 1",
+        f"WIDTH {len(rows)}",
+        "HEIGHT 1",
+        "VIEWPOINT 0 0 0 1 0 0 0",
+        f"POINTS {len(rows)}",
+        "DATA binary\n",
+    ]
+    return "\n".join(header).encode() + rows.tobytes()
+
+
+def _bin(scan: Scan) -> bytes:
+    return np.pad(scan.points_m.astype("<f4"), ((0, 0), (0, 1))).tobytes()
+
+
+_WRITERS: dict[str, Callable[[Scan], bytes]] = {"ply": _ply, "pcd": _pcd, "bin": _bin}
+
+
+def write_scan(path: Path, scan: Scan) -> None:
+    """Write a scan in the format of the file's suffix, atomically."""
+    write_bytes(path, _WRITERS[path.suffix[1:]](scan))

@@ -1,0 +1,241 @@
+"""A trained model as a scanner sees it: how far rays go, which of them come back, and how true that is. Host-facing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32
+from nerfstudio.cameras.rays import RayBundle
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.spatial import KDTree
+
+from edge_depth_nerf.films.placed import SceneToModel
+from edge_depth_nerf.lidar.patterns import ScanPattern, pattern_of_scan
+from edge_depth_nerf.lidar.sweeps import MIN_RANGE_M
+from edge_depth_nerf.lidar.trajectory import Trajectory
+from edge_depth_nerf.scene.sweeps import SceneScanner, SceneSweep, SweepRays
+
+HIT = 0.5
+"""A ray that stops less than this share of its light hits nothing."""
+MOST_LEARNED_SWEEPS, MOST_EVALUATED_SWEEPS = 4, 10
+MOST_RAYS = 30_000
+"""Of a sweep, for learning which rays come back and for figures."""
+_PIXEL_AREA = 1e-6
+"""Of a beam at distance 1; nerfacto does not use it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cast:
+    """What rays meet."""
+
+    distance_m: Float32[np.ndarray, "*rays"]
+    """Where half of the light that is stopped is stopped."""
+    hit: Float32[np.ndarray, "*rays"]
+    """The share of the light that is stopped, 0 to 1."""
+
+
+class Caster:
+    """Casts rays into a trained model."""
+
+    def __init__(self, model: Any, to_model: SceneToModel) -> None:
+        """Take nerfstudio's model, ours or nerfacto, and the scene's place in it."""
+        self._model, self._to_model = model, to_model
+
+    @torch.no_grad()
+    def cast(self, origin_m: Float[np.ndarray, "*rays 3"], direction: Float[np.ndarray, "*rays 3"]) -> Cast:
+        """Cast rays from places in the scene (metres) along unit vectors in the scene."""
+        shape = direction.shape[:-1]
+        flat = [each.reshape(1, -1, 3) for each in (origin_m, direction)]
+        place = self._to_model
+        origins = place.units_per_metre * (flat[0] @ place.rotation.T + place.shift_m)
+        given = (torch.from_numpy(each.astype(np.float32)) for each in (origins, flat[1] @ place.rotation.T))
+        origins_, directions = (each.to(self._model.device) for each in given)
+        one = origins_.new_ones(*origins_.shape[:-1], 1)
+        rays = RayBundle(origins_, directions, _PIXEL_AREA * one, torch.zeros_like(one, dtype=torch.long))
+        rays.metadata = {"directions_norm": one}
+        outputs = self._model.get_outputs_for_camera_ray_bundle(rays)
+        found = (outputs[name].reshape(shape).float().cpu().numpy() for name in ("depth", "accumulation"))
+        depth, hit = found
+        return Cast(depth / np.float32(place.units_per_metre), hit)
+
+    def scan(self, pattern: ScanPattern, time_s: float, scanner: Trajectory) -> tuple[Cast, NDArray, NDArray]:
+        """Cast all rays of a turn at `time_s` while the scanner moves.
+
+        Returns:
+            What they meet, [rings, firings]; and their origins [firings, 3] and directions [rings, firings, 3] in the
+            scene.
+        """
+        poses = scanner.at(time_s + pattern.offset_s)
+        directions = np.einsum("fij,rfj->rfi", poses[:, :3, :3], pattern.directions)
+        origins = poses[:, :3, 3]
+        return self.cast(np.broadcast_to(origins, directions.shape), directions), origins, directions
+
+
+def in_scanner(sweep: SceneSweep, rays: SweepRays, scanner: Trajectory) -> Float[np.ndarray, "rays 3"]:
+    """Give a sweep's points in the scanner's frame at each point's own time."""
+    poses = scanner.at(sweep.time_s + rays.offset_s.astype(np.float64))
+    along = np.einsum("nji,nj->ni", poses[:, :3, :3], rays.direction.astype(np.float64))
+    return along * rays.distance_m[:, None].astype(np.float64)
+
+
+def recorded_pattern(scanner: SceneScanner) -> ScanPattern | None:
+    """Find the pattern of a drive's own scanner, from the middle one of its sweeps; None if that has no rings.
+
+    Raises:
+        InputError: the sweep's points do not lie at regular azimuths.
+    """
+    sweep = scanner.sweeps[len(scanner.sweeps) // 2]
+    rays = sweep.read()
+    if len(scanner.sweeps) < 2 or rays.ring.min() < 0:
+        return None
+    points_m = in_scanner(sweep, rays, scanner.trajectory)
+    return pattern_of_scan(points_m, rays.ring, scanner.timing, str(sweep.path))
+
+
+def came_back(
+    sweep: SceneSweep, rays: SweepRays, pattern: ScanPattern, scanner: Trajectory
+) -> Bool[np.ndarray, "rings firings"]:
+    """Say which rays of the recorded pattern gave a point in a sweep."""
+    points_m = in_scanner(sweep, rays, scanner)
+    found = np.zeros((len(pattern.elevation_rad), pattern.firings), bool)
+    known = (rays.ring >= 0) & (rays.ring < len(found))
+    found[rays.ring[known], pattern.columns(points_m[known])] = True
+    # firings are not as regular as the pattern: one between two that came back did, too
+    return found | (np.roll(found, 1, axis=1) & np.roll(found, -1, axis=1))
+
+
+class RayDrop:
+    """Which rays a scanner gets back, learned from a drive's own: a logistic regression on what they meet."""
+
+    def __init__(self, weights: NDArray[np.float64] | None = None) -> None:
+        """Take what `learned` found; without it every ray that hits something comes back."""
+        self._weights = weights
+
+    @staticmethod
+    def _features(cast: Cast) -> NDArray[np.float64]:
+        hit, far = cast.hit.astype(np.float64), np.log(np.maximum(cast.distance_m, MIN_RANGE_M).astype(np.float64))
+        return np.stack([np.ones_like(hit), hit, far, far**2, hit * far], axis=-1)
+
+    @classmethod
+    def learned(cls, cast: Cast, back: Bool[np.ndarray, "*rays"]) -> RayDrop:
+        """Learn from rays, and which of them came back."""
+        features, wanted = cls._features(cast).reshape(-1, 5), np.where(back.reshape(-1), 1.0, -1.0)
+        if len(np.unique(wanted)) < 2:
+            # all came back, or none: nothing tells them apart
+            return cls()
+
+        def loss(weights: NDArray) -> tuple[float, NDArray]:
+            margin = wanted * (features @ weights)
+            slope = -wanted / (1 + np.exp(np.clip(margin, -50, 50)))
+            value = np.logaddexp(0, -margin).mean() + 1e-6 * weights @ weights
+            return float(value), slope @ features / len(wanted) + 2e-6 * weights
+
+        return cls(minimize(loss, np.zeros(5), jac=True, method="L-BFGS-B").x)
+
+    def kept(self, cast: Cast, reach_m: float) -> Bool[np.ndarray, "*rays"]:
+        """Say which rays come back from within the scanner's reach."""
+        within = (cast.distance_m >= MIN_RANGE_M) & (cast.distance_m <= reach_m)
+        if self._weights is None:
+            return within & (cast.hit >= HIT)
+        return within & (self._features(cast) @ self._weights > 0)
+
+
+def learn_ray_drop(caster: Caster, scanner: SceneScanner, pattern: ScanPattern) -> RayDrop:
+    """Learn from a drive's own sweeps which rays come back; only from those that the training saw."""
+    training = [sweep for sweep in scanner.sweeps if not sweep.held_out]
+    rng, casts, back = np.random.default_rng(0), [], []
+    for sweep in _spread(training, MOST_LEARNED_SWEEPS):
+        whole = came_back(sweep, sweep.read(), pattern, scanner.trajectory)
+        rows, columns = (rng.integers(count, size=MOST_RAYS // MOST_LEARNED_SWEEPS) for count in whole.shape)
+        poses = scanner.trajectory.at(sweep.time_s + pattern.offset_s)[columns]
+        along = np.einsum("nij,nj->ni", poses[:, :3, :3], pattern.directions[rows, columns])
+        casts.append(caster.cast(poses[:, :3, 3], along))
+        back.append(whole[rows, columns])
+    if not casts:
+        return RayDrop()
+    together = Cast(*(np.concatenate([getattr(each, name) for each in casts]) for name in ("distance_m", "hit")))
+    return RayDrop.learned(together, np.concatenate(back))
+
+
+def _spread(sweeps: Sequence[SceneSweep], most: int) -> list[SceneSweep]:
+    places = np.unique(np.linspace(0, len(sweeps) - 1, min(most, len(sweeps))).round().astype(int))
+    return [sweeps[place] for place in places] if len(sweeps) else []
+
+
+def errors(measured_m: Float[np.ndarray, "rays"], rendered_m: Float[np.ndarray, "rays"]) -> dict[str, float]:
+    """Give figures of rendered distances along rays whose length a scanner measured."""
+    error_m = np.abs(rendered_m.astype(np.float64) - measured_m)
+    return {
+        "rays": float(len(error_m)),
+        "median_m": float(np.median(error_m)),
+        "p95_m": float(np.quantile(error_m, 0.95)),
+        "within_10_cm": float((error_m <= 0.1).mean()),
+        "within_30_cm": float((error_m <= 0.3).mean()),
+        "abs_rel": float((error_m / measured_m).mean()),
+    }
+
+
+def chamfer_m(points_m: Float[np.ndarray, "points 3"], others_m: Float[np.ndarray, "others 3"]) -> float:
+    """Give the mean distance from a point of one scan to the nearest of the other, mean of both ways, metres."""
+    ways = (KDTree(others_m).query(points_m)[0], KDTree(points_m).query(others_m)[0])
+    return float(np.mean([way.mean() for way in ways]))
+
+
+def evaluate(
+    caster: Caster, scanner: SceneScanner, pattern: ScanPattern | None, ray_drop: RayDrop
+) -> dict[str, dict[str, float]]:
+    """Hold the model against what no training saw: held-out sweeps, and held-out beams of the others.
+
+    Along each recorded ray, of at most `MOST_RAYS` a sweep, the rendered distance is compared with the measured one.
+
+    Returns:
+        Figures of `sweeps` and `beams`, where there are any. With a pattern those of sweeps have also `drop_f1` (of
+        rays that did not come back) and `chamfer_m` between the whole rendered scan and the recorded one.
+    """
+    found: dict[str, dict[str, float]] = {}
+    chosen = {
+        "sweeps": [sweep for sweep in scanner.sweeps if sweep.held_out],
+        "beams": [sweep for sweep in scanner.sweeps if not sweep.held_out],
+    }
+    for name, sweeps in chosen.items():
+        measured, rendered, more = [], [], []
+        for sweep in _spread(sweeps, MOST_EVALUATED_SWEEPS):
+            rays = sweep.read()
+            of_use = np.flatnonzero(rays.held_out if name == "beams" else np.ones(len(rays.ring), bool))
+            if len(of_use) > MOST_RAYS:
+                of_use = np.random.default_rng(0).choice(of_use, MOST_RAYS, replace=False)
+            if not len(of_use):
+                continue
+            cast = caster.cast(rays.origin_m[of_use].astype(np.float64), rays.direction[of_use].astype(np.float64))
+            measured.append(rays.distance_m[of_use])
+            rendered.append(cast.distance_m)
+            if pattern is not None and name == "sweeps":
+                more.append(_of_whole(caster, scanner.trajectory, sweep, rays, pattern, ray_drop))
+        if measured:
+            found[name] = errors(np.concatenate(measured), np.concatenate(rendered))
+            found[name] |= {key: float(np.mean([each[key] for each in more])) for key in (more[0] if more else ())}
+    return found
+
+
+def _of_whole(
+    caster: Caster,
+    scanner: Trajectory,
+    sweep: SceneSweep,
+    rays: SweepRays,
+    pattern: ScanPattern,
+    ray_drop: RayDrop,
+) -> dict[str, float]:
+    cast, origins, directions = caster.scan(pattern, sweep.time_s, scanner)
+    kept = ray_drop.kept(cast, pattern.reach_m)
+    lost, truly = ~kept, ~came_back(sweep, rays, pattern, scanner)
+    both = (lost & truly).sum()
+    points_m = (origins[None] + directions * cast.distance_m[..., None])[kept]
+    return {
+        "drop_f1": float(2 * both / max(1, lost.sum() + truly.sum())),
+        "chamfer_m": chamfer_m(points_m, rays.points_m) if len(points_m) else float("nan"),
+    }

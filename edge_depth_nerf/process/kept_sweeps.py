@@ -1,0 +1,119 @@
+"""Keeps the scanners' own rays beside the pictures: each measurement where and when it was made (`scene.sweeps`)."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from numpy.typing import NDArray
+from rich.console import Console
+
+from edge_depth_nerf.base.console import run_jobs
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.lidar.patterns import rings_of
+from edge_depth_nerf.lidar.sweeps import Sweep, held_out_beams
+from edge_depth_nerf.lidar.trajectory import MAX_POSE_GAP_S, Trajectory
+from edge_depth_nerf.lidar.world import offsets_s
+from edge_depth_nerf.process.options import ProcessOptions
+from edge_depth_nerf.process.reading import read_if_whole
+from edge_depth_nerf.process.recording import RecordedSweep, Recording
+from edge_depth_nerf.scene.sweeps import UNKNOWN_RING, SceneScanner, SceneSweep, SweepRays, write_rays
+
+FOLDER = "sweeps"
+
+
+def keep_sweeps(
+    recording: Recording,
+    options: ProcessOptions,
+    held_out: Collection[int],
+    offset_m: Float64[np.ndarray, "3"],
+    made_from: Sequence[Path],
+    console: Console,
+) -> list[SceneScanner]:
+    """Write the rays of the sweeps between the first picture and the last, those that are missing or out of date.
+
+    Args:
+        recording: with a trajectory.
+        options: where to; raw_lidar takes all points of a sweep as measured at once; holdout_beams marks rays.
+        held_out: numbers of the frames that are kept from training.
+        offset_m: the scene's origin in the recording's world.
+        made_from: files that all rays depend on, such as found poses.
+        console: where progress is shown.
+
+    Returns:
+        The scanners with what was written; without sweeps that cannot be read.
+    """
+    assert recording.trajectory is not None
+    times_s = [picture.time_s for picture in recording.pictures]
+    by_scanner: dict[str, list[RecordedSweep]] = {}
+    for sweep in sorted(recording.sweeps, key=lambda sweep: sweep.time_s):
+        near = sweep.frame is not None or min(times_s) <= sweep.time_s <= max(times_s)
+        if near and recording.trajectory.gap_s(sweep.time_s) <= MAX_POSE_GAP_S:
+            by_scanner.setdefault(sweep.scanner, []).append(sweep)
+    jobs, scanners = [], []
+    for name, sweeps in by_scanner.items():
+        poses = recording.trajectory.at(np.array([sweep.time_s for sweep in sweeps]))
+        kept = []
+        for number, (sweep, vehicle_to_world) in enumerate(zip(sweeps, poses, strict=True)):
+            pose = vehicle_to_world @ sweep.to_vehicle
+            pose[:3, 3] -= offset_m
+            path = options.output / FOLDER / name / f"{number:010d}.npz"
+            kept.append(SceneSweep(path, name, sweep.frame, sweep.time_s, sweep.frame in held_out, pose))
+            if not _is_fresh(path, [sweep.path, *made_from]):
+                write = partial(_write, path, sweep, recording.trajectory, offset_m, options)
+                jobs.append(partial(read_if_whole, write, strict=options.strict))
+        scanners.append(SceneScanner(name, tuple(kept), sweeps[0].timing))
+    if jobs:
+        run_jobs(jobs, "Keeping the scanners' rays", console)
+    found = [
+        SceneScanner(scanner.name, tuple(sweep for sweep in scanner.sweeps if sweep.path.is_file()), scanner.timing)
+        for scanner in scanners
+    ]
+    return [scanner for scanner in found if scanner.sweeps]
+
+
+def _is_fresh(path: Path, made_from: Sequence[Path]) -> bool:
+    return path.is_file() and all(path.stat().st_mtime_ns > each.stat().st_mtime_ns for each in made_from)
+
+
+def _write(
+    path: Path, recorded: RecordedSweep, trajectory: Trajectory, offset_m: NDArray, options: ProcessOptions
+) -> bool:
+    path.unlink(missing_ok=True)
+    write_rays(path, rays_of(recorded.read(), recorded, trajectory, offset_m, options))
+    return True
+
+
+def rays_of(
+    sweep: Sweep, recorded: RecordedSweep, trajectory: Trajectory, offset_m: NDArray, options: ProcessOptions
+) -> SweepRays:
+    """Give a sweep's measurements as rays in the scene, whose origin is at `offset_m` in the recording's world."""
+    offset_s = offsets_s(sweep, recorded.timing, deskew=not options.raw_lidar)
+    in_vehicle = torch.from_numpy(recorded.to_vehicle)
+    mounted = in_vehicle[:3, 3].expand(len(sweep.points_m), 3)
+    points = sweep.points_m @ in_vehicle[:3, :3].T + in_vehicle[:3, 3]
+    origin, there = (
+        trajectory.to_world(each, recorded.time_s + offset_s).numpy() - offset_m for each in (mounted, points)
+    )
+    along = there - origin
+    distance = np.linalg.norm(along, axis=1)
+    try:
+        ring = rings_of(sweep.points_m.numpy(), str(recorded.path))
+    except InputError:
+        ring = np.full(len(distance), UNKNOWN_RING)
+    beams = np.zeros(len(distance), np.int16)
+    if options.holdout_beams:
+        beams = held_out_beams(sweep, options.holdout_beams).numpy().astype(np.int16)
+    return SweepRays(
+        origin_m=origin.astype(np.float32),
+        direction=(along / distance[:, None]).astype(np.float32),
+        distance_m=distance.astype(np.float32),
+        offset_s=offset_s.numpy().astype(np.float32),
+        intensity=sweep.reflectance.numpy().astype(np.float32),
+        ring=ring.astype(np.int16),
+        of_beam=beams,
+    )

@@ -1,0 +1,285 @@
+"""The scanners' own rays in a scene, and scans rendered of it: a room whose every distance is known in closed form."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from drives import SEQUENCE, RoomDrive, cut, pose, wall_distance, write_points, write_room_drive
+from rich.console import Console
+
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_json, write_json
+from edge_depth_nerf.films import scan_command
+from edge_depth_nerf.films.placed import SceneToModel
+from edge_depth_nerf.films.scan_command import render_lidar
+from edge_depth_nerf.films.scan_options import RenderLidarOptions
+from edge_depth_nerf.films.scanning import Caster
+from edge_depth_nerf.lidar.patterns import ScanPattern
+from edge_depth_nerf.lidar.scans import PointTimes, ScanFormat, read_scan
+from edge_depth_nerf.plugin.config import edge_depth_nerf_lite
+from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
+from edge_depth_nerf.process.converters import convert
+from edge_depth_nerf.process.options import Kitti360Options
+from edge_depth_nerf.scene.reader import read_scene
+from edge_depth_nerf.scene.sweeps import SceneScanner, scanners_of
+
+QUIET = Console(quiet=True)
+PATTERN = ScanPattern("test", np.radians(np.linspace(15.0, -25.0, 12)), 240, 100.0)
+LOST_M = 18.0
+"""The scanner loses what is further away."""
+FRAMES = 9
+
+
+def measure(drive: RoomDrive, frame: int) -> np.ndarray:
+    """What the turning scanner measures, ring by ring, each firing from where the scanner is at its time."""
+    to_world = np.stack([drive.velo_to_world(frame + offset / 0.1) for offset in PATTERN.offset_s])
+    rays = np.einsum("fij,rfj->rfi", to_world[:, :3, :3], PATTERN.directions)
+    distance, _ = wall_distance(np.broadcast_to(to_world[None, :, :3, 3], rays.shape), rays)
+    points = (PATTERN.directions * distance[..., None]).reshape(-1, 3)
+    return points[distance.reshape(-1) <= LOST_M]
+
+
+def process(drive: RoomDrive, output: Path, **options: Any) -> SceneScanner:
+    given = {"root": drive.root, "sequence": SEQUENCE, "output": output, "sweeps": 0, "holdout_every": 4}
+    convert(Kitti360Options(**given | options), QUIET)
+    scene = read_scene(output)
+    return scanners_of(scene.meta, scene.path)["velodyne"]
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory) -> RoomDrive:
+    room = write_room_drive(tmp_path_factory.mktemp("room") / "drive", frames=FRAMES, size=32)
+    for frame in room.frames:
+        write_points(room.sweep(frame), measure(room, frame))
+    return room
+
+
+@pytest.fixture(scope="module")
+def scanner(drive) -> SceneScanner:
+    return process(drive, drive.root.parent / "scene", holdout_beams=5)
+
+
+def offset_m(scanner: SceneScanner) -> np.ndarray:
+    return np.array(read_json(scanner.sweeps[0].path.parents[2] / "transforms.json")["world_offset_m"])
+
+
+# ---- rays in the scene -----------------------------------------------------------------------------------------
+def test_rays_are_where_and_when_the_scanner_measured(drive, scanner):
+    assert len(scanner.sweeps) == FRAMES and [sweep.frame for sweep in scanner.sweeps] == list(drive.frames)
+    assert [sweep.held_out for sweep in scanner.sweeps] == [frame % 4 == 2 for frame in drive.frames]
+    for sweep in scanner.sweeps:
+        rays = sweep.read()
+        np.testing.assert_allclose(
+            sweep.scanner_to_scene[:3, 3] + offset_m(scanner), drive.velo_to_world(sweep.frame)[:3, 3], atol=1e-6
+        )
+        there = np.stack([drive.velo_to_world(sweep.frame + offset / 0.1)[:3, 3] for offset in rays.offset_s])
+        np.testing.assert_allclose(rays.origin_m + offset_m(scanner), there, atol=1e-4)
+        distance, _ = wall_distance(rays.origin_m + offset_m(scanner), rays.direction.astype(np.float64))
+        np.testing.assert_allclose(rays.distance_m, distance, atol=2e-3)
+        assert np.ptp(rays.offset_s) > 0.09 and (rays.intensity == 0.5).all()
+        assert rays.ring.min() == 0 and rays.ring.max() == len(PATTERN.elevation_rad) - 1
+        # some beams of every sweep are held out, and none of these points is in a map
+        assert 0.05 < rays.held_out.mean() < 0.4
+
+
+def test_raw_lidar_takes_a_turn_as_one_moment(drive, tmp_path):
+    rays = process(drive, tmp_path / "scene", raw_lidar=True).sweeps[3].read()
+    assert (rays.offset_s == 0).all() and np.ptp(rays.origin_m, axis=0).max() == 0 and not rays.held_out.any()
+
+
+def test_what_is_there_stays_and_what_changed_is_written_again(drive, scanner, tmp_path):
+    output = tmp_path / "scene"
+    first = process(drive, output)
+    times = {sweep.path: sweep.path.stat().st_mtime_ns for sweep in first.sweeps}
+    first.sweeps[5].path.unlink()
+    drive.sweep(7).touch()
+    again = process(drive, output)
+    written = [sweep.frame for sweep in again.sweeps if sweep.path.stat().st_mtime_ns != times[sweep.path]]
+    assert written == [5, 7]
+
+
+def test_a_broken_sweep_is_left_out(tmp_path):
+    room = write_room_drive(tmp_path / "drive", frames=FRAMES, size=32)
+    cut(room.sweep(3))
+    found = process(room, tmp_path / "scene")
+    assert [sweep.frame for sweep in found.sweeps] == [0, 1, 2, 4, 5, 6, 7, 8]
+    # of points in all directions no rings are known, which is no fault
+    assert (found.sweeps[0].read().ring == -1).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda entry: entry.update(file_path="../x.npz"), "file_path is '../x.npz', expected the path"),
+        (lambda entry: entry.update(timestamp_s="now"), "timestamp_s is 'now', expected a number"),
+        (lambda entry: entry.update(transform_matrix=[[2, 0, 0, 0]] * 4), "not a rotation"),
+        (lambda entry: entry.update(timestamp_s=-1e9), "do not increase"),
+    ],
+)
+def test_entries_that_are_none(scanner, change, message):
+    path = scanner.sweeps[0].path.parents[2] / "transforms.json"
+    meta = read_json(path)
+    change(meta["scanners"]["velodyne"]["sweeps"][4])
+    with pytest.raises(InputError, match=message):
+        scanners_of(meta, path)
+
+
+def test_a_broken_file_of_rays_is_named(scanner, tmp_path):
+    path = tmp_path / "0000000000.npz"
+    path.write_bytes(scanner.sweeps[0].path.read_bytes()[:-500])
+    with pytest.raises(InputError, match=r"0000000000\.npz"):
+        replace(scanner.sweeps[0], path=path).read()
+    arrays = dict(np.load(scanner.sweeps[0].path))
+    np.savez(path, **arrays | {"distance_m": arrays["distance_m"] * np.nan})
+    with pytest.raises(InputError, match="distance_m is not finite"):
+        replace(scanner.sweeps[0], path=path).read()
+
+
+# ---- rendered scans --------------------------------------------------------------------------------------------
+class RoomModel:
+    """Renders the room exactly, in the model's coordinates, but for what is said to be wrong."""
+
+    device = torch.device("cpu")
+
+    def __init__(self, place: SceneToModel, world_offset_m: np.ndarray, off_m: float = 0.0) -> None:
+        self.place, self.world_offset_m, self.off_m = place, world_offset_m, off_m
+        self.cast = 0
+
+    def get_outputs_for_camera_ray_bundle(self, rays: Any) -> dict[str, torch.Tensor]:
+        place, self.cast = self.place, self.cast + len(rays.origins.reshape(-1, 3))
+        origins, directions = rays.origins.double().numpy(), rays.directions.double().numpy()
+        np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1, atol=1e-6)
+        world = (origins / place.units_per_metre - place.shift_m) @ place.rotation + self.world_offset_m
+        distance, _ = wall_distance(world, directions @ place.rotation)
+        depth = torch.from_numpy((distance + self.off_m) * place.units_per_metre)[..., None]
+        return {"depth": depth.float(), "accumulation": torch.ones_like(depth).float()}
+
+
+@pytest.fixture
+def trained(scanner, tmp_path, monkeypatch) -> Path:
+    """The config.yml of a training with 10 m in a unit, whose model is the room."""
+    scene, config = scanner.sweeps[0].path.parents[2], tmp_path / "run/config.yml"
+    settings = edge_depth_nerf_lite.config
+    parser = FisheyeDepthDataParserConfig(metres_per_unit=10.0)
+    datamanager = replace(settings.pipeline.datamanager, dataparser=parser, data=scene)  # pyright: ignore
+    config.parent.mkdir()
+    config.write_text(yaml.dump(replace(settings, pipeline=replace(settings.pipeline, datamanager=datamanager))))
+
+    def caster(model: Any, place: SceneToModel) -> Caster:
+        return Caster(RoomModel(place, offset_m(scanner), off_m=model), place)
+
+    monkeypatch.setattr(scan_command, "_model", lambda *_: 0.0)
+    monkeypatch.setattr(scan_command, "Caster", caster)
+    return config
+
+
+TIMED = ScanFormat(times=PointTimes("time"))
+
+
+def test_scans_along_the_recorded_path_are_those_that_were_recorded(drive, trained):
+    output = render_lidar(RenderLidarOptions(trained), QUIET)
+    for frame in drive.frames:
+        scan = read_scan(output / f"{frame:010d}.ply", TIMED)
+        points_m, offset_s = scan.points_m.numpy(), scan.offset_s.numpy()
+        # each point is the wall's, seen from where the scanner was at the point's own time
+        there = np.stack([drive.velo_to_world(frame + offset / 0.1) for offset in offset_s])
+        world = np.einsum("nij,nj->ni", there[:, :3, :3], points_m)
+        distance, _ = wall_distance(there[:, :3, 3], world / np.linalg.norm(world, axis=1)[:, None])
+        np.testing.assert_allclose(np.linalg.norm(points_m, axis=1), distance, atol=5e-3)
+        assert (np.diff(offset_s) >= 0).all() and np.ptp(offset_s) > 0.09
+        # what the drive's scanner loses is lost here, too
+        assert distance.max() < LOST_M + 0.5
+        assert len(points_m) == pytest.approx(len(measure(drive, frame)), rel=0.03)
+    figures = read_json(output / "figures.json")
+    for name in ("sweeps", "beams"):
+        assert figures[name]["median_m"] < 2e-3 and figures[name]["within_10_cm"] == 1
+    assert figures["sweeps"]["drop_f1"] > 0.9 and figures["sweeps"]["chamfer_m"] < 0.1
+    lines = [line.split() for line in (output / "poses.txt").read_text().splitlines()[1:]]
+    np.testing.assert_allclose(
+        np.array(lines, float)[:, 1:4], [drive.velo_to_world(frame)[:3, 3] for frame in drive.frames], atol=1e-6
+    )
+
+
+def test_figures_say_how_far_a_model_is_off(trained, monkeypatch):
+    monkeypatch.setattr(scan_command, "_model", lambda *_: 0.2)
+    output = render_lidar(RenderLidarOptions(trained, every=9), QUIET)
+    found = read_json(output / "figures.json")["sweeps"]
+    assert found["median_m"] == pytest.approx(0.2, abs=2e-3) and found["p95_m"] == pytest.approx(0.2, abs=2e-3)
+    assert found["within_10_cm"] == 0 and found["within_30_cm"] == 1
+
+
+@pytest.mark.parametrize("form", ["ply", "pcd", "bin"])
+def test_files_hold_places_times_and_rings(trained, form):
+    output = render_lidar(RenderLidarOptions(trained, sensor="vlp-16", form=form, every=9), QUIET)
+    path = output / f"{0:010d}.{form}"
+    scan = read_scan(path, ScanFormat() if form == "bin" else TIMED)
+    points_m = scan.points_m.numpy()
+    elevation = np.degrees(np.arcsin(points_m[:, 2] / np.linalg.norm(points_m, axis=1)))
+    np.testing.assert_allclose(elevation, np.round((elevation - 15) / 2) * 2 + 15, atol=1e-3)
+    if form != "bin":
+        ring = read_scan(path, ScanFormat(times=PointTimes("ring"))).offset_s
+        assert ring is not None and scan.offset_s is not None
+        np.testing.assert_allclose(15 - 2 * ring.numpy(), elevation, atol=1e-3)
+
+
+def test_a_lane_shift_is_as_far_as_it_was_asked_for(drive, trained):
+    output = render_lidar(RenderLidarOptions(trained, path="lane-shift", shift_m=1.5), QUIET)
+    lines = np.array([line.split() for line in (output / "poses.txt").read_text().splitlines()[1:]], float)
+    recorded = np.array([drive.velo_to_world(frame)[:3, 3] for frame in drive.frames])
+    # the vehicle's y is right
+    left = -(lines[:, 1:4] - recorded) @ pose(0)[:3, 1]
+    assert left[0] == pytest.approx(0, abs=1e-6) and left[4] == pytest.approx(1.5, abs=1e-3)
+
+
+def test_the_pattern_of_a_file_and_a_path_of_ones_own(drive, trained, tmp_path, capsys):
+    (tmp_path / "path.txt").write_text(
+        "0 1000 3800 117 0 0 0 1\n0.1 1000.5 3800 117 0 0 0 1\n0.2 1040 3800 117 0 0 0 1\n"
+    )
+    options = RenderLidarOptions(trained, sensor=str(drive.sweep(0)), path=str(tmp_path / "path.txt"))
+    output = render_lidar(options, Console(width=200))
+    said = " ".join(capsys.readouterr().out.split())
+    assert "1 of 3 poses lie more than 10 m from the drive, the furthest 3" in said and "12 × 240 rays" in said
+    assert len(list(output.glob("*.ply"))) == 3
+
+
+def test_an_interrupted_run_goes_on(trained):
+    output = render_lidar(RenderLidarOptions(trained), QUIET)
+    times = {path: path.stat().st_mtime_ns for path in output.glob("*.ply")}
+    (output / f"{3:010d}.ply").unlink()
+    assert render_lidar(RenderLidarOptions(trained), QUIET) == output
+    assert [path.name for path in sorted(times) if path.stat().st_mtime_ns != times[path]] == [f"{3:010d}.ply"]
+    with pytest.raises(InputError, match="holds other scans"):
+        render_lidar(RenderLidarOptions(trained, sensor="vlp-16"), QUIET)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"sensor": "hdl-23"}, "--sensor hdl-23: neither a scanner .recorded, hdl-64, vlp-16, os1-128. nor a file"),
+        ({"path": "nowhere.txt"}, "--path nowhere.txt: neither recorded nor lane-shift, nor a file"),
+        ({"scanner": "front"}, "--scanner front: .* has no such scanner; it has velodyne"),
+        ({"shift_m": math.nan}, "--shift-m nan"),
+        ({"every": 0}, "--every 0"),
+    ],
+)
+def test_options_that_cannot_be_used(trained, options, message):
+    with pytest.raises(InputError, match=message):
+        render_lidar(RenderLidarOptions(trained, **options), QUIET)
+    assert not (trained.parent / "scans").exists()
+
+
+def test_a_folder_with_something_else_is_refused(trained, tmp_path):
+    write_json(tmp_path / "mine/notes.json", {})
+    with pytest.raises(InputError, match="mine: holds something else"):
+        render_lidar(RenderLidarOptions(trained, output=tmp_path / "mine"), QUIET)
+
+
+def test_a_scene_without_sweeps_says_what_to_do(trained, scanner, monkeypatch):
+    monkeypatch.setattr(scan_command, "scanners_of", lambda *_: {})
+    with pytest.raises(InputError, match="keeps no sweeps of a scanner, so --sensor recorded is unknown"):
+        render_lidar(RenderLidarOptions(trained), QUIET)
