@@ -46,6 +46,70 @@ def with_orientation(path: Path, pixels: np.ndarray, orientation: int) -> Path:
     return path
 
 
+# ---- times -----------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("content", "keys"),
+    [
+        ("\ufeff" + "0.0\r\n0.1\r\n0.2\r\n0.3", ""),
+        ("timestamp\n0.0\n0.1\n0.2\n0.3\n", ""),
+        ('"image","time"\n' + "".join(f"{number:06d},{number / 10}\n" for number in range(4)), ""),
+        # TUM's rgb.txt and EuRoC's data.csv
+        ("# timestamp filename\n" + "".join(f"{number / 10} rgb/{number:06d}.png\n" for number in range(4)), ""),
+        (
+            "#timestamp [ns],filename\r\n" + "".join(f"{number}00000000,{number:06d}.png\r\n" for number in range(4)),
+            'time_unit = "ns"\n',
+        ),
+        # KITTI's timestamps.txt, and ISO's form
+        ("".join(f"2011-09-26 13:02:25.{number}00000000\n" for number in range(4)), "time_offset_s = -1317042145\n"),
+        ("".join(f"2011-09-26T13:02:25.{number}Z\n" for number in range(4)), "time_offset_s = -1317042145\n"),
+    ],
+)
+def test_times_as_tools_write_them(mine: Path, content: str, keys: str) -> None:
+    (mine / "times.txt").write_bytes(content.encode())
+    edit(mine, ('times_file = "times.txt"\n', f'times_file = "times.txt"\n{keys}'))
+    assert [picture.time_s for picture in read(mine).pictures] == pytest.approx([0, 0.1, 0.2, 0.3], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("content", "keys", "message"),
+    [
+        (
+            "2011-09-26 13:02:25.1\n",
+            'time_unit = "ns"\n',
+            "line 1: the time is a date, but time_unit is 'ns'.*leave out",
+        ),
+        ("0.0 a.png\nb.png 0.1\n", "", r"line 2: some lines .* or have it elsewhere \(NAME TIME, after TIME NAME\)"),
+        ("0.0 a.png 7\n", "", "line 1: 3 words, expected a time, a file's name and a time"),
+        ("0 a/000000.png\n1 b/000000.png\n", "", "has two times for 000000.png, 0.000000 and 1.000000"),
+    ],
+)
+def test_other_times_are_named(mine: Path, content: str, keys: str, message: str) -> None:
+    (mine / "times.txt").write_text(content)
+    edit(mine, ('times_file = "times.txt"\n', f'times_file = "times.txt"\n{keys}'))
+    with pytest.raises(InputError, match=message):
+        read(mine)
+
+
+def test_a_marked_rig_file_and_poses_with_a_heading(mine: Path) -> None:
+    (mine / "rig.toml").write_text("\ufeff" + (mine / "rig.toml").read_text().replace("\n", "\r\n"))
+    poses = (mine / "poses.txt").read_text()
+    (mine / "poses.txt").write_text("\ufefftimestamp tx ty tz qx qy qz qw\n" + poses)
+    assert len(read(mine).pictures) == 4
+    (mine / "poses.txt").write_text(
+        "".join(f"{line} {line}\n" for line in poses.splitlines()[:4]).replace(" 1\n", " 1 1\n")
+    )
+    with pytest.raises(InputError, match=r"line 1: 17 numbers as EuRoC's ground truth has .*, expected 8"):
+        read(mine)
+
+
+@pytest.mark.parametrize("given", ["left [raw]", "left [raw]/*.png", "left ?[raw]/0*.png"])
+def test_a_folder_with_brackets_in_its_name(mine: Path, given: str) -> None:
+    (mine / "images").rename(mine / "left [raw]")
+    (mine / "left ?[raw]").symlink_to("left [raw]")
+    edit(mine, ('images = "images"', f'images = "{given}"'))
+    assert len(read(mine).pictures) == 4
+
+
 # ---- pictures --------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
 @pytest.mark.parametrize("orientation", [1, 3, 6, 8])

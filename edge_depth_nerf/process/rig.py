@@ -214,8 +214,10 @@ def _chosen(rig: Rig, names: Sequence[str]) -> list[RigCamera]:
 def _files(root: Path, given: str, suffixes: tuple[str, ...]) -> list[Path]:
     """Files of a folder, or those that a pattern names, in the order of their names."""
     path, parts = root / given, Path(given).parts
-    wild = [number for number, part in enumerate(parts) if any(sign in part for sign in "*?[")]
-    if wild:
+    # a folder may be called "left [raw]"
+    there = next((number for number in range(len(parts)) if not root.joinpath(*parts[: number + 1]).exists()), 0)
+    wild = [number for number, part in enumerate(parts) if number >= there and any(sign in part for sign in "*?[")]
+    if wild and not path.is_dir():
         folder = root.joinpath(*parts[: wild[0]])
         try:
             found = [file for file in folder.glob(str(Path(*parts[wild[0] :]))) if file.is_file()]
@@ -257,7 +259,10 @@ def _number_in(path: Path) -> float:
 
 def _timed(files: list[Path], clock: Clock) -> list[_Timed]:
     """Files with their times, in the order of time."""
-    counts = _times_of_file(clock.times_file, files) if clock.times_file else [_number_in(path) for path in files]
+    if clock.times_file:
+        counts = _times_of_file(clock.times_file, files, clock.time_unit)
+    else:
+        counts = [_number_in(path) for path in files]
     timed = sorted(map(_Timed, files, clock.seconds(counts)), key=lambda item: item.time_s)
     for before, after in pairwise(timed):
         if before.time_s == after.time_s:
@@ -267,10 +272,15 @@ def _timed(files: list[Path], clock: Clock) -> list[_Timed]:
     return timed
 
 
-def _times_of_file(path: Path, files: list[Path]) -> list[float]:
-    lines = read_times(path)
+def _times_of_file(path: Path, files: list[Path], unit: str) -> list[float]:
+    lines = read_times(path, unit)
     if lines and lines[0][0] is not None:
-        by_name = dict(lines)
+        by_name: dict[str, float] = {}
+        for name, time in lines:
+            # other tools write the folder as well, as in rgb/000001.png
+            last = Path(str(name)).name
+            if by_name.setdefault(last, time) != time:
+                raise InputError(f"{path}: has two times for {last}, {by_name[last]:f} and {time:f}. Remove one.")
         found = [by_name.get(file.name, by_name.get(file.stem)) for file in files]
         for file, time in zip(files, found, strict=True):
             if time is None:
@@ -388,7 +398,9 @@ def _pose_list(poses: RigPoses) -> tuple[np.ndarray, np.ndarray]:
     matrices, times_file = read_kitti(poses.file), poses.times_file
     if poses.times_from_names:
         raise InputError(f"{poses.file}: KITTI's poses have no names; give poses.times_file or poses.rate_hz.")
-    counts = list(range(len(matrices))) if times_file is None else [time for _, time in read_times(times_file)]
+    counts: Sequence[float] = range(len(matrices))
+    if times_file is not None:
+        counts = [time for _, time in read_times(times_file, poses.time_unit)]
     if len(counts) != len(matrices):
         raise InputError(f"{times_file}: {len(counts)} times for the {len(matrices)} poses of {poses.file.name}.")
     return np.array(poses.seconds(counts), np.float64), matrices

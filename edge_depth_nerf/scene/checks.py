@@ -37,6 +37,8 @@ def check_picture_size(path: Path, camera: Camera) -> int:
         FileNotFoundError: there is no such file.
         InputError: it has not, or cannot be read.
     """
+    if path.suffix.lower() == ".png":
+        read_png_header(path)
     head = picture_head(path)
     if (head.width, head.height) != (camera.width, camera.height):
         turned = head.orientation > 4 and (head.height, head.width) == (camera.width, camera.height)
@@ -45,8 +47,6 @@ def check_picture_size(path: Path, camera: Camera) -> int:
             "in the file: turn the files themselves, as `mogrify -auto-orient` does."
         )
         raise InputError(size_error(path, head.width, head.height, camera) + (remedy if turned else ""))
-    if head.format == "PNG":
-        read_png_header(path)
     return head.orientation
 
 
