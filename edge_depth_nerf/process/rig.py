@@ -38,7 +38,7 @@ from edge_depth_nerf.scene.writer import Skipped, summarise
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".avif")
 """Pictures and masks that are found in a folder."""
 _LOOKED_AT = 5
-"""So many of a camera's pictures tell how many bits are used."""
+"""So many of a camera's pictures tell how many bits are used, and so many scans whether any can be read."""
 _RIG_FILES = ("rig.toml", "rig.json")
 _MOST_LATE_S = 60.0
 """A scan's points are measured within this time of the scan's own; beyond, their unit or their clock is another."""
@@ -507,7 +507,25 @@ def _sweeps(
                     timing=lidar.timing,
                 )
             )
+        _check_some([sweep for sweep in found if sweep.scanner == lidar.name])
     return found
+
+
+def _check_some(sweeps: list[RecordedSweep]) -> None:
+    """Read some scans of a scanner: what is wrong with all of them is said before anything long begins.
+
+    Raises:
+        InputError: the fault of the first, if none can be read.
+    """
+    faults = []
+    for sweep in sweeps[:: max(1, len(sweeps) // _LOOKED_AT)]:
+        try:
+            sweep.read()
+            return
+        except (InputError, FileNotFoundError) as error:
+            faults.append(error)
+    if faults:
+        raise faults[0]
 
 
 def _read(path: Path, lidar: RigLidar, counted_from_s: float) -> Sweep:
