@@ -194,13 +194,13 @@ class PictureHead(NamedTuple):
     format: str
     """One of `_FORMATS`."""
     orientation: int
-    """Of its EXIF, 1 to 8; 1 = as the pixels stand, which is how they are used in any case."""
+    """Of its EXIF, 1 to 8; 1 = none. Nothing is turned by it."""
 
 
 def picture_head(path: Path) -> PictureHead:
     """Read a picture's header alone.
 
-    Pixels are used as they stand in the file, as by nerfstudio and COLMAP: no EXIF orientation turns them, so that all
+    Pixels are used in the file's own order, as by nerfstudio and COLMAP: no EXIF orientation turns them, so that all
     sizes agree. Every reader of TIFF turns its pixels as the file says, and there it counts as the file's own order.
 
     Raises:
@@ -225,7 +225,7 @@ def picture_head(path: Path) -> PictureHead:
 
 
 def _decode(path: Path, flags: int) -> tuple[NDArray, str]:
-    """Decode a picture as it stands in the file, channels in OpenCV's order; and give its format."""
+    """Decode a picture without turning it, channels in OpenCV's order; and give its format."""
     # decoders allocate what a header promises
     kind = picture_head(path).format
     content = np.fromfile(path, np.uint8)

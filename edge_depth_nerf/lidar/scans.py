@@ -303,8 +303,8 @@ def _feather_table(path: Path, columns: list[str] | None = None) -> Any:
         from pyarrow import ArrowException, feather  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise InputError(
-            f"{path}: reading .feather scans needs pyarrow, which is not installed. Run `pip install pyarrow`, or "
-            "convert the scans to .npz."
+            f"{path}: reading .feather scans needs pyarrow, which is not installed. Run `pip install "
+            "'pyarrow<26'`, or convert the scans to .npz."
         ) from None
     try:
         return feather.read_table(path, columns=columns, memory_map=True)

@@ -164,9 +164,9 @@ def recording_of_rig(rig: Rig, options: RigOptions | JbnuDepth360Options, kind: 
 def _turned_notice(camera: str, orientations: Counter[int]) -> str:
     found = ", ".join(f"{orientation} in {count}" for orientation, count in sorted(orientations.items()))
     return (
-        f"{camera}: pictures have an EXIF orientation ({found} of them), and are used as their pixels stand in the "
-        "file, as by nerfstudio and COLMAP. OpenCV's imread turns them: if this camera was calibrated so, turn the "
-        "files themselves, as `mogrify -auto-orient` does."
+        f"{camera}: pictures have an EXIF orientation ({found} of them), which turns none of them here, as in "
+        "nerfstudio and COLMAP. OpenCV's imread turns them: if this camera was calibrated so, turn the files "
+        "themselves, as `mogrify -auto-orient` does."
     )
 
 
@@ -198,7 +198,8 @@ def _whole_inputs(rig: Rig, cameras: Sequence[RigCamera], *, with_poses: bool) -
     """The files whose bytes decide about the scene: the rig file, poses, times."""
     poses = [rig.poses] if rig.poses and with_poses else []
     times = [clock.times_file for clock in (*cameras, *rig.lidars, *poses)]
-    return (rig.path, *(found.file for found in poses), *(path for path in times if path is not None))
+    lenses = [camera.calibration.file for camera in cameras if camera.calibration]
+    return (rig.path, *(found.file for found in poses), *(path for path in times if path is not None), *lenses)
 
 
 def _chosen(rig: Rig, names: Sequence[str]) -> list[RigCamera]:
@@ -512,7 +513,7 @@ def _sweeps(
 
 
 def _check_some(sweeps: list[RecordedSweep]) -> None:
-    """Read some scans of a scanner: what is wrong with all of them is said before anything long begins.
+    """Read some scans of a scanner: what is wrong with all of them is an error before anything long begins.
 
     Raises:
         InputError: the fault of the first, if none can be read.

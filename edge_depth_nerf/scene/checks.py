@@ -43,8 +43,8 @@ def check_picture_size(path: Path, camera: Camera) -> int:
     if (head.width, head.height) != (camera.width, camera.height):
         turned = head.orientation > 4 and (head.height, head.width) == (camera.width, camera.height)
         remedy = (
-            f" Its EXIF orientation {head.orientation} would turn it to that size, but pixels are used as they stand "
-            "in the file: turn the files themselves, as `mogrify -auto-orient` does."
+            f" Its EXIF orientation {head.orientation} would turn it to that size, but turns no picture here: turn the "
+            "files themselves, as `mogrify -auto-orient` does."
         )
         raise InputError(size_error(path, head.width, head.height, camera) + (remedy if turned else ""))
     return head.orientation
