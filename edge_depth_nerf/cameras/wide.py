@@ -48,8 +48,12 @@ class _Unified(Camera):
 
     @cached_property
     def _mei(self) -> MEI:
-        """The unified model with ξ = α / (1 - α); its plane is larger by 1 - α."""
+        """The unified model with ξ = α / (1 - α), whose plane is smaller by `_shrinks`."""
         return MEI(self.width, self.height, 1.0, 1.0, 0.0, 0.0, self.alpha / (1.0 - self.alpha), 0.0, 0.0, 0.0, 0.0)
+
+    @property
+    def _shrinks(self) -> float:
+        return 1.0 - self.alpha
 
     @cached_property
     def theta_max_rad(self) -> float:
@@ -70,10 +74,10 @@ class _Unified(Camera):
 
     def _to_plane(self, points: Tensor) -> tuple[Tensor, Tensor]:
         plane, defined = self._mei._to_plane(self._moved(points))
-        return plane / (1.0 - self.alpha), defined
+        return plane / self._shrinks, defined
 
     def _from_plane(self, plane: Tensor) -> Tensor:
-        return self._back(self._mei._from_plane(plane * (1.0 - self.alpha)))
+        return self._back(self._mei._from_plane(plane * self._shrinks))
 
 
 @dataclass(frozen=True)
@@ -114,6 +118,10 @@ class EUCM(_Unified):
         super().__post_init__()
         if not self.beta > 0:
             raise InputError(f"{self.model} camera: beta is {self.beta}, expected more than 0.")
+
+    @property
+    def _shrinks(self) -> float:
+        return (1.0 - self.alpha) * math.sqrt(self.beta)
 
     def _moved(self, points: Tensor) -> Tensor:
         return torch.cat((math.sqrt(self.beta) * points[..., :2], points[..., 2:]), -1)

@@ -22,7 +22,7 @@ RATIONAL = (
     "CALIB_RATIONAL_MODEL, or undistort the pictures (cv2.undistort) and give them as a pinhole without distortion"
 )
 """What to do with a calibration of that model."""
-_MAX_BYTES = 1 << 18
+_MAX_BYTES = 1 << 16
 _RADTAN, _EQUIDISTANT = ("k1", "k2", "p1", "p2"), ("k1", "k2", "k3", "k4")
 _PINHOLE = ("fx", "fy", "cx", "cy")
 _KALIBR: dict[tuple[str, str], tuple[Any, tuple[str, ...], tuple[str, ...]]] = {
@@ -44,9 +44,10 @@ _BASALT: dict[str, tuple[Any, tuple[str, ...], dict[str, float]]] = {
 }
 _OCAM_LINES = 5
 _OCAM_COEFFICIENTS = range(1, 8)
+_OF_SCALE = (1e-2, 1e6)
 
 
-def read_calibration(path: Path, name: str = "") -> Camera:
+def read_lens(path: Path, name: str = "") -> Camera:
     """Read a lens from a calibration file, whose kind its suffix tells: .yaml, .json, or .txt.
 
     Args:
@@ -73,11 +74,10 @@ def read_calibration(path: Path, name: str = "") -> Camera:
 
 
 def _kalibr(path: Path, name: str) -> Camera:
+    text = read_text(path, _MAX_BYTES)
     try:
-        content = yaml.safe_load(read_text(path, _MAX_BYTES))
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        if isinstance(error, InputError):
-            raise
+        content = yaml.safe_load(text)
+    except Exception as error:  # PyYAML raises whatever its constructors meet
         said = " ".join(str(error).split())
         raise InputError(f"{path}: not valid YAML ({said}). Expected Kalibr's camchain.yaml.") from None
     cameras = content if isinstance(content, dict) else {}
@@ -135,10 +135,11 @@ def _ocam(path: Path, name: str) -> Camera:
         )
     values = [[value for value in line if value is not None] for line in numbers]
     coefficients, (row, column), (c, d, e), (height, width) = values[0][1:], values[2], values[3], values[4]
-    if name or count not in _OCAM_COEFFICIENTS or coefficients[0] == 0 or c <= 0:
+    if name or count not in _OCAM_COEFFICIENTS or not _OF_SCALE[0] < abs(coefficients[0]) < _OF_SCALE[1] or c <= 0:
         raise InputError(
             f"{path}: {count} coefficients, the first {coefficients[0] if count else 'missing'}, c = {c}; expected 1 "
-            f"to {_OCAM_COEFFICIENTS[-1]}, the first not 0, c above 0, and no name of a camera: the file has one."
+            f"to {_OCAM_COEFFICIENTS[-1]}, the first a focal length in pixels, c above 0, and no name: the "
+            "file has one camera."
         )
     scale = abs(coefficients[0])
     given = {"fx": scale, "fy": c * scale, "cx": column, "cy": row, "shear_x": e, "shear_y": d / c}

@@ -39,7 +39,7 @@ from edge_depth_nerf.cameras import EUCM, MEI, Camera, DoubleSphere, KannalaBran
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar.scans import PointTimes, ScanFormat
 from edge_depth_nerf.lidar.sweeps import SweepTiming
-from edge_depth_nerf.process.calibration_file import RATIONAL, read_calibration
+from edge_depth_nerf.process.calibration_file import RATIONAL, read_lens
 from edge_depth_nerf.process.poses import pose_of_quaternion, transform_of_rows
 
 if sys.version_info >= (3, 11):
@@ -290,7 +290,7 @@ class RigCamera(_Sensor):
         if twice := self.model_fields_set & {*_LENS, *_LENS_NUMBERS, "pixel_centre"}:
             raise InputError(f".{min(twice)}: the calibration file describes the lens; remove one of them.")
         try:
-            return read_calibration(self.calibration.file, self.calibration.camera)
+            return read_lens(self.calibration.file, self.calibration.camera)
         except InputError as error:
             raise InputError(f".calibration: {error}") from None
 
