@@ -186,6 +186,6 @@ def _camera(model: Any, given: dict[str, float], size: Any, where: str) -> Camer
     none = {key: 0.0 for key in ("k1", "k2", "p1", "p2") if model is MEI}
     centred = {**none, **given, "cx": given["cx"] + 0.5, "cy": given["cy"] + 0.5}
     try:
-        return model(**{key: int(side) for key, side in sides.items()}, **centred)
+        return model(width=int(sides["width"]), height=int(sides["height"]), **centred)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
