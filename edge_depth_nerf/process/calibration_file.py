@@ -23,6 +23,8 @@ RATIONAL = (
 )
 """What to do with a calibration of that model."""
 _MAX_BYTES = 1 << 16
+_MAX_BRACKETS = 500
+"""No camchain has more, and PyYAML's time grows with the square of their depth."""
 _RADTAN, _EQUIDISTANT = ("k1", "k2", "p1", "p2"), ("k1", "k2", "k3", "k4")
 _PINHOLE = ("fx", "fy", "cx", "cy")
 _KALIBR: dict[tuple[str, str], tuple[Any, tuple[str, ...], tuple[str, ...]]] = {
@@ -76,6 +78,8 @@ def read_lens(path: Path, name: str = "") -> Camera:
 def _kalibr(path: Path, name: str) -> Camera:
     text = read_text(path, _MAX_BYTES)
     try:
+        if text.count("[") + text.count("{") > _MAX_BRACKETS:
+            raise ValueError(f"more than {_MAX_BRACKETS} brackets")
         content = yaml.safe_load(text)
     except Exception as error:  # PyYAML raises whatever its constructors meet
         said = " ".join(str(error).split())
