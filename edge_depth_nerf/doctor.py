@@ -222,6 +222,7 @@ def check_extras() -> Iterator[Finding]:
         ("COLMAP", "pycolmap", "colmap", "refined poses (by default in process) and --poses colmap"),
         ("KISS-ICP", "kiss_icp", "odometry", "poses from LiDAR (process --poses lidar)"),
         ("transformers", "transformers", "hf", "ready-made depth networks (estimate-depth --hf)"),
+        ("laspy", "laspy", "las", "scans in .las and .laz files"),
         ("Dask", "distributed", "cluster", "many machines (--cluster)"),
     ):
         there = find_spec(package) is not None

@@ -15,6 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 from drives import CAM0_TO_VELO, CAM_TO_POSE, MeiTwin
+from PIL import Image
 from scenes import SAMPLE_DRIVE, write_scene
 
 from edge_depth_nerf.base.files import (
@@ -39,6 +40,7 @@ from edge_depth_nerf.masks.semantics import read_labels
 from edge_depth_nerf.method.error_model import read_calibration
 from edge_depth_nerf.mono.files import read_npy as read_map
 from edge_depth_nerf.mono.network import DepthNetwork, NetworkSettings, load_network, save_network
+from edge_depth_nerf.process.calibration_file import read_lens
 from edge_depth_nerf.process.kitti360.calibration import (
     read_cam_to_pose,
     read_cam_to_velo,
@@ -151,6 +153,12 @@ def jpeg(suffix: str) -> bytes:
     return cv2.imencode(suffix, np.arange(16 * 12 * 3, dtype=np.uint8).reshape(12, 16, 3))[1].tobytes()
 
 
+def by_pillow(kind: str) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(np.arange(16 * 12 * 3, dtype=np.uint8).reshape(12, 16, 3)).save(file, kind)
+    return file.getvalue()
+
+
 def scene(folder: Path) -> Path:
     return write_scene(folder, frames=2, ply_file_path=None) / "transforms.json"
 
@@ -210,6 +218,25 @@ TIMES = "".join(f"2013-05-28 08:46:{second:02d}.123456789\n" for second in range
 TUM = "# time x y z qx qy qz qw\n" + "".join(f"{t} {t} 2 3 0 0 0 1\n" for t in range(12))
 FRAMES = {"frames": [{"file_path": f"front/{n}.png", "transform_matrix": np.eye(4).tolist()} for n in range(4)]}
 
+CAMCHAIN = """cam0:
+  camera_model: omni
+  intrinsics: [1.2, 6.5, 6.25, 8.0, 6.0]
+  distortion_model: radtan
+  distortion_coeffs: [-0.1, 0.01, 0.001, 0.002]
+  T_cam_imu:
+  - [1.0, 0.0, 0.0, 0.1]
+  resolution: [16, 12]
+"""
+BASALT = {
+    "value0": {
+        "intrinsics": [
+            {"camera_type": "ucm", "intrinsics": {"fx": 6.5, "fy": 6.5, "cx": 8.0, "cy": 6.0, "alpha": 0.5}}
+        ],
+        "resolution": [[16, 12]],
+    }
+}
+OCAM = "#polynomial\n\n3 -3.2 0.0 0.045\n\n#inverse\n\n2 1 2\n\n5.6 7.7\n\n0.999 2e-3 -1e-3\n\n12 16\n"
+
 OURS: dict[str, Reader] = {
     "kitti yaml": Reader(named("image_02.yaml", MeiTwin.kitti360("image_02", 1400).yaml("image_02")), read_mei_camera),
     "kitti cam to pose": Reader(
@@ -223,6 +250,9 @@ OURS: dict[str, Reader] = {
     "poses of nerfstudio": Reader(named("a.json", json.dumps(FRAMES)), read_nerfstudio, "json"),
     "times": Reader(named("a.txt", "".join(f"a{n}.png {n}.5\n" for n in range(9))), read_times),
     "rig toml": Reader(named("rig.toml", RIG), tables),
+    "calibration of kalibr": Reader(named("a.yaml", CAMCHAIN), read_lens),
+    "calibration of basalt": Reader(named("a.json", json.dumps(BASALT)), read_lens, "json"),
+    "calibration of ocam": Reader(named("a.txt", OCAM), read_lens),
     "rig json": Reader(named("rig.json", json.dumps(tomllib.loads(RIG))), tables, "json"),
 }
 """Parsers that are written out in this project: those of the coverage-guided fuzzer."""
@@ -244,6 +274,8 @@ READERS: dict[str, Reader] = {
     "picture jpg": Reader(named("a.jpg", jpeg(".jpg")), read_image, "binary"),
     "picture bmp": Reader(named("a.bmp", jpeg(".bmp")), read_image, "binary"),
     "picture tif": Reader(named("a.tif", jpeg(".tif")), read_image, "binary"),
+    "picture webp": Reader(named("a.webp", by_pillow("WEBP")), read_image, "binary"),
+    "picture avif": Reader(named("a.avif", by_pillow("AVIF")), read_image, "binary"),
     "picture copied": Reader(picture(write_png, np.zeros((12, 16, 3), np.uint8)), read_png_bytes, "png"),
     "mask": Reader(picture(write_mask, np.ones((12, 16), bool)), read_mask, "png"),
     "distance": Reader(picture(write_distance_png, np.full((12, 16), 9.0)), read_distance_png, "png"),

@@ -14,10 +14,12 @@ from lenses import FISHEYE, IMAGE_02, IMAGE_03, KITTI, angle, nerfstudio_directi
 from torch import Tensor
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.cameras import MEI, Camera, KannalaBrandt, Pinhole, camera_from_dict
+from edge_depth_nerf.cameras import EUCM, MEI, Camera, DoubleSphere, KannalaBrandt, OCam, Pinhole, camera_from_dict
 from edge_depth_nerf.cameras.distortion import Distortion
 
 PINHOLE = Pinhole(640, 480, 500.0, 505.0, 320.5, 239.0, -0.3, 0.1, 1e-3, -2e-3)
+# polynomial of OCamCalib's own example: -69.7 + 0.000529 ρ² - 1.75e-6 ρ³ + 4.33e-9 ρ⁴
+OCAM = OCam(640, 480, 69.6915, 69.6, 320.8, 240.6, b2=-0.03689, b3=0.008505, b4=-0.001466, shear_x=4e-4, shear_y=-3e-4)
 CAMERAS = [
     *KITTI,
     pytest.param(replace(IMAGE_02, k2=-2.0), id="mei-folding-distortion"),
@@ -33,6 +35,12 @@ CAMERAS = [
     pytest.param(Pinhole(640, 480, 500.0, 505.0, 320.5, 239.0), id="pinhole"),
     pytest.param(PINHOLE, id="pinhole-barrel"),
     pytest.param(Pinhole(640, 480, 500.0, 505.0, 320.5, 239.0, -0.2), id="pinhole-folding"),
+    pytest.param(DoubleSphere(512, 512, 158.0, 157.5, 254.9, 256.9, xi=-0.18, alpha=0.59), id="double-sphere"),
+    pytest.param(DoubleSphere(512, 512, 158.0, 157.5, 254.9, 256.9, xi=0.2, alpha=0.35), id="double-sphere-open"),
+    pytest.param(EUCM(512, 512, 158.0, 157.5, 254.9, 256.9, alpha=0.65, beta=1.1), id="eucm"),
+    pytest.param(EUCM(512, 512, 158.0, 157.5, 254.9, 256.9, alpha=0.4, beta=0.8), id="eucm-open"),
+    pytest.param(OCAM, id="ocam"),
+    pytest.param(replace(OCAM, shear_x=0.0, shear_y=0.0, theta_limit_rad=math.radians(95)), id="ocam-to-95"),
 ]
 each_camera = pytest.mark.parametrize("camera", CAMERAS)
 

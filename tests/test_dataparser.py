@@ -3,6 +3,7 @@ import pytest
 import torch
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from PIL import Image
 from scenes import fisheye, pinhole, transforms, write_scene
 
 from edge_depth_nerf.base.errors import InputError
@@ -39,6 +40,49 @@ def test_the_default_scale_says_metres():
     assert default_metres_per_unit(line) == 30  # half of 60 m
     assert default_metres_per_unit(line / 10) == 10  # never under 10 m
     assert default_metres_per_unit(line * 10) == 128  # 4 · 128 / 2048 = 0.25 m, the coarsest cell allowed
+
+
+@pytest.mark.parametrize("applied", [None, [[0, 1, 0, 3], [1, 0, 0, 0], [0, 0, -1, 0]]])
+def test_positions_of_utm_keep_their_millimetres(tmp_path, applied):
+    scene, offset = write_scene(tmp_path), np.array([448_000.0, 5_428_000.0, 110.0])
+    near = parse(scene, metres_per_unit=20.0).cameras.camera_to_worlds
+
+    def move(meta):
+        for frame in meta["frames"]:
+            for row, shift in zip(frame["transform_matrix"], offset, strict=False):
+                row[3] += shift
+        if applied is not None:
+            meta.update(applied_transform=applied, applied_scale=2.0)
+
+    edit(scene, move)
+    far = parse(scene, metres_per_unit=20.0).cameras.camera_to_worlds
+    between = [20 * (poses[:, :, 3] - poses[:1, :, 3]) for poses in (near, far)]
+    assert np.allclose(between[0], between[1], atol=1e-4) and np.allclose(near[:, :, :3], far[:, :, :3], atol=1e-6)
+    assert between[0].abs().max() > 1
+
+
+def test_the_crop_of_a_fisheye_is_kept(tmp_path):
+    scene = write_scene(tmp_path, mask=False)
+    whole = FisheyeDepthDataset(parse(scene)).mask(0)
+    edit(scene, lambda meta: meta.update(fisheye_crop_radius=9.0))
+    cropped = FisheyeDepthDataset(parse(scene)).mask(0)
+    row, column = np.indices(whole.shape) + 0.5
+    height, width = whole.shape
+    assert np.array_equal(cropped, whole & (np.hypot(row - height / 2, column - width / 2) <= 9))
+    assert 0 < cropped.sum() < whole.sum()
+
+
+def test_no_orientation_turns_a_picture(tmp_path):
+    """As in nerfstudio's own reader, to whose pixels poses and lenses belong."""
+    scene = write_scene(tmp_path)
+    path = scene / "images/0000.png"
+    pixels = FisheyeDepthDataset(parse(scene)).rgb(0)
+    exif = Image.Exif()
+    exif[0x112] = 3
+    Image.fromarray(pixels).save(path, exif=exif.tobytes())
+    dataset = FisheyeDepthDataset(parse(scene))
+    assert np.array_equal(dataset.rgb(0), pixels)
+    assert np.array_equal(dataset.get_numpy_image(0), pixels)
 
 
 def test_maps_follow_the_pictures(tmp_path):

@@ -5,15 +5,30 @@ from models import pipeline_config, pipeline_of
 from scenes import write_scene
 
 from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import write_distance_png
 from edge_depth_nerf.plugin.pipeline import NotFiniteError
 
 
 def test_a_depth_loss_without_any_prior_is_an_error(tmp_path):
-    scene = write_scene(tmp_path, lidar=False, mono=False)
+    scene = write_scene(tmp_path, lidar=False)
+    for path in (scene / "mono").iterdir():
+        write_distance_png(path, np.zeros((28, 32)))
     with pytest.raises(InputError, match=r"no training pixel has a depth prior.*estimate-depth.*depth-loss none"):
         pipeline_of(scene)
     pipeline = pipeline_of(scene, depth_loss="none")
     assert np.isfinite(float(pipeline.get_train_loss_dict(0)[1]["rgb_loss"].detach()))
+
+
+def test_a_scene_without_depth_maps_is_trained_as_plain_nerfacto(tmp_path, capsys):
+    scene = write_scene(tmp_path, lidar=False, mono=False)
+    pipeline = pipeline_of(scene)
+    assert "no depth maps" in (said := " ".join(capsys.readouterr().out.split())) and "is plain nerfacto" in said
+    losses = pipeline.get_train_loss_dict(0)[1]
+    assert np.isfinite(float(losses["rgb_loss"].detach())) and not any("depth" in name for name in losses)
+    with pytest.raises(InputError, match="the scene has no LiDAR maps, but depth_source lidar needs them"):
+        config = pipeline_config(scene)
+        config.datamanager.depth_source = "lidar"
+        config.setup(device="cpu", test_mode="val")
 
 
 def test_nothing_is_integrated_for_a_model_without_depth_loss(tmp_path, monkeypatch):

@@ -96,6 +96,32 @@ def write_feather(folder: Path) -> tuple[Path, ScanFormat]:
     return folder / "a.feather", TIMED
 
 
+def write_las(folder: Path, suffix: str = ".las") -> tuple[Path, ScanFormat]:
+    laspy = pytest.importorskip("laspy", reason="laspy is missing, which reads .las and .laz")
+    header = laspy.LasHeader(point_format=1, version="1.2")
+    header.scales, header.offsets = np.full(3, 1 / 1024), np.zeros(3)
+    header.add_extra_dim(laspy.ExtraBytesParams("strength", "f4"))
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = POINTS.T
+    las.strength, las.gps_time = INTENSITY, COUNTS / 1e9
+    las.write(folder / f"a{suffix}")
+    return folder / f"a{suffix}", ScanFormat(names={"intensity": "strength"}, times=PointTimes("gps_time"))
+
+
+def write_laz(folder: Path) -> tuple[Path, ScanFormat]:
+    return write_las(folder, ".laz")
+
+
+def write_empty_padding_pcd(folder: Path) -> tuple[Path, ScanFormat]:
+    """What pcl_ros writes of clouds of Ouster, RoboSense and Velodyne: padding of no bytes."""
+    header = (
+        "VERSION 0.7\nFIELDS x y z _ intensity _ t\nSIZE 4 4 4 1 4 1 4\nTYPE F F F U F U U\nCOUNT 1 1 1 0 1 0 1\n"
+        "WIDTH 3\nHEIGHT 1\nPOINTS 3\nDATA binary\n"
+    )
+    (folder / "a.pcd").write_bytes(header.encode() + records().tobytes())
+    return folder / "a.pcd", TIMED
+
+
 def write_compressed_pcd(folder: Path) -> tuple[Path, ScanFormat]:
     content = b"".join(records()[name].tobytes() for name in ("x", "y", "z", "intensity", "t"))
     packed = lzf_literals(content)
@@ -141,6 +167,9 @@ def write_padded_pcd(folder: Path) -> tuple[Path, ScanFormat]:
         pytest.param(lambda folder: (pcd(folder / "a.pcd", "binary", records().tobytes()), TIMED), id="pcd binary"),
         write_compressed_pcd,
         write_padded_pcd,
+        write_empty_padding_pcd,
+        write_las,
+        write_laz,
     ],
 )
 def test_every_format_gives_the_same_points(tmp_path: Path, write) -> None:
@@ -181,7 +210,9 @@ def test_an_archive_says_what_it_lacks(tmp_path: Path) -> None:
 def test_tables_want_pyarrow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.feather").write_bytes(b"ARROW1 and so on")
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(InputError, match=r"a\.feather: .* pyarrow, which is not installed\. Run `pip install pyarrow`"):
+    with pytest.raises(
+        InputError, match=r"a\.feather: .* pyarrow, which is not installed\. Run `pip install 'pyarrow<26'`"
+    ):
         check_scan(tmp_path / "a.feather", ScanFormat())
 
 
@@ -195,6 +226,38 @@ def test_broken_tables_are_named(tmp_path: Path) -> None:
     path.write_bytes(whole)
     with pytest.raises(InputError, match=r"a\.feather: has no column X"):
         check_scan(path, replace(scan, names={"x": "X"}))
+
+
+@pytest.mark.parametrize("write", [write_las, write_laz])
+def test_broken_las_is_named(tmp_path: Path, write) -> None:
+    path, scan = write(tmp_path)
+    whole = path.read_bytes()
+    for length in (20, 240, len(whole) - 3):
+        path.write_bytes(whole[:length])
+        with pytest.raises(InputError, match=rf"{path.name}: .*(cannot be read as|truncated)"):
+            read_scan(path, scan)
+
+
+def test_las_wants_laspy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.laz").write_bytes(b"LASF")
+    monkeypatch.setitem(sys.modules, "laspy", None)
+    with pytest.raises(InputError, match=r"a\.laz: .* laspy, which is not installed\. Run `pip install '\.\[las\]'`"):
+        check_scan(tmp_path / "a.laz", ScanFormat())
+
+
+def test_times_that_their_type_has_rounded_away(tmp_path: Path) -> None:
+    """Seconds since 1970 in float32 step by 128 s; those of a turn are kept, and so are those since power-on."""
+    for begun_s, step in ((1_369_730_762.0, r"steps of 128 s: they are rounded away"), (3600.0, None)):
+        columns = np.column_stack((POINTS, INTENSITY, begun_s + COUNTS / 1e9)).astype(np.float32)
+        np.save(tmp_path / "a.npy", columns)
+        scan = ScanFormat(("x", "y", "z", "intensity", "t"), times=PointTimes("t", absolute=True))
+        if step is None:
+            assert read_scan(tmp_path / "a.npy", scan, begun_s).offset_s is not None
+            continue
+        with pytest.raises(
+            InputError, match=rf"a\.npy: the points' times \(t, float32\).*{step}.*leave out point_times"
+        ):
+            read_scan(tmp_path / "a.npy", scan, begun_s)
 
 
 def test_times_on_the_clock_keep_their_digits(tmp_path: Path) -> None:
@@ -232,7 +295,7 @@ def saved(path: Path, array: np.ndarray) -> Path:
 
 
 BROKEN = {
-    "unknown format": (lambda f: named(f, "a.las", b"LASF"), r"a\.las: a scan of unknown format \.las.*\.bin, \.npy"),
+    "unknown format": (lambda f: named(f, "a.e57", b"ASTM"), r"a\.e57: a scan of unknown format \.e57.*\.bin, \.npy"),
     "empty file": (lambda f: named(f, "a.bin", b""), r"a\.bin: an empty file"),
     "cut .bin": (lambda f: named(f, "a.bin", bytes(18)), r"a\.bin: 18 bytes, expected a multiple of 16"),
     "all NaN": (lambda f: saved(f / "a.npy", np.full((4, 4), np.nan)), r"a\.npy: none of its 4 points.*4 are NaN"),

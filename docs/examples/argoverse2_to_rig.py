@@ -1,6 +1,6 @@
 """A log of Argoverse 2's sensor data set as a rig: a link to its sensors, rig.json and poses.txt.
 
-    pip install pyarrow
+    pip install 'pyarrow<26'
     python argoverse2_to_rig.py LOG OUTPUT      # such as /data/av2/sensor/train/01bb304d-7bd8-35f8-bbef-7086b688e35e
     edge-depth-nerf process rig --root OUTPUT --output scenes/av2
 

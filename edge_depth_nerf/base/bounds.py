@@ -89,7 +89,7 @@ def check_bytes(path: Path, most: int) -> int:
 
 
 def read_text(path: Path, most_bytes: int) -> str:
-    """Read a file of UTF-8 text.
+    """Read a file of UTF-8 text, without the mark that some editors put before it.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -97,7 +97,7 @@ def read_text(path: Path, most_bytes: int) -> str:
     """
     check_bytes(path, most_bytes)
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not a text file ({error}). Copy or make the file again.") from None
 
@@ -111,7 +111,7 @@ def text_lines(path: Path) -> Iterator[tuple[int, str]]:
     """
     check_bytes(path, MAX_TEXT_BYTES)
     found = 0
-    with path.open(encoding="utf-8") as file:
+    with path.open(encoding="utf-8-sig") as file:
         number = 0
         while True:
             number += 1

@@ -18,8 +18,9 @@ import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable
+from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -39,6 +40,11 @@ from edge_depth_nerf.base.jpeg import is_jpeg, jpeg_fault
 
 DISTANCE_STEPS_PER_METRE = 256
 """A distance PNG counts in 1/256 m."""
+_FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP", "AVIF")
+"""Pillow's names of the pictures that are read."""
+_BY_PILLOW = ("WEBP", "AVIF")
+_LOSSY = ("JPEG", *_BY_PILLOW)
+_EXIF_ORIENTATION = 0x112
 
 
 FORGOTTEN_AFTER_S = 24 * 3600.0
@@ -180,8 +186,22 @@ def write_png(path: Path, image: NDArray) -> None:
     write_bytes(path, encoded.tobytes())
 
 
-def picture_size(path: Path) -> tuple[int, int]:
-    """Width and height of a PNG, JPEG, BMP or TIFF, from its header alone.
+class PictureHead(NamedTuple):
+    """What a picture's file says before it is decoded."""
+
+    width: int
+    height: int
+    format: str
+    """One of `_FORMATS`."""
+    orientation: int
+    """Of its EXIF, 1 to 8; 1 = none. Nothing is turned by it."""
+
+
+def picture_head(path: Path) -> PictureHead:
+    """Read a picture's header alone.
+
+    Pixels are used in the file's own order, as by nerfstudio and COLMAP: no EXIF orientation turns them, so that all
+    sizes agree. Every reader of TIFF turns its pixels as the file says, and there it counts as the file's own order.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -191,7 +211,9 @@ def picture_size(path: Path) -> tuple[int, int]:
 
     size = check_bytes(path, MAX_PICTURE_BYTES)
     try:
-        with Image.open(path, formats=("PNG", "JPEG", "BMP", "TIFF")) as image:
+        with Image.open(path, formats=_FORMATS) as image:
+            kind = str(image.format)
+            turned = 1 if kind == "TIFF" else image.getexif().get(_EXIF_ORIENTATION, 1)
             width, height = image.size
     except Exception as error:  # Pillow raises whatever its readers meet
         what = str(error) if isinstance(error, Image.DecompressionBombError) else "truncated or not a picture"
@@ -199,26 +221,40 @@ def picture_size(path: Path) -> tuple[int, int]:
             f"{path}: cannot be decoded as a picture ({size} bytes; {what}). Copy or make the file again."
         ) from None
     check_pixels(width, height, str(path))
-    return width, height
+    return PictureHead(width, height, kind, turned if turned in range(1, 9) else 1)
 
 
-def _decode(path: Path, flags: int) -> NDArray:
-    # OpenCV allocates what a header promises
-    picture_size(path)
+def _decode(path: Path, flags: int) -> tuple[NDArray, str]:
+    """Decode a picture without turning it, channels in OpenCV's order; and give its format."""
+    # decoders allocate what a header promises
+    kind = picture_head(path).format
     content = np.fromfile(path, np.uint8)
-    try:
-        image = cv2.imdecode(content, flags)
-    except cv2.error:
-        image = None
-    # libpng fills what a truncated file lacks with zeros, so the end mark is looked for as well
     fault: str | None = "truncated or not a picture"
+    try:
+        if kind in _BY_PILLOW:
+            image = _by_pillow(content.tobytes(), flags)
+        else:
+            image = cv2.imdecode(content, flags | cv2.IMREAD_IGNORE_ORIENTATION)
+    except Exception as error:  # of either, whatever its readers meet
+        image, fault = None, str(error).splitlines()[0] if kind in _BY_PILLOW and str(error) else fault
+    # libpng fills what a truncated file lacks with zeros, so the end mark is looked for as well
     if image is not None and (path.suffix.lower() != ".png" or b"IEND" in content[-16:].tobytes()):
         fault = _fault_of(path, content.tobytes())
     if image is None or fault is not None:
         raise InputError(
             f"{path}: cannot be decoded as a picture ({content.size} bytes; {fault}). Copy or make the file again."
         )
-    return image
+    return image, kind
+
+
+def _by_pillow(content: bytes, flags: int) -> NDArray:
+    """Decode what OpenCV is often built without, to 8-bit BGR, or BGRA where there is alpha and `flags` keep it."""
+    from PIL import Image
+
+    with Image.open(BytesIO(content), formats=_BY_PILLOW) as image:
+        has_alpha = flags == cv2.IMREAD_UNCHANGED and "A" in image.getbands()
+        pixels = np.asarray(image.convert("RGBA" if has_alpha else "RGB"))
+    return np.concatenate((pixels[..., 2::-1], pixels[..., 3:]), -1)
 
 
 def _fault_of(path: Path, content: bytes) -> str | None:
@@ -243,7 +279,13 @@ def read_image(path: Path) -> NDArray[np.uint8]:
         FileNotFoundError: there is no such file.
         InputError: truncated or not a picture.
     """
-    return np.ascontiguousarray(_decode(path, cv2.IMREAD_COLOR)[..., ::-1])
+    return np.ascontiguousarray(_decode(path, cv2.IMREAD_COLOR)[0][..., ::-1])
+
+
+def largest_of_16_bits(path: Path) -> int | None:
+    """The largest value of a picture with 16 bits a channel; None if it has 8. Raises as `read_image`."""
+    pixels, _ = _decode(path, cv2.IMREAD_UNCHANGED)
+    return int(pixels.max()) if pixels.dtype == np.uint16 else None
 
 
 def check_is_folder(output: Path) -> None:
@@ -257,13 +299,18 @@ def check_is_folder(output: Path) -> None:
 
 
 def read_mask(path: Path) -> NDArray[np.bool_]:
-    """Read a mask as H×W bool, True = use the pixel (any value but 0).
+    """Read a mask as H×W bool, True = use the pixel: any value but 0, and not transparent.
+
+    Lossy formats smear 0 and 255 a little, so that there the half is what counts.
 
     Raises:
         FileNotFoundError: there is no such file.
         InputError: truncated or not a picture.
     """
-    return _decode(path, cv2.IMREAD_GRAYSCALE) > 0
+    pixels, kind = _decode(path, cv2.IMREAD_UNCHANGED)
+    channels = pixels.reshape(*pixels.shape[:2], -1)
+    mask = (channels[..., :3] > (127 if kind in _LOSSY else 0)).any(-1)
+    return mask & (channels[..., 3] > 0) if channels.shape[2] == 4 else mask
 
 
 def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
@@ -292,7 +339,7 @@ def read_distance_png(path: Path, metres_per_step: float = 1 / DISTANCE_STEPS_PE
         FileNotFoundError: there is no such file.
         InputError: truncated, or not a 16-bit single-channel PNG.
     """
-    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    image, _ = _decode(path, cv2.IMREAD_UNCHANGED)
     if image.dtype != np.uint16 or image.ndim != 2:
         raise InputError(
             f"{path}: expected a 16-bit single-channel PNG in units of 1/256 m, found "

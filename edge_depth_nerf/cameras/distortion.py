@@ -55,7 +55,7 @@ class Distortion:
         for power, k in enumerate(self.radial, start=1):
             rise += [(2 * power + 1) * k, 0.0]
             scale += [k, 0.0]
-        return min(_first_positive_root(rise), _first_positive_root(scale))
+        return min(first_positive_root(rise), first_positive_root(scale))
 
     def distort(self, plane: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
         """Apply F; the result means something only for |plane| <= `radius_max`."""
@@ -195,7 +195,7 @@ class Distortion:
         return rows / determinant[..., None, None]
 
 
-def _first_positive_root(ascending: list[float]) -> float:
+def first_positive_root(ascending: list[float]) -> float:
     """The smallest positive real root of a polynomial with value 1 at zero; infinity without one."""
     roots = np.roots(ascending[::-1])
     real = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0)]

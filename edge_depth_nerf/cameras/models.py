@@ -23,7 +23,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from edge_depth_nerf.base.bounds import MAX_PIXELS, finite, shown
+from edge_depth_nerf.base.bounds import MAX_PIXELS
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras.distortion import Distortion
 
@@ -169,7 +169,7 @@ class Camera(ABC):
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """All parameters under their names, and "model"; `camera_from_dict` reads it back."""
+        """All parameters under their names, and "model"; `named.camera_from_dict` reads it back."""
         return {"model": self.model, **dataclasses.asdict(self)}
 
 
@@ -330,39 +330,3 @@ class Pinhole(Camera):
     def _from_plane(self, plane: Tensor) -> Tensor:
         rays = torch.cat((plane, torch.ones_like(plane[..., :1])), -1)
         return rays / rays.norm(dim=-1, keepdim=True)
-
-
-_MODELS: dict[str, type[Camera]] = {camera.model: camera for camera in (MEI, KannalaBrandt, Pinhole)}
-
-
-def camera_from_dict(parameters: dict[str, Any], where: str) -> Camera:
-    """Build the camera that `Camera.to_dict` described.
-
-    Raises:
-        InputError: the model is unknown, a field is missing, unknown, or not a usable number.
-    """
-    name = parameters.get("model")
-    if not isinstance(name, str) or name not in _MODELS:
-        raise InputError(f"{where}: unknown camera model {name!r}, expected one of {', '.join(_MODELS)}.")
-    model = _MODELS[name]
-    fields = dataclasses.fields(model)
-    given = parameters.keys() - {"model"}
-    missing = [f.name for f in fields if f.name not in given and f.default is dataclasses.MISSING]
-    unknown = sorted(given - {f.name for f in fields})
-    if missing or unknown:
-        faults = [f"lacks {', '.join(missing)}"] if missing else []
-        faults += [f"has unknown {', '.join(unknown)}"] if unknown else []
-        expected = ", ".join(f.name for f in fields)
-        raise InputError(f"{where}: the {name} camera {' and '.join(faults)}; expected {expected}.")
-    numbers = {}
-    for key in given:
-        value, whole = finite(parameters[key]), key in ("width", "height")
-        # a file may hold 700 for 700.0
-        if value is None or (whole and value % 1 != 0):
-            kind = "a whole number" if whole else "a finite number"
-            raise InputError(f"{where}: {key} of the {name} camera is {shown(parameters[key])}, expected {kind}.")
-        numbers[key] = int(value) if whole else value
-    try:
-        return model(**numbers)
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None

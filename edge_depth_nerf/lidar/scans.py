@@ -1,9 +1,10 @@
-"""Reading LiDAR scans of any recorder: .bin, .npy, .npz, .ply, .pcd and .feather files.
+"""Reading LiDAR scans of any recorder: .bin, .npy, .npz, .ply, .pcd, .las, .laz and .feather files.
 
     .bin    values one after another, little-endian; their columns and type are declared
     .npy    a structured array, or points × columns, whose columns are declared
     .npz    the same, one of its arrays
     .feather    a table of Arrow's with named columns; read by pyarrow, which is not among this project's dependencies
+    .las, .laz    with the names of the format's dimensions, x, y, z scaled; read by laspy, an extra of this project
     .ply    the element `vertex`; ascii, binary_little_endian, binary_big_endian
     .pcd    ascii, binary, binary_compressed
 
@@ -22,7 +23,8 @@ import math
 import struct
 import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
@@ -37,9 +39,9 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import ARRAY_ERRORS, read_array_header, read_npz
 from edge_depth_nerf.lidar.sweeps import MAX_POINTS, Sweep, usable_points
 
-Encoding = Literal["records", "text", "lzf", "matrix", "archive", "table"]
+Encoding = Literal["records", "text", "lzf", "matrix", "archive", "table", "las"]
 
-SCAN_SUFFIXES = (".bin", ".npy", ".npz", ".ply", ".pcd", ".feather")
+SCAN_SUFFIXES = (".bin", ".npy", ".npz", ".ply", ".pcd", ".las", ".laz", ".feather")
 """The formats that can be read."""
 MAX_CLOUD_POINTS = 10_000_000
 """No point cloud of a scene has more."""
@@ -52,6 +54,8 @@ _MAX_LZF_RATIO = 100
 _MAX_HEADER_BYTES = 1 << 16
 _LOOKED_AT = 200_000
 """So many values of a file tell its columns."""
+_COARSEST_S = 5e-3
+"""Times of points in larger steps say nothing within a turn."""
 _AGAIN = "Copy or export the file again, or delete it so that its frame is skipped."
 
 _PLY_TYPES = {
@@ -116,8 +120,8 @@ class _Header:
     """One point, field by field."""
     count: int
     encoding: Encoding
-    """Records one after another, lines of text, PCD's compressed columns, an array of NumPy's, one in an archive, or a
-    table of Arrow's."""
+    """Records one after another, lines of text, PCD's compressed columns, an array of NumPy's, one in an archive, a
+    table of Arrow's, or LAS."""
     offset: int = 0
     """Where the points begin, in bytes."""
 
@@ -147,6 +151,7 @@ def read_scan(path: Path, scan: ScanFormat, time_s: float = 0.0) -> Sweep:
     intensity = columns.get(scan.name("intensity"), np.zeros(len(points_m)))
     offset_s = None
     if scan.times is not None:
+        _check_steps(path, header, columns[scan.times.column], scan.times)
         offset_s = torch.from_numpy(columns[scan.times.column] * scan.times.seconds_per_count - time_s)
     return usable_points(path, torch.from_numpy(points_m), torch.from_numpy(intensity), offset_s)
 
@@ -158,6 +163,21 @@ def columns_told(path: Path) -> int:
     size -= size.mean()
     alike = {count: float((size[count:] * size[:-count]).mean()) for count in range(3, 9)}
     return min(count for count in alike if alike[count] >= 0.9 * max(alike.values()))
+
+
+def _check_steps(path: Path, header: _Header, counts: np.ndarray, times: PointTimes) -> None:
+    """Refuse times that their type has rounded away."""
+    kind = header.record[times.column].base
+    if kind.kind != "f" or header.encoding == "text" or not np.isfinite(counts).any():
+        return
+    largest = np.abs(counts[np.isfinite(counts)]).max()
+    step_s = float(np.spacing(largest.astype(kind))) * times.seconds_per_count
+    if step_s > _COARSEST_S:
+        raise InputError(
+            f"{path}: the points' times ({times.column}, {kind.name}) are as large as {largest:.6g}, where this type "
+            f"counts in steps of {step_s:.3g} s: they are rounded away. Record them as float64 or as whole numbers, or "
+            "leave out point_times and give turn_s with direction."
+        )
 
 
 def read_cloud(path: Path) -> tuple[Float64[np.ndarray, "points 3"], UInt8[np.ndarray, "points 3"] | None]:
@@ -185,6 +205,7 @@ def _read_header(path: Path, scan: ScanFormat, most: int = MAX_POINTS) -> _Heade
     readers = {
         **{".bin": _bin_header, ".npy": _npy_header, ".npz": _npz_header},
         **{".ply": _ply_header, ".pcd": _pcd_header, ".feather": _feather_header},
+        **dict.fromkeys((".las", ".laz"), _las_header),
     }
     suffix = path.suffix.lower()
     if suffix not in readers:
@@ -295,8 +316,8 @@ def _feather_table(path: Path, columns: list[str] | None = None) -> Any:
         from pyarrow import ArrowException, feather  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise InputError(
-            f"{path}: reading .feather scans needs pyarrow, which is not installed. Run `pip install pyarrow`, or "
-            "convert the scans to .npz."
+            f"{path}: reading .feather scans needs pyarrow, which is not installed. Run `pip install "
+            "'pyarrow<26'`, or convert the scans to .npz."
         ) from None
     try:
         return feather.read_table(path, columns=columns, memory_map=True)
@@ -309,6 +330,38 @@ def _feather_header(path: Path, size: int, scan: ScanFormat) -> _Header:
     # text, lists and the like are no numbers
     fields = [(field.name, _ARROW_TYPES.get(str(field.type), "O")) for field in table.schema]
     return _Header(_record(path, fields), table.num_rows, "table")
+
+
+@contextmanager
+def _las_reader(path: Path) -> Iterator[Any]:
+    """Open a .las or .laz file; what is wrong with it is an InputError."""
+    try:
+        import laspy
+    except ImportError:
+        raise InputError(
+            f"{path}: reading {path.suffix} scans needs laspy, which is not installed. Run `pip install "
+            "'.[las]'`, or convert the scans to .npz."
+        ) from None
+    try:
+        with laspy.open(path) as reader:
+            yield reader
+    except InputError:
+        raise
+    except Exception as error:  # laspy and lazrs raise whatever they meet
+        raise InputError(f"{path}: cannot be read as {path.suffix} ({error}). {_AGAIN}") from None
+
+
+def _las_header(path: Path, size: int, scan: ScanFormat) -> _Header:
+    with _las_reader(path) as reader:
+        head = reader.header
+        names = [name for name in head.point_format.dimension_names if name not in ("X", "Y", "Z")]
+        end = head.offset_to_point_data + head.point_count * head.point_format.size
+        if not head.are_points_compressed and end > size:
+            raise InputError(
+                f"{path}: {size} bytes, but its header declares {head.point_count} points, {end} bytes: truncated. "
+                f"{_AGAIN}"
+            )
+        return _Header(_record(path, [(name, "f8") for name in (*"xyz", *names)]), head.point_count, "las")
 
 
 def _header_lines(path: Path, file: BinaryIO, last: str) -> list[list[str]]:
@@ -362,13 +415,16 @@ def _pcd_header(path: Path, size: int, scan: ScanFormat) -> _Header:
             # PCL calls padding "_", several times over
             unique = f"{name}{number}" if name == "_" else name
             code = "<" + {"F": "f", "I": "i", "U": "u"}[kind] + width
+            if count == 0:
+                # padding of no bytes, as pcl_ros writes
+                continue
             fields.append((unique, code) if count == 1 else (unique, code, (count,)))
         points = int(words["POINTS"][0]) if "POINTS" in words else int(words["WIDTH"][0]) * int(words["HEIGHT"][0])
         encodings: dict[str, Encoding] = {"ascii": "text", "binary": "records", "binary_compressed": "lzf"}
         encoding = encodings[words["DATA"][0]]
     except (KeyError, ValueError, IndexError) as error:
         raise InputError(f"{path}: the header cannot be read ({error!r}). {_AGAIN}") from None
-    if points < 0 or any(count < 1 for count in counts):
+    if points < 0 or any(count < 0 for count in counts):
         raise InputError(f"{path}: the header has a negative count. {_AGAIN}")
     return _Header(_record(path, fields), points, encoding, offset)
 
@@ -399,6 +455,10 @@ def _read_columns(
     elif header.encoding == "table":
         table = _feather_table(path, names)
         picked = {name: table[name].to_numpy() for name in names}
+    elif header.encoding == "las":
+        with _las_reader(path) as reader:
+            points = reader.read()
+            picked = {name: np.asarray(points[name]) for name in names}
     elif header.encoding == "text":
         picked = _text_columns(path, header, names)
     elif header.encoding == "lzf":

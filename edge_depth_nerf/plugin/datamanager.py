@@ -415,6 +415,7 @@ def _table_key(dataset: FisheyeDepthDataset, cache: PriorCache | None) -> str:
     described = {
         "versions": [TABLE_VERSION, CACHE_VERSION],
         "files": stats,
+        **({} if scene.crop_radius_px is None else {"crop_radius_px": scene.crop_radius_px}),
         "scene": [scene.theta_max_rad, scene.lidar_metres_per_count, scene.lidar_is_z_depth],
         "lenses": [repr((picture.lens, picture.up_in_camera.tolist())) for picture in dataset.pictures],
         "prior": None if cache is None else [cache.depth_source, dataclasses.asdict(cache.options)],

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import torch
 import tyro
 from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
@@ -28,6 +29,10 @@ SMALLEST_METRES_PER_UNIT = 10.0
 """What stands around the road is some 10 m away, however short the drive."""
 LARGEST_METRES_PER_UNIT = 128.0
 """The finest of 2048 cells is then 0.25 m: larger ones would blur kerbs and poles. The drive's ends are squeezed."""
+
+
+FAR_FROM_ORIGIN_M = 8192.0
+"""From here on float32 steps by a millimetre."""
 
 
 def default_metres_per_unit(camera_positions_m: NDArray) -> float:
@@ -150,6 +155,34 @@ def transforms_path(data: Path) -> Path:
     return path
 
 
+def _place_exactly(
+    outputs: DataparserOutputs, meta: dict[str, Any], frames: dict[Path, dict[str, Any]], from_colmap: bool
+) -> None:
+    """Place cameras that are far from the origin again, in float64.
+
+    nerfstudio's parser rounds positions to float32 before it subtracts their mean, which puts those of UTM, some 5,000
+    km away, off by up to half a metre. The parser's own transform stays, for exporters to invert.
+
+    Args:
+        outputs: the parser's; its cameras are changed.
+        meta: of transforms.json.
+        frames: its frames by their pictures.
+        from_colmap: whether there is COLMAP's model beside it, for which the parser has a transform of its own.
+    """
+    matrices = np.array([frames[image]["transform_matrix"] for image in outputs.image_filenames], np.float64)
+    positions_m = matrices[:, :3, 3]
+    if np.abs(positions_m).max() < FAR_FROM_ORIGIN_M:
+        return
+    to_scene, applied = np.eye(4), np.eye(4)
+    to_scene[:3] = outputs.dataparser_transform.double().numpy()
+    of_colmap = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]] if from_colmap else np.eye(4)[:3]
+    applied[:3] = np.array(meta.get("applied_transform", of_colmap), np.float64)[:3]
+    to_scene = to_scene @ np.linalg.inv(applied)
+    scale = outputs.dataparser_scale / meta.get("applied_scale", 1.0)
+    moved = (positions_m @ to_scene[:3, :3].T + to_scene[:3, 3]) * scale
+    outputs.cameras.camera_to_worlds[:, :, 3] = torch.from_numpy(moved).float()
+
+
 class FisheyeDepth(Nerfstudio):
     """Parser of scene folders."""
 
@@ -176,11 +209,12 @@ class FisheyeDepth(Nerfstudio):
         if not outputs.image_filenames:
             raise InputError(f"{path}: no picture is left for the split {split!r}; it needs one at least.")
         outputs.cameras = without_undefined_ray(outputs.cameras)
+        by_picture = {self._get_fname(Path(frame["file_path"]), path.parent): frame for frame in frames}
+        _place_exactly(outputs, meta, by_picture, (Path(self.config.data) / "colmap/sparse/0").exists())
 
         scene = scene_of(meta, path, self.config.depth_kind, self.config.depth_unit_scale_factor)
-        names = {self._get_fname(Path(frame["file_path"]), path.parent): frame["file_path"] for frame in frames}
         by_name = {picture.name: picture for picture in scene.pictures}
-        pictures = [by_name[names[image]] for image in outputs.image_filenames]
+        pictures = [by_name[by_picture[image]["file_path"]] for image in outputs.image_filenames]
         outputs.metadata.update(
             scene=scene,
             pictures=pictures,

@@ -15,15 +15,18 @@ import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.plugin.compat import allow_numpy_scalars_in_checkpoints, ignore_deprecations_of_host
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManager, FisheyeDepthDataManagerConfig
+from edge_depth_nerf.plugin.dataparser import transforms_path
 from edge_depth_nerf.plugin.detail import TrainingDetail
 from edge_depth_nerf.plugin.fused.build import kernels_prepared
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel, EdgeDepthNerfModelConfig
 from edge_depth_nerf.plugin.plain_errors import say_errors_plainly
 from edge_depth_nerf.plugin.viewer import DrivePanel
+from edge_depth_nerf.scene.format import depth_sources, layers_of, read_transforms
 
 FARTHEST_UNITS = 1e6
 """nerfstudio's sampler turns a distance x beyond 1 into 1 - 1/(2x): float32 has no such number below 1 from 2^23 on."""
@@ -33,6 +36,14 @@ MOST_NOT_FINITE = 5
 """So many of them may be: the scaler of mixed precision skips such a step. NaN in a parameter stays, and makes more."""
 MOST_NAMED = 5
 """An error names so many pictures."""
+
+
+def _has_depth(data: FisheyeDepthDataManagerConfig) -> bool:
+    """Whether any picture of the scene has a map that a prior can be made of."""
+    # nerfstudio's commands set the one, and the DataManager moves it to the other
+    path = transforms_path(Path(data.data or data.dataparser.data))
+    wanted = {*depth_sources()}
+    return any(wanted & layers_of(frame) for frame in read_transforms(path)["frames"])
 
 
 @dataclass
@@ -63,10 +74,19 @@ class EdgeDepthPipeline(VanillaPipeline):
         """Build both parts; a model gets neither a prior nor further pixels that it would not use.
 
         Raises:
-            InputError: the model has a depth loss, but no training pixel has a prior; or its far plane is out of range.
+            InputError: the model has a depth loss, and the depth maps give no training pixel a prior; or its far
+                plane is out of range. A scene without such maps is trained without the loss.
         """
         model, data = config.model, config.datamanager
         assert isinstance(model, EdgeDepthNerfModelConfig) and isinstance(data, FisheyeDepthDataManagerConfig)
+        if model.depth_loss != "none" and data.depth_source == "auto" and not _has_depth(data):
+            CONSOLE.log(
+                f"[yellow]{escape(str(data.dataparser.data))}: the scene has no depth maps (LiDAR, monocular or from "
+                "motion), so there is no prior and this training is plain nerfacto. `edge-depth-nerf estimate-depth` "
+                "makes monocular maps."
+            )
+            model = replace(model, depth_loss="none")
+            config = replace(config, model=model)
         if model.depth_loss == "none":
             config = replace(config, datamanager=replace(data, depth_source="none"))
         elif model.surface_loss_mult == 0:

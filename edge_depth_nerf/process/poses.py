@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from datetime import datetime, timezone
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,8 @@ QUATERNION_TOLERANCE = 1e-3
 """How far a quaternion's length may be from 1; four written digits still pass."""
 SAME_POSE_M, SAME_POSE_DEG = 0.02, 0.2
 """Poses of one time that differ by no more are one; the first counts."""
+_HEADING = re.compile(r"[\"'A-Za-z_\[\]().:/-]+")
+"""What a column may be called in a first line that is no data."""
 
 DOUBLED_SHARE, FEW_POSES = 0.01, 10
 """Of so many lines the time may be that of the line before; of one in any case, if there are not fewer poses."""
@@ -44,9 +47,10 @@ def read_tum(path: Path) -> tuple[Float64[np.ndarray, "poses"], Float64[np.ndarr
     times, poses, doubled = [], [], []
     for line, values in _number_lines(path):
         if len(values) != 8:
+            of_euroc = " as EuRoC's ground truth has (nanoseconds, and qw first)" if len(values) == 17 else ""
             raise InputError(
-                f"{path}, line {line}: {len(values)} numbers, expected 8 (time x y z qx qy qz qw, TUM's format). "
-                "Check poses.format in the rig file."
+                f"{path}, line {line}: {len(values)} numbers{of_euroc}, expected 8 (time x y z qx qy qz qw, TUM's "
+                "format, in seconds). Check poses.format in the rig file, or write the file in that form."
             )
         if abs(values[0]) > MAX_TIME_S:
             raise InputError(f"{path}, line {line}: its time {values[0]:g} is no time in seconds.")
@@ -123,26 +127,68 @@ def read_nerfstudio(path: Path) -> dict[str, Transform]:
     return poses
 
 
-def read_times(path: Path) -> list[tuple[str | None, float]]:
-    """Read a time a line: "TIME", or "NAME TIME".
+def read_times(path: Path, unit: str = "s") -> list[tuple[str | None, float]]:
+    """Read a time a line: "TIME", "NAME TIME", or "TIME NAME" where the name is no number.
+
+    Dates, as in KITTI's timestamps.txt, are read as UTC. A first line of names alone is passed over.
+
+    Args:
+        path: the file.
+        unit: what the rig file says that its numbers count, for the check that dates come without one.
 
     Returns:
-        Names, None where there are none, and times in the file's unit.
+        Names, None where there are none, and times in the file's unit; dates as seconds since 1970.
 
     Raises:
         FileNotFoundError: there is no such file.
-        InputError: a line is neither, or some have names and some have none.
+        InputError: a line is something else, or lines have different forms.
     """
     found: list[tuple[str | None, float]] = []
+    first = ""
     for line, words in _lines(path):
-        if len(words) > 2:
-            raise InputError(f"{path}, line {line}: {len(words)} words, expected a time, or a file's name and a time.")
-        found.append((words[0] if len(words) == 2 else None, finite_number(words[-1], f"{path}, line {line}")))
-        if (found[0][0] is None) != (found[-1][0] is None):
+        form, name, time = _time_of_line(words, f"{path}, line {line}")
+        if form == "date" and unit != "s":
             raise InputError(
-                f"{path}, line {line}: some lines have a file's name and some have none; use one form for all lines."
+                f"{path}, line {line}: the time is a date, but time_unit is {unit!r}. Dates need no unit: leave out "
+                "time_unit."
             )
+        first = first or form
+        if form != first:
+            raise InputError(
+                f"{path}, line {line}: some lines have a file's name and some have none, or have it elsewhere ({form}, "
+                f"after {first}); use one form for all lines."
+            )
+        found.append((name, time))
     return found
+
+
+def _time_of_line(words: list[str], where: str) -> tuple[str, str | None, float]:
+    """The form of a line, and its name and time."""
+    if (dated := seconds_of_date(" ".join(words))) is not None:
+        return "date", None, dated
+    if len(words) > 2:
+        raise InputError(
+            f"{where}: {len(words)} words, expected a time, a file's name and a time, a time and a file's name, or a "
+            "date as 2013-05-28 08:46:02.123456789."
+        )
+    if len(words) == 1:
+        return "TIME", None, finite_number(words[0], where)
+    if not _is_number(words[1]) and _is_number(words[0]):
+        return "TIME NAME", words[1], finite_number(words[0], where)
+    return "NAME TIME", words[0], finite_number(words[1], where)
+
+
+def seconds_of_date(text: str) -> float | None:
+    """Seconds since 1970 of a date like 2013-05-28 08:46:02.123456789, read as UTC, to some 0.2 µs; else None."""
+    # datetime stops at microseconds
+    whole, _, fraction = text.removesuffix("Z").partition(".")
+    if not re.fullmatch(r"[0-9]*", fraction):
+        return None
+    try:
+        stamp = datetime.strptime(whole.replace("T", " "), "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc)
+    except ValueError:
+        return None
+    return stamp.timestamp() + float(f"0.{fraction or 0}")
 
 
 def pose_of_quaternion(translation: list[float], quaternion: list[float], where: str) -> Transform:
@@ -185,10 +231,21 @@ def transform_of_rows(rows: object, where: str) -> Transform:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Lines with something in them, counted from 1, as words; what follows # is left out."""
+    """Lines with something in them, counted from 1, as words; what follows # and a first line of names are left out."""
+    begun = False
     for number, line in text_lines(path):
         if words := line.partition("#")[0].replace(",", " ").split():
-            yield number, words
+            if begun or not all(_HEADING.fullmatch(word) and not _is_number(word) for word in words):
+                yield number, words
+            begun = True
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def finite_number(word: str, where: str, remedy: str = "") -> float:

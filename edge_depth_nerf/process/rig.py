@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import statistics
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Float64
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE, as_people_count, picture_size
+from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE, as_people_count, largest_of_16_bits
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar import Sweep, transform_points
 from edge_depth_nerf.lidar.scans import SCAN_SUFFIXES, check_scan, read_scan
@@ -29,13 +29,16 @@ from edge_depth_nerf.lidar.sweeps import usable_points
 from edge_depth_nerf.lidar.trajectory import MAX_POSE_GAP_S, Trajectory
 from edge_depth_nerf.process.options import JbnuDepth360Options, RigOptions
 from edge_depth_nerf.process.poses import read_kitti, read_nerfstudio, read_times, read_tum
+from edge_depth_nerf.process.reading import read_if_whole
 from edge_depth_nerf.process.recording import DepthFile, RecordedCamera, RecordedPicture, RecordedSweep, Recording
 from edge_depth_nerf.process.rig_file import Clock, Rig, RigCamera, RigLidar, RigPoses, read_rig
-from edge_depth_nerf.scene.checks import Tolerance, check_size, size_error
+from edge_depth_nerf.scene.checks import Tolerance, check_picture_size, check_size
 from edge_depth_nerf.scene.writer import Skipped, summarise
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-"""Pictures that are found in a folder."""
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".avif")
+"""Pictures and masks that are found in a folder."""
+_LOOKED_AT = 5
+"""So many of a camera's pictures tell how many bits are used, and so many scans whether any can be read."""
 _RIG_FILES = ("rig.toml", "rig.json")
 _MOST_LATE_S = 60.0
 """A scan's points are measured within this time of the scan's own; beyond, their unit or their clock is another."""
@@ -130,11 +133,13 @@ def recording_of_rig(rig: Rig, options: RigOptions | JbnuDepth360Options, kind: 
         for name, picture in sorted(pictures.items()):
             with tolerance.of(frame, name):
                 recorded.append(companions.picture(by_name[name], frame, picture, camera_poses.get(picture.path)))
+    for camera in cameras:
+        _check_bits([picture.path for picture in recorded if picture.camera == camera.name], camera.name)
     frame_times_s = {frame: _time(pictures) for frame, pictures in kept.items()}
     sweeps = _sweeps(scans, frame_times_s, path, options.sweeps, tolerance)
     for camera in cameras:
         if camera.ego_mask:
-            check_size(camera.ego_mask, camera.camera)
+            check_picture_size(camera.ego_mask, camera.camera)
     return Recording(
         cameras=tuple(RecordedCamera(c.name, c.camera, c.to_vehicle, c.ego_mask) for c in cameras),
         pictures=tuple(recorded),
@@ -151,6 +156,7 @@ def recording_of_rig(rig: Rig, options: RigOptions | JbnuDepth360Options, kind: 
                 for lidar in rig.lidars
                 if lidar.timing is None and lidar.format.times is None and lidar.corrected_to is None
             ),
+            *(_turned_notice(name, counts) for name, counts in companions.turned.items()),
         ),
     )
 
@@ -165,11 +171,45 @@ def _doubled(poses: RigPoses | None) -> list[str]:
     return [said] if lines else []
 
 
+def _turned_notice(camera: str, orientations: Counter[int]) -> str:
+    found = ", ".join(f"{orientation} in {count}" for orientation, count in sorted(orientations.items()))
+    return (
+        f"{camera}: pictures have an EXIF orientation ({found} of them), which turns none of them here, as in "
+        "nerfstudio and COLMAP. OpenCV's imread turns them: if this camera was calibrated so, turn the files "
+        "themselves, as `mogrify -auto-orient` does."
+    )
+
+
+def _check_bits(pictures: list[Path], camera: str) -> None:
+    """Refuse pictures of 10, 12 or 14 bits that lie at the lower end of 16.
+
+    Raises:
+        InputError: none of some pictures uses the upper bits.
+    """
+    looked_at = pictures[:: max(1, len(pictures) // _LOOKED_AT)] if pictures else []
+    largest = 0
+    for path in looked_at:
+        if path.suffix.lower() not in (".png", ".tif", ".tiff"):
+            return
+        found = read_if_whole(partial(largest_of_16_bits, path))
+        if found is None:
+            return
+        largest = max(largest, found)
+    bits = next(bits for bits in (10, 12, 14, 16) if largest < 1 << bits)
+    if 0 < largest and bits < 16:
+        raise InputError(
+            f"{looked_at[0]}: 16-bit pictures of {camera}, but the largest value of {len(looked_at)} of them is "
+            f"{largest}: {bits} bits at the lower end, so that they would be {1 << (16 - bits)} times too dark. "
+            f"Stretch them, as `mogrify -evaluate multiply {1 << (16 - bits)}` does, or write 8 bits."
+        )
+
+
 def _whole_inputs(rig: Rig, cameras: Sequence[RigCamera], *, with_poses: bool) -> tuple[Path, ...]:
     """The files whose bytes decide about the scene: the rig file, poses, times."""
     poses = [rig.poses] if rig.poses and with_poses else []
     times = [clock.times_file for clock in (*cameras, *rig.lidars, *poses)]
-    return (rig.path, *(found.file for found in poses), *(path for path in times if path is not None))
+    lenses = [camera.calibration.file for camera in cameras if camera.calibration]
+    return (rig.path, *(found.file for found in poses), *(path for path in times if path is not None), *lenses)
 
 
 def _chosen(rig: Rig, names: Sequence[str]) -> list[RigCamera]:
@@ -185,8 +225,10 @@ def _chosen(rig: Rig, names: Sequence[str]) -> list[RigCamera]:
 def _files(root: Path, given: str, suffixes: tuple[str, ...]) -> list[Path]:
     """Files of a folder, or those that a pattern names, in the order of their names."""
     path, parts = root / given, Path(given).parts
-    wild = [number for number, part in enumerate(parts) if any(sign in part for sign in "*?[")]
-    if wild:
+    # a folder may be called "left [raw]"
+    there = next((number for number in range(len(parts)) if not root.joinpath(*parts[: number + 1]).exists()), 0)
+    wild = [number for number, part in enumerate(parts) if number >= there and any(sign in part for sign in "*?[")]
+    if wild and not path.is_dir():
         folder = root.joinpath(*parts[: wild[0]])
         try:
             found = [file for file in folder.glob(str(Path(*parts[wild[0] :]))) if file.is_file()]
@@ -228,7 +270,10 @@ def _number_in(path: Path) -> float:
 
 def _timed(files: list[Path], clock: Clock) -> list[_Timed]:
     """Files with their times, in the order of time."""
-    counts = _times_of_file(clock.times_file, files) if clock.times_file else [_number_in(path) for path in files]
+    if clock.times_file:
+        counts = _times_of_file(clock.times_file, files, clock.time_unit)
+    else:
+        counts = [_number_in(path) for path in files]
     timed = sorted(map(_Timed, files, clock.seconds(counts)), key=lambda item: item.time_s)
     for before, after in pairwise(timed):
         if before.time_s == after.time_s:
@@ -238,10 +283,15 @@ def _timed(files: list[Path], clock: Clock) -> list[_Timed]:
     return timed
 
 
-def _times_of_file(path: Path, files: list[Path]) -> list[float]:
-    lines = read_times(path)
+def _times_of_file(path: Path, files: list[Path], unit: str) -> list[float]:
+    lines = read_times(path, unit)
     if lines and lines[0][0] is not None:
-        by_name = dict(lines)
+        by_name: dict[str, float] = {}
+        for name, time in lines:
+            # other tools write the folder as well, as in rgb/000001.png
+            last = Path(str(name)).name
+            if by_name.setdefault(last, time) != time:
+                raise InputError(f"{path}: has two times for {last}, {by_name[last]:f} and {time:f}. Remove one.")
         found = [by_name.get(file.name, by_name.get(file.stem)) for file in files]
         for file, time in zip(files, found, strict=True):
             if time is None:
@@ -360,7 +410,9 @@ def _pose_list(poses: RigPoses) -> tuple[np.ndarray, np.ndarray]:
     matrices, times_file = read_kitti(poses.file), poses.times_file
     if poses.times_from_names:
         raise InputError(f"{poses.file}: KITTI's poses have no names; give poses.times_file or poses.rate_hz.")
-    counts = list(range(len(matrices))) if times_file is None else [time for _, time in read_times(times_file)]
+    counts: Sequence[float] = range(len(matrices))
+    if times_file is not None:
+        counts = [time for _, time in read_times(times_file, poses.time_unit)]
     if len(counts) != len(matrices):
         raise InputError(f"{times_file}: {len(counts)} times for the {len(matrices)} poses of {poses.file.name}.")
     return np.array(poses.seconds(counts), np.float64), matrices
@@ -468,7 +520,25 @@ def _sweeps(
                     columns=len(lidar.columns) if lidar.dtype == "float32" and item.path.suffix == ".bin" else None,
                 )
             )
+        _check_some([sweep for sweep in found if sweep.scanner == lidar.name])
     return found
+
+
+def _check_some(sweeps: list[RecordedSweep]) -> None:
+    """Read some scans of a scanner: what is wrong with all of them is an error before anything long begins.
+
+    Raises:
+        InputError: the fault of the first, if none can be read.
+    """
+    faults = []
+    for sweep in sweeps[:: max(1, len(sweeps) // _LOOKED_AT)]:
+        try:
+            sweep.read()
+            return
+        except (InputError, FileNotFoundError) as error:
+            faults.append(error)
+    if faults:
+        raise faults[0]
 
 
 def _read(path: Path, lidar: RigLidar, counted_from_s: float) -> Sweep:
@@ -499,6 +569,8 @@ class _Companions:
 
     def __init__(self, rig: Path, cameras: Sequence[RigCamera], options: RigOptions | JbnuDepth360Options) -> None:
         self._options = options
+        self.turned: dict[str, Counter[int]] = defaultdict(Counter)
+        """How many of each camera's pictures have which EXIF orientation, beside those that stand upright."""
         keys = ("truth_distance", "truth_rgb") if options.mono else ("mono", "truth_distance", "truth_rgb")
         for key in keys:
             lacking = [camera.name for camera in cameras if getattr(camera, key) is None]
@@ -508,7 +580,8 @@ class _Companions:
                 )
         self._found = {
             (camera.name, what): _by_stem(
-                _files(options.root, given, (".png",)), f"{rig}: cameras.{camera.name}.{what}"
+                _files(options.root, given, IMAGE_SUFFIXES if what == "masks" else (".png",)),
+                f"{rig}: cameras.{camera.name}.{what}",
             )
             for camera in cameras
             for what, given in (
@@ -522,10 +595,9 @@ class _Companions:
         self, camera: RigCamera, frame: int, picture: _Timed, camera_to_world: Transform | None
     ) -> RecordedPicture:
         """A picture with all that comes with it."""
-        if picture.path.suffix.lower() == ".png":
-            check_size(picture.path, camera.camera)
-        elif (size := picture_size(picture.path)) != (camera.camera.width, camera.camera.height):
-            raise InputError(size_error(picture.path, *size, camera.camera))
+        orientation = check_picture_size(picture.path, camera.camera)
+        if orientation != 1:
+            self.turned[camera.name][orientation] += 1
         # an option goes before what the rig file names
         mask = self._by_number("frame_masks", camera, frame) or self._by_name(camera, "masks", picture.path)
         mono = self._by_number("mono", camera, frame) or self._by_name(camera, "mono", picture.path)
@@ -543,7 +615,7 @@ class _Companions:
                 )
         for path in (mask, truth_rgb):
             if path is not None:
-                check_size(path, camera.camera)
+                check_picture_size(path, camera.camera)
         return RecordedPicture(
             camera=camera.name,
             frame=frame,

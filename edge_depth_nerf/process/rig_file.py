@@ -14,7 +14,7 @@ import math
 import re
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
@@ -35,10 +35,11 @@ from pydantic.fields import FieldInfo
 
 from edge_depth_nerf.base.bounds import MAX_TIME_S, path_inside, read_text, shown
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.cameras import MEI, Camera, KannalaBrandt, Pinhole
+from edge_depth_nerf.cameras import EUCM, MEI, Camera, DoubleSphere, KannalaBrandt, Pinhole
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar.scans import PointTimes, ScanFormat
 from edge_depth_nerf.lidar.sweeps import SweepTiming
+from edge_depth_nerf.process.calibration_file import RATIONAL, read_lens
 from edge_depth_nerf.process.poses import pose_of_quaternion, transform_of_rows
 
 if sys.version_info >= (3, 11):
@@ -56,12 +57,20 @@ _MAX_DOTS = 1000
 """No line of TOML has more: the parser's time and memory grow with the square of a key's parts."""
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _NAME = r"[A-Za-z0-9_][A-Za-z0-9_-]*"
+_FISHEYE = (KannalaBrandt, ("k1", "k2", "k3", "k4"))
+_DOUBLE_SPHERE = (DoubleSphere, ("xi", "alpha"))
 _MODELS: dict[str, tuple[Any, tuple[str, ...]]] = {
     "mei": (MEI, ("xi", "k1", "k2", "p1", "p2")),
-    "kannala-brandt": (KannalaBrandt, ("k1", "k2", "k3", "k4")),
+    **dict.fromkeys(("kannala-brandt", "opencv_fisheye", "equidistant"), _FISHEYE),
     "pinhole": (Pinhole, ("k1", "k2", "p1", "p2", "k3")),
+    **dict.fromkeys(("double-sphere", "ds"), _DOUBLE_SPHERE),
+    "eucm": (EUCM, ("alpha", "beta")),
 }
-"""Models, and what they have beside focal lengths and principal point; 0 if it is left out, but for ξ."""
+"""Models, and what they have beside focal lengths and principal point; `_OF_MODEL` are needed, others 0 if left out."""
+_OF_MODEL = ("xi", "alpha", "beta")
+_LENS = ("model", "width", "height", "fx", "fy", "cx", "cy")
+"""What describes a lens, unless a calibration file does."""
+_LENS_NUMBERS = ("xi", "alpha", "beta", "k1", "k2", "k3", "k4", "p1", "p2")
 
 
 def _inside(value: object, info: Any) -> Path:
@@ -112,8 +121,9 @@ class _Table(BaseModel):
         """Look for missing and unknown keys, and say which is meant."""
         if not isinstance(values, dict):
             raise InputError(f" is {shown(values)}, expected a table.")
+        needed = cls._needed(values)
         for name, field in cls.model_fields.items():
-            if field.is_required() and name not in values:
+            if name in needed and values.get(name) is None:
                 close = difflib.get_close_matches(name, values.keys() - cls.model_fields.keys(), 1, 0.75)
                 slip = f" There is {close[0]}: is {name} meant?" if close else ""
                 raise InputError(f".{name} is missing; expected {_expected(field)}.{slip}")
@@ -121,8 +131,14 @@ class _Table(BaseModel):
             if name not in cls.model_fields:
                 close = difflib.get_close_matches(name, cls.model_fields, 1, 0.6)
                 slip = f" Is {close[0]} meant?" if close else ""
-                raise InputError(f".{name}: unknown key;{slip} known are {', '.join(cls.model_fields)}.")
+                hint = f" {RATIONAL}." if name in ("k5", "k6") and "k4" in cls.model_fields else ""
+                raise InputError(f".{name}: unknown key;{slip} known are {', '.join(cls.model_fields)}.{hint}")
         return values
+
+    @classmethod
+    def _needed(cls, values: dict[str, Any]) -> set[str]:
+        """The keys without which it says too little."""
+        return {name for name, field in cls.model_fields.items() if field.is_required()}
 
     @field_validator("*", mode="wrap")
     @classmethod
@@ -206,18 +222,33 @@ class DepthMaps(_Table):
     metres_per_count: Scale
 
 
+class CalibrationFile(_Table):
+    """A calibration tool's file, instead of a lens's numbers."""
+
+    file: File
+    camera: Text = ""
+    """Which of its cameras, where there are several."""
+
+
 class RigCamera(_Sensor):
     """A camera of the rig."""
 
-    model: Literal["mei", "kannala-brandt", "pinhole"]
-    width: Side
-    height: Side
-    fx: Positive
-    fy: Positive
-    cx: Number
-    cy: Number
+    calibration: CalibrationFile | None = None
+    """Takes the place of `_LENS` and `_LENS_NUMBERS`."""
+    model: (
+        Literal["mei", "kannala-brandt", "opencv_fisheye", "equidistant", "pinhole", "double-sphere", "ds", "eucm"]
+        | None
+    ) = None
+    width: Side | None = None
+    height: Side | None = None
+    fx: Positive | None = None
+    fy: Positive | None = None
+    cx: Number | None = None
+    cy: Number | None = None
     pixel_centre: float = 0
     xi: Number | None = None
+    alpha: Number | None = None
+    beta: Number | None = None
     k1: Number = 0.0
     k2: Number = 0.0
     k3: Number = 0.0
@@ -236,24 +267,57 @@ class RigCamera(_Sensor):
     truth_rgb: Files | None = None
     depth: DepthMaps | None = None
 
+    @field_validator("model", mode="before")
+    @classmethod
+    def _check_model(cls, value: Any) -> Any:
+        if value in ("rational", "rational_polynomial"):
+            raise InputError(f" is {value!r}: {RATIONAL}.")
+        return value
+
+    @classmethod
+    def _needed(cls, values: dict[str, Any]) -> set[str]:
+        return super()._needed(values) | ({*_LENS} if values.get("calibration") is None else set())
+
     @cached_property
     def camera(self) -> Camera:
         """Its model, pixel centres at +0.5."""
+        camera = self._calibrated() if self.calibration else self._of_numbers()
+        limit_rad = min(math.radians(self.theta_max_deg), math.pi)
+        return replace(camera, theta_limit_rad=limit_rad)
+
+    def _calibrated(self) -> Camera:
+        assert self.calibration is not None
+        if twice := self.model_fields_set & {*_LENS, *_LENS_NUMBERS, "pixel_centre"}:
+            raise InputError(f".{min(twice)}: the calibration file describes the lens; remove one of them.")
+        try:
+            return read_lens(self.calibration.file, self.calibration.camera)
+        except InputError as error:
+            raise InputError(f".calibration: {error}") from None
+
+    def _of_numbers(self) -> Camera:
+        assert self.model and self.width and self.height and self.cx is not None and self.cy is not None
         for key, value, size in (("cx", self.cx, self.width), ("cy", self.cy, self.height)):
             if not 0 < value < size:
                 raise InputError(f".{key} is {value}, expected a pixel within the picture, 0 to {size}.")
         if self.pixel_centre not in (0, 0.5, 1):
             raise InputError(f".pixel_centre is {self.pixel_centre}, expected one of 0, 0.5, 1.")
         kind, own = _MODELS[self.model]
-        if wrong := self.model_fields_set & {"xi", "k1", "k2", "k3", "k4", "p1", "p2"} - {*own}:
-            raise InputError(f".{min(wrong)}: unknown key; a camera of model {self.model} has {', '.join(own)}.")
-        if "xi" in own and self.xi is None:
-            raise InputError(".xi is missing; expected a number.")
+        if wrong := self.model_fields_set & {*_LENS_NUMBERS} - {*own}:
+            hint = f" {RATIONAL}." if "k4" in wrong and self.model == "pinhole" else ""
+            raise InputError(f".{min(wrong)}: unknown key; a camera of model {self.model} has {', '.join(own)}.{hint}")
+        if lacking := [key for key in own if key in _OF_MODEL and getattr(self, key) is None]:
+            raise InputError(f".{lacking[0]} is missing; expected a number.")
         shift = 0.5 - self.pixel_centre
-        common = (self.width, self.height, self.fx, self.fy, self.cx + shift, self.cy + shift)
-        limit_rad = min(math.radians(self.theta_max_deg), math.pi)
         try:
-            return kind(*common, **{key: getattr(self, key) for key in own}, theta_limit_rad=limit_rad)
+            return kind(
+                width=self.width,
+                height=self.height,
+                fx=self.fx,
+                fy=self.fy,
+                cx=self.cx + shift,
+                cy=self.cy + shift,
+                **{key: getattr(self, key) for key in own},
+            )
         except InputError as error:
             raise InputError(f".model: {error}") from None
 

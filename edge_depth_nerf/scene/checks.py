@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import read_mask
+from edge_depth_nerf.base.files import picture_head, read_mask
 from edge_depth_nerf.base.png import PngHeader, read_png_header
 from edge_depth_nerf.cameras import Camera
 
@@ -28,6 +28,26 @@ def check_size(path: Path, camera: Camera) -> PngHeader:
     if (header.width, header.height) != (camera.width, camera.height):
         raise InputError(size_error(path, header.width, header.height, camera))
     return header
+
+
+def check_picture_size(path: Path, camera: Camera) -> int:
+    """Check by its header that a picture or mask of any format has its camera's size; give its EXIF orientation.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: it has not, or cannot be read.
+    """
+    if path.suffix.lower() == ".png":
+        read_png_header(path)
+    head = picture_head(path)
+    if (head.width, head.height) != (camera.width, camera.height):
+        turned = head.orientation > 4 and (head.height, head.width) == (camera.width, camera.height)
+        remedy = (
+            f" Its EXIF orientation {head.orientation} would turn it to that size, but turns no picture here: turn the "
+            "files themselves, as `mogrify -auto-orient` does."
+        )
+        raise InputError(size_error(path, head.width, head.height, camera) + (remedy if turned else ""))
+    return head.orientation
 
 
 def check_distance(path: Path, camera: Camera) -> None:

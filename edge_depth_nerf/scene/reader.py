@@ -124,6 +124,8 @@ class SceneFolder:
     """transforms.json without its frames."""
     theta_max_rad: float
     """The angle from the axis beyond which the scene uses no ray."""
+    crop_radius_px: float | None
+    """Of a fisheye scene of nerfstudio's: the circle around each picture's middle beyond which no pixel is used."""
     lidar_metres_per_count: float
     """Unit of the LiDAR files."""
     lidar_is_z_depth: bool
@@ -179,8 +181,12 @@ class SceneFolder:
         """
         # the size in transforms.json may be anything, that of a decoded mask is in memory already
         mask = self.mask(picture)
-        within = self.rays(picture).within
-        return within.copy() if mask is None else mask & within
+        usable = self.rays(picture).within.copy()
+        if self.crop_radius_px is not None:
+            row, column = np.indices(usable.shape) + 0.5
+            height, width = usable.shape
+            usable &= np.hypot(column - width / 2, row - height / 2) <= self.crop_radius_px
+        return usable if mask is None else mask & usable
 
     def mask(self, picture: ScenePicture) -> Bool[np.ndarray, "h w"] | None:
         """Read a picture's mask, True = use; None if it has none. Raises as `usable`."""
@@ -330,6 +336,7 @@ def scene_of(
         own=own,
         meta={key: value for key, value in meta.items() if key != "frames"},
         theta_max_rad=math.radians(number_of(meta.get("theta_max_deg", 180.0), f"{path}: theta_max_deg")),
+        crop_radius_px=meta.get("fisheye_crop_radius") if model == FISHEYE_MODEL else None,
         # of this project's own key both are known
         lidar_metres_per_count=1 / DISTANCE_STEPS_PER_METRE if own_lidar else depth_metres_per_count,
         lidar_is_z_depth=not own_lidar and depth_kind == "z_depth",

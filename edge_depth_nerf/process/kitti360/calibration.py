@@ -7,10 +7,8 @@ Each error names the file and the line.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from datetime import datetime, timezone
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +17,7 @@ from edge_depth_nerf.base.bounds import shown, text_lines
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras import MEI
 from edge_depth_nerf.cameras.transforms import Transform
-from edge_depth_nerf.process.poses import finite_number, transform_of_rows
+from edge_depth_nerf.process.poses import finite_number, seconds_of_date, transform_of_rows
 
 _MEI_FIELDS = {
     "mirror_parameters": ("xi",),
@@ -186,17 +184,12 @@ def read_timestamps(path: Path) -> list[float]:
     """
     times = []
     for number, line in _lines(path):
-        # datetime stops at microseconds
-        whole, _, fraction = line.partition(".")
-        try:
-            stamp = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc)
-            if not re.fullmatch(r"[0-9]*", fraction):
-                raise ValueError
-            times.append(stamp.timestamp() + float(f"0.{fraction or 0}"))
-        except ValueError:
+        time = seconds_of_date(line)
+        if time is None:
             raise InputError(
                 f"{path}, line {number}: {shown(line)} is not a time like 2013-05-28 08:46:02.123456789. {_DOWNLOAD}"
-            ) from None
+            )
+        times.append(time)
     return times
 
 

@@ -1,0 +1,195 @@
+"""Lenses from the files of calibration tools: Kalibr's camchain.yaml, Basalt's calibration.json, OCamCalib's text.
+
+All three count pixels from the first one's centre; cameras have centres at +0.5. Transforms in these files are not
+read: where a sensor is, the rig file says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from edge_depth_nerf.base.bounds import finite, read_text, shown
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_json
+from edge_depth_nerf.cameras import EUCM, MEI, Camera, DoubleSphere, KannalaBrandt, OCam, Pinhole
+
+RATIONAL = (
+    "k4, k5 and k6 belong to OpenCV's rational model, which has no place here: calibrate again without "
+    "CALIB_RATIONAL_MODEL, or undistort the pictures (cv2.undistort) and give them as a pinhole without distortion"
+)
+"""What to do with a calibration of that model."""
+_MAX_BYTES = 1 << 16
+_MAX_BRACKETS = 500
+"""No camchain has more, and PyYAML's time grows with the square of their depth."""
+_RADTAN, _EQUIDISTANT = ("k1", "k2", "p1", "p2"), ("k1", "k2", "k3", "k4")
+_PINHOLE = ("fx", "fy", "cx", "cy")
+_KALIBR: dict[tuple[str, str], tuple[Any, tuple[str, ...], tuple[str, ...]]] = {
+    ("pinhole", "none"): (Pinhole, _PINHOLE, ()),
+    ("pinhole", "radtan"): (Pinhole, _PINHOLE, _RADTAN),
+    ("pinhole", "equidistant"): (KannalaBrandt, _PINHOLE, _EQUIDISTANT),
+    ("omni", "none"): (MEI, ("xi", *_PINHOLE), ()),
+    ("omni", "radtan"): (MEI, ("xi", *_PINHOLE), _RADTAN),
+    ("ds", "none"): (DoubleSphere, ("xi", "alpha", *_PINHOLE), ()),
+    ("eucm", "none"): (EUCM, ("alpha", "beta", *_PINHOLE), ()),
+}
+"""Kalibr's camera and distortion models: ours, and the order of its numbers."""
+_BASALT: dict[str, tuple[Any, tuple[str, ...], dict[str, float]]] = {
+    "pinhole": (Pinhole, _PINHOLE, {}),
+    "kb4": (KannalaBrandt, (*_PINHOLE, *_EQUIDISTANT), {}),
+    "ds": (DoubleSphere, (*_PINHOLE, "xi", "alpha"), {}),
+    "eucm": (EUCM, (*_PINHOLE, "alpha", "beta"), {}),
+    "ucm": (EUCM, (*_PINHOLE, "alpha"), {"beta": 1.0}),
+}
+_OCAM_LINES = 5
+_OCAM_COEFFICIENTS = range(1, 8)
+_OF_SCALE = (1e-2, 1e6)
+
+
+def read_lens(path: Path, name: str = "") -> Camera:
+    """Read a lens from a calibration file, whose kind its suffix tells: .yaml, .json, or .txt.
+
+    Args:
+        path: the file.
+        name: which of its cameras; may be left out where there is one.
+
+    Returns:
+        The camera, pixel centres at +0.5.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: another kind of file, broken, without that camera, or with a model that is not known.
+    """
+    readers: dict[str, Callable[[Path, str], Camera]] = {
+        **{".yaml": _kalibr, ".yml": _kalibr},
+        **{".json": _basalt, ".txt": _ocam},
+    }
+    if path.suffix.lower() not in readers:
+        raise InputError(
+            f"{path}: expected Kalibr's camchain (.yaml), Basalt's calibration (.json) or OCamCalib's calib_results "
+            "(.txt). Write the numbers of another tool into the rig file."
+        )
+    return readers[path.suffix.lower()](path, name)
+
+
+def _kalibr(path: Path, name: str) -> Camera:
+    text = read_text(path, _MAX_BYTES)
+    try:
+        if text.count("[") + text.count("{") > _MAX_BRACKETS:
+            raise ValueError(f"more than {_MAX_BRACKETS} brackets")
+        content = yaml.safe_load(text)
+    except Exception as error:  # PyYAML raises whatever its constructors meet
+        said = " ".join(str(error).split())
+        raise InputError(f"{path}: not valid YAML ({said}). Expected Kalibr's camchain.yaml.") from None
+    cameras = content if isinstance(content, dict) else {}
+    found = {str(key): one for key, one in cameras.items() if isinstance(one, dict) and "camera_model" in one}
+    where, camera = _chosen(path, found, name, "Kalibr's camchain.yaml")
+    distortion = str(camera.get("distortion_model", "none"))
+    kind = (str(camera["camera_model"]), distortion)
+    if kind not in _KALIBR:
+        known = ", ".join("-".join(one) for one in _KALIBR)
+        raise InputError(f"{where}: the model {shown('-'.join(kind))} is not known; expected one of {known}.")
+    model, order, of_distortion = _KALIBR[kind]
+    given = _numbers(camera.get("intrinsics"), order, f"{where}.intrinsics")
+    given |= _numbers(camera.get("distortion_coeffs", []), of_distortion, f"{where}.distortion_coeffs")
+    return _camera(model, given, camera.get("resolution"), where)
+
+
+def _basalt(path: Path, name: str) -> Camera:
+    content = read_json(path)
+    whole = content.get("value0") if isinstance(content, dict) else None
+    cameras = whole.get("intrinsics") if isinstance(whole, dict) else None
+    sizes = whole.get("resolution") if isinstance(whole, dict) else None
+    if not (isinstance(cameras, list) and isinstance(sizes, list) and len(cameras) == len(sizes)):
+        raise InputError(
+            f"{path}: expected Basalt's calibration.json: value0 with intrinsics and resolution, a list each."
+        )
+    named = {
+        f"cam{number}": {"of": one, "size": size} for number, (one, size) in enumerate(zip(cameras, sizes, strict=True))
+    }
+    where, camera = _chosen(path, named, name, "Basalt's calibration.json")
+    of = camera["of"] if isinstance(camera["of"], dict) else {}
+    kind, values = str(of.get("camera_type")), of.get("intrinsics")
+    if kind not in _BASALT or not isinstance(values, dict):
+        remedy = f" {RATIONAL[0].upper()}{RATIONAL[1:]}." if kind == "pinhole-radtan8" else ""
+        raise InputError(
+            f"{where}: the model {shown(kind)} is not known; expected one of {', '.join(_BASALT)}.{remedy}"
+        )
+    model, order, further = _BASALT[kind]
+    given = _numbers([values.get(key) for key in order], order, f"{where}.intrinsics")
+    return _camera(model, {**given, **further}, camera["size"], where)
+
+
+def _ocam(path: Path, name: str) -> Camera:
+    """OCamCalib's calib_results.txt; its first axis is down, its second right, and its third looks backwards."""
+    lines = [
+        line.split() for line in read_text(path, _MAX_BYTES).splitlines() if line.strip() and line.strip()[0] != "#"
+    ]
+    numbers = [[_word(word) for word in line] for line in lines]
+    polynomial = numbers[0] if numbers else []
+    count = int(polynomial[0] or 0) if polynomial else 0
+    fits = len(numbers) == _OCAM_LINES and [len(line) for line in numbers[2:]] == [2, 3, 2]
+    if not fits or count != len(polynomial) - 1 or any(None in numbers[line] for line in (0, 2, 3, 4)):
+        raise InputError(
+            f"{path}: expected OCamCalib's calib_results.txt: the polynomial and its inverse with their numbers of "
+            "coefficients, centre (row, column), affine parameters c, d, e, and size (height, width)."
+        )
+    values = [[value for value in line if value is not None] for line in numbers]
+    coefficients, (row, column), (c, d, e), (height, width) = values[0][1:], values[2], values[3], values[4]
+    if name or count not in _OCAM_COEFFICIENTS or not _OF_SCALE[0] < abs(coefficients[0]) < _OF_SCALE[1] or c <= 0:
+        raise InputError(
+            f"{path}: {count} coefficients, the first {coefficients[0] if count else 'missing'}, c = {c}; expected 1 "
+            f"to {_OCAM_COEFFICIENTS[-1]}, the first a focal length in pixels, c above 0, and no name: the "
+            "file has one camera."
+        )
+    scale = abs(coefficients[0])
+    given = {"fx": scale, "fy": c * scale, "cx": column, "cy": row, "shear_x": e, "shear_y": d / c}
+    for power, coefficient in enumerate(coefficients[1:], start=1):
+        given[f"b{power}"] = coefficient * scale**power / coefficients[0]
+    return _camera(OCam, given, [width, height], str(path))
+
+
+def _word(word: str) -> float | None:
+    try:
+        return finite(float(word))
+    except ValueError:
+        return None
+
+
+def _chosen(path: Path, cameras: dict[str, dict[str, Any]], name: str, kind: str) -> tuple[str, dict[str, Any]]:
+    """The camera of that name, or the only one, with where it stands."""
+    if not cameras:
+        raise InputError(f"{path}: has no camera; expected {kind}.")
+    if not name and len(cameras) == 1:
+        name = next(iter(cameras))
+    if name not in cameras:
+        asked = f"no camera {name!r}" if name else f"{len(cameras)} cameras"
+        raise InputError(
+            f"{path}: {asked}; it has {', '.join(cameras)}. Name one, as calibration = {{file = {path.name!r}, "
+            f"camera = {next(iter(cameras))!r}}}."
+        )
+    return f"{path}: {name}", cameras[name]
+
+
+def _numbers(values: Any, names: tuple[str, ...], where: str) -> dict[str, float]:
+    found = [finite(value) for value in values] if isinstance(values, list) else []
+    given = {name: value for name, value in zip(names, found, strict=False) if value is not None}
+    if len(given) != len(names) or (names and len(found) != len(names)):
+        raise InputError(f"{where} is {shown(values)}, expected {len(names)} numbers: {', '.join(names)}.")
+    return given
+
+
+def _camera(model: Any, given: dict[str, float], size: Any, where: str) -> Camera:
+    sides = _numbers(size, ("width", "height"), f"{where}: resolution")
+    if any(side % 1 for side in sides.values()):
+        raise InputError(f"{where}: resolution is {shown(size)}, expected whole numbers of pixels.")
+    # what has no distortion has none of its numbers
+    none = {key: 0.0 for key in ("k1", "k2", "p1", "p2") if model is MEI}
+    centred = {**none, **given, "cx": given["cx"] + 0.5, "cy": given["cy"] + 0.5}
+    try:
+        return model(width=int(sides["width"]), height=int(sides["height"]), **centred)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
