@@ -416,6 +416,15 @@ def read_rig(path: Path, root: Path, prepare: Callable[[dict[str, Any]], None] |
         raise InputError(f"{path}: expected tables [cameras.NAME], [lidars.NAME] and [poses].")
     if prepare is not None:
         prepare(content)
+    return rig_of(content, path, root)
+
+
+def rig_of(content: dict[str, Any], path: Path, root: Path) -> Rig:
+    """Check the tables of a rig file, or those that a data set's own calibration makes; errors name `path`.
+
+    Raises:
+        InputError: a key is missing, unknown or wrong.
+    """
     try:
         return _rig(_Whole.model_validate(content, context={"root": root}), path)
     except ValidationError as error:
