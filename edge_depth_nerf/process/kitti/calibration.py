@@ -3,9 +3,9 @@
 Frames: cameras (x right, y down, z forward), velodyne and IMU (x forward, y left, z up), world (x east, y north, z up).
 Transforms are 4×4, metres, named a_to_b. Each error names the file.
 
-A rectified picture is P · (x, y, z, 1), with x, y, z in the rectified camera 0. So P = K · (I | t), and a point p of that
-frame is p + t in the camera of P: the fourth column tells where the cameras are. P and S belong to the pictures as they
-are published, rectified and cropped.
+A rectified picture is P · (x, y, z, 1), with x, y, z in the rectified camera 0. So P = K · (I | t), and a point p of
+that frame is p + t in the camera of P: the fourth column tells where the cameras are. P and S belong to the published
+pictures, which are rectified and cropped.
 """
 
 from __future__ import annotations

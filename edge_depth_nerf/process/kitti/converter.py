@@ -37,7 +37,6 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import picture_size
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar.trajectory import Trajectory
-from edge_depth_nerf.process.kitti360.calibration import read_timestamps
 from edge_depth_nerf.process.kitti.calibration import (
     RectifiedCamera,
     read_oxts,
@@ -47,6 +46,7 @@ from edge_depth_nerf.process.kitti.calibration import (
     read_transform,
     read_values,
 )
+from edge_depth_nerf.process.kitti360.calibration import read_timestamps
 from edge_depth_nerf.process.options import KittiOptions
 from edge_depth_nerf.process.poses import read_kitti as read_kitti_poses
 from edge_depth_nerf.process.poses import read_times
