@@ -21,15 +21,15 @@ _PLUMB_BOB = ("plumb_bob", "", "none", "rational_polynomial", "brown_conrady", "
 _EQUIDISTANT = ("equidistant", "fisheye", "kannala_brandt", "kannala_brandt4")
 _GRID = 25
 """Points along each side at which models are compared."""
-
-Pixels = Float64[np.ndarray, "points 2"]
+_LEAST_INVERTED = 0.9
+"""A calibration that gives a smaller share of the pixels a ray does not hold for its pictures."""
 
 
 @dataclass(frozen=True)
 class Lens:
     """A camera's model and numbers, by the keys of rig.toml."""
 
-    keys: dict[str, str | float]
+    keys: dict[str, str | int | float]
     rotation: Float64[np.ndarray, "3 3"]
     """From the camera's frame to that of its rectified pictures; the identity for others."""
     note: str = ""
@@ -69,7 +69,7 @@ def lens_of(info: Any, width: int, height: int, rectified: bool) -> Lens | str:
         note = f"CameraInfo is of {part[0]:g}×{part[1]:g} px and was scaled to the pictures"
     elif part.all():
         return f"its CameraInfo is of {part[0]:g}×{part[1]:g} px, its pictures of {width}×{height} px"
-    keys: dict[str, str | float] = {
+    keys: dict[str, str | int | float] = {
         "model": "pinhole",
         "width": width,
         "height": height,
@@ -99,7 +99,7 @@ def _named(names: tuple[str, ...], values: NDArray) -> dict[str, float]:
     return {name: float(value) for name, value in zip(names, values, strict=False) if value != 0}
 
 
-def _fitted(keys: dict[str, Any], distortion: NDArray) -> tuple[dict[str, str | float], float, str]:
+def _fitted(keys: dict[str, Any], distortion: NDArray) -> tuple[dict[str, str | int | float], float, str]:
     """Of the models that rig.toml has, the one closest to a distortion of OpenCV's, and its error over the picture."""
     focal = np.array([keys["fx"], keys["fy"]])
     centre = np.array([keys["cx"], keys["cy"]])
@@ -112,6 +112,8 @@ def _fitted(keys: dict[str, Any], distortion: NDArray) -> tuple[dict[str, str | 
         np.column_stack((plane, np.ones(len(plane)))), np.zeros(3), np.zeros(3), matrix, distortion
     )
     whole = np.linalg.norm(again[:, 0] - pixels, axis=-1) < 0.05
+    if whole.mean() < _LEAST_INVERTED:
+        return {}, np.inf, "none"
     plane, target = plane[whole], (pixels[whole] - centre) / focal
     x, y = plane.T
     squared = x * x + y * y

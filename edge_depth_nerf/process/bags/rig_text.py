@@ -84,7 +84,7 @@ def _lens_lines(camera: FoundCamera) -> list[str]:
     return ([f"# {camera.lens.note}"] if camera.lens.note else []) + numbers
 
 
-def _plain(value: str | float) -> str | float | int:
+def _plain(value: str | int | float) -> str | int | float:
     """Without NumPy's types, which TOML does not know."""
     return value if isinstance(value, (str, int)) else float(value)
 
@@ -116,8 +116,8 @@ def _mounting_lines(mounted: Mounted, vehicle: str) -> list[str]:
 
 
 def _floats(row: np.ndarray) -> list[float]:
-    # -0.0 is written as 0
-    return [float(value) + 0.0 for value in row]
+    # chains leave the last digits unsure; -0.0 is written as 0
+    return [round(float(value), 12) + 0.0 for value in row]
 
 
 def looks_upward(to_vehicle: Transform) -> bool:

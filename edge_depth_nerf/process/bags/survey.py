@@ -337,7 +337,7 @@ def _find_poses(options: UnpackOptions, found: Survey, by_type: dict[str, list[T
     sources = [each for each in sources if options.poses in (None, each[0].name) and each[0].messages > 1]
     if options.poses is not None and not sources:
         raise InputError(
-            f"--poses {options.poses}: expected a topic with poses: Odometry, PoseStamped, /tf, or a NavSatFix with Imu."
+            f"--poses {options.poses}: expected a topic with poses: Odometry, PoseStamped, /tf, or NavSatFix."
         )
     for topic in by_type.get(FIX, []):
         if not imus:
