@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,7 +21,6 @@ FIRST_NS = 1_700_000_000_123_456_789
 """The stamps' own clock; messages are recorded some milliseconds later."""
 LATE_NS = 7_000_000
 OPTICAL = Rotation.from_matrix(np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], float))
-COLUMNS, TURN_S = 360, 0.1
 KINDS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 
 
@@ -144,20 +142,6 @@ def camera_info(name: str, seconds: float, **changes: Any) -> Said:
     return Said(f"/{name}/camera_info", "sensor_msgs/msg/CameraInfo", seconds, {**fields, **changes})
 
 
-@cache
-def turn(start_s: float) -> tuple[NDArray, NDArray]:
-    """A turn that starts at a time: points where the scanner was when it measured them, and seconds from the start."""
-    azimuths = np.pi - np.arange(COLUMNS) / COLUMNS * 2 * np.pi
-    elevations = np.linspace(-0.5, 0.3, 40)
-    offsets = np.arange(COLUMNS) / COLUMNS * TURN_S
-    points = []
-    for azimuth, offset in zip(azimuths, offsets, strict=True):
-        rays = data_sets.beams(np.full(len(elevations), azimuth), elevations)
-        to_world = data_sets.vehicle(start_s + offset) @ data_sets.to_vehicle("scanner")
-        points.append(rays * data_sets.reach(to_world[:3, 3], rays @ to_world[:3, :3].T)[:, None])
-    return np.concatenate(points), np.repeat(offsets, len(elevations))
-
-
 def cloud(
     seconds: float, points: NDArray, times: NDArray | None, field: str = "t", topic: str = "/lidar/points"
 ) -> Said:
@@ -231,7 +215,7 @@ def hall(poses: bool = True, calibrated: bool = True, mounted: bool = True, time
             if calibrated:
                 yield camera_info(name, data_sets.camera_time(name, number))
         start_s = number * data_sets.INTERVAL_S - 0.05
-        points, offsets = turn(start_s)
+        points, offsets = data_sets.turn(start_s)
         yield cloud(start_s, points, (offsets * 1e9).astype(np.uint32) if timed else None)
         yield Said("/rosout", "std_msgs/msg/String", start_s, {"data": "all is well"})
     if poses:

@@ -76,7 +76,7 @@ def test_what_is_written(whole: tuple[Path, Path]) -> None:
             found = read_image(recording / f"images/{name}/{stamp}{suffix}").astype(int)
             assert np.abs(found - data_sets.picture(name, number)).max() <= most
     start_s = 2 * data_sets.INTERVAL_S - 0.05
-    points, offsets = bags.turn(start_s)
+    points, offsets = data_sets.turn(start_s)
     table = np.load(recording / f"lidar/lidar/{bags.stamp_ns(start_s)}.npy")
     assert table.dtype.names == ("x", "y", "z", "intensity", "t") and len(table) == len(points)
     np.testing.assert_allclose(np.stack([table[axis] for axis in "xyz"], -1), points, atol=1e-5)
@@ -367,9 +367,9 @@ def test_one_topic_of_each_camera_and_scanner(tmp_path: Path) -> None:
     for number in range(data_sets.FRAMES):
         again = bags.image("front", number, data_sets.picture("front", number), compressed=True)
         said += [again, replace(again, topic="/front/image_rect_color")]
-        points, _ = bags.turn(number * 0.1)
+        points, _ = data_sets.turn(number * 0.1)
         said.append(bags.cloud(number * 0.1, points[:100], None, topic="/lidar/filtered"))
-    said.append(bags.cloud(0.0, bags.turn(0.0)[0], None, topic="/map"))
+    said.append(bags.cloud(0.0, data_sets.turn(0.0)[0], None, topic="/map"))
     depth = {"header": bags.header(0, "d"), "height": 2, "width": 2, "step": 4, "encoding": "16UC1", "data": [0] * 8}
     said.append(bags.Said("/depth/image_raw", "sensor_msgs/msg/Image", 0.0, depth))
     bag = bags.write_bag(tmp_path, "db3", said)
@@ -403,7 +403,7 @@ def test_livox(tmp_path: Path) -> None:
         "livox_ros_driver2/CustomPoint[] points",
     }
     said = [each for each in bags.hall() if each.topic != "/lidar/points"]
-    points, offsets = bags.turn(0.05)
+    points, offsets = data_sets.turn(0.05)
     points, offsets = points[::7], offsets[::7]
     inner = [
         {"offset_time": round(offset * 1e9), **bags.xyz(point), "reflectivity": 9}

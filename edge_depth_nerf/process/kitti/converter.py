@@ -149,8 +149,12 @@ def _description(layout: _Layout, options: KittiOptions) -> dict[str, Any]:
 
 def _path(layout: _Layout) -> Trajectory:
     poses = layout.poses()
-    # a pose beyond the times has no frame
-    frames = [frame for frame in sorted(poses) if frame < len(layout.times_s)]
+    frames, lines = sorted(poses), len(layout.times_s)
+    if frames and frames[-1] >= lines:
+        raise InputError(
+            f"{layout.times_file}: ends after line {lines}, but {layout.poses_file} has a pose of frame {frames[-1]}, "
+            f"which needs line {frames[-1] + 1}. The file is truncated; copy it again from the data set."
+        )
     try:
         return Trajectory(
             np.array([layout.times_s[frame] for frame in frames], np.float64),
