@@ -282,8 +282,9 @@ def ddad(root: Path) -> Path:
     for name, number, seconds in readings():
         world = vehicle(seconds) @ to_vehicle(name)
         world[:3, 3] += OFF
-        time_us = FIRST_S * 10**6 + round(seconds * 1e6)
-        stamp = datetime.fromtimestamp(FIRST_S, timezone.utc).replace(microsecond=round(seconds * 1e6))
+        # its dates take counts of 0.1 µs for µs, and lie in the year 2455
+        time_us = FIRST_S * 10**7 + round(seconds * 1e7)
+        stamp = datetime.fromtimestamp(time_us // 10**6, timezone.utc).replace(microsecond=time_us % 10**6)
         identity = {"log": "", "name": names[name], "timestamp": stamp.isoformat().replace("+00:00", "Z"), "index": "0"}
         datum: dict[str, Any] = {"annotations": {}, "metadata": {}, "pose": pose_entry(world)}
         if name in CAMERAS:
