@@ -126,12 +126,15 @@ def run(command: Command) -> None:
     done = work(command.options if isinstance(command, Process) else command)
     if isinstance(command, SynthesizeOptions):
         _say_next("Make a scene of it", f"edge-depth-nerf process {_converter(command)} --output SCENE")
-    elif isinstance(command, UnpackOptions) and done is not None:
-        from edge_depth_nerf.process.bags.command import todo_lines
+    elif isinstance(command, UnpackOptions):
+        if done is not None:
+            from edge_depth_nerf.process.bags.command import todo_lines
 
-        if todo := todo_lines(done):
-            _say_next("First fill in", f"{done}/rig.toml, lines {', '.join(map(str, todo))}")
-        _say_next("Make a scene of it", f"edge-depth-nerf process rig --root {shlex.quote(str(done))} --output SCENE")
+            if todo := todo_lines(done):
+                _say_next("First fill in", f"{done}/rig.toml, lines {', '.join(map(str, todo))}")
+            _say_next(
+                "Make a scene of it", f"edge-depth-nerf process rig --root {shlex.quote(str(done))} --output SCENE"
+            )
     elif isinstance(command, Process):
         scene = shlex.quote(str(done[0]))
         _say_next("Look at it", f"edge-depth-nerf inspect {scene}")

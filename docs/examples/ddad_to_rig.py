@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-
 LATEST_US = 4_000_000_000_000_000
 """The year 2096."""
 

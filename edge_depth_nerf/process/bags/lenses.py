@@ -107,7 +107,7 @@ def _fitted(keys: dict[str, Any], distortion: NDArray) -> tuple[dict[str, str | 
     columns, rows = np.meshgrid(np.linspace(0, keys["width"] - 1, _GRID), np.linspace(0, keys["height"] - 1, _GRID))
     pixels = np.stack((columns.ravel(), rows.ravel()), -1)
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 500, 1e-10)
-    plane = cv2.undistortPointsIter(pixels[:, None], matrix, distortion, None, None, criteria)[:, 0]
+    plane = cv2.undistortPointsIter(pixels[:, None], matrix, distortion, np.eye(3), np.eye(3), criteria)[:, 0]
     again, _ = cv2.projectPoints(
         np.column_stack((plane, np.ones(len(plane)))), np.zeros(3), np.zeros(3), matrix, distortion
     )

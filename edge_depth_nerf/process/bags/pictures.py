@@ -97,6 +97,10 @@ def _samples(message: Any) -> NDArray[np.unsignedinteger]:
     return np.ascontiguousarray(table[:, :needed]).view(kind)
 
 
+def _converted(samples: NDArray, code: int) -> NDArray[np.uint8]:
+    return np.asarray(cv2.cvtColor(samples, code), np.uint8)
+
+
 def decode(message: Any, bits: int) -> NDArray[np.uint8]:
     """A raw picture as H×W×3 RGB or H×W grey; `bits` of 16-bit ones are used.
 
@@ -107,11 +111,11 @@ def decode(message: Any, bits: int) -> NDArray[np.uint8]:
     if _depth(message) == 16:
         samples = np.minimum(samples.astype(np.uint32) >> (bits - 8), 255).astype(np.uint8)
     if bayer := _bayer_of(encoding):
-        return cv2.cvtColor(samples, bayer[0])
+        return _converted(samples, bayer[0])
     if encoding in _YUV:
-        return cv2.cvtColor(samples.reshape(message.height, message.width, 2), _YUV[encoding])
+        return _converted(samples.reshape(message.height, message.width, 2), _YUV[encoding])
     if encoding in _PLANES:
-        return cv2.cvtColor(samples, _PLANES[encoding])
+        return _converted(samples, _PLANES[encoding])
     channels, _, order = _CHANNELS[encoding]
     pixels = samples.reshape(message.height, message.width, channels)[..., order]
     return pixels[..., 0] if channels == 1 else np.ascontiguousarray(pixels)
@@ -139,7 +143,7 @@ def _developed(content: bytes, code: int) -> NDArray[np.uint8]:
     mosaic = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_GRAYSCALE)
     if mosaic is None:
         raise InputError(f"{len(content)} bytes that cannot be decoded as a picture")
-    return cv2.cvtColor(mosaic, code)
+    return _converted(mosaic, code)
 
 
 def size_of(message: Any) -> tuple[int, int]:
