@@ -20,6 +20,7 @@ from edge_depth_nerf.films.scan_options import RenderLidarOptions
 from edge_depth_nerf.inspecting.options import InspectOptions
 from edge_depth_nerf.mono.options import EstimateDepthOptions
 from edge_depth_nerf.plugin.compat import join_lines_of_option_help
+from edge_depth_nerf.process.bags.options import UnpackOptions
 from edge_depth_nerf.process.converters import CONVERTERS
 from edge_depth_nerf.process.options import ProcessOptions
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
@@ -45,6 +46,7 @@ class Doctor:
 
 Command = (
     Annotated[SynthesizeOptions, tyro.conf.subcommand("synthesize")]
+    | Annotated[UnpackOptions, tyro.conf.subcommand("unpack")]
     | Annotated[Process, tyro.conf.subcommand("process")]
     | Annotated[EstimateDepthOptions, tyro.conf.subcommand("estimate-depth")]
     | Annotated[InspectOptions, tyro.conf.subcommand("inspect")]
@@ -126,6 +128,15 @@ def run(command: Command) -> None:
     done = work(command.options if isinstance(command, Process) else command)
     if isinstance(command, SynthesizeOptions):
         _say_next("Make a scene of it", f"edge-depth-nerf process {_converter(command)} --output SCENE")
+    elif isinstance(command, UnpackOptions):
+        if done is not None:
+            from edge_depth_nerf.process.bags.command import todo_lines
+
+            if todo := todo_lines(done):
+                _say_next("First fill in", f"{done}/rig.toml, lines {', '.join(map(str, todo))}")
+            _say_next(
+                "Make a scene of it", f"edge-depth-nerf process rig --root {shlex.quote(str(done))} --output SCENE"
+            )
     elif isinstance(command, Process):
         scene = shlex.quote(str(done[0]))
         _say_next("Look at it", f"edge-depth-nerf inspect {scene}")
@@ -136,6 +147,8 @@ def _work_of(command: Command) -> Callable[..., Any]:
     """Import what carries out a command."""
     if isinstance(command, SynthesizeOptions):
         from edge_depth_nerf.synthetic.drive import synthesize_drive as work
+    elif isinstance(command, UnpackOptions):
+        from edge_depth_nerf.process.bags.command import unpack as work
     elif isinstance(command, Process):
         from edge_depth_nerf.process.command import process_drive as work
     elif isinstance(command, EstimateDepthOptions) and command.cluster is None:

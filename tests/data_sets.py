@@ -7,6 +7,7 @@ are pinholes without distortion; sweeps are corrected to the frame that their da
 import json
 from dataclasses import dataclass
 from datetime import datetime, timezone
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,8 @@ CAMERAS = {"front": (0.0, (1.6, 0.0, 1.4)), "side": (75.0, (1.2, 0.3, 1.5))}
 """Heading in the vehicle, degrees to the left, and place."""
 SCANNER = (90.0, (1.0, 0.1, 1.9))
 CAMERA_DELAY_S = {"front": 0.013, "side": 0.004}
+COLUMNS, TURN_S = 360, 0.1
+"""Of a turn of the scanner."""
 OFF = np.array([600.0, 1500.0, 0.0])
 """Worlds of data sets lie far from their origins."""
 
@@ -91,6 +94,20 @@ def points(time_s: float, frame: NDArray) -> NDArray:
     hits = to_world[:3, 3] + in_world * reach(to_world[:3, 3], in_world)[:, None]
     back = np.linalg.inv(vehicle(time_s) @ frame)
     return hits @ back[:3, :3].T + back[:3, 3]
+
+
+@cache
+def turn(start_s: float) -> tuple[NDArray, NDArray]:
+    """A turn that starts at a time: points where the scanner was when it measured them, and seconds from the start."""
+    azimuths = np.pi - np.arange(COLUMNS) / COLUMNS * 2 * np.pi
+    elevations = np.linspace(-0.5, 0.3, 40)
+    offsets = np.arange(COLUMNS) / COLUMNS * TURN_S
+    points = []
+    for azimuth, offset in zip(azimuths, offsets, strict=True):
+        rays = beams(np.full(len(elevations), azimuth), elevations)
+        to_world = vehicle(start_s + offset) @ to_vehicle("scanner")
+        points.append(rays * reach(to_world[:3, 3], rays @ to_world[:3, :3].T)[:, None])
+    return np.concatenate(points), np.repeat(offsets, len(elevations))
 
 
 def quaternion_w_first(pose: NDArray) -> list[float]:
@@ -265,8 +282,9 @@ def ddad(root: Path) -> Path:
     for name, number, seconds in readings():
         world = vehicle(seconds) @ to_vehicle(name)
         world[:3, 3] += OFF
-        time_us = FIRST_S * 10**6 + round(seconds * 1e6)
-        stamp = datetime.fromtimestamp(FIRST_S, timezone.utc).replace(microsecond=round(seconds * 1e6))
+        # its dates take counts of 0.1 µs for µs, and lie in the year 2455
+        time_us = FIRST_S * 10**7 + round(seconds * 1e7)
+        stamp = datetime.fromtimestamp(time_us // 10**6, timezone.utc).replace(microsecond=time_us % 10**6)
         identity = {"log": "", "name": names[name], "timestamp": stamp.isoformat().replace("+00:00", "Z"), "index": "0"}
         datum: dict[str, Any] = {"annotations": {}, "metadata": {}, "pose": pose_entry(world)}
         if name in CAMERAS:

@@ -57,9 +57,15 @@ def test_pythons(monkeypatch, running, state):
 def test_missing_libraries_are_findings(monkeypatch):
     spec = doctor.find_spec
     monkeypatch.setattr(doctor, "find_spec", lambda name: None if name in hidden else spec(name))
-    hidden = {"pycolmap", "kiss_icp", "transformers", "distributed", "tinycudann", "numba"}
+    hidden = {"pycolmap", "kiss_icp", "transformers", "rosbags", "distributed", "tinycudann", "numba"}
     extras = found(doctor.check_extras)
-    for name, extra in (("COLMAP", "colmap"), ("KISS-ICP", "odometry"), ("transformers", "hf"), ("Dask", "cluster")):
+    for name, extra in (
+        ("COLMAP", "colmap"),
+        ("KISS-ICP", "odometry"),
+        ("transformers", "hf"),
+        ("rosbags", "bags"),
+        ("Dask", "cluster"),
+    ):
         assert extras[name].state == "note" and f"'.[{extra}]'" in extras[name].remedy
     assert found(doctor.check_kernels)["Hash grids"].state == "problem"
     hidden.remove("numba")

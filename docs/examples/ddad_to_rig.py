@@ -19,6 +19,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+LATEST_US = 4_000_000_000_000_000
+"""The year 2096."""
+
 
 def matrix(pose: dict[str, dict[str, float]]) -> np.ndarray:
     """A pose of the data set, 4×4."""
@@ -53,6 +56,8 @@ def main(scene: Path, output: Path) -> None:
             rig["lidars"][name] |= {"corrected_to": "timestamp"}
         file = (scene / datum["filename"]).resolve()
         time_us = round(datetime.fromisoformat(reading["id"]["timestamp"].replace("Z", "+00:00")).timestamp() * 1e6)
+        # the data set counts 0.1 µs where its dates say µs: 2019 becomes 2463
+        time_us = time_us // 10 if time_us > LATEST_US else time_us
         link = output / name / f"{time_us}{file.suffix}"
         link.parent.mkdir(parents=True, exist_ok=True)
         link.symlink_to(file)

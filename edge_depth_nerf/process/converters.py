@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from edge_depth_nerf.process.options import JbnuDepth360Options, Kitti360Options, ProcessOptions, RigOptions
+from edge_depth_nerf.process.options import (
+    JbnuDepth360Options,
+    Kitti360Options,
+    KittiOptions,
+    ProcessOptions,
+    RigOptions,
+)
 
 if TYPE_CHECKING:
     from edge_depth_nerf.process.recording import Recording
@@ -33,6 +39,7 @@ class Converter:
 
 CONVERTERS: dict[str, Converter] = {
     "kitti360": Converter(Kitti360Options, "kitti360.converter", "read_kitti360"),
+    "kitti": Converter(KittiOptions, "kitti.converter", "read_kitti"),
     "jbnu-depth360": Converter(JbnuDepth360Options, "jbnu_depth360", "read_jbnu_depth360"),
     "rig": Converter(RigOptions, "rig", "read_rig_recording"),
 }

@@ -144,6 +144,20 @@ class Kitti360Options(ProcessOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+class KittiOptions(ProcessOptions):
+    """Turn a drive of KITTI's raw data or of its odometry benchmark into a scene folder."""
+
+    root: Path
+    """The data set's folder: the one that holds 2011_09_26 and the other days (raw data), or sequences and poses
+    (odometry)."""
+    sequence: str
+    """The drive, such as 2011_09_26_drive_0005_sync, or the sequence of the odometry benchmark, such as 07."""
+    cameras: tuple[str, ...] = ("image_02", "image_03")
+    """Which cameras: image_00, image_01 (grey, left and right), image_02, image_03 (colour). The odometry benchmark
+    calls them image_0 to image_3."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class RigOptions(ProcessOptions):
     """Turn your own recording into a scene folder. docs/rig.md says how to describe it."""
 

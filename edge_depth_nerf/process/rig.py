@@ -27,7 +27,7 @@ from edge_depth_nerf.lidar import Sweep, transform_points
 from edge_depth_nerf.lidar.scans import SCAN_SUFFIXES, check_scan, read_scan
 from edge_depth_nerf.lidar.sweeps import usable_points
 from edge_depth_nerf.lidar.trajectory import MAX_POSE_GAP_S, Trajectory
-from edge_depth_nerf.process.options import JbnuDepth360Options, RigOptions
+from edge_depth_nerf.process.options import JbnuDepth360Options, KittiOptions, RigOptions
 from edge_depth_nerf.process.poses import read_kitti, read_nerfstudio, read_times, read_tum
 from edge_depth_nerf.process.reading import read_if_whole
 from edge_depth_nerf.process.recording import DepthFile, RecordedCamera, RecordedPicture, RecordedSweep, Recording
@@ -40,6 +40,7 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".a
 _LOOKED_AT = 5
 """So many of a camera's pictures tell how many bits are used, and so many scans whether any can be read."""
 _RIG_FILES = ("rig.toml", "rig.json")
+_Options = RigOptions | JbnuDepth360Options | KittiOptions
 _MOST_LATE_S = 60.0
 """A scan's points are measured within this time of the scan's own; beyond, their unit or their clock is another."""
 
@@ -50,6 +51,16 @@ class _Timed:
 
     path: Path
     time_s: float
+
+
+@dataclass(frozen=True)
+class Numbered:
+    """What a data set tells of its frames by their numbers, instead of in files that a rig file names."""
+
+    times_s: Sequence[float]
+    """Of frame 0, 1 and so on; the last number in a file's name is its frame."""
+    path: Trajectory | None
+    """The vehicle's; None if poses are still to be found."""
 
 
 @dataclass(frozen=True)
@@ -96,29 +107,30 @@ def read_rig_recording(options: RigOptions) -> Recording:
     return recording_of_rig(rig, options, "rig")
 
 
-def recording_of_rig(rig: Rig, options: RigOptions | JbnuDepth360Options, kind: str) -> Recording:
+def recording_of_rig(rig: Rig, options: _Options, kind: str, numbered: Numbered | None = None) -> Recording:
     """Find and check the files that a rig file describes.
 
     Args:
         rig: what the file says.
         options: root, the recording's folder; which cameras and frames.
         kind: what the scene says that it is made of.
+        numbered: times and path of a data set that has them by the frames' numbers.
 
     Raises:
         FileNotFoundError: a folder or file of the recording is missing.
         InputError: an option or a file of the recording cannot be used.
     """
     root, cameras = options.root, _chosen(rig, options.cameras)
-    files = {camera.name: _timed(_files(root, camera.images, IMAGE_SUFFIXES), camera) for camera in cameras}
-    path, camera_poses = None, {}
-    if options.poses == "recorded":
+    files = {camera.name: _timed(_files(root, camera.images, IMAGE_SUFFIXES), camera, numbered) for camera in cameras}
+    path, camera_poses = numbered and numbered.path, {}
+    if options.poses == "recorded" and numbered is None:
         if rig.poses is None:
             raise InputError(
                 f"{rig.path}: has no table [poses]. Give poses (docs/rig.md), or compute them: --poses lidar, "
                 "--poses colmap."
             )
         path, camera_poses = _path(rig, rig.poses, cameras, files)
-    scans = [_Scans(lidar, _timed(_files(root, lidar.scans, SCAN_SUFFIXES), lidar)) for lidar in rig.lidars]
+    scans = [_Scans(lidar, _timed(_files(root, lidar.scans, SCAN_SUFFIXES), lidar, numbered)) for lidar in rig.lidars]
     _check_clocks(rig, files, scans, path)
 
     kept, skipped = _usable(_frames(files), options, path, camera_poses, scans)
@@ -268,19 +280,31 @@ def _number_in(path: Path) -> float:
     return float(numbers[-1])
 
 
-def _timed(files: list[Path], clock: Clock) -> list[_Timed]:
+def _timed(files: list[Path], clock: Clock, numbered: Numbered | None) -> list[_Timed]:
     """Files with their times, in the order of time."""
-    if clock.times_file:
-        counts = _times_of_file(clock.times_file, files, clock.time_unit)
+    if numbered is not None:
+        times_s = [_time_of_frame(path, clock, numbered) for path in files]
+    elif clock.times_file is not None:
+        times_s = clock.seconds(_times_of_file(clock.times_file, files, clock.time_unit))
     else:
-        counts = [_number_in(path) for path in files]
-    timed = sorted(map(_Timed, files, clock.seconds(counts)), key=lambda item: item.time_s)
+        times_s = clock.seconds([_number_in(path) for path in files])
+    timed = sorted(map(_Timed, files, times_s), key=lambda item: item.time_s)
     for before, after in pairwise(timed):
         if before.time_s == after.time_s:
             raise InputError(
                 f"{after.path} and {before.path.name} have the same time, {after.time_s:.6f} s; correct the times."
             )
     return timed
+
+
+def _time_of_frame(path: Path, clock: Clock, numbered: Numbered) -> float:
+    frame = int(_number_in(path))
+    if frame >= len(numbered.times_s):
+        raise InputError(
+            f"{clock.times_file}: ends after line {len(numbered.times_s)}, but {path} needs line {frame + 1}. The file "
+            "is truncated; copy it again from the data set."
+        )
+    return numbered.times_s[frame]
 
 
 def _times_of_file(path: Path, files: list[Path], unit: str) -> list[float]:
@@ -335,7 +359,7 @@ def _frames(files: dict[str, list[_Timed]]) -> list[dict[str, _Timed]]:
 
 def _usable(
     frames: list[dict[str, _Timed]],
-    options: RigOptions | JbnuDepth360Options,
+    options: _Options,
     path: Trajectory | None,
     camera_poses: dict[Path, Transform],
     scans: Sequence[_Scans],
@@ -388,7 +412,7 @@ def _path(
             f"{poses.file}: {len(times)} pose{'' if len(times) == 1 else 's'}, expected at least two, for the "
             "vehicle's motion."
         )
-    upright = _upright(poses.up)
+    upright = upright_world(poses.up)
 
     def in_metres(pose: Float64[np.ndarray, "*poses 4 4"]) -> Float64[np.ndarray, "*poses 4 4"]:
         moved = pose.copy()
@@ -456,7 +480,7 @@ def _picture_poses(
     return times, np.stack([found[item.path] for item in posed]), best.to_vehicle, found
 
 
-def _upright(up: str) -> Transform:
+def upright_world(up: str) -> Transform:
     """The turn of the world that makes its upward axis z; axes are exchanged, nothing more."""
     axes, axis = np.eye(3), "xyz".index(up[-1])
     upward, forward = axes[axis] * (-1.0 if up.startswith("-") else 1.0), axes[(axis + 1) % 3]
@@ -567,7 +591,7 @@ class _Companions:
     does.
     """
 
-    def __init__(self, rig: Path, cameras: Sequence[RigCamera], options: RigOptions | JbnuDepth360Options) -> None:
+    def __init__(self, rig: Path, cameras: Sequence[RigCamera], options: _Options) -> None:
         self._options = options
         self.turned: dict[str, Counter[int]] = defaultdict(Counter)
         """How many of each camera's pictures have which EXIF orientation, beside those that stand upright."""

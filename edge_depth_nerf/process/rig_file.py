@@ -53,6 +53,10 @@ MAX_SIDE_PX = 20_000
 """No picture is larger."""
 MAX_RIG_BYTES = 1 << 18
 """No rig file is larger: a thousand sensors."""
+TODO = "TODO"
+"""A text that begins so stands for a value that is not known yet; what follows says what it is."""
+_TODO_LINE = re.compile(rf"""\s*([\w.-]+)\s*=\s*["']{TODO}:?\s*(.*?)["']\s*(#.*)?""")
+_TABLE_LINE = re.compile(r"\s*\[([^\[\]]+)\]\s*(#.*)?")
 _MAX_DOTS = 1000
 """No line of TOML has more: the parser's time and memory grow with the square of a key's parts."""
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -471,10 +475,11 @@ def read_rig(path: Path, root: Path, prepare: Callable[[dict[str, Any]], None] |
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; it describes the cameras and scanners (docs/rig.md).")
     parse, syntax = (json.loads, "JSON") if path.suffix.lower() == ".json" else (_parse_toml, "TOML")
+    text = read_text(path, MAX_RIG_BYTES)
+    if syntax == "TOML":
+        _check_todo(text, path)
     try:
-        content = parse(read_text(path, MAX_RIG_BYTES))
-    except InputError:
-        raise
+        content = parse(text)
     except (ValueError, RecursionError) as error:
         raise InputError(
             f"{path}: not valid {syntax} ({error}). Repair the file; docs/rig.md has an example."
@@ -483,6 +488,15 @@ def read_rig(path: Path, root: Path, prepare: Callable[[dict[str, Any]], None] |
         raise InputError(f"{path}: expected tables [cameras.NAME], [lidars.NAME] and [poses].")
     if prepare is not None:
         prepare(content)
+    return rig_of(content, path, root)
+
+
+def rig_of(content: dict[str, Any], path: Path, root: Path) -> Rig:
+    """Check the tables of a rig file, or those that a data set's own calibration makes; errors name `path`.
+
+    Raises:
+        InputError: a key is missing, unknown or wrong.
+    """
     try:
         return _rig(_Whole.model_validate(content, context={"root": root}), path)
     except ValidationError as error:
@@ -490,6 +504,24 @@ def read_rig(path: Path, root: Path, prepare: Callable[[dict[str, Any]], None] |
         key = ".".join(str(part) for part in first["loc"] if part != "[key]")
         said = first.get("ctx", {}).get("error") or f" is {shown(first['input'])}: {first['msg']}."
         raise InputError(f"{path}: {f'{key}{said}'.removeprefix('.')}") from None
+
+
+def _check_todo(text: str, path: Path) -> None:
+    """Refuse values that are still to be filled in, by their lines."""
+    table, found = "", []
+    for number, line in enumerate(text.splitlines(), 1):
+        if heading := _TABLE_LINE.fullmatch(line):
+            table = f"{heading[1].strip()}."
+        elif todo := _TODO_LINE.fullmatch(line):
+            found.append((number, f"{table}{todo[1]}", todo[2]))
+    if not found:
+        return
+    number, key, what = found[0]
+    others = ", ".join(str(number) for number, _, _ in found[1:20])
+    more = f" {TODO} stands in lines {others}, too." if others else ""
+    raise InputError(
+        f"{path}, line {number}: {key} is a {TODO}; write there what it asks for: {what or 'a value'}.{more}"
+    )
 
 
 def _parse_toml(text: str) -> dict[str, Any]:

@@ -1,0 +1,1 @@
+"""ROS bags: what is in them, and how it becomes a recording that `process rig` reads."""

@@ -1,0 +1,186 @@
+"""Frames of ROS: where sensors are mounted, and where the vehicle was.
+
+A transform of ROS maps points of its child's frame to its header's frame: it is the child's pose there. Frames form a
+tree; a chain from one to the other may go up and down. Transforms are 4×4, metres, named a_to_b.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.spatial.transform import Rotation, Slerp
+
+from edge_depth_nerf.cameras.transforms import Transform
+from edge_depth_nerf.lidar.trajectory import Trajectory
+
+Edge = tuple[str, str]
+"""Parent and child."""
+VEHICLE_FRAMES = ("base_link", "base_footprint", "ego_vehicle", "vehicle", "body", "imu_link", "imu")
+"""What the vehicle's frame is called, where nothing tells."""
+_UNIT = 1e-2
+"""How far the length of a quaternion may be from 1; they are brought to 1."""
+_SAME = 1e-6
+"""A transform that never changes by more, in metres and in the quaternion's parts, is a mounting."""
+_A, _E2 = 6378137.0, 6.69437999014e-3
+"""WGS 84: the earth's larger radius, and its eccentricity squared."""
+
+
+def name_of(frame: str) -> str:
+    """A frame's name; old drivers write a slash before it."""
+    return frame.lstrip("/")
+
+
+@dataclass
+class Poses:
+    """Poses over time, collected one by one; those that are none are counted."""
+
+    values: array = field(default_factory=lambda: array("d"))
+    """Time (s), x, y, z, qx, qy, qz, qw, one pose after another."""
+    broken: int = 0
+    """How many had no unit quaternion, or no numbers."""
+
+    def add(self, time_ns: int, place: Any, turn: Any) -> None:
+        """Append a pose of a position and a quaternion of ROS."""
+        numbers = (place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w)
+        length = float(np.linalg.norm(numbers[3:]))
+        if not (np.isfinite(numbers).all() and abs(length - 1) <= _UNIT):
+            self.broken += 1
+            return
+        self.values.extend((time_ns / 1e9, *numbers[:3], *(part / length for part in numbers[3:])))
+
+    @property
+    def table(self) -> Float64[np.ndarray, "poses 8"]:
+        """All of them, in order of time, one for each time."""
+        table = np.array(self.values, np.float64).reshape(-1, 8)
+        return table[np.unique(table[:, 0], return_index=True)[1]]
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether nothing moves."""
+        table = self.table
+        return bool(len(table)) and bool((np.ptp(table[:, 1:], axis=0) <= _SAME).all())
+
+
+def matrices(table: Float64[np.ndarray, "poses 8"]) -> Float64[np.ndarray, "poses 4 4"]:
+    """Poses as transforms."""
+    poses = np.tile(np.eye(4), (len(table), 1, 1))
+    if len(table):
+        poses[:, :3, :3] = Rotation.from_quat(table[:, 4:]).as_matrix()
+        poses[:, :3, 3] = table[:, 1:4]
+    return poses
+
+
+def rows_of(times_s: Float64[np.ndarray, "poses"], poses: Float64[np.ndarray, "poses 4 4"]) -> list[str]:
+    """Lines of TUM's format."""
+    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat() if len(poses) else np.empty((0, 4))
+    return [
+        f"{time:.9f} {' '.join(f'{value:.9f}' for value in (*pose[:3, 3], *quaternion))}\n"
+        for time, pose, quaternion in zip(times_s, poses, quaternions, strict=True)
+    ]
+
+
+def chain(edges: Sequence[Edge], source: str, target: str) -> list[tuple[Edge, bool]] | None:
+    """The edges from one frame to another, each with whether it goes up, to the parent; None without a way."""
+    ways: dict[str, list[tuple[Edge, bool]]] = {source: []}
+    waiting = deque([source])
+    while waiting:
+        frame = waiting.popleft()
+        if frame == target:
+            return ways[frame]
+        for edge in edges:
+            parent, child = edge
+            after = parent if child == frame else child if parent == frame else None
+            if after is not None and after not in ways:
+                ways[after] = [*ways[frame], (edge, child == frame)]
+                waiting.append(after)
+    return None
+
+
+def mounting(edges: Mapping[Edge, Transform], source: str, target: str) -> Transform | None:
+    """The transform from a frame to another along mountings; None without a chain."""
+    way = chain(list(edges), source, target)
+    if way is None:
+        return None
+    found = np.eye(4)
+    for edge, up in way:
+        found = (edges[edge] if up else np.linalg.inv(edges[edge])) @ found
+    return found
+
+
+def root_of(edges: Sequence[Edge], frame: str) -> str:
+    """The topmost frame above one."""
+    parents = {child: parent for parent, child in edges}
+    seen = {frame}
+    while frame in parents and parents[frame] not in seen:
+        frame = parents[frame]
+        seen.add(frame)
+    return frame
+
+
+def path_of(
+    moving: Mapping[Edge, Poses], fixed: Mapping[Edge, Transform], vehicle: str
+) -> tuple[Float64[np.ndarray, "poses"], Float64[np.ndarray, "poses 4 4"], str] | None:
+    """The vehicle's poses in the topmost frame above it, at the times of the fastest edge, and that frame's name.
+
+    None if nothing between them moves.
+    """
+    edges = [*moving, *fixed]
+    world = root_of(edges, vehicle)
+    way = chain(edges, vehicle, world) or []
+    paths = {edge: poses.table for edge, _ in way if (poses := moving.get(edge)) is not None}
+    if not paths or min(map(len, paths.values())) < 2:
+        return None
+    times_s = max(paths.values(), key=len)[:, 0]
+    first, last = max(table[0, 0] for table in paths.values()), min(table[-1, 0] for table in paths.values())
+    times_s = times_s[(times_s >= first) & (times_s <= last)]
+    found = np.tile(np.eye(4), (len(times_s), 1, 1))
+    for edge, _ in way:
+        table = paths.get(edge)
+        step = fixed[edge] if table is None else Trajectory(table[:, 0], matrices(table)).at(times_s)
+        found = step @ found
+    return times_s, found, world
+
+
+def by_satellite(
+    fixes: Float64[np.ndarray, "fixes 4"],
+    turns: Float64[np.ndarray, "turns 5"],
+    antenna_to_vehicle: Transform,
+    imu_to_vehicle: Transform,
+) -> tuple[Float64[np.ndarray, "poses"], Float64[np.ndarray, "poses 4 4"]]:
+    """The vehicle's poses by satellite fixes and the IMU's orientations, in a world of east, north and up.
+
+    Its origin is the first fix, on the ellipsoid of WGS 84.
+
+    Args:
+        fixes: time (s), latitude and longitude (degrees), altitude (m) of the antenna.
+        turns: time (s) and quaternion (x, y, z, w) of the IMU, by ROS from east.
+        antenna_to_vehicle: where the antenna is.
+        imu_to_vehicle: where the IMU is.
+    """
+    fixes = fixes[(fixes[:, 0] >= turns[0, 0]) & (fixes[:, 0] <= turns[-1, 0])]
+    if not len(fixes):
+        return np.empty(0), np.empty((0, 4, 4))
+    latitude, longitude = np.radians(fixes[:, 1]), np.radians(fixes[:, 2])
+    radius = _A / np.sqrt(1 - _E2 * np.sin(latitude) ** 2)
+    flat = (radius + fixes[:, 3]) * np.cos(latitude)
+    up_axis = (radius * (1 - _E2) + fixes[:, 3]) * np.sin(latitude)
+    earth = np.stack((flat * np.cos(longitude), flat * np.sin(longitude), up_axis), -1)
+    lat, lon = latitude[0], longitude[0]
+    axes = np.array(
+        [
+            [-np.sin(lon), np.cos(lon), 0],
+            [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)],
+            [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)],
+        ]
+    )
+    poses = np.tile(np.eye(4), (len(fixes), 1, 1))
+    imu_to_world = Slerp(turns[:, 0], Rotation.from_quat(turns[:, 1:]))(fixes[:, 0]).as_matrix()
+    poses[:, :3, :3] = imu_to_world @ imu_to_vehicle[:3, :3].T
+    poses[:, :3, 3] = (earth - earth[0]) @ axes.T - poses[:, :3, :3] @ antenna_to_vehicle[:3, 3]
+    return fixes[:, 0], poses

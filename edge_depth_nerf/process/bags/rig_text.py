@@ -1,0 +1,125 @@
+"""The rig.toml of an unpacked bag: what was found, and TODO lines for what was not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from edge_depth_nerf.cameras.transforms import Transform
+from edge_depth_nerf.process.bags.survey import FoundCamera, FoundScanner
+from edge_depth_nerf.process.rig_file import TODO
+
+_UPWARD = 0.9
+"""A camera whose axis points up so steeply has a frame with x forward, not an optical one."""
+
+
+@dataclass(frozen=True)
+class Mounted:
+    """Where a sensor is."""
+
+    to_vehicle: Transform | None
+    """None if that is not known."""
+    frame: str
+    """Its own frame in the bag."""
+
+
+def rig_text(
+    bag: str,
+    vehicle: str,
+    cameras: Sequence[tuple[FoundCamera, Mounted]],
+    scanners: Sequence[tuple[FoundScanner, Mounted]],
+    poses: str | None,
+) -> str:
+    """The whole file.
+
+    Args:
+        bag: its name.
+        vehicle: the name of the vehicle's frame.
+        cameras: those that were written.
+        scanners: likewise.
+        poses: where the poses come from; None if there are none.
+    """
+    lines = [f"# Made by `edge-depth-nerf unpack` from {bag}. docs/rig.md explains each key.", ""]
+    if poses is None:
+        lines += ["# The bag has no poses. Add a table [poses], or compute them: --poses lidar or --poses colmap."]
+    else:
+        lines += [f"# {poses}", "[poses]", 'file = "poses.txt"', 'format = "tum"']
+    for camera, mounted in cameras:
+        lines += ["", f"# {camera.topic.name}", f"[cameras.{camera.name}]", f'images = "images/{camera.name}"', *_CLOCK]
+        lines += _lens_lines(camera)
+        lines += _mounting_lines(mounted, vehicle)
+    for scanner, mounted in scanners:
+        lines += ["", f"# {scanner.topic.name}", f"[lidars.{scanner.name}]", f'scans = "lidar/{scanner.name}"', *_CLOCK]
+        lines += _turn_lines(scanner)
+        lines += _mounting_lines(mounted, vehicle)
+    if not scanners:
+        lines += [
+            "",
+            "# The bag has no scans. Add depth maps (docs/rig.md), or scans of another file as [lidars.NAME].",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+_CLOCK = ("times_from_names = true", 'time_unit = "ns"')
+
+
+def _todo(key: str, what: str) -> str:
+    return f'{key} = "{TODO}: {what}"'
+
+
+def _lens_lines(camera: FoundCamera) -> list[str]:
+    size = [f"width = {camera.width}", f"height = {camera.height}"]
+    if isinstance(camera.lens, str):
+        lacking = [("model", "mei, kannala-brandt or pinhole")]
+        lacking += [(key, "focal length in pixels") for key in ("fx", "fy")]
+        lacking += [(key, "principal point in pixels") for key in ("cx", "cy")]
+        named = [_todo(key, what) for key, what in lacking]
+        return [f"# {camera.lens}; calibrate it, and add its distortion (k1 …)", *size, *named]
+    numbers = [
+        f'{key} = "{value}"' if isinstance(value, str) else f"{key} = {value!r}"
+        for key, value in ((key, _plain(value)) for key, value in camera.lens.keys.items())
+    ]
+    return ([f"# {camera.lens.note}"] if camera.lens.note else []) + numbers
+
+
+def _plain(value: str | int | float) -> str | int | float:
+    """Without NumPy's types, which TOML does not know."""
+    return value if isinstance(value, (str, int)) else float(value)
+
+
+def _turn_lines(scanner: FoundScanner) -> list[str]:
+    note = [f"# {scanner.note}"] if scanner.note else []
+    if scanner.times is not None:
+        turn = [f"turn_s = {scanner.turn_s:.6f}", f'timestamp = "{scanner.timestamp}"']
+        times = 'point_times = {column = "t", unit = "s", counted_from = "timestamp"}'
+        return [*note, f"# from the field {scanner.times.field}, in {scanner.times.unit}", *turn, times]
+    how = "clockwise or counter-clockwise, seen from above"
+    return [
+        *note,
+        "# If a scan is a turn, fill in direction, and correct the other three lines. If its points are corrected for",
+        '# the vehicle\'s motion, replace these four lines by corrected_to = "timestamp". Otherwise remove them.',
+        f"turn_s = {scanner.turn_s:.6f}",
+        'timestamp = "end"',
+        _todo("direction", how),
+        "start_azimuth_deg = 180",
+    ]
+
+
+def _mounting_lines(mounted: Mounted, vehicle: str) -> list[str]:
+    if mounted.to_vehicle is None:
+        what = f"4 rows of 4 numbers, from its frame ({mounted.frame or 'without name'}) to the vehicle's ({vehicle})"
+        return [_todo("to_vehicle", what)]
+    rows = [f"    [{', '.join(f'{value:.12g}' for value in _floats(row))}]," for row in mounted.to_vehicle]
+    return ["to_vehicle = [", *rows, "]"]
+
+
+def _floats(row: np.ndarray) -> list[float]:
+    # chains leave the last digits unsure; -0.0 is written as 0
+    return [round(float(value), 12) + 0.0 for value in row]
+
+
+def looks_upward(to_vehicle: Transform) -> bool:
+    """Whether a camera's axis points up, which a frame with x forward would make of it."""
+    return bool(to_vehicle[2, 2] > _UPWARD)
