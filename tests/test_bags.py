@@ -81,7 +81,7 @@ def test_what_is_written(whole: tuple[Path, Path]) -> None:
     assert table.dtype.names == ("x", "y", "z", "intensity", "t") and len(table) == len(points)
     np.testing.assert_allclose(np.stack([table[axis] for axis in "xyz"], -1), points, atol=1e-5)
     np.testing.assert_allclose(table["t"], offsets, atol=1e-8)
-    times, poses = read_tum(recording / "poses.txt")
+    times, poses, _ = read_tum(recording / "poses.txt")
     np.testing.assert_allclose(times[0], bags.stamp_ns(-0.2) / 1e9, atol=1e-6)
     for time, pose in zip(times, poses, strict=True):
         np.testing.assert_allclose(pose, bags.world(time - bags.FIRST_NS / 1e9), atol=1e-5)
@@ -182,7 +182,7 @@ def test_poses_of_each_kind(tmp_path: Path, source: str) -> None:
         said += list(pose_messages(source, step * 0.02))
     text = run(bags.write_bag(tmp_path, "db3", said), tmp_path / "recording", vehicle="base_link")
     assert "left out" not in text
-    times, poses = read_tum(tmp_path / "recording/poses.txt")
+    times, poses, _ = read_tum(tmp_path / "recording/poses.txt")
     # the origin of fixes is the antenna's first one
     origin = (bags.world(-0.2) @ ANTENNA)[:3, 3] if source == "gps" else np.zeros(3)
     assert len(times) >= 49
