@@ -53,6 +53,7 @@ def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 
 # ---- the whole way ---------------------------------------------------------------------------------------------
 @pytest.mark.slow
+@pytest.mark.parametrize("whole", ["mcap"], indirect=True)
 def test_lidar_lies_on_the_walls(whole: tuple[Path, Path], tmp_path: Path) -> None:
     """Pictures, calibration, mountings, poses and the points' own times together."""
     options = RigOptions(root=whole[1], output=tmp_path / "scene", find_ego=False, sky=False, strict=True)

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
 import cv2
@@ -141,9 +141,19 @@ class _Points:
     in_scanner: Float64[np.ndarray, "n 3"]
     offset_s: Float64[np.ndarray, "n"]
     sweep: RecordedSweep
+    _given: list[Float64[np.ndarray, "n 3"]] = field(default_factory=list)
+    """Where they are as given, once that was asked."""
 
     def world(self, reading: Reading, path: Trajectory) -> Float64[np.ndarray, "n 3"]:
         """Where they are, read in another way."""
+        if reading.keeps_scans:
+            # most readings of cameras: found once
+            if not self._given:
+                self._given.append(self._placed(reading, path))
+            return self._given[0]
+        return self._placed(reading, path)
+
+    def _placed(self, reading: Reading, path: Trajectory) -> Float64[np.ndarray, "n 3"]:
         offset_s = self.offset_s if reading.point_times is None else reading.point_times(self.offset_s)
         times_s = torch.from_numpy(self.sweep.time_s + reading.scans_later_s + offset_s)
         in_vehicle = torch.from_numpy(_moved(reading.scanner(self.sweep.to_vehicle), self.in_scanner))
@@ -188,6 +198,14 @@ class _Fit:
 
 def _moved(transform: Transform, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     return points @ transform[:3, :3].T + transform[:3, 3]
+
+
+def _inverse(rigid: Transform) -> Transform:
+    """The inverse of a rotation and a translation; NumPy's takes a millisecond where threads are many."""
+    found = np.eye(4)
+    found[:3, :3] = rigid[:3, :3].T
+    found[:3, 3] = -rigid[:3, :3].T @ rigid[:3, 3]
+    return found
 
 
 def _sampled(picture: Float32[np.ndarray, "h w"], places: Float[np.ndarray, "... 2"]) -> Float32[np.ndarray, "..."]:
@@ -275,7 +293,7 @@ class _View:
         own = [picture.camera_to_world for picture in pair.pictures]
         if own[0] is not None and own[1] is not None:
             # pictures' own poses say how the camera moved, and the vehicle's path where LiDAR is
-            second = first @ np.linalg.inv(own[0]) @ own[1]
+            second = first @ _inverse(own[0]) @ own[1]
         return first, second
 
     def seen(
@@ -284,7 +302,7 @@ class _View:
         """Points that both pictures of a pair see, in the first camera, and their pixels in both."""
         pixels, in_first, kept = [], world, np.ones(len(world), bool)
         for number, pose in enumerate(self.poses(pair, reading)):
-            in_camera = _moved(np.linalg.inv(pose), world)
+            in_camera = _moved(_inverse(pose), world)
             found, inside = _projected(self.small, in_camera)
             kept &= inside
             kept[kept] = _sampled(self.usable, found[kept]) > 0.99
@@ -296,7 +314,7 @@ class _View:
 
     def edge(self, pair: _Pair, world: Float64[np.ndarray, "n 3"], reading: Reading) -> tuple[float, int]:
         """Sum of the edges' strength at points of the world, and how many there are."""
-        in_camera = _moved(np.linalg.inv(self.poses(pair, reading)[0]), world)
+        in_camera = _moved(_inverse(self.poses(pair, reading)[0]), world)
         pixels, inside = _projected(self._finer, in_camera)
         inside[inside] = _sampled(self._finer_usable, pixels[inside]) > 0.99
         return float(_sampled(pair.edges, pixels[inside]).sum()), int(inside.sum())
@@ -574,7 +592,8 @@ def _evaluated(source: _Source, views: Sequence[_View]) -> tuple[list[LidarFigur
     off = [one for one in figures if one.ratio is not None and abs(math.log(one.ratio)) > math.log(OFF)]
     known = sum(one.ratio is not None for one in figures)
     doubt = len(off) * 2 > known or any(fit.lack > _DOUBT for fit in given.values())
-    best = _best(source, given, apart_m, doubt)
+    judged = any(fit.tells or fit.points < _FEWEST for fit in given.values())
+    best = _best(source, given, apart_m, doubt) if judged else []
     if best:
         return figures, [_said(best)]
     poor = [one for one in figures if one.ratio is not None and one.correlation < 1 - _DOUBT]
@@ -711,7 +730,7 @@ def _ratios(source: _Source, view: _View) -> tuple[np.ndarray, np.ndarray]:
         in_first, (first, _) = view.seen(pair, world, Reading())
         in_first, first = in_first[:_SEARCHED], first[:_SEARCHED]
         poses = view.poses(pair, Reading())
-        to_second = np.linalg.inv(poses[1]) @ poses[0]
+        to_second = _inverse(poses[1]) @ poses[0]
         tried = in_first[:, None] * np.exp(-_LOG_RATIOS)[:, None]
         pixels, inside = _projected(view.small, _moved(to_second, tried.reshape(-1, 3)))
         pixels, inside = pixels.reshape(*tried.shape[:2], 2), inside.reshape(tried.shape[:2])

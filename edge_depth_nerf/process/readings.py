@@ -59,6 +59,12 @@ class Reading:
     step: float = 0.0
     """How far from the true amount it may be."""
 
+    @property
+    def keeps_scans(self) -> bool:
+        """Whether LiDAR's points are in the world where they were as given."""
+        timed = self.scans_later_s or self.point_times is not None
+        return self.scanner is _same and self.path is None and not timed
+
 
 def _turned(axis: str, degrees: float) -> Transform:
     found = np.eye(4)
@@ -68,10 +74,6 @@ def _turned(axis: str, degrees: float) -> Transform:
 
 def _after(change: Transform) -> Change:
     return lambda given: given @ change
-
-
-def _inverse(given: Transform) -> Transform:
-    return np.linalg.inv(given)
 
 
 def _rescaled(given: Transform, metres: float) -> Transform:
