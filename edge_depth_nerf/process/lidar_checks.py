@@ -86,10 +86,13 @@ _LOG_RATIOS = np.linspace(-1.8, 1.8, 91)
 """Distances are searched from a sixth of LiDAR's to six times them."""
 _LEAST_LACK = 0.03
 """Less is noise."""
+_MOST_BY_EDGES, _MOST_BY_SWEEPS = 0.15, 1.0
+"""The logarithms of edges and of how far sweeps are apart change the gain by so much at most."""
 _MOVES = 0.6
 """A reading fits only if its lack is less than this part of what it were if the camera had not moved."""
 _DOUBT = 0.3
-"""`_best` searches for large faults only above this lack, or where the ratio is off."""
+"""`_best` searches for large faults only above this lack, above that of a camera that stands, or where the ratio is
+off."""
 _TRIED_WHOLE = 8
 """So many readings, the best on some of the pairs, are tried on all of them."""
 _LEAST_GAINS = (-0.05, 0.01)
@@ -177,7 +180,7 @@ class _Pair:
 
     pictures: tuple[RecordedPicture, RecordedPicture]
     contrasts: tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]
-    edges: Float32[np.ndarray, "h w"]
+    edges: Float32[np.ndarray, "h2 w2"]
     """Of the first picture."""
 
 
@@ -591,9 +594,8 @@ def _evaluated(source: _Source, views: Sequence[_View]) -> tuple[list[LidarFigur
     figures = [_figures(source, view, fit, apart_m) for view, fit in given.items()]
     off = [one for one in figures if one.ratio is not None and abs(math.log(one.ratio)) > math.log(OFF)]
     known = sum(one.ratio is not None for one in figures)
-    doubt = len(off) * 2 > known or any(fit.lack > _DOUBT for fit in given.values())
-    judged = any(fit.tells or fit.points < _FEWEST for fit in given.values())
-    best = _best(source, given, apart_m, doubt) if judged else []
+    doubt = len(off) * 2 > known or any(fit.lack > min(_DOUBT, fit.still) for fit in given.values())
+    best = _best(source, given, apart_m, doubt) if _may_gain(given, apart_m) >= CLEAR_SMALL else []
     if best:
         return figures, [_said(best)]
     poor = [one for one in figures if one.ratio is not None and one.correlation < 1 - _DOUBT]
@@ -609,6 +611,13 @@ def _evaluated(source: _Source, views: Sequence[_View]) -> tuple[list[LidarFigur
         "tried fits. Check to_vehicle, the clocks, the units and the poses."
         for one in unfit
     ]
+
+
+def _may_gain(given: Mapping[_View, _Fit], apart_m: float | None) -> float:
+    """The largest gain that any reading could have; 0 where nothing tells how well the given one fits."""
+    told = [fit for fit in given.values() if fit.tells or fit.points < _FEWEST]
+    gains = [math.log(fit.lack / _LEAST_LACK) + (3 * _MOST_BY_EDGES if fit.edge else 0) for fit in told]
+    return max(gains, default=0.0) + (0.0 if apart_m is None or not told else _MOST_BY_SWEEPS)
 
 
 def _best(source: _Source, given: dict[_View, _Fit], apart_m: float | None, doubt: bool) -> list[_Candidate]:
@@ -664,15 +673,19 @@ def _tried(
         return unfit
     gain = math.log(lacks[0] / lacks[1])
     steps = [math.log(a.edge / b.edge) for b, a in told if a.edge > 0 and b.edge > 0]
-    step = float(np.clip(np.mean(steps), -0.15, 0.15)) if steps else 0.0
+    step = _within(float(np.mean(steps)), _MOST_BY_EDGES) if steps else 0.0
     if some is None and reading.both and (gain < _LEAST_GAINS[0] or step < _LEAST_GAINS[1]):
         return unfit
     gain += 3 * step
     of_sweeps = candidate.sensor == source.name and not reading.scales
     if apart_m is not None and of_sweeps and gain > -0.2:
         other_m = source.apart_m(reading)
-        gain += 0.0 if other_m is None else float(np.clip(math.log(apart_m / other_m), -1, 1))
+        gain += 0.0 if other_m is None else _within(math.log(apart_m / other_m), _MOST_BY_SWEEPS)
     return replace(candidate, gain=gain, lack=lacks[1] / len(told), before=lacks[0] / len(told))
+
+
+def _within(value: float, most: float) -> float:
+    return min(max(value, -most), most)
 
 
 def _refined(source: _Source, best: _Candidate, given: dict[_View, _Fit], apart_m: float | None) -> _Candidate:
