@@ -48,7 +48,7 @@ def test_version(monkeypatch, capsys):
     ("words", "said"),
     [
         (["synthesise", "--output", "x"], "synthesise: no such command. Is synthesize meant? There are synthesize, "),
-        (["xyz"], "xyz: no such command. There are synthesize, process, "),
+        (["xyz"], "xyz: no such command. There are synthesize, unpack, process, "),
         (
             ["process", "kitti-360"],
             "kitti-360: no such converter of `process`. Is kitti360 meant? There are kitti360, ",

@@ -234,7 +234,7 @@ def test_a_training_prepares_kernels_around_its_set_up(monkeypatch, tmp_path):
 
     from edge_depth_nerf.plugin import pipeline
 
-    order: list[str] = []
+    order, scene = list[str](), write_scene(tmp_path / "scene", frames=2)
 
     @contextmanager
     def around(device: Any) -> Any:
@@ -252,7 +252,7 @@ def test_a_training_prepares_kernels_around_its_set_up(monkeypatch, tmp_path):
         for mode in ("val", "test", "inference"):
             order.clear()
             with pytest.raises(InterruptedError):
-                pipeline_config(tmp_path, **more).setup(device="cuda:0", test_mode=mode)
+                pipeline_config(scene, **more).setup(device="cuda:0", test_mode=mode)
             assert order == [*(begins if mode == "val" else []), "set-up"]
 
 
