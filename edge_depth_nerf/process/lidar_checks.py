@@ -97,8 +97,8 @@ _TRIED_WHOLE = 8
 """So many readings, the best on some of the pairs, are tried on all of them."""
 _LEAST_GAINS = (-0.05, 0.01)
 """Of a small angle or shift, contrast may lose so much at most, and edges must gain so much."""
-_UNSEEN = 5
-"""A scanner of which a pair of pictures sees fewer of `_POINTS` points does not see what the camera sees."""
+_UNSEEN = 0.01
+"""A scanner of which a camera's pictures see a smaller share of the points does not see what the camera sees."""
 _FEWEST_RATIOS = 30
 """The median of fewer ratios says nothing."""
 _SEARCHED = 800
@@ -197,6 +197,8 @@ class _Fit:
     """How many points both pictures of a pair see."""
     tells: bool
     """Whether enough points lie on things with contrast."""
+    share: float
+    """How many of a scan's points they are."""
 
 
 def _moved(transform: Transform, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -342,7 +344,7 @@ def _in_front(pixels: Float[np.ndarray, "n 2"], distance_m: Float[np.ndarray, "n
     return distance_m < 1.3 * nearest[square]
 
 
-def _fit(values: Sequence[np.ndarray], edges: Sequence[tuple[float, int]]) -> _Fit:
+def _fit(values: Sequence[np.ndarray], edges: Sequence[tuple[float, int]], asked: int) -> _Fit:
     """Of contrasts in the first picture, in the second, and in the second at the first's pixels."""
     first, second, still = np.concatenate(values, 1).astype(np.float64) if values else np.zeros((3, 0))
     power = float(first @ first)
@@ -353,7 +355,8 @@ def _fit(values: Sequence[np.ndarray], edges: Sequence[tuple[float, int]]) -> _F
         return max(1 - float(first @ other) / max(math.sqrt(power * float(other @ other)), 1e-9), _LEAST_LACK)
 
     edge = float(strength) / count if count >= _FEWEST / 4 else 0.0
-    return _Fit(lack(second) if tells else 1.0, lack(still) if tells else 1.0, edge, len(first), tells)
+    lacks = (lack(second), lack(still)) if tells else (1.0, 1.0)
+    return _Fit(*lacks, edge, len(first), tells, len(first) / max(1, asked))
 
 
 class _Source:
@@ -374,7 +377,7 @@ class _Source:
 
     def fit(self, view: _View, pairs: Iterable[_Pair], reading: Reading) -> _Fit:
         """How well a reading of this fits a camera."""
-        values, edges = [], []
+        values, edges, asked = [], [], 0
         for pair in pairs:
             scan = None
             if pair.pictures[0].depth is not None:
@@ -384,12 +387,13 @@ class _Source:
                 if scan is None:
                     continue
                 world = scan.seen.world(reading, self._path)
+            asked += len(world)
             _, pixels = view.seen(pair, world, reading)
             of_pictures = [_sampled(c, p) for c, p in zip(pair.contrasts, pixels, strict=True)]
             values.append(np.stack([*of_pictures, _sampled(pair.contrasts[1], pixels[0])]))
             if scan is not None:
                 edges.append(view.edge(pair, scan.edges.world(reading, self._path), reading))
-        return _fit(values, edges)
+        return _fit(values, edges, asked)
 
     def nearest(self, time_s: float) -> _Scan | None:
         """The sweep of a time, if there is one."""
@@ -600,10 +604,11 @@ def _evaluated(source: _Source, views: Sequence[_View]) -> tuple[list[LidarFigur
         return figures, [_said(best)]
     poor = [one for one in figures if one.ratio is not None and one.correlation < 1 - _DOUBT]
     unfit = [one for one in poor if one in off or one.correlation < _FITTING]
-    unseen = [view.camera.name for view, fit in given.items() if fit.points < _UNSEEN * len(view.pairs)]
+    # of a scanner that looks ahead, a camera that looks back sees nothing
+    unseen = bool(given) and all(fit.share < _UNSEEN for fit in given.values())
     said = [
-        f"No point of {source.name} lies in the pictures of {', '.join(unseen)}. If its field meets theirs, check "
-        "to_vehicle of both (in metres?), the clocks, and the times of its points."
+        f"No point of {source.name} lies in any picture: check to_vehicle (in metres?), the clocks, and the times of "
+        "its points."
     ]
     return figures, (said if unseen else []) + [
         f"{one.scanner} does not lie on what {one.camera} shows: its distances are {one.ratio:.2f} times those of the "
@@ -615,7 +620,7 @@ def _evaluated(source: _Source, views: Sequence[_View]) -> tuple[list[LidarFigur
 
 def _may_gain(given: Mapping[_View, _Fit], apart_m: float | None) -> float:
     """The largest gain that any reading could have; 0 where nothing tells how well the given one fits."""
-    told = [fit for fit in given.values() if fit.tells or fit.points < _FEWEST]
+    told = [fit for fit in given.values() if fit.tells or fit.share < _UNSEEN]
     gains = [math.log(fit.lack / _LEAST_LACK) + (3 * _MOST_BY_EDGES if fit.edge else 0) for fit in told]
     return max(gains, default=0.0) + (0.0 if apart_m is None or not told else _MOST_BY_SWEEPS)
 
