@@ -20,7 +20,7 @@ import zlib
 from collections.abc import Callable, Iterable
 from io import BytesIO
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -361,6 +361,23 @@ ARRAY_ERRORS = (
 """What NumPy raises at headers of arrays that hold anything."""
 
 
+_parsing = threading.Lock()
+"""NumPy reads headers by Python's parser, which Python 3.11 before 3.11.8 may use in one thread at a time (its issue
+106905)."""
+
+
+def load_npy(path: Path, mmap_mode: Literal["r"] | None = None) -> NDArray:
+    """Load an array as NumPy does, in any thread."""
+    with _parsing:
+        return np.load(path, mmap_mode=mmap_mode, allow_pickle=False)
+
+
+def load_archive(content: bytes) -> dict[str, NDArray]:
+    """Load all arrays of a .npz archive in memory as NumPy does, in any thread."""
+    with _parsing, np.load(BytesIO(content), allow_pickle=False) as archive:
+        return dict(archive)
+
+
 def read_array_header(file: Any, where: str) -> tuple[tuple[int, ...], bool, np.dtype]:
     """Shape, whether in Fortran's order, and type of an array in NumPy's format; `file` is then at its numbers.
 
@@ -370,7 +387,8 @@ def read_array_header(file: Any, where: str) -> tuple[tuple[int, ...], bool, np.
     try:
         version = np.lib.format.read_magic(file)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, fortran, kind = read(file)
+        with _parsing:
+            shape, fortran, kind = read(file)
     except ARRAY_ERRORS as error:
         said = (str(error).splitlines() or [""])[0]
         raise InputError(f"{where}: cannot be read as an array ({said}). Copy or make the file again.") from None

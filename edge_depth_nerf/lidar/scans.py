@@ -36,7 +36,7 @@ from jaxtyping import Float64, Shaped, UInt8
 
 from edge_depth_nerf.base.bounds import check_bytes, shown
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import ARRAY_ERRORS, read_array_header, read_npz
+from edge_depth_nerf.base.files import ARRAY_ERRORS, load_npy, read_array_header, read_npz
 from edge_depth_nerf.lidar.sweeps import MAX_POINTS, Sweep, usable_points
 
 Encoding = Literal["records", "text", "lzf", "matrix", "archive", "table", "las"]
@@ -258,7 +258,7 @@ def _npy_array(path: Path) -> np.ndarray:
         raise InputError(f"{path}: {size} bytes, but its header declares {shown(promised)}: truncated. {_AGAIN}")
     try:
         # mapped: nothing is allocated
-        return np.load(path, mmap_mode="r", allow_pickle=False)
+        return load_npy(path, "r")
     except (*ARRAY_ERRORS, OSError) as error:
         raise InputError(f"{path}: cannot be read as an array ({error}). {_AGAIN}") from error
 

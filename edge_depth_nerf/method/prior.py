@@ -23,6 +23,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from numpy.typing import NDArray
 
 from edge_depth_nerf.base.checked_cache import content_of, keep_last, used, write_checked
+from edge_depth_nerf.base.files import load_archive
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.masks.sky import regions_like_sky
@@ -472,8 +473,8 @@ def _read(path: Path, shape: tuple[int, ...]) -> Prior | None:
     content = content_of(path, CACHE_VERSION)
     if content is None:
         return None
-    with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-        prior = Prior(archive["distance_m"], archive["sigma_m"])
+    archive = load_archive(content)
+    prior = Prior(archive["distance_m"], archive["sigma_m"])
     if any(m.shape != shape or m.dtype != np.float32 for m in (prior.distance_m, prior.sigma_m)):
         return None
     used(path)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE, read_array_header, read_distance_png
+from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE, load_npy, read_array_header, read_distance_png
 from edge_depth_nerf.base.png import read_png_header
 from edge_depth_nerf.cameras.rays import LEAST_COSINE
 from edge_depth_nerf.mono.options import Along
@@ -143,4 +143,4 @@ def read_npy(path: Path) -> NDArray[np.float32]:
     shape = npy_shape(path)
     # beyond float32's range is infinity, which is no distance
     with np.errstate(over="ignore"):
-        return np.load(path, allow_pickle=False).reshape(shape).astype(np.float32)
+        return load_npy(path).reshape(shape).astype(np.float32)

@@ -26,7 +26,7 @@ from rich.console import Console
 
 from edge_depth_nerf.base.checked_cache import content_of, write_checked
 from edge_depth_nerf.base.console import progress_bars, run_jobs, say
-from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE
+from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE, load_archive
 from edge_depth_nerf.cameras.transforms import opencv_to_opengl
 from edge_depth_nerf.scene.format import OWN_MOTION
 from edge_depth_nerf.scene.put_maps import write_maps
@@ -189,8 +189,7 @@ def _read(path: Path, kind: type[Maps]) -> Maps | None:
     content = content_of(path, VERSION)
     if content is None:
         return None
-    with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-        return kind(**archive)
+    return kind(**load_archive(content))
 
 
 def _write(path: Path, maps: Swept | MotionDistance) -> None:
