@@ -95,8 +95,8 @@ _DOUBT = 0.3
 off."""
 _TRIED_WHOLE = 8
 """So many readings, the best on some of the pairs, are tried on all of them."""
-_LEAST_GAINS = (-0.05, 0.01)
-"""Of a small angle or shift, contrast may lose so much at most, and edges must gain so much."""
+_LEAST_GAINS = (0.25, 0.01)
+"""Of a small angle or shift, contrast must gain so much, and edges: on bare walls edges alone would fit by chance."""
 _UNSEEN = 0.01
 """A scanner of which a camera's pictures see a smaller share of the points does not see what the camera sees."""
 _FEWEST_RATIOS = 30
@@ -670,7 +670,8 @@ def _tried(
     reading, unfit = candidate.reading, replace(candidate, gain=-math.inf)
     before = [given[view] for view in candidate.views]
     after = [source.fit(view, some[view] if some else view.pairs, reading) for view in candidate.views]
-    told = [(b, a) for b, a in zip(before, after, strict=True) if b.tells or a.tells]
+    # points that are seen, but on nothing with contrast, tell nothing
+    told = [(b, a) for b, a in zip(before, after, strict=True) if b.tells or (a.tells and b.share < _UNSEEN)]
     if not told:
         return unfit
     lacks = sum(b.lack for b, _ in told), sum(a.lack for _, a in told)
