@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import picture_size
+from edge_depth_nerf.base.files import picture_head
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.process.kitti.calibration import (
@@ -134,7 +134,7 @@ def _description(layout: _Layout, options: KittiOptions) -> dict[str, Any]:
         first = min(layout.folders[name].glob("*.png"), default=None)
         if first is None:
             raise FileNotFoundError(f"{layout.folders[name]}: no .png; the pictures of {name} belong there.")
-        width, height = picture_size(first)
+        width, height, *_ = picture_head(first)
         cameras[name] = {
             **{"images": str(layout.folders[name].relative_to(options.root)), "times_file": times_file},
             **{"model": "pinhole", "width": width, "height": height},
@@ -214,7 +214,7 @@ def _check_crop(values: dict[str, np.ndarray], folders: dict[str, Path], path: P
     for name, folder in folders.items():
         size = values.get(f"S_rect_{name[-2:]}", np.zeros(0)).astype(int).tolist()
         first = min(folder.glob("*.png"), default=None)
-        if first is not None and (there := list(picture_size(first))) != size:
+        if first is not None and (there := list(picture_head(first)[:2])) != size:
             raise InputError(
                 f"{path}: S_rect_{name[-2:]} is {'×'.join(map(str, size)) or 'missing'}, but {first} has "
                 f"{'×'.join(map(str, there))} pixels. The calibration is of another day, or the pictures were resized."
