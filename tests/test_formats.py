@@ -323,7 +323,9 @@ def test_a_camchain_gives_the_lens(
 
 @pytest.mark.parametrize("name", ["opencv_fisheye", "equidistant"])
 def test_other_names_of_kannala_brandt(mine: Path, name: str) -> None:
-    assert lens_of(mine, f'model = "{name}"\n{OF_SIZE}') == KannalaBrandt(16, 12, 6.5, 6.5, 8.5, 6.5, -0.01, 0.0, 0.0, 0.0)
+    assert lens_of(mine, f'model = "{name}"\n{OF_SIZE}') == KannalaBrandt(
+        16, 12, 6.5, 6.5, 8.5, 6.5, -0.01, 0.0, 0.0, 0.0
+    )
 
 
 def ocam_rays(pixels: np.ndarray, polynomial: list[float], centre: tuple, affine: tuple) -> np.ndarray:

@@ -414,7 +414,9 @@ def arguments(settings: Settings) -> dict[str, list[dict[str, Any]]]:
         return {"positions": points, "table": table.requires_grad_(), "scalings": scalings, "dtype": dtype}
 
     grids = [grid(*size, along) for size in SIZES_ON_CUDA.values() for along in (True, False)]
-    given = {name: each.on_gpu.in_a_step(torch.device(device), sizes=sizes) for name, each in functions_of_a_gpu().items()}
+    given = {
+        name: each.on_gpu.in_a_step(torch.device(device), sizes=sizes) for name, each in functions_of_a_gpu().items()
+    }
     return given | {"hash grid": grids}
 
 

@@ -212,15 +212,16 @@ def picture_head(path: Path) -> PictureHead:
     size = check_bytes(path, MAX_PICTURE_BYTES)
     try:
         with Image.open(path, formats=_FORMATS) as image:
-            kind = str(image.format)
+            kind, (width, height) = str(image.format), image.size
+            check_pixels(width, height, str(path))
             turned = 1 if kind == "TIFF" else image.getexif().get(_EXIF_ORIENTATION, 1)
-            width, height = image.size
+    except InputError:
+        raise
     except Exception as error:  # Pillow raises whatever its readers meet
         what = str(error) if isinstance(error, Image.DecompressionBombError) else "truncated or not a picture"
         raise InputError(
             f"{path}: cannot be decoded as a picture ({size} bytes; {what}). Copy or make the file again."
         ) from None
-    check_pixels(width, height, str(path))
     return PictureHead(width, height, kind, turned if turned in range(1, 9) else 1)
 
 
