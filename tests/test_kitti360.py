@@ -284,15 +284,15 @@ def test_vehicle_mask_is_found_corrected_and_kept(tmp_path: Path) -> None:
     path = tmp_path / "scene/ego_masks/image_02.png"
     mask = read_mask(path)
     before = (tmp_path / "scene/lidar/image_02/0000000000.png").read_bytes()
-    mask[24:] = False
+    mask[26:] = False
     write_mask(path, mask)
     report = process(drive, tmp_path / "scene")
     assert report.written >= 3, "that camera's pictures"
     assert vehicles_unknown(tmp_path / "scene") == ["image_03"]
     assert ["image_03: nothing is masked" in notice for notice in report.notices].count(True) == 1
-    assert not read_mask(tmp_path / "scene/masks/image_02.png")[24:].any()
+    assert not read_mask(tmp_path / "scene/masks/image_02.png")[26:].any()
     after = read_distance_png(tmp_path / "scene/lidar/image_02/0000000000.png")
-    assert not after[24:].any() and after[:24].any()
+    assert not after[26:].any() and after[:26].any()
     process(drive, tmp_path / "other", ego_mask=tmp_path / "scene/ego_masks")
     assert (tmp_path / "other/lidar/image_02/0000000000.png").read_bytes() != before
     assert (read_distance_png(tmp_path / "other/lidar/image_02/0000000000.png") == after).all()

@@ -193,12 +193,10 @@ class _Fit:
     """The lack if the points were at the same pixels in both: as if the camera had not moved."""
     edge: float
     """0 without edges."""
-    points: int
-    """How many points both pictures of a pair see."""
     tells: bool
     """Whether enough points lie on things with contrast."""
     share: float
-    """How many of a scan's points they are."""
+    """What part of a scan's points both pictures of a pair see."""
 
 
 def _moved(transform: Transform, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -356,7 +354,7 @@ def _fit(values: Sequence[np.ndarray], edges: Sequence[tuple[float, int]], asked
 
     edge = float(strength) / count if count >= _FEWEST / 4 else 0.0
     lacks = (lack(second), lack(still)) if tells else (1.0, 1.0)
-    return _Fit(*lacks, edge, len(first), tells, len(first) / max(1, asked))
+    return _Fit(*lacks, edge, tells, len(first) / max(1, asked))
 
 
 class _Source:

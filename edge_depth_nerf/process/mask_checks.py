@@ -19,8 +19,8 @@ _WORKING_PX = 160
 """Pictures are averaged down until the longer side is about so long."""
 _PICTURES = 8
 """So many pictures of a camera, spread over the drive."""
-_MOST_HIDDEN = 0.6
-"""A mask that hides more of the lens is reported: half of a picture may be a bonnet."""
+_MOST_HIDDEN = 0.5
+"""A mask that hides more of the lens is reported."""
 _INVERTED = 1.5
 """What is hidden may change by so much more than what is used. Right masks of rendered drives give 0.08 to 0.14,
 inverted ones 7 to 12."""
