@@ -28,7 +28,7 @@ from functools import cached_property, partial
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Float64, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, Int, UInt8
 from scipy.spatial import KDTree
 
 from edge_depth_nerf.base.files import read_distance_png, read_image
@@ -749,10 +749,15 @@ def _ratios(source: _Source, view: _View) -> tuple[np.ndarray, np.ndarray]:
         poses = view.poses(pair, Reading())
         to_second = _inverse(poses[1]) @ poses[0]
         tried = in_first[:, None] * np.exp(-_LOG_RATIOS)[:, None]
-        pixels, inside = _projected(view.small, _moved(to_second, tried.reshape(-1, 3)))
+        in_second = _moved(to_second, tried.reshape(-1, 3)).reshape(tried.shape)
+        pixels, inside = _projected(view.small, in_second.reshape(-1, 3))
         pixels, inside = pixels.reshape(*tried.shape[:2], 2), inside.reshape(tried.shape[:2])
+        # what comes nearer gets larger
+        larger = np.linalg.norm(tried, axis=-1) / np.linalg.norm(in_second, axis=-1).clip(1e-6)
         one = _sampled(pair.contrasts[0], first[:, None] + patch)
-        other = _sampled(pair.contrasts[1], np.nan_to_num(pixels)[:, :, None] + patch)
+        other = _sampled(
+            pair.contrasts[1], np.nan_to_num(pixels)[:, :, None] + larger.clip(0.25, 4)[..., None, None] * patch
+        )
         one, other = one - one.mean(-1, keepdims=True), other - other.mean(-1, keepdims=True)
         size = np.linalg.norm(one, axis=-1)[:, None] * np.linalg.norm(other, axis=-1)
         alike = np.where(inside, (one[:, None] * other).sum(-1) / np.maximum(size, 0.05), -1.0)
@@ -761,7 +766,14 @@ def _ratios(source: _Source, view: _View) -> tuple[np.ndarray, np.ndarray]:
         second = np.where(far, alike, -1.0).max(-1)
         middle = len(_LOG_RATIOS) // 2
         moves = np.linalg.norm(pixels[:, middle + 10] - pixels[:, middle - 10], axis=-1)
-        sure = (alike.max(-1) > 0.8) & (alike.max(-1) - second > 0.15) & (moves > 3)
-        found.append(_LOG_RATIOS[best[sure]])
+        sure = (alike.max(-1) > 0.9) & (alike.max(-1) - second > 0.15) & (moves > 3)
+        found.append(_LOG_RATIOS[best[sure]] + _peak(alike[sure], best[sure]) * (_LOG_RATIOS[1] - _LOG_RATIOS[0]))
         sides.append((first[sure, 0] / view.small.width * 3).astype(int))
     return np.concatenate(found), np.concatenate(sides)
+
+
+def _peak(values: Float[np.ndarray, "n k"], best: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """Where a parabola through the largest value and its neighbours has its maximum, in steps from the largest."""
+    padded = np.pad(values, ((0, 0), (1, 1)), mode="edge")
+    before, middle, after = (padded[np.arange(len(best)), best + side] for side in range(3))
+    return np.clip(0.5 * (before - after) / np.minimum(before - 2 * middle + after, -1e-9), -0.5, 0.5)
