@@ -265,6 +265,7 @@ class _View:
         self.usable, self._finer_usable = (
             cv2.erode(downscale_mask(usable, factor).astype(np.float32), np.ones((9, 9))) for factor in self._factors
         )
+        self._vehicles: dict[tuple[float, ...], Float64[np.ndarray, "2 4 4"]] = {}
         self.pairs = self._pairs(recording)
 
     def _pairs(self, recording: Recording) -> list[_Pair]:
@@ -291,8 +292,15 @@ class _View:
         """Camera to world, of both pictures."""
         assert self._path is not None
         path = self._path if reading.path is None else reading.path(self._path)
-        times_s = np.array([picture.time_s for picture in pair.pictures]) + reading.pictures_later_s
-        first, second = (vehicle @ reading.camera(self.camera.to_vehicle) for vehicle in path.at(times_s))
+        times_s = tuple(picture.time_s + reading.pictures_later_s for picture in pair.pictures)
+        if path is not self._path:
+            vehicles = path.at(np.array(times_s))
+        else:
+            # most readings leave the path as it is
+            if times_s not in self._vehicles:
+                self._vehicles[times_s] = path.at(np.array(times_s))
+            vehicles = self._vehicles[times_s]
+        first, second = (vehicle @ reading.camera(self.camera.to_vehicle) for vehicle in vehicles)
         own = [picture.camera_to_world for picture in pair.pictures]
         if own[0] is not None and own[1] is not None:
             # pictures' own poses say how the camera moved, and the vehicle's path where LiDAR is
