@@ -50,7 +50,6 @@ PAPER = {
     PRIOR + "sigma_mode",
     PRIOR + "sigma_constant_m",
     PRIOR + "motion",
-    PRIOR + "integration.least_returns",
     PRIOR + "integration.sigma_depth_growth_per_m",
     PRIOR + "integration.normalise",
     PRIOR + "integration.keep_returns",

@@ -89,7 +89,7 @@ def test_the_losses_of_samples_are_finite(dtype: torch.dtype) -> None:
 # ---- integration -----------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("dtype", [*HALVES, torch.float32])
 @pytest.mark.parametrize("autocast", [None, *HALVES])
-@pytest.mark.parametrize("normalise", ["pooled", "per-source"])
+@pytest.mark.parametrize("normalise", ["pooled", "residual"])
 def test_integration_is_finite(dtype: torch.dtype, autocast: Any, normalise: Any) -> None:
     torch.manual_seed(2)
     lidar, mono = torch.rand(20, 23) * 80, torch.rand(20, 23) * 80

@@ -81,7 +81,7 @@ def assert_equal(found: IntegratedDepth, exact: IntegratedDepth, atol: float) ->
 
 
 CHOICES = list(
-    itertools.product(["edge-aware", "spatial-gaussian"], ["pooled", "per-source"], [False, True], [0.7, 0.0, 1.0])
+    itertools.product(["edge-aware", "spatial-gaussian"], ["pooled", "residual"], [False, True], [0.7, 0.0, 1.0])
 )
 
 
@@ -109,10 +109,10 @@ def test_both_forms_are_equal(kind, normalise, keep_returns, alpha, dtype):
         {"kernel_size": 3, "sigma_space_px": 0.5},
         {"kernel_size": 21},
         {"sigma_depth_m": 0.05},
-        {"sigma_depth_m": 30.0, "normalise": "per-source"},
+        {"sigma_depth_m": 30.0, "normalise": "residual"},
         {"sigma_depth_m": 0.05, "sigma_depth_growth_per_m": 0.01},
-        {"sigma_depth_growth_per_m": 0.05, "normalise": "per-source"},
-        {"least_returns": 4.0, "normalise": "per-source"},
+        {"sigma_depth_growth_per_m": 0.05, "normalise": "residual"},
+        {"least_returns": 4.0, "normalise": "residual"},
         {"least_returns": 4.0, "normalise": "pooled"},
     ],
     ids=str,
@@ -142,41 +142,73 @@ def test_one_point_by_hand(integrate):
     assert float(result.distance_m[1, 1]) == pytest.approx(10.458672, abs=2e-6)
     assert float(result.mono_share[1, 1]) == pytest.approx(0.770664, abs=2e-6)
     assert float(result.spread_m[1, 1]) == pytest.approx(0.840812, abs=2e-6)
-    # per source: counts do not matter, 0.7 · 12 + 0.3 · 10 = 11.4, spread 2 · sqrt(0.7 · 0.3) = 0.916515
-    result = integrate(lidar, mono, everywhere(mono), IntegrationOptions(kernel_size=3, normalise="per-source"))
-    assert float(result.distance_m[1, 1]) == pytest.approx(11.4, abs=2e-6)
-    assert float(result.mono_share[1, 1]) == pytest.approx(0.3, abs=2e-6)
-    assert float(result.spread_m[1, 1]) == pytest.approx(0.916515, abs=2e-6)
+    # residual: 12 is 1.2 times the average 10; of 2 returns it weighs a / 2 = 0.472980: 10 · 1.2^0.472980 = 10.900619
+    options = IntegrationOptions(kernel_size=3, normalise="residual", least_returns=2.0)
+    result = integrate(lidar, mono, everywhere(mono), options)
+    assert float(result.distance_m[1, 1]) == pytest.approx(10.900619, abs=2e-6)
+    assert float(result.mono_share[1, 1]) == pytest.approx(1 - 0.472980, abs=2e-6)
+    assert float(result.spread_m[1, 1]) == pytest.approx(0, abs=2e-6)
     # (1, 0) does not see the return in its 3×3 window
     assert float(result.distance_m[1, 0]) == pytest.approx(10.0, abs=1e-6)
+    # a second return of 9 at the centre, weight 1: mean (a ln 1.2 + ln 0.9) / (1 + a), at a weight of
+    # 1.945959 / 2 = 0.972980; spread: that of the logarithms, by the same part
+    lidar[1, 1] = 9.0
+    result = integrate(lidar, mono, everywhere(mono), options)
+    mean = (0.945959 * np.log(1.2) + np.log(0.9)) / 1.945959
+    variance = (0.945959 * np.log(1.2) ** 2 + np.log(0.9) ** 2) / 1.945959 - mean**2
+    distance = 10 * np.exp(0.972980 * mean)
+    assert float(result.distance_m[1, 1]) == pytest.approx(distance, abs=2e-5)
+    assert float(result.spread_m[1, 1]) == pytest.approx(distance * np.sqrt(0.972980 * variance), abs=2e-4)
 
 
 @BOTH
 def test_a_lone_point_makes_no_square(integrate):
-    # one return of 12 among 10: with its whole share all of its 9×9 window is 11.4 and what lies beyond is 10;
-    # with least_returns it has the weight s = exp(-(k² + l²)/18) · 0.7 / 4 against 0.3, if less than all of 0.7
+    # one return of 12 among 10: with its whole weight all of its 9×9 window is 12 and what lies beyond is 10;
+    # with least_returns it corrects by its weight, exp(-(k² + l²)/18), over 4
     mono = torch.full((15, 15), 10.0)
     lidar = torch.zeros(15, 15)
     lidar[7, 7] = 12.0
-    square = integrate(lidar, mono, everywhere(mono), IntegrationOptions(normalise="per-source")).distance_m
-    assert float(square[7, 8]) == pytest.approx(11.4, abs=1e-5) == float(square[3, 3])
+    square = integrate(
+        lidar, mono, everywhere(mono), IntegrationOptions(normalise="residual", least_returns=0.1)
+    ).distance_m
+    assert float(square[7, 8]) == pytest.approx(12.0, abs=1e-5) == float(square[3, 3])
     assert float(square[7, 12]) == 10
-    options = IntegrationOptions(normalise="per-source", least_returns=4.0)
+    options = IntegrationOptions(normalise="residual", least_returns=4.0)
     soft = integrate(lidar, mono, everywhere(mono), options).distance_m
     for down, right in ((0, 1), (2, 3), (4, 4)):
-        weight = 0.7 * np.exp(-(down**2 + right**2) / 18) / 4
-        expected = 10 + 2 * weight / (weight + 0.3)
+        expected = 10 * 1.2 ** (np.exp(-(down**2 + right**2) / 18) / 4)
         assert float(soft[7 + down, 7 + right]) == pytest.approx(expected, abs=1e-5)
     # where returns are dense nothing changes
     dense = torch.full((15, 15), 12.0)
     dense[:, ::3] = 0
-    replaced = IntegrationOptions(normalise="per-source")
-    known, unchanged = (integrate(dense, mono, everywhere(mono), one) for one in (options, replaced))
-    assert_same(known, unchanged, 0)
+    known, unchanged = (
+        integrate(dense, mono, everywhere(mono), one)
+        for one in (options, IntegrationOptions(normalise="residual", least_returns=0.1))
+    )
+    assert_same(known, unchanged, 1e-6)
+
+
+@BOTH
+def test_lidar_on_a_slope_corrects_the_slope(integrate):
+    # road: distances grow along the rows; LiDAR says 4 % more, in every fourth row. Its values, averaged in a window
+    # (pooled), say what is at other rows; its differences say 4 % everywhere
+    mono = (8 * 1.06 ** torch.arange(20.0, dtype=torch.float64))[:, None].expand(20, 9).contiguous()
+    lidar = torch.zeros_like(mono)
+    lidar[2::4] = 1.04 * mono[2::4]
+    options = IntegrationOptions(sigma_depth_m=100.0, sigma_space_px=1.0, normalise="residual", least_returns=0.1)
+    none = integrate(torch.zeros_like(mono), mono, everywhere(mono), options).distance_m
+    found = integrate(lidar, mono, everywhere(mono), options).distance_m
+    inner = slice(8, 12)
+    # the window's average of the map itself is a little more than its middle, and is what LiDAR is compared with
+    above = none[10, 4] / mono[10, 4]
+    torch.testing.assert_close(found[inner], 1.04 / above * none[inner], rtol=1e-6, atol=0)
+    pooled = integrate(lidar, mono, everywhere(mono), IntegrationOptions(sigma_depth_m=100.0, sigma_space_px=1.0))
+    off = (pooled.distance_m[inner] / (1.04 * mono[inner]) - 1).abs().mean()
+    assert (found[inner] / (1.04 * mono[inner]) - 1).abs().max() < 1e-6 < 0.01 < off
 
 
 @pytest.mark.parametrize("kind", ["edge-aware", "spatial-gaussian"])
-@pytest.mark.parametrize("normalise", ["pooled", "per-source"])
+@pytest.mark.parametrize("normalise", ["pooled", "residual"])
 @BOTH
 def test_constant_map_stays(integrate, kind, normalise):
     mono = torch.full((12, 15), 73.3)
@@ -190,7 +222,7 @@ def test_constant_map_stays(integrate, kind, normalise):
 
 @settings(deadline=None, max_examples=20)
 @given(seed=st.integers(0, 1000), scale=st.floats(0.05, 20))
-@pytest.mark.parametrize("normalise", ["pooled", "per-source"])
+@pytest.mark.parametrize("normalise", ["pooled", "residual"])
 def test_scaling_distances_scales_the_prior(normalise, seed, scale):
     lidar, mono, valid = random_maps(seed, dtype=torch.float64)
     options = IntegrationOptions(sigma_depth_m=1.3, normalise=normalise)
@@ -236,12 +268,12 @@ def test_limits_of_alpha(integrate):
     only_mono = IntegrationOptions(alpha=0.0)
     assert_same(integrate(lidar, mono, valid, only_mono), integrate(lidar * 3, mono, valid, only_mono))
     no_lidar = torch.zeros_like(mono)
-    for options in (only_mono, IntegrationOptions(), IntegrationOptions(normalise="per-source")):
+    for options in (only_mono, IntegrationOptions(), IntegrationOptions(normalise="residual")):
         alone = integrate(no_lidar, mono, valid, options)
         assert_same(alone, integrate(no_lidar, mono, valid))
         assert (alone.mono_share == 1).all()
     # LiDAR everywhere: no monocular value counts
-    dense = integrate(mono + 1, mono, valid, IntegrationOptions(normalise="per-source"))
+    dense = integrate(mono + 1, mono, valid, IntegrationOptions(normalise="residual"))
     assert (dense.mono_share == 0).all()
 
 
@@ -273,7 +305,7 @@ def test_an_edge_keeps_the_sides_apart(integrate):
     mono[:, 10:] = 30.0
     lidar = torch.zeros(9, 20)
     lidar[4, 12] = 31.0
-    for normalise in ("pooled", "per-source"):
+    for normalise in ("pooled", "residual"):
         near = integrate(lidar, mono, everywhere(mono), IntegrationOptions(normalise=normalise)).distance_m
         torch.testing.assert_close(near[:, :10], mono[:, :10], rtol=0, atol=1e-5)
         assert float(near[4, 12]) > 30.01
@@ -342,7 +374,7 @@ def two_threads():
     torch.set_num_threads(before)
 
 
-@pytest.mark.parametrize("normalise", ["pooled", "per-source"])
+@pytest.mark.parametrize("normalise", ["pooled", "residual"])
 def test_threads_and_concurrent_callers_change_no_bit(normalise, two_threads, monkeypatch):
     options = IntegrationOptions(normalise=normalise)
     maps = [random_maps(seed, 120, 150) for seed in range(3)]
@@ -355,7 +387,7 @@ def test_threads_and_concurrent_callers_change_no_bit(normalise, two_threads, mo
         assert_same(result, expected, atol=0)
 
 
-@pytest.mark.parametrize("normalise", ["pooled", "per-source"])
+@pytest.mark.parametrize("normalise", ["pooled", "residual"])
 @pytest.mark.parametrize("width", [511, 512, 513, 1030])
 def test_both_forms_are_equal_on_wide_maps(width, normalise):
     # on the CPU the columns are worked on 512 at a time
@@ -408,7 +440,7 @@ def test_half_precision_and_gradients_do_not_matter():
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-@pytest.mark.parametrize("normalise", ["pooled", "per-source"])
+@pytest.mark.parametrize("normalise", ["pooled", "residual"])
 def test_equals_the_cpu_on_a_gpu(normalise):
     lidar, mono, valid = random_maps(10)
     options = IntegrationOptions(normalise=normalise)
@@ -507,9 +539,7 @@ def random_motion(seed: int, mono: torch.Tensor) -> torch.Tensor:
     return torch.tensor(np.where(rng.random(mono.shape) < 0.1, rng.choice([-1, np.nan, np.inf], mono.shape), near))
 
 
-@pytest.mark.parametrize(
-    "fields", [{}, {"normalise": "per-source", "least_returns": 4.0, "keep_returns": True}], ids=str
-)
+@pytest.mark.parametrize("fields", [{}, {"normalise": "residual", "least_returns": 4.0, "keep_returns": True}], ids=str)
 @pytest.mark.parametrize("weight", [0.0, 0.8, 1.0])
 def test_three_sources(fields, weight):
     lidar, mono, valid = random_maps(11, dtype=torch.float64)

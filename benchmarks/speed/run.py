@@ -220,7 +220,7 @@ def make_frame(size: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 
 def integration_s(threads: int) -> float:
     """Best of five: the prior of a frame of 1400 px, in the default form."""
-    before, frame, options = torch.get_num_threads(), make_frame(1400), IntegrationOptions(normalise="per-source")
+    before, frame, options = torch.get_num_threads(), make_frame(1400), IntegrationOptions(normalise="residual")
     torch.set_num_threads(threads)
     best = min(turns.seconds(lambda: integrate_depth(*frame, options)) for _ in range(6))
     torch.set_num_threads(before)

@@ -17,6 +17,12 @@ weight ρ that the measured errors of both give:
 where a pixel has both, and the one it has elsewhere. This d̂, of both, is also what g compares. Without motion nothing
 changes.
 
+Eq. 5 averages distances of pixels that are not at the same distance: on a slope, or beside an edge, that is an error.
+normalise "residual" averages d̂ alone, and then what LiDAR adds to it:
+
+        s  = (1/Σ g) Σ g d̂
+        d̃  = s exp(Σ g 1(d > 0) ln(d/s) / max(Σ g 1(d > 0), n)),   all read at [i+k, j+l], n = least_returns
+
 Nothing here is differentiated: the prior is data. Compiled loops (`integration_numba`) integrate on the CPU, torch on a
 GPU (`integrate_by_torch`, which tests compare the loops with); both in float64, which keeps the ratios of weights up to
 37 sigma_depth_m.
@@ -26,7 +32,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -46,7 +52,7 @@ MOTION_RELATIVE_ERROR, MONO_RELATIVE_ERROR = 0.03, 0.1
 FLOOR_M = 0.05
 """Standard deviation that LiDAR, its calibration and its alignment leave of a prior, metres."""
 Kernel = Literal["edge-aware", "spatial-gaussian"]
-Normalise = Literal["pooled", "per-source"]
+Normalise = Literal["pooled", "residual"]
 SigmaMode = Literal["constant", "combined"]
 
 CPU_STRIP_PIXELS = 1 << 16
@@ -84,7 +90,7 @@ class IntegrationOptions:
     """
 
     alpha: float = 0.7
-    """Weight of a LiDAR point; a monocular value has 1 - alpha. 0 to 1 (Eq. 5)."""
+    """pooled: weight of a LiDAR point; a monocular value has 1 - alpha. 0 to 1 (Eq. 5)."""
     kernel_size: int = 9
     """Width of the square window in pixels, odd (Eq. 7)."""
     sigma_space_px: float = 3.0
@@ -98,11 +104,11 @@ class IntegrationOptions:
     kernel: Kernel = "edge-aware"
     """edge-aware: Eq. 7. spatial-gaussian: Eq. 7 without its distance factor (the rival of Table 4)."""
     normalise: Normalise = "pooled"
-    """pooled: Eq. 5, each pixel of the window counts. per-source: alpha weights the two sources, whatever their
-    counts."""
-    least_returns: float = 0.0
-    """per-source: where the LiDAR points of a window together weigh less than this many points at its centre, LiDAR's
-    weight is reduced in proportion. 0: a single point has LiDAR's whole weight in its window, and makes a square."""
+    """pooled: Eq. 5. residual: the monocular map is averaged alone, and LiDAR points correct it around them by their
+    relative difference from it."""
+    least_returns: float = 2.0
+    """residual: where the LiDAR points of a window together weigh less than this many points at its centre, they count
+    in proportion. With 0.1 a single point corrects its whole window, and makes a square."""
     keep_returns: bool = False
     """Keep a LiDAR point's distance (d̃ = d, spread 0, monocular share 0) instead of averaging it with its window."""
 
@@ -113,7 +119,7 @@ class IntegrationOptions:
         _check_number("sigma_depth_growth_per_m", self.sigma_depth_growth_per_m, 0.0)
         if not (self.kernel_size >= 1 and self.kernel_size % 2 == 1):
             raise InputError(f"kernel_size is {self.kernel_size}; expected an odd whole number of pixels from 1.")
-        _check_number("least_returns", self.least_returns, 0.0)
+        _check_number("least_returns", self.least_returns, 0.1)
         check_choice("kernel", self.kernel, Kernel)
         check_choice("normalise", self.normalise, Normalise)
 
@@ -127,7 +133,8 @@ class IntegratedDepth:
     spread_m: Float[Tensor, "*batch h w"]
     """Weighted standard deviation, metres, of the values that were averaged into d̃ (weights as in Eq. 5)."""
     mono_share: Float[Tensor, "*batch h w"]
-    """The part of d̃'s weight that came from monocular values, 0 to 1; LiDAR gave the rest."""
+    """The part of d̃'s weight that came from monocular values, 0 to 1; LiDAR gave the rest. With normalise residual, 1
+    less LiDAR's weight over least_returns."""
 
 
 def _check_maps(function: str, **maps: Tensor | None) -> None:
@@ -181,10 +188,8 @@ def integrate_depth(
     `spread_m` is the weighted standard deviation of the very values that were averaged, from sums of their
     differences to the centre's d̂ (so that 80 m do not swallow 8 cm).
 
-    normalise "per-source" first divides each source's weights by the sum of its spatial weights alone, then lets alpha
-    weigh the two: how many pixels a source has in the window no longer counts, how well they agree with the centre
-    still does. (Were each source divided by its whole weight, a lone LiDAR point behind an edge would get the full
-    alpha, and the edges would be gone.) A source that is alone in the window gets all.
+    With normalise "residual" it is the root of two squares: d̂'s spread in the window, and that of LiDAR's relative
+    differences, by LiDAR's part of the weight.
 
     Args:
         lidar_m: D, metres along the ray, 0 = no LiDAR point.
@@ -226,29 +231,39 @@ def _along_axis(options: IntegrationOptions) -> list[float]:
 
 
 def _integrate_on_cpu(lidar: Tensor, mono: Tensor, valid: Tensor, options: IntegrationOptions, out: Tensor) -> None:
-    """Integrate one map, [h, w] each, into [3, h, w], rows as the fields of IntegratedDepth.
-
-    Threads of our own share the rows out: they wait for each other without spinning, and unlike Numba's they
-    allow concurrent callers and forked processes. There are as many as torch may use.
-    """
+    """Integrate one map, [h, w] each, into [3, h, w], rows as the fields of IntegratedDepth."""
     # imported here, because Numba takes half a second to load
-    from edge_depth_nerf.method.integration_numba import TILE, integrate_rows
+    from edge_depth_nerf.method.integration_numba import correct_rows, integrate_rows
 
-    height, width = mono.shape
-    integrate = functools.partial(
-        integrate_rows,
-        *(tensor.contiguous().numpy() for tensor in (lidar, mono, valid)),
-        *(tensor.numpy() for tensor in out),
+    points, estimates, usable = (tensor.contiguous().numpy() for tensor in (lidar, mono, valid))
+    kernel = (
         np.array(_along_axis(options)),
         # 0 makes Eq. 7's second factor 1
         options.sigma_depth_m**-2 if options.kernel == "edge-aware" else 0.0,
         float(options.sigma_depth_growth_per_m),
         LOWEST_EXPONENT,
-        float(options.alpha),
-        options.normalise == "per-source",
-        float(options.least_returns),
-        options.keep_returns,
     )
+    result = [tensor.numpy() for tensor in out]
+    if options.normalise == "pooled":
+        share, keeps = float(options.alpha), options.keep_returns
+        _by_strips(functools.partial(integrate_rows, points, estimates, usable, *result, *kernel, share, keeps), mono)
+        return
+    smooth = [np.empty(mono.shape) for _ in range(3)]
+    none = np.zeros_like(points)
+    _by_strips(functools.partial(integrate_rows, none, estimates, usable, *smooth, *kernel, 0.0, False), mono)
+    correct = functools.partial(correct_rows, points, estimates, *smooth[:2], *result, *kernel)
+    _by_strips(functools.partial(correct, float(options.least_returns), options.keep_returns), mono)
+
+
+def _by_strips(integrate: Callable[[int, int], None], mono: Tensor) -> None:
+    """Call a loop with the first row and the one after the last of each strip of a map.
+
+    Threads of our own share the rows out: they wait for each other without spinning, and unlike Numba's they
+    allow concurrent callers and forked processes. There are as many as torch may use.
+    """
+    from edge_depth_nerf.method.integration_numba import TILE
+
+    height, width = mono.shape
     strip = max(1, CPU_STRIP_PIXELS // max(TILE, width))
     tops = range(0, height, strip)
     bottoms = [min(top + strip, height) for top in tops]
@@ -276,21 +291,48 @@ def integrate_by_torch(
     usable = valid & _is_distance(mono)
     points = usable & _is_distance(lidar)
     centres = torch.where(usable, mono, 0).double()
-    values = torch.where(points, lidar.double(), centres)
-    size = int(options.kernel_size)
-    maps = torch.stack([centres, values, (usable & ~points).double(), points.double()])
-    # of each pixel its window, without a copy: [4, h, w, kernel, kernel]
-    windows = torch.nn.functional.pad(maps, (size // 2,) * 4).unfold(1, size, 1).unfold(2, size, 1)
-    rows = max(1, WINDOW_NUMBERS // max(1, size * size * mono.shape[1]))
-    averaged = [
-        _averaged(some, centre, options)
-        for some, centre in zip(windows.split(rows, 1), centres.split(rows), strict=True)
-    ]
-    result = torch.cat(averaged, 1) * usable
+    if options.normalise == "pooled":
+        values = torch.where(points, lidar.double(), centres)
+        maps = torch.stack([centres, values, (usable & ~points).double(), points.double()])
+        result = _in_windows(_averaged, maps, options)
+    else:
+        smooth = _in_windows(_averaged, torch.stack([centres, centres, usable.double(), 0 * centres]), options)
+        residual = torch.where(points, lidar.double() / smooth[0], 1).log()
+        corrections = _in_windows(_corrections, torch.stack([centres, residual, points.double()]), options)
+        result = _corrected(smooth, corrections)
+    result = result * usable
     if options.keep_returns:
         kept = torch.stack([lidar.double(), torch.zeros_like(centres), torch.zeros_like(centres)])
         result = torch.where(points, kept, result)
     out.copy_(result)
+
+
+def _in_windows(
+    of_windows: Callable[[Tensor, Tensor, IntegrationOptions], Tensor],
+    maps: Float[Tensor, "maps h w"],
+    options: IntegrationOptions,
+) -> Float[Tensor, "3 h w"]:
+    """Compute something of each pixel's window and centre, some rows at a time; the first map is what g compares."""
+    size = int(options.kernel_size)
+    # of each pixel its window, without a copy: [maps, h, w, kernel, kernel]
+    windows = torch.nn.functional.pad(maps, (size // 2,) * 4).unfold(1, size, 1).unfold(2, size, 1)
+    rows = max(1, WINDOW_NUMBERS // max(1, size * size * maps.shape[2]))
+    parts = zip(windows.split(rows, 1), maps[0].split(rows), strict=True)
+    return torch.cat([of_windows(some, centres, options) for some, centres in parts], 1)
+
+
+def _weights(
+    mono: Float[Tensor, "h w k k"], centres: Float[Tensor, "h w"], options: IntegrationOptions
+) -> Float[Tensor, "h w k k"]:
+    """Give g of Eq. 7."""
+    along_axis = centres.new_tensor(_along_axis(options))
+    space = along_axis[:, None] * along_axis
+    if options.kernel == "spatial-gaussian":
+        return space.expand_as(mono)
+    centre = centres[..., None, None]
+    sigma_m = (options.sigma_depth_growth_per_m * centre.square()).clamp(min=options.sigma_depth_m)
+    exponent = -0.5 * ((mono - centre) / sigma_m).square()
+    return torch.where(exponent > LOWEST_EXPONENT, exponent.exp() * space, 0)
 
 
 def _averaged(
@@ -298,30 +340,39 @@ def _averaged(
 ) -> Float[Tensor, "3 h w"]:
     """Give d̃, spread and monocular share of pixels, by Eq. 5 to 7; 0 where η is."""
     mono, values, is_mono, is_lidar = windows
-    along_axis = centres.new_tensor(_along_axis(options))
-    space = along_axis[:, None] * along_axis
-    centre = centres[..., None, None]
-    g = space
-    if options.kernel == "edge-aware":
-        sigma_m = (options.sigma_depth_growth_per_m * centre.square()).clamp(min=options.sigma_depth_m)
-        exponent = -0.5 * ((mono - centre) / sigma_m).square()
-        g = torch.where(exponent > LOWEST_EXPONENT, exponent.exp() * space, 0)
-    mono_factor, lidar_factor = centres.new_tensor([1 - options.alpha, options.alpha])
-    if options.normalise == "per-source":
-        tiny = torch.finfo(torch.float64).tiny
-        mono_factor = mono_factor / (space * is_mono).sum((-2, -1), keepdim=True).clamp(min=tiny)
-        lidar_points = (space * is_lidar).sum((-2, -1), keepdim=True)
-        lidar_factor = lidar_factor / lidar_points.clamp(min=max(options.least_returns, tiny))
-    of_mono = g * is_mono * mono_factor
-    weights = of_mono + g * is_lidar * lidar_factor
+    g = _weights(mono, centres, options)
+    of_mono = g * is_mono * (1 - options.alpha if options.normalise == "pooled" else 1.0)
+    weights = of_mono + g * is_lidar * options.alpha
     eta = weights.sum((-2, -1))
     some = eta > 0
     share = weights / torch.where(some, eta, 1)[..., None, None]
     # from the centre, so that 80 m do not swallow 8 cm
+    centre = centres[..., None, None]
     mean = (share * (values - centre)).sum((-2, -1))
     variance = (share * (values - centre - mean[..., None, None]).square()).sum((-2, -1))
     mono_share = of_mono.sum((-2, -1)) / torch.where(some, eta, 1)
     return torch.stack([centres + mean, variance.sqrt(), mono_share]) * some
+
+
+def _corrections(
+    windows: Float[Tensor, "3 h w k k"], centres: Float[Tensor, "h w"], options: IntegrationOptions
+) -> Float[Tensor, "3 h w"]:
+    """Give mean and variance of the LiDAR points' ln(d/s) in windows, and their part of the weight, 0 to 1."""
+    mono, residual, is_lidar = windows
+    weights = _weights(mono, centres, options) * is_lidar
+    total = weights.sum((-2, -1))
+    share = weights / torch.where(total > 0, total, 1)[..., None, None]
+    mean = (share * residual).sum((-2, -1))
+    variance = (share * (residual - mean[..., None, None]).square()).sum((-2, -1))
+    part = total / total.clamp(min=options.least_returns)
+    return torch.stack([mean, variance, part])
+
+
+def _corrected(smooth: Float[Tensor, "3 h w"], corrections: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 h w"]:
+    mean, variance, part = corrections
+    distance_m = smooth[0] * (part * mean).exp()
+    spread_m = (smooth[1].square() + part * variance * distance_m.square()).sqrt()
+    return torch.stack([distance_m, spread_m, 1 - part])
 
 
 def select_prior(

@@ -22,10 +22,8 @@ TILE = 512
 
 # Of a tile's centres, each a stretch of TILE numbers in one array, at these places. It is one array with places known
 # to the compiler because it vectorises a loop only if it can tell that what is written is not what is read.
-GUIDE, INVERSE_VARIANCE, MONO_FACTOR, LIDAR_FACTOR, ETA, FIRST, SECOND, ETA_MONO, STRETCHES = range(9)
+GUIDE, INVERSE_VARIANCE, ETA, FIRST, SECOND, ETA_MONO, STRETCHES = range(7)
 
-_LEAST = 2.3e-308
-"""float64's least number with all its digits."""
 _LOG2_E = 1 / math.log(2)
 _LN2_HIGH = 6.93147180369123816490e-01
 """ln 2 to 32 bits, so that its product with a whole number below 1024 is exact (Cody and Waite's reduction)."""
@@ -39,8 +37,16 @@ _compiled = compiled(fastmath={"contract"})
 
 
 @_compiled
+@no_type_check
+def _inverse_variance(guide, inverse_variance, growth_per_m):
+    """Give 1 / σ_d² of a centre."""
+    widest = growth_per_m * guide * guide
+    return min(inverse_variance, 1 / (widest * widest)) if widest > 0 else inverse_variance
+
+
+@_compiled
 @no_type_check  # the tests' type checker would wrap what Numba has to read
-def _add_shift(mono, value, is_mono, is_lidar, centres, count, spatial, lowest_exponent):
+def _add_shift(mono, value, is_mono, is_lidar, centres, count, spatial, alpha, lowest_exponent):
     """Add to the sums of `count` centres what they get from their neighbours at one shift of the window."""
     for j in range(count):
         difference = mono[j] - centres[GUIDE * TILE + j]
@@ -56,8 +62,8 @@ def _add_shift(mono, value, is_mono, is_lidar, centres, count, spatial, lowest_e
         bits = np.float64(p).view(np.int64) + (np.float64(rounded).view(np.int64) << np.int64(52))
         g = np.int64(bits).view(np.float64) * spatial if exponent > lowest_exponent else 0.0
 
-        from_mono = g * is_mono[j] * centres[MONO_FACTOR * TILE + j]
-        weight = from_mono + g * is_lidar[j] * centres[LIDAR_FACTOR * TILE + j]
+        from_mono = g * is_mono[j] * (1 - alpha)
+        weight = from_mono + g * is_lidar[j] * alpha
         x = value[j] - centres[GUIDE * TILE + j]
         weighted = weight * x
         centres[ETA * TILE + j] += weight
@@ -86,27 +92,6 @@ def _fill_tile(lidar, mono, valid, top, left, tile):
 
 @_compiled
 @no_type_check
-def _sum_along_rows(exists, space, sums):
-    """Give the spatial weights of a source's pixels, summed along the windows' rows."""
-    for i in range(sums.shape[0]):
-        sums[i] = 0
-        for l in range(len(space)):
-            for j in range(sums.shape[1]):
-                sums[i, j] += space[l] * exists[i, j + l]
-
-
-@_compiled
-@no_type_check
-def _divided(share, along_rows, i, j, space, least):
-    """Divide a source's share by its spatial weight in the window of a centre, or by `least`, if that is more."""
-    total = 0.0
-    for k in range(len(space)):
-        total += space[k] * along_rows[i + k, j]
-    return share / max(total, least, _LEAST) if total > 0 else 0.0
-
-
-@_compiled
-@no_type_check
 def integrate_rows(
     lidar,
     mono,
@@ -119,8 +104,6 @@ def integrate_rows(
     growth_per_m,
     lowest_exponent,
     alpha,
-    per_source,
-    least_returns,
     keep_returns,
     rows_from,
     rows_to,
@@ -139,8 +122,6 @@ def integrate_rows(
         growth_per_m: σ_d is at least so much times the square of the centre's distance.
         lowest_exponent: distance factors of lower exponents are 0; at least -708, where float64 loses digits.
         alpha: LiDAR's share.
-        per_source: divide each source's weights by the sum of its spatial weights.
-        least_returns: but LiDAR's by no less than this.
         keep_returns: a LiDAR point is its own prior.
         rows_from: first row.
         rows_to: row after the last.
@@ -149,13 +130,9 @@ def integrate_rows(
     columns = min(TILE, width)
     tile = np.empty((4, rows_to - rows_from + 2 * radius, columns + 2 * radius))
     centres = np.empty(STRETCHES * TILE)
-    along_rows = np.empty((2, tile.shape[1], columns if per_source else 0))
     distance[rows_from:rows_to], spread[rows_from:rows_to], mono_share[rows_from:rows_to] = 0, 0, 0
     for left in range(0, width, TILE):
         _fill_tile(lidar, mono, valid, rows_from - radius, left - radius, tile)
-        if per_source:
-            _sum_along_rows(tile[2], space, along_rows[0])
-            _sum_along_rows(tile[3], space, along_rows[1])
         for i in range(rows_to - rows_from):
             used = tile[2, i + radius] + tile[3, i + radius]
             first, last = radius, columns + radius
@@ -168,17 +145,8 @@ def integrate_rows(
                 continue
             for j in range(count):
                 guide = tile[0, i + radius, first + j + radius]
-                widest = growth_per_m * guide * guide
                 centres[GUIDE * TILE + j] = guide
-                centres[INVERSE_VARIANCE * TILE + j] = (
-                    min(inverse_variance, 1 / (widest * widest)) if widest > 0 else inverse_variance
-                )
-                mono_factor, lidar_factor = 1 - alpha, alpha
-                if per_source:
-                    mono_factor = _divided(mono_factor, along_rows[0], i, first + j, space, 0.0)
-                    lidar_factor = _divided(lidar_factor, along_rows[1], i, first + j, space, least_returns)
-                centres[MONO_FACTOR * TILE + j] = mono_factor
-                centres[LIDAR_FACTOR * TILE + j] = lidar_factor
+                centres[INVERSE_VARIANCE * TILE + j] = _inverse_variance(guide, inverse_variance, growth_per_m)
             centres[ETA * TILE :] = 0
             for k in range(2 * radius + 1):
                 for l in range(2 * radius + 1):
@@ -190,6 +158,7 @@ def integrate_rows(
                         centres,
                         count,
                         space[k] * space[l],
+                        alpha,
                         lowest_exponent,
                     )
             for j in range(count):
@@ -205,3 +174,65 @@ def integrate_rows(
                 distance[y, x] = centres[GUIDE * TILE + j] + mean
                 spread[y, x] = math.sqrt(max(variance, 0.0))
                 mono_share[y, x] = centres[ETA_MONO * TILE + j] / eta
+
+
+@_compiled
+@no_type_check
+def correct_rows(
+    lidar,
+    mono,
+    smooth,
+    smooth_spread,
+    distance,
+    spread,
+    mono_share,
+    space,
+    inverse_variance,
+    growth_per_m,
+    lowest_exponent,
+    least_returns,
+    keep_returns,
+    rows_from,
+    rows_to,
+):
+    """Correct the rows of a smoothed map by the LiDAR points around each pixel, of which there are few.
+
+    Arguments as of `integrate_rows`, and:
+        smooth: [h, w] float64, the average of the estimates, 0 where there is none.
+        smooth_spread: the same of their spread.
+    """
+    (height, width), radius = mono.shape, len(space) // 2
+    total = np.zeros((rows_to - rows_from, width))
+    first, second = np.zeros_like(total), np.zeros_like(total)
+    for y in range(max(0, rows_from - radius), min(height, rows_to + radius)):
+        for x in range(width):
+            if not (smooth[y, x] > 0 and 0 < lidar[y, x] < np.inf):
+                continue
+            residual = math.log(lidar[y, x] / smooth[y, x])
+            for i in range(max(y - radius, rows_from), min(y + radius + 1, rows_to)):
+                for j in range(max(x - radius, 0), min(x + radius + 1, width)):
+                    if smooth[i, j] == 0:
+                        continue
+                    difference = float(mono[y, x]) - float(mono[i, j])
+                    of_centre = _inverse_variance(float(mono[i, j]), inverse_variance, growth_per_m)
+                    exponent = -0.5 * difference * difference * of_centre
+                    if exponent > lowest_exponent:
+                        g = math.exp(exponent) * space[i - y + radius] * space[j - x + radius]
+                        total[i - rows_from, j] += g
+                        first[i - rows_from, j] += g * residual
+                        second[i - rows_from, j] += g * residual * residual
+    for i in range(rows_to - rows_from):
+        y = rows_from + i
+        for x in range(width):
+            if keep_returns and smooth[y, x] > 0 and 0 < lidar[y, x] < np.inf:
+                distance[y, x], spread[y, x], mono_share[y, x] = lidar[y, x], 0, 0
+                continue
+            distance[y, x], spread[y, x] = smooth[y, x], smooth_spread[y, x]
+            mono_share[y, x] = 1 if smooth[y, x] > 0 else 0
+            if total[i, x] > 0:
+                part = total[i, x] / max(total[i, x], least_returns)
+                mean = first[i, x] / total[i, x]
+                variance = max(second[i, x] / total[i, x] - mean * mean, 0.0)
+                corrected = smooth[y, x] * math.exp(part * mean)
+                distance[y, x], mono_share[y, x] = corrected, 1 - part
+                spread[y, x] = math.sqrt(smooth_spread[y, x] ** 2 + part * variance * corrected**2)

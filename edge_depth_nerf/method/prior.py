@@ -42,7 +42,7 @@ from edge_depth_nerf.method.integration import (
     weight_of_errors,
 )
 
-CACHE_VERSION = 6
+CACHE_VERSION = 7
 """Part of every key: raised whenever the same inputs give another prior."""
 
 KEPT_SETS = 4
@@ -96,7 +96,7 @@ class PriorOptions:
     used only if their error could be measured."""
     integration: IntegrationOptions = field(
         default_factory=lambda: IntegrationOptions(
-            normalise="per-source", least_returns=4.0, keep_returns=True, sigma_depth_growth_per_m=0.005
+            normalise="residual", keep_returns=True, sigma_depth_growth_per_m=0.005
         )
     )
     """Eq. 5-7 and their variants; the default is what measures best (docs/prior.md)."""
