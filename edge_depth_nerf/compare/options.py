@@ -33,24 +33,21 @@ class TrainingOptions:
     """What the three commands train."""
 
     scenes: tyro.conf.Positional[tuple[Path, ...]]
-    """Scene folders written by `edge-depth-nerf process`; the tables use their names."""
+    """Scene folders; the tables use their names."""
     output: Path
     """Folder for the runs, and for all that is made of them."""
     methods: tuple[MethodName, ...] = ()
-    """Names of methods, such as nerfacto, ds-nerf or edge-lidar (docs/compare.md). Not set: compare takes each loss and
-    ours with each prior, search those with a loss, grid all."""
+    """Names of methods, such as nerfacto, ds-nerf or edge-lidar, and the defaults: docs/compare.md."""
     steps: int | None = None
     """Training steps of each run. Not set: the preset's."""
     seeds: tuple[int, ...] = (0,)
     """Seeds; each method is trained once with each. A grid searches with the first."""
     preset: Preset = "lite"
-    """The configuration that all methods share. lite: for a CPU; full: for a GPU; paper: full size, and edge-… is the
-    literal method."""
+    """What all methods share. lite: for a CPU; full: for a GPU; paper: full, and edge-… is the literal method."""
     jobs: int | None = None
     """Parallel trainings. Not set: one per core; on a GPU, one."""
     cluster: str | None = None
-    """Run each training as a task on a Dask cluster: local, or a scheduler's address, such as tcp://10.0.0.1:8786
-    (docs/cluster.md)."""
+    """Train on a Dask cluster: local, or a scheduler's address (docs/cluster.md)."""
 
     def check(self) -> None:
         """Check what can be checked without looking at the disk.
@@ -86,14 +83,13 @@ def _check_once(name: str, values: tuple[object, ...]) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class CompareOptions(TrainingOptions):
-    """Train each method on each scene with one configuration, evaluate all alike, and make the paper's tables.
+    """Train each method on each scene, evaluate all alike, and make tables of all that is in the folder.
 
-    You can stop at any time; run the same command again to resume. You can add scenes, methods and seeds to the folder
-    later; the tables include everything in it.
+    You can stop at any time; run the same command again to resume.
     """
 
     tuned: Path | None = None
-    """λ and σ of the methods: tuned.json of a search, or a file of that form. Not set: the defaults."""
+    """λ and σ of the methods: tuned.json of a search. Not set: the defaults."""
     detail: bool = False
     """Evaluate all views twice, also with the detail of training pictures. This takes longer."""
     rivals_implementation: Annotated[Implementation, tyro.conf.Suppress] = "same"
@@ -103,10 +99,9 @@ class CompareOptions(TrainingOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class SearchOptions(TrainingOptions):
-    """Train each method with each λ and σ on tuning scenes, and write the best of each to tuned.json.
+    """Train each method with each λ and σ, and write the best to tuned.json, for `compare --tuned`.
 
-    `edge-depth-nerf compare --tuned` reads that file. You can stop at any time; run the same command again to resume,
-    with more values of λ and σ if you like.
+    You can stop at any time; run the same command again to resume, also with more values.
     """
 
     lambdas: tuple[float, ...]
@@ -144,10 +139,10 @@ class SearchOptions(TrainingOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class GridOptions(SearchOptions):
-    """Say what prior, loss, extras and the whole are worth: train each loss with each prior, with and without extras.
+    """Train each loss with each prior, with and without extras, to see what each is worth.
 
-    λ and σ of each are searched on the tuning scenes first; then all are trained and evaluated on the scenes. You can
-    stop at any time; run the same command again to resume.
+    λ and σ of each are searched on the tuning scenes first. You can stop at any time; run the same command again to
+    resume.
     """
 
     tuning: tuple[Path, ...]

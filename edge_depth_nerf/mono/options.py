@@ -26,7 +26,7 @@ class EstimateDepthOptions:
     """
 
     scenes: tyro.conf.Positional[tuple[Path, ...]]
-    """Scene folders written by `edge-depth-nerf process`; one network is trained on all of them."""
+    """Scene folders; one network is trained on all of them."""
     model: Path | None = None
     """Weights to start from. Without --train-steps they are used as given, and the scenes need no LiDAR."""
     train_steps: int | None = None
@@ -38,19 +38,17 @@ class EstimateDepthOptions:
     output: Path | None = None
     """Where the trained weights go. Not set: mono_network.safetensors in the first scene."""
     hf: str | None = None
-    """Instead, a network of the transformers library: its folder, or its name in Hugging Face's cache. Nothing is
-    downloaded. Needs `pip install '.[hf]'`."""
+    """Instead, a network of the transformers library: its folder, or its name in Hugging Face's cache. Needs `pip
+    install '.[hf]'`."""
     hf_output: HfOutput = "auto"
     """What its maps are: metric (z in metres), relative or inverse (up to scale and shift); auto: as its config
     states."""
     maps: Path | None = None
-    """Instead, maps of another tool for every picture of the one scene: a folder with CAMERA/FRAME.npy or .png (16 bit,
-    0 = none)."""
+    """Instead, maps of another tool for all pictures of one scene: a folder with CAMERA/FRAME.npy or .png (16 bit)."""
     maps_kind: MapsKind | None = None
-    """What they are: metric (metres), relative or inverse (depth, or one over depth, up to scale and shift; fitted to
-    LiDAR)."""
+    """What they are: metric (metres), or up to scale and shift relative (depth) or inverse (one over depth)."""
     maps_along: Along | None = None
-    """Whether they are measured along the ray (distance) or along the optical axis (z)."""
+    """Whether they are along the ray (distance) or along the optical axis (z)."""
     metres_per_count: float | None = None
     """Of PNGs with metric maps, such as 0.00390625 (1/256)."""
     maps_trained_on: TrainedOn | None = None
@@ -60,8 +58,7 @@ class EstimateDepthOptions:
     predict: bool = True
     """Write maps. Off: only train a network, for `--model` later."""
     cluster: str | None = None
-    """Train on one worker of a Dask cluster, then make each scene's maps as a task: local, or a scheduler's address
-    (docs/cluster.md)."""
+    """Run on a Dask cluster: local, or a scheduler's address (docs/cluster.md)."""
 
     def check(self) -> None:
         """Check the ranges.

@@ -87,8 +87,8 @@ class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig):
     dataparser: AnnotatedDataParserUnion = field(default_factory=FisheyeDepthDataParserConfig)
     """Specifies the dataparser used to unpack the data."""
     depth_source: str = "auto"
-    """The prior's source: integrated (LiDAR, monocular maps, motion), one of lidar, mono, motion or another source
-    alone, none, or auto: what the scene has."""
+    """The prior's source. integrated: LiDAR, monocular maps and motion; lidar, mono, motion or another: this one alone;
+    none; auto: what the scene has."""
     prior: tyro.conf.Suppress[PriorOptions] = field(default_factory=PriorOptions)
     """How the prior is computed from these maps."""
     surface_rays_per_batch: int = 16384

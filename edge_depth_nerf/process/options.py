@@ -26,17 +26,17 @@ class ProcessOptions:
     first: int = 0
     """Number of the first frame."""
     frames: int | None = None
-    """How many frames to take. Not set: to the end of the drive. Frames without pose, picture or sweep are skipped."""
+    """How many frames. Not set: to the end of the drive. Frames without pose, picture or sweep are skipped."""
     stride: int = 1
     """Take every stride-th frame."""
     frames_per_scene: int | None = None
-    """Split the drive into consecutive scenes of at most this many frames: 000, 001, … in the output folder."""
+    """Split the drive into scenes of at most this many frames: 000, 001, … in the output folder."""
     downscale: int = 1
     """Average blocks of this many pixels by this many into one."""
     holdout_every: int = 8
     """Hold out one frame in this many, for all cameras; 0 holds out none."""
     holdout_beams: int = 0
-    """Hold out one band of elevation (0.4°) in this many from every sweep, to evaluate with; 0 holds out none."""
+    """Hold out one band of elevation (0.4°) in this many, to evaluate with; 0 holds out none."""
     theta_max_deg: float = 95.0
     """Mask out rays farther than this from the optical axis, in degrees."""
     poses: Literal["recorded", "colmap", "lidar"] = "recorded"
@@ -45,40 +45,36 @@ class ProcessOptions:
     refine_poses: bool = True
     """Refine the poses by the pictures, if that improves them. Needs `pip install '.[colmap]'`."""
     sweeps: int = 3
-    """Accumulate this many LiDAR sweeps before and after each training picture's own, without those of held-out
-    frames."""
+    """Accumulate this many LiDAR sweeps before and after each picture's own; never held-out ones."""
     raw_lidar: bool = False
-    """Project LiDAR points as in the paper: not de-skewed, and with points that the camera cannot see."""
+    """Use LiDAR points as in the paper: not de-skewed, and also those that the camera cannot see."""
     ego_mask: Path | None = None
-    """Mask of the vehicle (255 = use the pixel, 0 = ignore it): a PNG, or a folder with CAMERA.png, in the raw
-    pictures' size."""
+    """Mask of the vehicle (0 = ignore the pixel): a PNG, or a folder with CAMERA.png, in the raw pictures' size."""
     find_ego: bool = True
-    """Without a mask, detect the vehicle as pixels that never change. You can correct ego_masks/ in the scene."""
+    """Without a mask, detect the vehicle as pixels that never change. You can correct ego_masks/."""
     frame_masks: Path | None = None
-    """Masks of single pictures: a folder with CAMERA/0000000123.png (255 = use the pixel) for every frame, in the raw
-    pictures' size."""
+    """Masks of all pictures: a folder with CAMERA/0000000123.png (0 = ignore the pixel), in the raw pictures' size."""
     find_moving: bool = False
-    """Find moving objects by LiDAR sweeps, and mask them out. You can correct moving_masks/ in the scene."""
+    """Find moving objects by LiDAR sweeps, and mask them out. You can correct moving_masks/."""
     moving_classes: tuple[str, ...] = (
         *("person", "rider", "car", "truck", "bus", "caravan", "trailer", "train", "motorcycle", "bicycle"),
         "unknown vehicle",
     )
     """Classes to mask out if the drive has KITTI-360's semantics; none keeps all."""
     motion: bool = True
-    """Find distances by comparing neighbouring pictures, also above LiDAR's field. Takes time (docs/motion.md)."""
+    """Find distances by comparing neighbouring pictures (docs/motion.md); this takes time."""
     mono: Path | None = None
-    """Monocular maps for every frame: a folder with CAMERA/0000000123.png, 16 bit, 1/256 m along the ray, 0 = none.
-    Their network must not have seen the drive's LiDAR. For other formats, use `estimate-depth --maps`."""
+    """Monocular maps of a network that has not seen the drive's LiDAR: a folder with CAMERA/0000000123.png (16 bit,
+    1/256 m along the ray), in the raw pictures' size. For others, use `estimate-depth --maps`."""
     estimate_depth: bool = True
     """Without monocular maps, train a network on the drive's LiDAR, as `estimate-depth` does."""
     strict: bool = False
-    """Stop at the first broken or missing file, and at signs of a wrong unit or clock. Otherwise up to a tenth is left
-    out, and listed."""
+    """Stop at the first broken file or sign of a wrong unit or clock. Otherwise up to a tenth is left out, and
+    listed."""
     sky: tyro.conf.Suppress[bool] = True
     """Give the sky no monocular distance, instead of a wrong one."""
     cluster: str | None = None
-    """Run each scene as a task on a Dask cluster: local, or a scheduler's address, such as tcp://10.0.0.1:8786
-    (docs/cluster.md)."""
+    """Make each scene on a Dask cluster: local, or a scheduler's address (docs/cluster.md)."""
 
     def chosen_frames(self, end: int, what: str) -> range:
         """Numbers of the frames that are asked for, of a drive that ends with frame `end`.
@@ -135,12 +131,11 @@ class KittiOptions(ProcessOptions):
     """Turn a drive of KITTI's raw data or of its odometry benchmark into a scene folder."""
 
     root: Path
-    """The data set's folder, with 2011_09_26 and other days (raw data), or sequences and poses (odometry)."""
+    """The folder with 2011_09_26 and other days (raw data), or with sequences and poses (odometry)."""
     sequence: str
-    """The drive, such as 2011_09_26_drive_0005_sync, or the odometry sequence, such as 07."""
+    """The drive, such as 2011_09_26_drive_0005_sync, or 07 (odometry)."""
     cameras: tuple[str, ...] = ("image_02", "image_03")
-    """Which cameras: image_00, image_01 (grey, left and right), image_02, image_03 (colour). For the odometry
-    benchmark, too."""
+    """Which cameras: image_00, image_01 (grey, left and right), image_02, image_03 (colour)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,7 +145,7 @@ class RigOptions(ProcessOptions):
     root: Path
     """The recording's folder; paths in the rig file are relative to it."""
     rig: Path | None = None
-    """The file that describes cameras, scanners and poses. Not set: rig.toml or rig.json in the recording's folder."""
+    """The description of cameras, scanners and poses. Not set: rig.toml or rig.json in the recording's folder."""
     cameras: tuple[str, ...] = ()
     """Which of its cameras. Not set: all."""
 
@@ -162,7 +157,6 @@ class JbnuDepth360Options(ProcessOptions):
     root: Path
     """The sequence's folder, with image and bin."""
     calibration: Path
-    """TOML or JSON with cameras, scanner and poses. Its paths are relative to its folder; those of pictures and scans
-    to the sequence's."""
+    """TOML or JSON with cameras, scanner and poses. Its paths are relative to its folder."""
     cameras: tuple[str, ...] = ()
     """Which of its cameras. Not set: all."""

@@ -37,8 +37,7 @@ class SynthesizeOptions:
     output: Path
     """Folder to write the drive to. Run the same command again to resume."""
     scene: SceneName = "street"
-    """street: houses, trees, parked cars; parking: an underground car park; turn: 90 degrees at a junction; traffic:
-    the street with moving cars and people; roundabout: around an island."""
+    """A street, an underground car park, a junction, a street with moving cars and people, or a roundabout."""
     frames: int = 40
     """Number of frames, 0.1 s apart, each with two pictures and one LiDAR sweep."""
     size: int = 350
@@ -48,8 +47,7 @@ class SynthesizeOptions:
     moving: tyro.conf.Suppress[int] = 0
     """Number of other cars that drive through the scene; their masks are written as truth/<sequence>/moving_masks."""
     layout: LayoutName = "kitti-360"
-    """kitti-360: two fisheyes, Velodyne; jbnu-depth360: four fisheyes, Ouster; rig: two fisheyes, a pinhole and a
-    scanner with a rig.toml."""
+    """kitti-360: two fisheyes; jbnu-depth360: four fisheyes; rig: two fisheyes and a pinhole with a rig.toml."""
 
     @property
     def has_movers(self) -> bool:
