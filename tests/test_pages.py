@@ -258,8 +258,8 @@ def test_options_named_in_the_text_exist(page, known_options):
         if not re.match(r"(pip|hf|python|pytest|apt-get|git|ssh|dask) ", span)
     ]
     named = {name for span in spans for name in re.findall(r"(?<![\w-])--[a-z][\w.-]*\w", span)}
-    # of pip, and of benchmarks/speed/gpu.py
-    assert not named - known_options - {"--force-reinstall", "--upgrade", "--upgrade-package", "--fake"}
+    # of pip
+    assert not named - known_options - {"--force-reinstall"}
 
 
 # ---- what is generated -----------------------------------------------------------------------------------------
