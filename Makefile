@@ -39,7 +39,7 @@ setup: $(VENV)/.installed
 demo: setup
 	$(BIN)/edge-depth-nerf demo --output outputs/demo
 
-# All methods on the real drive in a folder of yours (docs/real_drive.md says which): make real REAL=FOLDER; some hours.
+# All methods on the real drive in a folder of yours (docs/results.md says which): make real REAL=FOLDER; some hours.
 real: setup
 	@test -n "$(REAL)" || { echo "Give the folder with the real drive: make real REAL=FOLDER"; exit 2; }
 	$(BIN)/python -m benchmarks.quality.real_drive --real "$(REAL)" --output outputs/real_drive

@@ -1,13 +1,11 @@
-"""Draw the charts of docs/results.md and docs/real_drive.md from their own tables: `python docs/make_chart.py`.
+"""Draw the chart of docs/results.md from its own table: `python docs/make_chart.py`.
 
-Run it after `benchmarks.pages` has written new tables.
+Run it after `benchmarks.pages` has written a new table.
 """
 
 from __future__ import annotations
 
 import argparse
-import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,31 +16,10 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import write_atomically
 
 DOCS = Path(__file__).resolve().parent
-
-
-@dataclass(frozen=True)
-class Chart:
-    """A picture of a page's tables."""
-
-    page: str
-    file: str
-    tables: Mapping[str, str]
-    """Generated tables of the page, and what is added to the titles of their rows."""
-    psnr_db: tuple[float, float]
-    """Ends of the axis."""
-    abs_rel: tuple[float, float]
-
-
-CHARTS = (
-    Chart("results.md", "results_unseen.svg", {"unseen: geometry": ""}, (29.5, 32), (0.01, 1)),
-    Chart(
-        "real_drive.md",
-        "results_real.svg",
-        {"real: table": "", "real: seconds": ", as many seconds as ours"},
-        (19, 22),
-        (0.008, 1),
-    ),
-)
+PAGE, TABLE, FILE = DOCS / "results.md", "real: table", "results_real.svg"
+"""The page, its generated table, and the chart."""
+PSNR_DB, ABS_REL = (19, 22), (0.008, 1)
+"""Ends of the axes."""
 SIZE_IN = (8.4, 3.2)
 OURS, RIVALS = "#2458a6", "#5f6b77"
 
@@ -58,30 +35,29 @@ class Result:
     abs_rel_spread: float
 
 
-def results(chart: Chart, page: str) -> list[Result]:
-    """Read the methods' figures from the page's tables.
+def results(page: str) -> list[Result]:
+    """Read the methods' figures from the page's table.
 
     Raises:
-        InputError: a table has no rows.
+        InputError: the table has no rows.
     """
-    found: list[Result] = []
-    for mark, added in chart.tables.items():
-        _, _, after = page.partition(f"<!-- {mark} -->")
-        lines = [line for line in after.partition("<!-- end -->")[0].splitlines() if line.startswith("|")]
-        rows = [[cell.strip(" *") for cell in line.strip("|").split("|")] for line in lines]
-        if len(rows) < 3:
-            raise InputError(
-                f"{chart.page}: the table under <!-- {mark} --> has no rows. Write it with python -m benchmarks.pages."
-            )
-        # a table of `compare` has an arrow that says which way is better
-        columns = [[heading.split(" ")[0] for heading in rows[0]].index(name) for name in ("PSNR", "AbsRel")]
-        for row in rows[2:]:
-            psnr, abs_rel = (re.split(" ± ", row[column]) for column in columns)
-            found.append(Result(row[0] + added, *map(float, psnr), *map(float, abs_rel)))
+    _, _, after = page.partition(f"<!-- {TABLE} -->")
+    lines = [line for line in after.partition("<!-- end -->")[0].splitlines() if line.startswith("|")]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    if len(rows) < 3:
+        raise InputError(
+            f"{PAGE.name}: the table under <!-- {TABLE} --> has no rows. Write it with python -m benchmarks.pages."
+        )
+    columns = [rows[0].index(name) for name in ("PSNR", "AbsRel")]
+    # a spread that is 0 as written is left out
+    figures = [
+        [float(each) for column in columns for each in f"{row[column]} ± 0".split(" ± ")[:2]] for row in rows[2:]
+    ]
+    found = [Result(row[0], *each) for row, each in zip(rows[2:], figures, strict=True)]
     return sorted(found, key=lambda each: each.psnr_db)
 
 
-def draw(chart: Chart, found: list[Result], path: Path) -> None:
+def draw(found: list[Result], path: Path) -> None:
     """Draw PSNR and AbsRel of each method side by side."""
     # text stays text, and the same results give the same file
     with rc_context({"svg.hashsalt": "edge-depth-nerf", "svg.fonttype": "none", "font.size": 9}):
@@ -93,11 +69,11 @@ def draw(chart: Chart, found: list[Result], path: Path) -> None:
             right.errorbar(one.abs_rel, one.title, xerr=one.abs_rel_spread, **style)
             for axes, value, text in (
                 (left, one.psnr_db, f"{one.psnr_db:.2f}"),
-                (right, one.abs_rel, f"{one.abs_rel:.{3 if one.abs_rel >= 0.02 else 4}f}"),
+                (right, one.abs_rel, f"{one.abs_rel:.3f}"),
             ):
                 axes.annotate(text, (value, one.title), (0, 6), textcoords="offset points", ha="center")
-        left.set(xlim=chart.psnr_db, ylim=(-0.5, len(found) - 0.2), xlabel="PSNR, dB (higher is better)")
-        right.set(xscale="log", xlim=chart.abs_rel, xlabel="AbsRel, log scale (lower is better)")
+        left.set(xlim=PSNR_DB, ylim=(-0.5, len(found) - 0.2), xlabel="PSNR, dB (higher is better)")
+        right.set(xscale="log", xlim=ABS_REL, xlabel="AbsRel, log scale (lower is better)")
         for axes in (left, right):
             axes.spines[["top", "right"]].set_visible(False)
             axes.grid(axis="y", alpha=0.3)
@@ -105,8 +81,6 @@ def draw(chart: Chart, found: list[Result], path: Path) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description="Draw the charts of docs/results.md and docs/real_drive.md.")
-    parser.add_argument("--output", type=Path, default=DOCS, help="folder to write them to")
-    folder = parser.parse_args().output
-    for each in CHARTS:
-        draw(each, results(each, (DOCS / each.page).read_text(encoding="utf-8")), folder / each.file)
+    parser = argparse.ArgumentParser(description="Draw the chart of docs/results.md.")
+    parser.add_argument("--output", type=Path, default=DOCS, help="folder to write it to")
+    draw(results(PAGE.read_text(encoding="utf-8")), parser.parse_args().output / FILE)

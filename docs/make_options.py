@@ -21,8 +21,6 @@ import tyro
 from edge_depth_nerf import cli
 from edge_depth_nerf.base.files import write_text
 from edge_depth_nerf.method.depth_losses import LOSSES
-from edge_depth_nerf.method.integration import IntegrationOptions
-from edge_depth_nerf.method.prior import PriorOptions
 from edge_depth_nerf.plugin.config import make_specifications, read_method_file
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManagerConfig
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
@@ -56,15 +54,14 @@ nerfstudio's other methods accept them in the same way.
 
 """
 
-PRESETS = """### What each method sets of nerfstudio's own
+HOSTS_OWN = """### What each method sets of nerfstudio's own
 
-These are from [nerfstudio_method.toml](../nerfstudio_method.toml). – means nerfstudio's default.
+Sizes, steps and learning rates are in [nerfstudio_method.toml](../nerfstudio_method.toml).
 
 Learning rates reach `--optimizers.….scheduler.lr-final` at the end of the training, whatever `--max-num-iterations` is;
 `--optimizers.….scheduler.max-steps` sets another end. `--pipeline.model.proposal-warmup`,
 `--pipeline.model.proposal-weights-anneal-max-num-iters` and `--optimizers.….scheduler.warmup-steps` below 1 are shares
 of the training. From 1 on they are steps, as in nerfstudio.
-
 """
 
 HOSTS = ("proposal_warmup", "proposal_weights_anneal_max_num_iters")
@@ -101,7 +98,7 @@ def kind_of(hint: Any) -> str:
         return ", ".join(kind_of(each) for each in arguments if each is not type(None))
     if origin in (tuple, list, Mapping):
         return f"{kind_of(arguments[0])} …"
-    return {bool: "switch", int: "whole number", float: "number", str: "word", Path: "path"}[hint]
+    return {bool: "switch", int: "integer", float: "number", str: "word", Path: "path"}[hint]
 
 
 def shown(value: Any) -> str:
@@ -141,8 +138,8 @@ def _prose(text: str) -> str:
 
 def table(rows: list[tuple[str, ...]], header: tuple[str, ...]) -> str:
     """A table in Markdown."""
-    lines = [header, tuple("---" for _ in header), *rows]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines) + "\n"
+    head, *body = (f"| {' | '.join(line)} |\n" for line in [header, *rows])
+    return f"{head}|{'---|' * len(header)}\n{''.join(body)}\n"
 
 
 # ---- our own commands ------------------------------------------------------------------------------------------
@@ -253,7 +250,7 @@ def methods() -> str:
         if rows:
             text += f"### {title}\n\n" + (DATAPARSER if is_parser else "")
             text += table(rows, ("option", "values", "default", "what"))
-    return text + presets()
+    return text + HOSTS_OWN
 
 
 def at(config: Any, name: str) -> Any:
@@ -261,28 +258,6 @@ def at(config: Any, name: str) -> Any:
     for part in name.split("."):
         config = config[part] if isinstance(config, dict) else getattr(config, part)
     return config
-
-
-def presets() -> str:
-    """What the file of methods sets that is not in the tables before."""
-    declared = read_method_file()
-    ours = (
-        *(FisheyeDepthDataManagerConfig, PriorOptions, IntegrationOptions),
-        *(
-            EdgeDepthNerfModelConfig,
-            *LOSSES.values(),
-            PoseRefinerConfig,
-            FisheyeDepthDataParserConfig,
-        ),
-    )
-    known = {name for cls in ours for name in field_docs(cls)} - {*HOSTS}
-    values = {name: declared["presets"][method["preset"]] for name, method in declared["methods"].items()}
-    names = dict.fromkeys(name for preset in values.values() for name in preset if name.split(".")[-1] not in known)
-    rows = [
-        (f"`--{dashed(name)}`", *(shown(preset[name]) if name in preset else "–" for preset in values.values()))
-        for name in names
-    ]
-    return PRESETS + table(rows, ("option", *(f"`{name}`" for name in values)))
 
 
 def page() -> str:

@@ -1,4 +1,4 @@
-"""Take the picture of docs/viewer.md: the viewer of a trained model, in a browser without a window.
+"""Take the picture of docs/films.md: the viewer of a trained model, in a browser without a window.
 
 python docs/make_viewer_picture.py --load-config outputs/sample_drive/edge-depth-nerf-lite/DATE/config.yml
 
@@ -92,7 +92,7 @@ def look_along_the_drive(viewer: Viewer, dataset: InputDataset) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description="Take the picture of docs/viewer.md.")
+    parser = argparse.ArgumentParser(description="Take the picture of docs/films.md.")
     parser.add_argument("--load-config", type=Path, required=True, help="config.yml of a training")
     parser.add_argument("--output", type=Path, default=ROOT / "docs" / "viewer.jpg", help="the picture")
     given = parser.parse_args()

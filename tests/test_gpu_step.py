@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,8 +13,6 @@ from edge_depth_nerf.method.depth_losses import LOSSES, Level, depth_loss
 from edge_depth_nerf.plugin.exposure import Gains
 
 pytestmark = pytest.mark.slow
-
-ROOT = Path(__file__).resolve().parent.parent
 
 MOST = {
     "full, a view": (176, 9.0),
@@ -83,18 +80,6 @@ def test_all_parameters_get_a_gradient_but_those_of_proposals_at_rest(counts):
     resting = counts["full, proposals rest"]["without_gradient"]
     assert len(resting) > 1
     assert all(name == "device_indicator_param" or name.startswith("proposal_networks") for name in resting)
-
-
-def test_the_page_says_what_is_counted(counts):
-    names = {"full, proposal networks at rest": "full, proposals rest", "full, poses refined": "full, poses"}
-    text = (ROOT / "docs" / "speed.md").read_text(encoding="utf-8").partition("| | kernels before |")[2]
-    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.split("\n\n")[0].splitlines()[2:]]
-    assert {names.get(row[0], row[0]) for row in rows} == set(MOST)
-    for name, _, kernels, _, gigabytes, uploads, _, waits in rows:
-        found = counts[names.get(name, name)]
-        expected = [found["kernels"], len(found["uploads"]), len(found["synchronisations"])]
-        assert [int(kernels), int(uploads), int(waits)] == expected, name
-        assert gigabytes == f"{found['gigabytes']:.1f}", name
 
 
 def test_the_counter_counts(gpu_counts):

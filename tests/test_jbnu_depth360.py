@@ -20,7 +20,7 @@ from edge_depth_nerf.synthetic.options import SynthesizeOptions
 
 pytestmark = pytest.mark.slow
 
-PAGE = Path(__file__).parents[1] / "docs" / "jbnu_depth360.md"
+PAGE = Path(__file__).parents[1] / "docs" / "rig.md"
 CAMERAS = ("front", "left", "rear", "right")
 FRAMES = 5
 
@@ -76,7 +76,8 @@ def published(tmp_path: Path) -> Path:
         np.full((8, 4), 3.0, "<f4").tofile(sequence / f"bin/{number:06d}.bin")
         if number != 22:
             write_png(sequence / f"image/{number:06d}.png", picture)
-    block = re.findall(r"```toml\n(.*?)```", PAGE.read_text(), re.S)[0]
+    section = PAGE.read_text().partition("## JBNU-Depth360")[2]
+    block = re.findall(r"```toml\n(.*?)```", section, re.S)[0]
     (tmp_path / "calibration.toml").write_text(block)
     lines = [f"{time:.2f} {time} 0 0 0 0 0 1\n" for time in np.arange(1.9, 2.7, 0.1)]
     (tmp_path / "poses.txt").write_text("".join(lines))

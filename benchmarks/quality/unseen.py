@@ -1,4 +1,4 @@
-"""What a claim is about, on drives that took no part in any choice: three seeds, equal seconds, the paper's tables.
+"""What a claim is about, on drives that took part in no choice: three seeds, equal seconds, the paper's tables.
 
     python -m benchmarks.quality.unseen --drives drives --scenes scenes --grid grid --output unseen
 
@@ -9,14 +9,13 @@ of ours, so that the kernel is the only difference. Then, in folders of their ow
     claims       nerfacto, the best rival of the grid, the literal method and ours: 2,000 steps, three seeds
     seconds      the grid's best rival without extras, for as many steps as ours' processor seconds allow
     tables       Tables 3 and 4 of the paper, with ours and with the literal method, beside the grid, and UrbanNeRF's
-                 line-of-sight form beside nerfstudio's: 1,000 steps, one seed
-    simulated    the claims with simulated monocular maps in place of the drive's own network
+                 line-of-sight form: 1,000 steps, one seed
     large        pictures of 700 px, 2,000 steps, one seed: nerfacto, DS-NeRF's loss, the literal method and ours on
                  the street (the last view of comparison_street_301_700.png is docs/unseen.jpg), nerfacto and ours on
                  all drives
     large_seconds    there, the best rival without extras, for as many steps as `seconds`
 
-Writes table.md. Stopped at any moment, the same command goes on.
+Writes table.md. To resume a stopped run, start the same command again.
 """
 
 from __future__ import annotations
@@ -24,7 +23,8 @@ from __future__ import annotations
 import argparse
 import math
 import statistics
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.commands import ours
@@ -36,11 +36,10 @@ from edge_depth_nerf.compare.methods import GRID, METHODS
 from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.results import Results, RunResult, read_results
 from edge_depth_nerf.compare.search import grids
-from edge_depth_nerf.compare.tables import make_tables
-from edge_depth_nerf.report.tables import page_of_tables
 
 DRIVES = {"street": 301, "parking": 302, "turn": 303, "roundabout": 304}
-"""Kinds of drives and their seeds; written down before any was made. 101 to 104 showed a fault that is corrected."""
+"""Kinds of drives and their seeds, which were chosen before any drive was made."""
+DRIVE_TITLES = {"street": "street", "parking": "car park", "turn": "turn by 90°", "roundabout": "roundabout"}
 SEQUENCE = "2013_05_28_drive_0000_sync"
 LITERAL: tuple[MethodName, ...] = ("edge-paper-lidar", "edge-paper-mono", "edge-paper-gaussian")
 """The literal method with one thing changed; λ and σ are the literal method's."""
@@ -49,31 +48,60 @@ BESIDE_THE_GRID: tuple[MethodName, ...] = (
     *LITERAL,
     "edge-mono",
     "edge-gaussian",
-    "urban-nerf-los-integrated",
     "urban-nerf-los",
-    # of the grid, too; trained beside the other form
-    "urban-nerf-integrated",
-    "urban-nerf",
 )
 SETTINGS_OF: dict[MethodName, MethodName] = {"edge-gaussian": "edge", **dict.fromkeys(LITERAL, "edge-paper")}
 """Methods that have λ and σ of another one, so that one thing alone differs."""
 LARGE_PX = 700
 LARGE: tuple[MethodName, ...] = ("nerfacto", "ds-nerf", "edge-paper", "edge")
 ON_ALL_LARGE: tuple[MethodName, ...] = ("nerfacto", "edge")
-FOLDERS = ("claims", "seconds", "tables", "simulated", "large", "large_seconds")
+FOLDERS = ("claims", "seconds", "tables", "large", "large_seconds")
 STEPS, GRIDS_STEPS = 2000, 1000
 CELLS: tuple[MethodName, ...] = tuple(
     name for cell, name in GRID.items() if cell.loss != "urban-nerf-los" and name != "nerfacto-lidar-extras"
 )
 """The cells of the grid on docs/results.md: LiDAR shows no sky, so without a loss it has little to give."""
 KEPT_SEARCHES = [Path(__file__).with_name(f"{name}_search.json.xz") for name in ("grid", "unseen")]
-IN_SECONDS = {
-    "PSNR": ("truth_masked_psnr", ".2f"),
-    "SSIM": ("truth_masked_ssim", ".3f"),
-    "AbsRel": ("truth_abs_rel", ".4f"),
-    "δ": ("truth_delta_1_25", ".3f"),
+REAL = [Path(__file__).with_name(f"{name}.json.xz") for name in ("real_drive", "real_drive_cells")]
+"""Runs of the real drive: ours, and methods that differ from it in one part."""
+USUAL: tuple[MethodName, ...] = ("nerfacto", "urban-nerf", "urban-nerf-los", "ds-nerf", "edge-paper", "edge")
+"""Methods as usual: the depth losses of others on LiDAR alone, without extras."""
+TITLES: dict[MethodName, str] = {
+    "urban-nerf-los": "UrbanNeRF loss, authors' form",
+    "urban-nerf-integrated": "UrbanNeRF loss on our prior",
+    "ds-nerf-integrated-extras": "DS-NeRF loss on our prior, with our extras",
 }
-"""Figures of the README's table and of those at equal seconds, and how they are written."""
+"""What the page calls methods that `METHODS` calls otherwise."""
+PSNR, ABS_REL, BESIDE = "truth_masked_psnr", "truth_abs_rel", "shifted_1m_masked_psnr"
+FIGURES = {
+    "PSNR": (PSNR, ".2f"),
+    "AbsRel": (ABS_REL, ".3f"),
+    "δ": ("truth_delta_1_25", ".3f"),
+    "PSNR 1 m beside": (BESIDE, ".2f"),
+}
+"""Figures of the tables of methods, and how they are written."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of ours, and methods that lack it alone."""
+
+    title: str
+    instead: str
+    other: MethodName
+    real: bool = True
+    """Whether the real drive has runs of the other method."""
+    literal: MethodName | None = None
+    """The literal method with the same change."""
+
+
+PARTS = (
+    Part("prior of LiDAR and pictures", "LiDAR alone", "edge-lidar", literal="edge-paper-lidar"),
+    Part("prior of LiDAR and pictures", "monocular maps alone", "edge-mono", real=False, literal="edge-paper-mono"),
+    Part("edge-aware kernel", "spatial Gaussian", "edge-gaussian", real=False, literal="edge-paper-gaussian"),
+    Part("edge loss", "DS-NeRF loss", "ds-nerf-integrated-extras"),
+    Part("extras", "none", "edge-plain"),
+)
 
 
 def claimed(grid: Results) -> tuple[MethodName, ...]:
@@ -111,93 +139,117 @@ def of(runs: Results, methods: Iterable[MethodName], seeds: Iterable[int] | None
     return Results([run for run in runs.runs if run.method in chosen and (some is None or run.seed in some)])
 
 
-def steps_of(runs: Iterable[RunResult]) -> str:
-    """How many steps runs have, as a table says it."""
-    return " to ".join(f"{each:,}" for each in sorted({run.content["steps"] for run in runs}))
+def with_spread(values: Sequence[float], form: str) -> str:
+    """Mean and standard deviation; the latter only if it is not 0 as written."""
+    spread = f"{statistics.stdev(values):{form}}" if len(values) > 1 else "0"
+    return f"{statistics.fmean(values):{form}}" + (f" ± {spread}" if float(spread) else "")
 
 
 def figures_of(runs: Iterable[RunResult], name: str, form: str = ".2f") -> str:
     """Mean over drives, with its standard deviation over seeds where there are several."""
     runs = list(runs)
     seeds = sorted({run.seed for run in runs})
-    means = [statistics.fmean(run.figures[name] for run in runs if run.seed == seed) for seed in seeds]
-    spread = f" ± {statistics.stdev(means):{form}}" if len(means) > 1 else ""
-    return f"{statistics.fmean(means):{form}}{spread}"
+    return with_spread(
+        [statistics.fmean(run.figures[name] for run in runs if run.seed == seed) for seed in seeds], form
+    )
 
 
-def short_table(claims: Results) -> Iterator[str]:
-    """Means over the drives, with their standard deviation over seeds, as Markdown: the README's table."""
-    yield "| " + " | ".join(["method", *IN_SECONDS, "steps", "processor seconds"]) + " |"
-    yield "|---" * (len(IN_SECONDS) + 3) + "|"
-    for method in claims.methods():
-        runs = of(claims, [method]).runs
-        cells = [figures_of(runs, name, form) for name, form in IN_SECONDS.values()]
-        seconds = f"{processor_seconds(claims, method):.0f}"
-        yield "| " + " | ".join([METHODS[method].title, *cells, steps_of(runs), seconds]) + " |"
+def title_of(method: MethodName) -> str:
+    """What the page calls a method."""
+    return TITLES.get(method, METHODS[method].title)
 
 
-def seconds_table(claims: Results, longer: Results) -> Iterator[str]:
-    """Ours and the rival after as many processor seconds, drive by drive, as Markdown."""
-    rival = longer.methods()[0]
-    both = {METHODS[rival].title: longer, METHODS["edge"].title: of(claims, ["edge"], longer.seeds())}
-    yield "| | " + " | ".join(["drive", *IN_SECONDS, "steps", "processor seconds"]) + " |"
-    yield "|---" * (len(IN_SECONDS) + 4) + "|"
-    for scene in [*longer.scenes(), "average"]:
-        for title, results in both.items():
-            runs = [run for run in results.runs if scene in (run.scene, "average")]
-            means = {name: statistics.fmean(run.figures[name] for run in runs) for name, _ in IN_SECONDS.values()}
-            cells = [f"{means[name]:{form}}" for name, form in IN_SECONDS.values()]
-            seconds = f"{statistics.fmean(run.curve[-1]['cpu_seconds'] for run in runs):.0f}"
-            yield "| " + " | ".join([title, scene, *cells, steps_of(runs), seconds]) + " |"
+def row(*cells: str) -> str:
+    """A row of a table, as Markdown."""
+    return "| " + " | ".join(cells) + " |"
 
 
-def page(parts: dict[str, Results], grid: Results) -> str:
-    """All tables as Markdown; a folder without runs has none.
+def methods_table(by_method: Mapping[MethodName, Results]) -> Iterator[str]:
+    """Means over the drives, with their standard deviation over seeds, as Markdown."""
+    yield row("method", *FIGURES, "processor seconds")
+    yield "|---" * (len(FIGURES) + 2) + "|"
+    for method, results in by_method.items():
+        cells = [figures_of(of(results, [method]).runs, name, form) for name, form in FIGURES.values()]
+        yield row(title_of(method), *cells, f"{processor_seconds(results, method):.0f}")
+
+
+def lead(results: Results, other: MethodName, name: str = PSNR, others: Results | None = None, kind: str = "") -> float:
+    """By how much a figure of ours is above another method's, over drives of a kind and seeds that both have."""
+    mine, theirs = (
+        {(run.scene, run.seed): run.figures[name] for run in of(each, [method]).runs if run.scene.startswith(kind)}
+        for each, method in ((results, "edge"), (others or results, other))
+    )
+    return statistics.fmean(mine[key] - theirs[key] for key in mine.keys() & theirs.keys())
+
+
+def drives_table(parts: Mapping[str, Results], grid: Results) -> Iterator[str]:
+    """By how many dB ours is ahead, drive by drive, as Markdown."""
+    best, rival = claimed(grid)[1], without_extras(grid)
+    claims, seconds, large = parts["claims"], parts["seconds"], parts["large"]
+    yield row(
+        "drive",
+        "nerfacto",
+        "nerfacto, 1 m beside",
+        f"{title_of(rival)}, equal time",
+        title_of(best),
+        f"nerfacto, {LARGE_PX} px",
+    )
+    yield "|---" * 6 + "|"
+    for kind, title in {**DRIVE_TITLES, "": "mean"}.items():
+        leads = [
+            lead(claims, "nerfacto", kind=kind),
+            lead(claims, "nerfacto", BESIDE, kind=kind),
+            lead(claims, rival, others=seconds, kind=kind),
+            lead(claims, best, kind=kind),
+            lead(large, "nerfacto", kind=kind),
+        ]
+        yield row(title, *(f"{each:+.2f}" for each in leads))
+
+
+def parts_table(one_seed: Results, real: Results) -> Iterator[str]:
+    """What each part of ours is worth, all else equal, as Markdown.
+
+    Args:
+        one_seed: the grid, and what is trained beside it.
+        real: the real drive.
+    """
+
+    def psnr(results: Results, method: MethodName, name: str) -> float:
+        return statistics.fmean(run.figures[name] for run in of(results, [method], [0]).runs)
+
+    def gain(results: Results, one: MethodName, other: MethodName, name: str = PSNR) -> str:
+        return f"{psnr(results, one, name) - psnr(results, other, name):+.2f}"
+
+    yield row("part", "instead of", "dB", "AbsRel ×", "real drive, dB", "as published, dB")
+    yield "|---" * 6 + "|"
+    for part in PARTS:
+        ratio = psnr(one_seed, "edge", ABS_REL) / psnr(one_seed, part.other, ABS_REL)
+        recorded = gain(real, "edge", part.other, "masked_psnr") if part.real else "–"
+        literal = gain(one_seed, "edge-paper", part.literal) if part.literal else "–"
+        yield row(part.title, part.instead, gain(one_seed, "edge", part.other), f"{ratio:.2f}", recorded, literal)
+
+
+def page(parts: Mapping[str, Results], grid: Results, real: Results) -> str:
+    """All tables as Markdown.
 
     Args:
         parts: by folder.
-        grid: the runs of the grid, for Tables 3 and 4.
+        grid: the runs of the grid.
+        real: runs of the real drive.
     """
-    lines = ["# Unseen drives", ""]
-
-    def add(title: str, results: Results, *labels: str) -> None:
-        made = [table for table in make_tables(results) if table.label in labels] if results.runs else []
-        if made:
-            # a heading for each, and the tables under it without theirs
-            text = page_of_tables("", [], made).split("\n\n")
-            kept = [part for part in text if not part.startswith("#")]
-            lines.extend([f"## {title}", "", "\n\n".join(kept).strip(), ""])
-
     claims = parts["claims"]
-    add("Claims: pictures", claims, "1")
-    if claims.runs:
-        lines += ["## Claims: short", "", *short_table(claims), ""]
-    add("Claims: geometry", claims, "5, average")
-    add("Claims: time", claims, "6, average")
-    if claims.runs and parts["seconds"].runs:
-        lines += ["## Equal seconds", "", *seconds_table(claims, parts["seconds"]), ""]
-    beside = parts["tables"]
-    one_seed = of(grid, ["edge", "edge-lidar", *BESIDE_THE_GRID], [0])
-    add("Sources", Results([*one_seed.runs, *of(beside, ["edge-mono"]).runs]), "3")
-    kernels = Results([*of(one_seed, ["edge"]).runs, *of(beside, ["edge-gaussian"]).runs])
-    add("Kernels: pictures", kernels, "4")
-    add("Kernels: geometry", kernels, "5, average")
-    literal = of(beside, ["edge-paper", *LITERAL])
-    add("As published, sources", literal, "3, as published")
-    add("As published, kernels", literal, "4, as published")
-    add("As published, geometry", literal, "5, average")
-    forms = of(beside, [name for name in BESIDE_THE_GRID if name.startswith("urban-nerf")])
-    add("Line of sight", forms, "5, average")
-    add("Simulated maps: pictures", parts["simulated"], "1")
-    add("Simulated maps: geometry", parts["simulated"], "5, average")
-    large = parts["large"]
-    add("700 px", large, *(f"5, {scene}" for scene in large.scenes() if scene.startswith("street")))
-    add("All drives at 700 px", of(large, ON_ALL_LARGE), "1")
-    if large.runs and parts["large_seconds"].runs:
-        lines += ["## Equal seconds at 700 px", "", *seconds_table(large, parts["large_seconds"]), ""]
-    used = [run for results in (claims, beside) for run in results.runs]
-    if used:
-        add("λ and σ", Results(used), "7")
+    nerfacto, best, literal, edge = claimed(grid)
+    short = {nerfacto: claims, literal: claims, without_extras(grid): parts["seconds"], best: claims, edge: claims}
+    one_seed = Results([*of(grid, METHODS, [0]).runs, *parts["tables"].runs])
+    tables = {
+        "Methods": methods_table(short),
+        "Methods as usual": methods_table(dict.fromkeys(USUAL, one_seed)),
+        "Drives": drives_table(parts, grid),
+        "Parts": parts_table(one_seed, real),
+    }
+    lines = ["# Unseen drives", ""]
+    for name, table in tables.items():
+        lines += [f"## {name}", "", *table, ""]
     return "\n".join(lines)
 
 
@@ -241,15 +293,8 @@ def main() -> None:
     compare(out / "large", large[:1], LARGE, STEPS)
     compare(out / "large_seconds", large, [without_extras(grid)], steps_in_our_seconds(grid))
     compare(out / "large", large, ON_ALL_LARGE, STEPS)
-    for name in names:
-        raw = options.drives / name
-        maps = ("--mono", raw / "simulated_mono" / SEQUENCE)
-        ours(*process, "--root", raw, *maps, "--output", out / "simulated_scenes" / name)
-    simulated = [out / "simulated_scenes" / name for name in names]
-    for seed in options.seeds:
-        compare(out / "simulated", simulated, claimed(grid), STEPS, seed)
     parts = {folder: read_results(out / folder / RUNS) for folder in FOLDERS}
-    write_text(out / "table.md", page(parts, grid))
+    write_text(out / "table.md", page(parts, grid, Results([run for file in REAL for run in results_of(file).runs])))
 
 
 if __name__ == "__main__":

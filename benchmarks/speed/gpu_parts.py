@@ -38,6 +38,13 @@ LATE = 20_000
 RENDERED_RAYS = 1 << 20
 CALLS = 20
 """So many calls of a function are recorded as one CUDA graph."""
+GRIDS = {
+    "field": (16, 19, 4096 * 48 + 4096 + 16384, 2048),
+    "proposal 0": (5, 17, 4096 * 256, 128),
+    "proposal 1": (5, 17, 4096 * 96, 256),
+}
+"""Hash grids of a step of the full preset: levels, log2 of a level's rows, points, finest resolution. The field has
+4,096 rays with the sky behind them, and 16,384 surface pixels."""
 LAUNCHES = ("cudaLaunchKernel", "cudaLaunchKernelExC", "cuLaunchKernel", "cuLaunchKernelEx", "cudaGraphLaunch")
 WAITS = ("cudaStreamSynchronize", "cudaDeviceSynchronize", "cudaEventSynchronize", "cudaMemcpy")
 CACHES = {"TRITON_CACHE_DIR": "triton", "TORCHINDUCTOR_CACHE_DIR": "inductor", "NUMBA_CACHE_DIR": "numba"}
@@ -394,9 +401,18 @@ def call_us(function: Callable[..., Any], given: dict[str, Any], settings: Setti
     return device_us(partial(worked, function, given, factors), settings)
 
 
+def make_points(count: int, *, along_rays: bool) -> Tensor:
+    """Points in the unit cube; 32 to a ray, as those of a training batch, or anywhere."""
+    if not along_rays:
+        return torch.rand(count, 3)
+    starts = torch.rand(count // 32, 1, 3)
+    ends = torch.rand(count // 32, 1, 3)
+    places, _ = torch.rand(count // 32, 32, 1).sort(dim=1)
+    return (starts + places * (ends - starts)).view(-1, 3)
+
+
 def arguments(settings: Settings) -> dict[str, list[dict[str, Any]]]:
     """What each function with a form for a GPU is given in a step of the full preset, by the form's name."""
-    from benchmarks.speed.hash_grid import SIZES_ON_CUDA, make_points
     from edge_depth_nerf.kernels.functions import PROPOSALS, STEP
 
     device, dtype = settings.device, torch.float32 if settings.fake else torch.float16
@@ -413,7 +429,7 @@ def arguments(settings: Settings) -> dict[str, list[dict[str, Any]]]:
         points = make_points(count, along_rays=along_rays).to(device)
         return {"positions": points, "table": table.requires_grad_(), "scalings": scalings, "dtype": dtype}
 
-    grids = [grid(*size, along) for size in SIZES_ON_CUDA.values() for along in (True, False)]
+    grids = [grid(*size, along) for size in GRIDS.values() for along in (True, False)]
     given = {
         name: each.on_gpu.in_a_step(torch.device(device), sizes=sizes) for name, each in functions_of_a_gpu().items()
     }

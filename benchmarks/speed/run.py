@@ -5,19 +5,14 @@
 Parts, each of which is kept in the results, with the commit and the machine it is of, as soon as it is there and not
 measured again (remove it there, or the file, to have it anew):
 
-    encoding     the hash grid, forward + backward, at three sizes (hash_grid.py)
     lite, full   training steps and views of the two presets (turns.py)
-    rays         how a step grows with the rays of a batch
-    samples      … with the samples of a ray
-    image_size   … with the pictures' size: step, first batch, memory
-    frames       … with the number of pictures of 350 px: first batch, batch (also from a cold disk), memory
+    frames       first batch, batch (also from a cold disk) and memory over the number of pictures of 350 px
     memory       300 pictures of 1400 px (memory.py)
-    start_up     `edge-depth-nerf --help`, and what the plugin adds to any ns-* command
     preparation  `process` and integration on one core and on all
 
 The drives are made by `edge-depth-nerf synthesize` under `--work` (of 1400 px: some minutes) and stay there. Nothing
 else should run: ratios are taken within rounds, but a busy machine widens their range. At the end the tables in
-docs/speed.md and the curves (docs/speed.svg) are written from the results; `--parts` without a value does only that.
+docs/speed.md are written from the results; `--parts` without a value does only that.
 """
 
 from __future__ import annotations
@@ -34,20 +29,18 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from benchmarks.speed import hash_grid, memory, turns
-from benchmarks.speed.report import draw, write_tables
+from benchmarks.speed import memory, turns
+from benchmarks.speed.report import write_tables
 from edge_depth_nerf.base.files import read_json, write_json
 from edge_depth_nerf.method.integration import IntegrationOptions, integrate_depth
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 PROGRAM = Path(sys.executable).with_name("edge-depth-nerf")
-BOTH = ("nerfacto", "ours")
 SEQUENCE = "2013_05_28_drive_0000_sync"
 SMALL_FRAMES, LARGE_FRAMES = 24, 6
 """Moments of the drive of 350 px and of that of 1400 px; two pictures each."""
@@ -75,64 +68,6 @@ def scene_of(work: Path, size: int, frames: int) -> Path:
     if not (scene / "transforms.json").is_file():
         subprocess.run(process_command(raw, scene), check=True)
     return scene
-
-
-def resized(scene: Path, size: int, folder: Path) -> Path:
-    """A scene with its pictures in another size; distances by nearest neighbour."""
-    meta = json.loads((scene / "transforms.json").read_text())
-    done = set()
-    for frame in meta["frames"]:
-        factor = size / frame["w"]
-        for key in ("w", "h"):
-            frame[key] = round(frame[key] * factor)
-        for key in ("fl_x", "fl_y", "cx", "cy"):
-            frame[key] *= factor
-        for key in [key for key in frame if key.startswith("truth")]:
-            del frame[key]
-        for key, name in frame.items():
-            if not key.endswith("_path") or name in done:
-                continue
-            image = cv2.imread(str(scene / name), cv2.IMREAD_UNCHANGED)
-            way = cv2.INTER_AREA if key == "file_path" else cv2.INTER_NEAREST
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            cv2.imwrite(str(folder / name), cv2.resize(image, (frame["w"], frame["h"]), interpolation=way))
-            done.add(name)
-    meta.pop("shifted_views", None)
-    meta.pop("ply_file_path", None)
-    (folder / "transforms.json").write_text(json.dumps(meta))
-    return folder
-
-
-def grown(scene: Path, values: list[Any], change: Callable[[Any, Any], None]) -> list[dict[str, Any]]:
-    """Steps of lite, in which something takes these values."""
-    rows = []
-    for value in values:
-        configs = turns.configurations("lite", scene, BOTH, lambda config, v=value: change(config, v))
-        rows.append({"value": value, **turns.race(configs, rounds=3, steps=3)})
-    return rows
-
-
-def set_rays(config: Any, rays: int) -> None:
-    config.pipeline.datamanager.train_num_rays_per_batch = rays
-
-
-def set_samples(config: Any, factor: float) -> None:
-    model = config.pipeline.model
-    model.num_nerf_samples_per_ray = round(factor * model.num_nerf_samples_per_ray)
-    model.num_proposal_samples_per_ray = tuple(round(factor * n) for n in model.num_proposal_samples_per_ray)
-
-
-def by_image_size(work: Path) -> list[dict[str, Any]]:
-    """40 pictures of each size: memory and batches, and a race of steps over some."""
-    rows = []
-    large = scene_of(work, 1400, LARGE_FRAMES)
-    for size in (350, 700, 1400):
-        with temporary(work) as folder:
-            scene = resized(large, size, folder / "scene")
-            steps = turns.race(turns.configurations("lite", scene, BOTH), rounds=3, steps=3)
-            memory.multiplied(scene, 40, folder / "many")
-            rows.append({"value": size, **steps, "data": both_measured(folder / "many")})
-    return rows
 
 
 def both_measured(scene: Path) -> dict[str, Any]:
@@ -166,32 +101,6 @@ def most_memory(work: Path) -> dict[str, Any]:
         found["ours"] = memory.measured("ours", folder)
         found["ours, again"] = memory.measured("ours", folder)
     return found
-
-
-PLUGIN = """
-import importlib.metadata, time
-from importlib.metadata import EntryPoints
-everything = importlib.metadata.entry_points
-def none_of_nerfstudio(group=""):
-    return EntryPoints() if group.startswith("nerfstudio") else everything(group=group)
-importlib.metadata.entry_points = none_of_nerfstudio
-import nerfstudio.configs.dataparser_configs, nerfstudio.configs.method_configs, sys
-assert not any(name.startswith("edge_depth_nerf") for name in sys.modules)
-started = time.perf_counter()
-import edge_depth_nerf.plugin.config, edge_depth_nerf.plugin.dataparser_config
-print(time.perf_counter() - started)
-"""
-"""All of nerfstudio's commands import its methods; what our entry points add is timed alone."""
-
-
-def start_up() -> dict[str, Any]:
-    """Seconds, five times each."""
-    help_s, plugin_s = [], []
-    for _ in range(5):
-        help_s.append(turns.seconds(lambda: subprocess.run([PROGRAM, "--help"], check=True, capture_output=True)))
-        done = subprocess.run([sys.executable, "-c", PLUGIN], check=True, capture_output=True, text=True)
-        plugin_s.append(float(done.stdout.split()[-1]))
-    return {"help_s": help_s, "plugin_adds_s": plugin_s}
 
 
 PREPARE = """
@@ -260,21 +169,16 @@ def parts(work: Path) -> dict[str, Callable[[], Any]]:
     sample = ROOT / "data" / "sample_drive"
     every = turns.ON_EVERY_MACHINE
     return {
-        "encoding": lambda: [hash_grid.measure(size) for size in hash_grid.SIZES],
         "lite": lambda: turns.race(turns.configurations("lite", sample, every), 5, 10, 1 << 16),
         "full": lambda: turns.race(turns.configurations("full", sample, every), 3, 3, 1 << 13),
-        "rays": lambda: grown(sample, [256, 512, 1024, 2048, 4096, 8192], set_rays),
-        "samples": lambda: grown(sample, [0.5, 1.0, 2.0, 4.0], set_samples),
-        "image_size": lambda: by_image_size(work),
         "frames": lambda: by_frames(work),
         "memory": lambda: most_memory(work),
-        "start_up": start_up,
         "preparation": lambda: preparation(work),
     }
 
 
 def main() -> None:
-    """Measure what is not there yet, and write tables and curves."""
+    """Measure what is not there yet, and write the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, default=Path("outputs/benchmark"))
     parser.add_argument("--results", type=Path, default=HERE / "results.json")
@@ -292,7 +196,6 @@ def main() -> None:
             results["sizes"] = {preset: turns.sizes_of(preset) for preset in turns.PRESETS}
             write_json(options.results, results)
     write_tables(results, [ROOT / "docs" / "speed.md"])
-    draw(results, ROOT / "docs" / "speed.svg")
 
 
 if __name__ == "__main__":

@@ -33,26 +33,21 @@ class TrainingOptions:
     """What the three commands train."""
 
     scenes: tyro.conf.Positional[tuple[Path, ...]]
-    """Scene folders written by `edge-depth-nerf process`; the tables use their names."""
+    """Scene folders; the tables use their names."""
     output: Path
     """Folder for the runs, and for all that is made of them."""
     methods: tuple[MethodName, ...] = ()
-    """Which methods: a loss (nerfacto, urban-nerf, urban-nerf-los, ds-nerf, edge, edge-paper), then its prior (-lidar,
-    -mono, -gaussian, -integrated) and its extras (-extras, -plain) where they are not the usual ones, such as
-    ds-nerf-integrated-extras; see docs/compare.md. Not set: compare takes each loss as usual and ours with each prior,
-    search those of them with a loss, grid all its cells."""
+    """Names of methods, such as nerfacto, ds-nerf or edge-lidar, and the defaults: docs/compare.md."""
     steps: int | None = None
-    """Training steps of each run; the learning rates fall over them. Not set: the preset's."""
+    """Training steps of each run. Not set: the preset's."""
     seeds: tuple[int, ...] = (0,)
-    """Seeds of the training; each method is trained once with each. A grid searches with the first."""
+    """Seeds; each method is trained once with each. A grid searches with the first."""
     preset: Preset = "lite"
-    """The configuration that all methods share. lite: a laptop's CPU; full: a GPU; paper: full size, and edge-… is the
-    literal method."""
+    """What all methods share. lite: for a CPU; full: for a GPU; paper: full, and edge-… is the literal method."""
     jobs: int | None = None
     """Parallel trainings. Not set: one per core; on a GPU, one."""
     cluster: str | None = None
-    """Train on a Dask cluster: local (processes on this machine, one for each GPU or core), or the address of a
-    scheduler, such as tcp://10.0.0.1:8786. Needs `pip install '.[cluster]'`; see docs/cluster.md."""
+    """Train on a Dask cluster: local, or a scheduler's address (docs/cluster.md)."""
 
     def check(self) -> None:
         """Check what can be checked without looking at the disk.
@@ -88,17 +83,15 @@ def _check_once(name: str, values: tuple[object, ...]) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class CompareOptions(TrainingOptions):
-    """Train each method on each scene with one configuration, evaluate all alike, and make the paper's tables.
+    """Train each method on each scene, evaluate all alike, and make tables of all that is in the folder.
 
-    You can stop at any time; run the same command again to resume. You can add scenes, methods and seeds to the folder
-    later; the tables include everything in it.
+    You can stop at any time; run the same command again to resume.
     """
 
     tuned: Path | None = None
-    """λ and σ of the methods: tuned.json of a search, or a file of that form. Not set: the defaults."""
+    """λ and σ of the methods: tuned.json of a search. Not set: the defaults."""
     detail: bool = False
-    """Evaluate all views twice, for all methods: as the model renders them, and with the detail that training pictures
-    show beyond their own renderings (with detail). Training pictures are rendered for it, which takes time."""
+    """Evaluate all views twice, also with the detail of training pictures. This takes longer."""
     rivals_implementation: Annotated[Implementation, tyro.conf.Suppress] = "same"
     """torch: nerfacto, ds-nerf and both forms of UrbanNeRF run in nerfstudio's own torch code, with the same results,
     to compare at equal seconds."""
@@ -106,17 +99,15 @@ class CompareOptions(TrainingOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class SearchOptions(TrainingOptions):
-    """Train each method with each λ and σ on tuning scenes, and write the best of each to tuned.json.
+    """Train each method with each λ and σ, and write the best to tuned.json, for `compare --tuned`.
 
-    `edge-depth-nerf compare --tuned` reads that file. You can stop at any time; run the same command again to resume,
-    with more values of λ and σ if you like.
+    You can stop at any time; run the same command again to resume, also with more values.
     """
 
     lambdas: tuple[float, ...]
     """The weights λ of the depth loss to try, 4 at least."""
     sigmas_m: tuple[Sigma, ...]
-    """The standard deviations σ to try, metres, 3 at least; own: the method's own σ (for edge-…: the prior's σ at each
-    pixel)."""
+    """The standard deviations σ to try, metres, 3 at least; own: the method's own σ."""
 
     def check(self) -> None:
         """Check what can be checked without looking at the disk; raises InputError."""
@@ -148,10 +139,10 @@ class SearchOptions(TrainingOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class GridOptions(SearchOptions):
-    """Say what prior, loss, extras and the whole are worth: train each loss with each prior, with and without extras.
+    """Train each loss with each prior, with and without extras, to see what each is worth.
 
-    λ and σ of each are searched on the tuning scenes first; then all are trained and evaluated on the scenes. You can
-    stop at any time; run the same command again to resume.
+    λ and σ of each are searched on the tuning scenes first. You can stop at any time; run the same command again to
+    resume.
     """
 
     tuning: tuple[Path, ...]

@@ -24,19 +24,18 @@ class CameraPathOptions:
     """Write a camera path through a trained scene. `ns-render camera-path` renders it as a film."""
 
     load_config: Path
-    """The training's config.yml. It names the scene and the coordinates that the model was trained in."""
+    """The training's config.yml."""
     scene: tyro.conf.Positional[Path | None] = None
-    """The scene folder. It is only needed if the folder was moved after the training."""
+    """The scene folder, only needed if it was moved after the training."""
     kind: Kind = "replay"
-    """replay: along the recorded path. lane-shift: smoothly to one side of it and back. orbit: a circle around a point
-    ahead of the vehicle, looking at it; LiDAR points in the way make the circle smaller."""
+    """replay: along the recorded path. lane-shift: to one side of it and back. orbit: a circle around a point ahead."""
     camera: FilmCamera = "fisheye"
-    """fisheye: equidistant, without the distortion of the drive's own lens; it looks where the drive's camera looked.
-    perspective: a pinhole that looks ahead. equirectangular: the whole sphere."""
+    """fisheye: equidistant, not the drive's own lens. perspective: a pinhole that looks ahead. equirectangular: the
+    whole sphere."""
     output: Path | None = None
     """The path file. Not set: camera_paths/KIND_CAMERA.json beside config.yml."""
     follow: str | None = None
-    """The camera of the drive whose path the film follows. Not set: the scene's first camera."""
+    """The camera of the drive whose path the film follows. Not set: the first."""
     shift_m: float = 1.0
     """lane-shift: how far to the left, metres; negative to the right."""
     ahead_m: float = 5.0
@@ -44,13 +43,11 @@ class CameraPathOptions:
     radius_m: float = 3.0
     """orbit: the largest radius of the circle, metres."""
     width: int | None = None
-    """The film's width, px. Not set: that of the drive's pictures; for equirectangular twice their height. The height
-    follows: fisheye has the proportions of the drive's pictures, perspective 16:9, equirectangular 2:1."""
+    """The film's width, px. Not set: that of the drive's pictures; for equirectangular twice their height."""
     fov_deg: float | None = None
-    """Angle of view across the film's width, degrees. Not set: fisheye has that of the drive's lens (180 for a
-    pinhole), perspective 90."""
+    """Angle of view across the width, degrees. Not set: fisheye has the lens's (180 for a pinhole), perspective 90."""
     fps: float | None = None
-    """Pictures per second. Not set: the drive's own rate, or 10 if the scene has no times."""
+    """Pictures per second. Not set: the drive's rate, or 10 if the scene has no times."""
     seconds: float | None = None
     """The film's length. Not set: the length of the drive; 6 s for an orbit."""
 

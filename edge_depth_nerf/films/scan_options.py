@@ -21,13 +21,11 @@ class RenderLidarOptions:
     load_config: Path
     """The training's config.yml."""
     scene: tyro.conf.Positional[Path | None] = None
-    """The scene folder. It is only needed if the folder was moved after the training."""
+    """The scene folder, only needed if it was moved after the training."""
     sensor: str = "recorded"
-    """The scanner: recorded (the drive's own), hdl-64, vlp-16, os1-128, or the file of a scan that has its pattern of
-    rings, in the scanner's frame: x forward, y left, z up."""
+    """The scanner: recorded (the drive's own), hdl-64, vlp-16, os1-128, or the file of a scan (docs/scans.md)."""
     path: str = "recorded"
-    """Where it drives: recorded (as the drive's scanner did), lane-shift (the same, to one side and back), or a file of
-    poses in TUM's format, one for each scan: scanner to the recording's world."""
+    """Where it drives: recorded, lane-shift (to one side and back), or a file of poses in TUM's format."""
     shift_m: float = 1.0
     """lane-shift: how far to the left, metres; negative to the right."""
     scanner: str | None = None
@@ -35,7 +33,7 @@ class RenderLidarOptions:
     every: int = 1
     """Render one of so many scans."""
     form: ScanForm = "ply"
-    """The files' format. bin: float32 x, y, z, intensity, as KITTI has it, with 0 as intensity and without times."""
+    """The files' format. bin: float32 x, y, z, 0, as KITTI has it, without times."""
     output: Path | None = None
     """The folder. Not set: scans/ beside config.yml."""
 

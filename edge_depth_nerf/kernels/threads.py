@@ -1,7 +1,7 @@
 """Threads of the compiled kernels on the CPU, and of torch in a training step.
 
-A step's tensors in torch are small: to wake a second thread takes longer than it saves (docs/speed.md). So torch gets
-one thread in a step, and the kernels, which have the large work, all of them.
+A step's tensors in torch are small: to wake a second thread takes longer than it saves. So torch gets one
+thread in a step, and the kernels, which have the large work, all of them.
 """
 
 from __future__ import annotations

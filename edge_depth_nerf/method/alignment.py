@@ -1,7 +1,7 @@
 """Monocular distance fitted to LiDAR, frame by frame: first one curve for the picture, then a smooth local correction.
 
 Pure. Maps are H×W metres along the ray, 0 = none. The curve is a line in logarithms, log d = scale + exponent · log m,
-fitted robustly (it measures better than a line in inverse distance: docs/prior.md); beyond the distances that have
+fitted robustly (on rendered drives it is better than a line in inverse distance); beyond the distances that have
 LiDAR points it continues as a factor. Its residual, log d - log m, is spread from the LiDAR points over the picture on
 a pyramid of coarse grids over column, row and log m, so that it crosses no edge of the monocular map. A cell's value is
 the mean over its LiDAR points. An imagined point draws it to the value of the coarser cell around it; the coarsest is

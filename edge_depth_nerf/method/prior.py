@@ -99,7 +99,7 @@ class PriorOptions:
             normalise="residual", keep_returns=True, sigma_depth_growth_per_m=0.005
         )
     )
-    """Eq. 5-7 and their variants; the default is what measures best (docs/prior.md)."""
+    """Eq. 5-7 and their variants; the default is what measured best."""
 
     def __post_init__(self) -> None:
         check_choice("align", self.align, Align)

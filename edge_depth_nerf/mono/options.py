@@ -26,46 +26,39 @@ class EstimateDepthOptions:
     """
 
     scenes: tyro.conf.Positional[tuple[Path, ...]]
-    """Scene folders written by `edge-depth-nerf process`; one network is trained on all of them."""
+    """Scene folders; one network is trained on all of them."""
     model: Path | None = None
-    """Weights to start from. Without --train-steps they are used without further training, and the scenes need no
-    LiDAR."""
+    """Weights to start from. Without --train-steps they are used as given, and the scenes need no LiDAR."""
     train_steps: int | None = None
     """Steps of training. Not set: the preset's number, or none with --model."""
     seconds: float | None = None
-    """Maximum seconds of training. The learning rate decreases so that it ends in time, and the result so far is
-    used."""
+    """Maximum seconds of training."""
     preset: Preset = "lite"
     """lite: minutes on a laptop's CPU; full: a larger network on larger pictures, for a GPU."""
     output: Path | None = None
     """Where the trained weights go. Not set: mono_network.safetensors in the first scene."""
     hf: str | None = None
-    """A ready-made network instead: the folder of a depth network of the transformers library, or its name in Hugging
-    Face's cache, such as depth-anything/Depth-Anything-V2-Small-hf. Nothing is downloaded. Needs `pip install
-    '.[hf]'`."""
+    """Instead, a network of the transformers library: its folder, or its name in Hugging Face's cache. Needs `pip
+    install '.[hf]'`."""
     hf_output: HfOutput = "auto"
-    """What its maps are: metric (z in metres), relative (depth up to scale and shift), inverse (disparity up to scale
-    and shift); auto: as its config states."""
+    """What its maps are: metric (z in metres), relative or inverse (up to scale and shift); auto: as its config
+    states."""
     maps: Path | None = None
-    """Maps of another tool instead: a folder with CAMERA/FRAME.npy (floating point) or .png (16 bit, 0 = none), in the
-    pictures' sizes; one for every picture of the one scene."""
+    """Instead, maps of another tool for all pictures of one scene: a folder with CAMERA/FRAME.npy or .png (16 bit)."""
     maps_kind: MapsKind | None = None
-    """What they are: metric (metres), relative (depth up to scale and shift), inverse (one over depth, up to scale and
-    shift). The last two are fitted to LiDAR."""
+    """What they are: metric (metres), or up to scale and shift relative (depth) or inverse (one over depth)."""
     maps_along: Along | None = None
-    """Whether they are measured along the ray (distance) or along the optical axis (z)."""
+    """Whether they are along the ray (distance) or along the optical axis (z)."""
     metres_per_count: float | None = None
     """Of PNGs with metric maps, such as 0.00390625 (1/256)."""
     maps_trained_on: TrainedOn | None = None
-    """What their network was trained on. scene: on LiDAR only, so that it knows nothing beyond the scanner's field of
-    elevation; they then give a prior there only with distances from motion. Not set: elsewhere."""
+    """scene: their network was trained on LiDAR only, so above its field they count only with motion. Not set:
+    elsewhere."""
 
     predict: bool = True
     """Write maps. Off: only train a network, for `--model` later."""
     cluster: str | None = None
-    """Work on a Dask cluster: local (processes on this machine, one for each GPU or core), or the address of a
-    scheduler, such as tcp://10.0.0.1:8786. The network is trained by one worker, then each scene's maps are a task.
-    Needs `pip install '.[cluster]'`; see docs/cluster.md."""
+    """Run on a Dask cluster: local, or a scheduler's address (docs/cluster.md)."""
 
     def check(self) -> None:
         """Check the ranges.

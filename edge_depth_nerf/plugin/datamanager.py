@@ -87,16 +87,14 @@ class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig):
     dataparser: AnnotatedDataParserUnion = field(default_factory=FisheyeDepthDataParserConfig)
     """Specifies the dataparser used to unpack the data."""
     depth_source: str = "auto"
-    """The prior's source. integrated: LiDAR and monocular maps (Eq. 5), and maps from motion if the scene has them.
-    lidar, mono (Table 3), motion or another source of the scene: this source alone. auto: what the scene has. none:
-    no prior."""
+    """The prior's source. integrated: LiDAR, monocular maps and motion; lidar, mono, motion or another: this one alone;
+    none; auto: what the scene has."""
     prior: tyro.conf.Suppress[PriorOptions] = field(default_factory=PriorOptions)
     """How the prior is computed from these maps."""
     surface_rays_per_batch: int = 16384
-    """Number of additional pixels in each training batch; those with a vague prior are dropped. Their colour is
-    compared with the field's at the prior's distance, with one sample per ray. 0: none."""
+    """Additional pixels in each batch, whose colour is compared with the field's at the prior's distance. 0: none."""
     cache_dir: Path | None = None
-    """Folder for integrated priors and tables of training pixels. Not set: .cache/ in the scene folder."""
+    """Folder for priors and tables of training pixels. Not set: .cache/ in the scene folder."""
 
     def source_of_prior(self, sources: Collection[str]) -> str | None:
         """Return the depth source, of layers that all pictures have; `auto` becomes what the scene has. None: no prior.

@@ -53,14 +53,13 @@ class FisheyeDepthDataParserConfig(NerfstudioDataParserConfig):
     _target: type = field(default_factory=lambda: FisheyeDepth)
     """Target class to instantiate."""
     metres_per_unit: float | None = None
-    """Metres per scene unit. Not set: half of the drive's extent, at least 10 m, and small enough to keep the finest
-    hash cell at 0.25 m."""
+    """Metres per scene unit. Not set: half of the drive's extent, from 10 m to 128 m."""
     depth_unit_scale_factor: tyro.conf.Suppress[float | None] = None  # pyright: ignore[reportIncompatibleVariableOverride]
     """Metres per count of the files under depth_file_path. Not set: what transforms.json says, else nerfstudio's
     0.001."""
     depth_kind: DepthKind = "auto"
-    """What the files under depth_file_path contain. auto: distance along the ray in scenes of this project and in
-    fisheye scenes, z_depth (nerfstudio's convention) in other people's pinhole scenes."""
+    """What the files under depth_file_path contain. auto: distance along the ray, but z_depth in other people's pinhole
+    scenes."""
     downscale_factor: tyro.conf.Suppress[int | None] = 1
     """How much smaller pictures nerfstudio reads from folders images_K; maps have one size, so it is 1."""
     orientation_method: tyro.conf.Suppress[Literal["pca", "up", "vertical", "none"]] = "none"
@@ -68,7 +67,7 @@ class FisheyeDepthDataParserConfig(NerfstudioDataParserConfig):
     auto_scale_poses: tyro.conf.Suppress[bool] = False
     """nerfstudio's scaling of all poses into +-1. It is off: metres_per_unit sets the scale."""
     eval_mode: Literal["fraction", "filename", "interval", "all"] = "interval"
-    """How a scene without split files is divided. Interval holds out every eval_interval-th picture."""
+    """How a scene without split files is divided. interval holds out every eval_interval-th picture."""
 
 
 def check_meta(meta: dict[str, Any], path: Path) -> list[dict[str, Any]]:

@@ -86,13 +86,12 @@ class EdgeDepthNerfModelConfig(NerfactoModelConfig):
     far_m: float = 1000.0
     """Where sampling ends along the ray, metres (replaces far_plane)."""
     depth_loss: DepthLossName = "edge"
-    """The loss on the distance prior: Eq. 4, nerfstudio's DS-NeRF or UrbanNeRF loss, UrbanNeRF's as its authors publish
-    it (line of sight with a narrowing σ, and separate weights), one that is registered, or none (plain nerfacto)."""
+    """The loss on the prior: Eq. 4, nerfstudio's DS-NeRF or UrbanNeRF loss, UrbanNeRF's as published, a registered one,
+    or none (plain nerfacto)."""
     losses: LossOptions = field(default_factory=LossOptions)
     """Options of these losses, by their names."""
     depth_loss_mult: float = 0.01
-    """Weight λ of the loss on the distance prior (not published; how it was chosen: docs/ablation.md). 0: the prior is
-    used for surface and sky only."""
+    """Weight λ of the loss on the prior. 0: the prior is used for surface and sky only."""
     depth_loss_levels: tyro.conf.Suppress[Literal["all", "final"]] = "all"
     """Whether the loss applies to the samples of the proposal networks too, or only to the final ones."""
     depth_loss_final: tyro.conf.Suppress[float] = 0.01
@@ -108,9 +107,8 @@ class EdgeDepthNerfModelConfig(NerfactoModelConfig):
     """With a depth loss: weight of the colour error of the field at the prior's distance, for the datamanager's
     `surface_rays_per_batch` additional pixels, with one sample each."""
     exposure: Exposure = "gain"
-    """How a camera's drifting exposure and white balance are modelled. gain: a factor per colour and training picture;
-    their geometric mean is 1, and views are rendered with it. embedding: nerfacto's appearance embedding; views use the
-    mean of all pictures, which does not give their mean colour. none: not modelled."""
+    """Exposure and white balance. gain: a factor per colour and training picture. embedding: nerfacto's appearance
+    embedding. none: not modelled."""
     camera_optimizer: CameraOptimizerConfig = field(default_factory=PoseRefinerConfig)
     """Poses that training refines."""
     proposal_warmup: float = 1 / 6  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -118,11 +116,11 @@ class EdgeDepthNerfModelConfig(NerfactoModelConfig):
     proposal_weights_anneal_max_num_iters: float = 1 / 30  # pyright: ignore[reportIncompatibleVariableOverride]
     """How long the proposals' weights count less than later: below 1 a share of the training, else steps."""
     detail: bool = False
-    """Add to rendered views what the training pictures that see most of them show beyond their own renderings. A view
-    from a new place then takes longer: up to eight training pictures are rendered first. Training stays the same."""
+    """Add detail of the training pictures to rendered views, which then take longer; training stays the same
+    (docs/method.md)."""
     implementation: Literal["fused", "torch"] = "fused"  # pyright: ignore[reportIncompatibleVariableOverride]
-    """What computes fields, samples and losses. fused: our own kernels, Numba's on the CPU and Triton's on CUDA. torch:
-    nerfstudio's code, with the same results and checkpoints, but many times slower on a CPU."""
+    """fused: our kernels. torch: nerfstudio's code, with the same results and checkpoints, but many times slower on a
+    CPU."""
 
 
 class EdgeDepthNerfModel(NerfactoModel):

@@ -50,8 +50,7 @@ class EdgeDepthTrainerConfig(TrainerConfig):
     _target: type = field(default_factory=lambda: EdgeDepthTrainer)
     """Target class to instantiate."""
     cuda_graphs: bool = True
-    """On a GPU, launch the kernels of a step as one, by CUDA graphs: several times faster, with the same results. Where
-    it is not possible, a line says why, and training continues without."""
+    """On a GPU, launch a step's kernels as one: several times faster, same results (docs/gpu.md)."""
 
     def print_to_terminal(self) -> None:
         """Print what is trained, and the settings that differ from the method's own; config.yml has all of them."""

@@ -5,7 +5,7 @@ A sequence, 230329/test_1 and so on, as published:
     image/000000.png                 pictures of the front camera
     bin/000000.bin                   scans; a scan's number is that of its picture
 
-Calibration and poses are not published: users provide them as a rig file, as docs/jbnu_depth360.md describes. What the
+Calibration and poses are not published: users provide them as a rig file, as docs/rig.md describes. What the
 data set is known, or taken, to have stands in `_fill_in` and may be left out there. All else is as for any rig.
 """
 

@@ -36,7 +36,7 @@ SMALLEST_PX = 12.0
 """Smaller regions of what is left are chance."""
 _CONFIDENCE = (-1.0, 3.5, 1.75)
 """Of a logistic function of 1, the root of the margin, and the agreeing neighbours over `_ALL_AGREE`: fitted to the
-ground truth of rendered drives, so that it is the share of distances that are right to 10 % (docs/motion.md)."""
+ground truth of rendered drives, so that it is the share of distances that are right to 10 %."""
 _ALL_AGREE = 8
 _MATCH_PX = 0.15
 """How exactly a point is found in the neighbours: standard deviation of what is right."""

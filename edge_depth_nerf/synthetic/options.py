@@ -35,23 +35,19 @@ class SynthesizeOptions:
     """Name of the sequence in the folders of KITTI-360's layout."""
 
     output: Path
-    """Folder to write the drive to. It must be new, empty, or an unfinished drive with the same options, which is then
-    continued."""
+    """Folder to write the drive to. Run the same command again to resume."""
     scene: SceneName = "street"
-    """street: houses, trees, parked cars; parking: an underground car park; turn: 90 degrees at a junction;
-    traffic: the street with cars that pass, one that stops and starts again, a bus, people on foot and a cyclist;
-    roundabout: around an island with trees."""
+    """A street, an underground car park, a junction, a street with moving cars and people, or a roundabout."""
     frames: int = 40
     """Number of frames, 0.1 s apart, each with two pictures and one LiDAR sweep."""
     size: int = 350
     """Width and height of the pictures in pixels; KITTI-360's own are 1400."""
     seed: int = 0
-    """Seed of everything random: the scene, the motion, noise and drop-outs. Same options, same bytes."""
+    """Seed of everything random. Same options, same bytes."""
     moving: tyro.conf.Suppress[int] = 0
     """Number of other cars that drive through the scene; their masks are written as truth/<sequence>/moving_masks."""
     layout: LayoutName = "kitti-360"
-    """kitti-360: two fisheyes, Velodyne; jbnu-depth360: four 183 degree fisheyes, Ouster; rig: two fisheyes to 110
-    degrees, a pinhole and a scanner, described by a rig.toml. --size is the width; not all pictures are square."""
+    """kitti-360: two fisheyes; jbnu-depth360: four fisheyes; rig: two fisheyes and a pinhole with a rig.toml."""
 
     @property
     def has_movers(self) -> bool:

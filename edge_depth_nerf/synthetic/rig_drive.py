@@ -10,7 +10,7 @@ with distortion ahead, a scanner whose points have times. Every camera has a clo
 
 The layout `jbnu-depth360`: four 183° fisheyes (Kannala-Brandt), a scanner of 32 beams.
 
-    calibration.toml, poses.txt             what docs/jbnu_depth360.md describes; the data set has neither
+    calibration.toml, poses.txt             what docs/rig.md describes; the data set has neither
     image/{front,left,rear,right}/000000.png, bin/000000.bin    (the data set publishes the front camera, in image/)
 
 Both, with c the camera:

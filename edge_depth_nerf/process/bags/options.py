@@ -17,16 +17,16 @@ class UnpackOptions:
     bag: tyro.conf.Positional[Path]
     """A ROS 1 bag (.bag), a ROS 2 bag (its folder, .mcap or .db3), or a folder with the parts of one."""
     output: Path | None = None
-    """The recording's folder to write. Run the same command again to resume an interrupted run."""
+    """The recording's folder to write. Run the same command again to resume."""
     list: bool = False
     """Only list the topics, with types and rates, and what each would be taken for."""
     topics: tuple[str, ...] = ()
     """Take pictures and scans of these topics only. Not set: one topic of each camera, and all scans."""
     poses: str | None = None
-    """The topic of the poses, such as /odometry/filtered, /tf, or that of a NavSatFix. Not set: the first that there is
-    of Odometry, PoseStamped, /tf, NavSatFix with Imu."""
+    """The topic of the poses, such as /odometry/filtered. Not set: the first of Odometry, PoseStamped, /tf, NavSatFix
+    with Imu."""
     vehicle: str | None = None
-    """The frame of the vehicle, which mountings lead to. Not set: that of the poses, or base_link."""
+    """The frame of the vehicle. Not set: that of the poses, or base_link."""
     start_s: float = 0.0
     """Begin so many seconds after the start of the bag."""
     seconds: float | None = None
