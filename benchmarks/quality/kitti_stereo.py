@@ -5,8 +5,8 @@
 FOLDER has, as NAME.png or NAME.bin, `prediction` and `gt/disp_occ_0` (disparities, 16 bits, 1/256 px), `gt/obj_map`
 (what moves) and `velodyne_points` (a raw sweep), all of 26 September 2011. The folder data of this repository on GitHub
 has them: ziliHarvey/LiDAR-Guided-Boundary-Bleeding-Refinement-for-Depth-Map. Every second frame, from the second on, is
-evaluated; the others (`--half a`) are for choices. Calibration uses sweeps alone. The ground truth is of many sweeps and
-scatters by itself: `scatter` measures that by the planes of its surroundings, and the shares within 1 and 2 standard
+evaluated; the others (`--half a`) are for choices. Calibration uses sweeps alone. The ground truth is of many sweeps,
+which scatter: `scatter` measures that by the planes of its surroundings, and the shares within 1 and 2 standard
 deviations count it. Writes table.md and table.json.
 """
 
