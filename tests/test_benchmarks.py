@@ -325,3 +325,29 @@ def test_every_file_of_the_benchmarks_stands_in_their_readme():
     files = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
     kept = {name for name in files if "__pycache__" not in name} - {"README.md", "__init__.py"}
     assert sorted(named) == sorted(kept)
+
+
+def test_the_scatter_of_ground_truth_is_that_beside_planes(benchmark_module):
+    scatter = benchmark_module("quality.kitti_stereo").scatter
+    y, x = np.mgrid[:60, :80]
+    # inverse distances of a plane are linear in the picture
+    plane = 1 / (0.02 + 0.001 * y + 0.0002 * x)
+    assert np.nanmax(scatter(plane)) < 1e-9
+    noise = np.random.default_rng(0).normal(0, 0.01, plane.shape)
+    known = np.where(np.random.default_rng(1).random(plane.shape) < 0.5, plane * (1 + noise), 0)
+    found = scatter(known)
+    assert np.isnan(found[known == 0]).all()
+    # around 60 pixels tell the plane, so its own error adds little
+    assert np.nanmedian(found) / 0.6745 == pytest.approx(0.01, rel=0.08)
+
+
+def test_the_stereo_table_is_of_its_figures(benchmark_module, pages):
+    stereo = benchmark_module("quality.kitti_stereo")
+    text = (ROOT / "docs" / "prior.md").read_text(encoding="utf-8")
+    kept = read_json(stereo.KEPT)
+    table = "\n".join(stereo.table(kept))
+    assert "<!-- stereo -->" in text and pages.with_part(text, "stereo", table) == text
+    # what the page says of it
+    for regions in kept.values():
+        assert all(2 * methods["network, aligned"]["ours_ahead"] > 65 for methods in regions.values())
+        assert regions["near"]["network, aligned"]["ours_ahead"] > 0.9 * 65
