@@ -272,6 +272,32 @@ def test_held_out_pictures_are_listed(scene, model, tmp_path):
     assert len(names) == 12 and not (without / "sparse/0/test.txt").exists()
 
 
+@pytest.mark.parametrize(("theta_max_deg", "fov_deg"), [(95.0, 90.0), (95.0, 60.0), (70.0, 90.0)])
+def test_views_leave_no_gap_and_stay_within_the_lens(theta_max_deg, fov_deg):
+    lens = KannalaBrandt(200, 200, 56.0, 56.0, 100.4, 99.3, -0.01, 0.01, -0.0025, 0.0)
+    limit = np.radians(theta_max_deg)
+    cuts = cuts_of(lens, limit, "nerfstudio", "pinhole", 5, fov_deg)
+    assert [cut.name for cut in cuts] == ["_front", "_left", "_right", "_up", "_down"]
+    # directions to the left, right, up and down, x right and y down
+    for name, axis in (("_left", [-1, 0]), ("_right", [1, 0]), ("_up", [0, -1]), ("_down", [0, 1])):
+        theta = np.linspace(0, min(limit, 1.4 * np.radians(fov_deg)), 200)[:-2]
+        line = np.stack((*(np.sin(theta) * side for side in axis), np.cos(theta)), 1)
+        seen = np.zeros(len(theta), bool)
+        for cut in (each for each in cuts if each.name in ("_front", name)):
+            pixels, valid = cut.lens.project(torch.from_numpy(line @ cut.view_to_camera))
+            seen |= (valid & cut.lens.inside(pixels)).numpy()
+        assert seen.all()
+    whole = np.ones((200, 200), bool)
+    assert all(cut.mask(whole).mean() > 0.99 for cut in cuts[:3])
+    assert all(abs(cut.lens.width / 2 / cut.lens.fx / np.tan(np.radians(fov_deg / 2)) - 1) < 0.02 for cut in cuts)
+    narrow = cuts_of(
+        KannalaBrandt(200, 80, 56.0, 56.0, 100.4, 40.0, 0.0, 0.0, 0.0, 0.0), limit, "nerfstudio", "pinhole", 5, 90.0
+    )
+    assert [cut.name for cut in narrow] == ["_front", "_left", "_right"] and narrow[0].lens.height < narrow[
+        0
+    ].lens.width
+
+
 # ---- nerfstudio ------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(("views", "files"), [("fisheye", "png"), ("pinhole", "png"), ("fisheye", "npy")])
 def test_depth_nerfacto_reads_true_depth_by_default(room, scene, views, files, tmp_path):

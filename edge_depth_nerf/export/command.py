@@ -130,6 +130,13 @@ def _write(output: Path, options: ExportOptions, scene: SceneFolder, priors: Pri
     else:
         seen = _run([partial(writer.seen, view, cloud) for view in views], "Finding what each view sees", console)
         write_model(output, views, seen, cloud)
+        if empty := [view.file_name for view, each in zip(views, seen, strict=True) if not len(each.index)]:
+            say(
+                console,
+                f"{len(empty)} of {len(views)} views see no point of the cloud ({empty[0]} …). They are in the model, "
+                "but gsplat's --depth_loss cannot read such views.",
+                "yellow",
+            )
     known, too_far = (sum(each) for each in zip(*counts, strict=True)) if counts else (0, 0)
     if too_far > LEAST_SHARE * known:
         say(

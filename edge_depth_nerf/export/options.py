@@ -17,6 +17,8 @@ Pictures = Literal["all", "training"]
 DepthFiles = Literal["png", "npy"]
 Cuts = Literal[1, 3, 5]
 LEAST_FOV_DEG, LARGEST_FOV_DEG = 20.0, 120.0
+LEAST_VOXEL_M = 0.01
+"""Of smaller cubes there would be more along a drive than are counted."""
 
 
 @dataclass(frozen=True)
@@ -61,9 +63,10 @@ class ExportOptions:
                 f"--fov-deg {self.fov_deg}: expected {LEAST_FOV_DEG:g} to {LARGEST_FOV_DEG:g} degrees. Wider pinhole "
                 "views show little but their rim."
             )
-        for name, value in (("voxel-m", self.voxel_m), ("most-error", self.most_error)):
-            if not (math.isfinite(value) and value > 0):
-                raise InputError(f"--{name} {value}: expected a positive number.")
+        if not (math.isfinite(self.voxel_m) and self.voxel_m >= LEAST_VOXEL_M):
+            raise InputError(f"--voxel-m {self.voxel_m}: expected {LEAST_VOXEL_M} m or more.")
+        if not (math.isfinite(self.most_error) and self.most_error > 0):
+            raise InputError(f"--most-error {self.most_error}: expected a positive number.")
         if self.most_points < 1:
             raise InputError(f"--most-points {self.most_points}: expected 1 or more.")
 
