@@ -134,7 +134,7 @@ def _write(output: Path, options: ExportOptions, scene: SceneFolder, priors: Pri
             say(
                 console,
                 f"{len(empty)} of {len(views)} views see no point of the cloud ({empty[0]} …). They are in the model, "
-                "but gsplat's --depth_loss cannot read such views.",
+                "but the depth loss of gsplat's trainer cannot read such views.",
                 "yellow",
             )
     known, too_far = (sum(each) for each in zip(*counts, strict=True)) if counts else (0, 0)
