@@ -246,7 +246,7 @@ def known_options() -> set[str]:
             entries = [name.replace("_", "-") for name in shown]
             names |= {*entries, *(f"no-{name}" for name in entries)}
     # of ns-export, which cannot be imported where open3d misses libusb
-    return {f"--{name}" for name in names} | {"--help", "--normal-method", DEBUG_OPTION}
+    return {f"--{name}" for name in names} | {"--help", "--normal-method", "--save-world-frame", DEBUG_OPTION}
 
 
 @pytest.mark.parametrize("page", PAGES)

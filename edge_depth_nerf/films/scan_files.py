@@ -11,6 +11,7 @@ from jaxtyping import Float32, Int16
 from numpy.typing import NDArray
 
 from edge_depth_nerf.base.files import write_bytes
+from edge_depth_nerf.lidar.ply import ply_bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,10 +36,7 @@ def _records(scan: Scan) -> NDArray:
 
 
 def _ply(scan: Scan) -> bytes:
-    rows = _records(scan)
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
-    header += [f"property {'ushort' if name == 'ring' else 'float'} {name}" for name in rows.dtype.names or ()]
-    return "\n".join([*header, "end_header\n"]).encode() + rows.tobytes()
+    return ply_bytes(_records(scan))
 
 
 def _pcd(scan: Scan) -> bytes:

@@ -153,6 +153,10 @@ def first_in_voxel(points_m: Float[np.ndarray, "points 3"], voxel_m: float) -> I
 
     The points are to lie within a million cubes of the origin.
     """
+    return np.sort(np.unique(voxel_keys(points_m, voxel_m), return_index=True)[1])
+
+
+def voxel_keys(points_m: Float[np.ndarray, "points 3"], voxel_m: float) -> Int64[np.ndarray, "points"]:
+    """Number the cubes of `voxel_m` that points lie in; within a million cubes of the origin."""
     cells = np.floor(points_m / voxel_m).astype(np.int64) + (1 << (_CELL_BITS - 1))
-    keys = (cells[:, 0] << (2 * _CELL_BITS)) | (cells[:, 1] << _CELL_BITS) | cells[:, 2]
-    return np.sort(np.unique(keys, return_index=True)[1])
+    return (cells[:, 0] << (2 * _CELL_BITS)) | (cells[:, 1] << _CELL_BITS) | cells[:, 2]

@@ -88,7 +88,7 @@ def pinhole_views(lens: KannalaBrandt | Pinhole, theta_max_rad: float) -> tuple[
         return (_view(lens, directions, np.eye(3), focal_px, float(tangent[0]), float(tangent[1])),)
     axes = FRONT_DEG if farthest_deg <= FRONT_REACH_DEG else FRONT_DEG + BACK_DEG
     tangent = math.tan(math.radians(HALF_ANGLE_DEG))
-    views = [_view(lens, directions, _upright(*axis), focal_px, tangent, tangent) for axis in axes]
+    views = [_view(lens, directions, upright_axes(*axis), focal_px, tangent, tangent) for axis in axes]
     best = np.full(within.shape, -1)
     most = np.zeros(within.shape, np.float32)
     for number, view in enumerate(views):
@@ -98,7 +98,7 @@ def pinhole_views(lens: KannalaBrandt | Pinhole, theta_max_rad: float) -> tuple[
     return tuple(view for number, view in enumerate(views) if (best == number).any())
 
 
-def _upright(azimuth_deg: float, elevation_deg: float) -> NDArray[np.float64]:
+def upright_axes(azimuth_deg: float, elevation_deg: float) -> NDArray[np.float64]:
     """Axes, as columns, of a view whose x stays level."""
     azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
     right = np.array([math.cos(azimuth), 0.0, -math.sin(azimuth)])

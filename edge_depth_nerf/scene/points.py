@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from edge_depth_nerf.base.files import read_npz, write_atomically, write_bytes
+from edge_depth_nerf.lidar.ply import ply_bytes
 from edge_depth_nerf.lidar.sweeps import first_in_voxel
 
 MAX_POINTS = 200_000
@@ -102,6 +103,4 @@ def _ply(part: _Part) -> bytes:
     rows = np.empty(len(part.points_m), dtype=list(kinds.items()))
     for column, name in enumerate(kinds):
         rows[name] = part.points_m[:, column] if column < 3 else part.colours[:, column - 3]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
-    header += [f"property {'float' if kind == '<f4' else 'uchar'} {name}" for name, kind in kinds.items()]
-    return ("\n".join([*header, "end_header"]) + "\n").encode() + rows.tobytes()
+    return ply_bytes(rows)
