@@ -97,6 +97,8 @@ _TRIED_WHOLE = 8
 """So many readings, the best on some of the pairs, are tried on all of them."""
 _LEAST_GAINS = (0.25, 0.01)
 """Of a small angle or shift, contrast must gain so much, and edges: on bare walls edges alone would fit by chance."""
+_REFINED = 3
+"""So many of these, the best, are refined."""
 _UNSEEN = 0.01
 """A scanner of which a camera's pictures see a smaller share of the points does not see what the camera sees."""
 _FEWEST_RATIOS = 30
@@ -491,9 +493,20 @@ class _Candidate:
     views: tuple[_View, ...]
     """Those that it concerns."""
     gain: float = -math.inf
+    by_contrast: float = 0.0
+    by_edges: float = 0.0
+    """Parts of it, before edges are cubed."""
     lack: float = 1.0
     before: float = 1.0
     """The mean lack as given."""
+
+    @property
+    def clear(self) -> bool:
+        """Whether it is named."""
+        if not self.reading.both:
+            return self.gain >= self.reading.clear and self.lack < _FITTING
+        gains = self.by_contrast >= _LEAST_GAINS[0] and self.by_edges >= _LEAST_GAINS[1]
+        return self.gain >= self.reading.clear and self.lack < _FITTING_SMALL and gains
 
 
 def _of_point_times(source: _Source) -> list[Reading]:
@@ -580,7 +593,7 @@ def _file_warnings(source: _Source, views: Sequence[_View]) -> list[str]:
     if far and np.median(far) > _FAR_SHARE:
         found.append(
             f"{np.median(far):.0%} of the points of {source.name} lie beyond 255 m: are they in another unit? Set "
-            "metres_per_unit to 0.01 for centimetres, 0.001 for millimetres."
+            "metres_per_unit to 0.01 for centimetres, 0.001 for millimetres, 0.0254 for inches."
         )
     for view in views:
         depth = view.pairs[0].pictures[0].depth if view.pairs else None
@@ -649,20 +662,17 @@ def _best(source: _Source, given: dict[_View, _Fit], apart_m: float | None, doub
     first = [_tried(source, one, given_of_some, None, some) for one in tried]
     chosen = sorted(first, key=lambda one: -one.gain)[:_TRIED_WHOLE]
     chosen += [one for one in first if one.reading.point_times is not None and one not in chosen]
-    whole = [_tried(source, one, given, apart_m) for one in chosen]
-    whole = [
-        one
-        for one in whole
-        if one.gain >= one.reading.clear and one.lack < (_FITTING_SMALL if one.reading.both else _FITTING)
-    ]
+    whole = sorted((_tried(source, one, given, apart_m) for one in chosen), key=lambda one: -one.gain)
+    # an angle between those tried fits only once it is found
+    whole = [_refined(source, one, given, apart_m) for one in whole[:_REFINED]] + whole[_REFINED:]
+    whole = [one for one in whole if one.clear]
     if not whole:
         return []
     best = max(whole, key=lambda one: one.gain)
     if len(best.views) == len(views) and best.sensor == source.name:
-        return [_refined(source, best, given, apart_m)]
+        return [best]
     of_cameras = [one for one in whole if one.sensor != source.name]
-    found = {one.sensor: one for one in sorted(of_cameras, key=lambda one: one.gain)}
-    return [_refined(source, one, given, apart_m) for one in found.values()]
+    return list({one.sensor: one for one in sorted(of_cameras, key=lambda one: one.gain)}.values())
 
 
 def _tried(
@@ -686,14 +696,13 @@ def _tried(
     gain = math.log(lacks[0] / lacks[1])
     steps = [math.log(a.edge / b.edge) for b, a in told if a.edge > 0 and b.edge > 0]
     step = _within(float(np.mean(steps)), _MOST_BY_EDGES) if steps else 0.0
-    if some is None and reading.both and (gain < _LEAST_GAINS[0] or step < _LEAST_GAINS[1]):
-        return unfit
+    parts = {"by_contrast": gain, "by_edges": step}
     gain += 3 * step
     of_sweeps = candidate.sensor == source.name and not reading.scales
     if apart_m is not None and of_sweeps and gain > -0.2:
         other_m = source.apart_m(reading)
         gain += 0.0 if other_m is None else _within(math.log(apart_m / other_m), _MOST_BY_SWEEPS)
-    return replace(candidate, gain=gain, lack=lacks[1] / len(told), before=lacks[0] / len(told))
+    return replace(candidate, gain=gain, lack=lacks[1] / len(told), before=lacks[0] / len(told), **parts)
 
 
 def _within(value: float, most: float) -> float:

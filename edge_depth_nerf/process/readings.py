@@ -118,6 +118,8 @@ _SAME_UNIT = 0.05
 """A unit is the one that is known if their logarithms differ by less."""
 _CLOCKS_S = (0.05, 0.1, 0.2, 0.5, 1.0)
 _ANGLES_DEG = (2.0, 5.0)
+_YAWS_DEG = (-150.0, -120.0, -60.0, -30.0, 30.0, 60.0, 120.0, 150.0)
+"""About the upright axis; by quarters it is turned with the axes."""
 
 
 def _mounting(sensor: str, said: str, change: Change) -> Reading:
@@ -164,6 +166,7 @@ def mountings(sensor: str) -> list[Reading]:
         if sensor == "scanner" or np.linalg.det(change[:3, :3]) > 0:
             remedy = "change its to_vehicle, or its points" if sensor == "scanner" else "change its to_vehicle"
             found.append(_mounting(sensor, f"{{name}} is {said}: {remedy}", _after(change)))
+    found += [replace(turn(sensor, "z" if sensor == "scanner" else "y")(angle), step=15.0) for angle in _YAWS_DEG]
     for unit, metres in UNITS.items():
         said = f"the translation in to_vehicle of {{name}} is in {unit}: give metres"
         found.append(_mounting(sensor, said, partial(_rescaled, metres=metres)))
