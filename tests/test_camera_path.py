@@ -14,6 +14,7 @@ from nerfstudio.configs.method_configs import method_configs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from rich.console import Console
 from scenes import fisheye, pinhole, transforms, write_scene
+from trainings import write_config
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json
@@ -242,11 +243,7 @@ def test_a_replay_has_the_poses_that_the_model_was_trained_with(trained, scene, 
 
 def film(scene: Path, tmp_path: Path, **options):
     """A film of a training with 10 m in a unit."""
-    output, config = tmp_path / "path.json", tmp_path / "config.yml"
-    settings = edge_depth_nerf_lite.config
-    parser = FisheyeDepthDataParserConfig(metres_per_unit=10.0)
-    datamanager = replace(settings.pipeline.datamanager, dataparser=parser, data=scene)  # pyright: ignore
-    config.write_text(yaml.dump(replace(settings, pipeline=replace(settings.pipeline, datamanager=datamanager))))
+    output, config = tmp_path / "path.json", write_config(tmp_path / "config.yml", scene)
     write_camera_path(CameraPathOptions(config, output=output, **options), QUIET)
     path = read_json(output)
     return path, get_path_from_json(path)
