@@ -294,6 +294,17 @@ def test_lengths_are_metres_of_the_scene(scene, tmp_path):
     assert np.allclose(moved[[0, 8]], 0, atol=1e-5)
 
 
+@pytest.mark.parametrize(("shift_m", "warned"), [(9.0, False), (-14.0, True)])
+def test_a_path_far_outside_the_drive_is_reported(scene, tmp_path, shift_m, warned, capsys):
+    config = write_config(tmp_path / "config.yml", scene)
+    asked = CameraPathOptions(config, output=tmp_path / "path.json", kind="lane-shift", shift_m=shift_m)
+    write_camera_path(asked, Console(width=200))
+    said = " ".join(capsys.readouterr().out.split())
+    # the path is back at the drive at both ends
+    assert ("5 of 9 poses of the path are more than 10 m from the drive, the furthest 13 m" in said) is warned
+    assert (tmp_path / "path.json").is_file()
+
+
 def test_an_orbit_of_a_scene(scene, tmp_path):
     path, cameras = film(scene, tmp_path, kind="orbit", ahead_m=2.0, radius_m=3.0)
     place = cameras.camera_to_worlds[:, :, 3].numpy()

@@ -38,6 +38,9 @@ class ProcessOptions:
     cut off."""
     holdout_every: int = 8
     """Hold out one frame in this many, for all cameras: with 8 the fifth, the 13th, the 21st …; 0 holds out none."""
+    holdout_cameras: tuple[str, ...] = ()
+    """Hold out all pictures of these cameras, to evaluate views beside the path. Neither training nor priors nor poses
+    see them."""
     holdout_beams: int = 0
     """Hold out one band of elevation in this many from every sweep. A band is 0.4° high (a beam or two of a scanner).
     No prior or network sees it; training views are evaluated with it. 0 holds out none."""
