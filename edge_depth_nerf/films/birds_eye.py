@@ -125,6 +125,9 @@ def render_tile(
     place, path_m, near = plan.of_tile(tile)
     colours = np.zeros((*near.shape, 4), np.uint8)
     height_m = np.full(near.shape, np.nan, np.float32)
+    # nerfstudio renders nothing of no rays
+    if not near.any():
+        return colours, height_m
     start_m = path_m[near] + above_m
     origin_m = np.concatenate([place[near], start_m[:, None]], axis=1)
     cast = caster.cast(origin_m, np.broadcast_to(DOWN, origin_m.shape), reach_m=above_m + BELOW_M)
