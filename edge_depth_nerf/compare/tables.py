@@ -346,7 +346,9 @@ def make_tables(results: Results) -> list[MadeTable]:
     has_edges = any(name.endswith("edge_recall") for run in results.runs for name in run.figures)
     for where, scenes in (first, *drives):
         for make in (_geometry_table, _time_table, *([_edges_table] if has_edges else [])):
-            tables.append(replace(make(results, where, scenes), on_terminal=where == first[0]))
+            # of many columns a terminal shows nothing
+            fits = where == first[0] and make is not _edges_table
+            tables.append(replace(make(results, where, scenes), on_terminal=fits))
     return [*tables, _settings_table(results)]
 
 
