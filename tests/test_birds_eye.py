@@ -101,7 +101,7 @@ def trained(scene, tmp_path, monkeypatch) -> Path:
 
 def render(config: Path, **options: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Colours with transparency, heights, and the places of pixels by the world file."""
-    given = {"metres_per_pixel": SIDE_M, "margin_m": 6.0}
+    given: dict[str, Any] = {"metres_per_pixel": SIDE_M, "margin_m": 6.0}
     output = render_birds_eye(BirdsEyeOptions(config, **given | options), QUIET)
     colours = np.asarray(Image.open(output / "road.png"))
     heights = np.asarray(Image.open(output / "height.tif"))
@@ -141,7 +141,8 @@ def test_what_nothing_shows_is_transparent(drive, trained):
     colours, _, place = render(trained)
     shown = colours[..., 3] == 255
     path = [[drive.camera_to_world(name, frame)[:2, 3] for frame in (0, 8)] for name in ("image_02", "image_03")]
-    dense = np.linspace(*np.mean(path, axis=0), 200)
+    first, last = np.mean(path, axis=0)
+    dense = np.linspace(first, last, 200)
     away = np.linalg.norm(place[:, :, None] - dense, axis=-1).min(-1)
     assert not shown[away > 6.3].any()
     assert not shown[((place > EMPTY[0]) & (place < EMPTY[1])).all(-1)].any()
@@ -181,8 +182,8 @@ def test_an_interrupted_run_goes_on(trained, monkeypatch):
         return whole(*given)
 
     # so small that some tiles within reach have no pixel near the path
-    monkeypatch.setattr(birds_eye, "TILE_PX", 8)
-    monkeypatch.setattr("edge_depth_nerf.films.ground_plan.TILE_PX", 8)
+    monkeypatch.setattr(birds_eye, "TILE_PX", 16)
+    monkeypatch.setattr("edge_depth_nerf.films.ground_plan.TILE_PX", 16)
     monkeypatch.setattr(birds_eye, "render_tile", until_the_third)
     with pytest.raises(KeyboardInterrupt):
         render(trained)

@@ -35,8 +35,9 @@ pytestmark = pytest.mark.slow
 
 
 def options(drive: RoomDrive, output: Path, **changes: Any) -> Kitti360Options:
-    given = {"root": drive.root, "sequence": SEQUENCE, "output": output, "sweeps": 1, "holdout_every": 4}
-    return Kitti360Options(**given | {"holdout_cameras": (HELD_OUT,)} | changes)
+    given: dict[str, Any] = {"root": drive.root, "sequence": SEQUENCE, "output": output, "sweeps": 1}
+    given |= {"holdout_every": 4, "holdout_cameras": (HELD_OUT,)}
+    return Kitti360Options(**given | changes)
 
 
 def process(drive: RoomDrive, output: Path, **changes: Any) -> Path:

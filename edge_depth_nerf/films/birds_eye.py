@@ -37,7 +37,8 @@ LEAST_M = 0.1
 """A ray that hits something at once begins inside it: a house, a tree, a bank."""
 DOWN = np.array([0.0, 0.0, -1.0])
 
-Colours, Heights = UInt8[np.ndarray, "h w 4"], Float32[np.ndarray, "h w"]
+Colours = UInt8[np.ndarray, "h w 4"]
+Heights = Float32[np.ndarray, "h w"]
 
 
 def render_birds_eye(options: BirdsEyeOptions, console: Console | None = None) -> Path:
