@@ -16,6 +16,7 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.compare.options import CompareOptions, GridOptions, SearchOptions
 from edge_depth_nerf.demo.options import DemoOptions
 from edge_depth_nerf.export.options import ExportOptions
+from edge_depth_nerf.films.birds_eye_options import BirdsEyeOptions
 from edge_depth_nerf.films.options import CameraPathOptions
 from edge_depth_nerf.films.scan_options import RenderLidarOptions
 from edge_depth_nerf.inspecting.options import InspectOptions
@@ -54,6 +55,7 @@ Command = (
     | Annotated[CameraPathOptions, tyro.conf.subcommand("camera-path")]
     | Annotated[RenderLidarOptions, tyro.conf.subcommand("render-lidar")]
     | Annotated[ExportOptions, tyro.conf.subcommand("export")]
+    | Annotated[BirdsEyeOptions, tyro.conf.subcommand("birds-eye")]
     | Annotated[CompareOptions, tyro.conf.subcommand("compare")]
     | Annotated[SearchOptions, tyro.conf.subcommand("search")]
     | Annotated[GridOptions, tyro.conf.subcommand("grid")]
@@ -165,6 +167,8 @@ def _work_of(command: Command) -> Callable[..., Any]:
         from edge_depth_nerf.films.scan_command import render_lidar as work
     elif isinstance(command, ExportOptions):
         from edge_depth_nerf.export.command import export_scene as work
+    elif isinstance(command, BirdsEyeOptions):
+        from edge_depth_nerf.films.birds_eye import render_birds_eye as work
     elif isinstance(command, CompareOptions):
         from edge_depth_nerf.compare.command import compare as work
     elif isinstance(command, GridOptions):

@@ -14,6 +14,7 @@ from nerfstudio.configs.method_configs import method_configs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from rich.console import Console
 from scenes import fisheye, pinhole, transforms, write_scene
+from trainings import write_config
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json
@@ -242,11 +243,7 @@ def test_a_replay_has_the_poses_that_the_model_was_trained_with(trained, scene, 
 
 def film(scene: Path, tmp_path: Path, **options):
     """A film of a training with 10 m in a unit."""
-    output, config = tmp_path / "path.json", tmp_path / "config.yml"
-    settings = edge_depth_nerf_lite.config
-    parser = FisheyeDepthDataParserConfig(metres_per_unit=10.0)
-    datamanager = replace(settings.pipeline.datamanager, dataparser=parser, data=scene)  # pyright: ignore
-    config.write_text(yaml.dump(replace(settings, pipeline=replace(settings.pipeline, datamanager=datamanager))))
+    output, config = tmp_path / "path.json", write_config(tmp_path / "config.yml", scene)
     write_camera_path(CameraPathOptions(config, output=output, **options), QUIET)
     path = read_json(output)
     return path, get_path_from_json(path)
@@ -295,6 +292,17 @@ def test_lengths_are_metres_of_the_scene(scene, tmp_path):
     moved = (shifted.camera_to_worlds - plain.camera_to_worlds)[:, :, 3].numpy()
     assert np.allclose(moved[4], [0, 0.2, 0], atol=1e-5)
     assert np.allclose(moved[[0, 8]], 0, atol=1e-5)
+
+
+@pytest.mark.parametrize(("shift_m", "warned"), [(9.0, False), (-14.0, True)])
+def test_a_path_far_outside_the_drive_is_reported(scene, tmp_path, shift_m, warned, capsys):
+    config = write_config(tmp_path / "config.yml", scene)
+    asked = CameraPathOptions(config, output=tmp_path / "path.json", kind="lane-shift", shift_m=shift_m)
+    write_camera_path(asked, Console(width=200))
+    said = " ".join(capsys.readouterr().out.split())
+    # the path is back at the drive at both ends
+    assert ("5 of 9 poses of the path are more than 10 m from the drive, the furthest 13 m" in said) is warned
+    assert (tmp_path / "path.json").is_file()
 
 
 def test_an_orbit_of_a_scene(scene, tmp_path):

@@ -21,6 +21,7 @@ from edge_depth_nerf.compare.evaluation import (
     shifted_views,
 )
 from edge_depth_nerf.compare.figures import affine_fitted
+from edge_depth_nerf.method.edges import EdgeRecall, depth_edges_found, picture_edges_found
 from edge_depth_nerf.method.metrics import masked_psnr
 from edge_depth_nerf.plugin.config import make_specifications, read_method_file
 
@@ -151,6 +152,14 @@ def test_shifted_views_have_the_figures_of_the_whole_picture(tmp_path):
             fitted = affine_fitted(outputs["rgb"].clamp(0, 1), target, mask)
             figures["affine_masked_psnr"] = float(masked_psnr(fitted, target, mask))
             figures |= model.evaluation.pooled()
+            distance_m, true_m = (
+                outputs["depth"][..., 0] * model.metres_per_unit,
+                view.batch["truth_distance_m"][..., 0],
+            )
+            edges = EdgeRecall()
+            edges.update("edge_recall", picture_edges_found(fitted, target, mask))
+            edges.update("truth_depth_edge_recall", depth_edges_found(distance_m, true_m, mask))
+            expected |= {f"shifted_{metres}m_{name}": value for name, value in edges.compute().items()}
             kept = ("masked_", "affine_", "truth_")
             expected |= {f"shifted_{metres}m_{name}": value for name, value in figures.items() if name.startswith(kept)}
     assert {"shifted_1m_masked_psnr", "shifted_1m_masked_ssim", "shifted_0m_truth_abs_rel"} <= set(found)

@@ -198,3 +198,30 @@ def test_runs_that_differ_in_unnamed_fields_are_refused(results):
         if run.method == "ds-nerf":
             run.content["named"], run.content["configuration"]["b"] = ["b"], "2"
     check_fair(results)
+
+
+def test_edges_on_the_path_beside_it_and_from_a_held_out_camera():
+    more = {
+        **{"truth_edge_recall": 0.8, "truth_depth_edge_recall": 0.7, "shifted_1m_edge_recall": 0.6},
+        **{
+            "shifted_0.5m_edge_recall": 0.75,
+            "shifted_0.5m_truth_depth_edge_recall": 0.5,
+            "shifted_0.5m_masked_psnr": 19,
+        },
+        **{"shifted_3m_edge_recall": 0.25, "camera_truth_affine_masked_psnr": 18.5, "camera_truth_edge_recall": 0.45},
+    }
+    runs = [fake("street", method, 0, 20.0, **more) for method in ("nerfacto", "edge")]
+    made = table(Results(runs, {"preset": "lite", "tuned": {}}, {}, 2), "9, street")
+    assert made.headings() == [
+        *(("PSNR ↑", "0 m"), ("PSNR ↑", "0.5 m")),
+        *(("edges ↑", "0 m"), ("edges ↑", "0.5 m"), ("edges ↑", "1 m"), ("edges ↑", "3 m")),
+        *(("depth edges ↑", "0 m"), ("depth edges ↑", "0.5 m")),
+        *(("held-out cameras", "PSNR, fitted ↑"), ("held-out cameras", "edges ↑")),
+    ]
+    expected = ["20.00", "19.00", "0.800", "0.750", "0.600", "0.250", "0.700", "0.500", "18.50", "0.450"]
+    assert [cell.text() for cell in made.rows[-1].cells] == expected
+    assert "Held-out cameras: training saw no picture" in made.caption and "the ground truth" in made.caption
+
+
+def test_runs_of_earlier_versions_have_no_table_of_edges(results):
+    assert not [made for made in tables.make_tables(results) if made.label.startswith("9")]

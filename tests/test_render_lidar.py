@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-import yaml
 from drives import SEQUENCE, RoomDrive, cut, pose, wall_distance, write_points, write_room_drive
 from rich.console import Console
+from trainings import write_config
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json, write_json
@@ -21,8 +21,6 @@ from edge_depth_nerf.films.scan_options import RenderLidarOptions
 from edge_depth_nerf.films.scanning import Caster
 from edge_depth_nerf.lidar.patterns import ScanPattern
 from edge_depth_nerf.lidar.scans import PointTimes, ScanFormat, read_scan
-from edge_depth_nerf.plugin.config import edge_depth_nerf_lite
-from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
 from edge_depth_nerf.process.converters import convert
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.scene.reader import read_scene
@@ -163,17 +161,12 @@ class RoomModel:
 @pytest.fixture
 def trained(scanner, tmp_path, monkeypatch) -> Path:
     """The config.yml of a training with 10 m in a unit, whose model is the room."""
-    scene, config = scanner.sweeps[0].path.parents[2], tmp_path / "run/config.yml"
-    settings = edge_depth_nerf_lite.config
-    parser = FisheyeDepthDataParserConfig(metres_per_unit=10.0)
-    datamanager = replace(settings.pipeline.datamanager, dataparser=parser, data=scene)  # pyright: ignore
-    config.parent.mkdir()
-    config.write_text(yaml.dump(replace(settings, pipeline=replace(settings.pipeline, datamanager=datamanager))))
+    config = write_config(tmp_path / "run/config.yml", scanner.sweeps[0].path.parents[2])
 
     def caster(model: Any, place: SceneToModel) -> Caster:
         return Caster(RoomModel(place, offset_m(scanner), off_m=model), place)
 
-    monkeypatch.setattr(scan_command, "_model", lambda *_: 0.0)
+    monkeypatch.setattr(scan_command, "load_model", lambda *_: 0.0)
     monkeypatch.setattr(scan_command, "Caster", caster)
     return config
 
@@ -206,7 +199,7 @@ def test_scans_along_the_recorded_path_are_those_that_were_recorded(drive, train
 
 
 def test_figures_say_how_far_a_model_is_off(trained, monkeypatch):
-    monkeypatch.setattr(scan_command, "_model", lambda *_: 0.2)
+    monkeypatch.setattr(scan_command, "load_model", lambda *_: 0.2)
     output = render_lidar(RenderLidarOptions(trained, every=9), QUIET)
     found = read_json(output / "figures.json")["sweeps"]
     assert found["median_m"] == pytest.approx(0.2, abs=2e-3) and found["p95_m"] == pytest.approx(0.2, abs=2e-3)
@@ -243,7 +236,9 @@ def test_the_pattern_of_a_file_and_a_path_of_ones_own(drive, trained, tmp_path, 
     options = RenderLidarOptions(trained, sensor=str(drive.sweep(0)), path=str(tmp_path / "path.txt"))
     output = render_lidar(options, Console(width=200))
     said = " ".join(capsys.readouterr().out.split())
-    assert "1 of 3 poses lie more than 10 m from the drive, the furthest 3" in said and "12 × 240 rays" in said
+    assert (
+        "1 of 3 poses of the path are more than 10 m from the drive, the furthest 3" in said and "12 × 240 rays" in said
+    )
     assert len(list(output.glob("*.ply"))) == 3
 
 

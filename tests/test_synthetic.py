@@ -7,13 +7,16 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from rich.console import Console
 from scenes import tree as files_of
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, read_mask
+from edge_depth_nerf.process.converters import convert
+from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.synthetic import layout as layout_module
 from edge_depth_nerf.synthetic import lidar, rig
-from edge_depth_nerf.synthetic.drive import WORLD_ORIGIN_M, synthesize_drive
+from edge_depth_nerf.synthetic.drive import WORLD_ORIGIN_M, _manifest, synthesize_drive
 from edge_depth_nerf.synthetic.layout import simulated_estimate
 from edge_depth_nerf.synthetic.materials import Material, Noise
 from edge_depth_nerf.synthetic.motion import Drive, Route, Turn, WindingRoute
@@ -468,6 +471,29 @@ def test_shifted_views_are_exactly_sideways(street):
             # the own car is not there: the ground below is seen
             below = int(0.6 * SIZE)
             assert np.mean(distance[below:][lens[below:]] > 0) > 0.99
+
+
+def test_views_beside_the_path_can_be_chosen_and_reach_the_scene(tmp_path, street_model):
+    drive = SynthesizeOptions(tmp_path / "drive", frames=FRAMES, size=40, shifts_m=(0.5, -1.0))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(layout_module, "build_scene", lambda _: street_model)
+        synthesize_drive(drive)
+    shifted = read_json(drive.output / "truth" / SEQUENCE / "shifted.json")
+    pose, place = poses_of(drive.output)[4], rig.CAMERA_TO_POSE["image_02"]
+    for name, shift_m in (("0.5", 0.5), ("-1", -1.0)):
+        offset = np.array(shifted[name]["image_02"]["4"])[:3, 3] - (pose @ place)[:3, 3]
+        np.testing.assert_allclose(offset, -shift_m * pose[:3, 1], atol=1e-8)
+    assert set(shifted) == {"0.5", "-1"}
+    asked = {"sequence": SEQUENCE, "find_ego": False, "refine_poses": False, "sweeps": 0}
+    convert(Kitti360Options(root=drive.output, output=tmp_path / "scene", **asked), Console(quiet=True))
+    views = read_json(tmp_path / "scene/transforms.json")["shifted_views"]
+    assert {name: len(entries) for name, entries in views.items()} == {"0.5": 2, "-1": 2}
+    assert (tmp_path / "scene" / views["0.5"][0]["truth_rgb_file_path"]).parts[-3] == "shifted_0.5m"
+    # a drive of an earlier version is still the same drive
+    assert "shifts_m" not in _manifest(SynthesizeOptions(tmp_path))["options"]
+    assert _manifest(drive)["options"]["shifts_m"] == [0.5, -1.0]
+    with pytest.raises(InputError, match=r"--shifts-m 0\.125: expected metres, -99 to 99, with at most two decimals"):
+        SynthesizeOptions(tmp_path, shifts_m=(0.125,)).check()
 
 
 def test_moving_cars_change_place_and_only_they_are_masked(parking, tmp_path):

@@ -115,7 +115,10 @@ def test_a_good_drive_gives_no_warning(whole: Recording) -> None:
         (turned(5), "roof is turned by -5.0° about its z axis"),
         (moved(np.diag([1.0, -1, 1])), r"roof is given in other axes, where \(x, -y, z\) is x, y, z"),
         (moved(np.eye(3) * 3.28084), r"the points of roof in feet\? metres_per_unit = 0.3048"),
-        (pictures_later(0.1), r"the clock of (roof .* add 0\.(09|1[0-2])|right .* add -0\.(09|1[0-2])) to its time_offset_s"),
+        (
+            pictures_later(0.1),
+            r"the clock of (roof .* add 0\.(09|1[0-2])|right .* add -0\.(09|1[0-2])) to its time_offset_s",
+        ),
         (inverted, "to_vehicle of right is inverted"),
         (scanner_inverted, "to_vehicle of roof is inverted"),
     ],

@@ -1,14 +1,28 @@
 """Short trainings in this process, on the CPU."""
 
 import copy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
+import yaml
 from models import shrink
 from nerfstudio.configs.method_configs import all_methods
 
+from edge_depth_nerf.plugin.config import edge_depth_nerf_lite
+from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
 from edge_depth_nerf.plugin.trainer import EdgeDepthTrainer
+
+
+def write_config(config: Path, scene: Path) -> Path:
+    """Write the config.yml of a training on a scene, with 10 m in a unit; without checkpoints."""
+    settings = edge_depth_nerf_lite.config
+    parser = FisheyeDepthDataParserConfig(metres_per_unit=10.0)
+    datamanager = replace(settings.pipeline.datamanager, dataparser=parser, data=scene)  # pyright: ignore
+    config.parent.mkdir(parents=True, exist_ok=True)
+    config.write_text(yaml.dump(replace(settings, pipeline=replace(settings.pipeline, datamanager=datamanager))))
+    return config
 
 
 def trainer_of(scene: Path, output: Path, rank: int = 0, world_size: int = 1, **changes: Any) -> EdgeDepthTrainer:

@@ -6,7 +6,7 @@ Host-facing. Masks and metrics of whole views are those of `ns-eval`, the same f
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -20,6 +20,7 @@ from torch import Tensor
 
 from edge_depth_nerf.base.files import read_distance_png, read_image, write_png
 from edge_depth_nerf.compare.figures import ANGLE_EDGES_DEG, DISTANCE_EDGES_M, BinnedErrors, affine_fitted
+from edge_depth_nerf.method.edges import EdgeRecall, depth_edges_found, picture_edges_found
 from edge_depth_nerf.method.metrics import LEAST_SQUARED_ERROR, DepthErrors, masked_lpips, masked_psnr, masked_ssim
 from edge_depth_nerf.plugin.dataset import FisheyeDepthDataset
 from edge_depth_nerf.plugin.detail import detail_shown
@@ -85,6 +86,11 @@ def _chosen(
     return [ChosenPixels(torch.cat([torch.full((len(at), 1), view), at], dim=1), known)] if len(at) else []
 
 
+def main_views(dataset: FisheyeDepthDataset) -> list[int]:
+    """Give the numbers of the views of cameras that are trained on; of all, if no such camera has any."""
+    return [each for each in range(len(dataset)) if each not in dataset.of_held_out_cameras] or [*range(len(dataset))]
+
+
 def choose_pixels(
     dataset: FisheyeDepthDataset,
     per_view: int = PIXELS_PER_VIEW,
@@ -94,12 +100,13 @@ def choose_pixels(
     """Choose random pixels inside the masks of a split's views; always the same ones.
 
     At most `per_view` of a view and `most` of all, of `most_views` spread evenly; None: of every view. A view that its
-    mask hides has none.
+    mask hides has none. Views of cameras that are held out as a whole are chosen only if there are no others.
     """
     generator = torch.Generator().manual_seed(0)
-    count = len(dataset) if most_views is None else min(len(dataset), most_views)
+    views = main_views(dataset)
+    count = len(views) if most_views is None else min(len(views), most_views)
     chosen = []
-    for view in (len(dataset) * (2 * number + 1) // (2 * count) for number in range(count)):
+    for view in (views[len(views) * (2 * number + 1) // (2 * count)] for number in range(count)):
         item = dataset[view]
         maps = {name: item.get(name) for name in (*COLOURS.values(), *DISTANCES.values())}
         chosen += _chosen(view, item["mask"][..., 0], min(per_view, most // count), generator, maps)
@@ -212,16 +219,21 @@ class ViewEvaluator:
         """Evaluate all held-out views; colours and distance of each are saved in a folder, as `ns-eval` names them.
 
         Returns:
-            The figures of `ns-eval` and, under affine_… and truth_affine_…, those after a colour fit; and the bins
-            by_angle_deg and by_distance_m, against ground truth where it is known, else against picture and LiDAR.
+            The figures of `ns-eval` and, under affine_… and truth_affine_…, those after a colour fit; edge_recall and
+            so on; under camera_… the same of the cameras that are held out as a whole, which the others leave out
+            unless these are all; and the bins by_angle_deg and by_distance_m, against ground truth where it is known,
+            else against picture and LiDAR.
         """
         dataset = self.pipeline.datamanager.eval_dataset
         by_angle, by_distance = BinnedErrors(ANGLE_EDGES_DEG), BinnedErrors(DISTANCE_EDGES_M)
 
+        def save(view: EvaluatedView, outputs: dict[str, Tensor], images: dict[str, Tensor]) -> None:
+            for name in ("img", "distance"):
+                _save(images[name], folder / f"eval_{name}_{view.number:04d}.png")
+
         def look(view: EvaluatedView, outputs: dict[str, Tensor], images: dict[str, Tensor]) -> None:
             number, batch = view.number, view.batch
-            for name in ("img", "distance"):
-                _save(images[name], folder / f"eval_{name}_{number:04d}.png")
+            save(view, outputs, images)
             rgb = outputs["rgb"].clamp(0, 1).cpu()
             distance_m = outputs["depth"][..., 0].cpu() * self.model.metres_per_unit
             mask = batch["mask"][..., 0].cpu()
@@ -233,7 +245,12 @@ class ViewEvaluator:
             if true_m is not None:
                 by_distance.update(true_m, mask, rgb, target, distance_m, true_m)
 
-        figures = self._mean(self._held_out_views(), look)
+        main, beside = main_views(dataset), dataset.of_held_out_cameras
+        figures = self._mean(self._held_out_views(main), look)
+        if beside:
+            # they were evaluated above if there are no others
+            of_cameras = figures if {*main} == beside else self._mean(self._held_out_views(beside), save)
+            figures |= {f"camera_{name}": value for name, value in of_cameras.items()}
         return figures, {"by_angle_deg": by_angle.compute(), "by_distance_m": by_distance.compute()}
 
     def with_detail(
@@ -252,12 +269,13 @@ class ViewEvaluator:
             _save(outputs["rgb"], folder / f"eval_detail_{view.number:04d}.png")
 
         with detail_shown(True):
-            found = self._mean(self._held_out_views(), look) | self.shifted(beside or {})
+            main = main_views(self.pipeline.datamanager.eval_dataset)
+            found = self._mean(self._held_out_views(main), look) | self.shifted(beside or {})
         return {f"detail_{name}": value for name, value in found.items() if "masked_" in name}
 
-    def _held_out_views(self) -> Iterator[EvaluatedView]:
-        loader = self.pipeline.datamanager.fixed_indices_eval_dataloader
-        return (EvaluatedView(number, camera, batch) for number, (camera, batch) in enumerate(loader))
+    def _held_out_views(self, wanted: Collection[int]) -> Iterator[EvaluatedView]:
+        loader = enumerate(self.pipeline.datamanager.fixed_indices_eval_dataloader)
+        return (EvaluatedView(number, camera, batch) for number, (camera, batch) in loader if number in wanted)
 
     def shifted(self, views: dict[str, list[Callable[[], EvaluatedView]]]) -> dict[str, float]:
         """Evaluate views beside the path against their ground truth, inside the mask: shifted_1m_masked_psnr etc.
@@ -266,17 +284,17 @@ class ViewEvaluator:
         """
         figures: dict[str, float] = {}
         for metres, chosen in views.items():
-            found, errors = [], DepthErrors()
+            found, errors, edges = [], DepthErrors(), EdgeRecall()
             with evaluated(self.model):
                 for view in (load() for load in chosen):
-                    found.append(self._inside_mask(view, errors))
+                    found.append(self._inside_mask(view, errors, edges))
                     self.on_view()
-            pooled = errors.compute("truth_")
+            pooled = errors.compute("truth_") | edges.compute()
             figures |= {f"shifted_{metres}m_{name}": value for name, value in {**_means(found), **pooled}.items()}
         return figures
 
-    def _inside_mask(self, view: EvaluatedView, errors: DepthErrors) -> dict[str, float]:
-        """Render the pixels of a view inside its mask; its figures there, and its distances added to `errors`."""
+    def _inside_mask(self, view: EvaluatedView, errors: DepthErrors, edges: EdgeRecall) -> dict[str, float]:
+        """Render the pixels of a view inside its mask; its figures there, and what is pooled added to the others."""
         model, mask, target = self.model, view.batch["mask"][..., 0].cpu(), view.batch["image"][..., :3].cpu()
         rgb, distance_m = torch.zeros(*mask.shape, 3), torch.zeros(mask.shape)
         # as a picture of one row
@@ -284,11 +302,15 @@ class ViewEvaluator:
         outputs = model.get_outputs_for_camera_ray_bundle(rays)
         rgb[mask] = outputs["rgb"][0].cpu().clamp(0, 1)
         distance_m[mask] = outputs["depth"][0, :, 0].cpu() * model.metres_per_unit
-        errors.update(distance_m, view.batch["truth_distance_m"][..., 0].cpu(), mask)
+        true_m = view.batch["truth_distance_m"][..., 0].cpu()
+        errors.update(distance_m, true_m, mask)
+        fitted = affine_fitted(rgb, target, mask)
+        edges.update("edge_recall", picture_edges_found(fitted, target, mask))
+        edges.update("truth_depth_edge_recall", depth_edges_found(distance_m, true_m, mask))
         figures = {
             "masked_psnr": float(masked_psnr(rgb, target, mask)),
             "masked_ssim": float(masked_ssim(rgb, target, mask)),
-            "affine_masked_psnr": float(masked_psnr(affine_fitted(rgb, target, mask), target, mask)),
+            "affine_masked_psnr": float(masked_psnr(fitted, target, mask)),
         }
         lpips = model.lpips.load(model.device)
         if lpips is not None:
@@ -297,8 +319,11 @@ class ViewEvaluator:
         return figures
 
     def _mean(self, views: Iterator[EvaluatedView], look: Callable[..., None]) -> dict[str, float]:
-        """Means over views of the model's own figures and of those after a colour fit; depth errors are pooled."""
-        model, found = self.model, []
+        """Means over views of the model's own figures and of those after a colour fit.
+
+        Depth errors and edges are pooled.
+        """
+        model, found, edges = self.model, [], EdgeRecall()
         model.evaluation.reset()
         with evaluated(model):
             for view in views:
@@ -311,10 +336,16 @@ class ViewEvaluator:
                         target = view.batch[key][..., :3].cpu()
                         fitted = affine_fitted(rgb, target, mask)
                         figures[f"{prefix}affine_masked_psnr"] = float(masked_psnr(fitted, target, mask))
+                        edges.update(f"{prefix}edge_recall", picture_edges_found(fitted, target, mask))
+                distance_m = outputs["depth"][..., 0].cpu() * model.metres_per_unit
+                for name in ("lidar", "truth"):
+                    if (true_m := view.batch.get(DISTANCES[name])) is not None:
+                        known = depth_edges_found(distance_m, true_m[..., 0].cpu(), mask)
+                        edges.update(f"{name}_depth_edge_recall", known)
                 look(view, outputs, images)
                 found.append(figures)
                 self.on_view()
-        return _means(found) | model.evaluation.pooled()
+        return _means(found) | model.evaluation.pooled() | edges.compute()
 
 
 def _save(colours: Tensor, path: Path) -> None:

@@ -201,6 +201,41 @@ def _geometry_table(results: Results, where: str, scenes: Sequence[str]) -> Made
     return _table(results, f"5, {where}", "Pictures and geometry", scenes, list(map(_column, metrics)), note)
 
 
+def _edges_table(results: Results, where: str, scenes: Sequence[str]) -> MadeTable:
+    """Edges beside PSNR: on the path, beside it, and of cameras that are held out."""
+    truth = "truth_" if psnr_metric(results) is TRUE_PSNR else ""
+    depth_edges = f"{'truth' if truth else 'lidar'}_depth_edge_recall"
+    figures = {name for run in results.runs for name in run.figures}
+    shifts = sorted(
+        {name.split("_")[1] for name in figures if name.startswith("shifted_")}, key=lambda m: float(m[:-1])
+    )
+    groups = []
+    for title, form, on_path, beside in (
+        ("PSNR ↑", ".2f", f"{truth}masked_psnr", "masked_psnr"),
+        ("edges ↑", ".3f", f"{truth}edge_recall", "edge_recall"),
+        ("depth edges ↑", ".3f", depth_edges, "truth_depth_edge_recall"),
+    ):
+        further = [Metric(f"shifted_{shift}_{beside}", f"{shift[:-1]} m", form) for shift in shifts]
+        groups.append((title, [Metric(on_path, "0 m", form), *further]))
+    of_cameras = [
+        Metric(f"camera_{truth}affine_masked_psnr", "PSNR, fitted ↑", ".2f"),
+        Metric(f"camera_{truth}edge_recall", "edges ↑", ".3f"),
+        Metric(f"camera_{depth_edges}", "depth edges ↑", ".3f"),
+    ]
+    groups.append(("held-out cameras", of_cameras))
+    groups = [(title, [metric for metric in metrics if metric.name in figures]) for title, metrics in groups]
+    columns = [_column(metric) for _, metrics in groups for metric in metrics]
+    note = (
+        "Metres to the left of the path. Edges: the share of the picture's edges that the view has within two pixels, "
+        f"in the same direction. Depth edges: the same of {'the ground truth' if truth else 'the held-out LiDAR'}."
+    )
+    if groups[-1][1]:
+        note += " Held-out cameras: training saw no picture of them; PSNR is after the colour fit."
+    made = _table(results, f"9, {where}", "Edges, and views beside the path", scenes, columns, note)
+    made.groups = [(title, [metric.heading for metric in metrics]) for title, metrics in groups if metrics]
+    return made
+
+
 def _time_table(results: Results, where: str, scenes: Sequence[str]) -> MadeTable:
     """Seconds, and the PSNR that they bring."""
     name, clock = curve_metric(results), clock_metric(results)
@@ -308,9 +343,12 @@ def make_tables(results: Results) -> list[MadeTable]:
             tables.append(made)
     # the average stands for its drives, which the page folds away
     *drives, first = means_over(everywhere)
+    has_edges = any(name.endswith("edge_recall") for run in results.runs for name in run.figures)
     for where, scenes in (first, *drives):
-        for make in (_geometry_table, _time_table):
-            tables.append(replace(make(results, where, scenes), on_terminal=where == first[0]))
+        for make in (_geometry_table, _time_table, *([_edges_table] if has_edges else [])):
+            # of many columns a terminal shows nothing
+            fits = where == first[0] and make is not _edges_table
+            tables.append(replace(make(results, where, scenes), on_terminal=fits))
     return [*tables, _settings_table(results)]
 
 

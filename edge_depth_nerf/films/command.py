@@ -21,7 +21,7 @@ from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.cameras import KannalaBrandt, Pinhole
 from edge_depth_nerf.films.options import LARGEST_PX, CameraPathOptions
 from edge_depth_nerf.films.paths import CameraPath, lane_shift, orbit, replay, up_of
-from edge_depth_nerf.films.placed import placed, poses_of
+from edge_depth_nerf.films.placed import outside, placed, poses_of
 from edge_depth_nerf.plugin.compat import quiet_host
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
 
@@ -92,6 +92,8 @@ def write_camera_path(options: CameraPathOptions, console: Console | None = None
     beside = options.load_config.parent
     output = options.output or beside / "camera_paths" / f"{options.kind}_{options.camera}.json"
     write_json(output, path_file(to_model.poses(poses), lens, options, fps))
+    if warning := outside(poses, scene):
+        say(console, warning, "yellow")
     say(console, f"{where}: {frames} pictures of {lens.width}×{lens.height}, {frames / fps:.1f} s at {fps:g} a second.")
     say(console, f"Path: {output}\nThe film:")
     config = str(options.load_config)

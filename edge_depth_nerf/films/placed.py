@@ -9,14 +9,17 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
+from scipy.spatial import KDTree
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import read_json_object
+from edge_depth_nerf.base.files import check_is_folder, read_json, read_json_object, write_json
 from edge_depth_nerf.films.training import read_dataparser
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
 
 SAVED_TRANSFORM = "dataparser_transforms.json"
 """A file beside config.yml. It contains the scene's transform at the time of the training."""
+OUTSIDE_M = 10.0
+"""A message warns of a path that is further from the drive than this."""
 SAME_PLACE = 1e-3
 """Largest difference of a camera's position between the path and the training, in scene units."""
 
@@ -44,6 +47,43 @@ def poses_of(pictures: Sequence[ScenePicture]) -> Float64[np.ndarray, "n 4 4"]:
     poses[:, :3, :3] = [picture.rotation for picture in pictures]
     poses[:, :3, 3] = [picture.position_m for picture in pictures]
     return poses
+
+
+def world_offset_m(scene: SceneFolder) -> Float64[np.ndarray, "3"]:
+    """Give the scene's origin in the recording's world."""
+    return np.array(scene.meta.get("world_offset_m", [0.0, 0.0, 0.0]), np.float64)
+
+
+def outside(poses: Float64[np.ndarray, "n 4 4"], scene: SceneFolder) -> str | None:
+    """Warn of poses in the scene that are far from where anything was recorded; None if there are none."""
+    driven = np.stack([picture.position_m for picture in scene.pictures])
+    away_m = KDTree(driven).query(poses[:, :3, 3])[0]
+    if not (away_m > OUTSIDE_M).any():
+        return None
+    return (
+        f"{int((away_m > OUTSIDE_M).sum())} of {len(poses)} poses of the path are more than {OUTSIDE_M:g} m from the "
+        f"drive, the furthest {away_m.max():.0f} m: nothing was recorded there, and what is rendered may be anything."
+    )
+
+
+def open_folder(output: Path, record_path: Path, record: dict[str, Any], what: str) -> None:
+    """Begin a folder of rendered files, or continue one with the same record.
+
+    Raises:
+        InputError: it has another record, or something else.
+    """
+    check_is_folder(output)
+    if record_path.is_file():
+        there = read_json(record_path)
+        differing = [key for key in record if not isinstance(there, dict) or there.get(key) != record[key]]
+        if differing:
+            raise InputError(
+                f"{output}: holds other {what} ({differing[0]} differs). Give another --output, or delete that folder."
+            )
+    elif output.is_dir() and any(output.iterdir()):
+        raise InputError(f"{output}: holds something else. Give another --output, or empty that folder.")
+    else:
+        write_json(record_path, record)
 
 
 def placed(load_config: Path, moved_to: Path | None) -> tuple[SceneFolder, SceneToModel]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -14,12 +13,12 @@ from scipy.spatial.transform import Rotation
 from edge_depth_nerf import __version__
 from edge_depth_nerf.base.console import progress_bars, say
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import check_is_folder, read_json, write_json, write_text
+from edge_depth_nerf.base.files import write_json, write_text
 from edge_depth_nerf.films.paths import CameraPath, lane_shift
-from edge_depth_nerf.films.placed import placed
+from edge_depth_nerf.films.placed import open_folder, outside, placed, world_offset_m
 from edge_depth_nerf.films.scan_files import Scan, write_scan
 from edge_depth_nerf.films.scan_options import RenderLidarOptions
-from edge_depth_nerf.films.scanning import Caster, RayDrop, evaluate, learn_ray_drop, recorded_pattern
+from edge_depth_nerf.films.scanning import Caster, RayDrop, evaluate, learn_ray_drop, load_model, recorded_pattern
 from edge_depth_nerf.lidar.patterns import SENSORS, TEN_TURNS, ScanPattern, pattern_of_scan, rings_of
 from edge_depth_nerf.lidar.scans import ScanFormat, read_scan
 from edge_depth_nerf.lidar.trajectory import Trajectory
@@ -29,8 +28,6 @@ from edge_depth_nerf.scene.reader import SceneFolder
 from edge_depth_nerf.scene.sweeps import SceneScanner, scanners_of
 
 RECORD, POSES, FIGURES = "scans.json", "poses.txt", "figures.json"
-OUTSIDE_M = 10.0
-"""Of a path further from the drive than this a message warns."""
 UP = np.array([0.0, 0.0, 1.0])
 _WORDS = {"sweeps": "Held-out sweeps", "beams": "Held-out beams"}
 
@@ -57,7 +54,9 @@ def render_lidar(options: RenderLidarOptions, console: Console | None = None) ->
     scanner = _scanner(scene, options)
     recorded = None if scanner is None else recorded_pattern(scanner)
     pattern = _pattern(options, scanner, recorded)
-    times_s, poses = _path(options, scene, scanner, console)
+    times_s, poses = _path(options, scene, scanner)
+    if warning := outside(poses, scene):
+        say(console, warning, "yellow")
     record = {
         "made_by": f"edge-depth-nerf {__version__}",
         "scene": str(scene.path),
@@ -65,9 +64,9 @@ def render_lidar(options: RenderLidarOptions, console: Console | None = None) ->
         **{name: getattr(options, name) for name in ("sensor", "path", "shift_m", "every", "form")},
         "scanner": None if scanner is None else scanner.name,
     }
-    _open(output, record)
+    open_folder(output, output / RECORD, record, "scans")
     with console.status("Loading the model …"), quiet_host():
-        caster = Caster(_model(options.load_config, scene.path), to_model)
+        caster = Caster(load_model(options.load_config, scene.path), to_model)
     ray_drop = RayDrop()
     if scanner is not None and recorded is not None:
         with console.status("Learning which rays come back"):
@@ -128,7 +127,7 @@ def _pattern(options: RenderLidarOptions, scanner: SceneScanner | None, recorded
 
 
 def _path(
-    options: RenderLidarOptions, scene: SceneFolder, scanner: SceneScanner | None, console: Console
+    options: RenderLidarOptions, scene: SceneFolder, scanner: SceneScanner | None
 ) -> tuple[Float64[np.ndarray, "scans"], Float64[np.ndarray, "scans 4 4"]]:
     """Give times of scans, and poses, scanner to scene."""
     if options.path in ("recorded", "lane-shift"):
@@ -144,48 +143,8 @@ def _path(
     if len(times_s) < 2:
         raise InputError(f"{options.path}: {len(times_s)} poses, expected at least two: scans need the motion.")
     poses = poses.copy()
-    poses[:, :3, 3] -= np.array(scene.meta.get("world_offset_m", [0.0, 0.0, 0.0]), np.float64)
-    driven = np.stack([picture.position_m for picture in scene.pictures])
-    away_m = np.array([np.linalg.norm(driven - pose[:3, 3], axis=1).min() for pose in poses])
-    if (away_m > OUTSIDE_M).any():
-        say(
-            console,
-            f"{options.path}: {int((away_m > OUTSIDE_M).sum())} of {len(poses)} poses lie more than {OUTSIDE_M:g} m "
-            f"from the drive, the furthest {away_m.max():.0f} m: nothing was recorded there, and what is rendered may "
-            "be anything.",
-            "yellow",
-        )
+    poses[:, :3, 3] -= world_offset_m(scene)
     return times_s, poses
-
-
-def _open(output: Path, record: dict[str, Any]) -> None:
-    """Begin the folder, or continue one that has the same scans."""
-    check_is_folder(output)
-    path = output / RECORD
-    if path.is_file():
-        there = read_json(path)
-        differing = [key for key in record if not isinstance(there, dict) or there.get(key) != record[key]]
-        if differing:
-            raise InputError(
-                f"{output}: holds other scans ({differing[0]} differs). Give another --output, or delete that folder."
-            )
-    elif output.is_dir() and any(output.iterdir()):
-        raise InputError(f"{output}: holds something else. Give another --output, or empty that folder.")
-    else:
-        write_json(path, record)
-
-
-def _model(load_config: Path, scene: Path) -> Any:
-    """Load a training's model, as nerfstudio does."""
-    from nerfstudio.utils.eval_utils import eval_setup
-
-    def of_scene(config: Any) -> Any:
-        config.pipeline.datamanager.data = scene
-        config.pipeline.datamanager.dataparser.data = scene
-        return config
-
-    _, pipeline, _, _ = eval_setup(load_config, test_mode="inference", update_config_callback=of_scene)
-    return pipeline.model
 
 
 def _render(
@@ -219,7 +178,7 @@ def _render(
 def _write_poses(
     path: Path, scene: SceneFolder, times_s: Float64[np.ndarray, "scans"], poses: Float64[np.ndarray, "scans 4 4"]
 ) -> None:
-    places = poses[:, :3, 3] + np.array(scene.meta.get("world_offset_m", [0.0, 0.0, 0.0]), np.float64)
+    places = poses[:, :3, 3] + world_offset_m(scene)
     turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
     lines = [
         " ".join(f"{value:.9f}" for value in (time_s, *place, *turn))

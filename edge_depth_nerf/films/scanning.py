@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,21 @@ class Cast:
     """Where half of the light that is stopped is stopped."""
     hit: Float32[np.ndarray, "*rays"]
     """The share of the light that is stopped, 0 to 1."""
+    rgb: Float32[np.ndarray, "*rays 3"] | None = None
+    """Colours, 0 to 1, where the model renders any."""
+
+
+def load_model(load_config: Path, scene: Path) -> Any:
+    """Load a training's model, as nerfstudio does."""
+    from nerfstudio.utils.eval_utils import eval_setup
+
+    def of_scene(config: Any) -> Any:
+        config.pipeline.datamanager.data = scene
+        config.pipeline.datamanager.dataparser.data = scene
+        return config
+
+    _, pipeline, _, _ = eval_setup(load_config, test_mode="inference", update_config_callback=of_scene)
+    return pipeline.model
 
 
 class Caster:
@@ -47,8 +63,17 @@ class Caster:
         self._model, self._to_model = model, to_model
 
     @torch.no_grad()
-    def cast(self, origin_m: Float[np.ndarray, "*rays 3"], direction: Float[np.ndarray, "*rays 3"]) -> Cast:
-        """Cast rays from places in the scene (metres) along unit vectors in the scene."""
+    def cast(
+        self,
+        origin_m: Float[np.ndarray, "*rays 3"],
+        direction: Float[np.ndarray, "*rays 3"],
+        reach_m: float | None = None,
+    ) -> Cast:
+        """Cast rays from places in the scene (metres) along unit vectors in the scene.
+
+        They begin at the model's near plane and end at its far plane; with `reach_m` they begin at their origins, end
+        after so many metres, and meet no sky.
+        """
         shape = direction.shape[:-1]
         flat = [each.reshape(1, -1, 3) for each in (origin_m, direction)]
         place = self._to_model
@@ -58,10 +83,13 @@ class Caster:
         one = origins_.new_ones(*origins_.shape[:-1], 1)
         rays = RayBundle(origins_, directions, _PIXEL_AREA * one, torch.zeros_like(one, dtype=torch.long))
         rays.metadata = {"directions_norm": one}
+        if reach_m is not None:
+            rays.nears, rays.fars = torch.zeros_like(one), one * reach_m * place.units_per_metre
         outputs = self._model.get_outputs_for_camera_ray_bundle(rays)
         found = (outputs[name].reshape(shape).float().cpu().numpy() for name in ("depth", "accumulation"))
         depth, hit = found
-        return Cast(depth / np.float32(place.units_per_metre), hit)
+        rgb = outputs["rgb"].reshape(*shape, 3).float().cpu().numpy() if "rgb" in outputs else None
+        return Cast(depth / np.float32(place.units_per_metre), hit, rgb)
 
     def scan(self, pattern: ScanPattern, time_s: float, scanner: Trajectory) -> tuple[Cast, NDArray, NDArray]:
         """Cast all rays of a turn at `time_s` while the scanner moves.

@@ -107,8 +107,8 @@ def check_meta(meta: dict[str, Any], path: Path) -> list[dict[str, Any]]:
 def check_split(meta: dict[str, Any], path: Path) -> None:
     """Check the lists of training and held-out pictures.
 
-    A frame is either trained on or held out, with all its cameras: they share one LiDAR sweep. (A scene with nothing
-    held out has the same pictures in both lists.)
+    A frame is either trained on or held out, with all its cameras: they share one LiDAR sweep. Cameras that are held
+    out as a whole do not count. (A scene with nothing held out has the same pictures in both lists.)
 
     Raises:
         InputError: a name that is no picture's, or a frame that is in both.
@@ -121,11 +121,13 @@ def check_split(meta: dict[str, Any], path: Path) -> None:
             raise InputError(f"{path}: {split}_filenames names {unknown[0]}, which is the file_path of no frame.")
     if "train" not in lists:
         return
+    trained = {by_name[name].get("camera") for name in lists["train"]}
     for split in ("val", "test"):
         held_out = lists.get(split, [])
         if set(held_out) == set(lists["train"]):
             continue
-        of_split = [{by_name[name].get("frame", name) for name in names} for names in (lists["train"], held_out)]
+        of_trained = [name for name in held_out if by_name[name].get("camera") in trained]
+        of_split = [{by_name[name].get("frame", name) for name in names} for names in (lists["train"], of_trained)]
         shared = sorted(of_split[0] & of_split[1], key=str)
         if shared:
             raise InputError(

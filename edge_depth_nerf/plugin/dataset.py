@@ -47,6 +47,12 @@ class FisheyeDepthDataset(InputDataset):
             )
         # not for the model, which gets what is left of the metadata
         self.scene, self.pictures = self.metadata.pop("scene"), self.metadata.pop("pictures")
+        held_out = self.scene.held_out_cameras()
+        self.of_held_out_cameras = {
+            number for number, picture in enumerate(self.pictures) if picture.camera in held_out
+        }
+        """Numbers of the pictures whose whole camera is held out."""
+        self._trained_frames = {picture.frame for picture in self.scene.pictures if not picture.held_out}
 
     def camera(self, image_idx: int) -> Camera:
         """Give the lens of a picture, as one of the project's own camera models."""
@@ -93,7 +99,9 @@ class FisheyeDepthDataset(InputDataset):
         image_idx = data["image_idx"]
         found: dict[str, Tensor] = {}
         for layer in EVALUATED_DISTANCES:
-            distance_m = self.distance_m(image_idx, layer)
+            # a camera that is held out shares its sweeps with cameras that are trained on
+            shared = image_idx in self.of_held_out_cameras and self.pictures[image_idx].frame in self._trained_frames
+            distance_m = None if shared and layer == "lidar" else self.distance_m(image_idx, layer)
             if distance_m is not None:
                 found[f"{layer.removesuffix('_distance')}_distance_m"] = torch.from_numpy(distance_m)[..., None]
         picture = self.pictures[image_idx]

@@ -33,6 +33,8 @@ from edge_depth_nerf.masks.lens import lens_circle
 from edge_depth_nerf.masks.semantics import check_classes, keep_static, read_labels
 from edge_depth_nerf.masks.semantics import sky as sky_of_labels
 from edge_depth_nerf.masks.sky import find_sky
+from edge_depth_nerf.process.found_path import with_all_cameras
+from edge_depth_nerf.process.held_out import check_holdout_cameras, is_held_out, of_training_cameras
 from edge_depth_nerf.process.kept_sweeps import keep_sweeps
 from edge_depth_nerf.process.lidar_checks import LidarCheck, check_lidar
 from edge_depth_nerf.process.mask_checks import mask_warnings
@@ -90,6 +92,7 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
     options.check()
     check_classes(options.moving_classes)
     recording = with_given_masks(recording, options)
+    check_holdout_cameras(recording, options)
     _check_poses(recording, options)
     with console.status("Checking cameras and files …"):
         source = _source(recording, options)
@@ -104,6 +107,7 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
     notices: list[str] = []
     if options.find_ego:
         held_out = _held_out(recording, options)
+        # a camera that is held out needs a mask, too, which no other camera's pictures depend on
         training = [picture for picture in recording.pictures if picture.frame not in held_out]
         recording, notices = find_vehicle(recording, training, options, console)
     recording, said = _posed(recording, options, console)
@@ -126,7 +130,7 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
             camera_to_world=recording.pose(picture),
             content=partial(builder.content, picture),
             timestamp_s=picture.timestamp_s,
-            held_out=picture.frame in held_out,
+            held_out=is_held_out(picture, held_out, options),
             inputs=builder.inputs(picture),
         )
         for picture in recording.pictures
@@ -144,7 +148,7 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
         strict=options.strict,
         console=console,
     )
-    notices += _never_held_out(recording, held_out, options.holdout_every)
+    notices += _never_held_out(of_training_cameras(recording, options), held_out, options.holdout_every)
     if not report.held_out:
         notices.append(_none_held_out(len({picture.frame for picture in recording.pictures}), options.holdout_every))
     report = dataclasses.replace(
@@ -230,7 +234,8 @@ def _posed(recording: Recording, options: ProcessOptions, console: Console) -> t
     if options.poses == "colmap":
         from edge_depth_nerf.process.colmap.poses import colmap_poses
 
-        recording = colmap_poses(recording, options, console)
+        found = colmap_poses(of_training_cameras(recording, options), options, console)
+        recording = found if found.cameras == recording.cameras else with_all_cameras(found, recording)
         notices = lidar_says(recording, options.output, console)
     elif options.poses == "lidar":
         notices = features_say(recording, options, console)
@@ -306,7 +311,7 @@ class _Builder:
         """Write down the poses that were found, and what is held out by them: other ones make other maps."""
         path = self._options.output / FOUND_POSES
         pictures, pose = self._recording.pictures, self._recording.pose
-        poses = [[p.camera, p.frame, p.frame in self._held_out, pose(p).tolist()] for p in pictures]
+        poses = [[p.camera, p.frame, self._is_held_out(p), pose(p).tolist()] for p in pictures]
         if not path.is_file() or read_json(path) != poses:
             write_json(path, poses)
         return path
@@ -334,8 +339,11 @@ class _Builder:
             beams=self._beams(picture, camera) if "beams" in self.layers else None,
             truth_distance=None if picture.truth_distance is None else load_distance(picture.truth_distance, factor),
             truth_rgb=None if picture.truth_rgb is None else load_picture(picture.truth_rgb, factor),
-            cloud=None if picture.frame in self._held_out else cloud,
+            cloud=None if self._is_held_out(picture) else cloud,
         )
+
+    def _is_held_out(self, picture: RecordedPicture) -> bool:
+        return is_held_out(picture, self._held_out, self._options)
 
     def _mask(
         self, picture: RecordedPicture, labels: UInt8[np.ndarray, "h w"] | None, camera: Camera
@@ -514,6 +522,7 @@ def _source(recording: Recording, options: ProcessOptions) -> dict[str, Any]:
         **({"mono_trained_on": "elsewhere"} if any(picture.mono for picture in recording.pictures) else {}),
         **{name: getattr(options, name) for name in ("sky", "theta_max_deg", "holdout_every")},
         **({"holdout_beams": options.holdout_beams} if options.holdout_beams else {}),
+        **({"holdout_cameras": sorted(options.holdout_cameras)} if options.holdout_cameras else {}),
         WHOLE: whole_sha256,
         INPUTS: digest.hexdigest(),
         **({INCOMPLETE: True} if recording.left_out else {}),

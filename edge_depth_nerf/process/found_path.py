@@ -50,6 +50,17 @@ def with_path(
     )
 
 
+def with_all_cameras(found: Recording, whole: Recording) -> Recording:
+    """Give a recording whose poses were found by some of its cameras the pictures of the others, of the same frames."""
+    assert found.trajectory is not None
+    reasons = {item.frame: item.reason for item in found.skipped}
+    frames = {picture.frame for picture in found.pictures}
+    every = with_path(
+        whole, found.trajectory, lambda p: None if p.frame in frames else reasons.get(p.frame, "no pose was found")
+    )
+    return dataclasses.replace(found, cameras=whole.cameras, pictures=every.pictures, skipped=every.skipped)
+
+
 def path_length_m(trajectory: Trajectory) -> float:
     """How far it is along a path, from pose to pose."""
     return float(np.linalg.norm(np.diff(trajectory.vehicle_to_world[:, :3, 3], axis=0), axis=-1).sum())

@@ -35,6 +35,8 @@ class ProcessOptions:
     """Average blocks of this many pixels by this many into one."""
     holdout_every: int = 8
     """Hold out one frame in this many, for all cameras; 0 holds out none."""
+    holdout_cameras: tuple[str, ...] = ()
+    """Hold out all pictures of these cameras, to evaluate views beside the path."""
     holdout_beams: int = 0
     """Hold out one band of elevation (0.4°) in this many, to evaluate with; 0 holds out none."""
     theta_max_deg: float = 95.0

@@ -153,6 +153,11 @@ class SceneFolder:
         names = dict.fromkeys(picture.camera for picture in self.pictures)
         return {name: tuple(picture for picture in self.pictures if picture.camera == name) for name in names}
 
+    def held_out_cameras(self) -> set[str]:
+        """The cameras none of whose pictures is for training."""
+        every = self.cameras().items()
+        return {name for name, pictures in every if self.split_known and all(each.held_out for each in pictures)}
+
     def frames(self) -> list[int]:
         """The numbers of all frames that any camera has, in order."""
         return sorted({picture.frame for picture in self.pictures})

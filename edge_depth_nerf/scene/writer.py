@@ -149,7 +149,7 @@ class SceneFrame:
 class ShiftedView:
     """A true view from beside the path; fields as of a `SceneFrame`."""
 
-    metres: int
+    metres: float
     """How far from the path."""
     camera: str
     frame: int
@@ -563,7 +563,7 @@ def _frame_files(frame: SceneFrame, layers: Collection[str]) -> dict[str, str]:
 
 
 def _shifted_files(view: ShiftedView) -> tuple[str, str]:
-    folder = f"truth/{{camera}}/shifted_{view.metres}m"
+    folder = f"truth/{{camera}}/shifted_{view.metres:g}m"
     return (_file(f"{folder}/rgb", view.camera, view.frame), _file(f"{folder}/distance", view.camera, view.frame))
 
 
@@ -677,7 +677,7 @@ def _write_frame(
 
 def _write_shifted(output: Path, view: ShiftedView, camera: Camera) -> None:
     picture, distance = view.content()
-    where = f"frame {view.frame} of {view.camera}, shifted by {view.metres} m"
+    where = f"frame {view.frame} of {view.camera}, shifted by {view.metres:g} m"
     size = (camera.height, camera.width)
     picture_file, distance_file = _shifted_files(view)
     _write_map(output / picture_file, picture, size, where, distance=False)
@@ -794,7 +794,7 @@ def _transforms(
         ordered = sorted(shifted, key=lambda item: (item.metres, item.camera, item.frame))
         distances = sorted({item.metres for item in shifted})
         content["shifted_views"] = {
-            str(metres): [_shifted_entry(item, offset) for item in ordered if item.metres == metres]
+            f"{metres:g}": [_shifted_entry(item, offset) for item in ordered if item.metres == metres]
             for metres in distances
         }
     return content

@@ -44,7 +44,6 @@ from edge_depth_nerf.synthetic.rig_drive import RIG_FILE_LAYOUTS
 VERSION = 1
 """Version of what is synthesised: drives of different versions do not mix in one folder."""
 
-SHIFTS_M = (1, 2)
 """How far the held-out views are moved to the car's left."""
 
 _MANIFEST = "drive.json"
@@ -62,13 +61,14 @@ def held_out(frame: int) -> bool:
     return frame % 8 == 4
 
 
-_ONCE_ONLY = {"layout": "kitti-360"}
+_ONCE_ONLY: dict[str, Any] = {"layout": "kitti-360", "shifts_m": [1.0, 2.0]}
 """What is not written into a drive's options: there was no other choice once."""
 
 
 def _manifest(options: SynthesizeOptions) -> dict[str, Any]:
     fields = dataclasses.asdict(options)
     del fields["output"]
+    fields["shifts_m"] = [float(shift_m) for shift_m in options.shifts_m]
     fields = {name: value for name, value in fields.items() if _ONCE_ONLY.get(name) != value}
     fields |= {"speed_m_s": options.mean_speed_m_s, "sequence": options.sequence}
     return {
@@ -159,8 +159,9 @@ class _Kitti360(DriveLayout):
     def moving_mask(self, name: str, frame: int) -> Path | None:
         return self._truth / "moving_masks" / name / f"{frame:010d}.png" if self.options.has_movers else None
 
-    def shifted(self, name: str, frame: int) -> dict[int, tuple[Path, Path]]:
-        folders = {metres: self._truth / name / f"shifted_{metres}m" for metres in SHIFTS_M if held_out(frame)}
+    def shifted(self, name: str, frame: int) -> dict[float, tuple[Path, Path]]:
+        shifts_m = self.options.shifts_m if held_out(frame) else ()
+        folders = {metres: self._truth / name / f"shifted_{metres:g}m" for metres in shifts_m}
         file = f"{frame:010d}.png"
         return {metres: (folder / "rgb" / file, folder / "distance" / file) for metres, folder in folders.items()}
 
@@ -181,7 +182,7 @@ class _Kitti360(DriveLayout):
             for kind, mask in masks.items():
                 write_mask(self.root / "truth" / "masks" / f"{name}{kind}.png", mask)
         shifted = {
-            str(metres): {
+            f"{metres:g}": {
                 name: {
                     str(frame): (to_world @ self.camera_pose(name, frame * FRAME_INTERVAL_S, metres)).tolist()
                     for frame in frames
@@ -189,7 +190,7 @@ class _Kitti360(DriveLayout):
                 }
                 for name in self.cameras
             }
-            for metres in SHIFTS_M
+            for metres in self.options.shifts_m
         }
         write_json(self.last_file, shifted)
 

@@ -109,7 +109,7 @@ class DriveLayout(ABC):
         """Where a picture shows nothing that moves; None where the drive has none."""
         return None
 
-    def shifted(self, name: str, frame: int) -> dict[int, tuple[Path, Path]]:
+    def shifted(self, name: str, frame: int) -> dict[float, tuple[Path, Path]]:
         """Picture and distances as seen from some metres to the car's left; empty where the layout has none."""
         return {}
 
@@ -133,7 +133,7 @@ class DriveLayout(ABC):
     def write_once(self) -> None:
         """Write what does not belong to one frame: calibration, times, poses, masks."""
 
-    def camera_pose(self, name: str, time_s: float, to_the_left_m: int = 0) -> NDArray[np.float64]:
+    def camera_pose(self, name: str, time_s: float, to_the_left_m: float = 0.0) -> NDArray[np.float64]:
         """Camera to scene, 4×4, with the whole car moved to its left."""
         sideways = np.eye(4)
         sideways[1, 3] = -to_the_left_m

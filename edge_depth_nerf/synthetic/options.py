@@ -46,6 +46,9 @@ class SynthesizeOptions:
     """Seed of everything random. Same options, same bytes."""
     moving: tyro.conf.Suppress[int] = 0
     """Number of other cars that drive through the scene; their masks are written as truth/<sequence>/moving_masks."""
+    shifts_m: tuple[float, ...] = (1.0, 2.0)
+    """kitti-360: distances to the left of the path from which true views are rendered, of every eighth frame, metres;
+    negative to the right. `compare` evaluates methods by them."""
     layout: LayoutName = "kitti-360"
     """kitti-360: two fisheyes; jbnu-depth360: four fisheyes; rig: two fisheyes and a pinhole with a rig.toml."""
 
@@ -75,5 +78,8 @@ class SynthesizeOptions:
             raise InputError(f"--size {self.size}: expected {_SIZE_RANGE_PX[0]} to {_SIZE_RANGE_PX[1]} pixels.")
         if self.seed < 0:
             raise InputError(f"--seed {self.seed}: expected 0 or more.")
+        if not all(abs(shift_m) <= 99 and round(shift_m, 2) == shift_m for shift_m in self.shifts_m):
+            given = " ".join(map(str, self.shifts_m))
+            raise InputError(f"--shifts-m {given}: expected metres, -99 to 99, with at most two decimals.")
         if not 0 <= self.moving <= _MOVING_MAX:
             raise InputError(f"--moving {self.moving}: expected 0 to {_MOVING_MAX} driving cars.")

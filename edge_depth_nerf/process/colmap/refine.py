@@ -177,7 +177,7 @@ def _digest(
         [p.camera, p.frame, recording.pose(p).tolist(), *map(_stamp, (p.path, p.mask, p.semantics))]
         for p in recording.pictures
     ]
-    rest = [_VERSION, version, given.tolist(), options.theta_max_deg, options.moving_classes]
+    rest = [_VERSION, version, given.tolist(), options.theta_max_deg, options.moving_classes, *options.holdout_cameras]
     return hashlib.sha256(json.dumps([cameras, pictures, rest]).encode()).hexdigest()
 
 
@@ -242,7 +242,11 @@ def _match(
         )
         for picture, shot, pose in zip(recording.pictures, shots, _camera_poses(shots, given), strict=True)
     ]
-    pairs = _pairs(posed, shared_views(recording, lenses))
+    pairs = [
+        (one, other)
+        for one, other in _pairs(posed, shared_views(recording, lenses))
+        if not {posed[one].camera, posed[other].camera} & {*options.holdout_cameras}
+    ]
     found = []
     with progress_bars(console, counted=True) as progress:
         task = progress.add_task("Matching pictures", total=len(pairs))

@@ -180,8 +180,8 @@ def _shifted_views(drive: Kitti360Drive, rig: Kitti360Rig, taken: set[tuple[str,
             continue
         where = f"{path}: {metres} m, {name}, frame {frame}"
         # they become the name of a folder
-        if not re.fullmatch(r"-?[0-9]{1,3}", metres):
-            raise InputError(f"{where}: expected a whole number of metres. Synthesise the drive again.")
+        if not re.fullmatch(r"-?[0-9]{1,3}(\.[0-9]{1,2})?", metres):
+            raise InputError(f"{where}: expected a number of metres. Synthesise the drive again.")
         camera_to_world = transform_of_rows(matrix, where)
         folder = drive.truth / name / f"shifted_{metres}m"
         picture, distance = (folder / kind / f"{frame:010d}.png" for kind in ("rgb", "distance"))
@@ -189,7 +189,7 @@ def _shifted_views(drive: Kitti360Drive, rig: Kitti360Rig, taken: set[tuple[str,
         check_distance(distance, rig.cameras[name])
         views.append(
             ShiftedView(
-                metres=int(metres),
+                metres=float(metres),
                 camera=name,
                 frame=frame,
                 camera_to_world=camera_to_world,

@@ -1,0 +1,68 @@
+"""Which places of a trained scene its training pictures have seen."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64
+
+from edge_depth_nerf.films.scanning import Caster
+from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
+
+REACH_M = 25.0
+"""A picture from further away shows too little of the road."""
+TRIES = 3
+"""So many pictures, the nearest ones in which a place would be visible, are asked whether something hides it."""
+AGREE = 0.1
+AGREE_M = 0.3
+"""A place is seen if the field shows something at its distance from the camera, within this share and this length."""
+KEPT_MASKS = 64
+
+
+class TrainingViews:
+    """The training pictures of a scene, asked for what they see."""
+
+    def __init__(self, scene: SceneFolder, caster: Caster) -> None:
+        """Take a scene, and what casts rays into the model that was trained on it."""
+        self._caster = caster
+        self._pictures = [each for each in scene.pictures if not (scene.split_known and each.held_out)]
+        self._positions_m = np.stack([picture.position_m for picture in self._pictures])
+        self._usable = lru_cache(KEPT_MASKS)(lambda number: scene.usable(self._pictures[number]))
+
+    def see(self, points_m: Float64[np.ndarray, "points 3"]) -> Bool[np.ndarray, "points"]:
+        """Say which points a picture shows: inside its mask, and with nothing before them in the field."""
+        seen = np.zeros(len(points_m), bool)
+        if not len(points_m):
+            return seen
+        middle = points_m.mean(axis=0)
+        reach_m = REACH_M + np.linalg.norm(points_m - middle, axis=1).max()
+        numbers = np.flatnonzero(np.linalg.norm(self._positions_m - middle, axis=1) <= reach_m)
+        if not len(numbers):
+            return seen
+        distance_m = np.stack([self._distance_m(number, points_m) for number in numbers.tolist()])
+        order = np.argsort(distance_m, axis=0)[:TRIES]
+        for nearest in order:
+            away_m = distance_m[nearest, np.arange(len(points_m))]
+            asked = np.flatnonzero(~seen & np.isfinite(away_m))
+            if not len(asked):
+                break
+            origin_m = self._positions_m[numbers[nearest[asked]]]
+            cast = self._caster.cast(origin_m, (points_m[asked] - origin_m) / away_m[asked, None])
+            seen[asked] = np.abs(cast.distance_m - away_m[asked]) <= AGREE * away_m[asked] + AGREE_M
+        return seen
+
+    def _distance_m(self, number: int, points_m: Float64[np.ndarray, "points 3"]) -> Float64[np.ndarray, "points"]:
+        """Distances from a picture's camera to those points that lie inside its mask; infinite for the others."""
+        picture: ScenePicture = self._pictures[number]
+        ahead = points_m - picture.position_m
+        in_camera = torch.from_numpy(ahead @ picture.rotation * np.array([1.0, -1.0, -1.0]))
+        pixels, valid = picture.lens.project(in_camera)
+        inside = np.flatnonzero((valid & picture.lens.inside(pixels)).numpy())
+        column, row = pixels.numpy()[inside].astype(int).T
+        found = np.full(len(points_m), np.inf)
+        used = inside[self._usable(number)[row, column]]
+        away_m = np.linalg.norm(ahead[used], axis=1)
+        found[used] = np.where(away_m <= REACH_M, away_m, np.inf)
+        return found
