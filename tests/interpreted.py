@@ -46,8 +46,9 @@ def _in_a_process(checks: Sequence[Callable[[], None]], before: Sequence[str], v
     assert done.stdout.endswith(f"{DONE}\n"), done.stdout + done.stderr
 
 
-def assert_near(found: torch.Tensor, expected: torch.Tensor, tolerance: float) -> None:
+def assert_near(found: torch.Tensor | None, expected: torch.Tensor | None, tolerance: float) -> None:
     """Differences relative to the largest value, of which there is one; NaN only where NaN is expected."""
+    assert found is not None and expected is not None
     assert found.shape == expected.shape
     expected = expected.double()
     is_nan = expected.isnan()

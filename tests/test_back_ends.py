@@ -145,7 +145,9 @@ def check_that_trials_run_each_kernel() -> None:
     assert launched == {name for module in modules for name in vars(module) if name.endswith("_kernel")}
 
     # the others are known to be right
-    del back_ends._tried[DISTORTION_LOSS.on_gpu, CPU]
+    form = DISTORTION_LOSS.on_gpu
+    assert form is not None
+    del back_ends._tried[form, CPU]
     right = modules[2].distortion_loss
 
     def off(edges: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:

@@ -178,6 +178,7 @@ def test_scans_along_the_recorded_path_are_those_that_were_recorded(drive, train
     output = render_lidar(RenderLidarOptions(trained), QUIET)
     for frame in drive.frames:
         scan = read_scan(output / f"{frame:010d}.ply", TIMED)
+        assert scan.offset_s is not None
         points_m, offset_s = scan.points_m.numpy(), scan.offset_s.numpy()
         # each point is the wall's, seen from where the scanner was at the point's own time
         there = np.stack([drive.velo_to_world(frame + offset / 0.1) for offset in offset_s])

@@ -67,7 +67,8 @@ BINS_M = (6.0, 8.0, 10.0, 15.0, 20.0, 30.0, 50.0, 80.0)
 def lidar_map(path: Path, one_of: int) -> np.ndarray:
     """Distances of a sweep's rings, or of one of so many, in the picture."""
     sweep = read_sweep(path)
-    elevation = np.degrees(np.arctan2(sweep.points_m[:, 2], sweep.points_m[:, :2].norm(dim=-1)).numpy())
+    points = sweep.points_m.numpy()
+    elevation = np.degrees(np.arctan2(points[:, 2], np.linalg.norm(points[:, :2], axis=-1)))
     kept = torch.from_numpy(np.round((2 - elevation) / 26.8 * 63).astype(int) % one_of == 0)
     sweep = replace(sweep, points_m=sweep.points_m[kept], reflectance=sweep.reflectance[kept])
     still = Trajectory(np.array([0.0, 1.0]), np.tile(np.eye(4), (2, 1, 1)))
@@ -140,7 +141,7 @@ def evaluate(folder: Path, names: list[str], one_of: int) -> dict[str, dict[str,
         methods = {"LiDAR": (lidar, None), "network": (mono, None), "network, aligned": (aligned, None)}
         methods |= {"Eq. 5-7, literal": (literal.distance_m, None), "ours": (ours.distance_m, ours.sigma_m)}
         known = (truth > 0) & (truth < FARTHEST_M) & ~moving & (ours.distance_m > 0) & (mono > 0)
-        away, none = distance_transform_edt(lidar <= 0) > NEAR_PX, lidar <= 0
+        away, none = np.asarray(distance_transform_edt(lidar <= 0)) > NEAR_PX, lidar <= 0
         farthest = cv2.dilate(truth, np.ones((5, 5)))
         edge = farthest > EDGE * cv2.erode(np.where(truth > 0, truth, np.float32(1e6)), np.ones((5, 5)))
         regions = {"at LiDAR points": known & ~none, "near": known & none & ~away, "away": known & away}

@@ -457,6 +457,7 @@ def beside_torch(name: str, function: Any, given: dict[str, Any], settings: Sett
         kernel, formula = function.on(torch.device(settings.device)), function.on_gpu.formula
         if kernel is None and settings.fake:
             kernel = formula  # most have no form for the CPU
+        assert kernel is not None
         row["torch, µs"] = call_us(formula, given, settings)
         row["kernel, µs"] = call_us(kernel, given, settings)
         ours, host = outcome(kernel, whole), outcome(formula, whole)

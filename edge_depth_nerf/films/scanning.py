@@ -147,7 +147,7 @@ class RayDrop:
     @staticmethod
     def _features(cast: Cast) -> NDArray[np.float64]:
         hit, far = cast.hit.astype(np.float64), np.log(np.maximum(cast.distance_m, MIN_RANGE_M).astype(np.float64))
-        return np.stack([np.ones_like(hit), hit, far, far**2, hit * far], axis=-1)
+        return np.stack([np.ones_like(hit), hit, far, np.square(far), hit * far], axis=-1).astype(np.float64)
 
     @classmethod
     def learned(cls, cast: Cast, back: Bool[np.ndarray, "*rays"]) -> RayDrop:

@@ -158,8 +158,11 @@ def on_gpu(
     most_columns: int | None = None,
 ) -> GpuForm:
     """Make a kernel of Triton that is tried out on a function's examples of both sizes."""
-    odd, in_a_step = (partial(examples, sizes=sizes) for sizes in (ODD, STEP))
-    return GpuForm(title, load, formula, odd, tolerance, most_columns, in_a_step)
+
+    def of_size(sizes: Sizes) -> Callable[[torch.device], Sequence[Example]]:
+        return lambda device: examples(device, sizes)
+
+    return GpuForm(title, load, formula, of_size(ODD), tolerance, most_columns, of_size(STEP))
 
 
 HASH_GRID = Function(
