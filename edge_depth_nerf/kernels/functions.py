@@ -159,8 +159,11 @@ def on_gpu(
 ) -> GpuForm:
     """Make a kernel of Triton that is tried out on a function's examples of both sizes."""
 
-    def of_size(sizes: Sizes) -> Callable[[torch.device], Sequence[Example]]:
-        return lambda device: examples(device, sizes)
+    def of_size(usual: Sizes) -> Callable[[torch.device], Sequence[Example]]:
+        def made(device: torch.device, sizes: Sizes = usual) -> Sequence[Example]:
+            return examples(device, sizes)
+
+        return made
 
     return GpuForm(title, load, formula, of_size(ODD), tolerance, most_columns, of_size(STEP))
 
