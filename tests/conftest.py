@@ -1,5 +1,7 @@
 """Shared fixtures and options: which tests are fast, where real data may lie, no surprises from the machine."""
 
+import ast
+import gc
 import os
 import signal
 import subprocess
@@ -17,6 +19,21 @@ from packaging.version import Version
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 # where tests run in the background of a shell Ctrl-C is ignored, by whatever they start, too
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+if (3, 11) <= sys.version_info < (3, 11, 8):
+    parse = ast.parse
+
+    def parse_without_collection(*arguments: Any, **options: Any) -> Any:
+        """Parse while no finalizer can, which raises SystemError in these versions (their issue 106905)."""
+        collects = gc.isenabled()
+        gc.disable()
+        try:
+            return parse(*arguments, **options)
+        finally:
+            if collects:
+                gc.enable()
+
+    ast.parse = parse_without_collection
 
 # the last versions for Python 3.10 would wrap what Numba and Triton have to read
 if Version(version("jaxtyping")) < Version("0.3.11"):

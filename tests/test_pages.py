@@ -31,7 +31,6 @@ from edge_depth_nerf import cli
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, write_json
 from edge_depth_nerf.entry import DEBUG_OPTION
-from edge_depth_nerf.kernels.preparation import without_garbage_collection
 from edge_depth_nerf.method.depth_losses import Level
 
 ROOT = Path(__file__).parents[1]
@@ -154,8 +153,7 @@ def parse_by_host(program: str, arguments: list[str]) -> None:
     with mock.patch.object(sys, "argv", [program, *arguments]):
         mains = [patch.start() for patch in patched]
         try:
-            with without_garbage_collection():  # for help, tyro parses source; threads of other tests may live on
-                entry()
+            entry()
             assert sum(main.call_count for main in mains) == 1
         finally:
             mock.patch.stopall()

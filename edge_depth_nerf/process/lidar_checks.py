@@ -716,7 +716,9 @@ def _refined(source: _Source, best: _Candidate, given: dict[_View, _Fit], apart_
         if best.reading.finer is None:
             break
         amounts = [best.reading.amount + side * step for side in (1, -1)]
-        others = [replace(best, reading=best.reading.finer(amount)) for amount in amounts]
+        # what it has to gain stays that of its kind
+        kind = {"both": best.reading.both, "clear": best.reading.clear}
+        others = [replace(best, reading=replace(best.reading.finer(amount), **kind)) for amount in amounts]
         best = max([best, *(_tried(source, one, given, apart_m) for one in others)], key=lambda one: one.gain)
         step /= 2
     return best
