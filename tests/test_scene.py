@@ -291,7 +291,11 @@ def test_shifted_views_and_truth(tmp_path: Path) -> None:
         truth = {"truth_distance": np.full((SIZE, SIZE), 7.0), "truth_rgb": content(frame.frame, 9).image}
         given.append(replace(frame, content=replace(content(frame.frame), **truth)))
     view = ShiftedView(
-        2, "image_02", 4, pose(4) @ pose(1), lambda: (np.full((SIZE, SIZE, 3), 9, np.uint8), np.full((SIZE, SIZE), 3.0))
+        2.0,
+        "image_02",
+        4,
+        pose(4) @ pose(1),
+        lambda: (np.full((SIZE, SIZE, 3), 9, np.uint8), np.full((SIZE, SIZE), 3.0)),
     )
     write(tmp_path / "scene", given=given, layers=("lidar", "truth_distance", "truth_rgb"), shifted=[view])
     meta = read_json(tmp_path / "scene/transforms.json")
