@@ -409,10 +409,10 @@ def test_an_interrupted_run_continues(scene, form, tmp_path, monkeypatch):
 def test_other_options_or_another_state_of_the_scene_are_another_export(tmp_path):
     scene = write_ball_scene(tmp_path / "scene")
     output = export(scene, tmp_path / "out")
-    with pytest.raises(InputError, match=r"holds another export .views differs.. Give another --output"):
+    with pytest.raises(InputError, match=r"holds other exports .views differs.. Give another --output"):
         export(scene, output, views="pinhole")
     os.utime(scene / "mono/0000.png", ns=(1, 1))
-    with pytest.raises(InputError, match=r"holds another export .files_of_the_scene differs"):
+    with pytest.raises(InputError, match=r"holds other exports .files_of_the_scene differs"):
         export(scene, output)
 
 

@@ -18,7 +18,7 @@ from rich.console import Console
 from scenes import transforms, write_scene
 
 from edge_depth_nerf import cli
-from edge_depth_nerf.base.files import write_png
+from edge_depth_nerf.base.files import write_json, write_png
 from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.base.pictures import NO_VALUE_RGB, colour_distance, distance_of_colours
 from edge_depth_nerf.compare.methods import METHODS
@@ -163,7 +163,10 @@ def test_drives_are_read_from_what_runs_left(tmp_path):
     frames = held_out_frames(scene)
     assert [view.title for view in drive.views] == [frame["file_path"] for frame in frames]
     assert f"All {len(frames)} held-out views" in drive.note and "without noise" in drive.note
-    assert drive.points is None
+    assert drive.points is None and "Warning" not in drive.note
+    write_json(scene / "checks.json", {"figures": [], "warnings": ["roof is turned by 180°."]})
+    (drive,) = make_drives({"x": (scene, {"one": tmp_path / "one", "two": tmp_path / "two"})}, console)
+    assert drive.note.startswith("Warning of `process`: roof is turned by 180°. All ")
     for view in drive.views:
         one, two = (float(view.figures[name]["PSNR, dB"]) for name in ("one", "two"))
         assert one > two + 5

@@ -76,6 +76,11 @@ def moved(matrix: np.ndarray) -> Change:
     return with_sweeps(lambda sweep: replace(sweep, points_m=sweep.points_m @ torch.from_numpy(matrix).T))
 
 
+def beside(metres: float) -> Change:
+    """Points that lie further to the left: a scanner whose place is wrong."""
+    return with_sweeps(lambda sweep: replace(sweep, points_m=sweep.points_m + torch.tensor([0.0, metres, 0.0])))
+
+
 def turned(degrees: float) -> Change:
     return moved(Rotation.from_euler("z", degrees, degrees=True).as_matrix())
 
@@ -115,6 +120,7 @@ def test_a_good_drive_gives_no_warning(whole: Recording) -> None:
         (turned(5), "roof is turned by -5.0° about its z axis"),
         (moved(np.diag([1.0, -1, 1])), r"roof is given in other axes, where \(x, -y, z\) is x, y, z"),
         (moved(np.eye(3) * 3.28084), r"the points of roof in feet\? metres_per_unit = 0.3048"),
+        (beside(0.6), r"roof sits -0\.[4-7]\d m further along its y axis"),
         (
             pictures_later(0.1),
             r"the clock of (roof .* add 0\.(09|1[0-2])|right .* add -0\.(09|1[0-2])) to its time_offset_s",

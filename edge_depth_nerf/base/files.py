@@ -449,3 +449,23 @@ def read_npz(path: Path, names: Iterable[str], most_bytes: int) -> dict[str, NDA
     except (OSError, ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(f"{path}: cannot be read as arrays ({error}). Delete or make the file again.") from None
     return found
+
+
+def open_folder(output: Path, record_path: Path, record: dict[str, Any], what: str) -> None:
+    """Begin a folder that one command writes, or continue one with the same record of what it is made of.
+
+    Raises:
+        InputError: it has another record, or something else.
+    """
+    check_is_folder(output)
+    if record_path.is_file():
+        there = read_json(record_path)
+        differing = [key for key in record if not isinstance(there, dict) or there.get(key) != record[key]]
+        if differing:
+            raise InputError(
+                f"{output}: holds other {what} ({differing[0]} differs). Give another --output, or delete that folder."
+            )
+    elif output.is_dir() and any(output.iterdir()):
+        raise InputError(f"{output}: holds something else. Give another --output, or empty that folder.")
+    else:
+        write_json(record_path, record)

@@ -94,7 +94,7 @@ def part_of(
     first = first_in_voxel(points_m, voxel_m)
     row, column, outward, points_m = row[first], column[first], outward[first], points_m[first]
 
-    normals = _normals(distance_m, found.directions, row, column)
+    normals = normals_of(distance_m, found.directions, row, column, WINDOW_PX)
     seen = np.abs(np.sum(normals * outward, 1)) >= FLATTEST
     near = neighbours_of(picture, others)
     if near:
@@ -103,8 +103,12 @@ def part_of(
     return Cloud(points_m, colours, normals @ pose[:3, :3].T, sigma_m[row, column]).chosen(seen)
 
 
-def _normals(
-    distance_m: Float64[np.ndarray, "h w"], directions: Float32[np.ndarray, "h w 3"], row: NDArray, column: NDArray
+def normals_of(
+    distance_m: Float64[np.ndarray, "h w"],
+    directions: Float32[np.ndarray, "h w 3"],
+    row: NDArray,
+    column: NDArray,
+    window_px: int,
 ) -> Float64[np.ndarray, "points 3"]:
     """Fit planes to a map around some of its pixels; unit normals towards the camera, in its frame.
 
@@ -115,7 +119,7 @@ def _normals(
     u = directions.astype(np.float64)
 
     def summed(values: NDArray) -> NDArray:
-        size = (WINDOW_PX, WINDOW_PX)
+        size = (window_px, window_px)
         return cv2.boxFilter(values, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)[row, column]
 
     matrix, right = np.empty((len(row), 3, 3)), np.empty((len(row), 3))

@@ -18,7 +18,7 @@ from rich.console import Console
 from edge_depth_nerf import __version__
 from edge_depth_nerf.base.console import run_jobs, say
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import check_is_folder, read_json, remove_leftovers, write_bytes, write_json
+from edge_depth_nerf.base.files import open_folder, remove_leftovers, write_bytes
 from edge_depth_nerf.base.one_writer import only_writer
 from edge_depth_nerf.export.cloud import Cloud, cloud_rows, merge_parts, part_of, write_part
 from edge_depth_nerf.export.colmap_form import MODEL, write_model
@@ -57,7 +57,7 @@ def export_scene(options: ExportOptions, console: Console | None = None) -> Path
     if not any(not picture.held_out for picture in scene.pictures):
         raise InputError(f"{scene.path}: has no training picture, and the cloud is made of these. Check its split.")
     with only_writer(output, console):
-        _open(output, _record(options, scene))
+        open_folder(output, output / RECORD, _record(options, scene), "exports")
         if (output / LAST[options.form]).is_file():
             say(console, f"{output}: is complete already.")
         else:
@@ -85,28 +85,6 @@ def _record(options: ExportOptions, scene: SceneFolder) -> dict[str, Any]:
         **given,
         "world_offset_m": list(scene.meta.get("world_offset_m", [0.0, 0.0, 0.0])),
     }
-
-
-def _open(output: Path, record: dict[str, Any]) -> None:
-    """Begin the folder, or continue one that has the same record.
-
-    Raises:
-        InputError: the folder holds something else.
-    """
-    check_is_folder(output)
-    path = output / RECORD
-    if path.is_file():
-        there = read_json(path)
-        differing = [key for key in record if not isinstance(there, dict) or there.get(key) != record[key]]
-        if differing:
-            raise InputError(
-                f"{output}: holds another export ({differing[0]} differs). Give another --output, or delete that "
-                "folder."
-            )
-    elif output.is_dir() and any(output.iterdir()):
-        raise InputError(f"{output}: holds something else. Give another --output, or empty that folder.")
-    else:
-        write_json(path, record)
 
 
 def _write(output: Path, options: ExportOptions, scene: SceneFolder, priors: Priors, console: Console) -> None:

@@ -19,11 +19,11 @@ from rich.console import Console
 from edge_depth_nerf import __version__
 from edge_depth_nerf.base.console import progress_bars, say
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import read_npz, remove_leftovers, write_bytes, write_text
+from edge_depth_nerf.base.files import open_folder, read_npz, remove_leftovers, write_bytes, write_text
 from edge_depth_nerf.films.birds_eye_options import RANGES, BirdsEyeOptions
 from edge_depth_nerf.films.ground_plan import TILE_PX, GroundPlan, Tile, driven_path
 from edge_depth_nerf.films.paths import up_of
-from edge_depth_nerf.films.placed import open_folder, placed, world_offset_m
+from edge_depth_nerf.films.placed import placed, world_offset_m
 from edge_depth_nerf.films.scanning import HIT, Caster, load_model
 from edge_depth_nerf.films.seen import TrainingViews
 from edge_depth_nerf.jobs.runs import steps_done

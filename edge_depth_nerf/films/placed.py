@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from scipy.spatial import KDTree
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import check_is_folder, read_json, read_json_object, write_json
+from edge_depth_nerf.base.files import read_json_object
 from edge_depth_nerf.films.training import read_dataparser
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
 
@@ -64,26 +64,6 @@ def outside(poses: Float64[np.ndarray, "n 4 4"], scene: SceneFolder) -> str | No
         f"{int((away_m > OUTSIDE_M).sum())} of {len(poses)} poses of the path are more than {OUTSIDE_M:g} m from the "
         f"drive, the furthest {away_m.max():.0f} m: nothing was recorded there, and what is rendered may be anything."
     )
-
-
-def open_folder(output: Path, record_path: Path, record: dict[str, Any], what: str) -> None:
-    """Begin a folder of rendered files, or continue one with the same record.
-
-    Raises:
-        InputError: it has another record, or something else.
-    """
-    check_is_folder(output)
-    if record_path.is_file():
-        there = read_json(record_path)
-        differing = [key for key in record if not isinstance(there, dict) or there.get(key) != record[key]]
-        if differing:
-            raise InputError(
-                f"{output}: holds other {what} ({differing[0]} differs). Give another --output, or delete that folder."
-            )
-    elif output.is_dir() and any(output.iterdir()):
-        raise InputError(f"{output}: holds something else. Give another --output, or empty that folder.")
-    else:
-        write_json(record_path, record)
 
 
 def placed(load_config: Path, moved_to: Path | None) -> tuple[SceneFolder, SceneToModel]:

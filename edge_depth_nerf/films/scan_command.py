@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 from edge_depth_nerf import __version__
 from edge_depth_nerf.base.console import progress_bars, say
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import write_json, write_text
+from edge_depth_nerf.base.files import open_folder, write_json, write_text
 from edge_depth_nerf.films.paths import CameraPath, lane_shift
-from edge_depth_nerf.films.placed import open_folder, outside, placed, world_offset_m
+from edge_depth_nerf.films.placed import outside, placed, world_offset_m
 from edge_depth_nerf.films.scan_files import Scan, write_scan
 from edge_depth_nerf.films.scan_options import RenderLidarOptions
 from edge_depth_nerf.films.scanning import Caster, RayDrop, evaluate, learn_ray_drop, load_model, recorded_pattern

@@ -25,7 +25,7 @@ from edge_depth_nerf.inspecting.figures import (
     measured_frames,
     path_figures,
 )
-from edge_depth_nerf.inspecting.findings import checks_of, find, limited
+from edge_depth_nerf.inspecting.findings import find, limited
 from edge_depth_nerf.inspecting.options import InspectOptions
 from edge_depth_nerf.inspecting.pose_check import check_poses, known_steps, pose_figures
 from edge_depth_nerf.inspecting.sheets import draw_sheet
@@ -93,7 +93,7 @@ def inspect_scene(options: InspectOptions, console: Console | None = None) -> di
             name: {
                 **camera_figures(scene, name, figures),
                 "epipolar": pose_figures(agreements, name),
-                "lidar_fit": [one for one in checks_of(scene).get("figures", ()) if one["camera"] == name],
+                "lidar_fit": [one for one in scene.checks().get("figures", ()) if one["camera"] == name],
             }
             for name in scene.cameras()
         },

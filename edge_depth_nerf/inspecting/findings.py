@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from edge_depth_nerf.base.files import read_json
 from edge_depth_nerf.inspecting.figures import PictureFigures, Step, recorded, steps, usual_length_m
 from edge_depth_nerf.inspecting.pose_check import BAD_MEDIAN_PX, bad_steps, pose_figures
 from edge_depth_nerf.masks.ego_files import ego_mask_path, vehicles_unknown
 from edge_depth_nerf.poses.matches import EpipolarAgreement
-from edge_depth_nerf.scene.format import CHECKS, REFINED_POSES
+from edge_depth_nerf.scene.format import REFINED_POSES
 from edge_depth_nerf.scene.reader import SceneFolder
 from edge_depth_nerf.scene.writer import best_holdout
 
@@ -79,15 +77,8 @@ def _frames(numbers: Iterable[int]) -> str:
     return f"frame{'s' if len(listed) > 1 else ''} {some}{more}"
 
 
-def checks_of(scene: SceneFolder) -> dict[str, Any]:
-    """What `process` measured of LiDAR against the pictures; empty where it did not."""
-    path = scene.folder / CHECKS
-    content = read_json(path) if path.is_file() else {}
-    return content if isinstance(content, dict) else {}
-
-
 def _checks(scene: SceneFolder) -> Iterator[Finding]:
-    for said in checks_of(scene).get("warnings", ()):
+    for said in scene.checks().get("warnings", ()):
         yield Finding("recording", f"{said} Correct it and process the drive again.")
 
 

@@ -98,7 +98,7 @@ _TRIED_WHOLE = 8
 _LEAST_GAINS = (0.25, 0.01)
 """Of a small angle or shift, contrast must gain so much, and edges: on bare walls edges alone would fit by chance."""
 _REFINED = 3
-"""So many of these, the best, are refined."""
+"""So many of these, the best, are refined if they gain."""
 _UNSEEN = 0.01
 """A scanner of which a camera's pictures see a smaller share of the points does not see what the camera sees."""
 _FEWEST_RATIOS = 30
@@ -664,7 +664,7 @@ def _best(source: _Source, given: dict[_View, _Fit], apart_m: float | None, doub
     chosen += [one for one in first if one.reading.point_times is not None and one not in chosen]
     whole = sorted((_tried(source, one, given, apart_m) for one in chosen), key=lambda one: -one.gain)
     # an angle between those tried fits only once it is found
-    whole = [_refined(source, one, given, apart_m) for one in whole[:_REFINED]] + whole[_REFINED:]
+    whole[:_REFINED] = [_refined(source, one, given, apart_m) if one.gain > 0 else one for one in whole[:_REFINED]]
     whole = [one for one in whole if one.clear]
     if not whole:
         return []

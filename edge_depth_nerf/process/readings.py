@@ -118,6 +118,7 @@ _SAME_UNIT = 0.05
 """A unit is the one that is known if their logarithms differ by less."""
 _CLOCKS_S = (0.05, 0.1, 0.2, 0.5, 1.0)
 _ANGLES_DEG = (2.0, 5.0)
+_OFFSETS_M = (0.5,)
 _YAWS_DEG = (-150.0, -120.0, -60.0, -30.0, 30.0, 60.0, 120.0, 150.0)
 """About the upright axis; by quarters it is turned with the axes."""
 
@@ -137,6 +138,18 @@ def turn(sensor: str, axis: str) -> Callable[[float], Reading]:
     return by
 
 
+def shift(sensor: str, axis: str) -> Callable[[float], Reading]:
+    """Make readings that move a "scanner" or a "camera" along an axis of its own, by metres."""
+
+    def by(metres: float) -> Reading:
+        moved = np.eye(4)
+        moved["xyz".index(axis), 3] = metres
+        said = f"{{name}} sits {metres:.2f} m further along its {axis} axis: multiply to_vehicle by this from the right"
+        return replace(_mounting(sensor, said, _after(moved)), finer=by, amount=metres)
+
+    return by
+
+
 def _later(sensor: str) -> Callable[[float], Reading]:
     def by(seconds: float) -> Reading:
         said = f"the clock of {{name}} is apart from the others: add {seconds:.2f} to its time_offset_s"
@@ -148,8 +161,9 @@ def _later(sensor: str) -> Callable[[float], Reading]:
 
 
 def small(sensor: str) -> list[Reading]:
-    """Angles and shifts of the clock."""
+    """Angles, offsets, and shifts of the clock."""
     amounts = [(turn(sensor, axis), _ANGLES_DEG) for axis in "xyz"] + [(_later(sensor), _CLOCKS_S)]
+    amounts += [(shift(sensor, axis), _OFFSETS_M) for axis in "xyz"]
     found = []
     for by, sizes in amounts:
         for size in sizes:

@@ -138,7 +138,7 @@ def make_drives(drives: Mapping[str, tuple[Path, Mapping[str, Path]]], console: 
         ShownDrive(
             title,
             [next(made) for _ in chosen[title]],
-            _note(frames[title], len(chosen[title])),
+            " ".join([*_warnings(scene), _note(frames[title], len(chosen[title]))]),
             _points(scene, MOST_POINTS // len(drives), console),
         )
         for title, (scene, _) in drives.items()
@@ -152,6 +152,11 @@ def _points(scene: Path, most: int, console: Console) -> ShownPoints | None:
     except (InputError, OSError) as error:
         say(console, f"{REPORT} does not show the points of this drive. {error}", "yellow")
         return None
+
+
+def _warnings(scene: Path) -> list[str]:
+    """Return what `process` found wrong with the recording."""
+    return [f"Warning of `process`: {each}" for each in read_scene(scene).checks().get("warnings", ())]
 
 
 def _note(frames: Sequence[Mapping[str, object]], shown: int) -> str:

@@ -19,11 +19,19 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 from numpy.typing import NDArray
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE, read_distance_png, read_image, read_mask, read_npy
+from edge_depth_nerf.base.files import (
+    DISTANCE_STEPS_PER_METRE,
+    read_distance_png,
+    read_image,
+    read_json,
+    read_mask,
+    read_npy,
+)
 from edge_depth_nerf.cameras import KannalaBrandt, Pinhole
 from edge_depth_nerf.cameras.rays import Rays, distance_from_z_depth, rays
 from edge_depth_nerf.lidar.scans import read_cloud
 from edge_depth_nerf.scene.format import (
+    CHECKS,
     DEPTH_KEY,
     DISTORTION,
     DISTORTION_PARAMS,
@@ -157,6 +165,12 @@ class SceneFolder:
         """The cameras none of whose pictures is for training."""
         every = self.cameras().items()
         return {name for name, pictures in every if self.split_known and all(each.held_out for each in pictures)}
+
+    def checks(self) -> dict[str, Any]:
+        """What `process` found when it held LiDAR, poses and masks against the pictures; empty if it did not."""
+        path = self.folder / CHECKS
+        content = read_json(path) if path.is_file() else {}
+        return content if isinstance(content, dict) else {}
 
     def frames(self) -> list[int]:
         """The numbers of all frames that any camera has, in order."""
