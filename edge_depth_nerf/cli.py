@@ -20,7 +20,7 @@ from edge_depth_nerf.films.birds_eye_options import BirdsEyeOptions
 from edge_depth_nerf.films.options import CameraPathOptions
 from edge_depth_nerf.films.scan_options import RenderLidarOptions
 from edge_depth_nerf.inspecting.options import InspectOptions
-from edge_depth_nerf.mono.options import EstimateDepthOptions
+from edge_depth_nerf.mono.options import EstimateDepthOptions, FisheyeDepthOptions
 from edge_depth_nerf.plugin.compat import join_lines_of_option_help
 from edge_depth_nerf.process.bags.options import UnpackOptions
 from edge_depth_nerf.process.converters import CONVERTERS
@@ -51,6 +51,7 @@ Command = (
     | Annotated[UnpackOptions, tyro.conf.subcommand("unpack")]
     | Annotated[Process, tyro.conf.subcommand("process")]
     | Annotated[EstimateDepthOptions, tyro.conf.subcommand("estimate-depth")]
+    | Annotated[FisheyeDepthOptions, tyro.conf.subcommand("fisheye-depth")]
     | Annotated[InspectOptions, tyro.conf.subcommand("inspect")]
     | Annotated[CameraPathOptions, tyro.conf.subcommand("camera-path")]
     | Annotated[RenderLidarOptions, tyro.conf.subcommand("render-lidar")]
@@ -159,6 +160,8 @@ def _work_of(command: Command) -> Callable[..., Any]:
         from edge_depth_nerf.mono.estimate import estimate_depth as work
     elif isinstance(command, EstimateDepthOptions):
         from edge_depth_nerf.mono.many import estimate_on_cluster as work
+    elif isinstance(command, FisheyeDepthOptions):
+        from edge_depth_nerf.mono.fisheye import fisheye_depth as work
     elif isinstance(command, InspectOptions):
         from edge_depth_nerf.inspecting.command import inspect_scene as work
     elif isinstance(command, CameraPathOptions):

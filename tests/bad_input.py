@@ -31,6 +31,7 @@ from edge_depth_nerf.base.files import (
     write_png,
 )
 from edge_depth_nerf.base.png import read_png_bytes
+from edge_depth_nerf.cameras.calibration_file import parse_toml, read_lens
 from edge_depth_nerf.compare.command import read_tuned
 from edge_depth_nerf.compare.results import check_fair, read_results
 from edge_depth_nerf.compare.specification import RunSpecification
@@ -40,7 +41,6 @@ from edge_depth_nerf.masks.semantics import read_labels
 from edge_depth_nerf.method.error_model import read_calibration
 from edge_depth_nerf.mono.files import read_npy as read_map
 from edge_depth_nerf.mono.network import DepthNetwork, NetworkSettings, load_network, save_network
-from edge_depth_nerf.process.calibration_file import read_lens
 from edge_depth_nerf.process.kitti360.calibration import (
     read_cam_to_pose,
     read_cam_to_velo,
@@ -51,7 +51,7 @@ from edge_depth_nerf.process.kitti360.calibration import (
 from edge_depth_nerf.process.options import RigOptions
 from edge_depth_nerf.process.poses import read_kitti, read_nerfstudio, read_times, read_tum
 from edge_depth_nerf.process.rig import read_rig_recording
-from edge_depth_nerf.process.rig_file import read_rig, tomllib
+from edge_depth_nerf.process.rig_file import read_rig
 from edge_depth_nerf.scene.reader import read_scene
 
 IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0"
@@ -253,7 +253,8 @@ OURS: dict[str, Reader] = {
     "calibration of kalibr": Reader(named("a.yaml", CAMCHAIN), read_lens),
     "calibration of basalt": Reader(named("a.json", json.dumps(BASALT)), read_lens, "json"),
     "calibration of ocam": Reader(named("a.txt", OCAM), read_lens),
-    "rig json": Reader(named("rig.json", json.dumps(tomllib.loads(RIG))), tables, "json"),
+    "calibration of a rig": Reader(named("rig.toml", RIG), read_lens),
+    "rig json": Reader(named("rig.json", json.dumps(parse_toml(RIG))), tables, "json"),
 }
 """Parsers that are written out in this project: those of the coverage-guided fuzzer."""
 

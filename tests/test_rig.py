@@ -18,11 +18,12 @@ from trainings import train
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, read_mask, write_json, write_png
 from edge_depth_nerf.cameras import MEI, KannalaBrandt, Pinhole
+from edge_depth_nerf.cameras.calibration_file import parse_toml
 from edge_depth_nerf.process.converters import convert
 from edge_depth_nerf.process.options import RigOptions
 from edge_depth_nerf.process.recording import Recording
 from edge_depth_nerf.process.rig import read_rig_recording
-from edge_depth_nerf.process.rig_file import read_rig, tomllib
+from edge_depth_nerf.process.rig_file import read_rig
 from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 
@@ -134,7 +135,7 @@ def test_cameras_are_read_as_the_page_says(drive: Path) -> None:
 
 
 def test_json_says_the_same(mine: Path) -> None:
-    content = tomllib.loads((mine / "rig.toml").read_text())
+    content = parse_toml((mine / "rig.toml").read_text())
     of_toml = read(mine)
     (mine / "rig.toml").unlink()
     write_json(mine / "rig.json", content)

@@ -40,6 +40,8 @@ from edge_depth_nerf.base.jpeg import is_jpeg, jpeg_fault
 
 DISTANCE_STEPS_PER_METRE = 256
 """A distance PNG counts in 1/256 m."""
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".avif")
+"""Pictures and masks that are found in a folder."""
 _FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP", "AVIF")
 """Pillow's names of the pictures that are read."""
 _BY_PILLOW = ("WEBP", "AVIF")

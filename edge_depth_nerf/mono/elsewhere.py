@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, fields
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.method.alignment import LEAST_POINTS
@@ -63,9 +63,7 @@ class FittedMaps:
         for picture in self.scene.pictures:
             if self.kind == "metric":
                 layers, samples = self._seen(picture)
-                start = [Line()] * len(layers)
-                lines = fit_lines(samples, self.kind, start) if len(layers) > 1 else start
-                yield picture, self._blended(picture, layers, lines)
+                yield picture, self._blended(picture, layers, _agreeing(samples, self.kind))
                 continue
             seen = self._seen(picture) if self._lidar_points(picture) >= LEAST_POINTS else None
             if seen is None or seen[1].lidar_points < LEAST_POINTS:
@@ -128,6 +126,20 @@ class FittedMaps:
                 f"{picture.name}: its map {'rises' if self.kind == 'inverse' else 'falls'} where LiDAR's distance "
                 f"rises (rank correlation {abs(found):.2f}), so it is not {self.kind}. Declare it {other}."
             )
+
+
+def agreed(layers: Sequence[Layer], usable: Bool[np.ndarray, "h w"], kind: Kind) -> Float32[np.ndarray, "h w"]:
+    """Blend views of one picture that were made to agree, without LiDAR: metres along the ray, or up to one scale."""
+    samples = take_samples(layers, np.zeros(usable.shape, np.float32), usable, _SAMPLES)
+    rows, columns = usable.shape
+    return blend(layers, _agreeing(samples, kind), kind, (rows, columns))
+
+
+def _agreeing(samples: Samples, kind: Kind) -> list[Line]:
+    start = [Line()] * len(samples.values)
+    if len(start) == 1:
+        return start
+    return fit_lines(samples, kind, start if kind == "metric" else None)
 
 
 def _thinned(samples: Samples) -> Samples:

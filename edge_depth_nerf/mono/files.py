@@ -1,9 +1,9 @@
-"""Monocular maps from any other tool, by file: FOLDER/CAMERA/FRAME.npy or .png, one for each picture of a scene."""
+"""Monocular maps from any other tool, by file: .npy or 16-bit .png, one for each picture of a scene, or each view."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,8 +37,7 @@ class MapFiles:
             InputError: it cannot be read, or holds no positive number.
         """
         path = self.by_picture[picture.name]
-        values = read_npy(path) if path.suffix == ".npy" else read_distance_png(path, self.metres_per_count)
-        values = np.where(np.isfinite(values) & (values > 0), values, np.float32(np.nan))
+        values = read_map(path, self.metres_per_count)
         if np.isnan(values).all():
             raise InputError(
                 f"{path}: contains no positive number, only zeros, negative numbers, NaN or infinity. "
@@ -62,17 +61,21 @@ def find_maps(scene: SceneFolder, folder: Path, kind: Kind, along: Along, metres
         raise FileNotFoundError(
             f"{folder}: no such folder. --maps takes the folder that holds CAMERA/FRAME.npy or .png."
         )
-    found = {picture.name: _find(folder, picture) for picture in scene.pictures}
+    found = {}
     for picture in scene.pictures:
-        path = found[picture.name]
-        height, width = npy_shape(path) if path.suffix == ".npy" else _png_shape(path)
-        if (width, height) != (picture.lens.width, picture.lens.height):
-            raise InputError(
-                f"{path}: is {width}×{height} (width × height), its picture {picture.name} "
-                f"{picture.lens.width}×{picture.lens.height}. A map needs a value for every pixel: make it in the "
-                "picture's own size."
-            )
-    has_png = any(path.suffix == ".png" for path in found.values())
+        camera = [part for part in Path(picture.camera).parts if part not in ("..", "/")]
+        stem = folder.joinpath(*camera, Path(picture.name).stem)
+        found[picture.name] = find_map(stem, picture.name, (picture.lens.width, picture.lens.height))
+    return MapFiles(found, kind, along, count_m(folder, found.values(), kind, metres_per_count))
+
+
+def count_m(folder: Path, paths: Iterable[Path], kind: Kind, metres_per_count: float | None) -> float:
+    """Say how many metres a count of PNGs is, which has to be given for metric ones alone.
+
+    Raises:
+        InputError: it is missing, or given without need.
+    """
+    has_png = any(path.suffix == ".png" for path in paths)
     if has_png and kind == "metric" and metres_per_count is None:
         raise InputError(
             f"{folder}: contains PNGs, whose unit is unknown. Give --metres-per-count, such as 0.00390625 (1/256 m, "
@@ -83,22 +86,38 @@ def find_maps(scene: SceneFolder, folder: Path, kind: Kind, along: Along, metres
             f"--metres-per-count {metres_per_count:g}: is for PNGs, but {folder} contains .npy files, which are in "
             "metres."
         )
-    return MapFiles(found, kind, along, metres_per_count or 1 / DISTANCE_STEPS_PER_METRE)
+    return metres_per_count or 1 / DISTANCE_STEPS_PER_METRE
 
 
-def _find(folder: Path, picture: ScenePicture) -> Path:
-    camera = [part for part in Path(picture.camera).parts if part not in ("..", "/")]
-    stem = folder.joinpath(*camera, Path(picture.name).stem)
+def find_map(stem: Path, picture: str, size: tuple[int, int]) -> Path:
+    """Find the map of a picture, .npy or .png behind `stem`, and check by its header that it has the size.
+
+    Raises:
+        FileNotFoundError: it is not there.
+        InputError: it is of another width or height, or of a kind that is not read.
+    """
     choices = [stem.with_name(f"{stem.name}{suffix}") for suffix in (".npy", ".png")]
     there = [path for path in choices if path.is_file()]
     if not there:
         raise FileNotFoundError(
-            f"{choices[0]}: no such file, nor {choices[1].name}. --maps needs a map for every picture of the scene, "
-            "under its camera's and its own name."
+            f"{choices[0]}: no such file, nor {choices[1].name}. --maps needs a map for every picture, "
+            "under its name; those of a scene in folders of their cameras."
         )
     if len(there) > 1:
         raise InputError(f"{there[0]}: {there[1].name} exists as well. Keep one map for each picture.")
+    height, width = npy_shape(there[0]) if there[0].suffix == ".npy" else _png_shape(there[0])
+    if (width, height) != size:
+        raise InputError(
+            f"{there[0]}: is {width}×{height} (width × height), its picture {picture} {size[0]}×{size[1]}. A map needs "
+            "a value for every pixel: make it in the picture's own size."
+        )
     return there[0]
+
+
+def read_map(path: Path, metres_per_count: float) -> NDArray[np.float32]:
+    """Read a map, H×W; NaN where it has no positive, finite number."""
+    values = read_npy(path) if path.suffix == ".npy" else read_distance_png(path, metres_per_count)
+    return np.where(np.isfinite(values) & (values > 0), values, np.float32(np.nan))
 
 
 def _png_shape(path: Path) -> tuple[int, int]:

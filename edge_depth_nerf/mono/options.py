@@ -1,4 +1,4 @@
-"""Options of `edge-depth-nerf estimate-depth`; a module of its own so that the command line starts fast."""
+"""Options of `estimate-depth` and `fisheye-depth`; a module of its own so that the command line starts fast."""
 
 from __future__ import annotations
 
@@ -106,10 +106,70 @@ class EstimateDepthOptions:
                 f"--maps {self.maps}: describe its values with --maps-kind metric, relative or inverse, and "
                 "--maps-along ray or z."
             )
-        if self.metres_per_count is not None and not 0 < self.metres_per_count < 1000:
-            raise InputError(f"--metres-per-count {self.metres_per_count:g}: expected more than 0, below 1000.")
+        check_count(self.metres_per_count)
 
     @property
     def trains(self) -> bool:
         """Whether anything is trained."""
         return self.model is None or self.train_steps is not None or self.seconds is not None
+
+
+@dataclass(frozen=True)
+class FisheyeDepthOptions:
+    """Get distance maps of fisheye pictures from any depth network, without LiDAR, poses or training.
+
+    With --hf it does all at once. Without, it cuts pinhole views for a network of yours, and then joins its --maps.
+    """
+
+    pictures: tyro.conf.Positional[Path]
+    """The folder of one camera's pictures."""
+    calibration: Path
+    """The file with its lens: Kalibr's .yaml, Basalt's .json, OCamCalib's .txt, or a .toml with the keys of a rig file
+    (docs/rig.md)."""
+    output: Path
+    """The folder for views, distance maps and pictures of them."""
+    camera: str = ""
+    """Which of the file's cameras, where there are several."""
+    mask: Path | None = None
+    """A picture that is 0 where nothing is of interest, such as the vehicle. The lens's dark rim is found anyway."""
+    theta_max_deg: float = 95.0
+    """What lies farther from the optical axis, degrees, is left out."""
+    hf: str | None = None
+    """A network of the transformers library, as for `estimate-depth`."""
+    hf_output: HfOutput = "auto"
+    """What its maps are; auto: as its config states."""
+    maps: Path | None = None
+    """The folder with a network's map of each view, named like the view: .npy or 16-bit .png."""
+    maps_kind: MapsKind | None = None
+    """What they are: metric (metres), or up to scale and shift relative (depth) or inverse (one over depth)."""
+    maps_along: Along = "z"
+    """Whether they are along the view's axis (z) or along the ray."""
+    metres_per_count: float | None = None
+    """Of PNGs with metric maps, such as 0.001."""
+
+    def check(self) -> None:
+        """Check the options before any file is read.
+
+        Raises:
+            InputError: an option is out of its range, or does not fit the others.
+        """
+        if not 0 < self.theta_max_deg <= 180:
+            raise InputError(f"--theta-max-deg {self.theta_max_deg:g}: expected degrees above 0, up to 180.")
+        if self.hf is not None and self.maps is not None:
+            raise InputError("--hf and --maps: expected one source of maps. Leave one of them out.")
+        if self.hf is None and self.hf_output != "auto":
+            raise InputError(f"--hf-output {self.hf_output}: is for --hf, which is not given.")
+        if (self.maps is None) != (self.maps_kind is None):
+            raise InputError("--maps and --maps-kind: give both of them, or none.")
+        if self.maps_along == "ray" and self.maps_kind in ("relative", "inverse"):
+            raise InputError(
+                f"--maps-along ray: with --maps-kind {self.maps_kind} nothing tells the maps' shift, as views of any "
+                "shift agree. Make maps along z, or metric ones."
+            )
+        check_count(self.metres_per_count)
+
+
+def check_count(metres_per_count: float | None) -> None:
+    """Raise an InputError for a unit that no PNG has."""
+    if metres_per_count is not None and not 0 < metres_per_count < 1000:
+        raise InputError(f"--metres-per-count {metres_per_count:g}: expected more than 0, below 1000.")

@@ -143,8 +143,9 @@ def blend(
 def fit_lines(samples: Samples, kind: Kind, start: Sequence[Line] | None = None) -> list[Line]:
     """Find scale and shift of each view; metric maps keep a shift of 0.
 
-    With a start, the views keep to these lines instead of to LiDAR, of which nothing is taken then. A view that nothing
-    is known of, neither by LiDAR nor by its neighbours, gets 0 and 0: no value.
+    With a start, the views keep to these lines instead of to LiDAR, of which nothing is taken then. Without a start
+    and LiDAR they agree up to one scale for all. A view that nothing is known of, neither by LiDAR nor by its
+    neighbours, gets 0 and 0: no value.
     """
     problem = _Problem(samples, kind, start)
     theta = problem.linear() if start is None else problem.of_lines(start)
@@ -223,17 +224,23 @@ class _Problem:
         # p · factor is the distance or its inverse
         factor = np.exp(-self.sign * self.log_cosine)
         wanted = np.exp(self.sign * self.log_target)
-        least, usual, most = np.quantile(wanted, (0.05, 0.5, 0.95))
+        alone = not len(pixel)
+        least, usual, most = (0.01, 1.0, 100.0) if alone else np.quantile(wanted, (0.05, 0.5, 0.95))
         pair_size = np.full(len(shared), usual)
         target_robust, pair_robust = np.ones(len(pixel)), np.ones(len(shared))
         theta = np.zeros((self.views, 2))
+        of_first = self._rows(first, self.basis[first, shared] * factor[first, shared][:, None])
+        of_second = self._rows(second, self.basis[second, shared] * factor[second, shared][:, None])
         for _ in range(_LINEAR_ROUNDS):
-            targets = self._rows(view, self.basis[view, pixel] * (factor[view, pixel] / wanted)[:, None])
-            pairs = self._rows(first, self.basis[first, shared] * (factor[first, shared] / pair_size)[:, None])
-            pairs -= self._rows(second, self.basis[second, shared] * (factor[second, shared] / pair_size)[:, None])
-            matrix = np.concatenate([targets, pairs])
-            right = np.concatenate([np.ones(len(pixel)), np.zeros(len(shared))])
-            weight = np.concatenate([self.target_weight * target_robust, self.pair_weight * pair_robust])
+            if alone:
+                # nothing tells the scale: the mean of what views share is 1
+                targets, weight = (of_first + of_second).mean(0, keepdims=True) / 2, np.ones(1)
+            else:
+                targets = self._rows(view, self.basis[view, pixel] * (factor[view, pixel] / wanted)[:, None])
+                weight = self.target_weight * target_robust
+            matrix = np.concatenate([targets, (of_first - of_second) / pair_size[:, None]])
+            right = np.concatenate([np.ones(len(targets)), np.zeros(len(shared))])
+            weight = np.concatenate([weight, self.pair_weight * pair_robust])
             theta = _solve(matrix, right, weight, damping=1e-9).reshape(-1, 2)
             said = (self.basis * theta[:, None]).sum(-1) * factor
             pair_size = np.clip((said[first, shared] + said[second, shared]) / 2, least, most)

@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Float64
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE, as_people_count, largest_of_16_bits
+from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE, IMAGE_SUFFIXES, as_people_count, largest_of_16_bits
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar import Sweep, transform_points
 from edge_depth_nerf.lidar.scans import SCAN_SUFFIXES, check_scan, read_scan
@@ -35,8 +35,6 @@ from edge_depth_nerf.process.rig_file import Clock, Rig, RigCamera, RigLidar, Ri
 from edge_depth_nerf.scene.checks import Tolerance, check_picture_size, check_size
 from edge_depth_nerf.scene.writer import Skipped, summarise
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".avif")
-"""Pictures and masks that are found in a folder."""
 _LOOKED_AT = 5
 """So many of a camera's pictures tell how many bits are used, and so many scans whether any can be read."""
 _RIG_FILES = ("rig.toml", "rig.json")

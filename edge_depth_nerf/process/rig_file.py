@@ -12,7 +12,6 @@ import difflib
 import json
 import math
 import re
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -35,17 +34,12 @@ from pydantic.fields import FieldInfo
 
 from edge_depth_nerf.base.bounds import MAX_TIME_S, path_inside, read_text, shown
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.cameras import EUCM, MEI, Camera, DoubleSphere, KannalaBrandt, Pinhole
+from edge_depth_nerf.cameras import Camera
+from edge_depth_nerf.cameras.calibration_file import MODELS, OF_MODEL, RATIONAL, parse_toml, read_lens
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar.scans import PointTimes, ScanFormat
 from edge_depth_nerf.lidar.sweeps import SweepTiming
-from edge_depth_nerf.process.calibration_file import RATIONAL, read_lens
 from edge_depth_nerf.process.poses import pose_of_quaternion, transform_of_rows
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 VEHICLE = "vehicle"
 """The frame that every sensor's transform leads to."""
@@ -57,21 +51,8 @@ TODO = "TODO"
 """A text that begins so stands for a value that is not known yet; what follows says what it is."""
 _TODO_LINE = re.compile(rf"""\s*([\w.-]+)\s*=\s*["']{TODO}:?\s*(.*?)["']\s*(#.*)?""")
 _TABLE_LINE = re.compile(r"\s*\[([^\[\]]+)\]\s*(#.*)?")
-_MAX_DOTS = 1000
-"""No line of TOML has more: the parser's time and memory grow with the square of a key's parts."""
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _NAME = r"[A-Za-z0-9_][A-Za-z0-9_-]*"
-_FISHEYE = (KannalaBrandt, ("k1", "k2", "k3", "k4"))
-_DOUBLE_SPHERE = (DoubleSphere, ("xi", "alpha"))
-_MODELS: dict[str, tuple[Any, tuple[str, ...]]] = {
-    "mei": (MEI, ("xi", "k1", "k2", "p1", "p2")),
-    **dict.fromkeys(("kannala-brandt", "opencv_fisheye", "equidistant"), _FISHEYE),
-    "pinhole": (Pinhole, ("k1", "k2", "p1", "p2", "k3")),
-    **dict.fromkeys(("double-sphere", "ds"), _DOUBLE_SPHERE),
-    "eucm": (EUCM, ("alpha", "beta")),
-}
-"""Models, and what they have beside focal lengths and principal point; `_OF_MODEL` are needed, others 0 if left out."""
-_OF_MODEL = ("xi", "alpha", "beta")
 _LENS = ("model", "width", "height", "fx", "fy", "cx", "cy")
 """What describes a lens, unless a calibration file does."""
 _LENS_NUMBERS = ("xi", "alpha", "beta", "k1", "k2", "k3", "k4", "p1", "p2")
@@ -305,11 +286,11 @@ class RigCamera(_Sensor):
                 raise InputError(f".{key} is {value}, expected a pixel within the picture, 0 to {size}.")
         if self.pixel_centre not in (0, 0.5, 1):
             raise InputError(f".pixel_centre is {self.pixel_centre}, expected one of 0, 0.5, 1.")
-        kind, own = _MODELS[self.model]
+        kind, own = MODELS[self.model]
         if wrong := self.model_fields_set & {*_LENS_NUMBERS} - {*own}:
             hint = f" {RATIONAL}." if "k4" in wrong and self.model == "pinhole" else ""
             raise InputError(f".{min(wrong)}: unknown key; a camera of model {self.model} has {', '.join(own)}.{hint}")
-        if lacking := [key for key in own if key in _OF_MODEL and getattr(self, key) is None]:
+        if lacking := [key for key in own if key in OF_MODEL and getattr(self, key) is None]:
             raise InputError(f".{lacking[0]} is missing; expected a number.")
         shift = 0.5 - self.pixel_centre
         try:
@@ -474,7 +455,7 @@ def read_rig(path: Path, root: Path, prepare: Callable[[dict[str, Any]], None] |
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; it describes the cameras and scanners (docs/rig.md).")
-    parse, syntax = (json.loads, "JSON") if path.suffix.lower() == ".json" else (_parse_toml, "TOML")
+    parse, syntax = (json.loads, "JSON") if path.suffix.lower() == ".json" else (parse_toml, "TOML")
     text = read_text(path, MAX_RIG_BYTES)
     if syntax == "TOML":
         _check_todo(text, path)
@@ -522,12 +503,6 @@ def _check_todo(text: str, path: Path) -> None:
     raise InputError(
         f"{path}, line {number}: {key} is a {TODO}; write there what it asks for: {what or 'a value'}.{more}"
     )
-
-
-def _parse_toml(text: str) -> dict[str, Any]:
-    if any(line.count(".") > _MAX_DOTS for line in text.splitlines()):
-        raise ValueError(f"a line with more than {_MAX_DOTS} dots")
-    return tomllib.loads(text)
 
 
 def _rig(whole: _Whole, path: Path) -> Rig:

@@ -1,12 +1,15 @@
-"""Lenses from the files of calibration tools: Kalibr's camchain.yaml, Basalt's calibration.json, OCamCalib's text.
+"""Lenses from files: Kalibr's camchain.yaml, Basalt's calibration.json, OCamCalib's text, and tables of a rig file.
 
-All three count pixels from the first one's centre; cameras have centres at +0.5. Transforms in these files are not
+All count pixels from the first one's centre; cameras have centres at +0.5. Transforms in these files are not
 read: where a sensor is, the rig file says.
 """
 
 from __future__ import annotations
 
+import math
+import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +18,13 @@ import yaml
 from edge_depth_nerf.base.bounds import finite, read_text, shown
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json
-from edge_depth_nerf.cameras import EUCM, MEI, Camera, DoubleSphere, KannalaBrandt, OCam, Pinhole
+from edge_depth_nerf.cameras.models import MEI, Camera, KannalaBrandt, Pinhole
+from edge_depth_nerf.cameras.wide import EUCM, DoubleSphere, OCam
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 RATIONAL = (
     "k4, k5 and k6 belong to OpenCV's rational model, which has no place here: calibrate again without "
@@ -23,6 +32,8 @@ RATIONAL = (
 )
 """What to do with a calibration of that model."""
 _MAX_BYTES = 1 << 16
+_MAX_DOTS = 1000
+"""No line of TOML has more: the parser's time and memory grow with the square of a key's parts."""
 _MAX_BRACKETS = 500
 """No camchain has more, and PyYAML's time grows with the square of their depth."""
 _RADTAN, _EQUIDISTANT = ("k1", "k2", "p1", "p2"), ("k1", "k2", "k3", "k4")
@@ -44,13 +55,24 @@ _BASALT: dict[str, tuple[Any, tuple[str, ...], dict[str, float]]] = {
     "eucm": (EUCM, (*_PINHOLE, "alpha", "beta"), {}),
     "ucm": (EUCM, (*_PINHOLE, "alpha"), {"beta": 1.0}),
 }
+_FISHEYE = (KannalaBrandt, ("k1", "k2", "k3", "k4"))
+_DOUBLE_SPHERE = (DoubleSphere, ("xi", "alpha"))
+MODELS: dict[str, tuple[Any, tuple[str, ...]]] = {
+    "mei": (MEI, ("xi", "k1", "k2", "p1", "p2")),
+    **dict.fromkeys(("kannala-brandt", "opencv_fisheye", "equidistant"), _FISHEYE),
+    "pinhole": (Pinhole, ("k1", "k2", "p1", "p2", "k3")),
+    **dict.fromkeys(("double-sphere", "ds"), _DOUBLE_SPHERE),
+    "eucm": (EUCM, ("alpha", "beta")),
+}
+"""Models, and what they have beside focal lengths and principal point; `OF_MODEL` are needed, others 0 if left out."""
+OF_MODEL = ("xi", "alpha", "beta")
 _OCAM_LINES = 5
 _OCAM_COEFFICIENTS = range(1, 8)
 _OF_SCALE = (1e-2, 1e6)
 
 
 def read_lens(path: Path, name: str = "") -> Camera:
-    """Read a lens from a calibration file, whose kind its suffix tells: .yaml, .json, or .txt.
+    """Read a lens from a calibration file, whose kind its suffix tells: .yaml, .json, .txt, or .toml.
 
     Args:
         path: the file.
@@ -65,12 +87,12 @@ def read_lens(path: Path, name: str = "") -> Camera:
     """
     readers: dict[str, Callable[[Path, str], Camera]] = {
         **{".yaml": _kalibr, ".yml": _kalibr},
-        **{".json": _basalt, ".txt": _ocam},
+        **{".json": _basalt, ".txt": _ocam, ".toml": _table},
     }
     if path.suffix.lower() not in readers:
         raise InputError(
-            f"{path}: expected Kalibr's camchain (.yaml), Basalt's calibration (.json) or OCamCalib's calib_results "
-            "(.txt). Write the numbers of another tool into the rig file."
+            f"{path}: expected Kalibr's camchain (.yaml), Basalt's calibration (.json), OCamCalib's calib_results "
+            "(.txt) or a rig file (.toml, docs/rig.md), which takes the numbers of any other tool."
         )
     return readers[path.suffix.lower()](path, name)
 
@@ -152,6 +174,34 @@ def _ocam(path: Path, name: str) -> Camera:
     return _camera(OCam, given, [width, height], str(path))
 
 
+def parse_toml(text: str) -> dict[str, Any]:
+    """Read TOML; raises ValueError or RecursionError."""
+    if any(line.count(".") > _MAX_DOTS for line in text.splitlines()):
+        raise ValueError(f"a line with more than {_MAX_DOTS} dots")
+    return tomllib.loads(text)
+
+
+def _table(path: Path, name: str) -> Camera:
+    """The keys of a lens in a rig file's table, or alone; all others are passed over."""
+    try:
+        content = parse_toml(read_text(path, _MAX_BYTES))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not valid TOML ({error}). docs/rig.md has an example.") from None
+    tables = content.get("cameras", {"camera": content})
+    found = {key: one for key, one in tables.items() if isinstance(one, dict)} if isinstance(tables, dict) else {}
+    where, lens = _chosen(path, found, name, "the keys of a lens, or tables [cameras.NAME]")
+    if lens.get("model") not in [*MODELS]:
+        raise InputError(f"{where}: model is {shown(lens.get('model'))}, expected one of {', '.join(MODELS)}.")
+    model, own = MODELS[lens["model"]]
+    keys = (*_PINHOLE, *own)
+    given = _numbers([lens.get(key, None if key in (*_PINHOLE, *OF_MODEL) else 0.0) for key in keys], keys, where)
+    more = _numbers([lens.get("pixel_centre", 0), lens.get("theta_max_deg", 180)], ("centre", "limit"), where)
+    for key in ("cx", "cy"):
+        given[key] -= more["centre"]
+    camera = _camera(model, given, [lens.get("width"), lens.get("height")], where)
+    return replace(camera, theta_limit_rad=math.radians(min(max(more["limit"], 1.0), 180.0)))
+
+
 def _word(word: str) -> float | None:
     try:
         return finite(float(word))
@@ -168,8 +218,8 @@ def _chosen(path: Path, cameras: dict[str, dict[str, Any]], name: str, kind: str
     if name not in cameras:
         asked = f"no camera {name!r}" if name else f"{len(cameras)} cameras"
         raise InputError(
-            f"{path}: {asked}; it has {', '.join(cameras)}. Name one, as calibration = {{file = {path.name!r}, "
-            f"camera = {next(iter(cameras))!r}}}."
+            f"{path}: {asked}; it has {', '.join(cameras)}. Name one: --camera {next(iter(cameras))}, or in a rig "
+            f"file calibration = {{file = {path.name!r}, camera = {next(iter(cameras))!r}}}."
         )
     return f"{path}: {name}", cameras[name]
 
