@@ -386,8 +386,8 @@ def test_rays_of_ocamcalib_are_those_of_its_own_code(mine: Path) -> None:
             r"left\.fx: the calibration file describes the",
         ),
         (
-            'calibration = {file = "rig.toml"}\n',
-            r"rig\.toml: expected Kalibr's camchain \(\.yaml\), Basalt's .*OCamCalib",
+            'calibration = {file = "lens.ini"}\n',
+            r"lens\.ini: expected Kalibr's camchain \(\.yaml\), Basalt's .*OCamCalib",
         ),
         ('calibration = {file = "times.txt"}\n', r"times\.txt: expected OCamCalib's calib_results\.txt"),
         ('calibration = {file = "none.yaml"}\n', r"none\.yaml: no such file"),

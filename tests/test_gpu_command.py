@@ -17,6 +17,7 @@ from scipy.spatial import KDTree
 from waiting import until
 
 from edge_depth_nerf.base.files import read_json, write_json
+from edge_depth_nerf.lidar.scans import read_cloud
 
 pytestmark = pytest.mark.slow
 
@@ -104,14 +105,11 @@ def test_a_function_that_fails_ends_no_other(parts, tmp_path):
 
 def test_the_priors_cloud_lies_where_lidars_points_do(parts, sample_drive, tmp_path):
     folder = parts.cloud_of_prior(parts.Settings(sample_drive, tmp_path, fake=True))
-    kinds = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
-    prior, lidar = (
-        np.frombuffer((scene / "points.ply").read_bytes().partition(b"end_header\n")[2], kinds)
-        for scene in (folder, sample_drive)
-    )
-    off_m, nearest = KDTree(prior["xyz"]).query(lidar["xyz"])
-    assert len(prior) > len(lidar) and np.median(off_m) < 0.3
-    assert np.corrcoef(lidar["rgb"].ravel(), prior["rgb"][nearest].ravel())[0, 1] > 0.8
+    (prior_m, prior_rgb), (lidar_m, lidar_rgb) = (read_cloud(scene / "points.ply") for scene in (folder, sample_drive))
+    assert prior_rgb is not None and lidar_rgb is not None
+    off_m, nearest = KDTree(prior_m).query(lidar_m)
+    assert len(prior_m) > len(lidar_m) and np.median(off_m) < 0.3
+    assert np.corrcoef(lidar_rgb.ravel(), prior_rgb[nearest].ravel())[0, 1] > 0.8
     assert read_json(folder / "transforms.json")["ply_file_path"] == "points.ply" and (folder / "images").is_dir()
 
 

@@ -189,33 +189,15 @@ def trained(settings: Settings, method: str, seed: int) -> Found:
 
 
 def cloud_of_prior(settings: Settings) -> Path:
-    """The scene with the prior's distances for its points.ply, thinned as LiDAR's are: a folder of links."""
-    from edge_depth_nerf.base.files import read_json, write_json
-    from edge_depth_nerf.scene.points import MAX_POINTS, merge_parts
+    """The scene as `export` writes it, whose points.ply is the prior's cloud: at most as many points as LiDAR's."""
+    from rich.console import Console
 
-    manager: Any = configuration(settings).pipeline.datamanager.setup(device="cpu", test_mode="val")
-    table = manager.train_pixel_sampler.table
-    batch = table.batch(0, min(len(table), round(4 * MAX_POINTS / table.share_with_prior)))
-    known = batch.prior_distance_m[:, 0] > 0
-    outputs = manager.train_dataset._dataparser_outputs
-    with torch.no_grad():
-        rays = manager.train_ray_generator(batch.indices[known])
-    along = batch.prior_distance_m[known] / manager.train_dataset.metadata["metres_per_unit"]
-    points = (rays.origins + rays.directions * along).double() / outputs.dataparser_scale
-    transform = outputs.dataparser_transform.double()
-    in_world = (points - transform[:3, 3]) @ transform[:3, :3]
-    colours = (batch.rgb[known] * 255).round().to(torch.uint8)
-    folder = settings.folder / "with_the_priors_cloud"
-    folder.mkdir(parents=True, exist_ok=True)
-    for path in settings.scene.resolve().iterdir():
-        if path.name not in ("points.ply", "transforms.json") and not (folder / path.name).exists():
-            (folder / path.name).symlink_to(path)
-    np.savez(folder / "points.npz", points_m=in_world.float().numpy(), colours=colours.numpy())
-    merge_parts([folder / "points.npz"], folder / "points.ply")
-    write_json(
-        folder / "transforms.json", read_json(settings.scene / "transforms.json") | {"ply_file_path": "points.ply"}
-    )
-    return folder
+    from edge_depth_nerf.export.command import export_scene
+    from edge_depth_nerf.export.options import ExportOptions
+    from edge_depth_nerf.scene.points import MAX_POINTS
+
+    output = settings.folder / "with_the_priors_cloud"
+    return export_scene(ExportOptions(settings.scene, output=output, most_points=MAX_POINTS), Console(quiet=True))
 
 
 def splatted(settings: Settings, scene: Path, name: str) -> Found:

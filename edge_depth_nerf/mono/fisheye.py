@@ -130,7 +130,7 @@ def open_fisheyes(options: FisheyeDepthOptions) -> Fisheyes:
     """
     if not options.calibration.is_file():
         raise FileNotFoundError(f"{options.calibration}: no such file. --calibration names the file with the lens.")
-    lens, theta_max_rad = read_lens(options.calibration, options.camera), math.radians(options.theta_max_deg)
+    lens, theta_max_rad = read_lens(options.calibration, options.camera or ""), math.radians(options.theta_max_deg)
     if not options.pictures.is_dir():
         raise FileNotFoundError(f"{options.pictures}: no such folder. Give the folder of one camera's pictures.")
     listed = [path for path in options.pictures.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]

@@ -118,28 +118,27 @@ class EstimateDepthOptions:
 class FisheyeDepthOptions:
     """Get distance maps of fisheye pictures from any depth network, without LiDAR, poses or training.
 
-    With --hf it does all at once. Without, it cuts pinhole views for a network of yours, and then joins its --maps.
+    Without --hf and --maps it cuts pinhole views for a network of yours.
     """
 
     pictures: tyro.conf.Positional[Path]
     """The folder of one camera's pictures."""
     calibration: Path
-    """The file with its lens: Kalibr's .yaml, Basalt's .json, OCamCalib's .txt, or a .toml with the keys of a rig file
-    (docs/rig.md)."""
+    """Its lens: a file of Kalibr (.yaml), Basalt (.json) or OCamCalib (.txt), or keys as in rig.toml (docs/rig.md)."""
     output: Path
-    """The folder for views, distance maps and pictures of them."""
-    camera: str = ""
+    """The folder to write to."""
+    camera: str | None = None
     """Which of the file's cameras, where there are several."""
     mask: Path | None = None
-    """A picture that is 0 where nothing is of interest, such as the vehicle. The lens's dark rim is found anyway."""
+    """A picture that is 0 where nothing is to be used, such as the vehicle."""
     theta_max_deg: float = 95.0
-    """What lies farther from the optical axis, degrees, is left out."""
+    """The largest angle from the optical axis that is used, degrees."""
     hf: str | None = None
     """A network of the transformers library, as for `estimate-depth`."""
     hf_output: HfOutput = "auto"
     """What its maps are; auto: as its config states."""
     maps: Path | None = None
-    """The folder with a network's map of each view, named like the view: .npy or 16-bit .png."""
+    """A folder with a network's map of each view, under its name: .npy or .png (16 bit)."""
     maps_kind: MapsKind | None = None
     """What they are: metric (metres), or up to scale and shift relative (depth) or inverse (one over depth)."""
     maps_along: Along = "z"
