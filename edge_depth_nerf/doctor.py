@@ -222,7 +222,7 @@ def check_extras() -> Iterator[Finding]:
         ("COLMAP", "pycolmap", "colmap", "refined poses (by default in process) and --poses colmap"),
         ("KISS-ICP", "kiss_icp", "odometry", "poses from LiDAR (process --poses lidar)"),
         ("rosbags", "rosbags", "bags", "ROS bags (unpack)"),
-        ("transformers", "transformers", "hf", "ready-made depth networks (estimate-depth --hf)"),
+        ("transformers", "transformers", "hf", "ready-made depth networks (--hf)"),
         ("laspy", "laspy", "las", "scans in .las and .laz files"),
         ("Dask", "distributed", "cluster", "many machines (--cluster)"),
     ):

@@ -5,10 +5,13 @@ import statistics
 import numpy as np
 import pytest
 from comparisons import fake
+from scenes import write_scene
 
 from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import write_json
 from edge_depth_nerf.compare import tables
-from edge_depth_nerf.compare.results import Results, check_fair
+from edge_depth_nerf.compare.report import _of_drive
+from edge_depth_nerf.compare.results import Results, RunResult, check_fair
 from edge_depth_nerf.report.tables import latex_of_tables, page_of_tables
 
 PSNR_OF = {
@@ -225,3 +228,14 @@ def test_edges_on_the_path_beside_it_and_from_a_held_out_camera():
 
 def test_runs_of_earlier_versions_have_no_table_of_edges(results):
     assert not [made for made in tables.make_tables(results) if made.label.startswith("9")]
+
+
+def test_an_export_beside_the_scene_is_named(tmp_path):
+    scene = write_scene(tmp_path / "street")
+    for name in ("street_points", "other_points"):
+        (tmp_path / name).mkdir()
+        write_json(tmp_path / name / "export_figures.json", {"text": f"12 points of {name}"})
+    run = RunResult(tmp_path, {"scene": str(scene), "scene_sha256": "1f"}, {})
+    assert {name: said for name, said in _of_drive("street", run).entries.items() if "Exported" in name} == {
+        "Exported: street_points": "12 points of street_points"
+    }

@@ -21,7 +21,7 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, read_mask, write_distance_png
 from edge_depth_nerf.cameras import KannalaBrandt
 from edge_depth_nerf.export import command
-from edge_depth_nerf.export.cloud import part_of
+from edge_depth_nerf.export.cloud import Cloud, figures_of, part_of
 from edge_depth_nerf.export.command import export_scene
 from edge_depth_nerf.export.cuts import cuts_of
 from edge_depth_nerf.export.options import ExportOptions
@@ -98,6 +98,24 @@ def test_points_lie_on_the_walls_and_their_normals_point_into_the_room(cloud):
     assert (np.abs(255 * colours - colour).max(1) < 3).mean() > 0.9
     # the walls that cameras see are all there
     assert (np.ptp(points, axis=0) > 0.9 * (ROOM[1] - ROOM[0])).sum() >= 2
+
+
+def test_figures_of_the_cloud_are_written(cloud):
+    points, _ = read_cloud(cloud)
+    found = read_json(cloud.with_name("export_figures.json"))
+    assert found["points"] == len(points) and found["text"].startswith(f"{len(points):,} points")
+    assert 0 < found["lidar_median_off_m"] < 0.02
+
+
+def test_lidar_beside_a_wall_is_off_by_its_distance(tmp_path):
+    rng = np.random.default_rng(0)
+    points = np.stack((rng.uniform(0, 4, 900), rng.uniform(0, 4, 900), np.zeros(900)), 1)
+    flat = Cloud(points, np.zeros_like(points), np.tile([0.0, 0, 1], (900, 1)), np.full(900, 0.05))
+    lidar = np.stack((rng.uniform(0, 4, 200), rng.uniform(0, 4, 200), rng.choice([-0.03, 0.03], 200)), 1)
+    found = figures_of(flat, lidar)
+    expected = {"points": 900, "median_sigma_m": 0.05, "lidar_median_off_m": 0.03}
+    assert found == {**expected, "text": "900 points, 3.0 cm from LiDAR's (median)"}
+    assert figures_of(flat, None)["text"] == "900 points"
 
 
 def test_points_are_thinned_in_world_metres(scene, cloud, tmp_path):

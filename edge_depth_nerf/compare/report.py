@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from edge_depth_nerf.base.files import read_json
+from edge_depth_nerf.base.files import read_json, read_json_object
 from edge_depth_nerf.compare.methods import METHODS
 from edge_depth_nerf.compare.results import Results, RunResult
 from edge_depth_nerf.compare.specification import OF_A_RUN, VIEWS
@@ -16,6 +16,7 @@ from edge_depth_nerf.jobs.runs import viewer_command
 from edge_depth_nerf.report.build import Commands, Facts, Plot, Report
 from edge_depth_nerf.report.tables import MadeTable
 from edge_depth_nerf.report.views import make_drives
+from edge_depth_nerf.scene.format import EXPORT_FIGURES
 
 
 def make_report(results: Results, tables: Sequence[MadeTable], plots: Sequence[Plot], console: Console) -> Report:
@@ -86,6 +87,8 @@ def _of_drive(scene: str, run: RunResult) -> Facts:
         "Size": f"{', '.join(sizes)} px" if sizes else "",
         "Sweeps around each picture": str(2 * source["sweeps"] + 1) if "sweeps" in source else "",
     }
+    for path in sorted(folder.parent.glob(f"{folder.name}_*/{EXPORT_FIGURES}")):
+        entries[f"Exported: {path.parent.name}"] = str(read_json_object(path, "text")["text"])
     return Facts(f"Drive {scene}", {name: value for name, value in entries.items() if value})
 
 

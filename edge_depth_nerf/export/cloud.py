@@ -9,12 +9,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt8
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from edge_depth_nerf.base.files import read_npz, write_atomically
 from edge_depth_nerf.cameras.transforms import Transform, opencv_to_opengl
@@ -212,6 +214,21 @@ def _summed(rows: NDArray[np.float64], keys: NDArray[np.int64]) -> tuple[NDArray
     unique, place = np.unique(keys, return_inverse=True)
     columns = [np.bincount(place, weights=rows[:, number], minlength=len(unique)) for number in range(rows.shape[1])]
     return np.stack(columns, 1).astype(np.float64), unique
+
+
+def figures_of(cloud: Cloud, lidar_m: Float[np.ndarray, "lidar 3"] | None) -> dict[str, Any]:
+    """Give the number of points and their median standard deviation; and how far LiDAR's points are from the cloud.
+
+    That is the median distance from the plane of the nearest point. LiDAR is part of the prior, so it tells whether
+    the two lie in one place, not how true the cloud is.
+    """
+    found: dict[str, Any] = {"points": len(cloud.points_m), "median_sigma_m": round(float(np.median(cloud.sigma_m)), 4)}
+    if lidar_m is not None and len(lidar_m):
+        nearest = KDTree(cloud.points_m).query(lidar_m)[1]
+        off_m = np.abs(((lidar_m - cloud.points_m[nearest]) * cloud.normals[nearest]).sum(1))
+        found["lidar_median_off_m"] = round(float(np.median(off_m)), 4)
+    off = f", {100 * found['lidar_median_off_m']:.1f} cm from LiDAR's (median)" if "lidar_median_off_m" in found else ""
+    return {**found, "text": f"{found['points']:,} points{off}"}
 
 
 def cloud_rows(cloud: Cloud, offset_m: Float[np.ndarray, "3"], number: str = "<f4") -> NDArray:

@@ -18,16 +18,16 @@ from rich.console import Console
 from edge_depth_nerf import __version__
 from edge_depth_nerf.base.console import run_jobs, say
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import open_folder, remove_leftovers, write_bytes
+from edge_depth_nerf.base.files import open_folder, remove_leftovers, write_bytes, write_json
 from edge_depth_nerf.base.one_writer import only_writer
-from edge_depth_nerf.export.cloud import Cloud, cloud_rows, merge_parts, part_of, write_part
+from edge_depth_nerf.export.cloud import Cloud, cloud_rows, figures_of, merge_parts, part_of, write_part
 from edge_depth_nerf.export.colmap_form import MODEL, write_model
 from edge_depth_nerf.export.nerfstudio_form import POINTS, write_transforms
 from edge_depth_nerf.export.options import ExportOptions
 from edge_depth_nerf.export.pictures import LARGEST_COUNT, MILLIMETRES, ExportedView, ViewWriter, views_of
 from edge_depth_nerf.export.priors import Priors
 from edge_depth_nerf.lidar.ply import ply_bytes
-from edge_depth_nerf.scene.format import CALIBRATION_FILE, TRANSFORMS
+from edge_depth_nerf.scene.format import CALIBRATION_FILE, EXPORT_FIGURES, TRANSFORMS
 from edge_depth_nerf.scene.reader import SceneFolder, read_scene
 
 RECORD = "export.json"
@@ -93,10 +93,12 @@ def _write(output: Path, options: ExportOptions, scene: SceneFolder, priors: Pri
     needed = training if only_cloud else scene.pictures
     _run([partial(priors.make, each) for each in needed if not priors.is_made(each)], "Making the prior", console)
     cloud = _cloud(output / WORK / "cloud", options, priors, training, console)
+    figures = figures_of(cloud, scene.points_m())
+    write_json(output / EXPORT_FIGURES, figures)
     if options.form == "points":
         offset_m = np.array(scene.meta.get("world_offset_m", [0.0, 0.0, 0.0]), np.float64)
         write_bytes(output / POINTS, ply_bytes(cloud_rows(cloud, offset_m, "<f8")))
-        _show(console, output, cloud, [])
+        _show(console, output, figures, [])
         return
     views, writer = views_of(scene, priors.stems, options), ViewWriter(output, priors, options)
     of_pictures = [list(group) for _, group in groupby(views, lambda view: view.picture.name)]
@@ -123,7 +125,7 @@ def _write(output: Path, options: ExportOptions, scene: SceneFolder, priors: Pri
             "which PNGs of millimetres cannot hold. --depth-files npy keeps them.",
             "yellow",
         )
-    _show(console, output, cloud, views)
+    _show(console, output, figures, views)
 
 
 def _run(jobs: Sequence[Callable[[], Any]], title: str, console: Console) -> list[Any]:
@@ -149,6 +151,6 @@ def _cloud(folder: Path, options: ExportOptions, priors: Priors, training: Seque
     return cloud
 
 
-def _show(console: Console, output: Path, cloud: Cloud, views: Sequence[ExportedView]) -> None:
+def _show(console: Console, output: Path, figures: dict[str, Any], views: Sequence[ExportedView]) -> None:
     pictures = f"{len(views)} pictures with depth and " if views else ""
-    say(console, f"{pictures}{len(cloud.points_m):,} points: {output}")
+    say(console, f"{pictures}{figures['text']}: {output}")

@@ -22,6 +22,8 @@ from edge_depth_nerf.base.files import read_json
 
 TRANSFORMS = "transforms.json"
 POINTS = "points.ply"
+EXPORT_FIGURES = "export_figures.json"
+"""What `export` writes of its cloud into its own folder, which lies beside the scene."""
 CALIBRATION_FILE = "mono_trust.json"
 """The calibration of the prior, beside the maps that it was measured on."""
 REFINED_POSES = "refined_poses.json"
