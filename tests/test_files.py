@@ -1,9 +1,13 @@
+import time
+from concurrent.futures import ThreadPoolExecutor
+
 import cv2
 import numpy as np
 import pytest
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import (
+    load_npy,
     read_distance_png,
     read_image,
     read_json,
@@ -87,3 +91,24 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
         write_atomically(path, fail)
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_arrays_are_parsed_by_one_thread_at_a_time(tmp_path, monkeypatch):
+    """NumPy's header goes through ast.parse, which fails in some Pythons where another thread parses as well."""
+    path, inside, most, load = tmp_path / "a.npy", [], [], np.load
+    np.save(path, np.arange(3))
+
+    def watched(*arguments, **options):
+        inside.append(0)
+        most.append(len(inside))
+        time.sleep(0.01)
+        try:
+            return load(*arguments, **options)
+        finally:
+            inside.pop()
+
+    monkeypatch.setattr(np, "load", watched)
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(load_npy, [path] * 4))
+    assert [array.tolist() for array in found] == [[0, 1, 2]] * 4
+    assert most == [1] * 4

@@ -18,6 +18,7 @@ from edge_depth_nerf.lidar import Sweep
 from edge_depth_nerf.lidar.scans import columns_told
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.masks.lens import lens_circle
+from edge_depth_nerf.process import lidar_checks
 from edge_depth_nerf.process.lidar_checks import LidarCheck, check_lidar
 from edge_depth_nerf.process.mask_checks import mask_warnings
 from edge_depth_nerf.process.options import RigOptions
@@ -132,6 +133,31 @@ def test_a_good_drive_gives_no_warning(whole: Recording) -> None:
 def test_what_is_wrong_is_named(recording: Recording, change: Change, said: str) -> None:
     (warning,) = checked(change(recording)).warnings
     assert re.search(said, warning), warning
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda recording: recording, None),
+        (pictures_later(0.3), r"the clock of (roof .* add 0\.(29|3[0-2])|right .* add -0\.(29|3[0-2])) to its"),
+        (beside(0.6), r"roof sits -0\.[4-7]\d m further along its y axis|right sits -0\.[4-7]\d m"),
+    ],
+)
+def test_noisy_pictures_name_small_faults(
+    recording: Recording, monkeypatch: pytest.MonkeyPatch, change: Change, said: str | None
+) -> None:
+    """Contrast then never agrees well."""
+    noise, read = np.random.default_rng(0), lidar_checks.read_image
+
+    def noisy(path: Path) -> np.ndarray:
+        clean = read(path)
+        return (clean + noise.normal(0, 50, clean.shape)).clip(0, 255).astype(np.uint8)
+
+    monkeypatch.setattr(lidar_checks, "read_image", noisy)
+    found = checked(change(recording))
+    assert len(found.warnings) == (said is not None)
+    assert said is None or re.search(said, found.warnings[0]), found.warnings
+    assert said is not None or found.figures[0].correlation < 0.85
 
 
 def test_point_times_that_count_backwards_are_named(recording: Recording) -> None:

@@ -79,17 +79,17 @@ _FEWEST = 400
 """Fewer LiDAR points seen in both pictures say nothing."""
 _FAINTEST = 0.02
 """Pictures with less contrast at the LiDAR points (root mean square) say nothing."""
-_FITTING, _FITTING_SMALL = 0.3, 0.1
-"""And only if the lack that it leaves is less; of small angles and shifts, lest a pillar is taken for the next, the
-second."""
+_FITTING = 0.3
+"""And only if the lack that it leaves is less."""
 _LOG_RATIOS = np.linspace(-1.8, 1.8, 91)
 """Distances are searched from a sixth of LiDAR's to six times them."""
 _LEAST_LACK = 0.03
 """Less is noise."""
 _MOST_BY_EDGES, _MOST_BY_SWEEPS = 0.15, 1.0
 """The logarithms of edges and of how far sweeps are apart change the gain by so much at most."""
-_MOVES = 0.6
-"""A reading fits only if its lack is less than this part of what it were if the camera had not moved."""
+_MOVES, _MOVES_SMALL = 0.6, 1 / 3
+"""A reading fits only if its lack is less than this part of what it were if the camera had not moved; of small angles
+and shifts the second, lest a pillar is taken for the next."""
 _DOUBT = 0.3
 """`_best` searches for large faults only above this lack, above that of a camera that stands, or where the ratio is
 off."""
@@ -499,6 +499,8 @@ class _Candidate:
     lack: float = 1.0
     before: float = 1.0
     """The mean lack as given."""
+    still: float = 1.0
+    """The mean lack if the camera had not moved."""
 
     @property
     def clear(self) -> bool:
@@ -506,7 +508,7 @@ class _Candidate:
         if not self.reading.both:
             return self.gain >= self.reading.clear and self.lack < _FITTING
         gains = self.by_contrast >= _LEAST_GAINS[0] and self.by_edges >= _LEAST_GAINS[1]
-        return self.gain >= self.reading.clear and self.lack < _FITTING_SMALL and gains
+        return self.gain >= self.reading.clear and self.lack < min(_FITTING, _MOVES_SMALL * self.still) and gains
 
 
 def _of_point_times(source: _Source) -> list[Reading]:
@@ -684,16 +686,18 @@ def _tried(
 ) -> _Candidate:
     """Try a reading, on some or all pairs of pictures, and with `apart_m` on sweeps."""
     reading, unfit = candidate.reading, replace(candidate, gain=-math.inf)
-    before = [given[view] for view in candidate.views]
-    after = [source.fit(view, some[view] if some else view.pairs, reading) for view in candidate.views]
+    fits = [given[view] for view in candidate.views]
+    others = [source.fit(view, some[view] if some else view.pairs, reading) for view in candidate.views]
     # points that are seen, but on nothing with contrast, tell nothing
-    told = [(b, a) for b, a in zip(before, after, strict=True) if b.tells or (a.tells and b.share < _UNSEEN)]
+    told = [(b, a) for b, a in zip(fits, others, strict=True) if b.tells or (a.tells and b.share < _UNSEEN)]
     if not told:
         return unfit
-    lacks = sum(b.lack for b, _ in told), sum(a.lack for _, a in told)
-    if lacks[1] > _MOVES * sum(a.still for _, a in told):
+    before, lack, still = (
+        float(np.mean(each)) for each in zip(*((b.lack, a.lack, a.still) for b, a in told), strict=True)
+    )
+    if lack > _MOVES * still:
         return unfit
-    gain = math.log(lacks[0] / lacks[1])
+    gain = math.log(before / lack)
     steps = [math.log(a.edge / b.edge) for b, a in told if a.edge > 0 and b.edge > 0]
     step = _within(float(np.mean(steps)), _MOST_BY_EDGES) if steps else 0.0
     parts = {"by_contrast": gain, "by_edges": step}
@@ -702,7 +706,7 @@ def _tried(
     if apart_m is not None and of_sweeps and gain > -0.2:
         other_m = source.apart_m(reading)
         gain += 0.0 if other_m is None else _within(math.log(apart_m / other_m), _MOST_BY_SWEEPS)
-    return replace(candidate, gain=gain, lack=lacks[1] / len(told), before=lacks[0] / len(told), **parts)
+    return replace(candidate, gain=gain, lack=lack, before=before, still=still, **parts)
 
 
 def _within(value: float, most: float) -> float:

@@ -116,7 +116,7 @@ _FACTORS = [0.15 * step for step in range(-20, 21) if step]
 _FINER = 0.075
 _SAME_UNIT = 0.05
 """A unit is the one that is known if their logarithms differ by less."""
-_CLOCKS_S = (0.05, 0.1, 0.2, 0.5, 1.0)
+_CLOCKS_S = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0)
 _ANGLES_DEG = (2.0, 5.0)
 _OFFSETS_M = (0.5,)
 _YAWS_DEG = (-150.0, -120.0, -60.0, -30.0, 30.0, 60.0, 120.0, 150.0)
