@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+import shlex
 import signal
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,10 +18,14 @@ from nerfstudio.viewer.viewer import Viewer
 from scenes import transforms, write_scene
 from trainings import trainer_of
 
+from edge_depth_nerf import cli
+from edge_depth_nerf.compare.options import CompareOptions
+from edge_depth_nerf.films.options import CameraPathOptions
 from edge_depth_nerf.jobs.runs import newest_checkpoint
 from edge_depth_nerf.kernels.threads import kernel_threads
 from edge_depth_nerf.plugin.grad_scaler import PatientGradScaler
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
+from edge_depth_nerf.plugin.pipeline import EdgeDepthPipeline
 from edge_depth_nerf.plugin.trainer import EdgeDepthTrainer
 
 STEPS = 6
@@ -244,3 +250,33 @@ def test_a_checkpoint_of_the_full_preset_on_a_cpu_is_taken_up_on_a_gpu_and_back(
     loaded(PatientGradScaler(enabled=True), 1)
     loaded(PatientGradScaler(enabled=False), 2)
     assert scalers[0] == {} and scalers[1]["scale"] == 2.0**16
+
+
+def test_a_training_says_where_it_is_and_ends_with_the_next_commands(trainer, monkeypatch, capsys):
+    monkeypatch.setattr("edge_depth_nerf.plugin.trainer.TOLD_EVERY_S", 0.0)
+    monkeypatch.setattr("edge_depth_nerf.plugin.trainer.TOLD_EVERY_SHARE", 0.0)
+    trainer.train()
+    said = capsys.readouterr().out
+    lines = re.findall(r"^Step (\d) of 6: loss (\d\.\d+), held-out PSNR (\d+\.\d) dB; .* rays/s(.*)$", said, re.M)
+    assert [line[0] for line in lines] == ["2", "3", "4", "5", "6"]
+    assert all(line[3].endswith("to go") for line in lines[:-1]) and lines[-1][3] == ""
+    assert float(lines[-1][2]) == pytest.approx(trainer.pipeline.held_out_psnr(), abs=3)
+    config = trainer.base_dir / "config.yml"
+    found = dict(re.findall(r"^([A-Z][a-z ]+): ((?:ns-|edge-depth-nerf ).*)$", said, re.M))
+    assert list(found) == ["View it", "Evaluate it", "Make a film", "Compare"]
+    assert all(f"--load-config {config}" in found[what] for what in ("View it", "Evaluate it", "Make a film"))
+    film, compared = (cli.parse(shlex.split(found[what])[1:]) for what in ("Make a film", "Compare"))
+    assert isinstance(film, CameraPathOptions) and film.load_config == config
+    assert isinstance(compared, CompareOptions) and compared.scenes == (trainer.config.data,)
+    assert compared.preset == "lite"
+
+
+def test_asking_for_held_out_psnr_changes_no_training(trainer, tmp_path):
+    other = trainer_of(trainer.config.data, tmp_path / "other", max_num_iterations=STEPS)
+    for step in range(3):
+        for each in (trainer, other):
+            torch.manual_seed(step)
+            each.train_iteration(step)
+        assert isinstance(other.pipeline, EdgeDepthPipeline) and 5 < other.pipeline.held_out_psnr() < 40
+    expected = parameters(trainer.pipeline)
+    assert all(torch.equal(value, expected[name]) for name, value in parameters(other.pipeline).items())

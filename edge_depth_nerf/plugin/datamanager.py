@@ -15,6 +15,7 @@ import errno
 import hashlib
 import json
 import os
+import shlex
 import tempfile
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
@@ -73,6 +74,8 @@ KEPT_TABLES = 8
 """This many tables of pixels are kept per scene, the last used ones. 300 pictures of 1400×1400 px take 6 GB."""
 
 
+SHORT_NAMES = {"lidar": "LiDAR", "mono": "monocular"}
+"""Of sources of the prior, in a line."""
 SURFACE_SIGMA_M = 0.1
 SURFACE_SIGMA_SHARE = 0.15
 """A prior is too vague for a surface if its sigma exceeds these metres plus this share of its distance."""
@@ -187,10 +190,14 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         self._surface_sampler = None
         if self.config.surface_rays_per_batch > 0 and table.share_with_prior > 0:
             self._surface_sampler = TablePixelSampler(table, self.config.surface_rays_per_batch, self.device)
-        CONSOLE.log(
-            f"{len(self.train_dataset)} training pictures, {len(table):,} valid pixels, "
-            f"{table.share_with_prior:.1%} of them with a depth prior"
-        )
+        said = f"{len(self.train_dataset)} training pictures, {len(table):,} pixels."
+        if table.share_with_prior > 0:
+            shares = (f"{SHORT_NAMES.get(name, name)} {share:.0%}" for name, share in table.shares_of_sources.items())
+            said += (
+                f" Prior: {'; '.join([f'{table.share_with_prior:.0%} of them', *filter(None, [', '.join(shares)])])}"
+            )
+            said += f"; `edge-depth-nerf inspect {shlex.quote(str(self.config.dataparser.data))}` shows it."
+        CONSOLE.print(said, soft_wrap=True, highlight=False, markup=False)
 
     def setup_eval(self) -> None:
         """Write or open the table of held-out pixels (no prior), and prepare the loaders of whole views."""
@@ -305,7 +312,6 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
             calibration = find_calibration(
                 scene, options, self._cache_dir(), dataset.image_filenames, CONSOLE, source, self.device
             )
-            CONSOLE.log(f"Depth prior: {calibration.summary()}")
         elif source == "mono" and options.sigma_mode == "calibrated":
             calibration = field_of_source(scene)
         elif self.config.depth_source == "auto" and source == "lidar":
@@ -391,7 +397,8 @@ def _load(dataset: FisheyeDepthDataset, cache: PriorCache | None, whole_windows:
         if sky is not None and (motion := maps.get("motion")) is not None:
             # a pixel that was matched between pictures is not sky
             sky &= ~(motion > 0)
-        return PicturePixels(rgb, mask, prior.distance_m, prior.sigma_m, sky)
+        sources = {name: found > 0 for name in depth_sources() if (found := maps.get(name)) is not None}
+        return PicturePixels(rgb, mask, prior.distance_m, prior.sigma_m, sky, sources)
 
     # OpenCV and torch release the interpreter's lock, so two threads read and integrate at the same time. They are only
     # a few pictures ahead, which limits memory.
