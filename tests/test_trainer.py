@@ -161,12 +161,15 @@ def test_detail_appears_when_training_ends(trainer, monkeypatch, switched_on):
     monkeypatch.setattr(Trainer, "_train_complete_viewer", lambda _: asked.append("waits"))
     monkeypatch.setattr(trainer, "viewer_state", viewer)
     layers = trainer.pipeline.drive.layers
-    monkeypatch.setattr(layers, "viewer", SimpleNamespace(trainer=trainer), raising=False)
+    button = SimpleNamespace(visible=True)
+    viewer_of_layers = SimpleNamespace(trainer=trainer, pause_train=button, resume_train=button)
+    monkeypatch.setattr(layers, "viewer", viewer_of_layers, raising=False)
     trainer.training_state = "training"
     layers.detail.value = switched_on
     assert not layers.shows_detail()
     trainer._train_complete_viewer()
     assert asked == ([True, "waits"] if switched_on else ["waits"])
+    assert not button.visible, "nothing can be paused any more"
 
 
 def test_a_relative_scene_is_said_to_be_relative(trainer, tmp_path, monkeypatch):
@@ -199,7 +202,7 @@ def test_a_drive_without_lidar_has_no_prior_of_it(tmp_path, monkeypatch, capsys)
             frame["motion_file_path"] = frame.pop("mono_file_path")
     trainer_of(scene, tmp_path / "runs", max_num_iterations=STEPS)
     said = capsys.readouterr().out
-    assert "with a depth prior" in said and "LiDAR alone" not in said
+    assert " Prior: " in said and "LiDAR alone" not in said
 
 
 @pytest.mark.parametrize("logged", [True, False])

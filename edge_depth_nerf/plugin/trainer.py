@@ -165,12 +165,13 @@ class EdgeDepthTrainer(Trainer):
         raise SystemExit(STOPPED_STATUS) from None
 
     def _train_complete_viewer(self) -> None:
-        """Show detail from now on, where the viewer's switch asks for it; then wait for Ctrl-C, as nerfstudio does."""
+        """End the viewer's training, show detail if its switch asks for it, and wait for Ctrl-C as nerfstudio does."""
         viewer, pipeline = self.viewer_state, self.pipeline
-        ours = isinstance(pipeline, EdgeDepthPipeline) and pipeline.drive.layers.detail.value
-        if ours and isinstance(viewer, Viewer):
-            self.training_state = "completed"
-            viewer._trigger_rerender()
+        if isinstance(pipeline, EdgeDepthPipeline) and isinstance(viewer, Viewer):
+            pipeline.drive.layers.end_training()
+            if pipeline.drive.layers.detail.value:
+                self.training_state = "completed"
+                viewer._trigger_rerender()
         super()._train_complete_viewer()
 
     def train_iteration(self, step: int) -> TRAIN_INTERATION_OUTPUT:
