@@ -18,7 +18,7 @@ MOST_LINES = {
     "edge_depth_nerf/compare": 2_960,
     "edge_depth_nerf/demo": 220,
     "edge_depth_nerf/export": 1_050,
-    "edge_depth_nerf/films": 1_800,
+    "edge_depth_nerf/films": 1_820,
     "edge_depth_nerf/inspecting": 1_440,
     "edge_depth_nerf/jobs": 810,
     "edge_depth_nerf/kernels": 3_810,

@@ -82,13 +82,9 @@ SURFACE_SIGMA_SHARE = 0.15
 
 
 @dataclass
-class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig):
-    """Rays of fisheye pictures with an edge-aware integrated depth prior."""
+class PriorSourceOptions:
+    """Our options, before nerfstudio's in the help."""
 
-    _target: type = field(default_factory=lambda: FisheyeDepthDataManager)
-    """Target class to instantiate."""
-    dataparser: AnnotatedDataParserUnion = field(default_factory=FisheyeDepthDataParserConfig)
-    """Specifies the dataparser used to unpack the data."""
     depth_source: str = "auto"
     """The prior's source. integrated: LiDAR, monocular maps and motion; lidar, mono, motion or another: this one alone;
     none; auto: what the scene has."""
@@ -98,6 +94,16 @@ class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig):
     """Additional pixels in each batch, whose colour is compared with the field's at the prior's distance. 0: none."""
     cache_dir: Path | None = None
     """Folder for priors and tables of training pixels. Not set: .cache/ in the scene folder."""
+
+
+@dataclass
+class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig, PriorSourceOptions):
+    """Rays of fisheye pictures with an edge-aware integrated depth prior."""
+
+    _target: type = field(default_factory=lambda: FisheyeDepthDataManager)
+    """Target class to instantiate."""
+    dataparser: AnnotatedDataParserUnion = field(default_factory=FisheyeDepthDataParserConfig)
+    """Specifies the dataparser used to unpack the data."""
 
     def source_of_prior(self, sources: Collection[str]) -> str | None:
         """Return the depth source, of layers that all pictures have; `auto` becomes what the scene has. None: no prior.

@@ -21,6 +21,7 @@ import yaml
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer import Viewer
@@ -45,13 +46,22 @@ PRESETS = {"edge-depth-nerf": "full", "edge-depth-nerf-paper": "paper"}
 
 
 @dataclass
-class EdgeDepthTrainerConfig(TrainerConfig):
+class TrainingOptions:
+    """Our options and the most used of nerfstudio's, before its others in the help."""
+
+    data: Path | None = None
+    max_num_iterations: int = 0
+    cuda_graphs: bool = True
+    """On a GPU, launch a step's kernels as one: several times faster, same results (docs/gpu.md)."""
+    pipeline: VanillaPipelineConfig = field(default_factory=VanillaPipelineConfig)
+
+
+@dataclass
+class EdgeDepthTrainerConfig(TrainerConfig, TrainingOptions):
     """nerfstudio's trainer with atomic checkpoints and a check for finite numbers."""
 
     _target: type = field(default_factory=lambda: EdgeDepthTrainer)
     """Target class to instantiate."""
-    cuda_graphs: bool = True
-    """On a GPU, launch a step's kernels as one: several times faster, same results (docs/gpu.md)."""
 
     def print_to_terminal(self) -> None:
         """Print what is trained, and the settings that differ from the method's own; config.yml has all of them."""
