@@ -48,7 +48,7 @@ def results(page: str) -> list[Result]:
         raise InputError(
             f"{PAGE.name}: the table under <!-- {TABLE} --> has no rows. Write it with python -m benchmarks.pages."
         )
-    columns = [rows[0].index(name) for name in ("PSNR", "AbsRel")]
+    columns = [rows[0].index(name) for name in ("masked PSNR", "AbsRel")]
     # a spread that is 0 as written is left out
     figures = [
         [float(each) for column in columns for each in f"{row[column]} ± 0".split(" ± ")[:2]] for row in rows[2:]

@@ -231,13 +231,14 @@ def methods() -> str:
     text = METHODS_HEADER
     for title, place, cls in groups:
         is_parser = cls is FisheyeDepthDataParserConfig
-        docs, hints = field_docs(cls), get_type_hints(cls, include_extras=True)
-        rows = []
+        ours = [base for base in reversed(cls.__mro__) if base.__module__.startswith("edge_depth_nerf.")]
+        docs = {name: text for base in ours for name, text in field_docs(base).items()}
+        hints, rows = get_type_hints(cls, include_extras=True), []
         for entry in dataclasses.fields(cls):
             # a group of options has a table of its own
             full = f"{place}.{entry.name}".removeprefix(".")
             hidden = is_marked(hints[entry.name], tyro.conf.Suppress)
-            if hidden or entry.name not in docs or entry.name in ("_target", "losses", *HOSTS) or full in places:
+            if hidden or not docs.get(entry.name) or entry.name in ("_target", "losses", *HOSTS) or full in places:
                 continue
             values = {name: at(config, full) for name, config in configs.items()}
             first = next(iter(values.values()))

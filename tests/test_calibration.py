@@ -176,7 +176,7 @@ def test_a_scene_is_calibrated_and_the_file_read_again(tmp_path):
         assert frame.held_out_after is not None and frame.held_out_after < 0.01
     assert calibration.drive_fit is not None
     assert calibration.drive_fit.apply(np.array([[11.0]], np.float32))[0, 0] == pytest.approx(10, rel=0.02)
-    assert "10.0% before" in calibration.summary()
+    assert "10.0% before" in " ".join(calibration.sentences())
 
 
 @pytest.mark.parametrize("key", ["lidar_file_path", "mono_file_path"])
@@ -202,7 +202,7 @@ def test_few_points_are_named(tmp_path):
     calibration = calibrate_scene(scene)
     (poor,) = [frame for frame in calibration.frames if frame.fit_of == "drive"]
     assert poor.frame == "images/0002.png" and poor.returns < 50 and poor.fit == calibration.drive_fit
-    assert "use that of the whole drive: images/0002.png." in calibration.summary()
+    assert "use that of the whole drive: images/0002.png." in " ".join(calibration.sentences())
 
 
 def test_a_calibration_is_found_until_its_files_change(tmp_path, monkeypatch):
@@ -254,7 +254,7 @@ def test_maps_of_zeros_give_no_model_but_no_error(tmp_path):
         change_map(scene, "mono_file_path", frame, lambda metres: metres * 0)
     calibration = calibrate_scene(scene)
     assert calibration.error_model is None and calibration.drive_fit is None
-    assert "LiDAR points are too few" in calibration.summary()
+    assert "LiDAR points are too few" in " ".join(calibration.sentences())
 
 
 def test_no_prior_beyond_lidars_field_but_from_a_source_trained_elsewhere(tmp_path):
@@ -320,7 +320,7 @@ def test_motion_counts_by_its_error_beside_monos(tmp_path):
     assert calibrated.motion.mono_relative_error == pytest.approx(0.02, rel=0.25)
     assert calibrated.motion.weight == pytest.approx(16 / 17, abs=0.04)
     assert doubted.motion.weight < 0.06
-    assert "95 % of the distances from motion are within" in calibrated.summary()
+    assert "95 % of the distances from motion are within" in " ".join(calibrated.sentences())
     assert read_calibration(right / CALIBRATION_FILE) == calibrated
     assert find_calibration(read_scene(right), PriorOptions()) == calibrated
     # other files, another calibration
@@ -331,7 +331,7 @@ def test_without_motion_a_calibration_says_nothing_of_it(tmp_path):
     scene = write_scene(tmp_path / "a")
     calibration = calibrate_scene(scene)
     assert calibration.motion is None and "motion" not in read_json(scene / CALIBRATION_FILE)
-    assert "motion" not in calibration.summary()
+    assert "motion" not in " ".join(calibration.sentences())
     same = with_motion(write_scene(tmp_path / "b"), 1.0)
     assert find_calibration(read_scene(same), PriorOptions(motion=False)) == calibration
     empty = with_motion(write_scene(tmp_path / "c"), 0.0)

@@ -1,5 +1,6 @@
 """Paths of films: their geometry, and what nerfstudio makes of the files."""
 
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from trainings import write_config
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json
-from edge_depth_nerf.films.command import write_camera_path
+from edge_depth_nerf.films.command import film_lens, write_camera_path
 from edge_depth_nerf.films.options import CameraPathOptions
 from edge_depth_nerf.films.paths import CameraPath, lane_shift, orbit, replay, up_of
 from edge_depth_nerf.plugin.config import edge_depth_nerf_lite
@@ -273,7 +274,11 @@ def test_angle_of_view_of_a_fisheye_grows_evenly(scene, tmp_path):
     assert angles_deg(cameras, (84, 0), (84, 48), (36, 96)) == pytest.approx([96, 48, 48], abs=1e-2)
     pinholes = write_scene(tmp_path / "pinholes", [pinhole()], frames=3)
     _, cameras = film(pinholes, tmp_path)
-    assert angles_deg(cameras, (14, 0)) == pytest.approx([90], abs=1e-2)
+    # that of the drive's lens, 32 px wide, evenly
+    assert angles_deg(cameras, (14, 0)) == pytest.approx([np.degrees(np.arctan(16 / pinhole().fx))], abs=1e-2)
+    _, cameras = film(pinholes, tmp_path, camera="perspective")
+    assert (int(cameras.width[0]), int(cameras.height[0])) == (32, 28)
+    assert torch.allclose(cameras.fx, torch.full_like(cameras.fx, pinhole().fx))
 
 
 def test_the_whole_sphere(scene, tmp_path):
@@ -303,6 +308,45 @@ def test_a_path_far_outside_the_drive_is_reported(scene, tmp_path, shift_m, warn
     # the path is back at the drive at both ends
     assert ("5 of 9 poses of the path are more than 10 m from the drive, the furthest 13 m" in said) is warned
     assert (tmp_path / "path.json").is_file()
+
+
+@pytest.mark.parametrize(
+    ("camera", "options"), [("perspective", {"fov_deg": 80.0}), ("fisheye", {}), ("equirectangular", {})]
+)
+def test_the_rays_of_a_film_are_those_that_are_rendered(scene, tmp_path, camera, options):
+    _, cameras = film(scene, tmp_path, camera=camera, width=48, **options)
+    asked = CameraPathOptions(Path("c.yml"), camera=camera, width=48, **options)
+    lens = film_lens(fisheye(32, 28), asked)
+    rows = round(24 * lens.height / lens.width)
+    pixels = (np.indices((rows, 24)).reshape(2, -1).T + 0.5) * (lens.height / rows, 2)
+    coords = torch.from_numpy(pixels).float()
+    rays = cameras.generate_rays(torch.zeros(len(pixels), 1, dtype=torch.long), coords=coords).directions.numpy()
+    assert np.allclose(lens.rays(camera) @ cameras.camera_to_worlds[0, :, :3].numpy().T, rays, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("options", "unseen"),
+    [
+        ({"fov_deg": 120.0}, 1 - (np.tan(np.radians(40)) / np.tan(np.radians(60))) ** 2),
+        ({}, None),
+        ({"kind": "orbit"}, 0.7),
+    ],
+)
+def test_what_no_camera_saw_is_reported(tmp_path, capsys, options, unseen):
+    """A pinhole of 80° that looks ahead; of the eight poses of an orbit, three look nearly the same way."""
+    lens = replace(pinhole(32, 32), fx=16 / np.tan(np.radians(40)), fy=16 / np.tan(np.radians(40)), cx=16.0, cy=16.0)
+    scene = write_scene(tmp_path / "scene", [lens], frames=18, mask=False)
+    with transforms(scene) as meta:
+        for number, frame in enumerate(meta["frames"]):
+            pose = np.eye(4)
+            pose[:3, :3], pose[0, 3] = looking(np.array([1.0, 0.0, 0.0])), number / 10
+            frame["transform_matrix"] = pose.tolist()
+    config = write_config(tmp_path / "config.yml", scene)
+    asked = CameraPathOptions(config, output=tmp_path / "path.json", camera="perspective", **options)
+    write_camera_path(asked, Console(width=300))
+    found = re.search(r"(\d+)% of the film's rays show what no training picture", capsys.readouterr().out)
+    assert (found is not None) is (unseen is not None)
+    assert found is None or int(found[1]) / 100 == pytest.approx(unseen, abs=0.1)
 
 
 def test_an_orbit_of_a_scene(scene, tmp_path):

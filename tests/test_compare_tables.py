@@ -34,32 +34,53 @@ def results():
     return Results(runs, {"preset": "lite", "tuned": {}}, {"nerfstudio": "1.1.5"}, 2)
 
 
-def table(results, label):
-    return next(made for made in tables.make_tables(results) if made.label == label)
+TO_CLEAN = "PSNR to clean ↑"
+RIVALS = "Rivals, drives of KITTI-360's kind"
+
+
+def table(results, title):
+    return next(made for made in tables.make_tables(results) if made.title == title)
 
 
 def test_where_the_weights_come_from(results):
     results.options |= {"tuned_on": "/scenes/tuning"}
     for run in results.runs:
         run.specification["weight"] = 0.1 if run.method == "ds-nerf" else None
-    made = table(results, "7")
+    made = table(results, "λ and σ")
     assert [row.cells[2].text() for row in made.rows] == ["–", "searched", "default"]
     assert "Searched on tuning." in made.notes and "flatter" not in made.caption
     results.options["tuned_on"] = "/scenes/street"
-    made = table(results, "7")
+    made = table(results, "λ and σ")
     assert "Searched on street." in made.notes and "flatter" in made.caption
     results.options["tuned_on"] = 7  # a file written by hand
-    assert "Searched on 7." in table(results, "7").notes
+    assert "Searched on 7." in table(results, "λ and σ").notes
     results.options["tuned_on"] = ["/scenes/tuning", "/scenes/turn"]
-    made = table(results, "7")
+    made = table(results, "λ and σ")
     assert "Searched on tuning and turn." in made.notes and "flatter" in made.caption
 
 
-def test_table_1_by_hand(results):
-    made = table(results, "1")
+def test_tables_are_numbered_and_those_for_a_terminal_come_first(results):
+    made = tables.make_tables(results)
+    assert [each.label for each in made] == [str(number) for number in range(1, len(made) + 1)]
+    assert [each.title for each in made if each.on_terminal] == [each.title for each in made[:4]]
+    assert [each.heading for each in made[:2]] == [f"Table 1. {RIVALS}", "Table 2. Pictures and geometry, average"]
+
+
+def test_the_papers_figures_are_shown_with_its_preset_alone(results):
+    def said() -> str:
+        return page_of_tables("Comparison", [], tables.make_tables(results))
+
+    assert "paper" not in said() and len(table(results, RIVALS).headings()) == 7
+    results.options["preset"] = "paper"
+    assert "(the paper's Table 1)" in said() and "averages do not follow" in said() and "+0.65" in said()
+
+
+def test_rivals_by_hand(results):
+    results.options["preset"] = "paper"
+    made = table(results, f"{RIVALS} (the paper's Table 1)")
     headings = made.headings()
-    assert headings[0] == ("street", "PSNR ↑") and headings[2] == ("turn", "PSNR ↑")
-    assert headings[4] == ("average", "PSNR ↑") and headings[-2:] == [("ours ahead", "dB"), ("ours ahead", "paper, dB")]
+    assert headings[0] == ("street", TO_CLEAN) and headings[2] == ("turn", TO_CLEAN)
+    assert headings[4] == ("average", TO_CLEAN) and headings[-2:] == [("ours ahead", "dB"), ("ours ahead", "paper, dB")]
     assert [row.title for row in made.rows] == ["nerfacto", "DS-NeRF loss", "ours"]
     nerfacto, ds_nerf, ours = made.rows
     # street, nerfacto: mean of 20, 21, 22.5 = 21.1667; deviation sqrt((1.3611 + 0.0278 + 1.7778) / 2) = 1.2583
@@ -75,10 +96,10 @@ def test_table_1_by_hand(results):
     assert "averages do not follow" in made.caption
 
 
-def test_table_1_has_other_losses_with_our_prior_and_extras(results):
+def test_rivals_have_other_losses_with_our_prior_and_extras(results):
     more = ("ds-nerf-integrated-extras", "edge-paper", "edge-plain", "edge-gaussian")
     results.runs += [fake("street", method, 0, 23.0) for method in more]
-    made = table(Results(results.runs, results.options, results.versions, 2), "1")
+    made = table(Results(results.runs, results.options, results.versions, 2), RIVALS)
     titles = [row.title for row in made.rows]
     assert titles[:2] == ["nerfacto", "DS-NeRF loss"] and titles[-2:] == ["as published", "ours"]
     assert titles[2:-2] == ["DS-NeRF loss, integrated, with extras"]
@@ -86,20 +107,21 @@ def test_table_1_has_other_losses_with_our_prior_and_extras(results):
 
 def test_one_seed_has_no_spread_and_one_drive_no_average(results):
     results.runs = [run for run in results.runs if run.seed == 1 and run.scene == "turn"]
-    made = table(results, "1")
+    made = table(results, RIVALS)
     assert made.rows[0].cells[0].text() == "23.00"
     assert {group for group, _ in made.headings()} == {"turn", "ours ahead"}
 
 
 def test_a_seed_that_a_drive_lacks_is_left_out_of_the_average(results):
     results.runs = [run for run in results.runs if (run.scene, run.method, run.seed) != ("turn", "nerfacto", 2)]
-    nerfacto = table(results, "1").rows[0]
+    nerfacto = table(results, RIVALS).rows[0]
     assert nerfacto.cells[4].text() == "22.00 ± 0.00"
-    assert nerfacto.cells[-2].text() == f"{5.25 / 2:+.2f} ± {statistics.stdev([2, 3.25]):.2f}"
+    assert nerfacto.cells[-1].text() == f"{5.25 / 2:+.2f} ± {statistics.stdev([2, 3.25]):.2f}"
 
 
-def test_tables_2_to_4_are_of_their_methods(results):
-    assert not [made for made in tables.make_tables(results) if made.label in ("2", "3", "4")]
+def test_the_papers_tables_are_of_their_methods(results):
+    results.options["preset"] = "paper"
+    assert "the paper's Table 2" not in page_of_tables("Comparison", [], tables.make_tables(results))
     results.runs += [
         fake("street", method, 0, psnr)
         for method, psnr in (("edge-lidar", 23.5), ("edge-mono", 22.0), ("edge-gaussian", 23.004))
@@ -108,15 +130,15 @@ def test_tables_2_to_4_are_of_their_methods(results):
     for run in results.runs[-3:]:
         run.content["source"] = "jbnu-depth360"
     results = Results(results.runs, results.options, results.versions, 2)
-    jbnu = table(results, "2")
+    jbnu = table(results, "Rivals, drives of JBNU-Depth360 (the paper's Table 2)")
     assert {group for group, _ in jbnu.headings()} == {"garage", "ours ahead"}
     assert [row.cells[-1].text() for row in jbnu.rows] == ["+0.12", "+0.04", "–"]
-    assert "garage" not in {group for group, _ in table(results, "1").headings()}
-    third = table(results, "3")
+    assert "garage" not in {group for group, _ in table(results, f"{RIVALS} (the paper's Table 1)").headings()}
+    third = table(results, "Source of depth (the paper's Table 3)")
     assert [row.title for row in third.rows] == ["LiDAR alone", "monocular alone", "ours"]
     assert "row of DS-NeRF" in third.caption
-    fourth = table(results, "4")
-    column = fourth.headings().index(("street", "PSNR ↑"))
+    fourth = table(results, "Kernel of the integration (the paper's Table 4)")
+    column = fourth.headings().index(("street", TO_CLEAN))
     assert [row.cells[column].text() for row in fourth.rows] == ["23.00", "23.83 ± 0.76"]
 
 
@@ -146,7 +168,7 @@ def test_steps_to_a_psnr(psnr, steps):
 
 
 def test_time_to_the_psnr_of_nerfacto(results):
-    made = table(results, "6, street")
+    made = table(results, "Time, street")
     ours = made.rows[-1]
     # by seed: nerfacto ends at 20, 21, 22.5; ours has 11.5 at 50 steps and 23 at 100, and so on
     expected = [50 + 50 * (end - own / 2) / (own / 2) for end, own in ((20, 23), (21, 24.5), (22.5, 24))]
@@ -157,9 +179,9 @@ def test_a_run_that_never_gets_there_leaves_no_mean(results):
     last = next(run for run in results.runs if (run.scene, run.method, run.seed) == ("street", "edge", 2))
     for point in last.curve:
         point["truth_psnr"] = 22.4
-    for label in ("6, street", "6, average"):
+    for label in ("Time, street", "Time, average"):
         assert table(results, label).rows[-1].cells[-1].text() == "never"
-    assert table(results, "6, turn").rows[-1].cells[-1].text() != "never"
+    assert table(results, "Time, turn").rows[-1].cells[-1].text() != "never"
 
 
 def test_latex_and_markdown_hold_the_same_cells(results):
@@ -214,9 +236,9 @@ def test_edges_on_the_path_beside_it_and_from_a_held_out_camera():
         **{"shifted_3m_edge_recall": 0.25, "camera_truth_affine_masked_psnr": 18.5, "camera_truth_edge_recall": 0.45},
     }
     runs = [fake("street", method, 0, 20.0, **more) for method in ("nerfacto", "edge")]
-    made = table(Results(runs, {"preset": "lite", "tuned": {}}, {}, 2), "9, street")
+    made = table(Results(runs, {"preset": "lite", "tuned": {}}, {}, 2), "Edges, and views beside the path, street")
     assert made.headings() == [
-        *(("PSNR ↑", "0 m"), ("PSNR ↑", "0.5 m")),
+        *((TO_CLEAN, "0 m"), (TO_CLEAN, "0.5 m")),
         *(("edges ↑", "0 m"), ("edges ↑", "0.5 m"), ("edges ↑", "1 m"), ("edges ↑", "3 m")),
         *(("depth edges ↑", "0 m"), ("depth edges ↑", "0.5 m")),
         *(("held-out cameras", "PSNR, fitted ↑"), ("held-out cameras", "edges ↑")),
@@ -227,7 +249,7 @@ def test_edges_on_the_path_beside_it_and_from_a_held_out_camera():
 
 
 def test_runs_of_earlier_versions_have_no_table_of_edges(results):
-    assert not [made for made in tables.make_tables(results) if made.label.startswith("9")]
+    assert not [made for made in tables.make_tables(results) if made.title.startswith("Edges")]
 
 
 def test_an_export_beside_the_scene_is_named(tmp_path):

@@ -2,6 +2,7 @@ import inspect
 import subprocess
 import sys
 from copy import deepcopy
+from dataclasses import fields
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
@@ -212,3 +213,24 @@ def test_users_of_other_methods_are_left_alone():
     """Every ns-* command loads the entry points; hooks, settings and others' classes stay the same."""
     done = subprocess.run([sys.executable, "-W", "ignore", "-c", UNCHANGED], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("part", "first"),
+    [
+        ("", ["data", "max_num_iterations", "cuda_graphs", "pipeline"]),
+        ("pipeline.datamanager", ["depth_source", "prior", "surface_rays_per_batch", "cache_dir"]),
+        ("pipeline.datamanager.dataparser", ["metres_per_unit", "depth_kind"]),
+        ("pipeline.model", ["near_m", "far_m", "depth_loss", "losses", "depth_loss_mult"]),
+    ],
+)
+def test_our_options_come_first_in_the_help(part, first):
+    """nerfstudio's stay as they are: their order, and defaults that no method sets."""
+    found = lookup(config.edge_depth_nerf.config, part) if part else config.edge_depth_nerf.config
+    names = [entry.name for entry in fields(found)]
+    assert names[: len(first)] == first
+    theirs = next(base for base in type(found).__mro__[1:] if base.__module__.startswith("nerfstudio."))
+    kept = [entry.name for entry in fields(theirs) if entry.name not in first]
+    assert [name for name in names if name in kept] == kept
+    if not part:
+        assert type(found)().max_num_iterations == theirs().max_num_iterations

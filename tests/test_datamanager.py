@@ -222,6 +222,25 @@ def test_two_processes_may_fill_one_cache(tmp_path):
     assert len(list((scene / ".cache" / "prior").iterdir())) == 8
 
 
+@pytest.mark.parametrize(
+    ("options", "prior"),
+    [
+        ({}, " Prior: 100% of them; LiDAR {lidar:.0%}, monocular 100%; `edge-depth-nerf inspect {scene}` shows it."),
+        ({"depth_source": "none"}, ""),
+    ],
+)
+def test_one_line_tells_of_the_prior(tmp_path, capsys, options, prior):
+    scene = write_scene(tmp_path / "scene")
+    data = manager(scene, **options)
+    said = [line for line in capsys.readouterr().out.splitlines() if "training pictures" in line or "rior" in line]
+    dataset = data.train_dataset
+    masks = [dataset.mask(number) for number in range(len(dataset))]
+    points = sum(int((dataset.distance_m(number, "lidar")[mask] > 0).sum()) for number, mask in enumerate(masks))
+    pixels = sum(int(mask.sum()) for mask in masks)
+    prior = prior.format(lidar=points / pixels, scene=scene)
+    assert said == [f"8 training pictures, {pixels:,} pixels.{prior}"]
+
+
 def test_the_calibration_of_training_pictures_is_found_or_made(tmp_path):
     scene = write_scene(tmp_path)
     made = calibrate_scene(scene)

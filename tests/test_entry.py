@@ -1,5 +1,6 @@
-"""How commands end early, as the terminal sees it."""
+"""How commands end early, as the terminal sees it, and what a file gets of their bars."""
 
+import io
 import os
 import signal
 import subprocess
@@ -8,8 +9,10 @@ import time
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from edge_depth_nerf import __version__, cli, entry
+from edge_depth_nerf.base import console as console_module
 from edge_depth_nerf.base import files
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.plugin import plain_errors
@@ -323,3 +326,17 @@ def test_ns_train_on_what_is_no_scene(tmp_path):
     assert "edge-depth-nerf-lite: 2000 steps on cpu, scene" in done.stdout and "--vis tensorboard" in done.stdout
     assert "FusedAdamConfig" not in done.stdout and len(done.stdout.splitlines()) < 10
     assert not (tmp_path / "runs").exists(), "no run was begun"
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_a_file_gets_a_line_now_and_then_where_a_terminal_has_bars(monkeypatch, terminal):
+    monkeypatch.setattr(console_module, "TOLD_EVERY_S", 0.01)
+    written = io.StringIO()
+    console = Console(file=written, force_terminal=terminal)
+    with console_module.told(console, "Process"), console_module.progress_bars(Console(quiet=True)) as bars:
+        bars.update(bars.add_task("Sweeping …", total=4.0), completed=1.0)
+        time.sleep(0.2)
+    lines = written.getvalue().splitlines()
+    assert "Process: 0 s, Sweeping 25 %" in lines or (terminal and not lines)
+    time.sleep(0.05)
+    assert written.getvalue().splitlines() == lines and not console_module._Bars.shown

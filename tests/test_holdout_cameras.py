@@ -13,13 +13,14 @@ from scenes import transforms, write_scene
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_image, read_json, write_png
-from edge_depth_nerf.compare.evaluation import ViewEvaluator, choose_pixels, evaluated
+from edge_depth_nerf.compare.evaluation import ViewEvaluator, choose_pixels
 from edge_depth_nerf.compare.figures import affine_fitted
 from edge_depth_nerf.lidar.scans import read_cloud
 from edge_depth_nerf.method.edges import picture_edges_found
 from edge_depth_nerf.method.metrics import masked_psnr
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig, check_split
 from edge_depth_nerf.plugin.dataset import FisheyeDepthDataset
+from edge_depth_nerf.plugin.pipeline import evaluated
 from edge_depth_nerf.process import motion
 from edge_depth_nerf.process.colmap import refine as refining
 from edge_depth_nerf.process.converters import convert, read_drive

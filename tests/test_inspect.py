@@ -253,7 +253,7 @@ def test_the_figures_in_the_terminal(sample_drive, tmp_path):
     said = console.export_text()
     for words in ("22 for training, 2 held out", "8.9 m (image_02)", "KANNALA_BRANDT for MEI", "128×128"):
         assert words in said
-    assert "measured on all pictures" in said
+    assert "measured on all pictures" in said and "Error of the monocular maps" in said
 
 
 # ---- small drives with one fault each --------------------------------------------------------------------------
@@ -538,7 +538,9 @@ def test_distances_from_motion_have_a_panel(drive, tmp_path):
     pictures = read_scene(drive).pictures
     maps = ((each.name, np.full((each.lens.height, each.lens.width), 5, np.float32)) for each in pictures)
     write_maps(drive, "motion", maps, {"kind": "for a test"})
-    (with_motion,) = look(drive, tmp_path / "with", frames=1, size=200)["sheets"]
+    summary = look(drive, tmp_path / "with", frames=1, size=200)
+    (with_motion,) = summary["sheets"]
+    assert summary["maps"]["motion_coverage"]["mean"] == 1
     before, after = (read_image(path) for path in (tmp_path / "without" / name, tmp_path / "with" / with_motion))
     # six panels in three columns; two more, motion and what the prior comes from, in four
     assert (before.shape[1], after.shape[1]) == (3 * (200 + 14), 4 * (200 + 14))

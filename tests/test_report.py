@@ -88,7 +88,7 @@ def test_errors_by_formula():
     assert red[0] > red[2] + 50 and blue[2] > blue[0] + 100  # 30 % too far, 50 % too near
     assert np.abs(distance_error[70, 24] - NO_VALUE_RGB).max() < 14
     squared = (np.square(30 / 255) / 3) / 2
-    assert shown.figures["m"]["PSNR, dB"] == f"{-10 * np.log10(squared):.2f}"
+    assert shown.figures["m"]["masked PSNR, dB"] == f"{-10 * np.log10(squared):.2f}"
     assert shown.figures["m"]["δ<1.25, 2-40 m"] == "0.000"
     right = show_view(replace(view, distances={"m": colour_distance(true_m * 1.1, mask)}), 10**6)
     assert right.figures["m"]["δ<1.25, 2-40 m"] == "1.000"
@@ -100,7 +100,7 @@ def test_a_view_without_distances_has_no_errors_of_them():
     view = ComparedView("a", grey, None, np.ones((20, 20), bool), nothing, None, {"m": grey}, {"m": grey})
     shown = show_view(view, 10**6)
     assert set(shown.truth) == {"colour"} and "distance-error" not in shown.rendered["m"]
-    assert list(shown.figures["m"]) == ["PSNR, dB"]
+    assert list(shown.figures["m"]) == ["masked PSNR, dB"]
 
 
 def test_lidar_points_are_spread_so_that_they_can_be_seen():
@@ -168,7 +168,7 @@ def test_drives_are_read_from_what_runs_left(tmp_path):
     (drive,) = make_drives({"x": (scene, {"one": tmp_path / "one", "two": tmp_path / "two"})}, console)
     assert drive.note.startswith("Warning of `process`: roof is turned by 180°. All ")
     for view in drive.views:
-        one, two = (float(view.figures[name]["PSNR, dB"]) for name in ("one", "two"))
+        one, two = (float(view.figures[name]["PSNR to clean, dB"]) for name in ("one", "two"))
         assert one > two + 5
         assert (view.figures["one"]["δ<1.25, 2-40 m"], view.figures["two"]["δ<1.25, 2-40 m"]) == ("1.000", "0.000")
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+import shlex
 import signal
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,10 +18,14 @@ from nerfstudio.viewer.viewer import Viewer
 from scenes import transforms, write_scene
 from trainings import trainer_of
 
+from edge_depth_nerf import cli
+from edge_depth_nerf.compare.options import CompareOptions
+from edge_depth_nerf.films.options import CameraPathOptions
 from edge_depth_nerf.jobs.runs import newest_checkpoint
 from edge_depth_nerf.kernels.threads import kernel_threads
 from edge_depth_nerf.plugin.grad_scaler import PatientGradScaler
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
+from edge_depth_nerf.plugin.pipeline import EdgeDepthPipeline
 from edge_depth_nerf.plugin.trainer import EdgeDepthTrainer
 
 STEPS = 6
@@ -155,12 +161,15 @@ def test_detail_appears_when_training_ends(trainer, monkeypatch, switched_on):
     monkeypatch.setattr(Trainer, "_train_complete_viewer", lambda _: asked.append("waits"))
     monkeypatch.setattr(trainer, "viewer_state", viewer)
     layers = trainer.pipeline.drive.layers
-    monkeypatch.setattr(layers, "viewer", SimpleNamespace(trainer=trainer), raising=False)
+    button = SimpleNamespace(visible=True)
+    viewer_of_layers = SimpleNamespace(trainer=trainer, pause_train=button, resume_train=button)
+    monkeypatch.setattr(layers, "viewer", viewer_of_layers, raising=False)
     trainer.training_state = "training"
     layers.detail.value = switched_on
     assert not layers.shows_detail()
     trainer._train_complete_viewer()
     assert asked == ([True, "waits"] if switched_on else ["waits"])
+    assert not button.visible, "nothing can be paused any more"
 
 
 def test_a_relative_scene_is_said_to_be_relative(trainer, tmp_path, monkeypatch):
@@ -193,7 +202,7 @@ def test_a_drive_without_lidar_has_no_prior_of_it(tmp_path, monkeypatch, capsys)
             frame["motion_file_path"] = frame.pop("mono_file_path")
     trainer_of(scene, tmp_path / "runs", max_num_iterations=STEPS)
     said = capsys.readouterr().out
-    assert "with a depth prior" in said and "LiDAR alone" not in said
+    assert " Prior: " in said and "LiDAR alone" not in said
 
 
 @pytest.mark.parametrize("logged", [True, False])
@@ -244,3 +253,33 @@ def test_a_checkpoint_of_the_full_preset_on_a_cpu_is_taken_up_on_a_gpu_and_back(
     loaded(PatientGradScaler(enabled=True), 1)
     loaded(PatientGradScaler(enabled=False), 2)
     assert scalers[0] == {} and scalers[1]["scale"] == 2.0**16
+
+
+def test_a_training_says_where_it_is_and_ends_with_the_next_commands(trainer, monkeypatch, capsys):
+    monkeypatch.setattr("edge_depth_nerf.plugin.trainer.TOLD_EVERY_S", 0.0)
+    monkeypatch.setattr("edge_depth_nerf.plugin.trainer.TOLD_EVERY_SHARE", 0.0)
+    trainer.train()
+    said = capsys.readouterr().out
+    lines = re.findall(r"^Step (\d) of 6: loss (\d\.\d+), held-out PSNR (\d+\.\d) dB; .* rays/s(.*)$", said, re.M)
+    assert [line[0] for line in lines] == ["2", "3", "4", "5", "6"]
+    assert all(line[3].endswith("to go") for line in lines[:-1]) and lines[-1][3] == ""
+    assert float(lines[-1][2]) == pytest.approx(trainer.pipeline.held_out_psnr(), abs=3)
+    config = trainer.base_dir / "config.yml"
+    found = dict(re.findall(r"^([A-Z][a-z ]+): ((?:ns-|edge-depth-nerf ).*)$", said, re.M))
+    assert list(found) == ["View it", "Evaluate it", "Make a film", "Compare"]
+    assert all(f"--load-config {config}" in found[what] for what in ("View it", "Evaluate it", "Make a film"))
+    film, compared = (cli.parse(shlex.split(found[what])[1:]) for what in ("Make a film", "Compare"))
+    assert isinstance(film, CameraPathOptions) and film.load_config == config
+    assert isinstance(compared, CompareOptions) and compared.scenes == (trainer.config.data,)
+    assert compared.preset == "lite"
+
+
+def test_asking_for_held_out_psnr_changes_no_training(trainer, tmp_path):
+    other = trainer_of(trainer.config.data, tmp_path / "other", max_num_iterations=STEPS)
+    for step in range(3):
+        for each in (trainer, other):
+            torch.manual_seed(step)
+            each.train_iteration(step)
+        assert isinstance(other.pipeline, EdgeDepthPipeline) and 5 < other.pipeline.held_out_psnr() < 40
+    expected = parameters(trainer.pipeline)
+    assert all(torch.equal(value, expected[name]) for name, value in parameters(other.pipeline).items())

@@ -486,14 +486,17 @@ def test_it_listens_on_this_machine_alone(training):
         pass
 
 
-def test_lenses_and_path_are_on_from_the_beginning(training):
-    until(lambda: bool(seen(training, "lenses") and seen(training, "path")))
+def test_pictures_are_off_at_first_and_the_path_is_on(training):
+    until(lambda: bool(seen(training, "path")))
+    handles = training.viewer.viser_server.scene._handle_from_node_name
+    assert not nodes(training, "lenses") and handles["/cameras"].visible is False
+    training.layers.switches["lenses"].value = True
+    until(lambda: bool(seen(training, "lenses")))
     count = len(training.trainer.pipeline.datamanager.train_dataset)
     assert len(nodes(training, "lenses")) == count == 22
     assert {name.rpartition("/")[2] for name in nodes(training, "path")} == {"image_02", "image_03"}
     # nerfstudio's pyramids give way
-    assert training.layers._host_frusta.visible is False
-    handles = training.viewer.viser_server.scene._handle_from_node_name
+    assert handles["/cameras"].visible is False
     poses = training.trainer.pipeline.datamanager.train_dataset.cameras.camera_to_worlds
     for index in (0, 13):
         ours, theirs = handles[f"/drive/lenses/{index:05d}"], training.viewer.camera_handles[index]
@@ -515,18 +518,12 @@ def test_clouds_are_made_when_first_switched_on_while_training_goes_on(training,
     until(lambda: training.trainer.step > before + 2)
 
 
-def test_nerfstudio_s_buttons_hide_the_lenses_too(training):
-    until(lambda: bool(seen(training, "lenses")))
-    switch = training.layers.switches["lenses"]
-    training.layers._hide_lenses(True)
-    assert seen(training, "lenses") is False and switch.value
-    training.layers._hide_lenses(False)
-    assert seen(training, "lenses") is True
-    switch.value = False
-    until(lambda: seen(training, "lenses") is False)
-    assert training.layers._host_frusta.visible is True
-    switch.value = True
-    until(lambda: seen(training, "lenses") is True and training.layers._host_frusta.visible is False)
+def test_the_buttons_of_a_training_are_those_of_its_state(training):
+    viewer = training.viewer
+    assert viewer.pause_train.visible and not (viewer.hide_images.visible or viewer.show_images.visible)
+    training.layers.end_training()
+    assert not (viewer.pause_train.visible or viewer.resume_train.visible)
+    viewer.pause_train.visible = True
 
 
 def test_a_file_that_went_away_is_said_and_the_switch_goes_back(training, capsys, monkeypatch):

@@ -25,7 +25,7 @@ DRIVES = {"street": 201, "parking": 202, "turn": 203, "roundabout": 204}
 SCENES = {"without": ("--no-motion",), "motion": ()}
 """Scenes of a drive, and the options that they are processed with."""
 COLUMNS = {
-    "PSNR": ("truth_masked_psnr", ".2f"),
+    "PSNR to clean": ("truth_masked_psnr", ".2f"),
     "AbsRel": ("truth_abs_rel", ".3f"),
     "PSNR 1 m beside": ("shifted_1m_masked_psnr", ".2f"),
 }

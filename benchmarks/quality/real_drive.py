@@ -57,7 +57,7 @@ class Column:
 
 
 COLUMNS = (
-    Column("PSNR", "masked_psnr", ".2f"),
+    Column("masked PSNR", "masked_psnr", ".2f"),
     Column("SSIM", "masked_ssim", ".3f"),
     Column("AbsRel", "lidar_abs_rel", ".3f"),
     Column("δ", "lidar_delta_1_25", ".3f"),

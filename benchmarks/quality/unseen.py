@@ -74,7 +74,7 @@ TITLES: dict[MethodName, str] = {
 """What the page calls methods that `METHODS` calls otherwise."""
 PSNR, ABS_REL, BESIDE = "truth_masked_psnr", "truth_abs_rel", "shifted_1m_masked_psnr"
 FIGURES = {
-    "PSNR": (PSNR, ".2f"),
+    "PSNR to clean": (PSNR, ".2f"),
     "AbsRel": (ABS_REL, ".3f"),
     "δ": ("truth_delta_1_25", ".3f"),
     "PSNR 1 m beside": (BESIDE, ".2f"),

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from typing import TypeVar
+from contextlib import contextmanager
+from threading import Event, Thread
+from typing import ClassVar, TypeVar
 
 from rich.console import Console
 from rich.progress import (
@@ -21,6 +24,9 @@ from rich.progress import (
 _MAX_THREADS = 8
 """More threads would hold more maps in memory at once."""
 
+TOLD_EVERY_S = 10.0
+"""Where bars cannot be drawn, a line tells so often how far the work is."""
+
 Result = TypeVar("Result")
 
 
@@ -29,10 +35,47 @@ def say(console: Console, text: str, style: str | None = None) -> None:
     console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
 
 
+class _Bars(Progress):
+    """Bars that `told` finds while they are shown."""
+
+    shown: ClassVar[list[Progress]] = []
+
+    def start(self) -> None:
+        self.shown.append(self)
+        super().start()
+
+    def stop(self) -> None:
+        super().stop()
+        if self in self.shown:
+            self.shown.remove(self)
+
+
+@contextmanager
+def told(console: Console, what: str) -> Iterator[None]:
+    """Print a line every few seconds while something is done, if the output is a file and so shows no bars."""
+    ended, began_s = Event(), time.monotonic()
+
+    def tell() -> None:
+        while not ended.wait(TOLD_EVERY_S):
+            tasks = [task for bars in list(_Bars.shown) for task in bars.tasks if not task.finished]
+            shares = [f", {task.description.rstrip('… ')} {task.percentage:.0f} %" for task in tasks]
+            say(console, f"{what}: {time.monotonic() - began_s:.0f} s{''.join(shares)}")
+
+    thread = Thread(target=tell, daemon=True)
+    if not console.is_terminal:
+        thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        if thread.ident is not None:
+            thread.join()
+
+
 def progress_bars(console: Console, counted: bool = False, transient: bool = False) -> Progress:
     """Make bars with a description, the time passed and left, and if `counted` how many of how many are done."""
     count: list[ProgressColumn] = [MofNCompleteColumn()] if counted else []
-    return Progress(
+    return _Bars(
         TextColumn("{task.description}"),
         BarColumn(),
         *count,

@@ -24,7 +24,10 @@ COMMON = {
     "steps_per_eval_image": 0,
     "steps_per_eval_all_images": 0,
     "vis": "tensorboard",
+    # each step in the log
+    "logging.local_writer.enable": True,
     "logging.local_writer.max_log_size": 0,
+    "logging.profiler": "basic",
     "timestamp": "run",
 }
 """What a compared training sets beyond its preset."""

@@ -6,8 +6,7 @@ Host-facing. Masks and metrics of whole views are those of `ns-eval`, the same f
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -25,6 +24,7 @@ from edge_depth_nerf.method.metrics import LEAST_SQUARED_ERROR, DepthErrors, mas
 from edge_depth_nerf.plugin.dataset import FisheyeDepthDataset
 from edge_depth_nerf.plugin.detail import detail_shown
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
+from edge_depth_nerf.plugin.pipeline import evaluated
 from edge_depth_nerf.scene.format import read_transforms
 
 PIXELS_PER_VIEW = 3000
@@ -34,24 +34,6 @@ MOST_TRAINED_VIEWS, MOST_TRAINED_PIXELS = 10, 10_000
 """Of training pictures, whose PSNR says how much has been learned at all."""
 COLOURS = {"psnr": "image", "truth_psnr": "truth_rgb"}
 DISTANCES = {name: f"{name}_distance_m" for name in ("lidar", "truth", "beams")}
-
-
-@contextmanager
-def evaluated(model: EdgeDepthNerfModel) -> Iterator[None]:
-    """Let a model in training be evaluated as after loading it, without any trace in the training."""
-    sampler = model.proposal_sampler
-    kept = {name: getattr(sampler, name) for name in ("_anneal", "_steps_since_update")}
-    was_training = model.training
-    model.eval()
-    # what a loaded model has; a training reaches it after its first hundreds of steps
-    sampler.set_anneal(1.0)
-    try:
-        with torch.no_grad():
-            yield
-    finally:
-        for name, value in kept.items():
-            setattr(sampler, name, value)
-        model.train(was_training)
 
 
 @dataclass(frozen=True, eq=False)

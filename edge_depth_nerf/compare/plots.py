@@ -143,10 +143,15 @@ def _lines(
     return found
 
 
+def _psnr_name(results: Results) -> str:
+    return "masked PSNR" if curve_metric(results) == "psnr" else "PSNR to clean"
+
+
 def _curves(results: Results, scenes: Sequence[str], title: str, key: str, label: str) -> Plot:
     """Plot how far held-out and trained-on pixels are right in the course of the training, a column for each drive."""
     psnr = curve_metric(results)
-    names = {psnr: "PSNR of held-out pixels, dB", f"trained_{psnr}": "PSNR of trained-on pixels, dB"}
+    said = _psnr_name(results)
+    names = {psnr: f"{said} of held-out pixels, dB", f"trained_{psnr}": f"{said} of trained-on pixels, dB"}
     names |= dict.fromkeys(DISTANCE_ERRORS, "AbsRel of held-out pixels")
     known = [name for name in names if all(name in run.curve[-1] for run in results.runs)]
     rows = [(name, names[name]) for name in known if DISTANCE_ERRORS[0] not in known or name != DISTANCE_ERRORS[1]]
@@ -166,7 +171,7 @@ def _binned(results: Results, scenes: Sequence[str], title: str, key: str) -> Pl
         x = [(entry["low"] + entry["high"]) / 2 for entry in bins[0]]
         return (x, np.mean([[entry[name] for entry in one] for one in bins], axis=0).tolist()) if x else None
 
-    rows = [("psnr", "PSNR, dB"), ("abs_rel", "AbsRel")]
+    rows = [("psnr", f"{_psnr_name(results)}, dB"), ("abs_rel", "AbsRel")]
     return plot_lines(title, _lines(results, scenes, rows, line), BINS[key], rows, key == "by_distance_m")
 
 

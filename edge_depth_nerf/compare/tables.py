@@ -1,4 +1,4 @@
-"""The paper's four tables, and what it does not report: geometry, views beside the path, time, λ and σ.
+"""What the paper's four tables compare, and what it does not: geometry, views beside the path, time, λ and σ.
 
 A cell is a mean over seeds with its sample standard deviation; an average over drives is taken for each seed first.
 """
@@ -27,7 +27,7 @@ PAPER_AHEAD_DB: dict[str, dict[MethodName, float]] = {
 MAPS = {"scene": "of a network trained on the drive", "elsewhere": "made elsewhere"}
 """What made monocular maps, by where that was trained."""
 KITTI360, JBNU = "kitti360", "jbnu-depth360"
-"""The kinds of source whose drives make Tables 1 and 2; all others come to Table 1."""
+"""The kinds of source whose drives are in the paper's Tables 1 and 2; all others come to the first table."""
 
 AVERAGES = (
     "The paper's averages do not follow from its rows. The differences shown are those that it states for its averages."
@@ -36,13 +36,13 @@ TEXT = "Some figures of the paper differ between its text and its tables."
 INTEGRATED = "In the paper the integrated depth is ahead of both sources."
 EDGE_AWARE = "In the paper the edge-aware kernel is ahead."
 SAME_ROW = (
-    "The paper's row of LiDAR alone (Table 3) is its row of DS-NeRF (Table 1), which has another loss. Here both are "
-    "trained: Table 3 differs only in the source of depth."
+    "The paper's row of LiDAR alone (its Table 3) is its row of DS-NeRF (its Table 1), which has another loss. Here "
+    "both are trained, and these rows differ only in the source of depth."
 )
 
 
-PSNR = Metric("masked_psnr", "PSNR ↑", ".2f")
-TRUE_PSNR = Metric("truth_masked_psnr", "PSNR ↑", ".2f")
+PSNR = Metric("masked_psnr", "masked PSNR ↑", ".2f")
+TRUE_PSNR = Metric("truth_masked_psnr", "PSNR to clean ↑", ".2f")
 
 
 def means_over(scenes: Sequence[str]) -> list[tuple[str, list[str]]]:
@@ -108,12 +108,15 @@ def quality_metrics(results: Results) -> list[Metric]:
 
 
 def _quality_table(
-    results: Results, label: str, title: str, scenes: list[str], methods: Sequence[MethodName]
+    results: Results,
+    title: str,
+    scenes: list[str],
+    methods: Sequence[MethodName],
+    published: Mapping[MethodName, float],
 ) -> MadeTable:
     metrics = quality_metrics(results)
     columns = means_over(scenes)
     groups = [(name, [metric.heading for metric in metrics]) for name, _ in columns]
-    published = PAPER_AHEAD_DB.get(label, {})
     rows = []
     for method in methods:
         cells = [_cell(results, chosen, method, _column(metric)) for _, chosen in columns for metric in metrics]
@@ -125,7 +128,7 @@ def _quality_table(
         groups.append(("ours ahead", ["dB", "paper, dB"] if published else ["dB"]))
     better = [metric.best for _ in columns for metric in metrics]
     mark_best(rows, better + [0] * (len(rows[0].cells) - len(better)))
-    return MadeTable(label, title, groups, rows, [AVERAGES, TEXT] if published else [])
+    return MadeTable("", title, groups, rows, [AVERAGES, TEXT] if published else [])
 
 
 def psnr_at(curve: Sequence[dict[str, float]], seconds: float, name: str, clock: str) -> float:
@@ -160,15 +163,13 @@ def clock_metric(results: Results) -> str:
     return "cpu_seconds" if on_cpu else "seconds"
 
 
-def _table(
-    results: Results, label: str, title: str, scenes: Sequence[str], columns: Sequence[_Column], note: str
-) -> MadeTable:
+def _table(results: Results, title: str, scenes: Sequence[str], columns: Sequence[_Column], note: str) -> MadeTable:
     rows = [
         Row(METHODS[method].title, [_cell(results, scenes, method, column) for column in columns])
         for method in results.methods()
     ]
     mark_best(rows, [column.best for column in columns])
-    return MadeTable(label, title, [("", [column.heading for column in columns])], rows, [note])
+    return MadeTable("", title, [("", [column.heading for column in columns])], rows, [note])
 
 
 def _geometry_table(results: Results, where: str, scenes: Sequence[str]) -> MadeTable:
@@ -178,7 +179,7 @@ def _geometry_table(results: Results, where: str, scenes: Sequence[str]) -> Made
     metrics = [
         psnr_metric(results),
         Metric(f"{truth}affine_masked_psnr", "fitted ↑", ".2f"),
-        *([Metric("masked_psnr", "recorded ↑", ".2f")] if truth else []),
+        *([PSNR] if truth else []),
         Metric(f"detail_{truth}masked_psnr", "with detail ↑", ".2f"),
         Metric(f"{reference}_abs_rel", "AbsRel ↓", ".3f", -1),
         Metric(f"{reference}_rmse_m", "RMSE m ↓", ".2f", -1),
@@ -190,7 +191,8 @@ def _geometry_table(results: Results, where: str, scenes: Sequence[str]) -> Made
     metrics = [metric for metric in metrics if any(metric.name in run.figures for run in results.runs)]
     notes = {
         "fitted": "Fitted: PSNR after an affine fit of each view's colours.",
-        "recorded": "Recorded: PSNR against the recorded picture.",
+        PSNR.heading: "Masked PSNR: against the recorded picture.",
+        TRUE_PSNR.heading: "PSNR to clean: against the picture without noise and exposure drift.",
         "AbsRel": f"AbsRel, RMSE, δ: rendered median distance against {known}, 1-60 m, over all pixels together, "
         "without sky.",
         "detail": "With detail: PSNR with what training pictures show beyond their own renderings.",
@@ -198,7 +200,7 @@ def _geometry_table(results: Results, where: str, scenes: Sequence[str]) -> Made
     }
     headings = " ".join(metric.heading for metric in metrics)
     note = " ".join(text for word, text in notes.items() if word in headings)
-    return _table(results, f"5, {where}", "Pictures and geometry", scenes, list(map(_column, metrics)), note)
+    return _table(results, f"Pictures and geometry, {where}", scenes, list(map(_column, metrics)), note)
 
 
 def _edges_table(results: Results, where: str, scenes: Sequence[str]) -> MadeTable:
@@ -211,7 +213,7 @@ def _edges_table(results: Results, where: str, scenes: Sequence[str]) -> MadeTab
     )
     groups = []
     for title, form, on_path, beside in (
-        ("PSNR ↑", ".2f", f"{truth}masked_psnr", "masked_psnr"),
+        (psnr_metric(results).heading, ".2f", f"{truth}masked_psnr", "masked_psnr"),
         ("edges ↑", ".3f", f"{truth}edge_recall", "edge_recall"),
         ("depth edges ↑", ".3f", depth_edges, "truth_depth_edge_recall"),
     ):
@@ -231,7 +233,7 @@ def _edges_table(results: Results, where: str, scenes: Sequence[str]) -> MadeTab
     )
     if groups[-1][1]:
         note += " Held-out cameras: training saw no picture of them; PSNR is after the colour fit."
-    made = _table(results, f"9, {where}", "Edges, and views beside the path", scenes, columns, note)
+    made = _table(results, f"Edges, and views beside the path, {where}", scenes, columns, note)
     made.groups = [(title, [metric.heading for metric in metrics]) for title, metrics in groups if metrics]
     return made
 
@@ -263,7 +265,7 @@ def _time_table(results: Results, where: str, scenes: Sequence[str]) -> MadeTabl
         f"{CLOCKS[clock]} of training, without evaluation, saving and making priors. PSNR is of random held-out "
         "pixels. A method that ends before ours keeps its last PSNR."
     )
-    return _table(results, f"6, {where}", "Time", scenes, columns, note)
+    return _table(results, f"Time, {where}", scenes, columns, note)
 
 
 def listed(found: Any) -> list[str]:
@@ -288,7 +290,7 @@ def _settings_table(results: Results) -> MadeTable:
         notes.append(f"Searched on {' and '.join(Path(drive).name for drive in drives)}.")
         if {run.specification["scene"] for run in results.runs}.intersection(drives):
             notes.append("These tables include a drive of the search: its figures flatter the searched values.")
-    return MadeTable("7", "λ and σ", [("", ["λ", "σ", "from"])], rows, notes)
+    return MadeTable("", "λ and σ", [("", ["λ", "σ", "from"])], rows, notes)
 
 
 def differing_fields(configurations: Sequence[Mapping[str, str]]) -> list[str]:
@@ -313,14 +315,14 @@ def fields_table(results: Results) -> MadeTable:
     ]
     headings = [METHODS[run.method].title for run in runs]
     note = "From the trained configurations. All other fields are equal."
-    return MadeTable("8", "Fields in which the methods differ", [("", headings)], rows, [note], on_terminal=False)
+    return MadeTable("", "Fields in which the methods differ", [("", headings)], rows, [note], on_terminal=False)
 
 
 def make_tables(results: Results) -> list[MadeTable]:
-    """Make the tables that the runs are enough for."""
+    """Make the tables that the runs are enough for, numbered from 1; those for a terminal come first."""
     kinds, everywhere = {run.scene: run.content.get("source") for run in results.runs}, results.scenes()
     of_jbnu = [scene for scene in everywhere if kinds[scene] == JBNU]
-    # each loss with each prior and extras that was trained; Tables 3 and 4 have ours with one thing changed
+    # each loss with each prior and extras that was trained; the last two have ours with one thing changed
     of_other_losses = [name for name, method in METHODS.items() if method.loss != "edge" and not method.variant]
     rivals = ["nerfacto-embedding", *of_other_losses, "edge-paper", "edge"]
     of_the_paper = ", drives of KITTI-360's kind" if {*kinds.values()} <= {KITTI360, JBNU} else ""
@@ -330,16 +332,19 @@ def make_tables(results: Results) -> list[MadeTable]:
         ("3", "Source of depth", everywhere, ["edge-lidar", "edge-mono", "edge"], [INTEGRATED, SAME_ROW]),
         ("4", "Kernel of the integration", everywhere, ["edge-gaussian", "edge"], [EDGE_AWARE]),
     ]
-    for label, title, _, names, notes in wanted[2:]:
+    for number, title, _, names, notes in wanted[2:]:
         literal = [name.replace("edge", "edge-paper", 1) for name in names]
-        wanted.append((f"{label}, as published", f"{title}, the published method", everywhere, literal, notes[:1]))
+        wanted.append((number, f"{title}, the published method", everywhere, literal, notes[:1]))
+    with_paper = results.options.get("preset") == "paper"
     tables = []
-    for label, title, scenes, names, notes in wanted:
+    for number, title, scenes, names, notes in wanted:
         there = {run.method for run in results.runs if run.scene in scenes}
         methods = [name for name in names if name in there]
         if len(methods) > 1:
-            made = _quality_table(results, label, title, scenes, methods)
-            made.notes += notes
+            published = PAPER_AHEAD_DB.get(number, {}) if with_paper else {}
+            full_title = f"{title} (the paper's Table {number})" if with_paper else title
+            made = _quality_table(results, full_title, scenes, methods, published)
+            made.notes += notes if with_paper else []
             tables.append(made)
     # the average stands for its drives, which the page folds away
     *drives, first = means_over(everywhere)
@@ -349,7 +354,8 @@ def make_tables(results: Results) -> list[MadeTable]:
             # of many columns a terminal shows nothing
             fits = where == first[0] and make is not _edges_table
             tables.append(replace(make(results, where, scenes), on_terminal=fits))
-    return [*tables, _settings_table(results)]
+    tables = sorted([*tables, _settings_table(results)], key=lambda made: not made.on_terminal)
+    return [replace(made, label=str(number)) for number, made in enumerate(tables, 1)]
 
 
 def introduction(results: Results) -> list[str]:
@@ -359,7 +365,8 @@ def introduction(results: Results) -> list[str]:
         f"{METHODS[name].title} {', '.join(str(seed) for seed in results.seeds() if results.has(name, seed))}"
         for name in results.methods()
     ]
-    against = "the picture without noise and exposure drift" if psnr_metric(results) is TRUE_PSNR else "the picture"
+    clean = psnr_metric(results) is TRUE_PSNR
+    against = "the picture without noise and exposure drift (to clean)" if clean else "the recorded picture"
     lines = [
         f"Preset {results.options.get('preset')}, {' and '.join(map(str, steps))} steps per run; drives "
         f"{', '.join(results.scenes())}.",

@@ -127,6 +127,9 @@ class MeasuredTrainer(EdgeDepthTrainer):
             write_json(self.progress_path, {"times": self.times, "curve": self.curve})
             super().save_checkpoint(step)
 
+    def tell(self, step: int, loss: torch.Tensor) -> None:
+        """Print nothing: the command's bar shows the share of all work."""
+
     def _after_step(self, steps: int) -> None:
         if steps in self._evaluated_at:
             with self.clock.stopped():

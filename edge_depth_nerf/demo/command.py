@@ -15,7 +15,7 @@ from typing import Any
 
 from rich.console import Console
 
-from edge_depth_nerf.base.console import say
+from edge_depth_nerf.base.console import say, told
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import check_is_folder, read_json, write_bytes, write_json
 from edge_depth_nerf.compare.command import RUNS, finished_runs, picture_name, read_comparison, write_comparison
@@ -115,11 +115,15 @@ def _make(options: DemoOptions, stages: Stages, recorded: dict[str, Any], consol
     """Do all stages, show their tables, and write the page and the picture; give what results.json holds."""
     output, compared = options.output, stages.comparison.output
     clock = _Clock(output / SECONDS)
-    with clock.stage("synthesize"):
+    with clock.stage("synthesize"), told(console, "Synthesize"):
         synthesize_drive(stages.synthesis)
-    with clock.stage("process"):
+    with clock.stage("process"), told(console, "Process"):
         process(stages.processing, console)
-    with clock.stage("compare"), finished_runs(stages.comparison, console) as comparison:
+    with (
+        clock.stage("compare"),
+        told(console, "Compare"),
+        finished_runs(stages.comparison, console) as comparison,
+    ):
         page = write_comparison(compared, comparison, console)
     show_tables(page.tables, console)
     # the folder may hold more: who liked it compares further methods there

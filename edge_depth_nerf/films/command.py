@@ -19,9 +19,10 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import write_json
 from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.cameras import KannalaBrandt, Pinhole
-from edge_depth_nerf.films.options import LARGEST_PX, CameraPathOptions
+from edge_depth_nerf.films.options import LARGEST_PX, CameraPathOptions, FilmCamera
 from edge_depth_nerf.films.paths import CameraPath, lane_shift, orbit, replay, up_of
 from edge_depth_nerf.films.placed import outside, placed, poses_of
+from edge_depth_nerf.films.seen import TrainingViews
 from edge_depth_nerf.plugin.compat import quiet_host
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
 
@@ -29,6 +30,10 @@ DEFAULT_RATE_HZ = 10.0
 """Used for scenes without times."""
 ORBIT_SECONDS = 6.0
 LARGEST_FILM_FRAMES = 100_000
+UNSEEN_SHARE = 0.1
+"""A message warns of a film of whose rays more than this were never recorded."""
+RAY_COLUMNS = 24
+"""So many rays across a film's picture are asked for what they show."""
 KEYFRAMES = 12
 """Number of keyframes. nerfstudio's viewer draws the path through them when it loads the file."""
 
@@ -46,6 +51,20 @@ class FilmLens:
     def fov_deg(self) -> float:
         """What path files call fov: nerfstudio computes every focal length as height / 2 / tan(fov / 2)."""
         return math.degrees(2 * math.atan(self.height / 2 / self.focal_px))
+
+    def rays(self, camera: FilmCamera) -> Float64[np.ndarray, "rays 3"]:
+        """Unit vectors through evenly spread pixels, in the camera (OpenGL's axes)."""
+        rows = max(1, round(RAY_COLUMNS * self.height / self.width))
+        v, u = ((np.indices((rows, RAY_COLUMNS)).reshape(2, -1) + 0.5).T / (rows, RAY_COLUMNS) - 0.5).T
+        if camera == "equirectangular":
+            longitude, latitude = 2 * np.pi * u, -np.pi * v
+            ahead = np.cos(latitude)
+            return np.stack((ahead * np.sin(longitude), np.sin(latitude), -ahead * np.cos(longitude)), axis=1)
+        x, y = u * self.width / self.focal_px, -v * self.height / self.focal_px
+        radius = np.maximum(np.hypot(x, y), 1e-9)
+        theta = np.arctan(radius) if camera == "perspective" else radius
+        rays = np.stack((np.sin(theta) * x / radius, np.sin(theta) * y / radius, -np.cos(theta)), axis=1)
+        return rays[theta < np.pi]
 
 
 def write_camera_path(options: CameraPathOptions, console: Console | None = None) -> Path:
@@ -94,6 +113,15 @@ def write_camera_path(options: CameraPathOptions, console: Console | None = None
     write_json(output, path_file(to_model.poses(poses), lens, options, fps))
     if warning := outside(poses, scene):
         say(console, warning, "yellow")
+    # lengths of other scenes are no metres
+    unseen = TrainingViews(scene).unseen_share(poses, lens.rays(options.camera)) if scene.own else 0.0
+    if unseen > UNSEEN_SHARE:
+        say(
+            console,
+            f"{unseen:.0%} of the film's rays show what no training picture nearby has in its field and mask: it was "
+            "never recorded, and may be anything. A smaller --fov-deg or another --camera or --kind shows less of it.",
+            "yellow",
+        )
     say(console, f"{where}: {frames} pictures of {lens.width}×{lens.height}, {frames / fps:.1f} s at {fps:g} a second.")
     say(console, f"Path: {output}\nThe film:")
     config = str(options.load_config)
@@ -108,7 +136,9 @@ def film_lens(lens: KannalaBrandt | Pinhole, options: CameraPathOptions) -> Film
     Raises:
         InputError: the computed height is out of range.
     """
-    aspect = {"fisheye": lens.width / lens.height, "perspective": 16 / 9, "equirectangular": 2.0}[options.camera]
+    own = lens.width / lens.height
+    wide = own if isinstance(lens, Pinhole) else 16 / 9
+    aspect = {"fisheye": own, "perspective": wide, "equirectangular": 2.0}[options.camera]
     width = options.width or _even(2.0 * lens.height if options.camera == "equirectangular" else float(lens.width))
     height = _even(width / aspect)
     if max(width, height) > LARGEST_PX:
@@ -116,10 +146,18 @@ def film_lens(lens: KannalaBrandt | Pinhole, options: CameraPathOptions) -> Film
     if options.camera == "equirectangular":
         return FilmLens(width, height, height / 2)
     if options.camera == "perspective":
-        return FilmLens(width, height, width / 2 / math.tan(math.radians(options.fov_deg or 90.0) / 2))
+        # what a wider lens shows beyond would be stretched
+        fov_deg = options.fov_deg or (own_fov_deg(lens) if isinstance(lens, Pinhole) else min(own_fov_deg(lens), 90.0))
+        return FilmLens(width, height, width / 2 / math.tan(math.radians(fov_deg) / 2))
     if options.fov_deg is None and isinstance(lens, KannalaBrandt):
         return FilmLens(width, height, lens.fx * width / lens.width)
-    return FilmLens(width, height, width / math.radians(options.fov_deg or 180.0))
+    return FilmLens(width, height, width / math.radians(options.fov_deg or own_fov_deg(lens)))
+
+
+def own_fov_deg(lens: KannalaBrandt | Pinhole) -> float:
+    """Angle of view of the drive's lens across the width, degrees."""
+    half = lens.width / 2 / lens.fx
+    return math.degrees(2 * min(math.atan(half) if isinstance(lens, Pinhole) else half, lens.theta_max_rad))
 
 
 def path_file(

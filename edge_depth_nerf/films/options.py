@@ -30,8 +30,8 @@ class CameraPathOptions:
     kind: Kind = "replay"
     """replay: along the recorded path. lane-shift: to one side of it and back. orbit: a circle around a point ahead."""
     camera: FilmCamera = "fisheye"
-    """fisheye: equidistant, not the drive's own lens. perspective: a pinhole that looks ahead. equirectangular: the
-    whole sphere."""
+    """fisheye: equidistant, with the scale of the drive's lens. perspective: a pinhole that looks ahead.
+    equirectangular: the whole sphere."""
     output: Path | None = None
     """The path file. Not set: camera_paths/KIND_CAMERA.json beside config.yml."""
     follow: str | None = None
@@ -45,7 +45,8 @@ class CameraPathOptions:
     width: int | None = None
     """The film's width, px. Not set: that of the drive's pictures; for equirectangular twice their height."""
     fov_deg: float | None = None
-    """Angle of view across the width, degrees. Not set: fisheye has the lens's (180 for a pinhole), perspective 90."""
+    """Angle of view across the width, degrees. Not set: that of the drive's lens; perspective 90 at most if that is a
+    fisheye."""
     fps: float | None = None
     """Pictures per second. Not set: the drive's rate, or 10 if the scene has no times."""
     seconds: float | None = None

@@ -87,6 +87,7 @@ def inspect_scene(options: InspectOptions, console: Console | None = None) -> di
         "points": None if points_m is None else len(points_m),
         "path": path_figures(scene),
         "paths_agree": None if agreement is None else {**asdict(agreement), "text": agreement.text()},
+        "calibration": shown_scene.calibration.sentences() if shown_scene.calibration else [],
         "measured": _sample(len(figures), len(scene.pictures)),
         "maps": map_figures(figures),
         "cameras": {
@@ -182,6 +183,8 @@ def _show(summary: dict[str, Any], console: Console) -> None:
             f"features are {found['median_px']:.2f} px from their epipolar lines (median; {found['min_px']:.2f} to "
             f"{found['max_px']:.2f} px over {found['steps']} steps)",
         )
+    if summary["calibration"]:
+        drive.add_row("prior", "\n".join(summary["calibration"]))
     console.print(drive)
 
     cameras = summary["cameras"]
@@ -225,6 +228,7 @@ def _rows(cameras: Sequence[dict[str, Any]]) -> list[tuple[str, list[str]]]:
         "pixels used": lambda c: _spread(c["used_share"], ".0%"),
         "LiDAR coverage": lambda c: _spread(c["lidar_coverage"], ".1%"),
         "mono coverage": lambda c: _spread(c["mono_coverage"], ".0%"),
+        "motion coverage": lambda c: _spread(c["motion_coverage"], ".0%"),
         "pixels with a prior": lambda c: _spread(c["prior_share"], ".0%"),
         "without a prior (sky, …)": lambda c: _number(c["no_prior_share"], ".0%"),
         "LiDAR / motion's distance": lambda c: fitted(c, "{ratio:.2f} (±{ratio_spread:.2f})"),

@@ -45,6 +45,8 @@ class PictureFigures:
     """Share of the usable pixels with a LiDAR point."""
     mono_coverage: float | None
     """Share of the usable pixels with a monocular distance."""
+    motion_coverage: float | None
+    """Share of the usable pixels with a distance from motion."""
     prior_share: float | None
     """Share of the usable pixels with a prior. The others show sky, or are out of reach of all sources."""
     lidar_m: NDArray[np.float32]
@@ -65,6 +67,7 @@ class PictureFigures:
             "brightness": _rounded(self.brightness),
             "lidar_coverage": _rounded(self.lidar_coverage),
             "mono_coverage": _rounded(self.mono_coverage),
+            "motion_coverage": _rounded(self.motion_coverage),
             "prior_share": _rounded(self.prior_share),
             "mono_over_lidar_median": _median(self.mono_over_lidar),
         }
@@ -105,6 +108,7 @@ def measure(picture: ScenePicture, maps: ShownMaps) -> PictureFigures:
         brightness=float(grey[usable].mean()) if usable.any() else 0.0,
         lidar_coverage=share(maps.lidar_m),
         mono_coverage=share(maps.mono_m),
+        motion_coverage=share(maps.distances_m.get("motion")),
         prior_share=share(prior_m),
         lidar_m=kept(maps.lidar_m, at(maps.lidar_m)),
         prior_m=kept(prior_m, at(prior_m)),
@@ -215,6 +219,7 @@ def map_figures(measured: Sequence[PictureFigures]) -> dict[str, Any]:
         "hidden_share_of_lens": spread([figures.hidden_share for figures in measured]),
         "lidar_coverage": spread([figures.lidar_coverage for figures in measured]),
         "mono_coverage": spread([figures.mono_coverage for figures in measured]),
+        "motion_coverage": spread([figures.motion_coverage for figures in measured]),
         "prior_share": prior,
         "no_prior_share": _rounded(1 - prior["mean"]) if prior else None,
         "lidar_distance_m": quantiles(pooled("lidar_m")),

@@ -138,6 +138,18 @@ def viewer_command(config: Path) -> str:
     return f"ns-viewer --load-config {shlex.quote(str(config))} --viewer.websocket-host 127.0.0.1"
 
 
+def commands_after(config: Path, scene: Path, preset: str) -> dict[str, str]:
+    """What to do with a trained model next, and the command for it."""
+    given = f"--load-config {shlex.quote(str(config))}"
+    compared = f"{shlex.quote(str(scene))} --output {shlex.quote(str(config.parents[2] / 'comparison'))}"
+    return {
+        "View it": viewer_command(config),
+        "Evaluate it": f"ns-eval {given} --output-path {shlex.quote(str(config.with_name('figures.json')))}",
+        "Make a film": f"edge-depth-nerf camera-path {given}",
+        "Compare": f"edge-depth-nerf compare {compared} --preset {preset} --methods nerfacto edge",
+    }
+
+
 def command_line(words: Sequence[str], options: Any) -> str:
     """Write the command that gives those options that are not at their defaults; what has no flag comes first."""
     found = [*words]

@@ -350,8 +350,12 @@ class Calibration:
         )
         return sigma
 
-    def summary(self) -> str:
-        """Sum up the calibration in some sentences for the user."""
+    def headline(self) -> str:
+        """Say the most important of it in a line."""
+        return f"{next(iter(self.sentences()), 'The prior is calibrated.')} `edge-depth-nerf inspect` tells more."
+
+    def sentences(self) -> list[str]:
+        """Sum up the calibration for the user, the most important first."""
         evaluated = [f for f in self.frames if f.held_out_before is not None and f.held_out_after is not None]
         parts = []
         if evaluated:
@@ -382,7 +386,7 @@ class Calibration:
                 f"The prior covers elevations from {low - FIELD_MARGIN_DEG:.0f}° to {high + FIELD_MARGIN_DEG:.0f}°, "
                 f"where LiDAR measured.{self._beyond_said()}"
             )
-        return " ".join(parts)
+        return parts
 
     def _beyond_said(self) -> str:
         """Say where else there is a prior."""

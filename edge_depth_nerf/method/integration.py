@@ -102,7 +102,7 @@ class IntegrationOptions:
     because the distances of neighbouring ground pixels differ by the square of their distance over the camera's height.
     0: Eq. 7."""
     kernel: Kernel = "edge-aware"
-    """edge-aware: Eq. 7. spatial-gaussian: Eq. 7 without its distance factor (the rival of Table 4)."""
+    """edge-aware: Eq. 7. spatial-gaussian: Eq. 7 without its distance factor."""
     normalise: Normalise = "pooled"
     """pooled: Eq. 5. residual: the monocular map is averaged alone, and LiDAR points correct it around them by their
     relative difference from it."""

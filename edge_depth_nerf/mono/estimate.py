@@ -178,7 +178,7 @@ def _estimate(
     for scene in scenes:
         if scene.has("lidar"):
             calibration = calibrate_scene(scene.path, console=console)
-            console.print(f"{scene.folder}: {calibration.summary()}", soft_wrap=True)
+            console.print(f"{scene.folder}: {calibration.headline()}", soft_wrap=True)
     return EstimateReport(weights, trained, count)
 
 

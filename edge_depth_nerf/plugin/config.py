@@ -16,7 +16,7 @@ from importlib import resources
 from typing import Any
 
 import torch
-from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
+from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
@@ -82,6 +82,8 @@ def base_config(method_name: str) -> TrainerConfig:
         optimizers={"proposal_networks": optimiser(), "fields": optimiser(), "camera_opt": optimiser(warmup=0.1)},
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15, websocket_host="127.0.0.1"),
         vis="viewer",
+        # the trainer says where it is, in lines that a file can hold
+        logging=LoggingConfig(local_writer=LocalWriterConfig(enable=False), profiler="none"),
     )
 
 

@@ -15,6 +15,7 @@ import errno
 import hashlib
 import json
 import os
+import shlex
 import tempfile
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
@@ -73,19 +74,17 @@ KEPT_TABLES = 8
 """This many tables of pixels are kept per scene, the last used ones. 300 pictures of 1400×1400 px take 6 GB."""
 
 
+SHORT_NAMES = {"lidar": "LiDAR", "mono": "monocular"}
+"""Of sources of the prior, in a line."""
 SURFACE_SIGMA_M = 0.1
 SURFACE_SIGMA_SHARE = 0.15
 """A prior is too vague for a surface if its sigma exceeds these metres plus this share of its distance."""
 
 
 @dataclass
-class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig):
-    """Rays of fisheye pictures with an edge-aware integrated depth prior."""
+class PriorSourceOptions:
+    """Our options, before nerfstudio's in the help."""
 
-    _target: type = field(default_factory=lambda: FisheyeDepthDataManager)
-    """Target class to instantiate."""
-    dataparser: AnnotatedDataParserUnion = field(default_factory=FisheyeDepthDataParserConfig)
-    """Specifies the dataparser used to unpack the data."""
     depth_source: str = "auto"
     """The prior's source. integrated: LiDAR, monocular maps and motion; lidar, mono, motion or another: this one alone;
     none; auto: what the scene has."""
@@ -95,6 +94,16 @@ class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig):
     """Additional pixels in each batch, whose colour is compared with the field's at the prior's distance. 0: none."""
     cache_dir: Path | None = None
     """Folder for priors and tables of training pixels. Not set: .cache/ in the scene folder."""
+
+
+@dataclass
+class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig, PriorSourceOptions):
+    """Rays of fisheye pictures with an edge-aware integrated depth prior."""
+
+    _target: type = field(default_factory=lambda: FisheyeDepthDataManager)
+    """Target class to instantiate."""
+    dataparser: AnnotatedDataParserUnion = field(default_factory=FisheyeDepthDataParserConfig)
+    """Specifies the dataparser used to unpack the data."""
 
     def source_of_prior(self, sources: Collection[str]) -> str | None:
         """Return the depth source, of layers that all pictures have; `auto` becomes what the scene has. None: no prior.
@@ -187,10 +196,14 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         self._surface_sampler = None
         if self.config.surface_rays_per_batch > 0 and table.share_with_prior > 0:
             self._surface_sampler = TablePixelSampler(table, self.config.surface_rays_per_batch, self.device)
-        CONSOLE.log(
-            f"{len(self.train_dataset)} training pictures, {len(table):,} valid pixels, "
-            f"{table.share_with_prior:.1%} of them with a depth prior"
-        )
+        said = f"{len(self.train_dataset)} training pictures, {len(table):,} pixels."
+        if table.share_with_prior > 0:
+            shares = (f"{SHORT_NAMES.get(name, name)} {share:.0%}" for name, share in table.shares_of_sources.items())
+            said += (
+                f" Prior: {'; '.join([f'{table.share_with_prior:.0%} of them', *filter(None, [', '.join(shares)])])}"
+            )
+            said += f"; `edge-depth-nerf inspect {shlex.quote(str(self.config.dataparser.data))}` shows it."
+        CONSOLE.print(said, soft_wrap=True, highlight=False, markup=False)
 
     def setup_eval(self) -> None:
         """Write or open the table of held-out pixels (no prior), and prepare the loaders of whole views."""
@@ -305,7 +318,6 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
             calibration = find_calibration(
                 scene, options, self._cache_dir(), dataset.image_filenames, CONSOLE, source, self.device
             )
-            CONSOLE.log(f"Depth prior: {calibration.summary()}")
         elif source == "mono" and options.sigma_mode == "calibrated":
             calibration = field_of_source(scene)
         elif self.config.depth_source == "auto" and source == "lidar":
@@ -391,7 +403,8 @@ def _load(dataset: FisheyeDepthDataset, cache: PriorCache | None, whole_windows:
         if sky is not None and (motion := maps.get("motion")) is not None:
             # a pixel that was matched between pictures is not sky
             sky &= ~(motion > 0)
-        return PicturePixels(rgb, mask, prior.distance_m, prior.sigma_m, sky)
+        sources = {name: found > 0 for name in depth_sources() if (found := maps.get(name)) is not None}
+        return PicturePixels(rgb, mask, prior.distance_m, prior.sigma_m, sky, sources)
 
     # OpenCV and torch release the interpreter's lock, so two threads read and integrate at the same time. They are only
     # a few pictures ahead, which limits memory.

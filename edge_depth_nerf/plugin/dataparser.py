@@ -47,19 +47,25 @@ def default_metres_per_unit(camera_positions_m: NDArray) -> float:
 
 
 @dataclass
-class FisheyeDepthDataParserConfig(NerfstudioDataParserConfig):
+class SceneOptions:
+    """Our options, before nerfstudio's in the help."""
+
+    metres_per_unit: float | None = None
+    """Metres per scene unit. Not set: half of the drive's extent, from 10 m to 128 m."""
+    depth_kind: DepthKind = "auto"
+    """What the files under depth_file_path contain. auto: distance along the ray, but z_depth in other people's pinhole
+    scenes."""
+
+
+@dataclass
+class FisheyeDepthDataParserConfig(NerfstudioDataParserConfig, SceneOptions):
     """Scene with fisheye (or pinhole) cameras, metric poses and distance maps."""
 
     _target: type = field(default_factory=lambda: FisheyeDepth)
     """Target class to instantiate."""
-    metres_per_unit: float | None = None
-    """Metres per scene unit. Not set: half of the drive's extent, from 10 m to 128 m."""
     depth_unit_scale_factor: tyro.conf.Suppress[float | None] = None  # pyright: ignore[reportIncompatibleVariableOverride]
     """Metres per count of the files under depth_file_path. Not set: what transforms.json says, else nerfstudio's
     0.001."""
-    depth_kind: DepthKind = "auto"
-    """What the files under depth_file_path contain. auto: distance along the ray, but z_depth in other people's pinhole
-    scenes."""
     downscale_factor: tyro.conf.Suppress[int | None] = 1
     """How much smaller pictures nerfstudio reads from folders images_K; maps have one size, so it is 1."""
     orientation_method: tyro.conf.Suppress[Literal["pca", "up", "vertical", "none"]] = "none"

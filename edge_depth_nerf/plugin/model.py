@@ -76,11 +76,9 @@ LARGEST_NEAR_PLANE_M = 0.5
 
 
 @dataclass
-class EdgeDepthNerfModelConfig(NerfactoModelConfig):
-    """nerfacto supervised by a distance prior."""
+class ModelOptions:
+    """Our options; dataclasses put fields of the last base first, and so does the help."""
 
-    _target: type = field(default_factory=lambda: EdgeDepthNerfModel)
-    """Target class to instantiate."""
     near_m: float = 0.2
     """Where sampling starts along the ray, metres (replaces near_plane)."""
     far_m: float = 1000.0
@@ -109,15 +107,23 @@ class EdgeDepthNerfModelConfig(NerfactoModelConfig):
     exposure: Exposure = "gain"
     """Exposure and white balance. gain: a factor per colour and training picture. embedding: nerfacto's appearance
     embedding. none: not modelled."""
+    detail: bool = False
+    """Add detail of the training pictures to rendered views, which then take longer; training stays the same
+    (docs/method.md)."""
+
+
+@dataclass
+class EdgeDepthNerfModelConfig(NerfactoModelConfig, ModelOptions):
+    """nerfacto supervised by a distance prior."""
+
+    _target: type = field(default_factory=lambda: EdgeDepthNerfModel)
+    """Target class to instantiate."""
     camera_optimizer: CameraOptimizerConfig = field(default_factory=PoseRefinerConfig)
     """Poses that training refines."""
     proposal_warmup: float = 1 / 6  # pyright: ignore[reportIncompatibleVariableOverride]
     """How long the proposal networks are trained less and less often: below 1 a share of the training, else steps."""
     proposal_weights_anneal_max_num_iters: float = 1 / 30  # pyright: ignore[reportIncompatibleVariableOverride]
     """How long the proposals' weights count less than later: below 1 a share of the training, else steps."""
-    detail: bool = False
-    """Add detail of the training pictures to rendered views, which then take longer; training stays the same
-    (docs/method.md)."""
     implementation: Literal["fused", "torch"] = "fused"  # pyright: ignore[reportIncompatibleVariableOverride]
     """fused: our kernels. torch: nerfstudio's code, with the same results and checkpoints, but many times slower on a
     CPU."""

@@ -6,7 +6,8 @@ nerfstudio would average depth errors over pictures.
 from __future__ import annotations
 
 import math
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -59,6 +60,24 @@ class EdgeDepthPipelineConfig(VanillaPipelineConfig):
         say_errors_plainly()
         ignore_deprecations_of_host()
         return super().setup(**kwargs)
+
+
+@contextmanager
+def evaluated(model: EdgeDepthNerfModel) -> Iterator[None]:
+    """Let a model in training be evaluated as after loading it, without any trace in the training."""
+    sampler = model.proposal_sampler
+    kept = {name: getattr(sampler, name) for name in ("_anneal", "_steps_since_update")}
+    was_training = model.training
+    model.eval()
+    # what a loaded model has; a training reaches it after its first hundreds of steps
+    sampler.set_anneal(1.0)
+    try:
+        with torch.no_grad():
+            yield
+    finally:
+        for name, value in kept.items():
+            setattr(sampler, name, value)
+        model.train(was_training)
 
 
 class NotFiniteError(InputError):
@@ -200,6 +219,14 @@ class EdgeDepthPipeline(VanillaPipeline):
             f"pictures: {listed}. Check them with `edge-depth-nerf inspect`. If they are fine, lower the learning "
             "rate or the weights of the losses, or turn mixed precision off (--mixed-precision False)."
         )
+
+    def held_out_psnr(self) -> float:
+        """PSNR of the next batch of held-out pixels, dB; it leaves no trace in a training."""
+        model = self.model
+        assert isinstance(model, EdgeDepthNerfModel)
+        with evaluated(model):
+            rays, batch = self.datamanager.next_eval(0)
+            return float(model.psnr(model(rays)["rgb"].clamp(0, 1), batch["image"]))
 
     def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict[str, Any], dict[str, Any]]:
         """Figures and pictures of one held-out view."""

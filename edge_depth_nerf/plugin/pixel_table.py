@@ -14,9 +14,10 @@ from __future__ import annotations
 
 import tempfile
 import warnings
-from collections.abc import Callable, Iterable
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import IO, Any
 
@@ -115,6 +116,8 @@ class PixelTable:
         if type(about["with_prior"]) is not int:
             raise ValueError(f"{path}: with_prior is no number")
         self._with_prior = about["with_prior"]
+        sources = about.get("sources")
+        self._sources = sources if isinstance(sources, dict) else {}
 
     def __len__(self) -> int:
         """Count the records: the valid pixels."""
@@ -124,6 +127,11 @@ class PixelTable:
     def share_with_prior(self) -> float:
         """Give the share of the records that have a prior."""
         return self._with_prior / len(self)
+
+    @property
+    def shares_of_sources(self) -> dict[str, float]:
+        """Give the share of the records at which each source has a distance; nothing for tables of before."""
+        return {name: count / len(self) for name, count in self._sources.items() if isinstance(count, int)}
 
     @property
     def nbytes(self) -> int:
@@ -172,6 +180,8 @@ class PicturePixels:
     prior_sigma_m: Float[np.ndarray, "h w"] | None = None
     sky: Bool[np.ndarray, "h w"] | None = None
     """Where it is known to show the sky; None: nowhere."""
+    sources: Mapping[str, Bool[np.ndarray, "h w"]] = field(default_factory=dict)
+    """Where each source of the prior has a distance."""
 
 
 def _bytes_of(records: NDArray) -> UInt8[Tensor, "n 15"]:
@@ -194,6 +204,7 @@ def write_table(path: Path, most_pixels: int, pictures: Iterable[PicturePixels])
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     rng, number, pixels, with_prior = np.random.default_rng(0), 0, 0, 0
+    sources: Counter[str] = Counter()
     with ExitStack() as stack:
         buckets: list[IO[bytes]] = [
             stack.enter_context(tempfile.TemporaryFile(dir=path.parent, prefix=".pixels."))
@@ -203,6 +214,7 @@ def write_table(path: Path, most_pixels: int, pictures: Iterable[PicturePixels])
             records = _records(picture, number - 1)
             pixels += len(records)
             with_prior += int((records["distance"] > 0).sum())
+            sources.update({name: int((has & picture.mask).sum()) for name, has in picture.sources.items()})
             bucket = rng.integers(len(buckets), size=len(records))
             ordered = records[np.argsort(bucket, kind="stable")]
             ends = np.cumsum(np.bincount(bucket, minlength=len(buckets)))
@@ -225,7 +237,7 @@ def write_table(path: Path, most_pixels: int, pictures: Iterable[PicturePixels])
                 file.truncate()
 
         write_checked(path, TABLE_VERSION, write)
-    about = {"version": TABLE_VERSION, "pixels": pixels, "with_prior": with_prior}
+    about = {"version": TABLE_VERSION, "pixels": pixels, "with_prior": with_prior, "sources": sources}
     write_json(_about(path), {**about, "pictures": number})
 
 

@@ -18,15 +18,17 @@ from typing import Any, Literal
 
 import torch
 import yaml
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer import Viewer
 
 from edge_depth_nerf.base.errors import STOPPED_STATUS, InputError
 from edge_depth_nerf.base.files import remove_leftovers, write_text
-from edge_depth_nerf.jobs.runs import checkpoints_in, newest_checkpoint
+from edge_depth_nerf.jobs.runs import checkpoints_in, commands_after, newest_checkpoint
 from edge_depth_nerf.kernels.table_adam import TableAdam
 from edge_depth_nerf.kernels.threads import torch_on_one_thread
 from edge_depth_nerf.plugin.compat import count_steps_against_all, ignore_deprecations_of_host, total_steps
@@ -37,20 +39,29 @@ from edge_depth_nerf.plugin.plain_errors import say_errors_plainly
 from edge_depth_nerf.plugin.settings import changed_settings
 from edge_depth_nerf.plugin.step_graphs import Capture, GpuCapture, StepGraphs, why_not
 
-COST_BETWEEN = (50, 100)
-"""After so many steps of a training a message reports what one costs: those between the two are measured."""
-FOR_A_GPU = ("edge-depth-nerf", "edge-depth-nerf-paper")
-"""Methods with full-size models."""
+TOLD_EVERY_S, TOLD_EVERY_SHARE = 10.0, 0.05
+"""Training prints a line after so many seconds, and after this share of the time since it began."""
+PRESETS = {"edge-depth-nerf": "full", "edge-depth-nerf-paper": "paper"}
+"""Methods with full-size models, meant for a GPU, and what `compare` calls their settings."""
 
 
 @dataclass
-class EdgeDepthTrainerConfig(TrainerConfig):
+class TrainingOptions:
+    """Our options and the most used of nerfstudio's, before its others in the help."""
+
+    data: Path | None = None
+    max_num_iterations: int = 0
+    cuda_graphs: bool = True
+    """On a GPU, launch a step's kernels as one: several times faster, same results (docs/gpu.md)."""
+    pipeline: VanillaPipelineConfig = field(default_factory=VanillaPipelineConfig)
+
+
+@dataclass
+class EdgeDepthTrainerConfig(TrainerConfig, TrainingOptions):
     """nerfstudio's trainer with atomic checkpoints and a check for finite numbers."""
 
     _target: type = field(default_factory=lambda: EdgeDepthTrainer)
     """Target class to instantiate."""
-    cuda_graphs: bool = True
-    """On a GPU, launch a step's kernels as one: several times faster, same results (docs/gpu.md)."""
 
     def print_to_terminal(self) -> None:
         """Print what is trained, and the settings that differ from the method's own; config.yml has all of them."""
@@ -94,11 +105,11 @@ class EdgeDepthTrainer(Trainer):
         self._interruption = _Interruption()
         self._last_step: int | None = None  # of this process
         self.graphs: StepGraphs | None = None
-        self._cost = _Cost()
+        self._progress = _Progress()
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Set up as nerfstudio does; Ctrl-C ends it with one line."""
-        if self.device == "cpu" and self.config.method_name in FOR_A_GPU and test_mode == "val":
+        if self.device == "cpu" and self.config.method_name in PRESETS and test_mode == "val":
             CONSOLE.print(
                 f"[yellow]{self.config.method_name} is meant for a GPU, but this training uses the CPU: expect hours. "
                 "edge-depth-nerf-lite takes minutes."
@@ -164,12 +175,13 @@ class EdgeDepthTrainer(Trainer):
         raise SystemExit(STOPPED_STATUS) from None
 
     def _train_complete_viewer(self) -> None:
-        """Show detail from now on, where the viewer's switch asks for it; then wait for Ctrl-C, as nerfstudio does."""
+        """End the viewer's training, show detail if its switch asks for it, and wait for Ctrl-C as nerfstudio does."""
         viewer, pipeline = self.viewer_state, self.pipeline
-        ours = isinstance(pipeline, EdgeDepthPipeline) and pipeline.drive.layers.detail.value
-        if ours and isinstance(viewer, Viewer):
-            self.training_state = "completed"
-            viewer._trigger_rerender()
+        if isinstance(pipeline, EdgeDepthPipeline) and isinstance(viewer, Viewer):
+            pipeline.drive.layers.end_training()
+            if pipeline.drive.layers.detail.value:
+                self.training_state = "completed"
+                viewer._trigger_rerender()
         super()._train_complete_viewer()
 
     def train_iteration(self, step: int) -> TRAIN_INTERATION_OUTPUT:
@@ -184,10 +196,31 @@ class EdgeDepthTrainer(Trainer):
                 if result is None:
                     result = super().train_iteration(step)
                 self._last_step = step
-            self._cost.note(step, self)
+            self.tell(step, result[0])
             return result
         except NotFiniteError as error:
             raise InputError(f"{error} {self._kept()}") from error
+
+    def tell(self, step: int, loss: torch.Tensor) -> None:
+        """Print a line on the training, if it is time."""
+        if self.local_rank == 0:
+            self._progress.note(step, loss, self)
+
+    def _check_viewer_warnings(self) -> None:
+        """Leave out nerfstudio's note that nothing is evaluated."""
+
+    def _after_train(self) -> None:
+        """Do as nerfstudio does, and say what comes next before the viewer waits."""
+        if self.local_rank == 0:
+            at_end = TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], lambda step: self._say_next())
+            self.callbacks.append(at_end)
+        super()._after_train()
+
+    def _say_next(self) -> None:
+        config, preset = self.base_dir / "config.yml", PRESETS.get(str(self.config.method_name), "lite")
+        scene = Path(self.pipeline.datamanager.get_datapath())
+        lines = [f"{what}: {command}" for what, command in commands_after(config, scene, preset).items()]
+        CONSOLE.print("\n".join(lines), soft_wrap=True, highlight=False, markup=False)
 
     def _threads(self) -> AbstractContextManager[None]:
         """Give the fused kernels on the CPU the threads, and torch one."""
@@ -276,33 +309,38 @@ class EdgeDepthTrainer(Trainer):
         return f"The last checkpoint, {newest}, is kept; resume with --load-dir {newest.parent}."
 
 
-class _Cost:
-    """Says once what a step costs, when it has become what it will be."""
+class _Progress:
+    """Says now and then where a training is: loss, PSNR of held-out pixels, milliseconds a step, time to go."""
 
     def __init__(self) -> None:
-        self._first: int | None = None
         self._began_s = 0.0
+        self._said: tuple[int, float] | None = None
+        """Step and time of the last line."""
 
-    def note(self, step: int, trainer: EdgeDepthTrainer) -> None:
-        """Take note that a step was taken; after some, print milliseconds, rays and memory."""
-        self._first = step if self._first is None else self._first
-        done = step - self._first + 1
-        if done not in COST_BETWEEN:
-            return
-        on_gpu = torch.device(trainer.device).type == "cuda"
-        if on_gpu:
-            torch.cuda.synchronize(trainer.device)
-        if done == COST_BETWEEN[0]:
+    def note(self, step: int, loss: torch.Tensor, trainer: EdgeDepthTrainer) -> None:
+        """Take note that a step was taken; print a line if it is time, and after the last one."""
+        if self._said is None:
+            # the first step compiles
             self._began_s = time.perf_counter()
+            self._said = step, self._began_s
             return
-        step_s = (time.perf_counter() - self._began_s) / (done - COST_BETWEEN[0])
+        last, last_s = self._said
+        now_s, left = time.perf_counter(), total_steps(trainer) - step - 1
+        if left and now_s - last_s < max(TOLD_EVERY_S, TOLD_EVERY_SHARE * (now_s - self._began_s)):
+            return
+        # waits for a GPU
+        said = f"Step {step + 1:,} of {total_steps(trainer):,}: loss {float(loss.detach()):.4f}"
+        step_s = (time.perf_counter() - last_s) / (step - last)
+        if isinstance(trainer.pipeline, EdgeDepthPipeline) and len(trainer.pipeline.datamanager.eval_dataset):
+            said += f", held-out PSNR {trainer.pipeline.held_out_psnr():.1f} dB"
         rays = trainer.pipeline.datamanager.get_train_rays_per_batch() * trainer.world_size
-        said = f"A step takes {1e3 * step_s:.3g} ms: {rays / step_s:,.0f} rays/s"
-        if on_gpu:
+        said += f"; {1e3 * step_s:.3g} ms a step, {rays / step_s:,.0f} rays/s"
+        if torch.device(trainer.device).type == "cuda":
             graphs = trainer.graphs is not None and trainer.graphs.recorded > 0
             said += f", {torch.cuda.max_memory_reserved(trainer.device) / 1e9:.1f} GB of GPU memory"
             said += f", {'by' if graphs else 'without'} CUDA graphs"
-        CONSOLE.print(f"{said}. {_duration(step_s * (total_steps(trainer) - step - 1))} to go.", highlight=False)
+        CONSOLE.print(said + (f"; {_duration(step_s * left)} to go" if left else ""), highlight=False, soft_wrap=True)
+        self._said = step, time.perf_counter()
 
 
 def _duration(seconds: float) -> str:

@@ -187,7 +187,8 @@ class DriveLayers(ViewerControl):
             "prior": self._switch(
                 "Depth prior", "prior", False, "The distances that supervise the training", has_prior
             ),
-            "lenses": self._switch("Lenses", "lenses", True, "What each camera sees; replaces nerfstudio's pyramids"),
+            # from inside one, its picture would look like a perfect rendering
+            "lenses": self._switch("Lenses", "lenses", False, "What each camera sees; replaces nerfstudio's pyramids"),
             "path": self._switch("Path", "path", True, "A line through the positions of each camera"),
         }
         self.meaning = ViewerDropdown(
@@ -205,7 +206,6 @@ class DriveLayers(ViewerControl):
         )
         self._frames: dict[str, viser.FrameHandle] = {}
         self._clouds: dict[str, Cloud] = {}
-        self._hidden = False
 
     def _switch(self, label: str, layer: str, shown: bool, hint: str, available: bool = True) -> ViewerCheckbox:
         hint = hint if available else "This training has none"
@@ -216,12 +216,14 @@ class DriveLayers(ViewerControl):
         super()._setup(viewer)
         self._install(viewer)
         viewer.viser_server.on_client_connect(self._welcome)
-        # created before nerfstudio's frusta, this parent shows or hides all of them
-        self._host_frusta = viewer.viser_server.scene.add_frame(HOST_FRUSTA, show_axes=False)
+        # created before nerfstudio's frusta, this parent hides all of them
+        viewer.viser_server.scene.add_frame(HOST_FRUSTA, show_axes=False, visible=False)
+        if viewer.trainer is None or viewer.trainer.training_state == "completed":
+            self.end_training()
         # nerfstudio asks for no other picture when a training is paused
         viewer.pause_train.on_click(lambda _: self._ask_for_detail())
-        viewer.hide_images.on_click(lambda _: self._hide_lenses(True))
-        viewer.show_images.on_click(lambda _: self._hide_lenses(False))
+        # our switch does what these do
+        viewer.hide_images.visible = viewer.show_images.visible = False
         for layer in self.switches:
             self._update(layer)
 
@@ -259,16 +261,13 @@ class DriveLayers(ViewerControl):
         if self.detail.value:
             self.viewer._trigger_rerender()
 
-    def _hide_lenses(self, hidden: bool) -> None:
-        self._hidden = hidden
-        self._update("lenses")
+    def end_training(self) -> None:
+        """Take away the buttons that pause and resume a training."""
+        self.viewer.pause_train.visible = self.viewer.resume_train.visible = False
 
     def _update(self, layer: str) -> None:
         """Show or hide a layer's nodes, according to its switch."""
         shown = bool(self.switches[layer].value)
-        if layer == "lenses":
-            self._host_frusta.visible = not shown
-            shown = shown and not self._hidden
         if layer in self._frames:
             self._frames[layer].visible = shown
         elif shown:

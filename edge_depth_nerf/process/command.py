@@ -161,4 +161,4 @@ def _add_mono(scene: SceneFolder, options: ProcessOptions, console: Console) -> 
 
         if saved_calibration(scene, PriorOptions()) is None:
             calibration = calibrate_scene(scene.path, console=console)
-            say(console, calibration.summary())
+            say(console, calibration.headline())

@@ -67,6 +67,11 @@ class MadeTable:
     on_terminal: bool = True
 
     @property
+    def heading(self) -> str:
+        """The title, after its number if it has one."""
+        return f"Table {self.label}. {self.title}" if self.label else self.title
+
+    @property
     def caption(self) -> str:
         """All notes in one text."""
         return " ".join(self.notes)
@@ -99,7 +104,7 @@ def show_tables(tables: Sequence[MadeTable], console: Console) -> None:
     for made in tables:
         if not made.on_terminal:
             continue
-        table = Table("", title=f"Table {made.label}. {made.title}", caption=made.caption)
+        table = Table("", title=made.heading, caption=made.caption)
         for group, heading in made.headings():
             table.add_column(f"{group}\n{heading}" if group else heading, justify="right")
         for row in made.rows:
@@ -116,7 +121,7 @@ def page_of_tables(title: str, lines: Sequence[str], tables: Sequence[MadeTable]
         for row in table.rows:
             cells = [f"**{cell.text()}**" if cell.best else cell.text() for cell in row.cells]
             lines.append(f"| {row.title} | {' | '.join(cells)} |")
-        parts += [f"## Table {table.label}. {table.title}", "\n".join(lines), *([table.caption] if table.notes else [])]
+        parts += [f"## {table.heading}", "\n".join(lines), *([table.caption] if table.notes else [])]
     return "\n\n".join(parts) + "\n"
 
 
@@ -161,5 +166,5 @@ def latex_of_tables(lines: Sequence[str], tables: Sequence[MadeTable]) -> str:
             bold = [rf"\textbf{{{text}}}" if cell.best else text for text, cell in zip(cells, row.cells, strict=True)]
             lines.append(f"{latex_text(row.title)} & {' & '.join(bold)} \\\\")
         lines += [r"\bottomrule", r"\end{tabular}", r"\end{table}"]
-        parts.append(f"% Table {table.label}\n" + "\n".join(lines))
+        parts.append(f"% {table.heading}\n" + "\n".join(lines))
     return "\n\n".join(parts) + "\n"

@@ -213,7 +213,8 @@ def show_view(view: ComparedView, allowance: int) -> ShownView:
             "colour-error": map_of(np.abs(error).mean(-1) / 2.55, view.mask, COLOUR_ERROR),
         }
         squared = float(np.square(error[view.mask] / 255).mean())
-        figures[name] = {"PSNR, dB": f"{-10 * math.log10(max(squared, LEAST_SQUARED_ERROR)):.2f}"}
+        psnr = "masked PSNR, dB" if view.clean_rgb is None else "PSNR to clean, dB"
+        figures[name] = {psnr: f"{-10 * math.log10(max(squared, LEAST_SQUARED_ERROR)):.2f}"}
         if compared.any():
             ratio = np.where(compared, distance_m / np.where(compared, view.distance_m, 1), 1).astype(np.float32)
             rendered[name]["distance-error"] = map_of(100 * (ratio - 1), compared, RELATIVE_ERROR, radius)
