@@ -52,6 +52,21 @@ def test_where_the_weights_come_from(results):
     assert "Searched on tuning and turn." in made.notes and "flatter" in made.caption
 
 
+def test_the_verdict_by_hand(results):
+    assert tables.verdict(results).startswith("Ours renders held-out pictures 2.4 dB better than nerfacto (PSNR, ")
+    # AbsRel is 1 / PSNR in these runs
+    ours, theirs = (
+        np.mean([1 / psnr for (_, name), found in PSNR_OF.items() if name == method for psnr in found])
+        for method in ("edge", "nerfacto")
+    )
+    assert f"wrong by {ours:.1%} on average, nerfacto's by {theirs:.1%}." in tables.verdict(results)
+    for run in results.runs:
+        del run.figures["truth_abs_rel"]
+        run.figures["truth_masked_psnr"] *= -1
+    assert "2.4 dB worse than nerfacto (PSNR, a measure of quality)." in tables.verdict(results)
+    assert tables.verdict(Results([run for run in results.runs if run.method != "nerfacto"])) == ""
+
+
 def test_table_1_by_hand(results):
     made = table(results, "1")
     headings = made.headings()
