@@ -1,15 +1,17 @@
 """Tables by hand, of made-up runs."""
 
+import re
 import statistics
 
 import numpy as np
 import pytest
 from comparisons import fake
+from rich.console import Console
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.compare import tables
 from edge_depth_nerf.compare.results import Results, check_fair
-from edge_depth_nerf.report.tables import latex_of_tables, page_of_tables
+from edge_depth_nerf.report.tables import latex_of_tables, page_of_tables, show_tables
 
 PSNR_OF = {
     ("street", "nerfacto"): (20.0, 21.0, 22.5),
@@ -50,6 +52,16 @@ def test_where_the_weights_come_from(results):
     results.options["tuned_on"] = ["/scenes/tuning", "/scenes/turn"]
     made = table(results, "7")
     assert "Searched on tuning and turn." in made.notes and "flatter" in made.caption
+
+
+def test_the_best_is_bold_everywhere(results, capsys):
+    made = table(results, "1")
+    show_tables([made], Console(force_terminal=True, width=300))
+    said, page = capsys.readouterr().out, page_of_tables("Title", [], [made])
+    for row in made.rows:
+        for cell in row.cells:
+            assert not cell.best or (f"\x1b[1m{cell.text()}\x1b[0m" in said and f"**{cell.text()}**" in page)
+    assert len(re.findall("\x1b\\[1m\\d", said)) == page.count("**") // 2 == 6
 
 
 def test_the_verdict_by_hand(results):

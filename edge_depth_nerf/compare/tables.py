@@ -385,11 +385,11 @@ def introduction(results: Results) -> list[str]:
         f"{', '.join(results.scenes())}.",
         "Seeds: " + "; ".join(seeds) + ".",
         f"Means over held-out views, PSNR in dB, inside the mask, against {against}; ± the standard deviation over "
-        "seeds.",
+        "seeds. Bold: the best of a column.",
         "Versions: " + ", ".join(f"{name} {number}" for name, number in results.versions.items()) + ".",
     ]
     if any(name.endswith("masked_flip") for run in results.runs for name in run.figures):
-        lines.append("FLIP: the difference that a viewer sees, 0 (none) to 1. Bold: the best of a column.")
+        lines.append("FLIP: the difference that a viewer sees, 0 (none) to 1.")
     if not any(name.endswith("lpips") for run in results.runs for name in run.figures):
         lines.append("LPIPS is missing: its weights were not on this machine.")
     if any(run.specification["implementation"] == "torch" for run in results.runs):
